@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.summary.run_summary import summarise
+from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.record.align import aligned_parts
 from cosim.record.decimation import decimate_all
 from cosim.record.run_record import RunRecord
@@ -236,7 +236,7 @@ def simulate_sampled(scenario: Scenario) -> Exploration:
         NoackError: the scenario is wrong, or has several loops.
     """
     record = simulate(resolve(scenario))
-    return of_record(record, SAMPLED, summarise(record, 0, HORIZON).diverged_at_s)
+    return of_record(record, SAMPLED, summarise_loop(record, 0, HORIZON).diverged_at_s)
 
 
 @np.errstate(all="ignore")  # a run may diverge

@@ -10,13 +10,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cosim.analysis.claims.claim_evaluation import RunClaims, certify_late, claims_of, list_violations
-from cosim.analysis.claims.run_evidence import certificates_together
+from cosim.analysis.claims.run_certificates import certificates_together
 from cosim.analysis.fidelity import fidelity_for_summary
 from cosim.analysis.replay.machine_replay import SharedMachines
 from cosim.analysis.replay.run_replay import replay, stored_verdict
+from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.analysis.summary.loops_over_time import LoopOverTime, loop_over_time
-from cosim.analysis.summary.network_summary import summarise_run, worst_loop
-from cosim.analysis.summary.run_summary import Outcome, linearisation, summarise
+from cosim.analysis.summary.plant_linearisation import linearisation
+from cosim.analysis.summary.run_summary import Outcome, summarise_run, worst_loop
 from cosim.analysis.summary.summary_model import (
     ConditionsPart,
     ExitPart,
@@ -248,7 +249,7 @@ def _evaluate_loops(
     for record, own in zip(records, expected, strict=True):
         phase_ns = run.phases_ns[record.number]
         status, reason = int(ending.status), ending.reason
-        summary = summarise(record, status, reason, phase_ns, own.assumptions)
+        summary = summarise_loop(record, status, reason, phase_ns, own.assumptions)
         if len(run.loops) == 1:
             # Written again with the results, so that none of them can cost the summary.
             _write_summary(ending.run_dir, _summary(run, ending, [summary]))

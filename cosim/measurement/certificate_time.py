@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.claims.observed_conditions import PacketLosses, causes_of
-from cosim.analysis.claims.run_evidence import scheduled_certificates
+from cosim.analysis.claims.run_certificates import scheduled_certificates
 from cosim.measurement.loss_bursts import outcomes
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario

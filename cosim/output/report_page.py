@@ -14,7 +14,7 @@ from urllib.parse import quote
 import numpy as np
 
 from cosim.analysis.summary.loops_over_time import LoopOverTime
-from cosim.analysis.summary.network_summary import worst_loop
+from cosim.analysis.summary.run_summary import worst_loop
 from cosim.analysis.summary.summary_model import LoopSummary, RunSummary
 from cosim.output.figures.figure_description import FigureDescription
 from cosim.output.figures.network_figures import network_figures

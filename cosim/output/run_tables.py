@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from cosim.analysis.fidelity import is_against
-from cosim.analysis.summary.run_summary import linearisation_rows
+from cosim.analysis.summary.plant_linearisation import linearisation_rows
 from cosim.analysis.summary.summary_model import (
     ChangePart,
     Claim,

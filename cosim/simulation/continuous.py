@@ -23,7 +23,7 @@ from typing import NamedTuple, SupportsFloat
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.record.run_events import Divergence, divergence
+from cosim.record.divergence import Divergence, divergence
 from cosim.simulation.exact_simulation import (
     DIVERGED,
     MAX_EVENTS,

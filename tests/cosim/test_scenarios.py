@@ -15,8 +15,9 @@ from scipy.linalg import eigvals, solve_continuous_are
 
 from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.analysis.claims.condition_reader import read_conditions
-from cosim.analysis.claims.run_evidence import scheduled_certificates
-from cosim.analysis.summary.run_summary import linearisation, linearisation_rows, summarise
+from cosim.analysis.claims.run_certificates import scheduled_certificates
+from cosim.analysis.summary.loop_summary import summarise_loop
+from cosim.analysis.summary.plant_linearisation import linearisation, linearisation_rows
 from cosim.analysis.summary.summary_model import ClaimVerdict, LinearisationPart, NoLinearisationPart
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate, simulate_loops
@@ -53,7 +54,7 @@ def run_of(name: str) -> RunRecord:
 def test_a_shipped_scenario_meets_its_assumptions_and_settles(name: str) -> None:
     skip_without_plant(SCENARIOS / f"{name}.toml")
     record = run_of(name)
-    summary = summarise(record, 0, "horizon").to_json()
+    summary = summarise_loop(record, 0, "horizon").to_json()
     assert summary["exit"]["status"] == 0
     assert summary["reached_s"] == pytest.approx(record.scenario.horizon_s)
     assert summary["missing_samples"] == 0
@@ -73,7 +74,7 @@ def test_the_loops_of_a_shipped_network_settle_and_keep_what_is_claimed(name: st
     shared = simulate_loops(shipped(name))
     require_capacity(shared.network.scenario)
     for record in shared.loops:
-        summary = summarise(record, 0, "horizon").to_json()
+        summary = summarise_loop(record, 0, "horizon").to_json()
         assert summary["exit"]["status"] == 0
         assert summary["assumption_violations"] == []
         assert summary["longest_loss_burst"] <= record.scenario.network.mansd

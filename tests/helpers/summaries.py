@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from cosim.analysis.summary.network_summary import summarise_run
-from cosim.analysis.summary.run_summary import summarise
+from cosim.analysis.summary.loop_summary import summarise_loop
+from cosim.analysis.summary.run_summary import summarise_run
 from cosim.analysis.summary.summary_model import ExitPart, LoopSummary, RunSummary
 from cosim.record.run_record import NETWORK_ROLES, RecordedRun, RunRecord
 
@@ -20,7 +20,7 @@ def alone(record: RunRecord) -> RecordedRun:
 def summary_of(record: RunRecord, **more: Any) -> RunSummary:
     """The summary of a completed run whose only loop has this record, with other values."""
     end = ExitPart(status=0, reason="horizon")
-    run = summarise_run(alone(record).network, [summarise(record, 0, "horizon")], end)
+    run = summarise_run(alone(record).network, [summarise_loop(record, 0, "horizon")], end)
     return with_values(run, **more)
 
 

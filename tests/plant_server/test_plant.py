@@ -9,7 +9,7 @@ import pytest
 
 from cosim.analysis.fidelity import IncomparableError, recorded_loop
 from cosim.analysis.replay import replay
-from cosim.analysis.summary.run_summary import summarise
+from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.record.run_record import RunRecord
 from noack.protocol.roles import Notice, Record
 from noack.protocol.wire_format import Flow, Message
@@ -54,7 +54,7 @@ def run(request: pytest.FixtureRequest) -> RunRecord:
 def test_a_trip_before_the_first_actuation_is_in_the_summary() -> None:
     run = with_outage(resolved("lane_following", "horizon_s=2"), 0.0, 0.4)
     assert next(one["t_ns"] for one in run.notices if one["level"] == "watchdog") == 102_000_000
-    watchdog = summarise(run, 0, "horizon").watchdog
+    watchdog = summarise_loop(run, 0, "horizon").watchdog
     assert (watchdog.trips, watchdog.first_s) == (1, pytest.approx(0.102))
 
 
@@ -62,7 +62,7 @@ def test_the_beginning_and_end_of_a_trip_are_reported_and_replayed(run: RunRecor
     trips = [(one["t_ns"], one["process"]) for one in run.notices if one["level"] == "watchdog"]
     assert trips == [(1_100_000_000, "plant"), (1_402_000_000, "plant")]
     policy = run.scenario.plant.watchdog.policy
-    assert summarise(run, 0, "horizon").to_json()["watchdog"] == {
+    assert summarise_loop(run, 0, "horizon").to_json()["watchdog"] == {
         "policy": policy, "timeout_s": pytest.approx(0.1), "trips": 1,
         "first_s": pytest.approx(1.1), "total_s": pytest.approx(0.302),
     }  # fmt: skip

@@ -34,7 +34,8 @@ from cosim.analysis.claims.claim_definition import (
     Envelope,
 )
 from cosim.analysis.claims.observed_conditions import AssumptionViolation, VoidFrom
-from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples, late_certificates
+from cosim.analysis.claims.run_certificates import late_certificates
+from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples
 from cosim.analysis.claims.run_parts import RunPart, common_end_ns, cut_part, start_error, up_to_common_end
 from cosim.analysis.summary.summary_model import Claim, ClaimVerdict, ViolationPart
 from cosim.record.decimation import decimate

@@ -2,7 +2,7 @@
 
 import math
 import sys
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -23,6 +23,7 @@ from cosim.analysis.claims.observed_conditions import (
     earliest,
     guarantee_causes,
 )
+from cosim.analysis.claims.run_certificates import LateSchedules, late_certificates, scheduled_certificates
 from cosim.analysis.claims.run_parts import RunPart
 from cosim.analysis.claims.trajectory_delta import trajectory_delta
 from cosim.analysis.summary.signal_statistics import SampleFacts, SampleFactsReader, signal_statistics
@@ -31,7 +32,6 @@ from cosim.record.run_record import RunRecord
 from noack.core.linear_systems import all_entries
 from noack.protocol.record_tables import NO_SEQUENCE
 from noack.protocol.roles import LOOP_ROLES
-from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.certificates.certified_bounds import (
     KnownStateBounds,
@@ -39,14 +39,9 @@ from noack.theory.certificates.certified_bounds import (
     known_state_bounds,
 )
 from noack.theory.certificates.conditions import allowed_conditions, ideal_conditions, nominal_conditions
-from noack.theory.certificates.region import scopes
 from noack.theory.certificates.scenario_certificates import certify
-from noack.theory.certificates.solution import Search, completed
 from noack.theory.paper import Theorem2, theorem_2
 
-LateSchedules = Generator[
-    NetworkConditions, Sequence[ScenarioCertificate], Sequence[ScenarioCertificate] | None
-]
 ROUNDING = 1e-9
 """Relative rounding error of an exact computation over a run of 10,000 steps."""
 _LONG_S = 1e300  # finite: the delay of an input that never arrived is infinite
@@ -153,7 +148,7 @@ class RunEvidence:
             return self.part.certificates
         return scheduled_certificates(self.record.scenario, self.part.start_error)
 
-    def late_schedules(self) -> "LateSchedules":
+    def late_schedules(self) -> LateSchedules:
         """Yield schedules of a run that was later than its scenario allows, until one is certified.
 
         They are the one that the whole run kept, and then those that it kept up to a time: the
@@ -335,64 +330,3 @@ class RunEvidence:
         if ideal is None or ideal.rate_per_s != trigger.alpha_per_s:
             return None
         return theorem_2(loop, trigger.beta, trigger.alpha_per_s, ideal.delta)
-
-
-def late_certificates(runs: Sequence[RunEvidence]) -> list[Sequence[ScenarioCertificate] | None]:
-    """Return the certificates under the widest of the late schedules of each run, if any."""
-    certificates_of: list[Sequence[ScenarioCertificate] | None] = [None] * len(runs)
-    due: list[tuple[int, LateSchedules, Sequence[ScenarioCertificate] | None]] = [
-        (number, run.late_schedules(), None)
-        for number, run in enumerate(runs)
-        if run.record.scenario.coverage.can_be_certified
-    ]
-    while due:
-        tried: list[tuple[int, LateSchedules, NetworkConditions]] = []
-        for number, search, certificates in due:
-            try:
-                conditions = next(search) if certificates is None else search.send(certificates)
-                tried.append((number, search, conditions))
-            except StopIteration as best:
-                certificates_of[number] = best.value
-        answers = certificates_together(
-            [runs[number].record.scenario for number, *_ in tried],
-            [runs[number].part.start_error for number, *_ in tried],
-            [conditions for *_, conditions in tried],
-        )
-        due = [(*search[:2], answer) for search, answer in zip(tried, answers, strict=True)]
-    return certificates_of
-
-
-def scheduled_certificates(scenario: Scenario, start_error: float | None = None) -> list[ScenarioCertificate]:
-    """Return the certificates of a resolved scenario under its schedule, if it can have any.
-
-    A part of a run that starts with an input of the part before has a ``start_error``.
-    """
-    (certificates,) = certificates_together([scenario], [start_error])
-    return certificates
-
-
-def certificates_together(
-    scenarios: Sequence[Scenario],
-    start_errors: Sequence[float | None] | None = None,
-    conditions: Sequence[NetworkConditions] | None = None,
-) -> list[list[ScenarioCertificate]]:
-    """Return the certificates of several scenarios; see :func:`scheduled_certificates`.
-
-    They are those under some conditions; by default, under the schedule of each scenario.
-    """
-    searches: list[Search[ScenarioCertificate]] = []
-    numbers: list[int] = []
-    for number, scenario in enumerate(scenarios):
-        if not scenario.coverage.can_be_certified:
-            continue
-        limits = allowed_conditions(scenario) if conditions is None else conditions[number]
-        error = 0.0
-        if start_errors is not None and (given := start_errors[number]) is not None:
-            limits, error = limits._replace(start_s=0.0), given
-        for scope in scopes(scenario, error):
-            searches.append(scope.search(limits))
-            numbers.append(number)
-    by_scenario: list[list[ScenarioCertificate]] = [[] for _ in scenarios]
-    for number, certificate in zip(numbers, completed(searches), strict=True):
-        by_scenario[number].append(certificate)
-    return by_scenario

@@ -1,62 +1,37 @@
-"""The summary of a loop, computed from its record.
+"""The summary of a run: its network, the summaries of its loops, and which loop is the worst."""
 
-:func:`linearisation` compares the linearisation of a non-linear plant with the loop's model.
-"""
-
-import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, SupportsFloat, TypedDict
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from cosim.analysis.summary.loop_statistics import (
-    drops_by_cause,
-    from_controller,
-    latency,
-    lateness,
-    missing_rows,
-    reported_violations,
-    unintended_losses,
-    watchdog_actions,
-)
-from cosim.analysis.summary.signal_statistics import disturbances, signal_statistics
+from cosim.analysis.summary.loop_summary import change_parts
 from cosim.analysis.summary.summary_model import (
-    AssumptionPart,
-    ChangePart,
+    Claim,
+    DeadlinesPart,
     ExitPart,
-    LinearisationPart,
+    InFlightPart,
+    LatenessPart,
     LoopSummary,
-    NoLinearisationPart,
-    RestartPart,
+    NetworkPart,
     RunSummary,
 )
-from cosim.record.run_events import Divergence, changes_of, divergence, packet_outcomes
-from cosim.record.run_record import RunRecord, no_such_loop
+from cosim.record.run_record import Rows, RunRecord, no_such_loop
 from noack.core.clock import NS_PER_S
-from noack.core.errors import ExitStatus, NoackError
-from noack.core.linear_systems import Matrix, Vector
-from noack.impairments.loss_prediction import expected_loss
-from noack.plants.plant_settings import PlantSystem
-from noack.plants.systems.linearisation import NO_STATE, STEP_NS, linearise
-from noack.protocol.record_tables import (
-    CONTROLLER_DELIVERY,
-    NETEM_PACKET,
-    PLANT_STEP,
-    UPDATES,
-    Fate,
-    effective,
-)
-from noack.protocol.roles import FAILED, LOOP_ROLES, RECORDER, RESTART
-from noack.protocol.wire_format import Flow
-from noack.scenario.resolution import loop_of
-from noack.scenario.runtime_parameters import text_of
-from noack.scenario.scenario import Scenario
-from noack.theory.certificates.assumptions import Assumption, assumptions
-from plant_server.plant import system_of
+from noack.core.errors import ExitStatus
+from noack.core.number_format import number as number_text
+from noack.impairments.feature import Impairment
+from noack.impairments.kinds.duplicate import Duplicate
+from noack.impairments.kinds.rate import Rate
+from noack.protocol.record_tables import NETEM_PACKET, Fate
+
+_BINS = 200
+_MOST_NAMED = 3
+_COLUMNS = ("sequence", "now_ns", "flow", "fate", "release_ns", "copy_ns", "size_bytes")
 
 
 @dataclass(frozen=True)
@@ -87,279 +62,189 @@ def outcome_of_loop(outcome: Outcome, loop: str | None) -> Outcome:
     return Outcome(outcome.run_dir, status, summary.exit.reason, summary, loop if len(names) > 1 else None)
 
 
-@np.errstate(all="ignore")  # a diverging run overflows and has a summary all the same
-def summarise(
-    record: RunRecord,
-    exit_status: int,
-    reason: str,
-    phase_ns: int = 0,
-    assumed: Sequence[Assumption] = (),
-) -> LoopSummary:
-    """Return the summary of a loop, without the results of replay, fidelity and claims.
+def summarise_run(
+    network: RunRecord,
+    loops: Sequence[LoopSummary],
+    end: ExitPart,
+    startup_s: float | None = None,
+) -> RunSummary:
+    """Return the summary of a run, from the record of its network and the summaries of its loops.
 
-    ``exit_status`` and ``reason`` are those of the run; the loop may have failed nevertheless. The
-    assumptions of its scenario may be known: ``assumed``.
+    ``end`` is how the run ended; a run that completed has failed if one of its loops failed.
+    ``startup_s`` is the wall time from the launch to simulated time 0; None if unknown.
     """
-    scenario, live = record.scenario, record.kind == "live"
-    missing, lost, diverged = missing_rows(record), unintended_losses(record), _divergence(record)
-    if exit_status == ExitStatus.OK and (why := _why_failed(record, missing, diverged)):
-        exit_status, reason = ExitStatus.FAILED, why
-    signals = signal_statistics(record)
-    return LoopSummary(
-        name=scenario.name,
-        number=record.number,
-        phase_s=phase_ns / NS_PER_S,
-        mode=scenario.mode,
-        reached_s=_seconds(record.last_ns(PLANT_STEP)) or 0.0,
-        **_transmissions(record),
-        link_share=None,  # of the network's bytes, which the record of the loop does not have
-        acknowledgements=from_controller(record, Flow.ACKNOWLEDGEMENT),
-        actuations=from_controller(record, Flow.ACTUATION),
-        **signals.for_summary(),
-        assumption_violations=reported_violations(record),
-        assumptions=[AssumptionPart(**status._asdict()) for status in assumed or assumptions(scenario)],
-        restarts=_restarts(record),
-        changes=change_parts(record),
-        missing_samples=sum(missing.values()),
-        missing_by_table={table: n for table, n in missing.items() if n},
-        unintended_losses=sum(lost.values()),
-        unintended_losses_by_leg={hop: n for hop, n in lost.items() if n},
-        rejected_datagrams={
-            role: rejected
-            for role, report in record.reports.items()
-            if (rejected := _rejected(report["channel"]))
-        },
-        lateness_us={role: lateness(record, role) for role in LOOP_ROLES if live},
-        latency_us=latency(record) if live else None,
-        realtime={role: report.get("realtime") or {} for role, report in record.reports.items() if live},
-        watchdog=watchdog_actions(record),
-        estimation=signals.estimation(),
-        disturbances=disturbances(record),
-        diverged_at_s=None if diverged is None else diverged.at_s,
-        exit=ExitPart(status=int(exit_status), reason=reason),
+    scenario = network.scenario
+    packets = network.columns(
+        NETEM_PACKET, *_COLUMNS, where=lambda rows: rows["flow"] < len(loops)
+    )  # the others are of the other direction
+    packets = network.with_departures(packets)
+    forwarded_bytes = np.bincount(
+        packets["flow"], np.where(packets["release_ns"] >= 0, packets["size_bytes"], 0), len(loops)
+    )
+    shares = forwarded_bytes / max(forwarded_bytes.sum(), 1)
+    reached_s = min(loop.reached_s for loop in loops)
+    return RunSummary(
+        kind=network.kind,
+        startup_s=startup_s,
+        scenario=scenario.name,
+        mansd=scenario.network.mansd,
+        constraints=[constraint.text() for constraint in scenario.network.constraints],
+        horizon_s=scenario.horizon_s,
+        speed=scenario.speed,
+        reached_s=reached_s,
+        network=_network_part(network, packets, loops, reached_s),
+        loops=[
+            loop.model_copy(update={"link_share": float(share)})
+            for loop, share in zip(loops, shares, strict=True)
+        ],
+        changes=change_parts(network),
+        deadlines=_deadlines([loop.lateness_us for loop in loops]),
+        exit=end if end.status != ExitStatus.OK else _end(end, loops),
     )
 
 
-class _Transmissions(TypedDict):
-    """The fields of a loop's summary about its updates."""
-
-    events: int
-    deliveries: int
-    drops: int
-    loss_expected: float | None
-    drops_by_cause: dict[str, int]
-    forced_deliveries: int
-    longest_loss_burst: int
-    delay_mean_s: float | None
-    delay_max_s: float | None
-    loss_bursts: dict[str, int]
-    inter_event_min_s: float | None
-    inter_event_median_s: float | None
-    inter_delivery_median_s: float | None
-
-
-def _transmissions(record: RunRecord) -> _Transmissions:
-    """Counts and intervals of transmissions."""
-    scenario, events, outcomes = record.scenario, record.events(), packet_outcomes(record)
-    deliveries = record.columns(CONTROLLER_DELIVERY, "t_ns", "dropouts")
-    intervals_s = np.diff(events["t_ns"]) * 1e-9
-    longest = int(deliveries["dropouts"].max(initial=0))
-    bursts, delays_s = outcomes.loss_bursts().tolist(), _delays_s(record)
+def _deadlines(lateness_us: Sequence[Mapping[str, LatenessPart]]) -> dict[str, DeadlinesPart]:
     return {
-        "events": len(events),
-        "deliveries": len(deliveries),
-        "drops": int(outcomes.lost.sum()),
-        "loss_expected": None if changes_of(record) else expected_loss(scenario.network.link).rate,
-        "drops_by_cause": drops_by_cause(outcomes),
-        "forced_deliveries": int((outcomes.fate == Fate.FORCED).sum()),
-        "longest_loss_burst": max([*bursts, longest]),
-        "delay_mean_s": _or_none(np.mean, delays_s),
-        "delay_max_s": _or_none(np.max, delays_s),
-        "loss_bursts": {str(n): count for n, count in sorted(Counter(bursts).items())},
-        "inter_event_min_s": _or_none(np.min, intervals_s),
-        "inter_event_median_s": _or_none(np.median, intervals_s),
-        "inter_delivery_median_s": _or_none(np.median, np.diff(deliveries["t_ns"]) * 1e-9),
+        role: DeadlinesPart(
+            steps=sum(late[role].steps for late in lateness_us),
+            late_steps=sum(late[role].late_steps for late in lateness_us),
+            max_us=max((late[role].max or 0.0 for late in lateness_us if late[role].steps), default=None),
+        )
+        for role in lateness_us[0]
     }
 
 
-def _delays_s(record: RunRecord) -> Vector:
-    """The times of the effectively delivered updates in the network."""
-    packets = record.columns(
-        NETEM_PACKET,
-        "sequence",
-        "now_ns",
-        "release_ns",
-        "flow",
-        "fate",
-        where=lambda rows: (rows["flow"] == UPDATES) & effective(rows["fate"]),
+def _end(end: ExitPart, loops: Sequence[LoopSummary]) -> ExitPart:
+    failed = [loop for loop in loops if loop.exit.status != ExitStatus.OK]
+    if not failed:
+        return end
+    if len(loops) == 1:
+        return loops[0].exit
+    named = [f"{loop.name} {_brief(loop)}" for loop in failed[:_MOST_NAMED]]
+    more = len(failed) - len(named)
+    names = ", ".join(named) + (f" and {more} more" if more else "")
+    reason = f"{len(failed)} of {len(loops)} loops failed ({names})"
+    return ExitPart(status=int(ExitStatus.FAILED), reason=reason)
+
+
+def _brief(loop: LoopSummary) -> str:
+    if loop.diverged_at_s is not None:
+        return f"diverged at {loop.diverged_at_s + loop.phase_s:.2f} s"
+    return f"failed: {loop.exit.reason}"
+
+
+def _network_part(
+    network: RunRecord, packets: Rows, loops: Sequence[LoopSummary], reached_s: float
+) -> NetworkPart:
+    fates, stages = packets["fate"], network.scenario.network.impairments
+    rates = [stage for stage in stages if isinstance(stage, Rate)]
+    slowest = min(rates, key=lambda rate: rate.rate_bps, default=None)
+    reached_ns = max(round(reached_s * NS_PER_S), 1)
+    return NetworkPart(
+        datagrams=len(packets),
+        forwarded=int((packets["release_ns"] >= 0).sum()),
+        forced_deliveries=int((fates == Fate.FORCED).sum()),
+        drops_by_cause=dict(sum((Counter(loop.drops_by_cause) for loop in loops), Counter())),
+        longest_loss_burst=max(loop.longest_loss_burst for loop in loops),
+        rate_bps=None if slowest is None else slowest.rate_bps,
+        utilisation=(None if slowest is None else _utilisation(packets, slowest, stages, reached_ns)),
+        in_flight=in_flight(packets, network.scenario.timing.horizon_ns, reached_ns),
     )
-    packets = record.with_departures(packets)
-    return np.asarray((packets["release_ns"] - packets["now_ns"]) / NS_PER_S)
 
 
-def _rejected(channel: Mapping[str, Any]) -> dict[str, int]:
-    """The datagrams that a process rejected, by reason, on all its sockets."""
-    both = (channel, channel.get("acknowledgements") or {})
-    return dict(sum((Counter(sockets.get("rejected") or {}) for sockets in both), Counter()))
+def _utilisation(packets: Rows, bottleneck: Rate, stages: Sequence[Impairment], until_ns: int) -> float:
+    """Return the share of a bottleneck's rate that was used until a time."""
+    copied = any(isinstance(stage, Duplicate) for stage in stages[: stages.index(bottleneck)])
+    departures = [packets[name] for name in (("release_ns", "copy_ns") if copied else ("release_ns",))]
+    copies_sent = sum(((at_ns >= 0) & (at_ns <= until_ns)).astype(np.int64) for at_ns in departures)
+    bits = (bottleneck.line_bits(packets["size_bytes"]) * copies_sent).sum()
+    return float(bits / bottleneck.rate_bps / until_ns * NS_PER_S)
 
 
-def _why_failed(record: RunRecord, missing: Mapping[str, int], diverged: Divergence | None) -> str | None:
-    """Return why a run that ended at its horizon failed; None if it did not fail."""
-    if diverged is not None:
-        return diverged.text
-    for notice in record.notices:
-        if notice["level"] == FAILED:
-            at_s = notice["t_ns"] * 1e-9
-            return f"the {notice['process']} failed at {at_s:g} s: {notice['text']}"
-    surplus = [f"{-n:,} of {table}" for table, n in missing.items() if n < 0]
-    if surplus:
-        return f"the record has more rows than the processes reported: {', '.join(surplus)}"
-    # Missing last rows of a killed process are no failure: a restarted process replaced it.
-    incomplete = [f"{missing[table]:,} of {table}" for table in record.tables if missing[table] > 0]
-    return f"rows are missing from the record: {', '.join(incomplete)}" if incomplete else None
+def in_flight(packets: Rows, horizon_ns: int, reached_ns: int) -> InFlightPart:
+    """Return how many datagrams were inside the network, in intervals of equal width."""
+    inside = times_inside(packets)
+    means, largest = counts_inside(*inside, np.linspace(0, horizon_ns, _BINS + 1))
+    (mean,), _ = counts_inside(*inside, np.array([0.0, reached_ns]))
+    return InFlightPart(
+        mean=float(mean),
+        max=int(largest.max()),
+        width_s=horizon_ns / _BINS / NS_PER_S,
+        mean_by_interval=means.round(6).tolist(),
+        max_by_interval=largest.tolist(),
+    )
 
 
-def _divergence(record: RunRecord) -> Divergence | None:
-    scenarios = [record.scenario, *(made.scenario for made in changes_of(record))]
-    batches = record.source.batches(PLANT_STEP, ("t_ns", "x"))
-    parts = ((steps["t_ns"] * 1e-9, steps["x"]) for steps in batches)
-    diverged = divergence(parts, record.count(PLANT_STEP), scenarios)
-    for notice in record.notices:
-        if diverged is not None and notice["level"] == FAILED:
-            text = f"the plant failed at {diverged.at_s:g} s: {notice['text']}"
-            return diverged._replace(text=text)
-    return diverged
+def times_inside(packets: Rows) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return when each delayed datagram, or its copy, came into the network, and when it left."""
+    begins, ends = [], []
+    for column in ("release_ns", "copy_ns"):
+        delayed = packets[packets[column] > packets["now_ns"]]
+        begins.append(delayed["now_ns"])
+        ends.append(delayed[column])
+    return np.concatenate(begins), np.concatenate(ends)
 
 
-def change_parts(record: RunRecord) -> list[ChangePart]:
-    """Return the changes of settings during the run."""
-    return [
-        ChangePart(
-            number=made.change.number,
-            t_s=made.change.t_ns / NS_PER_S,
-            settings=dict(made.change.settings),
-            what=text_of(made.change.settings),
-            in_force_from_s={role: ns / NS_PER_S for role, ns in made.since_ns.items()},
-        )
-        for made in changes_of(record)
-    ]
+def counts_inside(
+    begin_ns: NDArray[np.int64], end_ns: NDArray[np.int64], edges_ns: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return mean and largest number of datagrams in the network between the edges, (k + 1,)."""
+    begin_ns, end_ns = np.sort(begin_ns), np.sort(end_ns)
+    # The number of datagrams at t is the number of begins minus the number of ends up to t; its
+    # integral from 0 to t is the sum of the times since each begin, minus that since each end.
+    integral = _time_since(begin_ns, edges_ns) - _time_since(end_ns, edges_ns)
+    first_ns, last_ns = (edges_ns[part].astype(np.int64) for part in (slice(-1), -1))
+    new_ns = begin_ns[(begin_ns > first_ns[0]) & (begin_ns < last_ns)]
+    at_ns = np.unique(np.concatenate([new_ns, first_ns]))
+    counts = np.searchsorted(begin_ns, at_ns, "right") - np.searchsorted(end_ns, at_ns, "right")
+    largest = np.maximum.reduceat(counts, np.searchsorted(at_ns, first_ns))
+    return np.diff(integral) / np.diff(edges_ns), largest
 
 
-def _restarts(record: RunRecord) -> list[RestartPart]:
-    """Return the processes that were restarted during the run, in order of time."""
-    restarts: list[RestartPart] = []
-    for role in (*LOOP_ROLES, RECORDER):
-        notices = [n for n in record.notices if (n["process"], n["level"]) == (role, RESTART)]
-        if role == RECORDER:  # the recorder has no rows
-            restarts += [
-                RestartPart(
-                    process=role,
-                    generation=number,
-                    last_s=None,
-                    first_s=notice["t_ns"] * 1e-9,
-                    what=notice["text"],
-                )
-                for number, notice in enumerate(notices, 1)
-            ]
-            continue
-        if not notices and len(record.generation_numbers(role)) == 1:
-            continue
-        active_s = {
-            generation.number: (_seconds(generation.first_ns), _seconds(generation.last_ns))
-            for generation in record.generations(role)
-        }
-        # Each restart has one notice. It is lost only if the process ended soon after, so the
-        # notices belong to the last generations.
-        reported = dict(enumerate(notices, max(max(active_s) - len(notices), 0) + 1))
-        last_s = active_s.pop(0)[-1]
-        for number in sorted(active_s.keys() | reported.keys()):
-            first_s, until_s = active_s.get(number, (None, last_s))
-            notice = reported[number]["text"] if number in reported else None
-            restarts.append(
-                RestartPart(process=role, generation=number, last_s=last_s, first_s=first_s, what=notice)
-            )
-            last_s = until_s
-    return sorted(restarts, key=lambda restart: restart.first_s or restart.last_s or math.inf)
+def _time_since(moments_ns: NDArray[np.int64], at_ns: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the sum over the moments before each time of the time since then."""
+    before = np.searchsorted(moments_ns, at_ns, "right")
+    sums = np.append(0.0, np.cumsum(moments_ns, dtype=np.float64))
+    return np.asarray(before * at_ns - sums[before])
 
 
-def _seconds(t_ns: int | None) -> float | None:
-    return None if t_ns is None else float(t_ns) * 1e-9
+class WorstLoop(NamedTuple):
+    """The loop that is shown in detail."""
+
+    number: int
+    why: str
+    """What makes it the worst."""
 
 
-def _or_none(
-    statistic: Callable[[NDArray[np.float64]], SupportsFloat], values: NDArray[np.float64]
-) -> float | None:
-    return float(statistic(values)) if len(values) else None
+def worst_loop(loops: Sequence[LoopSummary]) -> WorstLoop:
+    """Return the worst loop of a run.
 
-
-Linearisation = LinearisationPart | NoLinearisationPart
-_EXACT = 1e-3
-"""Tolerance for an entry with a half-width of 0, as the linearisation uses finite differences."""
-
-
-def linearisation(resolved: Scenario) -> Linearisation | None:
-    """Return the linearisation of a resolved scenario's plant; None for a linear plant.
-
-    Its fields: ``A`` and ``B`` by rows; ``eigenvalues`` of A + BK as pairs of real and imaginary
-    part; ``off_A`` and ``off_B``, A − Â and B − B̂; ``in_box``, whether these are within the
-    half-widths of the scenario's uncertainty box, None without a box. If x is not the whole state,
-    the only field is ``A``, with the value None.
+    That is a loop that failed; else the one that came nearest to, or exceeded, a certified bound of
+    ‖e_c‖ or ‖x‖; without such bounds, the one with the largest ‖e_c‖.
     """
-    if resolved.coverage.is_linear:
-        return None
-    loop, plant = loop_of(resolved), resolved.plant
-
-    def system_at(x0: Vector) -> PlantSystem:
-        started = plant.model_copy(update={"initial_state": tuple(x0.tolist())})
-        return system_of(resolved.model_copy(update={"plant": started}))
-
-    n, m = loop.n, loop.m
-    try:
-        with np.errstate(all="ignore"):
-            if (exact := plant.system.linearisation()) is not None:
-                A, B = exact
-            else:
-                is_fixed = plant.system.has_own_step
-                step_ns = resolved.timing.plant_period_ns if is_fixed else STEP_NS
-                linearised = linearise(system_at, n, m, settling_s=plant.system.settling_s, step_ns=step_ns)
-                A, B = linearised.A, linearised.B
-    except NoackError:  # a user's plant: its code fails, or it does not accept this x(0)
-        A, B = np.full((n, n), np.nan), np.full((n, m), np.nan)
-    if not (np.isfinite(A).all() and np.isfinite(B).all()):
-        return NoLinearisationPart(A=None)
-    off_A, off_B = A - loop.A_model, B - loop.B_model
-    poles = np.linalg.eigvals(A + B @ loop.K)
-    in_box: bool | None = None
-    if plant.uncertainty_A is not None or plant.uncertainty_B is not None:
-        in_box = _is_within(off_A, plant.uncertainty_A) and _is_within(off_B, plant.uncertainty_B)
-    return LinearisationPart(
-        A=A.tolist(),
-        B=B.tolist(),
-        eigenvalues=[[float(pole.real), float(pole.imag)] for pole in poles],
-        off_A=off_A.tolist(),
-        off_B=off_B.tolist(),
-        in_box=in_box,
-    )
+    for loop in loops:
+        if loop.exit.status != ExitStatus.OK:
+            return WorstLoop(loop.number, loop.exit.reason)
+    used = [_share_used(loop.claims) for loop in loops]
+    if max(used) > 0:
+        number = int(np.argmax(used))
+        text = f"largest share of a certified bound of ‖e_c‖ or ‖x‖: {100 * used[number]:.3g} %"
+        return WorstLoop(loops[number].number, text)
+    errors = [-1.0 if loop.sup_e_c_norm is None else loop.sup_e_c_norm for loop in loops]
+    number = int(np.argmax(errors))
+    text = f"largest ‖e_c‖, {number_text(errors[number])}; no loop has a certified bound"
+    return WorstLoop(loops[number].number, text)
 
 
-def _is_within(off: Matrix, halfwidth: ArrayLike | None) -> bool:
-    allowed = np.zeros_like(off) if halfwidth is None else np.array(halfwidth)
-    return bool((np.abs(off) <= np.maximum(allowed, _EXACT)).all())
-
-
-def linearisation_rows(linearised: Linearisation) -> tuple[tuple[str, str], ...]:
-    """Return a linearisation as text: quantities and their values."""
-    if isinstance(linearised, NoLinearisationPart):
-        return (("the plant, linearised", f"none: {NO_STATE}, or it is another program"),)
-    slowest = max(real for real, _ in linearised.eigenvalues)
-    worst, where = max(
-        (abs(entry), f"{name}[{i}, {j}]")
-        for name, off in (("A", linearised.off_A), ("B", linearised.off_B))
-        for i, row in enumerate(off, 1)
-        for j, entry in enumerate(row, 1)
-    )
-    box = {True: ", inside the box", False: ", outside the box", None: ""}[linearised.in_box]
-    return (
-        ("the plant, linearised: poles of A + BK", f"up to {slowest:.3g} /s"),
-        ("  largest difference to the model", f"{where}, by {worst:.3g}{box}"),
+def _share_used(claims: Sequence[Claim]) -> float:
+    """Return the largest share of a certified bound that a loop reached; 0 without a bound."""
+    return max(
+        (
+            claim.ratio
+            for claim in claims
+            if "certificate" in claim.source
+            and claim.ratio is not None
+            and claim.bound.startswith(("‖e_c‖ ≤", "‖W e_c‖ ≤", "‖x‖ ≤"))
+        ),
+        default=0.0,
     )

@@ -22,7 +22,7 @@ from noack.core.number_format import at_least, at_most
 
 with lazy_modules():
     from controller_node import controller
-    from cosim.analysis.summary import run_summary
+    from cosim.analysis.summary import plant_linearisation
     from cosim.doctor import findings, machine_measures
     from cosim.live import launcher
     from cosim.live.processes import child_processes
@@ -228,8 +228,8 @@ def _print_plant(console: "Console", resolved: "scenario.Scenario") -> None:
         console.print(f"the plant: {about}", highlight=False, markup=False)
     if (law := getattr(controller.law_of(resolved), "about", None)) is not None:
         console.print(f"the controller: {law}", highlight=False, markup=False)
-    if (near := run_summary.linearisation(resolved)) is not None:
-        for label, value in run_summary.linearisation_rows(near):
+    if (near := plant_linearisation.linearisation(resolved)) is not None:
+        for label, value in plant_linearisation.linearisation_rows(near):
             console.print(f"{label}: {value}", highlight=False, markup=False)
     for line in _dependent_defaults(resolved):
         console.print(line, highlight=False, markup=False)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.summary.loops_over_time import INTERVALS, add_link_bytes, empty_over_time, intervals_of
-from cosim.analysis.summary.network_summary import counts_inside, times_inside
+from cosim.analysis.summary.run_summary import counts_inside, times_inside
 from cosim.output.viewer.loop_feed import LAG_S, SHOWN, LoopFeed, log_level
 from cosim.output.viewer.run_recording import ERROR, SIZE, RunRecording
 from cosim.record.record_source import rows_by_loop

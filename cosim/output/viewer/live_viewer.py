@@ -34,7 +34,7 @@ from types import FrameType
 from typing import IO, Self
 from urllib.parse import parse_qs, quote
 
-from cosim.analysis.summary.network_summary import worst_loop
+from cosim.analysis.summary.run_summary import worst_loop
 from cosim.analysis.summary.summary_model import read_summary
 from cosim.output.viewer.pictures.picture import TIMELINE
 from cosim.output.viewer.rerun_program import (

@@ -40,7 +40,7 @@ from cosim.analysis.summary.loops_over_time import (
     loops_over_time,
     quantiles,
 )
-from cosim.analysis.summary.network_summary import WorstLoop, worst_loop
+from cosim.analysis.summary.run_summary import WorstLoop, worst_loop
 from cosim.analysis.summary.summary_model import RunSummary
 from cosim.output.figures.palette import CONTROLLER, LOST, NETWORK, SERIES
 from cosim.output.viewer import blueprint as bp

@@ -6,7 +6,7 @@ import pytest
 
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, RunClaims
 from cosim.analysis.replay import replay
-from cosim.analysis.summary.run_summary import summarise
+from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.record import run_record
 from cosim.record.align import align_tables
 from cosim.record.run_record import RunRecord
@@ -42,7 +42,7 @@ def record(request: pytest.FixtureRequest, content: dict[str, Any]) -> RunRecord
 def results(record: RunRecord) -> dict[str, Any]:
     claims = RunClaims(record)
     return {
-        "summary": summarise(record, 0, "horizon").model_dump(mode="json"),
+        "summary": summarise_loop(record, 0, "horizon").model_dump(mode="json"),
         "replay": replay(record).to_json(),
         "claims": [claim.model_dump(mode="json") for claim in claims.evaluate()],
         "violations": claims.violations(),

@@ -8,9 +8,9 @@ import pytest
 
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.replay import replay
-from cosim.analysis.summary.run_summary import summarise
+from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.analysis.summary.summary_model import ClaimVerdict
-from cosim.record.run_events import GROWTH, Divergence, divergence
+from cosim.record.divergence import GROWTH, Divergence, divergence
 from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous import run_continuous, summary
 from cosim.simulation.virtual_time import simulate
@@ -48,7 +48,7 @@ def plant(A: Any, B: Any, gain: Any, factor: float = 1.02) -> dict[str, Any]:
 
 def require_sound(record: RunRecord, status: ExitStatus = ExitStatus.OK) -> dict[str, Any]:
     """Replay, summary and claims of a run: bit-exact, valid JSON, and no false violation."""
-    found = summarise(record, 0, "horizon").to_json()
+    found = summarise_loop(record, 0, "horizon").to_json()
     json.dumps(found, allow_nan=False)
     assert found["exit"]["status"] == status, found["exit"]
     assert replay(record).bit_exact is True
@@ -139,7 +139,7 @@ def test_a_non_finite_input_is_not_applied(content: dict[str, Any]) -> None:
     # The plant rejects non-finite inputs and holds the applied one; here there is none.
     assert np.isfinite(record["plant_step"]["u"]).all()
     assert np.isfinite(record["plant_step"]["x"]).all()
-    found = summarise(record, 0, "horizon").to_json()
+    found = summarise_loop(record, 0, "horizon").to_json()
     assert found["rejected_datagrams"]["plant"]["not_finite"] == sent.sum()
 
 
@@ -229,16 +229,16 @@ def unstable(content: dict[str, Any], horizon_s: float) -> Scenario:
 
 def test_a_simulated_run_that_diverges_fails(content: dict[str, Any]) -> None:
     resolved = unstable(content, 8.0)
-    sampled = summarise(simulate(resolved), 0, "horizon").to_json()
+    sampled = summarise_loop(simulate(resolved), 0, "horizon").to_json()
     continuous = summary(run_continuous(resolved), resolved).to_json()
     for found in (sampled, continuous):
         assert found["exit"]["status"] == 1
         assert found["exit"]["reason"].startswith("diverged: ‖x‖ passed ")
         assert 1e6 < found["final_state_norm"] < np.inf
     assert sampled["diverged_at_s"] == pytest.approx(continuous["diverged_at_s"], abs=0.1)
-    stopped = summarise(simulate(resolved), 130, "stopped by the user (SIGINT)").to_json()
+    stopped = summarise_loop(simulate(resolved), 130, "stopped by the user (SIGINT)").to_json()
     assert stopped["exit"] == {"status": 130, "reason": "stopped by the user (SIGINT)"}
     assert stopped["diverged_at_s"] == sampled["diverged_at_s"]
-    short = summarise(simulate(unstable(content, 0.5)), 0, "horizon").to_json()
+    short = summarise_loop(simulate(unstable(content, 0.5)), 0, "horizon").to_json()
     assert short["final_state_norm"] < GROWTH * short["initial_state_norm"]
     assert (short["exit"]["status"], short["diverged_at_s"]) == (0, None)

@@ -77,7 +77,7 @@ def test_a_signal_while_a_run_is_finalised_names_the_command_that_completes_it(
         signal.raise_signal(number)
 
     with monkeypatch.context() as patch:
-        patch.setattr(finalize, "summarise", signalled)
+        patch.setattr(finalize, "summarise_loop", signalled)
         result = invoke("simulate", *SHORT, "--runs", tmp_path)
     assert result.exit_code == status
     (run_dir,) = (path for path in tmp_path.iterdir() if not path.is_symlink())

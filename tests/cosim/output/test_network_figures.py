@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cosim.analysis.summary.network_summary import LoopsOverTime
+from cosim.analysis.summary.loops_over_time import LoopsOverTime
 from cosim.output.figures.figure_description import Band, FigureDescription, Heat, Item, Line
 from cosim.output.figures.network_figures import NAMED, error_map, norms_figure
 

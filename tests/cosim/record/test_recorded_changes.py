@@ -7,7 +7,7 @@ import pytest
 
 from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.analysis.replay import replay
-from cosim.analysis.summary.run_summary import summarise
+from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.analysis.summary.summary_model import ClaimVerdict
 from cosim.record.align import align_tables
 from cosim.record.run_events import changes_of
@@ -57,7 +57,7 @@ def test_the_cap_in_force_holds_for_losses_that_change() -> None:
     assert (found.bit_exact, found.gaps) == (True, [])
     scale = float(np.abs(align_tables(record).x_s).max())
     assert np.nanmax(identity_residual(record)) <= 1e-12 * max(scale, 1.0)
-    assert summarise(record, 0, "horizon").to_json()["assumption_violations"] == []
+    assert summarise_loop(record, 0, "horizon").to_json()["assumption_violations"] == []
     packets = record[NETEM_PACKET]
     longest = {cap: packets["consecutive_losses"][(packets["now_ns"] >= since_ns)
                                                   & (packets["now_ns"] < until_ns)].max()
@@ -115,7 +115,7 @@ def test_a_change_received_too_late_is_reported_and_voids_its_claims() -> None:
     (made,) = changes_of(record)
     assert list(made.late) == ["controller"]
     assert made.everywhere_ns == made.late["controller"] > 990 * MS
-    (violation,) = summarise(record, 0, "horizon").to_json()["assumption_violations"]
+    (violation,) = summarise_loop(record, 0, "horizon").to_json()["assumption_violations"]
     assert "change received too late" in violation["what"]
     assert violation["process"] == "controller"
     claims = [one for one in RunClaims(record).evaluate() if one.source == "(I1)"]

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from cosim.analysis.summary.run_summary import summarise
+from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.api.runs import open_run
 from cosim.record.run_directory import (
     LATEST,
@@ -56,7 +56,7 @@ def test_a_damaged_column_or_report_is_refused_or_ignored(run_dir: Path) -> None
         reports.write_text(json.dumps(given | {"plant": report}))
         record = load_record(run_dir)
         assert record.reports.keys() == {"sensor", "netem", "controller"}
-        assert summarise(record, 0, "").to_json()["missing_samples"] == 0
+        assert summarise_loop(record, 0, "").to_json()["missing_samples"] == 0
     number = whole.column_names.index("t_ns")
     for values, expected in COLUMNS:
         pq.write_table(whole.set_column(number, "t_ns", values(len(whole))), path)
@@ -86,7 +86,7 @@ def test_the_readable_part_of_a_damaged_spool_is_read(run_dir: Path) -> None:
     kept = [*rows["input"][:2].tolist(), *rows["input"][4:].tolist()]
     assert finished[PLANT_STEP]["input"].tolist() == kept
     assert [notice["text"] for notice in finished.notices] == ["MANSD violated", "last"]
-    assert summarise(finished, 0, "").to_json()["missing_by_table"] == {PLANT_STEP: 2}
+    assert summarise_loop(finished, 0, "").to_json()["missing_by_table"] == {PLANT_STEP: 2}
     assert steps == len(finished[PLANT_STEP]) + 2
 
 

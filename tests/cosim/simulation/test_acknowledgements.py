@@ -6,7 +6,7 @@ import pytest
 
 from cosim.analysis.certificates import Certificates
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
-from cosim.analysis.summary.run_summary import summarise
+from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.analysis.summary.summary_model import ClaimVerdict
 from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous import continuous_loop_of
@@ -65,7 +65,7 @@ def test_each_direction_has_its_own_random_stream() -> None:
 
 def test_the_summary_counts_acknowledgements() -> None:
     record = run_of()
-    summary = summarise(record, 0, "horizon").to_json()
+    summary = summarise_loop(record, 0, "horizon").to_json()
     counts = summary["acknowledgements"]
     assert counts["sent"] == summary["deliveries"] == len(record[CONTROLLER_DELIVERY])
     assert counts["received"] == len(record[SENSOR_ACKNOWLEDGEMENT])
@@ -73,7 +73,7 @@ def test_the_summary_counts_acknowledgements() -> None:
     assert 0 <= counts["sent"] - counts["lost"] - counts["received"] <= 2  # in flight at the end
     assert summary["unintended_losses"] == summary["missing_samples"] == 0
     assert summary["identity_residual_max"] is None
-    assert summarise(simulate(plain()), 0, "horizon").acknowledgements is None
+    assert summarise_loop(simulate(plain()), 0, "horizon").acknowledgements is None
 
 
 def test_the_baseline_has_no_claims() -> None:

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.analysis.summary.run_summary import summarise
+from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import VirtualRun, simulate, simulate_loops
 from noack.core.core_library import core, ffi
@@ -122,7 +122,7 @@ def test_the_controller_reports_a_violated_assumption(busy_content: dict[str, An
     assert {notice["level"] for notice in record.notices} == {"violation"}
     deliveries = record[CONTROLLER_DELIVERY]
     long_gaps = deliveries[deliveries["dropouts"] > 0]
-    violations = summarise(record, 0, "horizon").to_json()["assumption_violations"]
+    violations = summarise_loop(record, 0, "horizon").to_json()["assumption_violations"]
     assert len(violations) == len(long_gaps) > 0
     for violation, gap in zip(violations, long_gaps, strict=True):
         assert violation["t_s"] == pytest.approx(gap["t_ns"] * 1e-9)
@@ -134,7 +134,7 @@ def test_a_violation_without_a_later_delivery_is_reported(busy_content: dict[str
     loss = {"model": "worst_case"}
     busy_content["network"] = {"mansd": 2, "enforce_mansd": False, "loss": loss}
     record = simulate(resolve(validate(busy_content, "test")))
-    summary = summarise(record, 0, "horizon").to_json()
+    summary = summarise_loop(record, 0, "horizon").to_json()
     (violation,) = summary["assumption_violations"]
     events = record[SENSOR_MEASUREMENT]
     event_ns = events["t_ns"][events["event"] >= 0]

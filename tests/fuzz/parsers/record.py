@@ -15,8 +15,8 @@ import pyarrow.parquet as pq
 from rich.console import Console
 
 from cosim.analysis.replay import replay
-from cosim.analysis.summary.network_summary import summarise_run
-from cosim.analysis.summary.run_summary import Outcome, summarise
+from cosim.analysis.summary.loop_summary import summarise_loop
+from cosim.analysis.summary.run_summary import Outcome, summarise_run
 from cosim.analysis.summary.summary_model import ExitPart, LoopSummary
 from cosim.live.finalize import reopen
 from cosim.live.recording.recorder import Recorder
@@ -93,7 +93,7 @@ def files(acknowledged: bool, live: bool) -> Mapping[str, bytes]:
     }
     kind = "live" if live else "simulated"
     run = alone(RunRecord(resolved, record.source, record.notices, reports, "live" if live else "simulated"))
-    own = summarise(run.loop(), 0, "finished").to_json()
+    own = summarise_loop(run.loop(), 0, "finished").to_json()
     own |= {
         "replay": replay(record).verdict().model_dump(),
         "claims": [CLAIM],
@@ -197,7 +197,7 @@ def _read(run_dir: Path) -> None:
     """Read a run directory as the commands on runs do."""
     cut_short = (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir()
     record = finish_record(run_dir).loop() if cut_short else load_record(run_dir)
-    json.loads(summarise(record, 0, "finished").model_dump_json())
+    json.loads(summarise_loop(record, 0, "finished").model_dump_json())
     found = replay(record)
     found.verdict().model_dump_json()
     json.dumps(found.to_json())

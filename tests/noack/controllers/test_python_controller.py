@@ -11,7 +11,7 @@ import pytest
 from scipy.optimize import minimize
 
 from cosim.analysis.replay import replay
-from cosim.analysis.summary.run_summary import summarise
+from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.record.run_record import RunRecord, load_record
 from cosim.simulation.virtual_time import simulate, simulate_run
 from noack.controllers.controller_settings import ControlModel
@@ -133,5 +133,5 @@ def test_the_safe_input_is_sent_after_a_control_law_fails(
     assert message in notice["text"]
     assert set(record[CONTROLLER_STEP]["u"][:, 0]) <= {0.0, 0.25}
     assert record[CONTROLLER_STEP]["u"][-1] == 0.25
-    end = summarise(record, ExitStatus.OK, "").exit
+    end = summarise_loop(record, ExitStatus.OK, "").exit
     assert (end.status, message in end.reason) == (ExitStatus.FAILED, True)

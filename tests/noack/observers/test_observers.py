@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.fidelity import recorded_loop
 from cosim.analysis.replay import replay
-from cosim.analysis.summary.run_summary import summarise
+from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.record.align import align_tables, true_states
 from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous import continuous_loop_of
@@ -132,7 +132,7 @@ def test_i1_and_the_certificate_are_claimed_of_the_estimate(
 
 def test_the_summary_contains_the_estimation_error(observed: dict[str, Any]) -> None:
     record = run(observed, disturbance=1, noise=2)
-    found = summarise(record, 0, "horizon").to_json()["estimation"]
+    found = summarise_loop(record, 0, "horizon").to_json()["estimation"]
     norms = np.linalg.norm(estimation_error(record), axis=1)
     assert found["max"] == pytest.approx(norms.max())
     assert found["rms"] == pytest.approx(np.sqrt((norms**2).mean()))
@@ -146,7 +146,7 @@ def test_the_summary_contains_the_estimation_error(observed: dict[str, Any]) -> 
     sizes = estimation_error(noisy).std(axis=0)
     assert 0.01 < sizes[0] < 0.03 < sizes[1] < 0.08
     assert {claim.verdict for claim in ClaimEvaluation(noisy).evaluate()} == {"held"}
-    assert summarise(noisy, 0, "horizon").to_json()["estimation"]["observer"] is None
+    assert summarise_loop(noisy, 0, "horizon").to_json()["estimation"]["observer"] is None
 
 
 def test_exact_simulation_is_refused_in_one_line(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import noack
-from cosim.analysis.summary.run_summary import linearisation
+from cosim.analysis.summary.plant_linearisation import linearisation
 from cosim.analysis.summary.summary_model import LinearisationPart
 from noack.core.errors import CallerError
 from noack.plants.gymnasium import GymnasiumSettings

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cosim.analysis.replay import replay
-from cosim.analysis.summary.run_summary import linearisation
+from cosim.analysis.summary.plant_linearisation import linearisation
 from cosim.analysis.summary.summary_model import NoLinearisationPart
 from cosim.live.finalize import finalize
 from cosim.record.run_record import load_record

@@ -19,7 +19,7 @@ from cosim.analysis.claims.observed_conditions import (
     ObservedConditions,
     combine,
 )
-from cosim.analysis.claims.run_evidence import certificates_together
+from cosim.analysis.claims.run_certificates import certificates_together
 from cosim.analysis.summary.summary_model import ClaimVerdict
 from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.virtual_time import simulate

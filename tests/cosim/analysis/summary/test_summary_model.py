@@ -14,7 +14,8 @@ from pydantic import BaseModel
 from rich.console import Console
 
 import noack
-from cosim.analysis.summary.run_summary import Outcome, summarise
+from cosim.analysis.summary.loop_summary import summarise_loop
+from cosim.analysis.summary.run_summary import Outcome
 from cosim.analysis.summary.summary_model import LoopSummary, NetworkPart, RunSummary, read_summary
 from cosim.output.report_page import Report, page
 from cosim.output.run_tables import key_numbers
@@ -161,7 +162,7 @@ def test_restarts_and_their_missing_first_rows_are_listed(content: dict[str, Any
         {"process": "sensor", "level": RESTART, "t_ns": k * 10_000_000, "text": f"after {k}"} for k in (2, 3)
     ]
     restarted = altered(record, {SENSOR_MEASUREMENT: rows}, notices=notices, reports={})
-    found = summarise(restarted, 0, "").to_json()
+    found = summarise_loop(restarted, 0, "").to_json()
     assert found["missing_by_table"]["sensor"] == 7
     first_s = (rows["now_ns"][[50, 80]] * 1e-9).tolist()
     assert {one["generation"]: (one["first_s"], one["what"]) for one in found["restarts"]} == {

@@ -14,7 +14,7 @@ import zenoh
 from rich.console import Console
 
 from cosim.analysis.claims.claim_evaluation import RunClaims, list_violations
-from cosim.analysis.summary.run_summary import summarise
+from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.live.monitoring.progress import progress_line
 from cosim.live.recording import recorder
 from cosim.live.recording.recorder import Recorder
@@ -271,7 +271,7 @@ def test_a_violation_found_at_the_end_is_reported_unless_the_run_was_stopped(
 
 
 def test_the_summary_lists_every_violated_assumption(outage: RunRecord) -> None:
-    reported = summarise(outage, 0, "horizon").assumption_violations
+    reported = summarise_loop(outage, 0, "horizon").assumption_violations
     assert reported == []  # no process detects that an input is old
     (violation,) = list_violations(reported, RunClaims(outage).violations())
     assert (violation.cause, violation.t_s, violation.process) == ("hold", pytest.approx(0.506), "recorder")

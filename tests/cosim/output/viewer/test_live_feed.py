@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cosim.analysis.summary.loops_over_time import INTERVALS, loops_over_time, quantiles
-from cosim.analysis.summary.network_summary import counts_inside, times_inside
+from cosim.analysis.summary.run_summary import counts_inside, times_inside
 from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.live_feed import LiveFeed
 from cosim.output.viewer.loop_feed import LoopFeed

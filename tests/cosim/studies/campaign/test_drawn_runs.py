@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import quad_vec
 from scipy.linalg import expm
 
-from cosim.analysis.summary.run_summary import summarise
+from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous import run_continuous
 from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS
@@ -56,7 +56,7 @@ def test_a_row_agrees_with_the_summary_of_the_run(overrides: tuple[str, ...]) ->
     one = work(*overrides)
     for draw, row in enumerate(one.run(range(2))):
         record = record_of(one, draw)
-        expected = summarise(record, ExitStatus.OK, "").to_json()
+        expected = summarise_loop(record, ExitStatus.OK, "").to_json()
         assert row["status"] == OK
         assert row["transmissions"] == expected["events"]
         assert row["deliveries"] == expected["deliveries"]
@@ -140,7 +140,7 @@ def test_a_row_agrees_with_the_summaries_of_the_loops() -> None:
     assert rows.dtype == LOOPS_ROW
     seeds = seeds_of(one.seed, 1)
     shared = simulate_loops(one.scenario.model_copy(update={"seeds": seeds}))
-    loops = [summarise(record, 0, "").to_json() for record in shared.loops]
+    loops = [summarise_loop(record, 0, "").to_json() for record in shared.loops]
     row = rows[1]
     assert row["transmissions"] == sum(loop["events"] for loop in loops) != rows[0]["transmissions"]
     assert row["deliveries"] == sum(loop["deliveries"] for loop in loops)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cosim.analysis.summary.loops_over_time import INTERVALS, intervals_of, loop_over_time
-from cosim.analysis.summary.network_summary import counts_inside, in_flight, worst_loop
+from cosim.analysis.summary.run_summary import counts_inside, in_flight, worst_loop
 from cosim.analysis.summary.summary_model import LoopSummary
 from cosim.simulation.virtual_time import simulate
 from noack.protocol.record_tables import NETEM_PACKET, network_tables
