@@ -168,7 +168,7 @@ def bounds_of(certificate: ScenarioCertificate, scenario: Scenario) -> Bounds:
     }
 
 
-class Search:
+class TriggerSearch:
     """All trials of a space on common draws; the draws after them confirm the choice."""
 
     def __init__(self, space: DesignSpace, limits: DesignLimits, box: Box, seed: int, draws: int) -> None:
@@ -410,7 +410,7 @@ def design(
     if limits.bounds:
         _require_certifiable(first)
     space = space_of(families)
-    search = Search(space, limits, box_of(first), seed, draws)
+    search = TriggerSearch(space, limits, box_of(first), seed, draws)
     best = search.run(progress)
     scenario = search.scenario(best)
     try:

@@ -20,7 +20,13 @@ from cosim.output.figures.figure_description import Axis, FigureDescription, Lin
 from cosim.output.figures.palette import LOST, NETWORK
 from cosim.simulation.exact_simulation import Population, run_batch, setting_of
 from cosim.studies.campaign.random_draws import box_of
-from cosim.studies.design.design_page import DesignOutcome, LoopResult, figure_of, gain_text, periodic_outcome
+from cosim.studies.design.design_outcome import (
+    DesignOutcome,
+    LoopResult,
+    figure_of,
+    gain_text,
+    periodic_outcome,
+)
 from cosim.studies.design.design_search import WORDS, bounds_of
 from cosim.studies.design.design_space import lqr_gain, round_gain
 from cosim.studies.design.network_search import (
@@ -65,7 +71,7 @@ class MeanCosts(NamedTuple):
     transmissions: float
 
 
-class Certified(NamedTuple):
+class CertifiedEventLoop(NamedTuple):
     """A loop with the largest M for which it has a certificate."""
 
     loop: EventLoop
@@ -196,7 +202,7 @@ class EventSearch:
         bound = min(math.log1p(self.state_bound(loop, m)), 50.0) if m else 50.0
         return -math.log1p(m) - 0.01 * (1 - bound / 50.0)
 
-    def run(self, progress: Progress = lambda share: None) -> tuple[Certified, Certified]:
+    def run(self, progress: Progress = lambda share: None) -> tuple[CertifiedEventLoop, CertifiedEventLoop]:
         """Return the given loop and the best one found."""
         plant, (Q, R) = self.plant, self.weights
         starts = [self.original]
@@ -224,7 +230,7 @@ class EventSearch:
         if value >= min(values[0], 0.0):  # no better than the given loop, or beyond a limit
             best = self.original
         original, chosen = (
-            Certified(loop, self.largest_m(loop), self.measure(loop, self._fresh))
+            CertifiedEventLoop(loop, self.largest_m(loop), self.measure(loop, self._fresh))
             for loop in (self.original, best)
         )
         return original, chosen
@@ -262,7 +268,9 @@ def _rounded(entries: Vector, template: EventLoop, alpha_per_s: float, beta: flo
     return EventLoop(K, to_digits(alpha_per_s, 6), to_digits(beta, 6))
 
 
-def event_outcome(search: EventSearch, original: Certified, best: Certified) -> DesignOutcome:
+def event_outcome(
+    search: EventSearch, original: CertifiedEventLoop, best: CertifiedEventLoop
+) -> DesignOutcome:
     """Return what is shown of a search."""
     of_network = search.request.goal == "network"
     return DesignOutcome(
@@ -285,7 +293,7 @@ def event_outcome(search: EventSearch, original: Certified, best: Certified) -> 
     )
 
 
-def _notes(search: EventSearch, original: Certified, best: Certified) -> Iterator[str]:
+def _notes(search: EventSearch, original: CertifiedEventLoop, best: CertifiedEventLoop) -> Iterator[str]:
     """Yield what the reader should know of a search."""
     limits, before, after = search.limits, original.loop.alpha_per_s, best.loop.alpha_per_s
     limit = f"a mean cost of at most {limits.cost:.4g}"
@@ -300,7 +308,7 @@ def _notes(search: EventSearch, original: Certified, best: Certified) -> Iterato
         yield f"the threshold and the certified bounds decay at {after:.4g} /s instead of {before:.4g} /s"
 
 
-def _loop_result(search: EventSearch, certified: Certified) -> LoopResult:
+def _loop_result(search: EventSearch, certified: CertifiedEventLoop) -> LoopResult:
     loop, m, measured = certified
 
     def bound(m: int) -> str:
@@ -322,7 +330,7 @@ def _loop_result(search: EventSearch, certified: Certified) -> LoopResult:
     return LoopResult(reach, cells, {"certified": m or None, **loop._asdict(), **measured._asdict()})
 
 
-def _figure(search: EventSearch, original: Certified, best: Certified) -> FigureDescription:
+def _figure(search: EventSearch, original: CertifiedEventLoop, best: CertifiedEventLoop) -> FigureDescription:
     """Describe the certified bounds of ‖x‖ over M, which end where the certificate does."""
     numbers = np.unique(np.geomspace(1, max(original.m, best.m, 2), 30).round().astype(int))
     items = []

@@ -204,10 +204,10 @@ class NetworkSearch:
         )
         self.original = GainCandidate(given_hold(self.scenario), rows_of(self.plant.K))
         base = self.quick_loop(self.original, margin.longest_ns).cost(self.plant.x0)
-        self.limit = request.cost * base
+        self.cost_limit = request.cost * base
         """Largest cost; infinite if the given loop is unstable without losses."""
         self.tried = self.examined = 0
-        self.highest: dict[Hold, int] = {}
+        self.highest_level: dict[Hold, int] = {}
         """By hold strategy: the highest level at which a loop was tried and not excluded."""
         self._graphs: dict[tuple[LossGuarantee, int, Hold, int], PatternGraph] = {}
 
@@ -256,11 +256,11 @@ class NetworkSearch:
             growth = self.growth(candidate, level)
             if not math.isfinite(cost) or not math.isfinite(growth):
                 return _UNSTABLE / 2 + min(max(growth, 0.0), _UNSTABLE / 4)
-        if cost <= self.limit:
+        if cost <= self.cost_limit:
             if growth < -_SLACK:
-                self.highest[candidate.hold] = max(level, self.highest.get(candidate.hold, -1))
+                self.highest_level[candidate.hold] = max(level, self.highest_level.get(candidate.hold, -1))
             return growth
-        return max(growth, -_SLACK) + _SLACK + math.log(cost / self.limit)
+        return max(growth, -_SLACK) + _SLACK + math.log(cost / self.cost_limit)
 
     def highest_possible(self, candidate: GainCandidate, level: int) -> tuple[int, float]:
         """Return the highest level from the given one on that is not excluded, and the next one's excess."""
@@ -299,7 +299,7 @@ class NetworkSearch:
                 return level, stability
         return least, None
 
-    def first(self) -> CertifiedLoop:
+    def certify_given(self) -> CertifiedLoop:
         """Return what the given loop is proven to meet; its bounds are refined until they decide."""
         start = 0
         if self.request.goal == "transmissions":
@@ -321,7 +321,7 @@ class NetworkSearch:
         stability = None
         while level >= 0 and (stability := self.stability(candidate, level)).verdict != "stable":
             level, stability = level - 1, None
-        following, limit = None, math.inf if candidate == self.original else self.limit
+        following, limit = None, math.inf if candidate == self.original else self.cost_limit
         while level + 1 < len(self.requirements) and self.cost(candidate, level + 1) <= limit:
             following = self.stability(candidate, level + 1)
             if following.verdict != "stable":
@@ -347,7 +347,7 @@ class NetworkSearch:
     def run(self, progress: Progress = lambda share: None) -> tuple[CertifiedLoop, CertifiedLoop]:
         """Return what the given loop is proven to meet, and the best loop found."""
         # The given loop, which the others must exceed.
-        original = self.first()
+        original = self.certify_given()
         self.tried, best, level = 0, original.candidate, -1
         if self.keeps_given_hold:
             level = original.level
@@ -369,7 +369,7 @@ class NetworkSearch:
         # The best start of each hold strategy, which is part of the answer even if it is not the best.
         first_of_each = {candidate.hold: candidate for _, _, candidate in reversed(ranked)}
         for hold, candidate in first_of_each.items():
-            if hold not in self.highest:  # it was tried from the given loop's level on only
+            if hold not in self.highest_level:  # it was tried from the given loop's level on only
                 self.highest_possible(candidate, 0)
         # The candidates that are improved, each with an equal share of the effort.
         pool = [best] if level >= 0 else []
@@ -398,7 +398,7 @@ class NetworkSearch:
     def by_hold(self) -> Iterator[tuple[str, str]]:
         """Yield the hold strategies with the names of their highest requirements."""
         for hold in self.holds:
-            level = self.highest.get(hold, -1)
+            level = self.highest_level.get(hold, -1)
             yield hold.text, self.requirements[level].name if level >= 0 else "nothing"
 
     def _improve(self, start: GainCandidate, level: int, most: int) -> GainCandidate | None:

@@ -20,7 +20,7 @@ from cosim.studies.campaign.random_draws import box_of
 from cosim.studies.design.design_search import (
     DesignLimits,
     DesignResult,
-    Search,
+    TriggerSearch,
     design,
     measure,
     require_draws,
@@ -253,7 +253,7 @@ def test_of_equal_transmissions_the_earlier_settling_is_chosen(found: DesignResu
         candidate=best.candidate._replace(alpha_per_s=best.candidate.alpha_per_s / 2),
         measured=best.measured._replace(settling_s=best.measured.settling_s + 0.001),
     )
-    search = Search(found.space, found.limits, box_of(found.scenario), found.seed, 200)
+    search = TriggerSearch(found.space, found.limits, box_of(found.scenario), found.seed, 200)
     assert search._best([later, best]) is best
 
 

@@ -14,8 +14,13 @@ import numpy as np
 import pytest
 
 from cosim.simulation.virtual_time import simulate
-from cosim.studies.design.design_page import DesignOutcome, periodic_outcome
-from cosim.studies.design.event_design import Certified, EventSearch, design_for_network, event_outcome
+from cosim.studies.design.design_outcome import DesignOutcome, periodic_outcome
+from cosim.studies.design.event_design import (
+    CertifiedEventLoop,
+    EventSearch,
+    design_for_network,
+    event_outcome,
+)
 from cosim.studies.design.hold_strategies import read_holds
 from cosim.studies.design.network_search import CertifiedLoop, DesignRequest, NetworkSearch
 from cosim.studies.design.quick_estimate import PatternGraph
@@ -49,8 +54,8 @@ class FoundEvents(NamedTuple):
     """The same of a loop with events."""
 
     search: EventSearch
-    given: Certified
-    best: Certified
+    given: CertifiedEventLoop
+    best: CertifiedEventLoop
     shown: DesignOutcome
 
 
@@ -116,7 +121,7 @@ def test_no_design_is_worse_than_what_was_given_and_each_is_proven(
     outcome = searched(shipped(name, *settings), design_request)
     given, best = outcome.given, outcome.best
     assert best.level >= given.level
-    assert best.cost <= outcome.search.limit or best == given
+    assert best.cost <= outcome.search.cost_limit or best == given
     if best.level >= 0:
         assert best.stability is not None
         assert LossMargin(resolve(outcome.shown.scenario)).coarse_bounds().upper < 1
