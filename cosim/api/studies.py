@@ -349,7 +349,7 @@ def campaign(
         path = find_shipped(str(source), "campaigns")
         plan = campaign_file.load(path)
     temporary = None if folder is not None else Path(tempfile.mkdtemp(prefix="noack-"))
-    start = partial(campaign_workers.local, workers or cores())
+    start = partial(campaign_workers.local_runner, workers or cores())
     try:
         bar, runs_folder = _runs_bar() if progress else None, Path(folder or temporary or "")
         finished = campaign_report.finish_campaign(

@@ -214,11 +214,11 @@ def worker_pool(workers: int | None, scheduler: str | None = None) -> StartWorke
     if scheduler is not None:
         if workers is not None:
             raise CallerError("--workers: with --scheduler the cluster's workers are used")
-        return lambda print_line: campaign_workers.cluster(scheduler, print_line)
+        return lambda print_line: campaign_workers.cluster_runner(scheduler, print_line)
     number = workers or cli.cores()
     if number > (limit := _PER_CORE * cli.cores()):
         raise CallerError(f"--workers {number}: on this machine at most {limit}")
-    return lambda print_line: campaign_workers.local(number)
+    return lambda print_line: campaign_workers.local_runner(number)
 
 
 def execute_campaign(

@@ -44,7 +44,7 @@ def figures(summary: CampaignSummary, store: Store) -> Iterator[FigureDescriptio
     """Describe the figures that the campaign asks for."""
     for i, spec in enumerate(summary.campaign.figures):
         places = set(summary.campaign.selected(spec.where))
-        results = [result for result in summary.results if result.point.place in places]
+        results = [result for result in summary.results if result.point.indices in places]
         match spec:
             case campaign_file.Pareto():
                 figure, caption = _pareto(summary, results, spec)

@@ -36,7 +36,7 @@ class Point:
     """A point of the grid."""
 
     number: int
-    place: tuple[int, ...]
+    indices: tuple[int, ...]
     """Index of the point's value on each axis."""
     labels: Mapping[str, str]
     """Labels by axis."""
@@ -160,7 +160,7 @@ def _require_effects(campaign: Campaign, points: Sequence[Point], path: Path) ->
     Raises:
         CallerError: an axis has no effect on the runs.
     """
-    runs = {point.place: blake2b(pickle.dumps(point.work)).digest() for point in points}
+    runs = {point.indices: blake2b(pickle.dumps(point.work)).digest() for point in points}
     for i, axis in enumerate(campaign.axes):
         contents: dict[bytes, str] = {}
         for value, label in enumerate(axis.labels):

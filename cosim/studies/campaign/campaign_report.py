@@ -21,7 +21,7 @@ from cosim.studies.campaign.campaign_file import Campaign
 from cosim.studies.campaign.campaign_grid import base_of, grid
 from cosim.studies.campaign.campaign_summary import CampaignSummary, summarise
 from cosim.studies.campaign.campaign_workers import Runner
-from cosim.studies.campaign.chunk_store import RUNS, Progress, Store, opened, run_campaign
+from cosim.studies.campaign.chunk_store import RUNS, Progress, Store, locked_folder, run_campaign
 from cosim.studies.campaign.metrics import METRICS, Estimate
 from noack.core.file_access import write_whole
 from noack.core.number_format import plus_minus
@@ -308,7 +308,7 @@ def finish_campaign(
         points = grid(plan, path)
     _, base = base_of(plan, path)
     store = Store(folder, points, int(draws or plan.draws), plan.chunk)  # also a number of NumPy
-    with stop_requests_raised(), opened(plan, base, store):
+    with stop_requests_raised(), locked_folder(plan, base, store):
         with workers() as runner, bar or nullcontext() as progress:
             new_runs = run_campaign(store, runner, progress)
         with show("summarising"):

@@ -134,23 +134,23 @@ class LostWorkersError(PeerError):
     """Workers have died or cannot be reached."""
 
 
-def alone(works: Sequence[Work], chunks: Iterable[Chunk]) -> Iterator[Finished]:
+def run_in_process(works: Sequence[Work], chunks: Iterable[Chunk]) -> Iterator[Finished]:
     """Compute chunks in this process."""
     for chunk in chunks:
         yield chunk, works[chunk.point].run(chunk.draws)
 
 
 @contextmanager
-def local(workers: int) -> Iterator[Runner]:
+def local_runner(workers: int) -> Iterator[Runner]:
     """Compute chunks in processes of this machine."""
     if workers == 1:
-        yield alone
+        yield run_in_process
         return
     with processes(workers) as pool:
 
         def run(works: Sequence[Work], chunks: Iterable[Chunk]) -> Iterator[Finished]:
             try:
-                yield from _windowed(pool, works, chunks, lambda: _AHEAD * workers)
+                yield from _limit_in_flight(pool, works, chunks, lambda: _AHEAD * workers)
             except BrokenProcessPool:
                 raise LostWorkersError("a worker process was killed (out of memory?)") from None
 
@@ -188,10 +188,10 @@ def run_alike(work: Work, draws: range, expected: Mapping[str, str] | None) -> N
 
 
 @contextmanager
-def cluster(address: str, say: Callable[[str], None] = lambda line: None) -> Iterator[Runner]:
+def cluster_runner(address: str, report: Callable[[str], None] = lambda line: None) -> Iterator[Runner]:
     """Compute chunks on the Dask cluster of this scheduler; workers need the same noack.
 
-    ``say`` is called with a message when the campaign waits for the cluster.
+    ``report`` is called with a message when the campaign waits for the cluster.
 
     Raises:
         CallerError: Dask is not installed, or the address is not valid.
@@ -213,10 +213,10 @@ def cluster(address: str, say: Callable[[str], None] = lambda line: None) -> Ite
         raise PeerError(f"--scheduler {address}: no Dask scheduler answers there") from None
 
     def run(works: Sequence[Work], chunks: Iterable[Chunk]) -> Iterator[Finished]:
-        size = _ClusterSize(client, address, say)
+        size = _ClusterSize(client, address, report)
         executor: Executor = client.get_executor(pure=False)
         try:
-            yield from _windowed(executor, works, chunks, size, arithmetic())
+            yield from _limit_in_flight(executor, works, chunks, size, arithmetic())
         except OtherArithmeticError as error:
             raise OtherArithmeticError(f"{address}: {error}") from None
         except (ImportError, RuntimeError) as error:
@@ -239,8 +239,8 @@ def cluster(address: str, say: Callable[[str], None] = lambda line: None) -> Ite
 class _ClusterSize:
     """The number of chunks that may be in flight on a cluster with a varying number of workers."""
 
-    def __init__(self, client: Any, address: str, say: Callable[[str], None]) -> None:
-        self._client, self._address, self._say = client, address, say
+    def __init__(self, client: Any, address: str, report: Callable[[str], None]) -> None:
+        self._client, self._address, self._report = client, address, report
         self._reported = False
         self._cores, self._looked_s, self._seen_s = 0, -math.inf, time.monotonic()
 
@@ -261,7 +261,7 @@ class _ClusterSize:
                 self._seen_s, self._reported = now_s, False
             elif not self._reported:
                 self._reported = True
-                self._say(f"{self._address}: no worker; waiting {_PATIENCE_S:g} s for one")
+                self._report(f"{self._address}: no worker; waiting {_PATIENCE_S:g} s for one")
             elif now_s - self._seen_s > _PATIENCE_S:
                 raise LostWorkersError(
                     f"{self._address}: the cluster has had no worker for {_PATIENCE_S:g} s "
@@ -270,7 +270,7 @@ class _ClusterSize:
         return max(_AHEAD * self._cores, 1)
 
 
-def _windowed(
+def _limit_in_flight(
     executor: Executor,
     works: Sequence[Work],
     chunks: Iterable[Chunk],

@@ -125,7 +125,7 @@ class Store:
 
 
 @contextmanager
-def opened(campaign: Campaign, base: Mapping[str, object], store: Store) -> Iterator[None]:
+def locked_folder(campaign: Campaign, base: Mapping[str, object], store: Store) -> Iterator[None]:
     """Lock a campaign's folder: a new folder, or one of the same campaign.
 
     The number of draws and the figures may differ from earlier. If no run is missing, code and
@@ -183,10 +183,10 @@ def _claim(folder: Path, manifest: Mapping[str, object]) -> Mapping[str, str]:
     if not isinstance(stored, dict) or not isinstance(stored.get("arithmetic"), dict):
         raise CallerError(f"{path}: not a manifest of a campaign; give another --out")
     made_by: dict[str, str] = stored.pop("arithmetic")
-    difference = _difference(stored, {k: v for k, v in manifest.items() if k != "arithmetic"})
-    if difference is not None:
+    mismatch = _difference(stored, {k: v for k, v in manifest.items() if k != "arithmetic"})
+    if mismatch is not None:
         raise CallerError(
-            f"{folder}: holds another campaign ({difference}); give another --out, or remove the folder"
+            f"{folder}: holds another campaign ({mismatch}); give another --out, or remove the folder"
         )
     return made_by
 

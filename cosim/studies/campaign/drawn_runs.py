@@ -106,10 +106,10 @@ class SampledWork:
             row["settling_s"] = t_s[norms > self.settle * norms[0]].max(initial=0.0)
         row["final_norm"] = norms[-1]
         row["cost"] = self._cost(record)
-        joined = align_tables(record)
+        aligned = align_tables(record)
         decay_per_s = policy_of(record.scenario).fading_per_s
-        scaled = joined.e_c_norm * np.exp(decay_per_s * joined.t_ns / NS_PER_S)
-        row["sup_e_c_scaled"] = scaled[in_common(record.scenario, joined)].max(initial=0.0)
+        scaled = aligned.e_c_norm * np.exp(decay_per_s * aligned.t_ns / NS_PER_S)
+        row["sup_e_c_scaled"] = scaled[in_common(record.scenario, aligned)].max(initial=0.0)
 
     def _cost(self, record: RunRecord) -> float:
         loop, steps = record.loop, record[PLANT_STEP]

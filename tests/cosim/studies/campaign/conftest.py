@@ -10,7 +10,7 @@ from click.testing import Result
 
 from cosim.studies.campaign.campaign_file import Campaign, load
 from cosim.studies.campaign.campaign_grid import Point, grid
-from cosim.studies.campaign.campaign_workers import alone
+from cosim.studies.campaign.campaign_workers import run_in_process
 from cosim.studies.campaign.chunk_store import Store, run_campaign
 from tests.command_line import invoke
 
@@ -73,7 +73,7 @@ def full(tmp_path: Path, campaign: Few) -> Store:
     """The folder of the campaign, with all runs."""
     settings, points = campaign
     store = Store(tmp_path / "out", points, settings.draws, settings.chunk)
-    assert run_campaign(store, alone) == 28
+    assert run_campaign(store, run_in_process) == 28
     return store
 
 

@@ -12,8 +12,8 @@ import pyarrow.dataset
 import pytest
 
 from cosim.studies.campaign.campaign_grid import base_of
-from cosim.studies.campaign.campaign_workers import alone
-from cosim.studies.campaign.chunk_store import Chunk, Store, opened, run_campaign
+from cosim.studies.campaign.campaign_workers import run_in_process
+from cosim.studies.campaign.chunk_store import Chunk, Store, locked_folder, run_campaign
 from noack.core import file_access
 from noack.core.errors import CallerError, MachineError
 from tests.cosim.studies.campaign.conftest import Few, Write, few_of
@@ -42,13 +42,13 @@ def test_every_chunk_contains_its_draws_and_their_axis_values(full: Store, campa
 def test_only_a_damaged_file_is_computed_again(full: Store) -> None:
     before = files(full.folder)
     assert list(full.missing()) == []
-    assert run_campaign(full, alone) == 0
+    assert run_campaign(full, run_in_process) == 0
     assert files(full.folder) == before
     path = full.folder / "runs" / "point-00001" / "draws-000000003.parquet"
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     assert list(full.missing()) == [Chunk(1, 3, 6)]
-    assert run_campaign(full, alone) == 3
+    assert run_campaign(full, run_in_process) == 3
     assert path.read_bytes() == whole
     changed = {name for name, when in files(full.folder).items() if before[name] != when}
     assert changed == {"runs/point-00001/draws-000000003.parquet"}
@@ -57,7 +57,7 @@ def test_only_a_damaged_file_is_computed_again(full: Store) -> None:
 def test_more_draws_keep_full_chunks_and_fewer_draws_keep_all(full: Store, campaign: Few) -> None:
     more = Store(full.folder, campaign[1], 10, 3)
     assert {(chunk.start, chunk.stop) for chunk in more.missing()} == {(6, 9), (9, 10)}
-    run_campaign(more, alone)
+    run_campaign(more, run_in_process)
     expected = campaign[1][2].work.run(range(10))["cost"]
     np.testing.assert_array_equal(more.columns(2, ["cost"])["cost"], expected)
     fewer = Store(full.folder, campaign[1], 4, 3)
@@ -82,7 +82,7 @@ def test_a_full_disk_gives_one_line_and_leaves_complete_files_only(
 
     monkeypatch.setattr(file_access, "new_file", fill)
     with pytest.raises(MachineError) as found:
-        run_campaign(store, alone)
+        run_campaign(store, run_in_process)
     assert str(found.value).startswith(f"{store.folder}/runs/")
     assert str(found.value).endswith(
         f".parquet: cannot be written: No space left on device; 12 of 28 runs are in "
@@ -90,15 +90,15 @@ def test_a_full_disk_gives_one_line_and_leaves_complete_files_only(
     )
     assert sum(path.is_file() for path in (store.folder / "runs").rglob("*")) == 4
     monkeypatch.undo()
-    assert run_campaign(store, alone) == 16
+    assert run_campaign(store, run_in_process) == 16
 
 
 def use(path: Path, folder: Path, draws: int | None = None) -> int:
     """Run a campaign's missing chunks in its folder; return the number of runs."""
     campaign, points = few_of(path)
     store = Store(folder, points, draws or campaign.draws, campaign.chunk)
-    with opened(campaign, base_of(campaign, path)[1], store):
-        return run_campaign(store, alone)
+    with locked_folder(campaign, base_of(campaign, path)[1], store):
+        return run_campaign(store, run_in_process)
 
 
 @pytest.mark.parametrize(
@@ -158,7 +158,7 @@ def test_a_folder_in_use_or_of_other_content_is_refused(
     campaign, points = few_of(path)
     store = Store(tmp_path / "out", points, 1, campaign.chunk)
     with (
-        opened(campaign, base_of(campaign, path)[1], store),
+        locked_folder(campaign, base_of(campaign, path)[1], store),
         pytest.raises(CallerError, match="another noack uses this folder"),
     ):
         use(path, store.folder)

@@ -18,9 +18,9 @@ from cosim.studies.campaign.campaign_workers import (
     Finished,
     LostWorkersError,
     Work,
-    alone,
     arithmetic,
-    cluster,
+    cluster_runner,
+    run_in_process,
 )
 from cosim.studies.campaign.chunk_store import Store, run_campaign
 from noack.core.errors import CallerError, PeerError
@@ -71,7 +71,7 @@ def test_a_killed_worker_gives_one_line_and_no_byte_depends_on_the_workers(
             workers.extend(p for p in children if "spawn_main" in " ".join(p.cmdline()))
             workers[0].kill()
 
-    with pytest.raises(LostWorkersError) as lost, campaign_workers.local(2) as runner:
+    with pytest.raises(LostWorkersError) as lost, campaign_workers.local_runner(2) as runner:
         run_campaign(by_two, runner, progress)
     text = str(lost.value)
     assert text.startswith("a worker process was killed (out of memory?); ")
@@ -79,10 +79,10 @@ def test_a_killed_worker_gives_one_line_and_no_byte_depends_on_the_workers(
     assert len(workers) == 2
     assert psutil.wait_procs(workers, timeout=60)[1] == []
     assert not list(by_two.folder.rglob(".*.partial"))
-    run_campaign(reverse, lambda works, chunks: alone(works, reversed(list(chunks))))
+    run_campaign(reverse, lambda works, chunks: run_in_process(works, reversed(list(chunks))))
     begun = contents(by_two.folder)
     assert 5 <= len(begun) < 80
-    assert run_campaign(by_two, alone) == 80 - len(begun)
+    assert run_campaign(by_two, run_in_process) == 80 - len(begun)
     assert begun.items() <= contents(by_two.folder).items()
     assert contents(by_two.folder) == contents(reverse.folder)
 
@@ -147,12 +147,12 @@ def test_a_signal_ends_a_campaign_with_one_line(
     many: Path, tmp_path: Path, run_command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def signalled(works: Sequence[Work], chunks: Iterable[Chunk]) -> Iterator[Finished]:
-        for i, finished in enumerate(alone(works, chunks)):
+        for i, finished in enumerate(run_in_process(works, chunks)):
             if i == 5:
                 signal.raise_signal(signal.SIGTERM)
             yield finished
 
-    monkeypatch.setattr(campaign_workers, "alone", signalled)
+    monkeypatch.setattr(campaign_workers, "run_in_process", signalled)
     ended = run_command(many)
     assert ended.exit_code == 143
     assert ended.stderr.splitlines()[-1] == (
@@ -230,7 +230,7 @@ def test_a_cluster_from_its_first_worker_to_its_end(
         patched.setattr(campaign_workers, "_PATIENCE_S", 0.5)
         with (
             pytest.raises(PeerError, match=r"the cluster has had no worker for 0\.5 s \(.*\); 0 of 120"),
-            cluster(dask.address, lines.append) as runner,
+            cluster_runner(dask.address, lines.append) as runner,
         ):
             run_campaign(there, runner)
     assert lines == [f"{dask.address}: no worker; waiting 0.5 s for one"]
@@ -240,7 +240,7 @@ def test_a_cluster_from_its_first_worker_to_its_end(
     other = {**arithmetic(), "numpy": "1.0"}
     with monkeypatch.context() as patched:
         patched.setattr(campaign_workers, "arithmetic", lambda: other)
-        with pytest.raises(PeerError) as refused, cluster(dask.address) as runner:
+        with pytest.raises(PeerError) as refused, cluster_runner(dask.address) as runner:
             run_campaign(there, runner)
     text = str(refused.value)
     assert text.startswith(f"{dask.address}: a worker on ")
@@ -248,8 +248,8 @@ def test_a_cluster_from_its_first_worker_to_its_end(
     assert files(there.folder) == {}
 
     # The bytes are the same if a worker is killed.
-    run_campaign(here, alone)
-    with cluster(dask.address) as runner:
+    run_campaign(here, run_in_process)
+    with cluster_runner(dask.address) as runner:
         assert run_campaign(there, runner, killing(first, 20)) == 120
     assert first.wait() != 0
     assert second.poll() is None
@@ -259,7 +259,7 @@ def test_a_cluster_from_its_first_worker_to_its_end(
     # A killed scheduler ends the campaign.
     with (
         pytest.raises(PeerError, match=r"the scheduler has ended; \d+ of 120 runs are in"),
-        cluster(dask.address) as runner,
+        cluster_runner(dask.address) as runner,
     ):
         run_campaign(unfinished, runner, killing(dask.scheduler, 20))
 
@@ -270,11 +270,11 @@ def test_an_unreachable_or_invalid_scheduler_address_gives_one_line(
     monkeypatch.setattr(campaign_workers, "_CONNECT_S", 0.5)
     with (
         pytest.raises(PeerError, match="no Dask scheduler answers there"),
-        cluster("tcp://127.0.0.1:9"),
+        cluster_runner("tcp://127.0.0.1:9"),
     ):
         pass
     for address in ("nonsense://x:1", "foo", "", "tcp://x", "tcp://x:abc", "tcp://x:99999"):
-        with pytest.raises(CallerError, match="write it as tcp://HOST:PORT"), cluster(address):
+        with pytest.raises(CallerError, match="write it as tcp://HOST:PORT"), cluster_runner(address):
             pass
 
 
@@ -285,5 +285,5 @@ def test_only_a_campaign_with_a_scheduler_imports_dask(
         monkeypatch.setitem(sys.modules, module, None)
     done = run_command(write(plan, draws=1, figures=[]))
     assert done.exit_code == 0, done.output
-    with pytest.raises(CallerError, match=r"pip install 'noack\[cluster\]'"), cluster("x:1"):
+    with pytest.raises(CallerError, match=r"pip install 'noack\[cluster\]'"), cluster_runner("x:1"):
         pass

@@ -11,7 +11,7 @@ from click.testing import Result
 
 from cosim.studies.campaign.campaign_grid import grid
 from cosim.studies.campaign.campaign_summary import summarise
-from cosim.studies.campaign.campaign_workers import alone
+from cosim.studies.campaign.campaign_workers import run_in_process
 from cosim.studies.campaign.chunk_store import Store, run_campaign
 from cosim.studies.campaign.drawn_runs import used_up
 from cosim.studies.capacity import capacity_plan as plans
@@ -48,7 +48,7 @@ def study(tmp_path: Path, queue: int, deadline_s: float = PERIOD_S) -> CapacityR
     )  # fmt: skip
     campaign = plan.campaign()
     store = Store(tmp_path, grid(campaign, Path("study")), plan.draws, 1)
-    run_campaign(store, alone)
+    run_campaign(store, run_in_process)
     summary = summarise(campaign, store)
     return CapacityResult(plan, summary, capacities(plan, summary, store), [])
 
