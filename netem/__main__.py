@@ -53,13 +53,13 @@ def run_network(run: RunProcess) -> None:
     network = RunNetwork(run.scenario, run.start, len(run.phases_ns))
     with run.open_socket() as endpoint:
         addresses = run.join(endpoint.getsockname()[:2])
-        ways = [
+        routes = [
             (addresses[ENDS[flow].sender], addresses[ENDS[flow].receiver])
             for flow in run.scenario.network.flows
         ]
         channel = NetworkChannel(
             endpoint,
-            ways,
+            routes,
             network=network,
             clock=run.clock,
             spin_ns=run.spin_ns,

@@ -128,7 +128,7 @@ class FateRecorder:
             name: np.empty(_GROUP_ROWS, kind)
             for name, kind in {"link": "int16", "direction": "int16", **NUMBERS}.items()
         }
-        self._gathered = 0
+        self._pending_rows = 0
         self._max_waiting = max_waiting
         self._queue: SimpleQueue[Rows | str | None] = SimpleQueue()
         self._taken = 0
@@ -193,24 +193,24 @@ class FateRecorder:
             if isinstance(item, str):
                 self._report(item)
             else:
-                self._gather(item.view(EVENT))
-        if self._gathered:
+                self._append(item.view(EVENT))
+        if self._pending_rows:
             self._write()
         self._end()
 
-    def _gather(self, rows: Rows) -> None:
+    def _append(self, rows: Rows) -> None:
         """Copy rows into columns, in groups, to release the interpreter lock often."""
         while len(rows):
-            part, rows = np.split(rows, [_GROUP_ROWS - self._gathered])
-            places = slice(self._gathered, self._gathered + len(part))
+            part, rows = np.split(rows, [_GROUP_ROWS - self._pending_rows])
+            places = slice(self._pending_rows, self._pending_rows + len(part))
             for name, column in self._columns.items():
                 column[places] = part[_FIELDS.get(name, name)]
-            self._gathered += len(part)
-            if self._gathered == _GROUP_ROWS:
+            self._pending_rows += len(part)
+            if self._pending_rows == _GROUP_ROWS:
                 self._write()
 
     def _write(self) -> None:
-        rows, self._gathered = self._gathered, 0
+        rows, self._pending_rows = self._pending_rows, 0
         if not self._failed:
             columns: list[pa.Array[Any]] = [
                 pa.DictionaryArray.from_arrays(self._columns[name][:rows], names)
@@ -312,7 +312,7 @@ def _is_kept(settings: "_Direction", rows: Mapping[str, NDArray[np.int64]]) -> b
 
 
 @contextmanager
-def opened_fates(path: Path) -> Iterator[tuple[pq.ParquetFile, Mapping[str, "_Link"]]]:
+def open_trace(path: Path) -> Iterator[tuple[pq.ParquetFile, Mapping[str, "_Link"]]]:
     """Open a trace; yields it, and the settings of its links at the start, by name.
 
     Raises:
@@ -335,7 +335,7 @@ def opened_fates(path: Path) -> Iterator[tuple[pq.ParquetFile, Mapping[str, "_Li
 
 
 def _read(path: Path) -> tuple[pa.Table, Mapping[str, "_Link"]]:
-    with opened_fates(path) as (file, links):
+    with open_trace(path) as (file, links):
         table = file.read()
         table.validate(full=True)
     if any(column.null_count for column in table.columns):

@@ -209,7 +209,7 @@ class NetworkChannel(CountingSocket):
 
     Args:
         endpoint: the process's socket.
-        ways: source and destination of each direction.
+        routes: source and destination of each direction.
         network: the network; a datagram's flow is that of :mod:`netem.channel`.
         clock: the run's clock.
         spin_ns: busy-wait for this time before a departure.
@@ -224,15 +224,15 @@ class NetworkChannel(CountingSocket):
     def __init__(
         self,
         endpoint: socket.socket,
-        ways: Sequence[tuple[Address, Address]],
+        routes: Sequence[tuple[Address, Address]],
         *,
         network: RunNetwork,
         clock: RunClock,
         spin_ns: int = 0,
         loops: int = 1,
     ) -> None:
-        self._directions = {source: number for number, (source, _) in enumerate(ways)}
-        destinations = [destination for _, destination in ways]
+        self._directions = {source: number for number, (source, _) in enumerate(routes)}
+        destinations = [destination for _, destination in routes]
         super().__init__(endpoint, destinations, list(self._directions))
         self._loops = loops
         self._foreign = self._of_no_loop = 0
