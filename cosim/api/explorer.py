@@ -110,7 +110,7 @@ class Explorer:
             NoackError: there is no such state.
         """
         _ = self.certificate
-        content = self._results.shown(self._state(state))
+        content = self._results.explored_run(self._state(state))
         return figure_drawing.draw(explored.exploration_figure(content))
 
     def save(self, path: str | PathLike[str]) -> Path:

@@ -124,7 +124,7 @@ class ExplorerWidget:
         if controls.shape == self._shape:
             for slider in controls.sliders:
                 widget = self._inputs[slider.key]
-                if abs(slider.place(widget.value) - slider.position) > slider.step / 2:
+                if abs(slider.position_of(widget.value) - slider.position) > slider.step / 2:
                     widget.value = slider.value
             return
         self._shape, self._inputs = controls.shape, {}
@@ -163,7 +163,7 @@ class ExplorerWidget:
 
         def moved(change: Mapping[str, float]) -> None:
             current = self._sliders[key]
-            value = current.value_at(current.place(change["new"]))
+            value = current.value_at(current.position_of(change["new"]))
             if value != current.value:
                 self._change(lambda draft: drag(draft, current, value))
 
@@ -182,6 +182,6 @@ class ExplorerWidget:
 def _png(results: DraftResults, state: int) -> bytes:
     buffer = io.BytesIO()
     with settings():
-        figure = draw(exploration_figure(results.shown(state)))
+        figure = draw(exploration_figure(results.explored_run(state)))
         figure.savefig(buffer, format="png", dpi=_DPI, pil_kwargs=_QUICK)
     return buffer.getvalue()

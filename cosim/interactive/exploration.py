@@ -163,11 +163,11 @@ def explore(scenario: Scenario) -> Exploration:
     """
     resolved = resolve(scenario)
     try:
-        return _of_exact(run_continuous(resolved, _MOST_EVENTS), resolved, "")
+        return _from_exact_run(run_continuous(resolved, _MOST_EVENTS), resolved, "")
     except TooManyEventsError as error:
         if error.run is None or error.run.reached_s <= 0:
             raise
-        return _of_exact(error.run, resolved, _cut(error.run))
+        return _from_exact_run(error.run, resolved, _cut(error.run))
 
 
 def _cut(run: ContinuousRun) -> str:
@@ -181,7 +181,7 @@ def _cut(run: ContinuousRun) -> str:
 
 
 @np.errstate(all="ignore")  # a run may diverge
-def _of_exact(run: ContinuousRun, resolved: Scenario, cut: str) -> Exploration:
+def _from_exact_run(run: ContinuousRun, resolved: Scenario, cut: str) -> Exploration:
     even = run.at(np.linspace(0.0, run.reached_s, POINTS))
     parts = [(even.t_s, even.x, even.e_s, even.e_c)]
     if 0 < len(run.before) <= _MOST_EVENT_POINTS:  # before, after, then the even times
@@ -220,7 +220,7 @@ _COLUMNS = 600
 """Width of the drawn figure; no peak is lost at this width."""
 
 
-def run_of(scenario: Scenario) -> Exploration:
+def explore_or_simulate(scenario: Scenario) -> Exploration:
     """Run a scenario exactly if the exact simulation covers it, else in virtual time.
 
     Raises:
@@ -236,11 +236,11 @@ def simulate_sampled(scenario: Scenario) -> Exploration:
         NoackError: the scenario is wrong, or has several loops.
     """
     record = simulate(resolve(scenario))
-    return of_record(record, SAMPLED, summarise_loop(record, 0, HORIZON).diverged_at_s)
+    return from_record(record, SAMPLED, summarise_loop(record, 0, HORIZON).diverged_at_s)
 
 
 @np.errstate(all="ignore")  # a run may diverge
-def of_record(record: RunRecord, kind: str, diverged_at_s: float | None = None) -> Exploration:
+def from_record(record: RunRecord, kind: str, diverged_at_s: float | None = None) -> Exploration:
     """Return the run of a loop's record, which may still grow; its samples are decimated."""
     resolved, parts = record.scenario, []
     columns = _COLUMNS if record.is_short else max(record.slice_columns // 10, 1)

@@ -9,7 +9,13 @@ from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
 
-from cosim.interactive.exploration import Ensemble, Exploration, explore_ensemble, run_of, why_not_exact
+from cosim.interactive.exploration import (
+    Ensemble,
+    Exploration,
+    explore_ensemble,
+    explore_or_simulate,
+    why_not_exact,
+)
 from cosim.interactive.scenario_draft import Draft
 from cosim.interactive.scenario_guarantee import Guarantee, Margin, certify, margin_of, warning
 from cosim.output.figures.figure_description import (
@@ -49,14 +55,14 @@ class ExploredRun(NamedTuple):
     """A run with other settings, for comparison."""
 
 
-def exploration_figure(shown: ExploredRun) -> FigureDescription:
+def exploration_figure(explored: ExploredRun) -> FigureDescription:
     """Describe the four panels of a run with all that is known of it.
 
     A name that several panels show is in the legend of the first.
     """
     known, rows = {"‖x‖"}, list[PanelRow]()
-    parts = [_state(shown), _errors(shown), _norm(shown), _events(shown)]
-    horizon_s = np.array([0.0, shown.run.scenario.horizon_s])
+    parts = [_state(explored), _errors(explored), _norm(explored), _events(explored)]
+    horizon_s = np.array([0.0, explored.run.scenario.horizon_s])
     for (title, items, y), height_in in zip(parts, _HEIGHTS_IN, strict=True):
         drawn = [item for item in items if _has_points(item)]
         names = [*dict.fromkeys(item.label for item in drawn)]
@@ -77,8 +83,8 @@ def _has_points(item: Band | Line | Marks) -> bool:
     return bool(np.isfinite(item.low if isinstance(item, Band) else item.y).any())
 
 
-def _state(shown: ExploredRun) -> _Part:
-    run, i, draws, other = shown.run, shown.state, shown.ensemble, shown.reference
+def _state(explored: ExploredRun) -> _Part:
+    run, i, draws, other = explored.run, explored.state, explored.ensemble, explored.reference
     x, x_s = run.x[:, i], run.x_s[:, i]
     x_c = np.where(run.controller_knows, run.x_c[:, i], np.nan)
     items: list[Band | Line | Marks] = [
@@ -97,9 +103,9 @@ def _state(shown: ExploredRun) -> _Part:
     return f"{run.state_names[i]}: plant and both models", items, Axis(about=about)
 
 
-def _errors(shown: ExploredRun) -> _Part:
-    run, draws, other = shown.run, shown.ensemble, shown.reference
-    floor, guarantee = _floor(run), shown.guarantee
+def _errors(explored: ExploredRun) -> _Part:
+    run, draws, other = explored.run, explored.ensemble, explored.reference
+    floor, guarantee = _floor(run), explored.guarantee
     e_s, e_c = _positive(run.e_s_norm, floor), _known_error(run, floor)
     items = [
         Line(x=run.t_s, y=e_s, label="‖e_s‖", colour=SENSOR),
@@ -120,8 +126,8 @@ def _errors(shown: ExploredRun) -> _Part:
     return "errors of the models (logarithmic)", items, y
 
 
-def _norm(shown: ExploredRun) -> _Part:
-    run, draws, other, guarantee = shown.run, shown.ensemble, shown.reference, shown.guarantee
+def _norm(explored: ExploredRun) -> _Part:
+    run, draws, other, guarantee = explored.run, explored.ensemble, explored.reference, explored.guarantee
     norm = _positive(run.x_norm, _SMALLEST * _largest(run.x_norm))
     items = [Line(x=run.t_s, y=norm, label="‖x‖", colour=PLANT, width=2.25)]
     if guarantee is not None:
@@ -134,13 +140,13 @@ def _norm(shown: ExploredRun) -> _Part:
     return "‖x‖ (logarithmic)", items, Axis(logarithmic=True, about=norm, decades=_DECADES)
 
 
-def _events(shown: ExploredRun) -> _Part:
-    t_s, delivered = shown.run.event_s, shown.run.delivered
+def _events(explored: ExploredRun) -> _Part:
+    t_s, delivered = explored.run.event_s, explored.run.delivered
     since_s = np.diff(t_s, prepend=0.0)
     dots = Marks(x=t_s[delivered], y=since_s[delivered], label="delivered", colour=CONTROLLER)
     crosses = Marks(x=t_s[~delivered], y=since_s[~delivered], label="lost", colour=LOST)
     items = [dots, replace(crosses, marker="x", stroke=1.6)]
-    if (other := shown.reference) is not None:
+    if (other := explored.reference) is not None:
         between_s = np.diff(other.event_s, prepend=0.0)
         before = Marks(x=other.event_s, y=between_s, label=KEPT, colour=FORCED, opacity=0.45)
         items.insert(0, before)
@@ -220,7 +226,7 @@ class DraftResults:
     @property
     def run(self) -> Exploration:
         """The run."""
-        return self._once(RUN, run_of)
+        return self._once(RUN, explore_or_simulate)
 
     @property
     def certificate(self) -> Guarantee:
@@ -271,7 +277,7 @@ class DraftResults:
             ]
         return groups
 
-    def shown(self, state: int) -> ExploredRun:
+    def explored_run(self, state: int) -> ExploredRun:
         """Return what a figure shows of the results that are computed."""
         return ExploredRun(
             self.run,

@@ -61,21 +61,21 @@ class Slider:
 
     @property
     def position(self) -> float:
-        """The place of the value on the slider."""
-        return self.place(self.value)
+        """The position of the value on the slider."""
+        return self.position_of(self.value)
 
     @property
     def ends(self) -> tuple[float, float]:
-        """The places of both ends."""
-        return self.place(self.low), self.place(self.high)
+        """The positions of both ends."""
+        return self.position_of(self.low), self.position_of(self.high)
 
-    def place(self, value: float) -> float:
-        """Return the place of a value on the slider."""
+    def position_of(self, value: float) -> float:
+        """Return the position of a value on the slider."""
         value = min(max(value, self.low), self.high)
         return math.log10(value) if self.logarithmic else value
 
     def value_at(self, position: float) -> float | int:
-        """Return the value at a place: whole, a multiple, or with three significant digits."""
+        """Return the value at a position: whole, a multiple, or with three significant digits."""
         value = 10.0**position if self.logarithmic else position
         value = min(max(value, self.low), self.high)
         if self.multiple_of:

@@ -30,10 +30,10 @@ class FileMenu:
         services: LabServices,
         calls: PageCalls,
         session: Session,
-        shown: Callable[[], ExploredRun | None],
+        explored: Callable[[], ExploredRun | None],
     ) -> None:
         self._services, self._calls, self._session = services, calls, session
-        self._shown = shown
+        self._explored = explored
         opener = ui.button(icon="more_vert").props('flat color=white dense aria-label="files"')
         with opener, ui.menu():
             ui.menu_item("save as scenario …", self._ask)
@@ -86,12 +86,12 @@ class FileMenu:
         ui.notify("copied; it opens as long as this page runs", type="positive")
 
     def _data(self) -> None:
-        if (shown := self._shown()) is not None:
-            ui.download(csv_of(shown.run), "exploration.csv", "text/csv")
+        if (explored := self._explored()) is not None:
+            ui.download(csv_of(explored.run), "exploration.csv", "text/csv")
 
     async def _figure(self, kind: FigureFormat) -> None:
-        if (shown := self._shown()) is not None:
-            content = await self._calls.compute(figure_file, shown, kind)
+        if (explored := self._explored()) is not None:
+            content = await self._calls.compute(figure_file, explored, kind)
             ui.download(content, f"exploration.{kind}")
 
 
@@ -107,8 +107,8 @@ def csv_of(run: Exploration) -> bytes:
     return text.getvalue()
 
 
-def figure_file(shown: ExploredRun, kind: FigureFormat) -> bytes:
+def figure_file(explored: ExploredRun, kind: FigureFormat) -> bytes:
     """Return the figure as a file's content; called in the worker process."""
     from cosim.output.figures.figure_files import file_content  # needs matplotlib
 
-    return file_content(exploration_figure(shown), kind, figure_width_in(kind, None))
+    return file_content(exploration_figure(explored), kind, figure_width_in(kind, None))

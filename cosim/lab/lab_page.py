@@ -186,22 +186,22 @@ class _Page:
 
     async def _show(self) -> None:
         """Show the chosen source."""
-        shown, live = self._explored_run(), self._source == LIVE
+        explored, live = self._explored_run(), self._source == LIVE
         with suppress(DraftError):  # the mistakes are shown; the sliders stay
             self._controls = controls_of(self._session.draft)
-        parts = self._drawing(shown) | {"note": self._note(shown), "verdict": self._verdict()}
+        parts = self._drawing(explored) | {"note": self._note(explored), "verdict": self._verdict()}
         if self._controls is not None:
             wrong = {mistake.key for mistake in self._session.mistakes}
             parts["controls"] = controls_part(self._controls, wrong, live=self._live.is_running)
-        if shown is not None:
-            run = shown.run
+        if explored is not None:
+            run = explored.run
             facts: Mapping[str, Sequence[tuple[str, str]]] = {f"this run ({run.kind})": run.numbers}
             if self._source == EXPLORE and self._session.results is not None:
                 facts = self._session.results.facts
             reference = self._reference()
             parts["compare"] = reference and compare(reference, run)._asdict()
             parts["facts"] = [[heading, [*map(list, rows)]] for heading, rows in facts.items()]
-            parts["states"] = {"names": run.state_names, "chosen": shown.state}
+            parts["states"] = {"names": run.state_names, "chosen": explored.state}
         name = self._live.report if live else self._recorded.chosen * (self._source == RECORDED)
         pending = {EXPLORE: self._session.pending, RECORDED: self._recorded.note}
         await self._parts.show(
@@ -211,14 +211,14 @@ class _Page:
             **parts,
         )
 
-    def _drawing(self, shown: ExploredRun | None) -> dict[str, object]:
+    def _drawing(self, explored: ExploredRun | None) -> dict[str, object]:
         """Return what is shown anew while a slider is dragged."""
-        parts: dict[str, object] = {"source": self._source, "stale": shown is None}
-        if shown is not None:
-            parts["figure"] = figure_part(exploration_figure(shown))
+        parts: dict[str, object] = {"source": self._source, "stale": explored is None}
+        if explored is not None:
+            parts["figure"] = figure_part(exploration_figure(explored))
         return parts
 
-    def _note(self, shown: ExploredRun | None) -> str:
+    def _note(self, explored: ExploredRun | None) -> str:
         """Return what is wrong with the settings, or what the drawing leaves out."""
         session = self._session
         if self._source != EXPLORE:
@@ -226,23 +226,23 @@ class _Page:
         first = session.mistakes[0].text if session.mistakes else ""
         more = f" (and {len(session.mistakes) - 1} more)" if len(session.mistakes) > 1 else ""
         note = first + more or session.note
-        is_old = note and shown is None and self._parts.has_figure
+        is_old = note and explored is None and self._parts.has_figure
         return f"{note}. The figure shows the settings before" if is_old else note
 
     def _explored_run(self) -> ExploredRun | None:
         """Return what the figure shows; None without a run."""
         view, reference = self._recorded.view, self._reference()
-        shown = None
+        explored = None
         if self._source == EXPLORE and self._session.results is not None:
-            shown = self._session.results.shown(0)
+            explored = self._session.results.explored_run(0)
         elif self._source == LIVE and self._live.run is not None:
-            shown = ExploredRun(self._live.run, 0)
+            explored = ExploredRun(self._live.run, 0)
         elif self._source == RECORDED and view is not None:
-            shown = ExploredRun(view.run, 0, guarantee=view.bounds)
-        if shown is None:
+            explored = ExploredRun(view.run, 0, guarantee=view.bounds)
+        if explored is None:
             return None
-        state = min(self._state, shown.run.x.shape[1] - 1)
-        return shown._replace(state=state, reference=reference and reference.run)
+        state = min(self._state, explored.run.x.shape[1] - 1)
+        return explored._replace(state=state, reference=reference and reference.run)
 
     def _reference(self) -> Reference | None:
         """Return the run that the shown one is compared with."""
@@ -286,11 +286,11 @@ class _Page:
 
     async def _show_run(self) -> None:
         """Show the figure of a new run at once; its words follow when the settings rest."""
-        shown = self._explored_run()
-        if self._source != EXPLORE or shown is None:
+        explored = self._explored_run()
+        if self._source != EXPLORE or explored is None:
             await self._show()
             return
-        await self._parts.show(slider=self._moved, **self._drawing(shown))
+        await self._parts.show(slider=self._moved, **self._drawing(explored))
 
     async def _settle(self) -> None:
         """Bring up to date what need not follow while a slider is dragged."""
@@ -340,11 +340,11 @@ class _Page:
         await self._session.change(draft)
 
     async def _keep_run(self) -> None:
-        shown = self._explored_run()
-        if self._kept is not None or shown is None:
+        explored = self._explored_run()
+        if self._kept is not None or explored is None:
             self._kept = None
         else:
-            self._kept = Reference(f"the kept run ({shown.run.kind})", shown.run)
+            self._kept = Reference(f"the kept run ({explored.run.kind})", explored.run)
         self._keep.set_text(_KEEP if self._kept is None else _FORGET)
         await self._show()
 

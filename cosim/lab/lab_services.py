@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self, TypeVar, TypeVarTuple
 
-from cosim.interactive.exploration import Exploration, explore_ensemble, run_of, why_not_exact
+from cosim.interactive.exploration import Exploration, explore_ensemble, explore_or_simulate, why_not_exact
 from cosim.interactive.exploration_figure import CERTIFICATE, ENSEMBLE, MARGIN, RUN, DraftResults
 from cosim.interactive.scenario_draft import Draft, DraftError, Mistake, known_scenarios
 from cosim.interactive.scenario_guarantee import certify, margin_of
@@ -269,7 +269,7 @@ class Session:
             results = DraftResults(self.draft)
             if (why := why_not_exact(scenario)) is not None:
                 self.note = f"in virtual time, which takes longer: {why}"
-                results.put(RUN, await self._compute("run", run_of, scenario))
+                results.put(RUN, await self._compute("run", explore_or_simulate, scenario))
             _ = results.run  # an exact one takes some milliseconds
             self.results, self.pending = results, "computing: certificate"
         except DraftError as error:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.interactive.exploration import LIVE, RECORDED, Exploration, of_record
+from cosim.interactive.exploration import LIVE, RECORDED, Exploration, from_record
 from cosim.interactive.scenario_guarantee import CERTIFIED, Guarantee
 from cosim.lazy_modules import lazy_modules
 from cosim.output.run_verdict import VerdictLine, remarks, verdict
@@ -59,7 +59,7 @@ def live_view(run_dir: Path) -> Exploration | None:
             rows = dict(rows_by_loop(table, recorded, phases_ns(scenario), [own])).get(0, rows)
         tables[table] = rows
     record = RunRecord(loop, tables, [], {})
-    return of_record(record, LIVE) if len(record[CONTROLLER_STEP]) else None
+    return from_record(record, LIVE) if len(record[CONTROLLER_STEP]) else None
 
 
 def recorded_view(directory: Path, loop: str | None) -> RunView:
@@ -73,9 +73,9 @@ def recorded_view(directory: Path, loop: str | None) -> RunView:
     number = run.number_of(loop if loop in names else names[0])
     record = run.loops[number]
     loop_summary = summary.loops[number]
-    shown = of_record(record, RECORDED, loop_summary.diverged_at_s)
+    explored = from_record(record, RECORDED, loop_summary.diverged_at_s)
     texts = tuple(remark.text for remark in remarks(summary.model_copy(update={"loops": [loop_summary]})))
-    return RunView(shown, verdict(summary), texts, _bounds(record), names)
+    return RunView(explored, verdict(summary), texts, _bounds(record), names)
 
 
 def _bounds(record: RunRecord) -> Guarantee | None:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import RunRecord, load_record
-from netem.fates import opened_fates
+from netem.fates import open_trace
 from netem.link_state import LinkState
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core
@@ -161,7 +161,7 @@ def read_fate_file(path: Path, number: int) -> PacketTrace:
     Raises:
         CallerError: one line; it is not a complete fate file, or has no such flow.
     """
-    with opened_fates(path) as (file, _):
+    with open_trace(path) as (file, _):
         counts: Counter[tuple[object, ...]] = Counter()
         for batch in file.iter_batches(columns=list(_FLOW)):
             table = pa.Table.from_batches([batch]).group_by([*_FLOW]).aggregate([([], "count_all")])

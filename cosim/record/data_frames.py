@@ -30,14 +30,14 @@ def with_seconds(table: pa.Table) -> pa.Table:
 @np.errstate(all="ignore")  # a run may diverge
 def samples(record: RunRecord) -> pa.Table:
     """Return plant, sensor and controller on the measurements' grid; :meth:`noack.Run.samples`."""
-    joined = align_tables(record)
-    columns: dict[str, NDArray[np.generic]] = {"t_s": _seconds(joined.t_ns), "t_ns": joined.t_ns}
-    for name, states in (("x", joined.x), ("x_s", joined.x_s), ("x_c", joined.x_c)):
+    aligned = align_tables(record)
+    columns: dict[str, NDArray[np.generic]] = {"t_s": _seconds(aligned.t_ns), "t_ns": aligned.t_ns}
+    for name, states in (("x", aligned.x), ("x_s", aligned.x_s), ("x_c", aligned.x_c)):
         columns |= dict(zip(entry_names(name, states.shape[1]), states.T, strict=True))
     columns |= {
-        "e_s_norm": joined.e_s_norm,
-        "threshold": joined.threshold,
-        "e_c_norm": joined.e_c_norm,
+        "e_s_norm": aligned.e_s_norm,
+        "threshold": aligned.threshold,
+        "e_c_norm": aligned.e_c_norm,
         "event": record[SENSOR_MEASUREMENT]["event"],
     }
     return _table(columns)

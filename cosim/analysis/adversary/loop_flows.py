@@ -439,7 +439,7 @@ class SampledRun(NamedTuple):
     event_s: tuple[float, ...]
 
 
-def run_of(flow: SampledFlow, delivered: Callable[[int], bool]) -> SampledRun:
+def run_sampled(flow: SampledFlow, delivered: Callable[[int], bool]) -> SampledRun:
     """Run the loop; ``delivered`` returns the fate of each update."""
     segment = flow.start()
     value, at_s = float(segment.value[0]), 0.0

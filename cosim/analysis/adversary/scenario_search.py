@@ -23,7 +23,7 @@ from cosim.analysis.adversary.loop_flows import (
     SegmentFlow,
     evaluate,
     measure_of,
-    run_of,
+    run_sampled,
     weight_of,
 )
 from cosim.analysis.adversary.pattern_search import (
@@ -123,11 +123,11 @@ def _find_sampled(
 ) -> WorstRun:
     began_s = time.monotonic()
     flow = SampledFlow(SampledLoop(resolved), objective, certificate)
-    own_run = run_of(flow, network_fates(resolved))
+    own_run = run_sampled(flow, network_fates(resolved))
     first_event = 0 if flow.loop.known_start else 1
     search = PatternSearch(flow, resolved.network.guarantee, report)
     exact = _search(search, own_run.delivered[first_event:], beam, most_nodes)
-    worst, lossless = _run(flow, search.pattern), run_of(flow, lambda event: True)
+    worst, lossless = _run(flow, search.pattern), run_sampled(flow, lambda event: True)
     bounds = disturbance_bounds(resolved) if objective in (Objective.ERROR, Objective.STATE) else None
     if bounds is not None:
         exact = False
@@ -159,7 +159,9 @@ def _find_sampled(
 def _run(flow: SampledFlow, pattern: Pattern) -> SampledRun:
     """Run a pattern that was searched; the first packet is not part of it."""
     first_event = 0 if flow.loop.known_start else 1
-    return run_of(flow, lambda event: event - first_event >= len(pattern) or pattern[event - first_event])
+    return run_sampled(
+        flow, lambda event: event - first_event >= len(pattern) or pattern[event - first_event]
+    )
 
 
 def _worsen_disturbances(

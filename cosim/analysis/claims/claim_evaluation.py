@@ -266,21 +266,21 @@ class RunClaims:
     def parts(self) -> list[ClaimEvaluation | Claim]:
         """The claims of each part; for a part without claims, the reason as a void claim."""
         record = self._checked_record
-        changes = [made for made in changes_of(record) if made.touches_claims]
+        changes = [change for change in changes_of(record) if change.touches_claims]
         first_ns = changes[0].first_ns if changes else NEVER_NS
         void = void_at_setpoint(record.scenario, knows_start=True)
-        own, certificates, error = record, self.certificates, None
+        part_record, certificates, error = record, self.certificates, None
         if self._setpoint is not None:
-            own, certificates = cut_part(record, record.scenario, 0, None), None
+            part_record, certificates = cut_part(record, record.scenario, 0, None), None
             if self._setpoint[1].any():  # the input is 0 at first, and not u_r
-                error = start_error(own, ClaimEvaluation(own).started_s)
+                error = start_error(part_record, ClaimEvaluation(part_record).started_s)
         offset = _offset(record.scenario)
         until_s = _until_s(first_ns, 0)
         part = RunPart(record, 0.0, until_s, error, void, certificates, offset)
-        parts: list[ClaimEvaluation | Claim] = [ClaimEvaluation(own, part)]
-        for made, after in zip(changes, [*changes[1:], None], strict=False):
+        parts: list[ClaimEvaluation | Claim] = [ClaimEvaluation(part_record, part)]
+        for change, after in zip(changes, [*changes[1:], None], strict=False):
             until_ns = NEVER_NS if after is None else after.first_ns
-            parts.append(self._claims_after(made, until_ns))
+            parts.append(self._claims_after(change, until_ns))
         return parts
 
     @property
@@ -318,7 +318,9 @@ class RunClaims:
         for part in self.parts:
             if not isinstance(part, Claim):
                 from_s = part.part.from_s
-                violations += [found._replace(t_s=found.t_s + from_s) for found in part.violations()]
+                violations += [
+                    violation._replace(t_s=violation.t_s + from_s) for violation in part.violations()
+                ]
         return sorted(violations, key=lambda violation: violation.t_s)
 
     def evaluate(self) -> list[Claim]:
@@ -339,7 +341,7 @@ class RunClaims:
                 ]
         return envelopes
 
-    def _claims_after(self, made: RecordedChange, until_ns: int) -> ClaimEvaluation | Claim:
+    def _claims_after(self, change: RecordedChange, until_ns: int) -> ClaimEvaluation | Claim:
         """The claims about the part of the run that follows a change."""
         record = self._checked_record
         known = record.events()["event"]
@@ -347,25 +349,25 @@ class RunClaims:
             CONTROLLER_DELIVERY,
             "t_ns",
             "sequence",
-            where=lambda rows: rows["t_ns"] >= made.everywhere_ns,
+            where=lambda rows: rows["t_ns"] >= change.everywhere_ns,
         )
         after = after[np.isin(after["sequence"], known)]
-        if made.everywhere_ns == NEVER_NS:
-            return _void_after(made, until_ns, "not every process received the change")
+        if change.everywhere_ns == NEVER_NS:
+            return _void_after(change, until_ns, "not every process received the change")
         if not len(after) or after["t_ns"][0] >= until_ns:
             up_to = "" if until_ns == NEVER_NS else f", up to {until_ns / NS_PER_S:.3f} s"
-            return _void_after(made, until_ns, f"no update was delivered after it{up_to}")
+            return _void_after(change, until_ns, f"no update was delivered after it{up_to}")
         origin_ns, sequence = int(after["t_ns"][0]), int(after["sequence"][0])
-        own = cut_part(record, made.scenario, origin_ns, sequence)
+        part_record = cut_part(record, change.scenario, origin_ns, sequence)
         part = RunPart(
             record,
             origin_ns / NS_PER_S,
             _until_s(until_ns, origin_ns),
-            start_error(own, ClaimEvaluation(own).started_s),
-            void_at_setpoint(made.scenario, knows_start=True),
-            offset=_offset(made.scenario),
+            start_error(part_record, ClaimEvaluation(part_record).started_s),
+            void_at_setpoint(change.scenario, knows_start=True),
+            offset=_offset(change.scenario),
         )
-        return ClaimEvaluation(own, part)
+        return ClaimEvaluation(part_record, part)
 
 
 def list_violations(
@@ -402,9 +404,9 @@ def claims_of(record: RunRecord) -> "RunClaims":
     return RunClaims(record)
 
 
-def _void_after(made: RecordedChange, until_ns: int, why: str) -> Claim:
+def _void_after(change: RecordedChange, until_ns: int, why: str) -> Claim:
     """Return a void claim for the part after a change, with the reason for having no claims."""
-    at_s, text = made.first_ns / NS_PER_S, text_of(made.change.settings)
+    at_s, text = change.first_ns / NS_PER_S, text_of(change.change.settings)
     until_s = None if until_ns == NEVER_NS else until_ns / NS_PER_S
     why = f"changed at {at_s:.3f} s: {text}; {why}"
     return void_claim("claims after a change", "claims", at_s, why, until_s)

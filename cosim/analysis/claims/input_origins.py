@@ -169,9 +169,9 @@ class InputOrigins:
         replaced = controlled & self._replaces & too_old(t_ns, sent_ns, self._timeout_ns)
         # Until the first input with a state, the certificates assume that the input is 0.
         safe = is_input & ~controlled & (began | ~(sizes == 0))
-        step_s, held = t_ns * 1e-9, controlled & ~replaced
+        step_s, is_held = t_ns * 1e-9, controlled & ~replaced
         return (
-            SampledSeries(step_s[held], age_ns[held] * 1e-9),
+            SampledSeries(step_s[is_held], age_ns[is_held] * 1e-9),
             SampledSeries(step_s[replaced], (t_ns - sent_ns)[replaced] * 1e-9),
             SampledSeries(step_s[safe], sizes[safe]),
         )

@@ -155,8 +155,8 @@ class RunEvidence:
         generator is sent the certificates of each, and returns those of the latest time. A
         certificate holds for every run that meets its conditions, whenever they were chosen.
         """
-        whole, until_s = self.part.whole or self.record, self.part.until_s
-        if not all(map(whole.is_complete, LOOP_ROLES)):  # rows that are missing may be later
+        whole_record, until_s = self.part.whole_record or self.record, self.part.until_s
+        if not all(map(whole_record.is_complete, LOOP_ROLES)):  # rows that are missing may be later
             return None
         if not any(certificate.exists for certificate in self._scheduled):
             return None
@@ -251,11 +251,11 @@ class RunEvidence:
         """
         limit = _ANY._replace(sampling_s=self._schedule.sampling_s)
         gaps = [self.observed.first_violation(limit, ("sampling", *CLOCK_CAUSES))]
-        whole = self.part.whole or self.record
+        whole_record = self.part.whole_record or self.record
         for role in LOOP_ROLES:
-            if whole.is_complete(role):
+            if whole_record.is_complete(role):
                 continue
-            gaps_ns = filter(None, (generation.gap_ns for generation in whole.generations(role)))
+            gaps_ns = filter(None, (generation.gap_ns for generation in whole_record.generations(role)))
             times_s = [ns * 1e-9 - self.part.from_s for ns in gaps_ns]
             why = f"rows of {role} are missing from the record"
             gaps += [VoidFrom(t_s, why) for t_s in times_s if t_s >= 0]

@@ -37,7 +37,7 @@ from noack.theory.certificates.conditions import about_setpoint
 class RunPart(NamedTuple):
     """A part of a run that is checked as a run of its own; by default the whole run."""
 
-    whole: RunRecord | None = None
+    whole_record: RunRecord | None = None
     """The record of the run, if that of the part is another one."""
     from_s: float = 0.0
     """Start of the part, in the run's time."""
@@ -122,33 +122,33 @@ def _shift(rows: Rows, origin_ns: int, x_r: Vector, u_r: Vector) -> Rows:
     return shifted
 
 
-def start_error(own: RunRecord, started_s: float) -> float:
+def start_error(part_record: RunRecord, started_s: float) -> float:
     """sup‖u − Kx‖ e^{αt} over the steps until the plant applied the first input of the part.
 
     u is constant within a step. So ‖u − Kx‖ is at most the larger of its values at both ends, plus
     a term for the curvature of x: Δt²/8 sup‖K A ẋ‖, with ẋ = e^{As}(Ax + Bu + Dw), w constant.
     """
-    alpha = policy_of(own.scenario).fading_per_s
-    largest, last = 0.0, np.zeros(0, own.tables[PLANT_STEP])
-    for batch in own.source.batches(PLANT_STEP):
+    alpha = policy_of(part_record.scenario).fading_per_s
+    largest, last = 0.0, np.zeros(0, part_record.tables[PLANT_STEP])
+    for batch in part_record.source.batches(PLANT_STEP):
         steps = np.concatenate([last, batch])
         ended = int(np.searchsorted(steps["t_ns"] * 1e-9, started_s)) + 1
         if len(steps[:ended]) > 1:
-            largest = max(largest, _input_error(own, steps[:ended], alpha))
+            largest = max(largest, _input_error(part_record, steps[:ended], alpha))
         if ended < len(steps):
             break
         last = steps[-1:]
     return max(largest, float(np.finfo(float).tiny))  # 0 would be that of a run from its start
 
 
-def _input_error(own: RunRecord, steps: Rows, alpha_per_s: float) -> float:
+def _input_error(part_record: RunRecord, steps: Rows, alpha_per_s: float) -> float:
     """Return the bound of ‖u − Kx‖ e^{αt} over at least two steps."""
-    loop = own.loop
-    x, u, dt_s = steps["x"], steps["u"][:-1], own.scenario.timing.plant_period_ns * 1e-9
+    loop = part_record.loop
+    x, u, dt_s = steps["x"], steps["u"][:-1], part_record.scenario.timing.plant_period_ns * 1e-9
     ends = np.maximum(row_norms(u - x[:-1] @ loop.K.T), row_norms(u - x[1:] @ loop.K.T))
     speed = x[:-1] @ loop.A.T + u @ loop.B.T
     grown = math.exp(min(float(np.linalg.norm(loop.A, 2)) * dt_s, 700.0))
-    forced, forcing = 0.0, bound_forcing(own.scenario, loop.B)
+    forced, forcing = 0.0, bound_forcing(part_record.scenario, loop.B)
     if forcing is not None:
         forced = float(np.linalg.norm(loop.K @ loop.A @ forcing.limited, axis=0).sum())
     bend = dt_s**2 / 8 * grown * (row_norms(speed @ (loop.K @ loop.A).T) + forced)

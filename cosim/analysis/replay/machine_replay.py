@@ -109,20 +109,20 @@ class InputReplay:
         replay.next = 0
         if (wrong := core.noack_replay_check(replay)) != ffi.NULL:
             raise ValueError(f"replay: {ffi.string(wrong).decode()}")
-        place_of = _Places(tables, order, before)
+        locate = _InputRows(tables, order, before)
         try:
             while (reason := core.noack_replay_inputs(replay)) != core.NOACK_DONE:
                 if reason == core.NOACK_CANNOT_TAKE:
                     raise ValueError("no run has these numbers")
                 if reason == core.NOACK_REPLAY_SETTING:
-                    self._announce(place_of)
+                    self._announce(locate)
                 else:
-                    self._recall(place_of)
+                    self._recall(locate)
                     self._machine.answer(reason)
         except _DAMAGE as error:
-            self._explain(place_of)
-            self._note(place_of, replay.next, f"the machine cannot take this input: {error}")
-        self._explain(place_of)
+            self._explain(locate)
+            self._note(locate, replay.next, f"the machine cannot take this input: {error}")
+        self._explain(locate)
         replay.difference = core.NOACK_EQUAL
         if self._is_network:
             self._machine.take_rows()
@@ -145,17 +145,17 @@ class InputReplay:
         heads = np.ascontiguousarray(sent[:, 1:]).view(f"V{PACKET_HEAD_BYTES}")
         return sent[:, 0], heads[:, 0]
 
-    def _recall(self, place_of: "_Places") -> None:
+    def _recall(self, locate: "_InputRows") -> None:
         """Let a part that is outside of noack answer as recorded."""
         if not isinstance(self._machine, Channel) and (asked := self._machine.asked) is not None:
-            table, row, rows = place_of(self._core.next)
+            table, row, rows = locate(self._core.next)
             if table in _ANSWERS:
                 asked.recorded = rows[_ANSWERS[table]][row].copy()
 
-    def _announce(self, place_of: "_Places") -> None:
+    def _announce(self, locate: "_InputRows") -> None:
         """Let the machine receive a change of settings; compare its row."""
         replay = self._core
-        table, row, rows = place_of(replay.next)
+        table, row, rows = locate(replay.next)
         recorded = rows[row]
         change = ParameterChange(
             int(recorded["sequence"]),
@@ -171,44 +171,44 @@ class InputReplay:
         if LOOP in (rows.dtype.names or ()):
             replayed[LOOP] = recorded[LOOP]
         if replay.difference == core.NOACK_EQUAL and replayed.tobytes() != recorded.tobytes():
-            self._explain(place_of)
-            first_difference = first_row_difference(table, place_of.number(table, row), recorded, replayed)
+            self._explain(locate)
+            first_difference = first_row_difference(table, locate.number(table, row), recorded, replayed)
             self.difference = self.difference or first_difference
         replay.before_ns = int(recorded["now_ns"])
         replay.next += 1
 
-    def _explain(self, place_of: "_Places") -> None:
+    def _explain(self, locate: "_InputRows") -> None:
         """Keep the first difference that the core has found."""
         replay = self._core
         if self.difference is not None or replay.difference == core.NOACK_EQUAL:
             return
         at, other = replay.difference_at, replay.other_ns
         other_ns = None if other == NEVER_NS else other
-        table, row, rows = place_of(at)
+        table, row, rows = locate(at)
         now_ns = int(rows["now_ns"][row])
         if replay.difference == core.NOACK_TIME_RUNS_BACKWARD:
-            self._note(place_of, at, "time runs backward", "now_ns", now_ns, other_ns)
+            self._note(locate, at, "time runs backward", "now_ns", now_ns, other_ns)
         elif replay.difference == core.NOACK_BEFORE_DEADLINE:
-            self._note(place_of, at, "acted before its deadline", "now_ns", now_ns, other_ns)
+            self._note(locate, at, "acted before its deadline", "now_ns", now_ns, other_ns)
         elif replay.difference == core.NOACK_OTHER_TABLE:
-            self._note(place_of, at, "the machine does not answer with one row of this table")
+            self._note(locate, at, "the machine does not answer with one row of this table")
         else:
             replayed = rows[row : row + 1].copy()
             own = replayed.view(np.uint8).reshape(-1)
             skipped = _prefix_bytes(rows.dtype)
             own[skipped:] = np.frombuffer(ffi.buffer(replay.replayed), np.uint8)[: len(own) - skipped]
-            number = place_of.number(table, row)
+            number = locate.number(table, row)
             self.difference = first_row_difference(table, number, rows[row], replayed[0])
 
-    def _note(self, place_of: "_Places", at: int, text: str, column: str = "", *values: int | None) -> None:
+    def _note(self, locate: "_InputRows", at: int, text: str, column: str = "", *values: int | None) -> None:
         """Keep a difference at an input, if it is the first one."""
-        table, row, rows = place_of(at)
-        number, now_ns = place_of.number(table, row), int(rows["now_ns"][row])
+        table, row, rows = locate(at)
+        number, now_ns = locate.number(table, row), int(rows["now_ns"][row])
         if self.difference is None:
             self.difference = difference(table, number, now_ns, text, column, *values)
 
 
-class _Places:
+class _InputRows:
     """Where the inputs are in the tables."""
 
     def __init__(self, tables: Slice, order: Numbers, before: Mapping[str, int]) -> None:
@@ -354,9 +354,9 @@ class MachineReplay:
         return tuple(part.result() for part in self._parts)
 
     @property
-    def whole(self) -> bool:
+    def is_complete(self) -> bool:
         """Whether every input was replayed."""
-        return all(result.whole for result in self.results)
+        return all(result.is_complete for result in self.results)
 
 
 class _GenerationReplay:
@@ -424,23 +424,23 @@ class _GenerationReplay:
         unexpected = np.flatnonzero(numbers != self._compared + np.arange(len(numbers)))
         if not len(unexpected):
             return order
-        whole = int(unexpected[0])
+        first_gap = int(unexpected[0])
         self._stopped = True
-        self._explain(owned, order, numbers, whole)
-        return order[:whole]
+        self._explain(owned, order, numbers, first_gap)
+        return order[:first_gap]
 
-    def _explain(self, owned: Slice, order: Numbers, numbers: Numbers, whole: int) -> None:
-        """Find out whether rows are missing before ``whole``, or its input number is wrong."""
-        expected, suspect = self._compared + whole, whole
+    def _explain(self, owned: Slice, order: Numbers, numbers: Numbers, first_gap: int) -> None:
+        """Find out whether rows are missing before ``first_gap``, or its input number is wrong."""
+        expected, suspect = self._compared + first_gap, first_gap
         complete = self._written == self._count
-        if numbers[whole] > expected:
+        if numbers[first_gap] > expected:
             if not complete:
                 self._missing_from = expected
                 return
             # No row is missing, so an ``input`` number is wrong.
             repeated = np.append(np.diff(numbers) == 0, False)
             wrong = np.flatnonzero(repeated | (numbers >= self._count))
-            suspect = int(wrong[0]) if len(wrong) else whole
+            suspect = int(wrong[0]) if len(wrong) else first_gap
         self._missing_from = None
         table, row = table_and_row(owned, int(order[suspect]))
         self._damage = difference(

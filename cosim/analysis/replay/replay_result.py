@@ -88,7 +88,7 @@ class ProcessReplay(SummaryPart):
     difference: ReplayDifference | None
 
     @property
-    def whole(self) -> bool:
+    def is_complete(self) -> bool:
         """Whether every input of the process was replayed."""
         return self.gap is None
 

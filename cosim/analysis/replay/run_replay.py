@@ -81,8 +81,8 @@ class MessageComparison:
         """Return the result of each hop after the last part."""
         netem = self._machines.get("netem")
         # A killed emulator may have forwarded messages whose rows are missing.
-        whole = self._record.is_complete("netem") if netem is None else netem.whole
-        results = [hop.result(network_is_whole=whole) for hop in self._hops]
+        is_complete = self._record.is_complete("netem") if netem is None else netem.is_complete
+        results = [hop.result(network_is_complete=is_complete) for hop in self._hops]
         return (*results, *_compare_changes(self._record))
 
 
@@ -131,7 +131,7 @@ class _Difference(NamedTuple):
 
     row: int
     """Number of the message among those of the hop."""
-    place: int
+    table_row: int
     """Row of the table."""
     now_ns: int
     what: str
@@ -180,8 +180,8 @@ class _HopComparison:
             self._add(packets.sent_in(self._flow))
         if self._was_forwarded:
             for flows, headers in survivors:
-                mine = headers[(flows == self._direction) & (headers["magic"] == MAGIC)]
-                self._survivors.update(mine["sequence"].tolist())
+                own_headers = headers[(flows == self._direction) & (headers["magic"] == MAGIC)]
+                self._survivors.update(own_headers["sequence"].tolist())
         self._compare_waiting()
         self._waiting = part[self._table]
 
@@ -209,10 +209,10 @@ class _HopComparison:
         self._sent = self._sent[first:]
         self._survivors = {k for k in self._survivors if k >= self._newest}
 
-    def result(self, *, network_is_whole: bool) -> MessagesReplay:
+    def result(self, *, network_is_complete: bool) -> MessagesReplay:
         """Return the first difference of all messages, after the last part."""
         self._compare_waiting()
-        counts = {_SENT: self._sender.whole, _FORWARDED: network_is_whole}
+        counts = {_SENT: self._sender.is_complete, _FORWARDED: network_is_complete}
         kinds = [kind for kind in (_CONTENT, _SENT, _FORWARDED) if counts.get(kind, True)]
         firsts = [self._first[kind] for kind in kinds if kind in self._first]
         first, first_difference = min(firsts, key=lambda difference: difference.row, default=None), None
@@ -230,11 +230,11 @@ class _HopComparison:
             sent = sent[np.argsort(sent[:, SEQUENCE], kind="stable")]
         self._sent = sent
 
-    def _places(self, sequences: Numbers) -> tuple[Numbers, NDArray[np.bool_]]:
-        """Return the place of each received number among the sent ones, and whether it is there."""
+    def _sent_rows(self, sequences: Numbers) -> tuple[Numbers, NDArray[np.bool_]]:
+        """Return the row of each received number among the sent ones, and whether it is there."""
         sent = np.append(self._sent[:, SEQUENCE], 0)
-        places = np.searchsorted(sent[:-1], sequences, "right") - 1
-        return places, (places >= 0) & (sent[places] == sequences)
+        sent_rows = np.searchsorted(sent[:-1], sequences, "right") - 1
+        return sent_rows, (sent_rows >= 0) & (sent[sent_rows] == sequences)
 
     def _compare_vectors(self) -> None:
         """Compare sequence number, time and vector of the received messages."""
@@ -247,9 +247,9 @@ class _HopComparison:
         if (np.diff(newest) > 0).all() and np.array_equal(words, in_turn):  # nothing was lost
             self._compared += len(words)
             return
-        places, known = self._places(numbers)
+        sent_rows, known = self._sent_rows(numbers)
         self._compared += int(known.sum())
-        is_newer, sent = numbers > newest[:-1], self._sent[places, :-1] if known.any() else words
+        is_newer, sent = numbers > newest[:-1], self._sent[sent_rows, :-1] if known.any() else words
         if known.all() and is_newer.all() and (words == sent).all():
             return
         for row in np.flatnonzero(~(known & is_newer & (words == sent).all(axis=1))).tolist():
@@ -275,10 +275,10 @@ class _HopComparison:
             self._run = max(sorted(counts), key=counts.__getitem__)
         sequences = np.where(is_valid, headers["sequence"].view(np.int64), -1)
         self._newest = int(max(self._newest, sequences.max(initial=-1)))
-        places, known = self._places(sequences)
+        sent_rows, known = self._sent_rows(sequences)
         self._compared += int(known.sum())
         entries = self._sent.shape[1] - VECTOR - 1
-        expected, sent = np.zeros(len(headers), HEADER_ROW), self._sent[places[known]]
+        expected, sent = np.zeros(len(headers), HEADER_ROW), self._sent[sent_rows[known]]
         if known.any():
             own = expected[known]
             own["magic"], own["flow"] = MAGIC, self._flow

@@ -50,8 +50,8 @@ class QuantileSketch:
             if self.count <= EXACT:
                 return
             values, self._values = np.concatenate(self._values), None
-        places, counts = np.unique(_bins(values), return_counts=True)
-        for bin_number, count in zip(places.tolist(), counts.tolist(), strict=True):
+        bins, counts = np.unique(_bins(values), return_counts=True)
+        for bin_number, count in zip(bins.tolist(), counts.tolist(), strict=True):
             self._counts[bin_number] = self._counts.get(bin_number, 0) + count
 
     def quantiles(self, *shares: float) -> list[float | None]:
@@ -69,10 +69,10 @@ class QuantileSketch:
         if self._values is not None:
             values = np.sort(np.concatenate([np.zeros(0), *self._values]))
             return values[self.count - np.asarray(ranks, np.intp)]
-        places = np.array(sorted(self._counts))
-        below = np.cumsum([self._counts[bin_number] for bin_number in places.tolist()])
+        bins = np.array(sorted(self._counts))
+        below = np.cumsum([self._counts[bin_number] for bin_number in bins.tolist()])
         at = np.searchsorted(below, self.count - np.asarray(ranks), side="right")
-        values = _middle(places[at.clip(max=len(places) - 1)])
+        values = _middle(bins[at.clip(max=len(bins) - 1)])
         values = np.where(np.asarray(ranks) <= 1, self._high, values)
         return np.asarray(np.clip(values, self._low, self._high))
 
@@ -91,11 +91,11 @@ def quantiles_in(
         shares: (s,); for columns, (s, 1).
         columns: the numbers of c columns.
     """
-    places = shares * (counts - 1)
-    before = np.floor(places).astype(np.intp)
+    positions = shares * (counts - 1)
+    before = np.floor(positions).astype(np.intp)
     after = np.minimum(before + 1, counts - 1)
     low, high = ordered[(before, *columns)], ordered[(after, *columns)]
-    part, apart = places - before, high - low
+    part, apart = positions - before, high - low
     return np.asarray(np.where(part < 0.5, low + apart * part, high - apart * (1 - part)))
 
 
@@ -103,10 +103,10 @@ def _bins(values: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the number of each value's bin; 0 is that of 0."""
     sizes = np.abs(values)
     with np.errstate(divide="ignore"):
-        places = 1 + np.floor(np.log(sizes / _SMALLEST) / np.log1p(RESOLUTION))
-    return (np.sign(values) * np.where(sizes < _SMALLEST, 0, places)).astype(np.int64)
+        bins = 1 + np.floor(np.log(sizes / _SMALLEST) / np.log1p(RESOLUTION))
+    return (np.sign(values) * np.where(sizes < _SMALLEST, 0, bins)).astype(np.int64)
 
 
-def _middle(places: NDArray[np.int64]) -> NDArray[np.float64]:
+def _middle(bins: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the geometric middle of each bin."""
-    return np.sign(places) * _SMALLEST * (1 + RESOLUTION) ** (np.abs(places) - 0.5)
+    return np.sign(bins) * _SMALLEST * (1 + RESOLUTION) ** (np.abs(bins) - 0.5)

@@ -64,7 +64,7 @@ class SampleFactsReader:
 
     def __init__(self, scenario: Scenario, until_s: float = math.inf) -> None:
         self._scenario, self._until_s = scenario, until_s
-        self._found = SampleFacts()
+        self._facts = SampleFacts()
         self._fresh_ns: int | None = None
         self._newest, self._last_ns = -1, 0
 
@@ -73,7 +73,7 @@ class SampleFactsReader:
         if not len(aligned.t_ns):
             return
         common = shares_update(self._scenario, aligned) if common is None else common
-        facts, t_s = self._found, aligned.t_ns * 1e-9
+        facts, t_s = self._facts, aligned.t_ns * 1e-9
         started = np.logical_or.accumulate(common) | facts.any_in_common
         gaps = np.flatnonzero(started & ~common)
         gap_s = float(t_s[gaps[0]]) if facts.gap_s is None and len(gaps) else facts.gap_s
@@ -87,16 +87,16 @@ class SampleFactsReader:
         longest_ns = int(np.diff(ends_ns).max(initial=facts.longest_update_ns))
         self._fresh_ns = int(ends_ns[-1]) if len(ends_ns) else None
         self._newest, self._last_ns = int(aligned.received[-1]), int(aligned.t_ns[-1])
-        self._found = SampleFacts(bool(started[-1]), gap_s, largest, longest_ns)
+        self._facts = SampleFacts(bool(started[-1]), gap_s, largest, longest_ns)
 
     @property
     def facts(self) -> SampleFacts:
         """What is known after the last part."""
         if self._fresh_ns is None:
-            return self._found
+            return self._facts
         since_ns = self._last_ns - self._fresh_ns
-        longest_ns = max(self._found.longest_update_ns, since_ns)
-        return self._found._replace(longest_update_ns=longest_ns)
+        longest_ns = max(self._facts.longest_update_ns, since_ns)
+        return self._facts._replace(longest_update_ns=longest_ns)
 
 
 class SignalFields(TypedDict):
@@ -128,10 +128,10 @@ class SignalStatistics:
         self._half = record.count(SENSOR_MEASUREMENT) // 2
         facts = SampleFactsReader(record.scenario)
         for bounded in bounded_parts(record):
-            part, left = bounded.part, bounded.residual
+            part, residual = bounded.part, bounded.residual
             self._add(part)
             facts.take(part.aligned, bounded.shared)
-            self._residual = _larger(self._residual, left[~np.isnan(left)])
+            self._residual = _larger(self._residual, residual[~np.isnan(residual)])
             self._estimation_error(part)
             self._read += len(part.rows)
         self.facts = facts.facts

@@ -383,17 +383,17 @@ def _sampled(scenario: Scenario, representative: int) -> Numbers:
     resolved = resolved_draw(scenario, representative, "model")
     continuous = run_continuous(resolved)
     record = simulate(resolved)
-    joined = align_tables(record)
+    aligned = align_tables(record)
     tested = record[SENSOR_MEASUREMENT]["event"] > 0  # event 0 happens without a test
-    ratios = joined.e_s_norm[tested] / joined.threshold[tested]
-    exact = continuous.at(joined.t_ns / NS_PER_S)
+    ratios = aligned.e_s_norm[tested] / aligned.threshold[tested]
+    exact = continuous.at(aligned.t_ns / NS_PER_S)
     return {
         "horizon_s": _SAMPLED_S,
         "period_s": resolved.timing.measurement_period_ns / NS_PER_S,
         "events": int(tested.sum()) + 1,
         "events_continuous": len(continuous.event_s),
         "beyond": float(ratios.max()),
-        "rms": math.sqrt(float(((joined.x - exact.x) ** 2).sum(axis=1).mean())),
+        "rms": math.sqrt(float(((aligned.x - exact.x) ** 2).sum(axis=1).mean())),
     }
 
 

@@ -10,7 +10,7 @@ import pytest
 from scipy.linalg import expm
 
 from cosim.analysis.adversary import Objective, conditions_of, find_worst
-from cosim.analysis.adversary.loop_flows import Pattern, SampledFlow, run_of
+from cosim.analysis.adversary.loop_flows import Pattern, SampledFlow, run_sampled
 from cosim.analysis.adversary.worst_disturbances import disturbance_bounds
 from cosim.record.run_record import RunRecord
 from cosim.simulation.sampled_loop import SampledLoop, Scales
@@ -165,7 +165,7 @@ def test_a_pattern_makes_the_run_of_the_machines(sections: dict[str, Any]) -> No
     lost = tuple((np.random.default_rng(1).uniform(size=100) < 0.5).tolist())
     record, delivered = run(resolved, lost, loop.delay_ns)
     flow = SampledFlow(loop, Objective.STATE, certificate)
-    sampled = run_of(flow, lambda event: event >= len(delivered) or delivered[event])
+    sampled = run_sampled(flow, lambda event: event >= len(delivered) or delivered[event])
     rows = record["sensor_measurement"]
     expected_s = rows["t_ns"][rows["event"] >= 0] * 1e-9
     assert len(expected_s) > 4
@@ -210,7 +210,7 @@ def test_the_found_signs_of_the_disturbances_are_the_worst_of_all(
     for signs in product((-1.0, 1.0), repeat=len(noise) if len(noise) else len(push)):
         sign = np.array(signs)[:, None]
         causes = (push, sign * bounds.noise) if len(noise) else (sign * bounds.columns.T, noise)
-        run = run_of(replace(flow, loop=flow.loop.with_disturbances(*causes)), lambda event: True)
+        run = run_sampled(replace(flow, loop=flow.loop.with_disturbances(*causes)), lambda event: True)
         worst = max(worst, run.value)
     search_result = find_worst(resolved, objective)
     assert search_result.value == pytest.approx(worst, rel=1e-9)

@@ -160,7 +160,7 @@ def test_missing_rows_are_reported(table: str) -> None:
     assert result.verdict().complete is False
     accounts = {account.process: account for account in result.processes}
     assert accounts[process].missing_from == accounts[process].compared == number
-    assert all(account.whole for name, account in accounts.items() if name != process)
+    assert all(account.is_complete for name, account in accounts.items() if name != process)
 
 
 @pytest.mark.parametrize("role", LOOP_ROLES)
