@@ -51,13 +51,13 @@ def test_rows_and_reasons_are_printed_and_written_as_json(
 ) -> None:
     path, row = tmp_path / "rows.json", Row("a", 1.5, "s", goal=Goal("<", 3))
     assert run(by_name(named("broken"), named("example", row)), ["--json", str(path)]) == 1
-    rows = {found["name"]: found for found in json.loads(path.read_text())}
+    rows = {row_document["name"]: row_document for row_document in json.loads(path.read_text())}
     assert rows["broken"]["value"] is None
     assert "no such program" in rows["broken"]["note"]
     assert rows["a"] == row.to_json() | {"benchmark": "example"}
-    said = capsys.readouterr().out
-    assert "Example" in said
-    assert "no such program" in said
+    output = capsys.readouterr().out
+    assert "Example" in output
+    assert "no such program" in output
 
 
 def rounds_of(ours: list[float], theirs: list[float]) -> Rounds:

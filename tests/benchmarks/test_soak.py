@@ -68,9 +68,9 @@ def noise(t: float) -> float:
 
 def judged(kib_of_s: Callable[[float], float], length_s: float = HOUR_S) -> Trend:
     at_s = np.arange(0.0, length_s, 5.0 if length_s <= HOUR_S else 60.0)
-    found = trend(at_s.tolist(), [80_000.0 + kib_of_s(t) for t in at_s], length_s)
-    assert found is not None
-    return found
+    fitted = trend(at_s.tolist(), [80_000.0 + kib_of_s(t) for t in at_s], length_s)
+    assert fitted is not None
+    return fitted
 
 
 @pytest.mark.parametrize(
@@ -92,14 +92,14 @@ def judged(kib_of_s: Callable[[float], float], length_s: float = HOUR_S) -> Tren
 def test_memory_may_grow_by_its_noise_and_not_more(
     kib_of_s: Callable[[float], float], length_s: float, flat: bool, allowed_kib: float
 ) -> None:
-    found = judged(kib_of_s, length_s)
-    assert found.allowed_kib == pytest.approx(allowed_kib)
-    assert (found.growth_kib <= found.allowed_kib) == flat
+    fitted = judged(kib_of_s, length_s)
+    assert fitted.allowed_kib == pytest.approx(allowed_kib)
+    assert (fitted.growth_kib <= fitted.allowed_kib) == flat
 
 
 def test_a_trend_needs_time_and_samples() -> None:
-    found = judged(lambda t: noise(t) + LEAK_KIB_PER_S * t)
-    assert found.slope_kib_per_h == pytest.approx(3600 * LEAK_KIB_PER_S, rel=0.1)
+    fitted = judged(lambda t: noise(t) + LEAK_KIB_PER_S * t)
+    assert fitted.slope_kib_per_h == pytest.approx(3600 * LEAK_KIB_PER_S, rel=0.1)
     assert warm_up_s(HOUR_S) == 300.0
     assert trend([0.0, 30.0], [1.0, 2.0], 60.0) is None
     with pytest.raises(MeasurementError, match="too rarely"):

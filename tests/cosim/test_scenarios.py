@@ -81,7 +81,7 @@ def test_the_loops_of_a_shipped_network_settle_and_keep_what_is_claimed(name: st
         assert summary["final_state_norm"] < 0.1 * summary["initial_state_norm"]
     count = len(shared.loops)
     for number in {0, count // 2, count - 1}:  # of every kind of loop
-        verdicts = [one.verdict for one in RunClaims(shared.loops[number]).evaluate()]
+        verdicts = [claim.verdict for claim in RunClaims(shared.loops[number]).evaluate()]
         assert ClaimVerdict.HELD in verdicts
         assert ClaimVerdict.VIOLATED not in verdicts
 
@@ -97,11 +97,13 @@ def test_the_certificates_on_recorded_networks_are_as_the_scenarios_say(
     record = run_of(f"lane_5g_{name}")
     conditions = allowed_conditions(record.scenario)
     assert conditions.delay_s == pytest.approx(delay_s)
-    found = [(one.t_s, one.worst) for one in read_conditions(record).violations(conditions)]
-    assert found == [pytest.approx(one) for one in late]
-    assert all(one.constants is not None for one in scheduled_certificates(record.scenario))
+    violations = [
+        (violation.t_s, violation.worst) for violation in read_conditions(record).violations(conditions)
+    ]
+    assert violations == [pytest.approx(expected) for expected in late]
+    assert all(certificate.constants is not None for certificate in scheduled_certificates(record.scenario))
     longest = resolved(f"lane_5g_{name}", "certificate={}")
-    certified = [one.constants is not None for one in scheduled_certificates(longest)]
+    certified = [certificate.constants is not None for certificate in scheduled_certificates(longest)]
     assert certified == [not late] * 2
 
 
@@ -109,8 +111,8 @@ def loop(name: str) -> LoopMatrices:
     return loop_of(resolved(name))
 
 
-def closed(found: LoopMatrices) -> Matrix:
-    poles: Matrix = np.linalg.eigvals(found.A_model + found.B_model @ found.K)
+def closed(matrices: LoopMatrices) -> Matrix:
+    poles: Matrix = np.linalg.eigvals(matrices.A_model + matrices.B_model @ matrices.K)
     return poles
 
 
@@ -119,8 +121,8 @@ def closed(found: LoopMatrices) -> Matrix:
 
 def linear_tanks(**given: Any) -> tuple[Matrix, Matrix]:
     settings = FourTankSettings(kind="four_tank", **given)
-    found = linearise(lambda x0: OdeSystem(settings.equations(), x0), 4, 2)
-    return found.A, found.B
+    linear = linearise(lambda x0: OdeSystem(settings.equations(), x0), 4, 2)
+    return linear.A, linear.B
 
 
 def zeros(A: Matrix, B: Matrix) -> list[float]:
@@ -128,8 +130,8 @@ def zeros(A: Matrix, B: Matrix) -> list[float]:
     C = np.eye(2, 4)
     pencil = np.block([[A, B], [C, np.zeros((2, 2))]])
     weight = np.diag([1.0, 1, 1, 1, 0, 0])
-    found = eigvals(pencil, weight)
-    return sorted(found[np.isfinite(found)].real.tolist())
+    eigenvalues = eigvals(pencil, weight)
+    return sorted(eigenvalues[np.isfinite(eigenvalues)].real.tolist())
 
 
 def test_the_tanks_time_constants_gains_and_zeros_are_johanssons() -> None:
@@ -148,9 +150,9 @@ def test_the_tanks_time_constants_gains_and_zeros_are_johanssons() -> None:
 
 def test_the_f16s_modes_are_the_published_ones() -> None:
     """Dutch roll −0.42 ± 3.06j, roll −3.615, spiral −0.0163 /s, and servos of 20.2 /s."""
-    found = np.linalg.eigvals(loop("f16_lateral").A_model)
+    poles = np.linalg.eigvals(loop("f16_lateral").A_model)
     expected = [-20.2, -20.2, -3.615, -1.0, -0.4224 - 3.0635j, -0.4224 + 3.0635j, -0.0163]
-    ordered = sorted(found, key=lambda pole: (pole.real, pole.imag))
+    ordered = sorted(poles, key=lambda pole: (pole.real, pole.imag))
     np.testing.assert_allclose(ordered, expected, atol=5e-4)
 
 
@@ -159,10 +161,10 @@ def test_the_f16s_modes_are_the_published_ones() -> None:
 
 def test_the_double_integrators_regulator_is_the_textbooks() -> None:
     """Gain (1, √2), poles (−1 ± j)/√2; ∫ position² + u² = √2 from (1, 0)."""
-    found = loop("double_integrator")
-    P = solve_continuous_are(found.A_model, found.B_model, np.diag([1.0, 0.0]), np.eye(1))
-    np.testing.assert_allclose(found.K, -found.B_model.T @ P, atol=1e-9)
-    poles = sorted(closed(found), key=lambda pole: pole.imag)
+    matrices = loop("double_integrator")
+    P = solve_continuous_are(matrices.A_model, matrices.B_model, np.diag([1.0, 0.0]), np.eye(1))
+    np.testing.assert_allclose(matrices.K, -matrices.B_model.T @ P, atol=1e-9)
+    poles = sorted(closed(matrices), key=lambda pole: pole.imag)
     np.testing.assert_allclose(poles, np.array([-1 - 1j, -1 + 1j]) / math.sqrt(2), atol=1e-9)
     fine = simulate(resolved("double_integrator", "plant.draw=nominal", "trigger.beta=1e-6",
                             "trigger.floor=1e-6", "network.loss={model='lossless'}"))  # fmt: skip
@@ -176,13 +178,13 @@ def test_the_double_integrators_regulator_is_the_textbooks() -> None:
 
 def test_the_quadrotors_gain_is_the_regulator_named_in_its_scenario() -> None:
     """Its model is the linearisation of its plant."""
-    found, settings = loop("quadrotor_hover"), QuadrotorSettings(kind="quadrotor")
+    matrices, settings = loop("quadrotor_hover"), QuadrotorSettings(kind="quadrotor")
     linear = linearise(lambda x0: OdeSystem(settings.equations(), x0), 12, 4)
-    np.testing.assert_allclose(found.A_model, linear.A, atol=1e-6)
-    np.testing.assert_allclose(found.B_model, linear.B, atol=1e-5)
+    np.testing.assert_allclose(matrices.A_model, linear.A, atol=1e-6)
+    np.testing.assert_allclose(matrices.B_model, linear.B, atol=1e-5)
     Q, R = np.diag([1.0] * 6 + [0.5] * 3 + [0.1] * 3), np.diag([1.0, 100.0, 100.0, 100.0])
-    P = solve_continuous_are(found.A_model, found.B_model, Q, R)
-    np.testing.assert_allclose(found.K, -np.linalg.solve(R, found.B_model.T @ P), atol=1e-5)
+    P = solve_continuous_are(matrices.A_model, matrices.B_model, Q, R)
+    np.testing.assert_allclose(matrices.K, -np.linalg.solve(R, matrices.B_model.T @ P), atol=1e-5)
 
 
 def test_luukkonens_gains_level_the_quadrotor_within_his_five_seconds() -> None:
@@ -233,14 +235,14 @@ def test_a_quadrotor_in_free_fall_without_drag_keeps_its_energy_and_its_angular_
 
 
 def test_a_summary_compares_the_cars_linearisation_with_the_model() -> None:
-    found = linearisation(resolved("lane_vehicle"))
-    assert isinstance(found, LinearisationPart)
-    assert found.in_box is True
-    assert max(real for real, _ in found.eigenvalues) == pytest.approx(-1.157, abs=2e-3)
+    linearised = linearisation(resolved("lane_vehicle"))
+    assert isinstance(linearised, LinearisationPart)
+    assert linearised.in_box is True
+    assert max(real for real, _ in linearised.eigenvalues) == pytest.approx(-1.157, abs=2e-3)
     believed = loop("lane_vehicle")
-    np.testing.assert_allclose(np.array(found.A) - found.off_A, believed.A_model, atol=1e-12)
-    np.testing.assert_allclose(np.array(found.B) - found.off_B, believed.B_model, atol=1e-12)
-    assert linearisation_rows(found)[1][1].endswith("inside the box")
+    np.testing.assert_allclose(np.array(linearised.A) - linearised.off_A, believed.A_model, atol=1e-12)
+    np.testing.assert_allclose(np.array(linearised.B) - linearised.off_B, believed.B_model, atol=1e-12)
+    assert linearisation_rows(linearised)[1][1].endswith("inside the box")
     other = linearisation(resolved("lane_vehicle", "plant.system.parameters=vw_vanagon"))
     assert isinstance(other, LinearisationPart)
     assert other.in_box is False

@@ -46,10 +46,10 @@ def starting() -> Iterator[Start]:
         cwd: Path | None = None,
     ) -> subprocess.Popen[str]:
         command = noack_command(*map(str, arguments), impatient=impatient)
-        own = {} if runtime is None else {"XDG_RUNTIME_DIR": str(runtime)}
-        own |= {} if viewer else WITHOUT_VIEWER
+        variables = {} if runtime is None else {"XDG_RUNTIME_DIR": str(runtime)}
+        variables |= {} if viewer else WITHOUT_VIEWER
         started.append(subprocess.Popen(
-            [*before, *command], text=True, cwd=cwd, env=os.environ | own | (environment or {}),
+            [*before, *command], text=True, cwd=cwd, env=os.environ | variables | (environment or {}),
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         ))  # fmt: skip
         return started[-1]

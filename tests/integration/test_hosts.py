@@ -111,15 +111,15 @@ AHEAD_S = 3
 def test_several_loops_run_on_hosts_with_different_clocks(
     start: Start, hosts: TwoHosts, tmp_path: Path
 ) -> None:
-    (_, own), (_, other) = hosts.addresses  # of IPv6
+    (_, first_host), (_, second_host) = hosts.addresses  # of IPv6
     (tmp_path / "three.toml").write_text(SEVERAL)
-    recording = start(0, "record", "three.toml", "--listen", own, "--json", *live.BARE)
+    recording = start(0, "record", "three.toml", "--listen", first_host, "--json", *live.BARE)
     live.wait_for(lambda: (tmp_path / "invitation.json").exists() or recording.poll() is not None)
     assert recording.poll() is None, recording.communicate()
     processes = joined(start, "netem", "controller", ahead_s=AHEAD_S)
     *reports, summary = end_well(*processes, recording)
-    places = {one["channel"]["local"].rpartition(":")[0].strip("[]") for one in reports}
-    assert places == {own, other}
+    addresses = {report["channel"]["local"].rpartition(":")[0].strip("[]") for report in reports}
+    assert addresses == {first_host, second_host}
     assert not (tmp_path / "invitation.json").exists()
     assert summary["network"]["replay"]["bit_exact"]
     for loop in summary["loops"]:
@@ -129,10 +129,10 @@ def test_several_loops_run_on_hosts_with_different_clocks(
     phase_ns = phases_ns(run.scenario)[1]
     assert phase_ns > 0
     for table in CLOCK_TABLES:
-        one, late, _ = (record[table] for record in run.loops)
-        assert len(one) > 0
-        assert (one["t_ns"] - late["t_ns"] == phase_ns).all()  # each loop has its own time
-        known = one[one["error_ns"] != LOST_NS]
+        undelayed, late, _ = (record[table] for record in run.loops)
+        assert len(undelayed) > 0
+        assert (undelayed["t_ns"] - late["t_ns"] == phase_ns).all()  # each loop has its own time
+        known = undelayed[undelayed["error_ns"] != LOST_NS]
         true_ns = -AHEAD_S * NS_PER_S * (OWNER[table] in ("netem", "controller"))
         assert (np.abs(known["offset_ns"] - true_ns) <= known["error_ns"]).all()
 
@@ -189,12 +189,12 @@ def test_a_host_that_comes_back_loses_no_row(start: Start, hosts: TwoHosts, tmp_
     assert loop["replay"]["complete"]
     assert loop["replay"]["bit_exact"]
     assert loop["unintended_losses"] > 0
-    assert {"void"} <= {one["verdict"] for one in loop["claims"]} <= {"void", "not applicable"}
-    found = load_record((tmp_path / "runs" / "latest").resolve())
-    assert len(found["controller_step"]) == 20 * live.RATE_HZ
+    assert {"void"} <= {claim["verdict"] for claim in loop["claims"]} <= {"void", "not applicable"}
+    run_record = load_record((tmp_path / "runs" / "latest").resolve())
+    assert len(run_record["controller_step"]) == 20 * live.RATE_HZ
     # Without the reference of time, the bound of the clock's error is lost, and all claims with it.
-    assert (found["controller_clock"]["error_ns"] == LOST_NS).any()
-    assert "controller clock lost" in {one["cause"] for one in loop["assumption_violations"]}
+    assert (run_record["controller_clock"]["error_ns"] == LOST_NS).any()
+    assert "controller clock lost" in {violation["cause"] for violation in loop["assumption_violations"]}
 
 
 @contextmanager
@@ -241,9 +241,9 @@ def hosts_file(folder: Path, address: str, command: str = "") -> str:
 def test_a_run_starts_its_processes_on_another_host(
     start: Start, hosts: TwoHosts, tmp_path: Path, ssh: Path
 ) -> None:
-    (own, _), (other, _) = hosts.addresses
+    (first_host, _), (second_host, _) = hosts.addresses
     run = start(
-        0, "run", "lane_following", "--hosts", hosts_file(tmp_path, own), "--json", *live.BARE,
+        0, "run", "lane_following", "--hosts", hosts_file(tmp_path, first_host), "--json", *live.BARE,
         *live.AT_RATE, *live.settings(horizon_s=3.0, network__encrypted=True),
         environment=on_path(ssh),
     )  # fmt: skip
@@ -252,8 +252,13 @@ def test_a_run_starts_its_processes_on_another_host(
     live.assert_complete(json.loads(stdout)["loops"][0])
     run_dir = (tmp_path / "runs" / "latest").resolve()
     reports = json.loads((run_dir / "reports.json").read_text())
-    places = {role: reports[role]["channel"]["local"].rpartition(":")[0] for role in LOOP_ROLES}
-    assert places == {"plant": own, "sensor": own, "netem": other, "controller": other}
+    addresses = {role: reports[role]["channel"]["local"].rpartition(":")[0] for role in LOOP_ROLES}
+    assert addresses == {
+        "plant": first_host,
+        "sensor": first_host,
+        "netem": second_host,
+        "controller": second_host,
+    }
     assert "netem on robot, controller on robot" in stderr
     assert not list(tmp_path.rglob("invitation*"))  # the keys were in no file
 

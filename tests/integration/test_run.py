@@ -54,13 +54,10 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     """A run on a machine that did not stall: a process that ends misses what others send later."""
     for _ in range(10):
         runs = tmp_path_factory.mktemp("runs")
-        found = run_scenario(runs, *settings(speed=5.0, horizon_s=20.0), viewer=True)
-        if (
-            found.status
-            or max(late["max"] for late in found.summary["loops"][0]["lateness_us"].values()) < 1e5
-        ):
+        run = run_scenario(runs, *settings(speed=5.0, horizon_s=20.0), viewer=True)
+        if run.status or max(late["max"] for late in run.summary["loops"][0]["lateness_us"].values()) < 1e5:
             break
-    return found
+    return run
 
 
 @pytest.fixture(scope="module")
@@ -74,9 +71,9 @@ def test_a_run_completes_with_a_complete_summary(finished: Finished) -> None:
     assert finished.loop["missing_samples"] == 0
     assert finished.loop["unintended_losses"] == 0
     violations = finished.loop["assumption_violations"]
-    assert "dropouts" not in {one["cause"] for one in violations}  # deadlines may be missed
+    assert "dropouts" not in {violation["cause"] for violation in violations}  # deadlines may be missed
     assert finished.loop["rejected_datagrams"] == {}
-    verdicts = {one["source"]: one["verdict"] for one in finished.loop["claims"]}
+    verdicts = {claim["source"]: claim["verdict"] for claim in finished.loop["claims"]}
     assert verdicts.keys() >= {"(I1)", "certificate", "box certificate"}
     assert "violated" not in verdicts.values()
     # States of a few units and some thousand steps: far below any physical difference.
@@ -100,12 +97,12 @@ def test_the_run_directory_holds_everything(finished: Finished) -> None:
 
 
 def test_the_run_is_replayed_bit_for_bit(live: RunRecord, finished: Finished) -> None:
-    found = replay(live)
-    assert found.first_difference is None, str(found.first_difference)
-    assert found.gaps == []
-    assert found.inputs == sum(len(live[table]) for table in tables(1, 1))
-    assert all(hop.compared == hop.received > 0 for hop in found.messages)
-    assert finished.loop["replay"] == found.verdict().model_dump()
+    result = replay(live)
+    assert result.first_difference is None, str(result.first_difference)
+    assert result.gaps == []
+    assert result.inputs == sum(len(live[table]) for table in tables(1, 1))
+    assert all(hop.compared == hop.received > 0 for hop in result.messages)
+    assert finished.loop["replay"] == result.verdict().model_dump()
     assert finished.summary["kind"] == live.kind == "live"
 
 
@@ -178,20 +175,20 @@ def test_a_run_is_changed_twice_and_stopped(
     until_s = finished.loop["judged_until_s"]
     assert 0 < until_s <= summary["reached_s"] + 0.1
     assert all((claim["since_s"] or 0.0) <= until_s for claim in finished.loop["claims"])
-    assert [one for one in finished.loop["claims"] if one["verdict"] == "violated"] == []
+    assert [claim for claim in finished.loop["claims"] if claim["verdict"] == "violated"] == []
     assert_complete(finished.loop)
     assert finished.loop["identity_residual_relative"] < 1e-9
     assert set(finished.loop["realtime"]) == set(LOOP_ROLES)
     assert running.left_behind() == []
 
-    assert [one["t_s"] for one in summary["changes"]] == [first["from_s"], second["from_s"]]
+    assert [change["t_s"] for change in summary["changes"]] == [first["from_s"], second["from_s"]]
     assert summary["changes"][1]["settings"] == {"controller.setpoint": [0.0, 0.0, 0.0, 1.0]}
     assert record.scenario.network.mansd == 4  # as it was at the start
-    changes = [one["text"] for one in record.notices if one["level"] == "change"]
+    changes = [notice["text"] for notice in record.notices if notice["level"] == "change"]
     assert len(changes) == 2
     assert all("; requested at " in text for text in changes)
-    if not any(one.late for one in changes_of(record)):  # a late change is a recorded violation
-        causes = {one["cause"] for one in finished.loop["assumption_violations"]}
+    if not any(change.late for change in changes_of(record)):  # a late change is a recorded violation
+        causes = {violation["cause"] for violation in finished.loop["assumption_violations"]}
         assert not causes & {"dropouts", "change"}
     assert [*(tmp_path / f"noack-{os.getuid()}" / "runs").iterdir()] == []
 

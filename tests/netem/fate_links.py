@@ -28,10 +28,10 @@ class Arrival(NamedTuple):
     size_bytes: int
 
 
-def _numbered(came: list[Arrival]) -> list[Arrival]:
+def _numbered(sent: list[Arrival]) -> list[Arrival]:
     """Number flows as a relay does, in the order of their first datagrams."""
     numbers: dict[int, int] = {}
-    return [one._replace(flow=numbers.setdefault(one.flow, len(numbers))) for one in came]
+    return [arrival._replace(flow=numbers.setdefault(arrival.flow, len(numbers))) for arrival in sent]
 
 
 arrivals = st.lists(
@@ -58,8 +58,8 @@ class Run:
     def events(self) -> NDArray[Any]:
         """The events of the arrivals, as a relay hands them to a tap."""
         events = np.zeros(len(self.decisions), EVENT)
-        for event, decision, came in zip(events, self.decisions, self.arrivals, strict=True):
-            now_ns, event["flow"], event["size_bytes"] = came
+        for event, decision, arrival in zip(events, self.decisions, self.arrivals, strict=True):
+            now_ns, event["flow"], event["size_bytes"] = arrival
             event["t_ns"] = 10**18 + now_ns
             for name in ("packet", "consecutive_losses", "fate", "bit", "copy_bit", "hold_back_ns"):
                 event[name] = getattr(decision, name)
@@ -68,7 +68,7 @@ class Run:
         return events
 
 
-def drive(link: Link, came: Sequence[Arrival]) -> Run:
+def drive(link: Link, sent: Sequence[Arrival]) -> Run:
     """Send datagrams through a link, and wait for all departures."""
     run, now_ns, counts = Run(), 0, dict.fromkeys(range(10), 0)
 
@@ -81,7 +81,7 @@ def drive(link: Link, came: Sequence[Arrival]) -> Run:
             (t_ns, output.flow, output.data) for output in outputs if isinstance(output, Datagram)
         )
 
-    for arrival in came:
+    for arrival in sent:
         now_ns += arrival.gap_ns
         release(now_ns)
         data = payload(arrival.flow, counts[arrival.flow], arrival.size_bytes)
@@ -98,9 +98,9 @@ def spec_of(link_settings: LinkSettings, name: str = "a") -> LinkSpec:
     return LinkSpec(name, here, here, link_settings, LinkSettings(), seed=7)
 
 
-def record(path: Path, link_settings: LinkSettings, came: Sequence[Arrival]) -> Run:
+def record(path: Path, link_settings: LinkSettings, sent: Sequence[Arrival]) -> Run:
     """Send datagrams through a link, and record their fates."""
-    run = drive(Link(link_settings, 7, "a", "forward"), came)
+    run = drive(Link(link_settings, 7, "a", "forward"), sent)
     with FateRecorder(path, [spec_of(link_settings)]) as recorder:
         events = run.events
         middle = len(events) // 2
@@ -108,5 +108,5 @@ def record(path: Path, link_settings: LinkSettings, came: Sequence[Arrival]) -> 
         departures["departure"] = 1
         recorder.take(np.concatenate([events[:middle], departures]), np.zeros(0, np.uint8))
         recorder.take(events[middle:], np.zeros(0, np.uint8))
-    assert (recorder.rows, recorder.missing_events) == (len(came), 0)
+    assert (recorder.rows, recorder.missing_events) == (len(sent), 0)
     return run

@@ -72,9 +72,10 @@ class SteppedChannel:
                 self.channel.decide(self._payloads[channel.asked.message.sequence])
             else:
                 self.channel.answer(question)
-        leaving = (channel.leaving[place] for place in range(channel.leaving_count))
+        leaving = (channel.leaving[index] for index in range(channel.leaving_count))
         datagrams = [
-            Datagram(one.flow, flipped(self._payloads[one.message.sequence], one.bit)) for one in leaving
+            Datagram(departure.flow, flipped(self._payloads[departure.message.sequence], departure.bit))
+            for departure in leaving
         ]
         batches = self.channel.take_rows()
         rows = [Record(table, row) for table, batch in batches for row in batch.tolist()]

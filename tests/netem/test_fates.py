@@ -217,62 +217,60 @@ def fates_of(folder: Path) -> Decisions:
     return read_fates(folder / "fates.parquet").decisions["a", "forward"]
 
 
-def seen(run: Run) -> list[tuple[int, ...]]:
+def observable(run: Run) -> list[tuple[int, ...]]:
     """Return the values that the sender and the receiver can observe."""
-    observable = attrgetter(
-        "fate", "packet", "consecutive_losses", "release_ns", "copy_ns", "bit", "copy_bit"
-    )
-    return list(map(observable, run.decisions))
+    values_of = attrgetter("fate", "packet", "consecutive_losses", "release_ns", "copy_ns", "bit", "copy_bit")
+    return list(map(values_of, run.decisions))
 
 
 @given(harsh.filter(lambda link: not link.chooses), arrivals, st.booleans())
 def test_the_same_arrivals_have_the_same_fates(
-    folder: Path, link: LinkSettings, came: list[Arrival], capped: bool
+    folder: Path, link: LinkSettings, sent: list[Arrival], capped: bool
 ) -> None:
     """The fates do not depend on the replaying link: another seed, no impairments."""
-    before = record(folder / "fates.parquet", link, came)
+    before = record(folder / "fates.parquet", link, sent)
     bare = LinkSettings(mansd=link.mansd) if capped else LinkSettings()
     for replaying in (link, bare):
-        again = drive(Link(replaying, 8, "b", decisions=fates_of(folder)), came)
-        assert seen(again) == seen(before)
+        again = drive(Link(replaying, 8, "b", decisions=fates_of(folder)), sent)
+        assert observable(again) == observable(before)
         assert again.departures == before.departures
 
 
 @given(harsh.filter(lambda link: not link.chooses), arrivals, st.data())
 def test_at_other_times_the_delays_are_the_same(
-    folder: Path, link: LinkSettings, came: list[Arrival], data: st.DataObject
+    folder: Path, link: LinkSettings, sent: list[Arrival], data: st.DataObject
 ) -> None:
     """tests/noack/impairments/test_mansd.py checks that the replay keeps the cap."""
-    before = record(folder / "fates.parquet", link, came)
-    gaps = st.lists(st.integers(0, MAX_GAP_NS), min_size=len(came), max_size=len(came))
+    before = record(folder / "fates.parquet", link, sent)
+    gaps = st.lists(st.integers(0, MAX_GAP_NS), min_size=len(sent), max_size=len(sent))
     mansd = data.draw(st.sampled_from([link.mansd, 0, 1, 2]))
-    moved = [one._replace(gap_ns=gap) for one, gap in zip(came, data.draw(gaps), strict=True)]
+    moved = [arrival._replace(gap_ns=gap) for arrival, gap in zip(sent, data.draw(gaps), strict=True)]
     replaying = link.model_copy(update={"mansd": mansd})
     again = drive(Link(replaying, 8, "b", decisions=fates_of(folder)), moved)
-    for old, old_came, new, new_came in zip(
+    for old, old_arrival, new, new_arrival in zip(
         before.decisions, before.arrivals, again.decisions, again.arrivals, strict=True
     ):
         if old.fate == new.fate and old.release_ns >= 0:
-            delay_ns = new.release_ns - new_came[0]
-            assert delay_ns >= old.release_ns - old_came[0]
-            assert new.hold_back_ns or delay_ns == old.release_ns - old_came[0]
+            delay_ns = new.release_ns - new_arrival[0]
+            assert delay_ns >= old.release_ns - old_arrival[0]
+            assert new.hold_back_ns or delay_ns == old.release_ns - old_arrival[0]
         lost = (Fate.DROPPED, Fate.CORRUPTED, Fate.OVERFLOWED, Fate.BLACKED_OUT)
         assert old.fate == new.fate or (old.fate in lost and new.fate == Fate.FORCED)
 
 
 @given(arrivals, st.data())
 def test_a_bit_that_a_datagram_does_not_have_is_not_flipped(
-    folder: Path, came: list[Arrival], data: st.DataObject
+    folder: Path, sent: list[Arrival], data: st.DataObject
 ) -> None:
     broken = settings_of("corrupt 100%")
-    record(folder / "fates.parquet", broken, came)
-    sizes = st.lists(st.integers(0, 40), min_size=len(came), max_size=len(came))
+    record(folder / "fates.parquet", broken, sent)
+    sizes = st.lists(st.integers(0, 40), min_size=len(sent), max_size=len(sent))
     other = [
         arrival._replace(size_bytes=size_bytes)
-        for arrival, size_bytes in zip(came, data.draw(sizes), strict=True)
+        for arrival, size_bytes in zip(sent, data.draw(sizes), strict=True)
     ]
     again = drive(Link(broken, 8, "b", decisions=fates_of(folder)), other)
-    for was, now, decision in zip(came, other, again.decisions, strict=True):
+    for was, now, decision in zip(sent, other, again.decisions, strict=True):
         corrupted = was.size_bytes > 0 and now.size_bytes > 0
         assert decision.fate == (Fate.CORRUPTED if corrupted else Fate.DELIVERED)
         assert (0 <= decision.bit < 8 * now.size_bytes) == corrupted

@@ -48,13 +48,13 @@ arrivals = st.lists(
 )  # fmt: skip
 
 
-class Both:
-    """Both machines; each input is given to both."""
+class ComparedNetworks:
+    """The network in the core and the oracle in Python; each input is given to both."""
 
     def __init__(self, resolved: Any, start: Start, sockets: list[socket.socket], loops: int) -> None:
         self.loops = loops
-        self.plain: Machine[Datagram] = network_of(resolved, start, loops=self.loops)
-        self.compiled: Any = RunNetwork(resolved, start, self.loops)
+        self.oracle: Machine[Datagram] = network_of(resolved, start, loops=self.loops)
+        self.core: Any = RunNetwork(resolved, start, self.loops)
         sender, sensor, plant, self._controller, *receivers = sockets
         peers = {name_of(sensor): receivers[0], name_of(self._controller): receivers[1]}
         self._other = plant if Flow.ACTUATION in resolved.network.flows else sensor
@@ -62,17 +62,17 @@ class Both:
         clock = RunClock(time.monotonic_ns() + NEVER_NS)
         ends = name_of(self._controller), name_of(self._other)
         sender.connect(ends[0])
-        self.compiled.open(clock, sender, peers, ends)
+        self.core.open(clock, sender, peers, ends)
         self._expected: dict[int, list[bytes]] = {0: [], 1: []}
         self.rows: list[Record] = []
 
     def arrive(self, data: bytes, flow: int, now_ns: int) -> None:
-        rows = self._release(now_ns)
-        rows += self._taken(self.plain.handle(Datagram(flow, data), now_ns))
-        self._compare(rows, self.compiled.handle(Datagram(flow, data), now_ns))
+        rows = self._release_oracle(now_ns)
+        rows += self._forwarded(self.oracle.handle(Datagram(flow, data), now_ns))
+        self._compare(rows, self.core.handle(Datagram(flow, data), now_ns))
 
-    def let_out(self, now_ns: int) -> None:
-        self._compare(self._release(now_ns), self.compiled.on_timer(now_ns))
+    def release(self, now_ns: int) -> None:
+        self._compare(self._release_oracle(now_ns), self.core.on_timer(now_ns))
 
     def received(self) -> tuple[list[bytes], list[bytes]]:
         """Return what the two receivers should have received; check that they did."""
@@ -80,13 +80,13 @@ class Both:
         assert {flow: [data for data, _ in drained[flow]] for flow in drained} == self._expected
         return self._expected[0], self._expected[1]
 
-    def _release(self, now_ns: int) -> list[Any]:
+    def _release_oracle(self, now_ns: int) -> list[Any]:
         rows = []
-        while (due_ns := self.plain.next_deadline_ns()) is not None and due_ns <= now_ns:
-            rows += self._taken(self.plain.on_timer(now_ns))
+        while (due_ns := self.oracle.next_deadline_ns()) is not None and due_ns <= now_ns:
+            rows += self._forwarded(self.oracle.on_timer(now_ns))
         return rows
 
-    def _taken(self, outputs: Any) -> list[Any]:
+    def _forwarded(self, outputs: Any) -> list[Any]:
         for output in outputs:
             if isinstance(output, Datagram):
                 self._expected[output.flow // self.loops].append(output.data)
@@ -94,20 +94,20 @@ class Both:
 
     def _compare(self, expected: Any, outputs: Any) -> None:
         assert list(outputs) == list(expected)
-        assert self.compiled.next_deadline_ns() == self.plain.next_deadline_ns()
+        assert self.core.next_deadline_ns() == self.oracle.next_deadline_ns()
         self.rows += expected
 
 
 @contextmanager
-def both(resolved: Any, start: Start = BEGINNING, loops: int = 1) -> Iterator[Both]:
+def compared(resolved: Any, start: Start = BEGINNING, loops: int = 1) -> Iterator[ComparedNetworks]:
     with endpoints(*["127.0.0.1"] * 6) as sockets:
-        machines = Both(resolved, start, sockets, loops)
-        with closing(machines.compiled):
-            yield machines
+        networks = ComparedNetworks(resolved, start, sockets, loops)
+        with closing(networks.core):
+            yield networks
 
 
 def network(forward: LinkSettings, reverse: LinkSettings, *flows: Flow) -> SimpleNamespace:
-    """Return what the machines read of a scenario."""
+    """Return what the networks read of a scenario."""
     links = (forward, reverse)
     network = SimpleNamespace(link=forward, flows=flows, link_of=lambda flow: links[flows.index(flow)])
     return SimpleNamespace(network=network, seeds=SimpleNamespace(loss=0))
@@ -135,21 +135,21 @@ def test_the_network_of_a_run_gives_the_rows_and_datagrams_of_the_plain_machine(
     """The two directions have 2 · ``loops`` flows in all, which the header tells apart."""
     now_ns = 0
     start = Start(generation=lives)
-    with both(network(forward, reverse, *crossing), start, loops) as machines:
+    with compared(network(forward, reverse, *crossing), start, loops) as networks:
         for number, (gap_ns, size, direction) in enumerate(steps):
             now_ns += gap_ns
             if gap_ns % 3 == 1:
-                machines.let_out(now_ns - gap_ns // 2)
+                networks.release(now_ns - gap_ns // 2)
             loop = number * 67 % loops
             head = bytes(6) + loop.to_bytes(2, "little") + bytes(24)
             data = (head + number.to_bytes(4, "big") * (size // 4))[:size]
-            machines.arrive(data, loop + loops * direction * (len(crossing) == 2), now_ns)
+            networks.arrive(data, loop + loops * direction * (len(crossing) == 2), now_ns)
         for data in (bytes(31), bytes(6) + loops.to_bytes(2, "little") + bytes(24)):
-            machines.compiled.handle(Datagram(0, data), now_ns)
-        machines.let_out(NEVER_NS)
-        machines.received()
-        assert machines.compiled.of_no_loop == 2
-    inputs = [record.row[0] for record in machines.rows]
+            networks.core.handle(Datagram(0, data), now_ns)
+        networks.release(NEVER_NS)
+        networks.received()
+        assert networks.core.of_no_loop == 2
+    inputs = [record.row[0] for record in networks.rows]
     assert inputs == list(range(inputs[0], inputs[0] + len(inputs)))
 
 

@@ -19,8 +19,8 @@ def test_no_combination_is_violated_and_each_would_be_without_it(
 ) -> None:
     monkeypatch.setattr(bench, "_BATCH", 200_000)
     for before in ("loss 50%", f"loss 30% {bench.REORDERING}"):
-        found, *rates = bench.check_rows(before, words, 200_000)
-        assert found.value == 0
+        violations, *rates = bench.check_rows(before, words, 200_000)
+        assert violations.value == 0
         assert all(rate.ratio == pytest.approx(1, abs=0.02) for rate in rates)
         free = outcomes_of(bench.Decider(f"{before} limit 1000000").decide())
         assert not is_allowed(free, settings_of(words))
@@ -35,9 +35,11 @@ def test_the_check_examines_windows_and_gaps() -> None:
 
 def test_every_policy_that_is_a_rule_is_compared() -> None:
     paper = {"beta": 0.5, "alpha_per_s": 0.25, "floor": 0.0}
-    found = bench.triggers(paper, np.eye(2)).values()
-    names = {one["policy"] for one in found} | {one["rule"]["policy"] for one in found if "rule" in one}
-    assert names == {name for name, made in POLICIES.items() if made.example(2) is not None}
+    triggers = bench.triggers(paper, np.eye(2)).values()
+    names = {trigger["policy"] for trigger in triggers} | {
+        trigger["rule"]["policy"] for trigger in triggers if "rule" in trigger
+    }
+    assert names == {name for name, kind in POLICIES.items() if kind.example(2) is not None}
 
 
 def test_a_bound_below_the_worst_run_is_reported() -> None:

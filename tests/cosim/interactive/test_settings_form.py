@@ -16,8 +16,8 @@ SCHEMA = json.loads((Path(__file__).parents[3] / "docs/scenario.schema.json").re
 
 
 def field(key: str, scenario: str = "lane_following") -> Field:
-    (found,) = [one for one in form_of(open_draft(scenario)).all_fields() if one.key == key]
-    return found
+    (match,) = [entry for entry in form_of(open_draft(scenario)).all_fields() if entry.key == key]
+    return match
 
 
 def leaves(content: Any, key: str = "") -> Iterator[str]:
@@ -29,7 +29,7 @@ def leaves(content: Any, key: str = "") -> Iterator[str]:
 
 
 def test_every_key_of_the_schema_has_a_field() -> None:
-    keys = {one.key for one in form_of(open_draft("lane_following")).all_fields()}
+    keys = {entry.key for entry in form_of(open_draft("lane_following")).all_fields()}
     top = {key.partition(".")[0] for key in keys}
     assert top == set(SCHEMA["properties"])
     for section in ("NetworkSection", "PlantSection", "ModelSection", "DecayingSettings",
@@ -42,15 +42,15 @@ def test_every_key_of_the_schema_has_a_field() -> None:
 def test_every_value_of_a_shipped_scenario_is_in_its_form(name: str) -> None:
     draft = open_draft(name)
     form = form_of(draft)
-    shown = {one.key: one for one in form.all_fields()}
+    fields = {entry.key: entry for entry in form.all_fields()}
     for key in leaves(draft.content):
         parts = key.split(".")
         known = [".".join(parts[:i]) for i in range(1, len(parts) + 1)]
-        assert set(known) & shown.keys(), key
-    for one in shown.values():
-        if text := one.text(draft):
-            assert one.value(text) == draft.value(one.key)
-            assert not one.options or text in one.options, one.key
+        assert set(known) & fields.keys(), key
+    for entry in fields.values():
+        if text := entry.text(draft):
+            assert entry.value(text) == draft.value(entry.key)
+            assert not entry.options or text in entry.options, entry.key
 
 
 def test_a_wrong_text_stays_as_it_is_typed_and_is_named_at_its_field() -> None:
@@ -72,7 +72,8 @@ def test_every_choice_gives_a_valid_scenario() -> None:
     for choice in controls_of(draft).choices:
         for value in choice.options:
             other = choose(draft, choice.key, value)
-            assert {one.key: one.value for one in controls_of(other).choices}[choice.key] == value
+            values = {control.key: control.value for control in controls_of(other).choices}
+            assert values[choice.key] == value
             assert (
                 draft_of_query(other.query(), "lane_following", {"lane_following": "lane_following"}).scenario
                 == other.scenario

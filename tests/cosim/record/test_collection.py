@@ -32,7 +32,7 @@ WRITER = {role: writer_of(secret) for role, secret in SECRETS.items()}
 
 
 @pytest.fixture
-def whole(content: dict[str, Any]) -> RunRecord:
+def full_record(content: dict[str, Any]) -> RunRecord:
     content["horizon_s"] = 2.0
     content["plant"]["rate_hz"] = 100.0
     content["controller"] = {"rate_hz": 100.0}
@@ -40,21 +40,23 @@ def whole(content: dict[str, Any]) -> RunRecord:
 
 
 @pytest.fixture
-def run_dir(whole: RunRecord, tmp_path: Path) -> Path:
+def run_dir(full_record: RunRecord, tmp_path: Path) -> Path:
     """A run whose record lacks the second half of the controller's ticks, and its report."""
-    found = tmp_path / "runs" / "run"
-    found.mkdir(parents=True)
-    run_directory.write_scenario(whole.scenario, found)
-    run_directory.write_environment(found, "live", RUN)
-    reports = {role: one | {"process": role, "generation": 0} for role, one in whole.reports.items()}
+    folder = tmp_path / "runs" / "run"
+    folder.mkdir(parents=True)
+    run_directory.write_scenario(full_record.scenario, folder)
+    run_directory.write_environment(folder, "live", RUN)
+    reports = {
+        role: report | {"process": role, "generation": 0} for role, report in full_record.reports.items()
+    }
     del reports["controller"]
-    (found / run_directory.REPORTS_FILE).write_text(json.dumps(reports))
+    (folder / run_directory.REPORTS_FILE).write_text(json.dumps(reports))
     joined = {WRITER[role]: {"process": role, "generation": 0} for role in SECRETS}
-    (found / run_directory.PROCESSES_FILE).write_text(json.dumps(joined))
-    tables = {table: whole[table] for table in whole.tables}
+    (folder / run_directory.PROCESSES_FILE).write_text(json.dumps(joined))
+    tables = {table: full_record[table] for table in full_record.tables}
     tables[CONTROLLER_STEP] = tables[CONTROLLER_STEP][:100]
-    write_run(alone(RunRecord(whole.scenario, tables, [], reports)), found)
-    return found
+    write_run(alone(RunRecord(full_record.scenario, tables, [], reports)), folder)
+    return folder
 
 
 def stored(record: RunRecord, table: str) -> Rows:
@@ -62,13 +64,13 @@ def stored(record: RunRecord, table: str) -> Rows:
     return with_loop(record[table], 0, run_tables(record.scenario)[table])
 
 
-class Kept:
+class HostFiles:
     """What a host kept: the second half of the controller's ticks, and its report."""
 
-    def __init__(self, folder: Path, whole: RunRecord, role: str = "controller") -> None:
+    def __init__(self, folder: Path, full_record: RunRecord, role: str = "controller") -> None:
         self.folder, self.role = folder, role
-        self.ticks = stored(whole, CONTROLLER_STEP)[100:]
-        self.report = whole.reports["controller"] | {"instance": WRITER[role], "generation": 0}
+        self.ticks = stored(full_record, CONTROLLER_STEP)[100:]
+        self.report = full_record.reports["controller"] | {"instance": WRITER[role], "generation": 0}
         self.spool = OwnSpool(folder, role, SECRETS[role], RUN)
 
     def path(self, table: str) -> Path:
@@ -83,10 +85,10 @@ class Kept:
 
 
 @pytest.fixture
-def kept(whole: RunRecord, tmp_path: Path) -> Iterator[Kept]:
-    kept = Kept(tmp_path / "kept", whole)
-    yield kept
-    kept.spool._files.close()
+def host_files(full_record: RunRecord, tmp_path: Path) -> Iterator[HostFiles]:
+    host_files = HostFiles(tmp_path / "kept", full_record)
+    yield host_files
+    host_files.spool._files.close()
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -95,94 +97,96 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
-def test_kept_rows_complete_the_record_also_twice(run_dir: Path, kept: Kept, whole: RunRecord) -> None:
-    kept.keep()
+def test_kept_rows_complete_the_record_also_twice(
+    run_dir: Path, host_files: HostFiles, full_record: RunRecord
+) -> None:
+    host_files.keep()
     for _ in range(2):
-        _, roles = collect(run_dir, str(kept.folder), finish_record)
+        _, roles = collect(run_dir, str(host_files.folder), finish_record)
         assert roles == ["controller"]
         again = load_record(run_dir)
         assert not +missing_rows(again)
-        for table in whole.tables:
-            assert again[table].tobytes() == whole[table].tobytes(), table
+        for table in full_record.tables:
+            assert again[table].tobytes() == full_record[table].tobytes(), table
         assert [path.name for path in run_dir.parent.iterdir()] == ["run"]
 
 
-def test_a_truncated_file_gives_its_complete_batches(run_dir: Path, kept: Kept) -> None:
-    for rows in (kept.ticks[:50], kept.ticks[50:]):
-        kept.add(CONTROLLER_STEP, rows)
-    path = kept.path(CONTROLLER_STEP)
+def test_a_truncated_file_gives_its_complete_batches(run_dir: Path, host_files: HostFiles) -> None:
+    for rows in (host_files.ticks[:50], host_files.ticks[50:]):
+        host_files.add(CONTROLLER_STEP, rows)
+    path = host_files.path(CONTROLLER_STEP)
     os.truncate(path, path.stat().st_size - 1)
-    collect(run_dir, str(kept.folder), finish_record)
+    collect(run_dir, str(host_files.folder), finish_record)
     assert load_record(run_dir).count(CONTROLLER_STEP) == 150
 
 
-def other_role(kept: Kept, whole: RunRecord) -> None:
-    kept.keep()
-    kept.add(PLANT_STEP, stored(whole, PLANT_STEP))
+def other_role(host_files: HostFiles, full_record: RunRecord) -> None:
+    host_files.keep()
+    host_files.add(PLANT_STEP, stored(full_record, PLANT_STEP))
 
 
-def other_process(kept: Kept, whole: RunRecord) -> None:
+def other_process(host_files: HostFiles, full_record: RunRecord) -> None:
     """Named after a process of another host, whose secret is not known here."""
-    kept.keep()
-    out = SpoolWriter(kept.folder / SPOOL, WRITER["plant"])
-    out.append(PLANT_STEP, 0, stored(whole, PLANT_STEP).tobytes())
+    host_files.keep()
+    out = SpoolWriter(host_files.folder / SPOOL, WRITER["plant"])
+    out.append(PLANT_STEP, 0, stored(full_record, PLANT_STEP).tobytes())
     out.append("key", 0, b"guessed")
     out.close()
 
 
-def unknown_process(kept: Kept, whole: RunRecord) -> None:
-    kept.keep()
-    kept.path(CONTROLLER_STEP).rename(kept.folder / SPOOL / f"{CONTROLLER_STEP}.stranger")
+def unknown_process(host_files: HostFiles, full_record: RunRecord) -> None:
+    host_files.keep()
+    host_files.path(CONTROLLER_STEP).rename(host_files.folder / SPOOL / f"{CONTROLLER_STEP}.stranger")
 
 
-def renumbered(kept: Kept, whole: RunRecord) -> None:
-    kept.keep()
-    kept.ticks["input"] += 10_000
-    kept.add(CONTROLLER_STEP, kept.ticks)
+def renumbered(host_files: HostFiles, full_record: RunRecord) -> None:
+    host_files.keep()
+    host_files.ticks["input"] += 10_000
+    host_files.add(CONTROLLER_STEP, host_files.ticks)
 
 
-def other_generation(kept: Kept, whole: RunRecord) -> None:
-    kept.ticks["input"] += 2**40
-    kept.keep()
+def other_generation(host_files: HostFiles, full_record: RunRecord) -> None:
+    host_files.ticks["input"] += 2**40
+    host_files.keep()
 
 
-def changed(kept: Kept, whole: RunRecord) -> None:
-    rows = stored(whole, CONTROLLER_STEP)
+def changed(host_files: HostFiles, full_record: RunRecord) -> None:
+    rows = stored(full_record, CONTROLLER_STEP)
     rows["u"][50] += 1.0
     rows["input"][0] -= 1  # so that the batch comes before the recorded one
-    kept.add(CONTROLLER_STEP, rows)
-    kept.spool.keep_report(kept.report)
+    host_files.add(CONTROLLER_STEP, rows)
+    host_files.spool.keep_report(host_files.report)
 
 
-def fewer_reported(kept: Kept, whole: RunRecord) -> None:
-    kept.report["rows"] = kept.report["rows"] | {CONTROLLER_STEP: 150}
-    kept.keep()
+def fewer_reported(host_files: HostFiles, full_record: RunRecord) -> None:
+    host_files.report["rows"] = host_files.report["rows"] | {CONTROLLER_STEP: 150}
+    host_files.keep()
 
 
-def report_of_another(kept: Kept, whole: RunRecord) -> None:
-    kept.report["instance"] = WRITER["plant"]
-    kept.keep()
+def report_of_another(host_files: HostFiles, full_record: RunRecord) -> None:
+    host_files.report["instance"] = WRITER["plant"]
+    host_files.keep()
 
 
-def link(kept: Kept, whole: RunRecord) -> None:
-    kept.keep()
-    secret = kept.path(CONTROLLER_STEP).rename(kept.folder / "elsewhere")
-    kept.path(CONTROLLER_STEP).symlink_to(secret)
+def link(host_files: HostFiles, full_record: RunRecord) -> None:
+    host_files.keep()
+    secret = host_files.path(CONTROLLER_STEP).rename(host_files.folder / "elsewhere")
+    host_files.path(CONTROLLER_STEP).symlink_to(secret)
 
 
-def fifo(kept: Kept, whole: RunRecord) -> None:
-    kept.keep()
-    os.mkfifo(kept.path("controller_setting"))
+def fifo(host_files: HostFiles, full_record: RunRecord) -> None:
+    host_files.keep()
+    os.mkfifo(host_files.path("controller_setting"))
 
 
-def part_of_a_row(kept: Kept, whole: RunRecord) -> None:
-    kept.keep()
-    kept.add(CONTROLLER_STEP, np.zeros(7, np.uint8))
+def part_of_a_row(host_files: HostFiles, full_record: RunRecord) -> None:
+    host_files.keep()
+    host_files.add(CONTROLLER_STEP, np.zeros(7, np.uint8))
 
 
-def huge_batch(kept: Kept, whole: RunRecord) -> None:
-    kept.keep()
-    with kept.path(CONTROLLER_STEP).open("ab") as file:
+def huge_batch(host_files: HostFiles, full_record: RunRecord) -> None:
+    host_files.keep()
+    with host_files.path(CONTROLLER_STEP).open("ab") as file:
         file.write((0).to_bytes(8, "little") + (2**33).to_bytes(8, "little"))
         file.truncate(2**33 + 2**20)  # sparse
 
@@ -205,12 +209,12 @@ def huge_batch(kept: Kept, whole: RunRecord) -> None:
     ],
 )
 def test_a_hostile_host_changes_nothing(
-    run_dir: Path, kept: Kept, whole: RunRecord, attack: Callable[..., None], reason: str
+    run_dir: Path, host_files: HostFiles, full_record: RunRecord, attack: Callable[..., None], reason: str
 ) -> None:
-    attack(kept, whole)
+    attack(host_files, full_record)
     before = contents(run_dir.parent)
     with pytest.raises(PeerError, match=reason) as caught:
-        collect(run_dir, str(kept.folder), finish_record)
+        collect(run_dir, str(host_files.folder), finish_record)
     assert len(str(caught.value).splitlines()) == 1
     assert contents(run_dir.parent) == before
 
@@ -228,28 +232,30 @@ def test_a_hostile_host_changes_nothing(
     ],
 )
 def test_a_record_that_cannot_be_completed_changes_nothing(
-    run_dir: Path, kept: Kept, error: Exception, reason: str, monkeypatch: pytest.MonkeyPatch
+    run_dir: Path, host_files: HostFiles, error: Exception, reason: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: Any, **__: Any) -> None:
         raise error
 
-    kept.keep()
+    host_files.keep()
     before = contents(run_dir.parent)
     if isinstance(error, shutil.Error):
         monkeypatch.setattr(shutil, "copytree", fail)
     with pytest.raises(NoackError, match=reason):
-        collect(run_dir, str(kept.folder), fail)
+        collect(run_dir, str(host_files.folder), fail)
     assert contents(run_dir.parent) == before
 
 
-def test_a_folder_without_kept_rows_of_this_run_is_refused(run_dir: Path, kept: Kept, tmp_path: Path) -> None:
+def test_a_folder_without_kept_rows_of_this_run_is_refused(
+    run_dir: Path, host_files: HostFiles, tmp_path: Path
+) -> None:
     with pytest.raises(CallerError, match="nothing was kept there"):
         collect(run_dir, str(tmp_path), finish_record)
-    kept.keep()
-    (kept.folder / "run_name.txt").write_text("another")
+    host_files.keep()
+    (host_files.folder / "run_name.txt").write_text("another")
     with pytest.raises(CallerError, match="it was kept of another run"):
-        collect(run_dir, str(kept.folder), finish_record)
-    (kept.folder / "run_name.txt").unlink()
-    os.mkfifo(kept.folder / "run_name.txt")
+        collect(run_dir, str(host_files.folder), finish_record)
+    (host_files.folder / "run_name.txt").unlink()
+    os.mkfifo(host_files.folder / "run_name.txt")
     with pytest.raises(NoackError, match="it was kept of another run"):
-        collect(run_dir, str(kept.folder), finish_record)
+        collect(run_dir, str(host_files.folder), finish_record)

@@ -128,12 +128,12 @@ def link(
     reverse: LinkSettings | None = None,
     *,
     host: str = HOSTS[4],
-    **others: Any,
+    **settings: Any,
 ) -> LinkSpec:
     """Return a link on loopback from a free port to a server."""
-    own = {"name": "test", "listen": (host, 0), "seed": 7} | others
+    fields = {"name": "test", "listen": (host, 0), "seed": 7} | settings
     nothing = LinkSettings()
-    return LinkSpec(to=to, forward=forward or nothing, reverse=reverse or nothing, **own)
+    return LinkSpec(to=to, forward=forward or nothing, reverse=reverse or nothing, **fields)
 
 
 @contextmanager
@@ -143,10 +143,10 @@ def relayed(
     host: str = HOSTS[4],
     segment: bool = False,
     taps: Sequence[Tap] = (),
-    **others: Any,
+    **link_settings: Any,
 ) -> Iterator[Any]:
     """Yield a server, clients, and a relay with a link between them; see :func:`link`."""
     with endpoints(host, *[host] * clients) as (server, *sockets):
-        spec = link(name_of(server), *settings, host=host, **others)
+        spec = link(name_of(server), *settings, host=host, **link_settings)
         with running([spec], segment=segment, taps=taps) as emulator:
             yield server, *sockets, emulator

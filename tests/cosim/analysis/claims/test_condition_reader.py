@@ -70,16 +70,16 @@ def batches(record: RunRecord, seed: int) -> Batches:
 
 def reported(record: RunRecord, seed: int = 0) -> list[AssumptionViolation]:
     """The violations that a monitor reports if it receives the run in batches."""
-    monitor, found = AssumptionMonitor(record.scenario), []
+    monitor, violations = AssumptionMonitor(record.scenario), []
     for batch in batches(record, seed):
         if batch is None:
-            found += monitor.advance()
+            violations += monitor.advance()
         else:
             monitor.take(*batch)
-    found += monitor.end()
+    violations += monitor.end()
     assert monitor.stopped is None
-    assert len({one.cause for one in found}) == len(found)
-    return found
+    assert len({violation.cause for violation in violations}) == len(violations)
+    return violations
 
 
 def hostile(seed: int) -> Any:
@@ -145,8 +145,8 @@ def test_batches_in_any_order_show_what_the_whole_record_shows(make: Make) -> No
             np.testing.assert_array_equal(getattr(in_parts, name), getattr(whole, name))
         assert parts[-1].start_s == whole.start_s
         assert all(part.start_s <= whole.start_s for part in parts)
-        violations = {one[:2] for one in reported(record, seed)}
-        assert violations == {one[:2] for one in whole.violations(allowed_conditions(resolved))}
+        violations = {violation[:2] for violation in reported(record, seed)}
+        assert violations == {violation[:2] for violation in whole.violations(allowed_conditions(resolved))}
         causes.update(cause for _, cause in violations)
 
     check()
@@ -169,7 +169,7 @@ def losing(*numbers: int, constraint: dict[str, Any]) -> Callable[[Make], RunRec
 def deaf(role: str, first: int, last: int) -> Callable[[Make], RunRecord]:
     """A run in which a process does not receive the messages ``first`` to ``last`` − 1."""
     return lambda make: simulate_with(
-        make(), role, lambda one: LosingMachine(one, lambda n: not first <= n < last), NO_DELAY
+        make(), role, lambda machine: LosingMachine(machine, lambda n: not first <= n < last), NO_DELAY
     )
 
 
@@ -193,14 +193,14 @@ def restarted_controller(make: Make) -> RunRecord:
     """A controller that is restarted at once without a known state, in steps of 10 ms."""
     resolved, at_ns = make(network={"initial_sync": "known_state"}), 2_000_000_000
     successor = controller_of(resolved, Start(1, at_ns))
-    return simulate_with(resolved, "controller", lambda one: RestartedMachine(one, successor, at_ns))
+    return simulate_with(resolved, "controller", lambda machine: RestartedMachine(machine, successor, at_ns))
 
 
 def restarted_sensor(make: Make) -> RunRecord:
     """A sensor that is restarted between two measurements, soon after an event."""
     resolved, at_ns = make(), 50_000_000
     successor = sensor_of(resolved, Start(1, at_ns))
-    record = simulate_with(resolved, "sensor", lambda one: RestartedMachine(one, successor, at_ns))
+    record = simulate_with(resolved, "sensor", lambda machine: RestartedMachine(machine, successor, at_ns))
     period_ns = resolved.timing.measurement_period_ns
     assert (np.diff(record[SENSOR_MEASUREMENT]["t_ns"]) == period_ns).all()
     return record
@@ -252,11 +252,11 @@ def test_a_late_run_has_the_certificate_of_its_lateness(
     violate: Callable[[Make], RunRecord], time: str, least_s: float, make: Make
 ) -> None:
     record = violate(make)
-    assert time in [f"{one.cause}_s" for one in reported(record)]
+    assert time in [f"{violation.cause}_s" for violation in reported(record)]
     claims = ClaimEvaluation(record)
     assert (covered := claims.certified_for) is not None
     assert least_s <= getattr(covered, time) == claims.conditions[time]
-    assert {one.verdict for one in claims.evaluate() if one.source in ("certificate", "(I1)")} == {
+    assert {claim.verdict for claim in claims.evaluate() if claim.source in ("certificate", "(I1)")} == {
         ClaimVerdict.HELD
     }
 
@@ -275,17 +275,17 @@ def test_a_run_is_certified_until_it_is_later_than_any_certificate_covers(
     claims = ClaimEvaluation(record)
     covered, series = claims.certified_for, getattr(claims.observed, time)
     assert covered is not None
-    (since_s,) = {one.since_s for one in claims.evaluate() if one.source == "certificate"}
+    (since_s,) = {claim.since_s for claim in claims.evaluate() if claim.source == "certificate"}
     assert since_s > min(reported(record)).t_s  # when it was later than allowed
     assert series.before(since_s).value.max(initial=0.01) == getattr(covered, f"{time}_s")
-    (found,) = {one.why for one in claims.evaluate() if one.source == "certificate"}
-    assert found.startswith(why)
-    assert found.endswith(BEYOND_CERTIFICATE)
+    (reason,) = {claim.why for claim in claims.evaluate() if claim.source == "certificate"}
+    assert reason.startswith(why)
+    assert reason.endswith(BEYOND_CERTIFICATE)
     # The next lateness has none.
     (most,) = series.peaks().value[series.peaks().t_s == since_s]
     later = covered._replace(**{f"{time}_s": most})
     (beyond,) = certificates_together([record.scenario], None, [later])
-    assert {one.constants for one in beyond} == {None}
+    assert {certificate.constants for certificate in beyond} == {None}
 
 
 # --- reports are timely and cost little memory ----------------------------------------------------
@@ -300,7 +300,7 @@ def test_an_input_that_is_too_old_is_reported_during_the_outage(make: Make) -> N
         for table in record.tables:
             until_ns = 2.0e9 if OWNER[table] == "controller" else 2.1e9
             monitor.take(table, record[table][record[table]["now_ns"] < until_ns])
-        assert [(one.t_s, one.cause) for one in monitor.advance()] == expected
+        assert [(violation.t_s, violation.cause) for violation in monitor.advance()] == expected
 
 
 def test_only_rows_that_are_still_needed_are_stored(make: Make) -> None:
@@ -381,9 +381,9 @@ def test_the_worst_case_of_a_schedule_occurs(
 
 def test_every_table_may_be_empty(run: RunRecord) -> None:
     empty = without(run, "plant", "sensor", "netem", "controller")
-    found = read_conditions(empty)
-    assert set(found.summary().values()) == {None}
-    assert found.first_violation(nominal_conditions(run.scenario, 0)) is not None
+    conditions = read_conditions(empty)
+    assert set(conditions.summary().values()) == {None}
+    assert conditions.first_violation(nominal_conditions(run.scenario, 0)) is not None
     step = np.zeros(1, run[PLANT_STEP].dtype)
     step["actuation"] = NO_SEQUENCE
     assert read_conditions(changed(empty, {PLANT_STEP: step})).start_s == np.inf
@@ -422,9 +422,9 @@ def test_no_run_leaves_the_conditions_of_its_schedule_and_some_reach_them(
         actuation, f"controller.predictions={predictions}", f"plant.rate_hz={plant_hz}",
         f"controller.rate_hz={controller_hz}", f"controller.phase={phase}",
     )  # fmt: skip
-    allowed, found = nominal_conditions(run, 0), read_conditions(simulate(run)).summary()
+    allowed, observed = nominal_conditions(run, 0), read_conditions(simulate(run)).summary()
     for name in ("delay_s", "hold_s", "start_s"):
-        assert found[name] is not None
-        assert found[name] <= getattr(allowed, name) + 1e-9, name  # type: ignore[operator]
+        assert observed[name] is not None
+        assert observed[name] <= getattr(allowed, name) + 1e-9, name  # type: ignore[operator]
     if reached and predictions == 1:
-        assert found["hold_s"] == pytest.approx(allowed.hold_s, abs=1e-9)
+        assert observed["hold_s"] == pytest.approx(allowed.hold_s, abs=1e-9)

@@ -50,12 +50,12 @@ class Fmu:
     """An instance that FMPy has made of an unzipped FMU."""
 
     def __init__(self, folder: Path) -> None:
-        found = fmpy.read_model_description(folder)
-        self.variables = {one.name: one for one in found.modelVariables}
+        description = fmpy.read_model_description(folder)
+        self.variables = {variable.name: variable for variable in description.modelVariables}
         self.log = list[str]()
         LOGS.append(self.log)
-        name = found.coSimulation.modelIdentifier
-        self.slave = FMU3Slave("", guid=found.guid, unzipDirectory=folder, modelIdentifier=name)
+        name = description.coSimulation.modelIdentifier
+        self.slave = FMU3Slave("", guid=description.guid, unzipDirectory=folder, modelIdentifier=name)
         self.slave.instantiate(logMessage=lambda *given: self.log.append(given[-1].decode()))
 
     def start(self) -> "Fmu":
@@ -64,14 +64,14 @@ class Fmu:
         return self
 
     def get(self, name: str) -> Any:
-        one = self.variables[name]
-        count = math.prod(int(dimension.start) for dimension in one.dimensions)
-        found = getattr(self.slave, f"get{one.type}")([one.valueReference], nValues=count)
-        return found if one.dimensions else found[0]
+        variable = self.variables[name]
+        count = math.prod(int(dimension.start) for dimension in variable.dimensions)
+        values = getattr(self.slave, f"get{variable.type}")([variable.valueReference], nValues=count)
+        return values if variable.dimensions else values[0]
 
     def set(self, name: str, value: Any) -> None:
-        one = self.variables[name]
-        getattr(self.slave, f"set{one.type}")([one.valueReference], np.ravel(value).tolist())
+        variable = self.variables[name]
+        getattr(self.slave, f"set{variable.type}")([variable.valueReference], np.ravel(value).tolist())
 
     def step(self, t_s: float, h_s: float, **inputs: Any) -> None:
         for name, value in inputs.items():
@@ -117,9 +117,9 @@ def folders(tmp_path: Path) -> Folders:
 
 def vectors(run: Any, table: str, name: str) -> Any:
     """A vector of a table's rows, (rows, entries)."""
-    found = run.table(table)
-    names = [one for one in found.column_names if re.fullmatch(rf"{name}_\d+", one)]
-    return np.transpose([found[one].to_numpy() for one in names])
+    columns = run.table(table)
+    names = [column for column in columns.column_names if re.fullmatch(rf"{name}_\d+", column)]
+    return np.transpose([columns[column].to_numpy() for column in names])
 
 
 @pytest.mark.parametrize(
@@ -139,7 +139,7 @@ def test_a_run_is_that_of_a_simulation(name: str, settings: Any, folders: Folder
     for k in range(last + 100):  # at the end, what is in flight arrives
         t_ns, t_s, h_s = k * h_ns, k * h_ns / 1e9, h_ns / 1e9
         if k <= last:
-            measured = next(one for one in plant.on_timer(t_ns) if isinstance(one, Message))
+            measured = next(output for output in plant.on_timer(t_ns) if isinstance(output, Message))
             x.append(measured.vector)
             for update in sensor.handle(measured, t_ns):
                 if isinstance(update, Message):
@@ -164,46 +164,46 @@ def test_a_run_is_that_of_a_simulation(name: str, settings: Any, folders: Folder
 def test_steps_may_have_any_length(folders: Folders) -> None:
     """A channel with steps ten times as long gives the controller packets ahead of their time."""
     first, second = folders(noack.load("double_integrator", BURSTS))
-    short, long, one, other = (Fmu(folder).start() for folder in (first, first, second, second))
+    short, long, short_steps, long_steps = (Fmu(folder).start() for folder in (first, first, second, second))
     u = list[tuple[Any, Any]]()
     for k in range(400):
         number, t_s, h_s = k // 10 + 1, k * H_S / 10, H_S / 10
         if k % 10 == 0:
             long.step(t_s, H_S, send=number, x=[number, 1.0])
         short.step(t_s, h_s, send=number, x=[number, 1.0])
-        u.append((one.follow(short, t_s, h_s), other.follow(long, t_s, h_s)))
+        u.append((short_steps.follow(short, t_s, h_s), long_steps.follow(long, t_s, h_s)))
     assert all(left == right for left, right in u)
-    assert long.get("arrivals") == short.get("arrivals") == other.get("arrivals") > 10
+    assert long.get("arrivals") == short.get("arrivals") == long_steps.get("arrivals") > 10
 
 
 def sent(channel: Fmu, steps: range) -> list[list[float]]:
     """Send a packet in each step; return what has arrived after each."""
-    found = []
+    outputs = []
     for k in steps:
         channel.step(k * H_S, H_S, send=k + 1, x=[k, -k])
-        found.append([channel.get("arrivals"), channel.get("received"), *channel.get("packet_x")])
-    return found
+        outputs.append([channel.get("arrivals"), channel.get("received"), *channel.get("packet_x")])
+    return outputs
 
 
 @pytest.mark.sanitized
 def test_instances_are_separate_and_can_begin_or_go_on_again(folders: Folders) -> None:
     folder, other = folders(noack.load("double_integrator", BURSTS))
-    one, two = Fmu(folder).start(), Fmu(folder).start()
-    whole = sent(one, range(60))
+    first, second = Fmu(folder).start(), Fmu(folder).start()
+    whole = sent(first, range(60))
     assert len({tuple(row) for row in whole}) > 20
-    assert sent(two, range(30)) == whole[:30]  # while the other one exists
-    kept = two.state()
-    assert sent(two, range(30, 60)) == whole[30:]
-    for instance in (one, two):
+    assert sent(second, range(30)) == whole[:30]  # while the other one exists
+    kept = second.state()
+    assert sent(second, range(30, 60)) == whole[30:]
+    for instance in (first, second):
         instance.set_state(kept)
         assert instance.state() == kept
         assert sent(instance, range(30, 60)) == whole[30:]
-    one.slave.reset()
-    assert sent(one.start(), range(60)) == whole
+    first.slave.reset()
+    assert sent(first.start(), range(60)) == whole
     controller = Fmu(other).start()
     for content in (controller.state(), kept[:-1], kept[:-1] + b"?"):
-        assert "the state is not one of this FMU" in two.refuses(two.set_state, content)
-    for instance in (one, two, controller):
+        assert "the state is not one of this FMU" in second.refuses(second.set_state, content)
+    for instance in (first, second, controller):
         instance.slave.freeInstance()
 
 
@@ -286,8 +286,8 @@ def test_resources_that_are_damaged_give_one_line(folders: Folders) -> None:
             path.write_bytes(wrong)
         with pytest.raises(Exception, match="Failed to instantiate"):
             Fmu(folder)
-        (found,) = LOGS[-1]
-        assert line in found
+        (logged,) = LOGS[-1]
+        assert line in logged
 
 
 def test_the_command_takes_scenarios_and_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -300,8 +300,8 @@ def test_the_command_takes_scenarios_and_runs(tmp_path: Path, monkeypatch: pytes
     names = [f"double_integrator_{role}.fmu" for role in ("channel", "controller")]
     assert [Path(name).read_bytes() for name in names] == expected
     run = noack.simulate(scenario, runs="runs")
-    found = invoke("export", str(run.directory), "--format", "fmu", "--out", "b.fmu", "--json")
-    for files in (run.export("c.fmu"), map(Path, json.loads(found.stdout)["files"])):
+    result = invoke("export", str(run.directory), "--format", "fmu", "--out", "b.fmu", "--json")
+    for files in (run.export("c.fmu"), map(Path, json.loads(result.stdout)["files"])):
         assert [path.read_bytes() for path in files] == expected
     loops = noack.simulate(noack.load("different_loops", {"horizon_s": 0.1}))
     with pytest.raises(CallerError, match="the scenario has loops"):
@@ -313,5 +313,5 @@ def test_the_command_takes_scenarios_and_runs(tmp_path: Path, monkeypatch: pytes
     Path("v1.2").mkdir()
     invoke("export", "double_integrator", "--format", "fmu", "--out", "v1.2")
     invoke("export", "double_integrator", "--format", "fmu", "--out", "v1.2/v1.2")
-    found = [path.name.removesuffix("_channel.fmu") for path in Path("v1.2").glob("*_channel.fmu")]
-    assert sorted(found) == ["double_integrator", "v1.2"]
+    names = [path.name.removesuffix("_channel.fmu") for path in Path("v1.2").glob("*_channel.fmu")]
+    assert sorted(names) == ["double_integrator", "v1.2"]

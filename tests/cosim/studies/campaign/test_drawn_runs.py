@@ -47,15 +47,15 @@ def work(*overrides: str, **changed: Any) -> SampledWork:
     return SampledWork(in_virtual_time(scenario(*overrides)), 7, **settings | changed)
 
 
-def record_of(one: SampledWork, draw: int) -> RunRecord:
-    return simulate(drawn_scenario(one.scenario, one.seed, draw))
+def record_of(sampled: SampledWork, draw: int) -> RunRecord:
+    return simulate(drawn_scenario(sampled.scenario, sampled.seed, draw))
 
 
 @pytest.mark.parametrize("overrides", [(), (LATE,), NEVER, ("mode=zoh",)])
 def test_a_row_agrees_with_the_summary_of_the_run(overrides: tuple[str, ...]) -> None:
-    one = work(*overrides)
-    for draw, row in enumerate(one.run(range(2))):
-        record = record_of(one, draw)
+    sampled = work(*overrides)
+    for draw, row in enumerate(sampled.run(range(2))):
+        record = record_of(sampled, draw)
         expected = summarise_loop(record, ExitStatus.OK, "").to_json()
         assert row["status"] == OK
         assert row["transmissions"] == expected["events"]
@@ -81,9 +81,9 @@ GUSTS = (
 def test_the_cost_is_the_integral_under_the_held_inputs(overrides: tuple[str, ...]) -> None:
     """Disturbances enter the cost only through the state."""
     Q, R = np.diag([1.0, 2.0, 3.0, 4.0]), np.diag([0.5, 0.25])
-    one = work("horizon_s=0.1", *overrides, Q=Q, R=R)
-    (row,) = one.run(range(1))
-    record = record_of(one, 0)
+    sampled = work("horizon_s=0.1", *overrides, Q=Q, R=R)
+    (row,) = sampled.run(range(1))
+    record = record_of(sampled, 0)
     cost = 0.0
     for step in record["plant_step"][:-1]:
         d, w = (step["d"], step["w"]) if overrides else (0.0, 0.0)
@@ -101,9 +101,9 @@ def test_the_cost_is_the_integral_under_the_held_inputs(overrides: tuple[str, ..
 
 def test_a_nonlinear_plant_is_drawn_and_its_cost_is_a_sum() -> None:
     given = load(SHIPPED / "cart_pole.toml", ["horizon_s=1.0", "plant.rate_hz=200.0"])
-    one = SampledWork(in_virtual_time(given), 7, None, None, 0.5, 1000)
-    (row,) = one.run(range(1))
-    record = record_of(one, 0)
+    sampled = SampledWork(in_virtual_time(given), 7, None, None, 0.5, 1000)
+    (row,) = sampled.run(range(1))
+    record = record_of(sampled, 0)
     steps = record["plant_step"]
     assert row["status"] == OK
     assert not record.scenario.coverage.is_linear
@@ -135,11 +135,11 @@ def shared_work(*overrides: str, **settings: Any) -> SharedNetworkWork:
 
 
 def test_a_row_agrees_with_the_summaries_of_the_loops() -> None:
-    one = shared_work("network.impairments=[]", "loops.0.count=2", checks_claims=True)
-    rows = one.run(range(2))
+    loops_work = shared_work("network.impairments=[]", "loops.0.count=2", checks_claims=True)
+    rows = loops_work.run(range(2))
     assert rows.dtype == LOOPS_ROW
-    seeds = seeds_of(one.seed, 1)
-    shared = simulate_loops(one.scenario.model_copy(update={"seeds": seeds}))
+    seeds = seeds_of(loops_work.seed, 1)
+    shared = simulate_loops(loops_work.scenario.model_copy(update={"seeds": seeds}))
     loops = [summarise_loop(record, 0, "").to_json() for record in shared.loops]
     row = rows[1]
     assert row["transmissions"] == sum(loop["events"] for loop in loops) != rows[0]["transmissions"]
@@ -154,8 +154,10 @@ def test_a_row_agrees_with_the_summaries_of_the_loops() -> None:
 def test_a_loop_that_diverges_costs_an_infinite_amount_and_is_counted() -> None:
     own = "A = [[0.0, 1.0], [900.0, 0.0]], B = [[0.0], [1.0]]"
     wild = f'{{ name = "wild", plant = {{ draw = "given", {own} }} }}'
-    one = shared_work("horizon_s=30", f'loops=[{{ name = "calm", count = 3 }}, {wild}]', most_events=400)
-    (row,) = one.run(range(1))
+    loops_work = shared_work(
+        "horizon_s=30", f'loops=[{{ name = "calm", count = 3 }}, {wild}]', most_events=400
+    )
+    (row,) = loops_work.run(range(1))
     assert row["loops_failed"] == 0.25
     assert np.isnan(row["cost"])
     assert np.isnan(row["loops_claims_held"])
@@ -186,8 +188,8 @@ def test_different_loops_keep_their_proportions(write: Write, plan: dict[str, An
 
     settings = {"loops": loops}
     _, points = few_of(write(plan, axes=axes(3, 9), settings=settings, **sampled))
-    found = [[(one.name, one.count) for one in point.scenario.loops] for point in points[::2]]
-    assert found == [[("a", 2), ("b", 1)], [("a", 6), ("b", 3)]]
+    counts = [[(loop.name, loop.count) for loop in point.scenario.loops] for point in points[::2]]
+    assert counts == [[("a", 2), ("b", 1)], [("a", 6), ("b", 3)]]
     assert points[0].scenario.loops[1].plant == {"initial_state": [2.0, 0.0]}
     rows = points[0].work.run(range(1))
     assert row_type(points) == rows.dtype
@@ -208,25 +210,25 @@ def test_draws_depend_neither_on_the_chunk_nor_on_the_grid_point(campaign: Few) 
     parts = [(slice(3, 5), first.population(11, range(3, 5)))]
     parts += [(slice(0, 9), box.population(11, range(9))) for box in others]
     for place, part in parts:
-        for found, expected in zip(part, whole, strict=True):
-            np.testing.assert_array_equal(found, expected[place])
+        for values, expected in zip(part, whole, strict=True):
+            np.testing.assert_array_equal(values, expected[place])
     assert first.population(11, range(10**8, 10**8 + 1)).x0.shape == (1, 2)
 
 
 def test_plants_are_drawn_uniformly_in_the_box(campaign: Few) -> None:
     point = campaign[1][0]
-    found = point.work.box.population(11, range(20_000))
+    drawn = point.work.box.population(11, range(20_000))
     centre, half = loop_of(drawn_scenario(with_plant(point.scenario, draw="nominal"), 0, 0)), 0.2
-    off = found.A[:, 1, 0] - centre.A[1, 0]
+    off = drawn.A[:, 1, 0] - centre.A[1, 0]
     assert np.abs(off).max() <= half
     # The standard deviation of a mean of 20,000 is below 0.001, that of a variance below 0.0001.
     assert abs(off.mean()) < 0.005
     assert off.var() == pytest.approx(half**2 / 3, abs=0.0005)
-    np.testing.assert_array_equal(found.A[:, 0], np.broadcast_to(centre.A[0], (20_000, 2)))
-    pairs = np.column_stack([off, found.A[:, 1, 1], found.x0, found.loss_seeds.astype(float)])
+    np.testing.assert_array_equal(drawn.A[:, 0], np.broadcast_to(centre.A[0], (20_000, 2)))
+    pairs = np.column_stack([off, drawn.A[:, 1, 1], drawn.x0, drawn.loss_seeds.astype(float)])
     correlation = np.corrcoef(pairs.T) - np.eye(5)
     assert np.abs(correlation).max() < 0.04  # 5.6 standard deviations
-    assert len(set(found.loss_seeds.tolist())) == 20_000
+    assert len(set(drawn.loss_seeds.tolist())) == 20_000
 
 
 def test_vertex_draws_are_corners_and_nominal_and_given_plants_are_constant(campaign: Few) -> None:
@@ -256,8 +258,8 @@ def test_a_draw_of_a_campaign_can_be_run_as_a_scenario(campaign: Few) -> None:
 def test_each_draw_has_its_own_window_of_a_trace() -> None:
     scenario = load(SHIPPED / "lane_following.toml")
     steps_ns = tuple(k * 10**6 for k in range(1000))
-    one = Replay(sent_ns=steps_ns, delays_ns=steps_ns, offset_s="random")
-    network = scenario.network.model_copy(update={"loss": NoLoss(), "impairments": (one,)})
+    replay = Replay(sent_ns=steps_ns, delays_ns=steps_ns, offset_s="random")
+    network = scenario.network.model_copy(update={"loss": NoLoss(), "impairments": (replay,)})
     scenario = scenario.model_copy(update={"network": network})
     begins_ms = [
         update_link_of(drawn_scenario(scenario, 5, draw)).decide(0, 1, 0).release_ns // 10**6

@@ -54,21 +54,21 @@ def study(tmp_path: Path, queue: int, deadline_s: float = PERIOD_S) -> CapacityR
 
 
 def limits_of(result: CapacityResult) -> tuple[PolicyCapacity, dict[str, float]]:
-    (found,) = result.capacities
-    return found, {name: one.median for name, one in found.limits.items()}
+    (policy_capacity,) = result.capacities
+    return policy_capacity, {name: limit.median for name, limit in policy_capacity.limits.items()}
 
 
 def test_a_queue_carries_as_many_periodic_loops_as_the_rate_allows(tmp_path: Path) -> None:
-    found, limits = limits_of(study(tmp_path / "long", queue=100))  # it delays, and drops nothing
-    assert found.any_limit.median == limits["deadline"] == 6
+    policy_capacity, limits = limits_of(study(tmp_path / "long", queue=100))  # it delays, and drops nothing
+    assert policy_capacity.any_limit.median == limits["deadline"] == 6
     assert limits["guarantee"] == np.inf
     result = study(tmp_path / "short", queue=6, deadline_s=2 * PERIOD_S)
     assert result.plan.periodic_loops == pytest.approx(6.0, rel=1e-6)
-    found, limits = limits_of(result)
+    policy_capacity, limits = limits_of(result)
     # The seventh loop overflows the queue of six, in which updates wait for about a period.
-    assert found.any_limit.median == limits["guarantee"] == 6
+    assert policy_capacity.any_limit.median == limits["guarantee"] == 6
     assert limits["deadline"] == np.inf
-    assert found.limited_by == "guarantee"
+    assert policy_capacity.limited_by == "guarantee"
 
 
 def test_a_policy_must_keep_the_cost_of_each_kind_of_loop() -> None:
@@ -81,8 +81,8 @@ def test_a_policy_must_keep_the_cost_of_each_kind_of_loop() -> None:
         return quiet | {"cost_of_a": np.full(3, a), "cost_of_b": np.full(3, b)}
 
     own = {"2 unshared": runs(1.0, 100.0), "4 unshared": runs(1.0, 90.0)}
-    found = capacity_of(plan, "model", "own", {"2": runs(1.9, 110.0), "4": runs(2.1, 110.0)} | own)
-    assert (found.any_limit.median, found.limited_by) == (2, "cost")
+    policy_capacity = capacity_of(plan, "model", "own", {"2": runs(1.9, 110.0), "4": runs(2.1, 110.0)} | own)
+    assert (policy_capacity.any_limit.median, policy_capacity.limited_by) == (2, "cost")
 
 
 def test_the_guarantee_is_used_up_by_a_burst_with_a_full_queue() -> None:
@@ -93,8 +93,8 @@ def test_the_guarantee_is_used_up_by_a_burst_with_a_full_queue() -> None:
         text = "".join(random.choice([*letters], 12))
         burst = int(random.integers(1, 5))
         bursts = re.findall("[xo]+", text)
-        expected = any(len(one) >= burst and "o" in one for one in bursts)
-        assert used_up(np.array([letters[one] for one in text]), burst) == expected, (text, burst)
+        expected = any(len(letter_burst) >= burst and "o" in letter_burst for letter_burst in bursts)
+        assert used_up(np.array([letters[letter] for letter in text]), burst) == expected, (text, burst)
         seen.add(expected)
     assert seen == {True, False}
 
@@ -121,11 +121,11 @@ def test_the_default_answers_for_the_shipped_mixture_and_says_how_long_it_takes(
         r"--thorough: \d+ (s|min)\n",
         result.stderr,
     )
-    found = json.loads(result.stdout)
-    assert (found["loops"], found["draws"], found["thorough"]) == ([11, 22, 33], 6, False)
-    for one in found["capacities"]:
-        if one["median"] is not None:
-            assert one["loops_by_kind"]["pendulum"] == 10 * one["factor"] == one["median"] / 1.1
+    document = json.loads(result.stdout)
+    assert (document["loops"], document["draws"], document["thorough"]) == ([11, 22, 33], 6, False)
+    for row in document["capacities"]:
+        if row["median"] is not None:
+            assert row["loops_by_kind"]["pendulum"] == 10 * row["factor"] == row["median"] / 1.1
     again = capacity("shared_bottleneck", *out, *SHORT[2:])
     assert again.exit_code == 0
     assert json.loads(again.stdout)["made"] == 0
@@ -140,11 +140,14 @@ def test_the_command_compares_the_policies_and_confirms_a_point_live(tmp_path: P
         "--confirm", "model=2", "--out", str(tmp_path),
     )  # fmt: skip
     assert result.exit_code == 0, result.output
-    found = json.loads(result.stdout)
-    assert {one["policy"] for one in found["capacities"]} == {"periodic", "zoh", "model", "slow"}
-    assert {one["disturbance"] for one in found["capacities"]} == {"as in the scenario", "common"}
-    assert len(found["comparisons"]) == 6
-    (live,) = found["live"]
+    document = json.loads(result.stdout)
+    assert {row["policy"] for row in document["capacities"]} == {"periodic", "zoh", "model", "slow"}
+    assert {row["disturbance"] for row in document["capacities"]} == {
+        "as in the scenario",
+        "common",
+    }
+    assert len(document["comparisons"]) == 6
+    (live,) = document["live"]
     assert (live["policy"], live["loops"], live["status"]) == ("model", 2, 0)
     assert live["values"]["transmissions"] > 0
     assert "crosses are live runs" in (tmp_path / "capacity.html").read_text()
@@ -158,11 +161,11 @@ def test_a_schedule_carries_as_many_loops_as_its_delay_allows(tmp_path: Path) ->
         "--set", "network.impairments.0.slot_s=0.01", "--set", "network.loss.probability=0",
         "--workers", "1", "--json", "--out", str(tmp_path), *SHORT,
     )  # fmt: skip
-    found = json.loads(result.stdout)
-    assert found["periodic_loops_by_rate"] == pytest.approx(6.0)
+    document = json.loads(result.stdout)
+    assert document["periodic_loops_by_rate"] == pytest.approx(6.0)
     inf = None  # of JSON
-    assert found["delay_bounds_s"]["periodic"] == pytest.approx([0.01, 0.02, 0.05, 0.18])
-    assert found["delay_bounds_s"]["model"] == pytest.approx([0.01, 0.02, 0.1, inf])
-    one, *_ = found["capacities"]
-    assert (one["policy"], one["median"]) == ("periodic", 5.0)
+    assert document["delay_bounds_s"]["periodic"] == pytest.approx([0.01, 0.02, 0.05, 0.18])
+    assert document["delay_bounds_s"]["model"] == pytest.approx([0.01, 0.02, 0.1, inf])
+    row, *_ = document["capacities"]
+    assert (row["policy"], row["median"]) == ("periodic", 5.0)
     assert result.exit_code == 0

@@ -53,5 +53,5 @@ def designed(scenario: Scenario, limits: DesignLimits, draws: int = 200, seed: i
 
 
 @pytest.fixture(scope="session")
-def found(scenario: Scenario) -> DesignResult:
+def result(scenario: Scenario) -> DesignResult:
     return designed(scenario, LIMITS)

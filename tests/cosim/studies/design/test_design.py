@@ -57,7 +57,7 @@ Design = Callable[..., Result]
 
 
 @pytest.fixture
-def one(tmp_path: Path) -> Path:
+def scalar_file(tmp_path: Path) -> Path:
     path = tmp_path / "one.toml"
     path.write_text(ONE)
     return path
@@ -78,8 +78,8 @@ def run_design(tmp_path: Path) -> Design:
 def paper_certificate(path: Path) -> dict[str, Any]:
     result = invoke("certify", path, "--json")
     assert result.exit_code == 0
-    found = json.loads(result.stdout)["certificates"]
-    return [one for one in found if one["under"] == "paper"][-1]
+    certificates = json.loads(result.stdout)["certificates"]
+    return [certificate for certificate in certificates if certificate["under"] == "paper"][-1]
 
 
 @pytest.mark.usefixtures("no_drawing")
@@ -92,10 +92,10 @@ def test_check_and_certify_accept_the_written_scenario(
         "--out", str(out), "--json",
     )  # fmt: skip
     assert result.exit_code == 0, result.stderr
-    found = json.loads(result.stdout)
-    best = found["best"]
-    assert found["confirmed"]
-    assert found["files"] == [str(tmp_path / "p.html"), str(out)]
+    document = json.loads(result.stdout)
+    best = document["best"]
+    assert document["confirmed"]
+    assert document["files"] == [str(tmp_path / "p.html"), str(out)]
     scale = float(best["gain"].rpartition(" ")[2])
     A, B = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
     K = lqr_gain(A, B, np.eye(2), np.array([[2.0 * scale]]))
@@ -112,10 +112,10 @@ def test_check_and_certify_accept_the_written_scenario(
 
 
 @pytest.mark.usefixtures("no_drawing")
-def test_a_chosen_norm_is_certified_as_written(one: Path, tmp_path: Path, run_design: Design) -> None:
+def test_a_chosen_norm_is_certified_as_written(scalar_file: Path, tmp_path: Path, run_design: Design) -> None:
     out = tmp_path / "chosen.toml"
     result = run_design(
-        one, "--settling", "4", "--quantile", "0.7", "--draws", "40", "--weights", "chosen",
+        scalar_file, "--settling", "4", "--quantile", "0.7", "--draws", "40", "--weights", "chosen",
         "--bound", "error=0.3", "--bound", "state=2",
         "--out", str(out), "--json",
     )  # fmt: skip
@@ -154,11 +154,11 @@ def test_limits_that_cannot_be_met_give_a_page_and_one_line(
 
 
 def test_the_lines_about_mistakes_are_those_that_were_approved(
-    mass: Path, one: Path, run_design: Design
+    mass: Path, scalar_file: Path, run_design: Design
 ) -> None:
     def mistake(line: str) -> list[str]:
         name, *words = shlex.split(line)
-        path = {"mass": mass, "one": one}[name]
+        path = {"mass": mass, "one": scalar_file}[name]
         result = run_design(path, *words)
         assert result.exit_code == 2, result.stderr
         assert result.stderr.count("\n") == 1
@@ -168,30 +168,30 @@ def test_the_lines_about_mistakes_are_those_that_were_approved(
 
 
 @pytest.mark.usefixtures("no_drawing")
-def test_a_loop_without_a_certificate_is_reported(one: Path, run_design: Design) -> None:
+def test_a_loop_without_a_certificate_is_reported(scalar_file: Path, run_design: Design) -> None:
     result = run_design(
-        one, "--settling", "4", "--bound", "error=1", "--under", "schedule",
+        scalar_file, "--settling", "4", "--bound", "error=1", "--under", "schedule",
         "--set", "plant.rate_hz=2", "--set", "controller.rate_hz=2",
     )  # fmt: skip
     assert result.exit_code == 1
     assert "no certified bound of sup‖e_c‖ (1 allowed)" in result.stderr
 
 
-def test_the_chosen_design_settles_in_time_on_draws_of_another_seed(found: DesignResult) -> None:
-    assert found.feasible
-    assert found.confirmed
-    setting = replace(setting_of(resolve(found.scenario)), settle=LIMITS.settle)
-    rows = run_batch(setting, box_of(found.scenario).population(99, range(2000)))
+def test_the_chosen_design_settles_in_time_on_draws_of_another_seed(result: DesignResult) -> None:
+    assert result.feasible
+    assert result.confirmed
+    setting = replace(setting_of(resolve(result.scenario)), settle=LIMITS.settle)
+    rows = run_batch(setting, box_of(result.scenario).population(99, range(2000)))
     share = float(np.mean(rows["settling_s"] <= LIMITS.settling_s))
     assert share >= LIMITS.quantile
     # 4 standard deviations of the difference of two means
-    spread = 4 * np.hypot(found.fresh.halfwidth, 0.12) / 1.96
-    assert abs(rows["transmissions"].mean() - found.fresh.transmissions) < spread
+    spread = 4 * np.hypot(result.fresh.halfwidth, 0.12) / 1.96
+    assert abs(rows["transmissions"].mean() - result.fresh.transmissions) < spread
 
 
-def test_the_chosen_design_is_certified_as_required(found: DesignResult, tmp_path: Path) -> None:
+def test_the_chosen_design_is_certified_as_required(result: DesignResult, tmp_path: Path) -> None:
     path = tmp_path / "chosen.toml"
-    path.write_text(dumps(found.scenario))
+    path.write_text(dumps(result.scenario))
     resolved = resolve(load(path))
     certificate = certify_box(resolved, ideal_conditions(resolved))
     assert certificate is not None
@@ -201,15 +201,15 @@ def test_the_chosen_design_is_certified_as_required(found: DesignResult, tmp_pat
     bound = certificate.constants.delta * resolved.decaying.beta / smallest
     assert bound <= LIMITS.bounds["error"]
     # The bound is the active limit: without it a cheaper design exists.
-    assert found.bounds is not None
-    assert found.bounds["error"] == pytest.approx(bound)
+    assert result.bounds is not None
+    assert result.bounds["error"] == pytest.approx(bound)
 
 
-def test_no_candidate_meets_the_limits_with_fewer_transmissions(found: DesignResult) -> None:
-    best = found.best.measured
-    assert found.best.full
+def test_no_candidate_meets_the_limits_with_fewer_transmissions(result: DesignResult) -> None:
+    best = result.best.measured
+    assert result.best.full
     assert best.settling_high_s <= LIMITS.settling_s
-    cheaper = [t for t in found.trials if t.measured.transmissions < best.transmissions]
+    cheaper = [t for t in result.trials if t.measured.transmissions < best.transmissions]
     assert len(cheaper) > 10
     for trial in cheaper:
         m = trial.measured
@@ -217,43 +217,43 @@ def test_no_candidate_meets_the_limits_with_fewer_transmissions(found: DesignRes
         assert late or trial.bounds["error"] > LIMITS.bounds["error"], trial
 
 
-def test_screening_excludes_no_design_that_all_draws_would_choose(found: DesignResult) -> None:
+def test_screening_excludes_no_design_that_all_draws_would_choose(result: DesignResult) -> None:
     """Every grid candidate that was only screened out is measured on all draws here."""
-    best = found.best.measured
-    population = box_of(found.scenario).population(found.seed, range(best.draws))
+    best = result.best.measured
+    population = box_of(result.scenario).population(result.seed, range(best.draws))
     rescued = 0
-    for trial in found.trials:
+    for trial in result.trials:
         if trial.full or trial.measured.transmissions > best.transmissions:
             continue
-        scenario = found.space.families[trial.candidate.family].with_trigger(trial.candidate)
+        scenario = result.space.families[trial.candidate.family].with_trigger(trial.candidate)
         rescued += measure(scenario, LIMITS, population).settling_high_s <= LIMITS.settling_s
     assert rescued == 0
 
 
-def test_the_trade_off_curve_contains_the_nondominated_candidates(found: DesignResult) -> None:
-    assert len(found.front) > 3
-    points = [(t.measured.transmissions, t.measured.settling_s) for t in found.front]
+def test_the_trade_off_curve_contains_the_nondominated_candidates(result: DesignResult) -> None:
+    assert len(result.front) > 3
+    points = [(t.measured.transmissions, t.measured.settling_s) for t in result.front]
     assert points == sorted(points)
     assert sorted((s for _, s in points), reverse=True) == [s for _, s in points]
-    for trial in found.front:
+    for trial in result.front:
         assert trial.full
         assert trial.bounds["error"] <= LIMITS.bounds["error"]
-    for trial in found.trials:
+    for trial in result.trials:
         if trial.bounds.get("error", 0.0) <= LIMITS.bounds["error"]:
             sent, settling_s = trial.measured.transmissions, trial.measured.settling_s
             assert not any(sent < a and settling_s < b for a, b in points)
             better = any(a <= sent and b <= settling_s for a, b in points)
-            assert better or trial in found.front or settling_s == math.inf
+            assert better or trial in result.front or settling_s == math.inf
 
 
-def test_of_equal_transmissions_the_earlier_settling_is_chosen(found: DesignResult) -> None:
-    best = found.best
+def test_of_equal_transmissions_the_earlier_settling_is_chosen(result: DesignResult) -> None:
+    best = result.best
     later = replace(
         best,
         candidate=best.candidate._replace(alpha_per_s=best.candidate.alpha_per_s / 2),
         measured=best.measured._replace(settling_s=best.measured.settling_s + 0.001),
     )
-    search = TriggerSearch(found.space, found.limits, box_of(found.scenario), found.seed, 200)
+    search = TriggerSearch(result.space, result.limits, box_of(result.scenario), result.seed, 200)
     assert search._best([later, best]) is best
 
 
@@ -265,15 +265,15 @@ def test_too_few_draws_for_a_quantile_are_refused_with_the_required_number() -> 
     assert 1 - 0.95**enough >= 0.975  # P(the largest value exceeds the quantile)
 
 
-def test_without_randomness_every_draw_is_the_exact_run(one: Path) -> None:
-    families = families_of(load(one), ("identity",), None)
-    found = design(families, DesignLimits(4.0, 0.5, 0.02, {}), draws=20, seed=0)
-    assert found.confirmed
-    assert found.fresh.halfwidth == 0
-    assert found.fresh.settling_high_s == found.fresh.settling_s
-    exact = run_continuous(resolve(found.scenario))
-    assert found.fresh.transmissions == len(exact.event_s)
-    x = exact.at([found.fresh.settling_s]).x
+def test_without_randomness_every_draw_is_the_exact_run(scalar_file: Path) -> None:
+    families = families_of(load(scalar_file), ("identity",), None)
+    result = design(families, DesignLimits(4.0, 0.5, 0.02, {}), draws=20, seed=0)
+    assert result.confirmed
+    assert result.fresh.halfwidth == 0
+    assert result.fresh.settling_high_s == result.fresh.settling_s
+    exact = run_continuous(resolve(result.scenario))
+    assert result.fresh.transmissions == len(exact.event_s)
+    x = exact.at([result.fresh.settling_s]).x
     assert abs(float(x[0, 0])) == pytest.approx(0.02, rel=1e-6)
 
 
