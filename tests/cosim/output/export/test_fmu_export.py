@@ -164,16 +164,18 @@ def test_a_run_is_that_of_a_simulation(name: str, settings: Any, folders: Folder
 def test_steps_may_have_any_length(folders: Folders) -> None:
     """A channel with steps ten times as long gives the controller packets ahead of their time."""
     first, second = folders(noack.load("double_integrator", BURSTS))
-    short, long, short_steps, long_steps = (Fmu(folder).start() for folder in (first, first, second, second))
+    short, long, short_controller, long_controller = (
+        Fmu(folder).start() for folder in (first, first, second, second)
+    )
     u = list[tuple[Any, Any]]()
     for k in range(400):
         number, t_s, h_s = k // 10 + 1, k * H_S / 10, H_S / 10
         if k % 10 == 0:
             long.step(t_s, H_S, send=number, x=[number, 1.0])
         short.step(t_s, h_s, send=number, x=[number, 1.0])
-        u.append((short_steps.follow(short, t_s, h_s), long_steps.follow(long, t_s, h_s)))
+        u.append((short_controller.follow(short, t_s, h_s), long_controller.follow(long, t_s, h_s)))
     assert all(left == right for left, right in u)
-    assert long.get("arrivals") == short.get("arrivals") == long_steps.get("arrivals") > 10
+    assert long.get("arrivals") == short.get("arrivals") == long_controller.get("arrivals") > 10
 
 
 def sent(channel: Fmu, steps: range) -> list[list[float]]:
