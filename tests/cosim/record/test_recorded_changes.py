@@ -78,7 +78,7 @@ def test_dropouts_are_compared_with_the_cap_of_their_time() -> None:
     controller.announce(ParameterChange(0, 50 * MS, {"network.mansd": 1}), 0)
     assert delivered(5, 60 * MS) == []  # four were lost while the cap was five
     (text,) = delivered(8, 90 * MS)
-    assert "2 successive dropouts" in text
+    assert "2 consecutive losses" in text
     assert "at most 1 assumed" in text
 
 
