@@ -35,7 +35,7 @@ from netem.relay.link_sockets import raise_file_limit
 from netem.relay.relay import Relay
 from netem.relay.relay_links import LinkSpec
 from netem.relay.relay_reports import DIRECTIONS, Direction, Tap, report_line
-from noack.core.errors import CallerError, ExitStatus, NoackError, why
+from noack.core.errors import CallerError, ExitStatus, MachineError, NoackError, why
 from noack.core.file_access import open_growing
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import address_text
@@ -143,6 +143,7 @@ def relay(
 
     Raises:
         CallerError: an address is in use, or a file cannot be written.
+        MachineError: the sockets cannot be opened.
     """
     check_options(options)
     if options.replay_fates is not None:
@@ -157,7 +158,10 @@ def relay(
             spin_ns = _SPIN_NS if options.realtime else 0
             devices = None if program is None else program.devices
             raise_file_limit()
-            opened = Relay(specs, options.segment, taps, spin_ns, devices)
+            try:
+                opened = Relay(specs, options.segment, taps, spin_ns, devices)
+            except OSError as error:  # no IPv6, or too many open files
+                raise MachineError(f"the sockets of the links cannot be opened: {why(error)}") from None
             stack.callback(opened.close)
             # Signals stay handled until all files are complete.
             signals = last.enter_context(Signals().handled())

@@ -166,8 +166,9 @@ class _Page:
                     await self._apply(lambda draft: drag(draft, slider, value), slider.key)
             case "fill":
                 fields = (field for field in self._form.all_fields() if field.key == message["key"])
-                field, text = next(fields), str(message["text"]).strip()
-                if text != field.text(self._session.draft):
+                field, text = next(fields, None), str(message["text"]).strip()
+                # The form may have been made anew without the field.
+                if field is not None and text != field.text(self._session.draft):
                     await self._apply(lambda draft: fill_in(draft, field, text), field.key)
             case "choose":
                 key, kind = message["key"], str(message["value"])

@@ -10,7 +10,7 @@ import shutil
 import signal
 import subprocess
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from netem.emulator_options import parse_options, shell_parser, shell_spec
 from netem.relay.device_link import DeviceLink
@@ -98,9 +98,11 @@ class _Program:
             for program in (main, *processes):
                 program.terminate()
             for program in (main, *processes):
-                program.wait(_ENDS_S)
+                with suppress(subprocess.TimeoutExpired):  # end_children kills it
+                    program.wait(_ENDS_S)
             process.end_children(earlier_children)  # of a guard that was killed
-            self.status = main.returncode if main.returncode >= 0 else 128 - main.returncode
+            returncode = -signal.SIGKILL if main.returncode is None else main.returncode
+            self.status = returncode if returncode >= 0 else 128 - returncode
             if signals.received is not None:
                 self.status = signals.status
 

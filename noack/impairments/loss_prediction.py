@@ -81,10 +81,9 @@ class ProbabilityCache:
         return self._probabilities[key]
 
     def add(self, probabilities: Mapping[str, float]) -> None:
-        """Add some; the oldest ones are removed."""
-        while len(self._probabilities) > self._most:
-            del self._probabilities[next(iter(self._probabilities))]
-        self._probabilities.update(probabilities)
+        """Add some as the newest; the oldest ones are removed."""
+        kept = {key: value for key, value in self._probabilities.items() if key not in probabilities}
+        self._probabilities = dict([*kept.items(), *probabilities.items()][-self._most :])
 
 
 _probabilities = ProbabilityCache(1000)
@@ -448,8 +447,8 @@ def with_target_loss(settings: LinkSettings) -> LinkSettings:
 
 def found_probabilities(*links: LinkSettings) -> dict[str, float]:
     """Return the probabilities of valid settings, for :func:`remember`; none where none is kept."""
-    keys = [_key(link) for link in links if with_target_loss(link) is not link]
-    return {key: _probabilities[key] for key in keys}
+    # Each is read at once, as a further one may remove it.
+    return {(key := _key(link)): _probabilities[key] for link in links if with_target_loss(link) is not link}
 
 
 def remember(probabilities: Mapping[str, float]) -> Mapping[str, float]:

@@ -1,8 +1,11 @@
 """A command line gives links; mistakes give error messages."""
 
+import errno
 import json
+import os
 import re
 import shlex
+import socket
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -16,6 +19,7 @@ from netem.emulator_options import parse_options, specs_of
 from netem.relay.relay import Relay
 from netem.relay.relay_links import LinkSpec
 from netem.tc_words import EXAMPLES, KEYWORDS, parse, settings_of
+from noack.core.errors import MachineError
 from noack.impairments.kinds.loss import LOSS_WORDS
 from tests.helpers.approved import compare_lines
 
@@ -63,6 +67,19 @@ def test_a_mistake_ends_the_program_with_the_approved_line(
         return [_OF_THE_SYSTEM.sub("(…)", err.strip()).replace(str(Path.cwd()), "FOLDER")]
 
     compare_lines(Path(__file__).with_name("option_mistakes.txt"), mistake)
+
+
+def test_a_socket_that_cannot_be_made_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def without_ipv6(family: int = socket.AF_INET, *arguments: Any, **options: Any) -> socket.socket:
+        raise OSError(errno.EAFNOSUPPORT, "as the operating system says it")
+
+    monkeypatch.setattr("socket.socket", without_ipv6)
+    assert main(["--listen", "[::1]:0", "--to", "[::1]:9"]) == MachineError("").exit_status
+    reason = os.strerror(errno.EAFNOSUPPORT)
+    line = f"noack netem: the sockets of the links cannot be opened: {reason}\n"
+    assert capsys.readouterr().err == line
 
 
 @pytest.mark.parametrize("columns", ["120", "60"])

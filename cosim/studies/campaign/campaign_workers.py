@@ -32,7 +32,7 @@ from noack.core.errors import CallerError, PeerError
 
 _PACKAGES = ("noack", "numpy", "scipy", "numba", "llvmlite")
 """The last two, if they are installed, compile the equations of vehicles with tyres."""
-_CODE = ("noack", "netem", "cosim")
+_CODE = ("noack", "netem", "cosim", "plant_server", "sensor_node", "controller_node")
 _NO_CODE_OF_RUNS = ("cli", "output", "studies")
 
 

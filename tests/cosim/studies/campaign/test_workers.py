@@ -48,6 +48,15 @@ def test_large_matrices_are_rounded_as_in_the_processes_of_a_run() -> None:
     assert len(found) == 1
 
 
+def test_the_digest_of_the_code_has_every_package_that_a_run_imports() -> None:
+    script = "import sys, cosim.simulation.sampled_loop, cosim.simulation.virtual_time; print(*sys.modules)"
+    imported = subprocess.check_output([sys.executable, "-c", script], text=True).split()
+    packages = {name.partition(".")[0] for name in imported}
+    root = Path(campaign_workers.__file__).parents[3]
+    own = {path.parent.name for path in root.glob("*/__init__.py")} & packages
+    assert {"noack", "plant_server"} <= own == {*campaign_workers._CODE}
+
+
 def contents(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*.parquet")}
 

@@ -59,7 +59,7 @@ def loop() -> tuple[Reach, np.ndarray, float]:
 def bounds_of(reach: Reach, spacing_s: float) -> tuple[np.ndarray, np.ndarray, float]:
     """The bounds by the flow, those without it, and the time between events."""
     each = np.full(LOSSES + 1, BETA)
-    sensor = SensorErrors(each, BETA, 0.0, 0.0, BETA, integrates=False, forced_s=math.inf)
+    sensor = SensorErrors(each, BETA, 0.0, 0.0, BETA, integrates=False, earliest_due_s=math.inf)
     kernel = reach.ellipsoid.flow.error.kernels[Output.WEIGHTED]
     missing = kernel.sups(spacing_s * np.arange(LOSSES))
     without_flow = BETA * (1 + np.append(0.0, np.cumsum(missing)))
