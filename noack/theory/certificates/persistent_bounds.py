@@ -82,7 +82,7 @@ class DisturbedCertificate:
             self.start_error or loop_of(self.resolved).setpoint is not None
         ):
             raise NoCertificateError("after a change or at a set-point the estimation error is not known")
-        conditions = self.trigger.tested(conditions)
+        conditions = self.trigger.conditions_of_tests(conditions)
         structured = self.start_error == 0.0
         # A part that decays as the threshold does, if there is one.
         if decays and self.resolved.coverage.is_decaying:
@@ -152,7 +152,7 @@ class DisturbedCertificate:
         lower bound of the inter-event time, certified without dividing into parts.
         """
         pairs: list[Added] = []
-        for start_bound, persistent_bound in self.trigger.divided(conditions, apart_s):
+        for start_bound, persistent_bound in self.trigger.divide(conditions, apart_s):
             with contextlib.suppress(NoCertificateError, NotDecayingError):
                 pairs.append((yield from self._divided(start_bound, persistent_bound, conditions)))
         return sorted(pairs, key=lambda pair: 0.0 if pair.persistent is None else pair.persistent.state)

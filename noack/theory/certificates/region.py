@@ -109,7 +109,7 @@ class _Box(CertificateScope):
             return [self._checked(Phases(main, persistent=added)) for main, added in pairs]
         trigger = self._trigger
         level = 0.0 if trigger.is_homogeneous else max(trigger.beta, trigger.floor)
-        tested, least_level = trigger.tested(conditions), trigger.floor or None
+        tested, least_level = trigger.conditions_of_tests(conditions), trigger.floor or None
         constants = yield from self._solve(tested, 0.0, level, least_level, longest=False)
         return [self._checked(Phases(constants))]
 

@@ -286,7 +286,7 @@ class CertificateScope:
             return
         if self._start_error or self._start.shape[1] != 1 or self._resolved.observer is not None:
             return
-        tested = trigger.tested(conditions)
+        tested = trigger.conditions_of_tests(conditions)
         for share in shares if self.decay_per_s["A + BK"] > 0 else ():
             rate = share * self.decay_per_s["A + BK"]
             plant = self._plant_at(error_gains(loop, rate), self._start, rate)
@@ -300,7 +300,7 @@ class CertificateScope:
     def _phases(self, conditions: NetworkConditions, *, longest: bool) -> Search[Phases]:
         """Search for the constants, and those after the threshold has reached its floor, if any."""
         trigger, floor = self._trigger, None
-        conditions = trigger.tested(conditions)
+        conditions = trigger.conditions_of_tests(conditions)
         main = yield from self._first_phase(conditions, longest=longest)
         if 0 < trigger.floor < trigger.beta and main.rate_per_s == trigger.alpha_per_s:
             floor = _at_floor(main, trigger.floor / trigger.beta)
