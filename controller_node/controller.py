@@ -1,8 +1,7 @@
 """The controller: runs the model x_c, which only a delivered update resets (eq:ModCont).
 
 This file turns a scenario into the core's controller. native/loop/controller.c has its steps, and
-explains them. Losses are compared with the network's guarantee from the recorded
-rows.
+explains them. Losses are compared with the network's guarantee from the recorded rows.
 """
 
 from collections.abc import Callable, Sequence

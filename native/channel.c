@@ -67,13 +67,13 @@ static void release(
     kept->datagram.bit = bit;
     if (bit >= 0 && bit < 8 * NOACK_HEAD_BYTES)
         kept->datagram.head[bit / 8] ^= (uint8_t)(1 << (bit % 8));
-    channel->put++;
+    channel->delayed_count++;
     if (!decision->waits && !kept->delayed && !is_behind(channel, direction, release_ns)) {
         leave(channel, kept);
         copy_datagram(&channel->leaving[channel->leaving_count++], &kept->datagram);
         return;
     }
-    int64_t place = channel->free_place, order = departure_order(direction, channel->put);
+    int64_t place = channel->free_place, order = departure_order(direction, channel->delayed_count);
     channel->free_place = kept->next;
     if (decision->waits)
         wait_for_link(

@@ -122,8 +122,8 @@ noack_packet_row packet_row(
     int64_t flow, const uint8_t *data);
 /* Whether a datagram, or its copy, is the first of both that is intact. */
 int is_first_intact(const noack_decision *decision, int copy);
-/* At equal times, datagrams leave in order of direction, then of arrival: put counts them. */
-int64_t departure_order(int64_t direction, int64_t put);
+/* At equal times, datagrams leave in order of direction, then of arrival, which is counted. */
+int64_t departure_order(int64_t direction, int64_t delayed_count);
 
 /* heap.c */
 

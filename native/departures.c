@@ -28,4 +28,6 @@ int is_first_intact(const noack_decision *decision, int copy) {
     return copy ? decision->bit >= 0 && decision->copy_bit < 0 : decision->bit < 0;
 }
 
-int64_t departure_order(int64_t direction, int64_t put) { return (direction << 62) + put; }
+int64_t departure_order(int64_t direction, int64_t delayed_count) {
+    return (direction << 62) + delayed_count;
+}

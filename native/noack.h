@@ -202,8 +202,8 @@ typedef struct { /* a link's state of a flow */
     int64_t newest;             /* greatest number among the packets that have left intact */
     int64_t since;              /* number of the first packet under the present settings */
     int64_t error_level;        /* of the packet that arrives; 0: unknown. The caller sets it */
-    int64_t waits, last_waiting; /* packets that wait until the link is free: how many, and the place
-                                    of the last one */
+    int64_t waiting_count; /* packets that wait until the link is free */
+    int64_t last_waiting;  /* place of the last one */
     int64_t longest_loss_burst; /* since then; counts final losses only */
 } noack_flow;
 
@@ -216,11 +216,12 @@ typedef struct { /* a stage's state that all flows share; departure times lie in
     int64_t drops;                        /* count_ of the RFC */
     int64_t last_drops, dropping;
     int64_t dropped_before;    /* 1: the law dropped the previous packet; drop_next_ns is not new */
-    int64_t used, left_bytes;  /* opportunities: which of those at busy_until_ns, from 1; its rest */
+    int64_t used;       /* opportunities: number of the one in use among those at busy_until_ns, from 1 */
+    int64_t left_bytes; /* bytes that it can still carry */
     int64_t total_bytes;       /* all bytes that were put into the queue */
     int64_t state, step;       /* Gilbert-Elliott, common to all flows: state, and number of its step */
-    int64_t waiting, waits;    /* packets that wait until the link is free: the place + 1 of the first
-                                  one, 0: none; how many */
+    int64_t first_waiting; /* of the packets that wait until the link is free, the place + 1; 0: none */
+    int64_t waiting_count;
 } noack_queue;
 
 typedef struct {
@@ -488,8 +489,8 @@ typedef struct { /* plant_server/plant.py makes it */
     int64_t carries_model;  /* 1: an actuation has x_c, too */
     int64_t input_period_ns; /* of the controller */
     int64_t watchdog, timeout_ns, notice_ns;
-    double *K;            /* (m, n), for NOACK_PREDICT, as is: */
-    noack_model fallback; /* dx/dt = H x */
+    double *K;            /* (m, n); used by NOACK_PREDICT only */
+    noack_model fallback; /* dx/dt = H x; used by NOACK_PREDICT only */
     /* state */
     int64_t measurements;
     double *x, *z;    /* (n,), (internal,) */
@@ -987,7 +988,7 @@ typedef struct { /* times are simulated and count from the relay's start, unless
     noack_packet_row *packets;
     noack_release_row *releases;
     int64_t heap_length, event_length, data_length, packet_rows, release_rows;
-    int64_t put; /* datagrams that have been delayed so far */
+    int64_t delayed_count; /* datagrams that have been delayed so far */
     int64_t free_slot, free_slots, free_block, free_blocks;
     void *scratch; /* noack_relay_scratch_bytes() bytes, which are 0 at first */
 } noack_relay;
@@ -1113,7 +1114,7 @@ typedef struct { /* both directions of the network of a run; each flow has the r
     noack_recorded outcome;
     noack_datagram asked;
     int64_t asked_ns;
-    int64_t put; /* datagrams that have been delayed so far */
+    int64_t delayed_count; /* datagrams that have been delayed so far */
     int64_t heap_count, places, free_place; /* free_place: -1: none */
     noack_heap_entry *heap; /* (places,) */
     noack_delayed *delayed; /* (places,) */

@@ -56,7 +56,7 @@ static void lower_key(noack_queue *queue, noack_waiting *waiting, int64_t place,
         return;
     noack_waiting *parent = &waiting[waiter->parent - 1];
     *(parent->left == place + 1 ? &parent->left : &parent->right) = 0;
-    queue->waiting = merge(waiting, queue->waiting, place + 1);
+    queue->first_waiting = merge(waiting, queue->first_waiting, place + 1);
 }
 
 int64_t flow_table_entry(const packet *packet, const noack_stage *stage) {
@@ -71,7 +71,7 @@ void enter_queue(packet *packet, int64_t key, int is_time) {
     if (decision->fate != NOACK_DELIVERED)
         return;
     noack_queue_enters(link, packet->stage, decision->arrival_ns);
-    if (queue->count + queue->waits >= link->stages[packet->stage].queue_places)
+    if (queue->count + queue->waiting_count >= link->stages[packet->stage].queue_places)
         refuse(decision, NOACK_OVERFLOWED);
     if (decision->fate != NOACK_DELIVERED)
         return;
@@ -105,14 +105,14 @@ void wait_for_link(
         .earliest_ns = decision->release_ns,
         .before = earlier,
     };
-    queue->waiting = merge(waiting, queue->waiting, place + 1);
-    queue->waits++;
-    for (int64_t left = flow->waits; left > 0 && waiting[earlier].key > key; left--) {
+    queue->first_waiting = merge(waiting, queue->first_waiting, place + 1);
+    queue->waiting_count++;
+    for (int64_t left = flow->waiting_count; left > 0 && waiting[earlier].key > key; left--) {
         lower_key(queue, waiting, earlier, key);
         earlier = waiting[earlier].before;
     }
     flow->last_waiting = place;
-    flow->waits++;
+    flow->waiting_count++;
 }
 
 void serve(
@@ -121,14 +121,14 @@ void serve(
     if (link->scheduler < 0)
         return;
     noack_queue *queue = &link->queues[link->scheduler];
-    while (queue->waiting != 0
-           && (queue->busy_until_ns <= now_ns || link->in_flight == queue->waits)) {
-        int64_t place = queue->waiting - 1;
+    while (queue->first_waiting != 0
+           && (queue->busy_until_ns <= now_ns || link->in_flight == queue->waiting_count)) {
+        int64_t place = queue->first_waiting - 1;
         const noack_waiting *next = &waiting[place];
         noack_flow *flow = &link->flows[next->row];
-        queue->waiting = merge(waiting, next->left, next->right);
-        queue->waits--;
-        flow->waits--;
+        queue->first_waiting = merge(waiting, next->left, next->right);
+        queue->waiting_count--;
+        flow->waiting_count--;
         int64_t end_ns = noack_queue_serve(link, link->scheduler, next->size_bytes);
         int64_t leaves_ns = max_of(end_ns + next->after_ns, next->earliest_ns);
         flow->first_release_ns = max_of(flow->first_release_ns, leaves_ns);

@@ -28,7 +28,7 @@ from noack.theory.certificates.conditions import (
 )
 from noack.theory.certificates.network_limits import NetworkLimits, network_limits
 from noack.theory.certificates.region import RegionScope
-from noack.theory.certificates.scenario_certificates import box, own_plant
+from noack.theory.certificates.scenario_certificates import box_scope, own_plant_scope
 from noack.theory.certificates.trigger_weight import choose_weight
 from noack.theory.margins.loss_margin import LossMargin, Stability
 from noack.theory.paper import Theorem2, theorem_2
@@ -103,7 +103,7 @@ class Certificates:
         self.scenario, self.weight, self.late_periods = scenario, weight, late_periods
         self._scheduled = nominal_conditions(scenario, late_periods)
         conditions = {IDEAL: ideal_conditions(scenario), SCHEDULE: self._scheduled}
-        scopes = (own_plant(scenario), None if BOX in void else box(scenario))
+        scopes = (own_plant_scope(scenario), None if BOX in void else box_scope(scenario))
         self._scopes = [scope for scope in scopes if scope is not None]
         if nonlinear is not None:
             self.nonlinear = f'plant.system.kind = "{nonlinear.plant.system.kind}"'

@@ -20,7 +20,7 @@ from noack.theory.certificates.conditions import (
     nominal_conditions,
     void_at_setpoint,
 )
-from noack.theory.certificates.scenario_certificates import own_plant
+from noack.theory.certificates.scenario_certificates import own_plant_scope
 
 CERTIFIED, VOID, NOT_COVERED = "certified", "no certificate", "not covered"
 _POINTS = 121
@@ -97,7 +97,7 @@ def _certificate(resolved: Scenario) -> ScenarioCertificate:
         raise CallerError(f"controller.setpoint: {void}")
     shifted = about_setpoint(resolved)
     late = resolved.certificate.late_periods
-    return own_plant(shifted).certificate(nominal_conditions(shifted, late))
+    return own_plant_scope(shifted).certificate(nominal_conditions(shifted, late))
 
 
 def _reason(certificate: ScenarioCertificate) -> str:

@@ -49,15 +49,15 @@ const char *noack_driver_check(const noack_driver *driver) {
 
 /* Write the datagram of the message that a machine sends, if it sends one. There must be room. */
 static void put_output(noack_driver *driver) {
-    driver_scratch *own = scratch_of(driver);
+    driver_scratch *scratch = scratch_of(driver);
     const noack_output *output = &driver->process->output;
-    own->pauses.worked = 1;
+    scratch->pauses.worked = 1;
     if (!output->sends)
         return;
-    int64_t place = own->out_count++;
-    own->out_flows[place] = output->message.flow == NOACK_ACKNOWLEDGEMENT;
-    own->out_vectors[place].iov_len =
-        (size_t)noack_wire_encode(&driver->wire, &output->message, own->out_data[place]);
+    int64_t place = scratch->out_count++;
+    scratch->out_flows[place] = output->message.flow == NOACK_ACKNOWLEDGEMENT;
+    scratch->out_vectors[place].iov_len =
+        (size_t)noack_wire_encode(&driver->wire, &output->message, scratch->out_data[place]);
 }
 
 /* Show Python the datagram that it opens or seals. */
@@ -68,13 +68,13 @@ static void point_to(noack_driver *driver, uint8_t *datagram, int64_t size_bytes
 
 /* Whether the next datagram to send must be encrypted. */
 static int must_seal(noack_driver *driver) {
-    driver_scratch *own = scratch_of(driver);
-    own->is_sealing = driver->wire.encrypted && own->sealed_count < own->out_count;
-    if (own->is_sealing) {
-        int64_t place = own->sealed_count++;
-        point_to(driver, own->out_data[place], (int64_t)own->out_vectors[place].iov_len);
+    driver_scratch *scratch = scratch_of(driver);
+    scratch->is_sealing = driver->wire.encrypted && scratch->sealed_count < scratch->out_count;
+    if (scratch->is_sealing) {
+        int64_t place = scratch->sealed_count++;
+        point_to(driver, scratch->out_data[place], (int64_t)scratch->out_vectors[place].iov_len);
     }
-    return own->is_sealing != 0;
+    return scratch->is_sealing != 0;
 }
 
 /* Ask Python for what a step needs. */
@@ -86,8 +86,8 @@ static int64_t ask(noack_driver *driver, int64_t question) {
 
 /* Examine the current datagram; return NOACK_DRIVER_OPEN if it must be opened. */
 static int64_t examine(noack_driver *driver) {
-    driver_scratch *own = scratch_of(driver);
-    const arrival *current = &own->arrivals[own->in_next];
+    driver_scratch *scratch = scratch_of(driver);
+    const arrival *current = &scratch->arrivals[scratch->in_next];
     uint8_t *datagram = current->data;
     int64_t size_bytes = current->size_bytes;
     int64_t loop = noack_wire_loop(datagram, size_bytes);
@@ -97,42 +97,43 @@ static int64_t examine(noack_driver *driver) {
         loop = 0;
     noack_machine *machine = noack_process_machine(driver->process, max_of(loop, 0));
     noack_reception *reception = is_answer ? &machine->acknowledgements : &machine->received;
-    own->now_ns = run_time_ns(&driver->clock);
+    scratch->now_ns = run_time_ns(&driver->clock);
     int64_t examination = NOACK_BAD_TAG;
     if (driver->opened != NOACK_NOT_AUTHENTIC)
         examination = noack_wire_examine(
             &driver->wire, reception, max_of(loop, 0), datagram, size_bytes,
-            is_peer(current->name, &driver->sources[is_answer]), driver->opened, &own->message);
+            is_peer(current->name, &driver->sources[is_answer]), driver->opened, &scratch->message);
     if (examination == NOACK_ENCRYPTED)
         return NOACK_DRIVER_OPEN;
     driver->opened = NOACK_NOT_OPENED;
-    noack_wire_count(reception, examination, &own->message);
-    own->is_accepted = examination == NOACK_ACCEPTED;
+    noack_wire_count(reception, examination, &scratch->message);
+    scratch->is_accepted = examination == NOACK_ACCEPTED;
     return NOACK_DRIVER_NOTHING;
 }
 
 /* Whether to look at the time and the sockets after a step: Python's answer may have taken long. */
 static int has_asked(noack_driver *driver) {
-    driver_scratch *own = scratch_of(driver);
-    int asked = own->has_asked != 0;
-    own->has_asked = 0;
+    driver_scratch *scratch = scratch_of(driver);
+    int asked = scratch->has_asked != 0;
+    scratch->has_asked = 0;
     return asked;
 }
 
 /* Handle the datagrams received, up to one that Python was asked about. */
 static int64_t handle_messages(noack_driver *driver) {
-    driver_scratch *own = scratch_of(driver);
-    while (own->in_next < own->in_end && own->out_count < BUFFERS) {
-        if (!own->is_accepted && examine(driver) == NOACK_DRIVER_OPEN)
+    driver_scratch *scratch = scratch_of(driver);
+    while (scratch->in_next < scratch->in_end && scratch->out_count < BUFFERS) {
+        if (!scratch->is_accepted && examine(driver) == NOACK_DRIVER_OPEN)
             return NOACK_DRIVER_OPEN;
-        if (own->is_accepted) {
-            int64_t question = noack_process_handle(driver->process, &own->message, own->now_ns);
+        if (scratch->is_accepted) {
+            int64_t question =
+                noack_process_handle(driver->process, &scratch->message, scratch->now_ns);
             if (question != NOACK_DONE)
                 return ask(driver, question);
             put_output(driver);
         }
-        own->is_accepted = 0;
-        own->in_next++;
+        scratch->is_accepted = 0;
+        scratch->in_next++;
         if (has_asked(driver))
             break;
     }
@@ -141,21 +142,21 @@ static int64_t handle_messages(noack_driver *driver) {
 
 /* Do ticks that are due, up to one that Python was asked about. */
 static int64_t do_ticks(noack_driver *driver) {
-    driver_scratch *own = scratch_of(driver);
-    for (int count = 0; count < TICKS && own->out_count < BUFFERS; count++) {
-        if (!own->is_ticking) {
+    driver_scratch *scratch = scratch_of(driver);
+    for (int count = 0; count < TICKS && scratch->out_count < BUFFERS; count++) {
+        if (!scratch->is_ticking) {
             int64_t due_ns = noack_process_due_ns(driver->process);
             if (due_ns == INT64_MAX)
                 break;
-            own->now_ns = run_time_ns(&driver->clock);
-            if (own->now_ns < due_ns)
+            scratch->now_ns = run_time_ns(&driver->clock);
+            if (scratch->now_ns < due_ns)
                 break;
-            own->is_ticking = 1;
+            scratch->is_ticking = 1;
         }
-        int64_t question = noack_process_tick(driver->process, own->now_ns);
+        int64_t question = noack_process_tick(driver->process, scratch->now_ns);
         if (question != NOACK_DONE)
             return ask(driver, question);
-        own->is_ticking = 0;
+        scratch->is_ticking = 0;
         put_output(driver);
         if (has_asked(driver))
             break;
@@ -181,22 +182,23 @@ static int64_t next_tick_ns(const noack_driver *driver, int64_t now_ns) {
    It is not cancelled if a datagram comes first, as the timeout of ppoll would be: cancelling the
    next timer of a core takes microseconds in a virtual machine. */
 static void set_timer(noack_driver *driver, int64_t wall_ns, int64_t at_ns) {
-    driver_scratch *own = scratch_of(driver);
-    if (wall_ns < own->timer_ns && own->timer_ns <= at_ns && at_ns - own->timer_ns < EARLY_NS)
+    driver_scratch *scratch = scratch_of(driver);
+    if (wall_ns < scratch->timer_ns && scratch->timer_ns <= at_ns
+        && at_ns - scratch->timer_ns < EARLY_NS)
         return;
     struct itimerspec at = {.it_value = {at_ns / NS_PER_S, at_ns % NS_PER_S}};
     timerfd_settime((int)driver->timer, TFD_TIMER_ABSTIME, &at, NULL);
-    own->timer_ns = at_ns;
+    scratch->timer_ns = at_ns;
 }
 
 /* Sleep until a socket has datagrams, a tick is near, or for wait_ns from wall_ns on. Return the
    sockets to read as bits, or -1 if a signal interrupted it. */
 static int64_t sleep_until_needed(
     noack_driver *driver, int64_t wall_ns, int64_t tick_ns, int64_t wait_ns) {
-    driver_scratch *own = scratch_of(driver);
-    int coalesces =
-        own->pauses.worked && !own->has_more && 0 < tick_ns && tick_ns < driver->coalescing_ns;
-    own->pauses.worked = 0;
+    driver_scratch *scratch = scratch_of(driver);
+    int coalesces = scratch->pauses.worked && !scratch->has_more && 0 < tick_ns
+                    && tick_ns < driver->coalescing_ns;
+    scratch->pauses.worked = 0;
     if (coalesces) {
         struct timespec pause = {0, driver->coalescing_ns};
         return clock_nanosleep(CLOCK_MONOTONIC, 0, &pause, NULL) == EINTR
@@ -240,22 +242,23 @@ static int has_many_rows(const noack_process *process) {
 }
 
 int64_t noack_drive(noack_driver *driver, int64_t until_ns) {
-    driver_scratch *own = scratch_of(driver);
+    driver_scratch *scratch = scratch_of(driver);
     for (;;) {
-        if (!own->is_sealing)
-            own->reason = do_steps(driver);
+        if (!scratch->is_sealing)
+            scratch->reason = do_steps(driver);
         if (must_seal(driver))
             return NOACK_DRIVER_SEAL;
-        if (own->out_count > 0)
+        if (scratch->out_count > 0)
             send_datagrams(driver);
-        if (own->reason == NOACK_DRIVER_OPEN)
+        if (scratch->reason == NOACK_DRIVER_OPEN)
             point_to(
-                driver, own->arrivals[own->in_next].data, own->arrivals[own->in_next].size_bytes);
-        if (own->reason != NOACK_DRIVER_NOTHING)
-            return own->reason;
-        if (own->in_next == own->in_end && own->message_next < own->message_end)
+                driver, scratch->arrivals[scratch->in_next].data,
+                scratch->arrivals[scratch->in_next].size_bytes);
+        if (scratch->reason != NOACK_DRIVER_NOTHING)
+            return scratch->reason;
+        if (scratch->in_next == scratch->in_end && scratch->message_next < scratch->message_end)
             take_datagrams(driver);
-        if (until_ns == INT64_MIN && own->in_next == own->in_end)
+        if (until_ns == INT64_MIN && scratch->in_next == scratch->in_end)
             return NOACK_DRIVEN;
         if (has_many_rows(driver->process))
             return NOACK_DRIVER_ROWS;
@@ -265,7 +268,7 @@ int64_t noack_drive(noack_driver *driver, int64_t until_ns) {
         int64_t wait_ns = wait_for_ns(driver, until_ns, now_ns, tick_ns);
         if (wait_ns == 0)
             return NOACK_DRIVEN;
-        if (own->in_next < own->in_end)
+        if (scratch->in_next < scratch->in_end)
             continue;
         int64_t ready = sleep_until_needed(driver, wall_ns, tick_ns, wait_ns);
         if (ready < 0)

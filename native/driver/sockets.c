@@ -9,10 +9,10 @@
 #include <sys/timerfd.h>
 #include <unistd.h>
 
-static void renew_header(driver_scratch *own, int64_t k) {
-    own->in_headers[k].msg_hdr.msg_namelen = NOACK_NAME_BYTES;
-    own->in_headers[k].msg_hdr.msg_control = &own->in_controls[k];
-    own->in_headers[k].msg_hdr.msg_controllen = sizeof own->in_controls[k];
+static void renew_header(driver_scratch *scratch, int64_t k) {
+    scratch->in_headers[k].msg_hdr.msg_namelen = NOACK_NAME_BYTES;
+    scratch->in_headers[k].msg_hdr.msg_control = &scratch->in_controls[k];
+    scratch->in_headers[k].msg_hdr.msg_controllen = sizeof scratch->in_controls[k];
 }
 
 /* Let epoll report a file that can be read by a bit; return 0 or errno. */
@@ -22,20 +22,20 @@ static int64_t watch(const noack_driver *driver, int64_t fd, uint64_t bit) {
 }
 
 int64_t noack_driver_open(noack_driver *driver) {
-    driver_scratch *own = scratch_of(driver);
+    driver_scratch *scratch = scratch_of(driver);
     for (int k = 0; k < BUFFERS; k++) {
-        own->out_vectors[k] = (struct iovec){own->out_data[k], 0};
-        own->out_headers[k].msg_hdr =
-            (struct msghdr){.msg_iov = &own->out_vectors[k], .msg_iovlen = 1};
+        scratch->out_vectors[k] = (struct iovec){scratch->out_data[k], 0};
+        scratch->out_headers[k].msg_hdr =
+            (struct msghdr){.msg_iov = &scratch->out_vectors[k], .msg_iovlen = 1};
     }
     for (int k = 0; k < MESSAGES; k++) {
-        own->in_vectors[k] = (struct iovec){own->in_data[k], MESSAGE_BYTES};
-        own->in_headers[k].msg_hdr = (struct msghdr){
-            .msg_name = own->in_names[k], .msg_iov = &own->in_vectors[k], .msg_iovlen = 1};
-        renew_header(own, k);
+        scratch->in_vectors[k] = (struct iovec){scratch->in_data[k], MESSAGE_BYTES};
+        scratch->in_headers[k].msg_hdr = (struct msghdr){
+            .msg_name = scratch->in_names[k], .msg_iov = &scratch->in_vectors[k], .msg_iovlen = 1};
+        renew_header(scratch, k);
     }
     /* A call that has received as many as it may does not look for another one. */
-    own->batch = min_of(driver->process->loops, MESSAGES - 1);
+    scratch->batch = min_of(driver->process->loops, MESSAGES - 1);
     driver->senders[0] = driver->senders[1] = -1;
     driver->timer = timerfd_create(CLOCK_MONOTONIC, TFD_CLOEXEC);
     driver->epoll = epoll_create1(EPOLL_CLOEXEC);
@@ -73,20 +73,21 @@ int is_peer(const uint8_t name[NOACK_NAME_BYTES], const noack_peer *peer) {
 void noack_driver_add_datagram(
     noack_driver *driver, const uint8_t name[NOACK_NAME_BYTES], const uint8_t *data,
     int64_t size_bytes) {
-    driver_scratch *own = scratch_of(driver);
-    uint8_t *place = own->in_data[MESSAGES - 1];
+    driver_scratch *scratch = scratch_of(driver);
+    uint8_t *place = scratch->in_data[MESSAGES - 1];
     size_bytes = min_of(size_bytes, BUFFER_BYTES);
     memcpy(place, data, (size_t)size_bytes);
-    memcpy(own->in_names[MESSAGES - 1], name, NOACK_NAME_BYTES);
-    if (own->in_next == own->in_end)
-        own->in_next = own->in_end = 0;
-    own->arrivals[own->in_end++] = (arrival){place, size_bytes, own->in_names[MESSAGES - 1]};
+    memcpy(scratch->in_names[MESSAGES - 1], name, NOACK_NAME_BYTES);
+    if (scratch->in_next == scratch->in_end)
+        scratch->in_next = scratch->in_end = 0;
+    scratch->arrivals[scratch->in_end++] =
+        (arrival){place, size_bytes, scratch->in_names[MESSAGES - 1]};
 }
 
 /* Send datagrams of one size as one message, which goes through the kernel once. Return their
    number, or -1 if that fails: the network's interface may refuse such messages. */
-static int send_segmented(driver_scratch *own, int fd, int64_t place, int64_t count) {
-    uint16_t size = (uint16_t)own->out_vectors[place].iov_len;
+static int send_segmented(driver_scratch *scratch, int fd, int64_t place, int64_t count) {
+    uint16_t size = (uint16_t)scratch->out_vectors[place].iov_len;
     control size_control = {
         .head = {
             .cmsg_level = IPPROTO_UDP,
@@ -94,41 +95,42 @@ static int send_segmented(driver_scratch *own, int fd, int64_t place, int64_t co
             .cmsg_len = CMSG_LEN(sizeof size)}};
     memcpy(CMSG_DATA(&size_control.head), &size, sizeof size);
     struct msghdr message = {
-        .msg_iov = &own->out_vectors[place],
+        .msg_iov = &scratch->out_vectors[place],
         .msg_iovlen = (size_t)count,
         .msg_control = &size_control,
         .msg_controllen = CMSG_SPACE(sizeof size)};
     if (sendmsg(fd, &message, MSG_DONTWAIT) >= 0)
         return (int)count;
-    own->is_unsegmented = errno == EINVAL || errno == EIO || errno == EMSGSIZE;
+    scratch->is_unsegmented = errno == EINVAL || errno == EIO || errno == EMSGSIZE;
     return -1;
 }
 
 /* Send datagrams of one socket, from a place on; return the number of those that were sent, or -1.
  */
-static int call_send(driver_scratch *own, int fd, int64_t place, int64_t count) {
-    const struct iovec *vectors = &own->out_vectors[place];
+static int call_send(driver_scratch *scratch, int fd, int64_t place, int64_t count) {
+    const struct iovec *vectors = &scratch->out_vectors[place];
     int64_t equal = 1;
     while (equal < count && vectors[equal].iov_len == vectors[0].iov_len)
         equal++;
-    if (equal > 1 && !own->is_unsegmented) {
-        int sent = send_segmented(own, fd, place, equal);
-        if (sent > 0 || !own->is_unsegmented)
+    if (equal > 1 && !scratch->is_unsegmented) {
+        int sent = send_segmented(scratch, fd, place, equal);
+        if (sent > 0 || !scratch->is_unsegmented)
             return sent;
     }
     if (count > 1)
-        return sendmmsg(fd, &own->out_headers[place], (unsigned)count, MSG_DONTWAIT);
-    const struct iovec *vector = &own->out_vectors[place];
+        return sendmmsg(fd, &scratch->out_headers[place], (unsigned)count, MSG_DONTWAIT);
+    const struct iovec *vector = &scratch->out_vectors[place];
     return send(fd, vector->iov_base, vector->iov_len, MSG_DONTWAIT) < 0 ? -1 : 1;
 }
 
 void send_datagrams(noack_driver *driver) {
-    driver_scratch *own = scratch_of(driver);
+    driver_scratch *scratch = scratch_of(driver);
     int has_failed = 0;
-    for (int64_t k = 0, end; k < own->out_count;) {
-        for (end = k + 1; end < own->out_count && own->out_flows[end] == own->out_flows[k];)
+    for (int64_t k = 0, end; k < scratch->out_count;) {
+        for (end = k + 1;
+             end < scratch->out_count && scratch->out_flows[end] == scratch->out_flows[k];)
             end++;
-        int sent = call_send(own, (int)driver->senders[own->out_flows[k]], k, end - k);
+        int sent = call_send(scratch, (int)driver->senders[scratch->out_flows[k]], k, end - k);
         if (sent > 0) {
             driver->sent += sent;
             k += sent;
@@ -138,20 +140,20 @@ void send_datagrams(noack_driver *driver) {
             k++;
         }
     }
-    own->out_count = own->sealed_count = 0;
+    scratch->out_count = scratch->sealed_count = 0;
 }
 
 /* Receive at most a number of messages from a place on; return their number. After an ICMP error of
    a datagram, it fails once. Of several loops, a message may have several datagrams. */
-static int64_t call_receive(driver_scratch *own, int fd, int64_t place, int64_t most) {
-    if (own->batch > 1)
-        return recvmmsg(fd, &own->in_headers[place], (unsigned)most, MSG_DONTWAIT, NULL);
+static int64_t call_receive(driver_scratch *scratch, int fd, int64_t place, int64_t most) {
+    if (scratch->batch > 1)
+        return recvmmsg(fd, &scratch->in_headers[place], (unsigned)most, MSG_DONTWAIT, NULL);
     socklen_t name_bytes = NOACK_NAME_BYTES;
     ssize_t size_bytes = recvfrom(
-        fd, own->in_data[place], BUFFER_BYTES, MSG_DONTWAIT,
-        (struct sockaddr *)own->in_names[place], &name_bytes);
-    own->in_headers[place].msg_len = (unsigned)max_of(size_bytes, 0);
-    own->in_headers[place].msg_hdr.msg_controllen = 0;
+        fd, scratch->in_data[place], BUFFER_BYTES, MSG_DONTWAIT,
+        (struct sockaddr *)scratch->in_names[place], &name_bytes);
+    scratch->in_headers[place].msg_len = (unsigned)max_of(size_bytes, 0);
+    scratch->in_headers[place].msg_hdr.msg_controllen = 0;
     return size_bytes < 0 ? -1 : 1;
 }
 
@@ -168,17 +170,17 @@ static int64_t segment_bytes(const struct mmsghdr *message) {
 }
 
 void take_datagrams(noack_driver *driver) {
-    driver_scratch *own = scratch_of(driver);
-    own->in_next = own->in_end = 0;
+    driver_scratch *scratch = scratch_of(driver);
+    scratch->in_next = scratch->in_end = 0;
     /* One place is left for a datagram that Python adds. */
-    while (own->message_next < own->message_end && own->in_end < BUFFERS - 1) {
-        int64_t number = own->message_next, all_bytes = own->in_headers[number].msg_len;
+    while (scratch->message_next < scratch->message_end && scratch->in_end < BUFFERS - 1) {
+        int64_t number = scratch->message_next, all_bytes = scratch->in_headers[number].msg_len;
         int64_t size_bytes =
-            min_of(segment_bytes(&own->in_headers[number]), all_bytes - own->taken_bytes);
-        const uint8_t *name = own->in_names[number];
-        own->arrivals[own->in_end++] =
-            (arrival){own->in_data[number] + own->taken_bytes, size_bytes, name};
-        own->taken_bytes += size_bytes;
+            min_of(segment_bytes(&scratch->in_headers[number]), all_bytes - scratch->taken_bytes);
+        const uint8_t *name = scratch->in_names[number];
+        scratch->arrivals[scratch->in_end++] =
+            (arrival){scratch->in_data[number] + scratch->taken_bytes, size_bytes, name};
+        scratch->taken_bytes += size_bytes;
         int64_t source = 0;
         while (source < 2 && !is_peer(name, &driver->sources[source]))
             source++;
@@ -186,26 +188,27 @@ void take_datagrams(noack_driver *driver) {
             driver->sources[source].received++;
         else
             driver->foreign++;
-        if (own->taken_bytes == all_bytes) {
-            renew_header(own, number);
-            own->taken_bytes = 0;
-            own->message_next++;
+        if (scratch->taken_bytes == all_bytes) {
+            renew_header(scratch, number);
+            scratch->taken_bytes = 0;
+            scratch->message_next++;
         }
     }
 }
 
 void receive_datagrams(noack_driver *driver, int64_t ready) {
-    driver_scratch *own = scratch_of(driver);
-    own->message_next = own->message_end = own->taken_bytes = own->has_more = 0;
+    driver_scratch *scratch = scratch_of(driver);
+    scratch->message_next = scratch->message_end = scratch->taken_bytes = scratch->has_more = 0;
     for (int64_t turn = 0; turn < driver->receiver_count; turn++) {
-        int64_t k = (own->first + turn) % driver->receiver_count;
-        int64_t most = min_of(own->batch, MESSAGES - 1 - own->message_end);
+        int64_t k = (scratch->first + turn) % driver->receiver_count;
+        int64_t most = min_of(scratch->batch, MESSAGES - 1 - scratch->message_end);
         if (!(ready >> k & 1) || most == 0)
             continue;
-        int64_t taken = call_receive(own, (int)driver->receivers[k], own->message_end, most);
-        own->message_end += max_of(taken, 0);
-        own->has_more |= taken == most;
+        int64_t taken =
+            call_receive(scratch, (int)driver->receivers[k], scratch->message_end, most);
+        scratch->message_end += max_of(taken, 0);
+        scratch->has_more |= taken == most;
     }
-    own->first ^= 1;
+    scratch->first ^= 1;
     take_datagrams(driver);
 }

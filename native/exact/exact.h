@@ -76,8 +76,8 @@ typedef struct { /* a run, or a part of one */
     int64_t stops;    /* 1: at its first event */
     double t_s;       /* start, then end */
     double *state;    /* (3, n) x, e_s, e_c at the start, then at the end */
-    double auxiliary; /* likewise */
-    int64_t event;    /* likewise: 1: an event at t_s */
+    double auxiliary; /* at the start, then at the end */
+    int64_t event;    /* 1: an event at t_s, at the start, then at the end */
     int64_t losses;   /* consecutive ones so far */
     double at_s;      /* time at which the supremum is attained */
     double growth;    /* e^(rt) of the supremum, at the start of a piece */

@@ -156,8 +156,8 @@ static double raise_supremum(
             return best;
         if (s == UNRESOLVED)
             return UNRESOLVED;
-        double found = climb(curve, p, s, end_s, rate, at_s);
-        best = largest_of(best * (1.0 + CERTAINTY), found * growth);
+        double peak = climb(curve, p, s, end_s, rate, at_s);
+        best = largest_of(best * (1.0 + CERTAINTY), peak * growth);
     }
     return UNRESOLVED;
 }
@@ -175,7 +175,7 @@ static double last_above(const double *curve, int p, double end_s, double level,
 }
 
 /* Whether |(x, e_s, e_c)| is below limit, and below limit times level if that is > 0. */
-static inline int is_within(models state, double limit, double level) {
+static inline int is_within(loop_state state, double limit, double level) {
     lanes x = plant_of(state), e_s = sensor_error(state), e_c = controller_error(state);
     if (level > 0.0)
         limit *= least(level, 1.0);

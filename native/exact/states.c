@@ -28,7 +28,7 @@ static inline double size_of(lanes v) { return sqrt(dot(v, v)); }
 /* Write the coefficients of degree begin to end; those of quadratic forms times a factor. The last
    three arguments are constants, each combination of which has code. */
 static inline __attribute__((always_inline)) void expand_with(
-    exact_memory *memory, models state, double factor, int begin, int end, int moves, int has_d,
+    exact_memory *memory, loop_state state, double factor, int begin, int end, int moves, int has_d,
     int has_q) {
     const double *H_k = memory->H_k, *A_k = memory->A_k, *X_k = memory->X_k, *D_k = memory->D_k;
     const double *KH_k = memory->KH_k, *weight = memory->weight;
@@ -69,7 +69,8 @@ static inline __attribute__((always_inline)) void expand_with(
     }
 }
 
-static void expand(exact_memory *memory, const models *state, double factor, int begin, int end) {
+static void expand(
+    exact_memory *memory, const loop_state *state, double factor, int begin, int end) {
     int own = memory->weight != NULL || memory->has_q;
     memory->weighted = own ? memory->own_weighted : memory->e;
     memory->error = memory->has_d ? memory->own_error : memory->weighted;
@@ -89,18 +90,18 @@ static void expand(exact_memory *memory, const models *state, double factor, int
 
 /* The same state with the plant's own as the reference, if that is small beside the present one:
    their difference would lose its digits. */
-static models renew_reference(exact_memory *memory, models state) {
+static loop_state renew_reference(exact_memory *memory, loop_state state) {
     const double small = 1e-8; /* of a square */
     lanes x = plant_of(state);
     if (dot(x, x) < small * dot(state.r, state.r)) {
-        state = (models){x, filled(0.0), sensor_error(state), subtract(state.q, state.e)};
+        state = (loop_state){x, filled(0.0), sensor_error(state), subtract(state.q, state.e)};
         memory->has_q = 1;
     }
     return state;
 }
 
 /* The rule's span after an event or after the start. */
-static rule_span next_span(const exact_memory *memory, models state, double t_s) {
+static rule_span next_span(const exact_memory *memory, loop_state state, double t_s) {
     lanes x = plant_of(state);
     double left = memory->quadratic ? left_side(memory, x) : 0.0;
     double size = memory->rule->forecasts ? size_of(weigh(memory->forecast_weight, x)) : 0.0;
@@ -109,7 +110,7 @@ static rule_span next_span(const exact_memory *memory, models state, double t_s)
 
 /* The comparison of a phase, scaled to the state. */
 static comparison comparison_at(
-    const exact_memory *memory, rule_phase phase, models state, double auxiliary) {
+    const exact_memory *memory, rule_phase phase, loop_state state, double auxiliary) {
     if (!memory->quadratic)
         return (comparison){phase, 1.0, 0.0, auxiliary};
     double size = sqrt(dot(state.r, state.r) + dot(state.e, state.e) + dot(state.d, state.d));
@@ -165,7 +166,7 @@ static double growth_at(const noack_exact *exact, double t_s) {
 /* Raise a row's supremum by that of a piece; return 0 if it is UNRESOLVED. bound: the norm does not
    exceed its threshold; NULL: it may. */
 static int measure_supremum(
-    exact_memory *memory, exact_run *run, models end, int q, double t_s, double length_s,
+    exact_memory *memory, exact_run *run, loop_state end, int q, double t_s, double length_s,
     const rule_phase *bound) {
     const noack_exact *exact = memory->exact;
     int of_state = exact->measure == NOACK_EXACT_STATE, fades = t_s < exact->fading_until_s;
@@ -191,8 +192,8 @@ static int measure_supremum(
 /* Add a piece's contribution to a row; settled is a level of |x|. Return the last time on the piece
  * at which |x| > settled; NONE; or UNRESOLVED. */
 static double measure_piece(
-    exact_memory *memory, exact_run *run, models end, double t_s, double length_s, double settled,
-    const rule_phase *bound) {
+    exact_memory *memory, exact_run *run, loop_state end, double t_s, double length_s,
+    double settled, const rule_phase *bound) {
     noack_exact_row *row = run->row;
     int64_t measure = memory->exact->measure;
     int q = degree_for(memory->measured_s, length_s);
@@ -213,7 +214,7 @@ static double measure_piece(
 
 /* Count an event, log it, and return whether its update arrives. */
 static int count_event(
-    const exact_memory *memory, exact_run *run, models state, double t_s, double last_s) {
+    const exact_memory *memory, exact_run *run, loop_state state, double t_s, double last_s) {
     const noack_exact *exact = memory->exact;
     noack_exact_row *row = run->row;
     int delivered = arrives(exact, run);
@@ -238,11 +239,11 @@ static int count_event(
 }
 
 /* The models after an event: x_s = x, and x_c = x if the update arrives. */
-static models updated(models state, int delivered) {
+static loop_state updated(loop_state state, int delivered) {
     lanes nothing = filled(0.0);
     if (delivered)
-        return (models){plant_of(state), nothing, nothing, nothing};
-    return (models){state.r, state.e, subtract(nothing, state.e), state.q};
+        return (loop_state){plant_of(state), nothing, nothing, nothing};
+    return (loop_state){state.r, state.e, subtract(nothing, state.e), state.q};
 }
 
 static void finish_row(
@@ -260,15 +261,15 @@ static void finish_row(
 }
 
 /* A state from x, e_s and e_c: the reference is x_c. */
-static models state_of(const double *signals) {
+static loop_state state_of(const double *signals) {
     lanes x = load(signals), e_s = load(signals + STRIDE), e_c = load(signals + 2 * STRIDE);
-    return (models){add(x, e_c), e_c, subtract(e_s, e_c), filled(0.0)};
+    return (loop_state){add(x, e_c), e_c, subtract(e_s, e_c), filled(0.0)};
 }
 
 enum { GOES_ON = -1 }; /* no status yet */
 
 typedef struct { /* how far a run has been followed */
-    models state;
+    loop_state state;
     double t_s, auxiliary;
     double first_s, last_s; /* of its events */
     double settled;         /* level of |x| */
@@ -282,7 +283,7 @@ typedef struct { /* how far a run has been followed */
 } progress;
 
 static progress begin(exact_memory *memory, exact_run *run) {
-    models state = state_of(run->state);
+    loop_state state = state_of(run->state);
     double size = size_of(plant_of(state)), settled = memory->exact->settle * size;
     double farthest_s = memory->reach_s[DEGREES - 1];
     if (memory->dynamic && memory->rule->decay_per_s > 0.0)
@@ -359,7 +360,7 @@ static double auxiliary_at(
 }
 
 /* Whether the state has diverged at a time of a piece; a usual one is not compared exactly. */
-static int has_diverged(const rule_phase *phase, models state, double s) {
+static int has_diverged(const rule_phase *phase, loop_state state, double s) {
     int is_usual = phase->threshold > 1e-10 && phase->rate_per_s * s < 1.0;
     return !(is_usual && is_within(state, 1e30, 1.0))
            && !is_within(state, LARGEST, threshold_after(phase, s));
@@ -418,7 +419,7 @@ static void follow(exact_memory *memory, exact_run *run) {
     }
     if (status == GOES_ON)
         status = NOACK_EXACT_UNDECIDED;
-    models state = now.state;
+    loop_state state = now.state;
     double span_s = now.last_s - now.first_s, size = size_of(plant_of(state));
     finish_row(run->row, status, now.t_s, span_s, now.above, size);
     run->t_s = now.t_s;
@@ -459,7 +460,7 @@ static void sample(
     exact_memory *memory, const double *state, double start_s, int64_t count, const double *t_s,
     double *states) {
     int64_t n = memory->exact->n, pieces = 0, expanded = 0;
-    models at = state_of(state);
+    loop_state at = state_of(state);
     double farthest_s = memory->reach_s[DEGREES - 1];
     memory->has_d = 1;
     memory->has_q = 0;
@@ -479,7 +480,7 @@ static void sample(
         }
         expanded = 1;
         double after_s = t_s[i] - start_s;
-        models there = state_at(memory, HIGHEST, after_s);
+        loop_state there = state_at(memory, HIGHEST, after_s);
         for (int j = 0; j < n; j++) {
             states[j] = after_s <= farthest_s ? entry(plant_of(there), j) : NAN;
             states[n + j] = after_s <= farthest_s ? entry(sensor_error(there), j) : NAN;

@@ -37,11 +37,11 @@ static const double LESS_STRICT[DEGREES] = {/* (1e-12/2^-53)^(1/(p + 1)) */
 
 typedef struct {
     lanes r, e, d, q;
-} models;
+} loop_state;
 
-static inline lanes plant_of(models state) { return subtract(state.r, state.e); }
-static inline lanes sensor_error(models state) { return add(state.e, state.d); }
-static inline lanes controller_error(models state) { return subtract(state.e, state.q); }
+static inline lanes plant_of(loop_state state) { return subtract(state.r, state.e); }
+static inline lanes sensor_error(loop_state state) { return add(state.e, state.d); }
+static inline lanes controller_error(loop_state state) { return subtract(state.e, state.q); }
 
 static inline int degree_of(int i) { return 4 + 4 * i; }
 
@@ -128,8 +128,8 @@ static inline lanes value(const double *curve, int p, double s) {
 }
 
 /* The state at a time on a piece. */
-static inline models state_at(const exact_memory *memory, int p, double s) {
-    models state = {load(memory->r), value(memory->e, p, s), load(memory->d), load(memory->q)};
+static inline loop_state state_at(const exact_memory *memory, int p, double s) {
+    loop_state state = {load(memory->r), value(memory->e, p, s), load(memory->d), load(memory->q)};
     if (memory->is_static)
         return state;
     state.r = value(memory->r, p, s);

@@ -112,7 +112,7 @@ static double *read_reals(int64_t count) {
     return place;
 }
 
-/* They come with the first byte of the stream. */
+/* The sockets come with the first byte of the stream. */
 static void read_sockets(void) {
     _Alignas(struct cmsghdr) uint8_t control[CMSG_SPACE(sizeof sockets)];
     uint8_t head[16];
@@ -221,7 +221,10 @@ static void receive(void) {
             return;
         /* Family, port and host: something may have come before the socket was connected. */
         int from_peer = memcmp(&name, &peer, name.ss_family == AF_INET ? 8 : 24) == 0;
-        *(from_peer ? &counts.received : &counts.foreign) += 1;
+        if (from_peer)
+            counts.received++;
+        else
+            counts.foreign++;
         handle(datagram, bytes, from_peer);
     }
 }
@@ -241,14 +244,15 @@ static void read_frame(void) {
     static struct {
         int64_t from_peer;
         uint8_t datagram[1024];
-    } other;
+    } forwarded;
     int64_t head[2];
     read_exactly(head, sizeof head);
     if (head[0] == NOACK_NODE_CLOCK && head[1] == sizeof settings.clock) {
         read_exactly(&settings.clock, head[1]);
-    } else if (head[0] == NOACK_NODE_DATAGRAM && 8 <= head[1] && head[1] <= (int64_t)sizeof other) {
-        read_exactly(&other, head[1]);
-        handle(other.datagram, head[1] - 8, other.from_peer);
+    } else if (
+        head[0] == NOACK_NODE_DATAGRAM && 8 <= head[1] && head[1] <= (int64_t)sizeof forwarded) {
+        read_exactly(&forwarded, head[1]);
+        handle(forwarded.datagram, head[1] - 8, forwarded.from_peer);
     } else {
         fail("noack has sent an unknown frame");
     }

@@ -86,21 +86,21 @@ void noack_client_remove(noack_relay *relay, int64_t row) {
 
 /* The row of the current datagram's sender; -1: there is none. */
 int64_t find_sender(noack_relay *relay) {
-    relay_scratch *own = scratch_of(relay);
-    int64_t key[5], k = own->batch_next, row = own->hints[k];
-    key_of(relay, own->in_names[k], own->batch_socket, key);
+    relay_scratch *scratch = scratch_of(relay);
+    int64_t key[5], k = scratch->batch_next, row = scratch->hints[k];
+    key_of(relay, scratch->in_names[k], scratch->batch_socket, key);
     if (row < 0 || !is_same(relay->clients[row].key, key))
-        row = noack_client_find(relay, own->in_names[k], own->batch_socket);
+        row = noack_client_find(relay, scratch->in_names[k], scratch->batch_socket);
     if (relay->client_rows <= FEW) /* the next datagram often has the same sender */
-        own->hints[(k + 1) % BUFFERS] = (int32_t)row;
+        scratch->hints[(k + 1) % BUFFERS] = (int32_t)row;
     return row;
 }
 
 /* The row that the table has first for the sender of datagram k; -1: none. */
 static int32_t row_of(const noack_relay *relay, int64_t k) {
-    const relay_scratch *own = scratch_of(relay);
+    const relay_scratch *scratch = scratch_of(relay);
     int64_t key[5];
-    key_of(relay, own->in_names[k], own->batch_socket, key);
+    key_of(relay, scratch->in_names[k], scratch->batch_socket, key);
     return relay->table[home_of(relay, key)];
 }
 
@@ -109,24 +109,24 @@ static int32_t row_of(const noack_relay *relay, int64_t k) {
    for the memory at each of its clients' tables. Here the same loads of all datagrams wait
    together. */
 void touch_clients(noack_relay *relay) {
-    relay_scratch *own = scratch_of(relay);
+    relay_scratch *scratch = scratch_of(relay);
     int64_t first_path = 2 * relay->links;
     uint64_t loaded = 0;
-    if (relay->client_rows <= FEW || own->batch_socket >= first_path || relay->devices)
+    if (relay->client_rows <= FEW || scratch->batch_socket >= first_path || relay->devices)
         return;
-    const noack_link *link = relay->directions[2 * own->batch_socket].link;
-    for (int64_t k = own->batch_next; k < own->batch_end; k++)
-        own->hints[k] = row_of(relay, k);
-    for (int64_t k = own->batch_next; k < own->batch_end; k++) {
-        int64_t row = own->hints[k];
+    const noack_link *link = relay->directions[2 * scratch->batch_socket].link;
+    for (int64_t k = scratch->batch_next; k < scratch->batch_end; k++)
+        scratch->hints[k] = row_of(relay, k);
+    for (int64_t k = scratch->batch_next; k < scratch->batch_end; k++) {
+        int64_t row = scratch->hints[k];
         if (row >= 0)
             loaded += (uint64_t)relay->clients[row].key[0] + (uint64_t)relay->clients[row].place
                       + (uint64_t)relay->sockets[first_path + row].fd;
     }
-    for (int64_t k = own->batch_next; k < own->batch_end; k++) {
-        int64_t row = own->hints[k];
-        if (row >= 0 && relay->clients[row].link == own->batch_socket)
+    for (int64_t k = scratch->batch_next; k < scratch->batch_end; k++) {
+        int64_t row = scratch->hints[k];
+        if (row >= 0 && relay->clients[row].link == scratch->batch_socket)
             loaded += (uint64_t)noack_link_touch(link, relay->clients[row].place);
     }
-    own->loaded = loaded;
+    scratch->loaded = loaded;
 }

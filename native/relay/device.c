@@ -110,20 +110,20 @@ static int is_multicast(const uint8_t *packet, int64_t size_bytes) {
 /* Read at most some packets into the free buffers; return their number, or -1. Packets for several
    receivers are discarded. */
 int read_packets(noack_relay *relay, int64_t socket, int most) {
-    relay_scratch *own = scratch_of(relay);
-    int64_t begin = own->batch_end;
+    relay_scratch *scratch = scratch_of(relay);
+    int64_t begin = scratch->batch_end;
     int taken = 0, fd = relay->sockets[socket].fd;
     while (taken < most) {
         int64_t k = begin + taken;
-        ssize_t size_bytes = read(fd, own->buffers[k], MOST_BYTES);
+        ssize_t size_bytes = read(fd, scratch->buffers[k], MOST_BYTES);
         if (size_bytes < 0)
             break;
-        if (is_multicast(own->buffers[k], size_bytes))
+        if (is_multicast(scratch->buffers[k], size_bytes))
             continue;
         taken++;
-        own->in_headers[k].msg_len = (unsigned)size_bytes;
-        own->in_headers[k].msg_hdr.msg_controllen = 0;
-        read_flow(own->buffers[k], size_bytes, socket != 0, own->in_names[k]);
+        scratch->in_headers[k].msg_len = (unsigned)size_bytes;
+        scratch->in_headers[k].msg_hdr.msg_controllen = 0;
+        read_flow(scratch->buffers[k], size_bytes, socket != 0, scratch->in_names[k]);
     }
     return taken > 0 ? taken : -1;
 }

@@ -20,16 +20,16 @@ int64_t noack_bucket_of(int64_t t_ns) {
 /* Whether three events fit: arrival of a datagram, its departure, its copy's departure. If there is
    a record: also whether a row of each table fits. */
 int has_room(const noack_relay *relay, int64_t size_bytes) {
-    const relay_scratch *own = scratch_of(relay);
+    const relay_scratch *scratch = scratch_of(relay);
     if (relay->records
         && (relay->packet_rows == relay->row_count || relay->release_rows == relay->row_count))
         return 0;
     if (relay->taps == 0)
         return 1;
-    if (relay->event_length + own->leaving_count + 3 > relay->event_count)
+    if (relay->event_length + scratch->leaving_count + 3 > relay->event_count)
         return 0;
     return relay->taps == 1
-           || relay->data_length + own->leaving_bytes + 3 * size_bytes <= relay->data_bytes;
+           || relay->data_length + scratch->leaving_bytes + 3 * size_bytes <= relay->data_bytes;
 }
 
 /* Copy a socket address's host; return its port. */

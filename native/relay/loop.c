@@ -16,32 +16,32 @@ enum { NO_CLIENT = -1, REFUSED = -2, NO_ROOM = -3 };
 int64_t noack_relay_scratch_bytes(void) { return (int64_t)sizeof(relay_scratch); }
 
 static void renew_header(noack_relay *relay, int64_t k) {
-    relay_scratch *own = scratch_of(relay);
-    struct msghdr *message = &own->in_headers[k].msg_hdr;
+    relay_scratch *scratch = scratch_of(relay);
+    struct msghdr *message = &scratch->in_headers[k].msg_hdr;
     message->msg_namelen = NOACK_NAME_BYTES;
-    message->msg_controllen = (size_t)own->control_bytes;
+    message->msg_controllen = (size_t)scratch->control_bytes;
 }
 
 void noack_relay_open(noack_relay *relay) {
-    relay_scratch *own = scratch_of(relay);
+    relay_scratch *scratch = scratch_of(relay);
     for (int k = 0; k < BUFFERS; k++) {
-        own->in_vectors[k] = (struct iovec){own->buffers[k], MOST_BYTES};
-        own->in_headers[k].msg_hdr = (struct msghdr){
-            .msg_name = own->in_names[k],
-            .msg_iov = &own->in_vectors[k],
+        scratch->in_vectors[k] = (struct iovec){scratch->buffers[k], MOST_BYTES};
+        scratch->in_headers[k].msg_hdr = (struct msghdr){
+            .msg_name = scratch->in_names[k],
+            .msg_iov = &scratch->in_vectors[k],
             .msg_iovlen = 1,
-            .msg_control = &own->in_controls[k],
+            .msg_control = &scratch->in_controls[k],
         };
-        own->hints[k] = -1;
+        scratch->hints[k] = -1;
         renew_header(relay, k);
     }
 }
 
 void noack_relay_read_stamps(noack_relay *relay) {
-    relay_scratch *own = scratch_of(relay);
-    own->stamps = 1;
-    own->control_bytes = CONTROL_BYTES;
-    for (int64_t k = own->batch_end; k < BUFFERS; k++)
+    relay_scratch *scratch = scratch_of(relay);
+    scratch->stamps = 1;
+    scratch->control_bytes = CONTROL_BYTES;
+    for (int64_t k = scratch->batch_end; k < BUFFERS; k++)
         renew_header(relay, k);
 }
 
@@ -53,16 +53,16 @@ int64_t noack_relay_watch(noack_relay *relay, int64_t fd, int64_t number) {
 void noack_relay_add_datagram(
     noack_relay *relay, int64_t socket, const uint8_t name[NOACK_NAME_BYTES], const uint8_t *data,
     int64_t size_bytes) {
-    relay_scratch *own = scratch_of(relay);
+    relay_scratch *scratch = scratch_of(relay);
     size_bytes = min_of(size_bytes, MOST_BYTES);
-    memcpy(own->buffers[0], data, (size_t)size_bytes);
-    memcpy(own->in_names[0], name, NOACK_NAME_BYTES);
-    own->in_headers[0].msg_len = (unsigned)size_bytes;
-    own->in_headers[0].msg_hdr.msg_controllen = 0; /* the arrival is unknown */
-    own->batch_socket = socket;
-    own->batch_next = 0;
-    own->batch_end = 1;
-    own->ready_count = own->ready_next = 0;
+    memcpy(scratch->buffers[0], data, (size_t)size_bytes);
+    memcpy(scratch->in_names[0], name, NOACK_NAME_BYTES);
+    scratch->in_headers[0].msg_len = (unsigned)size_bytes;
+    scratch->in_headers[0].msg_hdr.msg_controllen = 0; /* the arrival is unknown */
+    scratch->batch_socket = socket;
+    scratch->batch_next = 0;
+    scratch->batch_end = 1;
+    scratch->ready_count = scratch->ready_next = 0;
 }
 
 const uint8_t *noack_relay_sender(const noack_relay *relay) {
@@ -74,16 +74,16 @@ int64_t noack_relay_receiver(const noack_relay *relay) { return scratch_of(relay
 /* Queue the datagram in the first free row of leaving for sending, behind those of the same socket;
    record its departure. */
 static void enqueue_departure(noack_relay *relay) {
-    relay_scratch *own = scratch_of(relay);
-    int32_t number = (int32_t)own->leaving_count++;
-    departure *leaving = &own->leaving[number];
+    relay_scratch *scratch = scratch_of(relay);
+    int32_t number = (int32_t)scratch->leaving_count++;
+    departure *leaving = &scratch->leaving[number];
     noack_direction *direction = &relay->directions[leaving->datagram.direction];
     leaving->stale = (uint8_t)noack_link_leave(
         direction->link, relay->clients[leaving->datagram.client].place, leaving->datagram.packet,
         max_of(leaving->datagram.size_bytes - headers_bytes(relay), 0), leaving->delayed,
         leaving->datagram.counts);
     leaving->error = 0;
-    own->leaving_bytes += leaving->datagram.size_bytes;
+    scratch->leaving_bytes += leaving->datagram.size_bytes;
     int64_t link = leaving->datagram.direction >> 1;
     if (direction->sends == NOACK_OWN_SOCKET)
         leaving->socket = (int32_t)(2 * relay->links + leaving->datagram.client);
@@ -93,11 +93,11 @@ static void enqueue_departure(noack_relay *relay) {
         leaving->socket = (int32_t)(relay->links + link);
     noack_socket *socket = &relay->sockets[leaving->socket];
     if (socket->is_queued) {
-        own->leaving[socket->tail].next = number;
+        scratch->leaving[socket->tail].next = number;
     } else {
         socket->is_queued = 1;
         socket->head = (uint16_t)number;
-        own->order[own->order_count++] = leaving->socket;
+        scratch->order[scratch->order_count++] = leaving->socket;
     }
     socket->tail = (uint16_t)number;
     leaving->next = -1;
@@ -105,18 +105,18 @@ static void enqueue_departure(noack_relay *relay) {
 
 /* Queue the datagrams that are due for sending; return CARRY_ON, or which buffer is full. */
 static int64_t release_due(noack_relay *relay, int64_t until_ns) {
-    relay_scratch *own = scratch_of(relay);
+    relay_scratch *scratch = scratch_of(relay);
     while (relay->heap_length > 0 && relay->heap[0].due_ns <= until_ns) {
         noack_heap_entry entry = relay->heap[0];
         const noack_slot *slot = &relay->slots[entry.slot];
-        if (own->leaving_count == LEAVING)
+        if (scratch->leaving_count == LEAVING)
             return NOACK_LEAVING_FULL;
         if (!has_room(relay, slot->size_bytes))
             return NOACK_EVENTS_FULL;
         heap_pop(relay->heap, &relay->heap_length);
         relay->now_ns = max_of(relay->now_ns, entry.due_ns);
         relay->clients[slot->client].in_flight--;
-        departure *leaving = &own->leaving[own->leaving_count];
+        departure *leaving = &scratch->leaving[scratch->leaving_count];
         *leaving = (departure){
             .datagram = *slot,
             .release_ns = entry.due_ns,
@@ -147,9 +147,9 @@ static int64_t row_of_loop(noack_relay *relay, const uint8_t *data, int64_t size
    A datagram is refused if it and its copy might not fit into the store, if it comes from a client
    beyond the maximum number, or if it is of no loop of the run. */
 static int64_t client_of(noack_relay *relay, int64_t number, int64_t size_bytes) {
-    relay_scratch *own = scratch_of(relay);
+    relay_scratch *scratch = scratch_of(relay);
     noack_direction *direction = &relay->directions[number];
-    const uint8_t *data = own->buffers[own->batch_next];
+    const uint8_t *data = scratch->buffers[scratch->batch_next];
     if (direction->keeps
         && (relay->free_slots < 2 || relay->free_blocks < 2 * blocks_for(size_bytes))) {
         if (!relay->no_memory)
@@ -157,7 +157,7 @@ static int64_t client_of(noack_relay *relay, int64_t number, int64_t size_bytes)
         direction->errors[ENOMEM]++;
         return REFUSED;
     }
-    int64_t row = own->batch_socket - 2 * relay->links;
+    int64_t row = scratch->batch_socket - 2 * relay->links;
     if (!(number & 1) || relay->devices) {
         noack_direction *forward = &relay->directions[number & ~INT64_C(1)];
         row = find_sender(relay);
@@ -176,9 +176,9 @@ static int64_t client_of(noack_relay *relay, int64_t number, int64_t size_bytes)
    The kernel's timestamps are of the wall clock. One from before the relay's start is ignored: the
    wall clock was set since. */
 static void read_arrival(noack_relay *relay) {
-    relay_scratch *own = scratch_of(relay);
-    struct msghdr *message = &own->in_headers[own->batch_next].msg_hdr;
-    own->arrival_ns = relay->read_ns;
+    relay_scratch *scratch = scratch_of(relay);
+    struct msghdr *message = &scratch->in_headers[scratch->batch_next].msg_hdr;
+    scratch->arrival_ns = relay->read_ns;
     struct cmsghdr *control = CMSG_FIRSTHDR(message);
     for (; control != NULL; control = CMSG_NXTHDR(message, control)) {
         if (control->cmsg_level != SOL_SOCKET || control->cmsg_type != SCM_TIMESTAMPNS)
@@ -186,9 +186,9 @@ static void read_arrival(noack_relay *relay) {
         struct timespec stamp;
         memcpy(&stamp, CMSG_DATA(control), sizeof stamp);
         int64_t stamp_ns = (int64_t)stamp.tv_sec * NS_PER_S + stamp.tv_nsec;
-        int64_t waited_ns = simulated_ns_of(&relay->clock, own->real_ns - stamp_ns);
+        int64_t waited_ns = simulated_ns_of(&relay->clock, scratch->real_ns - stamp_ns);
         if (waited_ns <= relay->read_ns)
-            own->arrival_ns = relay->read_ns - waited_ns;
+            scratch->arrival_ns = relay->read_ns - waited_ns;
     }
 }
 
@@ -197,16 +197,16 @@ static void read_arrival(noack_relay *relay) {
 static void release(
     noack_relay *relay, int64_t direction, int64_t client, const noack_decision *decision,
     int copy) {
-    relay_scratch *own = scratch_of(relay);
-    const uint8_t *data = own->buffers[own->batch_next];
-    departure *leaving = &own->leaving[own->leaving_count];
+    relay_scratch *scratch = scratch_of(relay);
+    const uint8_t *data = scratch->buffers[scratch->batch_next];
+    departure *leaving = &scratch->leaving[scratch->leaving_count];
     noack_slot *datagram = &leaving->datagram;
     int64_t release_ns = copy ? decision->copy_ns : decision->release_ns;
     int delayed = release_ns > relay->now_ns;
     datagram->packet = decision->packet;
     datagram->arrival_ns = relay->now_ns;
     datagram->bit = copy ? decision->copy_bit : decision->bit;
-    datagram->size_bytes = (int32_t)own->in_headers[own->batch_next].msg_len;
+    datagram->size_bytes = (int32_t)scratch->in_headers[scratch->batch_next].msg_len;
     datagram->direction = (int32_t)direction;
     datagram->client = (int32_t)client;
     datagram->copy = (uint8_t)copy;
@@ -222,8 +222,8 @@ static void release(
         enqueue_departure(relay);
         return;
     }
-    relay->put++;
-    int64_t order = departure_order(direction & 1, relay->put);
+    relay->delayed_count++;
+    int64_t order = departure_order(direction & 1, relay->delayed_count);
     if (decision->waits)
         wait_for_link(
             relay->directions[direction].link, relay->clients[client].place, relay->waiting,
@@ -236,9 +236,9 @@ static void release(
 
 /* Decide for the current datagram, of a client. */
 static void decide(noack_relay *relay, int64_t number, int64_t row, int64_t size_bytes) {
-    relay_scratch *own = scratch_of(relay);
+    relay_scratch *scratch = scratch_of(relay);
     noack_client *client = &relay->clients[row];
-    const uint8_t *data = own->buffers[own->batch_next];
+    const uint8_t *data = scratch->buffers[scratch->batch_next];
     noack_link *link = relay->directions[number].link;
     noack_decision decision;
     client->last_ns = relay->now_ns;
@@ -261,22 +261,22 @@ static void decide(noack_relay *relay, int64_t number, int64_t row, int64_t size
 
 /* Decide for the datagrams received from one socket; return CARRY_ON, or why this ended. */
 static int64_t decide_batch(noack_relay *relay) {
-    relay_scratch *own = scratch_of(relay);
-    int64_t link = own->batch_socket, reverse = link >= 2 * relay->links;
+    relay_scratch *scratch = scratch_of(relay);
+    int64_t link = scratch->batch_socket, reverse = link >= 2 * relay->links;
     if (reverse)
-        link = relay->clients[own->batch_socket - 2 * relay->links].link;
+        link = relay->clients[scratch->batch_socket - 2 * relay->links].link;
     if (relay->devices) {
         link = 0;
-        reverse = own->batch_socket != 0;
+        reverse = scratch->batch_socket != 0;
     }
-    for (; own->batch_next < own->batch_end; own->batch_next++) {
-        int64_t size_bytes = own->in_headers[own->batch_next].msg_len;
+    for (; scratch->batch_next < scratch->batch_end; scratch->batch_next++) {
+        int64_t size_bytes = scratch->in_headers[scratch->batch_next].msg_len;
         read_arrival(relay);
         /* Decision times ascend, so that a datagram that is due between two arrivals leaves between
            them. In a record, the time of the decision is the machine's input. */
         int64_t now_ns = relay->read_ns;
         if (!relay->records)
-            now_ns = min_of(own->arrival_ns, relay->read_ns);
+            now_ns = min_of(scratch->arrival_ns, relay->read_ns);
         now_ns = max_of(relay->now_ns, now_ns);
         int64_t reason = release_due(relay, now_ns);
         if (reason != NOACK_CARRY_ON)
@@ -284,7 +284,7 @@ static int64_t decide_batch(noack_relay *relay) {
         relay->now_ns = now_ns;
         if (now_ns >= relay->change_ns)
             return NOACK_CHANGE_DUE;
-        if (own->leaving_count + 2 > LEAVING)
+        if (scratch->leaving_count + 2 > LEAVING)
             return NOACK_LEAVING_FULL;
         if (!has_room(relay, size_bytes))
             return NOACK_EVENTS_FULL;
@@ -295,7 +295,7 @@ static int64_t decide_batch(noack_relay *relay) {
             return NOACK_STORE_FULL;
         if (row >= 0)
             decide(relay, 2 * link + reverse, row, size_bytes);
-        renew_header(relay, own->batch_next);
+        renew_header(relay, scratch->batch_next);
     }
     return NOACK_CARRY_ON;
 }
@@ -309,18 +309,19 @@ static int64_t departs_in_ns(const noack_relay *relay) {
 
 /* Until when to wait for datagrams; INT64_MIN: the time for housekeeping has come. */
 static int64_t waiting_ends_ns(noack_relay *relay, int64_t until_ns) {
-    relay_scratch *own = scratch_of(relay);
+    relay_scratch *scratch = scratch_of(relay);
     if (relay->read_ns < until_ns)
         return until_ns;
-    if (own->due_since_ns == 0)
-        own->due_since_ns = relay->read_ns;
+    if (scratch->due_since_ns == 0)
+        scratch->due_since_ns = relay->read_ns;
     int64_t more_ns = 0;
     if (until_ns != INT64_MIN)
         more_ns = put_off_ns(
-            &own->pauses, noack_clock_wait_ns(&relay->clock, relay->read_ns - own->due_since_ns),
-            departs_in_ns(relay), own->has_more != 0, own->is_busy != 0);
+            &scratch->pauses,
+            noack_clock_wait_ns(&relay->clock, relay->read_ns - scratch->due_since_ns),
+            departs_in_ns(relay), scratch->has_more != 0, scratch->is_busy != 0);
     if (more_ns == 0) {
-        own->ready_count = own->ready_next = own->due_since_ns = 0;
+        scratch->ready_count = scratch->ready_next = scratch->due_since_ns = 0;
         return INT64_MIN;
     }
     return relay->read_ns + simulated_ns_of(&relay->clock, more_ns) + 1;
@@ -328,7 +329,7 @@ static int64_t waiting_ends_ns(noack_relay *relay, int64_t until_ns) {
 
 /* Wait for a datagram or the next release time; return 0 if a signal interrupted it. */
 static int wait_for_datagrams(noack_relay *relay, int64_t until_ns) {
-    relay_scratch *own = scratch_of(relay);
+    relay_scratch *scratch = scratch_of(relay);
     int64_t wait_ns = noack_clock_wait_ns(&relay->clock, until_ns - relay->read_ns);
     if (relay->heap_length > 0)
         wait_ns = max_of(min_of(wait_ns, departs_in_ns(relay) - relay->spin_ns), 0);
@@ -337,18 +338,18 @@ static int wait_for_datagrams(noack_relay *relay, int64_t until_ns) {
     if (relay->only_socket >= 0)
         fd = relay->sockets[relay->only_socket].fd;
     struct pollfd readable = {.fd = fd, .events = POLLIN};
-    int found = ppoll(&readable, 1, &limit, NULL);
-    if (found > 0 && relay->only_socket >= 0) {
-        own->ready[0].events = readable.revents & POLLERR ? EPOLLERR : EPOLLIN;
-        own->ready[0].data.u64 = (uint64_t)relay->only_socket;
-    } else if (found > 0) {
-        found = epoll_wait(fd, own->ready, READY, 0);
+    int ready = ppoll(&readable, 1, &limit, NULL);
+    if (ready > 0 && relay->only_socket >= 0) {
+        scratch->ready[0].events = readable.revents & POLLERR ? EPOLLERR : EPOLLIN;
+        scratch->ready[0].data.u64 = (uint64_t)relay->only_socket;
+    } else if (ready > 0) {
+        ready = epoll_wait(fd, scratch->ready, READY, 0);
     }
-    own->ready_count = max_of(found, 0);
-    own->ready_next = 0;
-    if (own->ready_count == 0)
+    scratch->ready_count = max_of(ready, 0);
+    scratch->ready_next = 0;
+    if (scratch->ready_count == 0)
         relay->read_ns = run_time_ns(&relay->clock);
-    return found >= 0;
+    return ready >= 0;
 }
 
 /* Receive datagrams from a socket, as far as there are buffers; return 0, or errno if there are
@@ -356,28 +357,28 @@ static int wait_for_datagrams(noack_relay *relay, int64_t until_ns) {
 
    If the last datagrams came one at a time, it receives one: looking for another takes time. */
 static int receive(noack_relay *relay, int64_t socket, int flags) {
-    relay_scratch *own = scratch_of(relay);
-    int64_t begin = own->batch_end, before_ns = relay->read_ns;
-    int fd = relay->sockets[socket].fd, most = own->is_busy ? (int)(BUFFERS - begin) : 1, taken;
+    relay_scratch *scratch = scratch_of(relay);
+    int64_t begin = scratch->batch_end, before_ns = relay->read_ns;
+    int fd = relay->sockets[socket].fd, most = scratch->is_busy ? (int)(BUFFERS - begin) : 1, taken;
     if (relay->devices) {
         taken = read_packets(relay, socket, most);
-    } else if (own->is_busy) {
-        taken = recvmmsg(fd, &own->in_headers[begin], (unsigned)most, flags, NULL);
+    } else if (scratch->is_busy) {
+        taken = recvmmsg(fd, &scratch->in_headers[begin], (unsigned)most, flags, NULL);
     } else {
-        ssize_t size_bytes = recvmsg(fd, &own->in_headers[begin].msg_hdr, flags & MSG_DONTWAIT);
-        own->in_headers[begin].msg_len = (unsigned)max_of(size_bytes, 0);
+        ssize_t size_bytes = recvmsg(fd, &scratch->in_headers[begin].msg_hdr, flags & MSG_DONTWAIT);
+        scratch->in_headers[begin].msg_len = (unsigned)max_of(size_bytes, 0);
         taken = size_bytes < 0 ? -1 : 1;
     }
     int error = taken > 0 ? 0 : errno;
     relay->read_ns = run_time_ns(&relay->clock);
-    if (own->stamps)
-        own->real_ns = clock_ns(CLOCK_REALTIME);
-    own->is_busy = taken > 1 || relay->read_ns - before_ns < BUSY_NS;
-    own->has_more = own->is_busy && taken == most;
+    if (scratch->stamps)
+        scratch->real_ns = clock_ns(CLOCK_REALTIME);
+    scratch->is_busy = taken > 1 || relay->read_ns - before_ns < BUSY_NS;
+    scratch->has_more = scratch->is_busy && taken == most;
     if (taken > 0) {
-        own->batch_socket = socket;
-        own->batch_next = begin;
-        own->batch_end = begin + taken;
+        scratch->batch_socket = socket;
+        scratch->batch_next = begin;
+        scratch->batch_end = begin + taken;
         touch_clients(relay);
     }
     return error;
@@ -385,8 +386,8 @@ static int receive(noack_relay *relay, int64_t socket, int flags) {
 
 /* Receive from the next socket that is ready. */
 static void receive_ready(noack_relay *relay) {
-    relay_scratch *own = scratch_of(relay);
-    const struct epoll_event *event = &own->ready[own->ready_next++];
+    relay_scratch *scratch = scratch_of(relay);
+    const struct epoll_event *event = &scratch->ready[scratch->ready_next++];
     if (event->events & EPOLLERR)
         take_errors(relay, (int64_t)event->data.u64);
     receive(relay, (int64_t)event->data.u64, MSG_DONTWAIT);
@@ -409,35 +410,35 @@ static int wait_and_receive(noack_relay *relay) {
 }
 
 int64_t noack_relay_run(noack_relay *relay, int64_t until_ns) {
-    relay_scratch *own = scratch_of(relay);
+    relay_scratch *scratch = scratch_of(relay);
     for (;;) {
         int64_t reason = NOACK_CARRY_ON, sent_ns = -1;
-        if (own->batch_next < own->batch_end)
+        if (scratch->batch_next < scratch->batch_end)
             reason = decide_batch(relay);
         if (reason == NOACK_CARRY_ON)
             reason = release_due(relay, relay->read_ns);
-        int all_taken = own->ready_next >= own->ready_count;
-        if (reason != NOACK_CARRY_ON || all_taken || BUFFERS - own->batch_end < FEW_BUFFERS) {
-            if (own->leaving_count > 0)
+        int all_taken = scratch->ready_next >= scratch->ready_count;
+        if (reason != NOACK_CARRY_ON || all_taken || BUFFERS - scratch->batch_end < FEW_BUFFERS) {
+            if (scratch->leaving_count > 0)
                 sent_ns = send_all(relay);
-            own->pauses.worked |= sent_ns >= 0;
+            scratch->pauses.worked |= sent_ns >= 0;
             if (reason == NOACK_LEAVING_FULL)
                 continue;
             if (reason != NOACK_CARRY_ON)
                 return reason;
-            own->batch_next = own->batch_end = 0;
+            scratch->batch_next = scratch->batch_end = 0;
         }
         if (all_taken) {
             relay->read_ns = sent_ns >= 0 ? sent_ns : run_time_ns(&relay->clock);
             int64_t wait_until_ns = waiting_ends_ns(relay, until_ns);
             if (wait_until_ns == INT64_MIN)
                 return NOACK_HOUSEKEEPING;
-            own->pauses.worked = 0;
+            scratch->pauses.worked = 0;
             int in_receive = receiving_waits(relay, wait_until_ns);
             if (!(in_receive ? wait_and_receive(relay) : wait_for_datagrams(relay, wait_until_ns)))
                 return NOACK_INTERRUPTED;
         }
-        if (own->ready_next < own->ready_count)
+        if (scratch->ready_next < scratch->ready_count)
             receive_ready(relay);
     }
 }

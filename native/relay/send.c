@@ -54,18 +54,18 @@ static int64_t icmp_error(struct msghdr *message) {
    makes the socket's next call fail once. Therefore the error queue is emptied after a failed call,
    to find out whether an ICMP error caused the failure. */
 int64_t take_errors(noack_relay *relay, int64_t socket) {
-    relay_scratch *own = scratch_of(relay);
+    relay_scratch *scratch = scratch_of(relay);
     int64_t found = 0;
     int taken = relay->devices ? 0 : ERRORS, fd = relay->sockets[socket].fd;
     while (taken == ERRORS) {
         for (int k = 0; k < ERRORS; k++) {
-            struct msghdr *message = &own->error_headers[k].msg_hdr;
+            struct msghdr *message = &scratch->error_headers[k].msg_hdr;
             *message = (struct msghdr){
-                .msg_control = &own->error_controls[k], .msg_controllen = ERROR_CONTROL_BYTES};
+                .msg_control = &scratch->error_controls[k], .msg_controllen = ERROR_CONTROL_BYTES};
         }
-        taken = recvmmsg(fd, own->error_headers, ERRORS, MSG_DONTWAIT | MSG_ERRQUEUE, NULL);
+        taken = recvmmsg(fd, scratch->error_headers, ERRORS, MSG_DONTWAIT | MSG_ERRQUEUE, NULL);
         for (int k = 0; k < taken; k++) {
-            int64_t error = icmp_error(&own->error_headers[k].msg_hdr), link = -1;
+            int64_t error = icmp_error(&scratch->error_headers[k].msg_hdr), link = -1;
             found += error != 0;
             if (socket >= 2 * relay->links)
                 link = relay->clients[socket - 2 * relay->links].link;
@@ -86,13 +86,13 @@ static int64_t vectors_of(const departure *leaving) {
    whose vectors begin at first, are copied behind each other: they share a vector. */
 static int64_t add_vectors(
     const noack_relay *relay, int64_t first, int64_t count, const departure *leaving) {
-    relay_scratch *own = scratch_of(relay);
-    struct iovec *vectors = own->out_vectors;
+    relay_scratch *scratch = scratch_of(relay);
+    struct iovec *vectors = scratch->out_vectors;
     size_t size_bytes = (size_t)leaving->datagram.size_bytes;
     if (leaving->slot < 0 && relay->segment && size_bytes <= FEW_BYTES) {
-        uint8_t *place = own->joined + own->joined_bytes;
+        uint8_t *place = scratch->joined + scratch->joined_bytes;
         memcpy(place, leaving->address, size_bytes);
-        own->joined_bytes += leaving->datagram.size_bytes;
+        scratch->joined_bytes += leaving->datagram.size_bytes;
         struct iovec *last = count > first ? &vectors[count - 1] : NULL;
         if (last != NULL && (uint8_t *)last->iov_base + last->iov_len == place) {
             last->iov_len += size_bytes;
@@ -151,17 +151,17 @@ static void write_destination(
 /* Fill a message with a datagram and the following ones that the kernel can segment; return the
    datagram after them, and add to the number of vectors in use. */
 static int64_t fill_message(noack_relay *relay, int header, int64_t number, int64_t *vectors) {
-    relay_scratch *own = scratch_of(relay);
-    const departure *first = &own->leaving[number];
-    struct msghdr *message = &own->out_headers[header].msg_hdr;
+    relay_scratch *scratch = scratch_of(relay);
+    const departure *first = &scratch->leaving[number];
+    struct msghdr *message = &scratch->out_headers[header].msg_hdr;
     int64_t begin = *vectors, size_bytes = first->datagram.size_bytes, all_bytes = size_bytes;
     int64_t end = add_vectors(relay, begin, begin, first), last_bytes = size_bytes, segments = 1;
-    *message = (struct msghdr){.msg_iov = own->out_vectors + begin};
-    own->out_first[header] = (int32_t)number;
+    *message = (struct msghdr){.msg_iov = scratch->out_vectors + begin};
+    scratch->out_first[header] = (int32_t)number;
     number = first->next;
     int can_segment = relay->segment && 0 < size_bytes && size_bytes < relay->segment_below;
     while (can_segment && number >= 0 && segments < MOST_SEGMENTS && last_bytes == size_bytes) {
-        const departure *other = &own->leaving[number];
+        const departure *other = &scratch->leaving[number];
         if (!may_join(relay, first, other, all_bytes) || end + vectors_of(other) > VECTORS)
             break;
         last_bytes = other->datagram.size_bytes;
@@ -171,7 +171,7 @@ static int64_t fill_message(noack_relay *relay, int header, int64_t number, int6
         number = other->next;
     }
     if (segments > 1)
-        write_segment_size(message, &own->out_controls[header], size_bytes);
+        write_segment_size(message, &scratch->out_controls[header], size_bytes);
     message->msg_iovlen = (size_t)(end - begin);
     write_destination(relay, message, first);
     *vectors = end;
@@ -180,12 +180,12 @@ static int64_t fill_message(noack_relay *relay, int header, int64_t number, int6
 
 /* Fill messages from a datagram on; return their number, and the datagram after them. */
 static int fill_messages(noack_relay *relay, int64_t number, int64_t *following) {
-    relay_scratch *own = scratch_of(relay);
+    relay_scratch *scratch = scratch_of(relay);
     int64_t vectors = 0;
     int headers = 0;
-    own->joined_bytes = 0;
+    scratch->joined_bytes = 0;
     while (number >= 0 && headers < LEAVING
-           && vectors + vectors_of(&own->leaving[number]) <= VECTORS)
+           && vectors + vectors_of(&scratch->leaving[number]) <= VECTORS)
         number = fill_message(relay, headers++, number, &vectors);
     *following = number;
     return headers;
@@ -214,9 +214,9 @@ static int call_send(const noack_relay *relay, int fd, struct mmsghdr *headers, 
     return sendmmsg(fd, headers, (unsigned)count, MSG_DONTWAIT);
 }
 
-static void mark_failed(relay_scratch *own, int64_t number, int64_t end, int error) {
-    for (; number != end; number = own->leaving[number].next)
-        own->leaving[number].error = error;
+static void mark_failed(relay_scratch *scratch, int64_t number, int64_t end, int error) {
+    for (; number != end; number = scratch->leaving[number].next)
+        scratch->leaving[number].error = error;
 }
 
 /* Send a number of messages; return the number of messages that were sent or failed.
@@ -225,11 +225,11 @@ static void mark_failed(relay_scratch *own, int64_t number, int64_t end, int err
    remaining datagrams must be filled again. following is the datagram after the last message; -1:
    none. */
 static int transmit(noack_relay *relay, int64_t socket, int headers, int64_t following) {
-    relay_scratch *own = scratch_of(relay);
+    relay_scratch *scratch = scratch_of(relay);
     int fd = relay->sockets[socket].fd, done = 0, tries = 0;
     int64_t waited_ns = 0;
     while (done < headers) {
-        int sent = call_send(relay, fd, &own->out_headers[done], headers - done);
+        int sent = call_send(relay, fd, &scratch->out_headers[done], headers - done);
         if (sent > 0) {
             done += sent;
             tries = 0;
@@ -242,21 +242,21 @@ static int transmit(noack_relay *relay, int64_t socket, int headers, int64_t fol
             waited_ns += wait_for_room(fd);
             continue;
         }
-        int64_t number = own->out_first[done];
+        int64_t number = scratch->out_first[done];
         if (error != EAGAIN && error != ENOBUFS) {
             tries++;
             if (tries < (take_errors(relay, socket) > 0 ? MOST_TRIES : TRIES))
                 continue;
-            const struct msghdr *message = &own->out_headers[done].msg_hdr;
+            const struct msghdr *message = &scratch->out_headers[done].msg_hdr;
             if (message->msg_controllen > 0) {
                 relay->segment_below =
-                    min_of(relay->segment_below, own->leaving[number].datagram.size_bytes);
+                    min_of(relay->segment_below, scratch->leaving[number].datagram.size_bytes);
                 return done;
             }
         }
         done++;
         tries = 0;
-        mark_failed(own, number, done < headers ? own->out_first[done] : following, error);
+        mark_failed(scratch, number, done < headers ? scratch->out_first[done] : following, error);
     }
     return done;
 }
@@ -279,7 +279,7 @@ static void account(noack_relay *relay, const departure *leaving, int64_t now_ns
 
 /* Send what is queued for a socket; return the number of calls for that. */
 static int64_t send_queued(noack_relay *relay, int32_t place) {
-    relay_scratch *own = scratch_of(relay);
+    relay_scratch *scratch = scratch_of(relay);
     const noack_socket *socket = &relay->sockets[place];
     int64_t number = socket->head, following, calls = 0;
     for (; number >= 0; number = following) {
@@ -287,9 +287,9 @@ static int64_t send_queued(noack_relay *relay, int32_t place) {
         if (socket->fd >= 0)
             done = transmit(relay, place, headers, following);
         else
-            mark_failed(own, number, following, socket->error);
+            mark_failed(scratch, number, following, socket->error);
         if (done < headers)
-            following = own->out_first[done];
+            following = scratch->out_first[done];
         calls++;
     }
     return calls;
@@ -299,23 +299,23 @@ static int64_t send_queued(noack_relay *relay, int32_t place) {
 
    The clock is read once for several calls, but for taps, which receive the time of each. */
 int64_t send_all(noack_relay *relay) {
-    relay_scratch *own = scratch_of(relay);
+    relay_scratch *scratch = scratch_of(relay);
     int64_t accounted = 0, calls = 0, now_ns = relay->read_ns;
-    for (int64_t place = 0; place < own->order_count; place++) {
-        calls += send_queued(relay, own->order[place]);
-        if (calls < CALLS_PER_READING && !relay->taps && place + 1 < own->order_count)
+    for (int64_t place = 0; place < scratch->order_count; place++) {
+        calls += send_queued(relay, scratch->order[place]);
+        if (calls < CALLS_PER_READING && !relay->taps && place + 1 < scratch->order_count)
             continue;
         calls = 0;
         now_ns = run_time_ns(&relay->clock);
         for (; accounted <= place; accounted++) {
-            noack_socket *socket = &relay->sockets[own->order[accounted]];
+            noack_socket *socket = &relay->sockets[scratch->order[accounted]];
             socket->is_queued = 0;
-            for (int32_t number = socket->head; number >= 0; number = own->leaving[number].next)
-                account(relay, &own->leaving[number], now_ns);
+            for (int32_t number = socket->head; number >= 0; number = scratch->leaving[number].next)
+                account(relay, &scratch->leaving[number], now_ns);
         }
     }
-    own->order_count = 0;
-    own->leaving_count = 0;
-    own->leaving_bytes = 0;
+    scratch->order_count = 0;
+    scratch->leaving_count = 0;
+    scratch->leaving_bytes = 0;
     return now_ns;
 }

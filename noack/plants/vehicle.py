@@ -178,9 +178,9 @@ def _load_parameters(settings: VehicleSettings) -> Parameters:
 
 
 def _start(x0: Vector, speed: float, parameters: Parameters) -> list[float]:
-    sideways, rate, yaw, lateral = x0.tolist()
-    slip = math.atan2(-sideways, speed)
-    return [0.0, -lateral, 0.0, math.hypot(sideways, speed), yaw, rate, slip]
+    lateral_velocity, yaw_rate, yaw, lateral_position = x0.tolist()
+    slip = math.atan2(-lateral_velocity, speed)
+    return [0.0, -lateral_position, 0.0, math.hypot(lateral_velocity, speed), yaw, yaw_rate, slip]
 
 
 def _output(z: Vector, parameters: Parameters) -> Vector:
@@ -189,15 +189,15 @@ def _output(z: Vector, parameters: Parameters) -> Vector:
 
 def _start_kinematic(x0: Vector, speed: float, parameters: Parameters) -> list[float]:
     # The reference point of this model is the rear axle; V follows from r, and the steering sets r.
-    _, rate, yaw, lateral = x0.tolist()
-    steering = math.atan(rate * (parameters.a + parameters.b) / speed)
-    return [0.0, -lateral - parameters.b * math.sin(yaw), steering, speed, yaw]
+    _, yaw_rate, yaw, lateral_position = x0.tolist()
+    steering = math.atan(yaw_rate * (parameters.a + parameters.b) / speed)
+    return [0.0, -lateral_position - parameters.b * math.sin(yaw), steering, speed, yaw]
 
 
 def _output_kinematic(z: Vector, parameters: Parameters) -> Vector:
-    behind, wheelbase = parameters.b, parameters.a + parameters.b
-    rate = z[3] * math.tan(z[2]) / wheelbase
-    return np.array([-behind * rate, rate, z[4], -z[1] - behind * math.sin(z[4])])
+    to_rear_axle, wheelbase = parameters.b, parameters.a + parameters.b
+    yaw_rate = z[3] * math.tan(z[2]) / wheelbase
+    return np.array([-to_rear_axle * yaw_rate, yaw_rate, z[4], -z[1] - to_rear_axle * math.sin(z[4])])
 
 
 def _start_by_library(name: str, x0: Vector, speed: float, parameters: Parameters) -> list[float]:

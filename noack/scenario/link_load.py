@@ -95,7 +95,7 @@ class DelayBound(NamedTuple):
     """The largest delay in each impairment that delays, by its key; infinite: no bound is known."""
     loops_s: list[float]
     """The largest delay of each loop's updates in all of them."""
-    certified: tuple[float, ...]
+    loops_certified_s: tuple[float, ...]
     """The delay that the certificates of each loop cover."""
 
     @property
@@ -106,12 +106,12 @@ class DelayBound(NamedTuple):
     @property
     def certified_s(self) -> float:
         """The largest delay that a loop's certificates cover."""
-        return max(self.certified)
+        return max(self.loops_certified_s)
 
     @property
     def is_certified(self) -> bool:
         """Whether the certificates cover every delay; times are whole nanoseconds."""
-        pairs = zip(self.certified, self.loops_s, strict=True)
+        pairs = zip(self.loops_certified_s, self.loops_s, strict=True)
         return all(round(bound_s * NS_PER_S) >= largest_s * NS_PER_S - 0.5 for bound_s, largest_s in pairs)
 
 
@@ -192,7 +192,7 @@ def _link_loads(run_parts: Sequence[_RunPart], flow: Flow, path: str, names: Seq
             continue
         previous: LinkLoad | None = None
         delay_s = _largest_bound(delays[index])
-        by_loops = tuple(_by_loops(names, delays[index])) if len(delays[index]) > 1 else ()
+        loop_bounds = tuple(_group_bounds(names, delays[index])) if len(delays[index]) > 1 else ()
         for change, direction, loops in run_parts:
             window = _window(direction)
             bits = [int(impairment.line_bits(loop.payload_bytes)) * loop.loops for loop in loops]
@@ -208,7 +208,7 @@ def _link_loads(run_parts: Sequence[_RunPart], flow: Flow, path: str, names: Seq
                 mandatory_at_most_bps=_share(window) * at_most_bps,
                 mandatory_at_least_bps=_share(window) * at_least_bps,
                 delay_bound_s=delay_s,
-                loop_bounds_s=by_loops,
+                loop_bounds_s=loop_bounds,
             )
             if previous is None or load._replace(change=previous.change) != previous:
                 loads.append(load)
@@ -216,7 +216,7 @@ def _link_loads(run_parts: Sequence[_RunPart], flow: Flow, path: str, names: Seq
     return loads
 
 
-def _by_loops(names: Sequence[str], delays_s: Sequence[float]) -> Iterator[tuple[str, float]]:
+def _group_bounds(names: Sequence[str], delays_s: Sequence[float]) -> Iterator[tuple[str, float]]:
     """Yield each bound of a delay, with the loops that have it, such as ``p-1, p-3 to p-5``."""
     for delay_s in dict.fromkeys(delays_s):
         loops = {loop for loop, loop_delay_s in enumerate(delays_s) if loop_delay_s == delay_s}
@@ -299,6 +299,7 @@ def _largest_delays(run_parts: Sequence[_RunPart]) -> tuple[list[list[float]], l
                 delays_s.append(_chosen_delays_s(impairment, impairment.scheduler, run_parts))
             else:
                 delays_s.append([_queue_delay_s(impairment, run_parts, spread_s, copied=copied)])
+            # One bound may be that of all loops.
             largest_s = [
                 before_s + added_s for before_s, added_s in zip(largest_s, cycle(delays_s[-1]), strict=False)
             ]
@@ -384,10 +385,12 @@ def _queue_delay_s(rate: Rate, run_parts: Sequence[_RunPart], spread_s: float, *
         return math.inf
     bits = [int(rate.line_bits(loop.payload_bytes)) for loop in run_parts[0].loops]
     counts = [loop.loops for loop in run_parts[0].loops]
-    by_loops = zip(*(part.loops for part in run_parts), strict=True)
-    least_s: list[float] = [min(demand.least_s for demand in demands) for demands in by_loops]
-    every_bps: float = sum(b * k / d for b, k, d in zip(bits, counts, least_s, strict=True))
-    together = sum(b * k for b, k in zip(bits, counts, strict=True))
+    demands_by_entry = zip(*(part.loops for part in run_parts), strict=True)
+    least_s: list[float] = [min(demand.least_s for demand in demands) for demands in demands_by_entry]
+    every_bps: float = sum(
+        bit_count * count / least for bit_count, count, least in zip(bits, counts, least_s, strict=True)
+    )
+    together = sum(bit_count * count for bit_count, count in zip(bits, counts, strict=True))
     copies = 2 if copied else 1
     if copies * every_bps <= rate.rate_bps:
         return copies * (together + every_bps * spread_s) / rate.rate_bps

@@ -129,9 +129,9 @@ def attacked(
     limit_x, limit_u = np.array(region.x)[:, None], np.array(region.u)[:, None]
     bounds = [of(t_s) for of in (certificate.state, certificate.sensor_error, certificate.controller_error)]
 
-    def share(what: str, values: Reals, limits: Reals | float) -> None:
+    def share(signal: str, values: Reals, limits: Reals | float) -> None:
         used = np.max(values / limits, initial=0.0)
-        worst[what] = max(worst[what], np.inf if np.isnan(used) else float(used))
+        worst[signal] = max(worst[signal], np.inf if np.isnan(used) else float(used))
 
     for number, t in enumerate(t_s.tolist()):
         share("‖e_s‖", loops.error_of(loops.x_s), bounds[1][number])
@@ -247,11 +247,11 @@ def main(runs: int) -> None:
         limits = zip((*loop.state_names, *loop.input_names), region.x + region.u, strict=True)
         worst = dict.fromkeys(("x", "‖x‖"), 0.0)
         for seed in range(0, runs, BATCH):
-            found = attacked(
+            shares = attacked(
                 resolved, case, certificate, runs=min(BATCH, runs - seed), steps=STEPS, seed=seed
             )
-            worst = {what: max(most, found[what]) for what, most in worst.items()}
-            assert max(found.values()) <= 1, found
+            worst = {signal: max(most, shares[signal]) for signal, most in worst.items()}
+            assert max(shares.values()) <= 1, shares
         print(
             f"| {name} | {', '.join(map(str, case.semi_axes))} "
             f"| {certificate.conditions.dropouts + 1} "

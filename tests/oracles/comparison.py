@@ -43,7 +43,7 @@ class Comparison:
         scenario = record.scenario
         self.rows = {table: record[table] for table in TIMES if table in record.tables}
         chance = chance_of(scenario, self.rows["netem_packet"])
-        self.found = run(settings_of(scenario) if settings is None else settings, chance)
+        self.reference = run(settings_of(scenario) if settings is None else settings, chance)
         self.error = 0.0
         """The largest difference, relative to the size of the quantity."""
         steps = self.rows["plant_step"]
@@ -51,7 +51,7 @@ class Comparison:
         self._largest = np.maximum.accumulate(np.linalg.norm(steps["x"], axis=1))
         self.tie_ns = self._tie_ns()
         """Time of a comparison of the trigger within rounding, decided differently, or None."""
-        assert self.found.keys() <= self.rows.keys()
+        assert self.reference.keys() <= self.rows.keys()
         for table, rows in self.rows.items():
             self._compare(table, rows)
 
@@ -61,7 +61,7 @@ class Comparison:
 
     def _tie_ns(self) -> int | None:
         for row, recorded in zip(
-            self.found["sensor_measurement"], self.rows["sensor_measurement"], strict=False
+            self.reference["sensor_measurement"], self.rows["sensor_measurement"], strict=False
         ):
             if (row["event"] == NONE) != (recorded["event"] == NONE):
                 t_ns, due_ns = row["t_ns"], row["due_ns"]
@@ -73,16 +73,16 @@ class Comparison:
         return None
 
     def _compare(self, table: str, rows: Rows) -> None:
-        found = self.found[table]
+        computed = self.reference[table]
         if self.tie_ns is not None:
-            found = [row for row in found if row[TIMES[table]] < self.tie_ns]
+            computed = [row for row in computed if row[TIMES[table]] < self.tie_ns]
             rows = rows[rows[TIMES[table]] < self.tie_ns]
-        assert len(found) == len(rows), table
-        for column in rows.dtype.names or () if found else ():
-            if column not in found[0]:
+        assert len(computed) == len(rows), table
+        for column in rows.dtype.names or () if computed else ():
+            if column not in computed[0]:
                 assert column in NOT_COMPUTED[table], f"{table}.{column}"
                 continue
-            own = np.array([row[column] for row in found])
+            own = np.array([row[column] for row in computed])
             if rows[column].dtype.kind == "i":
                 np.testing.assert_array_equal(rows[column], own, f"{table}.{column}")
             else:

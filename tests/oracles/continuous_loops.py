@@ -2,8 +2,7 @@
 
 Between events z = (x, x_s, x_c) follows ż = Fz, from node to node of the grid by the matrix
 exponential, and in a step with an event by its Taylor series; the event is found by dividing the
-step again and again.
-Values just before an event count, too.
+step again and again. Values just before an event count, too.
 """
 
 from typing import NamedTuple
@@ -108,15 +107,15 @@ def simulate_continuous_time(system: System, delivered: Flags, _: Steps) -> Cont
 
 def _series(F: Reals, z: Reals) -> Reals:
     """The coefficients of e^{Fs} z, (order + 1, runs, 3n)."""
-    found = [z]
+    coefficients = [z]
     for k in range(1, _ORDER + 1):
-        found.append(found[-1] @ F.T / k)
-    return np.array(found)
+        coefficients.append(coefficients[-1] @ F.T / k)
+    return np.array(coefficients)
 
 
 def _at(series: Reals, s: Reals) -> Reals:
     """The values at times (k, runs), as (k, runs, 3n)."""
-    found = np.broadcast_to(series[-1], (*s.shape, series.shape[2]))
+    values = np.broadcast_to(series[-1], (*s.shape, series.shape[2]))
     for coefficients in series[-2::-1]:
-        found = found * s[..., None] + coefficients
-    return found
+        values = values * s[..., None] + coefficients
+    return values

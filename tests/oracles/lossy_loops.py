@@ -64,6 +64,7 @@ class System:
 
     @property
     def lag(self) -> int:
+        """Delay of an input in steps; 0 if the plant applies K x_c continuously."""
         return self.lag_steps if self.hold_steps else 0
 
 
@@ -103,7 +104,7 @@ class Plants(NamedTuple):
 
     pool: list[tuple[Matrix, Matrix]]
     """(A, B) of each."""
-    which: NDArray[np.int64]
+    plant_index: NDArray[np.int64]
     """(runs, STEPS) the index of each run's plant in each step."""
 
 
@@ -225,7 +226,7 @@ class _Loops:
         if self.plants is None:
             self.x = following[0]
         else:
-            self.x = np.array(following)[self.plants.which[:, step], self.every]
+            self.x = np.array(following)[self.plants.plant_index[:, step], self.every]
         model = self.propagators[0].model
         self.x_s, self.x_c = self.x_s @ model, self.x_c @ model
 

@@ -36,10 +36,12 @@ class LoopMaps:
     def __init__(self, resolved: Scenario, unit_ns: int, least: int = 1, most: int = 1) -> None:
         self.resolved, self.unit_ns, self.least, self.is_periodic = resolved, unit_ns, least, most == 1
         loop, timing = loop_of(resolved), resolved.timing
+        # The times of the loop.
         self._step_ns, self._tick_ns = timing.plant_period_ns, timing.controller_period_ns
         self._phase_ns, n, m = timing.controller_phase_ns, loop.n, loop.m
         self._delay_ns = sum(round(one.delay_s * 1e9) for one in resolved.network.impairments)
-        # s is x in the newest update that is not lost; it may not have arrived yet.
+        # The rates of z = (x, x_c, u, w, s), and its jumps at a step, event, arrival and tick. w is the
+        # input of the next step. s is x in the newest update that is not lost; it may not have arrived yet.
         x, x_c, u, w, s = np.split(np.eye(3 * n + 2 * m), np.cumsum([n, n, m, m]))
         self._rates = np.vstack([loop.A @ x + loop.B @ u, loop.H @ x_c, 0 * u, 0 * w, 0 * s])
         arrived = expm(loop.H * self._delay_ns * 1e-9) @ s
@@ -48,9 +50,11 @@ class LoopMaps:
         self._arrive = np.vstack([x, arrived, u, w, s])
         without = w if controller.timeout_input == "hold" else 0 * w
         self._ticks = [np.vstack([x, x_c, u, sent, s]) for sent in (loop.K @ x_c, without)]
+        # How old x_c may become.
         timeout_s = controller.update_timeout_s
         self._timeout_ns = 2**62 if timeout_s is None else round(timeout_s * 1e9)
         self._oldest = 1 if timeout_s is None else -(-self._timeout_ns // unit_ns)
+        # The map of each interval: by choice, age before, and whether the update is delivered.
         cycle_ns = int(np.lcm(self._step_ns, self._tick_ns))
         slots = cycle_ns // int(np.gcd(cycle_ns, unit_ns))
         assert self.is_periodic or slots == 1
@@ -59,7 +63,7 @@ class LoopMaps:
             [[self._interval(choice, length, age, delivered) for delivered in (False, True)]
              for age in range(1, self._oldest + 1)]
             for choice, length in enumerate(lengths)
-        ])  # by choice, age before, and whether the update is delivered  # fmt: skip
+        ])  # fmt: skip
         self._lengths = np.array(lengths)
         self._times = self._lengths / (1 if self.is_periodic else most)
 

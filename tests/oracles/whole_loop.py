@@ -352,8 +352,8 @@ def run(s: Settings, chance: Chance) -> Rows:
         sensor.acknowledge(number, event_ns)
 
     def controller_ticks(t_ns: int, k: int) -> None:
-        way = (cross, 1) if s.actuations_cross else (deliver,)
-        at(t_ns, DATAGRAM, *way, plant_receives, k, *controller.tick(k, t_ns))
+        route = (cross, 1) if s.actuations_cross else (deliver,)
+        at(t_ns, DATAGRAM, *route, plant_receives, k, *controller.tick(k, t_ns))
         if t_ns + s.controller_period_ns <= s.horizon_ns:
             at(t_ns + s.controller_period_ns, TICK, controller_ticks, k + 1)
 

@@ -42,7 +42,7 @@ from noack.scenario.scenario_file import completed, put, toml_text
 from noack.settings.section import ReadTable, Table
 from noack.theory.certificates.certified_bounds import ScenarioCertificate, envelope_formula
 from noack.theory.certificates.conditions import nominal_conditions
-from noack.theory.certificates.scenario_certificates import own_plant
+from noack.theory.certificates.scenario_certificates import own_plant_scope
 
 _WITH_FILE = (FmuSettings, GymnasiumSettings, PythonPlantSettings)
 _FLOOR_SHARE = 0.05
@@ -261,10 +261,10 @@ class _Builder:
         resolved.coverage.require_unchanging()
         resolved.coverage.require_certifiable()
         conditions = nominal_conditions(resolved, resolved.certificate.late_periods)
-        certificate = own_plant(resolved).certificate(conditions)
+        certificate = own_plant_scope(resolved).certificate(conditions)
         if certificate.constants is not None:
             return certificate, certificate.constants.loop_gain
-        return certificate, own_plant(resolved).loop_gain(conditions)
+        return certificate, own_plant_scope(resolved).loop_gain(conditions)
 
     def search(self, trials: Sequence[_Trial], report: Callable[[str], None]) -> _Trial:
         """Return the trial that is used."""

@@ -111,7 +111,7 @@ def compiled_dynamics(model: str) -> Compiled | None:
 
     if not is_compiled(model):
         _print(while_compiling("the vehicle's equations", is_cached=_folder(model) is not None))
-    compiled = _compiled(model)
+    compiled = _make_compilable(model)
     example = (
         np.zeros(1),
         np.zeros(4),
@@ -180,7 +180,7 @@ def rates_with_held_cambers(
         cambers[k] = tyre.cambers[k]
 
 
-def _compiled(model: str) -> Compiled:
+def _make_compilable(model: str) -> Compiled:
     from numba.extending import overload, register_jitable  # an extra of noack
 
     dynamics, lateral = _dynamics(model), library("utils.tire_model", "formula_lateral")

@@ -22,7 +22,6 @@ from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, discretise
@@ -32,11 +31,15 @@ from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import EstimationBound
 from noack.theory.bounds.enclosure import NotDecayingError, factors
 from noack.theory.bounds.gains import Forcing, NormalForcing
-from noack.theory.bounds.stacked_norms import product_along_last, spectral_norm, spectral_norms_along_last
+from noack.theory.bounds.stacked_norms import (
+    Stack,
+    product_along_last,
+    spectral_norm,
+    spectral_norms_along_last,
+)
 
 MISMATCH = "Â − A"
 """Name of the output by which the plant's steps differ from the model's."""
-Stack = NDArray[np.float64]
 _MOST_GAINS = 1500
 _SETTLED = 1e-9
 _MOST_STEPS = 100_000
@@ -148,7 +151,7 @@ class EstimationError:
         initial_estimate = loop.x0 if known else np.zeros(loop.n)
         if observer.initial_estimate is not None:
             initial_estimate = np.array(observer.initial_estimate)
-        start = (self._rest[0] @ (initial_estimate - loop.x0))[None, :, None]
+        start = (self._correction[0] @ (initial_estimate - loop.x0))[None, :, None]
         nothing = np.zeros((len(self._gains), 0, loop.n, 1))
         fixed = self._peak(nothing, alpha_per_s, start)
         for sources, peak in zip(self._persistent_sources, self._settled_peaks, strict=True):
@@ -198,7 +201,7 @@ class EstimationError:
         sources, covariances = self._sources(self._normal_increments, 0.0), []
         for k, L in enumerate(self._gains):
             effect, noise = np.hstack([*sources[k]]), L * self._noise_deviations
-            covariances.append((self._rest[k] @ self._between, effect @ effect.T + noise @ noise.T))
+            covariances.append((self._correction[k] @ self._between, effect @ effect.T + noise @ noise.T))
         return covariances
 
     @cached_property
@@ -261,7 +264,7 @@ class EstimationError:
         return np.linalg.matrix_power(self._model.Ad, self._model.steps)
 
     @cached_property
-    def _rest(self) -> Stack:
+    def _correction(self) -> Stack:
         """I − L_k C, (k, n, n)."""
         return np.eye(self._loop.n) - self._gains @ self._model.C
 
@@ -271,10 +274,10 @@ class EstimationError:
         for i in range(self._model.steps):
             effects.append(np.exp(alpha_per_s * self._period_s * (i + 1)) * power)
             power = self._model.Ad @ power
-        return np.asarray(self._rest[:, None] @ np.array(effects))
+        return np.asarray(self._correction[:, None] @ np.array(effects))
 
     def _steps(self, alpha_per_s: float) -> Stack:
-        return np.asarray(self._growth(alpha_per_s) * self._rest @ self._between)
+        return np.asarray(self._growth(alpha_per_s) * self._correction @ self._between)
 
     def _peak(self, sources: Stack, alpha_per_s: float, start: Stack | None = None) -> float:
         """Return sup_k Σ_j ‖W Φ(k, j) S_j‖, scaled; the last gain and source apply from then on."""
@@ -287,23 +290,23 @@ class EstimationError:
         powers = _powers(steps[-1], min(_ENTRIES // max(old.size, last.size) + 1, 256))
         transformed = factor @ powers[1:]
 
-        def rests(steps: slice) -> Stack:
-            sums = _sums(transformed[steps], last) / (1 - rate) + _sums(transformed[steps], old)
-            return np.asarray(output_gain * sums)
+        def bound_remainders(powers: slice) -> Stack:
+            by_new = _sums(transformed[powers], last) / (1 - rate)
+            return np.asarray(output_gain * (by_new + _sums(transformed[powers], old)))
 
         for _ in range(_MOST_STEPS // len(transformed)):
             # The same for every number of further measurements, (powers,).
             totals = total + np.cumsum(_sums(W @ powers[:-1], last))
             sums = _sums(W @ powers[1:], old) + totals
-            largests = np.maximum.accumulate(np.maximum(sums, largest))
-            last_rest = rests(slice(-1, None))[0]
-            if last_rest <= _TAIL_SHARE * largests[-1]:  # the rests fall
-                every = rests(slice(None))
-                number = np.argmax(every <= _TAIL_SHARE * largests)
-                return float((largests[number] + every[number]) * _ROUNDING)
-            total, largest = totals[-1], largests[-1]
+            largest_so_far = np.maximum.accumulate(np.maximum(sums, largest))
+            last_remainder = bound_remainders(slice(-1, None))[0]
+            if last_remainder <= _TAIL_SHARE * largest_so_far[-1]:  # the remainders fall
+                remainders = bound_remainders(slice(None))
+                first_small = np.argmax(remainders <= _TAIL_SHARE * largest_so_far)
+                return float((largest_so_far[first_small] + remainders[first_small]) * _ROUNDING)
+            total, largest = totals[-1], largest_so_far[-1]
             old, last = product_along_last(powers[-1], old), product_along_last(powers[-1], last)
-        return float((largest + last_rest) * _ROUNDING)
+        return float((largest + last_remainder) * _ROUNDING)
 
     def _excess(self, sources: Stack, total: float, alpha_per_s: float) -> float:
         """Return sup_k of Σ_j ‖W Φ(k, j) S_j‖ minus the total for settled gains, scaled."""

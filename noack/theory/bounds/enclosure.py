@@ -215,7 +215,7 @@ class ResponseBounds:
     @cached_property
     def _bends(self) -> "_Bends":
         nodes = self._nodes[..., :-1]
-        return _bends(self.generator, nodes, np.diff(self.edges_s), self.decay, self._columns)
+        return _bound_bends(self.generator, nodes, np.diff(self.edges_s), self.decay, self._columns)
 
     @cached_property
     def _nodes(self) -> Stack:
@@ -328,7 +328,9 @@ class _Bends:
         return np.asarray(np.minimum(factor * self.least[..., None, :, :], bound))
 
 
-def _bends(generator: Matrix, nodes: Stack, steps_s: Stack, decay: Decay | None, columns: Groups) -> _Bends:
+def _bound_bends(
+    generator: Matrix, nodes: Stack, steps_s: Stack, decay: Decay | None, columns: Groups
+) -> _Bends:
     """Return the factors for the cells that start at the nodes, (…, n, r, k): Taylor's formula."""
     powers, growth_per_s = _taylor(generator)
     exponents = growth_per_s[..., None] * steps_s
@@ -427,7 +429,7 @@ def _straight(generator: Matrix, state: Matrix, step_s: Stack, decay: Decay) -> 
     """Return whether e^{Gτ} Y is close to its chord over a step, (…)."""
     everything = Outputs({"": np.eye(generator.shape[-1])})
     size = np.linalg.norm(state, axis=(-2, -1))
-    bends = _bends(generator, state[..., None], step_s[..., None], decay, [slice(None)])
+    bends = _bound_bends(generator, state[..., None], step_s[..., None], decay, [slice(None)])
     return np.asarray(step_s**2 / 8 * bends.over(everything)[..., 0, 0, 0] <= _SAG * size)
 
 

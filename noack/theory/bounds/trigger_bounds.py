@@ -168,7 +168,7 @@ class TriggerBounds:
         """Whether events are at most some time apart."""
         return math.isfinite(self.rule.longest_ns)
 
-    def tested(self, conditions: NetworkConditions) -> NetworkConditions:
+    def conditions_of_tests(self, conditions: NetworkConditions) -> NetworkConditions:
         """Return the conditions with the times of the rule's comparisons.
 
         Raises:
@@ -189,7 +189,7 @@ class TriggerBounds:
         """Return all bounds; their unit is the level, or 1 without one.
 
         Args:
-            conditions: as :meth:`tested` returns them.
+            conditions: as :meth:`conditions_of_tests` returns them.
             level: the largest threshold, scaled.
             least_level: the smallest threshold; None if it may be arbitrarily small.
 
@@ -232,7 +232,7 @@ class TriggerBounds:
             times = times._replace(shortest_s=max(times.shortest_s, conditions.spacing_s))
         return bounds[0]._replace(unit=level or 1.0, times=times, further=tuple(bounds[1:]))
 
-    def divided(
+    def divide(
         self, conditions: NetworkConditions, apart_s: float
     ) -> list[tuple[TriggerBound, TriggerBound]]:
         """Return each bound without its constant, and with it, both in units of 1.

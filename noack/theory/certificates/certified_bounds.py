@@ -22,7 +22,6 @@ from functools import cached_property
 from typing import Literal, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.number_format import at_least, at_most
@@ -32,11 +31,9 @@ from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import Constants, NetworkConditions
 from noack.theory.bounds.disturbances import bound_forcing
 from noack.theory.bounds.enclosure import KernelBounds, response
-from noack.theory.bounds.gains import Output, PlantGains, error_gains
+from noack.theory.bounds.gains import Counts, Output, PlantGains, error_gains
 from noack.theory.certificates.assumptions import Assumption
 from noack.theory.certificates.conditions import BOX, OWN_PLANT
-
-Counts = NDArray[np.int64]
 
 
 class Region(NamedTuple):

@@ -385,17 +385,20 @@ class ErrorInequalities:
             or not spacing_s.all()
         ):
             return None
+        # p of each stage: a row of the signals.
         sizes, sups = self._input_effects(Output.GAIN, count, spacing_s, own_growth)
         shape = len(spacing_s), len(Signal)
         late_s = (delay_s - np.arange(count)[:, None] * spacing_s).clip(0.0, own_growth.longest_s)
-        highest = float(np.max(self._plant.driven[Output.GAIN][0].sup()))
         counts = np.arange(count)[:, None] + np.zeros_like(events)
         rows = self._with_missing(Output.GAIN, present, counts, spacing_s, own_growth)
         rows += _UNIT[Signal.AGE_INPUT]
+        # The share of π from updates that act late.
+        highest = float(np.max(self._plant.driven[Output.GAIN][0].sup()))
         by_input = present[..., Signal.INPUT_ERROR]
-        late = np.minimum(by_input, highest * (delay_s - counts * spacing_s).clip(min=0.0))
-        rows[..., Signal.INPUT_ERROR] = late
-        shares_left = 1 - (by_input - late)[..., None]
+        input_before_update = np.minimum(by_input, highest * (delay_s - counts * spacing_s).clip(min=0.0))
+        rows[..., Signal.INPUT_ERROR] = input_before_update
+        shares_left = 1 - (by_input - input_before_update)[..., None]
+        # Stage by stage; π where its own share is 1 or more.
         stages = _Stages(np.zeros((0, *shape)), late_s)
         for row, share_left, number in zip(rows, shares_left, counts, strict=True):
             row = row + stages.entered(sizes, sups, number)

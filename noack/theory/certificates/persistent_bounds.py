@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -37,13 +37,20 @@ PlantAt = Callable[[ErrorGains, Matrix, float], PlantGains]
 """Returns the plant's gains from the gains of the models, the start of x, and α."""
 _CHORD_ROUNDS = 2
 """So often the chord of a threshold is shortened by the bound of x that it has given."""
-Added = tuple[Constants, Constants | None]
-"""Constants whose bounds are added."""
 _RATE_SHARES = (0.7, 0.4, 0.2, 0.05)
 """Rates that are tried, as shares of the loop's decay rate."""
 SHARES = (0.5, 0.2, 0.8)
 """Values of λ that are tried."""
 ConstantsOfParts = TypeVar("ConstantsOfParts", bound=Sequence[Constants])
+
+
+class Added(NamedTuple):
+    """Constants whose bounds are added."""
+
+    main: Constants
+    """Of what follows from the start."""
+    persistent: Constants | None = None
+    """Of what persists."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +82,7 @@ class DisturbedCertificate:
             self.start_error or loop_of(self.resolved).setpoint is not None
         ):
             raise NoCertificateError("after a change or at a set-point the estimation error is not known")
-        conditions = self.trigger.tested(conditions)
+        conditions = self.trigger.conditions_of_tests(conditions)
         structured = self.start_error == 0.0
         # A part that decays as the threshold does, if there is one.
         if decays and self.resolved.coverage.is_decaying:
@@ -88,7 +95,7 @@ class DisturbedCertificate:
                     structured=structured,
                     shares=SHARES if longest else (),
                 )
-                return [parts]
+                return [Added(*parts)]
             except NotDecayingError:
                 pass
         pairs = yield from self._without_decay(conditions, decays=decays, longest=longest)
@@ -125,7 +132,7 @@ class DisturbedCertificate:
         if decays and is_divided and longest:
             apart_s = constants.inter_event_s or 0.0
             divided = yield from self._of_constant_threshold(conditions, apart_s)
-        return [*divided, (constants, None)]
+        return [*divided, Added(constants)]
 
     def with_plants(
         self, decaying: Constants, persistent: Constants | None
@@ -145,10 +152,10 @@ class DisturbedCertificate:
         lower bound of the inter-event time, certified without dividing into parts.
         """
         pairs: list[Added] = []
-        for start_bound, persistent_bound in self.trigger.divided(conditions, apart_s):
+        for start_bound, persistent_bound in self.trigger.divide(conditions, apart_s):
             with contextlib.suppress(NoCertificateError, NotDecayingError):
                 pairs.append((yield from self._divided(start_bound, persistent_bound, conditions)))
-        return sorted(pairs, key=lambda pair: 0.0 if pair[1] is None else pair[1].state)
+        return sorted(pairs, key=lambda pair: 0.0 if pair.persistent is None else pair.persistent.state)
 
     def _divided(
         self, start_bound: TriggerBound, persistent_bound: TriggerBound, conditions: NetworkConditions
@@ -168,7 +175,7 @@ class DisturbedCertificate:
 
         x0 = loop_of(self.resolved).x0
         decaying, *added = yield from choose_rate(solve_at, self.slowest_per_s, x0, x0)
-        return decaying, added[0] if added else None
+        return Added(decaying, *added)
 
     @cached_property
     def _decaying(self) -> CertificatePart:

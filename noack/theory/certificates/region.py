@@ -17,7 +17,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
-from itertools import starmap
 from typing import NamedTuple
 
 import numpy as np
@@ -44,7 +43,12 @@ from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.certificates.assumptions import Assumption, AssumptionStatus
 from noack.theory.certificates.certified_bounds import Region, ScenarioCertificate
 from noack.theory.certificates.conditions import REGION
-from noack.theory.certificates.scenario_certificates import CertificateScope, Phases, box, own_plant
+from noack.theory.certificates.scenario_certificates import (
+    CertificateScope,
+    Phases,
+    box_scope,
+    own_plant_scope,
+)
 from noack.theory.certificates.solution import Search, completed_alone
 
 _WIDER = 1.02
@@ -62,7 +66,7 @@ def scopes(resolved: Scenario, start_error: float = 0.0) -> list[CertificateScop
     These are its own plant and the box around it, if it is linear; otherwise its plant on a region.
     """
     if resolved.coverage.is_certifiable:
-        linear = own_plant(resolved, start_error), box(resolved, start_error)
+        linear = own_plant_scope(resolved, start_error), box_scope(resolved, start_error)
         return [scope for scope in linear if scope is not None]
     return [RegionScope(resolved, start_error)] if resolved.coverage.can_be_certified else []
 
@@ -102,20 +106,20 @@ class _Box(CertificateScope):
         """
         if not self.is_simple:
             pairs = yield from self._disturbed.constants(conditions, decays=False, longest=False)
-            return [(main, None, persistent) for main, persistent in starmap(self._checked, pairs)]
+            return [self._checked(Phases(main, persistent=added)) for main, added in pairs]
         trigger = self._trigger
         level = 0.0 if trigger.is_homogeneous else max(trigger.beta, trigger.floor)
-        tested, least_level = trigger.tested(conditions), trigger.floor or None
+        tested, least_level = trigger.conditions_of_tests(conditions), trigger.floor or None
         constants = yield from self._solve(tested, 0.0, level, least_level, longest=False)
-        return [(*self._checked(constants, None), None)]
+        return [self._checked(Phases(constants))]
 
     def _coordinate_bounds(self, phases: list[Phases], conditions: NetworkConditions) -> Vector:
         bounds = list[Vector]()
-        for decaying, _, persistent in phases:
+        for phase in phases:
             parts = (
-                [(self._plants[decaying.rate_per_s], decaying)]
+                [(self._plants[phase.main.rate_per_s], phase.main)]
                 if self.is_simple
-                else (self._disturbed.with_plants(decaying, persistent))
+                else self._disturbed.with_plants(phase.main, phase.persistent)
             )
             total = np.zeros(self._loop.n + self._loop.m)
             for plant, constants in parts:
@@ -191,8 +195,8 @@ class RegionScope(_Box):
         for _ in range(_ATTEMPTS):
             try:
                 inclusion = self._motion.over(widths)
-                box = _Box(self._resolved, inclusion, self._start_error, self._other_start)
-                phases, reached = yield from box.bounded(conditions)
+                plants = _Box(self._resolved, inclusion, self._start_error, self._other_start)
+                phases, reached = yield from plants.bounded(conditions)
             except (NotEnclosedError, SystemFailedError) as error:  # also from a user's class
                 if isinstance(error, NotInstalledError):
                     raise CertificateNotCheckedError(str(error)) from None
@@ -204,10 +208,10 @@ class RegionScope(_Box):
                 raise NotDecayingError(f"{where}: {error}") from None
             if (reached < widths).all():
                 region = Region.of(widths, inclusion)
-                self._proven[conditions] = _ProvenRegion(region, box.decay_per_s)
+                self._proven[conditions] = _ProvenRegion(region, plants.decay_per_s)
                 if longest:
                     with contextlib.suppress(NoCertificateError, NotDecayingError):
-                        return (yield from box.all_phases(conditions))
+                        return (yield from plants.all_phases(conditions))
                 return phases
             wider = np.maximum(widths, _WIDER * reached + _LEAST * reached.max())
             # The bounds grow faster than the region: towards a region that holds them, steps shrink.

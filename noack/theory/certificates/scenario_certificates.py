@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -38,8 +39,16 @@ _TIMED_RATES = (0.7, 0.4, 0.1)
 has a certificate is used."""
 _SHARES_OF_ALPHA = (0.8, 0.6, 0.4, 0.2)
 _TOO_LARGE = "intermediate results are too large or too small for floating point"
-Phases = tuple[Constants, Constants | None, Constants | None]
-"""The constants, those from the floor on, and those under persistent disturbances."""
+
+
+class Phases(NamedTuple):
+    """The constants of one bound of a run."""
+
+    main: Constants
+    floor: Constants | None = None
+    """Those from when the threshold has reached its floor."""
+    persistent: Constants | None = None
+    """Those to be added under persistent disturbances."""
 
 
 def trigger_bounds(resolved: Scenario) -> TriggerBounds:
@@ -51,18 +60,18 @@ def trigger_bounds(resolved: Scenario) -> TriggerBounds:
 
 
 def certify(resolved: Scenario, conditions: NetworkConditions) -> ScenarioCertificate:
-    """The certificate of a scenario's own plant; see :class:`CertificateScope`."""
-    return own_plant(resolved).certificate(conditions)
+    """Return the certificate of a scenario's own plant; see :class:`CertificateScope`."""
+    return own_plant_scope(resolved).certificate(conditions)
 
 
 def certify_box(resolved: Scenario, conditions: NetworkConditions) -> ScenarioCertificate | None:
-    """The certificate of all plants in the scenario's uncertainty box; None if it has none."""
-    scope = box(resolved)
+    """Return the certificate of all plants in the scenario's uncertainty box; None if it has none."""
+    scope = box_scope(resolved)
     return None if scope is None else scope.certificate(conditions)
 
 
-def own_plant(resolved: Scenario, start_error: float = 0.0) -> "CertificateScope":
-    """A scenario's own plant."""
+def own_plant_scope(resolved: Scenario, start_error: float = 0.0) -> "CertificateScope":
+    """Return a scenario's own plant."""
     loop = loop_of(resolved)
 
     def plant_at(error: ErrorGains, start: Matrix, alpha_per_s: float) -> PlantGains:
@@ -71,8 +80,8 @@ def own_plant(resolved: Scenario, start_error: float = 0.0) -> "CertificateScope
     return CertificateScope(OWN_PLANT, resolved, loop.A + loop.B @ loop.K, plant_at, start_error)
 
 
-def box(resolved: Scenario, start_error: float = 0.0) -> "CertificateScope | None":
-    """All plants in the scenario's uncertainty box; None if it has none."""
+def box_scope(resolved: Scenario, start_error: float = 0.0) -> "CertificateScope | None":
+    """Return all plants in the scenario's uncertainty box; None if it has none."""
     loop, plant = loop_of(resolved), resolved.plant
     if plant.uncertainty_A is None and plant.uncertainty_B is None:
         return None
@@ -141,8 +150,8 @@ class CertificateScope:
         self._trigger = trigger_bounds(resolved)
         # Where events have a due time, a missed update is missed for a limited time.
         due = self._trigger.has_due_time
-        self._held = not self._loop.H.any() and not due
-        decays = math.inf if self._held or due else -spectral_abscissa(self._loop.H)
+        self._models_hold = not self._loop.H.any() and not due
+        decays = math.inf if self._models_hold or due else -spectral_abscissa(self._loop.H)
         self.decay_per_s = {"the models": decays, "A + BK": -spectral_abscissa(closed_loop)}
         """Decay rates; that of the models is infinite if they hold."""
         assert start is None or self.is_simple  # other starts are those of the scenario
@@ -212,7 +221,7 @@ class CertificateScope:
         """Return the loop gain of a certificate; at least 1, perhaps infinite, if there is none."""
         # Whether inputs of an earlier run are covered depends on the constants.
         try:
-            search = self._solved(conditions, longest=self._start_error > 0)
+            search = self._solve_inequalities(conditions, longest=self._start_error > 0)
             constants = completed_alone(search)
         except NoCertificateError as error:
             gain = max(error.loop_gain, 1.0)
@@ -235,34 +244,32 @@ class CertificateScope:
             NotDecayingError: a mode of the loop decays too slowly.
         """
         try:
-            solved = yield from self._solved(conditions, longest=True)
+            solved = yield from self._solve_inequalities(conditions, longest=True)
         except (NoCertificateError, NotDecayingError) as error:
             solved, void = [], error
-        apart_s = max((main.inter_event_s or 0.0 for main, _, _ in solved), default=0.0)
-        timed = self._timed(conditions, apart_s)
+        apart_s = max((main.inter_event_s or 0.0 for main, *_ in solved), default=0.0)
+        timed = self._constants_from_due_times(conditions, apart_s)
         if timed is None:
             if not solved:
                 raise void
             return solved
         apart_s = max(apart_s, timed.inter_event_s or 0.0)
-        useful = [phases for phases in solved if not _is_within(timed, phases[0])]
-        return [(timed._replace(inter_event_s=apart_s), None, None), *useful]
+        useful = [phases for phases in solved if not _is_within(timed, phases.main)]
+        return [Phases(timed._replace(inter_event_s=apart_s)), *useful]
 
-    def _solved(self, conditions: NetworkConditions, *, longest: bool) -> Search[list[Phases]]:
+    def _solve_inequalities(self, conditions: NetworkConditions, *, longest: bool) -> Search[list[Phases]]:
         """Search for the constants that solve the inequalities.
 
         ``longest``: search for the tightest bounds and the longest δ; otherwise any suffice.
         """
         try:
             if self.is_simple:
-                main, floor = yield from self._phases(conditions, longest=longest)
-                return [(main, floor, None)]
-            pairs = yield from self._disturbed_phases(conditions, longest=longest)
-            return [(main, None, persistent) for main, persistent in pairs]
+                return [(yield from self._phases(conditions, longest=longest))]
+            return (yield from self._disturbed_phases(conditions, longest=longest))
         except (OverflowError, np.linalg.LinAlgError):
             raise NoCertificateError(_TOO_LARGE) from None
 
-    def _timed(self, conditions: NetworkConditions, apart_s: float) -> Constants | None:
+    def _constants_from_due_times(self, conditions: NetworkConditions, apart_s: float) -> Constants | None:
         """Return constants that follow from the times of deliveries alone, if they exist.
 
         ``apart_s``: events are known to be that far apart.
@@ -279,7 +286,7 @@ class CertificateScope:
             return
         if self._start_error or self._start.shape[1] != 1 or self._resolved.observer is not None:
             return
-        tested = trigger.tested(conditions)
+        tested = trigger.conditions_of_tests(conditions)
         for share in shares if self.decay_per_s["A + BK"] > 0 else ():
             rate = share * self.decay_per_s["A + BK"]
             plant = self._plant_at(error_gains(loop, rate), self._start, rate)
@@ -290,26 +297,22 @@ class CertificateScope:
                     bound = bound._replace(times=bound.times._replace(shortest_s=least_s))
                     yield Deliveries(plant, tested, bound)
 
-    def _phases(
-        self, conditions: NetworkConditions, *, longest: bool
-    ) -> Search[tuple[Constants, Constants | None]]:
+    def _phases(self, conditions: NetworkConditions, *, longest: bool) -> Search[Phases]:
         """Search for the constants, and those after the threshold has reached its floor, if any."""
         trigger, floor = self._trigger, None
-        conditions = trigger.tested(conditions)
+        conditions = trigger.conditions_of_tests(conditions)
         main = yield from self._first_phase(conditions, longest=longest)
         if 0 < trigger.floor < trigger.beta and main.rate_per_s == trigger.alpha_per_s:
             floor = _at_floor(main, trigger.floor / trigger.beta)
-        return self._checked(main, floor)
+        return self._checked(Phases(main, floor))
 
-    def _disturbed_phases(
-        self, conditions: NetworkConditions, *, longest: bool
-    ) -> Search[list[tuple[Constants, Constants | None]]]:
+    def _disturbed_phases(self, conditions: NetworkConditions, *, longest: bool) -> Search[list[Phases]]:
         """Search for the constants, and those to be added under persistent disturbances."""
         alpha = self._trigger.alpha_per_s
-        decays = not self._held and below(alpha, min(self.decay_per_s.values()))
+        decays = not self._models_hold and below(alpha, min(self.decay_per_s.values()))
         search = self._disturbed.constants(conditions, decays=decays, longest=longest)
         pairs = yield from search
-        return [self._checked(*pair) for pair in pairs]
+        return [self._checked(Phases(main, persistent=added)) for main, added in pairs]
 
     @cached_property
     def _disturbed(self) -> DisturbedCertificate:
@@ -317,21 +320,21 @@ class CertificateScope:
             self._resolved, self._plant_at, self._trigger, self._start_error, min(self.decay_per_s.values())
         )
 
-    def _checked(self, main: Constants, added: Constants | None) -> tuple[Constants, Constants | None]:
+    def _checked(self, phases: Phases) -> Phases:
         """Return the constants.
 
         Raises:
             NoCertificateError: they do not cover the inputs at the start, or are not finite.
         """
-        if main.input_error < self._start_error:
+        if phases.main.input_error < self._start_error:
             raise NoCertificateError(
                 f"at its start the input was {self._start_error:.3g} from Kx; a certificate "
-                f"covers at most {main.input_error:.3g}"
+                f"covers at most {phases.main.input_error:.3g}"
             )
-        for constants in (main, added):
+        for constants in phases:
             if constants is not None and not _is_finite(constants):
                 raise NoCertificateError(_TOO_LARGE)
-        return main, added
+        return phases
 
     def _first_phase(self, conditions: NetworkConditions, *, longest: bool) -> Search[Constants]:
         trigger, decay = self._trigger, min(self.decay_per_s.values())
@@ -341,7 +344,7 @@ class CertificateScope:
                 with contextlib.suppress(NoCertificateError):
                     return (yield from self._solve(conditions, 0.0, 0.0, None, longest=False))
             return (yield from self._fastest(conditions, decay))
-        if not self._held and below(alpha, decay) and floor < beta:
+        if not self._models_hold and below(alpha, decay) and floor < beta:
             try:
                 return (yield from self._solve(conditions, alpha, beta, beta, longest=longest))
             except NotDecayingError:
@@ -349,7 +352,7 @@ class CertificateScope:
                     raise
                 return (yield from self._slower(conditions, alpha))
         # Certify a slower decay or none; the smallest event level is then the floor, if any.
-        slower = 0.0 if self._held or floor > 0 else max(_SLOWER * decay, 0.0)
+        slower = 0.0 if self._models_hold or floor > 0 else max(_SLOWER * decay, 0.0)
         level = max(beta, floor)
         return (yield from self._solve(conditions, slower, level, floor or None, longest=longest))
 
@@ -364,7 +367,7 @@ class CertificateScope:
             return ((yield from self._solve(conditions, rate_per_s, 0.0, None)),)
 
         # Inputs of an earlier run are bounded without a rate.
-        if not self._held and 0 < decay < math.inf and self._start_error == 0.0:
+        if not self._models_hold and 0 < decay < math.inf and self._start_error == 0.0:
             with contextlib.suppress(NotDecayingError, NoCertificateError):
                 (constants,) = yield from choose_rate(at_rate, decay, self._loop.x0, self._start)
                 return constants

@@ -136,12 +136,12 @@ class _Tilts:
     """The bound as a function of s, and its minimum."""
 
     def __init__(self, maps: PeriodMaps, chain: OutcomeChain) -> None:
-        self._period, self._chain = maps, chain
-        self._maps = np.array(maps.reduced[0])
+        self._period_maps, self._chain = maps, chain
+        self._matrices = np.array(maps.reduced[0])
         self._chances = np.array([chain.delivered, chain.lost])
         self._steps = np.nonzero(self._chances)
         self._shares = chain.distribution()[self._steps[1]] * self._chances[self._steps]
-        modes, size = len(chain.lost), len(self._maps[0])
+        modes, size = len(chain.lost), len(self._matrices[0])
         self._forward = self._backward = np.tile(np.eye(size), (modes, 1, 1))
 
     def bound(self) -> float:
@@ -150,10 +150,10 @@ class _Tilts:
 
         start = np.zeros(len(self._shares))
         # Too many states are refused before the search.
-        M0, M1 = self._maps
+        M0, M1 = self._matrices
         second_moments(M0, M1, self._tilted(start))
         s = minimize(self._value, start, jac=True, method="L-BFGS-B", options={"maxiter": _ITERATIONS}).x
-        radius = self._period.radius_bound(self._tilted(s))
+        radius = self._period_maps.radius_bound(self._tilted(s))
         exponent = self._mean(s) + math.log(radius)
         return math.exp(exponent / 2) * (1 + 1e-12)
 
@@ -188,14 +188,14 @@ class _Tilts:
         chances = np.array([chain.delivered, chain.lost])
         X, Y, radius, before = self._forward, self._backward, 0.0, -1.0
         for _ in range(_POWERS):
-            X, radius = _scaled(_mapped_moments(self._maps, chances, X))
-            Y, _ = _scaled(_mapped_moments(self._maps.transpose(0, 2, 1), chances.transpose(0, 2, 1), Y))
+            X, radius = _scaled(_mapped_moments(self._matrices, chances, X))
+            Y, _ = _scaled(_mapped_moments(self._matrices.transpose(0, 2, 1), chances.transpose(0, 2, 1), Y))
             if abs(radius - before) <= _PRECISION * radius:
                 break
             before = radius
         self._forward, self._backward = X, Y
         is_delivered, source, target = self._steps
-        M = self._maps[is_delivered]
+        M = self._matrices[is_delivered]
         weights = chances[self._steps] * np.einsum(
             "eab,eab->e", Y[target], M @ X[source] @ M.transpose(0, 2, 1)
         )

@@ -210,7 +210,7 @@ class LoopMoments:
     def of_cost(self, number: int) -> "LoopMoments":
         """Return the moments of the components of z on which a cost depends, now or later.
 
-        If all moments are bounded, they are returned.
+        If all moments are bounded, these are the moments of all components.
         """
         steps = [step for slot in self._slots for step in slot]
         acts_on = np.any([step.matrix != 0 for step in steps], axis=0)

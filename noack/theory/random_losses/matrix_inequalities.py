@@ -56,7 +56,7 @@ class MatrixInequalities:
         """Return values inside for which the last one is the largest, to a share of _GAP.
 
         t times the last value plus Σ log det is made large by Newton's method, for larger and larger t.
-        The last values that are inside by more than rounding are retransformed, None if there are none.
+        The result is the last values that are inside by more than rounding; None if there are none.
         """
         dimension = sum(map(len, self._constants))
         weight, confirmed = 1.0, None

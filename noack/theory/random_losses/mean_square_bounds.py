@@ -48,11 +48,16 @@ _CELLS = 64
 _MOST_LOST, _ROUNDS, _SETTLED, _FIRST = 256, 30, 0.999, 1e6
 _A, _PI, _ONE = np.eye(3)
 """a, π and 1; every other signal is bounded by a combination of them."""
-
-
-_Signals = tuple[Vector, Vector]
-"""Rows that bound R_E x and p."""
 _Term = TypeVar("_Term", float, Vector)
+
+
+class _SignalRows(NamedTuple):
+    """Rows that bound signals."""
+
+    mismatch: Vector
+    """Of R_E x."""
+    input_error: Vector
+    """Of p."""
 
 
 class MeanSquares(NamedTuple):
@@ -144,7 +149,7 @@ class _MomentInequalities:
         self._drive = [response(error.scaled_H, D) for D in columns]
         self._recent = [response_until(error.scaled_H, D, delay_s) for D in columns if delay_s > 0]
         self._ages = error.age_gains(conditions.hold_s)
-        self._signals = self._state(Output.MISMATCH), _PI + self._start_error * _ONE
+        self._signals = _SignalRows(self._state(Output.MISMATCH), _PI + self._start_error * _ONE)
         self._missing = {str(output): self._missing_events(output, self._signals) for output in error.outputs}
 
     def solve(self) -> tuple[_Bounds | None, float]:
@@ -164,14 +169,14 @@ class _MomentInequalities:
             values = np.append(solution.bound, 1.0)
             if not np.isfinite(values).all():
                 return bounds, min(loop_gain, float(solution.loop_gain))
-            found = _Bounds(
+            new_bounds = _Bounds(
                 {C: float(row @ values) for C, row in states.items()},
                 {C: float(row @ values) for C, row in errors.items()},
                 *solution.bound.tolist(),
             )
-            if bounds and found.states[Output.STATE] > _SETTLED * bounds.states[Output.STATE]:
+            if bounds and new_bounds.states[Output.STATE] > _SETTLED * bounds.states[Output.STATE]:
                 break
-            bounds, loop_gain = found, float(solution.loop_gain)
+            bounds, loop_gain = new_bounds, float(solution.loop_gain)
         return bounds, loop_gain
 
     def refine(self, bounds: _Bounds) -> _Bounds:
@@ -204,13 +209,13 @@ class _MomentInequalities:
         at_start = float(self._start_error) + errors[Output.GAIN] + in_flight if conditions.start_s else 0.0
         return KnownRms(bounds.sensor_error, other, aged, at_start)
 
-    def _driving(self, bounds: _Bounds) -> _Signals:
+    def _driving(self, bounds: _Bounds) -> _SignalRows:
         """Return rows that bound R_E x, and p at all times: before and after the first input, at t_a.
 
         E‖p‖² ≤ π² + sup‖p‖² P(t < t_a), as t_a may depend on the losses.
         """
         input_error = float(np.hypot(bounds.input_error, self._start_error))
-        return bounds.states[Output.MISMATCH] * _ONE, input_error * _ONE
+        return _SignalRows(bounds.states[Output.MISMATCH] * _ONE, input_error * _ONE)
 
     def _improved(self, bounds: _Bounds, functions: Sequence[QuadraticFunction]) -> _Bounds:
         """Bound every signal by what is known of the others."""
@@ -242,7 +247,7 @@ class _MomentInequalities:
             total = total + gain * (states[C] + errors[C])
         return total
 
-    def _tested(self, signals: _Signals) -> Vector:
+    def _tested(self, signals: _SignalRows) -> Vector:
         """Return the row that bounds a: β, grown until the next test, and what enters before it."""
         sampling_s = self._conditions.sampling_s
         a = self._beta * self._error.stretch(sampling_s) * _ONE
@@ -256,7 +261,7 @@ class _MomentInequalities:
         free, gain = self._plant.states[output]
         return np.asarray(gain * _PI + (free + self._start[output]) * _ONE)
 
-    def _missing_events(self, output: Output, signals: _Signals) -> "_Missing":
+    def _missing_events(self, output: Output, signals: _SignalRows) -> "_Missing":
         """Return what bounds the missing events' part of C e_c, and the present error."""
         error, C, conditions = self._error, self._error.outputs[output], self._conditions
         delay_s, kernels = conditions.delay_s, [drive.through(C) for drive in self._drive]
@@ -284,7 +289,7 @@ class _MomentInequalities:
         return np.asarray(missing.present + missing.recent + best)
 
 
-def _input_row(gains: Iterable[Stack], signals: _Signals) -> Vector:
+def _input_row(gains: Iterable[Stack], signals: _SignalRows) -> Vector:
     """Return the row of E x and B p with these gains."""
     return sum((gain * row for gain, row in zip(gains, signals, strict=False)), np.zeros(3))
 

@@ -78,7 +78,8 @@ class QuadraticFunction(NamedTuple):
     def level(self, known: KnownRms) -> float:
         """Bound of the mean of xᵀXx + yᵀPy, at every fixed time."""
         loop, of_other = self.loop, self.of_inputs[0]
-        entering = self.of_sensor_error * known.sensor_error**2 + of_other * loop.other(known) ** 2
+        entering = self.of_sensor_error * known.sensor_error**2
+        entering += of_other * loop.bound_other_inputs(known) ** 2
         first = loop.start @ self.state @ loop.start
         begun = of_other * known.start**2 * loop.start_s
         added = self.added * known.sensor_error**2
@@ -144,12 +145,12 @@ class LossyFlow:
         ])  # fmt: skip
         self.entering = np.vstack([self.input, 0 * self.input, -self.input])
 
-    def other(self, known: KnownRms) -> float:
+    def bound_other_inputs(self, known: KnownRms) -> float:
         """Bound ω of w."""
         return known.other + (0.0 if self.counts_age else known.aged)
 
-    def flight(self, rate_per_s: float) -> Matrix:
-        """D, (n, n), enlarged by the rounding of an exponential.
+    def effect_in_flight(self, rate_per_s: float) -> Matrix:
+        """Return D, (n, n), enlarged by the rounding of an exponential.
 
         The delay is halved until the models hardly move, then D(2t) = D(t) + e^{Mᵀt} D(t) e^{Mt}. One
         exponential would also have the growing e^{−Mᵀt}, in which D of a fast mode is lost.
@@ -177,7 +178,7 @@ def quadratic_functions(loop: LossyFlow, known: KnownRms) -> list[QuadraticFunct
     zero = np.zeros_like(loop.model)
     searches = [_Search(loop, known, share, loop.inverse_weight, zero) for share in _OF_STATE]
     searches += [_Search(loop, known, share, zero, np.eye(len(zero))) for share in _OF_ERROR]
-    return [function for search in searches if (function := search.function()) is not None]
+    return [function for search in searches if (function := search.find_function()) is not None]
 
 
 class _Unknowns(NamedTuple):
@@ -210,23 +211,23 @@ class _Search:
         self._of_error = of_error @ self._sum
         # The mean squares of w, then and at first, and x(0), for a = 1.
         unit = known.sensor_error
-        self._other = (loop.other(known) / unit) ** 2
+        self._other = (loop.bound_other_inputs(known) / unit) ** 2
         self._begun = (known.start / unit) ** 2 * loop.start_s
         self._start = loop.start / unit
-        self._flight = loop.flight(self._rate) if loop.delay_s > 0 else None
+        self._flight = loop.effect_in_flight(self._rate) if loop.delay_s > 0 else None
 
-    def function(self) -> QuadraticFunction | None:
-        """The function for the smallest bound that was found; None if it cannot be confirmed."""
+    def find_function(self) -> QuadraticFunction | None:
+        """Return the function for the smallest bound that is found; None if it cannot be confirmed."""
         try:
-            first = self._first()
-            found = (
-                None if first is None else MatrixInequalities(self._blocks, len(first)).maximise_last(first)
-            )
+            first = self._first_values()
+            if first is None:
+                return None
+            solution = MatrixInequalities(self._blocks, len(first)).maximise_last(first)
         except np.linalg.LinAlgError:  # a matrix is singular to rounding
             return None
-        if found is None:
+        if solution is None:
             return None
-        X, P, mu, nu, zetas, _ = self._unknowns(found)
+        X, P, mu, nu, zetas, _ = self._unknowns(solution)
         return QuadraticFunction(X, P + nu * self._sensor, nu, self._rate, mu, zetas, self._loop)
 
     def _unknowns(self, values: Vector) -> _Unknowns:
@@ -277,8 +278,8 @@ class _Search:
         squared = np.diag(np.repeat(squares, loop.entering.shape[1]))
         return np.asarray(np.block([[form, sides], [sides.T, squared]]))
 
-    def _first(self) -> Vector | None:
-        """Values inside of all inequalities; None if rounding leaves none.
+    def _first_values(self) -> Vector | None:
+        """Return values inside of all inequalities; None if rounding leaves none.
 
         q decays by itself, so a large P_qq covers what q does to x. A larger P_ss covers the events,
         ζ_f and ζ_h what v_f and v_h do to x, and large μ and ζ what e_s and w do. Then all is made small.

@@ -175,7 +175,7 @@ def unlimited_losses(
         NotPredictableError: the losses are no Markov chain over the packets.
     """
     losses = loss_process(resolved.network.link)
-    found, void = _at_fixed_times(resolved, losses, conditions)
+    moments, void = _at_fixed_times(resolved, losses, conditions)
     bursts = _bursts(resolved, scope, losses, conditions)
     paper_rate, at_events = _paper(resolved, losses)
     return UnlimitedLosses(
@@ -184,9 +184,9 @@ def unlimited_losses(
         resolved.timing.horizon_ns / NS_PER_S,
         tuple(bursts),
         tuple(moments_of_runs(bursts)),
-        found,
+        moments,
         at_events,
-        found.rate_per_s if found and found.rate_per_s > 0 else None,
+        moments.rate_per_s if moments and moments.rate_per_s > 0 else None,
         paper_rate,
         void,
     )
@@ -231,17 +231,17 @@ def _at_fixed_times(
     if trigger.floor > 0:
         alpha = 0.0
     beta, p = max(trigger.beta, trigger.floor), losses.largest_probability
-    found, reason = None, None
+    moments, reason = None, None
     for share in _RATES:
         try:
-            found = mean_squares(*_gains(loop, share * alpha), conditions, beta, p)
+            moments = mean_squares(*_gains(loop, share * alpha), conditions, beta, p)
         except (NoCertificateError, NotDecayingError) as error:
             reason = str(error)
-        if found and (share == 1 or found.loop_gain < _CLEARLY):
+        if moments and (share == 1 or moments.loop_gain < _CLEARLY):
             break
-    if found is None:
+    if moments is None:
         return None, reason
-    return mean_squares(*_gains(loop, found.rate_per_s), conditions, beta, p, refined=True), None
+    return mean_squares(*_gains(loop, moments.rate_per_s), conditions, beta, p, refined=True), None
 
 
 def _gains(loop: LoopMatrices, rate_per_s: float) -> tuple[ErrorGains, PlantGains]:

@@ -87,8 +87,8 @@ def test_the_random_scenarios_have_every_feature() -> None:
     counts: Counter[str] = Counter()
     for number in range(RANDOM):
         scenario, outcome = random_run(number).scenario, compared(number)
-        steps, measured = outcome.found["plant_step"], outcome.found["sensor_measurement"]
-        delivered, packets = outcome.found["controller_delivery"], outcome.rows["netem_packet"]
+        steps, measured = outcome.reference["plant_step"], outcome.reference["sensor_measurement"]
+        delivered, packets = outcome.reference["controller_delivery"], outcome.rows["netem_packet"]
         has = {
             scenario.mode: True,
             scenario.network.initial_sync: True,
@@ -98,11 +98,11 @@ def test_the_random_scenarios_have_every_feature() -> None:
             f"input after the timeout: {scenario.controller.timeout_input}": any(
                 row["t_ns"] - max((d["t_ns"] for d in delivered if d["model_t_ns"] <= row["t_ns"]), default=0)
                 >= scenario.timing.update_timeout_ns
-                for row in outcome.found["controller_step"]
+                for row in outcome.reference["controller_step"]
             ),
             "set point": any(scenario.controller.setpoint or ()),
             "changes": bool(scenario.changes),
-            "acknowledgements": bool(outcome.found["sensor_acknowledgement"]),
+            "acknowledgements": bool(outcome.reference["sensor_acknowledgement"]),
             "updates lost": any(row["dropouts"] > 0 for row in delivered),
             "updates late": any(row["model_t_ns"] > row["t_ns"] for row in delivered),
             "update of the time of a step": any(

@@ -44,24 +44,24 @@ def of(system: System) -> tuple[LoopMatrices, Theorem2]:
         state_names=names, input_names=names[: len(system.K)],
     )  # fmt: skip
     delta = certified_or_skipped(system, NetworkConditions(system.mansd)).delta
-    found = theorem_2(loop, system.beta, system.alpha, delta)
-    assert found is not None
-    return loop, found
+    paper = theorem_2(loop, system.beta, system.alpha, delta)
+    assert paper is not None
+    return loop, paper
 
 
 @settings(SEARCH, max_examples=2)
 @given(systems(weighted=False))
 def test_theorem_2_is_what_its_equations_say(system: System) -> None:
     """Every quantity recomputed from eq:tau, eq:Htil and eq:normXt; F at t_i = 0 and far out."""
-    loop, found = of(system)
-    closed, alpha, bar = loop.A + loop.B @ loop.K, system.alpha, found.alpha_bar_per_s
+    loop, paper = of(system)
+    closed, alpha, bar = loop.A + loop.B @ loop.K, system.alpha, paper.alpha_bar_per_s
     assert alpha < bar < -spectral_abscissa(closed)
     fast = float(np.abs(np.linalg.eigvals(closed)).max())
     t_s = np.concatenate([np.linspace(0, 20 / fast, 300), np.linspace(0, 20 / (bar - alpha), 300)])
     sampled = np.linalg.norm(expm((closed + bar * np.eye(loop.n)) * t_s[:, None, None]), 2, (1, 2))
     # ‖e^{(A+BK)t}‖ ≤ c e^{−ᾱt}, and c is close to its smallest possible value.
-    assert sampled.max() / ROUNDING <= found.c <= 1.01 * sampled.max()
-    beta, delta, c = system.beta, found.delta, found.c
+    assert sampled.max() / ROUNDING <= paper.c <= 1.01 * sampled.max()
+    beta, delta, c = system.beta, paper.delta, paper.c
     BK, gap, x0 = norm(loop.B @ loop.K), bar - alpha, float(np.linalg.norm(system.x0))
     tilde, hat = norm(loop.A + loop.B @ loop.K - loop.H), norm(loop.H)
     F_bar = tilde * c * (x0 - beta * delta * BK / gap)
@@ -70,23 +70,23 @@ def test_theorem_2_is_what_its_equations_say(system: System) -> None:
     for t_i in (0.0, 1.0 / gap, 1e9):
         bold_F = F_bar * math.exp(-gap * t_i) / (hat + bar) + F / (hat + alpha)
         least_s = min(least_s, math.log(1 + beta / bold_F) / (hat + bar))
-    assert found.inter_event_s == pytest.approx(least_s, rel=1e-12)
-    assert (found.a_hat, found.a_tilde) == pytest.approx((hat, tilde))
+    assert paper.inter_event_s == pytest.approx(least_s, rel=1e-12)
+    assert (paper.a_hat, paper.a_tilde) == pytest.approx((hat, tilde))
     for t in (0.0, 0.3, 5.0):
         right = c * x0 * math.exp(-bar * t) + beta * c * delta * BK / gap * (
             math.exp(-alpha * t) - math.exp(-bar * t)
         )
-        assert found.state(np.array([t]), alpha)[0] == pytest.approx(right, rel=1e-12)
+        assert paper.state(np.array([t]), alpha)[0] == pytest.approx(right, rel=1e-12)
 
 
 @settings(SEARCH, max_examples=2)
 @given(systems(weighted=False, **INSTANT), seeds)
 def test_theorem_2_is_never_exceeded_in_the_papers_loop(system: System, seed: int) -> None:
-    _, found = of(system)
+    _, paper = of(system)
     trace, t_s = simulate_continuous_time(system, *networks(seed, system)), times_s(system)
-    bounds = np.exp(system.alpha * t_s) * found.state(t_s, system.alpha)
+    bounds = np.exp(system.alpha * t_s) * paper.state(t_s, system.alpha)
     assert trace.state.max() <= bounds.max() * ROUNDING
-    assert trace.inter_event_s >= found.inter_event_s / ROUNDING
+    assert trace.inter_event_s >= paper.inter_event_s / ROUNDING
 
 
 @pytest.mark.parametrize("alpha", [0.1, 2.0])
@@ -101,8 +101,8 @@ def test_the_slower_of_model_and_threshold_determines_the_interval(alpha: float)
         for gamma in np.geomspace(1e-3, 1e3, 2000)
         if (eta := float((x * np.exp(-gamma * passed_s)).min())) > 0
     )
-    found = longest_interval_s(Interval(t_s, x, model), beta, alpha, kappa)
-    assert expected * (1 - 1e-9) <= found <= 1.02 * expected
+    longest_s = longest_interval_s(Interval(t_s, x, model), beta, alpha, kappa)
+    assert expected * (1 - 1e-9) <= longest_s <= 1.02 * expected
 
 
 def test_a_trajectory_through_0_has_no_longest_interval() -> None:
@@ -203,13 +203,13 @@ def histories(draw: st.DrawFn) -> History:
 
 def follow(history: History, trigger: TriggerRule, at_once: int = 25) -> list[tuple[float, float, Vector]]:
     """Return both bounds, and (I1), at each moment; the monitor takes so many moments at once."""
-    monitor, found = ErrorMonitor(history.H, trigger, PERIOD_NS), []
+    monitor, followed = ErrorMonitor(history.H, trigger, PERIOD_NS), []
     for first in range(0, len(history.moments), at_once):
         columns = zip(*history.moments[first : first + at_once], strict=True)
         t_ns, e_s, events, received, _ = map(np.array, columns)
         bounds = monitor.take(t_ns, e_s, events, received)
-        found += zip(bounds.identity.tolist(), bounds.printed.tolist(), bounds.missed, strict=True)
-    return found
+        followed += zip(bounds.identity.tolist(), bounds.printed.tolist(), bounds.missed, strict=True)
+    return followed
 
 
 def explicit(history: History, trigger: TriggerRule, upto: int) -> tuple[float, float]:
@@ -236,9 +236,9 @@ def test_both_bounds_are_the_explicit_sums(
     history: History, alpha: float, floor: float, at_once: int
 ) -> None:
     trigger = decaying_rule(0.5, alpha, floor, history.weight)
-    for upto, found in enumerate(follow(history, trigger, at_once)):
+    for upto, bounds in enumerate(follow(history, trigger, at_once)):
         expected = explicit(history, trigger, upto)
-        assert found[:2] == pytest.approx(expected, rel=1e-9, abs=1e-12)
+        assert bounds[:2] == pytest.approx(expected, rel=1e-9, abs=1e-12)
 
 
 @settings(max_examples=15)
@@ -247,9 +247,9 @@ def test_the_identity_holds_for_every_trigger_plant_and_network(history: History
     """It is x_c − x_s, and bounds the error; no assumption on trigger, plant or network."""
     trigger = decaying_rule(1e-3, 1.0, 0.0, history.weight)
     largest = 0.0
-    for moment, found in zip(history.moments, follow(history, trigger, at_once), strict=True):
+    for moment, bounds in zip(history.moments, follow(history, trigger, at_once), strict=True):
         error = float(np.linalg.norm(history.weight @ moment.e_c))
         largest = max(largest, error)
-        assert error <= found[0] + 1e-12 * max(largest, 1.0)
+        assert error <= bounds[0] + 1e-12 * max(largest, 1.0)
         between = moment.e_c if moment.event >= 0 else moment.e_c - moment.e_s
-        np.testing.assert_allclose(found[2], between, rtol=0, atol=1e-9 * max(largest, 1.0))
+        np.testing.assert_allclose(bounds[2], between, rtol=0, atol=1e-9 * max(largest, 1.0))

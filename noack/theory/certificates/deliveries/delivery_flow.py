@@ -75,7 +75,7 @@ class DeliveryFlow:
         self.start = self.weight @ plant.start
         self.model_growth = float(error.kernels[Output.WEIGHTED].sup())
         """sup ‖e^{(H+αI)τ}‖_W"""
-        self.input_error = self.weight @ plant.input_matrix
+        self.input_matrix = self.weight @ plant.input_matrix
         self.gain = error.split_K[1] @ self.inverse
         self.edges_s, self._propagators = self._grid()
         self.states = np.ascontiguousarray(self._propagators[:, :, : self.n])
@@ -137,7 +137,7 @@ class DeliveryFlow:
     @cached_property
     def _unit_responses(self) -> tuple[Stack, Stack, Vector]:
         """e^{Fτ} (0, I) and e^{Fτ} (BU, −BU) at the nodes, and step²/8 · ‖F‖² e^{‖F‖ step}."""
-        by_input = self._propagators @ np.vstack([self.input_error, -self.input_error])
+        by_input = self._propagators @ np.vstack([self.input_matrix, -self.input_matrix])
         exponents = np.diff(self.edges_s) * float(np.linalg.norm(self.generator, 2))
         return self._propagators[:, :, self.n :], by_input, exponents**2 / 8 * np.exp(exponents)
 
@@ -153,7 +153,7 @@ class DeliveryFlow:
 
     @cached_property
     def error_effects(self) -> tuple[Vector, Vector]:
-        """The same for C = (0, I)."""
+        """Bound the effects on e_c: :meth:`unit_effects` for C = (0, I)."""
         return self.unit_effects(np.eye(2 * self.n)[self.n :])
 
     def transformed(self, matrix: Matrix) -> Matrix:

@@ -174,7 +174,8 @@ class GapLoop:
         self.scaled_H = self.H + plant.alpha_per_s * np.eye(self.n)
         M, BK = plant.closed_loop, plant.B @ plant.error.K
         self.F = np.block([[M, BK], [self.scaled_H - M, self.scaled_H - BK]])
-        self.BK = np.vstack([BK, -BK])
+        self.input_by_state = np.vstack([BK, -BK])
+        """(B; −B) K"""
         self.starts_late = conditions.start_s > gaps.least_s * ROUNDING
         # An update may be in flight for d; what is delivered before the first input, until then.
         d = conditions.delay_s
@@ -308,7 +309,7 @@ class GapLoop:
         if self.conditions.hold_s == 0 or not self.H.any():
             return spectral_norm(without_ages) * ROUNDING
         # By how much the products at the nodes may differ from those between them.
-        input_rate = self.BK @ self.H
+        input_rate = self.input_by_state @ self.H
         row = np.hstack([shape, 0 * shape])
         Y = F @ F @ input_rate - 2 * F @ input_rate @ G + input_rate @ G @ G
         bend = response_until(F, Y @ inverse, grid.until_s, grid.cells).through(row).sup_on_grid()

@@ -180,7 +180,7 @@ class DeliveryEllipsoid:
         flow = self.flow
         # The largest ‖p‖ for each γ, by bisection.
         S = self.shape @ flow.closed_loop @ self.inverse
-        by_input = self.shape @ flow.input_error
+        by_input = self.shape @ flow.input_matrix
         squares = by_input @ by_input.T / 2
         gain = float(np.linalg.norm(by_input, 2))
         largest = 0.0
@@ -248,10 +248,10 @@ class Reach:
         """
         largest, input_errors, bounds = self.ellipsoid.drive_limit
         input_errors = input_errors + (self._changes(bounds) + self.effects.age_input) / self.scale
-        first_cell = int(np.argmax(np.append(input_errors, np.inf) * FLOW_ROUNDING >= largest))
+        first_open_cell = int(np.argmax(np.append(input_errors, np.inf) * FLOW_ROUNDING >= largest))
         states = self.ellipsoid.state_bounds
         is_inside = self._sup_after_last_node(states, 1.0, most=1.0) <= 1
-        return is_inside and self._sup_followed(states, 1.0, first_cell) <= 1
+        return is_inside and self._sup_followed(states, 1.0, first_open_cell) <= 1
 
     def _changes(self, bounds: "_CellBounds") -> Vector:
         """Bound what delay and hold change of C z over the cells, (k,)."""
@@ -259,11 +259,11 @@ class Reach:
 
     @cached_property
     def _error_changes(self) -> Vector:
-        """The same of e_c."""
+        """Bounds of what delay and hold change of e_c over the cells, (k,)."""
         return self.effects.changes(self.ellipsoid.flow.error_effects)
 
     @cached_property
-    def _state_bounds(self) -> Vector:
+    def _state_limits(self) -> Vector:
         """Bounds of ‖ΛWx‖ over the cells, for c = 1."""
         return 1 + self._changes(self.ellipsoid.state_bounds) / self.scale
 
@@ -277,7 +277,7 @@ class Reach:
         # All is in proportion to c, for D/c.
         errors, changes = self.error_bound + self._error_changes, self._changes(bounds)
         cells = slice(first_cell, self._followed_cells)
-        return bounds.sup(errors / self.scale, self._state_bounds, changes / self.scale, cells, enough)
+        return bounds.sup(errors / self.scale, self._state_limits, changes / self.scale, cells, enough)
 
     def _sup_after_last_node(self, bounds: "_CellBounds", enough: float, *, most: float = math.inf) -> float:
         """Bound ‖C z‖ after the last node that is followed, for c = 1.

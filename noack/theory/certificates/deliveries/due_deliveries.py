@@ -276,9 +276,9 @@ class Deliveries:
             bounds[first:] = np.maximum(bounds[first:], larger_ends(later))
             # A w until an earlier time, and times between two nodes.
             bounds[first:] += T**2 / 8 * self._start_response(C, self._start_bend, cells)
-            second_derivative = self._start_response(C @ loop.F @ loop.F, loop.BK, cells)
+            second_derivative = self._start_response(C @ loop.F @ loop.F, loop.input_by_state, cells)
             bounds[first:] += loop.grid.cell_s**2 / 8 * T * second_derivative
-            bounds[:first] += T * self._start_response(C, loop.BK, max(first, 1))
+            bounds[:first] += T * self._start_response(C, loop.input_by_state, max(first, 1))
             bounds += self._output_sags[number] * np.linalg.norm(self.gains.shape @ self._x0)
             # The age of the input.
             bounds += loop.input_responses[number] @ start.age_input
@@ -315,7 +315,7 @@ class Deliveries:
     def _start_bend(self) -> Matrix:
         """Y: what w has added bends by e^{Fr} Y e^{Hs} x(0) where it ends at s, r ago."""
         loop = self.loop
-        return loop.F @ loop.BK - loop.BK @ loop.scaled_H
+        return loop.F @ loop.input_by_state - loop.input_by_state @ loop.scaled_H
 
     def _start_response(self, C: Matrix, Y: Matrix, cells: int) -> float:
         """Bound ‖C e^{Fr} Y e^{Hs} x(0)‖ over cells of r, and s up to T."""

@@ -50,8 +50,11 @@ class _SumOfErrors:
         count: int,
         later_s: float,
     ) -> None:
-        error, all_growths = plant.error, [growth for row in growths for growth in row]
-        self._growths, ages_s = growths, spacing_s * np.arange(count, dtype=np.float64)
+        error = plant.error
+        all_growths = [growth for row in growths for growth in row]
+        self._growths = growths
+        self._begin_s = begin_s
+        ages_s = spacing_s * np.arange(count, dtype=np.float64)
         # Gains of the errors of missing events, and of what had entered before them.
         missing = np.array([error.kernels[C].sups(ages_s) for C in error.outputs])[:, None]
         kernels = [plant.driven[C] for C in error.outputs]
@@ -73,7 +76,7 @@ class _SumOfErrors:
         self._gains = np.dstack([present, np.broadcast_to(missing, (*present.shape, count))])
         """(o, g, i), like those of what has entered."""
         highest = np.array([kernel.sup() for kernel, _ in kernels])
-        self._highest, self._begin_s = highest[:, None], begin_s
+        self._highest = highest[:, None]
 
     def bound(
         self, b: Vector, input_error: float, mismatch: float, start_error: float

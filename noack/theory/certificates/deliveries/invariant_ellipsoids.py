@@ -135,7 +135,7 @@ class InvariantEllipsoids:
         shapes = np.linalg.inv(inverses)
         closed_loops = shapes @ self.flow.closed_loop @ inverses
         decay_rates = -np.linalg.eigvalsh(closed_loops + closed_loops.swapaxes(-1, -2))[:, -1] / 2
-        gains = np.linalg.norm(shapes @ self.flow.input_error, 2, axis=(1, 2)) / decay_rates
+        gains = np.linalg.norm(shapes @ self.flow.input_matrix, 2, axis=(1, 2)) / decay_rates
         outputs, loop_gains = self.plant.error.outputs, np.zeros(len(scales))
         for output, gain in self.age_gains.items():
             C = outputs[output] @ self.flow.inverse @ inverses

@@ -162,7 +162,7 @@ class _LostEvent:
         self._age_input = reach.effects.age_input
         self._acts_within_s = reach.effects.acts_within_s
         n, shape, identity = flow.n, reach.ellipsoid.shape, np.eye(2 * flow.n)
-        event = exponential(flow.generator * window_s)
+        to_event = exponential(flow.generator * window_s)
         # What q changes after the event, and has changed before it.
         by_input = flow.error_effects[1][[flow.cell_at(time_s) for time_s in r_s.tolist()]]
         self._input_changes = self._age_input * by_input if self._age_input else np.zeros(len(r_s))
@@ -172,23 +172,23 @@ class _LostEvent:
         rows = [
             identity[n:] / (error_before + error_change),
             shape @ identity[:n] / (state_bound + state_change),
-            event[n:] / error_before,
-            shape @ event[:n] / state_bound,
-            *(Y @ event for Y in outputs),
+            to_event[n:] / error_before,
+            shape @ to_event[:n] / state_bound,
+            *(Y @ to_event for Y in outputs),
         ]
         forms = np.array([row.T @ row for row in rows])
         self._forms = np.broadcast_to(forms, (len(r_s), *forms.shape))
-        self._z = flows @ event
+        self._z = flows @ to_event
         # x + e_c follows the models: e^{Hr} is the sum of both rows of e^{Fr} (I, 0).
         models = flows[:, :n, :n] + flows[:, n:, :n]
-        self._e_s = self._z[:, n:] - models @ event[n:]
+        self._e_s = self._z[:, n:] - models @ to_event[n:]
 
     def _input_response_before(self, C: Matrix, ago_s: float) -> float:
         """Bound ∫ ‖C e^{−As} BU‖ ds over some time; (I, 0) e^{−Fs} (BU, −BU) = e^{−As} BU."""
         if not (self._age_input and ago_s):
             return 0.0
         flow = self._flow
-        responses = response_until(flow.BK - flow.closed_loop, flow.input_error, ago_s)
+        responses = response_until(flow.BK - flow.closed_loop, flow.input_matrix, ago_s)
         return float(responses.through(C).integral_on_grid())
 
     def largest_error(self, sensor_errors: Vector, summed: Vector) -> float:

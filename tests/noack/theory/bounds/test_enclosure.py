@@ -19,7 +19,7 @@ from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError, respon
 Rng = np.random.Generator
 
 
-def turned(rng: Rng, blocks: Matrix) -> Matrix:
+def in_skew_coordinates(rng: Rng, blocks: Matrix) -> Matrix:
     """The same system in skew coordinates."""
     S = rng.normal(size=blocks.shape) + 2 * np.eye(len(blocks))
     return np.asarray(S @ blocks @ np.linalg.inv(S))
@@ -32,12 +32,12 @@ def dense(rng: Rng, n: int) -> Matrix:
 
 def stiff(rng: Rng, n: int) -> Matrix:
     rates = np.geomspace(1.0, 10.0 ** rng.uniform(2, 4), n)
-    return turned(rng, np.diag(-rates)) if n > 1 else np.array([[-1e4]])
+    return in_skew_coordinates(rng, np.diag(-rates)) if n > 1 else np.array([[-1e4]])
 
 
 def defective(rng: Rng, n: int) -> Matrix:
     """A single Jordan block."""
-    return turned(rng, np.diag(np.ones(n - 1), 1) - rng.uniform(0.3, 1.0) * np.eye(n))
+    return in_skew_coordinates(rng, np.diag(np.ones(n - 1), 1) - rng.uniform(0.3, 1.0) * np.eye(n))
 
 
 def non_normal(rng: Rng, n: int) -> Matrix:

@@ -17,7 +17,7 @@ from noack.theory.bounds.certificate_terms import CertificatePart, Constants, Es
 from noack.theory.bounds.gains import ErrorGains, Forcing, PlantGains
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.persistent_bounds import solve_two_parts
-from noack.theory.certificates.scenario_certificates import own_plant
+from noack.theory.certificates.scenario_certificates import own_plant_scope
 from noack.theory.certificates.solution import completed_alone
 from tests.noack.theory.certificates.certified_loops import conditions_of, gains_of
 from tests.oracles.lossy_loops import (
@@ -231,7 +231,7 @@ class ObservedLoop:
         )  # fmt: skip
 
     def certificate(self) -> ScenarioCertificate:
-        return own_plant(resolve(self.scenario)).certificate(conditions_of(self.system))
+        return own_plant_scope(resolve(self.scenario)).certificate(conditions_of(self.system))
 
 
 class Filter:

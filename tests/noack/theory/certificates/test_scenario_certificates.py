@@ -21,7 +21,7 @@ from noack.theory.bounds.certificate_terms import Constants, NetworkConditions
 from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import allowed_conditions, ideal_conditions, nominal_conditions
-from noack.theory.certificates.scenario_certificates import box, certify, certify_box, own_plant
+from noack.theory.certificates.scenario_certificates import box_scope, certify, certify_box, own_plant_scope
 from noack.theory.certificates.solution import completed
 from tests.noack.theory.certificates.certificate_kinds.policies import exceeded_by, scenario_with
 from tests.noack.theory.certificates.certified_loops import conditions_of
@@ -135,7 +135,7 @@ def test_certificates_that_are_computed_together_are_those_of_each_loop() -> Non
     scopes = [
         (scope, allowed_conditions(loop))
         for loop in loops
-        for scope in (own_plant(loop), box(loop))
+        for scope in (own_plant_scope(loop), box_scope(loop))
         if scope is not None
     ]
     found = completed([scope.search(conditions) for scope, conditions in scopes])
@@ -179,4 +179,4 @@ def test_events_that_are_due_may_come_as_soon_as_they_are_due() -> None:
     conditions = nominal_conditions(resolved)
     missing = conditions._replace(sampling_s=5 * conditions.spacing_s)
     for one in (conditions, missing):
-        assert own_plant(resolved).certificate(one).inter_event_s == pytest.approx(0.04)
+        assert own_plant_scope(resolved).certificate(one).inter_event_s == pytest.approx(0.04)

@@ -36,11 +36,11 @@ def edge(source: int, target: int, matrix: Matrix, duration: int = 1) -> Edge:
     ],
 )
 def test_the_joint_spectral_radius_is_that_of_the_closed_form(matrices: list[Matrix], value: float) -> None:
-    found = joint_spectral_radius([edge(0, 0, matrix) for matrix in matrices], accuracy=1e-6)
-    assert found.lower <= value * (1 + 1e-15)
-    assert found.upper >= value
-    assert found.lower == pytest.approx(value, rel=1e-7)
-    assert found.upper == pytest.approx(value, rel=6e-3)  # the defective one needs many vertices
+    bounds = joint_spectral_radius([edge(0, 0, matrix) for matrix in matrices], accuracy=1e-6)
+    assert bounds.lower <= value * (1 + 1e-15)
+    assert bounds.upper >= value
+    assert bounds.lower == pytest.approx(value, rel=1e-7)
+    assert bounds.upper == pytest.approx(value, rel=6e-3)  # the defective one needs many vertices
 
 
 def random_graph(rng: np.random.Generator) -> list[Edge]:
@@ -85,10 +85,10 @@ def test_a_growth_near_the_threshold_is_decided(seed: int) -> None:
     edges = random_graph(np.random.default_rng(seed))
     sharp = joint_spectral_radius(edges, accuracy=1e-5).lower
     for wanted in (0.999, 1.001):
-        found = joint_spectral_radius(scaled(edges, wanted / sharp), accuracy=0.1, threshold=1.0)
-        assert (found.upper < 1) == (wanted < 1)
-        assert (found.lower > 1) == (wanted > 1)
-        assert found.needed_effort == 0
+        bounds = joint_spectral_radius(scaled(edges, wanted / sharp), accuracy=0.1, threshold=1.0)
+        assert (bounds.upper < 1) == (wanted < 1)
+        assert (bounds.lower > 1) == (wanted > 1)
+        assert bounds.needed_effort == 0
 
 
 def test_the_estimate_of_the_work_is_mostly_that_of_a_complete_search() -> None:
@@ -108,9 +108,9 @@ def test_the_estimate_of_the_work_is_mostly_that_of_a_complete_search() -> None:
 
 def test_a_growth_that_is_the_threshold_is_undecided() -> None:
     turn = np.array([[0.6, -0.8], [0.8, 0.6]])
-    found = joint_spectral_radius([edge(0, 0, turn), edge(0, 0, turn.T)], threshold=1.0, effort=0.1)
-    assert found.lower <= 1 <= found.upper < 1 + 1e-3
-    assert found.needed_effort == np.inf
+    bounds = joint_spectral_radius([edge(0, 0, turn), edge(0, 0, turn.T)], threshold=1.0, effort=0.1)
+    assert bounds.lower <= 1 <= bounds.upper < 1 + 1e-3
+    assert bounds.needed_effort == np.inf
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -118,19 +118,19 @@ def test_no_norms_and_no_products_prove_a_bound_below_the_growth(seed: int) -> N
     """Their bounds hold in any coordinates; a broken copy without the best cycle is caught."""
     rng = np.random.default_rng(seed)
     edges = random_graph(rng)
-    system, found = SwitchedSystem.of(edges), joint_spectral_radius(edges, accuracy=1e-3)
+    system, bounds = SwitchedSystem.of(edges), joint_spectral_radius(edges, accuracy=1e-3)
     norms = NormSearch(system).improve(0.0)
-    assert found.lower <= norms.upper
-    assert found.lower <= NormSearch(remembering(system, 3)).improve(0.0).upper
+    assert bounds.lower <= norms.upper
+    assert bounds.lower <= NormSearch(remembering(system, 3)).improve(0.0).upper
     n = system.dimension
     forms = np.eye(n) + 0.5 * rng.normal(size=(system.graph.nodes, n, n))
-    for turned in (norms.system, system.in_coordinates(forms)):
-        assert turned is not None
-        for growth in (0.5 * found.lower, 1.01 * found.lower):
-            assert bound_by_products(turned, growth, 300).upper >= found.lower
-    zero = [one._replace(matrix=exactly(0 * one.matrix.middle)) if number in found.cycle else one
+    for transformed in (norms.system, system.in_coordinates(forms)):
+        assert transformed is not None
+        for growth in (0.5 * bounds.lower, 1.01 * bounds.lower):
+            assert bound_by_products(transformed, growth, 300).upper >= bounds.lower
+    zero = [one._replace(matrix=exactly(0 * one.matrix.middle)) if number in bounds.cycle else one
             for number, one in enumerate(edges)]  # fmt: skip
-    assert NormSearch(SwitchedSystem.of(zero)).improve(0.0).upper < found.lower
+    assert NormSearch(SwitchedSystem.of(zero)).improve(0.0).upper < bounds.lower
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -158,10 +158,10 @@ def test_a_graph_with_one_cycle_is_decided(seed: int) -> None:
     Π = np.linalg.multi_dot([np.eye(n), np.eye(n), *matrices[::-1]])
     matrices *= value / np.abs(np.linalg.eigvals(Π)).max() ** (1 / length)
     edges = [edge(k, (k + 1) % length, matrix) for k, matrix in enumerate(matrices)]
-    found = joint_spectral_radius(edges)
-    assert found.lower <= found.upper <= found.lower * (1 + 1e-9)
-    assert found.lower == pytest.approx(value, rel=1e-9)
-    assert sorted(found.cycle) == list(range(length))
+    bounds = joint_spectral_radius(edges)
+    assert bounds.lower <= bounds.upper <= bounds.lower * (1 + 1e-9)
+    assert bounds.lower == pytest.approx(value, rel=1e-9)
+    assert sorted(bounds.cycle) == list(range(length))
 
 
 def rational(matrix: Matrix) -> Any:
@@ -183,9 +183,9 @@ def test_products_and_differences_contain_the_exact_ones(seed: int) -> None:
     A, B, C = matrix(rng, 3, 5), matrix(rng, 5, 4), matrix(rng, 3, 4)
     R = np.abs(matrix(rng, 3, 5)) * 1e-9
     end = rational(A) + rational(R) * rng.choice([-1, 1], R.shape)
-    found = IntervalMatrix(A, R) @ exactly(B)
-    assert contains(found, end @ rational(B))
-    assert contains(found - exactly(C), end @ rational(B) - rational(C))
+    product = IntervalMatrix(A, R) @ exactly(B)
+    assert contains(product, end @ rational(B))
+    assert contains(product - exactly(C), end @ rational(B) - rational(C))
     sharp = exactly(A) @ exactly(B)
     assert contains(sharp, rational(A) @ rational(B))
     assert (sharp.radius <= 1e-14 * (np.abs(A) @ np.abs(B))).all()
@@ -196,9 +196,9 @@ def test_products_and_differences_contain_the_exact_ones(seed: int) -> None:
 def test_inverse_contains_the_exact_one(seed: int) -> None:
     A = np.random.default_rng(seed).normal(size=(2, 2))
     (a, b), (c, d) = rational(A)
-    found = inverse(A)
-    assert found is not None
-    assert contains(found, np.array([[d, -b], [-c, a]]) / (a * d - b * c))
+    inverse_A = inverse(A)
+    assert inverse_A is not None
+    assert contains(inverse_A, np.array([[d, -b], [-c, a]]) / (a * d - b * c))
 
 
 def test_singular_matrices_have_no_inverse() -> None:
@@ -222,9 +222,9 @@ def test_an_enclosed_exponential_contains_that_of_the_closed_form() -> None:
 
 def test_nilpotent_systems_do_not_grow() -> None:
     shift = np.diag([1.0, 1.0], k=1)
-    found = joint_spectral_radius([edge(0, 0, shift), edge(0, 0, 2 * shift)])
-    assert found.lower == 0
-    assert found.upper < 0.01
+    bounds = joint_spectral_radius([edge(0, 0, shift), edge(0, 0, 2 * shift)])
+    assert bounds.lower == 0
+    assert bounds.upper < 0.01
 
 
 def test_maps_that_are_zero_have_norms_near_0() -> None:
@@ -238,9 +238,9 @@ def test_sizes_beyond_the_range_of_doubles_prove_nothing_false() -> None:
     assert zero.upper < 1e-90
     turn = np.array([[0.0, 1e300], [1e-300, 0.0]])
     with np.errstate(all="ignore"):
-        found = joint_spectral_radius([edge(0, 0, turn), edge(0, 0, 0.9 * np.eye(2))])
-    assert found.lower == pytest.approx(1)
-    assert found.upper >= 1
+        bounds = joint_spectral_radius([edge(0, 0, turn), edge(0, 0, 0.9 * np.eye(2))])
+    assert bounds.lower == pytest.approx(1)
+    assert bounds.upper >= 1
 
 
 def test_edges_that_are_on_no_cycle_do_not_count() -> None:

@@ -61,11 +61,11 @@ def test_growth_does_not_depend_on_units_and_holds_for_fast_modes() -> None:
     units, chain = np.ldexp(1.0, [0, 30, -30]), unlimited(independent(0.3))
     for fastest in (1.0, 1e-9):
         M0, M1 = (fastest * rng.normal(size=(3, 3)) + 0.5 * np.eye(3)[0] for _ in range(2))
-        turned = [units[:, None] * one / units for one in (M0, M1)]
+        scaled = [units[:, None] * one / units for one in (M0, M1)]
         for found, expected in (
-            (mean_square_growth([(turned[0], turned[1])], chain),
+            (mean_square_growth([(scaled[0], scaled[1])], chain),
              mean_square_growth([(M0, M1)], chain)),
-            (almost_sure_growth(turned[0], turned[1], chain), almost_sure_growth(M0, M1, chain)),
+            (almost_sure_growth(scaled[0], scaled[1], chain), almost_sure_growth(M0, M1, chain)),
         ):  # fmt: skip
             assert found == pytest.approx(expected, rel=1e-5)
     with pytest.raises(NotPredictableError, match="beyond 1e308"):

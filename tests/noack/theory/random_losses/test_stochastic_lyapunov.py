@@ -63,4 +63,4 @@ def test_the_effect_of_updates_in_flight_is_that_of_its_equation_for_fast_modes(
     M = H + (0.2 + rate_per_s) * np.eye(2)
     moved = K @ expm(M * delay_s)
     expected = solve_continuous_lyapunov(M.T, moved.T @ moved - K.T @ K)
-    assert flow.flight(rate_per_s) == pytest.approx(expected, rel=1e-6)
+    assert flow.effect_in_flight(rate_per_s) == pytest.approx(expected, rel=1e-6)

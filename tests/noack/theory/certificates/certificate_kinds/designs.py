@@ -105,8 +105,8 @@ def _designed(wanted: Wanted) -> Design | EventDesign | None:
     """Search, briefly; None: nothing is certified."""
     if wanted.system is None:
         search = NetworkSearch(wanted.scenario, wanted.request)
-        found = Design(search, *search.run())
-        return found if found.best.stability else None
+        design = Design(search, *search.run())
+        return design if design.best.stability else None
     with patch.multiple(event_design, COSTS_OF_INPUT=(1.0,), _ALPHAS=(0.5,)):
         events = EventSearch(wanted.scenario, wanted.request, 0, draws=4)
         events.certificate = cache(events.certificate)  # type: ignore[method-assign]
@@ -117,43 +117,43 @@ def _designed(wanted: Wanted) -> Design | EventDesign | None:
     return EventDesign(events, best, certificate)
 
 
-def _certify(case: Case, change: Callable[[Any], Any] = lambda found: found) -> Bounds | None:
-    found = _designed(case.loop)
-    if found is None:
+def _certify(case: Case, change: Callable[[Any], Any] = lambda design: design) -> Bounds | None:
+    design = _designed(case.loop)
+    if design is None:
         return None
-    case.found = change(found)
-    if isinstance(found, EventDesign):
+    case.found = change(design)
+    if isinstance(design, EventDesign):
         return dict.fromkeys(("e_s", "e_c", "x", "1/δ"), 1.0)
     return {"growth": 1.0, "pattern": 1.0, "cost": 1 + 1e-6, "level": 1.0, "limit": 1 + 1e-6}
 
 
 def _simulate(case: Case, rng: Rng) -> Observed:
-    wanted, found = case.loop, case.found
-    if isinstance(found, EventDesign):
-        return _simulate_events(wanted.system, found, rng)
+    wanted, design = case.loop, case.found
+    if isinstance(design, EventDesign):
+        return _simulate_events(wanted.system, design, rng)
     worst, runs = dict.fromkeys(("growth", "pattern", "cost", "limit"), 0.0), 0
-    worst["level"] = (found.given.level + 2) / (found.best.level + 2)
-    if found.best != found.given:
-        worst["limit"] = found.best.cost / found.search.limit
-    for one in (found.given, found.best):
-        cost = found.maps(one, one.level).cost(found.search.plant.x0, *found.search.weights)
+    worst["level"] = (design.given.level + 2) / (design.best.level + 2)
+    if design.best != design.given:
+        worst["limit"] = design.best.cost / design.search.limit
+    for one in (design.given, design.best):
+        cost = design.maps(one, one.level).cost(design.search.plant.x0, *design.search.weights)
         if cost != one.cost:  # both may be infinite
             worst["cost"] = max(worst["cost"], cost / one.cost, one.cost / cost)
         for level, stability in ((one.level, one.stability), (one.level + 1, one.beyond)):
             if stability is not None:
-                tried, shares = growth_shares(found.maps(one, level), stability, rng)
+                tried, shares = growth_shares(design.maps(one, level), stability, rng)
                 runs, worst = runs + tried, worst | {name: max(shares[name], worst[name]) for name in shares}
     return Observed(runs, worst)
 
 
-def _simulate_events(given: System, found: EventDesign, rng: Rng) -> Observed:
+def _simulate_events(given: System, design: EventDesign, rng: Rng) -> Observed:
     """The plant is on the edge of the box; without a certificate of the box it is the one drawn."""
-    certificate, (K, alpha, beta) = found.certificate, found.best.loop
-    drawn = loop_of(resolve(found.search.scenario_of(found.best.loop, found.best.m)))
+    certificate, (K, alpha, beta) = design.certificate, design.best.loop
+    drawn = loop_of(resolve(design.search.scenario_of(design.best.loop, design.best.m)))
     system = replace(
-        given, A=given.A if found.search.of_box else drawn.A, alpha=alpha, beta=beta,
+        given, A=given.A if design.search.of_box else drawn.A, alpha=alpha, beta=beta,
         K=np.array(K), H=given.H + given.B @ (np.array(K) - given.K),
-        mansd=found.best.m - 1, delay_steps=int(certificate.conditions.delay_s / given.step_s + 1e-6),
+        mansd=design.best.m - 1, delay_steps=int(certificate.conditions.delay_s / given.step_s + 1e-6),
     )  # fmt: skip
 
     def worst(system: System, trace: Trace) -> dict[str, float]:
@@ -162,31 +162,31 @@ def _simulate_events(given: System, found: EventDesign, rng: Rng) -> Observed:
     return search_losses(system, rng, worst_of=worst)
 
 
-def _one_level_further(found: Design) -> Design:
-    level = min(found.best.level + 1, len(found.search.requirements) - 1)
-    return found._replace(best=found.best._replace(level=level, beyond=None))
+def _one_level_further(design: Design) -> Design:
+    level = min(design.best.level + 1, len(design.search.requirements) - 1)
+    return design._replace(best=design.best._replace(level=level, beyond=None))
 
 
-def _given_gain(found: Design) -> Design:
-    return found._replace(best=found.best._replace(candidate=found.given.candidate, beyond=None))
+def _given_gain(design: Design) -> Design:
+    return design._replace(best=design.best._replace(candidate=design.given.candidate, beyond=None))
 
 
-def _given_hold(found: Design) -> Design:
-    candidate = found.best.candidate._replace(hold=found.given.candidate.hold)
-    return found._replace(best=found.best._replace(candidate=candidate, beyond=None))
+def _given_hold(design: Design) -> Design:
+    candidate = design.best.candidate._replace(hold=design.given.candidate.hold)
+    return design._replace(best=design.best._replace(candidate=candidate, beyond=None))
 
 
-def _no_cost_of_inputs(found: Design) -> Design:
-    Q, R = found.search.weights
-    with patch.object(found.search, "weights", (Q, 0 * R)):
-        cost = found.search.cost(found.best.candidate, found.best.level)
-    return found._replace(best=found.best._replace(cost=cost))
+def _no_cost_of_inputs(design: Design) -> Design:
+    Q, R = design.search.weights
+    with patch.object(design.search, "weights", (Q, 0 * R)):
+        cost = design.search.cost(design.best.candidate, design.best.level)
+    return design._replace(best=design.best._replace(cost=cost))
 
 
-def _one_loss_less(found: EventDesign) -> EventDesign:
-    certificate = found.search.certificate(found.best.loop, max(found.best.m - 1, 1))
+def _one_loss_less(design: EventDesign) -> EventDesign:
+    certificate = design.search.certificate(design.best.loop, max(design.best.m - 1, 1))
     assert certificate is not None
-    return found._replace(certificate=certificate)
+    return design._replace(certificate=certificate)
 
 
 DESIGNS = Kind(

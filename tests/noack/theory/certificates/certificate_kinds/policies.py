@@ -120,7 +120,7 @@ class NotBefore:
 
 
 @dataclass
-class Growing:
+class GrowthRule:
     """‖x‖² has grown by a factor since the last event; it says nothing about e_s."""
 
     factor: float
@@ -134,7 +134,7 @@ class Growing:
 
 
 @dataclass
-class Between:
+class AnyTimeRule:
     """After any number of steps between two; it stands for every forecast."""
 
     shortest: int
@@ -214,7 +214,7 @@ def _lyapunov(system: System, rng: Rng) -> PolicyCase:
     steps = int(rng.integers(1, 4)) * system.sample_steps
     rule = {"policy": "lyapunov", "rate_per_s": 0.3}
     settings = {"policy": "deadline", "rule": rule, "interval_s": steps * system.step_s}
-    return settings, AtLatest(steps, Growing(float(rng.choice([0.9, 2.0, 100.0])), system.sample_steps))
+    return settings, AtLatest(steps, GrowthRule(float(rng.choice([0.9, 2.0, 100.0])), system.sample_steps))
 
 
 def _self_triggered(system: System, rng: Rng) -> PolicyCase:
@@ -224,7 +224,7 @@ def _self_triggered(system: System, rng: Rng) -> PolicyCase:
         "growth_per_s": 1.0, "mismatch_per_s": 1.0, "shortest_s": shortest * system.step_s,
         "longest_s": (shortest + more) * system.step_s,
     }  # fmt: skip
-    return settings, Between(shortest, shortest + more, int(rng.integers(1000)))
+    return settings, AnyTimeRule(shortest, shortest + more, int(rng.integers(1000)))
 
 
 def _dwell(system: System, rng: Rng) -> PolicyCase:
