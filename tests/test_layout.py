@@ -19,7 +19,7 @@ from native.build import HEADER
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("noack", "plant_server", "sensor_node", "controller_node", "netem", "cosim")
 EXEMPT = ("__init__", "__main__")
-MOST_MODULES = 463
+MOST_MODULES = 470
 LINES = {
     "noack/scenario": 4100,
     "noack/controllers": 270,
@@ -32,28 +32,28 @@ LINES = {
     "noack/protocol": 1265,
     "noack/runtime": 5780,
     "noack/settings": 600,
-    "noack/theory": 12915,
+    "noack/theory": 12945,
     "noack/traces": 1320,
     "noack/trigger": 1075,
-    "netem": 6530,
-    "cosim/analysis": 8300,
+    "netem": 6545,
+    "cosim/analysis": 8335,
     "cosim/api": 1685,
     "cosim/cli": 3425,
     "cosim/doctor": 810,
-    "cosim/interactive": 1780,
+    "cosim/interactive": 1785,
     "cosim/lab": 1975,
     "cosim/live": 3975,
     "cosim/measurement": 2965,
     "cosim/output": 8635,
-    "cosim/record": 3705,
+    "cosim/record": 3715,
     "cosim/simulation": 1945,
-    "cosim/studies": 9420,
+    "cosim/studies": 9450,
     "plant_server": 420,
     "sensor_node": 395,
     "controller_node": 420,
     "benchmarks": 3700,
-    "native": 11155,
-    "tests": 49700,
+    "native": 11170,
+    "tests": 49760,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 
