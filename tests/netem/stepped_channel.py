@@ -51,7 +51,7 @@ class SteppedChannel:
         self._payloads[number] = data
         outputs = self._step(lambda: int(core.noack_channel_handle(channel, datagram, now_ns)))
         self._handled += 1
-        self._copies[number] = channel.put - before - channel.leaving_count
+        self._copies[number] = channel.delayed_count - before - channel.leaving_count
         self._forget(number)
         return outputs
 
