@@ -47,11 +47,11 @@ class SteppedChannel:
             "flow": message.flow, "size_bytes": len(data), "arrival_ns": _UNKNOWN_NS,
             "bit": -1, "head": data[:PACKET_HEAD_BYTES], "message": {"sequence": number},
         })  # fmt: skip
-        before = channel.put
+        before = channel.delayed_count
         self._payloads[number] = data
         outputs = self._step(lambda: int(core.noack_channel_handle(channel, datagram, now_ns)))
         self._handled += 1
-        self._copies[number] = channel.put - before - channel.leaving_count
+        self._copies[number] = channel.delayed_count - before - channel.leaving_count
         self._forget(number)
         return outputs
 
