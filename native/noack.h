@@ -1,9 +1,10 @@
 /* The core's one declaration of every structure and function that Python uses.
 
    native/build.py gives this file to cffi, and noack/core/core_library.py makes numpy's row types
-   of it. Therefore it has declarations, enumerations and these comments only; every number is an
-   int64_t or a double. Times are integer nanoseconds. Python allocates all memory; the core keeps
-   no state of its own, and calls neither clock nor allocator. */
+   of it. Therefore it has declarations, enumerations and these comments only; every number is a
+   double or an integer of a stated width. Times are integer nanoseconds. Python allocates all
+   memory; the core allocates none. Machines, link and simulators call no clock and no socket; the
+   driver and the relay do. */
 
 /* ---- Packets ------------------------------------------------------------------------------- */
 

@@ -373,7 +373,7 @@ def _table(rows: list[dict[str, object]]) -> "pa.Table":
     return pa.Table.from_pylist(rows)
 
 
-Result = Run | Certificates | MarginResult | CampaignResult
+Result = Run | Certificates | MarginResult | MeanCost | CampaignResult
 
 
 def save_tables(result: Result, folder: str | PathLike[str]) -> list[Path]:

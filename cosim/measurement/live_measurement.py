@@ -61,7 +61,7 @@ LIVE_OPTIONS = {
     "silence": "--silence",
     "save": "--save",
 }
-"""Options of the command line, by field of :class:`LiveOptions`."""
+"""Options of the command line, by field of :class:`LiveProbeOptions`."""
 
 
 def is_address(source: str) -> bool:

@@ -176,10 +176,10 @@ class RelayMemory:
         relay.free_block = begin
         relay.free_blocks += blocks
         self._block_next = np.concatenate((self._block_next, following))
-        self._places = np.array([chunk.ctypes.data for chunk in self._chunks], np.intp)
+        self._chunk_addresses = np.array([chunk.ctypes.data for chunk in self._chunks], np.intp)
         relay.block_count = len(self._block_next)
         relay.block_next = pointer_to(self._block_next, "int32_t *")
-        relay.chunks = pointer_to(self._places, "uint8_t * *")
+        relay.chunks = pointer_to(self._chunk_addresses, "uint8_t * *")
 
 
 class RelayDirection(LinkState):

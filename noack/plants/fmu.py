@@ -453,26 +453,26 @@ def temporary_folder() -> Iterator[Path]:
         _remove_if_left(abandoned)
     while True:
         folder = Path(tempfile.mkdtemp(prefix=_PREFIX))
-        lock = _locked(folder)
-        if lock is not None and folder.is_dir():
+        descriptor = _locked(folder)
+        if descriptor is not None and folder.is_dir():
             break
-        if lock is not None:  # another process removed it before it was locked
-            os.close(lock)
+        if descriptor is not None:  # another process removed it before it was locked
+            os.close(descriptor)
     try:
         yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-        os.close(lock)
+        os.close(descriptor)
 
 
 def _remove_if_left(folder: Path) -> None:
     with suppress(OSError):
         if folder.lstat().st_uid != os.getuid():
             return
-        lock = _locked(folder)
-        if lock is not None:
+        descriptor = _locked(folder)
+        if descriptor is not None:
             shutil.rmtree(folder, ignore_errors=True)
-            os.close(lock)
+            os.close(descriptor)
 
 
 def _locked(folder: Path) -> int | None:

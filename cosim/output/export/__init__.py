@@ -43,7 +43,7 @@ class ExportedRun:
     """Of the only loop, or of the network that the loops share."""
     summary: dict[str, object]
     """The content of ``summary.json``, or its part about the loop."""
-    inner: "Sequence[ExportedRun]" = ()
+    loops: "Sequence[ExportedRun]" = ()
     """The loops that share the network."""
     name: str = ""
     """Of the loop; empty for the run itself."""
@@ -129,8 +129,8 @@ def _exported_run(run_dir: Path, loop: str | None) -> ExportedRun:
         own = summary.of_loop(record.scenario.name).to_json() if summary else content
         return ExportedRun(run_dir, record, own)
     parts = dict(zip(run.names, content.get("loops", []), strict=False))
-    inner = [
+    loops = [
         ExportedRun(run_dir, record, parts.get(name, {}), (), name, phase_ns)
         for name, record, phase_ns in zip(run.names, run.loops, run.phases_ns, strict=True)
     ]
-    return ExportedRun(run_dir, run.network, content, inner)
+    return ExportedRun(run_dir, run.network, content, loops)

@@ -26,7 +26,7 @@ def write(run: ExportedRun, folder: Path, *, certificates: bool = True) -> list[
         buffer = io.BytesIO()
         csv.write_csv(_with_hex(table), buffer)
         written.append(write_whole(folder / f"{name}.csv", buffer.getvalue()))
-    for loop in run.inner:
+    for loop in run.loops:
         written += write(loop, folder / loop.name)
     return written
 

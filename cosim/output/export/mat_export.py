@@ -56,7 +56,7 @@ def _content(run: ExportedRun, *, certificates: bool) -> dict[str, object]:
     content["scenario"] = record.scenario.model_dump(mode="json", exclude_none=True)
     content["environment"] = run.environment
     if record.is_network:
-        content["loops"] = {loop.name: _content(loop, certificates=certificates) for loop in run.inner}
+        content["loops"] = {loop.name: _content(loop, certificates=certificates) for loop in run.loops}
         return content
     for name, table in (("samples", samples(record)), ("events", events(record))):
         content[name] = {column: _array(table[column].to_numpy()) for column in table.column_names}

@@ -63,17 +63,20 @@ def write(run: ExportedRun, path: Path, *, certificates: bool = True) -> list[Pa
         raise CallerError(
             "MCAP needs the package mcap, which is not installed; pip install 'noack[mcap]'"
         ) from None
+    written = path
     try:
         with new_file(path) as file:
             writer = Writer(file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
             writer.start(profile="", library="noack")
             _write(writer, run)
             writer.finish()  # type: ignore[no-untyped-call]
-        if ros2.is_installed():
-            return [path, _write_ros(run, path)]
+        if not ros2.is_installed():
+            return [path]
+        written = path.with_suffix(_ROS_SUFFIX)
+        _write_ros(run, written)
     except (OSError, ValueError) as error:
-        raise MachineError(f"{path}: cannot be written: {why(error)}") from None
-    return [path]
+        raise MachineError(f"{written}: cannot be written: {why(error)}") from None
+    return [path, written]
 
 
 def _write(writer: "Writer", run: ExportedRun) -> None:
@@ -92,10 +95,10 @@ def _write(writer: "Writer", run: ExportedRun) -> None:
             writer.add_attachment(0, 0, name, media, (run.directory / name).read_bytes())
     _write_log(writer, run)
     _write_tables(writer, run, [*record.tables])
-    for loop in run.inner:
+    for loop in run.loops:
         own = [table for table in loop.record.tables if OWNER[table] != "netem"]
         _write_tables(writer, loop, own)
-    for loop in run.inner or [run]:
+    for loop in run.loops or [run]:
         _write_errors(writer, loop)
 
 
@@ -221,21 +224,19 @@ def _type(name: str, field: np.dtype[np.generic]) -> dict[str, object]:
     return {"type": "array", "items": entry, "minItems": size, "maxItems": size}
 
 
-def _write_ros(run: ExportedRun, path: Path) -> Path:
-    """Write the file with ROS 2 messages; return its path. Raise OSError if that fails."""
+def _write_ros(run: ExportedRun, path: Path) -> None:
+    """Write the file with ROS 2 messages. Raise OSError if that fails."""
     from mcap.writer import CompressionType, Writer  # an extra, whose absence the caller reports
 
-    path = path.with_suffix(_ROS_SUFFIX)
     with new_file(path) as file:
         writer = Writer(file, compression=CompressionType.ZSTD)
         writer.start(profile="ros2", library="noack")
         bag = _Bag(writer)
-        loops = run.inner or [run]
+        loops = run.loops or [run]
         for loop in loops:
             bag.write_loop(loop, is_only=len(loops) == 1)
         bag.write_log(run)
         writer.finish()  # type: ignore[no-untyped-call]
-    return path
 
 
 class _Bag:

@@ -63,16 +63,19 @@ _NARROW_IN = 2.5
 """A shorter axis has few numbers."""
 _COLUMNS = 600
 """Pixel columns of a panel, to which lines are reduced."""
-_MARKS, _CROWD = 120, 80
-"""Columns of markers in a panel, which are wider than a pixel; more markers than ``_CROWD`` are
-drawn smaller."""
-_CROWDED = 6.0
+_MARKS, _CROWDED_MARKERS = 120, 80
+"""Columns of markers in a panel, which are wider than a pixel; more markers than
+``_CROWDED_MARKERS`` are drawn smaller."""
+_FEW_NUMBERS_RATIO = 6.0
 """Ratio of the ends of a logarithmic axis from which it has room for few numbers in a paper."""
 _NARROWEST_CELL_IN = 0.42
 """Narrowest cell of a map in which its number is written."""
 _MOST_CELLS = 1000
 """A map of more cells is a bitmap."""
-_TOP, _DARK = 0.97, 0.6
+_MARK_HEIGHT = 0.97
+"""Of marks at the top of a panel, as a share of its height."""
+_DARK_CELL = 0.6
+"""A cell of a map with a lower value, as a share of the largest, has white numbers."""
 _EM_PER_CHARACTER_OF_LABEL = 0.5  # a label of an axis may be a little longer than the axis
 _SHORTEST_LINE = 8
 _UNIT, _NO_BREAK = re.compile(r"\[[^]]*\]"), "\N{NO-BREAK SPACE}"
@@ -225,7 +228,7 @@ def _(item: Band, axes: Axes, norm: Normalize | None) -> Artist | None:
 def _(item: Marks, axes: Axes, norm: Normalize | None) -> Artist | None:
     x = finite(item.x, positive=axes.get_xscale() == "log")
     y = finite(item.y, positive=axes.get_yscale() == "log")
-    y = np.full(len(x), _TOP) if item.at_top else y
+    y = np.full(len(x), _MARK_HEIGHT) if item.at_top else y
     is_finite = np.isfinite(x) & np.isfinite(y)
     x, y, size = x[is_finite], y[is_finite], item.size
     if not len(x):
@@ -247,7 +250,7 @@ def _(item: Marks, axes: Axes, norm: Normalize | None) -> Artist | None:
     if item.reduced:
         keep = decimate(x, y, _MARKS)
         x, y = x[keep], y[keep]
-        size *= min(max(math.sqrt(_CROWD / len(keep)), 0.4), 1.0)
+        size *= min(max(math.sqrt(_CROWDED_MARKERS / len(keep)), 0.4), 1.0)
     if item.stems is not None:
         feet = np.column_stack([np.zeros(len(x)), y, np.full(len(x), np.nan)])
         axes.plot(np.repeat(x, 3), feet.ravel(), linewidth=1.0, color=rgb(item.stems))
@@ -315,7 +318,7 @@ def _(item: Heat, axes: Axes, norm: Normalize | None) -> Artist | None:
         for (row, column), value in np.ndenumerate(item.values):
             if np.isfinite(value):
                 middle = left + (column + 0.5) * (right - left) / columns
-                colour = "#ffffff" if float(norm(value)) < _DARK else "#000000"
+                colour = "#ffffff" if float(norm(value)) < _DARK_CELL else "#000000"
                 axes.text(middle, row, f"{value:.3g}", ha="center", va="center", size=7.5, color=colour)
     return None
 
@@ -421,7 +424,7 @@ class _Numbers(LogFormatter):
     def _is_crowded(self) -> bool:
         """Whether only 1, 3, 10, 30, … have room: on the horizontal axis of a paper's figure."""
         low, high = self.axis.get_view_interval()  # type: ignore[union-attr]
-        return layout().is_paper and self.axis.axis_name == "x" and high > _CROWDED * low  # type: ignore[union-attr]
+        return layout().is_paper and self.axis.axis_name == "x" and high > _FEW_NUMBERS_RATIO * low  # type: ignore[union-attr]
 
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")

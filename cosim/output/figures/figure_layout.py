@@ -87,14 +87,14 @@ class FigureLayout(NamedTuple):
 
 
 _SCREEN = FigureLayout(SCREEN_IN)
-_WIDTH: ContextVar[FigureLayout] = ContextVar("figure_layout", default=_SCREEN)
+_LAYOUT: ContextVar[FigureLayout] = ContextVar("figure_layout", default=_SCREEN)
 _ROOM_BESIDE_TITLE_IN = 5.0
 _LEAST_SCALE, _LEAST_BESIDE = 0.6, 0.4
 
 
 def layout() -> FigureLayout:
     """Return the sizes of the figures that are drawn now."""
-    return _WIDTH.get()
+    return _LAYOUT.get()
 
 
 @contextmanager
@@ -102,11 +102,11 @@ def figure_width(width_in: float, *, latex: bool = False) -> Iterator[None]:
     """Draw and save figures of this width, perhaps with the fonts of LaTeX, within the context."""
     is_paper = width_in < SCREEN_IN
     wanted = _of_paper(width_in) if is_paper else _SCREEN._replace(width_in=width_in)
-    token = _WIDTH.set(wanted._replace(latex=latex))
+    token = _LAYOUT.set(wanted._replace(latex=latex))
     try:
         yield
     finally:
-        _WIDTH.reset(token)
+        _LAYOUT.reset(token)
 
 
 def _of_paper(width_in: float) -> FigureLayout:

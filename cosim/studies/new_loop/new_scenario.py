@@ -46,19 +46,25 @@ from noack.theory.certificates.scenario_certificates import own_plant_scope
 
 _WITH_FILE = (FmuSettings, GymnasiumSettings, PythonPlantSettings)
 _FLOOR_SHARE = 0.05
+"""The floor of the threshold, as a share of beta."""
 _FASTEST_ALPHA_PER_S = 1.0
 _RATES_HZ = (1.0, 2.0, 5.0, 10.0, 20.0, 25.0, 50.0, 100.0, 200.0, 250.0, 500.0)
-_FASTEST_PER_S = 1000.0
+_FASTEST_EIGENVALUE_PER_S = 1000.0
 """Faster eigenvalues do not determine the rate: no loop can follow them."""
 _STEPS_PER_TIME_CONSTANT = 50
+"""The least, for the fastest eigenvalue of the loop."""
 _INPUT_WEIGHTS = (1.0, 10.0, 100.0)
 _LOOSE = 200.0
+"""A bound of ‖x‖ above this multiple of ‖x(0)‖ is used only if there is no other."""
 _START = 0.1
-_SMALLER, _FEWEST = 0.5, 6
+"""x(0) of a state, if the plant has none."""
+_SMALLER, _MOST_SMALLER_STARTS = 0.5, 5
+"""If the loop does not return, x(0) is multiplied by this, so often at most."""
 _RETURNED = 0.1
+"""Share of ‖x(0)‖ below which the loop has returned."""
 _LONGEST_RUN_S = 20.0
-_LONGEST_S, _FASTEST = 1e7, 1000.0
-"""What a scenario may have."""
+_LONGEST_HORIZON_S, _HIGHEST_SPEED = 1e7, 1000.0
+"""The largest that a scenario may have."""
 
 
 @dataclass(frozen=True)
@@ -134,13 +140,15 @@ def new(
     build = _Builder(model, Path(path), fixed)
     best = build.search(list(_trials(plant_model, _initial_state(model, fixed_state))), report)
     report("simulating")
-    for _ in range(_FEWEST):
-        if (returns := build.returns(best)) or fixed_state is not None:
+    returns = build.returns(best)
+    for _ in range(_MOST_SMALLER_STARTS):
+        if returns or fixed_state is not None:
             break
         best = replace(best, x0=best.x0 * _SMALLER)
+        returns = build.returns(best)
     certificate, _ = build.certified(best)
     notes = tuple(_notes(best, certificate, returns, build.is_linear))
-    text = _commented(build.content(best), notes, best)
+    text = _commented(build.content(best), notes, best, fixed)
     found_certificate = certificate if certificate.exists else None
     return NewScenario(best.gain, build.scenario(best), text, found_certificate, notes)
 
@@ -174,7 +182,9 @@ def _trials(model: LinearModel | LoopGain, x0: Vector) -> Iterator[_Trial]:
     """Yield what is tried, the preferred settings first."""
     gains = [model] if isinstance(model, LoopGain) else [gain(model, r=weight) for weight in _INPUT_WEIGHTS]
     for loop_gain in gains:
-        fastest = max((size for size in np.abs(loop_gain.eigenvalues) if size < _FASTEST_PER_S), default=1)
+        fastest = max(
+            (size for size in np.abs(loop_gain.eigenvalues) if size < _FASTEST_EIGENVALUE_PER_S), default=1
+        )
         least_rate_hz = _STEPS_PER_TIME_CONSTANT * fastest
         base = next((rate for rate in _RATES_HZ if rate >= least_rate_hz), _RATES_HZ[-1])
         base = loop_gain.model.plant.rates.get("rate_hz", base)
@@ -198,15 +208,15 @@ class _Builder:
         model, reference = self._model, self._model.plant
         start = trial.x0 if trial.weight is None else trial.weight @ trial.x0
         beta, alpha = to_digits(BETA_SHARE * norm(start) or BETA_SHARE), trial.alpha_per_s
-        horizon_s = min(to_digits(math.log(1 / SETTLED) / alpha), _LONGEST_S)
+        horizon_s = min(to_digits(math.log(1 / SETTLED) / alpha), _LONGEST_HORIZON_S)
         weight = None
         if trial.weight is not None:
             weight = [[to_digits(entry, 6) for entry in row] for row in trial.weight]
         content: Table = {
             "name": "".join(c if c.isascii() and c.isalnum() else "_" for c in self._path.stem),
-            "description": f"{reference.label} over a network that loses half of the updates.",
+            "description": f"{reference.label} over a network{self._losses}.",
             "horizon_s": horizon_s,
-            "speed": min(max(1.0, float(round(horizon_s / _LONGEST_RUN_S))), _FASTEST),
+            "speed": min(max(1.0, float(round(horizon_s / _LONGEST_RUN_S))), _HIGHEST_SPEED),
             "model": {
                 "A": model.A.tolist(),
                 "B": model.B.tolist(),
@@ -237,6 +247,11 @@ class _Builder:
         for key, value in self._fixed.items():
             put(content, key, value, f"--set {key}")
         return content
+
+    @property
+    def _losses(self) -> str:
+        is_given = any(key.startswith("network") for key in self._fixed)
+        return "" if is_given else " that loses half of the updates"
 
     def _system(self) -> Table:
         """Return the table plant.system, with a file's name relative to the scenario's folder."""
@@ -333,7 +348,7 @@ def _notes(trial: _Trial, certificate: ScenarioCertificate, returns: bool, is_li
 
 
 _COMMENTS = {
-    "horizon_s": "Length of the run in simulated time: e^(−alpha_per_s t) falls to a hundredth.",
+    "horizon_s": "Length of the run in simulated time.",
     "speed": "Simulated time per wall time of a live run.",
     "model": "What sensor and controller know of the plant: ẋ = A x + B u, per second.",
     "plant": "The true plant.",
@@ -343,8 +358,7 @@ _COMMENTS = {
     "controller.rate_hz": "Inputs per second of simulated time.",
     "trigger": "The sensor transmits when the error of its model exceeds the threshold "
     "max(beta e^(−alpha_per_s t), floor).",
-    "trigger.beta": "The first threshold, a tenth of the norm of x(0). Larger: fewer "
-    "transmissions, larger errors.",
+    "trigger.beta": "The first threshold. Larger: fewer transmissions, larger errors.",
     "trigger.floor": "The last threshold. With 0, x converges to 0.",
     "trigger.weight": "W of the norm ‖W e‖ of errors, chosen for the certificate.",
     "network.mansd": "Maximum consecutive losses, M − 1. The network delivers the next packet.",
@@ -353,13 +367,21 @@ _COMMENTS = {
 }
 
 
-def _commented(content: ReadTable, notes: Sequence[str], trial: _Trial) -> str:
+_REASONS = {
+    "horizon_s": " Until its end e^(−alpha_per_s t) falls to a hundredth.",
+    "trigger.beta": " It is a tenth of the norm of x(0).",
+}
+"""How values are chosen that are not given."""
+
+
+def _commented(content: ReadTable, notes: Sequence[str], trial: _Trial, fixed: ReadTable) -> str:
     """Return the file: the content with comments."""
     poles, decay = eigenvalue_text(trial.gain.eigenvalues), trial.gain.decay_per_s
     comments = _COMMENTS | {
         "model.gain": f"u = gain x_c. {trial.gain.method}; eigenvalues of A + B gain: {poles} /s.",
         "trigger.alpha_per_s": f"Must be below the decay rate of A + B gain, {decay:.4g} /s.",
     }
+    comments |= {key: comments[key] + reason for key, reason in _REASONS.items() if key not in fixed}
     lines = [f"# A scenario for {trial.gain.model.plant.label}, written by `noack new`."]
     lines += [line for note in notes for line in _comment(note)]
     return "\n".join([*lines, *_section("", content, comments), ""])

@@ -140,13 +140,19 @@ def test_every_key_of_the_file_that_is_chosen_has_a_comment() -> None:
 
 
 def test_given_settings_stay_and_the_rest_is_chosen_around_them() -> None:
-    given = {"network.mansd": 3, "plant.rate_hz": 1000.0, "plant.system.cart_kg": 1.0}
+    given = {
+        "network.mansd": 3, "network.loss.probability": 0.1, "plant.rate_hz": 1000.0,
+        "plant.system.cart_kg": 1.0, "trigger.beta": 0.004,
+    }  # fmt: skip
     made = noack.new("cart_pole", settings=given, initial_state=[0.0, 0.0, 0.05, 0.0])
     scenario = made.scenario
     assert (scenario.network.mansd, scenario.plant.rate_hz) == (3, 1000.0)
     assert scenario.plant.initial_state == (0.0, 0.0, 0.05, 0.0)
     assert scenario.plant.system.content()["cart_kg"] == 1.0
     assert made.certificate is not None
+    assert "loses half of the updates" not in made.text
+    assert "a tenth of the norm" not in made.text
+    assert "falls to a hundredth" in made.text  # the horizon is chosen
 
 
 def test_an_initial_state_from_which_the_plant_does_not_return_is_made_smaller() -> None:
