@@ -137,9 +137,9 @@ class Channel:
         message = {"sequence": number}
         datagram = ffi.new("noack_datagram *", {"message": message, "flow": flow, "bit": -1})
         datagram.size_bytes, datagram.arrival_ns = size_bytes, now_ns
-        earlier_put = self.core.put
+        earlier_count = self.core.delayed_count
         leaving = self._departures(lambda: core.noack_channel_handle(self.core, datagram, now_ns))
-        return leaving, self.core.put - earlier_put
+        return leaving, self.core.delayed_count - earlier_count
 
     @property
     def due_ns(self) -> int:

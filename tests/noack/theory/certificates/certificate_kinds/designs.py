@@ -15,7 +15,7 @@ from unittest.mock import patch
 import numpy as np
 
 from cosim.studies.design import event_design
-from cosim.studies.design.event_design import Certified, EventSearch
+from cosim.studies.design.event_design import CertifiedEventLoop, EventSearch
 from cosim.studies.design.network_search import CertifiedLoop, DesignRequest, NetworkSearch
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
@@ -57,7 +57,7 @@ class EventDesign(NamedTuple):
     """What is said of the best loop with events."""
 
     search: EventSearch
-    best: Certified
+    best: CertifiedEventLoop
     certificate: ScenarioCertificate
 
 
