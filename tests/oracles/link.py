@@ -211,7 +211,7 @@ class Link:
             if isinstance(rate.discipline, MaximumError) and _is_update(message.data):
                 key -= message.data[5]
             self._waiting.append(_Waiting(key, leaving.number, entry_ns, decision.after_ns, leaving))
-            self._queue.waits = len(self._waiting)
+            self._queue.waiting_count = len(self._waiting)
             return ()
         # Overdue datagrams leave first, even if ``on_timer`` has not been called for them yet.
         overdue = bool(self._in_flight) and self._in_flight[0].release_ns <= release_ns
@@ -233,7 +233,7 @@ class Link:
             bits = int(rate.line_bits(size_bytes))
             self._free = begin + Fraction(bits * 10**9, rate.rate_bps)
             link = self._state.core  # it knows how many wait, and until when the link is busy
-            self._queue.waits = len(self._waiting)
+            self._queue.waiting_count = len(self._waiting)
             assert core.noack_queue_serve(link, link.scheduler, size_bytes) == int(self._free)
             leaves_ns = max(
                 int(self._free) + first.after_ns, first.leaving.release_ns, self.flow(flow).first_release_ns

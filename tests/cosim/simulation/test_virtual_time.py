@@ -127,7 +127,7 @@ def test_the_controller_reports_a_violated_assumption(busy_content: dict[str, An
     for violation, gap in zip(violations, long_gaps, strict=True):
         assert violation["t_s"] == pytest.approx(gap["t_ns"] * 1e-9)
         assert violation["process"] == "controller"
-        assert f"{gap['dropouts']} successive dropouts" in violation["what"]
+        assert f"{gap['dropouts']} consecutive losses" in violation["what"]
 
 
 def test_a_violation_without_a_later_delivery_is_reported(busy_content: dict[str, Any]) -> None:

@@ -134,7 +134,7 @@ def _simulate(case: Case, rng: Rng) -> Observed:
     worst, runs = dict.fromkeys(("growth", "pattern", "cost", "limit"), 0.0), 0
     worst["level"] = (design.given.level + 2) / (design.best.level + 2)
     if design.best != design.given:
-        worst["limit"] = design.best.cost / design.search.limit
+        worst["limit"] = design.best.cost / design.search.cost_limit
     for one in (design.given, design.best):
         cost = design.maps(one, one.level).cost(design.search.plant.x0, *design.search.weights)
         if cost != one.cost:  # both may be infinite
