@@ -44,16 +44,16 @@ LINES = {
     "cosim/lab": 1975,
     "cosim/live": 3975,
     "cosim/measurement": 2965,
-    "cosim/output": 8635,
+    "cosim/output": 8640,
     "cosim/record": 3715,
     "cosim/simulation": 1945,
-    "cosim/studies": 9450,
+    "cosim/studies": 9470,
     "plant_server": 420,
     "sensor_node": 395,
     "controller_node": 420,
     "benchmarks": 3700,
-    "native": 11170,
-    "tests": 49760,
+    "native": 11175,
+    "tests": 49765,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 
