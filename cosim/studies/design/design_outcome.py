@@ -33,7 +33,8 @@ _GROWTH_CAPTION = (
 )
 _MOST_REQUIREMENTS = 60
 """Largest number of requirements in the figure of the growth."""
-_HEIGHT_IN = 3.8
+HEIGHT_IN = 3.8
+"""Height of the figures of a design."""
 
 
 class LoopResult(NamedTuple):
@@ -126,7 +127,7 @@ def gain_text(K: Rows) -> str:
 
 def figure_of(name: str, panel: Panel, caption: str) -> FigureDescription:
     """Return the figure of an outcome."""
-    return one_panel(name, panel, _HEIGHT_IN).captioned(caption)
+    return one_panel(name, panel, HEIGHT_IN).captioned(caption)
 
 
 def periodic_outcome(search: NetworkSearch, original: CertifiedLoop, best: CertifiedLoop) -> DesignOutcome:

@@ -27,7 +27,7 @@ from cosim.output.figures.figure_files import save_figures
 from cosim.output.figures.figure_format import FigureFiles
 from cosim.output.page_kit import templates
 from cosim.output.result_tables import ResultTable, terminal_table
-from cosim.studies.design.design_outcome import DesignOutcome
+from cosim.studies.design.design_outcome import HEIGHT_IN, DesignOutcome
 from cosim.studies.design.design_search import WORDS, DesignResult, certified
 from noack.core.file_access import write_whole
 from noack.core.number_format import plus_minus
@@ -39,7 +39,6 @@ _CAPTION = (
     "the chosen candidate on new draws."
 )
 _FRONT_CAPTION = "The trade-off curve; intervals have 95 % confidence, not corrected for the selection"
-_HEIGHT_IN = 3.8
 _MOST_ROWS = 20
 HEADINGS = ("transmissions", "settling time", "α [1/s]", "β", "weight", "gain")
 _LOOP_HEADINGS = ("", "given", "designed")
@@ -121,7 +120,7 @@ def trade_off(result: DesignResult) -> FigureDescription:
         x=Axis(label="transmissions (mean)", logarithmic=settles),
         y=Axis(label=f"settling time, {100 * result.limits.quantile:g} % quantile [s]"),
     )
-    return one_panel("trade-off", panel, _HEIGHT_IN).captioned(_CAPTION)
+    return one_panel("trade-off", panel, HEIGHT_IN).captioned(_CAPTION)
 
 
 def rows(result: DesignResult) -> list[tuple[str, ...]]:
