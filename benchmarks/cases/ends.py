@@ -7,6 +7,7 @@ killed.
 
 import argparse
 import os
+import resource
 import shutil
 import subprocess
 import tempfile
@@ -73,19 +74,32 @@ class End(NamedTuple):
     """CPU time of the replay."""
 
 
-def end_of(horizon_s: float, folder: Path) -> End:
-    """Simulate, spool and complete a run; replay it once more."""
-    say(f"a run of {horizon_s:g} s")
-    run_dir, began_s = in_new_process(spooled_run, horizon_s, folder), time.monotonic()
+def completed(run_dir: Path) -> tuple[float, resource.struct_rusage]:
+    """Complete a run by ``noack summary``; return its wall time in s and what the process used.
+
+    Call it in a small process: Linux counts the memory of the process that starts another one as used
+    by that one.
+
+    Raises:
+        MeasurementError: the command failed.
+    """
+    began_s = time.monotonic()
     process = subprocess.Popen([*NOACK, "summary", str(run_dir)], stdout=subprocess.DEVNULL)
     _, status, usage = os.wait4(process.pid, 0)
     wall_s = time.monotonic() - began_s
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode != 0:
         raise MeasurementError(f"the end of the run failed with {process.returncode}")
-    end = End(
-        wall_s, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024, in_new_process(replay_s, run_dir)
-    )
+    return wall_s, usage
+
+
+def end_of(horizon_s: float, folder: Path) -> End:
+    """Simulate, spool and complete a run; replay it once more."""
+    say(f"a run of {horizon_s:g} s")
+    run_dir = in_new_process(spooled_run, horizon_s, folder)
+    wall_s, usage = in_new_process(completed, run_dir)
+    cpu_s = usage.ru_utime + usage.ru_stime
+    end = End(wall_s, cpu_s, usage.ru_maxrss / 1024, in_new_process(replay_s, run_dir))
     shutil.rmtree(run_dir)
     return end
 
