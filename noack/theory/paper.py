@@ -201,12 +201,14 @@ def _growths(H: MatrixKey, weight: MatrixKey, period_ns: int) -> _Growths:
 
 
 _SHARE, _NEAREST = 1e-2, 0.98
+"""Of the range of ᾱ: where the search ends, and how near it comes to the decay rate, where c is infinite."""
 _FIRST_STEP, _STEPS_UNTIL_DOUBLED = 1 / 64, 64
 """Times at which ‖e^{Gt}‖ is sampled: the first step, times ‖G‖; steps until it is doubled."""
 _LAST_TIME = 50.0
 """The last of them, times the difference between the decay rates of loop and threshold."""
 _GOLDEN = (math.sqrt(5) - 1) / 2
 _CELLS = 256
+"""Cells of the suprema in Theorem 1."""
 
 
 class Theorem2(NamedTuple):

@@ -20,6 +20,7 @@ _FINE_CELLS = 256
 _SHORTEST_S, LONGEST_S = 1e-9, 1e6
 """Limits of the window."""
 _PICARD_ROUNDS = 8
+"""Iterations of Volterra's inequality, each of which gives a bound."""
 
 
 class ErrorGrowth:

@@ -11,7 +11,8 @@ from noack.core.linear_systems import Matrix
 
 Stack = NDArray[np.float64]
 ROUNDING = 1 + 1e-9
-"""A computed norm, times this, is not below the exact one."""
+"""A computed norm, times this, is not below the exact one: estimated, not proven (docs/theory.md, "Why the
+suprema are enclosed, not sampled")."""
 
 
 def stack_product(matrix: Matrix, stack: Stack) -> Stack:

@@ -21,9 +21,13 @@ from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
 
 _UNIT = 2.0**-53
+"""u, the largest relative error of an operation in double precision."""
 ENLARGED = 1 + 2.0**-40
+"""Exceeds the rounding of a computed radius of up to 8,000 terms."""
 _UNDERFLOW = 1e-290
+"""Exceeds what underflow hides of a term."""
 _DIGITS = 384
+"""Binary digits after the point: products of hundreds of steps lose far fewer."""
 _ONE = 1 << _DIGITS
 _LARGEST = int(np.finfo(np.float64).max)
 _TERMS = 60

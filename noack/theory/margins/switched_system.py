@@ -23,6 +23,7 @@ from noack.theory.margins.exact_matrices import IntervalMatrix, exactly, inverse
 
 Numbers = NDArray[np.int64]
 _ITERATIONS = 60
+"""Of the search for balanced coordinates, which need not be exact."""
 _ROUNDEST = 1e-6
 """Smallest eigenvalue of a quadratic form, relative to the largest one."""
 _TINY = float(np.finfo(np.float64).tiny)
@@ -31,7 +32,9 @@ _SLOWEST = -50.0
 _EQUAL = 1e-12
 """Logarithms of growths that differ by less are those of one cycle."""
 _SQUARINGS = 44
+"""j up to which Π^(2^j) is used: the factor n^(1/2^j) of the lower bound is then 1 to 3e-13."""
 _SUBTRACTED = 1 - 1e-15
+"""Lower bounds are multiplied and upper ones divided by this, for the rounding of an operation."""
 
 
 class Edge(NamedTuple):

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 _MOST_ENTRIES = 16_000
 """Largest size of the operator's matrix, which is sparse: few states follow a state."""
 _MOST_SLOTS = 100
+"""Transmissions after which the times of a loop must repeat: each has maps of its own."""
 _MOST_DENSE = 500
 """Size up to which all eigenvalues are computed."""
 _ABOVE = (1e-7, 1e-6, 1e-5, 1e-4)
@@ -136,7 +137,7 @@ class PeriodMaps(NamedTuple):
             size = len(self.reduced[0][0])
             identity = triangles(np.tile(np.eye(size), (len(outcomes.lost), 1, 1)))
             try:
-                solution = from_triangles(resolved_by(operator, bound, identity), size)
+                solution = from_triangles(solve_resolvent(operator, bound, identity), size)
             except RuntimeError:  # singular by rounding
                 continue
             if self.prove_below(bound, solution, outcomes):
@@ -220,7 +221,7 @@ def triangles(stack: Stack) -> Vector:
     return stack[..., i, j].ravel()
 
 
-def resolved_by(operator: "csc_array[np.float64]", value: float, entries: Vector) -> Vector:
+def solve_resolvent(operator: "csc_array[np.float64]", value: float, entries: Vector) -> Vector:
     """Return the solution X of value · X − operator(X) = the entries."""
     from scipy.sparse import eye_array, linalg  # slow to import
 
