@@ -11,14 +11,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from cosim.simulation.continuous import ContinuousLoop
-from cosim.studies.paper.published_result import (
-    ComparedValue,
-    PublishedResult,
-    run_from_each,
-    shipped_loop,
-    stored_matrices,
-    unit_states,
-)
+from cosim.studies.paper.published_result import ComparedValue, PublishedResult, stored_matrices
+from cosim.studies.paper.reproduction_runs import run_from_each, shipped_loop, unit_states
 from noack.core.linear_systems import Matrix
 
 Blocks = Mapping[tuple[int, int], Matrix]
@@ -160,7 +154,7 @@ def _run(loop: ContinuousLoop, P: Matrix, x0: Matrix) -> tuple[float, float]:
 
     At a transmission the paper's functional V is xᵀPx. The one at t = 0 counts.
     """
-    log = run_from_each(loop, x0, 20.0, places=100)
+    log = run_from_each(loop, x0, 20.0, most_events=100)
     assert log.states is not None
     happened = ~np.isnan(log.event_s)
     x, t_s = log.states[:, :, 0][happened], log.event_s[happened]
