@@ -1,4 +1,4 @@
-"""Matrices with all rounding: enclosures in double precision, and 384 digits after the point.
+"""Matrices with all rounding: enclosures in double precision, and 384 binary digits after the point.
 
 :class:`IntervalMatrix`: entries are known up to a radius. A computed product of k terms differs
 from the exact one by at most k u/(1 − k u) times the product of the absolute values, u = 2⁻⁵³, in
@@ -29,7 +29,9 @@ _UNDERFLOW = 1e-290
 _DIGITS = 384
 """Binary digits after the point: products of hundreds of steps lose far fewer."""
 _ONE = 1 << _DIGITS
+"""The number 1 in these units."""
 _LARGEST = int(np.finfo(np.float64).max)
+"""In double precision."""
 _TERMS = 60
 """Of Taylor's series of an exponential with a norm up to 1/16: the remainder is below 2⁻⁵⁰⁰."""
 
@@ -116,7 +118,7 @@ class FixedPointMatrix:
         return FixedPointMatrix((self.entries @ other.entries) >> _DIGITS, error)
 
     def then(self, later: "FixedPointMatrix") -> "FixedPointMatrix":
-        """Return the product for x that becomes M x, and then is multiplied by another matrix."""
+        """Return the product that applies this matrix first, and then a later one."""
         return later @ self
 
     def __add__(self, other: "FixedPointMatrix") -> "FixedPointMatrix":

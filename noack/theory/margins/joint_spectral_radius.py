@@ -161,6 +161,7 @@ class _Enclosure:
         return self._system
 
     def _search(self, remembers: bool = False) -> NormSearch:
+        """Return the search for norms, which goes on from the best ones so far."""
         if remembers not in self._searches:
             system, entries = self._system, FEW_ENTRIES
             if remembers:
@@ -213,11 +214,13 @@ class _Enclosure:
             accuracy *= _COARSER
 
     def _search_longer(self, growth: float) -> float:
+        """Search for longer cycles; return the effort that a proof would need, which is not known."""
         if not self._is_large:
             self.cycle = max(self.cycle, self._longest_cycle, key=lambda cycle: cycle.growth)
         return math.inf
 
     def _prove_by_polytopes(self, growth: float, most_vertices: int) -> float:
+        """Try to prove a growth; return the effort that this would need, which is not known."""
         if not self._is_large:
             start = initial_vertices(self._balanced, self.cycle, growth)
             polytopes = InvariantPolytopes(self._balanced, growth, start)
@@ -243,6 +246,7 @@ class _Enclosure:
 
 
 def _best_cycle(system: SwitchedSystem, balanced: SwitchedSystem, search: tuple[int, int]) -> Cycle:
+    """Search in balanced coordinates; return the better bound of the cycle in both coordinates."""
     most_edges, beam = search
     cycle = find_cycle(balanced, min(max(most_edges, system.graph.nodes), _MOST_CYCLE_EDGES), beam)
     if not cycle.path:

@@ -39,6 +39,7 @@ class EventTimes(NamedTuple):
 
 
 EVERY_STEP = EventTimes()
+"""The sensor transmits at every step."""
 
 
 class Burst(NamedTuple):
@@ -70,9 +71,8 @@ def list_bursts(
 ) -> list[Burst]:
     """Return the graph of a guarantee between deliveries; node 0 is that of the first delivery.
 
-    Different states of the automaton after which the same is allowed are one node.
-
-    Of edges between the same nodes with the same time, there is the one with the fewest losses.
+    States of the automaton that allow the same are one node. Of several edges with the same nodes and
+    the same time, only the one with the fewest losses is kept: its map is that of all of them.
 
     Raises:
         CallerError: there are more than 5,000 edges.

@@ -85,7 +85,8 @@ class GapGrid(NamedTuple):
     ends: NDArray[np.int64]
     """The node at the end of each gap, (gaps,)."""
     windows: NDArray[np.int64]
-    """Cells for which updates may still be in flight, by times at which their events can have been."""
+    """The number of cells for which an update is still in flight, for each time at which its event may have
+    been, (windows,)."""
 
     @classmethod
     def of(cls, gaps: Gaps, delay_s: float, fastest_per_s: float) -> "GapGrid":

@@ -55,11 +55,11 @@ class SensorErrors(NamedTuple):
     grid_s: float
     """Tests are multiples of this after an event; 0 if the trigger is tested at all times."""
     level: float
-    """At an event it, or what is compared, is at least this large; 0 if nothing is known."""
+    """The least ‖e_s‖_W at an event, or its least integral if that is compared; 0 if nothing is known."""
     integrates: bool
     """Whether its integral since the event is compared."""
     earliest_due_s: float
-    """So long after an event the next one may be due without any of this."""
+    """The earliest time after an event at which the next one may be due, whatever e_s is."""
 
     def since_event(self, r_s: Vector, lost: int) -> Vector:
         """Bound ‖e_s‖_W at times after an event, while so many events have been lost, (k,)."""

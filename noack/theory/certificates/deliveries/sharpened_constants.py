@@ -224,7 +224,7 @@ class _SharpenedBounds:
 
 
 def errors_at_events(errors: Vector) -> Vector:
-    """Bound ‖e_c‖_W after each event: 0 if it is received; a lost one was not missing before."""
+    """Bound ‖e_c‖_W at a delivery, and up to the first, second, … lost event: one less is missing then."""
     return np.append(0.0, errors[:-1])
 
 
