@@ -244,9 +244,11 @@ class ResponseBounds:
         """Return bounds of ‖C e^{Gτ} D‖ for every output and each group of columns of D."""
         columns, nodes = self._columns, self._nodes
         steps_s = np.diff(self.edges_s)[..., None, None, :]
+        # The norms at the nodes, with the rounding of the products.
         norms = outputs.each(spectral_norms_along_last, product_along_last(outputs.stacked, nodes), columns)
         magnitudes = product_along_last(np.abs(outputs.stacked), np.abs(nodes))
         norms += EPSILON * nodes.shape[-3] * outputs.each(frobenius_norms_along_last, magnitudes, columns)
+        # Over each cell by both ends and the sag, and beyond the last one by the decay.
         bends = self._bends.over(outputs)
         middle = 0.5 * (norms[..., :-1] + norms[..., 1:])
         highest = larger_ends(norms) + steps_s**2 / 8 * bends

@@ -218,6 +218,7 @@ class _EdgeInequalities(NamedTuple):
             squares = np.einsum("eij,ekl->eikjl", factors, factors)
             return np.asarray(basis.T @ squares.reshape(-1, n * n, n * n) @ basis)
 
+        # The curvature: a block for each pair of P_v and P_w of an edge.
         crossed = -products(mixed)
         blocks = np.concatenate([products(G), products(steps @ mixed), crossed, crossed.swapaxes(1, 2)])
         rows = np.concatenate([sources, targets, sources, targets]) * size
@@ -228,6 +229,7 @@ class _EdgeInequalities(NamedTuple):
         shape = (count * size, count * size)
         curvature = coo_array((blocks.ravel(), (i.ravel(), j.ravel())), shape=shape).tocsc()
         solver = splu(curvature, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+        # Newton's equations, bordered by that of log γ.
         slope, border = of_nodes(-G, np.eye(n)), of_nodes(transformed @ G, np.zeros((n, n)))
         along, across = solver.solve(slope), solver.solve(border)
         sums = np.trace(transformed, axis1=1, axis2=2)

@@ -135,7 +135,7 @@ def _remembering(chain: OutcomeChain, present: int, before: int) -> OutcomeChain
 
 
 class _Tilts:
-    """The bound as a function of s, and its minimum."""
+    """The bound as a function of s, by which the probabilities of the steps are tilted, and its minimum."""
 
     def __init__(self, maps: PeriodMaps, chain: OutcomeChain) -> None:
         self._period_maps, self._chain = maps, chain

@@ -98,6 +98,7 @@ def flow(generator: Matrix, intensity: Matrix, forms: Stack, duration_s: float) 
     units = np.ldexp(1.0, balancing_exponents(np.abs(generator)))
     per_unit, squares = units[:, None] / units, np.outer(units, units)
     generator, intensity, forms = generator * per_unit, intensity * squares, forms / squares
+    # Gauss's formula over a short interval, which is then doubled.
     size = float(np.linalg.norm(generator)) * duration_s
     halvings = max(math.ceil(math.log2(size)), 0) if size > 1 else 0
     t_s = duration_s / 2**halvings

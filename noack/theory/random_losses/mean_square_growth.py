@@ -92,6 +92,7 @@ class PeriodMaps(NamedTuple):
         exponents = balancing_exponents(np.abs(stack).max(axis=(0, 1)))
         shifts = exponents[:, None] - exponents
         stack = np.ldexp(stack, shifts)
+        # The common range of all maps, and balanced coordinates of it.
         U, singular, _ = np.linalg.svd(stack.transpose(2, 0, 1, 3).reshape(size, -1))
         rank = max(int((singular > 10 * size * EPSILON * singular[0]).sum()), 1)
         range_maps = U[:, :rank].T @ stack @ U[:, :rank]
@@ -99,6 +100,7 @@ class PeriodMaps(NamedTuple):
         nodes = np.zeros(len(every), np.int64)
         (T,) = Graph(nodes, nodes, nodes + 1).balancing(every)
         range_maps = T @ range_maps @ np.linalg.inv(T)
+        # The same coordinates for the enclosed maps, and orthogonal ones beyond the range.
         coordinates = U.T.copy()
         coordinates[:rank] = T @ coordinates[:rank]
         if (inverse_coordinates := inverse(coordinates)) is None:
