@@ -68,8 +68,9 @@ def bound_outputs(
     Returns:
         The bounds, (j,), infinite where Q is too flat, and their weights, (j, i).
     """
-    weights = np.full(forms.shape[:2], 1 / forms.shape[1]) if first_weights is None else first_weights
-    best_weights = weights.copy()
+    if first_weights is None:
+        first_weights = np.full(forms.shape[:2], 1 / forms.shape[1])
+    weights, best_weights = first_weights.copy(), first_weights.copy()
     bounds = np.full(len(forms), np.inf)
     possible = np.zeros(len(forms))
     active = np.arange(len(forms))
