@@ -53,6 +53,7 @@ SHORTER = {
 
 def shorter(words: list[str]) -> list[str]:
     more = ("--effort", "5") if "--effort" in words else SHORTER.get(words[0], ())
+    more = ("--figure", "errors") if "pdf" in words else more
     return [*words, *(more[:1] if "horizon_s" in " ".join(words) else more)]
 
 

@@ -54,7 +54,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     """A run on a machine that did not stall: a process that ends misses what others send later."""
     for _ in range(10):
         runs = tmp_path_factory.mktemp("runs")
-        run = run_scenario(runs, *settings(speed=5.0, horizon_s=20.0), viewer=True)
+        run = run_scenario(runs, *settings(speed=2.5, horizon_s=10.0), viewer=True)
         if run.status or max(late["max"] for late in run.summary["loops"][0]["lateness_us"].values()) < 1e5:
             break
     return run
