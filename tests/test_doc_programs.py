@@ -48,7 +48,7 @@ SHORTER = {
     "margin": ("--no-period", "--most", "2"),
     "doctor": ("--seconds", "0.1"),
 }
-"""Arguments added to a command to shorten it; other tests cover reports and long runs."""
+"""Arguments added to a command to shorten it; other tests cover reports, figures of pages and long runs."""
 
 
 def shorter(words: list[str]) -> list[str]:
@@ -57,7 +57,7 @@ def shorter(words: list[str]) -> list[str]:
     return [*words, *(more[:1] if "horizon_s" in " ".join(words) else more)]
 
 
-@pytest.mark.usefixtures("no_recording")
+@pytest.mark.usefixtures("no_recording", "no_drawing")
 @pytest.mark.parametrize("command", sorted(set(commands())))
 def test_every_command_works(command: str, run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     program, *words = shlex.split(command.partition(" > ")[0])
