@@ -10,6 +10,7 @@ import os
 import signal
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 # Before numpy is imported: threads slow small matrices down.
@@ -110,6 +111,12 @@ def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
 def no_recording(monkeypatch: pytest.MonkeyPatch) -> None:
     """Finalise runs without a recording for the viewer: half of a short run's end."""
     monkeypatch.setattr("cosim.live.finalize._write_recording", lambda *_: None)
+
+
+@pytest.fixture
+def without_viewer(no_recording: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Start processes without the viewer's package, which is slow to import; see its folder."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent / "integration" / "without_viewer"))
 
 
 @pytest.fixture

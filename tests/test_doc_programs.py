@@ -57,12 +57,6 @@ def shorter(words: list[str]) -> list[str]:
     return [*words, *(more[:1] if "horizon_s" in " ".join(words) else more)]
 
 
-@pytest.fixture
-def without_viewer(no_recording: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Live runs without what only the viewer needs, half of their time."""
-    monkeypatch.setenv("PYTHONPATH", WITHOUT_VIEWER["PYTHONPATH"])
-
-
 @pytest.mark.usefixtures("without_viewer", "no_drawing")
 @pytest.mark.parametrize("command", sorted(set(commands())))
 def test_every_command_works(command: str, run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -134,6 +134,7 @@ def test_the_default_answers_for_the_shipped_mixture_and_says_how_long_it_takes(
     assert "takes about" not in again.stderr
 
 
+@pytest.mark.usefixtures("without_viewer")
 def test_the_command_compares_the_policies_and_confirms_a_point_live(tmp_path: Path) -> None:
     result = capacity(
         str(FILE), "--set", LOOP, "--loops", "2", "--draws", "1", "--disturbance", "1",
