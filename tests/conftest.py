@@ -10,6 +10,7 @@ import os
 import signal
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 # Before numpy is imported: threads slow small matrices down.
@@ -26,9 +27,11 @@ sys.dont_write_bytecode = False
 gc.disable()  # until everything is loaded, of which nothing is garbage
 
 FIRST = (
-    "tests/test_doc_programs.py", "tests/integration/", "tests/cosim/lab/", "tests/native/",
-    "tests/cosim/simulation/test_whole_loop.py", "tests/test_docs.py", "tests/other_system/",
-    "tests/noack/theory/certificates/test_certificate_kinds.py", "tests/attacks/", "tests/cosim/studies/",
+    "tests/native/test_sanitized.py", "tests/cosim/lab/test_page.py", "tests/test_doc_programs.py",
+    "tests/integration/", "tests/native/", "tests/cosim/simulation/test_whole_loop.py", "tests/test_docs.py",
+    "tests/other_system/",
+    "tests/noack/theory/certificates/test_certificate_kinds.py", "tests/attacks/", "tests/cosim/",
+    "tests/netem/", "tests/noack/plants/", "tests/noack/theory/",
 )  # fmt: skip
 """What takes longest, in this order: a worker runs whole files, and none should end alone."""
 
@@ -108,6 +111,12 @@ def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
 def no_recording(monkeypatch: pytest.MonkeyPatch) -> None:
     """Finalise runs without a recording for the viewer: half of a short run's end."""
     monkeypatch.setattr("cosim.live.finalize._write_recording", lambda *_: None)
+
+
+@pytest.fixture
+def without_viewer(no_recording: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Start processes without the viewer's package, which is slow to import; see its folder."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent / "integration" / "without_viewer"))
 
 
 @pytest.fixture

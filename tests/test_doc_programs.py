@@ -48,15 +48,16 @@ SHORTER = {
     "margin": ("--no-period", "--most", "2"),
     "doctor": ("--seconds", "0.1"),
 }
-"""Arguments added to a command to shorten it; other tests cover reports and long runs."""
+"""Arguments added to a command to shorten it; other tests cover reports, figures of pages and long runs."""
 
 
 def shorter(words: list[str]) -> list[str]:
     more = ("--effort", "5") if "--effort" in words else SHORTER.get(words[0], ())
+    more = ("--figure", "errors") if "pdf" in words else more
     return [*words, *(more[:1] if "horizon_s" in " ".join(words) else more)]
 
 
-@pytest.mark.usefixtures("no_recording")
+@pytest.mark.usefixtures("without_viewer", "no_drawing")
 @pytest.mark.parametrize("command", sorted(set(commands())))
 def test_every_command_works(command: str, run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     program, *words = shlex.split(command.partition(" > ")[0])
@@ -80,6 +81,7 @@ def snippets() -> list[str]:
     return [snippet for snippet in found if not snippet.startswith("#")]
 
 
+@pytest.mark.usefixtures("without_viewer")
 @pytest.mark.parametrize("snippet", snippets())
 def test_every_snippet_runs(
     snippet: str, run_folder: Path, monkeypatch: pytest.MonkeyPatch,

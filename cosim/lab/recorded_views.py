@@ -59,7 +59,8 @@ def live_view(run_dir: Path) -> Exploration | None:
             rows = dict(rows_by_loop(table, recorded, phases_ns(scenario), [own])).get(0, rows)
         tables[table] = rows
     record = RunRecord(loop, tables, [], {})
-    return from_record(record, LIVE) if len(record[CONTROLLER_STEP]) else None
+    view = from_record(record, LIVE) if len(record[CONTROLLER_STEP]) else None
+    return view if view is not None and len(view.t_s) else None  # no measurement may be recorded yet
 
 
 def recorded_view(directory: Path, loop: str | None) -> RunView:

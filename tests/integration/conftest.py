@@ -14,6 +14,7 @@ import psutil
 import pytest
 
 from noack.protocol.roles import ROLES
+from tests.command_line import invoke
 from tests.helpers.waiting import PATIENCE_S, wait_for
 
 EPHEMERAL = ("--set", "ports={}")
@@ -172,17 +173,13 @@ def private_files(folder: Path) -> list[Path]:
     return [path for path in (folder / f"noack-{os.getuid()}").rglob("*") if path.is_file()]
 
 
-def run_scenario(runs: Path, *arguments: str, viewer: bool = False) -> Finished:
-    done = subprocess.run(
-        noack_command("run", "lane_following", "--json", "--runs", str(runs), *BARE, *arguments),
-        env=os.environ | ({} if viewer else WITHOUT_VIEWER),
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        check=False,
-    )
-    summary = json.loads(done.stdout)
-    return Finished(done.returncode, summary, done.stderr, (runs / "latest").resolve())
+def run_scenario(runs: Path, *arguments: str) -> Finished:
+    """Run the command in this process, which has its modules; it starts the run's processes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", WITHOUT_VIEWER["PYTHONPATH"])
+        patch.setattr("cosim.live.finalize._write_recording", lambda *_: None)
+        done = invoke("run", "lane_following", "--json", "--runs", runs, *BARE, *arguments)
+    return Finished(done.exit_code, json.loads(done.stdout), done.stderr, (runs / "latest").resolve())
 
 
 class Running:

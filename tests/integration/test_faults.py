@@ -163,6 +163,7 @@ def fill(disk: Path) -> None:
                 break
 
 
+@pytest.mark.usefixtures("no_drawing")
 def test_a_run_on_a_disk_that_fills_up_can_be_finalised_later(start: Start, small: Path) -> None:
     running = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=240.0))
     running.wait_recording()
@@ -198,8 +199,6 @@ def test_a_run_on_a_disk_that_fills_up_can_be_finalised_later(start: Start, smal
         assert len(rows) * row_bytes >= bytes_on_disk - 16 * batches_at_most - row_bytes
         assert np.array_equal(rows["sequence"], np.arange(len(rows)))
     assert not (run_dir / "spool").exists()
-    assert (run_dir / "report.html").stat().st_size > 100_000
-
     summary = json.loads((run_dir / "summary.json").read_text())
     assert summary["exit"]["status"] == 1
     failed = summary["exit"]["reason"]

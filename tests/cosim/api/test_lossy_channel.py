@@ -103,7 +103,7 @@ def test_a_packet_of_m_successive_ones_arrives_in_each_direction(settings: dict[
     env = noack.LossyChannel(Clock(), {**lossy, "actuation": lossy})
     longest = {"observation": 0, "action": 0}
     for seed in range(5):
-        observations, infos = episode(env, 4000, seed=seed)
+        observations, infos = episode(env, 1000, seed=seed)
         for direction in longest:
             longest[direction] = max(longest[direction], *losses(infos, direction))
             ages = [info["network"][direction]["age_steps"] for info in infos[1:]]

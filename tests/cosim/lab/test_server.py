@@ -26,6 +26,15 @@ from cosim.lab import lab_server, lab_services, live_run
 from cosim.lab.lab_server import AddressGuard, LabOptions
 from cosim.lab.lab_services import LabServices, PageCalls, Session
 from cosim.lab.live_run import LiveRun
+from cosim.lab.recorded_views import live_view
+from cosim.record.run_directory import SCENARIO_FILE
+from cosim.simulation.virtual_time import simulate
+from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
+from noack.runtime.spool import SPOOL, SpoolWriter
+from noack.scenario.scenario_file import dumps
+from tests.cosim.record.test_spool_conversion import mixed_rows
+from tests.helpers.shipped import resolved
+from tests.helpers.summaries import alone
 from tests.integration import conftest as live
 from tests.integration.conftest import WITHOUT_VIEWER
 
@@ -203,6 +212,19 @@ def test_the_newest_run_that_has_ended_is_known(tmp_path: Path) -> None:
     with LabServices("lane_following", tmp_path, tmp_path / "runs") as services:
         assert services.recorded() == ["2", "1"]
         assert [services.has_ended(name) for name in services.recorded()] == [False, True]
+
+
+def test_a_run_without_a_recorded_measurement_is_not_drawn_yet(tmp_path: Path) -> None:
+    """On a busy machine the controller's rows may come first."""
+    record = simulate(resolved("double_integrator", "horizon_s=0.1"))
+    rows = mixed_rows(alone(record))
+    (tmp_path / SCENARIO_FILE).write_text(dumps(record.scenario))
+    writer = SpoolWriter(tmp_path / SPOOL, "recorder")
+    for table in (CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT):
+        assert live_view(tmp_path) is None
+        writer.append(table, 0, rows[table].tobytes())
+    assert live_view(tmp_path) is not None
+    writer.close()
 
 
 def test_mistakes_leave_no_run(drawn: list[Session]) -> None:

@@ -54,6 +54,7 @@ def test_a_watcher_whose_output_is_closed_does_not_stop_the_others() -> None:
     assert seen == [-1, 1.0, 2.0]
 
 
+@pytest.mark.usefixtures("without_viewer")
 def test_a_live_run_serves_its_metrics_and_logs_its_events(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as free:
         address = free.getsockname()

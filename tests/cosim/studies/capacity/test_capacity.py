@@ -111,18 +111,20 @@ def capacity(*words: str) -> Result:
 
 @pytest.mark.usefixtures("no_page")
 def test_the_default_answers_for_the_shipped_mixture_and_says_how_long_it_takes(
-    tmp_path: Path,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    assert plans.QUICK.draws == 6
+    monkeypatch.setattr(plans, "QUICK", plans.QUICK._replace(draws=2))
     out = "--out", str(tmp_path), "--workers", "1", "--json", "--set", "horizon_s=0.2"
     result = capacity("shared_bottleneck", *out, *SHORT[2:])
     assert result.exit_code == 0, result.output
     assert re.search(
-        r"108 runs of 0.2 s with 11 to 33 loops; the simulation takes about \d+ s on an idle core; "
+        r"36 runs of 0.2 s with 11 to 33 loops; the simulation takes about \d+ s on an idle core; "
         r"--thorough: \d+ (s|min)\n",
         result.stderr,
     )
     document = json.loads(result.stdout)
-    assert (document["loops"], document["draws"], document["thorough"]) == ([11, 22, 33], 6, False)
+    assert (document["loops"], document["draws"], document["thorough"]) == ([11, 22, 33], 2, False)
     for row in document["capacities"]:
         if row["median"] is not None:
             assert row["loops_by_kind"]["pendulum"] == 10 * row["factor"] == row["median"] / 1.1
@@ -132,6 +134,7 @@ def test_the_default_answers_for_the_shipped_mixture_and_says_how_long_it_takes(
     assert "takes about" not in again.stderr
 
 
+@pytest.mark.usefixtures("without_viewer")
 def test_the_command_compares_the_policies_and_confirms_a_point_live(tmp_path: Path) -> None:
     result = capacity(
         str(FILE), "--set", LOOP, "--loops", "2", "--draws", "1", "--disturbance", "1",

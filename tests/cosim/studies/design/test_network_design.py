@@ -144,7 +144,7 @@ def test_each_hold_strategy_has_the_most_that_its_best_loop_reached() -> None:
 
 
 def test_the_search_is_deterministic() -> None:
-    request = DesignRequest(period_s=PERIOD_S, effort=20)
+    request = DesignRequest(period_s=PERIOD_S, effort=5)
     first, second = (design_for_network(shipped("cart_pole", LINEAR), request).to_json() for _ in range(2))
     assert first == second
 

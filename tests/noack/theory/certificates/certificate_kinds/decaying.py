@@ -118,9 +118,6 @@ class NoCurvature(ErrorGains):
         outputs = dict(super().outputs)
         return outputs | {Output.GAIN_CURVATURE: 0 * outputs[Output.GAIN_CURVATURE]}
 
-    def hold_remainder(self, hold_s: float) -> float:
-        return 0.0
-
 
 class OnlyTheFirstMoment(ErrorGains):
     """Uses ‖C W^{−1}‖, the value at τ = 0, instead of the supremum over τ."""
