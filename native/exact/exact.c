@@ -155,17 +155,24 @@ static double *take_square(double **next, const exact_code *code, int64_t n, con
     return taken;
 }
 
+typedef struct { /* a quadratic form: the squares of the rows of P minus those of N */
+    int64_t up_rows, down_rows;
+    const double *up, *down; /* P and N */
+} form_rows;
+
 /* Take [P; N] as (blocks, 2, N, N), and the signs of its rows. */
 static double *take_form(
-    double **next, const exact_code *code, const exact_memory *memory, int64_t n, int64_t up_rows,
-    const double *up, int64_t down_rows, const double *down, double **signs) {
-    int64_t square = code->n * code->stride;
+    double **next, const exact_code *code, const exact_memory *memory, form_rows rows,
+    double **signs) {
+    int64_t square = code->n * code->stride, n = memory->exact->n;
     double *form = take(next, memory->blocks * 2 * square);
     *signs = take(next, memory->blocks * code->stride);
-    for (int64_t row = 0; row < up_rows + down_rows; row++) {
+    for (int64_t row = 0; row < rows.up_rows + rows.down_rows; row++) {
         int64_t block = row / code->n, at = row % code->n;
-        const double *from = row < up_rows ? up + row * 2 * n : down + (row - up_rows) * 2 * n;
-        (*signs)[block * code->stride + at] = row < up_rows ? 1.0 : -1.0;
+        int is_up = row < rows.up_rows;
+        const double *from =
+            is_up ? rows.up + row * 2 * n : rows.down + (row - rows.up_rows) * 2 * n;
+        (*signs)[block * code->stride + at] = is_up ? 1.0 : -1.0;
         for (int64_t j = 0; j < n; j++) {
             form[2 * block * square + j * code->stride + at] = from[j];
             form[(2 * block + 1) * square + j * code->stride + at] = from[n + j];
@@ -219,13 +226,11 @@ static int64_t lay_out(const noack_exact *exact, const exact_code *code, exact_m
     for (int64_t i = 0; i < n * n; i++)
         memory->is_static &= exact->H[i] == 0.0;
     if (memory->quadratic) {
-        memory->form = take_form(
-            &next, code, memory, n, rule->up_rows, rule->up, rule->down_rows, rule->down,
-            &memory->form_signs);
+        form_rows compared = {rule->up_rows, rule->down_rows, rule->up, rule->down};
+        form_rows gain = {rule->gain_up_rows, rule->gain_down_rows, rule->gain_up, rule->gain_down};
+        memory->form = take_form(&next, code, memory, compared, &memory->form_signs);
         memory->y = take(&next, blocks * curve);
-        memory->gain = take_form(
-            &next, code, memory, n, rule->gain_up_rows, rule->gain_up, rule->gain_down_rows,
-            rule->gain_down, &memory->gain_signs);
+        memory->gain = take_form(&next, code, memory, gain, &memory->gain_signs);
         memory->w = take(&next, blocks * curve);
     }
     code->prepare_shared(memory);

@@ -25,11 +25,13 @@ typedef struct { /* the comparison from the start of a piece on */
 
 static inline double size_of(lanes v) { return sqrt(dot(v, v)); }
 
-/* Write the coefficients of degree begin to end; those of quadratic forms times a factor. The last
-   three arguments are constants, each combination of which has code. */
+enum { MOVES = 1, HAS_D = 2, HAS_Q = 4 }; /* what of a state is not 0: H, d and q */
+
+/* Write the coefficients of degree begin to end; those of quadratic forms times a factor. What the
+   state has is a constant, for each value of which there is code. */
 static inline __attribute__((always_inline)) void expand_with(
-    exact_memory *memory, loop_state state, double factor, int begin, int end, int moves, int has_d,
-    int has_q) {
+    exact_memory *memory, loop_state state, double factor, int begin, int end, int what) {
+    int moves = what & MOVES, has_d = what & HAS_D, has_q = what & HAS_Q;
     const double *H_k = memory->H_k, *A_k = memory->A_k, *X_k = memory->X_k, *D_k = memory->D_k;
     const double *KH_k = memory->KH_k, *weight = memory->weight;
     double *rs = memory->r, *es = memory->e, *ds = memory->d, *qs = memory->q, *xs = memory->x;
@@ -79,13 +81,13 @@ static void expand(
         memory->has_D_k = 1;
     }
     if (memory->has_q)
-        expand_with(memory, *state, factor, begin, end, 1, 1, 1);
+        expand_with(memory, *state, factor, begin, end, MOVES | HAS_D | HAS_Q);
     else if (memory->is_static)
-        expand_with(memory, *state, factor, begin, end, 0, 1, 0);
+        expand_with(memory, *state, factor, begin, end, HAS_D);
     else if (memory->has_d)
-        expand_with(memory, *state, factor, begin, end, 1, 1, 0);
+        expand_with(memory, *state, factor, begin, end, MOVES | HAS_D);
     else
-        expand_with(memory, *state, factor, begin, end, 1, 0, 0);
+        expand_with(memory, *state, factor, begin, end, MOVES);
 }
 
 /* The same state with the plant's own as the reference, if that is small beside the present one:

@@ -66,6 +66,18 @@ from noack.trigger.trigger_rule import Policy, TriggerRule
 
 _PART_NUMBERS = 2**20
 """Numbers in the jumps that are computed at once."""
+_RATE_RESOLUTION, _NEAREST_RATE = 1e-2, 0.98
+"""As shares of the range of ᾱ: the accuracy of the search, and the largest ᾱ; c is infinite at the end."""
+_FIRST_STEP, _STEPS_UNTIL_DOUBLED = 1 / 64, 64
+"""Times at which ‖e^{Gt}‖ is sampled: the first step, times ‖G‖; steps until it is doubled."""
+_LAST_TIME = 50.0
+"""The last of them, times the difference between the decay rates of loop and threshold."""
+_GOLDEN = (math.sqrt(5) - 1) / 2
+"""The golden section."""
+_THEOREM_1_CELLS = 256
+"""Cells over which its suprema are bounded."""
+_GAMMAS = np.geomspace(1e-3, 1e3, 61)
+"""γ of Theorem 1 that are tried, per second, (61,)."""
 
 
 class MissedJumps(NamedTuple):
@@ -106,15 +118,18 @@ class MissedEvents:
             events: the sequence number of the event at each measurement, negative for none, (k,).
             received: that of the newest update that the controller has, negative for none, (k,).
         """
+        # Events that are missing at first, and new ones.
         new = np.flatnonzero(events >= 0)
         sequences = np.append(self._sequences, events[new])
         times_ns = np.append(self._times_ns, t_ns[new])
         errors = np.concatenate([self._errors, e_s[new]])
+        # Each is missing until an update arrives that is not older; some still are at the end.
         begins = np.append(np.zeros(len(self._sequences), np.int64), new)
         ends = np.maximum(np.searchsorted(np.maximum.accumulate(received), sequences), begins)
         lasting = ends == len(t_ns)
         self._sequences, self._times_ns = sequences[lasting], times_ns[lasting]
         self._errors = errors[lasting]
+        # Pairs of a measurement and an event that is missing there.
         lengths = ends - begins
         totals = np.cumsum(lengths)
         begin, batch = 0, max(_PART_NUMBERS // errors.shape[1], 1)
@@ -200,15 +215,6 @@ def _growths(H: MatrixKey, weight: MatrixKey, period_ns: int) -> _Growths:
     return _Growths(matrix_of(H), matrix_of(weight), period_ns)
 
 
-_SHARE, _NEAREST = 1e-2, 0.98
-_FIRST_STEP, _STEPS_UNTIL_DOUBLED = 1 / 64, 64
-"""Times at which ‖e^{Gt}‖ is sampled: the first step, times ‖G‖; steps until it is doubled."""
-_LAST_TIME = 50.0
-"""The last of them, times the difference between the decay rates of loop and threshold."""
-_GOLDEN = (math.sqrt(5) - 1) / 2
-_CELLS = 256
-
-
 class Theorem2(NamedTuple):
     """Theorem 2 with its constants."""
 
@@ -274,10 +280,10 @@ def _best_rate_per_s(
 
     # At one end of the range c tends to infinity, at the other end 1/(ᾱ − α) does. The larger of
     # two values between leaves a smaller range, whose golden section is the other one.
-    low, high = 0.0, _NEAREST
+    low, high = 0.0, _NEAREST_RATE
     left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
     left_s, right_s = about_s(left), about_s(right)
-    while high - low > _SHARE:
+    while high - low > _RATE_RESOLUTION:
         if left_s > right_s:
             high, right, right_s = right, left, left_s
             left = high - _GOLDEN * (high - low)
@@ -327,10 +333,6 @@ def _theorem_2(
     )
 
 
-_GAMMAS = np.geomspace(1e-3, 1e3, 61)
-"""The γ that are tried, (61,)."""
-
-
 class Interval(NamedTuple):
     """A trajectory between two events: k samples."""
 
@@ -377,6 +379,6 @@ def theorem_1(H: Matrix, alpha_per_s: float, longest_s: Sequence[float]) -> floa
         reach_s = math.fsum(longest_s[k:])
         if not math.isfinite(reach_s) or alpha_per_s * reach_s > 700:
             return math.inf
-        responses = response_until(H, identity, reach_s, _CELLS)
+        responses = response_until(H, identity, reach_s, _THEOREM_1_CELLS)
         delta += math.exp(alpha_per_s * reach_s) * float(responses.through(identity).sup_on_grid())
     return delta

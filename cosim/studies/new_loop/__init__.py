@@ -10,4 +10,6 @@ ALPHA_SHARE = 0.5
 SETTLED = 0.01
 """The horizon is the time in which e^(−αt) falls to this."""
 MANSD = 4
+"""M − 1, the maximum number of consecutive losses; less if nothing is certified with it."""
 LOSS_PROBABILITY = 0.5
+"""Of each update, before this maximum is applied."""

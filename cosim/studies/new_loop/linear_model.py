@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,25 +23,35 @@ from noack.settings.user_files import UserCode
 
 TOLERANCE = 1e-6
 """Relative size below which an entry of the controllability matrix is 0."""
-_ROUNDING = 1e-14
+_PROJECTION_ROUNDING = 1e-14
 """Rounding of a projection, relative to what is projected."""
-_REST = 1e-6
+_DRIFT_ROUNDING = 1e-6
 """A drift below this share of the largest entry of A and B is rounding."""
-_ROUGH, _ROUGH_LEAST = 0.5, 1e-3
+_NOT_SMOOTH, _SMALL_ERROR = 0.5, 1e-3
+"""A plant is not smooth if in a tenth of a neighbourhood its error is more than this share of that in all
+of it, where a tenth is expected; an error below the second number may be rounding."""
 _REAL, _ZERO = 1e-7, 1e-12
 """Sizes, relative to the largest eigenvalue, below which imaginary parts and numbers are 0."""
-_DIGITS = 10
+_GAIN_DIGITS = 10
+"""Significant digits of the entries of K: what remains is below the errors of any model."""
 Complex = NDArray[np.complex128]
+
+
+class SampledError(NamedTuple):
+    """The error of a linear model in a neighbourhood of its point."""
+
+    within: float
+    """Half-width of the neighbourhood, in each coordinate's units."""
+    of_states: Vector
+    """Largest sampled error of each state's derivative, relative, (n,)."""
 
 
 @dataclass(frozen=True)
 class LinearModel:
     """A plant's linear model ẋ ≈ drift + A (x − at) + B (u − input); n states, m inputs.
 
-    ``A``, (n, n), and ``B``, (n, m), are per second. ``errors`` has the half-width of a
-    neighbourhood and the relative error of each state in it. ``eigenvalues`` are those of A,
-    ``rank`` is that of the controllability matrix, and no input changes the eigenvalues
-    ``uncontrollable``.
+    ``A``, (n, n), and ``B``, (n, m), are per second. ``eigenvalues`` are those of A, ``rank`` is
+    that of the controllability matrix, and no input changes the eigenvalues ``uncontrollable``.
     """
 
     plant: PlantReference
@@ -50,7 +61,7 @@ class LinearModel:
     input: Vector
     drift: Vector
     source: str  # "derivative" or "motion"; "exact": the plant's own A and B; "known": the loop's Â and B̂
-    errors: tuple[tuple[float, Vector], ...]
+    errors: tuple[SampledError, ...]
 
     @property
     def eigenvalues(self) -> Complex:
@@ -77,12 +88,12 @@ class LinearModel:
     def rests(self) -> bool:
         """Whether the plant rests at the point."""
         scale = np.abs(np.hstack([self.A, self.B])).max(axis=1)
-        return bool((np.abs(self.drift) <= _REST * scale).all())
+        return bool((np.abs(self.drift) <= _DRIFT_ROUNDING * scale).all())
 
     def to_json(self) -> Table:
         """Return the document of ``noack linearise --json``."""
         arrays = {key: getattr(self, key).tolist() for key in ("at", "input", "A", "B", "drift")}
-        errors = [{"within": within, "of_states": by_state.tolist()} for within, by_state in self.errors]
+        errors = [{"within": within, "of_states": of_states.tolist()} for within, of_states in self.errors]
         return (
             {"plant": self.plant.label, "settings": self.plant.settings}
             | arrays
@@ -90,10 +101,10 @@ class LinearModel:
                 "is_equilibrium": self.rests,
                 "source": self.source,
                 "errors": errors,
-                "eigenvalues": _pairs(self.eigenvalues),
+                "eigenvalues": _real_and_imaginary(self.eigenvalues),
                 "rank": self.rank,
                 "tolerance": TOLERANCE,
-                "uncontrollable": _pairs(self.uncontrollable),
+                "uncontrollable": _real_and_imaginary(self.uncontrollable),
                 "is_stabilisable": bool((self.uncontrollable.real < 0).all()),
             }
         )
@@ -101,7 +112,7 @@ class LinearModel:
     def __repr__(self) -> str:
         states, inputs = self.plant.state_names, self.plant.input_names
         matrices = np.hstack([self.A, self.B])
-        return "\n".join([_matrix("Â, B̂", matrices, states, states + inputs), *self._sentences()])
+        return "\n".join([_matrix_text("Â, B̂", matrices, states, states + inputs), *self._sentences()])
 
     @property
     def origin(self) -> str:
@@ -126,7 +137,7 @@ class LinearModel:
             worst = int(np.argmax(np.where(np.isnan(error), np.inf, error)))
             name = self.plant.state_names[worst]
             yield f"relative error within ±{within:g}, sampled: up to {error[worst]:.2g} ({name})"
-        if self.errors and self._is_rough(*(error for _, error in self.errors)):
+        if self.errors and self._is_rough(*(error.of_states for error in self.errors)):
             yield "the error does not shrink with the neighbourhood: the plant is not smooth there"
         yield f"eigenvalues: {eigenvalue_text(self.eigenvalues)} /s"
         yield f"controllable: {self.rank} of {len(self.A)} states (tolerance {TOLERANCE:g})"
@@ -136,7 +147,8 @@ class LinearModel:
 
     @staticmethod
     def _is_rough(wide: Vector, narrow: Vector) -> bool:
-        return bool((narrow > np.maximum(_ROUGH * wide, _ROUGH_LEAST)).any())
+        """Return whether the errors of the states hardly shrink with the neighbourhood."""
+        return bool((narrow > np.maximum(_NOT_SMOOTH * wide, _SMALL_ERROR)).any())
 
 
 @dataclass(frozen=True)
@@ -165,7 +177,7 @@ class LoopGain:
         return self.model.to_json() | {
             "gain": self.K.tolist(),
             "method": self.method,
-            "closed_loop_eigenvalues": _pairs(self.eigenvalues),
+            "closed_loop_eigenvalues": _real_and_imaginary(self.eigenvalues),
             "alpha_below_per_s": self.decay_per_s,
         }
 
@@ -173,7 +185,7 @@ class LoopGain:
         plant = self.model.plant
         return "\n".join(
             [
-                _matrix("K", self.K, plant.input_names, plant.state_names),
+                _matrix_text("K", self.K, plant.input_names, plant.state_names),
                 f"u = K x; {self.method}",
                 f"in a scenario's [model]: gain = {self.K.tolist()}",
                 f"Â and B̂ are computed from {self.model.origin}",
@@ -224,23 +236,23 @@ def linearise(
     at, input = ([given] if isinstance(given, float | int) else given for given in (at, input))  # noqa: A001
     sizes = (None if at is None else len(at), None if input is None else len(input))
     reference = plant_reference(plant, settings or {}, sizes)
-    x, u = vector("at", at, reference.n, "states"), vector("input", input, reference.m, "inputs")
+    x, u = parse_vector("at", at, reference.n, "states"), parse_vector("input", input, reference.m, "inputs")
     point = {"x0": x, "u0": u, "step_ns": reference.step_ns, "settling_s": reference.system.settling_s}
     with np.errstate(all="ignore"):
         exact = reference.matrices or reference.system.linearisation()
         if exact is None:
-            motion = linear_motion(reference.at, reference.n, reference.m, **point)  # type: ignore[arg-type]
+            motion = linear_motion(reference.system_at, reference.n, reference.m, **point)  # type: ignore[arg-type]
         else:
             motion = LinearMotion(*exact, exact[0] @ x + exact[1] @ u, "motion")
     if motion.void is not None:
         raise CallerError(f"{plant}: no linear model: {motion.void}")
-    widths = () if reference.matrices else (within, within / 10)
-    errors = tuple(
-        (width, largest_errors(reference.at, motion, np.full(reference.n + reference.m, width), **point))  # type: ignore[arg-type]
-        for width in widths
-    )
+    errors = []
+    for width in () if reference.matrices else (within, within / 10):
+        halfwidths = np.full(reference.n + reference.m, width)
+        of_states = largest_errors(reference.system_at, motion, halfwidths, **point)  # type: ignore[arg-type]
+        errors.append(SampledError(width, of_states))
     source = motion.source if exact is None else "exact"
-    return LinearModel(reference, motion.A, motion.B, x, u, motion.drift, source, errors)
+    return LinearModel(reference, motion.A, motion.B, x, u, motion.drift, source, tuple(errors))
 
 
 def gain(
@@ -266,28 +278,28 @@ def gain(
         NoackError: an unstable eigenvalue is not controllable, or a value is wrong.
     """
     model = plant if isinstance(plant, LinearModel) else linearise(plant, settings=settings)
-    if model is not plant and (known := model.plant.known) is not None:
+    if model is not plant and (known := model.plant.model_matrices) is not None:
         model = replace(model, A=known[0], B=known[1], source="known")
     label, uncontrollable = model.plant.label, model.uncontrollable
     if len(uncontrollable) and uncontrollable[0].real >= 0:
         worst = eigenvalue_text(uncontrollable[:1])
         raise CallerError(f"{label}: no gain stabilises it: the eigenvalue {worst} /s is not controllable")
     if poles is None:
-        Q, R = (_diagonal(*weight) for weight in (("q", q, model.A), ("r", r, model.B.T)))
-        K = _regulator(model, Q, R)
+        Q, R = (_weight_matrix(*weight) for weight in (("q", q, model.A), ("r", r, model.B.T)))
+        K = _regulator_gain(model, Q, R)
         method = f"linear-quadratic regulator, Q = {_diagonal_text(Q)}, R = {_diagonal_text(R)}"
     elif q is not None or r is not None:
         raise CallerError("poles: give either these or the weights q and r")
     else:
         pole_values = np.array(poles, dtype=np.complex128)
-        K, method = _placed(model, pole_values), f"poles {eigenvalue_text(pole_values)} /s"
-    K = np.array([[to_digits(value, _DIGITS) for value in row] for row in K])
+        K, method = _place_poles(model, pole_values), f"poles {eigenvalue_text(pole_values)} /s"
+    K = np.array([[to_digits(value, _GAIN_DIGITS) for value in row] for row in K])
     if (reason := instability(model.A, model.B, K)) is not None:
         raise CallerError(f"{label}: {reason}")
     return LoopGain(model, K, method)
 
 
-def _regulator(model: LinearModel, Q: Matrix, R: Matrix) -> Matrix:
+def _regulator_gain(model: LinearModel, Q: Matrix, R: Matrix) -> Matrix:
     from scipy.linalg import solve_continuous_are  # importing scipy takes 0.2 s
 
     try:
@@ -297,7 +309,7 @@ def _regulator(model: LinearModel, Q: Matrix, R: Matrix) -> Matrix:
     return np.asarray(-np.linalg.solve(R, model.B.T @ P), dtype=np.float64)
 
 
-def _placed(model: LinearModel, poles: Complex) -> Matrix:
+def _place_poles(model: LinearModel, poles: Complex) -> Matrix:
     from scipy.signal import place_poles  # importing scipy takes 0.2 s
 
     basis = model.controllable
@@ -315,7 +327,7 @@ def _placed(model: LinearModel, poles: Complex) -> Matrix:
     return np.asarray(-placed.gain_matrix @ basis.T, dtype=np.float64)
 
 
-def _diagonal(key: str, weights: ArrayLike | None, shaped: Matrix) -> Matrix:
+def _weight_matrix(key: str, weights: ArrayLike | None, shaped: Matrix) -> Matrix:
     """Return a diagonal weight with an entry for each row of ``shaped``."""
     size, values = len(shaped), np.atleast_1d(np.array(1.0 if weights is None else weights, np.float64))
     if values.shape not in ((1,), (size,)):
@@ -343,7 +355,7 @@ def controllable_states(A: Matrix, B: Matrix) -> Matrix:
     while new.shape[1] and basis.shape[1] < len(A):
         projection = np.eye(len(A)) - basis @ basis.T
         noise = TOLERANCE * norm(np.linalg.norm(np.abs(projection) @ terms, axis=1))
-        noise += _ROUNDING * norm(np.linalg.norm(terms, axis=1))
+        noise += _PROJECTION_ROUNDING * norm(np.linalg.norm(terms, axis=1))
         directions, sizes, _ = np.linalg.svd(projection @ new, full_matrices=False)
         last = directions[:, sizes > noise]
         basis = np.linalg.qr(np.hstack([basis, last]))[0]
@@ -368,7 +380,7 @@ def eigenvalue_text(values: Complex) -> str:
     return ", ".join(texts)
 
 
-def vector(key: str, entries: object, size: int, meaning: str) -> Vector:
+def parse_vector(key: str, entries: object, size: int, meaning: str) -> Vector:
     """Return a given vector, (size,); None is 0. Raise CallerError if it is not one."""
     try:
         values = np.zeros(size) if entries is None else np.array(entries, dtype=np.float64)
@@ -407,7 +419,7 @@ def model_or_gain(plant: str, settings: ReadTable) -> LinearModel | LoopGain:
     gain_rows = document["gain"]
     if not isinstance(gain_rows, list) or not all(isinstance(row, list) for row in gain_rows):
         raise CallerError(f"{plant}: gain: expected a list of rows")
-    rows = [vector("gain", row, len(model.A), "states") for row in gain_rows]
+    rows = [parse_vector("gain", row, len(model.A), "states") for row in gain_rows]
     if len(rows) != model.plant.m:
         raise CallerError(f"{plant}: gain: {len(rows)} rows; the plant has {model.plant.m} inputs")
     K = np.array(rows)
@@ -416,7 +428,7 @@ def model_or_gain(plant: str, settings: ReadTable) -> LinearModel | LoopGain:
     return LoopGain(model, K, str(document.get("method", "given")))
 
 
-def _matrix(name: str, matrix: Matrix, rows: Sequence[str], columns: Sequence[str]) -> str:
+def _matrix_text(name: str, matrix: Matrix, rows: Sequence[str], columns: Sequence[str]) -> str:
     entries = ([f"{value:.6g}" for value in row] for row in matrix)
     table: Rows = [[name, *columns], *([row, *cells] for row, cells in zip(rows, entries, strict=True))]
     return as_text(table)
@@ -426,5 +438,5 @@ def _vector_text(values: Vector) -> str:
     return f"({', '.join(f'{value:.4g}' for value in values)})"
 
 
-def _pairs(values: Complex) -> list[list[float]]:
+def _real_and_imaginary(values: Complex) -> list[list[float]]:
     return [[float(value.real), float(value.imag)] for value in values]

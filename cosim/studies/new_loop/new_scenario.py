@@ -26,7 +26,7 @@ from cosim.studies.new_loop.linear_model import (
     eigenvalue_text,
     gain,
     model_or_gain,
-    vector,
+    parse_vector,
 )
 from noack.core.errors import CallerError, MachineError, why
 from noack.core.file_access import new_file
@@ -44,25 +44,29 @@ from noack.theory.certificates.certified_bounds import ScenarioCertificate, enve
 from noack.theory.certificates.conditions import nominal_conditions
 from noack.theory.certificates.scenario_certificates import own_plant_scope
 
-_WITH_FILE = (FmuSettings, GymnasiumSettings, PythonPlantSettings)
+_PLANTS_WITH_FILE = (FmuSettings, GymnasiumSettings, PythonPlantSettings)
 _FLOOR_SHARE = 0.05
 """The floor of the threshold, as a share of beta."""
 _FASTEST_ALPHA_PER_S = 1.0
+"""α is at most this, so that the horizon of a fast loop is at least 4.6 s."""
 _RATES_HZ = (1.0, 2.0, 5.0, 10.0, 20.0, 25.0, 50.0, 100.0, 200.0, 250.0, 500.0)
+"""Rates that are chosen from: their periods are whole milliseconds."""
 _FASTEST_EIGENVALUE_PER_S = 1000.0
 """Faster eigenvalues do not determine the rate: no loop can follow them."""
 _STEPS_PER_TIME_CONSTANT = 50
 """The least, for the fastest eigenvalue of the loop."""
 _INPUT_WEIGHTS = (1.0, 10.0, 100.0)
+"""r of the regulators that are tried: with a larger one the gain is slower."""
 _LOOSE = 200.0
 """A bound of ‖x‖ above this multiple of ‖x(0)‖ is used only if there is no other."""
-_START = 0.1
+_DEFAULT_START = 0.1
 """x(0) of a state, if the plant has none."""
-_SMALLER, _MOST_SMALLER_STARTS = 0.5, 5
+_SMALLER, _MOST_SMALLER_DEFAULT_STARTS = 0.5, 5
 """If the loop does not return, x(0) is multiplied by this, so often at most."""
 _RETURNED = 0.1
 """Share of ‖x(0)‖ below which the loop has returned."""
 _LONGEST_RUN_S = 20.0
+"""Wall time of a live run; a longer horizon runs faster."""
 _LONGEST_HORIZON_S, _HIGHEST_SPEED = 1e7, 1000.0
 """The largest that a scenario may have."""
 
@@ -137,20 +141,20 @@ def new(
     fixed_state = fixed.pop("plant.initial_state", initial_state)
     model = plant_model.model if isinstance(plant_model, LoopGain) else plant_model
     _require_rest(model)
-    build = _Builder(model, Path(path), fixed)
-    best = build.search(list(_trials(plant_model, _initial_state(model, fixed_state))), report)
+    trials = _TrialScenarios(model, Path(path), fixed)
+    best = trials.search(list(_list_trials(plant_model, _initial_state(model, fixed_state))), report)
     report("simulating")
-    returns = build.returns(best)
-    for _ in range(_MOST_SMALLER_STARTS):
+    returns = trials.returns(best)
+    for _ in range(_MOST_SMALLER_DEFAULT_STARTS):
         if returns or fixed_state is not None:
             break
         best = replace(best, x0=best.x0 * _SMALLER)
-        returns = build.returns(best)
-    certificate, _ = build.certified(best)
-    notes = tuple(_notes(best, certificate, returns, build.is_linear))
-    text = _commented(build.content(best), notes, best, fixed)
+        returns = trials.returns(best)
+    certificate, _ = trials.certify(best)
+    notes = tuple(_notes(best, certificate, returns, trials.is_linear))
+    text = _file_text(trials.content(best), notes, best, fixed)
     found_certificate = certificate if certificate.exists else None
-    return NewScenario(best.gain, build.scenario(best), text, found_certificate, notes)
+    return NewScenario(best.gain, trials.scenario(best), text, found_certificate, notes)
 
 
 def _require_rest(model: LinearModel) -> None:
@@ -173,12 +177,12 @@ def _initial_state(model: LinearModel, fixed_state: object) -> Vector:
     n, unit = model.plant.n, np.eye(model.plant.n)
     if fixed_state is not None or model.plant.initial_state is not None:
         fixed_state = model.plant.initial_state if fixed_state is None else fixed_state
-        return vector("x0", fixed_state, n, "states")
+        return parse_vector("x0", fixed_state, n, "states")
     is_rate = [any((model.A[i] == unit[j]).all() for i in range(n) if i != j) for j in range(n)]
-    return np.where(is_rate, 0.0, _START) if not all(is_rate) else np.full(n, _START)
+    return np.where(is_rate, 0.0, _DEFAULT_START) if not all(is_rate) else np.full(n, _DEFAULT_START)
 
 
-def _trials(model: LinearModel | LoopGain, x0: Vector) -> Iterator[_Trial]:
+def _list_trials(model: LinearModel | LoopGain, x0: Vector) -> Iterator[_Trial]:
     """Yield what is tried, the preferred settings first."""
     gains = [model] if isinstance(model, LoopGain) else [gain(model, r=weight) for weight in _INPUT_WEIGHTS]
     for loop_gain in gains:
@@ -186,17 +190,17 @@ def _trials(model: LinearModel | LoopGain, x0: Vector) -> Iterator[_Trial]:
             (size for size in np.abs(loop_gain.eigenvalues) if size < _FASTEST_EIGENVALUE_PER_S), default=1
         )
         least_rate_hz = _STEPS_PER_TIME_CONSTANT * fastest
-        base = next((rate for rate in _RATES_HZ if rate >= least_rate_hz), _RATES_HZ[-1])
-        base = loop_gain.model.plant.rates.get("rate_hz", base)
+        usual_hz = next((rate_hz for rate_hz in _RATES_HZ if rate_hz >= least_rate_hz), _RATES_HZ[-1])
+        usual_hz = loop_gain.model.plant.rates.get("rate_hz", usual_hz)
         is_fixed = loop_gain.model.plant.system.has_own_step
-        for rate in (base,) if is_fixed else (base, 2 * base):
+        for rate_hz in (usual_hz,) if is_fixed else (usual_hz, 2 * usual_hz):
             for mansd in range(MANSD, 0, -1):
                 for share in (ALPHA_SHARE, ALPHA_SHARE / 2):
                     alpha = to_digits(min(share * loop_gain.decay_per_s, _FASTEST_ALPHA_PER_S))
-                    yield _Trial(loop_gain, rate, mansd, alpha, x0)
+                    yield _Trial(loop_gain, rate_hz, mansd, alpha, x0)
 
 
-class _Builder:
+class _TrialScenarios:
     """Builds, certifies and simulates the scenarios of trials."""
 
     def __init__(self, model: LinearModel, path: Path, fixed: ReadTable) -> None:
@@ -257,7 +261,7 @@ class _Builder:
         """Return the table plant.system, with a file's name relative to the scenario's folder."""
         system, model = self._model.plant.system, self._model
         table = system.content()
-        if isinstance(system, _WITH_FILE) and system.file is not None:
+        if isinstance(system, _PLANTS_WITH_FILE) and system.file is not None:
             table["file"] = os.path.relpath(system.file, self._path.absolute().parent)
             table.pop("sha256", None)
         if isinstance(system, FmuSettings):
@@ -270,7 +274,7 @@ class _Builder:
         """Return the loaded scenario."""
         return completed(self.content(trial), self._path)
 
-    def certified(self, trial: _Trial) -> tuple[ScenarioCertificate, float]:
+    def certify(self, trial: _Trial) -> tuple[ScenarioCertificate, float]:
         """Return the certificate of a trial's linear plant, perhaps void, and its loop gain."""
         resolved = with_linear_plant(resolve(self.scenario(trial)))
         resolved.coverage.require_unchanging()
@@ -290,7 +294,7 @@ class _Builder:
             if (content := str(self.content(trial))) in contents:  # the given settings exclude it
                 continue
             contents.add(content)
-            certificate, loop_gain = self.certified(trial)
+            certificate, loop_gain = self.certify(trial)
             if certificate.constants is None:
                 closest = min(closest, (loop_gain, trial), key=lambda entry: entry[0])
                 continue
@@ -311,7 +315,7 @@ class _Builder:
         except CallerError:
             return None
         weighted = replace(trial, weight=weight)
-        return weighted if self.certified(weighted)[0].exists else None
+        return weighted if self.certify(weighted)[0].exists else None
 
     def returns(self, trial: _Trial) -> bool:
         """Whether ‖x‖ ends below a tenth of its maximum, in virtual time."""
@@ -334,7 +338,9 @@ def _notes(trial: _Trial, certificate: ScenarioCertificate, returns: bool, is_li
         losses = certificate.conditions.guarantee.meaning
         yield f"Certified for {plant}, for every pattern of losses with {losses}: {bound}."
     if not is_linear:
-        errors = ", ".join(f"{by_state.max():.2g} within ±{w:g}" for w, by_state in trial.gain.model.errors)
+        errors = ", ".join(
+            f"{of_states.max():.2g} within ±{within:g}" for within, of_states in trial.gain.model.errors
+        )
         yield (
             "The plant itself is not linear. If its equations are known, noack certify searches a "
             "certificate on a region that it does not leave; without one, a run checks only what "
@@ -374,7 +380,7 @@ _REASONS = {
 """How values are chosen that are not given."""
 
 
-def _commented(content: ReadTable, notes: Sequence[str], trial: _Trial, fixed: ReadTable) -> str:
+def _file_text(content: ReadTable, notes: Sequence[str], trial: _Trial, fixed: ReadTable) -> str:
     """Return the file: the content with comments."""
     poles, decay = eigenvalue_text(trial.gain.eigenvalues), trial.gain.decay_per_s
     comments = _COMMENTS | {
@@ -383,22 +389,22 @@ def _commented(content: ReadTable, notes: Sequence[str], trial: _Trial, fixed: R
     }
     comments |= {key: comments[key] + reason for key, reason in _REASONS.items() if key not in fixed}
     lines = [f"# A scenario for {trial.gain.model.plant.label}, written by `noack new`."]
-    lines += [line for note in notes for line in _comment(note)]
-    return "\n".join([*lines, *_section("", content, comments), ""])
+    lines += [line for note in notes for line in _comment_lines(note)]
+    return "\n".join([*lines, *_section_lines("", content, comments), ""])
 
 
-def _section(name: str, table: ReadTable, comments: Mapping[str, str]) -> list[str]:
-    lines = _comment(comments.get(name, ""))
+def _section_lines(name: str, table: ReadTable, comments: Mapping[str, str]) -> list[str]:
+    lines = _comment_lines(comments.get(name, ""))
     lines = ["", *lines, f"[{name}]"] if name else lines
     inner: list[str] = []
     for key, value in table.items():
         path = f"{name}.{key}" if name else key
         if isinstance(value, dict):
-            inner += _section(path, value, comments)
+            inner += _section_lines(path, value, comments)
         else:
-            lines += _comment(comments.get(path, "")) + toml_text({key: value}).splitlines()
+            lines += _comment_lines(comments.get(path, "")) + toml_text({key: value}).splitlines()
     return lines + inner
 
 
-def _comment(text: str) -> list[str]:
+def _comment_lines(text: str) -> list[str]:
     return textwrap.wrap(text, 98, initial_indent="# ", subsequent_indent="# ")

@@ -26,6 +26,7 @@ from noack.settings.section import ReadTable, Table
 from noack.settings.user_files import located
 
 _GYMNASIUM = "gymnasium:"
+"""What the name of an environment begins with."""
 _MOST_TRIED = 16
 """Largest number of states and of inputs that is tried with a class that names neither."""
 _KINDS = sorted(kind for kind, plant in PLANTS.items() if plant.scenario and plant is not LinearSettings)
@@ -48,7 +49,7 @@ class PlantReference:
     rates: Mapping[str, float]  # rate_hz and measure_every of its plant, if they are given
     initial_state: tuple[float, ...] | None = None
     matrices: tuple[Matrix, Matrix] | None = None  # A and B of a linear plant
-    known: tuple[Matrix, Matrix] | None = None  # Â and B̂, which sensor and controller know of it
+    model_matrices: tuple[Matrix, Matrix] | None = None  # Â and B̂, which sensor and controller know of it
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -72,7 +73,7 @@ class PlantReference:
         """Its steps per second; that of a scenario by default."""
         return self.rates.get("rate_hz", 500.0)
 
-    def at(self, x0: Vector) -> PlantSystem:
+    def system_at(self, x0: Vector) -> PlantSystem:
         """Return the system at an initial state."""
         A, B = self.matrices or (np.zeros((self.n, self.n)), np.zeros((self.n, self.m)))
         return self.system.system(PlantStart(x0, A, B, self.step_ns))
@@ -103,13 +104,13 @@ def plant_reference(
     assert isinstance(plant, dict)
     if not isinstance(plant["system"], dict) or plant["system"].get("kind") != kind:
         raise CallerError(f"--set plant.system: the plant is {label}; set its values, one by one")
-    system = _settings(plant["system"], label)
-    rates = {key: _rate(key, plant[key]) for key in ("rate_hz", "measure_every") if key in plant}
+    system = _validated_settings(plant["system"], label)
+    rates = {key: _positive_rate(key, plant[key]) for key in ("rate_hz", "measure_every") if key in plant}
     if isinstance(system, GymnasiumSettings):
         return _of_environment(label, settings, system)
     if isinstance(system, FmuSettings):
         n, m = len(system.state_variables), len(system.input_variables)
-        names = _plain(system.state_variables), _plain(system.input_variables)
+        names = _plain_names(system.state_variables), _plain_names(system.input_variables)
         return PlantReference(label, settings, system, n, m, names, rates)
     if isinstance(system, PythonPlantSettings):
         n, m = _sizes_of_class(system, label, sizes)
@@ -127,7 +128,7 @@ def _system_table(label: str) -> Table | None:
     if label.startswith(_GYMNASIUM):
         return {"kind": "gymnasium", "id": label.removeprefix(_GYMNASIUM)}
     if label.endswith(".py"):
-        raise CallerError(f"{label}: which class of it? {_classes(Path(label))}")
+        raise CallerError(f"{label}: which class of it? {_class_hint(Path(label))}")
     if colon and file.endswith(".py"):
         return {"kind": "python", "file": file, "name": name}
     if label.endswith(".fmu"):
@@ -139,13 +140,13 @@ def _system_table(label: str) -> Table | None:
     return {"kind": "python", "name": label} if colon else None
 
 
-def _rate(key: str, value: object) -> float:
+def _positive_rate(key: str, value: object) -> float:
     if not isinstance(value, int | float) or not value > 0:
         raise CallerError(f"--set plant.{key}: {value!r}; give a positive number")
     return float(value)
 
 
-def _classes(path: Path) -> str:
+def _class_hint(path: Path) -> str:
     with suppress(OSError, SyntaxError, ValueError):
         statements = ast.parse(path.read_bytes()).body
         if names := [statement.name for statement in statements if isinstance(statement, ast.ClassDef)]:
@@ -153,7 +154,7 @@ def _classes(path: Path) -> str:
     return f"write {path}:Class"
 
 
-def _settings(table: object, label: str) -> PlantSettings:
+def _validated_settings(table: object, label: str) -> PlantSettings:
     """Return validated settings whose file is found; an FMU may lack the names of variables."""
     assert isinstance(table, dict)
     if table["kind"] == "fmu" and not {"state_variables", "input_variables"} <= table.keys():
@@ -200,7 +201,7 @@ def _of_environment(label: str, settings: ReadTable, system: GymnasiumSettings) 
     return PlantReference(label, settings, system, environment.n, environment.m, (None, None), rates)
 
 
-def _plain(names: Sequence[str]) -> tuple[str, ...]:
+def _plain_names(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(re.sub(r"\W", "_", name) for name in names)
 
 

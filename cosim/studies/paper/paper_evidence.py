@@ -23,6 +23,7 @@ from cosim.simulation.continuous import (
 from cosim.simulation.virtual_time import simulate
 from cosim.studies.campaign.random_draws import box_of, drawn_scenario
 from noack.core.clock import NS_PER_S
+from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.plants.linear import lane_following
 from noack.protocol.record_tables import SENSOR_MEASUREMENT, entry_names
@@ -37,13 +38,19 @@ from noack.trigger.trigger_rule import TriggerRule, error_form
 Numbers = dict[str, object]
 Mode = Literal["model", "zoh"]
 MODES: tuple[Mode, ...] = ("model", "zoh")
+"""The loops of the page: MB-ET and ZOH-ET."""
 SEED = 0
 """Seed of the campaign ``paper``."""
-_FEW, _SOME = 25, 100
-"""Number of draws with certificates, which take long, and with the states at deliveries."""
-_LONG_S = 300.0
-_SAMPLED_S = 20.0
+CERTIFIED_DRAWS = range(25)
+"""Draws with certificates, each of which takes about a second."""
+_DELIVERY_DRAWS = 100
+"""Number of draws whose states at deliveries are compared."""
+_MOST_TRIED = 100
+"""Draws among which an unstable plant is looked for."""
+_EXACT_MODEL_S, _SAMPLED_S = 300.0, 20.0
+"""Lengths of the run with an exact model, and of the one whose trigger is sampled."""
 _SAMPLES = 101
+"""Samples of an interval between two events."""
 _ROUNDING = 1e-12
 """Smaller numbers are rounding errors, which depend on the machine."""
 _ZERO = 1e-6
@@ -65,24 +72,29 @@ def open_loop_eigenvalues(A: Matrix) -> Vector:
     return np.where(np.abs(eigenvalues) < tolerance, 0.0, eigenvalues)
 
 
-def evidence(scenario: Scenario, draws: int, representative: int) -> Numbers:
+def evidence(
+    scenario: Scenario, draws: int, representative: int, certified: Sequence[int] = CERTIFIED_DRAWS
+) -> Numbers:
     """Return all numbers of the page's sections on assumptions and errors, as JSON.
 
     Args:
         scenario: that of the base; its plant and initial state are not yet drawn.
         draws: number of draws.
         representative: the draw that is the example.
+        certified: the draws below this number that are certified, besides the example.
     """
     M, trigger = scenario.network.mansd + 1, scenario.decaying
     return {
         "example": {"M": M, "beta": trigger.beta, "alpha_per_s": trigger.alpha_per_s},
         "eigenvalues": _eigenvalues(),
         "plants": _plants(scenario, draws),
-        "growth": _growth(scenario, min(draws, _SOME)),
-        "certificates": _certificates(scenario, [*range(min(draws, _FEW)), representative]),
+        "growth": _growth(scenario, min(draws, _DELIVERY_DRAWS)),
+        "certificates": _certificates(
+            scenario, [*(draw for draw in certified if draw < draws), representative]
+        ),
         "loss": _loss(M),
         "exact_model": _exact_model(scenario),
-        "trapped": _trapped(scenario),
+        "without_growth": _without_growth(scenario),
         "slow_model": _slow_model(M),
         "standstill": _standstill(scenario),
         "overshoot": _overshoot(scenario, representative),
@@ -201,7 +213,7 @@ def _loss(M: int) -> Numbers:
 
 def _exact_model(scenario: Scenario) -> Numbers:
     """Proposition 1 fails for an exact model: the nominal lane, only the first packet delivered."""
-    resolved = resolved_draw(_nominal(scenario, _LONG_S), 0, "model")
+    resolved = resolved_draw(_nominal(scenario, _EXACT_MODEL_S), 0, "model")
     run = _only_first_arrives(resolved)
     loop = loop_of(resolved)
     eigenvalues, vectors = np.linalg.eig(loop.H)
@@ -212,7 +224,7 @@ def _exact_model(scenario: Scenario) -> Numbers:
     ]
     times_s = [0.0, 10.0, 20.0, 30.0]
     return {
-        "horizon_s": _LONG_S,
+        "horizon_s": _EXACT_MODEL_S,
         "events": len(run.event_s),
         "times_s": times_s,
         "norms": np.linalg.norm(run.at(times_s).x, axis=1).tolist(),
@@ -220,26 +232,31 @@ def _exact_model(scenario: Scenario) -> Numbers:
     }
 
 
-def _trapped(scenario: Scenario) -> Numbers:
+def _without_growth(scenario: Scenario) -> Numbers:
     """Return the dimensions of the set of x with (x, x) in the span of Γ's stable modes.
 
     "model" and "zoh" count eigenvalues 0 as stable (no exponential growth), "strictly" does not.
+
+    Raises:
+        CallerError: no plant is unstable.
     """
-    for draw in itertools.count():
+    for draw in range(_MOST_TRIED):
         loop = loop_of(resolved_draw(scenario, draw, "model"))
         if unstable := int((open_loop_eigenvalues(loop.A).real > _ZERO).sum()):
             break
+    else:
+        raise CallerError(f"{scenario.name}: none of {_MOST_TRIED} drawn plants is unstable")
     return {
         "draw": draw,
         "n": loop.n,
         "unstable": unstable,
-        "model": _stable_pairs(loop, loop.H, _ZERO),
-        "zoh": _stable_pairs(loop, np.zeros_like(loop.H), _ZERO),
-        "strictly": _stable_pairs(loop, loop.H, -_ZERO),
+        "model": _dimension_without_growth(loop, loop.H, _ZERO),
+        "zoh": _dimension_without_growth(loop, np.zeros_like(loop.H), _ZERO),
+        "strictly": _dimension_without_growth(loop, loop.H, -_ZERO),
     }
 
 
-def _stable_pairs(loop: LoopMatrices, H: Matrix, least_real: float) -> int:
+def _dimension_without_growth(loop: LoopMatrices, H: Matrix, least_real: float) -> int:
     """Return the dimension of the x for which (x, x) excites no mode of Γ with a larger real part.
 
     Γ = [[A, BK], [0, H]]. The rows of the left invariant subspace of these modes vanish on such a
@@ -344,6 +361,7 @@ def _theorem_1(scenario: Scenario, representative: int) -> Numbers:
 
 
 def _longest_s(run: ContinuousRun, event: int) -> float:
+    """Return δ̄_j of the interval after an event, from the trajectory."""
     trigger = run.system.decaying
     t_s = np.linspace(run.event_s[event], run.event_s[event + 1], _SAMPLES)
     samples = run.system.sample(run.after[event], t_s)

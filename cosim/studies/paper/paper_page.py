@@ -103,7 +103,7 @@ def numbers(campaign: FinishedCampaign) -> Document:
         "evidence": evidence(_base(campaign), draws, draw),
         "summary": campaign.summary.to_json(),
     }
-    rounded: Document = _rounded(document)
+    rounded: Document = rounded_numbers(document)
     return rounded
 
 
@@ -126,12 +126,12 @@ def _representative(campaign: FinishedCampaign) -> int:
     return int(np.argmin(distance))
 
 
-def _rounded(value: Any) -> Any:
+def rounded_numbers(value: Any) -> Any:
     """Return values as in the JSON file: rounded, integers without a point, null for infinity."""
     if isinstance(value, Mapping):
-        return {key: _rounded(entry) for key, entry in value.items()}
+        return {key: rounded_numbers(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_rounded(entry) for entry in value]
+        return [rounded_numbers(entry) for entry in value]
     if isinstance(value, str | bool | int) or value is None:
         return value
     if not math.isfinite(value):

@@ -1,7 +1,8 @@
 """Coordinates in which a linear system contracts: ‖L e^{Gs} Y‖ ≤ ‖L Y‖ e^{−νs}.
 
-−ν is the logarithmic norm of L G L^{−1}. Any invertible L with ν > 0 is suitable; LᵀL is then a
-Lyapunov function. ν is computed from the final L, so rounding in the computation of L is harmless.
+−ν is the logarithmic norm (Dahlquist, 1958) of L G L^{−1}. Any invertible L with ν > 0 is suitable;
+LᵀL is then a Lyapunov function. ν is computed from the final L, so rounding in the computation of L
+is harmless.
 """
 
 import contextlib

@@ -40,13 +40,14 @@ from noack.theory.bounds.stacked_norms import (
 
 MISMATCH = "Â − A"
 """Name of the output by which the plant's steps differ from the model's."""
-_MOST_GAINS = 1500
-_SETTLED = 1e-9
-_MOST_STEPS = 100_000
-_TAIL_SHARE = 1e-4
+_MOST_GAINS, _SETTLED = 1500, 1e-9
+"""Gains of an observer that are followed; the relative change of a settled one."""
+_MOST_STEPS, _TAIL_SHARE = 100_000, 1e-4
+"""Measurements over which sources are summed; the share that their remainder may be at the end."""
 _ENTRIES = 100_000
 """Of the effects that are computed together."""
 _ROUNDING = 1 + 1e-6
+"""Exceeds the rounding of sums over up to 100,000 measurements, as estimated."""
 
 
 class NormalBounds(NamedTuple):

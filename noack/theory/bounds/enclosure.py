@@ -15,8 +15,8 @@ computed together. The grids of a stack have equally many nodes; where one ends 
 cells have the width 0.
 
 Rounding: the error of the products C Y is bounded by n ε |C| |Y|, which matters if C and D are
-ill-conditioned. All other rounding errors, about 1e-12 of a value, are covered by a relative
-inflation of 1e-9.
+ill-conditioned. All other rounding errors, about 1e-12 of a value, are to be covered by a relative
+inflation of 1e-9 (``ROUNDING``).
 """
 
 import math
@@ -46,18 +46,22 @@ from noack.theory.bounds.stacked_norms import (
 )
 
 _TAYLOR_TERMS = 4
+"""Terms by which a second derivative over a cell is bounded; then comes the remainder."""
 _LARGEST_EXPONENT = 100.0
+"""Larger exponents of a remainder count as infinite: its bound would be of no use."""
 _BLOCK = 64
+"""Powers of e^{Gs} that are multiplied with a state by one product."""
 _FIRST_STEP, _STEP = 0.05, 0.2
 """Step lengths as shares of the fastest mode's time constant."""
 _SAG = 0.005
 """A step may become longer if the chord deviates from e^{Gτ}D by at most this share of its norm."""
-_CELLS_PER_BLOCK = 256
-_MOST_CELLS = 60_000
+_CELLS_PER_BLOCK, _MOST_CELLS = 256, 60_000
+"""Cells of equal length, after which the step is chosen anew; limit of all cells."""
 _MOST_ENTRIES = 4_000_000
 """Largest number of entries of all matrices of a response. With many states there are fewer cells,
 and the looser bound beyond the grid applies earlier."""
 _TAIL_SHARE = 1e-5
+"""The grid ends where the bound of the rest is this share of the area so far."""
 Name = TypeVar("Name", bound=str)
 Groups = Sequence[slice]
 """Groups of columns."""
@@ -240,9 +244,11 @@ class ResponseBounds:
         """Return bounds of ‖C e^{Gτ} D‖ for every output and each group of columns of D."""
         columns, nodes = self._columns, self._nodes
         steps_s = np.diff(self.edges_s)[..., None, None, :]
+        # The norms at the nodes, with the rounding of the products.
         norms = outputs.each(spectral_norms_along_last, product_along_last(outputs.stacked, nodes), columns)
         magnitudes = product_along_last(np.abs(outputs.stacked), np.abs(nodes))
         norms += EPSILON * nodes.shape[-3] * outputs.each(frobenius_norms_along_last, magnitudes, columns)
+        # Over each cell by both ends and the sag, and beyond the last one by the decay.
         bends = self._bends.over(outputs)
         middle = 0.5 * (norms[..., :-1] + norms[..., 1:])
         highest = larger_ends(norms) + steps_s**2 / 8 * bends

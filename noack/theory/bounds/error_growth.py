@@ -1,7 +1,8 @@
 """The growth of e_s between two tests of a trigger, and from an event until it can reach a level.
 
 :class:`ErrorGrowth` bounds e_s from a test on until the next one; :func:`first_passage_s` bounds the
-time from an event until the next one (Volterra's inequality, iterated).
+time from an event until the next one by iterating a Volterra inequality (Gripenberg, Londen and
+Staffans, *Volterra Integral and Functional Equations*, 1990).
 """
 
 import math
@@ -20,6 +21,7 @@ _FINE_CELLS = 256
 _SHORTEST_S, LONGEST_S = 1e-9, 1e6
 """Limits of the window."""
 _PICARD_ROUNDS = 8
+"""Iterations of Volterra's inequality, each of which gives a bound."""
 
 
 class ErrorGrowth:
@@ -28,7 +30,7 @@ class ErrorGrowth:
     Then ‖e_s‖_W ≤ ``fixed`` + ``estimation`` η + Σ_C ``shares``_C sup‖C x‖ =: b. Until the next
     test, sup‖e_s‖_W ≤ ``stretch`` b + ``driven`` · (sup‖p‖, sup‖R_E x‖, 1).
 
-    ``ages_s``: b bounds the mean of ‖e_s‖_W over the times so long ago; by default ``longest_s``.
+    ``ages_s``: b bounds the mean of ‖e_s‖_W over the times of these ages; by default only ``longest_s``.
     """
 
     def __init__(

@@ -11,7 +11,8 @@ from noack.core.linear_systems import Matrix
 
 Stack = NDArray[np.float64]
 ROUNDING = 1 + 1e-9
-"""A computed norm, times this, is not below the exact one."""
+"""A computed norm, times this, is not below the exact one: estimated, not proven (docs/theory.md, "Why the
+suprema are enclosed, not sampled")."""
 
 
 def stack_product(matrix: Matrix, stack: Stack) -> Stack:
@@ -80,7 +81,8 @@ def _largest_eigenvalues_along_last(products: Stack) -> Stack:
         return np.asarray(0.5 * (a + d) + np.hypot(0.5 * (a - d), b))
     if n > 3:
         return np.asarray(np.linalg.eigvalsh(np.moveaxis(products, (0, 1), (-2, -1)))[..., -1])
-    # The largest root of the characteristic polynomial, of the matrix with the trace 3.
+    # The largest root of the characteristic polynomial, of the matrix with the trace 3 (Smith,
+    # Communications of the ACM 4, 1961).
     (a, b, c), (_, d, e), (_, _, f) = products
     scale = (a + d + f) / 3
     a, b, c, d, e, f = np.array([a, b, c, d, e, f]) / np.where(scale > 0, scale, 1.0)

@@ -33,8 +33,10 @@ _RELATIVE, _RESIDUAL = 1e-7, 1e-13
 """Least eigenvalue of a positive definite Q₂₂, and the error of a computed Q, as shares of ‖Q‖."""
 _AVERAGED = 2.0 ** np.arange(-6, 5)
 """Times over which an integral is averaged, in time constants of the model."""
-_NONE = 'where the rule does not transmit, e_s may still have any size; combine it with policy = "deadline"'
-_ACCUMULATE = (
+_NO_BOUND = (
+    'where the rule does not transmit, e_s may still have any size; combine it with policy = "deadline"'
+)
+_EVENTS_ACCUMULATE = (
     "events may accumulate, since no threshold keeps them apart; "
     'test the rule at sampling times, or combine it with policy = "dwell"'
 )
@@ -222,12 +224,12 @@ class TriggerBounds:
         if math.isfinite(times.longest_s):
             bounds.append(TriggerBound(0.0, None, untested_s=times.longest_s - h_s, is_tested=False))
         if not bounds:
-            raise NoCertificateError(_NONE)
+            raise NoCertificateError(_NO_BOUND)
         # Events are apart by times, or because e_s has to grow.
         is_separated = times.shortest_s or conditions.spacing_s or any(b.least_event_error for b in bounds)
         grows_first = level > 0 and self.comparison is not None and self.comparison.least > 0
         if not is_separated and not grows_first:
-            raise NoCertificateError(_ACCUMULATE)
+            raise NoCertificateError(_EVENTS_ACCUMULATE)
         if self.is_homogeneous:
             times = times._replace(shortest_s=max(times.shortest_s, conditions.spacing_s))
         return bounds[0]._replace(unit=level or 1.0, times=times, further=tuple(bounds[1:]))

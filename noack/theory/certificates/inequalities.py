@@ -64,6 +64,7 @@ _UNIT = np.eye(len(Signal))
 MOST_STAGES = 16
 """With more missing events π is used for all of them."""
 _EPSILON = float(np.finfo(float).eps)
+"""The relative distance of two neighbouring doubles: twice the error of an operation."""
 
 
 class Solution(NamedTuple):
@@ -89,7 +90,7 @@ def solve_inequalities(F: Matrix, g: Vector) -> Solution:
     minor, x, w = _eliminated(remainder, g, right)
     loop_gain = np.asarray(1 - minor)
     is_small = loop_gain < 1
-    if not is_small.all():
+    if not is_small.all():  # the elimination ends too early there
         large = ~is_small
         with np.errstate(invalid="ignore"):
             minors = [np.linalg.det(remainder[large][..., :k, :k]) for k in range(1, size + 1)]
@@ -97,6 +98,7 @@ def solve_inequalities(F: Matrix, g: Vector) -> Solution:
         gains = np.concatenate([1 - np.min(minors, axis=0)[..., None], diagonal], axis=-1)
         is_finite = np.isfinite(gains).all(axis=-1)
         loop_gain[large] = np.where(is_finite, np.maximum(gains.max(axis=-1), 1.0), np.inf)
+    # F w < w is confirmed with all rounding, and x is raised until x − F x ≥ g.
     rounding = (size + 4) * _EPSILON
     F_x, F_w = _applied(F, x), _applied(F, w)
     slack = w - F_w - rounding * (w + F_w)

@@ -17,6 +17,7 @@ _LEAST_S = 1e-6
 _USUAL_S = 1e-3
 """Tried first, if the schedule's time is 0."""
 _RESOLUTION = 1e-3
+"""Relative accuracy of a limit."""
 _WIDER, _NEXT = 4.0, 1.2
 """Factors from a time to the next one until the limit is enclosed: without a guess, and at least."""
 _STEPS = 6

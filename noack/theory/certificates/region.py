@@ -56,8 +56,11 @@ _WIDER = 1.02
 _LEAST = 1e-9
 """Least width of a region in each direction, as a share of its largest."""
 _ATTEMPTS = 40
+"""Regions that are tried."""
 _MOST_NAMES = 8
+"""Up to so many bounds of a region are named in a reason."""
 _TIMES = ("sampling_s", "spacing_s", "delay_s", "hold_s", "start_s")
+"""The times of conditions with which the bounds increase."""
 
 
 def scopes(resolved: Scenario, start_error: float = 0.0) -> list[CertificateScope]:

@@ -34,10 +34,12 @@ from noack.theory.certificates.persistent_bounds import DisturbedCertificate, Pl
 from noack.theory.certificates.solution import Problem, Search, completed_alone, sharpened
 
 _SLOWER = 0.9
+"""Rate that is certified if α is too large, as a share of the decay rate of the loop."""
 _TIMED_RATES = (0.7, 0.4, 0.1)
 """Rates that are tried where events are due, as shares of the decay rate of A + BK: the first that
 has a certificate is used."""
 _SHARES_OF_ALPHA = (0.8, 0.6, 0.4, 0.2)
+"""Rates that are tried for a box, as shares of α."""
 _TOO_LARGE = "intermediate results are too large or too small for floating point"
 
 

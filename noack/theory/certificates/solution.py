@@ -32,7 +32,9 @@ from noack.theory.certificates.deliveries.sharpened_constants import can_be_shar
 from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities, LoopConstants
 
 _SPACING_SETTLED = 1e-3
+"""Relative change of δ at which the search for it ends."""
 _MOST_ROUNDS = 200
+"""Limit of this search; without a consistent δ the least one is used."""
 
 
 class Problem(NamedTuple):

@@ -1,4 +1,4 @@
-"""Matrices with all rounding: enclosures in double precision, and 384 digits after the point.
+"""Matrices with all rounding: enclosures in double precision, and 384 binary digits after the point.
 
 :class:`IntervalMatrix`: entries are known up to a radius. A computed product of k terms differs
 from the exact one by at most k u/(1 − k u) times the product of the absolute values, u = 2⁻⁵³, in
@@ -21,11 +21,17 @@ from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
 
 _UNIT = 2.0**-53
+"""u, the largest relative error of an operation in double precision."""
 ENLARGED = 1 + 2.0**-40
+"""Exceeds the rounding of a computed radius of up to 8,000 terms."""
 _UNDERFLOW = 1e-290
+"""Exceeds what underflow hides of a term."""
 _DIGITS = 384
+"""Binary digits after the point: products of hundreds of steps lose far fewer."""
 _ONE = 1 << _DIGITS
+"""The number 1 in these units."""
 _LARGEST = int(np.finfo(np.float64).max)
+"""In double precision."""
 _TERMS = 60
 """Of Taylor's series of an exponential with a norm up to 1/16: the remainder is below 2⁻⁵⁰⁰."""
 
@@ -112,7 +118,7 @@ class FixedPointMatrix:
         return FixedPointMatrix((self.entries @ other.entries) >> _DIGITS, error)
 
     def then(self, later: "FixedPointMatrix") -> "FixedPointMatrix":
-        """Return the product for x that becomes M x, and then is multiplied by another matrix."""
+        """Return the product that applies this matrix first, and then a later one."""
         return later @ self
 
     def __add__(self, other: "FixedPointMatrix") -> "FixedPointMatrix":

@@ -21,15 +21,18 @@ from noack.core.linear_systems import Matrix, Vector
 from noack.theory.margins.exact_matrices import ENLARGED, IntervalMatrix, exactly
 from noack.theory.margins.switched_system import Cycle, SwitchedSystem
 
-_EXCHANGES = 400
-_IMPROVEMENT = 1e-11
-_PIVOT = 1e-9
+_MOST_EXCHANGES = 400
+"""Of the simplex method; a basis before the optimal one bounds the norm, too."""
+_IMPROVEMENT, _PIVOT = 1e-11, 1e-9
+"""Smaller violations of the dual's inequalities, and smaller entries of a column, are rounding."""
 _PRODUCTS = 250_000
 """Of a product of matrices: the BLAS uses several threads for larger ones, which is slower here."""
 UNIT = 0.1
+"""Length of the unit vectors among the first vertices: they are there only to span the space."""
 _INSIDE = 1 - 1e-9
-_ROUNDS = 60
-_WORK_PER_VERTEX = 1_000_000
+"""Norm up to which an image is inside, although it is rounded."""
+_MOST_ROUNDS, _WORK_PER_VERTEX = 60, 1_000_000
+"""Limits: rounds in which images are added; entries that are compared, for each vertex that is allowed."""
 _FARTHEST = 1e3
 """Entries of a vertex, whose first ones have at most 1; products are rarely that much larger."""
 
@@ -77,7 +80,7 @@ class PolytopeNorm:
         signs = np.where(points >= 0, 1.0, -1.0) * np.sign(np.diag(V[:n]))
         coefficients = np.abs(points) / self._units
         active = np.arange(k)
-        for _ in range(_EXCHANGES):
+        for _ in range(_MOST_EXCHANGES):
             active = active[coefficients[active].sum(axis=1) > enough]
             if not len(active):
                 break
@@ -159,7 +162,7 @@ class InvariantPolytopes:
         pending, most_vertices = dict(enumerate(self.vertices)), self.count + most_vertices
         graph = self.system.graph
         steps = self.system.matrices.middle / (self.growth**graph.durations)[:, None, None]
-        for _ in range(_ROUNDS):
+        for _ in range(_MOST_ROUNDS):
             images: dict[int, list[Matrix]] = {}
             for source, target, step in zip(graph.sources, graph.targets, steps, strict=True):
                 if source in pending:

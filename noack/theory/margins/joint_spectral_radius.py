@@ -41,13 +41,17 @@ from noack.theory.margins.switched_system import (
 )
 
 ACCURACY = 2e-4
+"""Wanted upper/lower − 1: some four digits of the growth."""
 _COARSER, _COARSEST = 4.0, 1e15
+"""Factor by which the accuracy becomes coarser after a proof that failed, and the largest one."""
 _MOST_CYCLE_EDGES = 60
 """Largest length of the cycles that are tried, also in a graph of more nodes."""
 MOST_VERTICES = 800
+"""Vertices that are added to polytopes to sharpen the bounds; their cost grows with the square."""
 _FEW_VERTICES, _MORE_VERTICES = 300, 4000
 """Limits of the two attempts to compare with a threshold."""
 _PRODUCTS, _MORE_PRODUCTS = 30_000, 300_000
+"""Limits of both attempts by products."""
 MOST_LEAVING = 60
 """Largest number of edges that leave a node for which polytopes are tried."""
 _REMEMBERED = 3
@@ -57,6 +61,9 @@ _LEAST_GROWTH = 1e-3
 _SMALLEST_POWER = 1e-280
 """Growths whose power by a duration is smaller are not distinguished from 0."""
 _ROUNDED = 1 + 1e-8
+"""A bound of at most γ times this counts as γ, from which it differs by its rounding only."""
+_LARGEST_EXPONENT, _NEAR_1 = 600.0, 1e-6
+"""Limits of a geometric sum: larger powers count as infinite, and such ratios as 1."""
 _SEARCH, _LONG_SEARCH = (20, 100), (40, 300)
 """Length of the cycles that are tried, at least the number of nodes, and the width of the beam."""
 _WITHIN = 0.1
@@ -154,6 +161,7 @@ class _Enclosure:
         return self._system
 
     def _search(self, remembers: bool = False) -> NormSearch:
+        """Return the search for norms, which goes on from the best ones so far."""
         if remembers not in self._searches:
             system, entries = self._system, FEW_ENTRIES
             if remembers:
@@ -206,11 +214,13 @@ class _Enclosure:
             accuracy *= _COARSER
 
     def _search_longer(self, growth: float) -> float:
+        """Search for longer cycles; return the effort that a proof would need, which is not known."""
         if not self._is_large:
             self.cycle = max(self.cycle, self._longest_cycle, key=lambda cycle: cycle.growth)
         return math.inf
 
     def _prove_by_polytopes(self, growth: float, most_vertices: int) -> float:
+        """Try to prove a growth; return the effort that this would need, which is not known."""
         if not self._is_large:
             start = initial_vertices(self._balanced, self.cycle, growth)
             polytopes = InvariantPolytopes(self._balanced, growth, start)
@@ -236,15 +246,13 @@ class _Enclosure:
 
 
 def _best_cycle(system: SwitchedSystem, balanced: SwitchedSystem, search: tuple[int, int]) -> Cycle:
+    """Search in balanced coordinates; return the better bound of the cycle in both coordinates."""
     most_edges, beam = search
     cycle = find_cycle(balanced, min(max(most_edges, system.graph.nodes), _MOST_CYCLE_EDGES), beam)
     if not cycle.path:
         return cycle
     # The original matrices have smaller radii.
     return cycle._replace(growth=max(cycle.growth, growth_bounds(system, cycle.path)[0]))
-
-
-_LARGEST_EXPONENT, _NEAR_1 = 600.0, 1e-6
 
 
 class ProductBound(NamedTuple):

@@ -26,8 +26,9 @@ from noack.theory.margins.switched_system import Edge
 from noack.theory.margins.time_triggered_loop import LoopTimes, TimeTriggeredLoop
 
 MOST_EDGES = 5000
-_FIRST_ACCURACY = 1e-2
-_QUICK_ACCURACY = 3e-2
+"""Limit of the graph of a guarantee: with more, the bounds of its growth would take too long."""
+_COARSE_ACCURACY, _QUICK_ACCURACY = 1e-2, 3e-2
+"""Wanted upper/lower − 1 of :meth:`LossMargin.coarse_bounds` and :meth:`LossMargin.first_bounds`."""
 
 
 class EventTimes(NamedTuple):
@@ -38,6 +39,7 @@ class EventTimes(NamedTuple):
 
 
 EVERY_STEP = EventTimes()
+"""The sensor transmits at every step."""
 
 
 class Burst(NamedTuple):
@@ -69,9 +71,8 @@ def list_bursts(
 ) -> list[Burst]:
     """Return the graph of a guarantee between deliveries; node 0 is that of the first delivery.
 
-    Different states of the automaton after which the same is allowed are one node.
-
-    Of edges between the same nodes with the same time, there is the one with the fewest losses.
+    States of the automaton that allow the same are one node. Of several edges with the same nodes and
+    the same time, only the one with the fewest losses is kept: its map is that of all of them.
 
     Raises:
         CallerError: there are more than 5,000 edges.
@@ -308,7 +309,7 @@ class LossMargin:
 
     def coarse_bounds(self, guarantee: LossGuarantee | None = None) -> Stability:
         """Return coarser bounds, which decide whether all patterns are stable."""
-        return self.stability(guarantee, _FIRST_ACCURACY)
+        return self.stability(guarantee, _COARSE_ACCURACY)
 
     def first_bounds(self) -> Stability:
         """Return bounds that take less than a second; they may leave stability undecided."""

@@ -22,21 +22,29 @@ from noack.theory.bounds.stacked_norms import Stack
 from noack.theory.margins.exact_matrices import ENLARGED, IntervalMatrix, exactly
 from noack.theory.margins.switched_system import Graph, Numbers, SwitchedSystem
 
-_FASTEST, _STEADY = 8, 17
 FEW_ENTRIES, MOST_ENTRIES = 1200, 2500
 """Numbers of entries of all P_v with which the search takes some seconds, and up to a minute."""
-_STAGES, _NEWTON_STEPS = 40, 40
-_HEAVIER = 4.0
-"""Factor of the weight of log γ from stage to stage."""
-_FIRST = 0.3
-"""Distance of the first log γ from the one that holds, per longest duration."""
-_CLOSE = 2e-5
-_DECREASE, _SHORTEST, _CENTERED = 0.1, 1e-6, 0.5
-_FIRST_EDGES, _FURTHER_EDGES = 200, 50
-_ATTEMPTS = 8
+_FASTEST, _SPREAD = 8, 17
+"""Edges by which a node is represented: those that grow most, and some spread over all durations."""
+_FIRST_EDGES, _FURTHER_EDGES, _ATTEMPTS = 200, 50, 8
+"""Edges whose inequalities are solved: at first; those that are added because they grow most; how often.
+Few edges decide the norms, and Newton's method takes a time in proportion to their number."""
 _SETTLED = 1e-4
+"""No edges are added if the others grow no more than this, in log γ per longest duration."""
+_MOST_STAGES, _HEAVIER = 40, 4.0
+"""Stages, and the factor of the weight of log γ from one to the next: some Newton steps suffice then."""
+_MOST_NEWTON_STEPS, _CENTRED = 40, 0.5
+"""Newton steps of a stage; it ends at this decrement, which promises half of it."""
+_ARMIJO_SHARE, _SHORTEST_STEP = 0.1, 1e-6
+"""Share of the promised decrease that a step must have, and the shortest part of a step that is tried."""
+_FIRST_DISTANCE = 0.3
+"""Distance of the first log γ from the one that holds, per longest duration."""
+_GAP = 2e-5
+"""Stages end if log γ is nearer to the smallest one than this, per longest duration."""
 _LARGEST_LOGARITHM = 300.0
+"""Of γ^−d: its square, by which P is multiplied, must not overflow."""
 _SMALLEST = 1e-300
+"""Smallest norm of a matrix, whose logarithm is taken."""
 
 
 class QuadraticNorms(NamedTuple):
@@ -85,8 +93,8 @@ class NormSearch:
         spread = np.unique(np.linspace(0, len(matrices) - 1, _FIRST_EDGES).astype(np.int64))
         numbers = np.union1d([edges[0] for edges in graph.leaving], spread)
         for _ in range(_ATTEMPTS):
-            self._squares = _Centers(graph, matrices).of(numbers).approach(self._squares, goal)
-            growths = _Centers(graph, matrices).log_growths(self._squares)
+            self._squares = _EdgeInequalities(graph, matrices).of(numbers).lower_growth(self._squares, goal)
+            growths = _EdgeInequalities(graph, matrices).log_growths(self._squares)
             if growths.max() <= max(growths[numbers].max() + settled, goal):
                 break
             numbers = np.union1d(numbers, np.argsort(-growths)[:_FURTHER_EDGES])
@@ -106,15 +114,15 @@ def number_of_entries(system: SwitchedSystem) -> int:
     return system.graph.nodes * n * (n + 1) // 2
 
 
-class _Centers(NamedTuple):
+class _EdgeInequalities(NamedTuple):
     """The inequalities F ≻ 0 of some edges."""
 
     graph: Graph
     matrices: Stack
 
-    def of(self, numbers: Numbers) -> "_Centers":
+    def of(self, numbers: Numbers) -> "_EdgeInequalities":
         """Return those of some edges; each node is still left by one."""
-        return _Centers(self.graph.at(numbers), self.matrices[numbers])
+        return _EdgeInequalities(self.graph.at(numbers), self.matrices[numbers])
 
     def log_growths(self, P: Stack) -> Vector:
         """Return log γ of every edge, (k,)."""
@@ -123,22 +131,22 @@ class _Centers(NamedTuple):
         norms = np.linalg.norm(transformed, 2, axis=(1, 2))
         return np.asarray(np.log(np.maximum(norms, _SMALLEST)) / self.graph.durations)
 
-    def approach(self, P: Stack, goal: float) -> Stack:
+    def lower_growth(self, P: Stack, goal: float) -> Stack:
         """Return P for a smaller log γ, at most ``goal`` if that is found."""
         longest, count = float(self.graph.durations.max()), self.matrices[:, 0].size
         known = float(self.log_growths(P).max())
-        level = known + _FIRST / longest
+        level = known + _FIRST_DISTANCE / longest
         weight = count * longest
-        for _ in range(_STAGES):
-            for _ in range(_NEWTON_STEPS):
+        for _ in range(_MOST_STAGES):
+            for _ in range(_MOST_NEWTON_STEPS):
                 moved = self._newton_step(P, level, weight)
                 if moved is None:
                     break
                 P, level, decrement = moved
-                if decrement < _CENTERED:
+                if decrement < _CENTRED:
                     break
             known = min(float(self.log_growths(P).max()), level)
-            if known < goal or count / weight < _CLOSE / longest:
+            if known < goal or count / weight < _GAP / longest:
                 break
             weight *= _HEAVIER
         return P
@@ -153,9 +161,9 @@ class _Centers(NamedTuple):
         except (np.linalg.LinAlgError, RuntimeError):  # singular by rounding
             return None
         value, share = self._value(P, level, weight), 1.0
-        while share > _SHORTEST:
+        while share > _SHORTEST_STEP:
             new = P + share * change, level + share * further
-            if self._value(*new, weight) < value - _DECREASE * share * decrement:
+            if self._value(*new, weight) < value - _ARMIJO_SHARE * share * decrement:
                 return *new, decrement
             share /= 2
         return None
@@ -210,6 +218,7 @@ class _Centers(NamedTuple):
             squares = np.einsum("eij,ekl->eikjl", factors, factors)
             return np.asarray(basis.T @ squares.reshape(-1, n * n, n * n) @ basis)
 
+        # The curvature: a block for each pair of P_v and P_w of an edge.
         crossed = -products(mixed)
         blocks = np.concatenate([products(G), products(steps @ mixed), crossed, crossed.swapaxes(1, 2)])
         rows = np.concatenate([sources, targets, sources, targets]) * size
@@ -220,6 +229,7 @@ class _Centers(NamedTuple):
         shape = (count * size, count * size)
         curvature = coo_array((blocks.ravel(), (i.ravel(), j.ravel())), shape=shape).tocsc()
         solver = splu(curvature, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+        # Newton's equations, bordered by that of log γ.
         slope, border = of_nodes(-G, np.eye(n)), of_nodes(transformed @ G, np.zeros((n, n)))
         along, across = solver.solve(slope), solver.solve(border)
         sums = np.trace(transformed, axis1=1, axis2=2)
@@ -264,9 +274,9 @@ def representatives(graph: Graph, growths: Vector) -> Numbers:
     """Return some edges that leave each node: those that grow most, and some of each duration."""
     chosen: list[Numbers] = []
     for edges in graph.leaving:
-        steady = edges[np.argsort(graph.durations[edges], kind="stable")]
-        places = np.linspace(0, len(steady) - 1, min(_STEADY, len(steady))).round().astype(np.int64)
-        chosen += [edges[np.argsort(-growths[edges], kind="stable")][:_FASTEST], steady[places]]
+        by_duration = edges[np.argsort(graph.durations[edges], kind="stable")]
+        places = np.linspace(0, len(by_duration) - 1, min(_SPREAD, len(by_duration))).round().astype(np.int64)
+        chosen += [edges[np.argsort(-growths[edges], kind="stable")][:_FASTEST], by_duration[places]]
     return np.unique(np.concatenate(chosen))
 
 

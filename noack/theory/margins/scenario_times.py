@@ -16,6 +16,7 @@ from noack.scenario.scenario import Scenario
 from noack.theory.margins.time_triggered_loop import LoopTimes
 
 _WITHOUT_DELAY = ("loss", "corrupt", "blackout", "duplicate")
+"""Kinds of impairments that do not change the delay of a packet."""
 
 
 def require_covered(resolved: Scenario) -> None:

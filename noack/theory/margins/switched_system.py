@@ -22,16 +22,21 @@ from noack.theory.bounds.stacked_norms import Stack
 from noack.theory.margins.exact_matrices import IntervalMatrix, exactly, inverse
 
 Numbers = NDArray[np.int64]
+"""Numbers of nodes or of edges, or durations, (k,)."""
 _ITERATIONS = 60
+"""Of the search for balanced coordinates, which need not be exact."""
 _ROUNDEST = 1e-6
 """Smallest eigenvalue of a quadratic form, relative to the largest one."""
 _TINY = float(np.finfo(np.float64).tiny)
+"""Added to a norm whose logarithm is taken, and to a root that may underflow."""
 _SLOWEST = -50.0
 """Paths of different durations are compared with the best growth if its logarithm is above this."""
 _EQUAL = 1e-12
 """Logarithms of growths that differ by less are those of one cycle."""
 _SQUARINGS = 44
+"""j up to which Π^(2^j) is used: the factor n^(1/2^j) of the lower bound is then 1 to 3e-13."""
 _SUBTRACTED = 1 - 1e-15
+"""Lower bounds are multiplied and upper ones divided by this, for the rounding of an operation."""
 
 
 class Edge(NamedTuple):
@@ -232,6 +237,7 @@ class Cycle(NamedTuple):
 
 
 NO_CYCLE = Cycle((), 0.0)
+"""No cycle was found, so that 0 is the lower bound."""
 
 
 def spectral_radius_bounds(product: IntervalMatrix) -> tuple[float, float]:

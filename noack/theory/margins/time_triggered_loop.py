@@ -71,27 +71,27 @@ class LoopTimes(NamedTuple):
         return sorted([(t_ns, False) for t_ns in steps] + [(t_ns, True) for t_ns in ticks])
 
 
-class Step(Protocol):
+class TimedMap(Protocol):
     """A map of the state over some time."""
 
     def then(self, later: Self) -> Self:
-        """Return this step and the one after it."""
+        """Return this map and the one after it."""
 
 
-_Step = TypeVar("_Step", bound=Step)
+_Map = TypeVar("_Map", bound=TimedMap)
 
 
-def repeated(step: _Step, times: int) -> _Step:
-    """Return a step once or more often in sequence, by repeated squaring."""
-    whole = step
+def repeated(part: _Map, times: int) -> _Map:
+    """Return a map once or more often in sequence, by repeated squaring."""
+    whole = part
     for digit in f"{times:b}"[1:]:
         whole = whole.then(whole)
         if digit == "1":
-            whole = whole.then(step)
+            whole = whole.then(part)
     return whole
 
 
-class Timeline(Generic[_Step]):
+class Timeline(Generic[_Map]):
     """The maps of (x, x_c, u, w) while no update arrives, in any arithmetic.
 
     Args:
@@ -103,15 +103,15 @@ class Timeline(Generic[_Step]):
     """
 
     def __init__(
-        self, times: LoopTimes, flow: Callable[[int], _Step], latch: _Step, tick: _Step, late_tick: _Step
+        self, times: LoopTimes, flow: Callable[[int], _Map], latch: _Map, tick: _Map, late_tick: _Map
     ) -> None:
         self._times, self._flow, self._latch = times, cache(flow), latch
         self._ticks = tick, late_tick
         self._cycle_ns = math.lcm(times.step_ns, times.tick_ns)
         self._advance = cache(self._advance_from_cycle)
 
-    def between(self, from_ns: int, until_ns: int, timeout_ns: int = NEVER_NS) -> _Step:
-        """Return what happens between two times; a tick at the end is excluded, a step at the start.
+    def between(self, from_ns: int, until_ns: int, timeout_ns: int = NEVER_NS) -> _Map:
+        """Return the map between two times; a tick at the end is excluded, and a step at the start.
 
         From ``timeout_ns`` on the ticks are late.
         """
@@ -121,15 +121,15 @@ class Timeline(Generic[_Step]):
             return in_time
         return in_time.then(self._advance(split_ns % self._cycle_ns, until_ns - split_ns, True))
 
-    def _advance_from_cycle(self, from_ns: int, duration_ns: int, is_late: bool) -> _Step:
+    def _advance_from_cycle(self, from_ns: int, duration_ns: int, is_late: bool) -> _Map:
         cycles, rest_ns = divmod(duration_ns, self._cycle_ns)
         last_part = self._occurrences(from_ns, from_ns + rest_ns, is_late)
         if not cycles:
             return last_part
         return repeated(self._occurrences(from_ns, from_ns + self._cycle_ns, is_late), cycles).then(last_part)
 
-    def _occurrences(self, from_ns: int, until_ns: int, is_late: bool) -> _Step:
-        parts, now_ns = list[_Step](), from_ns
+    def _occurrences(self, from_ns: int, until_ns: int, is_late: bool) -> _Map:
+        parts, now_ns = list[_Map](), from_ns
         for t_ns, is_tick in self._times.occurrences(from_ns, until_ns):
             parts += [self._flow(t_ns - now_ns), self._ticks[is_late] if is_tick else self._latch]
             now_ns = t_ns

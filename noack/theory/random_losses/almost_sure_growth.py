@@ -40,9 +40,11 @@ _MEMORIES = ((0, 0), (4, 0), (4, 4), (12, 0), (12, 4))
 """Lengths up to which the present burst and the one before are told apart."""
 _SHORT, _CLOSE = 4, 1.02
 """Longer bursts are told apart only if the bound is already below this: that takes seconds."""
-_POWERS = 400
-_PRECISION = 1e-11
+_MOST_POWERS, _PRECISION = 400, 1e-11
+"""Powers of the operator by which ρ(s) is found, and its relative change at which they end: only the
+search for s uses it."""
 _ITERATIONS = 40
+"""Limit of the search for s."""
 
 
 class RandomGrowth(NamedTuple):
@@ -133,7 +135,7 @@ def _remembering(chain: OutcomeChain, present: int, before: int) -> OutcomeChain
 
 
 class _Tilts:
-    """The bound as a function of s, and its minimum."""
+    """The bound as a function of s, by which the probabilities of the steps are tilted, and its minimum."""
 
     def __init__(self, maps: PeriodMaps, chain: OutcomeChain) -> None:
         self._period_maps, self._chain = maps, chain
@@ -187,7 +189,7 @@ class _Tilts:
         chain = self._tilted(s)
         chances = np.array([chain.delivered, chain.lost])
         X, Y, radius, before = self._forward, self._backward, 0.0, -1.0
-        for _ in range(_POWERS):
+        for _ in range(_MOST_POWERS):
             X, radius = _scaled(_mapped_moments(self._matrices, chances, X))
             Y, _ = _scaled(_mapped_moments(self._matrices.transpose(0, 2, 1), chances.transpose(0, 2, 1), Y))
             if abs(radius - before) <= _PRECISION * radius:

@@ -46,13 +46,15 @@ from noack.theory.random_losses.mean_square_growth import (
     from_triangles,
     mean_square_growth,
     require_few_slots,
-    resolved_by,
     second_moments,
+    solve_resolvent,
     triangles,
 )
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
+"""Of Gauss's formula on [−1, 1]."""
 _MOST_PERIODS = 100_000
+"""Limit of the periods until a horizon, which are followed one by one or by a power of their map."""
 
 
 class MomentStep(NamedTuple):
@@ -96,6 +98,7 @@ def flow(generator: Matrix, intensity: Matrix, forms: Stack, duration_s: float) 
     units = np.ldexp(1.0, balancing_exponents(np.abs(generator)))
     per_unit, squares = units[:, None] / units, np.outer(units, units)
     generator, intensity, forms = generator * per_unit, intensity * squares, forms / squares
+    # Gauss's formula over a short interval, which is then doubled.
     size = float(np.linalg.norm(generator)) * duration_s
     halvings = max(math.ceil(math.log2(size)), 0) if size > 1 else 0
     t_s = duration_s / 2**halvings
@@ -233,7 +236,7 @@ class LoopMoments:
         scaled = np.ldexp(maps, exponents[:, None] - exponents)
         steps = [second_moments(delivered, lost, self._outcomes) for delivered, lost in scaled]
         cycle = reduce(lambda before, step: step @ before, steps)
-        return np.ldexp(resolved_by(cycle, 1.0, np.ldexp(entries, units)), -units)
+        return np.ldexp(solve_resolvent(cycle, 1.0, np.ldexp(entries, units)), -units)
 
     @cached_method
     def stationary(self) -> tuple[SecondMoments, Vector] | None:

@@ -17,12 +17,13 @@ from noack.core.linear_systems import Matrix, Vector
 
 _GAP = 0.02
 """Share of the last entry by which a larger one may exist."""
-_HEAVIER, _NEWTON_STEPS = 8.0, 60
+_HEAVIER, _MOST_NEWTON_STEPS = 8.0, 60
 """How t grows, and the most steps for one t."""
-_CENTERED, _DECREASE, _SHORTEST = 0.05, 0.1, 1e-10
+_CENTRED, _ARMIJO_SHARE, _SHORTEST_STEP = 0.05, 0.1, 1e-10
 """Newton's decrement (a square) where a t is done; the share of a step's promised increase that it
 must have (Armijo's rule), and the shortest part of a step that is tried."""
 _ROUNDING = 1e-13
+"""Exceeds the relative rounding of an entry, a sum of hundreds of products."""
 Blocks = tuple[Vector, *tuple[Matrix, ...]]
 """Numbers that are to be positive, and symmetric matrices that are to be positive definite."""
 
@@ -61,9 +62,9 @@ class MatrixInequalities:
         dimension = sum(map(len, self._constants))
         weight, confirmed = 1.0, None
         while True:
-            for _ in range(_NEWTON_STEPS):
+            for _ in range(_MOST_NEWTON_STEPS):
                 step, decrement = self._newton_step(values, weight)
-                moved = self._step_along(values, step, weight, decrement) if decrement > _CENTERED else None
+                moved = self._step_along(values, step, weight, decrement) if decrement > _CENTRED else None
                 if moved is None:
                     break
                 values = moved
@@ -97,9 +98,9 @@ class MatrixInequalities:
     def _step_along(self, values: Vector, step: Vector, weight: float, decrement: float) -> Vector | None:
         """Return the values after a step along which the objective grows, shortened if need be."""
         length, now = 1.0, self._objective(values, weight)
-        while length > _SHORTEST:
+        while length > _SHORTEST_STEP:
             moved = values + length * step
-            if self._objective(moved, weight) >= now + _DECREASE * length * decrement:
+            if self._objective(moved, weight) >= now + _ARMIJO_SHARE * length * decrement:
                 return np.asarray(moved)
             length /= 2
         return None

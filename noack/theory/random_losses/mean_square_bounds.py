@@ -45,7 +45,13 @@ from noack.theory.random_losses.stochastic_lyapunov import (
 )
 
 _CELLS = 64
-_MOST_LOST, _ROUNDS, _SETTLED, _FIRST = 256, 30, 0.999, 1e6
+"""Cells of the time between two tests."""
+_MOST_LOST = 256
+"""Lost events whose parts are bounded one by one; what is beyond is bounded by a geometric sum."""
+_FIRST = 1e6
+"""Values of a and π, in β, at which the concave terms are replaced by tangents first: far above any."""
+_MOST_ROUNDS, _SETTLED = 30, 0.999
+"""Rounds of tangents, and of functions; they end where the bound of x falls by less than this factor."""
 _A, _PI, _ONE = np.eye(3)
 """a, π and 1; every other signal is bounded by a combination of them."""
 _Term = TypeVar("_Term", float, Vector)
@@ -159,7 +165,7 @@ class _MomentInequalities:
         """
         bounds: _Bounds | None = None
         values, loop_gain = np.array([*(_FIRST * self._beta,) * 2, 1.0]), np.inf
-        for _ in range(_ROUNDS):
+        for _ in range(_MOST_ROUNDS):
             errors = {C: self._controller_error(values, missing) for C, missing in self._missing.items()}
             states = {C: self._state(C) for C in self._plant.outputs}
             rows = np.array(
@@ -188,7 +194,7 @@ class _MomentInequalities:
         functions = quadratic_functions(LossyFlow(*loop), known)
         if not functions and self._conditions.hold_s > 0:
             functions = quadratic_functions(LossyFlow(*loop, counts_age=False), known)
-        for _ in range(_ROUNDS):
+        for _ in range(_MOST_ROUNDS):
             before, bounds = bounds, self._improved(bounds, functions)
             if bounds.states[Output.STATE] > _SETTLED * before.states[Output.STATE]:
                 break

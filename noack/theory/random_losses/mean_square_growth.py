@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 _MOST_ENTRIES = 16_000
 """Largest size of the operator's matrix, which is sparse: few states follow a state."""
 _MOST_SLOTS = 100
+"""Transmissions after which the times of a loop must repeat: each has maps of its own."""
 _MOST_DENSE = 500
 """Size up to which all eigenvalues are computed."""
 _ABOVE = (1e-7, 1e-6, 1e-5, 1e-4)
@@ -91,6 +92,7 @@ class PeriodMaps(NamedTuple):
         exponents = balancing_exponents(np.abs(stack).max(axis=(0, 1)))
         shifts = exponents[:, None] - exponents
         stack = np.ldexp(stack, shifts)
+        # The common range of all maps, and balanced coordinates of it.
         U, singular, _ = np.linalg.svd(stack.transpose(2, 0, 1, 3).reshape(size, -1))
         rank = max(int((singular > 10 * size * EPSILON * singular[0]).sum()), 1)
         range_maps = U[:, :rank].T @ stack @ U[:, :rank]
@@ -98,6 +100,7 @@ class PeriodMaps(NamedTuple):
         nodes = np.zeros(len(every), np.int64)
         (T,) = Graph(nodes, nodes, nodes + 1).balancing(every)
         range_maps = T @ range_maps @ np.linalg.inv(T)
+        # The same coordinates for the enclosed maps, and orthogonal ones beyond the range.
         coordinates = U.T.copy()
         coordinates[:rank] = T @ coordinates[:rank]
         if (inverse_coordinates := inverse(coordinates)) is None:
@@ -136,7 +139,7 @@ class PeriodMaps(NamedTuple):
             size = len(self.reduced[0][0])
             identity = triangles(np.tile(np.eye(size), (len(outcomes.lost), 1, 1)))
             try:
-                solution = from_triangles(resolved_by(operator, bound, identity), size)
+                solution = from_triangles(solve_resolvent(operator, bound, identity), size)
             except RuntimeError:  # singular by rounding
                 continue
             if self.prove_below(bound, solution, outcomes):
@@ -220,7 +223,7 @@ def triangles(stack: Stack) -> Vector:
     return stack[..., i, j].ravel()
 
 
-def resolved_by(operator: "csc_array[np.float64]", value: float, entries: Vector) -> Vector:
+def solve_resolvent(operator: "csc_array[np.float64]", value: float, entries: Vector) -> Vector:
     """Return the solution X of value · X − operator(X) = the entries."""
     from scipy.sparse import eye_array, linalg  # slow to import
 

@@ -39,6 +39,7 @@ _OF_STATE, _OF_ERROR = (0.1, 0.35), (0.35, 0.75)
 _LARGEST = 1e4
 """Bound of the traces of X and P where ‖e_s‖_W ≤ 1 and V ≤ 1; without one they could be infinite."""
 _INFLATED = 1 + 1e-9
+"""Exceeds the rounding of an exponential or a norm, as estimated."""
 _MOST_STATES = 8
 """With 7 the four searches took up to 12 s of CPU on a busy machine, with 12 about a minute."""
 _LEFT = 0.01

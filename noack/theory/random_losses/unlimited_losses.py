@@ -36,15 +36,18 @@ from noack.theory.random_losses.mean_square_bounds import MeanSquares, mean_squa
 ORDERS = (1, 2)
 """r of the moments at events, and of a run's largest values."""
 _TERMS = 1024
-_MOST_BURST = 64
-_CERTAIN = 1 - 1e-9
+"""Lost updates whose probability is computed; a geometric sum bounds the rest."""
+_MOST_BURST, _CERTAIN = 64, 1 - 1e-9
+"""Longest burst for which a certificate is sought; a probability after which longer ones do not matter."""
 _ROUNDING = 1e-9
 """Above the relative error of a probability, which is a sum of products of numbers that are not negative."""
 _SLOWER = 0.9
+"""α that is used if the trigger's is too large, as a share of the decay rate of the loop."""
 _RATES = (1.0, 0.5, 0.25, 1e-3)
 """Shares of the trigger's rate at which mean squares are tried, until one of the smaller ones has a
 loop gain that is clearly below 1: near 1 the bounds are large."""
-_CLEARLY = 0.9
+_CLEARLY_BELOW_1 = 0.9
+"""A loop gain that is clearly below 1."""
 
 
 def moment_at_events(error: ErrorGains, losses: LossProcess, spacing_s: float, order: int) -> float:
@@ -237,7 +240,7 @@ def _at_fixed_times(
             moments = mean_squares(*_gains(loop, share * alpha), conditions, beta, p)
         except (NoCertificateError, NotDecayingError) as error:
             reason = str(error)
-        if moments and (share == 1 or moments.loop_gain < _CLEARLY):
+        if moments and (share == 1 or moments.loop_gain < _CLEARLY_BELOW_1):
             break
     if moments is None:
         return None, reason

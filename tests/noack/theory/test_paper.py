@@ -136,9 +136,9 @@ def test_no_other_rate_gives_theorem_2_a_longer_inter_event_time(name: str) -> N
 
 
 def test_theorem_2_requires_a_threshold_that_decays_more_slowly_than_the_loop() -> None:
-    one = np.ones((1, 1))
+    unit = np.ones((1, 1))
     names = ("x",)
-    loop = LoopMatrices(one, one, -3 * one, -2 * one, one, one, np.ones(1), None, names, names)
+    loop = LoopMatrices(unit, unit, -3 * unit, -2 * unit, unit, unit, np.ones(1), None, names, names)
     assert theorem_2(loop, 0.1, 1.99, 1.0) is not None
     assert theorem_2(loop, 0.1, 2.0, 1.0) is None
     assert theorem_2(loop, 0.1, 0.0, 1.0) is None

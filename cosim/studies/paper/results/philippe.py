@@ -13,7 +13,9 @@ _WORKS = {1: [1, 1], 2: [0, 1], 3: [1, 0], 4: [0, 0]}
 _EDGES = (123, 212, 131, 312, 231, 323, 331, 344, 431)
 """From node, to node, mode."""
 _WHERE, _RADIUS = "library's test", 0.9748171979372
+"""Published growth per step, and where it stands."""
 _CYCLE = (2, 1, 2, 3, 1, 1, 1, 1)
+"""The modes of the published cycle that grows most."""
 _HOW = "by noack margin's enclosures: a cycle from below, invariant polytopes from above"
 
 

@@ -11,14 +11,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from cosim.simulation.continuous import ContinuousLoop
-from cosim.studies.paper.published_result import (
-    ComparedValue,
-    PublishedResult,
-    run_from_each,
-    shipped_loop,
-    stored_matrices,
-    unit_states,
-)
+from cosim.studies.paper.published_result import ComparedValue, PublishedResult, stored_matrices
+from cosim.studies.paper.reproduction_runs import run_from_each, shipped_loop, unit_states
 from noack.core.linear_systems import Matrix
 
 Blocks = Mapping[tuple[int, int], Matrix]
@@ -62,11 +56,11 @@ def symmetric(blocks: Blocks) -> Matrix:
     return matrix
 
 
-def output_feedback(v: Solution, h: float, epsilon: float, *, waits: bool) -> list[Matrix]:
+def output_feedback(solution: Solution, h: float, epsilon: float, *, waits: bool) -> list[Matrix]:
     """Return what must be positive for Example 1: Theorem 1 if the sensor waits, else Remark 1."""
     A, C, BK, d = np.array([[0, 1], [0, -3.0]]), np.array([[1.0, 0]]), np.array([[0], [3.0]]), DELTA
-    P, U, X, X1, P2, P3 = (v[name] for name in ("P", "U", "X", "X1", "P2", "P3"))
-    Y1, Y2, Y3, omega = (v[name] for name in ("Y1", "Y2", "Y3", "Omega"))
+    P, U, X, X1, P2, P3 = (solution[name] for name in ("P", "U", "X", "X1", "P2", "P3"))
+    Y1, Y2, Y3, omega = (solution[name] for name in ("Y1", "Y2", "Y3", "Omega"))
     symmetric_X, event, closed = X + X.T, epsilon * C.T @ omega @ C, A - BK @ C
     first = A.T @ P2 + P2.T @ A + 2 * d * P - Y1 - Y1.T + (0 if waits else event)
     second, corner = P - P2.T + A.T @ P3 - Y2, symmetric_X - 2 * X1 - 2 * X1.T
@@ -89,13 +83,13 @@ def output_feedback(v: Solution, h: float, epsilon: float, *, waits: bool) -> li
     return [*positive, -symmetric(start), -symmetric(end), -symmetric(event_phase)]
 
 
-def cart_pole(v: Solution, h: float, epsilon: float, *, waits: bool) -> list[Matrix]:
+def cart_pole(solution: Solution, h: float, epsilon: float, *, waits: bool) -> list[Matrix]:
     """Return what must be positive for Example 2: Theorem 2 if the sensor waits, else Remark 3."""
     A = np.array([[0, 1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1], [0, 0, 10 / 3, 0]])
     B1, B2, C1 = np.ones((4, 1)), np.array([[0], [0.1], [0], [-1 / 30]]), np.ones((1, 4))
     K = np.array([[2.9129, 10.4357, 287.9029, 160.3271]])
-    P, S0, S1, R0, R1 = (v[name] for name in ("P", "S0", "S1", "R0", "R1"))
-    omega, G0, G1 = (v[name] for name in ("Omega", "G0", "G1"))
+    P, S0, S1, R0, R1 = (solution[name] for name in ("P", "S0", "S1", "R0", "R1"))
+    omega, G0, G1 = (solution[name] for name in ("Omega", "G0", "G1"))
     H, BK, DK, limit = DELAY_S**2 * R0 + h**2 * R1, B2 @ K, 0.1 * K, -(GAMMA**2) * np.eye(1)
     first, through = A.T @ P + P @ A + S0 - R0 + C1.T @ C1, P @ BK + C1.T @ DK
     shared = {(1, 1): first, (2, 2): S1 - S0 - R0 - R1, (3, 3): -R1 - S1}
@@ -132,7 +126,7 @@ def _rows() -> list[ComparedValue]:
     loops = (("switching", "Theorem 1", _switching()), ("periodic", "Remark 1", _periodic()))
     means = []
     for name, statement, loop in loops:
-        grown, mean = _run(loop, solved[statement]["P"], unit_states(100, 2))
+        grown, mean = _growth_and_transmissions(loop, solved[statement]["P"], unit_states(100, 2))
         means.append(mean)
         quantity, place = f"growth of V, {name}", f"follows from {statement}"
         rows.append(ComparedValue(quantity, place, "≤", "1", f"{grown:.3f}", _RUN, grown <= 1))
@@ -155,12 +149,12 @@ def _periodic() -> ContinuousLoop:
     return shipped_loop("selivanov_switching", [trigger, "plant.rate_hz=200"])
 
 
-def _run(loop: ContinuousLoop, P: Matrix, x0: Matrix) -> tuple[float, float]:
+def _growth_and_transmissions(loop: ContinuousLoop, P: Matrix, x0: Matrix) -> tuple[float, float]:
     """Return the largest V(t_k) e^(2δt_k) / V(0) of all runs, and the mean number of transmissions.
 
     At a transmission the paper's functional V is xᵀPx. The one at t = 0 counts.
     """
-    log = run_from_each(loop, x0, 20.0, places=100)
+    log = run_from_each(loop, x0, 20.0, most_events=100)
     assert log.states is not None
     happened = ~np.isnan(log.event_s)
     x, t_s = log.states[:, :, 0][happened], log.event_s[happened]

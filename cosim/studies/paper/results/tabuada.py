@@ -4,17 +4,13 @@ import numpy as np
 from scipy.integrate import quad
 
 from cosim.simulation.continuous import ContinuousLoop
-from cosim.studies.paper.published_result import (
-    ComparedValue,
-    PublishedResult,
-    run_from_each,
-    shipped_loop,
-    unit_states,
-)
+from cosim.studies.paper.published_result import ComparedValue, PublishedResult
+from cosim.studies.paper.reproduction_runs import run_from_each, shipped_loop, unit_states
 
 _WHERE = "Corollary IV.1"
 _HOW = "shortest inter-event time of exact runs of 2 s; τ is the corollary's integral"
 _SIGMAS = (0.02, 0.05, 0.1, 0.2)
+"""σ of the triggers ‖e‖ > σ‖x‖ that are simulated."""
 _CLOSE = 1.2
 """The shortest time found is at most this multiple of τ."""
 

@@ -21,7 +21,9 @@ LOSSES = tuple(share / 10 for share in range(10))
 STEPS, N, TARGET_M = 250, 20, 0.5
 """Periods of a run, 5 s; predicted inputs; the position to be reached, from 0."""
 _ANGLE = 2
+"""Number of the state."""
 _NEAR_M = 0.01
+"""Distance from the target that counts as arrived after 5 s; nothing is published."""
 _ABSTRACT, _README = "abstract", "authors' Results/README.md"
 _HOW = (
     "the largest of 20 runs of the linear plant for 5 s, with losses of 0, 10, … 90 % in each "
@@ -30,6 +32,7 @@ _HOW = (
 _SHRINK = 0.99999
 """Share of the tightened limits within which the steady position is."""
 _SOLVED = 1e-9
+"""Rounding of a solution: a smaller residual is 0, and limits may be exceeded by this."""
 
 
 class ConstrainedPlant(NamedTuple):
@@ -80,26 +83,22 @@ class Optimisation:
     def __init__(self, plant: ConstrainedPlant) -> None:
         self.plant, n = plant, len(plant.A)
         self.P, self.K = plant.terminal()
+        self._free, predicted = _predictions(plant)
+        # The cost: the differences z_k − z̄ of the unknowns, which are the inputs and s.
+        differences = predicted.copy()
+        differences[::n, N] = -1.0
+        self._weighted = differences.T @ block_diag(*[plant.Q] * N, self.P)
+        self._target = 10 * self.P[0, 0]
+        hessian = self._weighted @ differences + np.diag([*[plant.R[0, 0]] * N, self._target])
+        self._root = np.linalg.cholesky(hessian)
+        # The limits of z_1 … z_{N−1}, of (z_N, s), and of the inputs: |rows · unknowns + by_start · z_0|.
         self._limits = np.array(
             [most - plant.tube(self.K, unit) for most, unit in zip(plant.most_x, np.eye(n), strict=True)]
         )
         most_u = plant.most_u - plant.tube(self.K, self.K[0])
-        powers = [np.linalg.matrix_power(plant.A, k) for k in range(N + 1)]
-        self._free = np.vstack(powers)  # all z_k from z_0
-        forced = np.zeros(((N + 1) * n, N + 1))  # all z_k − z̄ from the inputs and s
-        for k in range(1, N + 1):
-            for i in range(k):
-                forced[k * n : (k + 1) * n, i] = (powers[k - 1 - i] @ plant.B)[:, 0]
-        predicted = forced.copy()
-        forced[::n, N] = -1.0
-        self._weighted = forced.T @ block_diag(*[plant.Q] * N, self.P)
-        self._target = 10 * self.P[0, 0]
-        hessian = self._weighted @ forced + np.diag([*[plant.R[0, 0]] * N, self._target])
-        self._root = np.linalg.cholesky(hessian)
         end, most_end = self._terminal_set(plant, most_u)
-        inputs = np.eye(N, N + 1)
         last = end[:, :n] @ predicted[-n:] + np.outer(end[:, n], np.eye(N + 1)[N])
-        self._rows = np.vstack([predicted[n:-n], last, inputs])
+        self._rows = np.vstack([predicted[n:-n], last, np.eye(N, N + 1)])
         self._by_start = np.vstack([self._free[n:-n], end[:, :n] @ self._free[-n:], np.zeros((N, n))])
         self._most = np.concatenate([np.tile(self._limits, N - 1), most_end, np.full(N, most_u)])
 
@@ -141,6 +140,16 @@ class Optimisation:
         return best[:N], float(best[N])
 
 
+def _predictions(plant: ConstrainedPlant) -> tuple[Matrix, Matrix]:
+    """Return the maps to z_0 … z_N, one below the other: from z_0, and from the inputs and s."""
+    n, powers = len(plant.A), [np.linalg.matrix_power(plant.A, k) for k in range(N + 1)]
+    from_inputs = np.zeros(((N + 1) * n, N + 1))
+    for k in range(1, N + 1):
+        for i in range(k):
+            from_inputs[k * n : (k + 1) * n, i] = (powers[k - 1 - i] @ plant.B)[:, 0]
+    return np.vstack(powers), from_inputs
+
+
 def _reaches(row: Vector, rows: Matrix, limits: Vector) -> float:
     """Return the largest value of a row in the set |rows · v| ≤ limits."""
     both, ends = np.vstack([rows, -rows]), np.tile(limits, 2)
@@ -160,6 +169,35 @@ class ControllerMessage(NamedTuple):
     def input(self, age: int, K: Vector, z: Vector) -> float:
         """Return the nominal input so many periods later, in the nominal state z."""
         return float(self.inputs[age]) if age < N else self.end - float(K @ z)
+
+
+class _Controller:
+    """The controller far away: what it has sent, and what it knows of the nominal plant."""
+
+    def __init__(self, optimisation: Optimisation) -> None:
+        self._optimisation = optimisation
+        self._assumed = np.zeros(len(optimisation.plant.A))
+        """The nominal state now, if the plant's side uses the newest message."""
+        self._acknowledged = 0
+        self.sent = list[ControllerMessage]()
+        """One for each period; without a solution the one before."""
+
+    def send(self) -> bool:
+        """Send the message of a period; return whether there is a solution."""
+        K = self._optimisation.K[0]
+        if (solution := self._optimisation.inputs(self._assumed)) is None:
+            self.sent.append(self.sent[-1])
+            return False
+        inputs, position_m = solution
+        self.sent.append(ControllerMessage(inputs, K[0] * position_m, self._acknowledged))
+        return True
+
+    def end_period(self, answer: Vector | None) -> None:
+        """Take the nominal state at the period's end, if the answer with it arrives."""
+        plant = self._optimisation.plant
+        self._assumed = plant.A @ self._assumed + plant.B[:, 0] * self.sent[-1].inputs[0]
+        if answer is not None:
+            self._assumed, self._acknowledged = answer, len(self.sent) - 1
 
 
 class RunOutcome(NamedTuple):
@@ -188,27 +226,22 @@ def run(optimisation: Optimisation, lost: float, disturbances: Matrix, own: Vect
     reach = np.array([plant.tube(optimisation.K, unit) for unit in np.eye(n)])
     arriving = np.random.default_rng(round(100 * lost)).random((STEPS, 2)) >= lost
     arriving[0] = True
-    sent, x, z, assumed = list[ControllerMessage](), np.zeros(n), np.zeros(n), np.zeros(n)
-    acknowledged = used = unbroken = unsolved = 0
+    controller, x, z = _Controller(optimisation), np.zeros(n), np.zeros(n)
+    used = received_in_sequence = unsolved = 0
     shares = np.zeros(3)
-    for k, ((arrives, answered), w) in enumerate(zip(arriving, disturbances, strict=True)):
-        if (solution := optimisation.inputs(assumed)) is None:
-            unsolved, arrives = unsolved + 1, False
-            sent.append(sent[-1])
-        else:
-            inputs, position_m = solution
-            sent.append(ControllerMessage(inputs, K[0] * position_m, acknowledged))
-        unbroken = unbroken + 1 if arrives else 0
-        if arrives and unbroken >= k - acknowledged:
+    for k, ((arrives, is_answered), w) in enumerate(zip(arriving, disturbances, strict=True)):
+        is_solved = controller.send()
+        unsolved += not is_solved
+        is_received = arrives and is_solved
+        received_in_sequence = received_in_sequence + 1 if is_received else 0
+        if is_received and received_in_sequence >= k - controller.sent[k].acknowledged:
             used = k
-        v = sent[used].input(k - used, K, z)
+        v = controller.sent[used].input(k - used, K, z)
         u = v - float(own @ (x - z))
         now = (np.abs(x - z) / reach).max(), (np.abs(x) / plant.most_x).max(), abs(u) / plant.most_u
         shares = np.maximum(shares, now)
-        assumed = A @ assumed + b * sent[k].inputs[0]
         z, x = A @ z + b * v, A @ x + b * u + w
-        if answered:
-            assumed, acknowledged = z, k
+        controller.end_period(z if is_answered else None)
     tube, state, most_input = shares.tolist()
     distance_m, plant_distance_m = abs(float(z[0]) - TARGET_M), abs(float(x[0]) - TARGET_M)
     return RunOutcome(tube, state, most_input, unsolved, distance_m, plant_distance_m)

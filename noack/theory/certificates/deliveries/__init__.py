@@ -9,7 +9,8 @@ An ellipsoid that x never leaves sharpens the constants of the inequalities:
 1. ``delivery_flow.py``. The system, e^{Fτ} at the nodes of a grid, and what delayed and held inputs
    change of it.
 2. ``delivery_reach.py``. Bounds of x and e_c for all states of an ellipsoid at the delivery. If
-   they lead back into the ellipsoid until the next one, x never leaves it.
+   they lead back into the ellipsoid until the next one, x never leaves it. Where several conditions
+   are used together, ``ellipsoid_intersections.py`` has the bounds.
 3. ``invariant_ellipsoids.py``. The search for such an ellipsoid that is small.
 4. ``lost_events.py``. Bounds of e_c after 0, 1, … lost events, and the time until the next event.
 5. ``inserted_bounds.py``. The inequalities, into which any bound that holds is inserted.

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.bounds.stacked_norms import ROUNDING, Stack
 
-_DELAYS = 64
-"""So many m are tried."""
+_LAGS = 64
+"""So many m are tried; the norms of all of them are one product."""
 
 
 class Ball(NamedTuple):
@@ -70,12 +70,13 @@ class BallHistory(NamedTuple):
     def last_return(self, last: slice) -> tuple[float, float] | None:
         """Return |κ|, and ‖r‖ + ρ + θS at most, of ξ(t) = κ c(t − m) + r at the last times t.
 
-        Of the m that are tried, it is that with the smallest (‖r‖ + ρ + θS)/(1 − |κ|); None if there is none.
+        Of the m that are tried, the one with the smallest (‖r‖ + ρ + θS)/(1 − |κ|) is used. None: no |κ| is
+        below 1.
         """
         times = np.arange(last.start, last.stop)[~np.isnan(self.weighted_sums[last])]
-        delays = np.unique(np.linspace(len(self.centres[last]), last.start - 1, _DELAYS).astype(int))
+        lags = np.unique(np.linspace(len(self.centres[last]), last.start - 1, _LAGS).astype(int))
         # κ of least squares for each m, and its largest rest.
-        earlier = self.centres[times - delays[delays > 0, None]]  # (m, times, n)
+        earlier = self.centres[times - lags[lags > 0, None]]  # (m, times, n)
         now = self.centres[times]
         kappas = (earlier * now).sum(axis=(1, 2)) / np.square(earlier).sum(axis=(1, 2))
         residuals = lengths(now - kappas[:, None, None] * earlier) + 1e-12 * lengths(now)

@@ -27,12 +27,22 @@ from noack.theory.bounds.contraction import logarithmic_norm
 from noack.theory.bounds.gains import Output, PlantGains
 from noack.theory.bounds.stacked_norms import Stack, larger_ends, spectral_norms, stack_product
 
-_CELLS_PER_STEP, _FIRST_STEP, _MOST_STEP = 32, 0.005, 0.02
-_MOST_GROWTH, _SETTLED, _MOST_CELLS = 1e6, 0.03, 3000
+_FIRST_STEP = 0.005
+"""First step of the grid, in time constants of the fastest mode: e^{Fτ} is then nearly straight."""
+_CELLS_PER_STEP = 32
+"""After so many cells the step is doubled, as fast modes have decayed."""
+_MOST_STEP = 0.02
+"""Limit of a step, in time constants of the fastest growing mode, which never decays."""
+_MOST_GROWTH = 1e6
+"""The grid ends where ‖e^{Fτ} (I, 0)‖ exceeds this, so that ``FLOW_ROUNDING`` covers its errors."""
+_SETTLED = 0.03
+"""The grid ends where the slowest mode of the models has decayed to this share: x_c is small then."""
+_MOST_CELLS = 3000
+"""Limit of the grid, for its time and memory."""
 _TAYLOR_TERMS = 4
-"""Terms by which a second derivative over a cell is bounded."""
+"""Terms by which a second derivative over a cell is bounded, as in ``enclosure.py``."""
 FLOW_ROUNDING = 1 + 1e-5
-"""Exceeds the error of e^{Fτ}: measured below 1e-12 of its norm, which is up to 1e6; no proof."""
+"""Exceeds the errors of e^{Fτ}: measured, not proven (docs/theory.md, "Why the suprema are enclosed")."""
 
 
 class InputEffects(NamedTuple):

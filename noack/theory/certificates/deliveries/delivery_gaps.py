@@ -28,14 +28,15 @@ from noack.theory.bounds.gains import Output, PlantGains
 from noack.theory.bounds.stacked_norms import ROUNDING, Stack, larger_ends, spectral_norm
 
 _MOST_GAPS, _MOST_CELLS = 256, 640
+"""Limits of the times g between two deliveries, and of the cells: the work grows with their product."""
 _CELL = 0.04
 """Length of a cell, in time constants of the flow."""
 _PIECES = 4
-"""In so many pieces of a gap the ages of the input are averaged."""
+"""In so many pieces of a gap the ages of the input are averaged: each one doubles the number of signs."""
 _SIGNS = np.array(list(itertools.product((-1.0, 1.0), repeat=_PIECES)))
 """All signs of the mean ages in the pieces."""
 _AGES = 4
-"""Cells into which ages of an input from 0 to σ are divided."""
+"""Cells into which ages of an input from 0 to σ are divided; the sag between them falls with the square."""
 _LEAST_THETA, _THETAS = 1e-6, 2.0 ** np.arange(0, 7)
 """θ that are tried, in units of the smallest one that may suit, which is at least ``_LEAST_THETA``."""
 ERROR, INPUT = "e_c in W", "e_c in K"
@@ -84,7 +85,8 @@ class GapGrid(NamedTuple):
     ends: NDArray[np.int64]
     """The node at the end of each gap, (gaps,)."""
     windows: NDArray[np.int64]
-    """Cells for which updates may still be in flight, by times at which their events can have been."""
+    """The number of cells for which an update is still in flight, for each time at which its event may have
+    been, (windows,)."""
 
     @classmethod
     def of(cls, gaps: Gaps, delay_s: float, fastest_per_s: float) -> "GapGrid":

@@ -1,25 +1,25 @@
 """Bounds of x and e_c after a delivery, for all states ξ of an ellipsoid.
 
 All that is uncertain of the flow (``delivery_flow.py``) is ξ, and the time of the next delivery.
-Let ‖Λξ‖ ≤ 1 and ‖e_c‖_W ≤ D at all times. At the time τ, ξ has ‖Λξ‖ ≤ 1 and ‖Nξ‖_W ≤ D, N the rows
-of e_c in e^{Fs} (I, 0) for an s ≤ τ. So ξ is in the ellipsoid λ‖Λξ‖² + (1 − λ)‖Nξ‖²/D² ≤ 1, for
-each λ in [0, 1]. So ‖C z(τ)‖ is at most the norm of C e^{Fτ} on this ellipsoid, and the λ with the
-smallest is used. If no ‖Λx(τ)‖ found in this way exceeds 1, ‖Λx‖ ≤ 1 holds at the next delivery,
-whenever it happens, and by induction at all times: the set ‖Λx‖ ≤ 1 is invariant.
+States and errors are in its coordinates, in which ‖·‖_W is ‖·‖. Let ‖Λξ‖ ≤ 1 and ‖e_c‖ ≤ D at all
+times. At the time τ, ξ has ‖Λξ‖ ≤ 1 and ‖Nξ‖ ≤ D, N the rows of e_c in e^{Fs} (I, 0) for an s ≤ τ.
+So ξ is in the ellipsoid λ‖Λξ‖² + (1 − λ)‖Nξ‖²/D² ≤ 1, for each λ in [0, 1]. So ‖C z(τ)‖ is at most
+the norm of C e^{Fτ} on this ellipsoid, and the λ with the smallest is used. If no ‖Λx(τ)‖ found in
+this way exceeds 1, ‖Λx‖ ≤ 1 holds at the next delivery, whenever it happens, and by induction at all
+times: the set ‖Λx‖ ≤ 1 is invariant.
 
 Over a cell of the grid, s is the left node. From the last node T on, x + e_c = e^{Hτ} ξ has
-decayed, and z has followed the system for T' from a state with ‖e_c‖_W ≤ D and ‖Λx‖ ≤ 1. If inputs
+decayed, and z has followed the system for T' from a state with ‖e_c‖ ≤ D and ‖Λx‖ ≤ 1. If inputs
 are delayed or held, the flow is followed until what they change is a share of D.
 
 Where bounds are largest, the conditions of several earlier times are used together
-(:func:`largest_outputs`). Up to the first event after the start x is known, so if inputs are
+(``ellipsoid_intersections.py``). Up to the first event after the start x is known, so if inputs are
 neither delayed nor held, the ellipsoid need only contain x at the first delivery after it.
 """
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import Enum
 from functools import cached_property
 from typing import NamedTuple
 
@@ -39,17 +39,33 @@ from noack.theory.certificates.deliveries.delivery_flow import (
     InputEffects,
     bend_terms,
 )
+from noack.theory.certificates.deliveries.ellipsoid_intersections import (
+    LEAST_CONDITION,
+    Wanted,
+    balancing_coordinates,
+    bound_outputs,
+    weights_favouring,
+)
 
 _ONLY_LAST_DELIVERY = 40.0
 """The logit of a λ of 1, to rounding: only ‖Λξ‖ ≤ 1 is used."""
 _LOGITS = np.append(np.arange(-12.0, 13.0, 2.0), _ONLY_LAST_DELIVERY)
-"""Logits of λ, ln λ/(1 − λ), that are tried first."""
-_NEIGHBOURS = np.array([-1.0, 0.0, 1.0])
+"""Logits of λ, ln λ/(1 − λ), that are tried first in each cell: from 6e-6 to 1."""
 _WIDTHS = np.array([1.5, 0.75, 0.37, 0.18, 0.09])
-"""Changes of the logit in each round of the search."""
+"""Changes of the logit in each round of the search: they fill the gaps of 2 between the first ones."""
+_NEIGHBOURS = np.array([-1.0, 0.0, 1.0])
+"""Multiples of the change that are compared in each round."""
 _CELLS_AT_ONCE = 16
+"""Cells with the highest bounds, which are improved together: one product for all of them."""
 _MOST_JOINT = 3
-"""The conditions of earlier times are used in so many rounds at most."""
+"""The conditions of earlier times are used in so many rounds at most: each takes long."""
+_CLEARLY_ENOUGH = 0.98
+"""Share of a sufficient bound from which on a bound at one end of a cell is not improved: the other end
+and the sag come on top."""
+_EARLIER_TIMES = 8
+"""Earlier times whose conditions are used together."""
+_WINDOWS = (1 / 6, 1 / 3, 2 / 3, 0.9, 1.0)
+"""T' as shares of the last node: long ones have decayed, short ones grow less."""
 _FIRST_WEIGHTS = np.array(
     [
         (first, (1 - first) * (1 - last), (1 - first) * last, 0.0)
@@ -63,26 +79,10 @@ _FIRST_WEIGHTS = np.array(
     ]
 )
 """Weights of ‖x_c‖, of ‖e_c‖ at both ends, and of ‖Λx‖, after the last node: the first to be tried."""
-_WINDOWS = (1 / 6, 1 / 3, 2 / 3, 0.9, 1.0)
-"""T' as shares of the last node."""
-_EARLIER_TIMES = 8
-"""Earlier times whose conditions are used together."""
 _WEIGHTED_FORMS = [0, 1, 2 * _EARLIER_TIMES + 1, 2]
-"""The forms to which ``_FIRST_WEIGHTS`` belong."""
-_WEIGHT_OF_OTHERS = 0.1
-"""Sum of the first weights of all other forms."""
+"""The forms of :meth:`Reach._rows_in` to which ``_FIRST_WEIGHTS`` belong."""
 _HALVINGS = 12
-_ROUNDS = 40
-_POWER = 0.3
-"""Weights are multiplied by this power of their form at the worst z."""
-_LEAST_WEIGHT = 1e-9
-_NEARLY_LARGEST = 0.97
-_CLEARLY_ENOUGH = 0.98
-"""Share of a sufficient bound from which on a bound at one end of a cell is not improved."""
-_NEARLY_OPTIMAL = 1 + 1e-5
-"""A bound is not improved further if no weights make it smaller by more than this factor."""
-_LEAST_CONDITION = 1e-10
-"""Smallest over largest eigenvalue of a sum of forms that is used."""
+"""Of the interval of the largest ‖p‖: it is found to 1/4096 from below."""
 
 
 class _Window(NamedTuple):
@@ -103,7 +103,7 @@ class _Window(NamedTuple):
 
 @dataclass(frozen=True)
 class DeliveryEllipsoid:
-    """The states ξ at a delivery with ‖Λ W ξ‖ ≤ 1."""
+    """The states ξ at a delivery with ‖Λξ‖ ≤ 1."""
 
     flow: DeliveryFlow
     shape: Matrix
@@ -202,7 +202,7 @@ class DeliveryEllipsoid:
 
 @dataclass(frozen=True)
 class Reach:
-    """All z after a delivery with ‖ΛWξ‖ ≤ c at the delivery and ‖e_c‖_W ≤ D since then."""
+    """All z after a delivery with ‖Λξ‖ ≤ c at the delivery and ‖e_c‖_W ≤ D since then."""
 
     ellipsoid: DeliveryEllipsoid
     scale: float
@@ -213,7 +213,7 @@ class Reach:
     followed_share: float = 1.0
     """e_c is followed until delay and hold may have changed it by this share of D."""
     first_cell: int = 0
-    """‖ΛWξ‖ ≤ c from this cell after the start on; before, x is that of the start."""
+    """‖Λξ‖ ≤ c from this cell after the start on; before, x is that of the start."""
 
     def sup(self, C: Matrix) -> float:
         """Bound ‖C z‖ at all times, for C of shape (q, 2n)."""
@@ -227,7 +227,7 @@ class Reach:
         return max(self.scale * max(followed, after), self._from_start(C))
 
     def sup_state(self, C: Matrix) -> float:
-        """Bound ‖C W x‖ at all times, for C of shape (q, n)."""
+        """Bound ‖C x‖ at all times, for C of shape (q, n)."""
         in_ellipsoid = self.scale * float(spectral_norm(C @ self.ellipsoid.inverse)) * FLOW_ROUNDING
         return max(in_ellipsoid, self._from_start(np.hstack([C, np.zeros_like(C)])))
 
@@ -235,7 +235,7 @@ class Reach:
         return self.ellipsoid.flow.from_start(C, self.error_bound) if self.first_cell else 0.0
 
     def largest_state(self, since_s: float = 0.0) -> float:
-        """Bound ‖ΛWx‖ from a time after the start on."""
+        """Bound ‖Λx‖ from a time after the start on."""
         if not self.first_cell:
             return self.scale
         flow, C = self.ellipsoid.flow, self.ellipsoid.state_bounds.C
@@ -264,7 +264,7 @@ class Reach:
 
     @cached_property
     def _state_limits(self) -> Vector:
-        """Bounds of ‖ΛWx‖ over the cells, for c = 1."""
+        """Bounds of ‖Λx‖ over the cells, for c = 1."""
         return 1 + self._changes(self.ellipsoid.state_bounds) / self.scale
 
     @cached_property
@@ -295,8 +295,8 @@ class Reach:
         if smallest <= enough:
             return smallest
         # By those of better weights.
-        first_weights = _weights_of(forms, _WEIGHTED_FORMS, _FIRST_WEIGHTS[norms.argmin(axis=1)])
-        largest, _ = largest_outputs(
+        first_weights = weights_favouring(forms, _WEIGHTED_FORMS, _FIRST_WEIGHTS[norms.argmin(axis=1)])
+        largest, _ = bound_outputs(
             forms, Y, enough, first_weights, wanted=Wanted.SMALLEST, added=added, most=min(smallest, most)
         )
         return min(smallest, float((largest + added).min()))
@@ -311,14 +311,14 @@ class Reach:
         n, windows = self.ellipsoid.flow.n, self.ellipsoid.windows(self._followed_cells)
         rows = np.array([self._rows_in(window) for window in windows])
         # Semi-axes of the ellipsoids of the first weights, in balanced coordinates.
-        coordinates = _balancing_coordinates(rows)
+        coordinates = balancing_coordinates(rows)
         balanced = rows @ coordinates[:, None]
         forms = balanced.swapaxes(-1, -2) @ balanced
         weighted = forms[:, _WEIGHTED_FORMS].reshape(len(windows), len(_WEIGHTED_FORMS), -1)
         first_forms = _FIRST_WEIGHTS @ weighted
         values, V = np.linalg.eigh(first_forms.reshape(len(windows), -1, 2 * n, 2 * n))
-        usable = values[..., :1] > _LEAST_CONDITION * values[..., -1:]  # others are too flat
-        semi_axes = V / np.sqrt(np.where(usable, values, _LEAST_CONDITION))[..., None, :]
+        usable = values[..., :1] > LEAST_CONDITION * values[..., -1:]  # others are too flat
+        semi_axes = V / np.sqrt(np.where(usable, values, LEAST_CONDITION))[..., None, :]
         cells = np.array([window.cells[-1] for window in windows])
         flows = np.array([window.flows[-1] for window in windows]) @ coordinates
         return cells, flows, forms, semi_axes
@@ -395,23 +395,27 @@ class _CellBounds:
             is_last = rounds[cells[-1]] > len(_WIDTHS) or joint_rounds == _MOST_JOINT
             if is_last or highest[cells[-1]] * FLOW_ROUNDING <= enough:
                 return float(highest[cells[-1]]) * FLOW_ROUNDING
-            # Where the best λ is found, by the conditions of earlier times.
-            settled = cells[rounds[cells] == len(_WIDTHS)]
-            if len(settled):
-                wanted = (enough - added[settled]).clip(min=0.0)
-                values = self._joint_bounds(errors, states, settled, logits[settled, None], wanted)
-                highest[settled] = np.minimum(highest[settled], values + added[settled])
-                rounds[settled] += 1
+            has_best_share = rounds[cells] == len(_WIDTHS)
+            if has_best_share.any():
+                cells = cells[has_best_share]
+                wanted = (enough - added[cells]).clip(min=0.0)
+                values = self._joint_bounds(errors, states, cells, logits[cells, None], wanted)
                 joint_rounds += 1
-                continue
-            # Elsewhere, by a better λ.
-            cells = cells[rounds[cells] < len(_WIDTHS)]
-            candidates = logits[cells, None] + _WIDTHS[rounds[cells], None] * _NEIGHBOURS
-            values = self._spectral_bounds(errors, cells, candidates)
-            index = values.argmin(axis=1)
-            logits[cells] = candidates[np.arange(len(cells)), index]
-            highest[cells] = np.minimum(highest[cells], values.min(axis=1) + added[cells])
+            else:
+                cells = cells[rounds[cells] < len(_WIDTHS)]
+                widths = _WIDTHS[rounds[cells], None]
+                values, logits[cells] = self._better_shares(errors, cells, logits[cells], widths)
+            highest[cells] = np.minimum(highest[cells], values + added[cells])
             rounds[cells] += 1
+
+    def _better_shares(
+        self, errors: Vector, cells: NDArray[np.int64], logits: Vector, widths: Matrix
+    ) -> tuple[Vector, Vector]:
+        """Return the bounds of cells by the best of three λ each, and its logit, (k,)."""
+        candidates = logits[:, None] + widths * _NEIGHBOURS
+        values = self._spectral_bounds(errors, cells, candidates)
+        best = np.arange(len(cells)), values.argmin(axis=1)
+        return values[best], candidates[best]
 
     def frobenius_bounds(self, errors: Vector, logits: Vector) -> Stack:
         """Return bounds in the Frobenius norm, for every λ, (k, j), given D for each cell."""
@@ -457,13 +461,13 @@ class _CellBounds:
             axis=1,
         )
         share = 1 / (1 + np.exp(-logits[:, 0]))
-        first_weights = _weights_of(rows, [0, _EARLIER_TIMES], np.stack([share, 1 - share], axis=1))
+        first_weights = weights_favouring(rows, [0, _EARLIER_TIMES], np.stack([share, 1 - share], axis=1))
         # The best weights at the right end, which are used at both ends.
-        coordinates = _balancing_coordinates(rows * np.sqrt(first_weights)[..., None, None])
+        coordinates = balancing_coordinates(rows * np.sqrt(first_weights)[..., None, None])
         rows = rows @ coordinates[:, None]
         forms = rows.swapaxes(-1, -2) @ rows
         ends = self.C @ np.array([flow.states[cells], flow.states[cells + 1]]) @ coordinates
-        bounds, weights = largest_outputs(forms, ends[1], _CLEARLY_ENOUGH * enough, first_weights)
+        bounds, weights = bound_outputs(forms, ends[1], _CLEARLY_ENOUGH * enough, first_weights)
         inverse = np.linalg.inv(np.einsum("ji,jiab->jab", weights, forms))
         squares = np.linalg.eigvalsh(ends @ inverse @ ends.swapaxes(-1, -2))[..., -1].max(axis=0)
         squares = np.where(np.isfinite(bounds), squares.clip(min=0.0), np.inf)
@@ -480,93 +484,3 @@ def _semi_axes(singular: Vector, logits: Vector) -> Stack:
 def _columns(stacks: list[Stack]) -> Matrix:
     """Return stacks of the same shape (k, 2n, n) side by side."""
     return np.asarray(np.concatenate(stacks).transpose(1, 0, 2).reshape(stacks[0].shape[1], -1))
-
-
-def _weights_of(forms: Stack, chosen: list[int], shares: Matrix) -> Matrix:
-    """Return weights of forms, (j, i): shares (j, chosen) of chosen ones, and a little for all of them."""
-    weights = np.full(forms.shape[:2], _WEIGHT_OF_OTHERS / forms.shape[1])
-    weights[:, chosen] += (1 - _WEIGHT_OF_OTHERS) * shares
-    return weights
-
-
-def _balancing_coordinates(rows: Stack) -> Stack:
-    """Return coordinates in which the sum of the squares of rows is the identity, (j, m, m).
-
-    ``rows`` is (j, i, q, m). The squares themselves may be too different for their rounding.
-    """
-    together = rows.reshape(len(rows), -1, rows.shape[-1])
-    return np.asarray(np.linalg.inv(np.linalg.qr(together, mode="r")))
-
-
-class Wanted(Enum):
-    """The bounds that are improved, of several."""
-
-    ALL = "all of them"
-    LARGEST = "those that are nearly as large as the largest one"
-    SMALLEST = "those that may become the smallest one"
-
-
-def largest_outputs(
-    forms: Stack,
-    Y: Stack,
-    enough: Vector | float,
-    first_weights: Stack | None = None,
-    *,
-    wanted: Wanted = Wanted.LARGEST,
-    cap: Vector | float = math.inf,
-    added: Vector | float = 0.0,
-    most: float = math.inf,
-) -> tuple[Vector, Stack]:
-    """Bound ‖Y z‖, (j,), for all z with forms of at most 1, (j, i, m, m); return the weights, too, (j, i).
-
-    Weights are improved from the first ones on. No bound below ``enough`` is improved, and none
-    that cannot become at most ``most``. Bounds above ``cap`` count as that, and all of them with
-    what is ``added``.
-    """
-    weights = np.full(forms.shape[:2], 1 / forms.shape[1]) if first_weights is None else first_weights
-    best_weights = weights.copy()
-    bounds = np.full(len(forms), np.inf)
-    possible = np.zeros(len(forms))
-    active = np.arange(len(forms))
-    for _ in range(_ROUNDS):
-        # The bounds by these weights.
-        chosen = forms[active]
-        Z = np.linalg.solve(np.einsum("ji,jiab->jab", weights[active], chosen), Y[active].swapaxes(1, 2))
-        values, vectors = np.linalg.eigh(Y[active] @ Z)
-        norms = np.sqrt(values[:, -1].clip(min=0.0)) * FLOW_ROUNDING
-        better = norms < bounds[active]
-        best_weights[active[better]] = weights[active[better]]
-        bounds[active] = np.minimum(bounds[active], norms)
-        # The forms of the z with the largest ‖Y z‖: those above the mean need more weight.
-        z = (Z @ vectors[:, :, -1:])[..., 0]
-        of_z = np.einsum("ja,jiab,jb->ji", z, chosen, z).clip(min=0.0)
-        largest = of_z.max(axis=1).clip(min=1e-300)
-        # Scaled to forms of at most 1, this z is possible, whatever the weights are.
-        possible[active] = np.maximum(possible[active], values[:, -1] / np.sqrt(largest))
-        weights[active] *= (of_z / largest[:, None]) ** _POWER
-        weights = weights.clip(min=_LEAST_WEIGHT)
-        weights /= weights.sum(axis=1, keepdims=True)
-        totals = np.minimum(bounds, cap) + added
-        may_become_smaller = bounds > _NEARLY_OPTIMAL * possible
-        active = np.flatnonzero(
-            may_become_smaller & _is_wanted(wanted, totals, possible + added, enough, most)
-        )
-        if not len(active):
-            break
-    # Sums of forms that are too flat bound nothing.
-    sums = np.linalg.eigvalsh(np.einsum("ji,jiab->jab", best_weights, forms))
-    bounds[~(sums[:, 0] > _LEAST_CONDITION * sums[:, -1])] = np.inf
-    return bounds, best_weights
-
-
-def _is_wanted(
-    wanted: Wanted, totals: Vector, possible: Vector, enough: Vector | float, most: float
-) -> NDArray[np.bool_]:
-    """Return which bounds are improved, given values that are possible, (j,)."""
-    if wanted is Wanted.LARGEST:
-        enough = np.maximum(enough, _NEARLY_LARGEST * float(totals.max()))
-    elif wanted is Wanted.SMALLEST:
-        if (totals <= enough).any():
-            return np.zeros(len(totals), dtype=bool)
-        most = min(most, float(totals.min()))
-    return np.asarray((totals > enough) & (possible <= most))

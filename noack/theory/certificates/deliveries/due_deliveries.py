@@ -44,13 +44,15 @@ from noack.theory.certificates.deliveries.delivery_balls import (
 from noack.theory.certificates.deliveries.delivery_gaps import ERROR, INPUT, GapGains, GapLoop, Gaps
 
 MOST_TIMES = 6000
-"""Balls are followed for so many steps of the gaps at most."""
+"""Balls are followed for so many steps of the gaps at most; then the norm ‖ξ‖ + θS bounds the rest."""
 BALLS_AT_ONCE = 64
-"""Outputs are bounded for so many balls at once."""
+"""Outputs are bounded for so many balls at once, and then it is tested whether the bounds have settled."""
 _DECAY_SHARES = (0.9, 0.7, 0.4)
 """Decay rates of Λ that are tried, as shares of that of the scaled A + BK."""
 _LEAST_SHARE = 1e-6
+"""Share of the identity in the right side of a Lyapunov equation, which makes it positive definite."""
 _CENTRING_ROUNDS = 3
+"""Moves of a centre towards the farthest ball, as in Bădoiu and Clarkson's algorithm for the smallest one."""
 
 
 class Deliveries:

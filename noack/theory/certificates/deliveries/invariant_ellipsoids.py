@@ -29,18 +29,25 @@ from noack.theory.certificates.deliveries.delivery_reach import DeliveryEllipsoi
 
 _MARGINS = (1.0, 1.01, 1.02, 1.05, 1.08, 1.12, 1.2, 1.35)
 _WIDE_MARGINS = (1.0, 1.15, 1.4, 1.8, 2.5, 3.5)
-"""Factors of the ellipsoid's computed scale that are tried; the wide ones with delay and hold."""
+"""Factors of the ellipsoid's computed scale that are tried, as that is found by samples; the wide ones
+with delay and hold, whose effects it leaves out."""
 _FOLLOWED_SHARES = (0.1, 0.3, 1.0)
 """Shares of D up to which e_c is followed, if delay and hold change it: those that are tried."""
 _FIRST_PARAMETERS = [(-1.5, -2.0, -7.0), (0.0, -7.0, -7.0), (-1.5, 0.0, -1.0), (-1.5, -7.0, -1.0)]
-"""Parameters of the ellipsoid that are tried first."""
+"""Parameters of the ellipsoid that are tried first: the logit of ν in its range, and the logarithms
+of the shares of I and of x(0) x(0)ᵀ in Q."""
 _DIRECTIONS = np.vstack([np.eye(3), -np.eye(3)])
+"""In each round one of these parameters is changed, up or down."""
 _WIDTHS = (1.5, 1.5, 1.5, 0.8, 0.8, 0.4, 0.4, 0.2)
-"""Changes of one parameter in each round of the search."""
+"""Its change in each round, from coarse to fine."""
 _COARSE, _FINE = np.exp(np.arange(-9.0, 13.0, 3.0)), np.exp(np.linspace(-2.0, 2.0, 9))
 """Multipliers μ: all of them, and around the best one."""
-_NODES, _CRITICAL_NODES = 16, 4
+_NODES = 16
+"""Nodes of the flow that are sampled: so many evenly spaced, and as many in geometric steps."""
+_CRITICAL_NODES = 4
+"""Nodes with the largest c, where μ is refined."""
 _ILL_CONDITIONED = 1e8
+"""Condition of Λ from which on it is not used: rounding could exceed ``FLOW_ROUNDING``."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +73,7 @@ class InvariantEllipsoids:
 
         Args:
             error_bound: D.
-            effects_of: returns how much delay and hold change the flow as long as ‖ΛWx‖ ≤ c.
+            effects_of: returns how much delay and hold change the flow as long as ‖Λx‖ ≤ c.
             start_s: until then the input is 0.
         """
         ellipsoid = self._best_ellipsoid

@@ -8,7 +8,7 @@ e^{Fw} z:
     ‖Λx‖ ≤ c and ‖e_c‖ ≤ D at z and z',  ‖e_s‖ = ‖C_r z'‖ ≤ β for r until the next event
 
 With positive weights of sum 1, z is in the ellipsoid of the sum of these forms, which bounds e_c =
-(0, I) e^{Fr} z' after r (``largest_outputs`` in ``delivery_reach.py``).
+(0, I) e^{Fr} z' after r (``ellipsoid_intersections.py``).
 
 After an event e_s begins at 0, so the same forms bound the time until the next event, too.
 """
@@ -24,19 +24,23 @@ from noack.theory.bounds.enclosure import KernelBounds, response_until
 from noack.theory.bounds.gains import Output
 from noack.theory.bounds.stacked_norms import Stack, larger_ends
 from noack.theory.certificates.deliveries.delivery_flow import FLOW_ROUNDING, bend_rows, bend_terms
-from noack.theory.certificates.deliveries.delivery_reach import Reach, Wanted, largest_outputs
+from noack.theory.certificates.deliveries.delivery_reach import Reach
+from noack.theory.certificates.deliveries.ellipsoid_intersections import Wanted, bound_outputs
 
-_NEAR, _RATIO, _MOST_NODES = np.linspace(0.0, 1.0, 20).tolist(), 1.03, 300
-"""First nodes of r in units of δ; then the ratio from node to node."""
+_FIRST_NODES = np.linspace(0.0, 1.0, 20).tolist()
+"""First nodes of r, in units of δ; no event comes before the last of them."""
+_NODE_RATIO, _MOST_NODES = 1.03, 300
+"""Ratio from one node to the next one after these, and the most nodes: r is up to 4000 δ."""
 _LATEST = 6.0
-"""Largest r in units of δ at which events are looked for."""
+"""Largest r in units of δ at which events are looked for; a limit of the work."""
 _DECAYED = 0.6
-"""‖e^{(H+αI)r}‖_W at the last r, if possible."""
+"""‖e^{(H+αI)r}‖_W at the last r, if possible: from there on the bound without the flow is used."""
 _NEARLY_SUMMED = 0.999
 """Share of the bound without the flow from which on nothing is gained."""
 _ERROR_AT_DELIVERY = 1e-3
-"""Bound of ‖e_c‖ at a delivery, where it is 0, in β."""
-_LATE_TERMS = 8
+"""Bound of ‖e_c‖ at a delivery, as a share of that of e_s: it is 0 there, but is divided by."""
+_TAYLOR_TERMS = 8
+"""Terms by which e_c'' over a cell is bounded; cells may be longer here than those of the flow."""
 
 
 class SensorErrors(NamedTuple):
@@ -51,11 +55,11 @@ class SensorErrors(NamedTuple):
     grid_s: float
     """Tests are multiples of this after an event; 0 if the trigger is tested at all times."""
     level: float
-    """At an event it, or what is compared, is at least this large; 0 if nothing is known."""
+    """The least ‖e_s‖_W at an event, or its least integral if that is compared; 0 if nothing is known."""
     integrates: bool
     """Whether its integral since the event is compared."""
     earliest_due_s: float
-    """So long after an event the next one may be due without any of this."""
+    """The earliest time after an event at which the next one may be due, whatever e_s is."""
 
     def since_event(self, r_s: Vector, lost: int) -> Vector:
         """Bound ‖e_s‖_W at times after an event, while so many events have been lost, (k,)."""
@@ -102,25 +106,20 @@ def errors_after_losses(
         at_delivery = max(_ERROR_AT_DELIVERY * sensor_error, reach.effects.first_error)
         error_before = float(errors[lost - 1]) if lost else at_delivery
         window_s = min(max(since_delivery_s, 0.0), most_s)
-        event = _LostEvent(reach, window_s, error_before, state_bound, outputs, r_s, flows)
-        # e_c until the next delivery, if at most so many events are lost.
-        if lost:
+        event = _SinceEvent(reach, window_s, error_before, state_bound, outputs, r_s, flows)
+        if lost:  # e_c until the next delivery, if at most so many events are lost
             summed = sensor_error + kernel.sups(r_s) * error_before
             largest = event.largest_error(sensor.since_event(r_s, lost), summed)
             errors[lost] = min(without_flow[lost], largest)
             if lost > 1 and errors[lost] > _NEARLY_SUMMED * float(summed[0]):
                 return errors, spacing_s  # after more losses nothing is gained, either
-        # The time until the next event. After a delivery e_s is at most ‖e^{(H+αI)r}‖ · first_error
-        # larger than C_r z.
-        late_error = 0.0 if lost else flow.model_growth * reach.effects.first_error
-        most_later_s = min(_LATEST * spacing_s, sensor.earliest_due_s)
-        later_s = event.next_event_s(sensor, late_error, bend, most_later_s)
-        since_delivery_s += max(spacing_s, later_s)
+        later_s = event.next_event_s(sensor, bend, spacing_s, is_delivered=not lost)
+        since_delivery_s += later_s
         if not lost:  # x(0) itself may be outside the ellipsoid
             since_delivery_s = min(since_delivery_s, first_event_s)
-            later_s = min(later_s, first_event_s)
+            later_s = max(min(later_s, first_event_s), spacing_s)
             state_bound = reach.largest_state(first_event_s - since_delivery_s)
-        apart_s = min(apart_s, max(spacing_s, later_s))
+        apart_s = min(apart_s, later_s)
     return errors, apart_s
 
 
@@ -132,14 +131,14 @@ def bend_of_error(reach: Reach, level: float) -> float:
 
 def _nodes_s(spacing_s: float, kernel: KernelBounds, most_s: float, grid_s: float) -> Vector:
     """Return times r, if possible up to one at which ‖e^{(H+αI)r}‖_W has fallen below a value."""
-    nodes_s = [spacing_s * share for share in _NEAR]
+    nodes_s = [spacing_s * share for share in _FIRST_NODES]
     while len(nodes_s) < _MOST_NODES and kernel.sup(nodes_s[-1]) > _DECAYED:
-        nodes_s.append(nodes_s[-1] * _RATIO)
+        nodes_s.append(nodes_s[-1] * _NODE_RATIO)
     r_s = np.array([time_s for time_s in nodes_s if time_s <= most_s])
     return grid_s * np.unique(np.rint(r_s / grid_s)) if grid_s else r_s
 
 
-class _LostEvent:
+class _SinceEvent:
     """Bounds at times r since an event that is a time w or more after the delivery.
 
     z is e^{Fw} ζ at the event. What q has changed since some time before is bounded with e^{−Fs} (BU, −BU).
@@ -161,6 +160,7 @@ class _LostEvent:
         self._error_before = error_before
         self._age_input = reach.effects.age_input
         self._acts_within_s = reach.effects.acts_within_s
+        self._first_error = reach.effects.first_error
         n, shape, identity = flow.n, reach.ellipsoid.shape, np.eye(2 * flow.n)
         to_event = exponential(flow.generator * window_s)
         # What q changes after the event, and has changed before it.
@@ -199,7 +199,7 @@ class _LostEvent:
         forms = np.concatenate([self._forms[:-1], no_events[:, None]], axis=1)
         # Up to the last node by the flow, then without it.
         cap = summed[:-1] - self._input_changes[1:]
-        ends, weights = largest_outputs(forms, self._z[1:, self._flow.n :], float(summed[-1]), cap=cap)
+        ends, weights = bound_outputs(forms, self._z[1:, self._flow.n :], float(summed[-1]), cap=cap)
         cells = np.maximum(ends, np.append(self._error_before, ends[:-1])) + self._sags(forms, weights)
         until_last = float(np.minimum(cells + self._input_changes[1:], summed[:-1]).max())
         return max(until_last, float(summed[-1]), self._error_before)
@@ -208,19 +208,23 @@ class _LostEvent:
         """Bound how much e_c differs from its chord in each cell of r."""
         steps_s = np.diff(self._r_s)
         inverse = np.linalg.inv(np.einsum("ji,jiab->jab", weights, forms))
-        terms, remainder = bend_terms(self._flow.generator, self._z[:-1], steps_s, _LATE_TERMS)
+        terms, remainder = bend_terms(self._flow.generator, self._z[:-1], steps_s, _TAYLOR_TERMS)
         bends = np.zeros(len(steps_s))
         # e_c of Taylor's terms, and the whole remainder.
         for rows in (*(term[:, self._flow.n :] for term in terms), remainder):
             bends += np.sqrt(np.abs(np.einsum("jab,jbc,jac->j", rows, inverse, rows)))
         return np.asarray(steps_s**2 / 8 * bends * FLOW_ROUNDING)
 
-    def next_event_s(self, sensor: SensorErrors, late_error: float, bend: float, most_s: float) -> float:
-        """Return a time before which there is no event; e_s may be larger than C_r z by ``late_error``."""
-        flow = self._flow
+    def next_event_s(
+        self, sensor: SensorErrors, bend: float, spacing_s: float, *, is_delivered: bool
+    ) -> float:
+        """Return a time before which there is no other event, at least ``spacing_s``."""
+        flow, most_s = self._flow, min(_LATEST * spacing_s, sensor.earliest_due_s)
+        # After a delivery e_s is at most ‖e^{(H+αI)r}‖ · first_error larger than C_r z.
+        late_error = flow.model_growth * self._first_error if is_delivered else 0.0
         level = sensor.level - (late_error * self._acts_within_s if sensor.integrates else late_error)
         if level <= 0:
-            return 0.0
+            return spacing_s
         if self._age_input:  # what is followed differs from e_s
             by_input = flow.unit_effects(bend_rows(flow))[1][flow.cell_at(most_s)]
             difference = float(np.linalg.norm(flow.H @ flow.H, 2)) * float(self._input_changes.max())
@@ -229,11 +233,13 @@ class _LostEvent:
         is_near = self._r_s <= most_s
         enough, most = (0.0, math.inf) if sensor.integrates else (0.9 * level, level)
         forms, e_s = self._forms[is_near], self._e_s[is_near]
-        ends, _ = largest_outputs(forms, e_s, enough, wanted=Wanted.ALL, most=most)
+        ends, _ = bound_outputs(forms, e_s, enough, wanted=Wanted.ALL, most=most)
         steps_s = np.diff(self._r_s[is_near])
         cells = larger_ends(ends) + steps_s**2 / 8 * bend + self._input_changes[1:][is_near[1:]]
         if sensor.integrates:
             cells = np.cumsum(steps_s * (np.maximum.accumulate(cells) + late_error))
         reached_s = float(self._r_s[np.append(cells >= level, True).argmax()])
         # Tests may lie beside the nodes if times are not those since an event.
-        return max(reached_s - sensor.grid_s, 0.0) if late_error and sensor.integrates else reached_s
+        if late_error and sensor.integrates:
+            reached_s -= sensor.grid_s
+        return max(spacing_s, reached_s)

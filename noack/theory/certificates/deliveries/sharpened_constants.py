@@ -31,11 +31,19 @@ from noack.theory.certificates.deliveries.invariant_ellipsoids import InvariantE
 from noack.theory.certificates.deliveries.lost_events import SensorErrors, bend_of_error, errors_after_losses
 from noack.theory.certificates.inequalities import Signal
 
-_ROUNDS, _SETTLED = 20, 0.99
+_MOST_ROUNDS, _SETTLED = 20, 0.99
+"""Limit of the rounds; they end when no bound of x or e_c falls below this share of the last one."""
 _MOST_INSERTIONS, _INSERTIONS_SETTLED = 60, 0.9999
-_SHORTEST_S, _LEAST_SHARE, _LEAST_BOUND = 1e-9, 1e-6, 1e-200
+"""The same of the insertions in a round."""
+_SHORTEST_S = 1e-9
+"""Least time between events with which lost ones are followed, in s: events are resolved to 1 ns."""
+_LEAST_SHARE = 1e-6
+"""Least bound of ‖e_c‖ at an event, as a share of D: where no event is lost it is 0, but D may not be."""
+_LEAST_BOUND = 1e-200
+"""Least bound by which an output is divided: a bound may be 0."""
 _SHORTEST_STEP, _MOST_STEPS = 0.005, 16
-"""Of the search for the next event: the shortest step as a share of the time, and the most steps."""
+"""Of the search for the next event: the shortest step as a share of the time, and the most steps.
+Each step takes as long as a bound for one output."""
 
 
 def can_be_sharpened(part: CertificatePart) -> bool:
@@ -62,7 +70,7 @@ def sharpened_constants(
     if not np.isfinite(bounds.signals).all():
         return constants
     sharpening.insert()
-    for _ in range(_ROUNDS):
+    for _ in range(_MOST_ROUNDS):
         earlier = bounds.errors[Output.WEIGHTED], bounds.states[Output.WEIGHTED]
         if not sharpening.sharpen_by_flow():
             break
@@ -129,7 +137,7 @@ class _SharpenedBounds:
         at_first = float(spectral_norm(gain)) * reach.effects.first_error
         input_error = max(reach.sup(np.hstack([0 * gain, gain])), at_first)
         bounds.errors[Output.GAIN] = min(bounds.errors[Output.GAIN], input_error)
-        if self.spacing_s >= max(self._acts_within_s, _SHORTEST_S):  # before, the last update has acted
+        if self.spacing_s >= max(self._acts_within_s, _SHORTEST_S):  # an update acts before the next event
             error = max(self._after_losses(reach), reach.effects.first_error)
             for output, bound in bounds.errors.items():
                 bounds.errors[output] = min(bound, error * self._part.plant.error.now(output))
@@ -139,7 +147,7 @@ class _SharpenedBounds:
         return True
 
     def _input_effects(self, ellipsoid: DeliveryEllipsoid, scale: float) -> InputEffects:
-        """Return what delay and hold change as long as ‖ΛWx‖ ≤ c, ``scale``.
+        """Return what delay and hold change as long as ‖Λx‖ ≤ c, ``scale``.
 
         x_c, from which the input is computed, is e^{(H+αI)τ} x of the event of the last update.
         """
@@ -216,7 +224,7 @@ class _SharpenedBounds:
 
 
 def errors_at_events(errors: Vector) -> Vector:
-    """Bound ‖e_c‖_W after each event: 0 if it is received; a lost one was not missing before."""
+    """Bound ‖e_c‖_W at a delivery, and up to the first, second, … lost event: one less is missing then."""
     return np.append(0.0, errors[:-1])
 
 

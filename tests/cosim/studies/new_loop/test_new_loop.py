@@ -134,7 +134,7 @@ def test_each_plant_of_noack_gets_a_scenario(name: str) -> None:
 def test_every_key_of_the_file_that_is_chosen_has_a_comment() -> None:
     lines = noack.new("double_integrator", "mass.toml").text.splitlines()
     for key in ("horizon_s", "gain", "initial_state", "beta", "alpha_per_s", "floor", "mansd"):
-        (before,) = {one for one, line in pairwise(lines) if line.startswith(f"{key} = ")}
+        (before,) = {previous for previous, line in pairwise(lines) if line.startswith(f"{key} = ")}
         assert before.startswith("# "), key
     assert max(map(len, (line for line in lines if line.startswith("#")))) <= 100
 
@@ -170,27 +170,27 @@ def test_an_initial_state_from_which_the_plant_does_not_return_is_made_smaller()
 def test_the_regulator_solves_the_riccati_equation(name: str) -> None:
     model = noack.linearise(name)
     n, m = model.B.shape
-    found = noack.gain(model, q=np.arange(1.0, n + 1), r=0.5)
+    regulator = noack.gain(model, q=np.arange(1.0, n + 1), r=0.5)
     Q, R = np.diag(np.arange(1.0, n + 1)), 0.5 * np.eye(m)
     P = solve_continuous_are(model.A, model.B, Q, R)
-    residual = model.A.T @ P + P @ model.A + Q - found.K.T @ R @ found.K
+    residual = model.A.T @ P + P @ model.A + Q - regulator.K.T @ R @ regulator.K
     assert np.abs(residual).max() < 1e-6 * np.abs(P).max()
-    assert found.decay_per_s > 0
+    assert regulator.decay_per_s > 0
 
 
 @pytest.mark.parametrize("poles", [[-1, -2, -3, -4], [-2 + 1j, -2 - 1j, -3 + 2j, -3 - 2j]])
 def test_a_regulator_has_the_poles_that_were_asked_for(poles: list[complex]) -> None:
-    found = noack.gain("cart_pole", poles=poles)
-    np.testing.assert_allclose(np.sort_complex(found.eigenvalues), np.sort_complex(poles), atol=1e-5)
+    placed = noack.gain("cart_pole", poles=poles)
+    np.testing.assert_allclose(np.sort_complex(placed.eigenvalues), np.sort_complex(poles), atol=1e-5)
 
 
 def test_the_double_integrators_gain_is_the_textbooks_whatever_plant_is_drawn() -> None:
     model = {"A": [[0.0, 1.0], [0.0, 0.0]], "B": [[0.0], [1.0]]}
     settings = {"model": model, "plant.uncertainty_B": [[0.0], [0.3]]}
-    found = noack.gain("double_integrator", q=[1.0, 0.0], settings=settings)
-    np.testing.assert_allclose(found.K, [[-1.0, -np.sqrt(2.0)]], atol=1e-9)
-    assert "gain = [[-1.0, -1.41421" in repr(found)
-    assert "from the scenario's [model], which sensor and controller know" in repr(found)
+    regulator = noack.gain("double_integrator", q=[1.0, 0.0], settings=settings)
+    np.testing.assert_allclose(regulator.K, [[-1.0, -np.sqrt(2.0)]], atol=1e-9)
+    assert "gain = [[-1.0, -1.41421" in repr(regulator)
+    assert "from the scenario's [model], which sensor and controller know" in repr(regulator)
 
 
 def test_an_fmu_is_linearised_and_its_operating_point_goes_into_the_scenario(
@@ -201,11 +201,11 @@ def test_an_fmu_is_linearised_and_its_operating_point_goes_into_the_scenario(
     unpack = Mock(wraps=fmpy.extract)
     monkeypatch.setattr(fmpy, "extract", unpack)
     fmu = build(folder, 2)
-    found = noack.linearise(str(fmu))
+    at_rest = noack.linearise(str(fmu))
     assert unpack.call_count == 1  # for hundreds of instances
     assert not Path(unpack.call_args.args[1]).exists()
-    np.testing.assert_allclose(found.A, [[0, 1], [-1, 1]], atol=1e-4)
-    np.testing.assert_allclose(found.B, [[0], [1]], atol=1e-4)
+    np.testing.assert_allclose(at_rest.A, [[0, 1], [-1, 1]], atol=1e-4)
+    np.testing.assert_allclose(at_rest.B, [[0], [1]], atol=1e-4)
     moved = noack.linearise(str(fmu), at=[1.0, 0.0], input=[1.0])
     np.testing.assert_allclose(moved.A, [[0, 1], [-1, 0]], atol=1e-4)
     made = noack.new(moved, "made.toml")
@@ -216,8 +216,8 @@ def test_an_fmu_is_linearised_and_its_operating_point_goes_into_the_scenario(
 
 
 def test_a_plant_that_makes_its_own_steps_is_linearised() -> None:
-    found = noack.linearise("pole.py:Stepped")
-    np.testing.assert_allclose([found.A[0, 0], found.B[0, 0]], [-2.0, 1.0], atol=1e-6)
+    model = noack.linearise("pole.py:Stepped")
+    np.testing.assert_allclose([model.A[0, 0], model.B[0, 0]], [-2.0, 1.0], atol=1e-6)
 
 
 def test_uncontrollable_states_are_found_in_any_coordinates() -> None:
@@ -243,11 +243,11 @@ def test_uncontrollable_states_are_found_in_any_coordinates() -> None:
 
 
 def test_a_plant_that_cannot_be_stabilised_gives_one_line() -> None:
-    found = noack.linearise("pole.py:Unreachable")
-    assert (found.rank, found.uncontrollable.tolist()) == (1, [1.0])
-    assert "no gain stabilises the plant" in repr(found)
+    model = noack.linearise("pole.py:Unreachable")
+    assert (model.rank, model.uncontrollable.tolist()) == (1, [1.0])
+    assert "no gain stabilises the plant" in repr(model)
     with pytest.raises(CallerError, match="the eigenvalue 1 /s is not controllable"):
-        noack.new(found)
+        noack.new(model)
 
 
 def test_a_stable_uncontrollable_part_stays_where_it_is() -> None:

@@ -16,7 +16,8 @@ from cosim.studies.campaign.campaign_file import load
 from cosim.studies.campaign.campaign_grid import grid
 from cosim.studies.paper import paper_evidence, paper_page
 from cosim.studies.paper.paper_evidence import Numbers, evidence, resolved_draw
-from cosim.studies.paper.paper_page import _rounded, render
+from cosim.studies.paper.paper_page import render, rounded_numbers
+from noack.core.errors import CallerError
 from noack.plants.linear import lane_following
 from noack.scenario.resolution import loop_of
 from tests.command_line import invoke
@@ -34,23 +35,17 @@ largest and smallest ones."""
 
 @pytest.fixture(scope="module")
 def computed() -> Numbers:
-    certified = paper_evidence._certificates
-    with pytest.MonkeyPatch.context() as patch:  # to certify all draws takes half a minute
-        patch.setattr(
-            paper_evidence, "_certificates",
-            lambda scenario, draws: certified(scenario, [*EXTREME, *draws[25:]]),
-        )  # fmt: skip
-        return evidence(SCENARIO, COMMITTED["summary"]["draws"], COMMITTED["representative"])
+    # To certify all draws takes half a minute.
+    return evidence(SCENARIO, COMMITTED["summary"]["draws"], COMMITTED["representative"], EXTREME)
 
 
 def test_the_committed_evidence_is_what_the_code_computes(computed: Numbers) -> None:
-    part, expected = _rounded(computed), copy.deepcopy(COMMITTED["evidence"])
-    counts = expected["certificates"], expected["certificates"]["theorem_2"]
-    assert [one["draws"] for one in counts] == [25, 26]
-    for one, count in zip(counts, (len(EXTREME), len(EXTREME) + 1), strict=True):
-        one["draws"] = count
-    counts[1]["negative"] = len(EXTREME) + 1  # it is so in all draws
-    assert_close(part, expected)
+    expected = copy.deepcopy(COMMITTED["evidence"])
+    certificates, theorem_2 = expected["certificates"], expected["certificates"]["theorem_2"]
+    assert (certificates["draws"], theorem_2["draws"]) == (25, 26)
+    certificates["draws"], theorem_2["draws"] = len(EXTREME), len(EXTREME) + 1
+    theorem_2["negative"] = len(EXTREME) + 1  # it is so in all draws
+    assert_close(rounded_numbers(computed), expected)
 
 
 def test_no_draw_exceeds_its_certified_bounds(computed: Numbers) -> None:
@@ -68,8 +63,8 @@ def assert_close(first: Any, second: Any) -> None:
             assert_close(first[key], second[key])
     elif isinstance(first, list):
         assert len(first) == len(second)
-        for one, other in zip(first, second, strict=True):
-            assert_close(one, other)
+        for entries in zip(first, second, strict=True):
+            assert_close(*entries)
     else:
         assert first == pytest.approx(second, rel=DIGITS, abs=1e-9)
 
@@ -110,8 +105,8 @@ def test_with_an_exact_model_x_is_the_undisturbed_closed_loop(computed: Numbers)
 
 
 @pytest.mark.parametrize("mode", ["model", "zoh"])
-def test_trapped_states_do_not_excite_the_unstable_mode(computed: Numbers, mode: str) -> None:
-    part = computed["trapped"]
+def test_states_without_growth_do_not_excite_the_unstable_mode(computed: Numbers, mode: str) -> None:
+    part = computed["without_growth"]
     assert part[mode] == part["n"] - part["unstable"] == 3
     loop = loop_of(resolved_draw(SCENARIO, part["draw"], "model"))
     n, BK = loop.n, loop.B @ loop.K
@@ -176,7 +171,7 @@ def test_the_committed_campaign_is_complete() -> None:
     campaign, summary = load(ROOT / "campaigns" / "paper.toml"), COMMITTED["summary"]
     assert summary["draws"] == campaign.draws >= 1000
     assert len(summary["points"]) == math.prod(len(axis.labels) for axis in campaign.axes)
-    assert [claim["says"] for claim in summary["claims"]] == [one.says for one in campaign.claims]
+    assert [claim["says"] for claim in summary["claims"]] == [claim.says for claim in campaign.claims]
 
 
 def test_the_command_runs_the_campaign_and_writes_the_page(
@@ -203,3 +198,9 @@ def test_a_folder_that_cannot_be_written_gives_one_line_before_any_simulation(
     (tmp_path / "file").touch()
     blocked = invoke("paper", "--out", tmp_path / "file")
     assert (blocked.exit_code, blocked.stderr.count("\n")) == (1, 1)
+
+
+def test_without_an_unstable_plant_there_is_no_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(paper_evidence, "open_loop_eigenvalues", lambda A: -np.ones(len(A)))
+    with pytest.raises(CallerError, match="none of 100 drawn plants is unstable"):
+        evidence(SCENARIO, 1, 0, [])

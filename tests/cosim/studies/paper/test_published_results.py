@@ -28,16 +28,17 @@ PAGE = (ROOT / "docs/published.md").read_text()
 
 @pytest.mark.parametrize("name", NAMES)
 def test_rows_are_as_published_and_as_documented(name: str) -> None:
-    found = reproduce(name)
-    for row in found.rows:
+    reproduction = reproduce(name)
+    for row, cells in zip(reproduction.rows, reproduction.table.rows, strict=True):
         assert row.as_expected, row
-        assert f"| {' | '.join(found.table.rows[found.rows.index(row)])} |" in PAGE
+        assert f"| {' | '.join(cells)} |" in PAGE
         assert row.verdict == ("reproduced" if row.relation == "=" else "agrees") or row.deviation
-    assert found.result.about in PAGE
+    assert reproduction.result.about in PAGE
     printed = StringIO()
-    print_rows(Console(file=printed, width=80), found)
+    print_rows(Console(file=printed, width=80), reproduction)
     lines = printed.getvalue().splitlines()
-    assert sum(line.endswith(("reproduced ", "agrees ", "differs ")) for line in lines) == len(found.rows)
+    verdicts = sum(line.endswith(("reproduced ", "agrees ", "differs ")) for line in lines)
+    assert verdicts == len(reproduction.rows)
 
 
 def test_a_value_that_differs_fails_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -101,11 +102,11 @@ def test_a_broken_solution_is_no_solution() -> None:
 
 
 def test_the_scaled_eigenvalue_is_that_of_the_matrix() -> None:
-    one, two = np.array([[4.0]]), np.array([[1.0, 0.0], [0.0, 9.0]])
-    blocks = {(1, 1): one, (1, 2): np.array([[0.0, 3.0]]), (2, 2): two}
+    corner, square = np.array([[4.0]]), np.array([[1.0, 0.0], [0.0, 9.0]])
+    blocks = {(1, 1): corner, (1, 2): np.array([[0.0, 3.0]]), (2, 2): square}
     matrix = selivanov_fridman.symmetric(blocks)
     assert selivanov_fridman.smallest_eigenvalue(matrix) == pytest.approx(0.5)  # 1 − 3/√(4·9)
-    assert selivanov_fridman.smallest_eigenvalue(-one) < 0
+    assert selivanov_fridman.smallest_eigenvalue(-corner) < 0
 
 
 @pytest.fixture(scope="module")
@@ -137,13 +138,13 @@ def test_predicted_inputs_are_the_best_within_the_limits(optimisation: umsonst_b
     for start in (np.zeros(4), np.array([0.2, 0.3, -0.02, 0.1]), np.array([0.4, 0.0, 0.05, -0.3])):
         solution = optimisation.inputs(start)
         assert solution is not None
-        found = np.append(*solution)
-        assert room(found, start).min() > -1e-9
+        predicted = np.append(*solution)
+        assert room(predicted, start).min() > -1e-9
         limits = {"type": "ineq", "fun": room, "args": (start,)}
-        other = minimize(
+        by_other_solver = minimize(
             cost, np.zeros(N + 1), (start,), "SLSQP", constraints=limits, options={"ftol": 1e-12}
         )
-        assert cost(found, start) <= other.fun * (1 + 1e-6)
+        assert cost(predicted, start) <= by_other_solver.fun * (1 + 1e-6)
     assert optimisation.inputs(np.array([0.0, 0.0, 0.07, 1.1])) is None
 
 

@@ -18,20 +18,20 @@ def test_a_scalar_box_is_as_large_as_it_can_be(alpha: float, share_of_A: float) 
     There, x is bounded by x₀ and |b|π over the worst rate's margin, exactly.
     """
     rate, k, beta, x0 = 2.0, -3.0, 0.1, 0.7
-    one, whole = np.eye(1), rate - alpha
-    models = ErrorGains(-rate * one, k * one, one, alpha)
+    unit, whole = np.eye(1), rate - alpha
+    models = ErrorGains(-rate * unit, k * unit, unit, alpha)
 
     def certified(size: float, half_A: float, half_B: float) -> Constants:
-        halves = size * half_A * one, size * half_B * one
-        plant = BoxGains(models, one, one, x0 * one, alpha, *halves)
+        halves = size * half_A * unit, size * half_B * unit
+        plant = BoxGains(models, unit, unit, x0 * unit, alpha, *halves)
         return solve(models, plant, NetworkConditions(2), TriggerBound(beta, beta))
 
     half_A, half_B = whole * share_of_A, whole * (1 - share_of_A) / -k
     with pytest.raises(NotDecayingError, match="box is too large"):
         certified(1.005, half_A, half_B)
     for size in (0.1, 0.5, 0.95):
-        found = certified(size, half_A, half_B)
-        state, p, margin = found.state, found.input_error, whole * (1 - size)
+        constants = certified(size, half_A, half_B)
+        state, p, margin = constants.state, constants.input_error, whole * (1 - size)
         forced = (1.0 + size * half_B) * p
         start = x0 * whole / margin  # bound for a state that does not decay
         # The enclosures' 0.5 %, and the separate bounds of start and input error.
@@ -39,4 +39,4 @@ def test_a_scalar_box_is_as_large_as_it_can_be(alpha: float, share_of_A: float) 
         assert state >= (start + forced / margin) * (1 - 1e-9)
         # w of the state and of the corresponding input.
         w = size * (half_A * state + half_B * (-k * state + p))
-        assert found.mismatch == pytest.approx(w, rel=1e-3)
+        assert constants.mismatch == pytest.approx(w, rel=1e-3)

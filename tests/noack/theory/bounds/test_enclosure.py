@@ -104,13 +104,13 @@ def test_no_value_is_above_its_enclosure_and_the_enclosure_is_tight(kind: str, d
     kernel = response(G, D).through(C)
     grid_s = float(kernel.edges_s[-1])
     t_s = times(G, 1.2 * grid_s)
-    found = values(C, G, D, t_s)
+    norms = values(C, G, D, t_s)
     on_grid = t_s < grid_s
     highest = kernel.highest[cell_of(kernel, t_s[on_grid])]
     # Values as small as the reference's rounding are not compared.
-    rounding = 1e-13 * found.max()
-    assert (highest + rounding >= found[on_grid] * ROUNDING).all()
-    assert (kernel.sups(t_s) + rounding >= found * ROUNDING).all()
+    rounding = 1e-13 * norms.max()
+    assert (highest + rounding >= norms[on_grid] * ROUNDING).all()
+    assert (kernel.sups(t_s) + rounding >= norms * ROUNDING).all()
     assert (np.diff(kernel.sups(t_s)) <= 0).all()
     assert kernel.sup() == kernel.sups(np.zeros(1))[0] == kernel.highest.max()
     assert kernel.sup() <= 1.01 * peak(kernel, C, G, D)
@@ -175,8 +175,8 @@ def exactly(C: Matrix, G: Matrix, D: Matrix, t_s: float) -> float:
             total = total + term
         for _ in range(halvings):
             total = total @ total
-        found = decimals(C) @ total @ decimals(D)
-    return float(np.linalg.norm(found.astype(np.float64), 2))
+        exact = decimals(C) @ total @ decimals(D)
+    return float(np.linalg.norm(exact.astype(np.float64), 2))
 
 
 @pytest.mark.parametrize(("kind", "condition"), [("dense", 1e4), ("stiff", 1e8), ("ringing", 1e11)])

@@ -25,9 +25,9 @@ def test_without_mismatch_or_push_the_threshold_is_never_reached() -> None:
     )  # fmt: skip
     plant = gains_of(system)
     assert passage_s(plant, 0.1, 0.0, 0.0, 0.0) >= 1e6
-    found = certify_loop(system, NetworkConditions(0))
-    assert found.inter_event_s is not None
-    assert found.inter_event_s >= 1e6
+    constants = certify_loop(system, NetworkConditions(0))
+    assert constants.inter_event_s is not None
+    assert constants.inter_event_s >= 1e6
     # ρ = π'(1 − e^{−t}): never above π', and half of it at ln 2.
     assert passage_s(plant, 0.5, 0.0, 1.0, 0.0) == pytest.approx(math.log(2), rel=0.01)
     assert passage_s(plant, 0.5, 0.0, 1.0, 0.0) <= math.log(2)

@@ -299,7 +299,7 @@ def random_observed_loop(rng: np.random.Generator, **fixed: Any) -> ObservedLoop
 
 
 def worst_shares(
-    loop: ObservedLoop, found: ScenarioCertificate, rng: np.random.Generator
+    loop: ObservedLoop, certificate: ScenarioCertificate, rng: np.random.Generator
 ) -> dict[str, float]:
     """Simulate with random and adversarial losses, disturbances and noise; the shares reached."""
     system, (p, n) = loop.system, loop.C.shape
@@ -312,10 +312,10 @@ def worst_shares(
     )  # fmt: skip
     t_s = times_s(system)
     shares = {
-        "e_s": trace.sensor_error / found.sensor_error(t_s),
-        "e_c": trace.controller_error / found.controller_error(t_s),
-        "x": trace.state / found.state(t_s),
-        "x̂ − x": estimate.errors / found.estimation_error(t_s),
+        "e_s": trace.sensor_error / certificate.sensor_error(t_s),
+        "e_c": trace.controller_error / certificate.controller_error(t_s),
+        "x": trace.state / certificate.state(t_s),
+        "x̂ − x": estimate.errors / certificate.estimation_error(t_s),
     }
     largest = {name: float(values.max()) for name, values in shares.items()}
-    return largest | {"δ": (found.inter_event_s or 0.0) / trace.inter_event_s}
+    return largest | {"δ": (certificate.inter_event_s or 0.0) / trace.inter_event_s}

@@ -49,7 +49,7 @@ def test_no_plant_of_a_disturbed_box_exceeds_its_bounds(seed: int) -> None:
         loop = random_disturbed_loop(rng, mismatch=0.0, noise=0.0, n=2, lasting=STEPS, floor=0.3)
         half = 0.02
         try:
-            found = box_certificate(loop.system, loop.columns, half, loop.floor)
+            certificate = box_certificate(loop.system, loop.columns, half, loop.floor)
         except (NoCertificateError, NotDecayingError):
             continue
         break
@@ -63,7 +63,7 @@ def test_no_plant_of_a_disturbed_box_exceeds_its_bounds(seed: int) -> None:
     pushes, _ = signals(loop, rng)
     drawn = networks(seed, system)
     trace = simulate(system, *drawn, floor=loop.floor, pushes=pushes, plants=plants)
-    shares = found.shares(trace)
+    shares = certificate.shares(trace)
     assert max(shares.values()) <= 1 + 1e-9, shares
     # Without the disturbance the bounds would be exceeded, or come closer.
     narrow = box_certificate(system, 1e-6 * loop.columns, half, loop.floor).shares(trace)

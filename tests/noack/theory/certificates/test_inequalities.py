@@ -34,10 +34,10 @@ def test_the_bound_is_above_the_exact_solution_and_close_to_it(size: int, radius
         F[unused : unused + 1], g[unused : unused + 1] = 0.0, 0.0
         scale = 10.0 ** (rng.integers(-150, 150) + rng.integers(-2, 3, size))
         F, g = F * (scale[:, None] / scale), g * scale
-        found = solve_inequalities(F, g)
-        assert np.isfinite(found.bound).all()
-        assert found.loop_gain < 1
-        for bound, exact in zip(found.bound, exact_solution(F, g), strict=True):
+        solution = solve_inequalities(F, g)
+        assert np.isfinite(solution.bound).all()
+        assert solution.loop_gain < 1
+        for bound, exact in zip(solution.bound, exact_solution(F, g), strict=True):
             assert Fraction(float(bound)) >= exact
             assert float(bound) <= float(exact) * (1 + 1e-10 / (1 - radius))
 
@@ -48,7 +48,7 @@ def test_a_spectral_radius_of_1_or_more_has_no_bound() -> None:
         F = rng.uniform(size=(size, size))
         F /= np.abs(np.linalg.eigvals(F)).max()
         for radius in (1 + 1e-12, 1.5, 40.0):
-            found = solve_inequalities(radius * F, np.ones(size))
-            assert np.isinf(found.bound).all()
-            assert found.loop_gain >= 1 - 1e-9
+            solution = solve_inequalities(radius * F, np.ones(size))
+            assert np.isinf(solution.bound).all()
+            assert solution.loop_gain >= 1 - 1e-9
     assert np.isinf(solve_inequalities(np.full((2, 2), np.nan), np.ones(2)).bound).all()

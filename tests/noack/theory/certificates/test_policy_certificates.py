@@ -30,12 +30,12 @@ def test_a_short_deadline_adds_decay_to_a_constant_threshold() -> None:
     for interval_s, decays in ((0.02, True), (1.0, False)):
         trigger = f'trigger={{policy="deadline", interval_s={interval_s}, rule={rule}}}'
         resolved = resolve(load(SCENARIO, [trigger]))
-        found = certify(resolved, allowed_conditions(resolved))
-        assert found.unit == ""  # the errors' constants are absolute
-        short = found.state(t_s)
+        certificate = certify(resolved, allowed_conditions(resolved))
+        assert certificate.unit == ""  # the errors' constants are absolute
+        short = certificate.state(t_s)
         assert (short <= alone * ROUNDING).all()
         assert short[-1] < 1e-100 if decays else short[-1] == pytest.approx(alone[-1])
-        known = known_state_bounds(resolved, found)
+        known = known_state_bounds(resolved, certificate)
         assert known is not None
         for bound in (known.state_deviation(t_s, t_s, missing), known.controller_error(t_s, missing)):
             assert bound[-1] < 1e-100 if decays else bound[-1] > 0.0

@@ -70,11 +70,11 @@ def test_a_sine_is_enclosed_almost_tightly() -> None:
 )  # fmt: skip
 def test_numbers_carry_enclosed_derivatives(of: Callable[[Enclosed | float], Enclosed]) -> None:
     middle, radius, h = 0.9, 0.3, 1e-6
-    found = of(Enclosed(_ball(middle, radius), [_ball(1.0)]))
+    enclosed = of(Enclosed(_ball(middle, radius), [_ball(1.0)]))
     for x in np.linspace(middle - radius, middle + radius, 41):
         slope = (of(x + h) - of(x - h)) / (2 * h)
-        assert abs(found.value - _ball(float(of(x)))).abs_lower() < 1e-12
-        assert abs(found.slopes[0] - _ball(float(slope))).abs_lower() < 1e-8
+        assert abs(enclosed.value - _ball(float(of(x)))).abs_lower() < 1e-12
+        assert abs(enclosed.slopes[0] - _ball(float(slope))).abs_lower() < 1e-8
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -152,9 +152,9 @@ def test_without_the_library_one_line_says_how_to_get_it(
 def test_a_run_is_held_against_its_region() -> None:
     for name, verdict in (("sine_pendulum", ClaimVerdict.HELD), ("cart_pole", ClaimVerdict.VOID)):
         record = simulate(resolve(load(SCENARIOS / f"{name}.toml", ["horizon_s=1.0"])))
-        claims = [one for one in RunClaims(record).evaluate() if one.source == "region certificate"]
-        assert {one.verdict for one in claims} == {verdict}
-        assert ("x stays in the region" in {one.what for one in claims}) == (name != "cart_pole")
+        claims = [claim for claim in RunClaims(record).evaluate() if claim.source == "region certificate"]
+        assert {claim.verdict for claim in claims} == {verdict}
+        assert ("x stays in the region" in {claim.what for claim in claims}) == (name != "cart_pole")
 
 
 @pytest.mark.parametrize(
@@ -182,7 +182,7 @@ def test_what_persists_is_bounded_on_a_region(setting: str) -> None:
 
 def test_without_its_package_a_certificate_is_not_checked(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jacobian_enclosure, "find_spec", lambda name: None)
-    found = certificate_of(CASES["pendulum"].resolved(), CASES["pendulum"].semi_axes)
-    assert "noack[regions]" in (found.void or "")
-    (assumption,) = (a for a in found.assumptions if a.what == "there is a certificate")
+    certificate = certificate_of(CASES["pendulum"].resolved(), CASES["pendulum"].semi_axes)
+    assert "noack[regions]" in (certificate.void or "")
+    (assumption,) = (a for a in certificate.assumptions if a.what == "there is a certificate")
     assert assumption.verdict == AssumptionStatus.NOT_CHECKED

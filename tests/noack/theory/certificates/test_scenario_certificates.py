@@ -99,17 +99,17 @@ def test_a_hold_under_the_papers_conditions_misses_m_thresholds() -> None:
 def test_a_void_certificate_gives_the_reason_and_no_bounds() -> None:
     no_gain = ["model.gain=[[0,0,0,0],[0,0,0,0]]", "model.allow_unstable=true"]
     resolved = shipped("lane_following", *no_gain)
-    found = certify(resolved, ideal_conditions(resolved))
-    assert found.constants is None
-    assert "grows" in str(found.void)
-    assert found.inter_event_s is None
+    certificate = certify(resolved, ideal_conditions(resolved))
+    assert certificate.constants is None
+    assert "grows" in str(certificate.void)
+    assert certificate.inter_event_s is None
     observed = shipped("pendulum_observed", "plant.uncertainty_A=[[0, 0], [0, 0.1]]")
     boxed = certify_box(observed, allowed_conditions(observed))
     assert boxed is not None
     assert "for one plant only, not for a box" in (boxed.void or "")
-    for envelope in (found.sensor_error, found.controller_error, found.state):
+    for envelope in (certificate.sensor_error, certificate.controller_error, certificate.state):
         assert np.isnan(envelope(np.linspace(0, 9, 4))).all()
-    assert (found.assumptions[-2].what, found.assumptions[-2].verdict) == (
+    assert (certificate.assumptions[-2].what, certificate.assumptions[-2].verdict) == (
         "there is a certificate", AssumptionStatus.VIOLATED,
     )  # fmt: skip
     assert "not below 1" in str(certify(shipped(), NetworkConditions(4, 0.5, 0.5)).void)
@@ -138,21 +138,21 @@ def test_certificates_that_are_computed_together_are_those_of_each_loop() -> Non
         for scope in (own_plant_scope(loop), box_scope(loop))
         if scope is not None
     ]
-    found = completed([scope.search(conditions) for scope, conditions in scopes])
-    assert any(one.constants is not None for one in found)
-    for together, (scope, conditions) in zip(found, scopes, strict=True):
+    certificates = completed([scope.search(conditions) for scope, conditions in scopes])
+    assert any(certificate.constants is not None for certificate in certificates)
+    for together, (scope, conditions) in zip(certificates, scopes, strict=True):
         # Sums over grids that end at different times are rounded differently.
         alone = leaves(scope.certificate(conditions).to_json())
-        for one, other in zip(leaves(together.to_json()), alone, strict=True):
-            is_real = isinstance(other, float)
-            assert one == (pytest.approx(other, rel=1e-12, abs=0.0) if is_real else other)
+        for entry, entry_alone in zip(leaves(together.to_json()), alone, strict=True):
+            is_real = isinstance(entry_alone, float)
+            assert entry == (pytest.approx(entry_alone, rel=1e-12, abs=0.0) if is_real else entry_alone)
 
 
 def leaves(value: Any) -> list[Any]:
     """The entries of tables and lists within each other, in one list."""
     if isinstance(value, dict):
         value = [*value, *value.values()]
-    return [x for one in value for x in leaves(one)] if isinstance(value, list | tuple) else [value]
+    return [leaf for entry in value for leaf in leaves(entry)] if isinstance(value, list | tuple) else [value]
 
 
 @pytest.mark.parametrize("late_periods", [0, 2])
@@ -178,5 +178,5 @@ def test_events_that_are_due_may_come_as_soon_as_they_are_due() -> None:
     resolved = resolve(load(ROOT / "scenarios" / "double_integrator.toml", [trigger, "network.mansd=0"]))
     conditions = nominal_conditions(resolved)
     missing = conditions._replace(sampling_s=5 * conditions.spacing_s)
-    for one in (conditions, missing):
-        assert own_plant_scope(resolved).certificate(one).inter_event_s == pytest.approx(0.04)
+    for tested in (conditions, missing):
+        assert own_plant_scope(resolved).certificate(tested).inter_event_s == pytest.approx(0.04)

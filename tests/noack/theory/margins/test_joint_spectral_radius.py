@@ -76,8 +76,8 @@ def test_the_norm_of_a_polytope_counts_what_its_combinations_miss() -> None:
 
 def scaled(edges: list[Edge], factor: float) -> list[Edge]:
     """The same system, whose growth is multiplied by a factor."""
-    return [edge(one.source, one.target, one.matrix.middle * factor**one.duration, one.duration)
-            for one in edges]  # fmt: skip
+    return [edge(step.source, step.target, step.matrix.middle * factor**step.duration, step.duration)
+            for step in edges]  # fmt: skip
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -128,8 +128,8 @@ def test_no_norms_and_no_products_prove_a_bound_below_the_growth(seed: int) -> N
         assert transformed is not None
         for growth in (0.5 * bounds.lower, 1.01 * bounds.lower):
             assert bound_by_products(transformed, growth, 300).upper >= bounds.lower
-    zero = [one._replace(matrix=exactly(0 * one.matrix.middle)) if number in bounds.cycle else one
-            for number, one in enumerate(edges)]  # fmt: skip
+    zero = [step._replace(matrix=exactly(0 * step.matrix.middle)) if number in bounds.cycle else step
+            for number, step in enumerate(edges)]  # fmt: skip
     assert NormSearch(SwitchedSystem.of(zero)).improve(0.0).upper < bounds.lower
 
 

@@ -74,12 +74,12 @@ def test_maps_are_those_of_a_simulated_run(name: str, settings: Sequence[str]) -
         return np.concatenate([step["x"], x_c, step["u"]])[: margin.loop.dimension]
 
     slots = margin.loop.times.slots
-    for before, one, following in zip(delivered[1:], delivered[2:], delivered[3:], strict=False):
-        usable_ns = margin.loop.times.usable_ns(int(one - before), delay_ns)
-        map_ = margin.loop.map(int(one % slots), usable_ns, int(following - one - 1)).middle
-        expected = state(following, one)
+    for before, present, following in zip(delivered[1:], delivered[2:], delivered[3:], strict=False):
+        usable_ns = margin.loop.times.usable_ns(int(present - before), delay_ns)
+        map_ = margin.loop.map(int(present % slots), usable_ns, int(following - present - 1)).middle
+        expected = state(following, present)
         np.testing.assert_allclose(
-            map_ @ state(one, before), expected, rtol=0, atol=1e-11 * np.abs(expected).max()
+            map_ @ state(present, before), expected, rtol=0, atol=1e-11 * np.abs(expected).max()
         )
 
 
@@ -90,10 +90,10 @@ def test_the_margin_does_not_depend_on_the_unit_of_the_input() -> None:
     for unit in (2.0**40, 1e-12):
         margin.loop = TimeTriggeredLoop(loop.A, loop.B * unit, loop.K / unit, loop.H, margin.loop.times)
         margin.maps = margin.loop.map  # type: ignore[assignment]
-        found = margin.stability(guarantee)
-        assert found.pattern == expected.pattern
-        assert found.lower == pytest.approx(expected.lower, rel=1e-9)
-        assert found.upper == pytest.approx(expected.upper, rel=1e-3)
+        stability = margin.stability(guarantee)
+        assert stability.pattern == expected.pattern
+        assert stability.lower == pytest.approx(expected.lower, rel=1e-9)
+        assert stability.upper == pytest.approx(expected.upper, rel=1e-3)
 
 
 def test_what_is_not_covered_is_refused_with_the_approved_line() -> None:

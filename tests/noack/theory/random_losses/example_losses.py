@@ -42,9 +42,9 @@ def unlimited(process: LossProcess) -> OutcomeChain:
 
 def scalar_loop(rate: float, gain: float, mismatch: float) -> PlantGains:
     """x' = −(rate + mismatch) x + p, a model that decays at ``rate``, and u = −gain x_c."""
-    one = np.eye(1)
-    error = ErrorGains(-rate * one, -gain * one, one, 0.0)
-    return PlantGains(error, (gain - rate - mismatch) * one, one, one, 0.0)
+    unit = np.eye(1)
+    error = ErrorGains(-rate * unit, -gain * unit, unit, 0.0)
+    return PlantGains(error, (gain - rate - mismatch) * unit, unit, unit, 0.0)
 
 
 def mean_square_growth(maps: list[tuple[Array, Array]], chain: OutcomeChain) -> float:

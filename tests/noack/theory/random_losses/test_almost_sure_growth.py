@@ -61,13 +61,13 @@ def test_growth_does_not_depend_on_units_and_holds_for_fast_modes() -> None:
     units, chain = np.ldexp(1.0, [0, 30, -30]), unlimited(independent(0.3))
     for fastest in (1.0, 1e-9):
         M0, M1 = (fastest * rng.normal(size=(3, 3)) + 0.5 * np.eye(3)[0] for _ in range(2))
-        scaled = [units[:, None] * one / units for one in (M0, M1)]
-        for found, expected in (
+        scaled = [units[:, None] * matrix / units for matrix in (M0, M1)]
+        for growth, expected in (
             (mean_square_growth([(scaled[0], scaled[1])], chain),
              mean_square_growth([(M0, M1)], chain)),
             (almost_sure_growth(scaled[0], scaled[1], chain), almost_sure_growth(M0, M1, chain)),
         ):  # fmt: skip
-            assert found == pytest.approx(expected, rel=1e-5)
+            assert growth == pytest.approx(expected, rel=1e-5)
     with pytest.raises(NotPredictableError, match="beyond 1e308"):
         mean_square_growth([(np.eye(2), np.full((2, 2), np.inf))], chain)
 
@@ -78,8 +78,8 @@ def test_a_tilted_bound_contains_the_rounding_of_the_frequencies(monkeypatch: py
     exact, inverse = almost_sure_growth(delivered, lost, chain), growth_module.inverse
 
     def inaccurate(matrix: Array) -> IntervalMatrix | None:
-        found = inverse(matrix)
-        return found and IntervalMatrix(found.middle, found.radius + 1e-6)
+        enclosed = inverse(matrix)
+        return enclosed and IntervalMatrix(enclosed.middle, enclosed.radius + 1e-6)
 
     monkeypatch.setattr(growth_module, "inverse", inaccurate)
     assert 1e-7 < almost_sure_growth(delivered, lost, chain) / exact - 1 < 1e-4

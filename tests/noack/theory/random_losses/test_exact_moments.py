@@ -94,10 +94,10 @@ def test_without_losses_the_moments_solve_a_lyapunov_equation() -> None:
     given = scenario(**NOISE, network={"mansd": 0, "loss": BURSTS})
     periods = periods_of(given, np.zeros((0, 3, 3)))
     moments = LoopMoments(periods, loss_process(given.network.link).outcomes(join_guarantee(0, ())))
-    found, period = moments.stationary(), periods.step(0, delivered=True)
-    assert found is not None
+    stationary, period = moments.stationary(), periods.step(0, delivered=True)
+    assert stationary is not None
     expected = solve_discrete_lyapunov(period.matrix, period.noise)
-    assert found[0].moments.sum(axis=0) == pytest.approx(expected, rel=1e-9, abs=1e-12)
+    assert stationary[0].moments.sum(axis=0) == pytest.approx(expected, rel=1e-9, abs=1e-12)
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.07])
@@ -124,14 +124,14 @@ def test_moments_do_not_depend_on_the_units_of_the_states() -> None:
     loop, unit = loop_of(given), 2.0 ** np.array([-25, 20])
     T = unit[:, None]
     other = replace(loop, A=T * loop.A / unit, B=T * loop.B, K=loop.K / unit, H=T * loop.H / unit)
-    found = []
+    costs = []
     for matrices, units in (loop, np.ones(2)), (other, unit):
         noise, form = np.diag((0.1 * units) ** 2), np.diag([*units**-2, 1.0])
         periods = LoopPeriods(matrices, loop_times(given, 250_000_000), noise, 0 * noise, form[None])
         stationary = LoopMoments(periods, outcomes).stationary()
         assert stationary is not None
-        found.append(stationary[1][0])
-    assert found[1] == pytest.approx(found[0], rel=1e-9)
+        costs.append(stationary[1][0])
+    assert costs[1] == pytest.approx(costs[0], rel=1e-9)
 
 
 @pytest.mark.parametrize("guarantee", [join_guarantee(2, ()), LossGuarantee()])

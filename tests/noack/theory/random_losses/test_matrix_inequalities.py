@@ -22,9 +22,9 @@ def largest_multiple(A: Matrix, B: Matrix, first: float) -> float:
     def blocks(values: Vector) -> Blocks:
         return np.zeros(0), A - values[0] * B
 
-    found = MatrixInequalities(blocks, 1).maximise_last(np.array([first]))
-    assert found is not None
-    return float(found[0])
+    solution = MatrixInequalities(blocks, 1).maximise_last(np.array([first]))
+    assert solution is not None
+    return float(solution[0])
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -52,8 +52,8 @@ def test_a_block_matrix_is_positive_up_to_the_inverse_of_a_norm(seed: int) -> No
     M = np.random.default_rng(seed).normal(size=(3, 3))
     zero = np.zeros((3, 3))
     exact = 1 / float(np.linalg.norm(M, 2))
-    found = largest_multiple(np.eye(6), -np.block([[zero, M], [M.T, zero]]), 1e-3 * exact)
-    assert NEARLY_LARGEST * exact <= found < exact
+    multiple = largest_multiple(np.eye(6), -np.block([[zero, M], [M.T, zero]]), 1e-3 * exact)
+    assert NEARLY_LARGEST * exact <= multiple < exact
 
 
 def test_numbers_divide_a_sum_in_the_best_way() -> None:
@@ -66,9 +66,9 @@ def test_numbers_divide_a_sum_in_the_best_way() -> None:
             return np.array([1 - x.sum(), *(x - costs * t)]), np.eye(1)
 
         first = np.append(np.full(3, 0.2) / units, 1e-3)
-        found = MatrixInequalities(blocks, 4).maximise_last(first)
-        assert found is not None
-        return found
+        solution = MatrixInequalities(blocks, 4).maximise_last(first)
+        assert solution is not None
+        return solution
 
     alone, scaled = found_in(np.ones(3)), found_in(np.array([1e-3, 1.0, 1e5]))
     assert NEARLY_LARGEST / costs.sum() <= alone[3] < 1 / costs.sum()
@@ -88,9 +88,9 @@ def test_a_matrix_of_unknowns_divides_a_trace_in_the_best_way() -> None:
         return np.array([1 - np.trace(X)]), X - values[6] * C
 
     first = np.append(0.2 * np.eye(3)[rows, columns], 1e-3 / np.trace(C))
-    found = MatrixInequalities(blocks, 7).maximise_last(first)
-    assert found is not None
-    assert NEARLY_LARGEST / np.trace(C) <= found[6] < 1 / np.trace(C)
+    solution = MatrixInequalities(blocks, 7).maximise_last(first)
+    assert solution is not None
+    assert NEARLY_LARGEST / np.trace(C) <= solution[6] < 1 / np.trace(C)
 
 
 @pytest.mark.parametrize(("distance", "is_confirmed"), [(1e-15, False), (1e-11, True)])
@@ -103,8 +103,8 @@ def test_a_matrix_that_is_positive_by_rounding_alone_is_not_confirmed(
     def blocks(values: Vector) -> Blocks:
         return np.array([1 - values[0]]), nearly_singular
 
-    found = MatrixInequalities(blocks, 1).maximise_last(np.array([0.5]))
-    assert (found is not None) is is_confirmed
+    solution = MatrixInequalities(blocks, 1).maximise_last(np.array([0.5]))
+    assert (solution is not None) is is_confirmed
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ def test_mean_squares_of_a_scalar_loop_are_those_of_the_inequalities_iterated_by
     """π = g|e_c|, |x| = 1 + π/(r + e), |e_c| = β + lost errors, of which all add (e|x| + π)/r."""
     rate, gain, mismatch, beta = 2.0, 1.5, 0.2, 0.1
     plant = scalar_loop(rate, gain, mismatch)
-    found = mean_squares(plant.error, plant, NetworkConditions(0), beta, p)
+    bounds = mean_squares(plant.error, plant, NetworkConditions(0), beta, p)
     e_c, powers = beta, p ** np.arange(1.0, 2000)
     for _ in range(2000):
         x = 1.0 + gain * e_c / (rate + mismatch)
@@ -25,9 +25,9 @@ def test_mean_squares_of_a_scalar_loop_are_those_of_the_inequalities_iterated_by
         tails = np.minimum(1, powers * whole / beta)
         burst = beta * np.sqrt(tails @ (2 * np.arange(len(tails)) + 1))
         e_c = beta + min(np.sqrt(p) * whole, burst)
-    assert found.controller_error == pytest.approx(e_c, rel=0.02)
-    assert found.state == pytest.approx(x, rel=0.02)
-    assert found.input_error == pytest.approx(gain * e_c, rel=0.02)
+    assert bounds.controller_error == pytest.approx(e_c, rel=0.02)
+    assert bounds.state == pytest.approx(x, rel=0.02)
+    assert bounds.input_error == pytest.approx(gain * e_c, rel=0.02)
 
 
 @pytest.mark.parametrize(
@@ -45,9 +45,9 @@ def test_mean_squares_without_a_quadratic_function_are_those_of_the_inequalities
     error = ErrorGains(-np.eye(1), np.array([[gain / unit]]), np.eye(1), 0.2)
     plant = PlantGains(error, np.array([[-1.2 - gain]]), np.array([[unit]]), np.array([[unit]]), 0.2)
     args = error, plant, conditions, 0.1 * unit, p
-    found, first = mean_squares(*args, refined=True), mean_squares(*args)
-    assert found.state <= first.state
-    assert found.controller_error <= first.controller_error
+    refined_bounds, first_bounds = mean_squares(*args, refined=True), mean_squares(*args)
+    assert refined_bounds.state <= first_bounds.state
+    assert refined_bounds.controller_error <= first_bounds.controller_error
 
 
 def test_inputs_that_are_too_old_for_the_fastest_mode_have_no_moments() -> None:

@@ -14,8 +14,8 @@ from tests.noack.theory.random_losses.example_losses import BURSTY, independent,
 
 @pytest.mark.parametrize("p", [0.0, 0.2, 0.6, 1.0])
 def test_a_scalar_grows_as_the_mean_of_its_squares(p: float) -> None:
-    found = mean_square_growth([(np.array([[0.5]]), np.array([[1.4]]))], unlimited(independent(p)))
-    assert found == pytest.approx(((1 - p) * 0.25 + p * 1.96) ** 0.5, rel=1e-6)
+    growth = mean_square_growth([(np.array([[0.5]]), np.array([[1.4]]))], unlimited(independent(p)))
+    assert growth == pytest.approx(((1 - p) * 0.25 + p * 1.96) ** 0.5, rel=1e-6)
 
 
 @pytest.mark.parametrize("process", [independent(0.4), BURSTY], ids=["independent", "bursty"])

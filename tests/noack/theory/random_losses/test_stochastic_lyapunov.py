@@ -20,11 +20,11 @@ def test_no_event_and_no_flow_raises_the_mean_of_a_quadratic_function(late: bool
         loop = draw(rng, alpha_share=0.3, probability=p)
         gains, H, K, W = gains_of(loop.system), loop.system.H, loop.system.K, loop.system.weight
         n, flow = len(H), LossyFlow(gains.error, gains, conditions, p)
-        one, zero = np.eye(n), np.zeros((n, n))
+        identity, zero = np.eye(n), np.zeros((n, n))
         x, q, e_s, w, v_f, v_h = np.split(np.eye(6 * n), 6)  # v is B (w + v_f + v_h) of the derivation
         B = loop.system.B @ gains.error.split_K[0]
         R, pushed = gains.error.split_K[1], np.pad(B, ((0, 0), (0, n - B.shape[1])))
-        G, shift = loop.system.A + loop.system.B @ K, gains.alpha_per_s * one
+        G, shift = loop.system.A + loop.system.B @ K, gains.alpha_per_s * identity
         entering = loop.system.B @ K @ (q + e_s) + late * pushed @ (w + v_f + v_h)
         rates = (
             (G + shift) @ x + entering, (H + shift) @ q, (H + shift) @ e_s - (G - H) @ x - entering,
@@ -43,7 +43,7 @@ def test_no_event_and_no_flow_raises_the_mean_of_a_quadratic_function(late: bool
             used = np.flatnonzero(np.abs(grown).sum(axis=0) + np.abs(allowed).sum(axis=0))
             difference = (allowed - grown)[np.ix_(used, used)]
             assert np.linalg.eigvalsh(difference)[0] > -1e-9 * np.linalg.norm(difference)
-            both, D = np.hstack([one, one]), zero
+            both, D = np.hstack([identity, identity]), zero
             for t in np.linspace(0, conditions.delay_s, 400)[:-1]:
                 remaining = np.exp(V.rate_per_s * t) * R @ expm((H + shift) * t)
                 D = D + remaining.T @ remaining * conditions.delay_s / 400

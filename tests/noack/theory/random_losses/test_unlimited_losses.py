@@ -11,9 +11,9 @@ from tests.noack.theory.random_losses.example_losses import BURSTY, independent,
 def test_in_a_contracting_norm_the_moments_at_events_are_those_of_the_geometric_law(p: float) -> None:
     error = scalar_loop(2.0, 3.0, 0.0).error
     for order, expected in (1, 1 / (1 - p)), (2, (1 + p) ** 0.5 / (1 - p)):
-        found = moment_at_events(error, independent(p), 0.0, order)
-        assert found == pytest.approx(expected, rel=1e-6)
-        assert moment_at_events(error, independent(p), 0.5, order) < found
+        moment = moment_at_events(error, independent(p), 0.0, order)
+        assert moment == pytest.approx(expected, rel=1e-6)
+        assert moment_at_events(error, independent(p), 0.5, order) < moment
 
 
 @pytest.mark.parametrize("order", [1, 2])

@@ -77,16 +77,16 @@ def _examine_all(kind: Kind, broken: str, loops: int, first: int) -> bool:
                 pool.submit(_examine_chunk, kind.name, broken, seeds[at : at + _CHUNK])
                 for at in range(0, count, _CHUNK)
             ]
-        found = reduce(Tally.plus, (part.result() for part in parts))
-    violated = found.violated[""]
+        tally = reduce(Tally.plus, (part.result() for part in parts))
+    violated = tally.violated[""]
     if broken:
-        share = violated / found.loops
-        print(f"{kind.name}, broken copy: {broken}: caught in {share:.1%} of {found.loops} loops")
+        share = violated / tally.loops
+        print(f"{kind.name}, broken copy: {broken}: caught in {share:.1%} of {tally.loops} loops")
         return violated > 0
-    closest = ", ".join(f"{name} {share:.3f}" for name, share in found.closest.items())
+    closest = ", ".join(f"{name} {share:.3f}" for name, share in tally.closest.items())
     print(
-        f"{kind.name}: {violated} of {found.loops} loops exceed a bound; {found.runs} runs; "
-        f"{found.refused} more loops not certified; largest shares of a bound: {closest}"
+        f"{kind.name}: {violated} of {tally.loops} loops exceed a bound; {tally.runs} runs; "
+        f"{tally.refused} more loops not certified; largest shares of a bound: {closest}"
     )
     return violated == 0
 

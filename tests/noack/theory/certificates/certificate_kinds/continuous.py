@@ -101,10 +101,10 @@ def _conditions(system: System) -> NetworkConditions:
     return NetworkConditions(guarantee_of(system).longest_burst, constraints=guarantee_of(system).rules[1:])
 
 
-def constants_of(found: Constants, beta: float) -> Bounds:
+def constants_of(constants: Constants, beta: float) -> Bounds:
     """The constants that are compared."""
-    more = {"x_W": found.state_weighted, "E x": max(found.mismatch, _ROUNDED)}
-    return bounds_of(found, beta) | more
+    more = {"x_W": constants.state_weighted, "E x": max(constants.mismatch, _ROUNDED)}
+    return bounds_of(constants, beta) | more
 
 
 def _bounds(system: System) -> Bounds | None:

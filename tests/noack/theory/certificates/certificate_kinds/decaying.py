@@ -78,8 +78,8 @@ def inputs_of_no_missing_event(system: System) -> Constants:
     true = ErrorInequalities._stages
 
     def wrong(*args: Any) -> Any:
-        found = true(*args)
-        return found and found._replace(inputs=np.broadcast_to(found.inputs[:1], found.inputs.shape))
+        stages = true(*args)
+        return stages and stages._replace(inputs=np.broadcast_to(stages.inputs[:1], stages.inputs.shape))
 
     with patch.object(ErrorInequalities, "_stages", wrong):
         return certify_loop(system)
@@ -115,8 +115,8 @@ class NoCurvature(ErrorGains):
 
     @property
     def outputs(self) -> dict[Output, np.ndarray]:  # type: ignore[override]
-        found = dict(super().outputs)
-        return found | {Output.GAIN_CURVATURE: 0 * found[Output.GAIN_CURVATURE]}
+        outputs = dict(super().outputs)
+        return outputs | {Output.GAIN_CURVATURE: 0 * outputs[Output.GAIN_CURVATURE]}
 
     def hold_remainder(self, hold_s: float) -> float:
         return 0.0
@@ -187,14 +187,14 @@ _CHANGED = 32
 """Number of its first updates whose outcomes are changed."""
 
 
-def bounds_of(found: Constants, beta: float) -> Bounds:
+def bounds_of(constants: Constants, beta: float) -> Bounds:
     """The constants that are compared, with the reciprocal of the inter-event time."""
     return {
-        "e_s": found.overshoot * beta,
-        "e_c": found.delta * beta,
-        "x": found.state,
-        "u − Kx": found.input_error,
-        "1/δ": 1 / (found.inter_event_s or 1e-300),
+        "e_s": constants.overshoot * beta,
+        "e_c": constants.delta * beta,
+        "x": constants.state,
+        "u − Kx": constants.input_error,
+        "1/δ": 1 / (constants.inter_event_s or 1e-300),
     }
 
 

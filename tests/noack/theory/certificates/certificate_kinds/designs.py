@@ -121,27 +121,27 @@ def _certify(case: Case, change: Callable[[Any], Any] = lambda design: design) -
     design = _designed(case.loop)
     if design is None:
         return None
-    case.found = change(design)
+    case.certified = change(design)
     if isinstance(design, EventDesign):
         return dict.fromkeys(("e_s", "e_c", "x", "1/δ"), 1.0)
     return {"growth": 1.0, "pattern": 1.0, "cost": 1 + 1e-6, "level": 1.0, "limit": 1 + 1e-6}
 
 
 def _simulate(case: Case, rng: Rng) -> Observed:
-    wanted, design = case.loop, case.found
+    wanted, design = case.loop, case.certified
     if isinstance(design, EventDesign):
         return _simulate_events(wanted.system, design, rng)
     worst, runs = dict.fromkeys(("growth", "pattern", "cost", "limit"), 0.0), 0
     worst["level"] = (design.given.level + 2) / (design.best.level + 2)
     if design.best != design.given:
         worst["limit"] = design.best.cost / design.search.cost_limit
-    for one in (design.given, design.best):
-        cost = design.maps(one, one.level).cost(design.search.plant.x0, *design.search.weights)
-        if cost != one.cost:  # both may be infinite
-            worst["cost"] = max(worst["cost"], cost / one.cost, one.cost / cost)
-        for level, stability in ((one.level, one.stability), (one.level + 1, one.beyond)):
+    for point in (design.given, design.best):
+        cost = design.maps(point, point.level).cost(design.search.plant.x0, *design.search.weights)
+        if cost != point.cost:  # both may be infinite
+            worst["cost"] = max(worst["cost"], cost / point.cost, point.cost / cost)
+        for level, stability in ((point.level, point.stability), (point.level + 1, point.beyond)):
             if stability is not None:
-                tried, shares = growth_shares(design.maps(one, level), stability, rng)
+                tried, shares = growth_shares(design.maps(point, level), stability, rng)
                 runs, worst = runs + tried, worst | {name: max(shares[name], worst[name]) for name in shares}
     return Observed(runs, worst)
 

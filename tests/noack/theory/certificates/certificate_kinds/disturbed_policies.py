@@ -137,8 +137,8 @@ _Loop = DisturbedPolicy | ObservedLoop
 
 def _bounds(change: Callable[[Any], _Loop], *names: str) -> Callable[[Case], Bounds | None]:
     def certified(case: Case) -> ScenarioCertificate | None:
-        found = change(case.loop).certificate()
-        return None if found.constants is None else found
+        certificate = change(case.loop).certificate()
+        return None if certificate.constants is None else certificate
 
     return shares_of(("e_s", "e_c", "x", *names), certified)
 
@@ -147,8 +147,8 @@ def _simulate(
     simulated: Callable[[Any, ScenarioCertificate, np.random.Generator], dict[str, float]],
 ) -> Callable[[Case, np.random.Generator], Observed]:
     def observed(case: Case, rng: np.random.Generator) -> Observed:
-        rounds = [simulated(case.loop, case.found, rng) for _ in range(_ROUNDS)]
-        return Observed(_ROUNDS * RUNS, {name: max(one[name] for one in rounds) for name in rounds[0]})
+        rounds = [simulated(case.loop, case.certified, rng) for _ in range(_ROUNDS)]
+        return Observed(_ROUNDS * RUNS, {name: max(shares[name] for shares in rounds) for name in rounds[0]})
 
     return observed
 

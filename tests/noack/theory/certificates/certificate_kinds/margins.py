@@ -107,13 +107,13 @@ def _used_forever(loop: LoopMaps) -> Stability:
 def _soon(loop: LoopMaps) -> Stability:
     shortest_ns, longest_ns = intervals_ns(loop.resolved)
     with patch.object(loss_margin, "intervals_ns", lambda resolved: (shortest_ns, shortest_ns)):
-        found = bounded(loop.resolved)
-    return found._replace(upper=found.upper ** (longest_ns / shortest_ns), pattern=())
+        stability = bounded(loop.resolved)
+    return stability._replace(upper=stability.upper ** (longest_ns / shortest_ns), pattern=())
 
 
 def _late_pattern(loop: LoopMaps) -> Stability:
-    found = bounded(loop.resolved)
-    return found._replace(pattern=found.pattern[1:] + found.pattern[:1])
+    stability = bounded(loop.resolved)
+    return stability._replace(pattern=stability.pattern[1:] + stability.pattern[:1])
 
 
 def _each_burst_alone(loop: LoopMaps) -> Stability:
@@ -127,11 +127,13 @@ def _each_burst_alone(loop: LoopMaps) -> Stability:
         return bounded(loop.resolved)
 
 
-def growth_shares(loop: LoopMaps, found: Stability, rng: np.random.Generator) -> Observed:
+def growth_shares(loop: LoopMaps, stability: Stability, rng: np.random.Generator) -> Observed:
     """Compare both bounds of the growth: with patterns, and with the own pattern of the lower one."""
     runs, growth = loop.worst_pattern(rng)
-    lower = found.lower / loop.growth_of(found.pattern, found.intervals_s) if found.pattern else 0.0
-    return Observed(runs, {"growth": growth / found.upper, "pattern": lower})
+    lower = 0.0
+    if stability.pattern:
+        lower = stability.lower / loop.growth_of(stability.pattern, stability.intervals_s)
+    return Observed(runs, {"growth": growth / stability.upper, "pattern": lower})
 
 
 def _bounds(certify: Callable[[LoopMaps], Stability]) -> Callable[[Case], Bounds | None]:
@@ -143,7 +145,7 @@ _ONE_SLOT = {"n": 2, "recovery": 0, "ticks": (12,)}
 
 MARGINS = Kind(
     "margin", drawn(random_loop, {}), _bounds(lambda loop: bounded(loop.resolved)),
-    lambda case, rng: growth_shares(case.loop, case.found, rng),
+    lambda case, rng: growth_shares(case.loop, case.certified, rng),
     {
         mistake: Broken(_bounds(certify), drawn(random_loop, where))
         for mistake, certify, where in (

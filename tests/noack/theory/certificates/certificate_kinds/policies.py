@@ -319,16 +319,16 @@ Conditions = NetworkConditions
 class NoShares(TriggerBounds):
     @property
     def comparison(self) -> ComparisonBound | None:  # type: ignore[override]
-        found = super().comparison
-        return None if found is None else found._replace(shares=(), has_root=False)
+        bound = super().comparison
+        return None if bound is None else bound._replace(shares=(), has_root=False)
 
 
 @dataclass(frozen=True)
 class NoCrossTerm(TriggerBounds):
     @property
     def comparison(self) -> ComparisonBound | None:  # type: ignore[override]
-        found = super().comparison
-        return None if found is None else found._replace(shares=found.shares[:1])
+        bound = super().comparison
+        return None if bound is None else bound._replace(shares=bound.shares[:1])
 
 
 @dataclass(frozen=True)
@@ -342,9 +342,9 @@ class NoTimeOfTheArea(TriggerBounds):
     """Takes the average of ‖e_s‖ for its value now."""
 
     def bound(self, conditions: Conditions, level: float, least_level: float | None) -> TriggerBound:
-        found = super().bound(conditions, level, least_level)
-        return found._replace(
-            window_s=0.0, further=tuple(one._replace(window_s=0.0) for one in found.further)
+        bound = super().bound(conditions, level, least_level)
+        return bound._replace(
+            window_s=0.0, further=tuple(further._replace(window_s=0.0) for further in bound.further)
         )
 
 
@@ -361,14 +361,14 @@ class AThirdOfTheTime(TriggerBounds):
     """Takes a third of the time up to the next event."""
 
     def bound(self, conditions: Conditions, level: float, least_level: float | None) -> TriggerBound:
-        found, h_s = super().bound(conditions, level, least_level), conditions.sampling_s
-        assert not all(one.is_tested for one in found.all_bounds)
+        whole, h_s = super().bound(conditions, level, least_level), conditions.sampling_s
+        assert not all(bound.is_tested for bound in whole.all_bounds)
 
-        def wrong(one: TriggerBound) -> TriggerBound:
-            third_s = (one.untested_s + h_s) / 3
-            return one if one.is_tested else one._replace(untested_s=third_s - h_s)
+        def wrong(bound: TriggerBound) -> TriggerBound:
+            third_s = (bound.untested_s + h_s) / 3
+            return bound if bound.is_tested else bound._replace(untested_s=third_s - h_s)
 
-        return wrong(found)._replace(further=tuple(map(wrong, found.further)))
+        return wrong(whole)._replace(further=tuple(map(wrong, whole.further)))
 
 
 def with_trigger(kind: type[TriggerBounds]) -> Callable[[Scenario, Conditions], Any]:
@@ -499,8 +499,8 @@ def _draw(kind: str, where: dict[str, Any], rng: np.random.Generator) -> Case:
 def _bounds(certify: _Certify) -> Callable[[Case], Bounds | None]:
     def certified(case: Case) -> ScenarioCertificate | None:
         resolved, _, system = case.loop
-        found = certify(resolved, conditions_of(system))
-        return None if found.constants is None else found
+        certificate = certify(resolved, conditions_of(system))
+        return None if certificate.constants is None else certificate
 
     return shares_of(("e_s", "e_c", "x", "1/δ"), certified)
 
@@ -513,7 +513,7 @@ def _simulate(case: Case, rng: np.random.Generator) -> Observed:
         return simulate(system, outcomes, delays, rule=rule)
 
     def worst(system: System, trace: Trace) -> dict[str, float]:
-        return policy_shares(trace, case.found, system)
+        return policy_shares(trace, case.certified, system)
 
     return search(drawn, rng, run, worst)
 

@@ -56,12 +56,12 @@ def certify(loop: RandomLoop, *, share: float = 1.0, **changes: float) -> Bounds
     gains, conditions = gains_of(system), conditions_of(system)._replace(**changes)
     network = conditions, system.beta, share * loop.probability
     try:
-        found = mean_squares(gains.error, gains, *network, refined=True)
+        bounds = mean_squares(gains.error, gains, *network, refined=True)
     except (NoCertificateError, NotDecayingError):
         return None
     return {
-        "e_s": found.sensor_error, "e_c": found.controller_error, "x": found.state,
-        "u − Kx": found.input_error,
+        "e_s": bounds.sensor_error, "e_c": bounds.controller_error, "x": bounds.state,
+        "u − Kx": bounds.input_error,
     }  # fmt: skip
 
 
@@ -124,17 +124,19 @@ def _draw_continuous(rng: np.random.Generator, **fixed: Any) -> RandomLoop:
 def _certify_runs(loop: RandomLoop, *, share: float = 1.0) -> Bounds | None:
     """The bounds, or those of a broken copy with fewer losses."""
     system = loop.system
-    one, p = np.ones(1), np.array([share * loop.probability])
-    losses = LossProcess(one, one[:, None], p, first_delivered=False)
+    unit, p = np.ones(1), np.array([share * loop.probability])
+    losses = LossProcess(unit, unit[:, None], p, first_delivered=False)
     bursts: list[BurstCertificate] = []
     try:
         for most in range(loop.most_lost + 1):
-            found = certify_loop(system, NetworkConditions(most))
-            events = int(STEPS * system.step_s / (found.inter_event_s or np.inf)) + 1
+            constants = certify_loop(system, NetworkConditions(most))
+            events = int(STEPS * system.step_s / (constants.inter_event_s or np.inf)) + 1
             probability = losses.keeps(LossGuarantee((LongestBurst(most),)), events)
-            e_c = found.delta * system.beta
+            e_c = constants.delta * system.beta
             bursts.append(
-                BurstCertificate(most, probability, events, found.delta, system.alpha, e_c, found.state)
+                BurstCertificate(
+                    most, probability, events, constants.delta, system.alpha, e_c, constants.state
+                )
             )
         at_events = [
             moment_at_events(gains_of(system).error, losses, 0.0, order) * system.beta for order in _MEANS

@@ -124,15 +124,15 @@ def _steep_loop(rng: np.random.Generator) -> RegionLoop:
 
 def _certified(case: Case) -> ScenarioCertificate | None:
     loop: RegionLoop = case.loop
-    found = attacked_regions.certificate_of(loop.resolved, loop.case.semi_axes)
-    return None if found.constants is None else found
+    certificate = attacked_regions.certificate_of(loop.resolved, loop.case.semi_axes)
+    return None if certificate.constants is None else certificate
 
 
 def _simulate(case: Case, rng: np.random.Generator) -> Observed:
-    (resolved, plant), region = case.loop, case.found.region
+    (resolved, plant), region = case.loop, case.certified.region
     seed = int(rng.integers(2**32))
     with np.errstate(all="ignore"):  # those of a broken copy diverge
-        shares = attacked(resolved, plant, case.found, runs=_RUNS, steps=_STEPS, seed=seed)
+        shares = attacked(resolved, plant, case.certified, runs=_RUNS, steps=_STEPS, seed=seed)
         box = Inclusion(*(np.array(matrix) for matrix in region[2:]))
         used = inclusion_share(box, plant.field, np.array(region.x + region.u), _POINTS)
     return Observed(_RUNS, shares | {"inclusion": used})

@@ -63,10 +63,10 @@ class KnownStateLoop:
         if not isinstance(self.loop, DisturbedLoop):
             part = KnownStatePart(gains_of(system), certify_loop(system), system.beta)
             return KnownStateBounds((part,), delay_s, np.zeros((len(system.A), 0)))
-        found = self.loop.certify()
+        parts = self.loop.certify()
         parts = (
-            KnownStatePart(gains_of(system), found.first, system.beta),
-            KnownStatePart(self.loop.pushed(), found.rest, 1.0),
+            KnownStatePart(gains_of(system), parts.first, system.beta),
+            KnownStatePart(self.loop.pushed(), parts.rest, 1.0),
         )
         return KnownStateBounds(parts, delay_s, self.loop.columns)
 
@@ -135,7 +135,7 @@ class Case:
     """A loop, and what was certified of it last."""
 
     loop: Any
-    found: Any = None
+    certified: Any = None
 
 
 def drawn(draw: Callable[..., Any], where: dict[str, Any]) -> Callable[..., Case]:
@@ -149,17 +149,17 @@ def shares_of(names: Iterable[str], certify: Callable[[Case], Any]) -> Callable[
 
     def bounds(case: Case) -> Bounds | None:
         try:
-            case.found = certify(case)
+            case.certified = certify(case)
         except (NoCertificateError, NotDecayingError):
             return None
-        return None if case.found is None else dict.fromkeys(names, 1.0)
+        return None if case.certified is None else dict.fromkeys(names, 1.0)
 
     return bounds
 
 
 def _simulate_disturbed(case: Case, rng: np.random.Generator) -> Observed:
-    found: Sum = case.found
-    return Observed(RUNS, found.shares(simulate_disturbed(case.loop, rng)))
+    parts: Sum = case.certified
+    return Observed(RUNS, parts.shares(simulate_disturbed(case.loop, rng)))
 
 
 def _disturbed_bounds(
@@ -183,14 +183,14 @@ DISTURBED = Kind(
 
 def _observed_bounds(change: Callable[[ObservedLoop], ObservedLoop]) -> Callable[..., Any]:
     def certified(case: Case) -> ScenarioCertificate | None:
-        found = change(case.loop).certificate()
-        return None if found.constants is None else found
+        certificate = change(case.loop).certificate()
+        return None if certificate.constants is None else certificate
 
     return shares_of(("e_s", "e_c", "x", "x̂ − x", "δ"), certified)
 
 
 def _simulate_observed(case: Case, rng: np.random.Generator) -> Observed:
-    return Observed(RUNS, worst_shares(case.loop, case.found, rng))
+    return Observed(RUNS, worst_shares(case.loop, case.certified, rng))
 
 
 def _luenberger(change: Callable[[ObservedLoop], ObservedLoop], **where: Any) -> Broken:
@@ -216,10 +216,10 @@ OBSERVED = Kind(
 
 
 def _simulate_known_state(case: Case, rng: np.random.Generator) -> Observed:
-    loop, found = case.loop, case.found
+    loop, certificate = case.loop, case.certified
     if isinstance(loop.loop, DisturbedLoop):
-        return Observed(RUNS, loop.shares(simulate_disturbed(loop.loop, rng), found))
-    return search(loop.loop, rng, simulate, lambda _, trace: loop.shares(trace, found))
+        return Observed(RUNS, loop.shares(simulate_disturbed(loop.loop, rng), certificate))
+    return search(loop.loop, rng, simulate, lambda _, trace: loop.shares(trace, certificate))
 
 
 def _known_state_bounds(change: Change) -> Callable[[Case], Bounds | None]:

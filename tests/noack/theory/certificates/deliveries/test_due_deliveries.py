@@ -32,13 +32,13 @@ def state_after(r_s: np.ndarray) -> np.ndarray:
 
 def test_the_bounds_of_a_scalar_loop_are_its_largest_values() -> None:
     """It decays from event to event, so they are those of the first gap."""
-    found = scalar_loop(0.0).constants(1.0)
+    constants = scalar_loop(0.0).constants(1.0)
     r_s = np.linspace(0.0, STEP_S, 2001)
     grown, state = np.exp(ALPHA * r_s), state_after(r_s)
     for bound, values in (
-        (found.state, grown * state),
-        (found.input_error, k * grown * (1 - state)),
-        (found.mismatch, (a + b * k) * grown * state),
+        (constants.state, grown * state),
+        (constants.input_error, k * grown * (1 - state)),
+        (constants.mismatch, (a + b * k) * grown * state),
     ):
         largest = X0 * float(np.abs(values).max())
         assert largest <= bound <= 1.002 * largest
