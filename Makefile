@@ -48,7 +48,7 @@ demo-zoh: setup ## The same with a zero-order hold instead of a model
 run: setup ## Run SCENARIO live
 	@$(BIN)/noack run "$(SCENARIO)" $(FLAGS)
 
-simulate: setup ## Run SCENARIO in virtual time (takes about a second)
+simulate: setup ## Run SCENARIO in virtual time (some seconds)
 	@$(BIN)/noack simulate "$(SCENARIO)" $(ARGS)
 
 view: setup ## Show the last run in the rerun viewer

@@ -193,7 +193,7 @@ _TOUR = (
     ("noack doctor", "check this machine"),
     ("noack run lane_following", "run the paper's example live"),
     ("noack view", "view the last run"),
-    ("noack simulate lane_following", "run it in virtual time, in a second"),
+    ("noack simulate lane_following", "run it in virtual time, in some seconds"),
     ("noack certify lane_following", "compute guaranteed bounds"),
     ("noack fidelity", "compare the last run with the ideal loop"),
     ("noack compare A B", "compare two or more runs"),

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from cosim.analysis.claims.observed_conditions import BEYOND_CERTIFICATE, CAUSES, SCHEDULE
+from cosim.analysis.claims.observed_conditions import BEYOND_CERTIFICATE, CAUSES, SCHEDULE, worst_time
 from cosim.analysis.summary.summary_model import Claim, ExitPart, FidelityPart, LoopSummary, RunSummary
 from cosim.output.run_tables import changes_in, downtime_text, shares_network, state_norm
 from noack.core.errors import ExitStatus
@@ -20,8 +20,6 @@ _NAMED = 3
 """Largest number of claims of a verdict that are named."""
 _SETTLED = 0.1
 """A loop is stable if ‖x‖ falls to this share of its largest value."""
-_ROSE = 1.001
-"""The verdict mentions that ‖x‖ has exceeded this multiple of its first value."""
 _MOST_VIOLATIONS = 5
 _MOST_GROWTH, _MOST_LATE = 10.0, 0.01
 
@@ -90,10 +88,13 @@ def state_text(
     word = state_of(largest, final, diverged_at_s)
     if largest is None or final is None or diverged_at_s is not None:
         return word
-    if word == "stable" and first is not None and largest > _ROSE * first:
-        return f"{word}, {norm} rose from {first:.3g} to {largest:.3g}, then fell to {final:.3g}"
+    if largest == 0:
+        return f"{word}, {norm} stayed at 0"
     if word == "stable":
-        return f"{word}, {norm} fell from {largest:.3g} to {final:.3g}"
+        start, top = f"{first or 0.0:.3g}", f"{largest:.3g}"
+        if first is not None and largest > first and top != start:
+            return f"{word}, {norm} rose from {start} to {top}, then fell to {final:.3g}"
+        return f"{word}, {norm} fell from {top} to {final:.3g}"
     return f"{word}, {norm} was at most {largest:.3g}, at the end {final:.3g}"
 
 
@@ -147,7 +148,7 @@ def guarantee_of(loop: LoopSummary) -> GuaranteeVerdict:
     void = [claim for claim in loop.claims if claim.verdict == "void"]
     late, covered = _lateness(loop), ""
     if late and _covers_lateness(loop):
-        covered = f"certificate recomputed for the lateness of this run: {late[0]}"
+        covered = f"certificate recomputed for the lateness of this run: {'; '.join(dict.fromkeys(late))}"
     if not void:
         return GuaranteeVerdict(GOOD, 0.0, covered)
     # Each part of the run between changes of settings needs a certificate that held.
@@ -235,8 +236,9 @@ def remarks(summary: RunSummary) -> Iterator[Remark]:
     ]
     for violation in violations[:_MOST_VIOLATIONS]:
         where = f"t = {violation.t_s:.3f} s (reported by {violation.process})"
+        what = violation.what + worst_time(violation.t_s, violation.worst_at_s)
         severe = violation.cause not in CAUSES  # the guarantee, or a change
-        yield Remark(f"assumption violated at {where}: {violation.what}", severe=severe)
+        yield Remark(f"assumption violated at {where}: {what}", severe=severe)
     if (more := len(violations) - _MOST_VIOLATIONS) > 0:
         plural = "s" * (more > 1)
         yield Remark(f"{more} more violation{plural} of an assumption", severe=True)
@@ -289,7 +291,8 @@ def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
             "noack margin, whether a time-triggered loop is proven stable"
         )
     unchecked = any(claim.verdict == "void" and _is_late(loop, claim) for claim in loop.claims)
-    if unchecked and not loop.missing_samples and summary.kind == "live" and not loop.restarts:
+    ended_well = summary.exit.status != ExitStatus.FAILED and not loop.missing_samples
+    if unchecked and ended_well and summary.kind == "live" and not loop.restarts:
         culprit = "A host or the network between hosts" if _has_clocks(loop) else "This machine"
         yield (
             f"{culprit} was later than any certificate of this loop allows, so some claims were not "

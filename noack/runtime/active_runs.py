@@ -70,7 +70,8 @@ def find_run(session: str | None = None, run_dir: Path | None = None) -> OpenRun
     if len(fitting) == 1:
         return fitting[0]
     if not runs:
-        raise CallerError("no run is active; start one, e.g. `noack demo`")
+        ended = "" if run_dir is None else f"the run {run_dir} is not active, and "
+        raise CallerError(f"{ended}no run is active; start one, e.g. `noack demo`")
     active = "active: " + ", ".join(run.run_dir for run in fitting or runs)
     if fitting:
         raise CallerError(f"several runs are {active}; choose one by --run DIRECTORY")

@@ -319,7 +319,8 @@ class RunClaims:
             if not isinstance(part, Claim):
                 from_s = part.part.from_s
                 violations += [
-                    violation._replace(t_s=violation.t_s + from_s) for violation in part.violations()
+                    violation._replace(t_s=violation.t_s + from_s, worst_at_s=violation.worst_at_s + from_s)
+                    for violation in part.violations()
                 ]
         return sorted(violations, key=lambda violation: violation.t_s)
 
@@ -379,7 +380,13 @@ def list_violations(
     """
     known = {violation.cause for violation in reported}
     return [*reported] + [
-        ViolationPart(t_s=violation.t_s, process="recorder", cause=violation.cause, what=violation.text)
+        ViolationPart(
+            t_s=violation.t_s,
+            process="recorder",
+            cause=violation.cause,
+            what=violation.text,
+            worst_at_s=violation.worst_at_s,
+        )
         for violation in observed
         if violation.cause not in known
     ]

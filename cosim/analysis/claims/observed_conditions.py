@@ -68,6 +68,17 @@ _NO_INPUT = "the plant applied no input at all, the first within {1:.4g} s requi
 """In place of a time until the first input, which is the only condition without an upper limit."""
 
 
+class Excess(NamedTuple):
+    """How far a series exceeded a limit."""
+
+    first_s: float
+    """The first time above it."""
+    worst: float
+    """The largest value."""
+    worst_at_s: float
+    """The time of the largest value."""
+
+
 class SampledSeries(NamedTuple):
     """A condition's value over time: k values, each determined at its time."""
 
@@ -78,12 +89,13 @@ class SampledSeries(NamedTuple):
         """The largest value; None if there is none."""
         return float(self.value.max()) if len(self.value) else None
 
-    def excess(self, limit: float) -> tuple[float, float] | None:
-        """Return the first time above a limit, and the largest value; None if it is kept."""
+    def excess(self, limit: float) -> Excess | None:
+        """Return how far the values exceed a limit; None if they keep it."""
         beyond = np.flatnonzero(self.value > limit + _TOLERANCE_S)
         if not len(beyond):
             return None
-        return float(self.t_s[beyond[0]]), float(self.value.max())
+        largest = int(self.value.argmax())
+        return Excess(float(self.t_s[beyond[0]]), float(self.value[largest]), float(self.t_s[largest]))
 
     def before(self, t_s: float) -> "SampledSeries":
         """Return the values before a time."""
@@ -146,7 +158,15 @@ class AssumptionViolation(NamedTuple):
     """One of ``CAUSES``, or the name of a rule of the guarantee."""
     worst: float
     text: str
-    """In words."""
+    """The largest excess, in words."""
+    worst_at_s: float
+    """The time of the largest excess."""
+
+
+def worst_time(t_s: float, worst_at_s: float | None) -> str:
+    """Return how long after a violation its largest excess was, in words; empty if it was the first."""
+    later_s = 0.0 if worst_at_s is None else worst_at_s - t_s
+    return f" (worst {later_s:.3f} s later)" if later_s > 0 else ""
 
 
 class ObservedConditions(NamedTuple):
@@ -195,9 +215,10 @@ class ObservedConditions(NamedTuple):
             state = states.get(rule.name, rule.start)
             values, states[rule.name] = self.losses.values(rule, conditions.delay_s, state)
             if (excess := values.excess(rule.limit)) is not None:
-                first_s, worst = excess
-                text = rule.violation(worst)
-                violations.append(AssumptionViolation(first_s, rule.name, worst, text))
+                text = rule.violation(excess.worst)
+                violations.append(
+                    AssumptionViolation(excess.first_s, rule.name, excess.worst, text, excess.worst_at_s)
+                )
         start = SampledSeries(np.zeros(1), np.array([self.start_s]))
         every: dict[str, tuple[SampledSeries, float]] = {
             "sampling": (self.sampling, conditions.sampling_s),
@@ -215,9 +236,11 @@ class ObservedConditions(NamedTuple):
             if causes is not None and cause not in causes:
                 continue
             if (excess := series.excess(limit)) is not None:
-                first_s, worst = excess
-                text = (_NO_INPUT if worst == np.inf else CAUSES[cause]).format(worst, limit)
-                violations.append(AssumptionViolation(first_s, cause, worst, text))
+                message = _NO_INPUT if excess.worst == np.inf else CAUSES[cause]
+                text = message.format(excess.worst, limit)
+                violations.append(
+                    AssumptionViolation(excess.first_s, cause, excess.worst, text, excess.worst_at_s)
+                )
         return violations
 
     def first_violation(

@@ -48,12 +48,15 @@ class AssumptionPart(SummaryPart):
 
 
 class ViolationPart(SummaryPart):
-    """An assumption that the run violated."""
+    """An assumption that the run violated, first at ``t_s``."""
 
     t_s: float
     process: Text
     cause: Text
     what: str
+    """The largest excess."""
+    worst_at_s: float | None = None
+    """Its time; None if a process reported the violation when it occurred."""
 
 
 class Quantiles(SummaryPart):

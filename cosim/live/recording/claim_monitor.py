@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cosim.analysis.claims.condition_reader import READ, AssumptionMonitor
-from cosim.analysis.claims.observed_conditions import SCHEDULE, AssumptionViolation
+from cosim.analysis.claims.observed_conditions import SCHEDULE, AssumptionViolation, worst_time
 from cosim.record.divergence import GrowthMonitor
 from cosim.record.record_source import rows_by_loop
 from cosim.record.run_record import Rows
@@ -87,7 +87,7 @@ class ClaimMonitor:
             self._waiting.setdefault(table, []).append(rows)
 
     def advance(self) -> list[Finding]:
-        """Return what was found since the last call."""
+        """Return what was found since the last call, in the order of time."""
         if self.stopped is None:
             began_s, first = time.thread_time(), True
             if not self._due:
@@ -115,7 +115,8 @@ class ClaimMonitor:
 
     def _check(self, loop: int, check: Callable[[AssumptionMonitor], Sequence[AssumptionViolation]]) -> None:
         for violation in check(self._monitors[loop]):
-            t_ns, text = round(violation.t_s * NS_PER_S), violation.text
+            t_ns = round(violation.t_s * NS_PER_S)
+            text = violation.text + worst_time(violation.t_s, violation.worst_at_s)
             if violation.cause in SCHEDULE:
                 limit = self._limit(loop, violation.cause)
                 self._add(loop, t_ns, "late", "later than allowed", f"{text}{limit}")
@@ -137,7 +138,9 @@ class ClaimMonitor:
             return ""
         finally:
             self._limits_s += time.thread_time() - began_s
-        return f"; there are certificates for up to {limit_s:.4g} s" if limit_s else ""
+        if not limit_s:
+            return ""
+        return f"; there are certificates for up to {limit_s:.4g} s, if nothing else is later than allowed"
 
     def _add(self, loop: int, t_ns: int, level: str, event: str, why: str) -> None:
         own = f"{event} from {t_ns / NS_PER_S:.3f} s on: {why}"
@@ -151,4 +154,4 @@ class ClaimMonitor:
 
     def _take_findings(self) -> list[Finding]:
         findings, self._found = self._found, []
-        return findings
+        return sorted(findings, key=lambda finding: finding.notice.t_ns)

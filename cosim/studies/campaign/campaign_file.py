@@ -305,6 +305,10 @@ class CampaignClaim(ScenarioSection):
         return self
 
 
+_CHUNK, _SAMPLED_CHUNK = 2000, 20
+"""Draws per file: each file takes some seconds."""
+
+
 class Campaign(ScenarioSection):
     """Many runs over a grid of settings."""
 
@@ -325,8 +329,11 @@ class Campaign(ScenarioSection):
     """Runs at each grid point, with different plants from the box, initial states and losses."""
     seed: Seed = 0
     """Seed of the draws. Draw i has the same plant, x(0) and losses at every grid point."""
-    chunk: Annotated[int, Field(ge=1, le=1_000_000)] = 2000
-    """Draws per file of the results. A worker computes one file at a time."""
+    chunk: Annotated[int, Field(ge=1, le=1_000_000)] = Field(
+        default_factory=lambda values: _SAMPLED_CHUNK if values.get("time") == "sampled" else _CHUNK
+    )
+    """Draws per file of the results; by default 2000, or 20 with sampled time. A worker computes one
+    file at a time."""
     axes: Annotated[tuple[CampaignAxis, ...], Field(min_length=1)]
     """The axes; the grid has all combinations of their values."""
     metrics: Metrics = Metrics()

@@ -251,8 +251,9 @@ def test_a_violation_is_reported_once_and_recorded(outage: RunRecord, late: Run)
     for until_ns in range(100_000_000, 1_200_000_000, 100_000_000):
         late.send_until(outage, until_ns)
         late.recorder.show()
-    cause = "an input was 0.101 s old, 0.007 s allowed"
-    line = f"later than allowed from 0.506 s on: {cause}; there are certificates for up to 0.06441 s"
+    cause = "an input was 0.101 s old, 0.007 s allowed (worst 0.092 s later)"
+    limit = "there are certificates for up to 0.06441 s, if nothing else is later than allowed"
+    line = f"later than allowed from 0.506 s on: {cause}; {limit}"
     assert late.warnings == [[]] * 5 + [[line]] * 6
     notices = late.finished().notices
     assert notices == [{"t_ns": 506_000_000, "level": "late", "text": line, "process": "recorder"}]
@@ -276,6 +277,7 @@ def test_the_summary_lists_every_violated_assumption(outage: RunRecord) -> None:
     (violation,) = list_violations(reported, RunClaims(outage).violations())
     assert (violation.cause, violation.t_s, violation.process) == ("hold", pytest.approx(0.506), "recorder")
     assert violation.what == "an input was 0.203 s old, 0.007 s allowed"
+    assert violation.worst_at_s == pytest.approx(0.7)
 
 
 def test_missing_rows_are_reported_as_an_unknown_result(outage: RunRecord, late: Run) -> None:
