@@ -225,7 +225,7 @@ class Relay:
     def _report_flows(self, direction: int) -> Sequence[FlowReport]:
         clients, flows = self._memory.clients, self._directions[direction].flows
         rows = self._clients.rows_of(direction // 2)
-        packets = flows["packets"][clients["place"][rows]]
+        packets = flows["packets"][clients["flow_row"][rows]]
         busiest = rows[np.argsort(-packets, kind="stable")[:_REPORTED_FLOWS]].tolist()
         return [
             FlowReport(
@@ -234,7 +234,7 @@ class Relay:
                 int(flow["packets"]),
                 int(flow["longest_loss_burst"]),
             )
-            for row, flow in zip(busiest, flows[clients["place"][busiest]], strict=True)
+            for row, flow in zip(busiest, flows[clients["flow_row"][busiest]], strict=True)
         ]
 
     def _listen(self, number: int) -> None:
