@@ -36,9 +36,11 @@ class ClientTable:
         self._memory = memory
         self._free_rows = list(reversed(range(len(memory.clients))))
         self._free_flow_rows: list[list[int]] = [[] for _ in links]
-        self._flow_rows = [0] * len(links)
+        self._used_flow_rows = [0] * len(links)
         self.ever = [0] * len(links)
+        """(links,) Clients so far."""
         self.present = [0] * len(links)
+        """(links,) Clients that are in the table."""
         self._paths: dict[int, Endpoint] = {}
         self._drops: dict[int, int] = {}
         self.drops = [0] * len(links)
@@ -49,11 +51,12 @@ class ClientTable:
 
     def add(self, link: int, name: bytes) -> None:
         """Add a client by its packed name; if that is impossible, refuse clients until one leaves."""
-        present, path, error = self.present[link], None, 0
+        present = self.present[link]
         if present >= self._links[link].spec.most_clients:
             self._warnings[link].report_full()
             self._set_full(link, True)
             return
+        path, error = None, 0
         if self._links[link].has_paths:
             path, error = return_path(self._links[link].server)
             if error in (errno.EMFILE, errno.ENFILE):
@@ -133,8 +136,8 @@ class ClientTable:
         if self._free_flow_rows[link]:
             flow_row = self._free_flow_rows[link].pop()
         else:
-            flow_row = self._flow_rows[link]
-            self._flow_rows[link] += 1
+            flow_row = self._used_flow_rows[link]
+            self._used_flow_rows[link] += 1
         number = self.ever[link]
         self.ever[link] += 1
         self.present[link] += 1
