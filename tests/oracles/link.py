@@ -1,7 +1,9 @@
 """The network of a run in plain Python: datagrams in, surviving datagrams out, maybe later.
 
-The core decides for each packet (native/link.c). What follows from the decisions is stated here
-once more, for native/channel.c: rows, copies, flipped bits, and the order of departures.
+The core decides for each packet (native/link.c): this is no independent statement of the decisions.
+:mod:`tests.oracles.loss_decisions` has one of losses, :mod:`tests.oracles.loss_language` one of the
+guarantee. Independent of native/channel.c is here what follows from the decisions: rows, copies,
+flipped bits, the queue of a rate that chooses, and the order of departures.
 """
 
 import heapq
