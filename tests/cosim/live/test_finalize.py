@@ -287,7 +287,7 @@ def test_the_end_does_not_wait_for_a_preparation_that_gets_no_time(
 
     def endless(helpers: FinalizeHelpers, *_: object) -> None:
         if part == "_write_early":
-            helpers._ended, helpers._writer = many_loops / "none" / "ended", current_thread()
+            helpers._end_file, helpers._writer = many_loops / "none" / "ended", current_thread()
         waiting = helpers.submit(time.sleep, 1e6)
         begun.set()
         waiting.result()
