@@ -70,7 +70,7 @@ class _Page:
         self._controls: Controls | None = None
         self._form = form_of(draft)
         self._moved = _MovedSlider("", "")
-        self._last = _Change("", 0.0)
+        self._last = _LastChange("", 0.0)
         self._unsettled = {""}
         """Keys that have changed since the settings rested."""
         self._client.on_disconnect(self._session.end)  # a page that connects again is a new one
@@ -317,7 +317,7 @@ class _Page:
     def _apply(self, change: Callable[[Draft], Draft], key: str) -> Awaitable[None]:
         """Apply a change at once, before the next event is handled; return what follows."""
         now_s = asyncio.get_running_loop().time()
-        last, self._last = self._last, _Change(key, now_s)
+        last, self._last = self._last, _LastChange(key, now_s)
         try:
             draft = change(self._session.draft)
         except NoackError as error:
@@ -371,8 +371,8 @@ class _MovedSlider(NamedTuple):
     text: str
 
 
-class _Change(NamedTuple):
-    """A change of a key at a time of the event loop."""
+class _LastChange(NamedTuple):
+    """The last change of a key, and its time in the event loop."""
 
     key: str
     at_s: float

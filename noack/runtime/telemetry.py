@@ -93,7 +93,7 @@ class ReceivedRows:
         return [(low, min(high, total)) for low, high in gaps if low < min(high, total)]
 
 
-class _Batch(NamedTuple):
+class _RowBatch(NamedTuple):
     table: str
     first: int
     """Number of the first row."""
@@ -126,9 +126,9 @@ class TelemetryBuffer:
         self._published = dict.fromkeys([*tables, NOTICES], 0)
         of_loops = [table for table, dtype in tables.items() if LOOP in (dtype.names or ())]
         self._by_loop = {table: np.zeros(0, np.int64) for table in of_loops}
-        self._kept: deque[_Batch] = deque()
+        self._kept: deque[_RowBatch] = deque()
         """The batches that are not known to be on disk, the oldest first."""
-        self._to_resend: deque[_Batch] = deque()
+        self._to_resend: deque[_RowBatch] = deque()
         self._old = 0
         """Number of those that were kept at the last confirmation, too."""
         self._kept_bytes = 0
@@ -206,7 +206,7 @@ class TelemetryBuffer:
         self._send(table, len(rows), rows.tobytes())
 
     def _send(self, table: str, rows: int, payload: bytes) -> None:
-        batch = _Batch(table, self._published[table], rows, payload)
+        batch = _RowBatch(table, self._published[table], rows, payload)
         self._published[table] += rows
         self._kept.append(batch)
         self._kept_bytes += len(payload)
@@ -224,7 +224,7 @@ class TelemetryBuffer:
 
     def _forget(self, rows: Mapping[str, Ranges]) -> None:
         """Drop batches that are on disk; plan to send older ones again that are not."""
-        remaining: deque[_Batch] = deque()
+        remaining: deque[_RowBatch] = deque()
         old = 0
         for i, batch in enumerate(self._kept):
             if not contain(rows.get(batch.table, ()), batch.first, batch.first + batch.rows):
@@ -235,7 +235,7 @@ class TelemetryBuffer:
         self._kept, self._old = remaining, len(remaining)
         self._kept_bytes = sum(len(batch.payload) for batch in remaining)
 
-    def _header(self, batch: _Batch) -> bytes:
+    def _header(self, batch: _RowBatch) -> bytes:
         header = {"first": batch.first, "rows": batch.rows, "generation": self._generation}
         return json.dumps(header).encode()
 
