@@ -160,7 +160,7 @@ def _open_to_others(
 
 @contextlib.contextmanager
 def _no_directory_if_refused(run_dir: Path) -> Iterator[None]:
-    """Remove the run directory if an error says that the run cannot be joined as was asked for."""
+    """Remove the run directory if an error says that the run cannot be joined in the requested way."""
     try:
         yield
     except NoackError:

@@ -129,7 +129,7 @@ class ProgressReport(RunProgress):
     model_config = ConfigDict(frozen=False)
 
     def add_warning(self, text: str) -> None:
-        """Add a line, e.g. about void claims; of many, the last says where the others are."""
+        """Add a line, e.g. about void claims; of many, the last names the place of the others."""
         if len(self.warnings) < _MOST_LINES:
             self.warnings.append(text)
         elif len(self.warnings) == _MOST_LINES:
