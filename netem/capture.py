@@ -47,15 +47,21 @@ _NAME, _DESCRIPTION, _RESOLUTION = 2, 3, 9
 _START, _END, _RECEIVED, _DROPPED = 2, 3, 4, 5
 
 
+class Interface(NamedTuple):
+    """A side of a link."""
+
+    name: str
+    description: str
+
+
 class PcapngSection:
     """The blocks of one capture file, in file order: header, packets, ..., statistics.
 
     Args:
-        interfaces: name and description of each side of each link; the ``interface`` of an event
-            is an index into them.
+        interfaces: each side of each link; the ``interface`` of an event is an index into them.
     """
 
-    def __init__(self, interfaces: Sequence[tuple[str, str]]) -> None:
+    def __init__(self, interfaces: Sequence[Interface]) -> None:
         self._interfaces = tuple(interfaces)
         self._missing = np.zeros(len(interfaces), np.int64)
         self._all_missing = np.zeros(len(interfaces), np.int64)
@@ -181,7 +187,7 @@ class CaptureWriter:
         """Why the capture ended early, in one line; None if it did not."""
         self._section = PcapngSection(
             [
-                (f"{spec.name} {side}", address_text(address))
+                Interface(f"{spec.name} {side}", address_text(address))
                 for spec in specs
                 for side, address in (("client", spec.listen), ("server", spec.to))
             ]

@@ -7,6 +7,7 @@ are several of a kind. Hence adding a delay does not change which packets are lo
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import accumulate, chain
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -148,53 +149,40 @@ class LinkState:
 
     def _new_link(self, settings: LinkSettings, rows: int, *, tracks: bool) -> CData:
         """Return a new ``noack_link`` of these settings, which shares the array of flows."""
-        # The stages, and the tables of numbers to which they refer.
         settings = with_target_loss(settings)
         tables = StageTables(
             scored=any(getattr(impairment, "loss_correlation", 0) != 0 for impairment in settings.impairments)
         )
         keyed = list(_stages(settings, tables, self._seed, self._name))
-        stages, places = ffi.new("noack_stage[]", max(len(keyed), 1)), 0
-        for row, (stage, key, _) in zip(stages, keyed, strict=False):
-            _write_stage(row, stage, key, places)
-            places += stage.queue_places
-        # The link, with its guarantee.
-        rule_fields, windows = _rule_fields(settings)
+        stage_array, stages = _stage_array(keyed), [stage for stage, *_ in keyed]
+        limits, windows = _loss_limits(settings)
+        tracks = tracks or any(impairment.delays for impairment in settings.impairments)
+        mansd = limits["mansd"]
         link = ffi.new(
             "noack_link *",
             {
-                "stages": stages,
+                "stages": stage_array,
                 "stage_count": len(keyed),
                 "recorded_flows": len(self._decisions_begin) - 1,
                 "limit": settings.limit,
-                "tracks": tracks or any(impairment.delays for impairment in settings.impairments),
+                "tracks": tracks,
+                "scheduler": next((index for index, stage in enumerate(stages) if stage.schedules), -1),
                 "rows": rows,
-                "departure_places": places,
-                "scheduler": next((index for index, (stage, *_) in enumerate(keyed) if stage.schedules), -1),
-                **rule_fields,
+                "recent_width": 1 << mansd.bit_length() if tracks and mansd >= 0 else 1,
+                "departure_places": sum(stage.queue_places for stage in stages),
+                **limits,
             },
         )
-        link.recent_width = 1 << link.mansd.bit_length() if link.tracks and link.mansd >= 0 else 1
-        # Its arrays: those that are read only, and its memory.
-        tables_of = {
+        read_only = {
             "integers": np.array(tables.integers, np.int64),
             "reals": np.array(tables.reals, np.float64),
             "windows": np.array(windows, dtype_of("noack_window")),
             "decisions": self._decisions,
         }
-        for name, array in tables_of.items():
+        for name, array in read_only.items():
             setattr(link, f"{name.removesuffix('s')}_count", len(array))
-        self._memory = {
-            **tables_of,
-            "decisions_begin": self._decisions_begin,
-            "memory": np.zeros((rows, len(keyed)), dtype_of("noack_stage_memory")),
-            "recent_ns": np.full((rows, link.recent_width), core.NOACK_NEVER_NS, np.int64),
-            "losses": np.zeros((rows, link.loss_width), np.int64),
-            "queues": np.zeros(len(keyed), dtype_of("noack_queue")),
-            "departures_ns": np.zeros(places, np.int64),
-            "flows": self.flows,
-        }
-        self._stages = stages
+        read_only["decisions_begin"] = self._decisions_begin
+        self._stages, self._memory = stage_array, read_only | _link_memory(link) | {"flows": self.flows}
         self._point(link)
         _require(core.noack_link_check(link))
         return link
@@ -215,13 +203,33 @@ class LinkState:
         self._point(self.core)
 
 
+class _KeyedStage(NamedTuple):
+    """A stage with the key and the name of its random stream."""
+
+    stage: Stage
+    key: tuple[int, int]
+    stream: tuple[str, ...]
+
+
 def stream_names(settings: LinkSettings, *name: str) -> list[tuple[str, ...]]:
     """Return the names of the random streams of a link's stages, in their order."""
-    return [stream for *_, stream in _stages(settings, StageTables(), 0, name)]
+    return [keyed.stream for keyed in _stages(settings, StageTables(), 0, name)]
 
 
-def _rule_fields(settings: LinkSettings) -> tuple[dict[str, int], list[tuple[int, int]]]:
-    """Return the fields of a ``noack_link`` that its rules set, and limit and length of each window."""
+def _link_memory(link: CData) -> dict[str, Array]:
+    """Return the arrays of a ``noack_link`` that the core writes, but for the flows."""
+    rows, stages = link.rows, link.stage_count
+    return {
+        "memory": np.zeros((rows, stages), dtype_of("noack_stage_memory")),
+        "recent_ns": np.full((rows, link.recent_width), core.NOACK_NEVER_NS, np.int64),
+        "losses": np.zeros((rows, link.loss_width), np.int64),
+        "queues": np.zeros(stages, dtype_of("noack_queue")),
+        "departures_ns": np.zeros(link.departure_places, np.int64),
+    }
+
+
+def _loss_limits(settings: LinkSettings) -> tuple[dict[str, int], list[tuple[int, int]]]:
+    """Return the fields of a ``noack_link`` that limit losses, and limit and length of each window."""
     rules = [constraint.rule for constraint in settings.constraints]
     windows = [(rule.limit, rule.window) for rule in rules if isinstance(rule, LossesInWindow)]
     between = (rule.deliveries for rule in rules if isinstance(rule, DeliveriesBetweenBursts))
@@ -233,8 +241,8 @@ def _rule_fields(settings: LinkSettings) -> tuple[dict[str, int], list[tuple[int
 
 def _stages(
     settings: LinkSettings, tables: StageTables, seed: int, name: Sequence[str]
-) -> Iterator[tuple[Stage, tuple[int, int], tuple[str, ...]]]:
-    """Return the stages, each with the key and the name of its random stream."""
+) -> Iterator[_KeyedStage]:
+    """Yield the stages; ``tables`` gets the numbers to which they refer."""
     numbers: Counter[str] = Counter()
     for impairment in settings.impairments:
         number = numbers[impairment.kind] + 1
@@ -244,15 +252,20 @@ def _stages(
         stage = impairment.stage(tables)
         if stage is not None:
             numbers[impairment.kind] = number
-            yield stage, tables.key, stream
+            yield _KeyedStage(stage, tables.key, stream)
 
 
-def _write_stage(row: CData, stage: Stage, key: tuple[int, int], queue_begin: int) -> None:
-    row.kind = getattr(core, f"NOACK_{stage.kind.upper()}")
-    row.key0, row.key1 = key
-    row.queue_places, row.queue_begin = stage.queue_places, queue_begin
-    for field, number in stage.numbers.items():
-        setattr(getattr(row, stage.structure or stage.kind), field, number)
+def _stage_array(stages: Sequence[_KeyedStage]) -> CData:
+    """Return the stages as an array of ``noack_stage``; their queues lie one after the other."""
+    array, queue_begin = ffi.new("noack_stage[]", max(len(stages), 1)), 0
+    for row, (stage, key, _) in zip(array, stages, strict=False):
+        row.kind = getattr(core, f"NOACK_{stage.kind.upper()}")
+        row.key0, row.key1 = key
+        row.queue_places, row.queue_begin = stage.queue_places, queue_begin
+        queue_begin += stage.queue_places
+        for field, number in stage.numbers.items():
+            setattr(getattr(row, stage.structure or stage.kind), field, number)
+    return array
 
 
 def _require(wrong: CData) -> None:

@@ -50,7 +50,7 @@ def lossy_udp(request: pytest.FixtureRequest) -> Iterator[Callable[..., LossyUdp
     """A function that starts an emulator: ``lossy_udp(server, "loss 30% mansd 4")``.
 
     It has the arguments of :class:`netem.lossy_udp.LossyUdp`. Clients send to the ``address`` of
-    what it returns. All end with the test; a test that fails says their seed and their losses.
+    what it returns. All end with the test; a test that fails reports their seed and their losses.
     """
     from netem.lossy_udp import LossyUdp
 
@@ -78,7 +78,7 @@ def lossy_udp(request: pytest.FixtureRequest) -> Iterator[Callable[..., LossyUdp
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Say which network a failed test had, and how to have it again."""
+    """Report which network a failed test had, and how to have it again."""
     report = yield
     if report.failed and (links := item.stash.get(_LINKS, [])):
         command = (

@@ -48,7 +48,7 @@ class RunNetwork:
         self._relay.inputs = self._relay.first_number = start.first_number
         self._relay.loops = self._loops
         flows = np.arange(self._loops)
-        clients["number"][flows] = clients["place"][flows] = flows
+        clients["number"][flows] = clients["flow_row"][flows] = flows
         network = resolved.network
         links = [(network.link_of(flow), link_name(flow)) for flow in network.flows]
         self._directions: list[RelayDirection] = []

@@ -159,7 +159,7 @@ def relay(
             devices = None if program is None else program.devices
             raise_file_limit()
             try:
-                opened = Relay(specs, options.segment, taps, spin_ns, devices)
+                opened = Relay(specs, segment=options.segment, taps=taps, spin_ns=spin_ns, devices=devices)
             except OSError as error:  # no IPv6, or too many open files
                 raise MachineError(f"the sockets of the links cannot be opened: {why(error)}") from None
             stack.callback(opened.close)

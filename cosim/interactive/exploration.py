@@ -11,6 +11,7 @@ plant, initial state and losses.
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,14 +53,19 @@ _SHORT = 0.5
 """Inter-event times shrink to 0 if the second half of the events takes less than this share of the
 time of the first."""
 EXACT, SAMPLED, LIVE, RECORDED = "exact", "sampled", "live", "recorded"
-Numbers = tuple[tuple[str, str], ...]
-"""Key numbers: label and value."""
 DRAWS = 200
 """Runs of an ensemble."""
 LOW, HIGH = 0.05, 0.95
 """Quantiles at the edges of a band."""
 _BAND_POINTS = 121
 _MOST_DRAW_EVENTS = 20_000
+
+
+class Fact(NamedTuple):
+    """A key number, or what else is known of a run, in words."""
+
+    label: str
+    value: str
 
 
 @dataclass(frozen=True)
@@ -93,7 +99,7 @@ class Exploration:
     """In words, why the run is drawn until its last event only; empty if it is drawn whole."""
 
     @cached_property
-    def numbers(self) -> Numbers:
+    def numbers(self) -> tuple[Fact, ...]:
         """The key numbers of the run."""
         events, lost = len(self.event_s), self.lost
         share = f" ({100 * lost / events:.0f} %)" if events else ""
@@ -104,14 +110,14 @@ class Exploration:
             ended = f"until {number(float(self.t_s[-1]), 4)} s"
         shortest_s = number(float(np.diff(self.event_s).min()), 4) + " s" if events > 1 else "–"
         return (
-            ("run", ended),
-            ("transmissions", str(events)),
-            ("delivered", str(events - lost)),
-            ("lost", f"{lost}{share}"),
-            ("longest loss burst", str(longest_burst(self.delivered))),
-            ("shortest inter-event time", shortest_s),
-            ("‖x‖ at the start", number(float(self.x_norm[0]), 4)),
-            ("‖x‖ at the end", number(float(self.x_norm[-1]), 4)),
+            Fact("run", ended),
+            Fact("transmissions", str(events)),
+            Fact("delivered", str(events - lost)),
+            Fact("lost", f"{lost}{share}"),
+            Fact("longest loss burst", str(longest_burst(self.delivered))),
+            Fact("shortest inter-event time", shortest_s),
+            Fact("‖x‖ at the start", number(float(self.x_norm[0]), 4)),
+            Fact("‖x‖ at the end", number(float(self.x_norm[-1]), 4)),
         )
 
     @property
@@ -288,15 +294,15 @@ class Ensemble:
     """Quantiles LOW, 0.5 and HIGH of the number of transmissions."""
 
     @property
-    def numbers(self) -> tuple[tuple[str, str], ...]:
-        """Key numbers: label and value."""
+    def numbers(self) -> tuple[Fact, ...]:
+        """The key numbers of the draws."""
         low, middle, high = self.transmissions
         sent = f"{low:.0f} to {high:.0f}, median {middle:.0f}" if math.isfinite(low) else "–"
-        left_out = (("draws with Zeno-like behaviour, not in the bands", f"{self.failed}"),)
+        left_out = Fact("draws with Zeno-like behaviour, not in the bands", f"{self.failed}")
         return (
-            (f"transmissions in 90 % of {self.draws} draws", sent),
-            ("draws that diverge", f"{self.diverged} of {self.draws}"),
-            *(left_out if self.failed else ()),
+            Fact(f"transmissions in 90 % of {self.draws} draws", sent),
+            Fact("draws that diverge", f"{self.diverged} of {self.draws}"),
+            *([left_out] if self.failed else []),
         )
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from cosim.interactive.exploration import (
     Ensemble,
     Exploration,
+    Fact,
     explore_ensemble,
     explore_or_simulate,
     why_not_exact,
@@ -61,29 +62,31 @@ def exploration_figure(explored: ExploredRun) -> FigureDescription:
     A name that several panels show is in the legend of the first.
     """
     known, rows = {"‖x‖"}, list[PanelRow]()
-    parts = [_state(explored), _errors(explored), _norm(explored), _events(explored)]
+    contents = [_state(explored), _errors(explored), _norm(explored), _events(explored)]
     horizon_s = np.array([0.0, explored.run.scenario.horizon_s])
-    for (title, items, y), height_in in zip(parts, _HEIGHTS_IN, strict=True):
-        drawn = [item for item in items if _has_points(item)]
+    for content, height_in in zip(contents, _HEIGHTS_IN, strict=True):
+        drawn = [item for item in content.items if _has_points(item)]
         names = [*dict.fromkeys(item.label for item in drawn)]
         legend = sorted((name for name in names if name not in known), key=KEPT.__eq__)
         known |= {*names}
-        x = time_axis(horizon_s, numbers=len(rows) == len(parts) - 1)
-        panel = Panel(title=title, items=drawn, x=x, y=y, legend=legend)
+        x = time_axis(horizon_s, numbers=len(rows) == len(contents) - 1)
+        panel = Panel(title=content.title, items=drawn, x=x, y=content.y, legend=legend)
         rows.append(PanelRow(panels=[panel], height_in=height_in))
-    description = "; ".join(title for title, _, _ in parts)
+    description = "; ".join(content.title for content in contents)
     return FigureDescription(name="exploration", rows=rows, description=description)
 
 
-_Part = tuple[str, Sequence[Band | Line | Marks], Axis]
-"""Title, items and vertical axis of a panel."""
+class _PanelContent(NamedTuple):
+    title: str
+    items: Sequence[Band | Line | Marks]
+    y: Axis
 
 
 def _has_points(item: Band | Line | Marks) -> bool:
     return bool(np.isfinite(item.low if isinstance(item, Band) else item.y).any())
 
 
-def _state(explored: ExploredRun) -> _Part:
+def _state(explored: ExploredRun) -> _PanelContent:
     run, i, draws, other = explored.run, explored.state, explored.ensemble, explored.reference
     x, x_s = run.x[:, i], run.x_s[:, i]
     x_c = np.where(run.controller_knows, run.x_c[:, i], np.nan)
@@ -100,10 +103,10 @@ def _state(explored: ExploredRun) -> _Part:
     if other is not None and i < other.x.shape[1]:
         items.insert(0, _reference_line(other, other.x[:, i]))
         about = np.concatenate([about, other.x[:, i]])
-    return f"{run.state_names[i]}: plant and both models", items, Axis(about=about)
+    return _PanelContent(f"{run.state_names[i]}: plant and both models", items, Axis(about=about))
 
 
-def _errors(explored: ExploredRun) -> _Part:
+def _errors(explored: ExploredRun) -> _PanelContent:
     run, draws, other = explored.run, explored.ensemble, explored.reference
     floor, guarantee = _floor(run), explored.guarantee
     e_s, e_c = _positive(run.e_s_norm, floor), _known_error(run, floor)
@@ -123,10 +126,10 @@ def _errors(explored: ExploredRun) -> _Part:
     if other is not None:
         items.insert(0, _reference_line(other, _known_error(other, floor)))
     y = Axis(logarithmic=True, about=about, decades=_DECADES)
-    return "errors of the models (logarithmic)", items, y
+    return _PanelContent("errors of the models (logarithmic)", items, y)
 
 
-def _norm(explored: ExploredRun) -> _Part:
+def _norm(explored: ExploredRun) -> _PanelContent:
     run, draws, other, guarantee = explored.run, explored.ensemble, explored.reference, explored.guarantee
     norm = _positive(run.x_norm, _SMALLEST * _largest(run.x_norm))
     items = [Line(x=run.t_s, y=norm, label="‖x‖", colour=PLANT, width=2.25)]
@@ -137,10 +140,11 @@ def _norm(explored: ExploredRun) -> _Part:
         items += [_edge(draws, _positive(edge, 0.0)) for edge in edges]
     if other is not None:
         items.insert(0, _reference_line(other, _positive(other.x_norm, _SMALLEST * _largest(other.x_norm))))
-    return "‖x‖ (logarithmic)", items, Axis(logarithmic=True, about=norm, decades=_DECADES)
+    y = Axis(logarithmic=True, about=norm, decades=_DECADES)
+    return _PanelContent("‖x‖ (logarithmic)", items, y)
 
 
-def _events(explored: ExploredRun) -> _Part:
+def _events(explored: ExploredRun) -> _PanelContent:
     t_s, delivered = explored.run.event_s, explored.run.delivered
     since_s = np.diff(t_s, prepend=0.0)
     dots = Marks(x=t_s[delivered], y=since_s[delivered], label="delivered", colour=CONTROLLER)
@@ -150,7 +154,7 @@ def _events(explored: ExploredRun) -> _Part:
         between_s = np.diff(other.event_s, prepend=0.0)
         before = Marks(x=other.event_s, y=between_s, label=KEPT, colour=FORCED, opacity=0.45)
         items.insert(0, before)
-    return "transmissions: time since the last one [s]", items, Axis(ends=(0.0, None))
+    return _PanelContent("transmissions: time since the last one [s]", items, Axis(ends=(0.0, None)))
 
 
 def _certified_line(guarantee: Guarantee, values: Vector) -> Line:
@@ -252,27 +256,30 @@ class DraftResults:
         return warning(self.run, certificate, self.margin if MARGIN in self.known else None)
 
     @property
-    def facts(self) -> dict[str, list[tuple[str, str]]]:
-        """What is computed, in groups of labels and values."""
+    def facts(self) -> dict[str, list[Fact]]:
+        """What is computed, in groups."""
         bands = self.ensemble if ENSEMBLE in self.known else None
         run = [*self.run.numbers, *(() if bands is None else bands.numbers)]
         groups = {f"this run ({self.run.kind})": run}
         if CERTIFICATE in self.known:
             certificate = self.certificate
             groups["certificate"] = [
-                ("certificate", f"{certificate.verdict}: {certificate.reason}"),
+                Fact("certificate", f"{certificate.verdict}: {certificate.reason}"),
                 *certificate.rows,
-                *((assumption, f"{verdict} ({why})") for verdict, assumption, why in certificate.assumptions),
+                *(
+                    Fact(assumption.what, f"{assumption.verdict} ({assumption.why})")
+                    for assumption in certificate.assumptions
+                ),
             ]
         if MARGIN in self.known:
             groups["margin"] = [
-                ("margin", self.margin.verdict),
+                Fact("margin", self.margin.verdict),
                 *(
-                    (
-                        f"M = {m}: growth of the worst pattern (D delivered, L lost) per event",
-                        f"{growth}, {verdict}",
+                    Fact(
+                        f"M = {row.m}: growth of the worst pattern (D delivered, L lost) per event",
+                        f"{row.growth}, {row.verdict}",
                     )
-                    for m, growth, verdict in self.margin.rows
+                    for row in self.margin.rows
                 ),
             ]
         return groups

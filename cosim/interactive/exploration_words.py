@@ -38,14 +38,23 @@ class Reference(NamedTuple):
     run: Exploration
 
 
+class ComparedNumber(NamedTuple):
+    """A quantity of two runs, as text."""
+
+    quantity: str
+    in_reference: str
+    in_run: str
+    difference: str
+    """In words."""
+
+
 class Comparison(NamedTuple):
     """What distinguishes a run from a reference."""
 
     title: str
     settings: str
     """The settings that differ, with both values."""
-    rows: tuple[tuple[str, str, str, str], ...]
-    """Quantity, its value in the reference and in the run, and the difference in words."""
+    rows: tuple[ComparedNumber, ...]
 
 
 def compare(reference: Reference, run: Exploration) -> Comparison:
@@ -93,13 +102,13 @@ def _text(value: object) -> str:
     return value_text(value) if isinstance(value, str | int | float | list | dict) else "–"
 
 
-def _counts(name: str, before: float, after: float) -> tuple[str, str, str, str]:
+def _counts(name: str, before: float, after: float) -> ComparedNumber:
     change = after - before
     words = f"{abs(change):g} {'more' if change > 0 else 'fewer'}" if change else "the same"
-    return name, f"{before:g}", f"{after:g}", words
+    return ComparedNumber(name, f"{before:g}", f"{after:g}", words)
 
 
-def _sizes(name: str, before: float, after: float) -> tuple[str, str, str, str]:
+def _sizes(name: str, before: float, after: float) -> ComparedNumber:
     texts = [number(value, 3) if math.isfinite(value) else "–" for value in (before, after)]
     words = "–"
     if texts[0] == texts[1]:
@@ -107,7 +116,7 @@ def _sizes(name: str, before: float, after: float) -> tuple[str, str, str, str]:
     elif math.isfinite(before) and math.isfinite(after) and before > 0:
         ratio = number(after / before, 3)
         words = "nearly the same" if ratio == "1" else f"{ratio} times as large"
-    return name, texts[0], texts[1], words
+    return ComparedNumber(name, texts[0], texts[1], words)
 
 
 def verdict_of(run: Exploration, guarantee: Guarantee | None) -> tuple[VerdictLine, ...]:

@@ -1,12 +1,13 @@
 """What is guaranteed for a scenario: certificate, margin, and a warning in words."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from cosim.analysis.certificates import constant_rows
 from cosim.analysis.margin_search import find_margin
-from cosim.interactive.exploration import Exploration
+from cosim.interactive.exploration import Exploration, Fact
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
 from noack.core.number_format import at_least, at_most, number
@@ -26,6 +27,14 @@ CERTIFIED, VOID, NOT_COVERED = "certified", "no certificate", "not covered"
 _POINTS = 121
 
 
+class OpenAssumption(NamedTuple):
+    """An assumption that does not hold for certain."""
+
+    verdict: str
+    what: str
+    why: str
+
+
 @dataclass(frozen=True)
 class Guarantee:
     """The certificate of a scenario's plant under its own schedule, at N times."""
@@ -34,15 +43,23 @@ class Guarantee:
     """CERTIFIED, VOID or NOT_COVERED."""
     reason: str
     """One sentence: what is guaranteed, or why nothing is."""
-    rows: tuple[tuple[str, str], ...]
-    """Constants: label and value."""
-    assumptions: tuple[tuple[str, str, str], ...]
-    """Verdict, what is assumed, and why."""
+    rows: tuple[Fact, ...]
+    """The constants."""
+    assumptions: tuple[OpenAssumption, ...]
     t_s: Vector
     e_s: Vector
     """Bound of ‖e_s‖; NaN without a certificate."""
     e_c: Vector
     x: Vector
+
+
+class MarginRow(NamedTuple):
+    """The stability of a loop for an M."""
+
+    m: str
+    growth: str
+    """Of the worst pattern per event."""
+    verdict: str
 
 
 @dataclass(frozen=True)
@@ -51,8 +68,7 @@ class Margin:
 
     verdict: str
     """In words."""
-    rows: tuple[tuple[str, str, str], ...]
-    """M, growth of the worst pattern, verdict."""
+    rows: tuple[MarginRow, ...]
     defined: bool
     """Whether the loop has a margin: its trigger has a longest time between events."""
 
@@ -72,7 +88,7 @@ def certify(scenario: Scenario) -> Guarantee:
         return Guarantee(NOT_COVERED, str(error), (), (), t_s, nothing, nothing, nothing)
     reason = _reason(certificate)
     assumptions = tuple(
-        (str(assumption.verdict), assumption.what, assumption.why)
+        OpenAssumption(str(assumption.verdict), assumption.what, assumption.why)
         for assumption in certificate.assumptions
         if assumption.verdict != AssumptionStatus.HOLDS and assumption.why != reason
     )
@@ -81,7 +97,7 @@ def certify(scenario: Scenario) -> Guarantee:
         return Guarantee(
             VOID if certificate.constants is None else CERTIFIED,
             reason,
-            tuple((label, values[0]) for label, values, _ in rows),
+            tuple(Fact(label, values[0]) for label, values, _ in rows),
             assumptions,
             t_s,
             certificate.sensor_error(t_s),
@@ -125,7 +141,9 @@ def margin_of(scenario: Scenario) -> Margin:
     except CallerError as error:
         return Margin(str(error), (), defined=False)
     rows = tuple(
-        (str(m), f"{at_least(stability.lower, 5)} – {at_most(stability.upper, 5)}", stability.verdict)
+        MarginRow(
+            str(m), f"{at_least(stability.lower, 5)} – {at_most(stability.upper, 5)}", stability.verdict
+        )
         for m, stability in margin.caps
     )
     return Margin(margin.verdict, rows, defined=True)

@@ -100,7 +100,7 @@ class LiveSource:
         if (live := self._services.live) is None:
             return [VerdictLine(_ABOUT, NEUTRAL)]
         if live.verdict:
-            return [VerdictLine(*line) for line in live.verdict]
+            return live.verdict
         lines = [VerdictLine(_words(live), NEUTRAL)]
         if (progress := live.progress) is not None:
             kept = progress.warnings[-1:] or ["guarantee kept so far"]

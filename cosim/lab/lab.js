@@ -16,7 +16,10 @@ function labById(name) {
    sent more than it draws. */
 function labShow(parts) {
   for (const [name, content] of Object.entries(parts)) LAB_PARTS[name](content);
-  return new Promise(done => document.hidden ? done(true) : requestAnimationFrame(() => done(true)));
+  return new Promise(done => {
+    if (document.hidden) done(true);
+    else requestAnimationFrame(() => done(true));
+  });
 }
 
 const LAB_PARTS = {
@@ -111,25 +114,26 @@ function labFill(select, options, chosen) {
   if (select.value !== chosen) select.value = chosen;
 }
 
-/* Choices and sliders. A slider that is being moved keeps its place: what arrives is older. */
+/* Choices and sliders. A slider that is being moved keeps its position: what arrives is older. */
 function labShowControls({choices, sliders}) {
   const place = labById('controls');
-  const shape = JSON.stringify([choices.map(one => one.key), sliders.map(one => one.key)]);
+  const shape = JSON.stringify([...choices, ...sliders].map(control => control.key));
   if (LAB.shape !== shape) {
     LAB.shape = shape;
     place.replaceChildren(...choices.map(labChoice), ...sliders.map(labSlider));
   }
-  choices.forEach((one, i) => labFill(place.children[i].lastChild, one.options, one.value));
-  sliders.forEach((one, i) => {
+  choices.forEach((choice, i) =>
+    labFill(place.children[i].lastChild, choice.options, choice.value));
+  sliders.forEach((slider, i) => {
     const row = place.children[choices.length + i], [label, value, input] = row.children;
     const moving = performance.now() - (input.labMoved ?? -1e9) < 400;
-    labSet(label, one.label);
-    labSet(value, input.ariaValueText = one.text);
+    labSet(label, slider.label);
+    labSet(value, input.ariaValueText = slider.text);
     for (const name of ['min', 'max', 'step']) {
-      if (input[name] !== String(one[name])) input[name] = one[name];
+      if (input[name] !== String(slider[name])) input[name] = slider[name];
     }
-    if (!moving) input.value = one.place;
-    row.classList.toggle('lab-wrong', one.wrong);
+    if (!moving) input.value = slider.position;
+    row.classList.toggle('lab-wrong', slider.wrong);
   });
 }
 
@@ -144,7 +148,7 @@ function labSlider(slider) {
   const input = labNode('input', {type: 'range', id: `lab-set-${slider.key}`});
   input.addEventListener('input', () => {
     input.labMoved = performance.now();
-    labSay('slide', {key: slider.key, place: input.valueAsNumber});
+    labSay('slide', {key: slider.key, position: input.valueAsNumber});
   });
   return labNode('div', {class: 'lab-slider'},
     labNode('label', {for: input.id}), labNode('output', {for: input.id}), input);
@@ -152,11 +156,11 @@ function labSlider(slider) {
 
 /* The form of all keys. A group is built when it is opened. */
 function labShowForm(form) {
-  const shape = group => [group.key, group.fields.map(one => one.key), group.groups.map(shape)];
+  const shape = group => [group.key, group.fields.map(field => field.key), group.groups.map(shape)];
   const place = labById('form'), text = JSON.stringify(shape(form));
   LAB.form = form;
   if (LAB.formShape !== text) {
-    const open = [...place.querySelectorAll('details[open]')].map(one => one.labKey);
+    const open = [...place.querySelectorAll('details[open]')].map(details => details.labKey);
     LAB.formShape = text;
     LAB.fields = new Map();
     place.replaceChildren(labGroup(form, open));
@@ -170,7 +174,7 @@ function labGroup(group, open) {
   const build = () => {
     if (inside.firstChild) return;
     inside.append(labNode('p', {}, group.help), ...group.fields.map(labField),
-      ...group.groups.map(one => labGroup(one, open)));
+      ...group.groups.map(inner => labGroup(inner, open)));
   };
   details.labKey = group.key;
   details.open = open.includes(group.key);
@@ -267,7 +271,7 @@ function labGoTo(step, begin) {
   labById('guide').replaceChildren(
     labNode('h2', {}, `${step + 1} of ${LAB.steps.length}: ${title}`), labNode('p', {}, text),
     labNode('p', {class: 'lab-drag'}, drag), labNode('div', {}, next, back, again));
-  [next, back, again].find(one => one.textContent === focused && !one.disabled)?.focus();
+  [next, back, again].find(made => made.textContent === focused && !made.disabled)?.focus();
   if (begin) labSay('step', {number: step});
 }
 

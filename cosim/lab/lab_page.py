@@ -14,6 +14,7 @@ from typing import NamedTuple
 from nicegui import ui
 from nicegui.events import GenericEventArguments, ValueChangeEventArguments
 
+from cosim.interactive.exploration import Fact
 from cosim.interactive.exploration_figure import CERTIFICATE, ExploredRun, exploration_figure
 from cosim.interactive.exploration_words import Reference, compare, verdict_of
 from cosim.interactive.scenario_draft import Draft, DraftError, draft_of_query, open_draft
@@ -68,14 +69,12 @@ class _Page:
         self._kept: Reference | None = None
         self._controls: Controls | None = None
         self._form = form_of(draft)
-        self._moved = ["", ""]
-        """Key and text of the slider that was moved last."""
-        self._last = ("", 0.0)
-        """Key of the last change, and when it was."""
+        self._moved = _MovedSlider("", "")
+        self._last = _LastChange("", 0.0)
         self._unsettled = {""}
         """Keys that have changed since the settings rested."""
         self._client.on_disconnect(self._session.end)  # a page that connects again is a new one
-        ui.on("lab", self._take)
+        ui.on("lab", self._respond)
 
     def build(self) -> None:
         """Build head, bar, figure and drawer."""
@@ -154,35 +153,6 @@ class _Page:
         await self._parts.show(source=EXPLORE, steps=steps)
         await self._session.change(self._session.draft)
 
-    async def _take(self, event: GenericEventArguments) -> None:
-        """Take what the visitor does with elements that are not the framework's."""
-        message = event.args
-        match message["what"]:
-            case "slide":
-                sliders = self._controls.sliders if self._controls else ()
-                if slider := next((slider for slider in sliders if slider.key == message["key"]), None):
-                    value = slider.value_at(float(message["place"]))
-                    self._moved = [slider.key, value_text(value)]
-                    await self._apply(lambda draft: drag(draft, slider, value), slider.key)
-            case "fill":
-                fields = (field for field in self._form.all_fields() if field.key == message["key"])
-                field, text = next(fields, None), str(message["text"]).strip()
-                # The form may have been made anew without the field.
-                if field is not None and text != field.text(self._session.draft):
-                    await self._apply(lambda draft: fill_in(draft, field, text), field.key)
-            case "choose":
-                key, kind = message["key"], str(message["value"])
-                await self._apply(lambda draft: choose(draft, key, kind), key)
-            case "state":
-                self._state = int(message["number"])
-                await self._show()
-            case "step":
-                step = STEPS[int(message["number"])]
-                draft = open_draft(step.scenario)
-                for name, setting in step.settings.items():
-                    draft = draft.with_value(name, setting)
-                await self._open(draft)
-
     # What is shown
 
     async def _show(self) -> None:
@@ -196,7 +166,7 @@ class _Page:
             parts["controls"] = controls_part(self._controls, wrong, live=self._live.is_running)
         if explored is not None:
             run = explored.run
-            facts: Mapping[str, Sequence[tuple[str, str]]] = {f"this run ({run.kind})": run.numbers}
+            facts: Mapping[str, Sequence[Fact]] = {f"this run ({run.kind})": run.numbers}
             if self._source == EXPLORE and self._session.results is not None:
                 facts = self._session.results.facts
             reference = self._reference()
@@ -257,7 +227,7 @@ class _Page:
             run = session.results.run if session.results else None
         return None if run is None else Reference(name, run)
 
-    def _verdict(self) -> list[tuple[str, str]]:
+    def _verdict(self) -> list["_TonedLine"]:
         lines: Sequence[VerdictLine] = ()
         if self._source == LIVE:
             lines = self._live.verdict
@@ -266,9 +236,45 @@ class _Page:
         elif self._source == EXPLORE and (results := self._session.results) is not None:
             known = CERTIFICATE in results.known
             lines = verdict_of(results.run, results.certificate if known else None)
-        return [(text, _TONES.get(style, "")) for text, style in lines]
+        return [_TonedLine(line.text, _TONES.get(line.style, "")) for line in lines]
 
     # What the visitor does
+
+    async def _respond(self, event: GenericEventArguments) -> None:
+        """Respond to an element that is not the framework's; see labSay in lab.js."""
+        message = event.args
+        match message["what"]:
+            case "slide":
+                await self._slide(message["key"], float(message["position"]))
+            case "fill":
+                await self._fill(message["key"], str(message["text"]).strip())
+            case "choose":
+                key, value = message["key"], str(message["value"])
+                await self._apply(lambda draft: choose(draft, key, value), key)
+            case "state":
+                self._state = int(message["number"])
+                await self._show()
+            case "step":
+                await self._begin_step(STEPS[int(message["number"])])
+
+    async def _slide(self, key: str, position: float) -> None:
+        sliders = self._controls.sliders if self._controls else ()
+        if slider := next((slider for slider in sliders if slider.key == key), None):
+            value = slider.value_at(position)
+            self._moved = _MovedSlider(key, value_text(value))
+            await self._apply(lambda draft: drag(draft, slider, value), key)
+
+    async def _fill(self, key: str, text: str) -> None:
+        field = next((field for field in self._form.all_fields() if field.key == key), None)
+        # The form may have been made anew without the field.
+        if field is not None and text != field.text(self._session.draft):
+            await self._apply(lambda draft: fill_in(draft, field, text), key)
+
+    async def _begin_step(self, step: "TutorialStep") -> None:
+        draft = open_draft(step.scenario)
+        for key, setting in step.settings.items():
+            draft = draft.with_value(key, setting)
+        await self._open(draft)
 
     async def _switch(self, event: ValueChangeEventArguments[str]) -> None:
         self._source = event.value
@@ -311,15 +317,14 @@ class _Page:
     def _apply(self, change: Callable[[Draft], Draft], key: str) -> Awaitable[None]:
         """Apply a change at once, before the next event is handled; return what follows."""
         now_s = asyncio.get_running_loop().time()
-        last_key, last_s = self._last
-        self._last = key, now_s
+        last, self._last = self._last, _LastChange(key, now_s)
         try:
             draft = change(self._session.draft)
         except NoackError as error:
             ui.notify(str(error), type="negative")
             return self._show()
         self._unsettled.add(key)
-        gesture = key != last_key or now_s - last_s > _GESTURE_S
+        gesture = key != last.key or now_s - last.at_s > _GESTURE_S
         return self._session.change(draft, gesture=gesture)
 
     async def _choose(self, event: ValueChangeEventArguments[str]) -> None:
@@ -357,6 +362,27 @@ class _Page:
         self._is_dark = not self._is_dark
         self._dark.set_value(self._is_dark)
         self._text.show_dark(dark=self._is_dark)
+
+
+class _MovedSlider(NamedTuple):
+    """The slider that was moved last, with its value as text."""
+
+    key: str
+    text: str
+
+
+class _LastChange(NamedTuple):
+    """The last change of a key, and its time in the event loop."""
+
+    key: str
+    at_s: float
+
+
+class _TonedLine(NamedTuple):
+    """A line of the verdict, with the class of its colours in lab.css."""
+
+    text: str
+    tone: str
 
 
 class TutorialStep(NamedTuple):

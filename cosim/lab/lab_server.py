@@ -134,7 +134,7 @@ class _LabServer(uvicorn.Server):
         self._on_start, self._on_end = on_start, on_end
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Give up what would keep it from ending, and end; if that takes too long, say where, and exit."""
+        """Cancel what would delay the end, and end; if that takes too long, print a traceback and exit."""
         faulthandler.dump_traceback_later(_END_S, exit=True, file=_STDERR)
         self._on_end()
         await super().shutdown(sockets)

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 from cosim.interactive.scenario_draft import Draft
 from cosim.live.launcher import launch
 from cosim.live.monitoring.run_watcher import Watcher
+from cosim.output.run_verdict import VerdictLine
 from cosim.output.viewer.rerun_program import is_installed
 from netem.shell import process
 from noack.core.errors import ExitStatus, NoackError
@@ -51,8 +52,8 @@ class LiveRun:
     """What happened, the newest line last."""
     first_line: int = 0
     """Number of lines that happened before these."""
-    verdict: list[tuple[str, str]] = field(default_factory=list)
-    """At the end: lines, each with its style as :mod:`cosim.output.run_verdict` names it."""
+    verdict: list[VerdictLine] = field(default_factory=list)
+    """At the end."""
     ok: bool | None = None
     exploration: "Exploration | None" = None
     """What is drawn of it: what was recorded when a page last asked for it."""
@@ -152,7 +153,7 @@ class LiveRun:
             case "ended":
                 self.state, self.ok = "ended", message["ok"]
                 self.run_dir = Path(message["run_dir"])
-                self.verdict = [(text, style) for text, style in message["verdict"]]
+                self.verdict = [VerdictLine(text, style) for text, style in message["verdict"]]
                 self._add(f"recorded in {self.run_dir}")
             case _:
                 self.state, self.ok = "failed", False

@@ -211,7 +211,7 @@ def controls_part(controls: Controls, wrong: set[str], *, live: bool) -> Json:
                 "min": slider.ends[0],
                 "max": slider.ends[1],
                 "step": slider.step,
-                "place": slider.position,
+                "position": slider.position,
                 "text": value_text(slider.value),
                 "wrong": slider.key in wrong,
             }

@@ -53,7 +53,7 @@ _REPORT_GRACE_S = 0.3
 _EXIT_GRACE_S = 5.0
 """By then a process has exited that has reported its end."""
 _CHANGE_DELAY_S = 0.2
-"""Wall time from a change's announcement to its effect: processes look every 0.05 s."""
+"""Wall time from a change's announcement to its effect: processes check every 0.05 s."""
 _MILLISECOND_NS = 1_000_000
 _START_DELAY_NS, _LONG_START_DELAY_NS = 30_000_000, 100_000_000
 """From the last arrival to the common epoch: time for the message to reach all processes. The

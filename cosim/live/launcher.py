@@ -21,7 +21,7 @@ from threading import Thread
 from cosim.lazy_modules import lazy_modules
 from cosim.live.coordinator import Coordinator
 from cosim.live.monitoring.run_watcher import Watcher, joint_watcher
-from cosim.live.processes.child_processes import ChildProcesses, Failure, RemoteStart, RestartPolicy
+from cosim.live.processes.child_processes import ChildProcesses, EndReason, RemoteStart, RestartPolicy
 from cosim.live.processes.finalize_helpers import RunEndingWithHelpers, lasting_helpers
 from cosim.live.processes.fork_server import ForkServer, fork_server
 from cosim.record.run_directory import (
@@ -160,7 +160,7 @@ def _open_to_others(
 
 @contextlib.contextmanager
 def _no_directory_if_refused(run_dir: Path) -> Iterator[None]:
-    """Remove the run directory if an error says that the run cannot be joined as was asked for."""
+    """Remove the run directory if an error says that the run cannot be joined in the requested way."""
     try:
         yield
     except NoackError:
@@ -202,12 +202,12 @@ class _Run:
         """How long the launcher still waits: for the start, for the end, or for the stop."""
         self._policy = RestartPolicy(descriptor.scenario, coordinator, children, watcher)
 
-    def watch(self, signals: Signals, store: Callable[[ExitStatus, str], None]) -> Failure:
+    def watch(self, signals: Signals, store: Callable[[ExitStatus, str], None]) -> EndReason:
         """Follow the run to its end; return its exit status and the reason of the end.
 
         ``store`` is called with the result of a run that ends early, before its processes end.
         """
-        result: Failure | None = None
+        result: EndReason | None = None
         last_s = time.monotonic()
         while not self._is_over(stopping=result is not None):
             self._coordinator.poll()
@@ -219,10 +219,10 @@ class _Run:
             if result is None:
                 result = _signalled(signals) or self._policy.check()
                 if result is None and self._limit.is_reached:
-                    result = (ExitStatus.FAILED, self._overdue())
+                    result = EndReason(ExitStatus.FAILED, self._overdue())
                 if result is not None:
                     store(*result)
-                    self._stop(result[1])
+                    self._stop(result.reason)
             elif self._limit.is_reached:
                 break
             time.sleep(_POLL_S if self._has_started else _STARTING_POLL_S)
@@ -232,7 +232,7 @@ class _Run:
             or _signalled(signals)
             or self._policy.check()
             or self._policy.unfinished()
-            or (ExitStatus.OK, HORIZON)
+            or EndReason(ExitStatus.OK, HORIZON)
         )
 
     def _follow_phase(self, *, stopping: bool) -> None:
@@ -311,10 +311,10 @@ class _Run:
         return f"the run did not end at its horizon: {failure}, {self._limit.explain_end()}"
 
 
-def _signalled(signals: Signals) -> Failure | None:
+def _signalled(signals: Signals) -> EndReason | None:
     if signals.received is None:
         return None
-    return signals.status, stop_reason(signals.received)
+    return EndReason(signals.status, stop_reason(signals.received))
 
 
 def overtime_s(run_s: float) -> float:

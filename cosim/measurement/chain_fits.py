@@ -117,14 +117,14 @@ class LossLikelihood:
         lost = np.array(losses)
         moves = np.array([[1 - to_bad, to_bad], [to_good, 1 - to_good]])
         start = np.array([to_good, to_bad]) / (to_bad + to_good)
-        log_d, d = _powers(moves * (1 - lost), self._deliveries.astype(float))
-        log_l, l = _powers(moves * lost, self._losses.astype(float))  # noqa: E741
-        log_loss, loss = log_l[:, self._loss_of], l[..., self._loss_of]
+        log_delivering, delivering = _powers(moves * (1 - lost), self._deliveries.astype(float))
+        log_losing, losing = _powers(moves * lost, self._losses.astype(float))
+        log_loss, loss = log_losing[:, self._loss_of], losing[..., self._loss_of]
         if self._left_out is not None:
             log_loss = np.where(self._left_out, 0.0, log_loss)
             loss = np.where(self._left_out, start[None, :, :, None], loss)
-        factors = _products(d[..., self._delivery_of[:-1]], loss)
-        total = log_d[:, self._delivery_of].sum(axis=1) + log_loss.sum(axis=1)
+        factors = _products(delivering[..., self._delivery_of[:-1]], loss)
+        total = log_delivering[:, self._delivery_of].sum(axis=1) + log_loss.sum(axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
             while (count := factors.shape[-1]) > 1:
                 odd = factors[..., count - count % 2 :]
@@ -133,7 +133,7 @@ class LossLikelihood:
                 total += np.log(scale).sum(axis=1)
                 factors = np.concatenate([factors / scale, odd], axis=-1)
             row = start if not count else (start[:, None] * factors[..., 0]).sum(axis=0)
-            total += np.log((row[:, None] * d[..., self._delivery_of[-1]]).sum(axis=(0, 1)))
+            total += np.log((row[:, None] * delivering[..., self._delivery_of[-1]]).sum(axis=(0, 1)))
         return np.where(np.isfinite(total), total, -np.inf)
 
 
@@ -182,27 +182,26 @@ def length_test(bursts: LossBursts, left_out: Flags, rates: ChainRates, paramete
     lengths = ((bursts.length[bursts.complete & ~left_out], True), (deliveries, False))
     statistic, degrees = 0.0, -parameters
     for observed, lost in lengths:
-        chi_squared, classes = _pearson(observed, rates, lost)
+        chi_squared, classes = _pearson(observed, rates, lost=lost)
         statistic, degrees = statistic + chi_squared, degrees + classes - 1
     if degrees < 1:
         return FitTest(None, max(degrees, 0), None)
     return FitTest(statistic, degrees, float(stats.chi2.sf(statistic, degrees)))
 
 
-def _pearson(observed: NDArray[np.int64], rates: ChainRates, lost: bool) -> tuple[float, int]:
-    """Return χ² and the number of classes."""
+def _pearson(observed: NDArray[np.int64], rates: ChainRates, *, lost: bool) -> tuple[float, int]:
+    """Return χ² and the number of classes, of the lengths of loss bursts or of deliveries."""
     count = len(observed)
-    edges = _edges(rates, lost, count)
+    edges = _edges(rates.survival(lost=lost), count)
     tails = np.append(rates.survival(lost=lost)(edges.astype(float)), 0.0)
     expected = -np.diff(tails) * count
     counts = np.histogram(observed, np.append(edges, np.iinfo(np.int64).max))[0]
     return float(((counts - expected) ** 2 / np.maximum(expected, 1e-300)).sum()), len(edges)
 
 
-def _edges(rates: ChainRates, lost: bool, count: int) -> NDArray[np.int64]:
+def _edges(survival: Callable[[Reals], Reals], count: int) -> NDArray[np.int64]:
     """Return the smallest length of each class: each class expects enough lengths."""
     longest = 1
-    survival = rates.survival(lost=lost)
     while count * survival(np.array([longest]))[0] >= FEWEST_EXPECTED and longest < 2**40:
         longest *= 2
     # Lengths that are worth an edge: all short ones, then ever coarser ones.

@@ -45,11 +45,11 @@ def binomial_estimate(successes: int, trials: int) -> IntervalEstimate | None:
         log_likelihood = xlogy(successes, probability) + xlogy(failures, 1 - probability)
         return float(xlogy(successes, share) + xlogy(failures, 1 - share) - log_likelihood) - _ALLOWED
 
-    def end(outer: float, certain: bool) -> float:
-        return outer if certain else float(optimize.brentq(lacking, share, outer, xtol=1e-15))
+    def end(outer: float) -> float:
+        return float(optimize.brentq(lacking, share, outer, xtol=1e-15))
 
-    low = 0.0 if not successes else end(min(1e-300, share / 2), False)
-    return IntervalEstimate(share, low, 1.0 if not failures else end(1 - 1e-16, False))
+    low = end(min(1e-300, share / 2)) if successes else 0.0
+    return IntervalEstimate(share, low, end(1 - 1e-16) if failures else 1.0)
 
 
 def poisson_estimate(count: int, exposure: float) -> IntervalEstimate:

@@ -221,7 +221,7 @@ def listen(address: Address, silence_s: float, save: Path | None, log: Callable[
             rows.flush()
             if not arrivals and receiver.is_over(time.monotonic_ns()):
                 break
-        result = _consistent(receiver.finish, socket)
+        result = _finish_probe(receiver.finish, socket)
         if result is None:
             raise NeverStartedError("stopped before a datagram of a probe arrived", signals.status)
     return result
@@ -263,15 +263,15 @@ def send(address: Address, plan: ProbePlan, save: Path | None, log: Callable[[st
             if refused == sender.sent:
                 raise PeerError(f"{address_text(address)}: {reason}; is a listener running there?")
             log(reason)
-        result = _consistent(sender.finish, socket)
+        result = _finish_probe(sender.finish, socket)
         assert result is not None
     return result
 
 
-def _consistent(
+def _finish_probe(
     finish: Callable[[int | None], ProbeResult | None], socket: ProbeSocket
 ) -> ProbeResult | None:
-    """Return the result, with what the socket found."""
+    """Return the result of one end, with notes about the socket; None if nothing was received."""
     try:
         result = finish(socket.kernel_drops)
     except ValueError as error:

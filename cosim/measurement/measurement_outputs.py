@@ -179,8 +179,8 @@ def _numbers(measurement: NetworkMeasurement, suffix: str) -> Iterator[tuple[str
     if delays.received:
         values = (duration(delays.quantiles_s[share]) for share in _SHOWN_DELAYS)
         yield f"delay {' / '.join(_SHOWN_DELAYS.values())}", " / ".join(values)
-    if delays.correlation:
-        yield "correlation of successive delays", f"{delays.correlation[0]:.2f}"
+    if delays.correlation.lags:
+        yield "correlation of successive delays", f"{delays.correlation.at_lags[0]:.2f}"
 
 
 def _share(count: int, total: int) -> str:
@@ -354,14 +354,14 @@ def _delays(measurement: NetworkMeasurement) -> Panel:
 
 
 def _correlation(measurement: NetworkMeasurement) -> Panel:
-    delays, (lags, losses) = measurement.delays, measurement.loss_correlation
+    delays, losses = measurement.delays, measurement.loss_correlation
     items = [
-        _curve(x, y, label, colour)
-        for x, y, label, colour in (
-            (delays.lags, delays.correlation, "delays", _BURSTS),
-            (lags, losses, "effective losses", _LOST),
+        _curve(correlation.lags, correlation.at_lags, label, colour)
+        for correlation, label, colour in (
+            (delays.correlation, "delays", _BURSTS),
+            (losses, "effective losses", _LOST),
         )
-        if x
+        if correlation.lags
     ]
     limits = [Rule(at=level, colour=_LIMIT, width=1.0) for level in (delays.white, -delays.white)]
     return Panel(

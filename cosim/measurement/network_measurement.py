@@ -44,12 +44,8 @@ class DelayStatistics:
     received: int
     quantiles_s: dict[float, float]
     """By share of the received packets."""
-    lags: tuple[int, ...]
-    """Distances in packets."""
-    correlation: tuple[float, ...]
-    """Correlation of the normal scores of the delays of two packets at each lag: scores have only
-    the ranks of the delays, so a few very long ones do not outweigh all others. The emulator's
-    ``delay … CORRELATION`` is this correlation at lag 1."""
+    correlation: "Correlation"
+    """Of the delays of two packets. The emulator's ``delay … CORRELATION`` is that at lag 1."""
     white: float
     """Size below which 95 % of the correlations of independent delays are."""
 
@@ -59,16 +55,26 @@ def delay_statistics(trace: PacketTrace) -> DelayStatistics:
     arrived = ~trace.lost
     delays_ns = trace.delay_ns[arrived]
     if not len(delays_ns):
-        return DelayStatistics(0, {}, (), (), 0.0)
+        return DelayStatistics(0, {}, Correlation((), ()), 0.0)
     quantiles = np.quantile(delays_ns, SHARES) * 1e-9
-    lags, correlation = autocorrelation(trace.delay_ns, arrived)
     return DelayStatistics(
         len(delays_ns),
         dict(zip(SHARES, quantiles.tolist(), strict=True)),
-        lags,
-        correlation,
+        autocorrelation(trace.delay_ns, arrived),
         1.96 / np.sqrt(len(delays_ns)),
     )
+
+
+class Correlation(NamedTuple):
+    """The correlation of the normal scores of two packets' values, at some distances.
+
+    Scores have only the ranks of the values, so that a few very large ones do not outweigh all
+    others.
+    """
+
+    lags: tuple[int, ...]
+    """Distances in packets."""
+    at_lags: tuple[float, ...]
 
 
 def normal_scores(values: NDArray[np.int64]) -> Reals:
@@ -80,17 +86,15 @@ def normal_scores(values: NDArray[np.int64]) -> Reals:
     return np.asarray((scores - scores.mean()) / deviation if deviation > 0 else 0.0 * scores)
 
 
-def autocorrelation(
-    values: NDArray[np.int64], known: NDArray[np.bool_]
-) -> tuple[tuple[int, ...], tuple[float, ...]]:
-    """Return lags and the correlation of the normal scores of the known ones of k values."""
+def autocorrelation(values: NDArray[np.int64], known: NDArray[np.bool_]) -> Correlation:
+    """Return the correlation of the known ones of k values; empty if they do not vary."""
     values, known = values[:_MOST_RANKED], known[:_MOST_RANKED]
     if not known.any():
-        return (), ()
+        return Correlation((), ())
     scores = np.zeros(len(known))
     scores[known] = normal_scores(values[known])
     if not scores.any():
-        return (), ()
+        return Correlation((), ())
     furthest = max(min(_LARGEST_LAG, len(known) // 4), 1)
     lags, correlations = [], []
     for lag in np.unique(np.geomspace(1, furthest, _MOST_LAGS).round()).astype(int).tolist():
@@ -98,7 +102,7 @@ def autocorrelation(
         if pairs >= _FEWEST_PAIRS:
             lags.append(lag)
             correlations.append(float(scores[lag:] @ scores[:-lag] / pairs))
-    return tuple(lags), tuple(correlations)
+    return Correlation(tuple(lags), tuple(correlations))
 
 
 @dataclass(frozen=True)
@@ -113,6 +117,14 @@ class MeasurementOptions:
     """K of the (m, K) table."""
     outage_s: float | None = None
     """Bursts of this duration or more are outages; None: the statistical rule."""
+
+
+class WindowLosses(NamedTuple):
+    """The most losses in windows of a length."""
+
+    in_all: int
+    without_outages: int | None
+    """In windows without an outage; None if there are none."""
 
 
 class FittedModel(NamedTuple):
@@ -184,11 +196,11 @@ class NetworkMeasurement:
         return [quantile_m(usual, share) for share in self.options.quantiles]
 
     @cached_property
-    def windows(self) -> dict[int, tuple[int, int | None]]:
-        """By K: most losses in K consecutive packets, in all and in windows without an outage."""
+    def windows(self) -> dict[int, WindowLosses]:
+        """By K: the most losses in K consecutive packets."""
         in_all = most_losses(self.bursts, self.options.windows)
         without_outages = most_losses(self.bursts, self.options.windows, self.is_outage)
-        return {window: (most, without_outages.get(window)) for window, most in in_all.items()}
+        return {window: WindowLosses(most, without_outages.get(window)) for window, most in in_all.items()}
 
     @cached_property
     def delays(self) -> DelayStatistics:
@@ -196,8 +208,8 @@ class NetworkMeasurement:
         return delay_statistics(self.trace)
 
     @cached_property
-    def loss_correlation(self) -> tuple[tuple[int, ...], tuple[float, ...]]:
-        """Lags, and the correlation of the effective losses of two packets."""
+    def loss_correlation(self) -> Correlation:
+        """The correlation of the effective losses of two packets."""
         all_known = np.ones(len(self.trace), bool)
         return autocorrelation(self.outcomes.effective.astype(np.int64), all_known)
 
@@ -266,11 +278,13 @@ class NetworkMeasurement:
             "quantiles": [asdict(quantile) for quantile in self.quantiles],
             "fewest_deliveries_between_bursts": self.fewest_deliveries,
             "windows": {
-                str(window): {"most_losses": every, "without_outages": usual}
-                for window, (every, usual) in self.windows.items()
+                str(window): {"most_losses": losses.in_all, "without_outages": losses.without_outages}
+                for window, losses in self.windows.items()
             },
             "delay_s": {str(share): value for share, value in self.delays.quantiles_s.items()},
-            "delay_correlation": dict(zip(map(str, self.delays.lags), self.delays.correlation, strict=True)),
+            "delay_correlation": dict(
+                zip(map(str, self.delays.correlation.lags), self.delays.correlation.at_lags, strict=True)
+            ),
             "interval_level": LEVEL,
             "models": {name: model.to_json() for name, model in self.models.items()},
             "chosen_model": self.chosen.fit.model if self.models else None,

@@ -116,7 +116,7 @@ def _delay(measurement: NetworkMeasurement) -> list[Mapping[str, object]]:
     if delays_ns.min() == delays_ns.max():
         return [{"kind": "delay", "delay_s": int(delays_ns[0]) * 1e-9}]
     samples_s = np.quantile(delays_ns, np.linspace(0, 1, _SAMPLES)) * 1e-9
-    correlation = measurement.delays.correlation[0] if measurement.delays.correlation else 0.0
+    correlation = next(iter(measurement.delays.correlation.at_lags), 0.0)
     return [
         {
             "kind": "delay",

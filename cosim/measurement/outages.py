@@ -123,10 +123,10 @@ class OutageFit:
 def fit_outages(
     durations_s: NDArray[np.float64], complete: NDArray[np.bool_], observed_s: float
 ) -> OutageFit:
-    """Fit outages.
+    """Estimate how often outages begin, and how long they last.
 
     Args:
-        durations_s: (n,) Their durations.
+        durations_s: (n,) Durations of the outages.
         complete: (n,) Whether they ended within the trace.
         observed_s: length of the trace.
     """

@@ -361,9 +361,9 @@ def moments_table(unlimited: UnlimitedLosses, error: str, beta: float) -> Result
         beta: β of the trigger, by which the bounds at events are multiplied.
     """
     bounds: list[tuple[str, float, int, float | None, float]] = []
-    if (found := unlimited.mean_squares) is not None:  # a mean is at most the root mean square
-        values = found.state, found.controller_error
-        bounds += [("at every time", found.rate_per_s, order, *values) for order in _MOMENT]
+    if (mean_squares := unlimited.mean_squares) is not None:  # a mean is at most the root mean square
+        values = mean_squares.state, mean_squares.controller_error
+        bounds += [("at every time", mean_squares.rate_per_s, order, *values) for order in _MOMENT]
     bounds += [
         *(("largest of a run", m.rate_per_s, m.order, m.state, m.controller_error) for m in unlimited.runs),
         *(

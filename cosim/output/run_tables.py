@@ -427,7 +427,7 @@ def loops_table(loops: Sequence[LoopSummary], title: str) -> ResultTable:
 
 
 def loop_row(loop: LoopSummary) -> tuple[str, ...]:
-    """Return what the table of the loops says of one, in its columns."""
+    """Return the row of a loop in the table of all loops."""
     claims = _verdicts(loop)
     held = f"{claims['held']} of {sum(claims.values())}"
     worse = [f"{claims['violated']} violated"] if claims["violated"] else []

@@ -114,7 +114,7 @@ def _print_loops(console: Console, summary: RunSummary, *, verbose: bool) -> Non
 
 
 def _void_lines(loops: Sequence[LoopSummary]) -> list[str]:
-    """Return why claims are void, and in which loops; nothing if the verdict says it.
+    """Return why claims are void, and in which loops; nothing if that is in the verdict.
 
     Reasons that differ only in numbers are one.
     """

@@ -168,7 +168,8 @@ class TableFile:
 
     Raises:
         CallerError: the file cannot be read, has too many rows, also in one group, does not have
-            all columns of its type, or has a column with missing values.
+            all columns of its type, or has groups of other types. A column with missing values is
+            refused when it is read.
     """
 
     def __init__(self, path: Path, dtype: RowType, most_rows: int = MOST_ROWS) -> None:
@@ -178,20 +179,18 @@ class TableFile:
         with self._open() as file:
             metadata = self._metadata = file.metadata
             groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
-        self.rows = int(metadata.num_rows)
-        if self.rows > most_rows:
-            raise CallerError(
-                f"{path}: has {self.rows:,} rows; a run of this scenario has at most {most_rows:,}"
-            )
-        if (largest := max((group.num_rows for group in groups), default=0)) > _MOST_GROUP_ROWS:
-            raise CallerError(
-                f"{path}: has {largest:,} rows in one part; at most {_MOST_GROUP_ROWS:,} are read"
-            )
-        places = {name: index for index, name in enumerate(metadata.schema.names)}
-        for name in [name for name, _ in _columns(dtype)]:
-            all_statistics = [group.column(places[name]).statistics for group in groups]
-            if any(statistics is not None and statistics.null_count for statistics in all_statistics):
-                raise CallerError(f"{path}: column {name} has holes")
+            self.rows = int(metadata.num_rows)
+            if self.rows > most_rows:
+                raise CallerError(
+                    f"{path}: has {self.rows:,} rows; a run of this scenario has at most {most_rows:,}"
+                )
+            if (largest := max((group.num_rows for group in groups), default=0)) > _MOST_GROUP_ROWS:
+                raise CallerError(
+                    f"{path}: has {largest:,} rows in one part; at most {_MOST_GROUP_ROWS:,} are read"
+                )
+            names = metadata.schema.names
+            places = {name: names.index(name) for name in (LOOP, "input") if name in names}
+            _require_types(file, [*places.values()])
         self.groups = [_group(group, places) for group in groups]
 
     def batches(self, dtype: RowType | None = None, groups: Iterable[int] | None = None) -> Iterator[Rows]:
@@ -263,6 +262,16 @@ class TableFile:
             for entry, values in copies:
                 entry[first : first + _ROWS_IN_CACHE] = values[first : first + _ROWS_IN_CACHE]
         return rows
+
+
+def _require_types(file: pq.ParquetFile, columns: list[int]) -> None:
+    """Raise ArrowException if a group has other types of these columns than the schema.
+
+    The statistics of such a group would end the process: the library throws an error that pyarrow
+    does not catch. It does catch that of reading, here of the first row.
+    """
+    for group in range(file.num_row_groups):
+        next(file.reader.iter_batches(1, row_groups=[group], column_indices=columns, use_threads=False), None)
 
 
 def _group(group: Any, places: Mapping[str, int]) -> _Group:

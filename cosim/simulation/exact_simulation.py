@@ -190,9 +190,14 @@ class ExactSimulation:
             np.zeros(k),
             np.zeros(k, np.int64),
         )
-        plant = (pointer_to(np.ascontiguousarray(part, np.float64), "double *") for part in (A, B))
-        kinds = ["double *"] * 3 + ["int64_t *"] + ["double *"] * 2 + ["int64_t *"]
-        core.noack_exact_segments(self.core, *plant, k, *map(pointer_to, segments, kinds))
+        A, B = (np.ascontiguousarray(part, np.float64) for part in (A, B))
+        given = {name: _pointer(array) for name, array in segments._asdict().items()}
+        core.noack_exact_follow(
+            self.core,
+            _pointer(A),
+            _pointer(B),
+            ffi.new("noack_exact_segments *", {"count": k, **given}),
+        )
         return segments
 
     def sample(
@@ -203,19 +208,23 @@ class ExactSimulation:
         A start is a state just after an event, (starts, 3, n), at an ascending time; the last one
         up to a time applies. States are NaN where a plant is too fast to be followed.
         """
+        A, B, start_s, starts, t_s = (
+            np.ascontiguousarray(part, np.float64) for part in (A, B, start_s, starts, t_s)
+        )
         states = np.empty((len(t_s), 3, self.n))
-        arrays = [np.ascontiguousarray(part, np.float64) for part in (A, B, start_s, starts, t_s)]
-        *known, times = (pointer_to(array, "double *") for array in arrays)
         core.noack_exact_sample(
-            self.core,
-            *known[:2],
-            len(start_s),
-            *known[2:],
-            len(t_s),
-            times,
-            pointer_to(states, "double *"),
+            self.core, _pointer(A), _pointer(B), _states(start_s, starts), _states(t_s, states)
         )
         return states
+
+
+def _states(t_s: Vector, states: NDArray[np.float64]) -> CData:
+    given = {"count": len(t_s), "t_s": _pointer(t_s), "states": _pointer(states)}
+    return ffi.new("noack_exact_states *", given)
+
+
+def _pointer(array: NDArray[np.float64] | NDArray[np.int64]) -> CData:
+    return pointer_to(array, "double *" if array.dtype == np.float64 else "int64_t *")
 
 
 def vanishes_s(rule: TriggerRule) -> float:

@@ -16,7 +16,7 @@ The trigger is that of the core, which the sensor has, too.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -74,58 +74,69 @@ class PlantGridLoop:
     @np.errstate(all="ignore")
     def run(self, *, delay: bool, hold: bool) -> PlantGridRun:
         """Simulate; once the state is not finite, it stays non-finite."""
-        # Start: the first measurement is an event, unless the start is known and passes the trigger.
-        schedule, period_ns, x0 = self._schedule, self._schedule.period_ns, self._system.loop.x0
-        last = len(schedule.measured) - 1
-        states = np.empty((last + 1, len(x0)))
-        states[0] = x_s = x0
-        trigger, in_common = _CoreTrigger(self._system.trigger, len(x0)), self._known_start
-        if in_common:
-            trigger.start(0, x0)
-        newest = _Update(-1, 0, 0, x0 if in_common else np.zeros_like(x0))
-        in_flight: list[_Update] = []
-        events: list[int] = []
-        step, event = 0, bool(schedule.measured[0])
-        if event and in_common:
-            event = trigger.test(0, x0[None], np.zeros_like(x0)[None]) is not None
+        now = self._begin()
         while True:
-            x, now_ns = states[step], step * period_ns
-            # At an event the sensor's model restarts, and the update of a delivered one is on its way.
-            if event:
-                x_s, in_common, number = x, True, len(events)
-                trigger.start(now_ns, x)
-                events.append(step)
-                if schedule.delivered(number):
-                    wait_ns = self._wait_ns(number, hold=hold) if delay else 0
-                    in_flight.append(_Update(number, now_ns, now_ns + wait_ns, x))
-                    in_flight.sort(key=lambda update: update.acts_ns)
-            # Of the updates that act by now, the newest counts.
-            while in_flight and in_flight[0].acts_ns <= now_ns:
-                newest = max(newest, in_flight.pop(0), key=lambda update: update.number)
-            if step == last:
-                return PlantGridRun(states, np.array(events, dtype=np.int64))
-            # Simulate a block of steps, which ends at the next update's effect, as if no event came.
-            until = min(step + _BLOCK, last)
-            if in_flight:
-                until = min(until, max(in_flight[0].acts_ns // period_ns, step + 1))
-            within = [update for update in in_flight if update.acts_ns < until * period_ns]
-            following = slice(step + 1, until + 1)
-            if hold:
-                states[following] = self._states_under_held_inputs(x, newest, step, until)
-            else:
-                states[following] = self._continuous(x, [newest, *within], step, until)
-            x_s_block = self._follow_model(x_s, self._steps_s[1 : until - step + 1])
-            # Continue from the block's first event: what follows it is discarded.
-            measured = np.flatnonzero(schedule.measured[following])
-            if in_common:
-                block = states[following][measured]
-                first = trigger.test((step + 1 + measured) * period_ns, block, x_s_block[measured] - block)
-            else:
-                first = 0 if len(measured) else None
-            event = first is not None
-            taken = until - step - 1 if first is None else int(measured[first])
-            x_s = x_s_block[taken]
-            step += 1 + taken
+            if now.is_event:
+                self._take_event(now, delay=delay, hold=hold)
+            self._apply_updates(now)
+            if now.step == len(now.states) - 1:
+                return PlantGridRun(now.states, np.array(now.event_steps, dtype=np.int64))
+            self._advance(now, hold=hold)
+
+    def _begin(self) -> "_Progress":
+        """Return step 0, which is an event unless the start is known and passes the trigger."""
+        x0, known_start = self._system.loop.x0, self._known_start
+        states = np.empty((len(self._steps_s), len(x0)))
+        states[0] = x0
+        trigger = _CoreTrigger(self._system.trigger, len(x0))
+        is_event = bool(self._schedule.measured[0])
+        if known_start:
+            trigger.start(0, x0)
+            is_event = is_event and trigger.test(0, x0[None], np.zeros_like(x0)[None]) is not None
+        start = _Update(-1, 0, 0, x0 if known_start else np.zeros_like(x0))
+        return _Progress(states, trigger, x0, start, known_start, is_event)
+
+    def _take_event(self, now: "_Progress", *, delay: bool, hold: bool) -> None:
+        """Reset the sensor's model; the update of a delivered event is on its way from now on."""
+        x, now_ns, number = now.states[now.step], now.step * self._schedule.period_ns, len(now.event_steps)
+        now.x_s, now.knows_state = x, True
+        now.trigger.start(now_ns, x)
+        now.event_steps.append(now.step)
+        if self._schedule.delivered(number):
+            wait_ns = self._wait_ns(number, hold=hold) if delay else 0
+            now.in_flight.append(_Update(number, now_ns, now_ns + wait_ns, x))
+            now.in_flight.sort(key=lambda update: update.acts_ns)
+
+    def _apply_updates(self, now: "_Progress") -> None:
+        """Apply the updates that act by now: the newest counts."""
+        now_ns = now.step * self._schedule.period_ns
+        while now.in_flight and now.in_flight[0].acts_ns <= now_ns:
+            now.newest = max(now.newest, now.in_flight.pop(0), key=lambda update: update.number)
+
+    def _advance(self, now: "_Progress", *, hold: bool) -> None:
+        """Simulate to the next event, at most to the next update's effect or over a block of steps."""
+        x, step, period_ns = now.states[now.step], now.step, self._schedule.period_ns
+        until = min(step + _BLOCK, len(now.states) - 1)
+        if now.in_flight:
+            until = min(until, max(now.in_flight[0].acts_ns // period_ns, step + 1))
+        following = slice(step + 1, until + 1)
+        if hold:
+            now.states[following] = self._states_under_held_inputs(x, now.newest, step, until)
+        else:
+            within = [update for update in now.in_flight if update.acts_ns < until * period_ns]
+            now.states[following] = self._continuous(x, [now.newest, *within], step, until)
+        x_s = self._follow_model(now.x_s, self._steps_s[1 : until - step + 1])
+        # What follows the first event is discarded.
+        measured = np.flatnonzero(self._schedule.measured[following])
+        first = 0 if len(measured) else None
+        if now.knows_state:
+            block = now.states[following][measured]
+            times_ns = (step + 1 + measured) * period_ns
+            first = now.trigger.test(times_ns, block, x_s[measured] - block)
+        now.is_event = first is not None
+        steps = until - step if first is None else int(measured[first]) + 1
+        now.x_s = x_s[steps - 1]
+        now.step += steps
 
     def _wait_ns(self, event: int, *, hold: bool) -> int:
         if hold:
@@ -175,6 +186,27 @@ class _Update(NamedTuple):
     event_ns: int
     acts_ns: int
     x: Vector
+
+
+@dataclass
+class _Progress:
+    """How far a run has been simulated."""
+
+    states: Matrix
+    """State at each step so far, (K + 1, n)."""
+    trigger: "_CoreTrigger"
+    x_s: Vector
+    """The sensor's model at the present step."""
+    newest: _Update
+    """The newest update that acts on the controller's model."""
+    knows_state: bool
+    """Whether the sensor's model has started; if not, the next measurement is an event."""
+    is_event: bool
+    """Whether there is an event at the present step."""
+    in_flight: list[_Update] = field(default_factory=list)
+    """In the order in which they act."""
+    event_steps: list[int] = field(default_factory=list)
+    step: int = 0
 
 
 class _CoreTrigger:

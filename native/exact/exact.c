@@ -139,50 +139,52 @@ const char *noack_exact_check(const noack_exact *exact) {
     return check_exact_rule(exact);
 }
 
-/* Take the next count numbers of the scratch, which are 0. */
-static double *take(double **next, int64_t count) {
-    double *taken = *next;
-    *next += count;
+typedef struct { /* the free part of the scratch, which is 0 */
+    double *next;
+    const exact_code *code; /* whose sizes the matrices get */
+} free_scratch;
+
+static double *take(free_scratch *scratch, int64_t count) {
+    double *taken = scratch->next;
+    scratch->next += count;
     return taken;
 }
 
 /* Take a matrix, or NULL for NULL. */
-static double *take_square(double **next, const exact_code *code, int64_t n, const double *matrix) {
+static double *take_square(free_scratch *scratch, int64_t n, const double *matrix) {
     if (matrix == NULL)
         return NULL;
-    double *taken = take(next, code->n * code->stride);
-    pad(n, n, matrix, code->stride, taken);
+    int64_t stride = scratch->code->stride;
+    double *taken = take(scratch, scratch->code->n * stride);
+    pad(n, n, matrix, stride, taken);
     return taken;
 }
 
-typedef struct { /* a quadratic form: the squares of the rows of P minus those of N */
+typedef struct { /* P and N of a rule's form, (rows, 2n) */
     int64_t up_rows, down_rows;
-    const double *up, *down; /* P and N */
-} form_rows;
+    const double *up, *down;
+} rule_form;
 
-/* Take [P; N] as (blocks, 2, N, N), and the signs of its rows. */
-static double *take_form(
-    double **next, const exact_code *code, const exact_memory *memory, form_rows rows,
-    double **signs) {
-    int64_t square = code->n * code->stride, n = memory->exact->n;
-    double *form = take(next, memory->blocks * 2 * square);
-    *signs = take(next, memory->blocks * code->stride);
-    for (int64_t row = 0; row < rows.up_rows + rows.down_rows; row++) {
-        int64_t block = row / code->n, at = row % code->n;
-        int is_up = row < rows.up_rows;
+static block_form take_form(
+    free_scratch *scratch, int64_t blocks, int64_t n, const rule_form *form) {
+    int64_t size = scratch->code->n, stride = scratch->code->stride, square = size * stride;
+    block_form taken;
+    taken.rows = take(scratch, blocks * 2 * square);
+    taken.signs = take(scratch, blocks * stride);
+    for (int64_t row = 0; row < form->up_rows + form->down_rows; row++) {
+        int64_t block = row / size, at = row % size, is_up = row < form->up_rows;
         const double *from =
-            is_up ? rows.up + row * 2 * n : rows.down + (row - rows.up_rows) * 2 * n;
-        (*signs)[block * code->stride + at] = is_up ? 1.0 : -1.0;
+            is_up ? form->up + row * 2 * n : form->down + (row - form->up_rows) * 2 * n;
+        taken.signs[block * stride + at] = is_up ? 1.0 : -1.0;
         for (int64_t j = 0; j < n; j++) {
-            form[2 * block * square + j * code->stride + at] = from[j];
-            form[(2 * block + 1) * square + j * code->stride + at] = from[n + j];
+            taken.rows[2 * block * square + j * stride + at] = from[j];
+            taken.rows[(2 * block + 1) * square + j * stride + at] = from[n + j];
         }
     }
-    return form;
+    return taken;
 }
 
-/* Lay a simulation's memory out in the scratch, from next on; with exact->scratch NULL only count.
- */
+/* Lay a simulation's memory out in the scratch; with memory NULL only count its numbers. */
 static int64_t lay_out(const noack_exact *exact, const exact_code *code, exact_memory *memory) {
     const noack_trigger_rule *rule = &exact->rule;
     int64_t square = code->n * code->stride, n = exact->n, curve = TERMS * code->stride;
@@ -191,9 +193,10 @@ static int64_t lay_out(const noack_exact *exact, const exact_code *code, exact_m
                     + 2 * blocks * (2 * square + code->stride + curve) + CACHE_LINE;
     if (memory == NULL)
         return count;
-    double *next = exact->scratch;
-    memset(next, 0, (size_t)count * sizeof *next);
-    next += (0 - (uintptr_t)next / sizeof *next) % CACHE_LINE; /* vectors do not cross lines */
+    double *begin = exact->scratch;
+    memset(begin, 0, (size_t)count * sizeof *begin);
+    begin += (0 - (uintptr_t)begin / sizeof *begin) % CACHE_LINE; /* vectors do not cross lines */
+    free_scratch scratch = {begin, code};
     memory->exact = exact;
     memory->rule = rule;
     memory->blocks = blocks;
@@ -201,37 +204,37 @@ static int64_t lay_out(const noack_exact *exact, const exact_code *code, exact_m
     memory->integrates = rule->integrates != 0;
     memory->dynamic = memory->quadratic && rule->is_dynamic;
     memory->grid_s = (double)rule->grid_ns * 1e-9;
-    memory->H = take_square(&next, code, n, exact->H);
-    memory->K = take(&next, square);
+    memory->H = take_square(&scratch, n, exact->H);
+    memory->K = take(&scratch, square);
     pad(exact->m, n, exact->K, code->stride, memory->K);
-    memory->weight = take_square(&next, code, n, rule->weight);
-    memory->forecast_weight = take_square(&next, code, n, rule->forecast_weight);
-    memory->Q = take_square(&next, code, n, exact->Q);
-    memory->R = take_square(&next, code, exact->m, exact->R);
-    memory->A = take(&next, square);
-    memory->B = take(&next, square);
-    memory->E = take(&next, square);
-    memory->minus_BK = take(&next, square);
-    memory->D_k = take(&next, (TERMS + 1) * square);
-    memory->H_k = take(&next, (TERMS + 1) * square);
-    memory->KH_k = take(&next, (TERMS + 1) * square);
-    memory->A_k = take(&next, (TERMS + 1) * square);
-    memory->X_k = take(&next, (TERMS + 1) * square);
+    memory->weight = take_square(&scratch, n, rule->weight);
+    memory->forecast_weight = take_square(&scratch, n, rule->forecast_weight);
+    memory->Q = take_square(&scratch, n, exact->Q);
+    memory->R = take_square(&scratch, exact->m, exact->R);
+    memory->A = take(&scratch, square);
+    memory->B = take(&scratch, square);
+    memory->E = take(&scratch, square);
+    memory->minus_BK = take(&scratch, square);
+    memory->D_k = take(&scratch, (TERMS + 1) * square);
+    memory->H_k = take(&scratch, (TERMS + 1) * square);
+    memory->KH_k = take(&scratch, (TERMS + 1) * square);
+    memory->A_k = take(&scratch, (TERMS + 1) * square);
+    memory->X_k = take(&scratch, (TERMS + 1) * square);
     double **curves[] = {&memory->r, &memory->e, &memory->d,         &memory->q,
                          &memory->x, &memory->u, &memory->own_error, &memory->own_weighted};
     for (int i = 0; i < 8; i++)
-        *curves[i] = take(&next, curve);
+        *curves[i] = take(&scratch, curve);
     memory->weighted = rule->weight == NULL ? memory->e : memory->own_weighted;
     memory->is_static = 1;
     for (int64_t i = 0; i < n * n; i++)
         memory->is_static &= exact->H[i] == 0.0;
     if (memory->quadratic) {
-        form_rows compared = {rule->up_rows, rule->down_rows, rule->up, rule->down};
-        form_rows gain = {rule->gain_up_rows, rule->gain_down_rows, rule->gain_up, rule->gain_down};
-        memory->form = take_form(&next, code, memory, compared, &memory->form_signs);
-        memory->y = take(&next, blocks * curve);
-        memory->gain = take_form(&next, code, memory, gain, &memory->gain_signs);
-        memory->w = take(&next, blocks * curve);
+        rule_form form = {rule->up_rows, rule->down_rows, rule->up, rule->down};
+        rule_form gain = {rule->gain_up_rows, rule->gain_down_rows, rule->gain_up, rule->gain_down};
+        memory->form = take_form(&scratch, blocks, n, &form);
+        memory->y = take(&scratch, blocks * curve);
+        memory->gain = take_form(&scratch, blocks, n, &gain);
+        memory->w = take(&scratch, blocks * curve);
     }
     code->prepare_shared(memory);
     return count;
@@ -278,49 +281,49 @@ void noack_exact_runs(
     }
 }
 
-void noack_exact_segments(
-    const noack_exact *exact, const double *A, const double *B, int64_t count, double *t_s,
-    double *states, double *auxiliaries, int64_t *events, double *values, double *at_s,
-    int64_t *statuses) {
+void noack_exact_follow(
+    const noack_exact *exact, const double *A, const double *B, noack_exact_segments *segments) {
     const exact_code *code = code_for(exact);
     int64_t n = exact->n, stride = code->stride;
     double state[3 * NOACK_EXACT_ENTRIES];
     exact_memory memory = {0};
     lay_out(exact, code, &memory);
     code->prepare(&memory, A, B);
-    for (int64_t i = 0; i < count; i++, states += 3 * n) {
+    for (int64_t i = 0; i < segments->count; i++) {
         noack_exact_row row = {.inter_event_min_s = INFINITY};
-        exact_run run = {.row = &row, .stops = 1, .t_s = t_s[i], .at_s = t_s[i], .state = state};
-        run.auxiliary = auxiliaries[i];
-        pack(n, stride, states, state);
+        double begin_s = segments->t_s[i], *own = segments->states + 3 * n * i;
+        exact_run run = {.row = &row, .stops = 1, .t_s = begin_s, .at_s = begin_s, .state = state};
+        run.auxiliary = segments->auxiliaries[i];
+        pack(n, stride, own, state);
         code->follow(&memory, &run);
-        unpack(n, stride, state, states);
-        t_s[i] = run.t_s;
-        auxiliaries[i] = run.auxiliary;
-        events[i] = run.event;
-        values[i] = exact->measure == NOACK_EXACT_COST ? row.cost : row.sup_e_c_scaled;
-        at_s[i] = run.at_s;
-        statuses[i] = row.status;
+        unpack(n, stride, state, own);
+        segments->t_s[i] = run.t_s;
+        segments->auxiliaries[i] = run.auxiliary;
+        segments->events[i] = run.event;
+        segments->values[i] = exact->measure == NOACK_EXACT_COST ? row.cost : row.sup_e_c_scaled;
+        segments->at_s[i] = run.at_s;
+        segments->statuses[i] = row.status;
     }
 }
 
 void noack_exact_sample(
-    const noack_exact *exact, const double *A, const double *B, int64_t starts,
-    const double *start_s, const double *start_states, int64_t count, const double *t_s,
-    double *states) {
+    const noack_exact *exact, const double *A, const double *B, const noack_exact_states *starts,
+    noack_exact_states *samples) {
     const exact_code *code = code_for(exact);
-    int64_t n = exact->n;
+    int64_t size = 3 * exact->n, sampled = 0;
     exact_memory memory = {0};
     lay_out(exact, code, &memory);
     code->prepare(&memory, A, B);
-    for (int64_t start = 0, sampled = 0; start < starts; start++, start_states += 3 * n) {
+    for (int64_t start = 0; start < starts->count; start++) {
         double state[3 * NOACK_EXACT_ENTRIES];
+        int is_last = start + 1 == starts->count;
         int64_t end = sampled;
-        while (end < count && (start + 1 == starts || t_s[end] < start_s[start + 1]))
+        while (end < samples->count && (is_last || samples->t_s[end] < starts->t_s[start + 1]))
             end++;
-        pack(n, code->stride, start_states, state);
+        pack(exact->n, code->stride, starts->states + size * start, state);
         code->sample(
-            &memory, state, start_s[start], end - sampled, t_s + sampled, states + 3 * n * sampled);
+            &memory, state, starts->t_s[start], end - sampled, samples->t_s + sampled,
+            samples->states + size * sampled);
         sampled = end;
     }
 }

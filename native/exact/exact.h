@@ -43,6 +43,11 @@ typedef struct { /* a point of a search: h(s) = g(s) - c e^(-rs), and its deriva
     double s, excess, slope, bend;
 } search_point;
 
+typedef struct {   /* a quadratic form |P z|^2 - |N z|^2 of z = (x, e_s), in blocks of N rows */
+    double *rows;  /* (blocks, 2, N, N) of [P; N] */
+    double *signs; /* (blocks, N) of each row */
+} block_form;
+
 typedef struct { /* memory of a simulation; arrays begin in the caller's scratch */
     const noack_exact *exact;
     const noack_trigger_rule *rule;
@@ -56,7 +61,7 @@ typedef struct { /* memory of a simulation; arrays begin in the caller's scratch
     /* shared by all runs; matrices in column-major order, columns padded to a stride */
     double *H, *K, *H_k, *KH_k;
     double *weight, *forecast_weight, *Q, *R; /* NULL: the identity */
-    double *form, *form_signs, *gain, *gain_signs;
+    block_form form, gain;                    /* of the comparison; of the rate of eta */
     /* of a plant */
     double *A, *B, *E, *A_k, *X_k;
     double *minus_BK, *D_k;

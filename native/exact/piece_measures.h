@@ -96,10 +96,18 @@ static double square_integrals(const exact_memory *memory, int p, double s) {
     return s * (sum(squares) + weighted_input_squares(memory, u_degree, s));
 }
 
-/* |y(s)| e^(rate s) at or near a maximum to the right of low_s; *at_s is the time. */
-static double climb(
-    const double *curve, int p, double low_s, double high_s, double rate, double *at_s) {
+typedef struct { /* |y(s)| e^(rate s) growth on [0, end_s]; y is a curve of degree p */
+    const double *curve;
+    int p;
+    double end_s, rate, growth;
+} growing_norm;
+
+/* The norm, without growth, at or near a maximum to the right of low_s; *at_s is the time. */
+static double climb(const growing_norm *norm, double low_s, double *at_s) {
     const int climbs = 12;
+    const double *curve = norm->curve;
+    int p = norm->p;
+    double rate = norm->rate, high_s = norm->end_s;
     curve_point at = point_at(curve, p, low_s);
     double low = dot(at.y, at.dy) + rate * dot(at.y, at.y);
     double best = sqrt(dot(at.y, at.y)) * fixed_exp(rate * low_s);
@@ -130,34 +138,35 @@ static double climb(
     return best;
 }
 
-/* The larger of best, which is at least the value at end_s, and the supremum of |y(s)| e^(rate s)
-   growth over [0, end_s], or UNRESOLVED. The value is attained, and the supremum exceeds it by at
-   most the share CERTAINTY (values below 1e-150 are ignored; values above 1e150 are infinite). A
-   curve that stays close to one level, such as an oscillation, is searched again as the scalar
-   |y|^2, in which cancelling terms vanish. */
+/* The larger of best, which is at least the norm at end_s, and the supremum of the norm, or
+   UNRESOLVED. The value is attained, and the supremum exceeds it by at most the share CERTAINTY
+   (values below 1e-150 are ignored; values above 1e150 are infinite). A curve that stays close to
+   one level, such as an oscillation, is searched again as the scalar |y|^2, in which cancelling
+   terms vanish. */
 static double raise_supremum(
-    exact_memory *memory, double best, const double *curve, int p, double end_s, double rate,
-    double growth, double *at_s) {
+    exact_memory *memory, const growing_norm *norm, double best, double *at_s) {
     const double smallest = 1e-150, too_large = 1e150;
+    const double *curve = norm->curve;
+    int p = norm->p;
     const int few_steps = 50, most_rises = 10000; /* each passes a maximum or rises by CERTAINTY */
     for (int rise = 0; rise < most_rises; rise++) {
         if (best >= too_large)
             return best;
-        double level = largest_of(best * (1.0 + CERTAINTY), smallest) / growth;
-        level_search search = {level, rate, end_s, 0};
+        double level = largest_of(best * (1.0 + CERTAINTY), smallest) / norm->growth;
+        level_search search = {level, norm->rate, norm->end_s, 0};
         double s = first_exit(curve, p, &search, ENDS_BELOW, few_steps);
         if (s == UNRESOLVED) {
             lanes signs = filled(1.0);
             squared(curve, p, 1, (const double *)&signs, memory->squares);
-            level_search again = {level * level, 2.0 * rate, end_s, 0};
+            level_search again = {level * level, 2.0 * norm->rate, norm->end_s, 0};
             s = first_root(memory->squares, 2 * p, &again, 0.0);
         }
         if (s == NONE)
             return best;
         if (s == UNRESOLVED)
             return UNRESOLVED;
-        double peak = climb(curve, p, s, end_s, rate, at_s);
-        best = largest_of(best * (1.0 + CERTAINTY), peak * growth);
+        double peak = climb(norm, s, at_s);
+        best = largest_of(best * (1.0 + CERTAINTY), peak * norm->growth);
     }
     return UNRESOLVED;
 }

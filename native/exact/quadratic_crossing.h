@@ -31,10 +31,10 @@ static int compare(exact_memory *memory, int p, double dynamic_variable) {
     double *g = memory->g, *eta = memory->eta, last = dynamic_variable;
     double decay_per_s = memory->rule->decay_per_s;
     int degree = 2 * p;
-    squared(memory->y, p, memory->blocks, memory->form_signs, g);
+    squared(memory->y, p, memory->blocks, memory->form.signs, g);
     if (!memory->dynamic)
         return degree;
-    squared(memory->w, p, memory->blocks, memory->gain_signs, eta);
+    squared(memory->w, p, memory->blocks, memory->gain.signs, eta);
     /* Compute the coefficients of eta from those of its gain, in place. */
     for (int k = 0; k <= degree + MORE; k++) {
         double gain = k <= degree ? eta[k] : 0.0;
@@ -53,8 +53,8 @@ static int compare(exact_memory *memory, int p, double dynamic_variable) {
 static double left_side(const exact_memory *memory, lanes x) {
     lanes total = filled(0.0);
     for (int64_t block = 0; block < memory->blocks; block++) {
-        lanes y = times(memory->form + block * 2 * N * STRIDE, x);
-        y = multiply(multiply(y, load(memory->form_signs + block * STRIDE)), y);
+        lanes y = times(memory->form.rows + block * 2 * N * STRIDE, x);
+        y = multiply(multiply(y, load(memory->form.signs + block * STRIDE)), y);
         total = block == 0 ? y : add(total, y);
     }
     return sqrt(largest_of(sum(total), 0.0));

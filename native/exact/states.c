@@ -25,20 +25,26 @@ typedef struct { /* the comparison from the start of a piece on */
 
 static inline double size_of(lanes v) { return sqrt(dot(v, v)); }
 
-enum { MOVES = 1, HAS_D = 2, HAS_Q = 4 }; /* what of a state is not 0: H, d and q */
+typedef struct { /* what curves are written: the coefficients of degree begin to end */
+    int begin, end;
+    double factor; /* of those of quadratic forms */
+} expansion;
 
-/* Write the coefficients of degree begin to end; those of quadratic forms times a factor. What the
-   state has is a constant, for each value of which there is code. */
-static inline __attribute__((always_inline)) void expand_with(
-    exact_memory *memory, loop_state state, double factor, int begin, int end, int what) {
-    int moves = what & MOVES, has_d = what & HAS_D, has_q = what & HAS_Q;
+typedef struct { /* whether r, d and q move; whether d and q differ from 0 */
+    int moves, has_d, has_q;
+} curve_kinds;
+
+/* Write the coefficients. kinds is a constant, and each has code of its own. */
+static inline __attribute__((always_inline)) void expand_kinds(
+    exact_memory *memory, loop_state state, expansion wanted, curve_kinds kinds) {
+    const int moves = kinds.moves, has_d = kinds.has_d, has_q = kinds.has_q;
     const double *H_k = memory->H_k, *A_k = memory->A_k, *X_k = memory->X_k, *D_k = memory->D_k;
     const double *KH_k = memory->KH_k, *weight = memory->weight;
     double *rs = memory->r, *es = memory->e, *ds = memory->d, *qs = memory->q, *xs = memory->x;
     double *us = memory->u, *errors = memory->own_error, *weighted = memory->own_weighted;
     lanes x_c = has_q ? subtract(state.r, state.q) : state.r;
     int quadratic = memory->quadratic;
-    for (int k = begin; k <= end; k++) {
+    for (int k = wanted.begin; k <= wanted.end; k++) {
         int table = k * N * STRIDE, at = k * STRIDE;
         lanes r = filled(0.0), d = r, q = r, e = times(X_k + table, state.r);
         e = add(times(A_k + table, state.e), e);
@@ -64,15 +70,15 @@ static inline __attribute__((always_inline)) void expand_with(
             store(errors + at, weigh(weight, e_s));
         if (quadratic) {
             int64_t place = at * memory->blocks;
-            put_rows(memory->form, memory->blocks, x, e_s, factor, memory->y + place);
+            put_rows(memory->form.rows, memory->blocks, x, e_s, wanted.factor, memory->y + place);
             if (memory->dynamic)
-                put_rows(memory->gain, memory->blocks, x, e_s, factor, memory->w + place);
+                put_rows(
+                    memory->gain.rows, memory->blocks, x, e_s, wanted.factor, memory->w + place);
         }
     }
 }
 
-static void expand(
-    exact_memory *memory, const loop_state *state, double factor, int begin, int end) {
+static void expand(exact_memory *memory, const loop_state *state, expansion wanted) {
     int own = memory->weight != NULL || memory->has_q;
     memory->weighted = own ? memory->own_weighted : memory->e;
     memory->error = memory->has_d ? memory->own_error : memory->weighted;
@@ -81,13 +87,13 @@ static void expand(
         memory->has_D_k = 1;
     }
     if (memory->has_q)
-        expand_with(memory, *state, factor, begin, end, MOVES | HAS_D | HAS_Q);
+        expand_kinds(memory, *state, wanted, (curve_kinds){1, 1, 1});
     else if (memory->is_static)
-        expand_with(memory, *state, factor, begin, end, HAS_D);
+        expand_kinds(memory, *state, wanted, (curve_kinds){0, 1, 0});
     else if (memory->has_d)
-        expand_with(memory, *state, factor, begin, end, MOVES | HAS_D);
+        expand_kinds(memory, *state, wanted, (curve_kinds){1, 1, 0});
     else
-        expand_with(memory, *state, factor, begin, end, MOVES);
+        expand_kinds(memory, *state, wanted, (curve_kinds){1, 0, 0});
 }
 
 /* The same state with the plant's own as the reference, if that is small beside the present one:
@@ -165,52 +171,62 @@ static double growth_at(const noack_exact *exact, double t_s) {
     return rate > 0.0 ? fixed_exp(rate * least(t_s, exact->fading_until_s)) : 1.0;
 }
 
-/* Raise a row's supremum by that of a piece; return 0 if it is UNRESOLVED. bound: the norm does not
-   exceed its threshold; NULL: it may. */
-static int measure_supremum(
-    exact_memory *memory, exact_run *run, loop_state end, int q, double t_s, double length_s,
-    const rule_phase *bound) {
+typedef struct { /* a piece of a run, which has been followed */
+    double t_s, length_s;
+    loop_state end;
+    const rule_phase
+        *bound; /* the norm of the error is at most its threshold; NULL: it may exceed it */
+} piece;
+
+/* Raise a row's supremum by that of a piece with curves of degree q; return 0 if it is UNRESOLVED.
+ */
+static int measure_supremum(exact_memory *memory, exact_run *run, const piece *done, int q) {
     const noack_exact *exact = memory->exact;
-    int of_state = exact->measure == NOACK_EXACT_STATE, fades = t_s < exact->fading_until_s;
-    const double *curve = of_state ? memory->x : memory->weighted;
-    lanes last = of_state ? plant_of(end) : weigh(memory->weight, controller_error(end));
-    double rate = fades ? exact->fading_per_s : 0.0, growth = run->growth;
-    run->growth = fades ? growth_at(exact, t_s + length_s) : growth;
-    double grown =
-        t_s + length_s <= exact->fading_until_s ? run->growth : growth * fixed_exp(rate * length_s);
-    double before = run->row->sup_e_c_scaled, at_s = length_s, ceiling = INFINITY;
-    if (bound != NULL)
-        ceiling = bound->threshold * (bound->rate_per_s > 0.0 ? growth : grown);
+    double end_s = done->t_s + done->length_s;
+    int of_state = exact->measure == NOACK_EXACT_STATE, fades = done->t_s < exact->fading_until_s;
+    lanes last =
+        of_state ? plant_of(done->end) : weigh(memory->weight, controller_error(done->end));
+    growing_norm norm = {
+        .curve = of_state ? memory->x : memory->weighted,
+        .p = q,
+        .end_s = done->length_s,
+        .rate = fades ? exact->fading_per_s : 0.0,
+        .growth = run->growth,
+    };
+    run->growth = fades ? growth_at(exact, end_s) : norm.growth;
+    double grown = end_s <= exact->fading_until_s ? run->growth
+                                                  : norm.growth * fixed_exp(norm.rate * norm.end_s);
+    double before = run->row->sup_e_c_scaled, at_s = norm.end_s, ceiling = INFINITY;
+    if (done->bound != NULL)
+        ceiling = done->bound->threshold * (done->bound->rate_per_s > 0.0 ? norm.growth : grown);
     double best = largest_of(before, size_of(last) * grown);
     if (!(ceiling <= best * (1.0 + CERTAINTY)))
-        best = raise_supremum(memory, best, curve, q, length_s, rate, growth, &at_s);
+        best = raise_supremum(memory, &norm, best, &at_s);
     if (best == UNRESOLVED)
         return 0;
-    run->at_s = best > before ? t_s + at_s : run->at_s;
+    run->at_s = best > before ? done->t_s + at_s : run->at_s;
     run->row->sup_e_c_scaled = best;
     return 1;
 }
 
 /* Add a piece's contribution to a row; settled is a level of |x|. Return the last time on the piece
- * at which |x| > settled; NONE; or UNRESOLVED. */
+   at which |x| > settled; NONE; or UNRESOLVED. */
 static double measure_piece(
-    exact_memory *memory, exact_run *run, loop_state end, double t_s, double length_s,
-    double settled, const rule_phase *bound) {
+    exact_memory *memory, exact_run *run, const piece *done, double settled) {
     noack_exact_row *row = run->row;
     int64_t measure = memory->exact->measure;
-    int q = degree_for(memory->measured_s, length_s);
+    int q = degree_for(memory->measured_s, done->length_s);
     if (measure == NOACK_EXACT_ROW || measure == NOACK_EXACT_COST)
-        row->cost += square_integrals(memory, q, length_s);
+        row->cost += square_integrals(memory, q, done->length_s);
     if (measure == NOACK_EXACT_TIMES || measure == NOACK_EXACT_COST)
         return NONE;
-    if (!measure_supremum(memory, run, end, q, t_s, length_s, bound))
+    if (!measure_supremum(memory, run, done, q))
         return UNRESOLVED;
     if (measure != NOACK_EXACT_ROW)
         return NONE;
-    lanes x = plant_of(end);
-    double within_s = last_above(memory->x, q, length_s, settled, x);
+    double within_s = last_above(memory->x, q, done->length_s, settled, plant_of(done->end));
     if (within_s >= 0.0)
-        row->settling_s = t_s + within_s;
+        row->settling_s = done->t_s + within_s;
     return within_s;
 }
 
@@ -338,7 +354,7 @@ static inline __attribute__((always_inline)) double search_piece(
     double factor = 1.0 / compared->scale, longest_s = least(now->farthest_s, *window_s);
     int expanded = 0; /* number of coefficients so far */
     if (compared->phase.compares && !now->looked) {
-        expand(memory, &now->state, factor, 0, 2);
+        expand(memory, &now->state, (expansion){0, 2, factor});
         expanded = 3;
         double soon_s = first_window(memory, compared, now->point, now->t_s);
         crossing = soon_s < longest_s ? LIKELY : UNKNOWN;
@@ -347,7 +363,7 @@ static inline __attribute__((always_inline)) double search_piece(
     }
     *window_s = longest_s;
     *p = degree_for(memory->reach_s, longest_s);
-    expand(memory, &now->state, factor, expanded, *p);
+    expand(memory, &now->state, (expansion){expanded, *p, factor});
     return find_event(memory, compared, *p, &now->point, now->t_s, longest_s, crossing);
 }
 
@@ -397,8 +413,8 @@ follow_piece(exact_memory *memory, exact_run *run, progress *now) {
     }
     int is_bounded = now->agree && !memory->quadratic && phase.compares && !memory->integrates
                      && exact->measure != NOACK_EXACT_STATE; /* e_c = e_s */
-    double within_s = measure_piece(
-        memory, run, now->state, now->t_s, spent_s, now->settled, is_bounded ? &phase : NULL);
+    piece done = {now->t_s, spent_s, now->state, is_bounded ? &phase : NULL};
+    double within_s = measure_piece(memory, run, &done, now->settled);
     if (within_s == UNRESOLVED)
         return NOACK_EXACT_UNDECIDED;
     now->above = within_s == spent_s;
@@ -470,7 +486,7 @@ static void sample(
         while (t_s[i] - start_s > farthest_s && farthest_s > 0.0 && pieces++ < MOST_PIECES) {
             if (!expanded) {
                 at = renew_reference(memory, at);
-                expand(memory, &at, 1.0, 0, HIGHEST);
+                expand(memory, &at, (expansion){0, HIGHEST, 1.0});
             }
             at = state_at(memory, HIGHEST, farthest_s);
             start_s += farthest_s;
@@ -478,7 +494,7 @@ static void sample(
         }
         if (!expanded) {
             at = renew_reference(memory, at);
-            expand(memory, &at, 1.0, 0, HIGHEST);
+            expand(memory, &at, (expansion){0, HIGHEST, 1.0});
         }
         expanded = 1;
         double after_s = t_s[i] - start_s;

@@ -120,13 +120,13 @@ void touch_clients(noack_relay *relay) {
     for (int64_t k = scratch->batch_next; k < scratch->batch_end; k++) {
         int64_t row = scratch->hints[k];
         if (row >= 0)
-            loaded += (uint64_t)relay->clients[row].key[0] + (uint64_t)relay->clients[row].place
+            loaded += (uint64_t)relay->clients[row].key[0] + (uint64_t)relay->clients[row].flow_row
                       + (uint64_t)relay->sockets[first_path + row].fd;
     }
     for (int64_t k = scratch->batch_next; k < scratch->batch_end; k++) {
         int64_t row = scratch->hints[k];
         if (row >= 0 && relay->clients[row].link == scratch->batch_socket)
-            loaded += (uint64_t)noack_link_touch(link, relay->clients[row].place);
+            loaded += (uint64_t)noack_link_touch(link, relay->clients[row].flow_row);
     }
     scratch->loaded = loaded;
 }

@@ -79,9 +79,9 @@ static void enqueue_departure(noack_relay *relay) {
     departure *leaving = &scratch->leaving[number];
     noack_direction *direction = &relay->directions[leaving->datagram.direction];
     leaving->stale = (uint8_t)noack_link_leave(
-        direction->link, relay->clients[leaving->datagram.client].place, leaving->datagram.packet,
-        max_of(leaving->datagram.size_bytes - headers_bytes(relay), 0), leaving->delayed,
-        leaving->datagram.counts);
+        direction->link, relay->clients[leaving->datagram.client].flow_row,
+        leaving->datagram.packet, max_of(leaving->datagram.size_bytes - headers_bytes(relay), 0),
+        leaving->delayed, leaving->datagram.counts);
     leaving->error = 0;
     scratch->leaving_bytes += leaving->datagram.size_bytes;
     int64_t link = leaving->datagram.direction >> 1;
@@ -226,7 +226,7 @@ static void release(
     int64_t order = departure_order(direction & 1, relay->delayed_count);
     if (decision->waits)
         wait_for_link(
-            relay->directions[direction].link, relay->clients[client].place, relay->waiting,
+            relay->directions[direction].link, relay->clients[client].flow_row, relay->waiting,
             leaving->slot, order, decision);
     else
         heap_push(
@@ -244,9 +244,9 @@ static void decide(noack_relay *relay, int64_t number, int64_t row, int64_t size
     client->last_ns = relay->now_ns;
     serve(link, relay->waiting, relay->now_ns, relay->heap, &relay->heap_length);
     if (!relay->devices)
-        link->flows[client->place].error_level = noack_wire_error_level(data, size_bytes);
+        link->flows[client->flow_row].error_level = noack_wire_error_level(data, size_bytes);
     noack_link_decide(
-        link, client->place, max_of(size_bytes - headers_bytes(relay), 0), relay->now_ns,
+        link, client->flow_row, max_of(size_bytes - headers_bytes(relay), 0), relay->now_ns,
         &decision);
     if (relay->taps)
         report_arrival(relay, number, row, data, size_bytes, &decision);

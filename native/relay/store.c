@@ -71,8 +71,8 @@ void noack_relay_latest(noack_relay *relay, int64_t direction, int64_t *latest_n
     for (int64_t i = 0; i < relay->heap_length; i++) {
         const noack_slot *slot = &relay->slots[relay->heap[i].slot];
         if (slot->direction == direction) {
-            int64_t place = relay->clients[slot->client].place;
-            latest_ns[place] = max_of(latest_ns[place], relay->heap[i].due_ns);
+            int64_t row = relay->clients[slot->client].flow_row;
+            latest_ns[row] = max_of(latest_ns[row], relay->heap[i].due_ns);
         }
     }
 }

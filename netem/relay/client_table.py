@@ -35,10 +35,12 @@ class ClientTable:
         self._links, self._warnings, self._directions = links, warnings, directions
         self._memory = memory
         self._free_rows = list(reversed(range(len(memory.clients))))
-        self._free_places: list[list[int]] = [[] for _ in links]
-        self._places = [0] * len(links)
+        self._free_flow_rows: list[list[int]] = [[] for _ in links]
+        self._used_flow_rows = [0] * len(links)
         self.ever = [0] * len(links)
+        """(links,) Clients so far."""
         self.present = [0] * len(links)
+        """(links,) Clients that are in the table."""
         self._paths: dict[int, Endpoint] = {}
         self._drops: dict[int, int] = {}
         self.drops = [0] * len(links)
@@ -49,11 +51,12 @@ class ClientTable:
 
     def add(self, link: int, name: bytes) -> None:
         """Add a client by its packed name; if that is impossible, refuse clients until one leaves."""
-        present, path, error = self.present[link], None, 0
+        present = self.present[link]
         if present >= self._links[link].spec.most_clients:
             self._warnings[link].report_full()
             self._set_full(link, True)
             return
+        path, error = None, 0
         if self._links[link].has_paths:
             path, error = return_path(self._links[link].server)
             if error in (errno.EMFILE, errno.ENFILE):
@@ -130,23 +133,22 @@ class ClientTable:
         if not self._free_rows:
             self._grow()
         row = self._free_rows.pop()
-        free = self._free_places[link]
-        if free:
-            place = free.pop()
+        if self._free_flow_rows[link]:
+            flow_row = self._free_flow_rows[link].pop()
         else:
-            place = self._places[link]
-            self._places[link] += 1
+            flow_row = self._used_flow_rows[link]
+            self._used_flow_rows[link] += 1
         number = self.ever[link]
         self.ever[link] += 1
         self.present[link] += 1
         for direction in self._directions[2 * link : 2 * link + 2]:
-            direction.start_flow(place, number)
+            direction.start_flow(flow_row, number)
         memory = self._memory
         _, name_bytes = packed_name(self._links[link].name)
         local, _ = packed_name(self._links[link].local)
         client = memory.clients[row]
         client["last_ns"] = memory.core.now_ns
-        client["number"], client["link"], client["place"] = number, link, place
+        client["number"], client["link"], client["flow_row"] = number, link, flow_row
         client["in_flight"] = 0
         client["name_bytes"] = name_bytes
         client["name"], client["local"] = name_array(name), name_array(local)
@@ -157,18 +159,18 @@ class ClientTable:
             self._set_path(row, path)
 
     def _set_path(self, row: int, path: Endpoint) -> None:
-        memory, place = self._memory, self._memory.first_path + row
+        memory = self._memory
         if self._directions[2 * int(memory.clients["link"][row]) + 1].tracks:
             stamp_arrivals(path)
         self._paths[row] = path
         self._drops[row] = 0
         local, _ = packed_name(path.getsockname())
         memory.clients["local"][row] = name_array(local)
-        memory.watch(path.fileno(), place)
+        memory.watch(path.fileno(), memory.first_path + row)
 
     def _forget(self, row: int) -> None:
         memory = self._memory
-        link, place = int(memory.clients["link"][row]), int(memory.clients["place"][row])
+        link = int(memory.clients["link"][row])
         core.noack_client_remove(memory.core, row)
         if row in self._paths:
             self._query_drops(row)
@@ -178,7 +180,7 @@ class ClientTable:
         memory.sockets["fd"][self._memory.first_path + row] = -1
         memory.sockets["error"][self._memory.first_path + row] = 0
         self._free_rows.append(row)
-        self._free_places[link].append(place)
+        self._free_flow_rows[link].append(int(memory.clients["flow_row"][row]))
         self.present[link] -= 1
         self._set_full(link, False)
 

@@ -6,6 +6,7 @@ import struct
 from dataclasses import dataclass
 
 from netem.relay.relay_links import LinkSpec
+from netem.relay.relay_reports import DIRECTIONS, Direction
 from noack.runtime.address import Address, SocketName
 
 _DROPPED = 11
@@ -48,10 +49,11 @@ class DeviceLink:
         """The address inside."""
         return self.spec.listen
 
-    def drops(self, reverse: bool) -> int:
+    def drops(self, direction: Direction) -> int:
         """Return how many packets a direction lost because a device was full."""
-        text = os.pread(self.statistics[reverse], 65536, 0).decode()
-        line = next(line for line in text.splitlines() if f"{self.names[reverse]}:" in line)
+        device = DIRECTIONS.index(direction)
+        text = os.pread(self.statistics[device], 65536, 0).decode()
+        line = next(line for line in text.splitlines() if f"{self.names[device]}:" in line)
         return int(line.partition(":")[2].split()[_DROPPED])
 
     def client_text(self, flow: bytes) -> str:

@@ -49,6 +49,7 @@ class Relay:
     def __init__(
         self,
         specs: Sequence[LinkSpec],
+        *,
         segment: bool = False,
         taps: Sequence[Tap] = (),
         spin_ns: int = 0,
@@ -62,8 +63,10 @@ class Relay:
         self._losses = [UnintendedLosses(spec.name, side) for spec in specs for side in DIRECTIONS]
         self._epoch_ns = self._rarely_ns = 0
         self._taps = tuple(taps)
-        data = any(tap.wants_data for tap in self._taps)
-        self._memory = RelayMemory(len(self.specs), segment, 1 + data if self._taps else 0)
+        payloads = any(tap.wants_data for tap in self._taps)
+        self._memory = RelayMemory(
+            len(self.specs), segment=segment, events=bool(self._taps), payloads=payloads
+        )
         self._memory.core.spin_ns = spin_ns
         self._directions = [
             RelayDirection(
@@ -161,8 +164,8 @@ class Relay:
         for number, link in enumerate(self._open_links):
             *_, port_unreachable = self._link_counts(number)
             self._warnings[number].port_unreachable(port_unreachable)
-            self._losses[2 * number].lost_in_kernel(link.drops(False))
-            lost = self._clients.drops[number] + link.drops(True)
+            self._losses[2 * number].lost_in_kernel(link.drops("forward"))
+            lost = self._clients.drops[number] + link.drops("reverse")
             self._losses[2 * number + 1].lost_in_kernel(lost)
         for direction, error, datagrams in self._send_errors():
             self._losses[direction].not_sent(error, datagrams)
@@ -225,7 +228,7 @@ class Relay:
     def _report_flows(self, direction: int) -> Sequence[FlowReport]:
         clients, flows = self._memory.clients, self._directions[direction].flows
         rows = self._clients.rows_of(direction // 2)
-        packets = flows["packets"][clients["place"][rows]]
+        packets = flows["packets"][clients["flow_row"][rows]]
         busiest = rows[np.argsort(-packets, kind="stable")[:_REPORTED_FLOWS]].tolist()
         return [
             FlowReport(
@@ -234,7 +237,7 @@ class Relay:
                 int(flow["packets"]),
                 int(flow["longest_loss_burst"]),
             )
-            for row, flow in zip(busiest, flows[clients["place"][busiest]], strict=True)
+            for row, flow in zip(busiest, flows[clients["flow_row"][busiest]], strict=True)
         ]
 
     def _listen(self, number: int) -> None:

@@ -68,9 +68,9 @@ class OpenLink:
         """Whether each client has a return path."""
         return self.spec.return_path
 
-    def drops(self, reverse: bool) -> int:
-        """Return how many datagrams the kernel dropped at the listening socket."""
-        return 0 if reverse else drops_of(self.endpoint) or 0
+    def drops(self, direction: Direction) -> int:
+        """Return how many datagrams the kernel dropped at the listening socket, which is forward."""
+        return (drops_of(self.endpoint) or 0) if direction == "forward" else 0
 
     def client_text(self, name: bytes) -> str:
         """Return a client's packed address as text."""

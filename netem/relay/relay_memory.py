@@ -32,24 +32,33 @@ class RelayMemory:
     Args:
         links: the links; their directions are numbered 2·link forward, 2·link + 1 reverse.
         segment: send successive datagrams of equal size as one message.
-        taps: 0: none; 1: without payloads; 2: with payloads.
+        events: collect events for taps.
+        payloads: with the payloads of their datagrams.
         row_count: number of rows of the record that are kept for each table; 0: no record.
     """
 
-    def __init__(self, links: int, segment: bool = False, taps: int = 0, row_count: int = 0) -> None:
+    def __init__(
+        self,
+        links: int,
+        *,
+        segment: bool = False,
+        events: bool = False,
+        payloads: bool = False,
+        row_count: int = 0,
+    ) -> None:
         self.first_path = 2 * links
         self._chunks: list[Bytes] = []
         self._epoll = select.epoll()
         self.directions: CData = ffi.new("noack_direction[]", 2 * links)
-        self.events: Rows = np.zeros(_EVENTS if taps else 0, EVENT)
-        self.data: Bytes = np.zeros(_DATA_BYTES if taps == 2 else 0, np.uint8)
+        self.events: Rows = np.zeros(_EVENTS if events else 0, EVENT)
+        self.data: Bytes = np.zeros(_DATA_BYTES if payloads else 0, np.uint8)
         self.packets: Rows = np.zeros(row_count, dtype_of("noack_packet_row"))
         self.releases: Rows = np.zeros(row_count, dtype_of("noack_release_row"))
         self._scratch = zeros_in_lines(core.noack_relay_scratch_bytes(), np.dtype(np.uint8))
         self.core: CData = ffi.new("noack_relay *", {
             "links": links, "epoll": self._epoll.fileno(), "only_socket": -1,
             "clock": {"speed": 1.0}, "change_ns": NEVER_NS, "segment": segment,
-            "segment_below": 2**16, "taps": taps, "records": row_count > 0,
+            "segment_below": 2**16, "taps": events + payloads, "records": row_count > 0,
             "directions": self.directions,
             "event_count": len(self.events), "data_bytes": len(self.data),
             "row_count": row_count, "free_slot": -1, "free_block": -1,

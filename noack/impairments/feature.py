@@ -231,6 +231,13 @@ class LossModel(StageFeature):
     """Whether a delay after it can be correlated with its losses."""
 
 
+class PacketOrder(NamedTuple):
+    """What may have happened to packets: whether some were delayed, and whether some overtook others."""
+
+    delayed: bool = False
+    reordered: bool = False
+
+
 class Impairment(StageFeature):
     """Base class of impairments; each has its own first word."""
 
@@ -262,9 +269,9 @@ class Impairment(StageFeature):
         own_s = self.longest_s if self.is_bounded else math.inf
         return least_s + self.shortest_s, largest_s + own_s
 
-    def reorders(self, delayed: bool, reordered: bool) -> tuple[bool, bool]:
-        """Return whether packets may be delayed, and reordered, after it; given both before it."""
-        return delayed, reordered
+    def order_after(self, before: PacketOrder) -> PacketOrder:
+        """Return the order of the packets after it, given that before it."""
+        return before
 
 
 CHANCE = (Part("probability", PERCENT, "P"), Part("correlation", CORRELATION, "CORR"))

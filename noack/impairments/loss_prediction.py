@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 
 from noack.core.errors import CallerError
 from noack.impairments.constraints import join_guarantee
-from noack.impairments.feature import Impairment
+from noack.impairments.feature import Impairment, PacketOrder
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_guarantee import LossGuarantee
@@ -115,10 +115,10 @@ def predict(settings: LinkSettings) -> LossPrediction:
     notes = list(
         dict.fromkeys(impairment.prediction_note for impairment in impairments if impairment.prediction_note)
     )
-    delayed, reordered = False, False
+    order = PacketOrder()
     for impairment in impairments:
-        delayed, reordered = impairment.reorders(delayed, reordered)
-    if settings.longest_burst != 0 and reordered:
+        order = impairment.order_after(order)
+    if settings.longest_burst != 0 and order.reordered:
         notes.append("not counting packets delivered out of order (stale)")
     return LossPrediction(rate, "; ".join(notes))
 
@@ -390,12 +390,12 @@ def loss_process(settings: LinkSettings) -> LossProcess:
     Raises:
         NotPredictableError: they cannot be computed; the message is the reason.
     """
-    delayed, reordered = False, False
+    order = PacketOrder()
     for impairment in settings.impairments:
-        delayed, reordered = impairment.reorders(delayed, reordered)
+        order = impairment.order_after(order)
         if impairment.prediction_note:
             raise NotPredictableError(f"the losses are known only {impairment.prediction_note}")
-    if reordered:
+    if order.reordered:
         raise NotPredictableError("packets may arrive out of order, which counts as a loss")
     try:
         start, moves, lost = joint_chain(with_target_loss(settings))

@@ -284,7 +284,7 @@ class RunProcess:
         return reached_ns
 
     def _all_done(self, is_done: bool) -> bool:
-        """Whether plant and controller have done their last steps; told whether this process has.
+        """Return whether plant and controller have done their last steps, given whether this process has.
 
         One that was stopped for a while does them after the horizon. The others must still receive
         what it sends then.

@@ -14,6 +14,7 @@ from contextlib import suppress
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,10 +40,8 @@ from noack.runtime.spool import (
 )
 
 _BATCH_ROWS = 256
-_HELD_BYTES = 64 * 1024 * 1024
+_MOST_KEPT_BYTES = 64 * 1024 * 1024
 _RESENT_AT_ONCE = 8  # batches that are sent again at a time: the loop waits for it
-_Batch = tuple[str, int, int, bytes]
-"""Table, number of the first row, rows, and the rows themselves."""
 Publish = Callable[[str, bytes, bytes], None]  # publishes a batch: table, header (JSON), rows
 Ranges = Sequence[tuple[int, int]]
 """Disjoint, ascending, half-open ranges of row numbers."""
@@ -94,6 +93,14 @@ class ReceivedRows:
         return [(low, min(high, total)) for low, high in gaps if low < min(high, total)]
 
 
+class _RowBatch(NamedTuple):
+    table: str
+    first: int
+    """Number of the first row."""
+    rows: int
+    payload: bytes
+
+
 class TelemetryBuffer:
     """Collects rows by table and passes them to ``publish``, which does not block.
 
@@ -119,10 +126,12 @@ class TelemetryBuffer:
         self._published = dict.fromkeys([*tables, NOTICES], 0)
         of_loops = [table for table, dtype in tables.items() if LOOP in (dtype.names or ())]
         self._by_loop = {table: np.zeros(0, np.int64) for table in of_loops}
-        self._held: deque[_Batch] = deque()
-        self._to_resend: deque[_Batch] = deque()
+        self._kept: deque[_RowBatch] = deque()
+        """The batches that are not known to be on disk, the oldest first."""
+        self._to_resend: deque[_RowBatch] = deque()
         self._old = 0
-        self._held_bytes = 0
+        """Number of those that were kept at the last confirmation, too."""
+        self._kept_bytes = 0
 
     def append(self, record: Record) -> None:
         """Add a row; a full batch is published."""
@@ -160,8 +169,8 @@ class TelemetryBuffer:
         if rows := self._persisted():
             self._forget(rows)
         for _ in range(min(len(self._to_resend), _RESENT_AT_ONCE)):
-            table, first, count, payload = self._to_resend.popleft()
-            self._publish(table, self._header(first, count), payload)
+            batch = self._to_resend.popleft()
+            self._publish(batch.table, self._header(batch), batch.payload)
 
     def totals(self) -> dict[str, int]:
         """Rows published so far, by table."""
@@ -172,8 +181,8 @@ class TelemetryBuffer:
         return {table: counts.tolist() for table, counts in self._by_loop.items()}
 
     def store_all(self) -> None:
-        """Store all batches that are held."""
-        while self._held:
+        """Store all batches that are not known to be on disk."""
+        while self._kept:
             self._store_oldest()
 
     def stored(self) -> dict[str, Ranges]:
@@ -181,11 +190,11 @@ class TelemetryBuffer:
         return {table: received.ranges for table, received in self._stored.items()}
 
     def resend(self, missing: Mapping[str, Ranges], publish: Publish) -> int:
-        """Publish the held batches again that overlap missing row ranges; return their number."""
+        """Publish the kept batches again that overlap missing row ranges; return their number."""
         sent = 0
-        for table, first, rows, payload in self._held:
-            if overlap(missing.get(table, ()), first, first + rows):
-                publish(table, self._header(first, rows), payload)
+        for batch in self._kept:
+            if overlap(missing.get(batch.table, ()), batch.first, batch.first + batch.rows):
+                publish(batch.table, self._header(batch), batch.payload)
                 sent += 1
         return sent
 
@@ -197,37 +206,38 @@ class TelemetryBuffer:
         self._send(table, len(rows), rows.tobytes())
 
     def _send(self, table: str, rows: int, payload: bytes) -> None:
-        first = self._published[table]
-        self._published[table] = first + rows
-        self._held.append((table, first, rows, payload))
-        self._held_bytes += len(payload)
-        while self._held_bytes > _HELD_BYTES:
+        batch = _RowBatch(table, self._published[table], rows, payload)
+        self._published[table] += rows
+        self._kept.append(batch)
+        self._kept_bytes += len(payload)
+        while self._kept_bytes > _MOST_KEPT_BYTES:
             self._store_oldest()
-        self._publish(table, self._header(first, rows), payload)
+        self._publish(table, self._header(batch), payload)
 
     def _store_oldest(self) -> None:
-        table, first, rows, payload = self._held.popleft()
-        self._held_bytes -= len(payload)
+        batch = self._kept.popleft()
+        self._kept_bytes -= len(batch.payload)
         self._old = max(self._old - 1, 0)
-        self._store(table, self._header(first, rows), payload)
-        self._stored.setdefault(table, ReceivedRows()).add(first, first + rows)
+        self._store(batch.table, self._header(batch), batch.payload)
+        stored = self._stored.setdefault(batch.table, ReceivedRows())
+        stored.add(batch.first, batch.first + batch.rows)
 
     def _forget(self, rows: Mapping[str, Ranges]) -> None:
         """Drop batches that are on disk; plan to send older ones again that are not."""
-        remaining: deque[_Batch] = deque()
+        remaining: deque[_RowBatch] = deque()
         old = 0
-        for i, batch in enumerate(self._held):
-            table, first, count, _ = batch
-            if not contain(rows.get(table, ()), first, first + count):
+        for i, batch in enumerate(self._kept):
+            if not contain(rows.get(batch.table, ()), batch.first, batch.first + batch.rows):
                 remaining.append(batch)
                 old += i < self._old
         # Newer batches may have been in flight when the recorder sent its confirmation.
         self._to_resend = deque(islice(remaining, old))
-        self._held, self._old = remaining, len(remaining)
-        self._held_bytes = sum(len(batch[3]) for batch in remaining)
+        self._kept, self._old = remaining, len(remaining)
+        self._kept_bytes = sum(len(batch.payload) for batch in remaining)
 
-    def _header(self, first: int, rows: int) -> bytes:
-        return json.dumps({"first": first, "rows": rows, "generation": self._generation}).encode()
+    def _header(self, batch: _RowBatch) -> bytes:
+        header = {"first": batch.first, "rows": batch.rows, "generation": self._generation}
+        return json.dumps(header).encode()
 
 
 def first_row(header: bytes) -> tuple[int, int]:

@@ -59,13 +59,27 @@ class _RunPart(NamedTuple):
     loops: Sequence[Demand]
 
 
+class NumberedLoop(NamedTuple):
+    """A loop of the run."""
+
+    number: int
+    name: str
+
+
+class LoopsBound(NamedTuple):
+    """A bound of the delay of some loops; infinite: there is none."""
+
+    loops: str
+    bound_s: float
+
+
 class LinkLoad(NamedTuple):
     """The load of a bottleneck; rates in bits per second."""
 
     change: int | None
     """The change of settings from which on this holds; None: from the start of the run on."""
-    loop: tuple[int, str] | None
-    """Number and name of the loop whose slots these are; None: what all loops share."""
+    loop: NumberedLoop | None
+    """The loop whose slots these are; None: what all loops share."""
     key: str
     flow: Flow
     window: LossWindow
@@ -78,14 +92,14 @@ class LinkLoad(NamedTuple):
     """The same, if each loop transmits as rarely as it can."""
     delay_bound_s: float | None
     """Bound of a datagram's delay in this queue, in the whole run; None: there is none."""
-    loop_bounds_s: tuple[tuple[str, float], ...] = ()
-    """The bounds of the loops that have one each, infinite if there is none: which loops, bound."""
+    loop_bounds: tuple[LoopsBound, ...] = ()
+    """The bounds of the loops, if they have one each."""
 
     @property
     def scope(self) -> str:
         """From when on this holds, and for which loop, as the beginning of a sentence."""
         change = "" if self.change is None else f"from changes.{self.change} on, "
-        return change if self.loop is None else f"{change}loop {self.loop[0]} ({self.loop[1]}), "
+        return change if self.loop is None else f"{change}loop {self.loop.number} ({self.loop.name}), "
 
 
 class DelayBound(NamedTuple):
@@ -186,8 +200,8 @@ def _link_loads(run_parts: Sequence[_RunPart], flow: Flow, path: str, names: Seq
     for index, impairment in enumerate(run_parts[0].direction.impairments):
         key = f"{path}.impairments.{index}"
         if isinstance(impairment, Schedule):
-            delays_of = [*zip(names, delays[index], strict=True)]
-            loads += _slot_loads(impairment, run_parts, (key, flow), delays_of)
+            bounds = [LoopsBound(*bound) for bound in zip(names, delays[index], strict=True)]
+            loads += _slot_loads(impairment, run_parts, key, flow, bounds)
         if not isinstance(impairment, Rate | Opportunities):
             continue
         previous: LinkLoad | None = None
@@ -208,7 +222,7 @@ def _link_loads(run_parts: Sequence[_RunPart], flow: Flow, path: str, names: Seq
                 mandatory_at_most_bps=_share(window) * at_most_bps,
                 mandatory_at_least_bps=_share(window) * at_least_bps,
                 delay_bound_s=delay_s,
-                loop_bounds_s=loop_bounds,
+                loop_bounds=loop_bounds,
             )
             if previous is None or load._replace(change=previous.change) != previous:
                 loads.append(load)
@@ -216,7 +230,7 @@ def _link_loads(run_parts: Sequence[_RunPart], flow: Flow, path: str, names: Seq
     return loads
 
 
-def _group_bounds(names: Sequence[str], delays_s: Sequence[float]) -> Iterator[tuple[str, float]]:
+def _group_bounds(names: Sequence[str], delays_s: Sequence[float]) -> Iterator[LoopsBound]:
     """Yield each bound of a delay, with the loops that have it, such as ``p-1, p-3 to p-5``."""
     for delay_s in dict.fromkeys(delays_s):
         loops = {loop for loop, loop_delay_s in enumerate(delays_s) if loop_delay_s == delay_s}
@@ -224,7 +238,7 @@ def _group_bounds(names: Sequence[str], delays_s: Sequence[float]) -> Iterator[t
         ends = sorted(loops - {loop - 1 for loop in loops})
         pairs = zip(begins, ends, strict=True)
         spans = (names[a] if a == b else f"{names[a]} to {names[b]}" for a, b in pairs)
-        yield ", ".join(spans), delay_s
+        yield LoopsBound(", ".join(spans), delay_s)
 
 
 def _largest_bound(delays_s: Sequence[float]) -> float | None:
@@ -235,27 +249,27 @@ def _largest_bound(delays_s: Sequence[float]) -> float | None:
 def _slot_loads(
     schedule: Schedule,
     run_parts: Sequence[_RunPart],
-    path: tuple[str, Flow],
-    delays_of: Sequence[tuple[str, float]],
+    key: str,
+    flow: Flow,
+    bounds: Sequence[LoopsBound],
 ) -> Iterator[LinkLoad]:
     """Yield for each entry of [[loops]] the load of the slots of its loop with the fewest of them.
 
-    ``delays_of`` has the name of each loop of the run and the bound of its delay.
+    ``bounds`` has that of each loop of the run.
     """
-    key, flow = path
     first, slots = 0, _slots(schedule, run_parts)
     round_s = len(schedule.order) * schedule.slot_ns / NS_PER_S
     for entry, loops in enumerate(run_parts[0].loops):
         number = min(range(first, first + loops.loops), key=lambda loop: len(slots[loop]))
         first += loops.loops
-        name, delay_s = delays_of[number]
+        name, delay_s = bounds[number]
         for change, direction, demands in run_parts:
             loop, window = demands[entry], _window(direction)
             bits = 8 * loop.payload_bytes
             must_pass = bits * _share(window)
             yield LinkLoad(
                 change=change,
-                loop=(number, name),
+                loop=NumberedLoop(number, name),
                 key=key,
                 flow=flow,
                 window=window,

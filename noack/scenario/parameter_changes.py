@@ -138,6 +138,15 @@ class AppliedParameters(NamedTuple, Generic[Prepared]):
     """Data that the machine computed from the scenario when the change was announced."""
 
 
+class _ChangedScenario(NamedTuple, Generic[Prepared]):
+    """A scenario with a change."""
+
+    scenario: Scenario
+    prepared: Prepared | None
+    settings: ReadTable
+    """Those of the change: while they exist, no other object has their identity."""
+
+
 class ChangeSchedule(Generic[Prepared]):
     """The scenarios of a run in the order of time, as announced to a machine.
 
@@ -146,7 +155,8 @@ class ChangeSchedule(Generic[Prepared]):
 
     def __init__(self, scenario: Scenario, prepare: Callable[[Scenario], Prepared] | None = None) -> None:
         self._prepare = prepare
-        self._results: dict[tuple[tuple[int, int], ...], tuple[Scenario, Prepared | None, ReadTable]] = {}
+        self._results: dict[tuple[tuple[int, int], ...], _ChangedScenario[Prepared]] = {}
+        """By number and identity of the settings of each change so far."""
         self._timeline = [AppliedParameters[Prepared](-(2**63), -1, {}, scenario, None)]
         self._taken = 1
 
@@ -191,9 +201,9 @@ class ChangeSchedule(Generic[Prepared]):
                 scenario, settings = timeline[index - 1].scenario, timeline[index].settings
                 scenario = changed(scenario, settings)
                 prepared = self._prepare(scenario) if self._prepare is not None else None
-                self._results[key] = scenario, prepared, settings  # the id stays its own
-            scenario, prepared, _ = self._results[key]
-            timeline[index] = timeline[index]._replace(scenario=scenario, prepared=prepared)
+                self._results[key] = _ChangedScenario(scenario, prepared, settings)
+            result = self._results[key]
+            timeline[index] = timeline[index]._replace(scenario=result.scenario, prepared=result.prepared)
         return timeline
 
     @property

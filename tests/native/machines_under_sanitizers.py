@@ -88,9 +88,9 @@ def machines_of(role: str, loops: list[tuple[Sizes, int]], scale: float, **more:
             for of, seed in loops
         ]  # fmt: skip
         own = SteppedMachines(parts, **more)
-        for one in own.machines:
+        for machine in own.machines:
             if role == "plant":
-                one.x[0] *= scale
+                machine.x[0] *= scale
     return own
 
 
@@ -104,14 +104,14 @@ def drive(own: SteppedMachines, given_inputs: list[Any]) -> None:
             continue
         loop, other, number, t_ns, seed = item
         loop %= len(own.parts)
-        one, rng = own.machines[loop], np.random.default_rng(seed)
+        machine, rng = own.machines[loop], np.random.default_rng(seed)
         if other and own.parts[loop].shape.acknowledged and own.role.name == "sensor":
-            sent = one.sent[0] if one.sent_count and seed % 2 else number
+            sent = machine.sent[0] if machine.sent_count and seed % 2 else number
             own.handle(Message(Flow.ACKNOWLEDGEMENT, sent, t_ns, NO_VECTOR, loop), t_ns)
             continue
-        if own.role.name == "sensor" and one.observer.kind:
-            t_ns = min(max(one.observer.t_ns, 0) + t_ns % (1000 * MS), TIMES_NS - 1)
-        vector = rng.choice(VALUES, one.machine.received.entries)
+        if own.role.name == "sensor" and machine.observer.kind:
+            t_ns = min(max(machine.observer.t_ns, 0) + t_ns % (1000 * MS), TIMES_NS - 1)
+        vector = rng.choice(VALUES, machine.machine.received.entries)
         if seed % 4:
             vector = rng.uniform(-1, 1, len(vector))
         own.handle(Message(own.role.receives, number, t_ns, vector, loop), t_ns)
@@ -179,7 +179,7 @@ def test_random_batches_run_clean(seed: int, size_and_policy: tuple[int, str], m
         trigger = random_rule(policy, rng, n, setting.trigger.weight)
         setting = replace(setting, trigger=trigger, most_events=200)
     rows, events = run_with_events(setting, random_population(rng, setting, 2))
-    assert [len(one.event_s) for one in events] == rows["transmissions"].tolist()
+    assert [len(run_events.event_s) for run_events in events] == rows["transmissions"].tolist()
 
 
 @settings(max_examples=40)
@@ -207,7 +207,7 @@ def test_matrices_and_states_of_any_numbers_run_clean(
 
 def test_batches_with_impossible_numbers_or_sizes_are_refused() -> None:
     plain = {"horizon_s": 1.0, "known_start": True}
-    one, trigger = np.eye(2), decaying_rule(0.5, 1.0)
+    identity, trigger = np.eye(2), decaying_rule(0.5, 1.0)
     for wrong in (
         {"horizon_s": np.nan}, {"horizon_s": -1.0}, {"settle": np.inf}, {"measure": 9},
         {"measure": -1}, {"fading_per_s": -1.0}, {"most_events": -1}, {"event_places": 3},
@@ -215,20 +215,20 @@ def test_batches_with_impossible_numbers_or_sizes_are_refused() -> None:
     ):  # fmt: skip
         numbers = {name: ffi.NULL if value is None else value for name, value in wrong.items()}
         with pytest.raises(ValueError, match=r"a (simulation|loop) has"):
-            _refused(one, trigger, {**plain, **numbers})
+            _refused(identity, trigger, {**plain, **numbers})
     for field, value in (
         ("level", -1.0), ("level", np.nan), ("rate_per_s", np.inf), ("floor", -1.0),
         ("up_rows", 257), ("up_rows", -1), ("down_rows", 2), ("grid_ns", -1), ("shortest_ns", -1),
         ("longest_ns", -1), ("longest_ns", 2**63 - 1), ("idle_ns", -(2**63)), ("decay_per_s", -1.0),
     ):  # fmt: skip
-        simulation = ExactSimulation(one, one, trigger, **plain)
+        simulation = ExactSimulation(identity, identity, trigger, **plain)
         setattr(simulation.core.rule, field, value)
         assert core.noack_exact_check(simulation.core) != ffi.NULL, field
 
 
-def _refused(one: np.ndarray, trigger: TriggerRule, numbers: dict[str, object]) -> None:
+def _refused(identity: np.ndarray, trigger: TriggerRule, numbers: dict[str, object]) -> None:
     """Change a simulation's numbers, and check it again."""
-    simulation = ExactSimulation(one, one, trigger, horizon_s=1.0, known_start=True)
+    simulation = ExactSimulation(identity, identity, trigger, horizon_s=1.0, known_start=True)
     for name, value in numbers.items():
         setattr(simulation.core, name, value)
     mistake = core.noack_exact_check(simulation.core)

@@ -76,7 +76,7 @@ def test_each_stage_kind_has_a_file_in_c_and_a_feature_in_python() -> None:
         if number != core.NOACK_STAGE_KINDS
     ]
     assert {path.stem for path in (ROOT / "native" / "impairments").glob("*.c")} == set(kinds)
-    made = [one.stage(StageTables()) for one in IMPAIRED if not names_file(one)]
+    made = [impairment.stage(StageTables()) for impairment in IMPAIRED if not names_file(impairment)]
     assert {stage.kind for stage in made if stage is not None} == set(kinds)
 
 
@@ -161,8 +161,8 @@ def test_the_second_of_two_builds_at_a_time_compiles_nothing(copy: Path) -> None
     (left / LIBRARY.name).write_bytes(b"half of")
     with ThreadPoolExecutor() as pool:
         done = list(pool.map(build, [copy, copy]))
-    assert [one.returncode for one in done] == [0, 0]
-    assert sorted(len(one.stdout.splitlines()) for one in done) == [0, 1]
+    assert [process.returncode for process in done] == [0, 0]
+    assert sorted(len(process.stdout.splitlines()) for process in done) == [0, 1]
     assert files(copy).keys() == {LIBRARY.name, HEADER}
 
 

@@ -82,9 +82,9 @@ def test_special_values_are_those_of_the_c_standard(name: str) -> None:
             expected = math.inf
         except ValueError:
             expected = -math.inf if x == 0.0 else math.nan
-        found = function(x)
-        assert found == pytest.approx(expected, rel=3e-16, abs=0.0, nan_ok=True), x
-        assert math.copysign(1.0, found) == math.copysign(1.0, expected) or math.isnan(found)
+        result = function(x)
+        assert result == pytest.approx(expected, rel=3e-16, abs=0.0, nan_ok=True), x
+        assert math.copysign(1.0, result) == math.copysign(1.0, expected) or math.isnan(result)
 
 
 def test_the_normal_distribution_and_its_quantile_are_those_of_scipy() -> None:
@@ -96,8 +96,8 @@ def test_the_normal_distribution_and_its_quantile_are_those_of_scipy() -> None:
     np.testing.assert_allclose(score(upper), -ndtri(1.0 - upper), rtol=1e-14, atol=1e-16)
     # Relative error 1e-14 plus the effect of the argument's rounding, z² ulps.
     z = np.linspace(-8.3, 8.3, 5001)
-    found = np.vectorize(core.noack_normal_cdf)(z)
-    assert (np.abs(found / ndtr(z) - 1) <= 1e-15 * (2 + z**2)).all()
+    probabilities = np.vectorize(core.noack_normal_cdf)(z)
+    assert (np.abs(probabilities / ndtr(z) - 1) <= 1e-15 * (2 + z**2)).all()
     # The scores of 0 and 1 are finite.
     ends = score([0.0, 2.0**-53, 2.0**-52, 0.5, 1 - 2.0**-53, 1.0])
     assert (np.diff(ends) > 0).all()
@@ -119,8 +119,8 @@ def test_the_exponential_does_not_decrease() -> None:
     """Searches for crossings rely on it up to rounding."""
     for begin in (-1.0, -0.0108304, 0.0, 0.0108304, 0.69314, 5.0, -700.0):
         x = begin + np.arange(3000) * math.ulp(begin or 1.0) * 4
-        found = [core.noack_exp(value) for value in x.tolist()]
-        assert found == sorted(found)
+        results = [core.noack_exp(value) for value in x.tolist()]
+        assert results == sorted(results)
 
 
 ONES = 0xFFFFFFFF
@@ -147,9 +147,9 @@ def test_uniform_numbers_are_the_words_of_the_counter(
 ) -> None:
     a, b, c, d = philox(packet & ONES, packet >> 32, flow, block, key0, key1)
     expected = tuple(((x << 32 | y) >> 11) / 2**53 for x, y in ((a, b), (c, d)))
-    found = uniform_pair(key0, key1, flow, packet, block)
-    assert all(0 <= u < 1 and u * 2**53 == int(u * 2**53) for u in found)
+    pair = uniform_pair(key0, key1, flow, packet, block)
+    assert all(0 <= u < 1 and u * 2**53 == int(u * 2**53) for u in pair)
     # Upper 27 bits: from the first word; lower 26 bits: the upper bits of the second word.
-    for u, (x, y) in zip(found, ((a, b), (c, d)), strict=True):
+    for u, (x, y) in zip(pair, ((a, b), (c, d)), strict=True):
         assert divmod(int(u * 2**53), 2**26) == (x >> 5, y >> 6)
-    assert np.allclose(found, expected, rtol=0, atol=2**-27)
+    assert np.allclose(pair, expected, rtol=0, atol=2**-27)

@@ -31,5 +31,5 @@ def test_the_machines_need_no_system(tools: str, tmp_path: Path) -> None:
     assert done.returncode == 0
     named = subprocess.run([f"{tools}nm", "-u", machines], capture_output=True, text=True, check=True)
     needed = {line.split()[-1] for line in named.stdout.splitlines()}
-    assert {one for one in needed if not one.startswith("__aeabi_")} <= BARE | LIBM
+    assert {symbol for symbol in needed if not symbol.startswith("__aeabi_")} <= BARE | LIBM
     assert "sqrt" in needed

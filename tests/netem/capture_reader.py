@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from hypothesis import strategies as st
 
-from netem.capture import PcapngSection
+from netem.capture import Interface, PcapngSection
 from netem.relay.relay_links import LinkSpec
 from netem.relay.relay_reports import EVENT, Bytes, Events
 from noack.impairments.link_settings import LinkSettings
@@ -17,7 +17,7 @@ T_NS = 1_767_225_600_123_456_789
 SPECS = [
     LinkSpec("link0", ("127.0.0.1", 1), ("127.0.0.1", 2), LinkSettings(), LinkSettings())
 ]  # fmt: skip
-INTERFACES = (("link0 client", "127.0.0.1:1"), ("link0 server", "127.0.0.1:2"))
+INTERFACES = (Interface("link0 client", "127.0.0.1:1"), Interface("link0 server", "127.0.0.1:2"))
 USUAL: dict[str, Any] = {
     "t_ns": T_NS, "family": 4, "source_port": 40_001, "destination_port": 40_002,
     "source": "192.0.2.1", "destination": "198.51.100.7", "flow": 3, "packet": 17,

@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from netem.capture import CaptureWriter, PcapngSection
+from netem.capture import CaptureWriter, Interface, PcapngSection
 from netem.relay.relay_reports import DIRECTIONS, EVENT, Bytes, Events
 from noack.core.errors import CallerError
 from tests.helpers.approved import compare_lines
@@ -116,7 +116,7 @@ def test_events_of_any_numbers_are_refused_or_written(described: dict[str, Any],
 
 
 def test_missing_events_are_reported_at_their_place_and_at_the_end() -> None:
-    section = PcapngSection((INTERFACES[0], ("link0 server", "")))
+    section = PcapngSection((INTERFACES[0], Interface("link0 server", "")))
     data = section.header()
     data += bytes(section.packets(*batch({}, {"interface": 1})))
     section.miss(np.array([0, 2**33 + 5]))

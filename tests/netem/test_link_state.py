@@ -20,6 +20,7 @@ from noack.protocol.roles import Notice, Record
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from tests.oracles.link import Datagram, Link, update_link_of
+from tests.oracles.loss_decisions import fates_of_flow
 
 MS = 1_000_000
 LOSSES = [
@@ -58,6 +59,15 @@ def fate_of(link: Link, flow: int, now_ns: int = 0) -> Fate:
 
 def fates(link: Link, flow: int, count: int) -> list[Fate]:
     return [fate_of(link, flow) for _ in range(count)]
+
+
+@pytest.mark.parametrize("loss", ["loss 60%", "loss gemodel 30% 20%", "loss gemodel 40% 30% 90% 10%"])
+@pytest.mark.parametrize("guarantee", ["", "mansd 2 first", "mansd 4 atmost 3 in 7", "mansd 3 recover 2"])
+def test_the_fates_are_those_of_the_definition(loss: str, guarantee: str) -> None:
+    settings = settings_of(f"{loss} {guarantee}")
+    link = Link(settings, 11, "a")
+    for flow in range(3):
+        assert fates(link, flow, 200) == fates_of_flow(settings, 11, "a", flow, 200)
 
 
 def drain(link: Link) -> list[tuple[int, Outputs]]:

@@ -22,12 +22,12 @@ class Sent(NamedTuple):
     """1 inbound, 2 outbound."""
 
 
-def packet_of(one: Sent, link_type: int = RAW, vlans: int = 0) -> bytes:
+def packet_of(sent: Sent, link_type: int = RAW, vlans: int = 0) -> bytes:
     """Return the packet with the header of a link type."""
-    ends = ip_address(one.source), ip_address(one.destination)
+    ends = ip_address(sent.source), ip_address(sent.destination)
     hosts = b"".join(end.packed for end in ends)
-    size = 8 + len(one.payload)
-    udp = struct.pack(">HHHH", one.source_port, one.destination_port, size, 0) + one.payload
+    size = 8 + len(sent.payload)
+    udp = struct.pack(">HHHH", sent.source_port, sent.destination_port, size, 0) + sent.payload
     if ends[0].version == 4:
         kind = b"\x08\x00"
         ip = struct.pack(">BBHHHBBH", 0x45, 0, 20 + size, 0, 0x4000, 64, 17, 0) + hosts + udp
@@ -54,9 +54,9 @@ def pcap_of(
     """Return a pcap file."""
     magic, unit_ns = (0xA1B23C4D, 1) if nano else (0xA1B2C3D4, 1000)
     parts = [struct.pack(f"{order}IHHiIII", magic, 2, 4, 0, 0, snap_bytes, link_type)]
-    for one in datagrams:
-        packet = packet_of(one, link_type, vlans)
-        seconds, rest_ns = divmod(one.t_ns, 10**9)
+    for datagram in datagrams:
+        packet = packet_of(datagram, link_type, vlans)
+        seconds, rest_ns = divmod(datagram.t_ns, 10**9)
         cut = packet[:snap_bytes]
         parts += [
             struct.pack(f"{order}IIII", seconds, rest_ns // unit_ns, len(cut), len(packet)), cut
@@ -79,10 +79,16 @@ def pcapng_of(
     parts = [block(0x0A0D0D0A, struct.pack(f"{order}IHHq", 0x1A2B3C4D, 1, 0, -1))]
     parts += [block(1, described) for _ in range(interfaces)]
     parts.append(block(0x0BAD, b"unknown"))
-    for one in datagrams:
-        packet = packet_of(one, link_type, vlans)
-        numbers = one.interface, one.t_ns >> 32, one.t_ns & 0xFFFF_FFFF, len(packet), len(packet)
+    for datagram in datagrams:
+        packet = packet_of(datagram, link_type, vlans)
+        numbers = (
+            datagram.interface,
+            datagram.t_ns >> 32,
+            datagram.t_ns & 0xFFFF_FFFF,
+            len(packet),
+            len(packet),
+        )
         data = packet + bytes(-len(packet) % 4)
-        flags = struct.pack(f"{order}HHI", 2, 4, one.direction) + bytes(4)
+        flags = struct.pack(f"{order}HHI", 2, 4, datagram.direction) + bytes(4)
         parts.append(block(6, struct.pack(f"{order}5I", *numbers) + data + flags))
     return b"".join(parts)

@@ -50,7 +50,7 @@ def simulate_continuous_time(system: System, delivered: Flags, _: Steps) -> Cont
         W @ E @ np.hstack([eye, none, none]),
     ]
     e_s = signals[0].T
-    rows, begins = np.vstack(signals).T, np.cumsum([0, *(len(one) for one in signals[:-1])])
+    rows, begins = np.vstack(signals).T, np.cumsum([0, *(len(signal) for signal in signals[:-1])])
     # A run is a row of each array; ``running`` are those that have outcomes left.
     leap, step_s = expm(F * system.step_s).T, system.step_s
     z, events = np.tile(system.x0, (len(delivered), 3)), np.zeros(len(delivered), dtype=np.int64)

@@ -1,7 +1,9 @@
 """The network of a run in plain Python: datagrams in, surviving datagrams out, maybe later.
 
-The core decides for each packet (native/link.c). What follows from the decisions is stated here
-once more, for native/channel.c: rows, copies, flipped bits, and the order of departures.
+The core decides for each packet (native/link.c): this is no independent statement of the decisions.
+:mod:`tests.oracles.loss_decisions` has one of losses, :mod:`tests.oracles.loss_language` one of the
+guarantee. Independent of native/channel.c is here what follows from the decisions: rows, copies,
+flipped bits, the queue of a rate that chooses, and the order of departures.
 """
 
 import heapq
@@ -224,7 +226,7 @@ class Link:
     def _serve(self, until_ns: float) -> None:
         """Begin to send what can begin until then: of what waits, the smallest."""
         while self._waiting and (int(self._free) <= until_ns or len(self._waiting) == self.in_flight):
-            first = min(self._waiting, key=lambda one: (self._flow_key(one), one.number))
+            first = min(self._waiting, key=lambda waiting: (self._flow_key(waiting), waiting.number))
             self._waiting.remove(first)
             rate = _scheduler(self._state.settings)
             assert rate is not None
@@ -241,9 +243,9 @@ class Link:
             self.flow(flow).first_release_ns = leaves_ns
             heapq.heappush(self._in_flight, first.leaving._replace(release_ns=leaves_ns))
 
-    def _flow_key(self, one: _Waiting) -> int:
+    def _flow_key(self, waiting: _Waiting) -> int:
         """The smallest key of what waits of the same flow."""
-        flow = one.leaving.datagram.flow
+        flow = waiting.leaving.datagram.flow
         return min(other.key for other in self._waiting if other.leaving.datagram.flow == flow)
 
     @property
@@ -260,8 +262,10 @@ class Link:
 
 def _scheduler(settings: LinkSettings) -> Any:
     """The rate that chooses what it sends; None: there is none."""
-    rates = [one for one in settings.impairments if isinstance(one, Rate)]
-    chosen = [one for one in rates if isinstance(one.discipline, Priority | EarliestDeadline | MaximumError)]
+    rates = [impairment for impairment in settings.impairments if isinstance(impairment, Rate)]
+    chosen = [
+        rate for rate in rates if isinstance(rate.discipline, Priority | EarliestDeadline | MaximumError)
+    ]
     return chosen[0] if chosen else None
 
 
@@ -271,7 +275,7 @@ def _is_update(data: bytes) -> bool:
 
 def update_link_of(resolved: Scenario, start: Start = BEGINNING) -> Link:
     """Return the link from sensor to controller of a resolved scenario."""
-    schedule = ChangeSchedule(resolved, lambda one: one.network.link)
+    schedule = ChangeSchedule(resolved, lambda scenario: scenario.network.link)
     return link_of(resolved.network.link, resolved.seeds.loss, UPDATE_LINK, start, schedule)
 
 

@@ -44,15 +44,19 @@ def allowed_rows(lost: NDArray[np.bool_], settings: LinkSettings) -> NDArray[np.
     lost = np.pad(lost, ((0, 0), (1, 0)))
     count, n = np.cumsum(lost, axis=1), lost.shape[1]
     allowed = np.ones(len(lost), bool)
-    windows = [(one.losses, one.window) for one in settings.constraints if isinstance(one, AtMost)]
+    windows = [
+        (constraint.losses, constraint.window)
+        for constraint in settings.constraints
+        if isinstance(constraint, AtMost)
+    ]
     if settings.mansd is not None:
         windows.append((settings.mansd, settings.mansd + 1))
     for losses, window in windows:
         begins = np.maximum(np.arange(n) - window, 0)
         allowed &= (count - count[:, begins] <= losses).all(axis=1)
-    for one in settings.constraints:
-        if isinstance(one, Recovery):
-            for later in range(2, one.deliveries + 1):  # two bursts, later - 1 deliveries apart
+    for constraint in settings.constraints:
+        if isinstance(constraint, Recovery):
+            for later in range(2, constraint.deliveries + 1):  # two bursts, later - 1 deliveries apart
                 ends = lost[:, :-later] & lost[:, later:]
                 apart = count[:, later:] - count[:, :-later] == 1
                 allowed &= ~(ends & apart).any(axis=1)

@@ -220,8 +220,8 @@ class _Loops:
         """Note the states, and propagate them over the step."""
         self.xs[step], self.x_cs[step] = self.x, self.x_c
         following = [
-            one.advance(self.x, self.x_c, self.inputs[step], self.has_input[step], push)
-            for one in self.propagators
+            propagator.advance(self.x, self.x_c, self.inputs[step], self.has_input[step], push)
+            for propagator in self.propagators
         ]
         if self.plants is None:
             self.x = following[0]

@@ -107,7 +107,7 @@ class _Draw:
             {"kind": "step", "at": "state", "amplitude": self.entries(0.1, 0.9, n), "from_s": 0.5},
         ]
         if self.chance(0.4):
-            plant["disturbances"] = [one for one in disturbances if self.chance(0.5)]
+            plant["disturbances"] = [disturbance for disturbance in disturbances if self.chance(0.5)]
         return plant
 
     def trigger(self, policy: str, *, inner: bool = False) -> Content:
@@ -136,7 +136,7 @@ class _Draw:
                                "longest_s": 0.4},
         }  # fmt: skip
         if policy in ("deadline", "dwell"):
-            kinds = [one for one in POLICIES if not inner or one in tables]
+            kinds = [policy for policy in POLICIES if not inner or policy in tables]
             rule = self.trigger(self.one_of(*kinds), inner=True)
             return {"policy": policy, "rule": rule, "interval_s": between(0.05, 0.3)}
         table = {"policy": policy} | tables[policy]

@@ -42,8 +42,8 @@ def settings_of(scenario: Scenario) -> Settings:
         plant_period_ns=timing.plant_period_ns, measure_every=scenario.plant.measure_every,
         controller_period_ns=timing.controller_period_ns,
         controller_phase_ns=timing.controller_phase_ns, horizon_ns=timing.horizon_ns,
-        rules=[(t_ns, rule_of(one)) for t_ns, one in in_force],
-        setpoints=[(t_ns, _x_r(one)) for t_ns, one in in_force],
+        rules=[(t_ns, rule_of(scenario_then)) for t_ns, scenario_then in in_force],
+        setpoints=[(t_ns, _x_r(scenario_then)) for t_ns, scenario_then in in_force],
         safe_input=np.zeros(loop.m) if safe_input is None else np.array(safe_input),
         predictions=scenario.controller.predictions,
         update_timeout_ns=np.rint(1e9 * (scenario.controller.update_timeout_s or np.inf)),
@@ -83,11 +83,11 @@ def observer_of(scenario: Scenario) -> Mapping[str, Array]:
     if observer.kind == "luenberger":
         return {"x": x, "L": np.array(observer.gain)}
     variances = {"state": np.zeros(n), "input": np.zeros(m)}
-    for one in plant.disturbances:
-        if one.kind == "gaussian":
-            variances[one.at] += np.square(one.std)
-        if one.kind == "uniform":
-            variances[one.at] += np.square(one.bound) / 3
+    for disturbance in plant.disturbances:
+        if disturbance.kind == "gaussian":
+            variances[disturbance.at] += np.square(disturbance.std)
+        if disturbance.kind == "uniform":
+            variances[disturbance.at] += np.square(disturbance.bound) / 3
     noise = np.square(plant.measurement.noise_std or 0.0)
     noise = noise + np.square(plant.measurement.noise_bound or 0.0) / 3
     A, B = (np.array(matrix) for matrix in scenario.model.matrices)
@@ -111,10 +111,10 @@ def chance_of(scenario: Scenario, packets: Any) -> Chance:
     n, m = scenario.model.dimensions
     steps = range(scenario.timing.horizon_ns // scenario.timing.plant_period_ns + 1)
     pushes = {"state": np.zeros((len(steps), n)), "input": np.zeros((len(steps), m))}
-    for number, one in enumerate(scenario.plant.disturbances):
+    for number, disturbance in enumerate(scenario.plant.disturbances):
         name = ("plant", "disturbance", str(number))
         source = SignalSource(scenario.timing.plant_period_ns, scenario.seeds.disturbance, name)
-        pushes[one.at] += one.signal(steps, source)
+        pushes[disturbance.at] += disturbance.signal(steps, source)
     v = _noise(scenario, steps)
     return Chance(
         d=pushes["input"].__getitem__,

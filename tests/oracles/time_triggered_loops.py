@@ -39,7 +39,7 @@ class LoopMaps:
         # The times of the loop.
         self._step_ns, self._tick_ns = timing.plant_period_ns, timing.controller_period_ns
         self._phase_ns, n, m = timing.controller_phase_ns, loop.n, loop.m
-        self._delay_ns = sum(round(one.delay_s * 1e9) for one in resolved.network.impairments)
+        self._delay_ns = sum(round(impairment.delay_s * 1e9) for impairment in resolved.network.impairments)
         # The rates of z = (x, x_c, u, w, s), and its jumps at a step, event, arrival and tick. w is the
         # input of the next step. s is x in the newest update that is not lost; it may not have arrived yet.
         x, x_c, u, w, s = np.split(np.eye(3 * n + 2 * m), np.cumsum([n, n, m, m]))
@@ -138,7 +138,7 @@ class LoopMaps:
         changes += [(t_ns, 3, tick(t_ns)) for t_ns in range(first_ns, end_ns, self._tick_ns)]
         if delivered:
             changes += [(begin_ns, 1, self._send), (begin_ns + self._delay_ns, 2, self._arrive)]
-        times_ns, _, whats = zip(*sorted(changes, key=lambda one: one[:2]), strict=True)
+        times_ns, _, whats = zip(*sorted(changes, key=lambda change: change[:2]), strict=True)
         return list(zip(np.diff(times_ns, prepend=begin_ns) * 1e-9, whats, strict=True))
 
     def _interval(self, choice: int, length: int, age: int, delivered: bool) -> Reals:

@@ -250,7 +250,7 @@ class Sensor:
         before, x = self.x_s, self.waiting[number]
         self.x_s = self.model.flow(x, event_ns, self.t_ns)
         self.trigger.event(event_ns, x)
-        self.waiting = {one: sent for one, sent in self.waiting.items() if one > number}
+        self.waiting = {event: sent_x for event, sent_x in self.waiting.items() if event > number}
         self.rows["sensor_acknowledgement"].append({
             "sequence": number, "t_ns": event_ns, "model_t_ns": self.t_ns, "x_s_before": before,
             "x_s": self.x_s,

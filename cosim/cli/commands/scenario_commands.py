@@ -198,7 +198,7 @@ def _check_loops(loaded: "scenario.Scenario", *, json: bool) -> None:
         print(f"{_COMMENT}{loop.name}: begins at {phase_ns / NS_PER_S:.6f} s, x(0) = ({x0})")
     for load in loads:
         delay = load.delay_bound_s
-        by_loops = "; ".join(f"{loops}: {_bound(own_s)}" for loops, own_s in load.loop_bounds_s)
+        by_loops = "; ".join(f"{loops}: {_bound(own_s)}" for loops, own_s in load.loop_bounds)
         print(
             f"{_COMMENT}{load.key}: {load.scope}{load.rate_bps:.0f} bit/s; "
             f"datagrams that must pass: {load.mandatory_at_least_bps:.0f} to "

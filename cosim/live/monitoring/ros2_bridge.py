@@ -125,7 +125,7 @@ def wait_for_run(run_dir: Path, timeout_s: float) -> OpenRun:
 
 @contextmanager
 def bridge_process(router: str, domain: int, *, listen: bool) -> Iterator[Watcher]:
-    """Start the bridge's process within the context; yield what tells it the run directory.
+    """Start the bridge's process within the context; yield the callbacks that send it the run directory.
 
     Raises:
         CallerError: it cannot join the graph of ROS 2; its process has printed why.

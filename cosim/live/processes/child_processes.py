@@ -43,11 +43,16 @@ MODULES = {
     "sensor": "sensor_node.__main__",
     "controller": "controller_node.__main__",
 }
-Failure = tuple[ExitStatus, str]
-"""Exit status and reason."""
 Child = ForkedProcess | subprocess.Popen[str]
 RESTART_BY_HAND_S = 60.0
 """How long a run waits for the restart of a process that was started by hand."""
+
+
+class EndReason(NamedTuple):
+    """How a process failed, or how a run ended."""
+
+    status: ExitStatus
+    reason: str
 
 
 def _require_printable(text: str) -> str:
@@ -202,7 +207,7 @@ class ChildProcesses:
         code = None if child is None else child.poll()
         return code is not None and not (role in self._hosts and code == SSH_FAILED)
 
-    def failures(self, reported: Callable[[str], str | None]) -> dict[str, Failure]:
+    def failures(self, reported: Callable[[str], str | None]) -> dict[str, EndReason]:
         """How launched processes failed, by role."""
         codes = {role: child.poll() for role, child in self._children.items()}
         return {role: self._failure(role, code, reported) for role, code in codes.items() if code}
@@ -235,19 +240,19 @@ class ChildProcesses:
             env=os.environ | ENVIRONMENT,
         )
 
-    def _failure(self, role: str, code: int, reported: Callable[[str], str | None]) -> Failure:
+    def _failure(self, role: str, code: int, reported: Callable[[str], str | None]) -> EndReason:
         if role in self._hosts and (why := self._remote_failure(role, code)) is not None:
-            return ExitStatus.FAILED, why
+            return EndReason(ExitStatus.FAILED, why)
         if code < 0:
-            return ExitStatus.FAILED, f"{role} died: killed by {signal_name(-code)}"
+            return EndReason(ExitStatus.FAILED, f"{role} died: killed by {signal_name(-code)}")
         if code in (ExitStatus.INTERRUPTED, ExitStatus.TERMINATED):
-            return ExitStatus.FAILED, f"{role} ended early: {signal_name(code - 128)}"
+            return EndReason(ExitStatus.FAILED, f"{role} ended early: {signal_name(code - 128)}")
         known = code in (ExitStatus.FAILED, ExitStatus.CALLER)
         lines, own = self._log_lines(role), f"noack {role}: "
         # Libraries write to the log, too; and on a full disk the log may be empty.
         logged = next((line.removeprefix(own) for line in lines[::-1] if line.startswith(own)), None)
         why = logged or reported(role) or "".join(lines[-1:]) or f"exit status {code}"
-        return ExitStatus(code) if known else ExitStatus.FAILED, f"{role}: {why}"
+        return EndReason(ExitStatus(code) if known else ExitStatus.FAILED, f"{role}: {why}")
 
     def _remote_failure(self, role: str, code: int) -> str | None:
         """Why a process did not run on another host, or is out of reach; None if it ran."""
@@ -288,7 +293,7 @@ def signal_name(number: int) -> str:
 class _Failed(NamedTuple):
     """A process that has failed and may be restarted."""
 
-    failure: Failure
+    failure: EndReason
     until_s: float
     """Reading of the monotonic clock until which the run waits for the restart."""
 
@@ -307,40 +312,41 @@ class RestartPolicy:
         self._children, self._watcher = children, watcher
         self._failed: dict[str, _Failed] = {}
 
-    def check(self) -> Failure | None:
+    def check(self) -> EndReason | None:
         """Restart what may be restarted; return why the run must end, None if it need not."""
         exited = self._children.failures(self._coordinator.reported_failure)
         return self._check_restarts(exited) or self._check_failures(exited)
 
-    def unfinished(self) -> Failure | None:
+    def unfinished(self) -> EndReason | None:
         """At the end of the run: a failure whose restart did not happen."""
         for failed in self._failed.values():
             status, why = failed.failure
-            return status, f"{why}; not restarted before the end"
+            return EndReason(status, f"{why}; not restarted before the end")
         return None
 
-    def _check_restarts(self, exited: dict[str, Failure]) -> Failure | None:
+    def _check_restarts(self, exited: dict[str, EndReason]) -> EndReason | None:
         """Follow the processes that the run waits for."""
         for role, ((status, why), until_s) in list(self._failed.items()):
             if self._coordinator.running_generation(role) is not None:
                 del self._failed[role]
                 self._watcher.restarted(role, self._t_s())
             elif role in exited:
-                return exited[role][0], f"{why}; restarted, {exited[role][1]}"
+                return EndReason(exited[role].status, f"{why}; restarted, {exited[role].reason}")
             elif time.monotonic() > until_s:
-                return status, f"{why}; not restarted within {self._restart_within_s(role):g} s"
+                within_s = self._restart_within_s(role)
+                return EndReason(status, f"{why}; not restarted within {within_s:g} s")
         return None
 
-    def _check_failures(self, exited: dict[str, Failure]) -> Failure | None:
+    def _check_failures(self, exited: dict[str, EndReason]) -> EndReason | None:
         """Restart, or wait for, each process that has failed since the last look."""
         for role, (status, why) in self._failures(exited).items():
             within_s = self._restart_within_s(role)
             started = self._coordinator.epoch_ns is not None
             if not started or self._is_past_horizon() or role == PLANT or not within_s:
-                return status, why
+                return EndReason(status, why)
             if self._children.has_reported(role):  # a restarted process would fail alike
-                return status, why
-            self._failed[role] = _Failed((status, why), time.monotonic() + within_s)
+                return EndReason(status, why)
+            self._failed[role] = _Failed(EndReason(status, why), time.monotonic() + within_s)
             launched = role in self._children
             self._coordinator.allow_restart(role, why, dead=self._children.is_dead(role))
             self._watcher.failed(why, self._t_s(), None if launched else role)
@@ -348,14 +354,14 @@ class RestartPolicy:
                 try:
                     self._children.restart(role)
                 except MachineError as error:
-                    return status, f"{why}; {error}"
+                    return EndReason(status, f"{why}; {error}")
         return None
 
-    def _failures(self, exited: dict[str, Failure]) -> dict[str, Failure]:
+    def _failures(self, exited: dict[str, EndReason]) -> dict[str, EndReason]:
         """Failures that are not being waited for, by role."""
         running = self._children.running()
         failures = {
-            role: (ExitStatus.FAILED, why)
+            role: EndReason(ExitStatus.FAILED, why)
             for role, why in self._coordinator.failures().items()
             # The exit status of a launched process explains more than its report.
             if not (role in running and self._coordinator.is_exiting(role))

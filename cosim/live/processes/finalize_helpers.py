@@ -54,10 +54,11 @@ class FinalizeHelpers:
         self._due: deque[Callable[[], object]] = deque()
         """What is still to be prepared."""
         self._expected: dict[int, Expectations] = {}
-        self._ended: Path | None = None
-        """Says that the run has ended to who writes tables; see ``cosim.record.spool_conversion``."""
+        self._end_file: Path | None = None
+        """Its existence is the sign for the process that writes tables that the run has ended; see
+        ``cosim.record.spool_conversion``."""
         self._writer: Thread | None = None
-        """Waits for them."""
+        """The thread that waits for this process."""
         self.early: Mapping[str, int] = {}
         """The tables that are written, with the bytes of their spool."""
 
@@ -71,7 +72,7 @@ class FinalizeHelpers:
         for first in self._loops[::_LOOPS_AT_ONCE]:
             block = self._loops[first:][:_LOOPS_AT_ONCE]
             self._due.append(partial(self._prepare_loops, run_dir, block))
-        self._due.append(lambda: self._idle("import_libraries"))
+        self._due.append(lambda: self._call_at_idle_priority("import_libraries"))
         self._due.append(partial(self._write_early, run_dir))
         for _ in range(self.count):
             self._threads.append(Thread(target=self._prepare_all, daemon=True))
@@ -87,32 +88,34 @@ class FinalizeHelpers:
             pass
 
     def _prepare_loops(self, run_dir: Path, block: range) -> None:
-        expectations = cast("Sequence[Expectations]", self._idle("expectations_of", run_dir, block))
+        expectations = cast(
+            "Sequence[Expectations]", self._call_at_idle_priority("expectations_of", run_dir, block)
+        )
         self._expected |= zip(block, expectations, strict=True)
 
     def _write_early(self, run_dir: Path) -> None:
-        self._ended, self._writer = run_dir / SPOOL / EARLY / EARLY_ENDED, current_thread()
+        self._end_file, self._writer = run_dir / SPOOL / EARLY / EARLY_ENDED, current_thread()
         written = self.submit(call_by_name, "cosim.record.spool_conversion", "write_early", run_dir).result()
         self.early = cast("Mapping[str, int]", written)
 
-    def _tell_writer(self) -> bool:
-        """Tell who writes tables that the run has ended; return whether it can know."""
-        if self._ended is None:  # nobody writes tables, or not yet
+    def _make_end_file(self) -> bool:
+        """Make the sign that the run has ended; return whether it exists."""
+        if self._end_file is None:  # no process writes tables, or not yet
             return False
         with suppress(OSError):  # its folder does not exist yet
-            self._ended.touch()
+            self._end_file.touch()
             return True
         return False
 
     @property
     def _is_writing(self) -> bool:
-        """Whether a process that was told writes the rest, no longer at idle priority."""
-        if self._ended is None or self._writer is None:
+        """Whether a process has seen the sign and writes the rest, no longer at idle priority."""
+        if self._end_file is None or self._writer is None:
             return False
-        return self._writer.is_alive() and not self._ended.exists()
+        return self._writer.is_alive() and not self._end_file.exists()
 
-    def _idle(self, function: str, *arguments: object) -> object:
-        """Let a process call a function of the end of the run at idle priority."""
+    def _call_at_idle_priority(self, function: str, *arguments: object) -> object:
+        """Return the result of a function of :mod:`cosim.live.finalize`, which a process calls."""
         return self.submit(at_idle_priority, "cosim.live.finalize", function, *arguments).result()
 
     def expectations(self, loops: range) -> "Sequence[Expectations] | None":
@@ -129,7 +132,7 @@ class FinalizeHelpers:
         until_s = time.monotonic() + _GRACE_S
         notified = False
         while any(thread.is_alive() for thread in self._threads):
-            notified = notified or self._tell_writer()
+            notified = notified or self._make_end_file()
             if time.monotonic() > until_s and not (notified and self._is_writing):
                 break
             time.sleep(_POLL_S)

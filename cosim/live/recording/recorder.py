@@ -129,7 +129,7 @@ class ProgressReport(RunProgress):
     model_config = ConfigDict(frozen=False)
 
     def add_warning(self, text: str) -> None:
-        """Add a line, e.g. about void claims; of many, the last says where the others are."""
+        """Add a line, e.g. about void claims; of many, the last names the place of the others."""
         if len(self.warnings) < _MOST_LINES:
             self.warnings.append(text)
         elif len(self.warnings) == _MOST_LINES:
@@ -176,7 +176,9 @@ class Recorder:
         self._feed: LiveFeed | None = None
         self.lost: MachineError | None = None
         """Why some stored rows are no longer on disk; known at the end."""
-        self._blind_reported = self.is_stopping = False
+        self._stop_reported = False
+        """Whether a warning says that claims are no longer checked."""
+        self.is_stopping = False
         """Whether the processes of the run end one by one: no more assumptions are checked."""
         session, key = plane.session, plane.key
         self._batches = session.declare_subscriber(
@@ -332,8 +334,8 @@ class Recorder:
             self._progress.add_warning(text)
             if self._feed is not None:
                 self._feed.log(notice.line())
-        if self._monitor.stopped is not None and not self._blind_reported:
-            self._blind_reported = True
+        if self._monitor.stopped is not None and not self._stop_reported:
+            self._stop_reported = True
             self._progress.add_warning(f"claims are checked after the run only: {self._monitor.stopped}")
 
     def _publish_progress(self) -> None:

@@ -53,14 +53,13 @@ class ExportedRun:
     @property
     def environment(self) -> dict[str, object]:
         """The content of ``environment.json``."""
-        kind = {"kind": self.record.kind}
-        return read_object(self.directory / ENVIRONMENT_FILE) | kind
+        return read_object(self.directory / ENVIRONMENT_FILE) | {"kind": self.record.kind}
 
 
 def export_run(
     run_dir: Path,
     path: Path,
-    kind: str | None = None,
+    file_format: str | None = None,
     *,
     loop: str | None = None,
     certificates: bool = True,
@@ -70,7 +69,7 @@ def export_run(
     Args:
         run_dir: the run directory, which has a summary.
         path: the file, or the folder.
-        kind: the format; by default that of the path's ending.
+        file_format: its name; by default that of the path's ending.
         loop: name of the loop to export; by default the whole run.
         certificates: whether a file of MATLAB has the certificates of each loop.
 
@@ -81,39 +80,39 @@ def export_run(
     """
     suffixes = {name: export_suffix(name) for name in FORMATS}
     by_ending = {suffix: name for name, suffix in suffixes.items()}
-    chosen = by_ending.get(path.suffix) if kind is None else kind
+    chosen = by_ending.get(path.suffix) if file_format is None else file_format
     if chosen is None or suffixes[chosen] not in ("", path.suffix):
         *first, last = (suffix or "a folder" for suffix in suffixes.values())
-        expected = f"{', '.join(first)} or {last}" if kind is None else suffixes[kind]
+        expected = f"{', '.join(first)} or {last}" if file_format is None else suffixes[file_format]
         raise CallerError(f"{path}: an export is written to {expected}")
     run = _exported_run(run_dir, loop)
     written: list[Path] = _module(chosen).write(run, path, certificates=certificates)
     return written
 
 
-def needs_run(kind: str) -> bool:
+def needs_run(file_format: str) -> bool:
     """Return whether a format is that of a run; else a scenario is enough."""
-    return not hasattr(_module(kind), "write_scenario")
+    return not hasattr(_module(file_format), "write_scenario")
 
 
-def export_scenario(scenario: "Scenario", path: Path, kind: str) -> list[Path]:
+def export_scenario(scenario: "Scenario", path: Path, file_format: str) -> list[Path]:
     """Export a scenario in a format that needs no run; return the written files.
 
     Raises:
         CallerError: the format cannot have something of the scenario.
         MachineError: a file cannot be written.
     """
-    written: list[Path] = _module(kind).write_scenario(scenario, path)
+    written: list[Path] = _module(file_format).write_scenario(scenario, path)
     return written
 
 
-def export_suffix(kind: str) -> str:
+def export_suffix(file_format: str) -> str:
     """Return the ending of the files of a format; empty for a folder."""
-    return str(_module(kind).SUFFIX)
+    return str(_module(file_format).SUFFIX)
 
 
-def _module(kind: str) -> ModuleType:
-    return import_module(f"{__name__}.{kind}{_ENDING}")
+def _module(file_format: str) -> ModuleType:
+    return import_module(f"{__name__}.{file_format}{_ENDING}")
 
 
 def _exported_run(run_dir: Path, loop: str | None) -> ExportedRun:

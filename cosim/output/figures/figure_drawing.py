@@ -8,7 +8,7 @@ import re
 import textwrap
 from collections.abc import Sequence
 from functools import singledispatch
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -56,9 +56,6 @@ from cosim.output.figures.figure_layout import (
 from cosim.record.align import Reals
 from cosim.record.decimation import decimate
 
-LegendItem = tuple[Artist, str]
-"""A drawn object and its label in the legend."""
-
 _NARROW_IN = 2.5
 """A shorter axis has few numbers."""
 _COLUMNS = 600
@@ -86,6 +83,13 @@ _ELSEWHERE = str.maketrans(
     | {"µ": r"$\mu$", "°": r"$^\circ$", "¹": "$^1$", "²": "$^2$", "³": "$^3$"}
 )
 """Characters at whose places Computer Modern has others; its mathematical fonts have them."""
+
+
+class LegendItem(NamedTuple):
+    """A drawn object and its label in the legend."""
+
+    drawn: Artist
+    label: str
 
 
 def draw(described: FigureDescription) -> Figure:
@@ -148,26 +152,26 @@ def _draw_panel(axes: Axes, place: Place, norm: Normalize | None) -> list[Legend
     for item in panel.items:
         if (artist := _draw(item, axes, norm)) is not None:
             drawn.setdefault(getattr(item, "label", ""), artist)
-    _finish_axis(axes, "x", panel.x, place.has_x)
-    _finish_axis(axes, "y", panel.y, place.has_y)
+    _finish_axis(axes, "x", panel.x, has_numbers=place.has_x)
+    _finish_axis(axes, "y", panel.y, has_numbers=place.has_y)
     if not np.isfinite(axes.dataLim.bounds).all():
         axes.text(0.5, 0.5, panel.empty, transform=axes.transAxes, ha="center", va="center")
         axes.tick_params(left=False, labelleft=False, which="both")
-    return [(drawn[label], label) for label in panel.labels if label in drawn]
+    return [LegendItem(drawn[label], label) for label in panel.labels if label in drawn]
 
 
 def _head(axes: Axes, figure: Figure, box: FigureBox, title: str, shown: Sequence[LegendItem]) -> None:
     """Write a title and a legend above a box, where there are no data."""
     space, bottom_in = layout(), figure.get_figheight() - box.top
-    rows = legend_rows([label for _, label in shown], box.width)
+    rows = legend_rows([item.label for item in shown], box.width)
     right_in, title_in = box.left + box.width, 0.0
     if not space.beside_title:  # the legend is below the title, and ends where all axes end
         right_in, title_in = space.width_in - space.right_in, space.legend_row_in * len(rows)
     for number, entries in enumerate(rows):
         above = len(rows) - 1 - number
         legend = axes.legend(
-            [shown[i][0] for i in entries],
-            [legend_text(shown[i][1]) for i in entries],
+            [shown[i].drawn for i in entries],
+            [legend_text(shown[i].label) for i in entries],
             loc="lower right",
             bbox_to_anchor=(right_in, bottom_in + above * space.legend_row_in),
             bbox_transform=figure.dpi_scale_trans,
@@ -359,7 +363,7 @@ def _for_log_axis(values: Reals) -> Reals:
     return shown
 
 
-def _finish_axis(axes: Axes, letter: Literal["x", "y"], described: Axis, has_numbers: bool) -> None:
+def _finish_axis(axes: Axes, letter: Literal["x", "y"], described: Axis, *, has_numbers: bool) -> None:
     """Set label, numbers and ends of an axis in which everything is drawn."""
     axis, box = (axes.xaxis, axes.bbox.width) if letter == "x" else (axes.yaxis, axes.bbox.height)
     axis.set_label_text(described.label if has_numbers else "")

@@ -170,7 +170,7 @@ class _AllLoops:
         self._models: list[Rows] = []
         knows_state = loops[0].network.initial_sync == "known_state"
         self._first_ns = np.full(len(loops), -1 if knows_state else _NEVER_NS)
-        """When each loop's controller began to know the state."""
+        """When each loop's controller received its first state."""
         self._over_time = empty_over_time(scenario)
         self._inside = np.zeros(0, np.int64), np.zeros(0, np.int64)
         self._sent = self._shares_sent = 0

@@ -322,7 +322,7 @@ class LiveView:
 
     def finish(self) -> None:
         """Report that the file is complete: downloads in progress end at its end."""
-        self._say("finish")
+        self._send_command("finish")
 
     def close(self, *, keep: bool = False) -> None:
         """Stop serving; a window stays open and keeps the received data.
@@ -332,7 +332,7 @@ class LiveView:
         """
         if self._host is None:
             return
-        self._say("keep" if keep else "finish")
+        self._send_command("keep" if keep else "finish")
         for pipe in (self._host.stdin, self._host.stdout):
             assert pipe is not None
             with contextlib.suppress(OSError):
@@ -343,7 +343,7 @@ class LiveView:
             self.url = None
             self.status = "the live view is closed"
 
-    def _say(self, word: str) -> None:
+    def _send_command(self, word: str) -> None:
         if self._host is None:
             return
         assert self._host.stdin is not None

@@ -201,15 +201,17 @@ class LoopFeed:
         frames = Frames(t_s, aligned.x, aligned.x_s, aligned.x_c, z)
         shown = self._kept_frames(len(t_s))
         self._view.move(aligned.t_ns[shown], frames.at(shown))
-        event_ns = rows["t_ns"][rows["event"] != NO_SEQUENCE]
-        if len(event_ns):
-            passed_s = _intervals_s(event_ns, self._last_event_ns)
-            kept = self._rows_to_show(event_ns, passed_s)
-            self._view.broadcasts(event_ns[kept], passed_s[kept])
-            self._last_event_ns = int(event_ns[-1])
-        self._lateness("sensor", rows)
         keep = max(int(np.searchsorted(self._track.model_ns, rows["t_ns"][-1], "right")) - 1, 0)
         self._track = self._track.since(keep)
+        self._events(rows["t_ns"][rows["event"] != NO_SEQUENCE])
+        self._lateness("sensor", rows)
+
+    def _events(self, event_ns: Times) -> None:
+        if len(event_ns):
+            passed_s = _intervals_s(event_ns, self._last_event_ns)
+            keep = self._rows_to_show(event_ns, passed_s)
+            self._view.broadcasts(event_ns[keep], passed_s[keep])
+            self._last_event_ns = int(event_ns[-1])
 
     @cached_property
     def _certificate(self) -> ScenarioCertificate | None:

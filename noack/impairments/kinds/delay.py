@@ -17,7 +17,15 @@ from pydantic import BaseModel, Field, FiniteFloat, model_validator
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core, ffi
 from noack.impairments.clauses import Clause, Part, Word
-from noack.impairments.feature import TC_CORRELATION, FileFeature, Impairment, Stage, StageTables, add_numbers
+from noack.impairments.feature import (
+    TC_CORRELATION,
+    FileFeature,
+    Impairment,
+    PacketOrder,
+    Stage,
+    StageTables,
+    add_numbers,
+)
 from noack.impairments.words import (
     CORRELATION,
     OWN_TIME_S,
@@ -170,9 +178,9 @@ class Delay(FileFeature, Impairment):
     def is_bounded(self) -> bool:
         return not self.jitter_s or self.distribution in ("uniform", "empirical")
 
-    def reorders(self, delayed: bool, reordered: bool) -> tuple[bool, bool]:
+    def order_after(self, before: PacketOrder) -> PacketOrder:
         varies = bool(self.jitter_s or self.samples_s or self.file)
-        return delayed or varies or self.delay_s > 0, reordered or varies
+        return PacketOrder(before.delayed or varies or self.delay_s > 0, before.reordered or varies)
 
     def meaning(self) -> str:
         text = f"delays each packet by {time_text(self.delay_s)}"

@@ -16,6 +16,7 @@ from noack.impairments.feature import (
     FileFeature,
     Impairment,
     Offset,
+    PacketOrder,
     Stage,
     StageTables,
     add_numbers,
@@ -122,8 +123,8 @@ class Opportunities(FileFeature, Impairment):
     def prediction_note(self) -> str:
         return "as long as no queue overflows"
 
-    def reorders(self, delayed: bool, reordered: bool) -> tuple[bool, bool]:
-        return True, False  # it serves in the order of arrival
+    def order_after(self, before: PacketOrder) -> PacketOrder:
+        return PacketOrder(delayed=True)  # it serves in the order of arrival
 
     def meaning(self) -> str:
         recording = self.file

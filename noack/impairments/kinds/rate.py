@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field, model_validator
 from noack.impairments.clauses import Clause, Part, Word
 from noack.impairments.disciplines import DISCIPLINES, Discipline
 from noack.impairments.disciplines.tail_drop import TailDrop
-from noack.impairments.feature import Impairment, Scheduler, Stage, StageTables
+from noack.impairments.feature import Impairment, PacketOrder, Scheduler, Stage, StageTables
 from noack.impairments.words import COUNT, RATE_BPS, SIGNED_COUNT, WordReader, rate_text
 from noack.settings.section import Table
 
@@ -122,8 +122,8 @@ class Rate(Impairment):
     def prediction_note(self) -> str:
         return self.discipline.prediction_note or "as long as no queue overflows"
 
-    def reorders(self, delayed: bool, reordered: bool) -> tuple[bool, bool]:
-        return True, False  # it serves in the order of arrival
+    def order_after(self, before: PacketOrder) -> PacketOrder:
+        return PacketOrder(delayed=True)  # it serves in the order of arrival
 
     def meaning(self) -> str:
         text = (

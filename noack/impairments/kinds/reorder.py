@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from noack.impairments.clauses import Clause, Part
-from noack.impairments.feature import CHANCE, CorrelatedChance, Impairment, Stage, StageTables
+from noack.impairments.feature import CHANCE, CorrelatedChance, Impairment, PacketOrder, Stage, StageTables
 from noack.impairments.words import COUNT, brief_percent
 from noack.settings.section import Probability
 
@@ -31,8 +31,9 @@ class Reorder(CorrelatedChance, Impairment):
     )
     behaviour: ClassVar = "reorder"
 
-    def reorders(self, delayed: bool, reordered: bool) -> tuple[bool, bool]:
-        return delayed, reordered or (delayed and self.probability > 0)
+    def order_after(self, before: PacketOrder) -> PacketOrder:
+        reorders = before.delayed and self.probability > 0
+        return before._replace(reordered=before.reordered or reorders)
 
     def delay_range_s(self, least_s: float, largest_s: float) -> tuple[float, float]:
         return 0.0, largest_s

@@ -15,6 +15,7 @@ from noack.impairments.feature import (
     FileFeature,
     Impairment,
     Offset,
+    PacketOrder,
     Stage,
     StageTables,
     add_numbers,
@@ -140,9 +141,9 @@ class Replay(FileFeature, Impairment):
     def prediction_note(self) -> str:
         return "" if self.repeat else "while the trace lasts"
 
-    def reorders(self, delayed: bool, reordered: bool) -> tuple[bool, bool]:
+    def order_after(self, before: PacketOrder) -> PacketOrder:
         varies = self.delays_ns is None or len(set(self.delays_ns) - {LOST_NS}) > 1
-        return True, reordered or varies
+        return PacketOrder(delayed=True, reordered=before.reordered or varies)
 
     def meaning(self) -> str:
         recording = self.file

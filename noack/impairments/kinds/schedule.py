@@ -9,7 +9,15 @@ from pydantic import Field, FiniteFloat, model_validator
 
 from noack.core.clock import NS_PER_S
 from noack.impairments.clauses import Clause, Part
-from noack.impairments.feature import MOST_FLOWS, Impairment, Stage, StageTables, add_numbers, numbers_text
+from noack.impairments.feature import (
+    MOST_FLOWS,
+    Impairment,
+    PacketOrder,
+    Stage,
+    StageTables,
+    add_numbers,
+    numbers_text,
+)
 from noack.impairments.words import COUNT, OWN_TIME_S, SIGNED_COUNT, list_of, time_text
 
 _EXAMPLE = "schedule 0,1,0,2 slot 5ms"
@@ -84,8 +92,8 @@ class Schedule(Impairment):
     def prediction_note(self) -> str:
         return "as long as every flow has slots, and no queue overflows"
 
-    def reorders(self, delayed: bool, reordered: bool) -> tuple[bool, bool]:
-        return True, False  # a flow's packets leave in the order of arrival
+    def order_after(self, before: PacketOrder) -> PacketOrder:
+        return PacketOrder(delayed=True)  # a flow's packets leave in the order of arrival
 
     def meaning(self) -> str:
         return (

@@ -25,7 +25,7 @@ _CONNECT_MS = 5000
 _RETRY = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5}
 """Of a connection whose other end does not answer."""
 _FIRST_POLL_S, _POLL_SHARE = 0.001, 0.05
-"""Time between two looks for a reply: at first, and as a share of the time waited so far."""
+"""Time between two checks for a reply: at first, and as a share of the time waited so far."""
 
 
 def open_session(kind: str, name: str, *, listen: bool) -> zenoh.Session:

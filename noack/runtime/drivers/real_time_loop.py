@@ -20,7 +20,7 @@ _OVERLOAD_SHARE = 0.9  # of CPU time in the time since the last housekeeping
 _TURNS_TO_CATCH_UP = 20
 """Of housekeeping, one second: a machine that is late at its end has this time to catch up."""
 _TURNS_TO_WAIT = 2 * _TURNS_TO_CATCH_UP
-"""Of housekeeping, for the others: they may be late, and then need a moment to say that they are
+"""Of housekeeping, for the others: they may be late, and then report a moment later that they are
 done."""
 
 
@@ -78,13 +78,13 @@ def run_loop(
 ) -> int:
     """Drive until simulated time ``end_ns`` (None: no end), or until ``stop()``.
 
-    Every 50 ms of wall time ``stop`` is asked. Before the first step and every 50 ms,
+    Every 50 ms of wall time ``stop`` is called. Before the first step and every 50 ms,
     ``external_inputs`` passes what does not come by sockets to the machines, and returns the outputs.
 
     The computer may not have run for a while before the end. So the loop goes on for up to a second
-    while a deadline is missed, and for up to two seconds until ``all_done`` is true: it is told
-    whether this process has done its work, and returns whether all processes of the run have. Then
-    come ``turns_after_end`` turns of housekeeping, 50 ms each.
+    while a deadline is missed, and for up to two seconds until ``all_done`` is true. It is called
+    with whether this process has done its work, and returns whether all processes of the run have.
+    Then come ``turns_after_end`` turns of housekeeping, 50 ms each.
 
     Returns:
         How late the next deadline was at the end, in ns; 0 if it was not late, or if that

@@ -287,13 +287,13 @@ def test_the_end_does_not_wait_for_a_preparation_that_gets_no_time(
 
     def endless(helpers: FinalizeHelpers, *_: object) -> None:
         if part == "_write_early":
-            helpers._ended, helpers._writer = many_loops / "none" / "ended", current_thread()
+            helpers._end_file, helpers._writer = many_loops / "none" / "ended", current_thread()
         waiting = helpers.submit(time.sleep, 1e6)
         begun.set()
         waiting.result()
 
-    for one in ("_prepare_loops", "_write_early", "_idle"):
-        monkeypatch.setattr(FinalizeHelpers, one, endless if one == part else lambda *_: None)
+    for method in ("_prepare_loops", "_write_early", "_call_at_idle_priority"):
+        monkeypatch.setattr(FinalizeHelpers, method, endless if method == part else lambda *_: None)
     monkeypatch.setattr(finalize_helpers, "_GRACE_S", 0.0)
     helpers = FinalizeHelpers(load(many_loops / SCENARIO_FILE))
     helpers.prepare(many_loops)

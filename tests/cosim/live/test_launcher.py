@@ -11,7 +11,7 @@ import pytest
 
 from cosim.live.launcher import WaitLimit, _Run, launch, require_disk_space, spool_bytes
 from cosim.live.monitoring.run_watcher import Watcher
-from cosim.live.processes.child_processes import ChildProcesses, Failure
+from cosim.live.processes.child_processes import ChildProcesses, EndReason
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.protocol.roles import RECORDER, ROLES
@@ -128,7 +128,7 @@ def case(content: dict[str, Any], tmp_path: Path) -> Case:
     ],
 )
 def test_only_a_killed_process_is_restarted(
-    case: Case, code: int, now_s: float, log: str | None, expected: Failure | None
+    case: Case, code: int, now_s: float, log: str | None, expected: EndReason | None
 ) -> None:
     """The reason is taken from the log, or else from the report."""
     case.log.unlink()

@@ -197,7 +197,7 @@ def test_a_written_model_has_the_parameters_and_delays(tmp_path: Path) -> None:
     assert fits[0] == pytest.approx(fits[1], rel=0.1)
     for share, delay_s in first.delays.quantiles_s.items():
         assert second.delays.quantiles_s[share] == pytest.approx(delay_s, abs=2e-4)
-    correlations = [measurement.delays.correlation[0] for measurement in (first, second)]
+    correlations = [measurement.delays.correlation.at_lags[0] for measurement in (first, second)]
     assert correlations[0] == pytest.approx(correlations[1], abs=0.03)
 
 

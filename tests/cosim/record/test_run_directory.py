@@ -1,11 +1,14 @@
 """Damaged run directories, those of other users, and the tables in docs/record.md."""
 
 import json
+import multiprocessing
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -26,10 +29,12 @@ from cosim.record.run_directory import (
 )
 from cosim.record.run_record import load_record
 from cosim.record.spool_conversion import finish_record
+from cosim.record.table_files import TableFile, write_table
 from noack.core.errors import CallerError
-from noack.protocol.record_tables import COMMON, PLANT_STEP, TABLES, Column, Table
+from noack.protocol.record_tables import COMMON, LOOP, PLANT_STEP, TABLES, Column, Table
 from noack.runtime.spool import SPOOL, SpoolWriter, notices_of
 from tests.fuzz.parsers.record import NOTICE, files, spooled
+from tests.oracles.link import flipped
 
 
 @pytest.fixture
@@ -61,7 +66,7 @@ def test_a_damaged_column_or_report_is_refused_or_ignored(run_dir: Path) -> None
     for values, expected in COLUMNS:
         pq.write_table(whole.set_column(number, "t_ns", values(len(whole))), path)
         with pytest.raises(CallerError, match=expected):
-            load_record(run_dir)
+            _ = load_record(run_dir)[PLANT_STEP]
     pq.write_table(whole, path)
     (run_dir / RECORD / "notices.jsonl").write_bytes(b"\xae\xff")
     with pytest.raises(CallerError, match=r"notices\.jsonl: cannot be read"):
@@ -100,6 +105,25 @@ def test_a_table_is_a_regular_file_in_parts_of_bounded_length(run_dir: Path) -> 
     os.mkfifo(path)
     with pytest.raises(CallerError, match="not a regular file"):
         load_record(run_dir)
+
+
+def test_a_flipped_bit_in_a_footer_does_not_end_the_process(tmp_path: Path) -> None:
+    path, dtype = tmp_path / f"{PLANT_STEP}.parquet", np.dtype([(LOOP, "<u2"), ("input", "<i8")])
+    write_table(path, [np.zeros(3, dtype)], dtype, {})
+    reader = multiprocessing.get_context("fork").Process(target=_read_with_flipped_bits, args=(path, dtype))
+    reader.start()
+    reader.join()
+    assert reader.exitcode == 0
+
+
+def _read_with_flipped_bits(path: Path, dtype: np.dtype[np.void]) -> None:
+    whole = path.read_bytes()
+    footer_bytes = int.from_bytes(whole[-8:-4], "little") + 8
+    for at in range(len(whole) - footer_bytes, len(whole)):
+        for bit in range(8):
+            path.write_bytes(flipped(whole, 8 * at + bit))
+            with suppress(CallerError):
+                _ = [*TableFile(path, dtype).batches()]
 
 
 # --- latest, and names ----------------------------------------------------------------------------

@@ -57,13 +57,13 @@ def write(path: Path, files: Files, *, kind: int = zipfile.ZIP_STORED) -> Path:
 
 def checked(files: Files) -> Files:
     """The files with a manifest that fits them."""
-    found = json.loads(files[MANIFEST])
-    found["files"] = {
+    manifest = json.loads(files[MANIFEST])
+    manifest["files"] = {
         name: {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
         for name, content in files.items()
         if name != MANIFEST
     }
-    return files | {MANIFEST: json.dumps(found).encode()}
+    return files | {MANIFEST: json.dumps(manifest).encode()}
 
 
 def test_the_same_run_gives_the_same_bytes(run: noack.Run, archive: Path, tmp_path: Path) -> None:
@@ -76,29 +76,29 @@ def test_the_same_run_gives_the_same_bytes(run: noack.Run, archive: Path, tmp_pa
 
 
 def test_a_simulated_run_is_repeated_bit_for_bit(archive: Path, run: noack.Run) -> None:
-    found = noack.reproduce(archive)
-    assert found.bit_exact
-    assert (found.differences, found.changes, found.numbers) == ([], [], [])
-    assert found.compared == sum(run.table(name).num_rows for name in run.tables)
+    repetition = noack.reproduce(archive)
+    assert repetition.bit_exact
+    assert (repetition.differences, repetition.changes, repetition.numbers) == ([], [], [])
+    assert repetition.compared == sum(run.table(name).num_rows for name in run.tables)
 
 
 def test_several_loops_are_repeated_bit_for_bit(tmp_path: Path) -> None:
     loops = noack.simulate(noack.load("shared_bottleneck", {"horizon_s": 0.2, "loops.0.count": 2}))
-    found = noack.reproduce(loops.archive(tmp_path / "a.zip"))
-    assert found.bit_exact
+    repetition = noack.reproduce(loops.archive(tmp_path / "a.zip"))
+    assert repetition.bit_exact
     shared = [name for name in loops.tables if OWNER[name] == "netem"]
     rows = sum(loops.table(name).num_rows for name in shared)
-    for one in loops.loops.values():
-        rows += sum(one.table(name).num_rows for name in one.tables)
-    assert found.compared == rows
+    for run in loops.loops.values():
+        rows += sum(run.table(name).num_rows for name in run.tables)
+    assert repetition.compared == rows
 
 
 @pytest.mark.usefixtures("without_viewer")
 def test_a_live_run_is_replayed_beside_a_simulation(tmp_path: Path) -> None:
     live = noack.run(noack.load("lane_following", {"horizon_s": 0.2, "ports": {}}))
-    found = noack.reproduce(live.archive(tmp_path / "a.zip"))
-    assert (found.kind, found.compared) == ("live", live.replay().inputs)
-    assert found.bit_exact
+    repetition = noack.reproduce(live.archive(tmp_path / "a.zip"))
+    assert (repetition.kind, repetition.compared) == ("live", live.replay().inputs)
+    assert repetition.bit_exact
 
 
 def test_a_repetition_names_what_differs(archive: Path, tmp_path: Path) -> None:
@@ -111,11 +111,11 @@ def test_a_repetition_names_what_differs(archive: Path, tmp_path: Path) -> None:
     words = ["reproduce", str(path), "--into", str(tmp_path / "i")]
     done = invoke(*words, "--json")
     assert done.exit_code == 1, done.output
-    found = json.loads(done.stdout)
-    assert not found["bit_exact"]
-    assert "sensor_measurement row 0, threshold: the row differs" in found["differences"][0]
-    assert found["changes"][0].startswith("numpy was 1.0, is ")
-    assert "transmissions" in [row[0] for row in found["numbers"]]
+    repetition = json.loads(done.stdout)
+    assert not repetition["bit_exact"]
+    assert "sensor_measurement row 0, threshold: the row differs" in repetition["differences"][0]
+    assert repetition["changes"][0].startswith("numpy was 1.0, is ")
+    assert "transmissions" in [row[0] for row in repetition["numbers"]]
     assert (tmp_path / "i/archived/summary.json").is_file()
     done = invoke(*words)
     assert (done.exit_code, done.stderr.count("\n")) == (2, 1)

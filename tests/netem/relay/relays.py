@@ -87,7 +87,7 @@ def running(
     specs: Sequence[LinkSpec], *, segment: bool = False, taps: Sequence[Tap] = ()
 ) -> Iterator[Running]:
     """Yield an open relay; it is closed at the end of the block."""
-    with closing(Relay(specs, segment, taps)) as relay:
+    with closing(Relay(specs, segment=segment, taps=taps)) as relay:
         yield Running(relay)
 
 

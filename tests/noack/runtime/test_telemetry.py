@@ -101,7 +101,7 @@ def test_lost_batches_are_sent_again_during_the_run() -> None:
 def test_the_oldest_batch_is_stored_at_the_memory_limit(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(telemetry, "_HELD_BYTES", 25 * ROW.itemsize)
+    monkeypatch.setattr(telemetry, "_MOST_KEPT_BYTES", 25 * ROW.itemsize)
     wire, again, disk = Wire(), Wire(), Wire()
     buffer = TelemetryBuffer(TABLES, wire, store=disk)
     fill(buffer, range(40))

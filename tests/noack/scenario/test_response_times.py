@@ -126,7 +126,7 @@ def test_the_loops_of_each_bound_are_named() -> None:
     levels = "network.impairments.0.discipline.levels=[1,2,1,3]"
     (found,) = link_loads(shipped("priority_channel", levels, "loops=[{name='p',count=5}]"))
     bounds = (("p-1, p-3", 0.0075), ("p-2", 0.01), ("p-4 to p-5", math.inf))
-    assert found.loop_bounds_s == bounds
+    assert found.loop_bounds == bounds
     assert found.delay_bound_s is None
 
 
