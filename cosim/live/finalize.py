@@ -175,7 +175,7 @@ def _evaluate_run(
         return helpers.call(_evaluate_stored_loops, own, block, helpers.expectations(block))
 
     with (
-        work_bar(f"claims of {loops} loops") as show,
+        work_bar(f"claims of {loops} loops", lines=True) as show,
         helpers.share(_blocks(run), evaluate_in_helper, show) as evaluate,
     ):
         if run.kind == "live" and loops > 1:
