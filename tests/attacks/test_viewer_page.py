@@ -4,7 +4,7 @@ import http.client
 import os
 import socket
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
@@ -99,7 +99,10 @@ def test_the_secret_is_new_each_time_long_and_on_no_command_line(server: Recordi
         secrets = {urlsplit(address).path.strip("/") for address in addresses}
     assert len(secrets) == 4
     assert all(len(secret) >= 43 for secret in secrets)  # 256 bits in base64
-    lines = [" ".join(child.cmdline()) for child in psutil.Process().children(recursive=True)]
+    lines = []
+    for child in psutil.Process().children(recursive=True):
+        with suppress(psutil.NoSuchProcess):  # one that has ended, also of an earlier test
+            lines.append(" ".join(child.cmdline()))
     assert any("--serve-web" in line for line in lines)
     assert not any(secret_of(server) in line for line in lines)
 
