@@ -60,7 +60,7 @@ static void load(noack_segments *segments, int64_t run) {
     plant->newest_ns = t_ns;
     plant->machine.step = step + 1;
     plant->measurements = step < 0 ? 0 : step / every + 1;
-    disturb(plant, begun);
+    noack_disturb(plant, begun);
     copy(n, segments->x_s + run * n, sensor->x_s);
     copy(n, segments->y + run * n, sensor->x);
     sensor->model_ns = t_ns;

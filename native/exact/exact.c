@@ -102,7 +102,7 @@ static int is_finite_nonnegative(double number) { return number >= 0.0 && number
 
 static const char *check_exact_rule(const noack_exact *exact) {
     const noack_trigger_rule *rule = &exact->rule;
-    const char *wrong = check_rule(rule, NEVER_NS);
+    const char *wrong = noack_check_rule(rule, NEVER_NS);
     if (wrong != NULL)
         return wrong;
     if (!is_finite_nonnegative(rule->level) || !is_finite_nonnegative(rule->rate_per_s)

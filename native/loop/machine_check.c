@@ -103,7 +103,7 @@ static const char *check_plant(const noack_plant *plant) {
     return check_model(&plant->fallback, n);
 }
 
-const char *check_rule(const noack_trigger_rule *rule, int64_t most_ns) {
+const char *noack_check_rule(const noack_trigger_rule *rule, int64_t most_ns) {
     const int64_t rows[] = {
         rule->up_rows, rule->down_rows, rule->gain_up_rows, rule->gain_down_rows};
     double *const matrices[] = {rule->up, rule->down, rule->gain_up, rule->gain_down};
@@ -139,7 +139,7 @@ static const char *check_sensor(const noack_sensor *sensor) {
     const noack_machine *machine = &sensor->machine;
     const char *wrong;
     if ((wrong = check_model(&sensor->model, machine->n)) != NULL
-        || (wrong = check_rule(&sensor->rule, MOST_NS)) != NULL
+        || (wrong = noack_check_rule(&sensor->rule, MOST_NS)) != NULL
         || (wrong = check_observer(&sensor->observer, machine)) != NULL)
         return wrong;
     if (machine->period_ns != 0)

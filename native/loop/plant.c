@@ -109,7 +109,7 @@ static int64_t notice(noack_plant *plant, int64_t t_ns, noack_note *note) {
     return 1;
 }
 
-void disturb(noack_plant *plant, int64_t step) {
+void noack_disturb(noack_plant *plant, int64_t step) {
     int64_t m = plant->machine.m;
     copy(m, plant->u, plant->applied);
     if (plant->at_input.width > 0) {
@@ -171,7 +171,7 @@ int64_t noack_plant_tick(
     if (step > 0)
         advance(plant);
     int64_t entry = choose_input(plant, t_ns);
-    disturb(plant, step);
+    noack_disturb(plant, step);
     put_step(plant, step, t_ns, now_ns, entry, output);
     output->notes = notice(plant, t_ns, note);
     machine->step++;

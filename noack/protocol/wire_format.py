@@ -38,6 +38,7 @@ MAGIC = b"NA"
 VERSION = 1
 MAX_DIMENSION = 64
 MAX_LOOPS = 65_535
+"""Maximum number of loops of a run; they are numbered from 0."""
 TIMES_NS = 2**62
 """Upper limit of times: sums of two fit the record's columns."""
 HEADER_ROW = np.dtype(
@@ -230,7 +231,7 @@ class Encoder:
             )
         core_message = self._message
         try:
-            if not 0 <= message.loop <= MAX_LOOPS:
+            if not 0 <= message.loop < MAX_LOOPS:
                 raise OverflowError(f"loop {message.loop}")
             core_message.flow, core_message.loop, core_message.t_ns = message.flow, message.loop, message.t_ns
             core_message.error_level = message.error_level.to_bytes(1, "little")[0]

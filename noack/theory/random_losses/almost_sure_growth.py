@@ -196,8 +196,8 @@ class _Tilts:
                 break
             before = radius
         self._forward, self._backward = X, Y
-        is_delivered, source, target = self._steps
-        M = self._matrices[is_delivered]
+        is_lost, source, target = self._steps
+        M = self._matrices[is_lost]
         weights = chances[self._steps] * np.einsum(
             "eab,eab->e", Y[target], M @ X[source] @ M.transpose(0, 2, 1)
         )
