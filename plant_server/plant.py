@@ -223,7 +223,7 @@ class Plant(MachinePart):
             "predictions": self.predictions, "input_period_ns": self.input_period_ns,
             "newest_sequence": NO_SEQUENCE, "fallback_sequence": NO_SEQUENCE, "missing_ns": -1,
             "x": np.zeros(n), "z": np.zeros(shape.internal), "u": np.zeros(m),
-            "applied": np.zeros(sources), "held": np.zeros((reported, m)),
+            "applied": np.zeros(sources), "recent_inputs": np.zeros((reported, m)),
             "inputs": np.zeros((self.predictions, m)), "x_c": np.zeros(n),
             "x_fallback": np.zeros(n), "scratch": np.zeros(2 * n + 2 * m),
         })  # fmt: skip

@@ -20,8 +20,8 @@ from noack.settings.section import ReadTable, Rows, ScenarioSection, require_sha
 from noack.trigger.trigger_rule import Policy, TriggerRule, require_rule
 
 Size = Annotated[FiniteFloat, Field(ge=1e-15, le=1e15)]
-Share = Annotated[FiniteFloat, Field(gt=0, le=1e9)]
-Interval = Annotated[FiniteFloat, Field(ge=1e-9, le=1e7)]
+Ratio = Annotated[FiniteFloat, Field(gt=0, le=1e9)]
+IntervalS = Annotated[FiniteFloat, Field(ge=1e-9, le=1e7)]
 
 if TYPE_CHECKING:
     AnyTrigger: TypeAlias = "PolicySettings"  # noack.scenario.sections inserts the union of all policies
@@ -159,7 +159,7 @@ class CombinedSettings(PolicySettings):
 
     rule: "AnyTrigger"
     """The rule that is combined."""
-    interval_s: Interval
+    interval_s: IntervalS
     """Time since the last event."""
 
     @field_validator("rule")

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from noack.core.clock import NS_PER_S
 from noack.settings.section import NonNegative, Rows, require_shape
-from noack.trigger.policy_settings import Interval, ModelMatrices, WeightedSettings, nanoseconds
+from noack.trigger.policy_settings import IntervalS, ModelMatrices, WeightedSettings, nanoseconds
 from noack.trigger.trigger_rule import TriggerRule, quadratic_form
 
 
@@ -24,7 +24,7 @@ class QuadraticSettings(WeightedSettings):
     """Q by rows, 2n x 2n, symmetric."""
     epsilon: NonNegative = 0.0
     """ε."""
-    period_s: Interval
+    period_s: IntervalS
     """Sampling period; a whole number of the time between measurements."""
     heartbeat: Annotated[int, Field(ge=0, le=1_000_000)] = 0
     """Transmit at the latest after this number of periods; 0: no heartbeat."""

@@ -293,8 +293,8 @@ class LoopChannel(CountingSocket):
         driver, driver_core = self._driver, self._driver.core
         for peer, address in zip(driver_core.sources, self._expected, strict=False):
             self.count_received(address, peer.received)
-        self._sources.add_others(driver_core.foreign)
-        driver_core.foreign = 0
+        self._sources.add_others(driver_core.unknown_source)
+        driver_core.unknown_source = 0
         rejected = {reason.value: n for reason, n in driver.rejected.items()}
         return super().report() | {
             "sent": driver_core.sent,

@@ -48,7 +48,7 @@ _LOOK_S = 0.05
 _ROWS = (core.NOACK_TICKS, core.NOACK_MESSAGES)
 _COPIED = (
     *("has_point", "acknowledges", "predictions", "carries_model", "timeout_ns", "holds_input"),
-    *("model_ns", "knows_state", "newest"),
+    *("model_ns", "has_state", "newest"),
 )
 _HEAD = struct.Struct("<qq")
 _GREETING = f"noack node {core.NOACK_NODE_VERSION} {ffi.sizeof('noack_node_settings')}"
@@ -79,7 +79,7 @@ class NodeDriver(LiveDriver):
         self._key, self._sockets = process.descriptor.key, list[socket.socket]()
         self._clock, self._sent_clock = RunClock(0), b""
         self._to_send, self._received = bytearray(), bytearray()
-        self._foreign, self._tick_s = 0, time.monotonic()
+        self._unknown_source, self._tick_s = 0, time.monotonic()
         self._is_closed = False
         tables = machines.core.tables
         rows = {kind: tables[kind].row_bytes - core.NOACK_LOOP_BYTES for kind in _ROWS}
@@ -204,7 +204,7 @@ class NodeDriver(LiveDriver):
         """Pass the program a datagram that Python has received."""
         from_peer = source[:2] == self._source
         if not from_peer:
-            self.core.foreign += 1
+            self.core.unknown_source += 1
         self._queue_message(core.NOACK_NODE_DATAGRAM, struct.pack("<q", from_peer) + data)
 
     def finish(self, sink: RecordSink) -> None:
@@ -287,8 +287,8 @@ class NodeDriver(LiveDriver):
         elif kind == core.NOACK_NODE_COUNTS:
             counts = ffi.from_buffer("noack_node_counts *", content)
             driver.sent, driver.sources[0].received = counts.sent, counts.received
-            driver.foreign += counts.foreign - self._foreign
-            self._foreign = counts.foreign
+            driver.unknown_source += counts.unknown_source - self._unknown_source
+            self._unknown_source = counts.unknown_source
             machine.received.accepted = counts.accepted
             machine.received.rejected = counts.rejected
         else:
