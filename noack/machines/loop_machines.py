@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.clock import NEVER_NS
-from noack.core.core_library import CData, CoreMemory, core, dtype_of, ffi, pointer_to
+from noack.core.core_library import CData, CoreMemory, StructRows, core, dtype_of, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.protocol.record_tables import LOOP, RecordShape, largest, tables
 from noack.protocol.roles import External, Notice, Record
@@ -28,8 +28,7 @@ from noack.protocol.wire_format import Flow
 from noack.scenario.parameter_changes import AppliedParameters, ChangeSchedule, ParameterChange, settings_key
 from noack.scenario.scenario import Scenario
 
-Rows = NDArray[np.void]
-NewRows = Callable[[int, "np.dtype[np.void]"], Rows]
+NewRows = Callable[[int, "np.dtype[np.void]"], StructRows]
 """Returns memory for a number of rows of a type."""
 _ROWS, _ROWS_OF_A_LOOP, _MOST_ROWS = 1024, 256, 16_384
 _NOTES = 256
@@ -87,7 +86,7 @@ class MachinePart(ABC):
     def answer(self, question: int, structure: CData) -> Sequence[Notice]:
         """Do what a step needs before it goes on; return lines for the log."""
 
-    def inspect(self, rows: Rows) -> Sequence[Notice]:
+    def inspect(self, rows: StructRows) -> Sequence[Notice]:
         """Return lines for the log about new rows of received messages."""
         return ()
 
@@ -183,7 +182,7 @@ class LoopMachines:
         """Loops of which every message may matter."""
         self._message = ffi.new("noack_message *")
         self._notes = np.zeros(_NOTES, dtype_of("noack_note"))
-        self._tables: dict[int, Rows] = {}
+        self._tables: dict[int, StructRows] = {}
         self._new_rows: NewRows = np.empty
         most = min(_ROWS_OF_A_LOOP * len(self.parts), _MOST_ROWS)
         self._fill_tables(rows or max(_ROWS, most))
@@ -244,7 +243,7 @@ class LoopMachines:
         for number, rows in self._tables.items():
             self._renew_table(number, new_rows(len(rows), rows.dtype))
 
-    def _renew_table(self, number: int, rows: Rows) -> None:
+    def _renew_table(self, number: int, rows: StructRows) -> None:
         self._tables[number] = rows
         self.core.tables[number].rows = pointer_to(rows, "uint8_t *")
 
@@ -273,13 +272,13 @@ class LoopMachines:
         self._keep_notices(loop, self.parts[loop].answer(question, self.machines[loop]))
         self._update_counting(loop)
 
-    def take_rows(self, *, last: bool = False) -> list[tuple[str, Rows]]:
+    def take_rows(self, *, last: bool = False) -> list[tuple[str, StructRows]]:
         """Return the rows since the last call, by table, and empty the core's tables.
 
         ``last``: the machines make no step before the caller has used the rows, which the next step
         overwrites.
         """
-        taken: list[tuple[str, Rows]] = []
+        taken: list[tuple[str, StructRows]] = []
         for number, rows in self._tables.items():
             table = self.core.tables[number]
             if table.count:
@@ -330,7 +329,7 @@ class LoopMachines:
             self._update_counting(loop)
         return outputs
 
-    def _inspect(self, rows: Rows) -> None:
+    def _inspect(self, rows: StructRows) -> None:
         notable = self._notable(rows)
         if not len(notable):
             return
@@ -345,7 +344,7 @@ class LoopMachines:
         else:
             self._counting.discard(loop)
 
-    def _notable(self, rows: Rows) -> Rows:
+    def _notable(self, rows: StructRows) -> StructRows:
         """Return the rows that a part may have to say something about."""
         notable = np.zeros(len(rows), np.bool_)
         if self._counting:

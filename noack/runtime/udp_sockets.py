@@ -32,7 +32,7 @@ _READ_AT_ONCE = 4096
 _SO_MEMINFO = 55
 _MEMINFO_WORDS = 9
 _MEMINFO_DROPS = 8
-SHED = "shed"
+DROPPED_IN_FLOOD = "shed"
 """Rejection reason of datagrams from unknown sources that the kernel dropped in a flood."""
 MAX_UDP_BYTES = 65_535
 # The default receive buffer holds 256 small datagrams; 4 MiB hold about 10,000. A datagram lost by
@@ -197,7 +197,7 @@ class CountingSocket(ABC):
 
     def rejected(self, by_reason: Mapping[str, int]) -> dict[str, int]:
         """Add the datagrams from unknown sources that the kernel dropped in a flood."""
-        return {reason: n for reason, n in (*by_reason.items(), (SHED, self._shed())) if n}
+        return {reason: n for reason, n in (*by_reason.items(), (DROPPED_IN_FLOOD, self._shed())) if n}
 
     def finish(self, now_ns: int, sink: RecordSink) -> None:
         """Read the datagrams that still wait, so that the counters are complete."""

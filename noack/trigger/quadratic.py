@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from noack.core.clock import NS_PER_S
-from noack.settings.section import NonNegative, Rows, require_shape
+from noack.settings.section import NonNegative, MatrixRows, require_shape
 from noack.trigger.policy_settings import IntervalS, ModelMatrices, WeightedSettings, nanoseconds
 from noack.trigger.trigger_rule import TriggerRule, quadratic_form
 
@@ -20,7 +20,7 @@ class QuadraticSettings(WeightedSettings):
     """Periodic event-triggered control: at sampling times, transmit when zᵀQz > ε, z = (x, e_s)."""
 
     policy: Literal["quadratic"]
-    Q: Rows
+    Q: MatrixRows
     """Q by rows, 2n x 2n, symmetric."""
     epsilon: NonNegative = 0.0
     """ε."""

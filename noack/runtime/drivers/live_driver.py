@@ -231,7 +231,7 @@ class LiveDriver:
         driver, seal = self.core, self._wire.seal
         assert seal is not None
         memory = ffi.buffer(driver.datagram, driver.datagram_bytes)
-        vector = seal.open(bytes(memory), HEADER_BYTES)
+        vector = seal.decrypt(bytes(memory), HEADER_BYTES)
         if vector is not None:
             memory[HEADER_BYTES : HEADER_BYTES + len(vector)] = vector
         driver.opened = core.NOACK_NOT_AUTHENTIC if vector is None else core.NOACK_OPENED
@@ -241,7 +241,7 @@ class LiveDriver:
         driver, seal = self.core, self._wire.seal
         assert seal is not None
         memory = ffi.buffer(driver.datagram, driver.datagram_bytes)
-        memory[:] = seal.close(bytes(memory[:HEADER_BYTES]), bytes(memory[HEADER_BYTES:-TAG_BYTES]))
+        memory[:] = seal.encrypt(bytes(memory[:HEADER_BYTES]), bytes(memory[HEADER_BYTES:-TAG_BYTES]))
 
 
 class LoopChannel(CountingSocket):

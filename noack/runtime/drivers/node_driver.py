@@ -36,7 +36,7 @@ from noack.runtime.run_process import RunProcess
 from noack.settings.user_files import unchanged
 
 _PR_SET_PDEATHSIG = 1
-_PATIENCE_S = 10.0
+_LONGEST_WAIT_S = 10.0
 """Longest wait for the program's first line, and for its end."""
 _STUCK_S = 1.0
 """A program that is late has stopped its ticks if the last one came longer ago than this."""
@@ -126,7 +126,7 @@ class NodeDriver(LiveDriver):
         return self
 
     def _first_line(self) -> bytes:
-        line, until_s = b"", time.monotonic() + _PATIENCE_S
+        line, until_s = b"", time.monotonic() + _LONGEST_WAIT_S
         with suppress(TimeoutError):
             while not line.endswith(b"\n") and len(line) < _GREETING_BYTES:
                 self._own.settimeout(max(until_s - time.monotonic(), 1e-6))
@@ -213,7 +213,7 @@ class NodeDriver(LiveDriver):
         Raise PeerError if it does not end, or fails, or has stopped its ticks before the horizon.
         """
         began_s, now_ns, goes_on = time.monotonic(), self._clock.now_ns(), True
-        until_s = began_s + _PATIENCE_S
+        until_s = began_s + _LONGEST_WAIT_S
         while goes_on and (wait_s := until_s - time.monotonic()) > 0:
             if not self._to_send:
                 with suppress(OSError):  # it has ended
@@ -309,11 +309,11 @@ class NodeDriver(LiveDriver):
     def _how_it_ended(self) -> str:
         """Return how; or that it has not, after its stream has ended or after a wait for it."""
         try:
-            code = self._program.wait(_PATIENCE_S if self._is_closed else 0.0)
+            code = self._program.wait(_LONGEST_WAIT_S if self._is_closed else 0.0)
         except subprocess.TimeoutExpired:
             if self._is_closed:
                 return "the program has closed its stream, but has not ended"
-            return f"the program has not answered for {_PATIENCE_S:g} s"
+            return f"the program has not answered for {_LONGEST_WAIT_S:g} s"
         end = f"exit status {code}"
         if code < 0:  # real-time signals have no names
             names = {number.value: number.name for number in signal.Signals}

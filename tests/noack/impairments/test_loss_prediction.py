@@ -26,7 +26,7 @@ from noack.impairments.loss_prediction import (
     loss_process,
     predict,
     read_files,
-    remember,
+    store_probabilities,
     with_target_loss,
 )
 from noack.impairments.markov_chain import NotPredictableError
@@ -178,7 +178,7 @@ def test_a_probability_that_another_process_found_is_not_computed_again(monkeypa
     assert list(found.values()) == [with_target_loss(settings).impairments[0].loss.probability]  # type: ignore[attr-defined]
     monkeypatch.setattr(loss_prediction, "_probabilities", ProbabilityCache(10))
     monkeypatch.setattr(loss_prediction, "predict", None)
-    remember(json.loads(json.dumps(found)))
+    store_probabilities(json.loads(json.dumps(found)))
     assert found_probabilities(settings_of("loss 10% keep loss 5% delay 9ms mansd 1")) == found
     for other in ("loss 10% keep loss 5% mansd 2", "loss 10% keep mansd 1"):
         with pytest.raises(TypeError):

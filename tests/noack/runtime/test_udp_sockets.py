@@ -15,7 +15,7 @@ from noack.protocol.wire_format import Flow
 from noack.runtime import udp_sockets
 from noack.runtime.address import LOOPBACK, Address, address_text, family_of, parse_address, parse_destination
 from noack.runtime.drivers.live_driver import LoopChannel
-from noack.runtime.udp_sockets import SHED, SourceCount, bind, enlarge_buffer, open_beside
+from noack.runtime.udp_sockets import DROPPED_IN_FLOOD, SourceCount, bind, enlarge_buffer, open_beside
 from tests.noack.runtime.drivers.live_loops import Live, measurement, scenario
 
 
@@ -68,7 +68,7 @@ def test_a_flood_displaces_no_peer_datagram_and_all_are_counted(content: dict[st
         live.channel.finish(0, live.rows)
         report = live.channel.report()
     rejected: Any = report["rejected"]
-    assert rejected[SHED] > 5000
+    assert rejected[DROPPED_IN_FLOOD] > 5000
     assert sum(rejected.values()) == sent
     assert report["accepted"] == 10
     assert report["kernel_drops"] == 0
