@@ -173,9 +173,10 @@ class LoopMachines:
         self.parts = tuple(parts)
         self.role = self.parts[0].role
         self.phases_ns = tuple(phases_ns or (0,) * len(self.parts))
-        self._memory = CoreMemory()
+        self.memory = CoreMemory()
+        """What the structures refer to."""
         self._notices: list[Notice] = []
-        self.core: CData = self._memory.keep(ffi.new("noack_process *"))
+        self.core: CData = self.memory.keep(ffi.new("noack_process *"))
         """The ``noack_process``; its address does not change."""
         self._fill_machines(templates or range(len(self.parts)))
         self._counting = {k for k, part in enumerate(self.parts) if part.counts_every_message}
@@ -192,7 +193,7 @@ class LoopMachines:
         core.noack_process_begin(self.core)
 
     def _fill_machines(self, templates: Sequence[int]) -> None:
-        process, count, keep = self.core, len(self.parts), self._memory.keep
+        process, count, keep = self.core, len(self.parts), self.memory.keep
         process.role, process.loops = self.role.number, count
         machines = keep(ffi.new(f"{self.role.structure}[]", count))
         setattr(process, f"{self.role.name}s", machines)
@@ -203,13 +204,13 @@ class LoopMachines:
         for number, first in enumerate(templates):
             copies.setdefault(first, []).append(number)
         for first, (_, *others) in copies.items():
-            mark = self._memory.size
-            self.parts[first].fill(machines[first], self._memory)
+            mark = self.memory.size
+            self.parts[first].fill(machines[first], self.memory)
             if others:
-                self._memory.copy(machines, first, others, mark)
+                self.memory.copy(machines, first, others, mark)
             for number in others:
                 if self.parts[number] is not self.parts[first]:
-                    self.parts[number].set_drawn_values(machines[number], self._memory)
+                    self.parts[number].set_drawn_values(machines[number], self.memory)
         for structure, phase_ns in zip(machines, self.phases_ns, strict=True):
             structure.machine.phase_ns = phase_ns
 
@@ -233,9 +234,9 @@ class LoopMachines:
         @cache
         def layout(shape: RecordShape) -> CData:
             own = tables(**asdict(shape)).get(name)
-            return ffi.NULL if own is None else self._memory.integers(row_layout(own, whole))
+            return ffi.NULL if own is None else self.memory.integers(row_layout(own, whole))
 
-        return self._memory.keep(ffi.new("int64_t *[]", [layout(shape) for shape in shapes]))
+        return self.memory.keep(ffi.new("int64_t *[]", [layout(shape) for shape in shapes]))
 
     def take_rows_from(self, new_rows: NewRows) -> None:
         """Let ``new_rows`` provide the memory of the rows, from before the first step on."""

@@ -40,11 +40,13 @@ class Rows:
     def __init__(self) -> None:
         self.tables: dict[str, list[Any]] = {}
         self.notices: list[Notice] = []
+        self._columns: dict[str, Sequence[str]] = {}
 
     def append(self, record: Record) -> None:
         self.tables.setdefault(record.table, []).append(record.row)
 
     def extend_table(self, table: str, rows: Any) -> None:
+        self._columns[table] = rows.dtype.names
         self.tables.setdefault(table, []).extend(plain(row.item()) for row in rows)
 
     def notice(self, notice: Notice) -> None:
@@ -52,9 +54,9 @@ class Rows:
 
     def flush(self) -> None: ...
 
-    def of(self, table: str, names: Sequence[str], column: str) -> list[Any]:
-        """Return a column, given the names of all."""
-        place = list(names).index(column)
+    def of(self, table: str, column: str) -> list[Any]:
+        """Return a column of rows that came as arrays."""
+        place = self._columns[table].index(column)
         return [row[place] for row in self.tables.get(table, ())]
 
 
