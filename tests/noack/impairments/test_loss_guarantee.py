@@ -101,14 +101,14 @@ def test_a_guarantee_implies_another_if_no_pattern_keeps_only_the_first() -> Non
     rng, longest, implied = np.random.default_rng(0), 9, 0
     patterns = [pattern for k in range(longest + 1) for pattern in product((True, False), repeat=k)]
     for _ in range(60):
-        given, other = random_guarantee(rng), random_guarantee(rng)
-        beyond = (p for p in patterns if allows(given, p) and not allows(other, p))
-        shortest, pattern = next(beyond, None), find_pattern_beyond(given, other)
+        known, other = random_guarantee(rng), random_guarantee(rng)
+        beyond = (p for p in patterns if allows(known, p) and not allows(other, p))
+        shortest, pattern = next(beyond, None), find_pattern_beyond(known, other)
         if pattern is None:
             implied += 1
             assert shortest is None
         else:
-            assert allows(given, pattern)
+            assert allows(known, pattern)
             assert not allows(other, pattern)
             assert allows(other, pattern[:-1])
             assert len(pattern) > longest if shortest is None else len(pattern) == len(shortest)
@@ -120,8 +120,8 @@ def test_one_window_implies_another_as_the_closed_form_says() -> None:
     for (window, other), losses in product(product(range(2, 6), range(1, 10)), range(3)):
         most = losses * (other // window) + min(losses, other % window)
         for limit in range(other):
-            given = guarantee(LossesInWindow(losses, window))
-            implied = find_pattern_beyond(given, guarantee(LossesInWindow(limit, other))) is None
+            known = guarantee(LossesInWindow(losses, window))
+            implied = find_pattern_beyond(known, guarantee(LossesInWindow(limit, other))) is None
             assert implied == (limit >= min(most, other)) or losses >= window
 
 

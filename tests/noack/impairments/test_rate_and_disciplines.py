@@ -282,9 +282,9 @@ def scheduled_departures(rate: Rate, mansd: int | None, arrivals: Any) -> tuple[
     def serve(now_ns: int) -> None:
         nonlocal free
         while waiting and int(free) <= now_ns:
-            keys = {arrivals[one][1]: key for key, one in sorted(waiting, reverse=True)}
-            first = min((keys[arrivals[one][1]], one) for _, one in waiting)[1]
-            waiting[:] = [one for one in waiting if one[1] != first]
+            keys = {arrivals[number][1]: key for key, number in sorted(waiting, reverse=True)}
+            first = min((keys[arrivals[number][1]], number) for _, number in waiting)[1]
+            waiting[:] = [entry for entry in waiting if entry[1] != first]
             arrival_ns, _, size, _ = arrivals[first]
             free = max(free, Fraction(arrival_ns)) + Fraction(bits(rate, size) * NS, rate.rate_bps)
             leaves_ns[first] = int(free)

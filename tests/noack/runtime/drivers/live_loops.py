@@ -31,7 +31,7 @@ MAKERS: dict[str, Callable[..., LoopMachines]] = {
 
 def plain(row: Sequence[Any]) -> tuple[Any, ...]:
     """Return a row with lists instead of arrays."""
-    return tuple(one.tolist() if isinstance(one, np.ndarray) else one for one in row)
+    return tuple(entry.tolist() if isinstance(entry, np.ndarray) else entry for entry in row)
 
 
 class Rows:
@@ -136,12 +136,12 @@ class Live:
 
 def received(endpoint: socket.socket, most_bytes: int = 2048) -> list[bytes]:
     """Return the datagrams that wait at a socket; loopback delivers at once."""
-    found = []
+    datagrams = []
     while True:
         try:
-            found.append(endpoint.recv(most_bytes))
+            datagrams.append(endpoint.recv(most_bytes))
         except BlockingIOError:
-            return found
+            return datagrams
 
 
 def measurement(number: int, x: Sequence[float], loop: int = 0) -> Message:

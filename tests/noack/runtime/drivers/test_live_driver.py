@@ -62,7 +62,7 @@ def test_datagrams_that_the_kernel_passes_together_are_handled_one_by_one(
     given = measurements(4, 50)
     with closing(Live("sensor", [scenario(content)] * 50)) as live:
         live.peer.connect(live.address)
-        sizes = {len(live.encoder.encode(one)) for one in given}
+        sizes = {len(live.encoder.encode(message)) for message in given}
         assert len(sizes) == 1
         head = [(socket.IPPROTO_UDP, UDP_SEGMENT, struct.pack("=H", *sizes))]
         for first in range(0, len(given), together):
@@ -71,7 +71,7 @@ def test_datagrams_that_the_kernel_passes_together_are_handled_one_by_one(
         live.drive_until_accepted(len(given))
         assert live.driver.core.sources[0].received == len(given) + len(range(together, len(given), together))
         rows = live.rows.tables[SENSOR_MEASUREMENT]
-        assert [row[0] for row in rows] == [one.loop for one in given]
+        assert [row[0] for row in rows] == [message.loop for message in given]
 
 
 @pytest.mark.sanitized
@@ -79,7 +79,7 @@ def test_messages_of_loops_that_tick_together_are_sent_together(content: dict[st
     with closing(Live("plant", [scenario(content)] * 50, since_ns=HOUR_NS)) as live:
         live.peer.setsockopt(socket.IPPROTO_UDP, UDP_GRO, 1)
         live.drive(lambda: live.driver.core.sent >= 500)
-        sizes = [len(one) for one in received(live.peer, 65_536)]
+        sizes = [len(datagram) for datagram in received(live.peer, 65_536)]
         assert max(sizes) == 64 * DATAGRAM_BYTES
         assert sum(sizes) == live.driver.core.sent * DATAGRAM_BYTES
 
