@@ -48,7 +48,8 @@ int64_t noack_clock_wait_ns(const noack_clock *clock, int64_t simulated_ns) {
 /* Datagrams that wait come first, as after a stall of this process. Else housekeeping waits for a
    step, and for a moment after it: the receivers of its messages come first, and the next step is
    usually a period away. It must not make a tick or a delayed datagram late. */
-int64_t noack_put_off_ns(pauses *pauses, int64_t overdue_ns, int64_t next_ns, int has_more, int is_busy) {
+int64_t noack_put_off_ns(
+    pauses *pauses, int64_t overdue_ns, int64_t next_ns, int has_more, int is_busy) {
     int64_t left_ns = MOST_PUT_OFF_NS - overdue_ns;
     pauses->has_followed |= pauses->worked;
     int settled =

@@ -107,7 +107,8 @@ typedef struct {          /* of a driver that returns to Python for housekeeping
 /* clock.c: how long to put off housekeeping that has been due for a time; 0: not at all. next_ns:
    the time until the next tick or departure. has_more: datagrams wait. is_busy: no pause is to be
    expected. All times are those of a clock on the wall. */
-int64_t noack_put_off_ns(pauses *pauses, int64_t overdue_ns, int64_t next_ns, int has_more, int is_busy);
+int64_t noack_put_off_ns(
+    pauses *pauses, int64_t overdue_ns, int64_t next_ns, int has_more, int is_busy);
 
 /* guarantee.c */
 int counts_losses(const noack_link *link);

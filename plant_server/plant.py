@@ -57,7 +57,9 @@ class Disturbance:
         widths: their entries, m and n; 0 where there is no disturbance.
     """
 
-    def __init__(self, at_input: list[DisturbanceSignal], at_state: list[DisturbanceSignal], widths: tuple[int, int]) -> None:
+    def __init__(
+        self, at_input: list[DisturbanceSignal], at_state: list[DisturbanceSignal], widths: tuple[int, int]
+    ) -> None:
         self._parts, self.widths = (at_input, at_state), widths
 
     def values(self, steps: range) -> tuple[Matrix, Matrix]:

@@ -16,7 +16,12 @@ from noack.core.errors import CallerError
 from noack.core.number_format import at_least, at_most, duration
 from noack.impairments.constraints import join_guarantee
 from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_guarantee import LossGuarantee, OutcomePattern, find_pattern_beyond, outcome_letters
+from noack.impairments.loss_guarantee import (
+    LossGuarantee,
+    OutcomePattern,
+    find_pattern_beyond,
+    outcome_letters,
+)
 from noack.impairments.loss_prediction import loss_process
 from noack.impairments.markov_chain import NotPredictableError
 from noack.scenario.scenario import Scenario

@@ -75,8 +75,7 @@ static void load(noack_segments *segments, int64_t run) {
     controller->model_ns = t_ns;
     controller->machine.step = first_tick(&controller->machine, t_ns);
     /* The controller has a state from the update of the first step on. */
-    controller->has_state =
-        segments->known_start || segments->sent[run * segments->places] != 0.0;
+    controller->has_state = segments->known_start || segments->sent[run * segments->places] != 0.0;
 }
 
 /* x_c at a step. */

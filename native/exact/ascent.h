@@ -22,13 +22,15 @@ static inline double bracketed(
     return 0.5 * (low_s + high_s);
 }
 
-/* The positive root of value + slope q + curvature_bound q^2/2, given value <= 0, or span if that is smaller.
+/* The positive root of value + slope q + curvature_bound q^2/2, given value <= 0, or span if that
+ * is smaller.
  */
 static inline double safe_step(double value, double slope, double curvature_bound, double span) {
     if (value + span * (slope + 0.5 * curvature_bound * span) <= 0.0)
         return span;
     double root = sqrt(slope * slope - 2.0 * curvature_bound * value);
-    return least(slope > 0.0 ? -2.0 * value / (slope + root) : (root - slope) / curvature_bound, span);
+    return least(
+        slope > 0.0 ? -2.0 * value / (slope + root) : (root - slope) / curvature_bound, span);
 }
 
 /* The root of an increasing h in (at.s, ahead_s), or NONE. evaluate gives h and its derivatives. */

@@ -71,8 +71,9 @@ int arrives(const noack_exact *exact, exact_run *run) {
 }
 
 static int64_t blocks_of(const noack_trigger_rule *rule, const exact_code *code) {
-    int64_t rows =
-        max_of(rule->positive_rows + rule->negative_rows, rule->positive_gain_rows + rule->negative_gain_rows);
+    int64_t rows = max_of(
+        rule->positive_rows + rule->negative_rows,
+        rule->positive_gain_rows + rule->negative_gain_rows);
     return max_of(2, (rows + code->n - 1) / code->n);
 }
 
@@ -173,8 +174,8 @@ static block_form take_form(
     taken.signs = take(scratch, blocks * stride);
     for (int64_t row = 0; row < form->positive_rows + form->negative_rows; row++) {
         int64_t block = row / size, at = row % size, is_positive = row < form->positive_rows;
-        const double *from =
-            is_positive ? form->positive + row * 2 * n : form->negative + (row - form->positive_rows) * 2 * n;
+        const double *from = is_positive ? form->positive + row * 2 * n
+                                         : form->negative + (row - form->positive_rows) * 2 * n;
         taken.signs[block * stride + at] = is_positive ? 1.0 : -1.0;
         for (int64_t j = 0; j < n; j++) {
             taken.rows[2 * block * square + j * stride + at] = from[j];
@@ -230,7 +231,9 @@ static int64_t lay_out(const noack_exact *exact, const exact_code *code, exact_m
         memory->is_static &= exact->H[i] == 0.0;
     if (memory->quadratic) {
         rule_form form = {rule->positive_rows, rule->negative_rows, rule->positive, rule->negative};
-        rule_form gain = {rule->positive_gain_rows, rule->negative_gain_rows, rule->positive_gain, rule->negative_gain};
+        rule_form gain = {
+            rule->positive_gain_rows, rule->negative_gain_rows, rule->positive_gain,
+            rule->negative_gain};
         memory->form = take_form(&scratch, blocks, n, &form);
         memory->y = take(&scratch, blocks * curve);
         memory->gain = take_form(&scratch, blocks, n, &gain);

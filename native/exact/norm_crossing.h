@@ -13,9 +13,10 @@
    y = 0, the kink of |y| only increases h'. So if h'(s) > L (a - s), h increases on all of [s, a].
    Then it has at most one root there, and Halley's method may take any steps within the interval.
 
-   b is curvature_bound() and valid on [0, a]. It is computed again if a smaller a makes it much smaller.
-   Nothing is sampled. Only rounding remains: if h is below 0 by less than the rounding error, steps
-   have about 1e-8 of the curve's time scale, and a tangency in floating point is found or missed.
+   b is curvature_bound() and valid on [0, a]. It is computed again if a smaller a makes it much
+   smaller. Nothing is sampled. Only rounding remains: if h is below 0 by less than the rounding
+   error, steps have about 1e-8 of the curve's time scale, and a tangency in floating point is found
+   or missed.
 
    A step either advances or is too short to change s in floating point, which ends the search. A
    curve that stays just below its threshold may need very many steps; then it is UNRESOLVED. */
@@ -54,16 +55,19 @@ static inline search_point look_at_square(const void *curve, const level_search 
         2.0 * (dot(at.dy, at.dy) + dot(at.y, at.ddy) - 2.0 * rate * rate * square)};
 }
 
-/* The length of a step that skips no crossing, at most span. speed is |y'|^2, curvature_bound is b. */
+/* The length of a step that skips no crossing, at most span. speed is |y'|^2, curvature_bound is b.
+ */
 static inline double safe_length(
-    double size, double radial, double speed, double level, double rate, double curvature_bound, double span) {
+    double size, double radial, double speed, double level, double rate, double curvature_bound,
+    double span) {
     const double small =
         0.125; /* share of the level below which |y| + |y'| q is the better bound */
     if (size < small * level)
         return safe_step(size - level, rate * level + sqrt(speed), curvature_bound, span);
     double turned = radial > 0.0 ? speed - radial * radial : speed;
     return safe_step(
-        size - level, rate * level + radial, curvature_bound + largest_of(turned, 0.0) / size, span);
+        size - level, rate * level + radial, curvature_bound + largest_of(turned, 0.0) / size,
+        span);
 }
 
 /* What is known before a search. LIKELY: a bound on all of |y| is not worth its computation. */

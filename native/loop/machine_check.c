@@ -105,8 +105,10 @@ static const char *check_plant(const noack_plant *plant) {
 
 const char *noack_check_rule(const noack_trigger_rule *rule, int64_t most_ns) {
     const int64_t rows[] = {
-        rule->positive_rows, rule->negative_rows, rule->positive_gain_rows, rule->negative_gain_rows};
-    double *const matrices[] = {rule->positive, rule->negative, rule->positive_gain, rule->negative_gain};
+        rule->positive_rows, rule->negative_rows, rule->positive_gain_rows,
+        rule->negative_gain_rows};
+    double *const matrices[] = {
+        rule->positive, rule->negative, rule->positive_gain, rule->negative_gain};
     for (int k = 0; k < 4; k++)
         if (!is_between(0, rows[k], 4 * NOACK_MAX_ENTRIES) || (rows[k] > 0 && matrices[k] == NULL))
             return "a trigger rule has no matrix";

@@ -76,7 +76,8 @@ void noack_observer_gain(noack_observer *observer, int64_t n) {
 /* P <- (I - L C) P (I - L C)' + L R L', made symmetric. */
 static void correct_covariance(noack_observer *observer, int64_t n) {
     int64_t p = observer->p, size = n * n;
-    double *I_minus_LC = observer->scratch, *half = I_minus_LC + size, *next = half + size, *LR = next + size;
+    double *I_minus_LC = observer->scratch, *half = I_minus_LC + size, *next = half + size,
+           *LR = next + size;
     noack_multiply(n, p, n, observer->gain, observer->C, 0, I_minus_LC);
     for (int64_t i = 0; i < n; i++)
         for (int64_t j = 0; j < n; j++)

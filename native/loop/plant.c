@@ -37,7 +37,9 @@ int64_t noack_plant_handle(
 /* Append the input of the last period, which the next measurement reports. */
 static void append_recent_input(noack_plant *plant) {
     int64_t m = plant->machine.m, kept = (plant->measure_every - 1) * m;
-    memmove(plant->recent_inputs, plant->recent_inputs + m, (size_t)kept * sizeof *plant->recent_inputs);
+    memmove(
+        plant->recent_inputs, plant->recent_inputs + m,
+        (size_t)kept * sizeof *plant->recent_inputs);
     copy(m, plant->u, plant->recent_inputs + kept);
 }
 

@@ -199,7 +199,8 @@ int64_t noack_sensor_handle(
         if (sensor->observer.kind == NOACK_NO_OBSERVER) {
             copy(machine->n, message->vector, sensor->x);
         } else if (!machine->observed) {
-            noack_observe(&sensor->observer, message, machine->n, machine->m, sensor->plant_period_ns);
+            noack_observe(
+                &sensor->observer, message, machine->n, machine->m, sensor->plant_period_ns);
             copy(machine->n, sensor->observer.x, sensor->x);
             machine->observed = 1;
         }

@@ -446,7 +446,10 @@ def with_target_loss(settings: LinkSettings) -> LinkSettings:
 
 
 def found_probabilities(*links: LinkSettings) -> dict[str, float]:
-    """Return the probabilities of valid settings, for :func:`store_probabilities`; none where none is kept."""
+    """Return the probabilities of valid settings, for :func:`store_probabilities`.
+
+    There is none where no loss rate is kept.
+    """
     # Each is read at once, as a further one may remove it.
     return {(key := _key(link)): _probabilities[key] for link in links if with_target_loss(link) is not link}
 

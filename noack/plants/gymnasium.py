@@ -17,7 +17,7 @@ from noack.core.errors import CallerError, one_line
 from noack.core.linear_systems import Vector
 from noack.plants.plant_settings import Names, PlantSettings, PlantStart, SystemFailedError
 from noack.protocol.wire_format import MAX_DIMENSION
-from noack.settings.section import Positive, Row, MatrixRows, require_length, require_shape
+from noack.settings.section import MatrixRows, Positive, Row, require_length, require_shape
 from noack.settings.user_files import FileSettings, UserCode, real_vector, unchanged
 
 Indices = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1, max_length=MAX_DIMENSION)]

@@ -24,7 +24,7 @@ from pydantic import BaseModel, Field, FiniteFloat, model_validator
 from noack.core.errors import CallerError, NoackError, one_line
 from noack.core.file_access import read_regular
 from noack.core.linear_systems import Vector
-from noack.settings.section import Row, MatrixRows, ScenarioSection
+from noack.settings.section import MatrixRows, Row, ScenarioSection
 
 UserCode = Any
 """A class of the user, an object of it, or what its code returns."""

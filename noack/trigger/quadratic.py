@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from noack.core.clock import NS_PER_S
-from noack.settings.section import NonNegative, MatrixRows, require_shape
+from noack.settings.section import MatrixRows, NonNegative, require_shape
 from noack.trigger.policy_settings import IntervalS, ModelMatrices, WeightedSettings, nanoseconds
 from noack.trigger.trigger_rule import TriggerRule, quadratic_form
 

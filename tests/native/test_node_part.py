@@ -19,7 +19,7 @@ ARM = "arm-none-eabi-"
 
 
 @pytest.mark.parametrize("tools", ["", ARM], ids=["own", "board"])
-def test_the_machines_need_no_system(tools: str, tmp_path: Path) -> None:
+def test_the_machines_need_no_system_and_take_no_names_of_a_firmware(tools: str, tmp_path: Path) -> None:
     if tools and shutil.which(f"{tools}gcc") is None:
         pytest.skip("arm-none-eabi-gcc is not installed")
     compiler = {"CC": f"{tools}gcc -mcpu=cortex-m4 -mthumb -Werror"} if tools else {}

@@ -18,7 +18,7 @@ from cosim.simulation.exact_simulation import ROW
 from cosim.studies.campaign.metrics import METRICS, Metric
 from noack.core.errors import CallerError
 from noack.scenario import toml_file
-from noack.settings.section import NonNegative, MatrixRows, ScenarioSection, Seed
+from noack.settings.section import MatrixRows, NonNegative, ScenarioSection, Seed
 
 MOST_POINTS = 10_000
 MOST_SERIES = 12

@@ -28,8 +28,8 @@ from noack.theory.margins.quadratic_norms import (
     NormSearch,
     norms_above,
     number_of_entries,
-    with_history,
     representatives,
+    with_history,
 )
 from noack.theory.margins.switched_system import (
     Cycle,

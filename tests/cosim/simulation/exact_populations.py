@@ -162,7 +162,7 @@ def check_events(run: ContinuousRun, setting: Setting) -> int:
 def value_of(form: QuadraticForm, z: Vector) -> float:
     """‖P z‖² − ‖N z‖²."""
     positive, negative = form.positive @ z, form.negative @ z
-    return float(up @ up - down @ down)
+    return float(positive @ positive - negative @ negative)
 
 
 def pieces(run: ContinuousRun) -> list[tuple[Any, float, float]]:

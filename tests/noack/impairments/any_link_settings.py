@@ -109,12 +109,15 @@ settings = _settings(_ANY, most=1_000_000)
 """All valid settings, including names of files."""
 computable = _settings(_ANY.filter(_is_computable))
 _choosing = st.tuples(
-    st.none() | st.sampled_from([impairment for impairment in IMPAIRED if impairment.kind in ("loss", "blackout")]),
+    st.none()
+    | st.sampled_from([impairment for impairment in IMPAIRED if impairment.kind in ("loss", "blackout")]),
     st.sampled_from([impairment for impairment in IMPAIRED if getattr(impairment, "scheduler", None)]),
     st.none() | st.sampled_from([*EXAMPLES[Corrupt], Delay(delay_s=0.004)]),
 ).map(lambda chain: [impairment for impairment in chain if impairment and _is_computable(impairment)])
 """Impairments with a queue that chooses what it sends."""
-harsh = _settings(st.sampled_from([impairment for impairment in IMPAIRED if _is_computable(impairment)])) | _chained(_choosing)
+harsh = _settings(
+    st.sampled_from([impairment for impairment in IMPAIRED if _is_computable(impairment)])
+) | _chained(_choosing)
 """Examples of the features in any order, with short times."""
 capped = harsh.filter(lambda settings: settings.impairments and settings.mansd is not None).map(
     lambda settings: settings.model_copy(update={"first_delivered": True})

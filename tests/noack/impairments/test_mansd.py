@@ -207,7 +207,9 @@ def test_a_restarted_link_keeps_the_guarantee_behind_any_history(words: str) -> 
     before = [list(history) for history in HISTORIES if is_allowed(history, settings)]
     assert all(is_allowed([*history, *lost], settings) for history in before)
     earlier = lost.index(True) - 1
-    assert earlier == 0 or any(not is_allowed([*history, *[False] * earlier, True], settings) for history in before)
+    assert earlier == 0 or any(
+        not is_allowed([*history, *[False] * earlier, True], settings) for history in before
+    )
 
 
 def lost_of(releases: Sequence[int | None]) -> list[bool]:

@@ -370,7 +370,8 @@ def test_a_scheduler_sends_the_first_of_what_waits_when_the_link_is_free(
     alike = [(t, flow, 72, level) for t, flow, _, level in arrivals]
     plain = rate.model_copy(update={"discipline": TailDrop()})
     of_both = [
-        core_departures(LinkSettings(impairments=(impairment,), mansd=mansd), alike)[1] for impairment in (rate, plain)
+        core_departures(LinkSettings(impairments=(impairment,), mansd=mansd), alike)[1]
+        for impairment in (rate, plain)
     ]
     assert of_both[0] == of_both[1]
 

@@ -102,7 +102,9 @@ def test_measurements_that_are_lost_are_bridged_and_replayed(observed: dict[str,
     observed["plant"]["measurement"] = {"C": [[1.0, 0.0]], "noise_std": [1e-9]}
     scenario = resolved(observed)
     lost = {30, 31, 32, 33, 70}
-    record = simulate_with(scenario, "sensor", lambda machine: LosingMachine(machine, lambda k: k not in lost))
+    record = simulate_with(
+        scenario, "sensor", lambda machine: LosingMachine(machine, lambda k: k not in lost)
+    )
     assert len(record[SENSOR_MEASUREMENT]) == 101 - len(lost)
     assert replay(record).bit_exact
     # The input during the gap is unknown: it changes as the model decays.
@@ -137,7 +139,9 @@ def test_the_summary_contains_the_estimation_error(observed: dict[str, Any]) -> 
     assert estimation["max"] == pytest.approx(norms.max())
     assert estimation["rms"] == pytest.approx(np.sqrt((norms**2).mean()))
     assert (estimation["observer"], estimation["outputs"], estimation["noise_std"]) == ("kalman", 1, [0.02])
-    assert estimation["expected_rms"] == pytest.approx(np.sqrt(np.trace(steady_state(record.scenario).covariance)))
+    assert estimation["expected_rms"] == pytest.approx(
+        np.sqrt(np.trace(steady_state(record.scenario).covariance))
+    )
     assert estimation["sup_e_c_norm"] > 0
     # Without an observer, noisy measurements are used as x.
     del observed["observer"]

@@ -209,7 +209,10 @@ def test_changes_announced_out_of_order_are_applied_in_order_of_time(scenario: S
     taken = schedule.take(250)
     assert [change.since_ns for change in taken] == [100, 200]
     scenarios = [change.scenario for change in taken]
-    assert [(scenario.network.mansd, scenario.decaying.beta) for scenario in scenarios] == [(5, 0.5), (5, 0.1)]
+    assert [(scenario.network.mansd, scenario.decaying.beta) for scenario in scenarios] == [
+        (5, 0.5),
+        (5, 0.1),
+    ]
     assert schedule.take(10**9) == []
     assert schedule.next_ns > 10**18
     caps = [scenario.network.mansd for scenario in schedule.between(0, 150)]

@@ -207,7 +207,9 @@ def test_the_bound_is_attained(rate_ppb: int, offset_ns: int, ages_ns: list[int]
         drift_ns = rate_ppb * age_ns // 10**9
         assert 0 <= interval.upper_ns - (offset_ns + drift_ns) <= 3
         assert 0 <= (offset_ns - drift_ns) - interval.lower_ns <= 3
-        assert interval.error_ns == max(interval.upper_ns - interval.midpoint_ns, interval.midpoint_ns - interval.lower_ns)
+        assert interval.error_ns == max(
+            interval.upper_ns - interval.midpoint_ns, interval.midpoint_ns - interval.lower_ns
+        )
 
 
 def test_an_exchange_that_contradicts_itself_is_not_used() -> None:

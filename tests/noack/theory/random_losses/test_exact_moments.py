@@ -19,9 +19,9 @@ from noack.theory.random_losses.exact_moments import (
     LoopMoments,
     LoopPeriods,
     MomentStep,
-    propagation,
     jump,
     periods_of,
+    propagation,
     start_of,
 )
 from tests.noack.theory.random_losses.example_losses import BURSTS, NOISE, scenario
