@@ -139,7 +139,7 @@ class Controller(MachinePart):
                 "x_c": np.zeros(n) if self.x0 is None else self.x0,
                 # A model without a state starts at the first tick, which is recorded.
                 "model_ns": self.first_ns + step * period_ns if start.is_restart else 0,
-                "knows_state": self.x0 is not None,
+                "has_state": self.x0 is not None,
                 # After a restart the updates before it are unknown.
                 "newest": core.NOACK_UNKNOWN_SEQUENCE if start.is_restart else core.NOACK_NO_SEQUENCE,
                 "x": np.zeros(n),

@@ -80,7 +80,7 @@ static void release(
             channel->links[direction], datagram->flow % channel->loops, channel->waiting, place,
             order, decision);
     else
-        heap_push(
+        noack_heap_push(
             channel->heap, &channel->heap_count, (noack_heap_entry){release_ns, order, place});
 }
 
@@ -127,7 +127,7 @@ int64_t noack_channel_release(noack_channel *channel, int64_t now_ns) {
         return NOACK_ROWS_FULL;
     noack_heap_entry entry = channel->heap[0];
     noack_delayed *leaving = &channel->delayed[entry.slot];
-    heap_pop(channel->heap, &channel->heap_count);
+    noack_heap_pop(channel->heap, &channel->heap_count);
     channel->releases[channel->release_count++] = (noack_release_row){
         .input = channel->inputs++,
         .sequence = channel->first_number + leaving->packet,

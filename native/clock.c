@@ -25,7 +25,7 @@ int64_t noack_clock_at_ns(const noack_clock *clock, int64_t own_ns) {
     int64_t wall_ns = own_ns - clock->epoch_ns;
     if (clock->slew_ppb > 0)
         wall_ns += applied_offset_ns(clock, own_ns);
-    return simulated_ns_of(clock, wall_ns);
+    return noack_simulated_ns_of(clock, wall_ns);
 }
 
 /* Truncate to a whole number, of 146 years at most. */
@@ -34,7 +34,7 @@ static int64_t whole_ns(double time_ns) {
     return (int64_t)fmin(fmax(time_ns, -most), most);
 }
 
-int64_t simulated_ns_of(const noack_clock *clock, int64_t wall_ns) {
+int64_t noack_simulated_ns_of(const noack_clock *clock, int64_t wall_ns) {
     return clock->speed == 1.0 ? wall_ns : whole_ns((double)wall_ns * clock->speed);
 }
 
@@ -48,7 +48,8 @@ int64_t noack_clock_wait_ns(const noack_clock *clock, int64_t simulated_ns) {
 /* Datagrams that wait come first, as after a stall of this process. Else housekeeping waits for a
    step, and for a moment after it: the receivers of its messages come first, and the next step is
    usually a period away. It must not make a tick or a delayed datagram late. */
-int64_t put_off_ns(pauses *pauses, int64_t overdue_ns, int64_t next_ns, int has_more, int is_busy) {
+int64_t noack_put_off_ns(
+    pauses *pauses, int64_t overdue_ns, int64_t next_ns, int has_more, int is_busy) {
     int64_t left_ns = MOST_PUT_OFF_NS - overdue_ns;
     pauses->has_followed |= pauses->worked;
     int settled =

@@ -95,7 +95,7 @@ int codel_is_due(const noack_link *link, int64_t number);
 void codel_drop(noack_link *link, int64_t number);
 
 /* clock.c, and driver.c: readings of a clock. */
-int64_t simulated_ns_of(const noack_clock *clock, int64_t wall_ns);
+int64_t noack_simulated_ns_of(const noack_clock *clock, int64_t wall_ns);
 int64_t clock_ns(int clock);
 int64_t run_time_ns(const noack_clock *clock);
 
@@ -107,7 +107,8 @@ typedef struct {          /* of a driver that returns to Python for housekeeping
 /* clock.c: how long to put off housekeeping that has been due for a time; 0: not at all. next_ns:
    the time until the next tick or departure. has_more: datagrams wait. is_busy: no pause is to be
    expected. All times are those of a clock on the wall. */
-int64_t put_off_ns(pauses *pauses, int64_t overdue_ns, int64_t next_ns, int has_more, int is_busy);
+int64_t noack_put_off_ns(
+    pauses *pauses, int64_t overdue_ns, int64_t next_ns, int has_more, int is_busy);
 
 /* guarantee.c */
 int counts_losses(const noack_link *link);
@@ -128,9 +129,9 @@ int64_t departure_order(int64_t direction, int64_t delayed_count);
 /* heap.c */
 
 /* There must be room. */
-void heap_push(noack_heap_entry *heap, int64_t *count, noack_heap_entry entry);
+void noack_heap_push(noack_heap_entry *heap, int64_t *count, noack_heap_entry entry);
 /* Remove the first entry. */
-void heap_pop(noack_heap_entry *heap, int64_t *count);
+void noack_heap_pop(noack_heap_entry *heap, int64_t *count);
 
 /* Whether the queue of a stage chooses when its link is free (waiting.c). */
 static inline int is_scheduler(const noack_stage *stage) {
@@ -166,12 +167,12 @@ static inline void copy_datagram(noack_datagram *to, const noack_datagram *from)
 }
 
 /* wire.c: the header of a message's datagram; and the tests of an authentic datagram. */
-void wire_header(const noack_wire *wire, const noack_message *message, uint8_t *header);
-int64_t wire_examine_message(
+void noack_wire_header(const noack_wire *wire, const noack_message *message, uint8_t *header);
+int64_t noack_wire_examine_message(
     const noack_reception *reception, int64_t from_peer, const noack_message *message);
 
 /* loop/machine_check.c: NULL, or what is wrong with a rule whose times are at most most_ns. */
-const char *check_rule(const noack_trigger_rule *rule, int64_t most_ns);
+const char *noack_check_rule(const noack_trigger_rule *rule, int64_t most_ns);
 
 /* link.c: decide as noack_link_decide does, by a recorded decision unless it is NULL. */
 void link_repeat(

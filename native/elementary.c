@@ -1,7 +1,7 @@
 /* Elementary functions with the same bits everywhere; elementary.h says how. */
 #include "core.h"
 
-const two_part POWERS_OF_2[32] = {
+const two_part NOACK_POWERS_OF_2[32] = {
     {0x1p+0, 0.0},
     {0x1.059b0dp+0, 0x1.8ac2ba1d73e2ap-27},
     {0x1.0b5587p+0, -0x1.833b784eb3a37p-27},
@@ -36,7 +36,7 @@ const two_part POWERS_OF_2[32] = {
     {0x1.f507658p+0, 0x1.b722a033a7c26p-27},
 };
 
-double exp_at_limits(double x) {
+double noack_exp_at_limits(double x) {
     if (!(x < 709.8))
         return isnan(x) ? x : INFINITY;
     if (x < -745.2)
@@ -78,7 +78,7 @@ double noack_log(double x) {
     double m = 2.0 * frexp(x, &exponent), f = m - 1.0;          /* 1 <= m < 2 */
     double log_2 = f + f * (1.0 - f) * (0.42086 - 0.15639 * f); /* with an error of 0.001 */
     int part = (int)(32.0 * log_2 + 0.5);                       /* from 0 to 32 */
-    two_part inverse = POWERS_OF_2[-part & 31];
+    two_part inverse = NOACK_POWERS_OF_2[-part & 31];
     double half = part > 0 ? 0.5 : 1.0;
     inverse.high *= half;
     inverse.low *= half;

@@ -20,7 +20,7 @@ typedef struct {
     double high, low; /* the first has 26 bits */
 } two_part;
 
-extern const two_part POWERS_OF_2[32]; /* 2^(i/32) */
+extern const two_part NOACK_POWERS_OF_2[32]; /* 2^(i/32) */
 
 /* ln 2/32; the first part has 36 bits, so that its product with a k is exact. */
 static const two_part LN2_STEP = {0x1.62e42fefap-6, 0x1.cf79abc9e3b3ap-45};
@@ -48,7 +48,7 @@ static inline power_parts exp_parts(double x) {
     double reduced = x - steps * LN2_STEP.high, correction = steps * LN2_STEP.low;
     double major = (reduced + to_multiple) - to_multiple, minor = (reduced - major) - correction;
     double r = reduced - correction, square = r * r;
-    two_part power = POWERS_OF_2[k & 31];
+    two_part power = NOACK_POWERS_OF_2[k & 31];
     double whole = power.high + power.low, product = power.high * major;
     double high = power.high + product, lost = product - (high - power.high);
     double low = (lost + (power.low + power.low * major)) + whole * minor;
@@ -64,11 +64,12 @@ static inline double power_of_2(int64_t exponent) {
     return power;
 }
 
-double exp_at_limits(double x); /* where e^x is close to the limits of doubles, or x is no number */
+double noack_exp_at_limits(
+    double x); /* where e^x is close to the limits of doubles, or x is no number */
 
 static inline double fixed_exp(double x) {
     if (!(fabs(x) < 708.0))
-        return exp_at_limits(x);
+        return noack_exp_at_limits(x);
     power_parts parts = exp_parts(x);
     return (parts.high + parts.low) * power_of_2(parts.exponent);
 }

@@ -5,7 +5,7 @@ static int is_before(const noack_heap_entry *a, const noack_heap_entry *b) {
     return a->due_ns < b->due_ns || (a->due_ns == b->due_ns && a->number < b->number);
 }
 
-void heap_push(noack_heap_entry *heap, int64_t *count, noack_heap_entry entry) {
+void noack_heap_push(noack_heap_entry *heap, int64_t *count, noack_heap_entry entry) {
     int64_t place = (*count)++;
     while (place > 0 && is_before(&entry, &heap[(place - 1) / 2])) {
         heap[place] = heap[(place - 1) / 2];
@@ -14,7 +14,7 @@ void heap_push(noack_heap_entry *heap, int64_t *count, noack_heap_entry entry) {
     heap[place] = entry;
 }
 
-void heap_pop(noack_heap_entry *heap, int64_t *count) {
+void noack_heap_pop(noack_heap_entry *heap, int64_t *count) {
     noack_heap_entry last = heap[--*count];
     int64_t place = 0;
     for (;;) {

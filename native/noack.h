@@ -417,9 +417,9 @@ typedef struct {
     /* the threshold that it forecasts */
     double beta, alpha_per_s, forecast_floor;
     double growth_per_s, mismatch_per_s, disturbance_per_s;
-    int64_t up_rows, down_rows, gain_up_rows, gain_down_rows;
-    double *up, *down;               /* P and N, (rows, 2n) */
-    double *gain_up, *gain_down;     /* of the rate of eta: |P_eta z|^2 - |N_eta z|^2 */
+    int64_t positive_rows, negative_rows, positive_gain_rows, negative_gain_rows;
+    double *positive, *negative;               /* P and N, (rows, 2n) */
+    double *positive_gain, *negative_gain;     /* of the rate of eta: |P_eta z|^2 - |N_eta z|^2 */
     /* W of the norm that is recorded, (n, n); NULL: the identity */
     double *weight;
     /* of the norm of x that a forecast begins with; NULL: likewise */
@@ -445,8 +445,8 @@ enum {
 
 enum noack_sequence { NOACK_NO_SEQUENCE = -1, NOACK_UNKNOWN_SEQUENCE = -2 };
 
-/* The flows of a loop, as noack.protocol.wire_format.Flow. */
-enum noack_flow_kind {
+/* What a message is, as noack.protocol.wire_format.Flow. */
+enum noack_message_kind {
     NOACK_MEASUREMENT = 1,
     NOACK_UPDATE,
     NOACK_ACTUATION,
@@ -572,7 +572,7 @@ typedef struct {
     double *u;                              /* (m,) held since the last step */
     double *applied;                        /* (sources,) the same, disturbed */
     /* (measure_every, m) the inputs since the last measurement, if reported */
-    double *held;
+    double *recent_inputs;
     double *inputs;                         /* (N, m) of the newest actuation */
     double *x_c;                            /* (n,) of it */
     int64_t newest_ns, newest_sequence;
@@ -615,7 +615,7 @@ typedef struct {
     double *x_s;           /* (n,) */
     double *event_x;       /* (n,) x - x_r at the last event */
     int64_t model_ns;
-    int64_t knows_state;   /* 0: the first measurement is an event */
+    int64_t has_state;   /* 0: the first measurement is an event */
     int64_t events;        /* number of the next one */
     int64_t wait_ns;       /* time until which it waits for an acknowledgement; -1: it does not */
     int64_t sent_count, sent_places;
@@ -652,7 +652,7 @@ typedef struct {
     /* State */
     double *x_c;                        /* (n,) */
     int64_t model_ns;
-    int64_t knows_state;
+    int64_t has_state;
     /* number of the last update; NOACK_UNKNOWN_SEQUENCE after a restart */
     int64_t newest;
     int64_t update_ns;                  /* time of its event; 0: that of x(0) */
@@ -923,7 +923,7 @@ typedef struct {
     int64_t timer;                /* a timerfd */
     int64_t epoll;                /* waits for the sockets and the timer */
     noack_peer sources[2];
-    int64_t foreign;              /* datagrams from other addresses */
+    int64_t unknown_source;              /* datagrams from other addresses */
     int64_t sent;
     int64_t errors[NOACK_ERRNOS]; /* datagrams that could not be sent, by errno */
     int64_t question;             /* a noack_question */
@@ -1216,12 +1216,12 @@ typedef struct {
     noack_machine machine;
     int64_t is_static, has_point, acknowledges, predictions, carries_model;
     int64_t timeout_ns, holds_input;
-    int64_t model_ns, knows_state, newest;
+    int64_t model_ns, has_state, newest;
 } noack_node_settings;
 
 /* The datagrams of a node so far. */
 typedef struct {
-    int64_t sent, received, foreign; /* foreign: not from the peer's address */
+    int64_t sent, received, unknown_source; /* unknown_source: not from the peer's address */
     int64_t accepted, rejected[NOACK_REJECTIONS];
 } noack_node_counts;
 

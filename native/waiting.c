@@ -132,6 +132,7 @@ void serve(
         int64_t end_ns = noack_queue_serve(link, link->scheduler, next->size_bytes);
         int64_t leaves_ns = max_of(end_ns + next->after_ns, next->earliest_ns);
         flow->first_release_ns = max_of(flow->first_release_ns, leaves_ns);
-        heap_push(heap, count, (noack_heap_entry){flow->first_release_ns, next->order, place});
+        noack_heap_push(
+            heap, count, (noack_heap_entry){flow->first_release_ns, next->order, place});
     }
 }

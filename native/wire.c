@@ -108,7 +108,7 @@ void noack_wire_tag(
     memcpy(tag, chain, NOACK_TAG_BYTES);
 }
 
-void wire_header(const noack_wire *wire, const noack_message *message, uint8_t *datagram) {
+void noack_wire_header(const noack_wire *wire, const noack_message *message, uint8_t *datagram) {
     uint16_t loop = (uint16_t)message->loop;
     datagram[0] = 'N';
     datagram[1] = 'A';
@@ -124,7 +124,7 @@ void wire_header(const noack_wire *wire, const noack_message *message, uint8_t *
 
 int64_t noack_wire_encode(const noack_wire *wire, const noack_message *message, uint8_t *datagram) {
     int64_t content_bytes = VECTOR + 8 * message->entries;
-    wire_header(wire, message, datagram);
+    noack_wire_header(wire, message, datagram);
     memcpy(datagram + VECTOR, message->vector, 8 * (size_t)message->entries);
     if (!wire->encrypted)
         noack_wire_tag(wire, content_bytes, datagram, datagram + content_bytes);
@@ -174,7 +174,7 @@ static int has_tag(const noack_wire *wire, const uint8_t *datagram, int64_t cont
     return ((tag[0] ^ received[0]) | (tag[1] ^ received[1])) == 0;
 }
 
-int64_t wire_examine_message(
+int64_t noack_wire_examine_message(
     const noack_reception *reception, int64_t from_peer, const noack_message *message) {
     if (!from_peer)
         return NOACK_BAD_SOURCE;
@@ -206,7 +206,7 @@ int64_t noack_wire_examine(
     memcpy(&message->sequence, datagram + SEQUENCE, 8);
     memcpy(&message->t_ns, datagram + TIME, 8);
     memcpy(message->vector, datagram + VECTOR, 8 * (size_t)message->entries);
-    return wire_examine_message(reception, from_peer, message);
+    return noack_wire_examine_message(reception, from_peer, message);
 }
 
 void noack_wire_count(

@@ -37,7 +37,7 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from netem.relay.relay_links import LinkSpec
 from netem.relay.relay_reports import DIRECTIONS, EVENT, Bytes, Direction, report_line
-from noack.core.core_library import Rows, dtype_of
+from noack.core.core_library import StructRows, dtype_of
 from noack.core.errors import CallerError, one_line
 from noack.core.file_access import open_growing, open_regular
 from noack.impairments.constraints import require_consistent
@@ -130,7 +130,7 @@ class FateRecorder:
         }
         self._pending_rows = 0
         self._max_waiting = max_waiting
-        self._queue: SimpleQueue[Rows | str | None] = SimpleQueue()
+        self._queue: SimpleQueue[StructRows | str | None] = SimpleQueue()
         self._taken = 0
         self._done = 0
         self._missed = 0
@@ -169,7 +169,7 @@ class FateRecorder:
         """Number of events that are not in the trace."""
         return self._missed + self._unwritten
 
-    def take(self, events: Rows, data: Bytes) -> None:
+    def take(self, events: StructRows, data: Bytes) -> None:
         """Queue the arrivals; called in the relay's thread."""
         try:
             rows = events.view(_RAW)[events["departure"] == 0]
@@ -198,7 +198,7 @@ class FateRecorder:
             self._write()
         self._end()
 
-    def _append(self, rows: Rows) -> None:
+    def _append(self, rows: StructRows) -> None:
         """Copy rows into columns, in groups, to release the interpreter lock often."""
         while len(rows):
             part, rows = np.split(rows, [_GROUP_ROWS - self._pending_rows])

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.core_library import Array, CData, core, dtype_of, ffi, pointer_to
+from noack.core.core_library import AnyArray, CData, core, dtype_of, ffi, pointer_to
 from noack.core.random_streams import stream_key
 from noack.impairments.feature import Stage, StageTables
 from noack.impairments.link_settings import Counters, Decisions, LinkSettings
@@ -67,7 +67,7 @@ class LinkState:
         self.core: CData = ffi.new("noack_link *")
         """The link, as the core's functions take it; its address does not change. It is valid as
         long as this object lives."""
-        self._memory: dict[str, Array] = {}
+        self._memory: dict[str, AnyArray] = {}
         self._stages: CData = None
         self.core[0] = self._new_link(settings, rows, tracks=bool(decisions))[0]
         _require(core.noack_recorded_check(self.core))
@@ -216,7 +216,7 @@ def stream_names(settings: LinkSettings, *name: str) -> list[tuple[str, ...]]:
     return [keyed.stream for keyed in _stages(settings, StageTables(), 0, name)]
 
 
-def _link_memory(link: CData) -> dict[str, Array]:
+def _link_memory(link: CData) -> dict[str, AnyArray]:
     """Return the arrays of a ``noack_link`` that the core writes, but for the flows."""
     rows, stages = link.rows, link.stage_count
     return {

@@ -13,7 +13,7 @@ from netem.channel import PACKET_ROW, Datagram, announce_change, due_settings, l
 from netem.relay.link_sockets import set_receive_timeout, stamp_arrivals
 from netem.relay.relay_memory import RelayDirection, RelayMemory, name_array
 from noack.core.clock import RunClock
-from noack.core.core_library import Rows, core
+from noack.core.core_library import StructRows, core
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE
 from noack.protocol.roles import Notice, Record, Start
@@ -199,7 +199,7 @@ def _first_entry(record: Record) -> int:
 class _RowList(list[Record]):
     """A sink that keeps the rows."""
 
-    def extend_table(self, table: str, rows: Rows) -> None:
+    def extend_table(self, table: str, rows: StructRows) -> None:
         """Add rows of a table."""
         self.extend(Record(table, row) for row in rows.tolist())
 

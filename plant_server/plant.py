@@ -44,7 +44,7 @@ from noack.scenario.sections import PlantSection
 PLANT = Role("plant", "noack_plant", Flow.ACTUATION, (PLANT_STEP, PLANT_ACTUATION, None))
 BLOCK = 256
 """Number of steps computed at once. A random value depends on its step's number only."""
-Signal = Callable[[range], Matrix]
+DisturbanceSignal = Callable[[range], Matrix]
 """Steps → the value added during each step, (k, entries)."""
 
 
@@ -57,7 +57,9 @@ class Disturbance:
         widths: their entries, m and n; 0 where there is no disturbance.
     """
 
-    def __init__(self, at_input: list[Signal], at_state: list[Signal], widths: tuple[int, int]) -> None:
+    def __init__(
+        self, at_input: list[DisturbanceSignal], at_state: list[DisturbanceSignal], widths: tuple[int, int]
+    ) -> None:
         self._parts, self.widths = (at_input, at_state), widths
 
     def values(self, steps: range) -> tuple[Matrix, Matrix]:
@@ -223,7 +225,7 @@ class Plant(MachinePart):
             "predictions": self.predictions, "input_period_ns": self.input_period_ns,
             "newest_sequence": NO_SEQUENCE, "fallback_sequence": NO_SEQUENCE, "missing_ns": -1,
             "x": np.zeros(n), "z": np.zeros(shape.internal), "u": np.zeros(m),
-            "applied": np.zeros(sources), "held": np.zeros((reported, m)),
+            "applied": np.zeros(sources), "recent_inputs": np.zeros((reported, m)),
             "inputs": np.zeros((self.predictions, m)), "x_c": np.zeros(n),
             "x_fallback": np.zeros(n), "scratch": np.zeros(2 * n + 2 * m),
         })  # fmt: skip
@@ -359,7 +361,7 @@ def disturbance_of(resolved: Scenario) -> Disturbance | None:
     """Return the disturbances of a resolved scenario's plant; None if it has none."""
     if not resolved.plant.disturbances:
         return None
-    signals: dict[Place, list[Signal]] = {"input": [], "state": []}
+    signals: dict[Place, list[DisturbanceSignal]] = {"input": [], "state": []}
     for number, disturbance in enumerate(resolved.plant.disturbances):
         name = ("plant", "disturbance", str(number))
         source = SignalSource(resolved.timing.plant_period_ns, resolved.seeds.disturbance, name)
@@ -369,7 +371,7 @@ def disturbance_of(resolved: Scenario) -> Disturbance | None:
     return Disturbance(signals["input"], signals["state"], widths)
 
 
-def _sum(signals: list[Signal], steps: range) -> Matrix:
+def _sum(signals: list[DisturbanceSignal], steps: range) -> Matrix:
     if not signals:
         return np.zeros((len(steps), 0))
     return np.asarray(sum(signal(steps) for signal in signals))

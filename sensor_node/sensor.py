@@ -62,7 +62,7 @@ class Observer:
         x: x̂ before the first measurement, (n,).
         reported: entries of a measurement that are inputs.
         period_ns: the plant's step.
-        knows_start: True: x̂ is the estimate at time 0; False: at the first measurement.
+        starts_from_x0: True: x̂ is the estimate at time 0; False: at the first measurement.
         restarted: whether the sensor replaces one that died; the earlier estimate is lost.
     """
 
@@ -71,7 +71,7 @@ class Observer:
     x: Vector
     reported: int
     period_ns: int
-    knows_start: bool
+    starts_from_x0: bool
     restarted: bool = False
 
     @property
@@ -82,7 +82,7 @@ class Observer:
     def fill(self, sensor: CData, memory: CoreMemory) -> None:
         """Fill the ``noack_observer`` of a sensor."""
         self.settings.fill(sensor.observer, self.model, self.x, memory)
-        sensor.observer.t_ns = 0 if self.knows_start else -1
+        sensor.observer.t_ns = 0 if self.starts_from_x0 else -1
         sensor.plant_period_ns = self.period_ns
 
     def first_notice(self, t_ns: int) -> Sequence[Notice]:
@@ -172,7 +172,7 @@ class Sensor(MachinePart):
         start = np.zeros(n) if self.x0 is None else self.x0
         memory.fill(sensor, {
             "is_user": self._trigger is not None, "acknowledged": self.timeout_ns is not None,
-            "timeout_ns": self.timeout_ns or 0, "knows_state": self.x0 is not None,
+            "timeout_ns": self.timeout_ns or 0, "has_state": self.x0 is not None,
             "events": self.first_number, "wait_ns": -1, "reports_error": self.reports_error,
             "x_s": start, "event_x": np.zeros(n), "x": np.zeros(n), "e_s": np.zeros(n),
         })  # fmt: skip
@@ -354,8 +354,8 @@ def observer_of(resolved: Scenario, *, restarted: bool) -> Observer | None:
     settings, loop = resolved.observer, loop_of(resolved)
     if settings is None:
         return None
-    knows_start = resolved.network.initial_sync == "known_state" and not restarted
-    x = loop.x0 if knows_start else np.zeros(loop.n)
+    starts_from_x0 = resolved.network.initial_sync == "known_state" and not restarted
+    x = loop.x0 if starts_from_x0 else np.zeros(loop.n)
     if settings.initial_estimate is not None:
         x = np.array(settings.initial_estimate)
     return Observer(
@@ -364,6 +364,6 @@ def observer_of(resolved: Scenario, *, restarted: bool) -> Observer | None:
         x,
         resolved.message_sizes.inputs_reported,
         resolved.timing.plant_period_ns,
-        knows_start,
+        starts_from_x0,
         restarted,
     )

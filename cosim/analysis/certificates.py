@@ -8,7 +8,7 @@ import numpy as np
 
 from noack.core.errors import CallerError, one_line
 from noack.core.linear_systems import Matrix
-from noack.core.number_format import NONE, Rows, as_html, as_text, at_least, at_most
+from noack.core.number_format import NONE, TextRows, as_html, as_text, at_least, at_most
 from noack.impairments.markov_chain import NotPredictableError
 from noack.plants.linear import LinearSettings
 from noack.scenario.resolution import loop_of, resolve
@@ -225,7 +225,7 @@ class Certificates:
     def _of(self, conditions: str) -> list[ScenarioCertificate]:
         return [certificate for under, certificate in self if under == conditions]
 
-    def _rows(self) -> Rows:
+    def _rows(self) -> TextRows:
         heads = [f"{under}, {covered_plants(certificate)}" for under, certificate in self]
         certificates = [certificate for _, certificate in self]
         rows = [[label, *values] for label, values, _ in constant_rows(certificates, None, 0.0)]

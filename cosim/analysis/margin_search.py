@@ -16,7 +16,12 @@ from noack.core.errors import CallerError
 from noack.core.number_format import at_least, at_most, duration
 from noack.impairments.constraints import join_guarantee
 from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_guarantee import LossGuarantee, Pattern, find_pattern_beyond, outcome_letters
+from noack.impairments.loss_guarantee import (
+    LossGuarantee,
+    OutcomePattern,
+    find_pattern_beyond,
+    outcome_letters,
+)
 from noack.impairments.loss_prediction import loss_process
 from noack.impairments.markov_chain import NotPredictableError
 from noack.scenario.scenario import Scenario
@@ -90,7 +95,7 @@ def compare_guarantees(
     return GuaranteeComparison(tuple(map(ComparedGuarantee, meanings, stabilities)), relations)
 
 
-def _relation(first: tuple[str, Pattern | None], second: tuple[str, Pattern | None]) -> str:
+def _relation(first: tuple[str, OutcomePattern | None], second: tuple[str, OutcomePattern | None]) -> str:
     """Return the relation of two guarantees, each with a pattern that the other one forbids."""
     (meaning, pattern), (other_meaning, other_pattern) = first, second
     if pattern is None and other_pattern is None:
@@ -105,7 +110,7 @@ def _relation(first: tuple[str, Pattern | None], second: tuple[str, Pattern | No
     )
 
 
-def _implication(meaning: str, implied: str, beyond: Pattern) -> str:
+def _implication(meaning: str, implied: str, beyond: OutcomePattern) -> str:
     return f"“{meaning}” implies “{implied}”, which also allows {outcome_letters(beyond)}"
 
 

@@ -24,7 +24,7 @@ from cosim.measurement.network_section import write_network
 from cosim.measurement.trace_sources import read_source
 from cosim.shipped_files import find_shipped
 from noack.core.errors import CallerError
-from noack.core.number_format import Rows, as_html, as_text
+from noack.core.number_format import TextRows, as_html, as_text
 from noack.core.process_limits import cores
 from noack.scenario import toml_file
 from noack.scenario.resolution import resolve
@@ -292,7 +292,7 @@ class CampaignResult:
         """Return the path of the page with all tables and figures."""
         return self.folder / campaign_report.PAGE
 
-    def _rows(self) -> Rows:
+    def _rows(self) -> TextRows:
         table = next(iter(campaign_report.campaign_tables(self._finished.summary)))
         return [(*table.headings,), *((*row,) for row in table.rows)]
 

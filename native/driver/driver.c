@@ -229,7 +229,7 @@ static int64_t wait_for_ns(
     if (driver->coalescing_ns > 0) /* no moment is better than another */
         return 0;
     int64_t overdue_ns = noack_clock_wait_ns(&driver->clock, now_ns - until_ns);
-    return put_off_ns(&scratch_of(driver)->pauses, overdue_ns, tick_ns, 0, 0);
+    return noack_put_off_ns(&scratch_of(driver)->pauses, overdue_ns, tick_ns, 0, 0);
 }
 
 /* Whether a table has so many rows that Python should take them before the next steps: few at a

@@ -152,7 +152,7 @@ static int64_t tick(noack_input_replay *replay, int64_t now_ns) {
     check_deadline(replay, due_ns, now_ns);
     if (due_ns == NO_TICK || process->role == NOACK_SENSOR)
         return NOACK_CANNOT_TAKE;
-    return do_tick(process, replay->loop, now_ns);
+    return noack_do_tick(process, replay->loop, now_ns);
 }
 
 static int64_t handle(
@@ -181,7 +181,7 @@ static int64_t handle(
             (size_t)columns->entries * sizeof *message.vector);
         message.entries += columns->entries;
     }
-    return handle_message(process, replay->loop, &message, now_ns);
+    return noack_handle_message(process, replay->loop, &message, now_ns);
 }
 
 static int64_t replay_machine(

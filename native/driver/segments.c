@@ -56,15 +56,15 @@ static void load(noack_segments *segments, int64_t run) {
     copy(m, segments->u + run * m, plant->u);
     copy(m, segments->u_next + run * m, plant->inputs);
     if (plant->reports_inputs)
-        memset(plant->held, 0, (size_t)(every * m) * sizeof *plant->held);
+        memset(plant->recent_inputs, 0, (size_t)(every * m) * sizeof *plant->recent_inputs);
     plant->newest_ns = t_ns;
     plant->machine.step = step + 1;
     plant->measurements = step < 0 ? 0 : step / every + 1;
-    disturb(plant, begun);
+    noack_disturb(plant, begun);
     copy(n, segments->x_s + run * n, sensor->x_s);
     copy(n, segments->y + run * n, sensor->x);
     sensor->model_ns = t_ns;
-    sensor->knows_state = 1;
+    sensor->has_state = 1;
     sensor->trigger.auxiliary = segments->auxiliary[run];
     noack_trigger_start(&sensor->rule, &sensor->trigger, n, t_ns, sensor->x_s, sensor->scratch + n);
     if (segments->gains != NULL) {
@@ -75,8 +75,7 @@ static void load(noack_segments *segments, int64_t run) {
     controller->model_ns = t_ns;
     controller->machine.step = first_tick(&controller->machine, t_ns);
     /* The controller has a state from the update of the first step on. */
-    controller->knows_state =
-        segments->known_start || segments->sent[run * segments->places] != 0.0;
+    controller->has_state = segments->known_start || segments->sent[run * segments->places] != 0.0;
 }
 
 /* x_c at a step. */
@@ -151,7 +150,7 @@ static int64_t measure(
     sensor->event = 0;
     noack_sensor_handle(sensor, &message, message.t_ns, output);
     sensor->is_user = 0;
-    if (segments->controller->knows_state) {
+    if (segments->controller->has_state) {
         advance_controller(segments, step, error);
         for (int64_t k = 0; k < n; k++)
             error[k] -= sensor->x[k];

@@ -187,7 +187,7 @@ void take_datagrams(noack_driver *driver) {
         if (source < 2)
             driver->sources[source].received++;
         else
-            driver->foreign++;
+            driver->unknown_source++;
         if (scratch->taken_bytes == all_bytes) {
             renew_header(scratch, number);
             scratch->taken_bytes = 0;

@@ -73,7 +73,7 @@ static void send(noack_simulation *simulation, const noack_output *output) {
     datagram->flow = direction * simulation->loops + message->loop;
     datagram->size_bytes = NOACK_HEADER_BYTES + 8 * message->entries + NOACK_TAG_BYTES;
     datagram->arrival_ns = UNKNOWN_ARRIVAL_NS;
-    wire_header(&simulation->wire, &datagram->message, datagram->head);
+    noack_wire_header(&simulation->wire, &datagram->message, datagram->head);
 }
 
 /* Forward what has left the network. */
@@ -150,7 +150,7 @@ static int64_t receive(noack_simulation *simulation, int64_t role, noack_datagra
         return NOACK_DONE;
     }
     noack_reception *reception = reception_of(simulation, role, message->flow, message->loop);
-    int64_t examination = wire_examine_message(reception, FROM_PEER, message);
+    int64_t examination = noack_wire_examine_message(reception, FROM_PEER, message);
     if (message->entries != reception->entries)
         examination = NOACK_BAD_LENGTH;
     if (examination == NOACK_ACCEPTED) {

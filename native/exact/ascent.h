@@ -22,13 +22,15 @@ static inline double bracketed(
     return 0.5 * (low_s + high_s);
 }
 
-/* The positive root of value + slope q + most q^2/2, given value <= 0, or span if that is smaller.
+/* The positive root of value + slope q + curvature_bound q^2/2, given value <= 0, or span if that
+ * is smaller.
  */
-static inline double safe_step(double value, double slope, double most, double span) {
-    if (value + span * (slope + 0.5 * most * span) <= 0.0)
+static inline double safe_step(double value, double slope, double curvature_bound, double span) {
+    if (value + span * (slope + 0.5 * curvature_bound * span) <= 0.0)
         return span;
-    double root = sqrt(slope * slope - 2.0 * most * value);
-    return least(slope > 0.0 ? -2.0 * value / (slope + root) : (root - slope) / most, span);
+    double root = sqrt(slope * slope - 2.0 * curvature_bound * value);
+    return least(
+        slope > 0.0 ? -2.0 * value / (slope + root) : (root - slope) / curvature_bound, span);
 }
 
 /* The root of an increasing h in (at.s, ahead_s), or NONE. evaluate gives h and its derivatives. */
@@ -38,7 +40,7 @@ static inline __attribute__((always_inline)) double ascend(
     double low_s = at.s, high_s = ahead_s;
     int beyond = 0;
     for (int turn = 0; turn < TURNS; turn++) {
-        double newton = -at.excess / at.slope, turned = 0.5 * newton * (at.bend / at.slope);
+        double newton = -at.excess / at.slope, turned = 0.5 * newton * (at.curvature / at.slope);
         double step = turned > -0.5 ? newton / (1.0 + turned) : newton;
         double following = at.slope > 0.0 ? at.s + step : INFINITY;
         if (fabs(step) <= CLOSE * at.s && fabs(turned) <= CLOSE && turn < FAST_STEPS)

@@ -71,8 +71,9 @@ int arrives(const noack_exact *exact, exact_run *run) {
 }
 
 static int64_t blocks_of(const noack_trigger_rule *rule, const exact_code *code) {
-    int64_t rows =
-        max_of(rule->up_rows + rule->down_rows, rule->gain_up_rows + rule->gain_down_rows);
+    int64_t rows = max_of(
+        rule->positive_rows + rule->negative_rows,
+        rule->positive_gain_rows + rule->negative_gain_rows);
     return max_of(2, (rows + code->n - 1) / code->n);
 }
 
@@ -80,12 +81,12 @@ static int64_t blocks_of(const noack_trigger_rule *rule, const exact_code *code)
 static int is_plain(const noack_exact *exact) {
     const noack_trigger_rule *rule = &exact->rule;
     int64_t n = exact->n;
-    if (rule->up_rows != n || rule->down_rows != 0)
+    if (rule->positive_rows != n || rule->negative_rows != 0)
         return 0;
     for (int64_t i = 0; i < n; i++)
         for (int64_t j = 0; j < n; j++) {
             double weight = rule->weight == NULL ? i == j : rule->weight[i * n + j];
-            if (rule->up[i * 2 * n + j] != 0.0 || rule->up[i * 2 * n + n + j] != weight)
+            if (rule->positive[i * 2 * n + j] != 0.0 || rule->positive[i * 2 * n + n + j] != weight)
                 return 0;
         }
     return 1;
@@ -93,7 +94,7 @@ static int is_plain(const noack_exact *exact) {
 
 int is_quadratic(const noack_exact *exact) {
     const noack_trigger_rule *rule = &exact->rule;
-    return rule->up_rows > 0
+    return rule->positive_rows > 0
            && (!is_plain(exact) || rule->is_dynamic || rule->from_event || rule->grid_ns > 0);
 }
 
@@ -102,7 +103,7 @@ static int is_finite_nonnegative(double number) { return number >= 0.0 && number
 
 static const char *check_exact_rule(const noack_exact *exact) {
     const noack_trigger_rule *rule = &exact->rule;
-    const char *wrong = check_rule(rule, NEVER_NS);
+    const char *wrong = noack_check_rule(rule, NEVER_NS);
     if (wrong != NULL)
         return wrong;
     if (!is_finite_nonnegative(rule->level) || !is_finite_nonnegative(rule->rate_per_s)
@@ -161,8 +162,8 @@ static double *take_square(free_scratch *scratch, int64_t n, const double *matri
 }
 
 typedef struct { /* P and N of a rule's form, (rows, 2n) */
-    int64_t up_rows, down_rows;
-    const double *up, *down;
+    int64_t positive_rows, negative_rows;
+    const double *positive, *negative;
 } rule_form;
 
 static block_form take_form(
@@ -171,11 +172,11 @@ static block_form take_form(
     block_form taken;
     taken.rows = take(scratch, blocks * 2 * square);
     taken.signs = take(scratch, blocks * stride);
-    for (int64_t row = 0; row < form->up_rows + form->down_rows; row++) {
-        int64_t block = row / size, at = row % size, is_up = row < form->up_rows;
-        const double *from =
-            is_up ? form->up + row * 2 * n : form->down + (row - form->up_rows) * 2 * n;
-        taken.signs[block * stride + at] = is_up ? 1.0 : -1.0;
+    for (int64_t row = 0; row < form->positive_rows + form->negative_rows; row++) {
+        int64_t block = row / size, at = row % size, is_positive = row < form->positive_rows;
+        const double *from = is_positive ? form->positive + row * 2 * n
+                                         : form->negative + (row - form->positive_rows) * 2 * n;
+        taken.signs[block * stride + at] = is_positive ? 1.0 : -1.0;
         for (int64_t j = 0; j < n; j++) {
             taken.rows[2 * block * square + j * stride + at] = from[j];
             taken.rows[(2 * block + 1) * square + j * stride + at] = from[n + j];
@@ -229,8 +230,10 @@ static int64_t lay_out(const noack_exact *exact, const exact_code *code, exact_m
     for (int64_t i = 0; i < n * n; i++)
         memory->is_static &= exact->H[i] == 0.0;
     if (memory->quadratic) {
-        rule_form form = {rule->up_rows, rule->down_rows, rule->up, rule->down};
-        rule_form gain = {rule->gain_up_rows, rule->gain_down_rows, rule->gain_up, rule->gain_down};
+        rule_form form = {rule->positive_rows, rule->negative_rows, rule->positive, rule->negative};
+        rule_form gain = {
+            rule->positive_gain_rows, rule->negative_gain_rows, rule->positive_gain,
+            rule->negative_gain};
         memory->form = take_form(&scratch, blocks, n, &form);
         memory->y = take(&scratch, blocks * curve);
         memory->gain = take_form(&scratch, blocks, n, &gain);

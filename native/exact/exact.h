@@ -40,7 +40,7 @@ typedef struct {               /* a search on [0, end_s] for the first crossing 
 } level_search;
 
 typedef struct { /* a point of a search: h(s) = g(s) - c e^(-rs), and its derivatives */
-    double s, excess, slope, bend;
+    double s, excess, slope, curvature;
 } search_point;
 
 typedef struct {   /* a quadratic form |P z|^2 - |N z|^2 of z = (x, e_s), in blocks of N rows */

@@ -43,7 +43,7 @@ static inline search_point evaluate(const void *curve, const level_search *searc
 }
 
 /* A bound on |g''| in [0, s]: the second derivative of the sum of |g_k| s^k. */
-static double bend_of(const double *g, int degree, double s) {
+static double curvature_bound(const double *g, int degree, double s) {
     double total = 0.0;
     for (int k = degree; k > 1; k--)
         total = total * s + k * (k - 1.0) * fabs(g[k]);
@@ -55,7 +55,7 @@ static double bend_of(const double *g, int degree, double s) {
 double first_root(const double *g, int degree, const level_search *search, double grain) {
     scalar_curve curve = {g, degree};
     double rate = search->rate, end_s = search->end_s, ahead_s = end_s;
-    double most = bend_of(g, degree, end_s);
+    double bound = curvature_bound(g, degree, end_s);
     search_point at = evaluate(&curve, search, 0.0);
     if (at.excess > grain || (at.excess >= -grain && at.slope > 0.0))
         return 0.0;
@@ -64,13 +64,13 @@ double first_root(const double *g, int degree, const level_search *search, doubl
     at.excess = least(at.excess, 0.0);
     for (int steps = 0; steps < MOST_STEPS; steps++) {
         double s = at.s;
-        if (at.slope > (most + rate * rate * level_at(search, s)) * (ahead_s - s)) {
+        if (at.slope > (bound + rate * rate * level_at(search, s)) * (ahead_s - s)) {
             s = ascend(evaluate, &curve, search, at, ahead_s);
             if (s != NONE || ahead_s == end_s)
                 return s;
             s = ahead_s;
         } else {
-            double step = safe_step(at.excess, at.slope, most, ahead_s - s);
+            double step = safe_step(at.excess, at.slope, bound, ahead_s - s);
             if (s + step >= end_s)
                 return NONE;
             if (!(s + step > s))
@@ -78,12 +78,12 @@ double first_root(const double *g, int degree, const level_search *search, doubl
             s = least(s + step, ahead_s);
             if (s + AHEAD * step < NEARER * ahead_s) {
                 ahead_s = s + AHEAD * step;
-                most = bend_of(g, degree, ahead_s);
+                bound = curvature_bound(g, degree, ahead_s);
             }
         }
         if (s == ahead_s) {
             ahead_s = end_s;
-            most = bend_of(g, degree, ahead_s);
+            bound = curvature_bound(g, degree, ahead_s);
         }
         at = evaluate(&curve, search, s);
         if (at.excess >= 0.0)

@@ -13,9 +13,10 @@
    y = 0, the kink of |y| only increases h'. So if h'(s) > L (a - s), h increases on all of [s, a].
    Then it has at most one root there, and Halley's method may take any steps within the interval.
 
-   b is bend() and valid on [0, a]. It is computed again if a smaller a makes it much smaller.
-   Nothing is sampled. Only rounding remains: if h is below 0 by less than the rounding error, steps
-   have about 1e-8 of the curve's time scale, and a tangency in floating point is found or missed.
+   b is curvature_bound() and valid on [0, a]. It is computed again if a smaller a makes it much
+   smaller. Nothing is sampled. Only rounding remains: if h is below 0 by less than the rounding
+   error, steps have about 1e-8 of the curve's time scale, and a tangency in floating point is found
+   or missed.
 
    A step either advances or is too short to change s in floating point, which ends the search. A
    curve that stays just below its threshold may need very many steps; then it is UNRESOLVED. */
@@ -54,16 +55,19 @@ static inline search_point look_at_square(const void *curve, const level_search 
         2.0 * (dot(at.dy, at.dy) + dot(at.y, at.ddy) - 2.0 * rate * rate * square)};
 }
 
-/* The length of a step that skips no crossing, at most span. speed is |y'|^2, most is b. */
+/* The length of a step that skips no crossing, at most span. speed is |y'|^2, curvature_bound is b.
+ */
 static inline double safe_length(
-    double size, double radial, double speed, double level, double rate, double most, double span) {
+    double size, double radial, double speed, double level, double rate, double curvature_bound,
+    double span) {
     const double small =
         0.125; /* share of the level below which |y| + |y'| q is the better bound */
     if (size < small * level)
-        return safe_step(size - level, rate * level + sqrt(speed), most, span);
+        return safe_step(size - level, rate * level + sqrt(speed), curvature_bound, span);
     double turned = radial > 0.0 ? speed - radial * radial : speed;
     return safe_step(
-        size - level, rate * level + radial, most + largest_of(turned, 0.0) / size, span);
+        size - level, rate * level + radial, curvature_bound + largest_of(turned, 0.0) / size,
+        span);
 }
 
 /* What is known before a search. LIKELY: a bound on all of |y| is not worth its computation. */
@@ -80,7 +84,7 @@ static double first_exit(
         if (largest(curve, p, end_s) < lowest * lowest)
             return NONE;
     }
-    double most = bend(curve, p, end_s), level = search->level;
+    double bound = curvature_bound(curve, p, end_s), level = search->level;
     curve_point at = evaluate(curve, p, search, 0.0);
     for (int steps = 0; steps < most_steps; steps++) {
         double square = dot(at.y, at.y), mixed = dot(at.y, at.dy), speed = dot(at.dy, at.dy);
@@ -90,19 +94,19 @@ static double first_exit(
         if (s >= end_s)
             return NONE;
         double radial = size > 0.0 ? mixed / size : sqrt(speed), slope = rate * level + radial;
-        if (slope > (most + rate * rate * level) * (ahead_s - s)) {
+        if (slope > (bound + rate * rate * level) * (ahead_s - s)) {
             if (crossing == ENDS_BELOW && ahead_s == end_s)
                 return NONE;
             double turned =
                 size > 0.0 ? speed - radial * radial + dot(at.y, at.ddy) : dot(at.dy, at.ddy);
-            double bent = turned / (size > 0.0 ? size : radial) - rate * rate * level;
-            search_point start = {s, size - level, slope, bent};
+            double curvature = turned / (size > 0.0 ? size : radial) - rate * rate * level;
+            search_point start = {s, size - level, slope, curvature};
             s = ascend(look_at_square, &own, search, start, ahead_s);
             if (s != NONE || ahead_s == end_s)
                 return s;
             s = ahead_s;
         } else {
-            double step = safe_length(size, radial, speed, level, rate, most, ahead_s - s);
+            double step = safe_length(size, radial, speed, level, rate, bound, ahead_s - s);
             if (s + step >= end_s)
                 return NONE;
             if (!(s + step > s))
@@ -110,12 +114,12 @@ static double first_exit(
             s = least(s + step, ahead_s);
             if (s + ahead * step < nearer * ahead_s && !search->backward) {
                 ahead_s = s + ahead * step;
-                most = bend(curve, p, ahead_s);
+                bound = curvature_bound(curve, p, ahead_s);
             }
         }
         if (s == ahead_s) {
             ahead_s = end_s;
-            most = bend(curve, p, ahead_s);
+            bound = curvature_bound(curve, p, ahead_s);
         }
         at = evaluate(curve, p, search, s);
         level = level_at(search, s);

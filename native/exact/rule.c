@@ -44,7 +44,7 @@ rule_phase phase_at(const exact_memory *memory, const rule_span *span, double t_
     const noack_trigger_rule *rule = memory->rule;
     if (t_s < span->begin_s)
         return (rule_phase){span->begin_s, 0, 0.0, 0.0};
-    if (rule->up_rows == 0)
+    if (rule->positive_rows == 0)
         return (rule_phase){span->due_s, 0, 0.0, 0.0};
     if (t_s < span->floor_from_s) {
         double threshold = span->level * fixed_exp(-rule->rate_per_s * (t_s - span->since_s));

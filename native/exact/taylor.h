@@ -148,19 +148,19 @@ typedef struct { /* of a curve at a time */
    y'' = 2 (E' + 3 s O') + 4 s^2 (E'' + s O''). */
 static inline curve_point point_at(const double *curve, int p, double s) {
     lanes even = load(curve + p * STRIDE), odd = filled(0.0), even_rise = odd, odd_rise = odd;
-    lanes even_bend = odd, odd_bend = odd; /* halves of E'' and O'' */
+    lanes even_curvature = odd, odd_curvature = odd; /* halves of E'' and O'' */
     double square = s * s;
 #pragma GCC unroll 2
     for (int k = p - 2; k >= 0; k -= 2) {
-        even_bend = fma_scaled(even_bend, square, even_rise);
-        odd_bend = fma_scaled(odd_bend, square, odd_rise);
+        even_curvature = fma_scaled(even_curvature, square, even_rise);
+        odd_curvature = fma_scaled(odd_curvature, square, odd_rise);
         even_rise = fma_scaled(even_rise, square, even);
         odd_rise = fma_scaled(odd_rise, square, odd);
         even = fma_scaled(even, square, load(curve + k * STRIDE));
         odd = fma_scaled(odd, square, load(curve + (k + 1) * STRIDE));
     }
     lanes half = fma_scaled(odd_rise, 3.0 * s, even_rise);
-    half = fma_scaled(fma_scaled(odd_bend, s, even_bend), 4.0 * square, half);
+    half = fma_scaled(fma_scaled(odd_curvature, s, even_curvature), 4.0 * square, half);
     return (curve_point){
         fma_scaled(odd, s, even),
         fma_scaled(fma_scaled(odd_rise, s, even_rise), 2.0 * s, odd),
@@ -170,7 +170,7 @@ static inline curve_point point_at(const double *curve, int p, double s) {
 
 /* A bound on |y''| in [0, s]. Entry by entry, the sum of |c_k| s^k bounds |y|, and its derivatives
    bound those of y; they do not decrease. */
-static inline double bend(const double *curve, int p, double s) {
+static inline double curvature_bound(const double *curve, int p, double s) {
     lanes total = magnitude(load(curve + p * STRIDE)), slope = filled(0.0), half = slope;
     for (int k = p - 1; k >= 0; k--) {
         half = fma_scaled(half, s, slope);

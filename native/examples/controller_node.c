@@ -148,7 +148,7 @@ static void read_settings(void) {
     controller.timeout_ns = settings.timeout_ns;
     controller.holds_input = settings.holds_input;
     controller.model_ns = settings.model_ns;
-    controller.knows_state = settings.knows_state;
+    controller.has_state = settings.has_state;
     controller.newest = settings.newest;
     transitions.n = n;
     transitions.is_static = settings.is_static;
@@ -224,7 +224,7 @@ static void receive(void) {
         if (from_peer)
             counts.received++;
         else
-            counts.foreign++;
+            counts.unknown_source++;
         handle(datagram, bytes, from_peer);
     }
 }

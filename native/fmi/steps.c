@@ -103,7 +103,7 @@ static void receive(fmu *instance, int64_t place) {
     };
     const double *packets = values_of(image, NOACK_FMU_PACKETS);
     copy(image->n, packets + place * image->n, message.vector);
-    int64_t examination = wire_examine_message(reception, 1, &message);
+    int64_t examination = noack_wire_examine_message(reception, 1, &message);
     if (examination == NOACK_ACCEPTED)
         noack_controller_handle(instance->controller, &message, image->now_ns, &instance->output);
     noack_wire_count(reception, examination, &message);

@@ -29,7 +29,7 @@ void noack_leaps(
             }
 }
 
-void multiply(
+void noack_multiply(
     int64_t rows, int64_t inner, int64_t columns, const double *A, const double *B, int transposed,
     double *restrict result) {
     for (int64_t i = 0; i < rows; i++, A += inner, result += columns) {

@@ -36,7 +36,7 @@ int64_t noack_controller_handle(
     noack_model_advance(&controller->model, message->vector, event_ns, model_ns, controller->x_c);
     controller->model_ns = machine->reached_ns = model_ns;
     controller->update_ns = event_ns;
-    controller->knows_state = 1;
+    controller->has_state = 1;
     begin_row(output, NOACK_MESSAGES, machine, message->sequence, event_ns, now_ns);
     put(output, model_ns);
     put_reals(output, n, message->vector);
@@ -70,7 +70,7 @@ static void apply_law(noack_controller *controller, const double *x, double *u) 
 
 /* Replace u, the input before, by the input for t_ns, at which the model's state is x. */
 static void choose_input(noack_controller *controller, int64_t t_ns, const double *x, double *u) {
-    if (!controller->knows_state)
+    if (!controller->has_state)
         copy(controller->machine.m, controller->safe_input, u);
     else if (t_ns - controller->update_ns < controller->timeout_ns)
         apply_law(controller, x, u);
@@ -86,7 +86,7 @@ static void append_predictions(noack_controller *controller, noack_output *outpu
     copy(n, controller->x_c, x);
     copy(m, output->message.vector, u);
     for (int64_t k = 1; k < controller->predictions; k++) {
-        if (controller->knows_state) {
+        if (controller->has_state) {
             int64_t next_ns = min_of(t_ns + machine->period_ns, MESSAGE_TIMES_NS);
             noack_model_advance(&controller->model, x, t_ns, next_ns, x);
             t_ns = next_ns;
@@ -105,7 +105,7 @@ int64_t noack_controller_tick(noack_controller *controller, int64_t now_ns, noac
         return NOACK_ASK_CHANGE;
     double *x_c = controller->scratch;
     noack_model_advance(&controller->model, controller->x_c, controller->model_ns, model_ns, x_c);
-    if (controller->is_user && controller->knows_state && !machine->answered) {
+    if (controller->is_user && controller->has_state && !machine->answered) {
         copy(n, x_c, controller->x);
         controller->asked_ns = t_ns;
         return NOACK_ASK_INPUT;

@@ -63,7 +63,7 @@ static void polynomial(int64_t n, double *const powers[4], double *result, doubl
         result[k] = terms[DEGREE] * powers[3][k];
     for (int k = DEGREE - 4; k >= 0; k -= 4) {
         if (k < DEGREE - 4) {
-            multiply(n, n, n, result, powers[3], 0, other);
+            noack_multiply(n, n, n, result, powers[3], 0, other);
             memcpy(result, other, (size_t)size * sizeof *result);
         }
         for (int j = 3; j > 0; j--)
@@ -82,9 +82,9 @@ void noack_exponential(int64_t n, const double *matrix, double *result, double *
     int halved = halvings(largest_column(n, matrix), 1.0);
     for (int64_t k = 0; k < size; k++)
         powers[0][k] = ldexp(matrix[k], -halved);
-    multiply(n, n, n, powers[0], powers[0], 0, powers[1]);
-    multiply(n, n, n, powers[1], powers[0], 0, powers[2]);
-    multiply(n, n, n, powers[1], powers[1], 0, powers[3]);
+    noack_multiply(n, n, n, powers[0], powers[0], 0, powers[1]);
+    noack_multiply(n, n, n, powers[1], powers[0], 0, powers[2]);
+    noack_multiply(n, n, n, powers[1], powers[1], 0, powers[3]);
     double cube = noack_cube_root(largest_column(n, powers[2]));
     double fourth = sqrt(sqrt(largest_column(n, powers[3])));
     double alpha = fourth > cube ? fourth : cube;
@@ -93,7 +93,7 @@ void noack_exponential(int64_t n, const double *matrix, double *result, double *
         scale(size, powers[k], -more * (k + 1));
     polynomial(n, powers, result, other);
     for (int k = 0; k < halved + more; k++) {
-        multiply(n, n, n, result, result, 0, other);
+        noack_multiply(n, n, n, result, result, 0, other);
         memcpy(result, other, (size_t)size * sizeof *result);
     }
 }

@@ -61,7 +61,7 @@ static inline int64_t tick_ns(const noack_machine *machine) {
 
 /* result = A B, or A B' if transposed; A is (rows, inner), result (rows, columns). They must not
    overlap. */
-void multiply(
+void noack_multiply(
     int64_t rows, int64_t inner, int64_t columns, const double *A, const double *B, int transposed,
     double *result);
 
@@ -74,15 +74,15 @@ static inline double image_norm(
 
 /* process.c: a step of the machine of a loop, at a time of the loop; only plants and controllers
    have ticks. */
-int64_t handle_message(
+int64_t noack_handle_message(
     noack_process *process, int64_t loop, const noack_message *message, int64_t now_ns);
-int64_t do_tick(noack_process *process, int64_t loop, int64_t now_ns);
+int64_t noack_do_tick(noack_process *process, int64_t loop, int64_t now_ns);
 
 /* plant.c: set the input of the system for a step: u + d, and w behind it. */
-void disturb(noack_plant *plant, int64_t step);
+void noack_disturb(noack_plant *plant, int64_t step);
 
 /* observer.c: advance x-hat to a measurement [y; u of the plant's steps since the last one]. */
-void observe(
+void noack_observe(
     noack_observer *observer, const noack_message *message, int64_t n, int64_t m,
     int64_t plant_period_ns);
 

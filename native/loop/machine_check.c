@@ -93,7 +93,7 @@ static const char *check_plant(const noack_plant *plant) {
         || !is_reached(plant->fallback_ns) || !is_between(0, plant->measurements, MOST_NUMBER))
         return "a plant has a timeout, a time or a number of measurements out of range";
     if (plant->x == NULL || plant->z == NULL || plant->u == NULL || plant->applied == NULL
-        || plant->held == NULL || plant->inputs == NULL || plant->scratch == NULL
+        || plant->recent_inputs == NULL || plant->inputs == NULL || plant->scratch == NULL
         || (plant->carries_model && plant->x_c == NULL))
         return "a plant has no state";
     if (plant->watchdog != NOACK_PREDICT)
@@ -103,10 +103,12 @@ static const char *check_plant(const noack_plant *plant) {
     return check_model(&plant->fallback, n);
 }
 
-const char *check_rule(const noack_trigger_rule *rule, int64_t most_ns) {
+const char *noack_check_rule(const noack_trigger_rule *rule, int64_t most_ns) {
     const int64_t rows[] = {
-        rule->up_rows, rule->down_rows, rule->gain_up_rows, rule->gain_down_rows};
-    double *const matrices[] = {rule->up, rule->down, rule->gain_up, rule->gain_down};
+        rule->positive_rows, rule->negative_rows, rule->positive_gain_rows,
+        rule->negative_gain_rows};
+    double *const matrices[] = {
+        rule->positive, rule->negative, rule->positive_gain, rule->negative_gain};
     for (int k = 0; k < 4; k++)
         if (!is_between(0, rows[k], 4 * NOACK_MAX_ENTRIES) || (rows[k] > 0 && matrices[k] == NULL))
             return "a trigger rule has no matrix";
@@ -139,7 +141,7 @@ static const char *check_sensor(const noack_sensor *sensor) {
     const noack_machine *machine = &sensor->machine;
     const char *wrong;
     if ((wrong = check_model(&sensor->model, machine->n)) != NULL
-        || (wrong = check_rule(&sensor->rule, MOST_NS)) != NULL
+        || (wrong = noack_check_rule(&sensor->rule, MOST_NS)) != NULL
         || (wrong = check_observer(&sensor->observer, machine)) != NULL)
         return wrong;
     if (machine->period_ns != 0)

@@ -44,16 +44,16 @@ static void solve(int64_t p, int64_t n, double *S, double *B) {
 }
 
 void noack_observer_predict(noack_observer *observer, int64_t n, int64_t m, const double *u) {
-    double *moved = observer->scratch, *pushed = moved + n;
-    noack_product(n, n, observer->Ad, observer->x, moved);
-    noack_product(n, m, observer->Bd, u, pushed);
+    double *free = observer->scratch, *forced = free + n;
+    noack_product(n, n, observer->Ad, observer->x, free);
+    noack_product(n, m, observer->Bd, u, forced);
     for (int64_t k = 0; k < n; k++)
-        observer->x[k] = moved[k] + pushed[k];
+        observer->x[k] = free[k] + forced[k];
     if (observer->kind != NOACK_KALMAN)
         return;
     double *half = observer->scratch;
-    multiply(n, n, n, observer->Ad, observer->P, 0, half);
-    multiply(n, n, n, half, observer->Ad, 1, observer->P);
+    noack_multiply(n, n, n, observer->Ad, observer->P, 0, half);
+    noack_multiply(n, n, n, half, observer->Ad, 1, observer->P);
     for (int64_t k = 0; k < n * n; k++)
         observer->P[k] += observer->Q[k];
 }
@@ -62,29 +62,30 @@ void noack_observer_gain(noack_observer *observer, int64_t n) {
     if (observer->kind != NOACK_KALMAN)
         return;
     int64_t p = observer->p;
-    double *through = observer->scratch, *S = through + n * p; /* through: C P */
-    multiply(p, n, n, observer->C, observer->P, 0, through);
-    multiply(p, n, p, through, observer->C, 1, S);
+    double *CP = observer->scratch, *S = CP + n * p;
+    noack_multiply(p, n, n, observer->C, observer->P, 0, CP);
+    noack_multiply(p, n, p, CP, observer->C, 1, S);
     for (int64_t k = 0; k < p * p; k++)
         S[k] += observer->R[k];
-    solve(p, n, S, through);
+    solve(p, n, S, CP);
     for (int64_t i = 0; i < n; i++)
         for (int64_t j = 0; j < p; j++)
-            observer->gain[i * p + j] = through[j * n + i];
+            observer->gain[i * p + j] = CP[j * n + i];
 }
 
 /* P <- (I - L C) P (I - L C)' + L R L', made symmetric. */
 static void correct_covariance(noack_observer *observer, int64_t n) {
     int64_t p = observer->p, size = n * n;
-    double *rest = observer->scratch, *half = rest + size, *next = half + size, *LR = next + size;
-    multiply(n, p, n, observer->gain, observer->C, 0, rest);
+    double *I_minus_LC = observer->scratch, *half = I_minus_LC + size, *next = half + size,
+           *LR = next + size;
+    noack_multiply(n, p, n, observer->gain, observer->C, 0, I_minus_LC);
     for (int64_t i = 0; i < n; i++)
         for (int64_t j = 0; j < n; j++)
-            rest[i * n + j] = (i == j ? 1.0 : 0.0) - rest[i * n + j];
-    multiply(n, n, n, rest, observer->P, 0, half);
-    multiply(n, n, n, half, rest, 1, next);
-    multiply(n, p, p, observer->gain, observer->R, 0, LR);
-    multiply(n, p, n, LR, observer->gain, 1, half);
+            I_minus_LC[i * n + j] = (i == j ? 1.0 : 0.0) - I_minus_LC[i * n + j];
+    noack_multiply(n, n, n, I_minus_LC, observer->P, 0, half);
+    noack_multiply(n, n, n, half, I_minus_LC, 1, next);
+    noack_multiply(n, p, p, observer->gain, observer->R, 0, LR);
+    noack_multiply(n, p, n, LR, observer->gain, 1, half);
     for (int64_t k = 0; k < size; k++)
         next[k] += half[k];
     for (int64_t i = 0; i < n; i++)
@@ -108,7 +109,7 @@ void noack_observer_correct(noack_observer *observer, int64_t n, const double *y
 
 /* The inputs of steps that a missing measurement would have reported are unknown: the first known
    input is used. */
-void observe(
+void noack_observe(
     noack_observer *observer, const noack_message *message, int64_t n, int64_t m,
     int64_t plant_period_ns) {
     int64_t t_ns = message->t_ns, known = (message->entries - observer->p) / m;

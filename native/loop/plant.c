@@ -34,25 +34,27 @@ int64_t noack_plant_handle(
     return NOACK_DONE;
 }
 
-/* Remember the input of the last period, which the next measurement reports. */
-static void remember_input(noack_plant *plant) {
+/* Append the input of the last period, which the next measurement reports. */
+static void append_recent_input(noack_plant *plant) {
     int64_t m = plant->machine.m, kept = (plant->measure_every - 1) * m;
-    memmove(plant->held, plant->held + m, (size_t)kept * sizeof *plant->held);
-    copy(m, plant->u, plant->held + kept);
+    memmove(
+        plant->recent_inputs, plant->recent_inputs + m,
+        (size_t)kept * sizeof *plant->recent_inputs);
+    copy(m, plant->u, plant->recent_inputs + kept);
 }
 
 /* Advance the system over a period under the input held. */
 static void advance(noack_plant *plant) {
     int64_t n = plant->machine.n;
     if (plant->reports_inputs)
-        remember_input(plant);
+        append_recent_input(plant);
     if (plant->system != NOACK_LINEAR)
         return;
-    double *moved = plant->scratch, *pushed = moved + n;
-    noack_product(n, n, plant->Ad, plant->x, moved);
-    noack_product(n, plant->sources, plant->Bd, plant->applied, pushed);
+    double *free = plant->scratch, *forced = free + n;
+    noack_product(n, n, plant->Ad, plant->x, free);
+    noack_product(n, plant->sources, plant->Bd, plant->applied, forced);
     for (int64_t k = 0; k < n; k++)
-        plant->x[k] = moved[k] + pushed[k];
+        plant->x[k] = free[k] + forced[k];
 }
 
 /* A predictive actuator: u + K(e^(H(t - t_j)) x_c - x_c), the controller's input if no update has
@@ -109,7 +111,7 @@ static int64_t notice(noack_plant *plant, int64_t t_ns, noack_note *note) {
     return 1;
 }
 
-void disturb(noack_plant *plant, int64_t step) {
+void noack_disturb(noack_plant *plant, int64_t step) {
     int64_t m = plant->machine.m;
     copy(m, plant->u, plant->applied);
     if (plant->at_input.width > 0) {
@@ -137,7 +139,7 @@ static void measure(noack_plant *plant, int64_t t_ns, noack_output *output) {
             y[k] += v[k];
     }
     if (plant->reports_inputs)
-        append(output, plant->measure_every * plant->machine.m, plant->held);
+        append(output, plant->measure_every * plant->machine.m, plant->recent_inputs);
 }
 
 static void put_step(
@@ -171,7 +173,7 @@ int64_t noack_plant_tick(
     if (step > 0)
         advance(plant);
     int64_t entry = choose_input(plant, t_ns);
-    disturb(plant, step);
+    noack_disturb(plant, step);
     put_step(plant, step, t_ns, now_ns, entry, output);
     output->notes = notice(plant, t_ns, note);
     machine->step++;

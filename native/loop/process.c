@@ -18,7 +18,7 @@ static void push_tick(noack_process *process, int64_t loop) {
     const noack_machine *machine = noack_process_machine(process, loop);
     int64_t t_ns = tick_ns(machine);
     if (t_ns != NO_TICK)
-        heap_push(
+        noack_heap_push(
             process->heap, &process->heap_count,
             (noack_heap_entry){t_ns + machine->phase_ns, loop, 0});
 }
@@ -77,7 +77,7 @@ static int64_t keep_outputs(noack_process *process, int64_t loop, int64_t questi
     return NOACK_DONE;
 }
 
-int64_t handle_message(
+int64_t noack_handle_message(
     noack_process *process, int64_t loop, const noack_message *message, int64_t now_ns) {
     noack_output *output = &process->output;
     if (process->role == NOACK_PLANT)
@@ -87,7 +87,7 @@ int64_t handle_message(
     return noack_controller_handle(&process->controllers[loop], message, now_ns, output);
 }
 
-int64_t do_tick(noack_process *process, int64_t loop, int64_t now_ns) {
+int64_t noack_do_tick(noack_process *process, int64_t loop, int64_t now_ns) {
     noack_output *output = &process->output;
     if (process->role == NOACK_CONTROLLER)
         return noack_controller_tick(&process->controllers[loop], now_ns, output);
@@ -100,7 +100,7 @@ int64_t noack_process_handle(noack_process *process, const noack_message *messag
     if (is_full(process, acknowledges ? NOACK_ACKNOWLEDGEMENTS : NOACK_MESSAGES))
         return NOACK_ROWS_FULL;
     now_ns -= noack_process_machine(process, loop)->phase_ns;
-    return keep_outputs(process, loop, handle_message(process, loop, message, now_ns));
+    return keep_outputs(process, loop, noack_handle_message(process, loop, message, now_ns));
 }
 
 int64_t noack_process_tick(noack_process *process, int64_t now_ns) {
@@ -108,9 +108,9 @@ int64_t noack_process_tick(noack_process *process, int64_t now_ns) {
         return NOACK_ROWS_FULL;
     int64_t loop = process->heap[0].number;
     now_ns -= noack_process_machine(process, loop)->phase_ns;
-    int64_t question = do_tick(process, loop, now_ns);
+    int64_t question = noack_do_tick(process, loop, now_ns);
     if (question == NOACK_DONE) {
-        heap_pop(process->heap, &process->heap_count);
+        noack_heap_pop(process->heap, &process->heap_count);
         push_tick(process, loop);
     }
     return keep_outputs(process, loop, question);

@@ -85,7 +85,7 @@ static void write_output(
         begin_message(output, NOACK_UPDATE, sensor->events++, message->t_ns);
         append(output, n, sensor->x);
         if (sensor->reports_error) {
-            int compares = sensor->is_user || sensor->rule.up_rows > 0;
+            int compares = sensor->is_user || sensor->rule.positive_rows > 0;
             double share = compares ? sides[0] / sides[1] : error;
             output->message.error_level = sensor->first ? 255 : error_level(share);
         }
@@ -94,7 +94,7 @@ static void write_output(
 
 /* x_s at a measurement: at the first one it is x, or 0 until an update is acknowledged. */
 static void advance_model(const noack_sensor *sensor, int64_t t_ns, double *x_s) {
-    if (sensor->knows_state)
+    if (sensor->has_state)
         noack_model_advance(&sensor->model, sensor->x_s, sensor->model_ns, t_ns, x_s);
     else
         copy(sensor->machine.n, sensor->acknowledged ? sensor->x_s : sensor->x, x_s);
@@ -111,7 +111,7 @@ static void keep_sent(noack_sensor *sensor, int64_t t_ns) {
 static int64_t handle_measurement(
     noack_sensor *sensor, const noack_message *message, int64_t now_ns, noack_output *output) {
     noack_machine *machine = &sensor->machine;
-    int64_t n = machine->n, t_ns = message->t_ns, first = !sensor->knows_state;
+    int64_t n = machine->n, t_ns = message->t_ns, first = !sensor->has_state;
     double *x_s = sensor->scratch, sides[2];
     if (sensor->acknowledged && sensor->sent_count == sensor->sent_places)
         return NOACK_ASK_ROOM;
@@ -134,7 +134,7 @@ static int64_t handle_measurement(
     write_output(sensor, message, x_s, sides, event, now_ns, output);
     copy(n, resets ? sensor->x : x_s, sensor->x_s);
     sensor->model_ns = machine->reached_ns = t_ns;
-    sensor->knows_state = 1;
+    sensor->has_state = 1;
     return NOACK_DONE;
 }
 
@@ -146,8 +146,8 @@ static int64_t find_sent(const noack_sensor *sensor, int64_t sequence) {
     return place;
 }
 
-/* Forget the oldest updates: those up to the acknowledged one. */
-static void forget(noack_sensor *sensor, int64_t count) {
+/* Drop the oldest updates: those up to the acknowledged one. */
+static void drop_acknowledged(noack_sensor *sensor, int64_t count) {
     int64_t n = sensor->machine.n, left = sensor->sent_count - count;
     memmove(sensor->sent, sensor->sent + count, (size_t)left * sizeof *sensor->sent);
     memmove(
@@ -178,7 +178,7 @@ static int64_t handle_acknowledgement(
         if (!sensor->is_user)
             noack_trigger_restart(
                 &sensor->rule, &sensor->trigger, n, t_ns, x, rule_scratch(sensor));
-        forget(sensor, place + 1);
+        drop_acknowledged(sensor, place + 1);
     }
     begin_row(output, NOACK_ACKNOWLEDGEMENTS, machine, message->sequence, t_ns, now_ns);
     put(output, sensor->model_ns);
@@ -199,7 +199,8 @@ int64_t noack_sensor_handle(
         if (sensor->observer.kind == NOACK_NO_OBSERVER) {
             copy(machine->n, message->vector, sensor->x);
         } else if (!machine->observed) {
-            observe(&sensor->observer, message, machine->n, machine->m, sensor->plant_period_ns);
+            noack_observe(
+                &sensor->observer, message, machine->n, machine->m, sensor->plant_period_ns);
             copy(machine->n, sensor->observer.x, sensor->x);
             machine->observed = 1;
         }

@@ -56,7 +56,7 @@ void noack_trigger_condition(
     state->since_ns = 0;
     if (rule->from_event) {
         set_z(n, x, NULL, z);
-        state->level = image_norm(rule->up_rows, 2 * n, rule->up, z, image);
+        state->level = image_norm(rule->positive_rows, 2 * n, rule->positive, z, image);
         state->since_ns = t_ns;
     }
     state->earliest_ns = t_ns + rule->idle_ns;
@@ -71,12 +71,12 @@ void noack_trigger_condition(
 /* The rate of the auxiliary variable at z. */
 static double rate_at(const noack_trigger_rule *rule, int64_t n, const double *z, double *image) {
     if (rule->integrates)
-        return image_norm(rule->up_rows, 2 * n, rule->up, z, image);
+        return image_norm(rule->positive_rows, 2 * n, rule->positive, z, image);
     if (!rule->is_dynamic)
         return 0.0;
-    double up = image_norm(rule->gain_up_rows, 2 * n, rule->gain_up, z, image);
-    double down = image_norm(rule->gain_down_rows, 2 * n, rule->gain_down, z, image);
-    return up * up - down * down;
+    double positive = image_norm(rule->positive_gain_rows, 2 * n, rule->positive_gain, z, image);
+    double negative = image_norm(rule->negative_gain_rows, 2 * n, rule->negative_gain, z, image);
+    return positive * positive - negative * negative;
 }
 
 /* The auxiliary variable after a time, from its rates at the first and the last time. */
@@ -121,12 +121,12 @@ static void compare(
     if (rule->integrates)
         return;
     int has_auxiliary = rule->is_dynamic && auxiliary > 0.0;
-    if (rule->down_rows > 0 || has_auxiliary) {
-        double down = image_norm(rule->down_rows, 2 * n, rule->down, z, image);
-        double parts[3] = {right, down, has_auxiliary ? sqrt(auxiliary) : 0.0};
+    if (rule->negative_rows > 0 || has_auxiliary) {
+        double negative = image_norm(rule->negative_rows, 2 * n, rule->negative, z, image);
+        double parts[3] = {right, negative, has_auxiliary ? sqrt(auxiliary) : 0.0};
         sides[1] = noack_norm(3, parts);
     }
-    sides[0] = image_norm(rule->up_rows, 2 * n, rule->up, z, image);
+    sides[0] = image_norm(rule->positive_rows, 2 * n, rule->positive, z, image);
 }
 
 int64_t noack_trigger_test(

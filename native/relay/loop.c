@@ -113,7 +113,7 @@ static int64_t release_due(noack_relay *relay, int64_t until_ns) {
             return NOACK_LEAVING_FULL;
         if (!has_room(relay, slot->size_bytes))
             return NOACK_EVENTS_FULL;
-        heap_pop(relay->heap, &relay->heap_length);
+        noack_heap_pop(relay->heap, &relay->heap_length);
         relay->now_ns = max_of(relay->now_ns, entry.due_ns);
         relay->clients[slot->client].in_flight--;
         departure *leaving = &scratch->leaving[scratch->leaving_count];
@@ -186,7 +186,7 @@ static void read_arrival(noack_relay *relay) {
         struct timespec stamp;
         memcpy(&stamp, CMSG_DATA(control), sizeof stamp);
         int64_t stamp_ns = (int64_t)stamp.tv_sec * NS_PER_S + stamp.tv_nsec;
-        int64_t waited_ns = simulated_ns_of(&relay->clock, scratch->real_ns - stamp_ns);
+        int64_t waited_ns = noack_simulated_ns_of(&relay->clock, scratch->real_ns - stamp_ns);
         if (waited_ns <= relay->read_ns)
             scratch->arrival_ns = relay->read_ns - waited_ns;
     }
@@ -229,7 +229,7 @@ static void release(
             relay->directions[direction].link, relay->clients[client].flow_row, relay->waiting,
             leaving->slot, order, decision);
     else
-        heap_push(
+        noack_heap_push(
             relay->heap, &relay->heap_length, (noack_heap_entry){release_ns, order, leaving->slot});
     relay->clients[client].in_flight++;
 }
@@ -316,7 +316,7 @@ static int64_t waiting_ends_ns(noack_relay *relay, int64_t until_ns) {
         scratch->due_since_ns = relay->read_ns;
     int64_t more_ns = 0;
     if (until_ns != INT64_MIN)
-        more_ns = put_off_ns(
+        more_ns = noack_put_off_ns(
             &scratch->pauses,
             noack_clock_wait_ns(&relay->clock, relay->read_ns - scratch->due_since_ns),
             departs_in_ns(relay), scratch->has_more != 0, scratch->is_busy != 0);
@@ -324,7 +324,7 @@ static int64_t waiting_ends_ns(noack_relay *relay, int64_t until_ns) {
         scratch->ready_count = scratch->ready_next = scratch->due_since_ns = 0;
         return INT64_MIN;
     }
-    return relay->read_ns + simulated_ns_of(&relay->clock, more_ns) + 1;
+    return relay->read_ns + noack_simulated_ns_of(&relay->clock, more_ns) + 1;
 }
 
 /* Wait for a datagram or the next release time; return 0 if a signal interrupted it. */

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from netem.link_state import Integers, LinkState
 from netem.relay.relay_reports import EVENT, Bytes
 from noack.core.clock import NEVER_NS
-from noack.core.core_library import CData, Rows, core, dtype_of, ffi, pointer_to
+from noack.core.core_library import CData, StructRows, core, dtype_of, ffi, pointer_to
 from noack.impairments.link_settings import Decisions, LinkSettings
 from noack.runtime.address import NAME_BYTES, SocketName, packed_name
 
@@ -50,10 +50,10 @@ class RelayMemory:
         self._chunks: list[Bytes] = []
         self._epoll = select.epoll()
         self.directions: CData = ffi.new("noack_direction[]", 2 * links)
-        self.events: Rows = np.zeros(_EVENTS if events else 0, EVENT)
+        self.events: StructRows = np.zeros(_EVENTS if events else 0, EVENT)
         self.data: Bytes = np.zeros(_DATA_BYTES if payloads else 0, np.uint8)
-        self.packets: Rows = np.zeros(row_count, dtype_of("noack_packet_row"))
-        self.releases: Rows = np.zeros(row_count, dtype_of("noack_release_row"))
+        self.packets: StructRows = np.zeros(row_count, dtype_of("noack_packet_row"))
+        self.releases: StructRows = np.zeros(row_count, dtype_of("noack_release_row"))
         self._scratch = zeros_in_lines(core.noack_relay_scratch_bytes(), np.dtype(np.uint8))
         self.core: CData = ffi.new("noack_relay *", {
             "links": links, "epoll": self._epoll.fileno(), "only_socket": -1,
@@ -67,7 +67,7 @@ class RelayMemory:
         self.core.scratch = pointer_to(self._scratch, "void *")
         self._set_clients(zeros_in_lines(_CLIENTS, CLIENT), np.zeros(2 * links + _CLIENTS, SOCKET))
         self.clients["number"] = self.sockets["fd"] = -1
-        self._waiting: Rows = np.zeros(0, dtype_of("noack_waiting"))
+        self._waiting: StructRows = np.zeros(0, dtype_of("noack_waiting"))
         self._set_slots(np.zeros(_SLOTS, ENTRY), np.zeros(_SLOTS, SLOT), 0)
         self._block_next = np.zeros(0, np.int32)
         self._add_chunk()
@@ -131,13 +131,13 @@ class RelayMemory:
         for row in np.flatnonzero(clients["number"] >= 0).tolist():
             core.noack_client_insert(self.core, row)
 
-    def take_events(self) -> tuple[Rows, Bytes]:
+    def take_events(self) -> tuple[StructRows, Bytes]:
         """Return the collected events and their payloads, which the next ones overwrite."""
         events, data = self.core.event_length, self.core.data_length
         self.core.event_length = self.core.data_length = 0
         return self.events[:events], self.data[:data]
 
-    def take_rows(self) -> tuple[Rows, Rows]:
+    def take_rows(self) -> tuple[StructRows, StructRows]:
         """Return the collected rows of the two tables, which the next ones overwrite."""
         packets, releases = self.core.packet_rows, self.core.release_rows
         self.core.packet_rows = self.core.release_rows = 0
@@ -153,7 +153,7 @@ class RelayMemory:
         """Stop waiting for datagrams."""
         self._epoll.close()
 
-    def _set_clients(self, clients: Rows, sockets: Rows) -> None:
+    def _set_clients(self, clients: StructRows, sockets: StructRows) -> None:
         self.clients, self.sockets = clients, sockets
         self._table = np.full(_TABLE_SHARE * len(clients), -1, np.int32)
         self.core.client_rows, self.core.table_places = len(clients), len(self._table)
@@ -161,7 +161,7 @@ class RelayMemory:
         self.core.sockets = pointer_to(sockets, "noack_socket *")
         self.core.table = pointer_to(self._table, "int32_t *")
 
-    def _set_slots(self, heap: Rows, slots: Rows, begin: int) -> None:
+    def _set_slots(self, heap: StructRows, slots: StructRows, begin: int) -> None:
         """Use these arrays; the slots from ``begin`` on are free."""
         relay, count = self.core, len(slots)
         slots["next"][begin:] = np.arange(begin + 1, count + 1)
@@ -171,7 +171,7 @@ class RelayMemory:
         self._heap, self._slots = heap, slots
         relay.heap = pointer_to(heap, "noack_heap_entry *")
         relay.slots = pointer_to(slots, "noack_slot *")
-        waiting: Rows = np.zeros(count, dtype_of("noack_waiting"))
+        waiting: StructRows = np.zeros(count, dtype_of("noack_waiting"))
         waiting[:begin] = self._waiting[:begin]
         self._waiting = waiting
         relay.waiting = pointer_to(waiting, "noack_waiting *")
@@ -252,7 +252,7 @@ def zeros_in_lines(count: int, dtype: np.dtype[_Element]) -> NDArray[_Element]:
     return room[begin : begin + size_bytes].view(dtype)
 
 
-def double_length(array: Rows) -> Rows:
+def double_length(array: StructRows) -> StructRows:
     """Return an array of twice the length; the new elements are 0."""
     return np.concatenate((array, np.zeros_like(array)))
 

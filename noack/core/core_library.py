@@ -19,9 +19,9 @@ LIBRARY = Path(__file__).with_name("libnoack.so")
 T = TypeVar("T")
 CData = Any
 """A structure or pointer of the core: mypy does not know its fields."""
-Array = NDArray[np.generic]
+AnyArray = NDArray[np.generic]
 """Numbers, or rows of a structure of the core."""
-Rows = NDArray[np.void]
+StructRows = NDArray[np.void]
 """Rows of a structure of the core."""
 Reals = NDArray[np.float64]
 SCRATCH_MATRICES = 10
@@ -101,7 +101,7 @@ def _format_of(kind: CData) -> DTypeLike:
     return _FORMATS[kind.cname]
 
 
-def pointer_to(array: Array, kind: str) -> CData:
+def pointer_to(array: AnyArray, kind: str) -> CData:
     """Return a pointer to the rows of a contiguous array, e.g. of kind ``"noack_flow *"``.
 
     It is valid while the array lives.
@@ -128,7 +128,7 @@ class CoreMemory:
     def __init__(self) -> None:
         self._kept: list[object] = []
         self._transitions: dict[bytes, CData] = {}
-        self._shared: list[Array] = []
+        self._shared: list[AnyArray] = []
 
     def keep(self, owner: T) -> T:
         """Keep an object alive as long as this memory; return it."""
@@ -222,7 +222,7 @@ class CoreMemory:
         self._shared += [H, steps_ns, matrices, scratch]
         return made
 
-    def _pointer(self, array: Array, kind: str) -> CData:
+    def _pointer(self, array: AnyArray, kind: str) -> CData:
         self._kept.append(array)
         return ffi.cast(kind, ffi.from_buffer(array))  # faster than numpy's address
 

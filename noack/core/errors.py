@@ -83,7 +83,7 @@ def plain_mistake(message: str) -> str:
 
 
 def one_line(error: BaseException) -> str:
-    """Return the message of a foreign error as one line."""
+    """Return the message of an error of another library as one line."""
     return " ".join(str(error).split())
 
 

@@ -20,7 +20,7 @@ _WIDE = Context(prec=400, Emin=MIN_EMIN, Emax=MAX_EMAX)
 _FIXED = range(-5, 7)  # powers of ten that are written without exponent notation
 _TIME_DIGITS = 3
 _SIZES = (1e9, 1e6, 1e3)
-Rows = Sequence[Sequence[str]]
+TextRows = Sequence[Sequence[str]]
 """The first entry of a row is its name."""
 _CELL = 'style="text-align: left; vertical-align: top; line-height: 1.4"'
 """At the cells, since the style sheets of notebooks align the text of each cell."""
@@ -129,7 +129,7 @@ def _rounded(number: float, last: int) -> str:
     return f"{rounded:.{max(-last, 0)}f}"
 
 
-def as_text(rows: Rows) -> str:
+def as_text(rows: TextRows) -> str:
     """Return rows as aligned columns."""
     widths = [max(map(_width, column)) for column in zip(*rows, strict=True)]
     lines = (
@@ -139,7 +139,7 @@ def as_text(rows: Rows) -> str:
     return "\n".join(line.rstrip() for line in lines)
 
 
-def as_html(rows: Rows) -> str:
+def as_html(rows: TextRows) -> str:
     """Return rows as an HTML table."""
     body = "".join(
         f'<tr><th scope="row" {_CELL}>{html.escape(name)}</th>'

@@ -23,7 +23,7 @@ from noack.core.core_library import core
 from noack.core.random_streams import uniform_pair
 from noack.impairments.clauses import Clause, Part
 from noack.impairments.loss_guarantee import LossRule
-from noack.impairments.markov_chain import Chain, Pattern, chance_chain
+from noack.impairments.markov_chain import Chain, PeriodicLosses, chance_chain
 from noack.impairments.words import CORRELATION, OWN_TIME_S, PERCENT, Quantity, brief_percent, time_text
 from noack.settings.section import Correlation, Probability, ScenarioSection
 from noack.settings.user_files import NamedFile
@@ -93,7 +93,7 @@ class Feature(ScenarioSection):
 
     @property
     def prediction_note(self) -> str:
-        """Return the condition under which the prediction of the loss rate holds."""
+        """The condition under which the prediction of the loss rate holds."""
         return ""
 
     def tc_lacks(self, earlier: Sequence["Impairment"]) -> str:
@@ -126,7 +126,7 @@ class Scheduler(QueueDiscipline):
     @property
     @abstractmethod
     def numbers(self) -> Sequence[int]:
-        """Return the number of each flow, from which the key of its packets follows."""
+        """The number of each flow, from which the key of its packets follows."""
 
     @abstractmethod
     def yields_ns(self, number: int, other_number: int) -> float:
@@ -156,7 +156,7 @@ class StageFeature(Feature):
             ValueError: it names a file that has not been read.
         """
 
-    def chains(self) -> Sequence[Chain | Pattern]:
+    def chains(self) -> Sequence[Chain | PeriodicLosses]:
         """Return its effect on packets as Markov chains, to predict the loss rate.
 
         Raises:
@@ -256,7 +256,7 @@ class Impairment(StageFeature):
 
     @property
     def is_bounded(self) -> bool:
-        """Whether no packet is delayed for longer than :meth:`longest_s`."""
+        """Whether no packet is delayed for longer than :attr:`longest_s`."""
         return True
 
     @property

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from noack.core.errors import CallerError
 
-Indices = NDArray[np.int64]
+StateIndices = NDArray[np.int64]
 
 _FORBIDDEN, _UNKNOWN = -1, -2
 
@@ -214,18 +214,18 @@ class LossAutomaton:
         start = tuple(rule.start for rule in self._rules)
         self._states = [start]
         self._numbers = {start: 0}
-        self._next: Indices = np.full((1, 2), _UNKNOWN)
+        self._next: StateIndices = np.full((1, 2), _UNKNOWN)
 
-    def after_loss(self, states: Indices) -> Indices:
+    def after_loss(self, states: StateIndices) -> StateIndices:
         """Return the states after the loss of the next packet; −1 where it is not allowed."""
         return self._after(states, 1)
 
-    def after_delivery(self, states: Indices) -> Indices:
+    def after_delivery(self, states: StateIndices) -> StateIndices:
         """Return the states after the delivery of the next packet."""
         return self._after(states, 0)
 
-    def _after(self, states: Indices, lost: int) -> Indices:
-        following: Indices = self._next[states, lost]
+    def _after(self, states: StateIndices, lost: int) -> StateIndices:
+        following: StateIndices = self._next[states, lost]
         if (unknown := following == _UNKNOWN).any():
             for state in np.unique(states[unknown]).tolist():
                 self._next[state, lost] = self._number(self._states[state], bool(lost))
@@ -253,8 +253,8 @@ class LossAutomaton:
 class Moves(NamedTuple):
     """The a states of a guarantee; state 0 is that before the first packet."""
 
-    after_loss: Indices  # (a,) −1: a loss is not allowed
-    after_delivery: Indices  # (a,)
+    after_loss: StateIndices  # (a,) −1: a loss is not allowed
+    after_delivery: StateIndices  # (a,)
 
 
 @lru_cache(maxsize=4)
@@ -272,11 +272,11 @@ def list_moves(guarantee: LossGuarantee, most: int) -> Moves | None:
 
 
 _MOST_STATES, _MOST_STEPS = 200_000, 200_000_000
-Pattern = tuple[bool, ...]
+OutcomePattern = tuple[bool, ...]
 """Whether each update is delivered, from the first one on."""
 
 
-def find_pattern_beyond(guarantee: LossGuarantee, implied: LossGuarantee) -> Pattern | None:
+def find_pattern_beyond(guarantee: LossGuarantee, implied: LossGuarantee) -> OutcomePattern | None:
     """Return a shortest pattern that a guarantee allows and another one forbids.
 
     None: there is none, so the guarantee implies the other one. A rule of the other guarantee is
@@ -318,7 +318,7 @@ class _States:
         if not is_small:
             raise CallerError(f"{self._meaning}: too many states to compare; use shorter windows")
 
-    def pattern_against(self, rule: LossRule) -> Pattern | None:
+    def pattern_against(self, rule: LossRule) -> OutcomePattern | None:
         """Return a shortest pattern that breaks a rule; None if the rule is implied."""
         if isinstance(rule, LongestBurst):
             return self._with_losses(rule.limit, rule.limit + 1)
@@ -328,7 +328,7 @@ class _States:
             return self._with_near_bursts(rule.deliveries)
         raise TypeError(rule)
 
-    def _with_losses(self, most: int, window: int) -> Pattern | None:
+    def _with_losses(self, most: int, window: int) -> OutcomePattern | None:
         """Return a shortest pattern with more losses in a window, which may be cut short."""
         if most >= window:
             return None
@@ -353,9 +353,9 @@ class _States:
             state = int((self._after_loss if losses[state] else self._after_delivery)[state])
         return tuple(pattern)
 
-    def _with_near_bursts(self, deliveries: int) -> Pattern | None:
+    def _with_near_bursts(self, deliveries: int) -> OutcomePattern | None:
         """Return a shortest pattern with fewer deliveries between two bursts of losses."""
-        patterns: list[Pattern] = []
+        patterns: list[OutcomePattern] = []
         states = np.flatnonzero(self._after_loss >= 0)
         reached = self._after_loss[states]
         for between in range(1, deliveries):
@@ -366,7 +366,7 @@ class _States:
             ]
         return min(patterns, key=len, default=None)
 
-    def _to(self, state: int) -> Pattern:
+    def _to(self, state: int) -> OutcomePattern:
         """Return a shortest pattern that reaches a state."""
         pattern: list[bool] = []
         while state:

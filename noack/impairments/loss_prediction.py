@@ -19,7 +19,7 @@ losses.
 ``loss 30% keep`` asks for a loss rate under the guarantee and the other impairments (the target
 loss rate). :func:`with_target_loss` finds the smallest probability for which the predicted rate of
 the whole direction is the target. That may take seconds; a process that must not wait receives what
-another one computed (:func:`remember`).
+another one computed (:func:`store_probabilities`).
 """
 
 import json
@@ -47,7 +47,7 @@ from noack.impairments.markov_chain import (
     Array,
     Chain,
     NotPredictableError,
-    Pattern,
+    PeriodicLosses,
     constrained_rate,
     moves_by_outcome,
     pattern_rate,
@@ -134,15 +134,15 @@ def joint_chain(settings: LinkSettings) -> tuple[Array, Array, Array]:
     return _joint_chain([part for impairment in settings.impairments for part in impairment.chains()])
 
 
-def _constrained_rate(parts: Sequence[Chain | Pattern], guarantee: LossGuarantee) -> float:
-    patterns = [part.lost for part in parts if isinstance(part, Pattern)]
+def _constrained_rate(parts: Sequence[Chain | PeriodicLosses], guarantee: LossGuarantee) -> float:
+    patterns = [part.lost for part in parts if isinstance(part, PeriodicLosses)]
     if len(patterns) == len(parts):
         return pattern_rate(_lost_by_any(patterns), guarantee)
     return constrained_rate(*_joint_chain(parts), guarantee)
 
 
-def _capped_rate(parts: Sequence[Chain | Pattern], mansd: int | None) -> float:
-    patterns = [part for part in parts if isinstance(part, Pattern)]
+def _capped_rate(parts: Sequence[Chain | PeriodicLosses], mansd: int | None) -> float:
+    patterns = [part for part in parts if isinstance(part, PeriodicLosses)]
     if len(patterns) == len(parts):
         return _pattern_rate([part.lost for part in patterns], mansd)
     start, moves, ineffective = _joint_chain(parts)
@@ -178,14 +178,14 @@ def _lost_by_any(patterns: Sequence[NDArray[np.bool_]]) -> NDArray[np.bool_]:
     return lost
 
 
-def _joint_chain(parts: Sequence[Chain | Pattern]) -> tuple[Array, Array, Array]:
+def _joint_chain(parts: Sequence[Chain | PeriodicLosses]) -> tuple[Array, Array, Array]:
     """Return the joint chain: start, matrix, probability of no effective delivery."""
-    states = math.prod(len(part.lost if isinstance(part, Pattern) else part.start) for part in parts)
+    states = math.prod(len(part.lost if isinstance(part, PeriodicLosses) else part.start) for part in parts)
     if states > MOST_STATES:
         raise NotPredictableError(f"together the impairments have {states} states, too many to compute with")
     start: Array = np.ones(1)
     moves: Array = np.ones((1, 1))
-    chains = [part.chain if isinstance(part, Pattern) else part for part in parts]
+    chains = [part.chain if isinstance(part, PeriodicLosses) else part for part in parts]
     joined: list[Chain] = []
     for chain in chains:
         n, size_so_far = len(chain.start), len(start)
@@ -441,17 +441,20 @@ def with_target_loss(settings: LinkSettings) -> LinkSettings:
         raise ValueError(f"{target_loss.impairment.text()}: only one loss of a direction can be kept")
     key = _key(settings)
     if key not in _probabilities:
-        remember({key: _probability(settings, target_loss)})
+        store_probabilities({key: _probability(settings, target_loss)})
     return _with_probability(settings, target_loss, _probabilities[key])
 
 
 def found_probabilities(*links: LinkSettings) -> dict[str, float]:
-    """Return the probabilities of valid settings, for :func:`remember`; none where none is kept."""
+    """Return the probabilities of valid settings, for :func:`store_probabilities`.
+
+    There is none where no loss rate is kept.
+    """
     # Each is read at once, as a further one may remove it.
     return {(key := _key(link)): _probabilities[key] for link in links if with_target_loss(link) is not link}
 
 
-def remember(probabilities: Mapping[str, float]) -> Mapping[str, float]:
+def store_probabilities(probabilities: Mapping[str, float]) -> Mapping[str, float]:
     """Use these probabilities, which another process found, instead of computing them."""
     _probabilities.add(probabilities)
     return probabilities

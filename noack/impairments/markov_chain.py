@@ -43,7 +43,7 @@ class Chain(NamedTuple):
     probability: float = 0.0  # Probability that it acts on a copy
 
 
-class Pattern(NamedTuple):
+class PeriodicLosses(NamedTuple):
     """A periodic loss pattern."""
 
     lost: NDArray[np.bool_]  # (period,)
@@ -55,7 +55,7 @@ class Pattern(NamedTuple):
         return Chain(np.eye(period)[-1], np.roll(np.eye(period), 1, axis=1), self.lost.astype(float))
 
 
-def pattern(period: int, lost: Iterable[int]) -> Pattern:
+def pattern(period: int, lost: Iterable[int]) -> PeriodicLosses:
     """Return the pattern in which these packet numbers of every ``period`` packets are lost.
 
     Raises:
@@ -65,7 +65,7 @@ def pattern(period: int, lost: Iterable[int]) -> Pattern:
         raise NotPredictableError(f"the loss pattern repeats only after {period} packets")
     flags = np.zeros(period, bool)
     flags[np.fromiter(lost, np.int64)] = True
-    return Pattern(flags)
+    return PeriodicLosses(flags)
 
 
 def chance_chain(probability: float, correlation: float, action: str) -> Chain:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.clock import NEVER_NS
-from noack.core.core_library import CData, CoreMemory, core, dtype_of, ffi, pointer_to
+from noack.core.core_library import CData, CoreMemory, StructRows, core, dtype_of, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.protocol.record_tables import LOOP, RecordShape, largest, tables
 from noack.protocol.roles import External, Notice, Record
@@ -28,8 +28,7 @@ from noack.protocol.wire_format import Flow
 from noack.scenario.parameter_changes import AppliedParameters, ChangeSchedule, ParameterChange, settings_key
 from noack.scenario.scenario import Scenario
 
-Rows = NDArray[np.void]
-NewRows = Callable[[int, "np.dtype[np.void]"], Rows]
+NewRows = Callable[[int, "np.dtype[np.void]"], StructRows]
 """Returns memory for a number of rows of a type."""
 _ROWS, _ROWS_OF_A_LOOP, _MOST_ROWS = 1024, 256, 16_384
 _NOTES = 256
@@ -87,7 +86,7 @@ class MachinePart(ABC):
     def answer(self, question: int, structure: CData) -> Sequence[Notice]:
         """Do what a step needs before it goes on; return lines for the log."""
 
-    def inspect(self, rows: Rows) -> Sequence[Notice]:
+    def inspect(self, rows: StructRows) -> Sequence[Notice]:
         """Return lines for the log about new rows of received messages."""
         return ()
 
@@ -174,16 +173,17 @@ class LoopMachines:
         self.parts = tuple(parts)
         self.role = self.parts[0].role
         self.phases_ns = tuple(phases_ns or (0,) * len(self.parts))
-        self._memory = CoreMemory()
+        self.memory = CoreMemory()
+        """What the structures refer to."""
         self._notices: list[Notice] = []
-        self.core: CData = self._memory.keep(ffi.new("noack_process *"))
+        self.core: CData = self.memory.keep(ffi.new("noack_process *"))
         """The ``noack_process``; its address does not change."""
         self._fill_machines(templates or range(len(self.parts)))
         self._counting = {k for k, part in enumerate(self.parts) if part.counts_every_message}
         """Loops of which every message may matter."""
         self._message = ffi.new("noack_message *")
         self._notes = np.zeros(_NOTES, dtype_of("noack_note"))
-        self._tables: dict[int, Rows] = {}
+        self._tables: dict[int, StructRows] = {}
         self._new_rows: NewRows = np.empty
         most = min(_ROWS_OF_A_LOOP * len(self.parts), _MOST_ROWS)
         self._fill_tables(rows or max(_ROWS, most))
@@ -193,7 +193,7 @@ class LoopMachines:
         core.noack_process_begin(self.core)
 
     def _fill_machines(self, templates: Sequence[int]) -> None:
-        process, count, keep = self.core, len(self.parts), self._memory.keep
+        process, count, keep = self.core, len(self.parts), self.memory.keep
         process.role, process.loops = self.role.number, count
         machines = keep(ffi.new(f"{self.role.structure}[]", count))
         setattr(process, f"{self.role.name}s", machines)
@@ -204,13 +204,13 @@ class LoopMachines:
         for number, first in enumerate(templates):
             copies.setdefault(first, []).append(number)
         for first, (_, *others) in copies.items():
-            mark = self._memory.size
-            self.parts[first].fill(machines[first], self._memory)
+            mark = self.memory.size
+            self.parts[first].fill(machines[first], self.memory)
             if others:
-                self._memory.copy(machines, first, others, mark)
+                self.memory.copy(machines, first, others, mark)
             for number in others:
                 if self.parts[number] is not self.parts[first]:
-                    self.parts[number].set_drawn_values(machines[number], self._memory)
+                    self.parts[number].set_drawn_values(machines[number], self.memory)
         for structure, phase_ns in zip(machines, self.phases_ns, strict=True):
             structure.machine.phase_ns = phase_ns
 
@@ -234,9 +234,9 @@ class LoopMachines:
         @cache
         def layout(shape: RecordShape) -> CData:
             own = tables(**asdict(shape)).get(name)
-            return ffi.NULL if own is None else self._memory.integers(row_layout(own, whole))
+            return ffi.NULL if own is None else self.memory.integers(row_layout(own, whole))
 
-        return self._memory.keep(ffi.new("int64_t *[]", [layout(shape) for shape in shapes]))
+        return self.memory.keep(ffi.new("int64_t *[]", [layout(shape) for shape in shapes]))
 
     def take_rows_from(self, new_rows: NewRows) -> None:
         """Let ``new_rows`` provide the memory of the rows, from before the first step on."""
@@ -244,7 +244,7 @@ class LoopMachines:
         for number, rows in self._tables.items():
             self._renew_table(number, new_rows(len(rows), rows.dtype))
 
-    def _renew_table(self, number: int, rows: Rows) -> None:
+    def _renew_table(self, number: int, rows: StructRows) -> None:
         self._tables[number] = rows
         self.core.tables[number].rows = pointer_to(rows, "uint8_t *")
 
@@ -273,13 +273,13 @@ class LoopMachines:
         self._keep_notices(loop, self.parts[loop].answer(question, self.machines[loop]))
         self._update_counting(loop)
 
-    def take_rows(self, *, last: bool = False) -> list[tuple[str, Rows]]:
+    def take_rows(self, *, last: bool = False) -> list[tuple[str, StructRows]]:
         """Return the rows since the last call, by table, and empty the core's tables.
 
         ``last``: the machines make no step before the caller has used the rows, which the next step
         overwrites.
         """
-        taken: list[tuple[str, Rows]] = []
+        taken: list[tuple[str, StructRows]] = []
         for number, rows in self._tables.items():
             table = self.core.tables[number]
             if table.count:
@@ -330,7 +330,7 @@ class LoopMachines:
             self._update_counting(loop)
         return outputs
 
-    def _inspect(self, rows: Rows) -> None:
+    def _inspect(self, rows: StructRows) -> None:
         notable = self._notable(rows)
         if not len(notable):
             return
@@ -345,7 +345,7 @@ class LoopMachines:
         else:
             self._counting.discard(loop)
 
-    def _notable(self, rows: Rows) -> Rows:
+    def _notable(self, rows: StructRows) -> StructRows:
         """Return the rows that a part may have to say something about."""
         notable = np.zeros(len(rows), np.bool_)
         if self._counting:

@@ -1,8 +1,18 @@
 """The Kalman filter (Kalman 1960), with the covariance update of Bucy and Joseph.
 
-At every step of the plant x̂ ← Âd x̂ + B̂d u, P ← Âd P Âdᵀ + Q. At a measurement S = C P Cᵀ + R, L
-= P Cᵀ S⁻¹, x̂ ← x̂ + L (y − C x̂), P ← (I − L C) P (I − L C)ᵀ + L R Lᵀ. With this update P stays
-symmetric and positive semidefinite for any rounding error of L.
+At every step of the plant::
+
+    x̂ ← Âd x̂ + B̂d u
+    P ← Âd P Âdᵀ + Q
+
+At a measurement::
+
+    S = C P Cᵀ + R
+    L = P Cᵀ S⁻¹
+    x̂ ← x̂ + L (y − C x̂)
+    P ← (I − L C) P (I − L C)ᵀ + L R Lᵀ
+
+With this update P stays symmetric and positive semidefinite for any rounding error of L.
 """
 
 from collections.abc import Iterator
@@ -14,7 +24,7 @@ from pydantic import model_validator
 from noack.core.core_library import CData, CoreMemory, core, ffi, reals_at
 from noack.core.linear_systems import Matrix, Vector
 from noack.observers.observer_settings import EstimationModel, NoiseVariances, ObserverSettings
-from noack.settings.section import Deviations, Rows, require_length, require_shape
+from noack.settings.section import Deviations, MatrixRows, require_length, require_shape
 
 
 class KalmanSettings(ObserverSettings):
@@ -34,12 +44,12 @@ class KalmanSettings(ObserverSettings):
     input_std: Deviations | None = None
     """Standard deviation of the disturbance of u, constant over a step, m entries; by default that
     of the random disturbances at = "input"."""
-    Q: Rows | None = None
+    Q: MatrixRows | None = None
     """Instead of process_std and input_std: covariance of the noise added to x in a plant step, n x
     n."""
     noise_std: Deviations | None = None
     """Standard deviation of v, p entries; by default that of the measurement."""
-    R: Rows | None = None
+    R: MatrixRows | None = None
     """Instead of noise_std: covariance of v, p x p."""
     initial_std: Deviations
     """Standard deviation of x − x̂ before the first measurement, n entries: P(0) = diag(·²)."""
@@ -130,7 +140,7 @@ class KalmanSettings(ObserverSettings):
         )
 
 
-def _require_covariance(key: str, rows: Rows | None, *, definite: bool) -> None:
+def _require_covariance(key: str, rows: MatrixRows | None, *, definite: bool) -> None:
     if rows is None:
         return
     matrix = np.array(rows)

@@ -15,7 +15,7 @@ from noack.core.core_library import CData, CoreMemory, core
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.observers.observer_settings import EstimationModel, NoiseVariances, ObserverSettings, observer_gain
-from noack.settings.section import Rows, require_shape
+from noack.settings.section import MatrixRows, require_shape
 
 Pole = FiniteFloat | tuple[FiniteFloat, ...]
 
@@ -26,7 +26,7 @@ class LuenbergerSettings(ObserverSettings):
     example: ClassVar = {"kind": "luenberger", "poles_per_s": [-20.0, -25.0]}
 
     kind: Literal["luenberger"]
-    gain: Rows | None = None
+    gain: MatrixRows | None = None
     """L by rows, n x p."""
     poles_per_s: tuple[Pole, ...] | None = None
     """Instead of gain: n poles s of the error in continuous time; a pair [re, im] stands for re ±

@@ -208,6 +208,10 @@ class FmuSystem:
             fmu.exitInitializationMode()
             self._instance.started = True
             self._read()
+        self._require_start(x0)
+
+    def _require_start(self, x0: Vector) -> None:
+        """Raise CallerError if the FMU begins at another state."""
         scale = np.abs(x0) + np.abs(self._operating_state) + 1.0
         if not np.all(np.abs(self.x - x0) <= _ALIKE * scale):
             raise CallerError(

@@ -17,7 +17,7 @@ from noack.core.errors import CallerError, one_line
 from noack.core.linear_systems import Vector
 from noack.plants.plant_settings import Names, PlantSettings, PlantStart, SystemFailedError
 from noack.protocol.wire_format import MAX_DIMENSION
-from noack.settings.section import Positive, Row, Rows, require_length, require_shape
+from noack.settings.section import MatrixRows, Positive, Row, require_length, require_shape
 from noack.settings.user_files import FileSettings, UserCode, real_vector, unchanged
 
 Indices = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1, max_length=MAX_DIMENSION)]
@@ -57,7 +57,7 @@ class GymnasiumSettings(FileSettings, PlantSettings):
     """Entries of s, counted from 0, that make up x, in x's order; by default all."""
     operating_state: Row | None = None
     """Values of these entries at x = 0; by default 0."""
-    actuation: Rows | None = None
+    actuation: MatrixRows | None = None
     """Matrix from u to the action, a row per entry of the action; by default the identity."""
     operating_action: Row | None = None
     """The action at u = 0; by default 0."""

@@ -1,6 +1,6 @@
 """The interface of a system that a plant advances, and the settings that every kind of plant has.
 
-Plants that are given by equations have a base with its integrator, and elementary functions.
+EquationSettings is the base of plants given by equations; OdeSystem integrates them.
 
 The loop uses x and u, the deviations from an operating point. The plant's own state z may have
 other coordinates, and more of them.

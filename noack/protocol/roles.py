@@ -52,12 +52,12 @@ ENDS: Mapping[Flow, Ends] = {
 
 
 def receiver_of(role: str, flow: Flow, network: Collection[Flow] = PAPER) -> str:
-    """To whom a process sends a flow; ``network`` has the flows that cross the network."""
+    """Return to which role a process sends a flow; ``network`` has the flows that cross the network."""
     return "netem" if flow in network and role != "netem" else ENDS[flow].receiver
 
 
 def sender_to(role: str, flow: Flow, network: Collection[Flow] = PAPER) -> str:
-    """From whom a process receives a flow; ``network`` has the flows that cross the network."""
+    """Return from which role a process receives a flow; ``network`` likewise."""
     return "netem" if flow in network and role != "netem" else ENDS[flow].sender
 
 

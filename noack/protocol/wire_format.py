@@ -38,6 +38,7 @@ MAGIC = b"NA"
 VERSION = 1
 MAX_DIMENSION = 64
 MAX_LOOPS = 65_535
+"""Maximum number of loops of a run; they are numbered from 0."""
 TIMES_NS = 2**62
 """Upper limit of times: sums of two fit the record's columns."""
 HEADER_ROW = np.dtype(
@@ -96,11 +97,11 @@ class EncryptedSeal:
         derived = hashlib.blake2b(_PURPOSE, key=key, digest_size=KEY_BYTES).digest()
         self._cipher, self._invalid = ChaCha20Poly1305(derived), InvalidTag
 
-    def close(self, header: bytes, vector: bytes) -> bytes:
+    def encrypt(self, header: bytes, vector: bytes) -> bytes:
         """Return the datagram with this header and vector."""
         return header + self._cipher.encrypt(_nonce_of(header), vector, header)
 
-    def open(self, datagram: bytes, header_bytes: int) -> bytes | None:
+    def decrypt(self, datagram: bytes, header_bytes: int) -> bytes | None:
         """Return the vector of a datagram; None if it was not made under the same key."""
         header = datagram[:header_bytes]
         try:
@@ -179,7 +180,7 @@ class Header(NamedTuple):
 
 
 def datagram_bytes(dimension: int) -> int:
-    """Size of a datagram that carries a vector of ``dimension`` entries."""
+    """Return the size of a datagram that carries a vector of ``dimension`` entries."""
     return HEADER_BYTES + 8 * dimension + TAG_BYTES
 
 
@@ -191,7 +192,7 @@ def read_header(datagram: bytes) -> Header | None:
 
 
 def loop_number(datagram: bytes) -> int | None:
-    """The loop field of a datagram, unverified; None if the datagram is too short."""
+    """Return the loop field of a datagram, unverified; None if the datagram is too short."""
     return datagram[6] | datagram[7] << 8 if len(datagram) >= HEADER_BYTES else None
 
 
@@ -230,7 +231,7 @@ class Encoder:
             )
         core_message = self._message
         try:
-            if not 0 <= message.loop <= MAX_LOOPS:
+            if not 0 <= message.loop < MAX_LOOPS:
                 raise OverflowError(f"loop {message.loop}")
             core_message.flow, core_message.loop, core_message.t_ns = message.flow, message.loop, message.t_ns
             core_message.error_level = message.error_level.to_bytes(1, "little")[0]
@@ -243,7 +244,7 @@ class Encoder:
         datagram = bytes(ffi.buffer(self._datagram, size_bytes))
         if self._wire.seal is None:
             return datagram
-        return self._wire.seal.close(datagram[:HEADER_BYTES], datagram[HEADER_BYTES:-TAG_BYTES])
+        return self._wire.seal.encrypt(datagram[:HEADER_BYTES], datagram[HEADER_BYTES:-TAG_BYTES])
 
 
 def rejected_of(reception: CData) -> dict[Rejection, int]:

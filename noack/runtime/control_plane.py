@@ -18,7 +18,7 @@ from zenoh import CongestionControl, Priority
 from zenoh.handlers import FifoChannel, RingChannel
 
 from noack.core.errors import NoAnswerError, PeerError
-from noack.impairments.loss_prediction import remember
+from noack.impairments.loss_prediction import store_probabilities
 from noack.protocol.roles import COORDINATOR
 from noack.runtime.active_runs import RUNS, run_name
 from noack.runtime.connections.zenoh_session import (
@@ -241,7 +241,7 @@ class ParameterUpdates:
         updates: list[ChangeAnnouncement] = []
         while self._waiting and (at_most is None or len(updates) < at_most):
             announced = self._waiting.pop(0)
-            remember(announced.target_losses)
+            store_probabilities(announced.target_losses)
             if announced.number >= self._next_number:  # a late process receives some twice
                 self._next_number = announced.number + 1
                 updates.append(announced)

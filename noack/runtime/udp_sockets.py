@@ -32,7 +32,7 @@ _READ_AT_ONCE = 4096
 _SO_MEMINFO = 55
 _MEMINFO_WORDS = 9
 _MEMINFO_DROPS = 8
-SHED = "shed"
+DROPPED_IN_FLOOD = "shed"
 """Rejection reason of datagrams from unknown sources that the kernel dropped in a flood."""
 MAX_UDP_BYTES = 65_535
 # The default receive buffer holds 256 small datagrams; 4 MiB hold about 10,000. A datagram lost by
@@ -197,7 +197,7 @@ class CountingSocket(ABC):
 
     def rejected(self, by_reason: Mapping[str, int]) -> dict[str, int]:
         """Add the datagrams from unknown sources that the kernel dropped in a flood."""
-        return {reason: n for reason, n in (*by_reason.items(), (SHED, self._shed())) if n}
+        return {reason: n for reason, n in (*by_reason.items(), (DROPPED_IN_FLOOD, self._shed())) if n}
 
     def finish(self, now_ns: int, sink: RecordSink) -> None:
         """Read the datagrams that still wait, so that the counters are complete."""
@@ -323,7 +323,8 @@ class SourceCount:
 
     def __init__(self, peers: Iterable[Address] = ()) -> None:
         self._peers = dict.fromkeys(peers, 0)
-        self._others: Counter[Address] = Counter()
+        self.others: Counter[Address] = Counter()
+        """Datagrams of the other sources that are known at present."""
         self._unnamed_count = 0
         self._pending_source: Address | None = None
         self._pending_count = 0
@@ -344,7 +345,7 @@ class SourceCount:
         """Datagrams by source; the rare sources together are ``others``."""
         self._fold()
         self._forget(_REPORTED_SOURCES)
-        sources = [*self._peers.items(), *self._others.most_common()]
+        sources = [*self._peers.items(), *self.others.most_common()]
         counts = {address_text(source): n for source, n in sources if n}
         return counts | ({"others": self._unnamed_count} if self._unnamed_count else {})
 
@@ -354,13 +355,13 @@ class SourceCount:
         if self._pending_source in self._peers:
             self._peers[self._pending_source] += self._pending_count
         else:
-            self._others[self._pending_source] += self._pending_count
-            if len(self._others) > _KNOWN_SOURCES:
+            self.others[self._pending_source] += self._pending_count
+            if len(self.others) > _KNOWN_SOURCES:
                 self._forget(_KNOWN_SOURCES // 2)
         self._pending_source, self._pending_count = None, 0
 
     def _forget(self, most: int) -> None:
         """Keep the ``most`` frequent sources: forged ones must not fill the memory."""
-        frequent = Counter(dict(self._others.most_common(most)))
-        self._unnamed_count += self._others.total() - frequent.total()
-        self._others = frequent
+        frequent = Counter(dict(self.others.most_common(most)))
+        self._unnamed_count += self.others.total() - frequent.total()
+        self.others = frequent

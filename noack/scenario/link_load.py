@@ -28,7 +28,7 @@ from noack.core.errors import CallerError
 from noack.core.number_format import at_least, at_most
 from noack.impairments.constraints import join_guarantee
 from noack.impairments.disciplines.tail_drop import TailDrop
-from noack.impairments.feature import Scheduler
+from noack.impairments.feature import Impairment, Scheduler
 from noack.impairments.kinds.opportunities import Opportunities
 from noack.impairments.kinds.rate import Rate
 from noack.impairments.kinds.schedule import Schedule
@@ -202,32 +202,43 @@ def _link_loads(run_parts: Sequence[_RunPart], flow: Flow, path: str, names: Seq
         if isinstance(impairment, Schedule):
             bounds = [LoopsBound(*bound) for bound in zip(names, delays[index], strict=True)]
             loads += _slot_loads(impairment, run_parts, key, flow, bounds)
-        if not isinstance(impairment, Rate | Opportunities):
-            continue
-        previous: LinkLoad | None = None
-        delay_s = _largest_bound(delays[index])
-        loop_bounds = tuple(_group_bounds(names, delays[index])) if len(delays[index]) > 1 else ()
-        for change, direction, loops in run_parts:
-            window = _window(direction)
-            bits = [int(impairment.line_bits(loop.payload_bytes)) * loop.loops for loop in loops]
-            at_most_bps = sum(b / loop.least_s for b, loop in zip(bits, loops, strict=True))
-            at_least_bps = sum(b / loop.largest_s for b, loop in zip(bits, loops, strict=True))
-            load = LinkLoad(
-                change=change,
-                loop=None,
-                key=key,
-                flow=flow,
-                window=window,
-                rate_bps=impairment.rate_bps,
-                mandatory_at_most_bps=_share(window) * at_most_bps,
-                mandatory_at_least_bps=_share(window) * at_least_bps,
-                delay_bound_s=delay_s,
-                loop_bounds=loop_bounds,
-            )
-            if previous is None or load._replace(change=previous.change) != previous:
-                loads.append(load)
-            previous = load
+        elif isinstance(impairment, Rate | Opportunities):
+            loop_bounds = tuple(_group_bounds(names, delays[index])) if len(delays[index]) > 1 else ()
+            delay_s = _largest_bound(delays[index])
+            loads += _rate_loads(impairment, run_parts, key, flow, delay_s, loop_bounds)
     return loads
+
+
+def _rate_loads(
+    impairment: Rate | Opportunities,
+    run_parts: Sequence[_RunPart],
+    key: str,
+    flow: Flow,
+    delay_s: float | None,
+    loop_bounds: tuple[LoopsBound, ...],
+) -> Iterator[LinkLoad]:
+    """Yield the load of a rate in each part of the run in which it differs from that before."""
+    previous: LinkLoad | None = None
+    for change, direction, loops in run_parts:
+        window = _window(direction)
+        bits = [int(impairment.line_bits(loop.payload_bytes)) * loop.loops for loop in loops]
+        at_most_bps = sum(b / loop.least_s for b, loop in zip(bits, loops, strict=True))
+        at_least_bps = sum(b / loop.largest_s for b, loop in zip(bits, loops, strict=True))
+        load = LinkLoad(
+            change=change,
+            loop=None,
+            key=key,
+            flow=flow,
+            window=window,
+            rate_bps=impairment.rate_bps,
+            mandatory_at_most_bps=_share(window) * at_most_bps,
+            mandatory_at_least_bps=_share(window) * at_least_bps,
+            delay_bound_s=delay_s,
+            loop_bounds=loop_bounds,
+        )
+        if previous is None or load._replace(change=previous.change) != previous:
+            yield load
+        previous = load
 
 
 def _group_bounds(names: Sequence[str], delays_s: Sequence[float]) -> Iterator[LoopsBound]:
@@ -306,24 +317,31 @@ def _largest_delays(run_parts: Sequence[_RunPart]) -> tuple[list[list[float]], l
     delays_s, copied = list[list[float]](), False
     for impairment in run_parts[0].direction.impairments:  # they cannot change
         spread_s = max(largest_s) - least_s
+        delays_s.append(_delays_in(impairment, run_parts, spread_s, copied=copied))
         if isinstance(impairment, Schedule | Rate):
-            if isinstance(impairment, Schedule):
-                delays_s.append(_slot_delays_s(impairment, run_parts, spread_s, copied=copied))
-            elif impairment.scheduler is not None:
-                delays_s.append(_chosen_delays_s(impairment, impairment.scheduler, run_parts))
-            else:
-                delays_s.append([_queue_delay_s(impairment, run_parts, spread_s, copied=copied)])
             # One bound may be that of all loops.
             largest_s = [
                 before_s + added_s for before_s, added_s in zip(largest_s, cycle(delays_s[-1]), strict=False)
             ]
         else:
-            delays_s.append([impairment.longest_s if impairment.is_bounded else math.inf])
             ranges_s = {before_s: impairment.delay_range_s(least_s, before_s) for before_s in set(largest_s)}
             largest_s = [ranges_s[before_s][1] for before_s in largest_s]
             least_s = min(ranges_s.values())[0]
         copied = copied or impairment.copies
     return delays_s, largest_s
+
+
+def _delays_in(
+    impairment: Impairment, run_parts: Sequence[_RunPart], spread_s: float, *, copied: bool
+) -> list[float]:
+    """Return the bounds of the delay in an impairment, of each loop or one for all."""
+    if isinstance(impairment, Schedule):
+        return _slot_delays_s(impairment, run_parts, spread_s, copied=copied)
+    if not isinstance(impairment, Rate):
+        return [impairment.longest_s if impairment.is_bounded else math.inf]
+    if impairment.scheduler is not None:
+        return _chosen_delays_s(impairment, impairment.scheduler, run_parts)
+    return [_queue_delay_s(impairment, run_parts, spread_s, copied=copied)]
 
 
 def _slot_delays_s(

@@ -30,9 +30,9 @@ from noack.settings.section import (
     Deviations,
     HalfWidthRows,
     HalfWidths,
+    MatrixRows,
     RateHz,
     Row,
-    Rows,
     ScenarioSection,
     kinds_in,
     require_length,
@@ -77,11 +77,11 @@ class ModelSection(ScenarioSection):
     """A named model; see noack/plants/linear.py."""
     parameters: dict[str, FiniteFloat] = Field({})
     """Parameters of the named model that differ from its defaults."""
-    A: Rows | None = None
+    A: MatrixRows | None = None
     """Â by rows, n x n, per second."""
-    B: Rows | None = None
+    B: MatrixRows | None = None
     """B̂ by rows, n x m."""
-    gain: Rows | None = None
+    gain: MatrixRows | None = None
     """K by rows, m x n; a named model has its own gain, and a file may have one."""
     file: str | None = None
     """An .npz or .mat file with A, B and, unless it is given here, the gain, named gain or K. A
@@ -209,7 +209,7 @@ def _closed_loop(A: Matrix, B: Matrix, K: Matrix) -> Matrix:
 class MeasurementSection(ScenarioSection):
     """The measurement of the plant: y = C x + v."""
 
-    C: Rows | None = None
+    C: MatrixRows | None = None
     """C by rows, p x n; by default the identity: every state is measured."""
     noise_std: Deviations | None = None
     """Standard deviation of the normally distributed part of v, p entries; by default 0."""
@@ -278,9 +278,9 @@ class PlantSection(ScenarioSection):
     """Half-widths of the uncertainty box around Â, n x n."""
     uncertainty_B: HalfWidthRows | None = None
     """Half-widths of the uncertainty box around B̂, n x m."""
-    A: Rows | None = None
+    A: MatrixRows | None = None
     """The true A, n x n, for draw = "given"."""
-    B: Rows | None = None
+    B: MatrixRows | None = None
     """The true B, n x m, for draw = "given"."""
     file: str | None = None
     """An .npz or .mat file with the true A and B, as for model.file."""

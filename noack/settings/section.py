@@ -132,7 +132,7 @@ RateHz = Annotated[FiniteFloat, Field(ge=1e-6, le=100_000), AfterValidator(_with
 """A run has at most 1e7 s: the times of its steps fit into 64 bits."""
 Row = Annotated[tuple[FiniteFloat, ...], Field(min_length=1, max_length=MAX_DIMENSION)]
 """A vector."""
-Rows = Annotated[tuple[Row, ...], Field(min_length=1, max_length=MAX_DIMENSION)]
+MatrixRows = Annotated[tuple[Row, ...], Field(min_length=1, max_length=MAX_DIMENSION)]
 """A matrix by rows."""
 
 _LONGEST_SHOWN = 60

@@ -24,7 +24,7 @@ from pydantic import BaseModel, Field, FiniteFloat, model_validator
 from noack.core.errors import CallerError, NoackError, one_line
 from noack.core.file_access import read_regular
 from noack.core.linear_systems import Vector
-from noack.settings.section import Row, Rows, ScenarioSection
+from noack.settings.section import MatrixRows, Row, ScenarioSection
 
 UserCode = Any
 """A class of the user, an object of it, or what its code returns."""
@@ -150,7 +150,7 @@ class ClassSettings(FileSettings):
     or noack.controllers; or, with file, the class in it."""
     file: str | None = None
     """A Python source file with the class; a relative name is relative to the scenario file."""
-    parameters: dict[str, bool | int | FiniteFloat | str | Row | Rows] = Field({})
+    parameters: dict[str, bool | int | FiniteFloat | str | Row | MatrixRows] = Field({})
     """Passed to the class as keyword arguments, arrays as lists."""
 
     @model_validator(mode="after")

@@ -13,8 +13,8 @@
 
 The docstring of each part has its chain of arguments. Labels such as eq:LossEv3 are those of the
 paper's source. docs/theory.md states the results, docs/derivations.md has the proofs and a table of
-the files. Modules are imported in the order bounds, paper, certificates, random_losses, margins:
-the paper's formulas need enclosed suprema, too.
+the files. Modules are imported in the order bounds, paper, certificates and margins,
+random_losses: the paper's formulas need enclosed suprema, too.
 
 Modules of scipy are imported in the functions that use them: their import takes longer than that of
 everything else here, and most certificates do not need them.

@@ -333,7 +333,7 @@ def _theorem_2(
     )
 
 
-class Interval(NamedTuple):
+class InterEventTrajectory(NamedTuple):
     """A trajectory between two events: k samples."""
 
     t_s: Vector
@@ -344,7 +344,9 @@ class Interval(NamedTuple):
     """(k,) ‖e^{H(t−t_j)} x(t_j)‖."""
 
 
-def longest_interval_s(interval: Interval, beta: float, alpha_per_s: float, kappa: float) -> float:
+def longest_interval_s(
+    interval: InterEventTrajectory, beta: float, alpha_per_s: float, kappa: float
+) -> float:
     """Return Theorem 1's δ̄_j from the trajectory: the minimum over the free constant γ > 0.
 
     η_j e^{γ(t−t_j)} ≤ ‖x(t)‖ and ‖e^{H(t−t_j)}x(t_j)‖ ≤ ζ_j e^{−κ(t−t_j)} give (eq:deltaa, deltak)

@@ -12,7 +12,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from noack.core.linear_systems import Matrix
-from noack.trigger.policy_settings import ModelMatrices, Share, Size, WeightedSettings
+from noack.trigger.policy_settings import ModelMatrices, Ratio, Size, WeightedSettings
 from noack.trigger.trigger_rule import QuadraticForm, TriggerRule, error_map, state_map
 
 
@@ -22,7 +22,7 @@ class MixedSettings(WeightedSettings):
     example_keys: ClassVar = {"sigma": 0.1, "epsilon": 0.05}
 
     policy: Literal["mixed"]
-    sigma: Share
+    sigma: Ratio
     """σ."""
     epsilon: Size
     """ε, in the units of ‖W x‖."""
@@ -37,5 +37,5 @@ class MixedSettings(WeightedSettings):
 
 def mixed_rule(n: int, sigma: float, epsilon: float, weight: Matrix | None) -> TriggerRule:
     """Return the rule for n states; σ > 0 without a unit, ε ≥ 0 in the units of ‖W x‖."""
-    down = np.asarray(sigma * state_map(n, weight))
-    return TriggerRule(QuadraticForm(error_map(n, weight), down), floor=epsilon, weight=weight)
+    negative = np.asarray(sigma * state_map(n, weight))
+    return TriggerRule(QuadraticForm(error_map(n, weight), negative), floor=epsilon, weight=weight)

@@ -2,7 +2,7 @@
 
 from typing import ClassVar, Literal
 
-from noack.trigger.policy_settings import Interval, ModelMatrices, WeightedSettings, nanoseconds
+from noack.trigger.policy_settings import IntervalS, ModelMatrices, WeightedSettings, nanoseconds
 from noack.trigger.trigger_rule import TriggerRule, no_form
 
 
@@ -12,7 +12,7 @@ class PeriodicSettings(WeightedSettings):
     example_keys: ClassVar = {"period_s": 1.0}
 
     policy: Literal["periodic"]
-    period_s: Interval
+    period_s: IntervalS
     """Period."""
 
     def trigger_policy(self, model: ModelMatrices) -> TriggerRule:

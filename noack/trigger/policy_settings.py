@@ -16,12 +16,12 @@ from pydantic import Field, FiniteFloat, field_validator
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, spectral_abscissa
-from noack.settings.section import ReadTable, Rows, ScenarioSection, require_shape
+from noack.settings.section import MatrixRows, ReadTable, ScenarioSection, require_shape
 from noack.trigger.trigger_rule import Policy, TriggerRule, require_rule
 
 Size = Annotated[FiniteFloat, Field(ge=1e-15, le=1e15)]
-Share = Annotated[FiniteFloat, Field(gt=0, le=1e9)]
-Interval = Annotated[FiniteFloat, Field(ge=1e-9, le=1e7)]
+Ratio = Annotated[FiniteFloat, Field(gt=0, le=1e9)]
+IntervalS = Annotated[FiniteFloat, Field(ge=1e-9, le=1e7)]
 
 if TYPE_CHECKING:
     AnyTrigger: TypeAlias = "PolicySettings"  # noack.scenario.sections inserts the union of all policies
@@ -48,7 +48,7 @@ class PolicySettings(ScenarioSection):
     if TYPE_CHECKING:
 
         @property
-        def weight(self) -> Rows | None:
+        def weight(self) -> MatrixRows | None:
             """W of the norm ‖v‖_W; None is the identity."""
             return None
 
@@ -100,7 +100,7 @@ class PolicySettings(ScenarioSection):
 class WeightedSettings(PolicySettings):
     """Settings of a policy with a norm of its own."""
 
-    weight: Rows | None = None
+    weight: MatrixRows | None = None
     """W of the norm ‖v‖_W = ‖W v‖₂ by rows, n x n, invertible; the identity unless given."""
 
     @property
@@ -118,7 +118,7 @@ class WeightedSettings(PolicySettings):
 class LyapunovFunctionSettings(WeightedSettings):
     """Settings of a policy that uses a Lyapunov function of the model's closed loop."""
 
-    Q: Rows | None = None
+    Q: MatrixRows | None = None
     """Q by rows, n x n, symmetric and positive definite; the identity unless given. P solves
     AᵀP + PA = −Q of the closed loop A = Â + B̂K."""
 
@@ -159,7 +159,7 @@ class CombinedSettings(PolicySettings):
 
     rule: "AnyTrigger"
     """The rule that is combined."""
-    interval_s: Interval
+    interval_s: IntervalS
     """Time since the last event."""
 
     @field_validator("rule")
@@ -178,7 +178,7 @@ class CombinedSettings(PolicySettings):
         return self.combined(rule, nanoseconds(self.interval_s))
 
     @property
-    def weight(self) -> Rows | None:
+    def weight(self) -> MatrixRows | None:
         return self.rule.weight
 
     def at_origin(self, t_s: float) -> Self:

@@ -11,8 +11,8 @@ import numpy as np
 from pydantic import Field
 
 from noack.core.clock import NS_PER_S
-from noack.settings.section import NonNegative, Rows, require_shape
-from noack.trigger.policy_settings import Interval, ModelMatrices, WeightedSettings, nanoseconds
+from noack.settings.section import MatrixRows, NonNegative, require_shape
+from noack.trigger.policy_settings import IntervalS, ModelMatrices, WeightedSettings, nanoseconds
 from noack.trigger.trigger_rule import TriggerRule, quadratic_form
 
 
@@ -20,11 +20,11 @@ class QuadraticSettings(WeightedSettings):
     """Periodic event-triggered control: at sampling times, transmit when zᵀQz > ε, z = (x, e_s)."""
 
     policy: Literal["quadratic"]
-    Q: Rows
+    Q: MatrixRows
     """Q by rows, 2n x 2n, symmetric."""
     epsilon: NonNegative = 0.0
     """ε."""
-    period_s: Interval
+    period_s: IntervalS
     """Sampling period; a whole number of the time between measurements."""
     heartbeat: Annotated[int, Field(ge=0, le=1_000_000)] = 0
     """Transmit at the latest after this number of periods; 0: no heartbeat."""

@@ -6,7 +6,7 @@ The mixed rule without its constant; see :mod:`noack.trigger.mixed`.
 from typing import ClassVar, Literal
 
 from noack.trigger.mixed import mixed_rule
-from noack.trigger.policy_settings import ModelMatrices, Share, WeightedSettings
+from noack.trigger.policy_settings import ModelMatrices, Ratio, WeightedSettings
 from noack.trigger.trigger_rule import TriggerRule
 
 
@@ -16,7 +16,7 @@ class RelativeSettings(WeightedSettings):
     example_keys: ClassVar = {"sigma": 0.2}
 
     policy: Literal["relative"]
-    sigma: Share
+    sigma: Ratio
     """σ."""
 
     def trigger_policy(self, model: ModelMatrices) -> TriggerRule:

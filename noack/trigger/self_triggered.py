@@ -16,7 +16,7 @@ from pydantic import model_validator
 
 from noack.settings.section import NonNegative, Positive
 from noack.trigger.decaying import decaying_text
-from noack.trigger.policy_settings import Interval, ModelMatrices, WeightedSettings, nanoseconds
+from noack.trigger.policy_settings import IntervalS, ModelMatrices, WeightedSettings, nanoseconds
 from noack.trigger.trigger_rule import Forecast, TriggerRule, no_form
 
 
@@ -49,9 +49,9 @@ class SelfTriggeredSettings(WeightedSettings):
     """a."""
     disturbance_per_s: NonNegative = 0.0
     """b, in the units of ‖W x‖ per second."""
-    shortest_s: Interval
+    shortest_s: IntervalS
     """Shortest time to the next event."""
-    longest_s: Interval
+    longest_s: IntervalS
     """Longest time to the next event."""
 
     @model_validator(mode="after")

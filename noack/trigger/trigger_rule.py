@@ -29,8 +29,8 @@ from noack.core.linear_systems import Matrix, Vector
 class QuadraticForm(NamedTuple):
     """The quadratic form ‖P z‖² − ‖N z‖² of z = (x, e_s)."""
 
-    up: Matrix  # P, shape (p, 2n)
-    down: Matrix  # N, shape (q, 2n); q = 0 for none
+    positive: Matrix  # P, shape (p, 2n)
+    negative: Matrix  # N, shape (q, 2n); q = 0 for none
 
 
 class DynamicVariable(NamedTuple):
@@ -107,14 +107,14 @@ class TriggerRule(NamedTuple):
         """The threshold of ‖e_s‖_W never falls below this; None: there is no such threshold."""
         if self.forecast is not None:
             return self.forecast.floor
-        up, n = self.form.up, self.form.up.shape[1] // 2
-        compares = np.array_equal(up, error_map(n, self.weight)) and not self.grid_ns
+        positive, n = self.form.positive, self.form.positive.shape[1] // 2
+        compares = np.array_equal(positive, error_map(n, self.weight)) and not self.grid_ns
         return self.floor if compares and not self.integrates else None
 
     @property
     def earliest_ns(self) -> float:
         """The first time after an event at which the next one can happen, whatever is measured."""
-        if len(self.form.up):
+        if len(self.form.positive):
             earliest_ns = max(self.idle_ns, 0.0)
         else:  # nothing is compared
             earliest_ns = self.longest_ns if self.forecast is None else self.shortest_ns
@@ -248,20 +248,20 @@ def fill_rule(structure: CData, rule: TriggerRule, n: int, memory: CoreMemory) -
                 "disturbance_per_s": forecast.disturbance_per_s,
             },
         )
-    forms = {"": rule.form, "gain_": None if dynamic is None else dynamic.gain}
-    for prefix, form in forms.items():
-        for name in ("up", "down"):
+    forms = {"": rule.form, "_gain": None if dynamic is None else dynamic.gain}
+    for suffix, form in forms.items():
+        for name in QuadraticForm._fields:
             matrix = None if form is None else getattr(form, name)
             if matrix is not None and matrix.shape[1] != 2 * n:
                 raise ValueError(f"trigger: expected {2 * n} columns, found {matrix.shape[1]}")
-            setattr(structure, f"{prefix}{name}_rows", 0 if matrix is None else len(matrix))
+            setattr(structure, f"{name}{suffix}_rows", 0 if matrix is None else len(matrix))
             if matrix is not None and len(matrix):
-                setattr(structure, f"{prefix}{name}", memory.reals(matrix))
+                setattr(structure, f"{name}{suffix}", memory.reals(matrix))
 
 
 def rule_rows(rule: TriggerRule) -> int:
     """Return the rows of a rule's longest matrix; at least the number of states."""
-    dynamic, n = rule.dynamic_variable, rule.form.up.shape[1] // 2
+    dynamic, n = rule.dynamic_variable, rule.form.positive.shape[1] // 2
     matrices = [*rule.form, *(() if dynamic is None else dynamic.gain)]
     return int(max(n, *map(len, matrices)))
 

@@ -30,7 +30,7 @@ from noack.protocol.roles import LOOP_ROLES, RECEIVES, sender_to
 from noack.protocol.wire_format import Flow, Rejection
 from noack.runtime.address import LOOPBACK
 from noack.runtime.run_descriptor import RunDescriptor, loads
-from noack.runtime.udp_sockets import SHED
+from noack.runtime.udp_sockets import DROPPED_IN_FLOOD
 from noack.scenario.resolution import loop_of
 from tests.attacks.kinds import Plan, Sent, Target, carry_out
 from tests.helpers.two_hosts import TwoHosts
@@ -248,7 +248,7 @@ def all_are_accounted_for(run: Attacked) -> Iterator[str]:
         sent, rejected = run.sent_to(role).total(), run.channel(role)["rejected"]
         if sum(rejected.values()) != sent:
             yield f"{role}: {sent} sent, {rejected}"
-        if role == "netem" and not rejected.keys() <= {Rejection.SOURCE.value, SHED}:
+        if role == "netem" and not rejected.keys() <= {Rejection.SOURCE.value, DROPPED_IN_FLOOD}:
             yield f"the emulator verifies addresses only, {rejected}"
 
 

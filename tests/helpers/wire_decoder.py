@@ -48,7 +48,7 @@ class Decoder:
         if found == core.NOACK_ENCRYPTED:
             found = core.NOACK_BAD_TAG
             assert self._wire.seal is not None
-            content = self._wire.seal.open(datagram, wire_format.HEADER_BYTES)
+            content = self._wire.seal.decrypt(datagram, wire_format.HEADER_BYTES)
             if content is not None:
                 readable = datagram[: wire_format.HEADER_BYTES] + content + datagram[-wire_format.TAG_BYTES :]
                 found = self._examine(readable, from_peer, opened=True)

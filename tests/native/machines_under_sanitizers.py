@@ -40,12 +40,12 @@ NUMBERS_OF = {
         "fallback_ns", "fallback_sequence", "missing_ns", "measurements", "watchdog",
     ),
     "sensor": (
-        *_MACHINE, "timeout_ns", "model_ns", "knows_state", "events", "wait_ns", "rule.from_event",
+        *_MACHINE, "timeout_ns", "model_ns", "has_state", "events", "wait_ns", "rule.from_event",
         "rule.integrates", "rule.is_dynamic", "rule.forecasts", "rule.grid_ns", "rule.idle_ns",
         "rule.shortest_ns", "rule.longest_ns", "trigger.since_ns", "trigger.earliest_ns",
         "trigger.latest_ns", "trigger.measured_ns", "trigger.event_ns",
     ),
-    "controller": (*_MACHINE, "model_ns", "knows_state", "newest", "acknowledges"),
+    "controller": (*_MACHINE, "model_ns", "has_state", "newest", "acknowledges"),
 }  # fmt: skip
 """Fields that are no sizes of arrays."""
 REALS = (
@@ -218,8 +218,8 @@ def test_batches_with_impossible_numbers_or_sizes_are_refused() -> None:
             _refused(identity, trigger, {**plain, **numbers})
     for field, value in (
         ("level", -1.0), ("level", np.nan), ("rate_per_s", np.inf), ("floor", -1.0),
-        ("up_rows", 257), ("up_rows", -1), ("down_rows", 2), ("grid_ns", -1), ("shortest_ns", -1),
-        ("longest_ns", -1), ("longest_ns", 2**63 - 1), ("idle_ns", -(2**63)), ("decay_per_s", -1.0),
+        ("positive_rows", 257), ("positive_rows", -1), ("negative_rows", 2), ("grid_ns", -1),
+        ("shortest_ns", -1), ("longest_ns", -1), ("longest_ns", 2**63 - 1), ("idle_ns", -(2**63)), ("decay_per_s", -1.0),
     ):  # fmt: skip
         simulation = ExactSimulation(identity, identity, trigger, **plain)
         setattr(simulation.core.rule, field, value)

@@ -19,7 +19,7 @@ ARM = "arm-none-eabi-"
 
 
 @pytest.mark.parametrize("tools", ["", ARM], ids=["own", "board"])
-def test_the_machines_need_no_system(tools: str, tmp_path: Path) -> None:
+def test_the_machines_need_no_system_and_take_no_names_of_a_firmware(tools: str, tmp_path: Path) -> None:
     if tools and shutil.which(f"{tools}gcc") is None:
         pytest.skip("arm-none-eabi-gcc is not installed")
     compiler = {"CC": f"{tools}gcc -mcpu=cortex-m4 -mthumb -Werror"} if tools else {}
@@ -33,3 +33,9 @@ def test_the_machines_need_no_system(tools: str, tmp_path: Path) -> None:
     needed = {line.split()[-1] for line in named.stdout.splitlines()}
     assert {symbol for symbol in needed if not symbol.startswith("__aeabi_")} <= BARE | LIBM
     assert "sqrt" in needed
+    named = subprocess.run(
+        [f"{tools}nm", "-g", "--defined-only", machines], capture_output=True, text=True, check=True
+    )
+    # Other names may be a firmware's own.
+    defined = {line.split()[-1] for line in named.stdout.splitlines()}
+    assert {symbol for symbol in defined if not symbol.lower().startswith("noack_")} == set()

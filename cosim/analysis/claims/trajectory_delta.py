@@ -14,7 +14,7 @@ from cosim.record.align import aligned_parts
 from cosim.record.run_record import RunRecord
 from noack.core.linear_systems import Matrix, Propagator, spectral_abscissa
 from noack.protocol.record_tables import NO_SEQUENCE
-from noack.theory.paper import Interval, longest_interval_s, theorem_1
+from noack.theory.paper import InterEventTrajectory, longest_interval_s, theorem_1
 
 
 class _Start(NamedTuple):
@@ -80,14 +80,14 @@ def _model_decay(record: RunRecord) -> float:
     return min(record.scenario.decaying.alpha_per_s, max(-spectral_abscissa(H), 0.0))
 
 
-def _intervals(record: RunRecord, until_s: float) -> Iterator[tuple[_Start, Interval]]:
+def _intervals(record: RunRecord, until_s: float) -> Iterator[tuple[_Start, InterEventTrajectory]]:
     """Yield the trajectory from every event before ``until_s`` to the next event."""
     propagate = Propagator(record.loop.H)
 
-    def interval(t_ns: NDArray[np.int64], x: Matrix) -> Interval:
+    def interval(t_ns: NDArray[np.int64], x: Matrix) -> InterEventTrajectory:
         model = [propagate(x[0], int(age_ns)) for age_ns in t_ns - t_ns[0]]
         norms = (np.linalg.norm(states, axis=1) for states in (x, np.array(model)))
-        return Interval(np.asarray(t_ns * 1e-9), *norms)
+        return InterEventTrajectory(np.asarray(t_ns * 1e-9), *norms)
 
     start: _Start | None = None
     t_ns, x = np.zeros(0, np.int64), np.zeros((0, record.loop.n))

@@ -18,7 +18,7 @@ from cosim.simulation.exact_simulation import ROW
 from cosim.studies.campaign.metrics import METRICS, Metric
 from noack.core.errors import CallerError
 from noack.scenario import toml_file
-from noack.settings.section import NonNegative, Rows, ScenarioSection, Seed
+from noack.settings.section import MatrixRows, NonNegative, ScenarioSection, Seed
 
 MOST_POINTS = 10_000
 MOST_SERIES = 12
@@ -164,9 +164,9 @@ class Metrics(ScenarioSection):
         "certificate_used",
     )
     """Columns of the tables."""
-    Q: Rows | None = None
+    Q: MatrixRows | None = None
     """Weight of the state in the cost ∫ xᵀQx + uᵀRu dt, by rows; by default the identity."""
-    R: Rows | None = None
+    R: MatrixRows | None = None
     """Weight of the input in the cost, by rows; by default the identity."""
     settle: Annotated[FiniteFloat, Field(gt=0, lt=1)] = 0.02
     """A run has settled when ‖x‖ stays below this share of ‖x(0)‖."""

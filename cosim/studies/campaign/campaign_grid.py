@@ -26,7 +26,7 @@ from noack.scenario.link_load import require_slots
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import completed, put
-from noack.settings.section import Rows, Table, require_shape
+from noack.settings.section import MatrixRows, Table, require_shape
 
 SCENARIOS = "scenarios"
 
@@ -220,7 +220,7 @@ def _work(campaign: Campaign, scenario: Scenario) -> tuple[Work, float | None]:
     return ContinuousWork(setting, box_of(scenario), campaign.seed), certified_error(resolved)
 
 
-def _weight(rows: Rows | None, key: str, size: int, reason: str) -> Matrix | None:
+def _weight(rows: MatrixRows | None, key: str, size: int, reason: str) -> Matrix | None:
     require_shape(rows, key, (size, size), reason)
     if rows is None:
         return None

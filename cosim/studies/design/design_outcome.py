@@ -25,7 +25,7 @@ from noack.core.clock import NS_PER_S
 from noack.core.number_format import NONE, at_least, at_most
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import dumps, toml_text
-from noack.settings.section import Rows
+from noack.settings.section import MatrixRows
 
 _GROWTH_CAPTION = (
     "Growth of the worst loss pattern found, per period: a lower bound, quickly computed. Below 1 "
@@ -120,7 +120,7 @@ class DesignOutcome:
         return dumps(self.scenario.model_copy(update={"name": name, "description": description}))
 
 
-def gain_text(K: Rows) -> str:
+def gain_text(K: MatrixRows) -> str:
     """Return a gain as lines of text."""
     return "\n".join(" ".join(f"{entry:.6g}" for entry in row) for row in K)
 

@@ -19,7 +19,7 @@ from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.core.number_format import to_digits
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
-from noack.settings.section import Rows
+from noack.settings.section import MatrixRows
 from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.certificates.trigger_weight import choose_weight
@@ -186,7 +186,7 @@ def _with_regulators(scenario: Scenario, Q: Matrix, R: Matrix) -> list[tuple[str
     return scenarios
 
 
-def round_gain(K: Matrix) -> Rows:
+def round_gain(K: Matrix) -> MatrixRows:
     """Return a gain with six digits: what is certified is what is printed."""
     return tuple(tuple(to_digits(entry, 6) for entry in row) for row in K.tolist())
 

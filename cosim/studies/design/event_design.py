@@ -42,7 +42,7 @@ from noack.core.linear_systems import Vector, spectral_abscissa
 from noack.core.number_format import NONE, at_most, to_digits
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
-from noack.settings.section import Rows, rows_of
+from noack.settings.section import MatrixRows, rows_of
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import nominal_conditions
 from noack.theory.certificates.scenario_certificates import certify, certify_box, outside_box
@@ -59,7 +59,7 @@ _MOST_M = 1000
 class EventLoop(NamedTuple):
     """A gain and a threshold."""
 
-    K: Rows
+    K: MatrixRows
     alpha_per_s: float
     beta: float
 

@@ -32,7 +32,7 @@ from noack.impairments.constraints.at_most import AtMost
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
-from noack.settings.section import Rows, rows_of
+from noack.settings.section import MatrixRows, rows_of
 from noack.theory.margins.loss_margin import LossMargin, Stability, capped, list_bursts, uncapped
 from noack.theory.margins.scenario_times import without_timeout
 from noack.theory.margins.time_triggered_loop import LoopTimes
@@ -56,7 +56,7 @@ class GainCandidate(NamedTuple):
     """A gain and what the controller does between updates."""
 
     hold: Hold
-    K: Rows
+    K: MatrixRows
 
 
 class Requirement(NamedTuple):

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from cosim.studies.new_loop.plant_reference import PlantReference, plant_reference
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, norm
-from noack.core.number_format import Rows, as_text, to_digits
+from noack.core.number_format import TextRows, as_text, to_digits
 from noack.plants.fmu import unpacked_once
 from noack.plants.systems.linearisation import LinearMotion, largest_errors
 from noack.plants.systems.linearisation import linearise as linear_motion
@@ -430,7 +430,7 @@ def model_or_gain(plant: str, settings: ReadTable) -> LinearModel | LoopGain:
 
 def _matrix_text(name: str, matrix: Matrix, rows: Sequence[str], columns: Sequence[str]) -> str:
     entries = ([f"{value:.6g}" for value in row] for row in matrix)
-    table: Rows = [[name, *columns], *([row, *cells] for row, cells in zip(rows, entries, strict=True))]
+    table: TextRows = [[name, *columns], *([row, *cells] for row, cells in zip(rows, entries, strict=True))]
     return as_text(table)
 
 

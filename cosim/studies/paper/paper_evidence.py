@@ -32,7 +32,7 @@ from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import Constants
 from noack.theory.certificates.conditions import ideal_conditions
 from noack.theory.certificates.scenario_certificates import certify
-from noack.theory.paper import Interval, longest_interval_s, theorem_1, theorem_2
+from noack.theory.paper import InterEventTrajectory, longest_interval_s, theorem_1, theorem_2
 from noack.trigger.trigger_rule import TriggerRule, error_form
 
 Numbers = dict[str, object]
@@ -365,7 +365,9 @@ def _longest_s(run: ContinuousRun, event: int) -> float:
     trigger = run.system.decaying
     t_s = np.linspace(run.event_s[event], run.event_s[event + 1], _SAMPLES)
     samples = run.system.sample(run.after[event], t_s)
-    interval = Interval(t_s, np.linalg.norm(samples.x, axis=1), np.linalg.norm(samples.x_s, axis=1))
+    interval = InterEventTrajectory(
+        t_s, np.linalg.norm(samples.x, axis=1), np.linalg.norm(samples.x_s, axis=1)
+    )
     return longest_interval_s(interval, trigger.level, trigger.rate_per_s, trigger.rate_per_s)
 
 

@@ -97,7 +97,7 @@ _SAMPLES = list_of(OWN_TIME_S, "delays in s, ms, us or ns, e.g. 1ms,2ms,10ms")
 _DelayS = Annotated[FiniteFloat, Field(ge=0, le=MOST_DELAY_S)]
 _Samples = Annotated[
     tuple[Annotated[FiniteFloat, Field(ge=-MOST_DELAY_S, le=MOST_DELAY_S)], ...],
-    Field(min_length=2, max_length=1_000_000),
+    Field(min_length=2, max_length=MAX_SAMPLES),
 ]
 
 

@@ -7,7 +7,7 @@ from typing import ClassVar, Literal, Self
 from noack.impairments.clauses import Clause, Word
 from noack.impairments.feature import Impairment, Stage, StageTables
 from noack.impairments.loss_models import LOSS_MODELS, Loss
-from noack.impairments.markov_chain import Chain, Pattern
+from noack.impairments.markov_chain import Chain, PeriodicLosses
 from noack.impairments.words import WordReader
 from noack.settings.section import Table
 
@@ -60,7 +60,7 @@ class LossOf(Impairment):
     def stage(self, tables: StageTables) -> Stage | None:
         return self.loss.stage(tables)
 
-    def chains(self) -> Sequence[Chain | Pattern]:
+    def chains(self) -> Sequence[Chain | PeriodicLosses]:
         return self.loss.chains()
 
     def without_files(self, folder: Path, place: str) -> Self:

@@ -23,7 +23,7 @@ from noack.impairments.feature import (
     offset_ns,
     require_inside,
 )
-from noack.impairments.markov_chain import NotPredictableError, Pattern
+from noack.impairments.markov_chain import NotPredictableError, PeriodicLosses
 from noack.impairments.words import OWN_TIME_NS, PERCENT, Quantity, brief_number, brief_percent, time_ns_text
 from noack.settings.section import Probability
 from noack.settings.user_files import NamedFile
@@ -187,7 +187,7 @@ class Replay(FileFeature, Impairment):
             applied_ns.append(latest_ns if delay_ns >= 0 else -1 - latest_ns)
         return applied_ns
 
-    def chains(self) -> Sequence[Pattern]:
+    def chains(self) -> Sequence[PeriodicLosses]:
         self.require_content(NotPredictableError)
         if not self._loses:
             return ()
@@ -195,7 +195,7 @@ class Replay(FileFeature, Impairment):
             raise NotPredictableError("recorded losses by time depend on when packets arrive")
         if not self.repeat:
             raise NotPredictableError("a trace that is replayed once has no long-run loss rate")
-        return (Pattern(np.array(self.delays_ns) < 0),)
+        return (PeriodicLosses(np.array(self.delays_ns) < 0),)
 
     def read_file(self, file: NamedFile) -> Self:
         path = find_trace(file.name, file.folder, file.named)

@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from noack.impairments.clauses import Clause, Part
 from noack.impairments.feature import LossModel, Stage, StageTables
-from noack.impairments.markov_chain import LONGEST_PATTERN, Pattern, pattern
+from noack.impairments.markov_chain import LONGEST_PATTERN, PeriodicLosses, pattern
 from noack.impairments.words import COUNT, Quantity
 
 
@@ -55,6 +55,6 @@ class PeriodicLoss(LossModel):
     def stage(self, tables: StageTables) -> Stage:
         return Stage(self.model, self.model_dump(exclude={"model"}))
 
-    def chains(self) -> Sequence[Pattern]:
+    def chains(self) -> Sequence[PeriodicLosses]:
         lost = range(self.first, self.first + min(self.burst, LONGEST_PATTERN))
         return (pattern(self.period, (number % self.period for number in lost)),)

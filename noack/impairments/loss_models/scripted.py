@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from noack.impairments.clauses import Clause, Part
 from noack.impairments.feature import LossModel, Stage, StageTables, add_numbers
-from noack.impairments.markov_chain import NotPredictableError, Pattern, pattern
+from noack.impairments.markov_chain import NotPredictableError, PeriodicLosses, pattern
 from noack.impairments.words import COUNT, Quantity, list_of
 
 MAX_SCRIPT = 10_000_000
@@ -56,7 +56,7 @@ class ScriptedLoss(LossModel):
         begin, end = add_numbers(tables.integers, self.lost)
         return Stage(self.model, {"period": self.repeat_every, "begin": begin, "end": end})
 
-    def chains(self) -> Sequence[Pattern]:
+    def chains(self) -> Sequence[PeriodicLosses]:
         if not self.repeat_every:
             raise NotPredictableError(
                 "a script that is played once loses the same packets however long a flow is"

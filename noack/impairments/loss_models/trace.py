@@ -9,7 +9,7 @@ from pydantic import Field
 from noack.impairments.clauses import Clause, file_name, flag
 from noack.impairments.feature import FileFeature, LossModel, StageTables
 from noack.impairments.loss_models.scripted import MAX_SCRIPT, ScriptedLoss
-from noack.impairments.markov_chain import NotPredictableError, Pattern
+from noack.impairments.markov_chain import NotPredictableError, PeriodicLosses
 from noack.settings.user_files import NamedFile
 
 _SPACES = b" \t\r\n\v\f"
@@ -40,7 +40,7 @@ class TraceLoss(FileFeature, LossModel):
     def stage(self, tables: StageTables) -> None:
         self.require_content()
 
-    def chains(self) -> Sequence[Pattern]:
+    def chains(self) -> Sequence[PeriodicLosses]:
         self.require_content(NotPredictableError)
         return ()
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from noack.impairments.clauses import Clause
 from noack.impairments.feature import LossModel, Stage, StageTables
-from noack.impairments.markov_chain import Pattern
+from noack.impairments.markov_chain import PeriodicLosses
 
 
 class WorstCaseLoss(LossModel):
@@ -24,5 +24,5 @@ class WorstCaseLoss(LossModel):
     def stage(self, tables: StageTables) -> Stage:
         return Stage(self.model, {})
 
-    def chains(self) -> Sequence[Pattern]:
-        return (Pattern(np.ones(1, bool)),)
+    def chains(self) -> Sequence[PeriodicLosses]:
+        return (PeriodicLosses(np.ones(1, bool)),)

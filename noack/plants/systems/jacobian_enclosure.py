@@ -137,7 +137,7 @@ class Enclosed:
             return NotImplemented
         return not (self < other or self > other)
 
-    __hash__ = None  # type: ignore[assignment] # as for every mutable number
+    __hash__ = None  # type: ignore[assignment] # == may be undecided, so no hash agrees with it
 
     def __bool__(self) -> bool:
         return not self == 0  # noqa: SIM201 # __ne__ would be another comparison

@@ -26,7 +26,7 @@ DONE = 0
 TOO_MANY_STEPS = -2
 TOO_SMALL_STEPS = -3
 """Status codes, those of scipy's "dopri5"."""
-_MAX_STEPS = 10_000
+MAX_STEPS = 10_000
 _MAX_JUMPS = 64
 """Number of changes that are located in a call. After them the error control alone handles the
 jumps, since a value may change its sign infinitely often."""
@@ -106,7 +106,7 @@ def advance(
         work.signs[k] = np.sign(work.values[k])
     left_s, step_s, smallest_s, jumps = duration_s, duration_s, _SMALLEST * duration_s, 0
     copy(work.values, work.start)
-    for _ in range(_MAX_STEPS):
+    for _ in range(MAX_STEPS):
         if left_s <= smallest_s:
             return DONE
         step_s = min(step_s, left_s)

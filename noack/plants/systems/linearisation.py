@@ -167,16 +167,23 @@ def _by_motion(system_at: SystemAt, x0: Vector, u0: Vector, settling_s: float, s
         return without(NO_STATE)
     if np.abs(np.linalg.eigvals(step)).min() < _FORGOTTEN:
         return without(NO_LOGARITHM)
-    with warnings.catch_warnings(action="ignore"):  # the result is checked next
+    logarithm = _logarithm(step)
+    if logarithm is None:
+        return without(NO_LOGARITHM)
+    generator = logarithm / (step_ns * 1e-9)
+    return LinearMotion(generator[:n, :n], generator[:n, n:], drift, "motion")
+
+
+def _logarithm(step: Matrix) -> Matrix | None:
+    """Return the real logarithm of a matrix; None: there is none, or it is too inexact."""
+    with warnings.catch_warnings(action="ignore"):  # the result is checked
         from scipy.linalg import expm, logm  # takes 0.2 s: linear plants do not need it
 
-        generator = np.real(logm(step))
-        if not np.isfinite(generator).all():
-            return without(NO_LOGARITHM)
-        if np.abs(expm(generator) - step).max() > _LOGARITHM * np.abs(step).max():
-            return without(NO_LOGARITHM)
-    generator /= step_ns * 1e-9
-    return LinearMotion(generator[:n, :n], generator[:n, n:], drift, "motion")
+        logarithm = np.asarray(np.real(logm(step)))
+        if not np.isfinite(logarithm).all():
+            return None
+        is_inexact = np.abs(expm(logarithm) - step).max() > _LOGARITHM * np.abs(step).max()
+    return None if is_inexact else logarithm
 
 
 def largest_errors(

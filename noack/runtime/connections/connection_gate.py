@@ -52,7 +52,7 @@ def accepting(
     *,
     name: str,
     linger_s: float = 0.0,
-    patience_s: float | None = None,
+    longest_wait_s: float | None = None,
 ) -> Iterator[asyncio.AbstractEventLoop]:
     """Accept connections on a thread meanwhile, and yield its event loop; at the end, end all.
 
@@ -62,7 +62,7 @@ def accepting(
         first: what a connection must send before; None: it is served at once.
         name: of the thread.
         linger_s: at the end, how long connections that are served may go on.
-        patience_s: longest wait at the end for a task that computes; None: no limit.
+        longest_wait_s: longest wait at the end for a task that computes; None: no limit.
     """
     listening.setblocking(False)
     loop = asyncio.new_event_loop()
@@ -73,7 +73,7 @@ def accepting(
         yield loop
     finally:
         loop.call_soon_threadsafe(loop.stop)
-        thread.join(patience_s)
+        thread.join(longest_wait_s)
 
 
 class TaskLimit:
@@ -103,9 +103,9 @@ class TaskLimit:
             self._hosts.pop(task, None)
 
     def _end_one(self) -> None:
-        crowd = Counter(self._hosts.values()).most_common(1)[0][0]
+        busiest_host = Counter(self._hosts.values()).most_common(1)[0][0]
         order = reversed(self._hosts) if self._end_newest else iter(self._hosts)
-        task = next(task for task in order if self._hosts[task] == crowd)
+        task = next(task for task in order if self._hosts[task] == busiest_host)
         del self._hosts[task]
         task.cancel()
 

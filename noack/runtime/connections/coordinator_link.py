@@ -62,7 +62,7 @@ OpenTarget = Callable[[], Awaitable[Streams]]
 _FOLDER = "links"
 _OPEN_S = 4.0
 """Longest time for a connection with the coordinator."""
-_PATIENCE_S = 10.0
+_LONGEST_WAIT_S = 10.0
 """Time within which the first connection is tried again."""
 _LINGER_S = 5.0
 """Longest time for which the program, at the end, sends what it has received."""
@@ -395,7 +395,7 @@ def _main() -> None:
 
 async def _connect_patiently(destination: Destination) -> Streams:
     """Connect with the coordinator; try again while that may succeed later."""
-    until_s = time.monotonic() + _PATIENCE_S
+    until_s = time.monotonic() + _LONGEST_WAIT_S
     while True:
         try:
             return await connect(destination)

@@ -77,7 +77,7 @@ def metrics_server(host_port: str, collect: "Callable[[], Iterable[Metric]]") ->
     first = FirstBytes(_is_complete, _MOST_REQUEST_BYTES, _REQUEST_S, _WRONG, _BUSY)
     with (
         _listening(address) as listening,
-        accepting(listening, answer, first, name="metrics", patience_s=_END_S),
+        accepting(listening, answer, first, name="metrics", longest_wait_s=_END_S),
     ):
         yield listening.getsockname()[:2]
 

@@ -231,7 +231,7 @@ class LiveDriver:
         driver, seal = self.core, self._wire.seal
         assert seal is not None
         memory = ffi.buffer(driver.datagram, driver.datagram_bytes)
-        vector = seal.open(bytes(memory), HEADER_BYTES)
+        vector = seal.decrypt(bytes(memory), HEADER_BYTES)
         if vector is not None:
             memory[HEADER_BYTES : HEADER_BYTES + len(vector)] = vector
         driver.opened = core.NOACK_NOT_AUTHENTIC if vector is None else core.NOACK_OPENED
@@ -241,7 +241,7 @@ class LiveDriver:
         driver, seal = self.core, self._wire.seal
         assert seal is not None
         memory = ffi.buffer(driver.datagram, driver.datagram_bytes)
-        memory[:] = seal.close(bytes(memory[:HEADER_BYTES]), bytes(memory[HEADER_BYTES:-TAG_BYTES]))
+        memory[:] = seal.encrypt(bytes(memory[:HEADER_BYTES]), bytes(memory[HEADER_BYTES:-TAG_BYTES]))
 
 
 class LoopChannel(CountingSocket):
@@ -293,8 +293,8 @@ class LoopChannel(CountingSocket):
         driver, driver_core = self._driver, self._driver.core
         for peer, address in zip(driver_core.sources, self._expected, strict=False):
             self.count_received(address, peer.received)
-        self._sources.add_others(driver_core.foreign)
-        driver_core.foreign = 0
+        self._sources.add_others(driver_core.unknown_source)
+        driver_core.unknown_source = 0
         rejected = {reason.value: n for reason, n in driver.rejected.items()}
         return super().report() | {
             "sent": driver_core.sent,

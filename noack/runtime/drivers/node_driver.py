@@ -36,7 +36,7 @@ from noack.runtime.run_process import RunProcess
 from noack.settings.user_files import unchanged
 
 _PR_SET_PDEATHSIG = 1
-_PATIENCE_S = 10.0
+_LONGEST_WAIT_S = 10.0
 """Longest wait for the program's first line, and for its end."""
 _STUCK_S = 1.0
 """A program that is late has stopped its ticks if the last one came longer ago than this."""
@@ -48,7 +48,7 @@ _LOOK_S = 0.05
 _ROWS = (core.NOACK_TICKS, core.NOACK_MESSAGES)
 _COPIED = (
     *("has_point", "acknowledges", "predictions", "carries_model", "timeout_ns", "holds_input"),
-    *("model_ns", "knows_state", "newest"),
+    *("model_ns", "has_state", "newest"),
 )
 _HEAD = struct.Struct("<qq")
 _GREETING = f"noack node {core.NOACK_NODE_VERSION} {ffi.sizeof('noack_node_settings')}"
@@ -79,7 +79,7 @@ class NodeDriver(LiveDriver):
         self._key, self._sockets = process.descriptor.key, list[socket.socket]()
         self._clock, self._sent_clock = RunClock(0), b""
         self._to_send, self._received = bytearray(), bytearray()
-        self._foreign, self._tick_s = 0, time.monotonic()
+        self._unknown_source, self._tick_s = 0, time.monotonic()
         self._is_closed = False
         tables = machines.core.tables
         rows = {kind: tables[kind].row_bytes - core.NOACK_LOOP_BYTES for kind in _ROWS}
@@ -126,7 +126,7 @@ class NodeDriver(LiveDriver):
         return self
 
     def _first_line(self) -> bytes:
-        line, until_s = b"", time.monotonic() + _PATIENCE_S
+        line, until_s = b"", time.monotonic() + _LONGEST_WAIT_S
         with suppress(TimeoutError):
             while not line.endswith(b"\n") and len(line) < _GREETING_BYTES:
                 self._own.settimeout(max(until_s - time.monotonic(), 1e-6))
@@ -204,7 +204,7 @@ class NodeDriver(LiveDriver):
         """Pass the program a datagram that Python has received."""
         from_peer = source[:2] == self._source
         if not from_peer:
-            self.core.foreign += 1
+            self.core.unknown_source += 1
         self._queue_message(core.NOACK_NODE_DATAGRAM, struct.pack("<q", from_peer) + data)
 
     def finish(self, sink: RecordSink) -> None:
@@ -213,7 +213,7 @@ class NodeDriver(LiveDriver):
         Raise PeerError if it does not end, or fails, or has stopped its ticks before the horizon.
         """
         began_s, now_ns, goes_on = time.monotonic(), self._clock.now_ns(), True
-        until_s = began_s + _PATIENCE_S
+        until_s = began_s + _LONGEST_WAIT_S
         while goes_on and (wait_s := until_s - time.monotonic()) > 0:
             if not self._to_send:
                 with suppress(OSError):  # it has ended
@@ -287,8 +287,8 @@ class NodeDriver(LiveDriver):
         elif kind == core.NOACK_NODE_COUNTS:
             counts = ffi.from_buffer("noack_node_counts *", content)
             driver.sent, driver.sources[0].received = counts.sent, counts.received
-            driver.foreign += counts.foreign - self._foreign
-            self._foreign = counts.foreign
+            driver.unknown_source += counts.unknown_source - self._unknown_source
+            self._unknown_source = counts.unknown_source
             machine.received.accepted = counts.accepted
             machine.received.rejected = counts.rejected
         else:
@@ -309,11 +309,11 @@ class NodeDriver(LiveDriver):
     def _how_it_ended(self) -> str:
         """Return how; or that it has not, after its stream has ended or after a wait for it."""
         try:
-            code = self._program.wait(_PATIENCE_S if self._is_closed else 0.0)
+            code = self._program.wait(_LONGEST_WAIT_S if self._is_closed else 0.0)
         except subprocess.TimeoutExpired:
             if self._is_closed:
                 return "the program has closed its stream, but has not ended"
-            return f"the program has not answered for {_PATIENCE_S:g} s"
+            return f"the program has not answered for {_LONGEST_WAIT_S:g} s"
         end = f"exit status {code}"
         if code < 0:  # real-time signals have no names
             names = {number.value: number.name for number in signal.Signals}

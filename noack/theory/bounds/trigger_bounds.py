@@ -71,12 +71,12 @@ def comparison_bound(rule: TriggerRule, weight: Matrix) -> ComparisonBound | Non
     """
     if rule.from_event or rule.dynamic_variable is not None:
         return None
-    n, (up, down) = len(weight), rule.form
-    if not len(up):
+    n, (positive, negative) = len(weight), rule.form
+    if not len(positive):
         return None
-    if up[:, :n].any() or down[:, n:].any():
+    if positive[:, :n].any() or negative[:, n:].any():
         return _of_mixed_form(rule.form, weight)
-    P, N = up[:, n:], down[:, :n]
+    P, N = positive[:, n:], negative[:, :n]
     if np.array_equal(P, weight):
         return ComparisonBound(1.0, (N,) if N.any() else (), 1.0, bool(N.any()))
     if not _is_definite(P.T @ P, 1.0):
@@ -89,8 +89,8 @@ def comparison_bound(rule: TriggerRule, weight: Matrix) -> ComparisonBound | Non
 def _of_mixed_form(form: QuadraticForm, weight: Matrix) -> ComparisonBound | None:
     """Return the bound of a form that compares e_s together with x."""
     n = len(weight)
-    Q = form.up.T @ form.up - form.down.T @ form.down
-    size_of_Q = float(np.linalg.norm(form.up, 2) ** 2 + np.linalg.norm(form.down, 2) ** 2)
+    Q = form.positive.T @ form.positive - form.negative.T @ form.negative
+    size_of_Q = float(np.linalg.norm(form.positive, 2) ** 2 + np.linalg.norm(form.negative, 2) ** 2)
     if not _is_definite(Q[n:, n:], size_of_Q):
         return None
     J = np.linalg.solve(Q[n:, n:], Q[n:, :n])

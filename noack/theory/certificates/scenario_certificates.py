@@ -15,7 +15,7 @@ import numpy as np
 from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.scenario.resolution import loop_of, rule_of
 from noack.scenario.scenario import Scenario
-from noack.settings.section import Rows
+from noack.settings.section import MatrixRows
 from noack.theory.bounds.box import BoxGains
 from noack.theory.bounds.certificate_terms import (
     CertificatePart,
@@ -116,7 +116,7 @@ def outside_box(resolved: Scenario) -> str | None:
     return None
 
 
-def _halfwidth(rows: Rows | None, matrix: Matrix) -> Matrix:
+def _halfwidth(rows: MatrixRows | None, matrix: Matrix) -> Matrix:
     return np.zeros_like(matrix) if rows is None else np.array(rows)
 
 

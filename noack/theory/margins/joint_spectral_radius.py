@@ -28,8 +28,8 @@ from noack.theory.margins.quadratic_norms import (
     NormSearch,
     norms_above,
     number_of_entries,
-    remembering,
     representatives,
+    with_history,
 )
 from noack.theory.margins.switched_system import (
     Cycle,
@@ -151,11 +151,11 @@ class _Enclosure:
         return _best_cycle(self._system, self._balanced, _LONG_SEARCH)
 
     @cached_property
-    def _remembering(self) -> SwitchedSystem:
+    def _with_history(self) -> SwitchedSystem:
         """The same system with more nodes, if they are not too many for the search for norms."""
         reaching = int(np.bincount(self._system.graph.targets).max())
         for classes in (_REMEMBERED,) if self._is_large else (reaching, _REMEMBERED):
-            system = remembering(self._system, classes)
+            system = with_history(self._system, classes)
             if number_of_entries(system) <= FEW_ENTRIES:
                 return system
         return self._system
@@ -165,7 +165,7 @@ class _Enclosure:
         if remembers not in self._searches:
             system, entries = self._system, FEW_ENTRIES
             if remembers:
-                system, entries = self._remembering, MOST_ENTRIES
+                system, entries = self._with_history, MOST_ENTRIES
             self._searches[remembers] = NormSearch(system, entries)
         return self._searches[remembers]
 

@@ -7,7 +7,7 @@ c log γ + Σ tr P_v − Σ log det F is made small by Newton's method, for larg
 
 The bound is computed from the norms with all rounding, so it does not depend on the search. It may
 stay above the joint spectral radius. Then there are more norms if the nodes also remember the last
-edges (:func:`remembering`), or products of several steps are shorter than γ^duration
+edges (:func:`with_history`), or products of several steps are shorter than γ^duration
 (:func:`~noack.theory.margins.joint_spectral_radius.bound_by_products`).
 """
 
@@ -253,7 +253,7 @@ def _symmetric_basis(n: int) -> Matrix:
     return basis
 
 
-def remembering(system: SwitchedSystem, classes: int) -> SwitchedSystem:
+def with_history(system: SwitchedSystem, classes: int) -> SwitchedSystem:
     """Return the same system with nodes that also remember the class of the last edge.
 
     The classes have equal numbers of edges, in the order of the edges. More norms give a smaller

@@ -112,7 +112,7 @@ def almost_sure_growth(delivered: IntervalMatrix, lost: IntervalMatrix, outcomes
         if present > _SHORT and best > _CLOSE:
             break
         try:
-            best = min(best, _Tilts(maps, _remembering(recurrent, present, before)).bound())
+            best = min(best, _TiltedBound(maps, _with_history(recurrent, present, before)).bound())
         except NotPredictableError:
             if best == math.inf:
                 raise
@@ -122,7 +122,7 @@ def almost_sure_growth(delivered: IntervalMatrix, lost: IntervalMatrix, outcomes
     return best
 
 
-def _remembering(chain: OutcomeChain, present: int, before: int) -> OutcomeChain:
+def _with_history(chain: OutcomeChain, present: int, before: int) -> OutcomeChain:
     """Return the chain whose states know the lengths of two bursts up to these numbers."""
     count = (present + 1) * (before + 1)
     places = np.arange(count)
@@ -134,7 +134,7 @@ def _remembering(chain: OutcomeChain, present: int, before: int) -> OutcomeChain
     return OutcomeChain(np.asarray(lost, np.float64), np.asarray(delivered, np.float64)).recurrent()
 
 
-class _Tilts:
+class _TiltedBound:
     """The bound as a function of s, by which the probabilities of the steps are tilted, and its minimum."""
 
     def __init__(self, maps: PeriodMaps, chain: OutcomeChain) -> None:
@@ -196,8 +196,8 @@ class _Tilts:
                 break
             before = radius
         self._forward, self._backward = X, Y
-        is_delivered, source, target = self._steps
-        M = self._matrices[is_delivered]
+        is_lost, source, target = self._steps
+        M = self._matrices[is_lost]
         weights = chances[self._steps] * np.einsum(
             "eab,eab->e", Y[target], M @ X[source] @ M.transpose(0, 2, 1)
         )

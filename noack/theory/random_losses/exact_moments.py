@@ -14,7 +14,7 @@ the cost between the samples.
 
 A period is composed of intervals (:class:`MomentStep`). Over an interval, x becomes M x + w with the
 covariance W of w, and the cost ∫ xᵀFx dt of a form F has the mean xᵀCx + c for a given x. A flow of
-a length t (:func:`flow`), ẋ = G x with white noise of intensity R, has
+a length t (:func:`propagation`), ẋ = G x with white noise of intensity R, has
 
     M = e^{Gt}, W = ∫₀ᵗ e^{Gs} R e^{Gᵀs} ds, C = ∫₀ᵗ e^{Gᵀs} F e^{Gs} ds,
     c = ∫₀ᵗ (t − s) trace(R e^{Gᵀs} F e^{Gs}) ds.
@@ -86,8 +86,8 @@ class MomentStep(NamedTuple):
         return MomentStep(M, W, C, self.constants)
 
 
-def flow(generator: Matrix, intensity: Matrix, forms: Stack, duration_s: float) -> MomentStep:
-    """Return the flow of ẋ = G x + white noise.
+def propagation(generator: Matrix, intensity: Matrix, forms: Stack, duration_s: float) -> MomentStep:
+    """Return the propagation by ẋ = G x + white noise.
 
     Args:
         generator: G, (S, S).
@@ -156,11 +156,11 @@ class LoopPeriods:
         tick = jump(np.vstack([x, x_c, u, loop.K @ x_c, d, s]), count)
 
         def flow_of(dt_ns: int) -> MomentStep:
-            return flow(generator, 0 * generator, forms, dt_ns / NS_PER_S)
+            return propagation(generator, 0 * generator, forms, dt_ns / NS_PER_S)
 
         self._between = Timeline(times, flow_of, latch, tick, tick).between
         self._send = jump(np.vstack([x, x_c, u, w, d, x]), count, s.T @ noise @ s)
-        during_delay = flow(loop.H, 0 * loop.H, np.zeros((0, n, n)), times.delay_ns / NS_PER_S).matrix
+        during_delay = propagation(loop.H, 0 * loop.H, np.zeros((0, n, n)), times.delay_ns / NS_PER_S).matrix
         self._receive = jump(np.vstack([x, during_delay @ s, u, w, d, s]), count)
 
     def step(self, slot: int, delivered: bool, duration_ns: int | None = None) -> MomentStep:

@@ -128,10 +128,10 @@ def check_events(run: ContinuousRun, setting: Setting) -> int:
     for state, begin_s, end_s in pieces(run):
         level, since_s = rule.level, 0.0
         if rule.from_event:
-            level, since_s = float(np.linalg.norm(rule.form.up[:, :n] @ state.x)), begin_s
+            level, since_s = float(np.linalg.norm(rule.form.positive[:, :n] @ state.x)), begin_s
 
         def flow(t_s: float, y: Vector) -> Vector:
-            rate = float(np.linalg.norm(rule.form.up @ y[: 2 * n])) if rule.integrates else 0.0
+            rate = float(np.linalg.norm(rule.form.positive @ y[: 2 * n])) if rule.integrates else 0.0
             if dynamic is not None:
                 rate = value_of(dynamic.gain, y[: 2 * n]) - dynamic.decay_per_s * y[-1]
             return np.append(G @ y[:-1], rate)
@@ -146,13 +146,13 @@ def check_events(run: ContinuousRun, setting: Setting) -> int:
         start = np.concatenate([*state[1:], [0.0 if rule.integrates else eta]])
         solved = solve_ivp(flow, (begin_s, end_s), start, "DOP853", rtol=1e-11, atol=1e-14, dense_output=True)
         from_s = begin_s + max(rule.idle_ns * 1e-9, 0.0)
-        if len(rule.form.up) and not rule.grid_ns and from_s < end_s - 1e-6:
+        if len(rule.form.positive) and not rule.grid_ns and from_s < end_s - 1e-6:
             inside = np.linspace(from_s, end_s, 203)[1:-1]
             largest = max(excess(t_s, solved.sol(t_s)) for t_s in inside[inside < end_s - 1e-7])
             assert largest <= 1e-8
             checked += 1
         eta = float(solved.y[-1, -1])
-        compares = len(rule.form.up) > 0 and not rule.grid_ns
+        compares = len(rule.form.positive) > 0 and not rule.grid_ns
         due = abs(end_s - begin_s - rule.longest_ns * 1e-9) < 1e-9
         if compares and end_s in run.event_s and not due and end_s > from_s + 1e-9:
             assert abs(excess(end_s, solved.y[:, -1])) <= 1e-7
@@ -161,8 +161,8 @@ def check_events(run: ContinuousRun, setting: Setting) -> int:
 
 def value_of(form: QuadraticForm, z: Vector) -> float:
     """‖P z‖² − ‖N z‖²."""
-    up, down = form.up @ z, form.down @ z
-    return float(up @ up - down @ down)
+    positive, negative = form.positive @ z, form.negative @ z
+    return float(positive @ positive - negative @ negative)
 
 
 def pieces(run: ContinuousRun) -> list[tuple[Any, float, float]]:

@@ -60,13 +60,13 @@ def test_the_predictive_controller_solves_its_quadratic_programme(x: tuple[float
     law = example("model_predictive", "ModelPredictive", 0.05, horizon=30, **limits)
     x0 = np.array(x)
     bound = {"type": "ineq", "fun": lambda z: law.h - np.abs(law.G @ z + law.E @ x0)}
-    found = minimize(
+    optimum = minimize(
         lambda z: 0.5 * z @ law.P @ z + (law.F @ x0) @ z, np.zeros(30), method="SLSQP",
         jac=lambda z: law.P @ z + law.F @ x0, constraints=[bound],
         options={"ftol": 1e-13, "maxiter": 1000},
     )  # fmt: skip
-    assert found.success
-    np.testing.assert_allclose(law.solve(x0), found.x, atol=1e-4)
+    assert optimum.success
+    np.testing.assert_allclose(law.solve(x0), optimum.x, atol=1e-4)
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
@@ -128,7 +128,7 @@ def test_the_safe_input_is_sent_after_a_control_law_fails(
     methods: dict[str, str], message: str, tmp_path: Path
 ) -> None:
     record = run_of(tmp_path, **methods)
-    (notice,) = [one for one in record.notices if one["level"] == "failed"]
+    (notice,) = [notice for notice in record.notices if notice["level"] == "failed"]
     assert notice["text"].startswith('controller.name = "Law": ')
     assert message in notice["text"]
     assert set(record[CONTROLLER_STEP]["u"][:, 0]) <= {0.0, 0.25}

@@ -24,7 +24,7 @@ def test_a_folder_and_a_fifo_are_not_replaced(tmp_path: Path) -> None:
         with pytest.raises(MachineError, match="cannot be written: not a regular file"):
             write_whole(path, "text")
     assert stat.S_ISFIFO(fifo.stat().st_mode)
-    assert [one.name for one in tmp_path.iterdir()] == ["fifo"]
+    assert [path.name for path in tmp_path.iterdir()] == ["fifo"]
 
 
 @pytest.mark.parametrize("name", ["a\0b", "n" * 300, "\udcff\0"])
@@ -45,7 +45,7 @@ def test_a_failure_keeps_the_old_file_and_leaves_no_new_one(tmp_path: Path) -> N
     with pytest.raises(KeyboardInterrupt):
         interrupted()
     assert path.read_text() == "old"
-    assert [one.name for one in tmp_path.iterdir()] == ["a.txt"]
+    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
 
 
 # --- limits of a process --------------------------------------------------------------------------
@@ -75,9 +75,9 @@ def test_a_run_names_a_limit_that_is_too_low(tmp_path: Path, command: str) -> No
     ],
 )
 def test_errors_of_a_limit_are_told_from_others(error: Exception, line: str | None) -> None:
-    found = exhausted_limit(error)
-    assert (found is None) == (line is None)
-    assert (found or "").startswith(line or "")
+    limit = exhausted_limit(error)
+    assert (limit is None) == (line is None)
+    assert (limit or "").startswith(line or "")
 
 
 # --- lines of errors ------------------------------------------------------------------------------

@@ -118,9 +118,9 @@ def test_lyapunov_equations_are_solved(n: int) -> None:
     rng = np.random.default_rng(n)
     M = rng.uniform(-1, 1, (n, n)) - 3 * np.eye(n)
     Q = rng.uniform(-1, 1, (n, n))
-    found = solve_lyapunov(M, Q)
-    assert M @ found + found @ M.T == pytest.approx(Q, abs=1e-12)
-    assert found == pytest.approx(solve_continuous_lyapunov(M, Q), abs=1e-12)
+    solution = solve_lyapunov(M, Q)
+    assert M @ solution + solution @ M.T == pytest.approx(Q, abs=1e-12)
+    assert solution == pytest.approx(solve_continuous_lyapunov(M, Q), abs=1e-12)
 
 
 def test_a_lyapunov_equation_without_a_solution_is_an_error() -> None:

@@ -17,8 +17,8 @@ def test_a_stream_is_the_documented_generator() -> None:
     digest = hashlib.blake2b(b"netem\0update\0loss\0" + b"0", digest_size=16).digest()
     key = [int.from_bytes(digest[i : i + 4], "little") for i in range(0, 16, 4)]
     by_hand = np.random.PCG64DXSM(np.random.SeedSequence(2, spawn_key=key))
-    found = stream(2, "netem", "update", "loss", "0").bit_generator
-    np.testing.assert_array_equal(found.random_raw(5), by_hand.random_raw(5))
+    generator = stream(2, "netem", "update", "loss", "0").bit_generator
+    np.testing.assert_array_equal(generator.random_raw(5), by_hand.random_raw(5))
     # The expected numbers are constants: a seed gives the same draws in every version.
     numbers = stream(2, "netem", "update", "loss", "0").random(3)
     assert numbers.tolist() == [0.676940330421062, 0.34315593350369966, 0.8542103866233243]

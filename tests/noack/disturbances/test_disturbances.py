@@ -67,15 +67,15 @@ def test_disturbances_have_their_distributions_and_are_independent(
     assert kstest(noise[:, 0] / 0.5, "norm").pvalue > 1e-3
     assert kstest(noise[:, 1], "uniform", (-0.2, 0.4)).pvalue > 1e-3
     # White and mutually independent: correlations of 4,000 samples are within 4/√4000.
-    for one, other in ((normal[1:], normal[:-1]), (w[1:, 0], w[:-1, 0]), (normal, w[:, 0])):
-        assert abs(np.corrcoef(one, other)[0, 1]) < 4 / np.sqrt(STEPS)
+    for signal, other in ((normal[1:], normal[:-1]), (w[1:, 0], w[:-1, 0]), (normal, w[:, 0])):
+        assert abs(np.corrcoef(signal, other)[0, 1]) < 4 / np.sqrt(STEPS)
 
 
 def test_a_disturbance_does_not_depend_on_the_order_of_the_steps(disturbed: dict[str, Any]) -> None:
-    one, other = disturbance_of(scenario_of(disturbed)), disturbance_of(scenario_of(disturbed))
-    assert one is not None
+    disturbance, other = disturbance_of(scenario_of(disturbed)), disturbance_of(scenario_of(disturbed))
+    assert disturbance is not None
     assert other is not None
-    d, w = one.values(range(BLOCK, 3 * BLOCK))
+    d, w = disturbance.values(range(BLOCK, 3 * BLOCK))
     for first in (2 * BLOCK, BLOCK):
         rows = slice(first - BLOCK, first)
         again = other.values(range(first, first + BLOCK))

@@ -34,7 +34,7 @@ def values(annotation: Any, metadata: list[Any]) -> st.SearchStrategy[Any]:
     if get_origin(annotation) is Literal:
         return st.sampled_from(get_args(annotation))
     if get_origin(annotation) in (Union, UnionType):
-        return st.one_of([values(one, metadata) for one in get_args(annotation)])
+        return st.one_of([values(argument, metadata) for argument in get_args(annotation)])
     if get_origin(annotation) is tuple:
         items = get_args(annotation)
         if items[-1] is ...:
@@ -100,8 +100,8 @@ def _chained(chains: st.SearchStrategy[list[Impairment]], most: int = 5) -> st.S
     }).filter(_consistent).map(lambda given: LinkSettings(**given))  # fmt: skip
 
 
-def _is_computable(one: Impairment) -> bool:
-    return not names_file(one) and not keeps_loss(one)
+def _is_computable(impairment: Impairment) -> bool:
+    return not names_file(impairment) and not keeps_loss(impairment)
 
 
 _ANY = st.one_of([varied(kind) for kind in IMPAIRMENTS])
@@ -109,24 +109,27 @@ settings = _settings(_ANY, most=1_000_000)
 """All valid settings, including names of files."""
 computable = _settings(_ANY.filter(_is_computable))
 _choosing = st.tuples(
-    st.none() | st.sampled_from([one for one in IMPAIRED if one.kind in ("loss", "blackout")]),
-    st.sampled_from([one for one in IMPAIRED if getattr(one, "scheduler", None)]),
+    st.none()
+    | st.sampled_from([impairment for impairment in IMPAIRED if impairment.kind in ("loss", "blackout")]),
+    st.sampled_from([impairment for impairment in IMPAIRED if getattr(impairment, "scheduler", None)]),
     st.none() | st.sampled_from([*EXAMPLES[Corrupt], Delay(delay_s=0.004)]),
-).map(lambda chain: [one for one in chain if one and _is_computable(one)])
+).map(lambda chain: [impairment for impairment in chain if impairment and _is_computable(impairment)])
 """Impairments with a queue that chooses what it sends."""
-harsh = _settings(st.sampled_from([one for one in IMPAIRED if _is_computable(one)])) | _chained(_choosing)
+harsh = _settings(
+    st.sampled_from([impairment for impairment in IMPAIRED if _is_computable(impairment)])
+) | _chained(_choosing)
 """Examples of the features in any order, with short times."""
-capped = harsh.filter(lambda one: one.impairments and one.mansd is not None).map(
-    lambda one: one.model_copy(update={"first_delivered": True})
+capped = harsh.filter(lambda settings: settings.impairments and settings.mansd is not None).map(
+    lambda settings: settings.model_copy(update={"first_delivered": True})
 )
 
 
 def words_can_say(settings: LinkSettings) -> bool:
     """Whether each reorder comes after a delay; words refuse a reorder without effect."""
     delayed, reordered = False, False
-    for one in settings.impairments:
-        if isinstance(one, Reorder) and (reordered or not delayed):
+    for impairment in settings.impairments:
+        if isinstance(impairment, Reorder) and (reordered or not delayed):
             return False
-        delayed = delayed or one.delays
-        reordered = isinstance(one, Reorder)
+        delayed = delayed or impairment.delays
+        reordered = isinstance(impairment, Reorder)
     return True

@@ -61,8 +61,8 @@ def _read(words: str) -> Any:
 
 
 _ALL = [_read(words) for line in WORDS.splitlines() for words in line.split(";") if words.strip()]
-IMPAIRED = [one for one in _ALL if isinstance(one, Impairment)]
-CONSTRAINED = [one for one in _ALL if isinstance(one, Constraint)]
+IMPAIRED = [feature for feature in _ALL if isinstance(feature, Impairment)]
+CONSTRAINED = [feature for feature in _ALL if isinstance(feature, Constraint)]
 EXAMPLES: dict[type[Feature], list[Feature]] = defaultdict(list)
 """By their classes, also of loss models and disciplines."""
 for _one in _ALL:
@@ -71,11 +71,11 @@ for _one in _ALL:
             EXAMPLES[type(_feature)].append(_feature)
 
 
-def names_file(one: Feature) -> bool:
+def names_file(feature: Feature) -> bool:
     """Whether it names a file that has not been read."""
-    return getattr(getattr(one, "loss", one), "file", None) is not None
+    return getattr(getattr(feature, "loss", feature), "file", None) is not None
 
 
-def keeps_loss(one: Feature) -> bool:
+def keeps_loss(feature: Feature) -> bool:
     """Whether it keeps a loss rate, which the others may make impossible."""
-    return bool(getattr(getattr(one, "loss", None), "keep", False))
+    return bool(getattr(getattr(feature, "loss", None), "keep", False))

@@ -28,21 +28,21 @@ SHAPES = {"uniform": stats.uniform(-1, 2), "normal": stats.norm(), "pareto": PAR
 
 def random_parts(decide: Any, words: str, *, before: str = "") -> Any:
     """Return the delays minus 50 ms, in units of 2 ms; delays are truncated to whole ns."""
-    found = decide(f"{before} delay 50ms 2ms {words}", COUNT).delays_ns
-    return (found + 0.5 - FIXED_NS) / JITTER_NS
+    delays_ns = decide(f"{before} delay 50ms 2ms {words}", COUNT).delays_ns
+    return (delays_ns + 0.5 - FIXED_NS) / JITTER_NS
 
 
-def assert_distributed(found: Any, shape: Any) -> None:
-    assert stats.kstest(found, shape.cdf).pvalue > 1e-4
+def assert_distributed(parts: Any, shape: Any) -> None:
+    assert stats.kstest(parts, shape.cdf).pvalue > 1e-4
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("correlation", [0.0, 0.6])
 def test_delays_have_the_set_shape_and_correlation(decide: Any, shape: str, correlation: float) -> None:
     """The normal scores of successive delays are an autoregressive process of order one."""
-    found = random_parts(decide, f"{100 * correlation}% distribution {shape}")
-    assert_distributed(found[:: 1 if correlation == 0 else 20], SHAPES[shape])  # 0.6²⁰: independent
-    z = stats.norm.ppf(SHAPES[shape].cdf(found))
+    parts = random_parts(decide, f"{100 * correlation}% distribution {shape}")
+    assert_distributed(parts[:: 1 if correlation == 0 else 20], SHAPES[shape])  # 0.6²⁰: independent
+    z = stats.norm.ppf(SHAPES[shape].cdf(parts))
     # Bartlett: variance of the measured autocorrelation of an AR(1) process.
     error = np.sqrt((1 + correlation**2) / (1 - correlation**2) / COUNT)
     for lag in (1, 2, 3):
@@ -62,9 +62,9 @@ def test_the_paretonormal_delay_combines_the_quantiles_of_both() -> None:
 
     variance = sum(quad(square_at, a, b, limit=200)[0] for a, b in ((-9, 0), (0, 6), (6, 36)))
     delay = Delay(jitter_s=1e-9, distribution="paretonormal")
-    found = quantile_of(LinkSettings(impairments=(delay,)))
+    quantile = quantile_of(LinkSettings(impairments=(delay,)))
     for u in np.linspace(0.001, 0.999, 99).tolist():
-        assert found(u) == pytest.approx(mixed(u) / np.sqrt(variance), rel=1e-7, abs=1e-9)
+        assert quantile(u) == pytest.approx(mixed(u) / np.sqrt(variance), rel=1e-7, abs=1e-9)
     # Of the largest uniform number, the unbounded distribution is cut: it fits into an integer.
     longest = quantile_of(settings_of("delay 3600s 3600s distribution pareto"))
     assert 1e15 < longest(1 - 2**-53) < 2**62
@@ -82,23 +82,23 @@ def test_observed_delays_have_the_quantiles_of_the_sample(decide: Any) -> None:
     sample_ns = np.random.default_rng(4).gamma(2.0, 3e6, 57)
     sample_ns[:4] = sample_ns[4]  # an atom
     delay = Delay(delay_s=0.05, distribution="empirical", samples_s=tuple(sample_ns / 1e9))
-    found = decide(LinkSettings(impairments=(delay,), limit=1_000_000), COUNT).delays_ns
+    delays_ns = decide(LinkSettings(impairments=(delay,), limit=1_000_000), COUNT).delays_ns
     grid = np.linspace(0, 1, 100_001)
     expected = np.floor(FIXED_NS + np.quantile(sample_ns, grid))  # in whole nanoseconds
-    assert found.min() >= expected[0] - 1
-    assert found.max() <= expected[-1]
-    assert stats.ks_2samp(found, expected).pvalue > 1e-4
+    assert delays_ns.min() >= expected[0] - 1
+    assert delays_ns.max() <= expected[-1]
+    assert stats.ks_2samp(delays_ns, expected).pvalue > 1e-4
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_negative_delays_become_0(decide: Any, shape: str) -> None:
     """Positive delays keep their distribution."""
-    found = decide(f"delay 0.5ms 2ms distribution {shape}", COUNT).delays_ns
+    delays_ns = decide(f"delay 0.5ms 2ms distribution {shape}", COUNT).delays_ns
     cdf = SHAPES[shape].cdf
     below = cdf(-0.25)
-    assert found.min() == 0
-    assert abs(np.mean(found == 0) - below) < 5 * np.sqrt(below * (1 - below) / COUNT)
-    above = cdf((found[found > 0] - 500_000) / JITTER_NS)
+    assert delays_ns.min() == 0
+    assert abs(np.mean(delays_ns == 0) - below) < 5 * np.sqrt(below * (1 - below) / COUNT)
+    above = cdf((delays_ns[delays_ns > 0] - 500_000) / JITTER_NS)
     assert_distributed((above - below) / (1 - below), stats.uniform())
 
 

@@ -61,7 +61,7 @@ def test_the_automaton_allows_exactly_the_sequences_that_keep_every_rule(
         after_loss = automaton.after_loss(states)
         allowed &= ~lost | (after_loss >= 0)
         states = np.where(lost & (after_loss >= 0), after_loss, automaton.after_delivery(states))
-    expected = [all(keeps(tuple(one), rule) for rule in rules) for one in sequences.tolist()]
+    expected = [all(keeps(tuple(sequence), rule) for rule in rules) for sequence in sequences.tolist()]
     assert allowed.tolist() == expected
 
 
@@ -70,8 +70,8 @@ def test_a_history_finds_the_first_violation_of_each_rule(
     lost: list[bool], rules: tuple[LossRule, ...]
 ) -> None:
     history, first = LossHistory(rules), dict.fromkeys(rules, len(lost))
-    for i, one in enumerate(lost):
-        for rule, _ in history.add(one):
+    for i, is_lost in enumerate(lost):
+        for rule, _ in history.add(is_lost):
             first[rule] = min(first[rule], i)
     for rule, at in first.items():
         assert keeps(tuple(lost[:at]), rule)
@@ -99,19 +99,19 @@ def random_guarantee(rng: np.random.Generator) -> LossGuarantee:
 
 def test_a_guarantee_implies_another_if_no_pattern_keeps_only_the_first() -> None:
     rng, longest, implied = np.random.default_rng(0), 9, 0
-    patterns = [one for k in range(longest + 1) for one in product((True, False), repeat=k)]
+    patterns = [pattern for k in range(longest + 1) for pattern in product((True, False), repeat=k)]
     for _ in range(60):
-        one, other = random_guarantee(rng), random_guarantee(rng)
-        beyond = (p for p in patterns if allows(one, p) and not allows(other, p))
-        shortest, found = next(beyond, None), find_pattern_beyond(one, other)
-        if found is None:
+        known, other = random_guarantee(rng), random_guarantee(rng)
+        beyond = (p for p in patterns if allows(known, p) and not allows(other, p))
+        shortest, pattern = next(beyond, None), find_pattern_beyond(known, other)
+        if pattern is None:
             implied += 1
             assert shortest is None
         else:
-            assert allows(one, found)
-            assert not allows(other, found)
-            assert allows(other, found[:-1])
-            assert len(found) > longest if shortest is None else len(found) == len(shortest)
+            assert allows(known, pattern)
+            assert not allows(other, pattern)
+            assert allows(other, pattern[:-1])
+            assert len(pattern) > longest if shortest is None else len(pattern) == len(shortest)
     assert 5 < implied < 55
 
 
@@ -120,8 +120,8 @@ def test_one_window_implies_another_as_the_closed_form_says() -> None:
     for (window, other), losses in product(product(range(2, 6), range(1, 10)), range(3)):
         most = losses * (other // window) + min(losses, other % window)
         for limit in range(other):
-            one = guarantee(LossesInWindow(losses, window))
-            implied = find_pattern_beyond(one, guarantee(LossesInWindow(limit, other))) is None
+            known = guarantee(LossesInWindow(losses, window))
+            implied = find_pattern_beyond(known, guarantee(LossesInWindow(limit, other))) is None
             assert implied == (limit >= min(most, other)) or losses >= window
 
 

@@ -112,18 +112,18 @@ def lost_packets(words: str, packets: Any) -> list[bool]:
     link.decide(0, 1, 0)
     flow = link.flow(0)
     assert flow is not None
-    found = []
+    losses = []
     for flow.packets in packets:
-        found.append(link.decide(0, 1, 0).fate == 1)
-    return found
+        losses.append(link.decide(0, 1, 0).fate == 1)
+    return losses
 
 
 @pytest.mark.parametrize("share", [0, 1])
 def test_probabilities_0_and_1_are_exact(decide: Any, share: int) -> None:
     never = ["loss 0%", "loss 0% 99.9%", "loss gemodel 0% 0%", "loss burst 0% 1", "loss none"]
     always = ["loss 100%", "loss 100% 99.9%", "loss gemodel 100% 0%", "loss worst"]
-    for one in always if share else never:
-        assert (decide(one, 10_000).fates == share).all()
+    for words in always if share else never:
+        assert (decide(words, 10_000).fates == share).all()
 
 
 @given(st.sets(st.integers(0, 60)), st.integers(0, 40))
@@ -141,8 +141,8 @@ def test_exactly_the_packets_of_a_script_are_lost(numbers: set[int], extra: int)
 @given(st.integers(1, 30), st.data(), st.integers(0, 50))
 def test_periodic_loss_drops_a_burst_in_every_period(period: int, data: st.DataObject, first: int) -> None:
     burst = data.draw(st.integers(0, period))
-    found = lost_packets(f"loss periodic {burst}/{period} from {first}", range(200))
-    assert found == [k >= first and (k - first) % period < burst for k in range(200)]
+    lost = lost_packets(f"loss periodic {burst}/{period} from {first}", range(200))
+    assert lost == [k >= first and (k - first) % period < burst for k in range(200)]
 
 
 STEP_NS = 10_000_000
@@ -161,8 +161,8 @@ def test_a_common_bad_state_concerns_all_flows_at_once() -> None:
         {link.decide(k, 1, step * STEP_NS + k * STEP_NS // 50).fate == 1 for k in range(50)}
         for step in range(500)
     ]
-    assert all(len(found) == 1 for found in states)
-    assert 0 < sum(found == {True} for found in states) < 500
+    assert all(len(seen) == 1 for seen in states)
+    assert 0 < sum(seen == {True} for seen in states) < 500
 
 
 @pytest.mark.parametrize("every", [1, 7, 1000])

@@ -26,7 +26,7 @@ from noack.impairments.loss_prediction import (
     loss_process,
     predict,
     read_files,
-    remember,
+    store_probabilities,
     with_target_loss,
 )
 from noack.impairments.markov_chain import NotPredictableError
@@ -76,8 +76,8 @@ def test_predicted_losses_are_those_of_the_closed_form() -> None:
     for p in (0.05, 0.5, 0.97):
         for m in (0, 1, 4, 17):
             rate = p * (1 - p**m) / (1 - p ** (m + 1))
-            found = predicted_loss(f"loss {100 * p}% mansd {m}")
-            assert found == pytest.approx(rate, rel=1e-12, abs=1e-15)
+            predicted = predicted_loss(f"loss {100 * p}% mansd {m}")
+            assert predicted == pytest.approx(rate, rel=1e-12, abs=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -174,12 +174,12 @@ def test_a_kept_loss_is_predicted_as_it_was_asked(words: str, asked: float) -> N
 def test_a_probability_that_another_process_found_is_not_computed_again(monkeypatch: Any) -> None:
     """Not even by the loops of a run; but other settings have another probability."""
     settings = settings_of("loss 10% keep loss 5% mansd 1 delay 1ms")
-    found = found_probabilities(settings, settings_of("delay 1ms"))
-    assert list(found.values()) == [with_target_loss(settings).impairments[0].loss.probability]  # type: ignore[attr-defined]
+    probabilities = found_probabilities(settings, settings_of("delay 1ms"))
+    assert list(probabilities.values()) == [with_target_loss(settings).impairments[0].loss.probability]  # type: ignore[attr-defined]
     monkeypatch.setattr(loss_prediction, "_probabilities", ProbabilityCache(10))
     monkeypatch.setattr(loss_prediction, "predict", None)
-    remember(json.loads(json.dumps(found)))
-    assert found_probabilities(settings_of("loss 10% keep loss 5% delay 9ms mansd 1")) == found
+    store_probabilities(json.loads(json.dumps(probabilities)))
+    assert found_probabilities(settings_of("loss 10% keep loss 5% delay 9ms mansd 1")) == probabilities
     for other in ("loss 10% keep loss 5% mansd 2", "loss 10% keep mansd 1"):
         with pytest.raises(TypeError):
             with_target_loss(settings_of(other))
@@ -221,14 +221,14 @@ def is_kept(guarantee: LossGuarantee, outcomes: tuple[bool, ...]) -> bool:
 
 
 @pytest.mark.parametrize("first", [False, True])
-@pytest.mark.parametrize("guarantee", KEPT, ids=lambda one: one.meaning)
+@pytest.mark.parametrize("guarantee", KEPT, ids=lambda guarantee: guarantee.meaning)
 @pytest.mark.parametrize("impairments", [[INDEPENDENT], [BURSTY], [BURSTY, INDEPENDENT]])
 def test_a_guarantee_is_kept_with_the_total_probability_of_all_patterns_that_keep_it(
     impairments: list[dict[str, object]], guarantee: LossGuarantee, first: bool
 ) -> None:
     losses = process(*impairments, first=first)
     patterns = list(product([False, True], repeat=8))
-    expected = sum(probability(losses, one) for one in patterns if is_kept(guarantee, one))
+    expected = sum(probability(losses, pattern) for pattern in patterns if is_kept(guarantee, pattern))
     assert losses.keeps(guarantee, 8) == pytest.approx(expected, rel=1e-9)
 
 
@@ -238,8 +238,8 @@ def test_tails_of_bursts_cover_every_packet_and_the_largest_probability_every_pa
     tails, longest = losses.tails(4)
     for j in range(1, 5):
         for k in range(j, 9):
-            ends = [one for one in product([False, True], repeat=k) if all(one[k - j :])]
-            assert sum(probability(losses, one) for one in ends) <= tails[j - 1] * (1 + 1e-9)
+            ends = [pattern for pattern in product([False, True], repeat=k) if all(pattern[k - j :])]
+            assert sum(probability(losses, pattern) for pattern in ends) <= tails[j - 1] * (1 + 1e-9)
     for past in product([False, True], repeat=5):
         given = probability(losses, (*past, True)) / probability(losses, past)
         assert given <= losses.largest_probability * (1 + 1e-9)

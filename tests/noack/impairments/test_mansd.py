@@ -29,7 +29,7 @@ def often_out_of_order(link: LinkSettings, more: bool) -> LinkSettings:
 
 
 links = st.builds(
-    often_out_of_order, any_settings.harsh.filter(lambda one: one.longest_burst is not None),
+    often_out_of_order, any_settings.harsh.filter(lambda settings: settings.longest_burst is not None),
     st.booleans(),
 )  # fmt: skip
 GAPS_NS = [0, 1, 1000, MS // 3, MS, 5 * MS, 100 * MS]
@@ -56,14 +56,14 @@ class Observer:
         self.counted: dict[int, list[int]] = {}
 
     def see(self, outputs: Sequence[Any]) -> None:
-        for one in outputs:
-            if not isinstance(one, Datagram):
+        for output in outputs:
+            if not isinstance(output, Datagram):
                 continue
-            parts = {one.data[k : k + 6] for k in (0, 6, 12)}
+            parts = {output.data[k : k + 6] for k in (0, 6, 12)}
             if len(parts) > 1:
                 continue
             flow, number = struct.unpack("<HI", parts.pop())
-            assert flow == one.flow
+            assert flow == output.flow
             counted = self.counted.setdefault(flow, [])
             if not counted or number > counted[-1]:
                 counted.append(number)
@@ -204,10 +204,12 @@ def test_a_restarted_link_keeps_the_guarantee_behind_any_history(words: str) -> 
     settings = settings_of(f"loss worst first {words}")
     link = Link(settings, 1, "a", restarted=True)
     lost = [link.decide(0, 100, t_ns).fate == core.NOACK_DROPPED for t_ns in range(30)]
-    before = [list(one) for one in HISTORIES if is_allowed(one, settings)]
-    assert all(is_allowed([*one, *lost], settings) for one in before)
+    before = [list(history) for history in HISTORIES if is_allowed(history, settings)]
+    assert all(is_allowed([*history, *lost], settings) for history in before)
     earlier = lost.index(True) - 1
-    assert earlier == 0 or any(not is_allowed([*one, *[False] * earlier, True], settings) for one in before)
+    assert earlier == 0 or any(
+        not is_allowed([*history, *[False] * earlier, True], settings) for history in before
+    )
 
 
 def lost_of(releases: Sequence[int | None]) -> list[bool]:

@@ -71,17 +71,17 @@ def test_each_packet_leaves_as_in_mahimahi(seed: int, mansd: int | None) -> None
     )
     link = Link(LinkSettings(impairments=(settings,), mansd=mansd, limit=1000), 0, "test")
     model = Mahimahi(times_ms, queue, queue_bytes)
-    now_ns, found, lost = 0, [], [0, 0, 0]
+    now_ns, releases_ns, lost = 0, [], [0, 0, 0]
     for number in range(40):
         now_ns += int(rng.choice([0, MS, rng.integers(3 * MS)]))
         size, flow = int(rng.choice([0, 1472, rng.integers(4001)])), number % 3
         must_pass = lost[flow] == mansd
         passes = model.enqueue(number, size, now_ns + offset_ms * MS, must_pass=must_pass)
         lost[flow] = 0 if passes else lost[flow] + 1
-        found.append(link.decide(flow, size, now_ns).release_ns)
+        releases_ns.append(link.decide(flow, size, now_ns).release_ns)
     model.run_until(now_ns + 2_000 * MS)  # 40 packets need at most 120 opportunities
     expected = [model.departures[number] for number in range(40)]
-    assert found == [-1 if at < 0 else at - offset_ms * MS for at in expected]
+    assert releases_ns == [-1 if at < 0 else at - offset_ms * MS for at in expected]
 
 
 def test_the_last_byte_of_an_opportunity_and_of_the_queue_is_used() -> None:
@@ -155,17 +155,17 @@ def test_a_packet_leaves_in_its_flows_next_free_slot(
     order = [sorted({0, *order}).index(flow) for flow in order]  # every flow up to the last has slots
     schedule = Schedule(order=tuple(flow - 1 for flow in order), slot_s=slot_ns / 1e9, queue=places)
     link = Link(LinkSettings(impairments=(schedule,), mansd=mansd, limit=1000), 0, "a")
-    model, losses, found, now_ns = Slots(tuple(order), slot_ns, places), [0] * 6, [], 0
+    model, losses, releases_ns, now_ns = Slots(tuple(order), slot_ns, places), [0] * 6, [], 0
     names: dict[int, int] = {}
     for number, (name, gap_ns) in enumerate(steps):
         now_ns += gap_ns
         flow = names.setdefault(name, len(names) + 1)  # in the order of the first packets
-        found.append(link.decide(name, 100, now_ns).release_ns)
+        releases_ns.append(link.decide(name, 100, now_ns).release_ns)
         lost = model.enqueue(flow, number, now_ns, losses[flow] == mansd)
         losses[flow] = (losses[flow] + 1) * lost
         assert link.decision.consecutive_losses == losses[flow] <= (80 if mansd is None else mansd)
     model.run_before(now_ns + 81 * len(order) * slot_ns)
-    assert found == [model.departures[number] for number in range(len(steps))]
+    assert releases_ns == [model.departures[number] for number in range(len(steps))]
 
 
 def test_copies_take_slots_and_a_changed_schedule_goes_on_after_those_that_are_taken() -> None:

@@ -54,11 +54,11 @@ def departures(rate: Rate, arrivals: Sequence[tuple[int, int, bool]]) -> list[in
     """
     free = Fraction(0)
     waiting: list[int] = []
-    found: list[int | None] = []
+    leaves_ns: list[int | None] = []
     for t_ns, size_bytes, forced in arrivals:
         waiting = [leaves for leaves in waiting if leaves > t_ns]
         if len(waiting) == rate.queue and not forced:
-            found.append(None)
+            leaves_ns.append(None)
             continue
         # The emulator compares in whole nanoseconds whether the line is busy.
         begin = free if int(free) >= t_ns else Fraction(t_ns)
@@ -66,8 +66,8 @@ def departures(rate: Rate, arrivals: Sequence[tuple[int, int, bool]]) -> list[in
         if len(waiting) == rate.queue:
             waiting.pop()
         waiting.append(int(free))
-        found.append(int(free))
-    return found
+        leaves_ns.append(int(free))
+    return leaves_ns
 
 
 @given(
@@ -84,11 +84,11 @@ def test_a_rate_serves_packets_as_a_queue(rate: Rate, steps: list[tuple[int, int
     other = Rate(rate_bps=1000, queue=3)  # so that the ring buffer's offset is not 0
     state = LinkState(LinkSettings(impairments=(other, rate)), 0, "a")
     link = state.core
-    found: list[int | None] = []
+    leaves_ns: list[int | None] = []
     for t_ns, size_bytes, forced in arrivals:
         room = core.noack_queue_enters(link, 1, t_ns)
-        found.append(core.noack_queue_serve(link, 1, size_bytes) if room or forced else None)
-    assert found == departures(rate, arrivals)
+        leaves_ns.append(core.noack_queue_serve(link, 1, size_bytes) if room or forced else None)
+    assert leaves_ns == departures(rate, arrivals)
     assert list(link.departures_ns[0:3]) == [0, 0, 0]
 
 
@@ -220,7 +220,7 @@ def codel_departures(
 
     def must_pass(number: int) -> bool:
         before = range(number - mansd, number) if mansd is not None else range(-1, 0)
-        return all(leaves_ns.get(one, 0) is None for one in before)
+        return all(leaves_ns.get(number, 0) is None for number in before)
 
     line = RfcCodel(
         round(codel.target_s * 1e9), round(codel.interval_s * 1e9), spare, must_pass,
@@ -238,8 +238,8 @@ def emulated_departures(
 ) -> list[int | None]:
     rate = Rate(rate_bps=RATE_BPS, queue=100_000, overhead_bytes=0, discipline=codel)
     link = Link(LinkSettings(impairments=(rate,), mansd=mansd, limit=1_000_000), 0, "a")
-    found = [link.decide(0, size, t).release_ns for t, size in arrivals]
-    return [None if t_ns < 0 else t_ns for t_ns in found]
+    releases_ns = [link.decide(0, size, t).release_ns for t, size in arrivals]
+    return [None if t_ns < 0 else t_ns for t_ns in releases_ns]
 
 
 @given(
@@ -262,11 +262,11 @@ def test_codel_drops_what_the_rfc_drops_and_serves_what_must_pass(
 
 def test_codel_drops_copies_of_delivered_packets() -> None:
     words = "duplicate 100% rate 8mbit 0 codel target 1us interval 1us mtu 0"
-    link, found = Link(settings_of(words), 0, "a"), set()
+    link, outcomes = Link(settings_of(words), 0, "a"), set()
     for k in range(50):
         decision = link.decide(0, 100, 10_000 * k)
-        found.add((decision.fate, decision.copy_ns >= 0))
-    assert found == {(0, True), (0, False), (4, False)}
+        outcomes.add((decision.fate, decision.copy_ns >= 0))
+    assert outcomes == {(0, True), (0, False), (4, False)}
 
 
 def scheduled_departures(rate: Rate, mansd: int | None, arrivals: Any) -> tuple[list[int], list[int]]:
@@ -277,17 +277,17 @@ def scheduled_departures(rate: Rate, mansd: int | None, arrivals: Any) -> tuple[
     scheduler, free = rate.discipline, Fraction(0)
     assert isinstance(scheduler, Scheduler)
     waiting: list[tuple[int, int]] = []
-    found, losses, burst = [-1] * len(arrivals), [], Counter[int]()
+    leaves_ns, losses, burst = [-1] * len(arrivals), [], Counter[int]()
 
     def serve(now_ns: int) -> None:
         nonlocal free
         while waiting and int(free) <= now_ns:
-            keys = {arrivals[one][1]: key for key, one in sorted(waiting, reverse=True)}
-            first = min((keys[arrivals[one][1]], one) for _, one in waiting)[1]
-            waiting[:] = [one for one in waiting if one[1] != first]
+            keys = {arrivals[number][1]: key for key, number in sorted(waiting, reverse=True)}
+            first = min((keys[arrivals[number][1]], number) for _, number in waiting)[1]
+            waiting[:] = [entry for entry in waiting if entry[1] != first]
             arrival_ns, _, size, _ = arrivals[first]
             free = max(free, Fraction(arrival_ns)) + Fraction(bits(rate, size) * NS, rate.rate_bps)
-            found[first] = int(free)
+            leaves_ns[first] = int(free)
 
     for number, (now_ns, flow, size, level) in enumerate(arrivals):
         serve(now_ns)
@@ -301,7 +301,7 @@ def scheduled_departures(rate: Rate, mansd: int | None, arrivals: Any) -> tuple[
             waiting.append((key, number))
         serve(now_ns)
     serve(2**60)
-    return found, losses
+    return leaves_ns, losses
 
 
 WAITING = (0, 9), (1, 1), (0, 200), (2, 8), (1, 127), (2, 3), (1, 128), (0, 255)
@@ -315,18 +315,18 @@ def core_departures(settings: LinkSettings, arrivals: Any) -> tuple[list[int], l
     link = LinkState(settings, 0, "a", rows=4)
     channel = Channel([link], loops=4)
     numbers: dict[tuple[int, int], int] = {}
-    found, losses = [-1] * len(arrivals), []
+    leaves_ns, losses = [-1] * len(arrivals), []
     for number, (now_ns, flow, size, level) in enumerate([*arrivals, (2**60, 0, 0, 0)]):
         while (due_ns := channel.due_ns) <= now_ns:
-            for one in channel.release(due_ns):
-                found[numbers[one.flow, one.number]] = due_ns
+            for packet in channel.release(due_ns):
+                leaves_ns[numbers[packet.flow, packet.number]] = due_ns
         if number < len(arrivals):
             numbers[flow, number] = number
             send(channel, flow, number, size, now_ns, level)
             losses.append(link.flow(flow).consecutive_losses)
     assert link.core.in_flight == 0
     assert link.counters.delivered_out_of_order == 0
-    return found, losses
+    return leaves_ns, losses
 
 
 @pytest.mark.parametrize("kind", [Priority, EarliestDeadline, MaximumError])
@@ -360,29 +360,30 @@ def test_a_scheduler_sends_the_first_of_what_waits_when_the_link_is_free(
         discipline = EarliestDeadline(deadlines_s=tuple(number * 0.05 for number in numbers))
     rate = Rate(rate_bps=rate_bps, queue=queue, discipline=discipline)
     now = np.cumsum([0, *(gap for gap, *_ in steps)])[1:].tolist()
-    arrivals = [(t, *one) for t, (_, *one) in zip(now, steps, strict=True)]
-    found = core_departures(LinkSettings(impairments=(rate,), mansd=mansd), arrivals)
-    assert found == scheduled_departures(rate, mansd, arrivals)
+    arrivals = [(t, *step) for t, (_, *step) in zip(now, steps, strict=True)]
+    outcome = core_departures(LinkSettings(impairments=(rate,), mansd=mansd), arrivals)
+    assert outcome == scheduled_departures(rate, mansd, arrivals)
     for flow in range(4):
-        of_flow = [t for t, one in zip(found[0], arrivals, strict=True) if one[1] == flow and t > 0]
+        of_flow = [t for t, arrival in zip(outcome[0], arrivals, strict=True) if arrival[1] == flow and t > 0]
         assert of_flow == sorted(of_flow)
     # As many wait in any order: of packets of one size, the same are lost as by tail drop.
     alike = [(t, flow, 72, level) for t, flow, _, level in arrivals]
     plain = rate.model_copy(update={"discipline": TailDrop()})
     of_both = [
-        core_departures(LinkSettings(impairments=(one,), mansd=mansd), alike)[1] for one in (rate, plain)
+        core_departures(LinkSettings(impairments=(impairment,), mansd=mansd), alike)[1]
+        for impairment in (rate, plain)
     ]
     assert of_both[0] == of_both[1]
 
 
 def test_a_change_makes_the_order_of_what_waits_final() -> None:
     link = LinkState(settings_of("rate 8mbit 0 queue 9 priority 3,2,1"), 0, "a", rows=3)
-    channel, found = Channel([link], loops=3), []
+    channel, departures = Channel([link], loops=3), []
     for flow in (0, 0, 1):
         channel.send(flow, 0, 1000, 0)
     channel.change(settings_of("rate 4mbit 0 queue 9 priority 3,2,1 delay 10ms"))
     channel.send(2, 0, 1000, 1)
     while channel.due_ns < 2**60:
         due_ns = channel.due_ns
-        found += [(one.flow, due_ns // MS) for one in channel.release(due_ns)]
-    assert found == [(0, 1), (1, 2), (0, 3), (2, 15)]
+        departures += [(packet.flow, due_ns // MS) for packet in channel.release(due_ns)]
+    assert departures == [(0, 1), (1, 2), (0, 3), (2, 15)]

@@ -63,8 +63,8 @@ def test_by_time_a_packet_gets_what_was_recorded_at_its_time(
     settings = replay(steps, by="time", repeat=repeat)
     sent_ns, length_ns = list(settings.sent_ns or ()), settings.length_ns
     arrivals = sorted(arrivals) + [length_ns + at for at in sent_ns]
-    found = outcomes(link_of(settings), sorted(arrivals))
-    for now_ns, delay_ns in zip(sorted(arrivals), found, strict=True):
+    delays_ns = outcomes(link_of(settings), sorted(arrivals))
+    for now_ns, delay_ns in zip(sorted(arrivals), delays_ns, strict=True):
         t = now_ns % length_ns
         k = bisect_right(sent_ns, t) - 1
         here = steps[k][1]
@@ -82,8 +82,8 @@ def test_a_packet_that_must_pass_has_the_delay_of_the_last_that_was_received() -
     """A share of the delay may be applied; losses remain."""
     steps = [(0, 30 * MS), (MS, -1), (MS, -1), (MS, 5 * MS)]
     link = link_of(replay(steps, delay_share=0.5), mansd=1)
-    found = outcomes(link, [k * 100 * MS for k in range(4)])
-    assert found == [15 * MS, -1, 15 * MS, 5 * MS // 2]
+    delays_ns = outcomes(link, [k * 100 * MS for k in range(4)])
+    assert delays_ns == [15 * MS, -1, 15 * MS, 5 * MS // 2]
 
 
 def test_a_random_place_is_drawn_by_the_seed_for_all_flows_uniformly() -> None:
@@ -106,13 +106,13 @@ def test_a_shipped_trace_is_reproduced_packet_by_packet(decide: Any, path: Path)
     """At the source's rate, each packet of two rounds is received when it was recorded."""
     trace = read_trace(path)
     settings = read_files(settings_of(f"replay {path} limit 100000"), Path())
-    (one,) = settings.impairments
-    assert isinstance(one, Replay)
-    sent_ns = np.concatenate([trace.sent_ns, one.length_ns + trace.sent_ns])
-    expected = np.concatenate([trace.received_ns, one.length_ns + trace.received_ns])
+    (replay,) = settings.impairments
+    assert isinstance(replay, Replay)
+    sent_ns = np.concatenate([trace.sent_ns, replay.length_ns + trace.sent_ns])
+    expected = np.concatenate([trace.received_ns, replay.length_ns + trace.received_ns])
     for words in (
         settings,
-        settings.model_copy(update={"impairments": (one.model_copy(update={"by": "time"}),)}),
+        settings.model_copy(update={"impairments": (replay.model_copy(update={"by": "time"}),)}),
     ):
         decided = decide(words, len(sent_ns), arrivals_ns=sent_ns)
         # By time, the last of several packets that were sent at once counts.

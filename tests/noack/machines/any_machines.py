@@ -271,8 +271,8 @@ def driven(
             outputs = machines.on_timer(now_ns)
         else:
             loop, outputs = message.loop, machines.handle(message, now_ns)
-        sent = [one for one in outputs if isinstance(one, Message)]
-        assert {one.loop for one in sent} <= {loop}
+        sent = [message for message in outputs if isinstance(message, Message)]
+        assert {message.loop for message in sent} <= {loop}
         inputs.sent[loop] += sent
         yield loop, message, now_ns, plain(outputs, numbered=not isinstance(machines, OneLoop))
 

@@ -56,8 +56,8 @@ def part_of(role: str, number: int, of: Sizes) -> Part:
 
 def outputs_of(part: Part, seed: int, rows: int = 1024) -> list[list[Any]]:
     """All outputs of a machine."""
-    one = SteppedMachines([part], rows=rows)
-    return [outputs for *_, outputs in driven(one, Inputs(one, seed), COUNT)]
+    stepped = SteppedMachines([part], rows=rows)
+    return [outputs for *_, outputs in driven(stepped, Inputs(stepped, seed), COUNT)]
 
 
 @given(sizes(), st.sampled_from(["plant", "sensor", "controller"]), st.integers(0, 1000))
@@ -104,8 +104,8 @@ def next_tick(alone: list[OneLoop], phases_ns: list[int]) -> int:
     """Return the loop whose tick is due first; at the same time, that of the smaller number."""
     dues_ns = [
         (due_ns + phases_ns[loop], loop)
-        for loop, one in enumerate(alone)
-        if (due_ns := one.next_deadline_ns()) is not None
+        for loop, machines in enumerate(alone)
+        if (due_ns := machines.next_deadline_ns()) is not None
     ]
     return min(dues_ns)[1]
 
@@ -128,7 +128,7 @@ def compare_rows(together: SteppedMachines, loop: int, written: Any, own: Record
 def test_a_change_that_a_later_loop_refuses_changes_no_loop(content: dict[str, Any]) -> None:
     """The second loop's trigger has no β."""
     other = content | {"trigger": {"policy": "absolute", "delta": 0.5}}
-    together = sensors_of([resolve(validate(one, "test")) for one in (content, other)])
+    together = sensors_of([resolve(validate(loop, "test")) for loop in (content, other)])
     with pytest.raises(CallerError, match="beta"):
         together.announce(ParameterChange(0, 50 * MS, {"trigger.beta": 0.5}), 0)
     assert [structure.machine.inputs for structure in together.machines] == [0, 0]
@@ -154,8 +154,8 @@ def machines_of(role: str) -> LoopMachines:
         part = sensor(0, OF, form=list(TABLES).index("dynamic"))
         part.observer = observer(next(_kalman()), 2, 3, 2, 2, 1.0)
         own = LoopMachines([part])
-        memory, one = own._memory, own.machines[0].model
-        memory.set_model(one, one.transitions, [20 * MS, 30 * MS], [None, np.ones(3), None])
+        memory, model = own.memory, own.machines[0].model
+        memory.set_model(model, model.transitions, [20 * MS, 30 * MS], [None, np.ones(3), None])
     else:
         own = LoopMachines([controller(next(_with_point()), OF)])
     assert text_of(own) is None
@@ -172,8 +172,8 @@ def _full_plants() -> Any:
 
 def _kalman() -> Any:
     for seed in range(100):
-        found = observer(np.random.default_rng(seed), 2, 3, 2, 2, 1.0)
-        if found.settings.kind == "kalman":
+        candidate = observer(np.random.default_rng(seed), 2, 3, 2, 2, 1.0)
+        if candidate.settings.kind == "kalman":
             yield np.random.default_rng(seed)
 
 

@@ -38,8 +38,8 @@ GUSTS = {"kind": "gaussian", "std": [0.5]}
 def estimation_error(record: RunRecord) -> NDArray[np.float64]:
     """x̂ − x at each measurement."""
     rows = record["sensor_measurement"]
-    found: NDArray[np.float64] = rows["x"] - true_states(record["plant_step"], rows["t_ns"])
-    return found
+    errors: NDArray[np.float64] = rows["x"] - true_states(record["plant_step"], rows["t_ns"])
+    return errors
 
 
 @pytest.fixture
@@ -78,9 +78,9 @@ def test_a_restarted_sensor_restarts_its_estimate_and_is_replayed(
     observed["observer"] = KALMAN | {"initial_estimate": [0.5, 0.0]}
     scenario, at_ns = resolved(observed), 800_000_000
     successor = sensor_of(scenario, Start(1, at_ns))
-    record = simulate_with(scenario, "sensor", lambda one: RestartedMachine(one, successor, at_ns))
-    notices = [one for one in record.notices if "observer" in one["text"]]
-    assert [(one["t_ns"], one["process"]) for one in notices] == [(at_ns, "sensor")]
+    record = simulate_with(scenario, "sensor", lambda machine: RestartedMachine(machine, successor, at_ns))
+    notices = [notice for notice in record.notices if "observer" in notice["text"]]
+    assert [(notice["t_ns"], notice["process"]) for notice in notices] == [(at_ns, "sensor")]
     rows = record[SENSOR_MEASUREMENT]
     again = np.flatnonzero(rows["input"] >= GENERATION)[0]
     assert rows["t_ns"][again] == at_ns
@@ -90,9 +90,9 @@ def test_a_restarted_sensor_restarts_its_estimate_and_is_replayed(
     np.testing.assert_allclose(rows["x"][again], [expected, 0.0], rtol=1e-12)
     notice = {"process": "sensor", "level": RESTART, "t_ns": at_ns, "text": "started anew"}
     again_record = changed(record, notices=[notice], reports={}, kind="live")
-    found = replay(again_record)
-    assert found.bit_exact, found.first_difference
-    assert found.inputs == sum(map(record.count, record.tables))
+    result = replay(again_record)
+    assert result.bit_exact, result.first_difference
+    assert result.inputs == sum(map(record.count, record.tables))
     verdicts = {str(claim.verdict) for claim in ClaimEvaluation(again_record).evaluate()}
     assert verdicts <= {"held", "void"}
 
@@ -102,7 +102,9 @@ def test_measurements_that_are_lost_are_bridged_and_replayed(observed: dict[str,
     observed["plant"]["measurement"] = {"C": [[1.0, 0.0]], "noise_std": [1e-9]}
     scenario = resolved(observed)
     lost = {30, 31, 32, 33, 70}
-    record = simulate_with(scenario, "sensor", lambda one: LosingMachine(one, lambda k: k not in lost))
+    record = simulate_with(
+        scenario, "sensor", lambda machine: LosingMachine(machine, lambda k: k not in lost)
+    )
     assert len(record[SENSOR_MEASUREMENT]) == 101 - len(lost)
     assert replay(record).bit_exact
     # The input during the gap is unknown: it changes as the model decays.
@@ -118,11 +120,11 @@ def test_i1_and_the_certificate_are_claimed_of_the_estimate(
     observed["horizon_s"] = 4.0
     record = run(observed)
     claims = ClaimEvaluation(record)
-    found = claims.evaluate()
-    assert {claim.source for claim in found} == {"(I1)", "certificate"}
-    assert any("‖x̂ − x‖" in claim.bound for claim in found)
-    assert all(claim.verdict == "held" for claim in found)
-    assert any("x_c − x̂" in claim.bound for claim in found)
+    evaluated = claims.evaluate()
+    assert {claim.source for claim in evaluated} == {"(I1)", "certificate"}
+    assert any("‖x̂ − x‖" in claim.bound for claim in evaluated)
+    assert all(claim.verdict == "held" for claim in evaluated)
+    assert any("x_c − x̂" in claim.bound for claim in evaluated)
     # Relative to the plant's own state the claim of (I1) would not hold, so it is not claimed.
     joined = align_tables(record)
     e_c = row_norms(joined.x_c - true_states(record[PLANT_STEP], joined.t_ns))
@@ -132,13 +134,15 @@ def test_i1_and_the_certificate_are_claimed_of_the_estimate(
 
 def test_the_summary_contains_the_estimation_error(observed: dict[str, Any]) -> None:
     record = run(observed, disturbance=1, noise=2)
-    found = summarise_loop(record, 0, "horizon").to_json()["estimation"]
+    estimation = summarise_loop(record, 0, "horizon").to_json()["estimation"]
     norms = np.linalg.norm(estimation_error(record), axis=1)
-    assert found["max"] == pytest.approx(norms.max())
-    assert found["rms"] == pytest.approx(np.sqrt((norms**2).mean()))
-    assert (found["observer"], found["outputs"], found["noise_std"]) == ("kalman", 1, [0.02])
-    assert found["expected_rms"] == pytest.approx(np.sqrt(np.trace(steady_state(record.scenario).covariance)))
-    assert found["sup_e_c_norm"] > 0
+    assert estimation["max"] == pytest.approx(norms.max())
+    assert estimation["rms"] == pytest.approx(np.sqrt((norms**2).mean()))
+    assert (estimation["observer"], estimation["outputs"], estimation["noise_std"]) == ("kalman", 1, [0.02])
+    assert estimation["expected_rms"] == pytest.approx(
+        np.sqrt(np.trace(steady_state(record.scenario).covariance))
+    )
+    assert estimation["sup_e_c_norm"] > 0
     # Without an observer, noisy measurements are used as x.
     del observed["observer"]
     observed["plant"]["measurement"] = {"noise_std": [0.02, 0.05]}
@@ -155,10 +159,10 @@ def test_exact_simulation_is_refused_in_one_line(
     disturbed = resolved(observed)
     del observed["plant"]["disturbances"]
     observed["observer"] = KALMAN | {"input_std": [0.5]}
-    for take in (continuous_loop_of, setting_of, lambda one: recorded_loop(simulate(one))):
-        for one, key in ((disturbed, r"plant\.disturbances"), (resolved(observed), "observer")):
+    for take in (continuous_loop_of, setting_of, lambda scenario: recorded_loop(simulate(scenario))):
+        for scenario, key in ((disturbed, r"plant\.disturbances"), (resolved(observed), "observer")):
             with pytest.raises(CallerError, match=key) as refusal:
-                take(one)
+                take(scenario)
             assert "\n" not in str(refusal.value)
 
 
@@ -167,8 +171,8 @@ def test_complex_poles_and_several_outputs_are_placed() -> None:
     wanted = (np.exp((-3 + 4j) * 0.01), np.exp((-3 - 4j) * 0.01), np.exp(-9 * 0.01 + 0j))
     for outputs in (np.eye(3)[:1], np.eye(3)[[0, 2]], np.eye(3)):
         L = observer_gain(Ad, outputs, wanted)
-        found = np.linalg.eigvals((np.eye(3) - L @ outputs) @ Ad)
-        np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(wanted), atol=1e-7)
+        poles = np.linalg.eigvals((np.eye(3) - L @ outputs) @ Ad)
+        np.testing.assert_allclose(np.sort_complex(poles), np.sort_complex(wanted), atol=1e-7)
 
 
 def test_an_unobservable_mode_is_reported_by_its_eigenvalue() -> None:
@@ -214,7 +218,7 @@ def test_the_scalar_steady_state_solves_the_quadratic_equation(content: dict[str
     f = np.exp(2 * a * h)
     b = r * (1 - f) - q
     before = (-b + np.sqrt(b**2 + 4 * q * r)) / 2
-    found = steady_state(resolved(content))
-    assert found.covariance[0, 0] == pytest.approx(before * r / (before + r), rel=1e-9)
-    assert found.gain[0, 0] == pytest.approx(before / (before + r), rel=1e-9)
-    assert found.radius == pytest.approx(np.exp(a * h) * r / (before + r), rel=1e-9)
+    steady = steady_state(resolved(content))
+    assert steady.covariance[0, 0] == pytest.approx(before * r / (before + r), rel=1e-9)
+    assert steady.gain[0, 0] == pytest.approx(before / (before + r), rel=1e-9)
+    assert steady.radius == pytest.approx(np.exp(a * h) * r / (before + r), rel=1e-9)

@@ -116,9 +116,9 @@ def test_mujocos_cart_pole_agrees_with_noacks() -> None:
     ours, theirs = (noack.simulate(name) for name in ("cart_pole", "cart_pole_mujoco"))
     np.testing.assert_allclose(columns(theirs), columns(ours), atol=1e-7)
     assert theirs.replay().bit_exact
-    found = linearisation(resolve(theirs.scenario))
-    assert isinstance(found, LinearisationPart)
-    assert np.abs(found.off_A).max() < 1e-6
+    part = linearisation(resolve(theirs.scenario))
+    assert isinstance(part, LinearisationPart)
+    assert np.abs(part.off_A).max() < 1e-6
     linear = json.loads(invoke("linearise", "cart_pole_mujoco", "--json").stdout)
     model = theirs.scenario.model
     np.testing.assert_allclose(linear["A"], model.A, atol=1e-6)

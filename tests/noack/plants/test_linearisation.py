@@ -42,13 +42,13 @@ class Moved:
 
 @pytest.mark.parametrize("angle", [0.0, 1.0, math.pi])
 def test_a_pendulum_has_its_jacobian_at_any_point(angle: float) -> None:
-    found = linearise(system, 2, 1, x0=np.array([angle, 0.2]), u0=np.array([0.3]))
+    linear = linearise(system, 2, 1, x0=np.array([angle, 0.2]), u0=np.array([0.3]))
     sine, cosine = math.sin(angle), math.cos(angle)
-    np.testing.assert_allclose(found.A, [[0, 1], [9.81 * cosine - 0.3 * sine, -0.1]], rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(found.B, [[0], [cosine]], rtol=1e-9)
-    np.testing.assert_allclose(found.drift, [0.2, 9.81 * sine - 0.02 + 0.3 * cosine], rtol=1e-12)
-    assert found.source == "derivative"
-    assert found.void is None
+    np.testing.assert_allclose(linear.A, [[0, 1], [9.81 * cosine - 0.3 * sine, -0.1]], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(linear.B, [[0], [cosine]], rtol=1e-9)
+    np.testing.assert_allclose(linear.drift, [0.2, 9.81 * sine - 0.02 + 0.3 * cosine], rtol=1e-12)
+    assert linear.source == "derivative"
+    assert linear.void is None
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
@@ -58,27 +58,27 @@ def test_units_of_any_size_do_not_change_the_relative_accuracy(scale: float) -> 
         return rate, acceleration
 
     at = np.zeros(2)
-    found = linearise(lambda x0: OdeSystem(PlantEquations(scaled), x0), 2, 1, x0=at)
-    np.testing.assert_allclose(found.B, [[0.0], [scale]], rtol=1e-9)
-    np.testing.assert_allclose(found.A, [[0.0, 1.0], [9.81, -0.1]], rtol=1e-9)
+    linear = linearise(lambda x0: OdeSystem(PlantEquations(scaled), x0), 2, 1, x0=at)
+    np.testing.assert_allclose(linear.B, [[0.0], [scale]], rtol=1e-9)
+    np.testing.assert_allclose(linear.A, [[0.0, 1.0], [9.81, -0.1]], rtol=1e-9)
 
 
 def test_the_motion_and_the_derivative_give_the_same_model() -> None:
     class OnlyMoved(OdeSystem):
         rates = None  # type: ignore[assignment]
 
-    found = linearise(lambda x0: OnlyMoved(PlantEquations(pendulum), x0), 2, 1)
-    assert found.source == "motion"
-    np.testing.assert_allclose(found.A, [[0, 1], [9.81, -0.1]], atol=1e-6)
-    np.testing.assert_allclose(found.B, [[0], [1]], atol=1e-6)
+    linear = linearise(lambda x0: OnlyMoved(PlantEquations(pendulum), x0), 2, 1)
+    assert linear.source == "motion"
+    np.testing.assert_allclose(linear.A, [[0, 1], [9.81, -0.1]], atol=1e-6)
+    np.testing.assert_allclose(linear.B, [[0], [1]], atol=1e-6)
 
 
 def test_the_remainder_is_of_the_second_order() -> None:
     """At θ₀ = 1 it is −g sin θ₀ δ²/2 and smaller terms, relative to the largest linear part."""
     at, held = np.array([1.0, 0.0]), np.zeros(1)
-    found = linearise(system, 2, 1, x0=at)
+    linear = linearise(system, 2, 1, x0=at)
     sizes = [
-        largest_errors(system, found, np.array([width, width, 0.0]), x0=at, u0=held) for width in (0.1, 0.01)
+        largest_errors(system, linear, np.array([width, width, 0.0]), x0=at, u0=held) for width in (0.1, 0.01)
     ]
     expected = 9.81 * math.sin(1.0) * 0.01**2 / 2 / (0.01 * (9.81 * math.cos(1.0) + 0.1))
     assert sizes[1][0] == 0.0  # ẋ₁ = x₂ is linear
@@ -91,8 +91,8 @@ DRAWN = itertools.count()  # as a plant that draws random numbers
 
 def test_a_derivative_that_is_not_the_same_twice_has_no_model() -> None:
     equations = PlantEquations(lambda t, z, u: (u[0] - z[0] + next(DRAWN),))
-    found = linearise(lambda x0: OdeSystem(equations, x0), 1, 1)
-    assert found.void == NOT_REPEATED
+    linear = linearise(lambda x0: OdeSystem(equations, x0), 1, 1)
+    assert linear.void == NOT_REPEATED
 
 
 @pytest.mark.parametrize(("step", "why"), [
@@ -102,9 +102,9 @@ def test_a_derivative_that_is_not_the_same_twice_has_no_model() -> None:
     (lambda x, u: 0.5 * x + u + next(DRAWN), NOT_REPEATED),
 ])  # fmt: skip
 def test_a_step_without_a_model_in_continuous_time_says_why(step: Any, why: str) -> None:
-    found = linearise(lambda x0: Moved(step, x0), 1, 1)
-    assert found.void == why
-    assert np.isnan(found.A).all()
+    linear = linearise(lambda x0: Moved(step, x0), 1, 1)
+    assert linear.void == why
+    assert np.isnan(linear.A).all()
 
 
 def test_dry_friction_is_found_by_the_error() -> None:
@@ -115,9 +115,9 @@ def test_dry_friction_is_found_by_the_error() -> None:
         return OdeSystem(PlantEquations(dry), x0)
 
     x, u = np.array([0.2]), np.zeros(1)
-    found = linearise(at, 1, 1, x0=x)
-    assert largest_errors(at, found, np.full(2, 0.1), x0=x, u0=u)[0] == 0.0
-    assert largest_errors(at, found, np.full(2, 0.5), x0=x, u0=u)[0] > 0.1
+    linear = linearise(at, 1, 1, x0=x)
+    assert largest_errors(at, linear, np.full(2, 0.1), x0=x, u0=u)[0] == 0.0
+    assert largest_errors(at, linear, np.full(2, 0.5), x0=x, u0=u)[0] > 0.1
 
 
 def start(n: int = 2, m: int = 1, step_ns: int = 50_000_000) -> PlantStart:
@@ -128,12 +128,12 @@ def test_the_pendulum_of_gymnasium_has_the_logarithm_of_its_step() -> None:
     """ω' = ω + (15 sin θ + 3u) h and θ' = θ + ω' h, with θ = 0 upright, h = 0.05 s."""
     pytest.importorskip("gymnasium", reason="the extra `gymnasium` is not installed")
     settings, h = GymnasiumSettings(kind="gymnasium", id="Pendulum-v1"), 0.05
-    found = linearise(lambda x0: settings.system(start()._replace(x0=x0)), 2, 1, step_ns=round(h * 1e9))
+    linear = linearise(lambda x0: settings.system(start()._replace(x0=x0)), 2, 1, step_ns=round(h * 1e9))
     step = np.array([[1 + 15 * h * h, h, 3 * h * h], [15 * h, 1, 3 * h], [0, 0, 1]])
     expected = logm(step) / h
-    np.testing.assert_allclose(found.A, expected[:2, :2], atol=1e-6)
-    np.testing.assert_allclose(found.B, expected[:2, 2:], atol=1e-6)
-    np.testing.assert_allclose(expm(found.A * h), step[:2, :2], atol=1e-7)
+    np.testing.assert_allclose(linear.A, expected[:2, :2], atol=1e-6)
+    np.testing.assert_allclose(linear.B, expected[:2, 2:], atol=1e-6)
+    np.testing.assert_allclose(expm(linear.A * h), step[:2, :2], atol=1e-7)
     moved = settings.system(start()._replace(x0=np.array([0.1, 0.2])))
     moved.advance(np.array([0.5]), 0, 50_000_000)
     speed = 0.2 + (15 * math.sin(0.1) + 1.5) * h

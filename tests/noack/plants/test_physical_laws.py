@@ -40,8 +40,8 @@ def published() -> signal.TransferFunction:
 
 def test_the_step_response_is_the_published_transfer_functions() -> None:
     _, angle = signal.step(published(), T=np.arange(101) * H_NS * 1e-9)
-    found = motion(DcMotor(settings(), np.zeros(3)), [1.0] * 100)
-    np.testing.assert_allclose(found[:, 0], angle, atol=1e-9)
+    states = motion(DcMotor(settings(), np.zeros(3)), [1.0] * 100)
+    np.testing.assert_allclose(states[:, 0], angle, atol=1e-9)
     assert angle[-1] > 5.0
 
 
@@ -64,9 +64,11 @@ def reference(motor: DcMotorSettings, x: np.ndarray, voltage: float, end_s: floa
             return float(s * z[1] if s else abs(K * z[2]) - T_c)
 
         change.terminal, change.direction = True, -1 if turning else 1  # type: ignore[attr-defined]
-        found = solve_ivp(derivative, (t_s, end_s), x, events=change, method="Radau", rtol=1e-10, atol=1e-13)
-        t_s, x = found.t[-1], found.y[:, -1].copy()
-        if found.status == 1 and turning:
+        solution = solve_ivp(
+            derivative, (t_s, end_s), x, events=change, method="Radau", rtol=1e-10, atol=1e-13
+        )
+        t_s, x = solution.t[-1], solution.y[:, -1].copy()
+        if solution.status == 1 and turning:
             x[1] = 0.0
     return x
 
@@ -107,10 +109,10 @@ def test_a_free_cart_pole_keeps_its_energy_and_its_momentum() -> None:
 def test_its_linearisation_has_the_poles_of_the_literature() -> None:
     """Open-loop poles by the Control Tutorials (MATLAB): 0, -0.1428, -5.6041, 5.5651."""
     equations = CartPoleSettings(kind="cart_pole").equations()
-    found = linearise(lambda x0: OdeSystem(equations, x0), 4, 1)
-    poles = np.sort(np.linalg.eigvals(found.A).real)
+    linear = linearise(lambda x0: OdeSystem(equations, x0), 4, 1)
+    poles = np.sort(np.linalg.eigvals(linear.A).real)
     np.testing.assert_allclose(poles, [-5.6041, -0.1428, 0.0, 5.5651], atol=1e-4)
-    np.testing.assert_allclose(found.B[:, 0], [0.0, 1.8182, 0.0, -4.5455], atol=1e-4)
+    np.testing.assert_allclose(linear.B[:, 0], [0.0, 1.8182, 0.0, -4.5455], atol=1e-4)
 
 
 def test_arithmetic_errors_in_a_derivative_count_as_divergence_others_are_raised() -> None:
@@ -134,8 +136,8 @@ def test_the_linearisation_has_the_published_frequency_response() -> None:
     A, B = settings().linearisation()
     w = np.logspace(-1, 7, 50)
     _, expected = signal.freqresp(published(), w)
-    found = [(np.linalg.solve(1j * one * np.eye(3) - A, B))[0, 0] for one in w]
-    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    response = [(np.linalg.solve(1j * frequency * np.eye(3) - A, B))[0, 0] for frequency in w]
+    np.testing.assert_allclose(response, expected, rtol=1e-9)
 
 
 TOLERANCES = 1e-6, 1e-9
@@ -182,7 +184,7 @@ def test_parabolas_between_jumps_are_exact(duration_s: float) -> None:
 
 def test_endless_changes_of_a_sign_end_the_integration(monkeypatch: pytest.MonkeyPatch) -> None:
     """z slides along the jump: no sign can be held, and an error control cannot pass."""
-    monkeypatch.setattr(jump_integrator, "_MAX_STEPS", 1000)
+    monkeypatch.setattr(jump_integrator, "MAX_STEPS", 1000)
     rates = Switched(lambda z, sign: [0.2 - sign])
     code, z = advanced(rates, [0.5], 2.0)
     assert code < 0

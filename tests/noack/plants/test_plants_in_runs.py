@@ -129,7 +129,7 @@ def test_a_failed_plant_stops_moving_and_the_run_is_recorded(
     assert len(x) == 501
     assert np.isfinite(x[:251]).all()
     assert np.isnan(x[251:]).all()
-    (notice,) = [one for one in record.notices if one["level"] == "failed"]
+    (notice,) = [notice for notice in record.notices if notice["level"] == "failed"]
     assert notice["t_ns"] == 502_000_000
     assert replay(record).bit_exact
     (loop,) = outcome.summary.loops

@@ -31,8 +31,8 @@ def parameters(car: str) -> Any:
 
 
 def linearised(chosen: VehicleSettings) -> tuple[np.ndarray, np.ndarray]:
-    found = linearise(lambda x0: OdeSystem(chosen.equations(), x0), 4, 1, settling_s=chosen.settling_s)
-    return found.A, found.B
+    linear = linearise(lambda x0: OdeSystem(chosen.equations(), x0), 4, 1, settling_s=chosen.settling_s)
+    return linear.A, linear.B
 
 
 @pytest.mark.parametrize("car", CARS)

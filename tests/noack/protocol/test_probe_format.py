@@ -24,8 +24,8 @@ def test_each_field_is_where_the_table_says(probe: ProbeDatagram, size_bytes: in
     assert int.from_bytes(data[8:12], "little") == zlib.crc32(data[:8] + data[12:])
     fields = [(at, at + 8) for at in range(12, 84, 8)] + [(84, 100)]
     signed = (36, 44)
-    found = [int.from_bytes(data[at:end], "little", signed=at in signed) for at, end in fields]
-    assert found == [*probe[1:]]
+    numbers = [int.from_bytes(data[at:end], "little", signed=at in signed) for at, end in fields]
+    assert numbers == [*probe[1:]]
     assert not any(data[100:])
     assert decode_probe(data) == probe
 

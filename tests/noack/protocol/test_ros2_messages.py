@@ -10,9 +10,9 @@ ENTRIES = ros2.Entries(1_234_567_890_123, ("y", "ψ"), np.array([0.1, -np.inf]))
 
 
 def test_a_joint_state_is_unchanged_by_writing_and_reading() -> None:
-    found = ros2.read_joint_state(ros2.joint_state(ENTRIES, "lane"))
-    assert found[:2] == ENTRIES[:2]
-    assert found.values.tobytes() == ENTRIES.values.tobytes()
+    entries = ros2.read_joint_state(ros2.joint_state(ENTRIES, "lane"))
+    assert entries[:2] == ENTRIES[:2]
+    assert entries.values.tobytes() == ENTRIES.values.tobytes()
 
 
 def test_no_part_of_a_joint_state_is_one() -> None:

@@ -16,7 +16,16 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from noack.protocol.wire_format import Encoder, Flow, Header, Message, Rejection, loop_number, read_header
+from noack.protocol.wire_format import (
+    MAX_LOOPS,
+    Encoder,
+    Flow,
+    Header,
+    Message,
+    Rejection,
+    loop_number,
+    read_header,
+)
 from tests.helpers.approved import compare_text
 from tests.oracles.wire import ACCEPTED, KEY, RUN, BothReceivers, datagram
 
@@ -171,6 +180,12 @@ def test_a_vector_or_key_that_a_flow_cannot_have_is_refused() -> None:
         Encoder(RUN, KEY).encode(Message(Flow.ACKNOWLEDGEMENT, 0, 0, np.zeros(1)))
     with pytest.raises(ValueError, match="does not fit its field"):
         Encoder(RUN, KEY).encode(Message(Flow.UPDATE, 0, 0, np.zeros(1), error_level=256))
+    for loop in (-1, MAX_LOOPS):
+        with pytest.raises(ValueError, match=f"does not fit its field: loop {loop}"):
+            Encoder(RUN, KEY).encode(Message(Flow.UPDATE, 0, 0, np.zeros(1), loop=loop))
+    for loop in (0, MAX_LOOPS - 1):
+        datagram = Encoder(RUN, KEY).encode(Message(Flow.UPDATE, 0, 0, np.zeros(1), loop=loop))
+        assert loop_number(datagram) == loop
     with pytest.raises(ValueError, match="32 bytes, not 31"):
         Encoder(RUN, bytes(31))
     for shape in ((0,), (65,), (2, 2), (1, 3)):
@@ -250,8 +265,8 @@ def test_the_published_file_is_what_both_receivers_do() -> None:
         }
         for version in (1, 2)
     ]  # fmt: skip
-    found = {entry["result"] for one in receivers for entry in one["datagrams"]}
-    assert len(found) == 11  # each reason but `shed`, and accepted
+    results = {entry["result"] for receiver in receivers for entry in receiver["datagrams"]}
+    assert len(results) == 11  # each reason but `shed`, and accepted
     about = "Datagrams in the order in which a receiver gets them; see wire.md, Test vectors"
     text = json.dumps({"about": about, "key": KEY.hex(), "receivers": receivers}, indent=1) + "\n"
     compare_text(DOCS / "wire-vectors.json", text)

@@ -178,7 +178,7 @@ def test_a_launched_process_connects_again_until_it_is_admitted(
     asking = partial(_admitted, "plant", changed(descriptor, launched=launched), Signals())
     if launched:
         assert asking().plane is cast(Any, tries[2])
-        assert [one.is_closed for one in tries] == [False, True, False]
+        assert [attempt.is_closed for attempt in tries] == [False, True, False]
     else:
         with pytest.raises(NoAnswerError, match="cannot reach"):
             asking()

@@ -17,11 +17,11 @@ Object = dict[str, Any]
 
 
 def objects(text: str) -> list[Object]:
-    found = [json.loads(line) for line in text.splitlines()]
-    for one in found:
-        assert {"time", "level", "source", "message"} <= one.keys()
-        assert one["time"].endswith("Z")
-    return found
+    lines = [json.loads(line) for line in text.splitlines()]
+    for line in lines:
+        assert {"time", "level", "source", "message"} <= line.keys()
+        assert line["time"].endswith("Z")
+    return lines
 
 
 def standard_error(monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
@@ -40,8 +40,8 @@ def test_each_line_of_the_log_becomes_a_json_object(monkeypatch: pytest.MonkeyPa
     print_to_stderr("text again")
     *lines, last = error.getvalue().splitlines()
     assert last == "text again"
-    found = [(one["level"], one["source"], one["message"]) for one in objects("\n".join(lines))]
-    assert found == [
+    lines = [(line["level"], line["source"], line["message"]) for line in objects("\n".join(lines))]
+    assert lines == [
         ("warning", "noack", "no disk"),
         ("info", "noack netem", "ready"),
         ("info", "noack", "a plain line"),
@@ -56,14 +56,14 @@ def test_an_event_has_its_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not log_event("info", "noack", "text", event="progress")
     with log_format(LogFormat.JSONL):
         assert log_event("info", "noack", "m", event="progress", x=math.inf, n=3, p=Path("a"))
-        (found,) = objects(error.getvalue())
+        (line,) = objects(error.getvalue())
         error.close()  # as a closed pipe, it is ignored
         assert log_event("info", "noack", "m")
-    assert (found["event"], found["x"], found["n"], found["p"]) == ("progress", None, 3, "a")
+    assert (line["event"], line["x"], line["n"], line["p"]) == ("progress", None, 3, "a")
 
 
 def test_a_mistake_becomes_a_json_object() -> None:
     done = invoke("run", "nowhere", "--log-format", "jsonl")
-    (found,) = objects(done.stderr)
-    assert (done.exit_code, found["level"]) == (2, "error")
-    assert found["message"].startswith("nowhere: no such file")
+    (line,) = objects(done.stderr)
+    assert (done.exit_code, line["level"]) == (2, "error")
+    assert line["message"].startswith("nowhere: no such file")

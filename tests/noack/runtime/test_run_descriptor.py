@@ -44,10 +44,10 @@ def test_an_invitation_is_for_its_owner_only_and_is_read_again(tmp_path: Path) -
     path.chmod(0o644)
     write_invitation(path, INVITED)
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
-    found = read_invitation(path, tmp_path / "kept")
+    descriptor = read_invitation(path, tmp_path / "kept")
     expected = {"run_dir": str(tmp_path / "kept" / "one"), "host": "127.0.0.1"}
-    assert found == INVITED.model_copy(update=expected)
-    assert [one.name for one in tmp_path.iterdir()] == ["invitation.json"]
+    assert descriptor == INVITED.model_copy(update=expected)
+    assert [path.name for path in tmp_path.iterdir()] == ["invitation.json"]
 
 
 def _absent(path: Path) -> None:
@@ -108,7 +108,7 @@ def test_an_invitation_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     with pytest.raises(CallerError, match="the invitation cannot be written: not a regular file"):
         write_invitation(tmp_path / "folder", INVITED)
-    assert [one.name for one in tmp_path.iterdir()] == ["folder"]  # no file with the keys is left
+    assert [path.name for path in tmp_path.iterdir()] == ["folder"]  # no file with the keys is left
 
 
 def test_a_run_removes_its_own_invitation_only(tmp_path: Path) -> None:
@@ -184,7 +184,7 @@ def test_exactly_one_of_many_concurrent_runs_opens_a_session(
         winner = errors.index("")
         refusal = "session 'lab': another run is open in it; choose --session NAME"
         assert sorted(errors) == ["", *[refusal] * (at_once - 1)]
-        found = find_descriptor("lab")
-        assert found is not None
-        assert found.run_id == winner
+        descriptor = find_descriptor("lab")
+        assert descriptor is not None
+        assert descriptor.run_id == winner
     assert list(private_folder().iterdir()) == []

@@ -167,18 +167,17 @@ def test_rows_that_the_recorder_never_takes_are_stored_and_reported(
 def test_what_two_runs_with_one_directory_keep_stays_apart(tmp_path: Path) -> None:
     """Runs of two recorders that began in one second, with processes on one host."""
     header = json.dumps({"first": 0}).encode()
-    one, again, other = (
+    first, again, other = (
         OwnSpool(tmp_path / "run", "sensor", writer, remote_run_name)
         for writer, remote_run_name in [("a", "0001"), ("b", "0001"), ("c", "0002")]
     )
     assert not (tmp_path / "run").exists()  # nothing is left of a run that kept nothing
-    for spool in (one, again, other):
+    for spool in (first, again, other):
         spool.append("sensor_event", header, b"rows")
-        spool._files.close()
-    assert one.folder == again.folder == tmp_path / "run"
+    assert first.folder == again.folder == tmp_path / "run"
     assert other.folder == tmp_path / "run-0002"
-    assert [kept_run_name(found) for found in (one.folder, other.folder)] == ["0001", "0002"]
-    assert len(list((one.folder / "spool").glob("sensor_event.*"))) == 2
+    assert [kept_run_name(spool) for spool in (first.folder, other.folder)] == ["0001", "0002"]
+    assert len(list((first.folder / "spool").glob("sensor_event.*"))) == 2
     assert len(list((other.folder / "spool").glob("sensor_event.*"))) == 1
 
 

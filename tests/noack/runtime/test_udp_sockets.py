@@ -15,7 +15,7 @@ from noack.protocol.wire_format import Flow
 from noack.runtime import udp_sockets
 from noack.runtime.address import LOOPBACK, Address, address_text, family_of, parse_address, parse_destination
 from noack.runtime.drivers.live_driver import LoopChannel
-from noack.runtime.udp_sockets import SHED, SourceCount, bind, enlarge_buffer, open_beside
+from noack.runtime.udp_sockets import DROPPED_IN_FLOOD, SourceCount, bind, enlarge_buffer, open_beside
 from tests.noack.runtime.drivers.live_loops import Live, measurement, scenario
 
 
@@ -33,23 +33,23 @@ def stack() -> Iterator[ExitStack]:
 
 
 def test_each_socket_receives_its_peer_and_the_port_cannot_be_bound_again(stack: ExitStack) -> None:
-    endpoint, first, second, stranger = (stack.enter_context(opened()) for _ in range(4))
+    endpoint, first, second, unknown_sender = (stack.enter_context(opened()) for _ in range(4))
     beside = open_beside(endpoint, [first.getsockname(), second.getsockname()])
-    for one in beside:
-        stack.enter_context(one)
-    for number, sender in enumerate((first, second, stranger)):
+    for receiver in beside:
+        stack.enter_context(receiver)
+    for number, sender in enumerate((first, second, unknown_sender)):
         for _ in range(number + 1):
             sender.sendto(bytes([number]), endpoint.getsockname())
-    for number, one in enumerate((*beside, endpoint)):
+    for number, receiver in enumerate((*beside, endpoint)):
         for _ in range(number + 1):
-            assert one.recv(9) == bytes([number])
+            assert receiver.recv(9) == bytes([number])
         with pytest.raises(BlockingIOError):
-            one.recv(9)
+            receiver.recv(9)
     for option in (socket.SO_REUSEPORT, socket.SO_REUSEADDR):
-        thief = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-        thief.setsockopt(socket.SOL_SOCKET, option, 1)
+        second_endpoint = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        second_endpoint.setsockopt(socket.SOL_SOCKET, option, 1)
         with pytest.raises(OSError, match="in use"):
-            thief.bind(endpoint.getsockname())
+            second_endpoint.bind(endpoint.getsockname())
 
 
 @pytest.mark.sanitized
@@ -68,7 +68,7 @@ def test_a_flood_displaces_no_peer_datagram_and_all_are_counted(content: dict[st
         live.channel.finish(0, live.rows)
         report = live.channel.report()
     rejected: Any = report["rejected"]
-    assert rejected[SHED] > 5000
+    assert rejected[DROPPED_IN_FLOOD] > 5000
     assert sum(rejected.values()) == sent
     assert report["accepted"] == 10
     assert report["kernel_drops"] == 0
@@ -115,7 +115,7 @@ def test_many_sources_take_bounded_memory_and_a_short_report() -> None:
         for source in (peer, (f"127.0.1.{number % 251}", number % 65_521)):
             count.add(source)
             total += 1
-    assert len(count._others) <= 256
+    assert len(count.others) <= 256
     report = count.report()
     assert report["127.0.0.1:1"] == 10_000
     assert report["127.0.0.1:2"] == 1

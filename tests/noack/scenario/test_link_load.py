@@ -124,8 +124,8 @@ def test_a_schedule_has_enough_slots_for_each_loop(
     loops = {"name": "a", "count": 3, "trigger": PERIODIC}
 
     def given(slot_s: float) -> Scenario:
-        one = {"kind": "schedule", "order": order, "slot_s": slot_s}
-        return scenario_of(content, 1, 1, loops, impairments=[one])
+        schedule = {"kind": "schedule", "order": order, "slot_s": slot_s}
+        return scenario_of(content, 1, 1, loops, impairments=[schedule])
 
     with pytest.raises(CallerError, match=re.escape(says)):
         require_capacity(given(0.031))
@@ -175,20 +175,20 @@ def test_the_bound_of_the_delay_is_in_closed_form_and_nearly_reached(
     reached_s: float,
 ) -> None:  # fmt: skip
     loops = {"name": "a", "count": 1, "trigger": PERIODIC}
-    stages = [one | {"rate_bps": round(one["rate_bps"])} if "rate_bps" in one else one
-              for one in stages]  # fmt: skip
+    stages = [stage | {"rate_bps": round(stage["rate_bps"])} if "rate_bps" in stage else stage
+              for stage in stages]  # fmt: skip
     given = scenario_of(content, 1000, 1, loops, impairments=stages, mansd=mansd)
     assert update_delay(given).largest_s == pytest.approx(bound_s, rel=1e-3)
     longest_s = max(longest_delay_s(given, 1, seed, together=False) for seed in range(8))
     assert reached_s <= longest_s <= bound_s * 1.001
 
 
-def _is_alone_valid(one: Impairment) -> bool:
+def _is_alone_valid(impairment: Impairment) -> bool:
     """Whether it needs no file, and no loss rate of several stages together."""
-    return not names_file(one) and not keeps_loss(one)
+    return not names_file(impairment) and not keeps_loss(impairment)
 
 
-EXAMPLES = [one for one in IMPAIRED if _is_alone_valid(one)]
+EXAMPLES = [impairment for impairment in IMPAIRED if _is_alone_valid(impairment)]
 QUEUES = [
     Rate(rate_bps=round(7 * BITS / 0.05 * share), queue=queue)
     for share in (0.4, 0.7, 1.1, 2.5) for queue in (1, 4)
@@ -215,7 +215,7 @@ def test_the_largest_delay_is_bounded_and_a_warning_tells_that_it_is_not_covered
     try:
         require_scores(stages)
     except ValueError:
-        stages = [one for one in stages if not getattr(one, "loss_correlation", 0)]
+        stages = [stage for stage in stages if not getattr(stage, "loss_correlation", 0)]
     content = {
         "name": "small", "horizon_s": 1.0, "model": {"name": "double_integrator"},
         "plant": {"initial_state": [1.0, 0.0]}, "trigger": PERIODIC,
@@ -235,5 +235,5 @@ def test_the_largest_delay_is_bounded_and_a_warning_tells_that_it_is_not_covered
     certificate = scenario.certificate.model_copy(update={"network_delay_s": covered_s})
     scenario = scenario.model_copy(update={"certificate": certificate})
     warnings = [*load_warnings(link_loads(scenario), scenario)]
-    warned = any("certificates cover" in one or "without bound" in one for one in warnings)
+    warned = any("certificates cover" in warning or "without bound" in warning for warning in warnings)
     assert warned == (bound_s > covered_s)

@@ -27,7 +27,7 @@ def test_a_loop_is_the_top_level_with_its_own_keys(content: dict[str, Any]) -> N
         {"name": "third", "trigger": periodic},
     )
     loops = loops_of(scenario)
-    assert [one.name for one in loops[:3]] == ["one", "other-01", "other-02"]
+    assert [loop.name for loop in loops[:3]] == ["one", "other-01", "other-02"]
     assert (loops[10].name, loops[11].name, len(loops)) == ("other-10", "third", 12)
     alone = validate(content, "here")
     assert loops_of(alone) == (alone,)
@@ -46,9 +46,9 @@ def test_each_loop_draws_its_own_plant_state_and_phase(content: dict[str, Any]) 
     }  # fmt: skip
     count = 200
     scenario = with_loops(content, {"name": "a", "count": count})
-    drawn = [loop_of(resolve(one)) for one in loops_of(scenario)]
-    assert len({one.A.tobytes() for one in drawn}) == count
-    assert len({one.x0.tobytes() for one in drawn}) == count
+    drawn = [loop_of(resolve(loop)) for loop in loops_of(scenario)]
+    assert len({system.A.tobytes() for system in drawn}) == count
+    assert len({system.x0.tobytes() for system in drawn}) == count
     phases, period_ns = phases_ns(scenario), scenario.timing.measurement_period_ns
     assert phases[0] == 0
     assert 0 <= min(phases) <= max(phases) < period_ns
@@ -61,7 +61,7 @@ def test_each_loop_draws_its_own_plant_state_and_phase(content: dict[str, Any]) 
     # They are functions of the run's seeds and the loop's number.
     fewer = with_loops(content, {"name": "b", "count": 3}, {"name": "c"})
     assert phases_ns(fewer) == phases[:4]
-    assert [one.seeds for one in loops_of(fewer)] == [one.seeds for one in loops_of(scenario)[:4]]
+    assert [loop.seeds for loop in loops_of(fewer)] == [loop.seeds for loop in loops_of(scenario)[:4]]
     other = with_loops(content | {"seeds": {"initial_state": 1}}, {"name": "a", "count": 3})
     assert phases_ns(other)[1:] != phases[1:3]
 

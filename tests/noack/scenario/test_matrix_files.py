@@ -150,9 +150,9 @@ def test_a_system_of_a_library_or_a_tuple_is_accepted_as_a_model(name: str) -> N
 def test_a_saved_system_is_read_back(suffix: str, read: Any, tmp_path: Path) -> None:
     path = tmp_path / f"plant{suffix}"
     save_model(path, signal.StateSpace(A, B, C, D), K)
-    found = read(path)
+    matrices = read(path)
     for name, expected in (("A", A), ("B", B), ("gain", K)):
-        assert np.array_equal(found[name], expected)
+        assert np.array_equal(matrices[name], expected)
     save_model(path, (A, B))
     assert "gain" not in read(path)
 

@@ -99,8 +99,8 @@ def test_the_shipped_lane_scenario_has_the_papers_numbers() -> None:
     """Â, B̂, K, β, α, M − 1 and the box of Section V."""
     scenario = load(SCENARIOS / "lane_following.toml")
     loop, paper = loop_of(resolve(scenario)), lane_following()
-    for found, expected in ((loop.A_model, paper.A), (loop.B_model, paper.B), (loop.K, paper.K)):
-        np.testing.assert_array_equal(found, expected)
+    for matrix, expected in ((loop.A_model, paper.A), (loop.B_model, paper.B), (loop.K, paper.K)):
+        np.testing.assert_array_equal(matrix, expected)
     rule = scenario.trigger
     assert (rule.beta, rule.alpha_per_s, rule.floor, rule.weight) == (0.5, 0.25, 0, None)
     assert scenario.network.mansd == 4
@@ -119,8 +119,8 @@ def test_states_that_are_equilibria_by_construction_are_taken(seed: int) -> None
     A, B = rng.normal(size=(n, n)), rng.normal(size=(n, m))
     x_r, u_r = rng.normal(size=n), rng.normal(size=m)
     A -= np.outer(A @ x_r + B @ u_r, x_r) / (x_r @ x_r)
-    found = input_at(A, B, x_r)
-    assert A @ x_r + B @ found == pytest.approx(np.zeros(n), abs=1e-9 * np.abs(A).max() * 10)
+    solved = input_at(A, B, x_r)
+    assert A @ x_r + B @ solved == pytest.approx(np.zeros(n), abs=1e-9 * np.abs(A).max() * 10)
 
 
 def test_the_matrices_that_are_kept_cannot_be_changed() -> None:
@@ -168,11 +168,11 @@ def test_an_invalid_change_is_refused_with_the_approved_line(scenario: Scenario)
 
 def test_a_change_leaves_all_other_settings_unchanged(scenario: Scenario) -> None:
     settings = {"network.loss.probability": 0.9, "network.mansd": 1, "trigger.beta": 0.25}
-    found = changed(scenario, settings)
-    assert found.network.loss == BernoulliLoss(probability=0.9)
-    assert (found.network.mansd, found.decaying.beta) == (1, 0.25)
+    new = changed(scenario, settings)
+    assert new.network.loss == BernoulliLoss(probability=0.9)
+    assert (new.network.mansd, new.decaying.beta) == (1, 0.25)
     back = {"network.loss.probability": 0.5, "network.mansd": 2, "trigger.beta": 0.5}
-    assert changed(found, back) == scenario
+    assert changed(new, back) == scenario
     moved = changed(scenario, {"controller.setpoint": [3.0, 0.0]})
     assert validate(moved.model_dump(mode="json"), "x") == moved
 
@@ -207,12 +207,15 @@ def test_changes_announced_out_of_order_are_applied_in_order_of_time(scenario: S
     assert schedule.next_ns == 100
     assert schedule.take(99) == []
     taken = schedule.take(250)
-    assert [one.since_ns for one in taken] == [100, 200]
-    scenarios = [one.scenario for one in taken]
-    assert [(one.network.mansd, one.decaying.beta) for one in scenarios] == [(5, 0.5), (5, 0.1)]
+    assert [change.since_ns for change in taken] == [100, 200]
+    scenarios = [change.scenario for change in taken]
+    assert [(scenario.network.mansd, scenario.decaying.beta) for scenario in scenarios] == [
+        (5, 0.5),
+        (5, 0.1),
+    ]
     assert schedule.take(10**9) == []
     assert schedule.next_ns > 10**18
-    caps = [one.network.mansd for one in schedule.between(0, 150)]
+    caps = [scenario.network.mansd for scenario in schedule.between(0, 150)]
     assert caps == [2, 5]
 
 

@@ -62,9 +62,9 @@ def longest_ns(scheduler: Scheduler, sizes: Any, arrivals: Any) -> list[int]:
 
     def let_out(until_ns: int) -> None:
         while (due_ns := channel.due_ns) <= until_ns:
-            for one in channel.release(due_ns):
-                own_ns = due_ns - sent_ns[one.flow][one.number]
-                longest[one.flow] = max(longest[one.flow], own_ns)
+            for packet in channel.release(due_ns):
+                own_ns = due_ns - sent_ns[packet.flow][packet.number]
+                longest[packet.flow] = max(longest[packet.flow], own_ns)
 
     for t_us, second, flow in sorted(arrivals):
         let_out(t_us * US)
@@ -76,16 +76,16 @@ def longest_ns(scheduler: Scheduler, sizes: Any, arrivals: Any) -> list[int]:
 
 def bounds_ns(scheduler: Scheduler, sizes: Any, least_us: Any) -> list[float]:
     flows = range(len(sizes))
-    found = []
+    bounds_ns = []
     for flow in flows:
         kinds: dict[Sender, int] = {}
-        for one in flows:
-            yields_ns = scheduler.yields_ns(scheduler.number(flow), scheduler.number(one))
-            kind = Sender(least_us[one] * US, sizes[one] * US, yields_ns)
-            kinds[kind] = kinds.get(kind, 0) + (one != flow)
+        for other in flows:
+            yields_ns = scheduler.yields_ns(scheduler.number(flow), scheduler.number(other))
+            kind = Sender(least_us[other] * US, sizes[other] * US, yields_ns)
+            kinds[kind] = kinds.get(kind, 0) + (other != flow)
         others = {kind: count for kind, count in kinds.items() if count}
-        found.append(response_ns(Sender(least_us[flow] * US, sizes[flow] * US), others))
-    return found
+        bounds_ns.append(response_ns(Sender(least_us[flow] * US, sizes[flow] * US), others))
+    return bounds_ns
 
 
 def scheduler_of(numbers: Any, kind: type[Scheduler]) -> Scheduler:
@@ -124,10 +124,10 @@ def test_no_arrivals_exceed_the_bound(loops: Any, kind: type[Scheduler], data: s
 def test_the_loops_of_each_bound_are_named() -> None:
     """Updates take 2.5 ms each, 10 ms apart; loops 0 to 2 need three quarters of the rate."""
     levels = "network.impairments.0.discipline.levels=[1,2,1,3]"
-    (found,) = link_loads(shipped("priority_channel", levels, "loops=[{name='p',count=5}]"))
+    (load,) = link_loads(shipped("priority_channel", levels, "loops=[{name='p',count=5}]"))
     bounds = (("p-1, p-3", 0.0075), ("p-2", 0.01), ("p-4 to p-5", math.inf))
-    assert found.loop_bounds == bounds
-    assert found.delay_bound_s is None
+    assert load.loop_bounds == bounds
+    assert load.delay_bound_s is None
 
 
 @pytest.mark.parametrize(

@@ -82,23 +82,23 @@ _SUGGESTED = re.compile(r"(?:try|e\.g\.|% is) (\[.*\]|[\d.]+)$")
 def test_the_lines_about_mistakes_are_those_that_were_approved(tmp_path: Path) -> None:
     """``APPROVE=1 pytest`` writes them anew: read the difference. What they suggest is valid."""
     page, text = Path(__file__).with_name("mistakes.txt"), ""
-    found: list[str] = []
+    lines: list[str] = []
     for line in page.read_text(encoding="utf-8").splitlines():
         if line.startswith("    "):
             continue
-        found.append(line)
+        lines.append(line)
         if line.startswith("# "):
             text = {"# LANE": LANE, "# DOUBLE": DOUBLE}[line]
         elif text:
             about = mistakes(text, tmp_path, line.split(" & "))
-            found += [f"    {one.removeprefix('FILE: ')}" for one in about]
+            lines += [f"    {mistake.removeprefix('FILE: ')}" for mistake in about]
             if suggested := _SUGGESTED.search(about[0]):
                 key = about[0].removeprefix("FILE: ").partition(" = ")[0].removesuffix(".0")
                 right = [*line.split(" & "), f"{key}={suggested[1]}", "model.allow_unstable=true"]
                 validate(tomllib.loads(content_with(text, right)), "here")
     if os.environ.get("APPROVE"):
-        page.write_text("\n".join(found) + "\n", encoding="utf-8")
-    assert "\n".join(found) + "\n" == page.read_text(encoding="utf-8")
+        page.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    assert "\n".join(lines) + "\n" == page.read_text(encoding="utf-8")
 
 
 def test_a_mistake_in_a_setting_is_not_attributed_to_the_file(tmp_path: Path) -> None:
@@ -121,10 +121,10 @@ def test_invalid_toml_is_reported_with_its_line(tmp_path: Path) -> None:
 def test_a_setting_names_an_entry_of_a_list(tmp_path: Path) -> None:
     path = tmp_path / "scenario.toml"
     path.write_text(LANE + '[[loops]]\nname = "a"\n[[loops]]\nname = "b"\n')
-    found = load(path, ["plant.initial_state.2=0.5", "loops.1.mode=zoh", "loops.1.name=c"])
-    assert found.plant.initial_state[2] == 0.5
-    assert found.loops is not None
-    assert [(one.name, one.mode) for one in found.loops] == [("a", None), ("c", "zoh")]
+    scenario = load(path, ["plant.initial_state.2=0.5", "loops.1.mode=zoh", "loops.1.name=c"])
+    assert scenario.plant.initial_state[2] == 0.5
+    assert scenario.loops is not None
+    assert [(loop.name, loop.mode) for loop in scenario.loops] == [("a", None), ("c", "zoh")]
     with pytest.raises(CallerError, match=r"^--set loops\.1\.name = .a.: the name a is already"):
         load(path, ["loops.1.name=a"])
 

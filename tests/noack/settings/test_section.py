@@ -27,9 +27,9 @@ def real_numbers(schema: Any) -> Iterator[Any]:
 def test_no_setting_accepts_infinity_or_nan(file: type[ScenarioSection]) -> None:
     """The JSON Schema cannot express it."""
     file.model_rebuild()
-    found = list(real_numbers(file.__pydantic_core_schema__))
-    assert len(found) > 20
-    assert {one.get("allow_inf_nan") for one in found} == {False}
+    schemas = list(real_numbers(file.__pydantic_core_schema__))
+    assert len(schemas) > 20
+    assert {schema.get("allow_inf_nan") for schema in schemas} == {False}
 
 
 def test_sections_without_their_source_have_no_descriptions(

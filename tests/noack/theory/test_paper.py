@@ -15,7 +15,7 @@ from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.bounds.enclosure import response
 from noack.theory.paper import (
     ErrorMonitor,
-    Interval,
+    InterEventTrajectory,
     Theorem2,
     _theorem_2,
     longest_interval_s,
@@ -101,13 +101,13 @@ def test_the_slower_of_model_and_threshold_determines_the_interval(alpha: float)
         for gamma in np.geomspace(1e-3, 1e3, 2000)
         if (eta := float((x * np.exp(-gamma * passed_s)).min())) > 0
     )
-    longest_s = longest_interval_s(Interval(t_s, x, model), beta, alpha, kappa)
+    longest_s = longest_interval_s(InterEventTrajectory(t_s, x, model), beta, alpha, kappa)
     assert expected * (1 - 1e-9) <= longest_s <= 1.02 * expected
 
 
 def test_a_trajectory_through_0_has_no_longest_interval() -> None:
     t_s = np.linspace(0, 1, 11)
-    through = Interval(t_s, np.abs(t_s - 0.5), np.ones(11))
+    through = InterEventTrajectory(t_s, np.abs(t_s - 0.5), np.ones(11))
     assert longest_interval_s(through, 0.1, 0.5, 0.5) == math.inf
     assert theorem_1(-np.eye(1), 0.5, [math.inf]) == math.inf
     assert theorem_1(-np.eye(1), 0.5, [1e6]) == math.inf  # e^{5e5} overflows

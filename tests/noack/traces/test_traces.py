@@ -70,8 +70,8 @@ def test_any_records_are_read_exactly(records: list[tuple[int, int]], data: st.D
             assert at == known[number][0] - sent[0]
             assert until == (-1 if known[number][1] < 0 else known[number][1] - sent[0])
         else:
-            a = max(one for one in numbers if one < number)
-            b = min(one for one in numbers if one > number)
+            a = max(other for other in numbers if other < number)
+            b = min(other for other in numbers if other > number)
             share = Fraction(int(number) - a, b - a)
             exact = known[a][0] + share * (known[b][0] - known[a][0]) - sent[0]
             assert until == -1
@@ -228,7 +228,7 @@ def network(count: int = 200, seed: int = 1) -> tuple[list[Sent], list[Sent], di
     sent = [Sent(T_NS + k * CAPTURE_PERIOD_NS, struct.pack(">Q", k)) for k in range(count)]
     delays = {k: rng.randrange(5 * CAPTURE_PERIOD_NS) + 1 for k in range(count) if rng.random() > 0.3}
     arrived = [sent[k]._replace(t_ns=sent[k].t_ns + delay) for k, delay in delays.items()]
-    arrived += [one._replace(t_ns=one.t_ns + 10**9) for one in arrived[::7]]
+    arrived += [packet._replace(t_ns=packet.t_ns + 10**9) for packet in arrived[::7]]
     return sent, sorted(arrived), delays
 
 
@@ -240,7 +240,7 @@ def delays_in(trace: PacketTrace) -> dict[int, int]:
 def test_two_captures_give_the_losses_and_relative_delays(offset_ns: int) -> None:
     sent, arrived, delays = network()
     other = Sent(T_NS, b"other")._replace(destination_port=53)
-    shifted = [one._replace(t_ns=one.t_ns + offset_ns, **AT_SERVER) for one in arrived]
+    shifted = [packet._replace(t_ns=packet.t_ns + offset_ns, **AT_SERVER) for packet in arrived]
     trace = trace_of(pcap_of(other, *sent), pcapng_of(*shifted))
     smallest = min(delays.values())
     assert delays_in(trace).keys() == delays.keys()
@@ -254,10 +254,10 @@ def test_two_captures_give_the_losses_and_relative_delays(offset_ns: int) -> Non
 
 def test_one_capture_of_both_ends_is_matched_in_the_right_direction() -> None:
     sent, arrived, delays = network()
-    forwarded = [one._replace(**AT_SERVER) for one in arrived]
+    forwarded = [packet._replace(**AT_SERVER) for packet in arrived]
     # An echo with the same payloads goes back over both interfaces.
     back = {"source": "198.51.100.7", "source_port": 6000, "destination": "192.0.2.1"}
-    echoes = [one._replace(t_ns=one.t_ns + 5, destination_port=5000, **back) for one in arrived]
+    echoes = [packet._replace(t_ns=packet.t_ns + 5, destination_port=5000, **back) for packet in arrived]
     trace = trace_of(pcapng_of(*sorted([*sent, *forwarded, *echoes])))
     assert delays_in(trace) == delays
 
@@ -297,7 +297,7 @@ def probes(count: int) -> list[Sent]:
 
 
 def test_a_probe_captured_at_the_receiver_has_its_sending_times() -> None:
-    arrived = [one for k, one in enumerate(probes(100)) if k % 4]
+    arrived = [packet for k, packet in enumerate(probes(100)) if k % 4]
     end = Sent(T_NS, encode_probe(ProbeDatagram(ProbeKind.END, 7, 0, 100, 0, 0, CAPTURE_PERIOD_NS, 100)))
     trace = trace_of(pcap_of(end, *arrived, end))
     assert len(trace) == 99
@@ -307,12 +307,12 @@ def test_a_probe_captured_at_the_receiver_has_its_sending_times() -> None:
 
 def test_a_capture_of_the_sender_alone_is_refused() -> None:
     with pytest.raises(ValueError, match="sender's end only"):
-        trace_of(pcapng_of(*(one._replace(direction=2) for one in probes(9))))
+        trace_of(pcapng_of(*(packet._replace(direction=2) for packet in probes(9))))
 
 
 def test_captures_that_do_not_show_what_was_lost_are_refused() -> None:
     sent, arrived, _ = network()
-    same = [one._replace(payload=b"same") for one in sent]
+    same = [packet._replace(payload=b"same") for packet in sent]
     for files, message in (
         ([pcap_of(*same), pcap_of(*arrived)], "199 of 200 datagrams have the payload of another"),
         ([pcap_of(*sent), pcap_of(*same)], "none of the complete datagrams"),
@@ -345,12 +345,12 @@ families = st.one_of(
 
 
 def read(data: bytes) -> list[tuple[int, CapturedFlow, bytes, bool]]:
-    found = []
+    packets = []
     for packet in captured_packets(io.BytesIO(data)):
         datagram = find_udp(packet.interface, packet.link_type, packet.data)
         assert datagram is not None
-        found.append((packet.t_ns, *datagram))
-    return found
+        packets.append((packet.t_ns, *datagram))
+    return packets
 
 
 @given(
@@ -364,14 +364,14 @@ def test_every_datagram_is_found_again(
         data = pcapng_of(*sent, link_type=link_type, order=order, vlans=vlans)
     else:
         data = pcap_of(*sent, link_type=link_type, order=order, vlans=vlans, nano=form == "pcap")
-    for one, (t_ns, flow, payload, is_complete) in zip(sent, read(data), strict=True):
-        assert t_ns == (one.t_ns // 1000 * 1000 if form == "micro" else one.t_ns)
-        assert payload == one.payload
+    for expected, (t_ns, flow, payload, is_complete) in zip(sent, read(data), strict=True):
+        assert t_ns == (expected.t_ns // 1000 * 1000 if form == "micro" else expected.t_ns)
+        assert payload == expected.payload
         assert is_complete
-        source = f"[{one.source}]" if ":" in one.source else one.source
-        destination = f"[{one.destination}]" if ":" in one.destination else one.destination
+        source = f"[{expected.source}]" if ":" in expected.source else expected.source
+        destination = f"[{expected.destination}]" if ":" in expected.destination else expected.destination
         assert str(flow) == (
-            f"{source}:{one.source_port} → {destination}:{one.destination_port} on interface 0"
+            f"{source}:{expected.source_port} → {destination}:{expected.destination_port} on interface 0"
         )
 
 

@@ -95,10 +95,10 @@ def test_a_send_on_delta_class_gives_the_same_run_as_the_policy(tmp_path: Path, 
             ['trigger={policy="absolute", delta=0.05}', "horizon_s=4.0", "plant.rate_hz=100.0"],
         )
     ).model_copy(update={"network": network})
-    found, expected = simulate(own), simulate(built_in)
-    assert len(events(found)) > 3
-    assert events(found) == events(expected)
-    rows, others = found[SENSOR_MEASUREMENT], expected[SENSOR_MEASUREMENT]
+    record, expected = simulate(own), simulate(built_in)
+    assert len(events(record)) > 3
+    assert events(record) == events(expected)
+    rows, others = record[SENSOR_MEASUREMENT], expected[SENSOR_MEASUREMENT]
     different = {name for name in rows.dtype.names if (rows[name] != others[name]).any()}
     assert different <= {"compared"}  # two functions for the same norm
     np.testing.assert_allclose(rows["compared"], others["compared"], rtol=1e-14)
@@ -147,6 +147,6 @@ def test_a_class_may_return_whether_to_transmit(tmp_path: Path) -> None:
             def test(self, t_s, x, e_s):
                 return t_s - self.since_s > 0.4999
     """
-    found = np.diff(events(simulate(scenario(tmp_path, code))))
-    assert len(found) > 5
-    assert set(found) == {500_000_000}
+    intervals_ns = np.diff(events(simulate(scenario(tmp_path, code))))
+    assert len(intervals_ns) > 5
+    assert set(intervals_ns) == {500_000_000}

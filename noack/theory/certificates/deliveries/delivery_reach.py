@@ -35,7 +35,7 @@ from noack.theory.bounds.stacked_norms import Stack, largest_eigenvalues, spectr
 from noack.theory.certificates.deliveries.delivery_flow import (
     FLOW_ROUNDING,
     NO_EFFECTS,
-    DeliveryFlow,
+    DeliveryPropagation,
     InputEffects,
     bend_terms,
 )
@@ -105,7 +105,7 @@ class _Window(NamedTuple):
 class DeliveryEllipsoid:
     """The states ξ at a delivery with ‖Λξ‖ ≤ 1."""
 
-    flow: DeliveryFlow
+    flow: DeliveryPropagation
     shape: Matrix
     """Λ, (n, n), invertible."""
 
@@ -371,7 +371,7 @@ class _CellBounds:
 
     @cached_property
     def unit_effects(self) -> tuple[Vector, Vector]:
-        """See :meth:`DeliveryFlow.unit_effects`."""
+        """See :meth:`DeliveryPropagation.unit_effects`."""
         return self._flow.unit_effects(self.C)
 
     def sup(

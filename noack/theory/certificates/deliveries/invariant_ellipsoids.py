@@ -22,7 +22,7 @@ from noack.theory.bounds.stacked_norms import Stack
 from noack.theory.certificates.deliveries.delivery_flow import (
     FLOW_ROUNDING,
     NO_EFFECTS,
-    DeliveryFlow,
+    DeliveryPropagation,
     InputEffects,
 )
 from noack.theory.certificates.deliveries.delivery_reach import DeliveryEllipsoid, Reach
@@ -99,9 +99,9 @@ class InvariantEllipsoids:
         return None
 
     @cached_property
-    def flow(self) -> DeliveryFlow:
+    def flow(self) -> DeliveryPropagation:
         """The flow between two deliveries."""
-        return DeliveryFlow(self.plant)
+        return DeliveryPropagation(self.plant)
 
     @cached_property
     def _first_event_cell(self) -> int:

@@ -90,10 +90,10 @@ async def nowhere() -> Streams:
 
 
 def unix_socket(path: str) -> socket.socket:
-    one = socket.socket(socket.AF_UNIX)
-    one.settimeout(60)
-    one.connect(path)
-    return one
+    connection = socket.socket(socket.AF_UNIX)
+    connection.settimeout(60)
+    connection.connect(path)
+    return connection
 
 
 def test_a_port_where_nothing_listens_is_named() -> None:
@@ -135,8 +135,8 @@ def test_a_run_with_another_key_refuses_the_invitation(
     listening: socket.socket, other: dict[str, object]
 ) -> None:
     with forwarding(listening, nowhere, PROTECTION):
-        found = reason(destination(listening, **other))  # type: ignore[arg-type]
-    assert "does not accept this invitation" in found
+        why = reason(destination(listening, **other))  # type: ignore[arg-type]
+    assert "does not accept this invitation" in why
 
 
 def test_a_host_without_answer_is_named(monkeypatch: pytest.MonkeyPatch, listening: socket.socket) -> None:
@@ -164,9 +164,9 @@ def test_the_link_tries_again_while_there_is_no_room(listening: socket.socket) -
     far.settimeout(60)
     with far, ThreadPoolExecutor() as pool:
         admitted = pool.submit(turn_away_then_admit)
-        with coordinator_link(destination(listening)) as path, unix_socket(path) as one:
-            one.sendall(b"hello")
-            assert one.recv(100) == b"hello to you"
+        with coordinator_link(destination(listening)) as path, unix_socket(path) as connection:
+            connection.sendall(b"hello")
+            assert connection.recv(100) == b"hello to you"
         admitted.result()
 
 
@@ -212,10 +212,10 @@ def connected(address: Address, host: str = "", own: KeyPair = KEYS.joining) -> 
 def echoed(connection: socket.socket, message: bytes = b"hello") -> bytes:
     connection.settimeout(60)
     connection.sendall(message)
-    found = b""
-    while len(found) < len(message) and (part := connection.recv(65_536)):
-        found += part
-    return found
+    received = b""
+    while len(received) < len(message) and (part := connection.recv(65_536)):
+        received += part
+    return received
 
 
 @pytest.mark.parametrize("kind", ["connect", "garbage", "half a proof", "a foreign proof"])
@@ -234,12 +234,12 @@ def test_a_flood_keeps_no_process_from_joining(
         def flood(count: int) -> None:
             for number in range(count):
                 host = f"127.0.{number % addresses}.1"
-                one = socket.create_connection(address, timeout=60, source_address=(host, 0))
-                stack.enter_context(closing(one))
-                proof = foreign.make(one.getsockname(), address)
+                connection = socket.create_connection(address, timeout=60, source_address=(host, 0))
+                stack.enter_context(closing(connection))
+                proof = foreign.make(connection.getsockname(), address)
                 sent = {"connect": b"", "garbage": b"\x16\3\1" * 100, "half a proof": proof[:10]}
                 with suppress(ConnectionError):
-                    one.sendall(sent.get(kind, proof))
+                    connection.sendall(sent.get(kind, proof))
 
         flood(100)
         with socket.create_connection(address, timeout=60) as plain:

@@ -35,11 +35,11 @@ def collect_much() -> Iterator[Metric]:
 
 def answered(reader: socket.socket) -> bytes:
     """What a reader still gets, until the end of its connection."""
-    found = b""
+    received = b""
     with suppress(ConnectionResetError):
         while part := reader.recv(2**20):
-            found += part
-    return found
+            received += part
+    return received
 
 
 @contextmanager
@@ -96,13 +96,13 @@ def test_readers_that_stall_keep_neither_others_nor_the_end_waiting(
     with ExitStack() as stack:
         with metrics_server(":0", collect_much if sent.endswith(b"\n") else collect) as address:
             stalled = [stack.enter_context(socket.create_connection(address)) for _ in range(30)]
-            for one in stalled:
-                one.sendall(sent)
+            for connection in stalled:
+                connection.sendall(sent)
             assert "noack_test" in read(address)
-        for one in stalled:
-            one.settimeout(60)
+        for connection in stalled:
+            connection.settimeout(60)
             with suppress(ConnectionResetError):
-                while one.recv(65_536):
+                while connection.recv(65_536):
                     pass
 
 

@@ -31,7 +31,7 @@ MAKERS: dict[str, Callable[..., LoopMachines]] = {
 
 def plain(row: Sequence[Any]) -> tuple[Any, ...]:
     """Return a row with lists instead of arrays."""
-    return tuple(one.tolist() if isinstance(one, np.ndarray) else one for one in row)
+    return tuple(entry.tolist() if isinstance(entry, np.ndarray) else entry for entry in row)
 
 
 class Rows:
@@ -40,11 +40,13 @@ class Rows:
     def __init__(self) -> None:
         self.tables: dict[str, list[Any]] = {}
         self.notices: list[Notice] = []
+        self._columns: dict[str, Sequence[str]] = {}
 
     def append(self, record: Record) -> None:
         self.tables.setdefault(record.table, []).append(record.row)
 
     def extend_table(self, table: str, rows: Any) -> None:
+        self._columns[table] = rows.dtype.names
         self.tables.setdefault(table, []).extend(plain(row.item()) for row in rows)
 
     def notice(self, notice: Notice) -> None:
@@ -52,9 +54,9 @@ class Rows:
 
     def flush(self) -> None: ...
 
-    def of(self, table: str, names: Sequence[str], column: str) -> list[Any]:
-        """Return a column, given the names of all."""
-        place = list(names).index(column)
+    def of(self, table: str, column: str) -> list[Any]:
+        """Return a column of rows that came as arrays."""
+        place = self._columns[table].index(column)
         return [row[place] for row in self.tables.get(table, ())]
 
 
@@ -134,12 +136,12 @@ class Live:
 
 def received(endpoint: socket.socket, most_bytes: int = 2048) -> list[bytes]:
     """Return the datagrams that wait at a socket; loopback delivers at once."""
-    found = []
+    datagrams = []
     while True:
         try:
-            found.append(endpoint.recv(most_bytes))
+            datagrams.append(endpoint.recv(most_bytes))
         except BlockingIOError:
-            return found
+            return datagrams
 
 
 def measurement(number: int, x: Sequence[float], loop: int = 0) -> Message:

@@ -27,16 +27,6 @@ SCENARIOS = Path(__file__).parents[3] / "scenarios"
 NOW = "now_ns"
 
 
-def columns(live: Live, table: str) -> Sequence[str]:
-    """Return the columns of a table of its machines."""
-    for number, name in enumerate(live.machines.role.tables):
-        if name == table:
-            names = live.machines._tables[number].dtype.names
-            assert names is not None
-            return names
-    raise KeyError(table)
-
-
 def one_by_one(live: Live, inputs: Sequence[tuple[Message | None, int]]) -> tuple[Any, Any]:
     """Pass inputs, each with its time, to machines without a driver; return messages and rows."""
     sent, rows = [], []
@@ -72,7 +62,7 @@ def test_datagrams_that_the_kernel_passes_together_are_handled_one_by_one(
     given = measurements(4, 50)
     with closing(Live("sensor", [scenario(content)] * 50)) as live:
         live.peer.connect(live.address)
-        sizes = {len(live.encoder.encode(one)) for one in given}
+        sizes = {len(live.encoder.encode(message)) for message in given}
         assert len(sizes) == 1
         head = [(socket.IPPROTO_UDP, UDP_SEGMENT, struct.pack("=H", *sizes))]
         for first in range(0, len(given), together):
@@ -81,7 +71,7 @@ def test_datagrams_that_the_kernel_passes_together_are_handled_one_by_one(
         live.drive_until_accepted(len(given))
         assert live.driver.core.sources[0].received == len(given) + len(range(together, len(given), together))
         rows = live.rows.tables[SENSOR_MEASUREMENT]
-        assert [row[0] for row in rows] == [one.loop for one in given]
+        assert [row[0] for row in rows] == [message.loop for message in given]
 
 
 @pytest.mark.sanitized
@@ -89,7 +79,7 @@ def test_messages_of_loops_that_tick_together_are_sent_together(content: dict[st
     with closing(Live("plant", [scenario(content)] * 50, since_ns=HOUR_NS)) as live:
         live.peer.setsockopt(socket.IPPROTO_UDP, UDP_GRO, 1)
         live.drive(lambda: live.driver.core.sent >= 500)
-        sizes = [len(one) for one in received(live.peer, 65_536)]
+        sizes = [len(datagram) for datagram in received(live.peer, 65_536)]
         assert max(sizes) == 64 * DATAGRAM_BYTES
         assert sum(sizes) == live.driver.core.sent * DATAGRAM_BYTES
 
@@ -105,8 +95,7 @@ def test_messages_are_handled_in_order_and_answered(
     with closing(Live("sensor", resolved, phases_ns, encrypted=encrypted)) as live:
         live.send(*given)
         live.drive_until_accepted(len(given))
-        names = columns(live, SENSOR_MEASUREMENT)
-        times_ns = live.rows.of(SENSOR_MEASUREMENT, names, NOW)
+        times_ns = live.rows.of(SENSOR_MEASUREMENT, NOW)
         sent, rows = one_by_one(
             live,
             [(message, now_ns + phases_ns[message.loop])
@@ -123,7 +112,7 @@ def test_messages_are_handled_in_order_and_answered(
         assert report["received_from"] == {own: len(given)}
         assert report["kernel_drops"] == 0
         each: Any = report["loops"]
-        assert [one["accepted"] for one in each] == [len(given) // loops] * loops
+        assert [loop["accepted"] for loop in each] == [len(given) // loops] * loops
 
 
 @pytest.mark.sanitized
@@ -138,9 +127,8 @@ def test_ticks_are_done_in_order_and_never_early(
     with closing(Live(role, [resolved] * loops, phases_ns, coalescing_ns=coalescing_ns)) as live:
         live.drive(lambda: live.driver.next_deadline_ns() is None)
         table = PLANT_STEP if role == "plant" else CONTROLLER_STEP
-        names = columns(live, table)
-        due_ns, now_ns = (live.rows.of(table, names, one) for one in ("t_ns", NOW))
-        numbers = live.rows.of(table, names, "loop")
+        due_ns, now_ns = (live.rows.of(table, column) for column in ("t_ns", NOW))
+        numbers = live.rows.of(table, "loop")
         phases = [phases_ns[number] for number in numbers]
         assert all(now >= due for now, due in zip(now_ns, due_ns, strict=True))
         in_run = [(due + phase, number)

@@ -68,21 +68,21 @@ def test_a_turn_of_housekeeping_follows_each_drive(busy: bool, monkeypatch: pyte
     monkeypatch.setattr(time, "sleep", pauses.append)
     cpu_s = count(0, 10**6 if busy else 0)
     monkeypatch.setattr(time, "thread_time", lambda: next(cpu_s))
-    one = Driven(RunClock(time.monotonic_ns(), 3.0))
+    driven = Driven(RunClock(time.monotonic_ns(), 3.0))
 
     def news(now_ns: int) -> Sequence[Record | Notice]:
-        one.steps.append("news")
+        driven.steps.append("news")
         return (Record("row", ()), Notice(now_ns, "info", "line"))
 
     late_ns = run_loop(
-        one, one, one.clock, log, end_ns=None,
-        stop=lambda: one.steps.append("stop") or len(one.steps) > 11, external_inputs=news,
+        driven, driven, driven.clock, log, end_ns=None,
+        stop=lambda: driven.steps.append("stop") or len(driven.steps) > 11, external_inputs=news,
     )  # fmt: skip
     turn = ["drive", "housekeeping", "news", "clock", "stop"]
-    assert one.steps == ["clock", "news", "housekeeping", *turn, *turn]
+    assert driven.steps == ["clock", "news", "housekeeping", *turn, *turn]
     assert log.rows == [1, 2]
     assert log.lines == ["row", "line", *["row", "line", "flush"] * 2]
-    assert all(period_ns <= 0.05e9 * 3.0 for period_ns in one.until_ns)
+    assert all(period_ns <= 0.05e9 * 3.0 for period_ns in driven.until_ns)
     assert late_ns > 5
     # A busy driver leaves the core to the other threads for a moment.
     assert len(pauses) == (2 if busy else 0)
@@ -114,28 +114,28 @@ def test_a_machine_that_is_late_at_its_end_catches_up_for_a_while(
 ) -> None:
     """The computer did not run for ten seconds; its steps take two turns or more."""
     monkeypatch.setattr(real_time_loop, "_TURNS_TO_CATCH_UP", turns)
-    one = Slow(10**10)
-    late_ns = run_loop(one, one, one.clock, Log(), end_ns=STEPS * PERIOD_NS, stop=never)
-    assert (one.served == STEPS) == (late_ns == 0) == (turns == 20)
+    driven = Slow(10**10)
+    late_ns = run_loop(driven, driven, driven.clock, Log(), end_ns=STEPS * PERIOD_NS, stop=never)
+    assert (driven.served == STEPS) == (late_ns == 0) == (turns == 20)
 
 
 @pytest.mark.parametrize("others_turns", [0, 7, 10**9])
 def test_a_machine_that_is_done_waits_for_the_others_for_a_while(others_turns: int) -> None:
     told = list[bool]()
-    one = Slow(0, served=STEPS)
+    driven = Slow(0, served=STEPS)
 
     def all_done(done: bool) -> bool:
         told.append(done)
         return done and told.count(True) > others_turns
 
-    run_loop(one, one, one.clock, Log(), end_ns=0, stop=never, turns_after_end=3, all_done=all_done)
+    run_loop(driven, driven, driven.clock, Log(), end_ns=0, stop=never, turns_after_end=3, all_done=all_done)
     assert told.count(True) == min(others_turns + 4, real_time_loop._TURNS_TO_WAIT + 1)
 
 
 def test_a_deadline_after_the_end_is_not_late() -> None:
     """The emulator may have packets in its queue for times after the end."""
     # The next deadline is after the first period, which is the end.
-    one = Slow(10**10, served=1)
-    late_ns = run_loop(one, one, one.clock, Log(), end_ns=1, stop=never)
+    driven = Slow(10**10, served=1)
+    late_ns = run_loop(driven, driven, driven.clock, Log(), end_ns=1, stop=never)
     assert late_ns == 0
-    assert one.served < STEPS
+    assert driven.served < STEPS

@@ -79,12 +79,12 @@ def test_the_core_reads_the_same_clocks(
     own: RunClock = RunClock(begin_ns, speed, lambda: readings[-1])
     other: RunClock = SlewedRunClock(begin_ns + offset_ns, speed, slewed, lambda: readings[-1])
     for clock in (own, other):
-        other_clock, found = in_core(clock), []
+        other_clock, times_ns = in_core(clock), []
         for wait_ns in sorted(waits):
             readings.append(readings[0] + wait_ns)
-            found.append(core.noack_clock_at_ns(other_clock, readings[-1]))
-            assert found[-1] == clock.now_ns()
-        assert found == sorted(found)
+            times_ns.append(core.noack_clock_at_ns(other_clock, readings[-1]))
+            assert times_ns[-1] == clock.now_ns()
+        assert times_ns == sorted(times_ns)
 
 
 PS, PPB = 1000, 10**9
@@ -202,18 +202,20 @@ def test_the_bound_is_attained(rate_ppb: int, offset_ns: int, ages_ns: list[int]
     there_ns = begin_ns + offset_ns
     offset.add(Exchange(begin_ns, there_ns, there_ns, begin_ns))
     for age_ns in ages_ns:
-        found = offset.interval(begin_ns + age_ns)
-        assert found is not None
+        interval = offset.interval(begin_ns + age_ns)
+        assert interval is not None
         drift_ns = rate_ppb * age_ns // 10**9
-        assert 0 <= found.upper_ns - (offset_ns + drift_ns) <= 3
-        assert 0 <= (offset_ns - drift_ns) - found.lower_ns <= 3
-        assert found.error_ns == max(found.upper_ns - found.midpoint_ns, found.midpoint_ns - found.lower_ns)
+        assert 0 <= interval.upper_ns - (offset_ns + drift_ns) <= 3
+        assert 0 <= (offset_ns - drift_ns) - interval.lower_ns <= 3
+        assert interval.error_ns == max(
+            interval.upper_ns - interval.midpoint_ns, interval.midpoint_ns - interval.lower_ns
+        )
 
 
 def test_an_exchange_that_contradicts_itself_is_not_used() -> None:
     offset = ClockOffset(1000)
-    found = offset.add(Exchange(0, 10**9, 2 * 10**9, 10**6))  # 1 s there, 1 ms here
-    assert found == Restart(RestartCause.CONTRADICTION, 0, 10**6)
+    result = offset.add(Exchange(0, 10**9, 2 * 10**9, 10**6))  # 1 s there, 1 ms here
+    assert result == Restart(RestartCause.CONTRADICTION, 0, 10**6)
     assert offset.interval(10**6) is None
     assert offset.add(Exchange(10**7, 0, 0, 10**7)) is None
     assert offset.interval(10**7) == (-(10**7) - 2, -(10**7) + 2)

@@ -72,10 +72,10 @@ def stack() -> Iterator[ExitStack]:
 @pytest.fixture
 def wire(stack: ExitStack) -> socket.socket:
     """A socket between client and reference."""
-    one = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-    one.bind(("127.0.0.1", 0))
-    one.settimeout(60)
-    return one
+    endpoint = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+    endpoint.bind(("127.0.0.1", 0))
+    endpoint.settimeout(60)
+    return endpoint
 
 
 def received(wire: socket.socket, kind: TimeKind) -> tuple[bytes, tuple[str, int]]:
@@ -231,8 +231,8 @@ def check_arrivals(random: Random, number: int, *, stamps: bool = True) -> int:
         for _ in range(random.randint(0, 3)):
             endpoint.arrive()
         known = len(endpoint.arrived_ps)
-        found = arrivals.receive(random.choice((1, 2, 64)))
-        for arrival, arrived_ps in zip(found, endpoint.arrived_ps[known:], strict=True):
+        received = arrivals.receive(random.choice((1, 2, 64)))
+        for arrival, arrived_ps in zip(received, endpoint.arrived_ps[known:], strict=True):
             assert arrived_ps < (arrival.latest_ns + 1) * PS
             assert arrival.latest_ns <= host.now_ps // PS
     return arrivals.clock_sets
@@ -247,8 +247,8 @@ ROOMY = ClocksSection(largest_error_us=1e6)  # a busy machine gives wide bounds
 
 
 def reference_at(stack: ExitStack, port: int = 0) -> TimeReference:
-    found = stack.enter_context(closing(TimeReference(("127.0.0.1", port), KEY)))
-    return stack.enter_context(answering(found))
+    reference = stack.enter_context(closing(TimeReference(("127.0.0.1", port), KEY)))
+    return stack.enter_context(answering(reference))
 
 
 def following(stack: ExitStack, clocks: HostClocks, settings: ClocksSection = ROOMY) -> ReferenceClock:
@@ -260,18 +260,18 @@ def following(stack: ExitStack, clocks: HostClocks, settings: ClocksSection = RO
 
 def polled(clock: ReferenceClock, readings: int = 20) -> ClockReport:
     """Read the clock, then poll; fail if a reading was outside of the bound, or backward."""
-    found, newest_ns = [], clock.monotonic_ns()
+    readings, newest_ns = [], clock.monotonic_ns()
     for _ in range(readings):
         before_ns = time.monotonic_ns()
         own_ns = clock.monotonic_ns()
-        found.append((before_ns, own_ns, time.monotonic_ns()))
+        readings.append((before_ns, own_ns, time.monotonic_ns()))
         assert own_ns >= newest_ns
         newest_ns = own_ns
         time.sleep(0.001)
     report = clock.poll()
     assert clock.monotonic_ns() >= newest_ns
     if report.error_ns is not None:
-        for before_ns, own_ns, after_ns in found:
+        for before_ns, own_ns, after_ns in readings:
             assert before_ns - report.error_ns <= own_ns <= after_ns + report.error_ns
     return report
 
@@ -352,18 +352,18 @@ def test_each_clock_report_is_a_row_and_each_change_a_line_of_the_log() -> None:
     ]
     clock = RunClock(0, 2.0, lambda: 0)
     record = ClockRecord("sensor", BEGINNING, clock, Scripted(reports), has_table=True)
-    outputs = [record.compare(2 * one.now_ns) for one in list(reports)]
-    rows = [one for each in outputs for one in each if isinstance(one, Record)]
-    assert [one.table for one in rows] == ["sensor_clock"] * 5
-    assert [one.row for one in rows] == [
+    outputs = [record.compare(2 * output.now_ns) for output in list(reports)]
+    rows = [output for each in outputs for output in each if isinstance(output, Record)]
+    assert [output.table for output in rows] == ["sensor_clock"] * 5
+    assert [output.row for output in rows] == [
         (0, 10, 0, 100 * ms, 50 * ms, 7, 3000),
         (1, 10, 100 * ms, 200 * ms, 100 * ms, 8, LOST_NS),
         (2, 10, 200 * ms, 300 * ms, 150 * ms, 8, LOST_NS),
         (3, 12, 20 * ms, 400 * ms, 200 * ms, 9, LOST_NS),
         (4, 13, 400 * ms, 500 * ms, 250 * ms, 9, 4000),
     ]
-    lines = [one for each in outputs for one in each if isinstance(one, Notice)]
-    assert [(one.t_ns, one.level) for one in lines] == [
+    lines = [output for each in outputs for output in each if isinstance(output, Notice)]
+    assert [(output.t_ns, output.level) for output in lines] == [
         (200 * ms, LOST), (400 * ms, LOST), (500 * ms, FOUND)
     ]  # fmt: skip
     assert lines[1].text == "the bound of its clock's error is lost: a contradiction"
@@ -372,8 +372,8 @@ def test_each_clock_report_is_a_row_and_each_change_a_line_of_the_log() -> None:
 def test_the_coordinators_own_clock_has_no_error() -> None:
     record = ClockRecord("plant", BEGINNING, RunClock(time.monotonic_ns()), None, has_table=True)
     for number in range(3):
-        (one,) = record.compare(0)
-        assert isinstance(one, Record)
-        assert one.row[0] == number
-        assert one.row[-2:] == (0, 0)
+        (output,) = record.compare(0)
+        assert isinstance(output, Record)
+        assert output.row[0] == number
+        assert output.row[-2:] == (0, 0)
     assert record.summary() == {}

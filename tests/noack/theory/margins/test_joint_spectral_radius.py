@@ -15,7 +15,7 @@ from noack.core.linear_systems import Matrix
 from noack.theory.margins.exact_matrices import IntervalMatrix, exactly, exponential, inverse
 from noack.theory.margins.invariant_polytopes import InvariantPolytopes, PolytopeNorm
 from noack.theory.margins.joint_spectral_radius import bound_by_products, joint_spectral_radius
-from noack.theory.margins.quadratic_norms import NormSearch, remembering
+from noack.theory.margins.quadratic_norms import NormSearch, with_history
 from noack.theory.margins.switched_system import Edge, SwitchedSystem, spectral_radius_bounds
 
 GOLDEN_RATIO = (1 + 5**0.5) / 2
@@ -121,7 +121,7 @@ def test_no_norms_and_no_products_prove_a_bound_below_the_growth(seed: int) -> N
     system, bounds = SwitchedSystem.of(edges), joint_spectral_radius(edges, accuracy=1e-3)
     norms = NormSearch(system).improve(0.0)
     assert bounds.lower <= norms.upper
-    assert bounds.lower <= NormSearch(remembering(system, 3)).improve(0.0).upper
+    assert bounds.lower <= NormSearch(with_history(system, 3)).improve(0.0).upper
     n = system.dimension
     forms = np.eye(n) + 0.5 * rng.normal(size=(system.graph.nodes, n, n))
     for transformed in (norms.system, system.in_coordinates(forms)):

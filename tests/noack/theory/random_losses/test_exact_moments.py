@@ -19,9 +19,9 @@ from noack.theory.random_losses.exact_moments import (
     LoopMoments,
     LoopPeriods,
     MomentStep,
-    flow,
     jump,
     periods_of,
+    propagation,
     start_of,
 )
 from tests.noack.theory.random_losses.example_losses import BURSTS, NOISE, scenario
@@ -34,7 +34,7 @@ def integrator() -> tuple[MomentStep, MomentStep]:
     G[0, 2] = 1.0
     sampler = np.array([[1.0, 0, 0], [1, 0, 0], [0, 0, 1]])
     controller = np.array([[1.0, 0, 0], [0, 1, 0], [0, K, 0]])
-    return flow(G, unit, unit[None], 0.1), jump(sampler, 1).then(jump(controller, 1))
+    return propagation(G, unit, unit[None], 0.1), jump(sampler, 1).then(jump(controller, 1))
 
 
 def test_moments_are_those_of_the_first_example_of_jitter_time() -> None:
@@ -71,7 +71,7 @@ def test_moments_are_those_of_the_second_example_of_jitter_time() -> None:
 
     G = x.T @ (np.array([[0.0, 1.0], [1.0, 0.0]]) @ x + np.array([[0.0], [1.0]]) @ u)
     weight, noise = np.diag([1.0, 0.1, *np.zeros(10), 0.1]), np.diag(eye[1])
-    passed = flow(G, noise, weight[None], 0.05)
+    passed = propagation(G, noise, weight[None], 0.05)
     by_first = execute(x, slice(2, 4), 0.1, 2).then(
         observer([[0.5309, 0.079, 0], [-0.8673, 0.8597, 0], [0, 0, 0]],
                  [[0.0059, 0.475, 0], [0.1392, 1.0065, 0], [1, 0, 0]])

@@ -18,7 +18,7 @@ from noack.theory.bounds.certificate_terms import Constants, NetworkConditions, 
 from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError
 from noack.theory.bounds.gains import PlantGains
 from noack.theory.certificates.deliveries import sharpened_constants
-from noack.theory.certificates.deliveries.delivery_flow import NO_EFFECTS, DeliveryFlow
+from noack.theory.certificates.deliveries.delivery_flow import NO_EFFECTS, DeliveryPropagation
 from noack.theory.certificates.deliveries.delivery_reach import Reach
 from noack.theory.certificates.deliveries.inserted_bounds import _OpenLoopErrors
 from noack.theory.certificates.deliveries.invariant_ellipsoids import InvariantEllipsoids
@@ -58,13 +58,13 @@ def no_lost_updates() -> AbstractContextManager[Any]:
 
 def no_mismatch(*, at_nodes: bool) -> AbstractContextManager[Any]:
     """The plant follows its model, at the nodes of the flow, too, or from them on only."""
-    exact = DeliveryFlow.__init__
+    exact = DeliveryPropagation.__init__
 
-    def without(flow: DeliveryFlow, plant: PlantGains) -> None:
+    def without(flow: DeliveryPropagation, plant: PlantGains) -> None:
         exact(flow, replace(plant, A=plant.error.H - plant.B @ plant.error.K) if at_nodes else plant)
         flow.generator[flow.n :, : flow.n] = 0.0
 
-    return patch.object(DeliveryFlow, "__init__", without)
+    return patch.object(DeliveryPropagation, "__init__", without)
 
 
 def no_age_of_inputs() -> AbstractContextManager[Any]:
