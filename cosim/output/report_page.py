@@ -103,11 +103,11 @@ def write_report(
     summary: RunSummary,
     run_dir: Path,
     loop: str | None = None,
-    known: Sequence[LoopOverTime] | None = None,
+    over_time: Sequence[LoopOverTime] | None = None,
 ) -> Path:
     """Write the report of a run, or of one of its loops; replace an existing one.
 
-    ``known`` is how each loop of the run went, if that is known.
+    ``over_time`` is how each loop of the run went, if that is known.
 
     Returns:
         The report's path.
@@ -125,7 +125,7 @@ def write_report(
         worst.number,
         worst.why,
         figures=[describe() for describe in described.values()],
-        network_figures=network_figures(run, shown, known) if shown.loops[1:] else (),
+        network_figures=network_figures(run, shown, over_time) if shown.loops[1:] else (),
         description=(run if shown.loops[1:] else record).scenario.description,
         scenario_toml=(run_dir / SCENARIO_FILE).read_text(encoding="utf-8"),
         environment=read_object(run_dir / ENVIRONMENT_FILE),

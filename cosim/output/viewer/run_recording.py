@@ -284,17 +284,17 @@ def write_view(
     summary: RunSummary,
     run_dir: Path,
     loop: str | None,
-    known: Sequence[LoopOverTime] | None = None,
+    over_time: Sequence[LoopOverTime] | None = None,
 ) -> None:
     """Write the recording of a run, or of one of its loops, from its record and its summary.
 
-    ``known`` is how each loop of the run went, if that is known.
+    ``over_time`` is how each loop of the run went, if that is known.
 
     Raises:
         ViewError: the recording cannot be written.
     """
     if loop is None and len(run.loops) > 1:
-        _write_network_view(run, summary, run_dir, loops_over_time(run, known))
+        _write_network_view(run, summary, run_dir, loops_over_time(run, over_time))
     else:
         write_loop_view(run.loop(loop), run_dir / file_of_loop(RECORDING_FILE, loop))
 
