@@ -75,9 +75,9 @@ def loop_over_time(record: RunRecord, phase_ns: int) -> LoopOverTime:
     for part in aligned_parts(record):
         aligned = part.aligned
         columns = intervals_of(aligned.t_ns + phase_ns, horizon_ns)
-        common = aligned.since_delivery(record.scenario)
+        delivered = aligned.since_delivery(record.scenario)
         _update_largest(states, columns, aligned.x_norm)
-        _update_largest(errors, columns[common], aligned.e_c_norm[common])
+        _update_largest(errors, columns[delivered], aligned.e_c_norm[delivered])
     return LoopOverTime(errors, states)
 
 
