@@ -37,7 +37,7 @@ from cosim.analysis.claims.observed_conditions import AssumptionViolation, VoidF
 from cosim.analysis.claims.run_certificates import late_certificates
 from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples
 from cosim.analysis.claims.run_parts import RunPart, common_end_ns, cut_part, start_error, up_to_common_end
-from cosim.analysis.summary.summary_model import Claim, ClaimVerdict, ViolationPart
+from cosim.analysis.summary.summary_model import NO_BOUND, Claim, ClaimVerdict, ViolationPart
 from cosim.record.decimation import decimate
 from cosim.record.run_events import RecordedChange, changes_of
 from cosim.record.run_record import RunRecord
@@ -75,7 +75,7 @@ def definitions(kind: type[_Kind]) -> list[_Kind]:
 def void_claim(claimed: str, source: str, since_s: float, why: str, until_s: float | None = None) -> Claim:
     """Return a claim that cannot be checked because there is no bound."""
     return Claim(
-        what=claimed, source=source, bound="none", certified=None, observed=None, ratio=None,
+        what=claimed, source=source, bound=NO_BOUND, certified=None, observed=None, ratio=None,
         verdict=ClaimVerdict.VOID, since_s=since_s, why=why, from_s=since_s, until_s=until_s,
     )  # fmt: skip
 

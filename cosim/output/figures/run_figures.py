@@ -37,7 +37,7 @@ from cosim.output.figures.figure_description import (
     time_axis,
 )
 from cosim.output.figures.palette import CONTROLLER, FORCED, LOST, PLANT, SENSOR, THRESHOLD, Colour
-from cosim.output.figures.timing_figures import (
+from cosim.output.figures.event_and_process_times import (
     clock_errors,
     clocks_figure,
     inter_event_figure,

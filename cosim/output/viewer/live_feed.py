@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cosim.analysis.summary.loops_over_time import INTERVALS, add_link_bytes, empty_over_time, intervals_of
 from cosim.analysis.summary.run_summary import counts_inside, times_inside
-from cosim.output.viewer.loop_feed import LAG_S, SHOWN, LoopFeed, log_level
+from cosim.output.viewer.loop_feed import LAG_S, SHOWN_TABLES, LoopFeed, log_level
 from cosim.output.viewer.run_recording import ERROR, SIZE, RunRecording
 from cosim.record.record_source import rows_by_loop
 from cosim.record.run_record import Rows
@@ -62,7 +62,7 @@ class LiveFeed:
             number: LoopFeed(loops[number], loop_view, certified=not view.is_shared)
             for number, loop_view in view.views.items()
         }
-        self._tables = SHOWN if view.is_shared else (*SHOWN, *CLOCK_TABLES)
+        self._tables = SHOWN_TABLES if view.is_shared else (*SHOWN_TABLES, *CLOCK_TABLES)
         self._waiting: dict[str, list[Rows]] = {}
         self._due: list[int] = []
         self._handed_ns = self._shown_ns = 0

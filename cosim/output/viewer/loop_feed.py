@@ -55,7 +55,7 @@ LAG_S = 0.2
 _PATIENCE_S = 1.0
 """Maximum wall time to wait for a controller that sends no rows."""
 
-SHOWN = (
+SHOWN_TABLES = (
     CONTROLLER_STEP,
     CONTROLLER_DELIVERY,
     CONTROLLER_SETTING,
@@ -102,7 +102,7 @@ class LoopFeed:
         # Other tables are not shown.
         self._types = tables_of(scenario)
         self._clock_tables = [table for table in CLOCK_TABLES if table in self._types]
-        self._pending: dict[str, list[Rows]] = {table: [] for table in (*SHOWN, *self._clock_tables)}
+        self._pending: dict[str, list[Rows]] = {table: [] for table in (*SHOWN_TABLES, *self._clock_tables)}
         self._track: ControllerTrack = initial_track(scenario)
         self._undrawn: list[Rows] = []
         self._forced: set[int] = set()

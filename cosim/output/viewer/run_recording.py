@@ -199,10 +199,10 @@ to the right.
 
 def _shown_loop(
     scenario: Scenario, kind: Kind, folder: str, phase_ns: int, *, animated: bool
-) -> bp.ShownLoop:
+) -> bp.LoopLayout:
     """Describe what is shown of a loop; lateness only if the processes have no other loop."""
     loop, is_timed = loop_of(scenario), kind == "live" and not folder
-    return bp.ShownLoop(
+    return bp.LoopLayout(
         run_text(scenario, kind),
         loop.state_names,
         loop.input_names,
@@ -215,7 +215,7 @@ def _shown_loop(
     )
 
 
-def _layout(loops: Mapping[str, bp.ShownLoop], count: int, worst: WorstLoop | None) -> rrb.Container:
+def _layout(loops: Mapping[str, bp.LoopLayout], count: int, worst: WorstLoop | None) -> rrb.Container:
     """Lay out a page of all ``count`` loops, and one for each that is shown."""
     kind = "" if count <= len(SERIES) else ", quantiles over the loops"
     plots = [

@@ -31,7 +31,7 @@ from cosim.output.figures.figure_files import inline, save_figure, save_figures
 from cosim.output.figures.figure_format import figure_files
 from cosim.output.figures.figure_layout import figure_width
 from cosim.output.figures.run_figures import Trajectory, Transmissions, run_figures, states_figure
-from cosim.output.figures.timing_figures import later_than
+from cosim.output.figures.event_and_process_times import later_than
 from cosim.output.run_tables import key_numbers
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate

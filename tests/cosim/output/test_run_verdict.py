@@ -12,7 +12,7 @@ from cosim.analysis.summary.run_summary import Outcome
 from cosim.analysis.summary.summary_model import Claim
 from cosim.live.finalize import finalize
 from cosim.output.run_tables import short_numbers
-from cosim.output.run_verdict import BAD, remarks, state_text, verdict
+from cosim.output.run_verdict import Tone, remarks, state_text, verdict
 from cosim.simulation.virtual_time import simulate_run
 from tests.helpers.approved import compare_lines
 from tests.helpers.shipped import shipped
@@ -34,8 +34,8 @@ def test_the_second_line_states_whether_the_guarantee_was_kept(outcome: Outcome)
     def stated(line: str) -> list[str]:
         changed = json.loads(line)
         changed["claims"] = [claim(**one) for one in changed["claims"]]
-        text, style = verdict(with_values(outcome.summary, **changed))[1]
-        return [f"{style}: {text}"]
+        text, tone = verdict(with_values(outcome.summary, **changed))[1]
+        return [f"{tone}: {text}"]
 
     compare_lines(Path(__file__).with_name("approved") / "verdicts.txt", stated)
 
@@ -82,7 +82,7 @@ def test_the_verdict_of_several_loops_counts_them() -> None:
     name = loops[2].name
     assert broken == (
         f"guarantee broken in 1 of 4 loops, since 1.000 s: {name}: violated: a",
-        BAD,
+        Tone.BAD,
     )
 
 
