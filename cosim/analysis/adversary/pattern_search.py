@@ -347,9 +347,7 @@ def follow(
     raise TooManyEventsError(f"trigger: more than {MAX_EVENTS} events: they accumulate")
 
 
-def try_likely_patterns(
-    search: PatternSearch, scenario_pattern: Pattern, rng: np.random.Generator
-) -> float:
+def try_likely_patterns(search: PatternSearch, scenario_pattern: Pattern, rng: np.random.Generator) -> float:
     """Try the scenario's, regular and random patterns.
 
     Returns:

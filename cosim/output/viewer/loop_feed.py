@@ -15,13 +15,13 @@ from cosim.record.align import (
     EventFollower,
     align_measurements,
     controller_track,
-    shares_update,
     initial_track,
+    shares_update,
     true_states,
 )
 from cosim.record.decimation import decimate_all
 from cosim.record.record_source import concatenate_rows
-from cosim.record.run_events import claimed_until_s, model_flow, messages_in
+from cosim.record.run_events import claimed_until_s, messages_in, model_flow
 from cosim.record.run_record import Rows
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import row_norms

@@ -47,7 +47,9 @@ def results(record: RunRecord) -> dict[str, Any]:
         "claims": [claim.model_dump(mode="json") for claim in claims.evaluate()],
         "violations": claims.violations(),
         "conditions": claims.conditions,
-        "envelopes": [(curve.label, curve.t_s.tobytes(), curve.values.tobytes()) for curve in claims.envelopes()],
+        "envelopes": [
+            (curve.label, curve.t_s.tobytes(), curve.values.tobytes()) for curve in claims.envelopes()
+        ],
         "inter_event_s": [
             passed_s
             for part in ClaimEvaluation(record).samples()

@@ -111,7 +111,11 @@ def test_costs_that_do_not_depend_on_what_grows_are_those_of_the_loop_without_it
         assert isinstance(cost, CostUnder)
         return cost
 
-    alone, beside, weighed = stationary_cost(1, 1.0), stationary_cost(2, 1.0, 0.0), stationary_cost(2, 1.0, 1e-12)
+    alone, beside, weighed = (
+        stationary_cost(1, 1.0),
+        stationary_cost(2, 1.0, 0.0),
+        stationary_cost(2, 1.0, 1e-12),
+    )
     assert not alone.grows
     assert beside.growth == pytest.approx(np.exp(0.5 * 0.25))
     assert beside.stationary.state_rms == (pytest.approx(alone.stationary.state_rms[0]), None)

@@ -16,6 +16,7 @@ from matplotlib.text import Text
 import noack
 from cosim.analysis.summary.quantiles import QuantileSketch
 from cosim.output.figures import palette
+from cosim.output.figures.event_and_process_times import later_than
 from cosim.output.figures.figure_description import (
     Axis,
     FigureDescription,
@@ -31,7 +32,6 @@ from cosim.output.figures.figure_files import inline, save_figure, save_figures
 from cosim.output.figures.figure_format import figure_files
 from cosim.output.figures.figure_layout import figure_width
 from cosim.output.figures.run_figures import Trajectory, Transmissions, run_figures, states_figure
-from cosim.output.figures.event_and_process_times import later_than
 from cosim.output.run_tables import key_numbers
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate

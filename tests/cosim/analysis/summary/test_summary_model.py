@@ -165,6 +165,7 @@ def test_restarts_and_their_missing_first_rows_are_listed(content: dict[str, Any
     summary = summarise_loop(restarted, 0, "").to_json()
     assert summary["missing_by_table"]["sensor"] == 7
     first_s = (rows["now_ns"][[50, 80]] * 1e-9).tolist()
-    assert {restart["generation"]: (restart["first_s"], restart["what"]) for restart in summary["restarts"]} == {
+    restarts = {part["generation"]: (part["first_s"], part["what"]) for part in summary["restarts"]}
+    assert restarts == {
         1: (first_s[0], None), 2: (None, "after 2"), 3: (first_s[1], "after 3"),
     }  # fmt: skip
