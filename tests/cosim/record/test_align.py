@@ -21,9 +21,9 @@ from cosim.record.run_record import Rows
 from noack.core.linear_systems import ModelFlow
 from noack.protocol.record_tables import NO_SEQUENCE
 from noack.protocol.roles import GENERATION
-from noack.scenario.resolution import LoopMatrices, resolve
+from noack.scenario.resolution import LoopMatrices
 from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_file import validate
+from tests.helpers.shipped import resolved
 
 MS = 1_000_000
 RATES = np.array([1.0, 3.0])
@@ -43,10 +43,9 @@ LOOP = LoopMatrices(
 START = ControllerTrack(np.zeros(1, np.int64), np.zeros((1, 2)), np.full(1, NO_SEQUENCE))
 STATE = [("input", "<i8"), ("model_t_ns", "<i8"), ("x_c", "<f8", (2,))]
 DELIVERY = [*STATE, ("sequence", "<i8")]
-REAL = ("e_s_norm", "compared", "threshold")
 MEASUREMENT = [
     *((name, "<i8") for name in ("input", "t_ns", "event")),
-    *((name, "<f8") for name in REAL),
+    *((name, "<f8") for name in ("e_s_norm", "compared", "threshold")),
     *((name, "<f8", (2,)) for name in ("x", "x_s")),
 ]
 
@@ -75,9 +74,8 @@ def decayed(state: list[float], ms: float) -> np.ndarray:
     return np.array(state) * np.exp(-RATES * ms * 1e-3)
 
 
-def scenario(**network: Any) -> Scenario:
-    content = {"name": "aligned", "horizon_s": 1.0, "model": {"name": "double_integrator"}}
-    return resolve(validate(content | {"network": network}, "here"))
+def scenario(initial_sync: str) -> Scenario:
+    return resolved("double_integrator", f"network.initial_sync={initial_sync!r}")
 
 
 TICKS = steps(
@@ -112,11 +110,10 @@ def test_a_restarted_controller_has_no_state_before_its_first_update() -> None:
     assert aligned.received.tolist() == [0, *[NO_SEQUENCE] * 3, 6, 6, 6]
 
 
-@pytest.mark.parametrize("ticks", range(5))
-@pytest.mark.parametrize("updates", range(3))
-def test_a_track_in_parts_is_the_whole_track(ticks: int, updates: int) -> None:
+@pytest.mark.parametrize("split", range(7))
+def test_a_track_in_parts_is_the_whole_track(split: int) -> None:
     numbers = [0, *sorted([*TICKS["input"], *UPDATES["input"]])]
-    last = numbers[ticks + updates]
+    last = numbers[split]
     early, delivered = TICKS["input"] <= last, UPDATES["input"] <= last
     track = controller_track(START, TICKS[early], UPDATES[delivered])
     track = controller_track(track, TICKS[~early], UPDATES[~delivered])
@@ -140,8 +137,8 @@ def test_the_model_follows_its_set_point_from_the_change_on() -> None:
 def test_a_restarted_sensor_shares_no_update_until_its_own_is_delivered() -> None:
     ticks, updates = steps(), deliveries((1, 10, [1.0, 1.0], 5), (2, 20, [1.0, 1.0], GENERATION))
     track = controller_track(START, ticks, updates)
-    without, known = scenario(), scenario(initial_sync="known_state")
-    for given, before_the_first in ((without, False), (known, True)):
+    for initial_sync, before_the_first in (("first_packet", False), ("known_state", True)):
+        given = scenario(initial_sync)
         shared = shares_update(given, align(track, [0, 10, 20]))
         assert shared.tolist() == [before_the_first, True, True]
         restarted = shares_update(given, align(track, [0, 10, 20], generation=1))
@@ -149,6 +146,6 @@ def test_a_restarted_sensor_shares_no_update_until_its_own_is_delivered() -> Non
 
 
 def test_the_controller_starts_from_the_known_state_or_from_0() -> None:
-    known = scenario(initial_sync="known_state")
-    assert not initial_track(scenario()).x_c.any()
-    assert initial_track(known).x_c[0].tolist() == known.plant.initial_state
+    known = scenario("known_state")
+    assert not initial_track(scenario("first_packet")).x_c.any()
+    assert initial_track(known).x_c[0].tolist() == [*known.plant.initial_state]
