@@ -53,7 +53,8 @@ from noack.protocol.record_tables import (
 )
 
 _LEAST_MEASUREMENTS = 10
-_NEVER_NS = 2**62
+_AFTER_ANY_TIME_NS = 2**62
+"""Later than any time of a run; differences of times still fit 64 bits."""
 
 
 class IncomparableError(CallerError):
@@ -101,13 +102,13 @@ def recorded_loop(record: RunRecord) -> RecordedLoop:
     numbers, event_ns = np.arange(len(events)), events["t_ns"]
     acts_at_tick = np.searchsorted(origins.newest, numbers)
     acts_at_step = np.searchsorted(latched.newest, numbers)
-    act_ns = np.append(origins.model_ns, _NEVER_NS)[acts_at_tick]
+    act_ns = np.append(origins.model_ns, _AFTER_ANY_TIME_NS)[acts_at_tick]
     network = network_fates(record.scenario)
     schedule = StepSchedule(
         period_ns=period_ns,
         measured=measured,
         delivered=lambda event: event in accepted if event < len(events) else network(event),
-        delay_ns=_delays(accepted, act_ns - event_ns, act_ns < _NEVER_NS),
+        delay_ns=_delays(accepted, act_ns - event_ns, act_ns < _AFTER_ANY_TIME_NS),
         delay_steps=_delays(accepted, acts_at_step - event_ns // period_ns, acts_at_step <= last),
         model_ns=latched.model_ns,
     )

@@ -9,16 +9,7 @@ from cosim.analysis.summary.summary_model import ExitPart
 from cosim.interactive.exploration import Exploration
 from cosim.interactive.scenario_draft import differences, leaf, value_text
 from cosim.interactive.scenario_guarantee import CERTIFIED, VOID, Guarantee
-from cosim.output.run_verdict import (
-    BAD,
-    DOUBTFUL,
-    GOOD,
-    NEUTRAL,
-    VerdictLine,
-    ending_line,
-    state_text,
-    transmission_line,
-)
+from cosim.output.run_verdict import Tone, VerdictLine, ending_line, state_text, transmission_line
 from noack.core.errors import ExitStatus
 from noack.core.number_format import number, percent
 from noack.runtime.life_cycle import HORIZON
@@ -142,10 +133,10 @@ def verdict_of(run: Exploration, guarantee: Guarantee | None) -> tuple[VerdictLi
 
 def _guarantee_line(run: Exploration, guarantee: Guarantee | None) -> VerdictLine:
     if guarantee is None:
-        return VerdictLine("guarantee: being computed", NEUTRAL)
+        return VerdictLine("guarantee: being computed", Tone.NEUTRAL)
     if guarantee.verdict != CERTIFIED:
         why = guarantee.reason if guarantee.verdict != VOID else f"{VOID}: {guarantee.reason}"
-        return VerdictLine(f"guarantee not checkable: {why}", DOUBTFUL)
+        return VerdictLine(f"guarantee not checkable: {why}", Tone.DOUBTFUL)
     with np.errstate(all="ignore"):
         used = [
             values / np.exp(np.interp(run.t_s, guarantee.t_s, np.log(bound)))
@@ -156,6 +147,6 @@ def _guarantee_line(run: Exploration, guarantee: Guarantee | None) -> VerdictLin
         ]
     above = np.nanmax(np.stack([*used, np.zeros_like(run.t_s)]), axis=0) > 1
     if above.any():
-        return VerdictLine(f"guarantee broken since {run.t_s[above][0]:.3f} s", BAD)
+        return VerdictLine(f"guarantee broken since {run.t_s[above][0]:.3f} s", Tone.BAD)
     share = percent(float(np.nanmax(np.append(used[0], 0.0))))
-    return VerdictLine(f"guarantee kept: ‖e_c‖ was at most {share} of its bound", GOOD)
+    return VerdictLine(f"guarantee kept: ‖e_c‖ was at most {share} of its bound", Tone.GOOD)

@@ -18,7 +18,7 @@ from cosim.interactive.sliders import controls_of
 from cosim.lab.lab_services import LabServices, PageCalls
 from cosim.lab.live_run import MOST_LINES, LiveRun
 from cosim.lab.recorded_views import RunView, compare_with_ideal, recorded_view, replay_run
-from cosim.output.run_verdict import DOUBTFUL, NEUTRAL, VerdictLine, transmission_line
+from cosim.output.run_verdict import Tone, VerdictLine, transmission_line
 from noack.core.errors import NoackError
 from noack.core.number_format import number
 from noack.runtime.active_runs import find_run, request_change
@@ -98,14 +98,14 @@ class LiveSource:
     def verdict(self) -> list[VerdictLine]:
         """How it is: the verdict at its end; before, what is known so far."""
         if (live := self._services.live) is None:
-            return [VerdictLine(_ABOUT, NEUTRAL)]
+            return [VerdictLine(_ABOUT, Tone.NEUTRAL)]
         if live.verdict:
             return live.verdict
-        lines = [VerdictLine(_words(live), NEUTRAL)]
+        lines = [VerdictLine(_words(live), Tone.NEUTRAL)]
         if (progress := live.progress) is not None:
             kept = progress.warnings[-1:] or ["guarantee kept so far"]
-            style = DOUBTFUL if progress.warnings else NEUTRAL
-            lines += [VerdictLine(kept[0], style)]
+            tone = Tone.DOUBTFUL if progress.warnings else Tone.NEUTRAL
+            lines += [VerdictLine(kept[0], tone)]
             lines += [transmission_line(progress.events, progress.deliveries)]
         return lines
 

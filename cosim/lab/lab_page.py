@@ -24,13 +24,12 @@ from cosim.lab.figure_sources import LiveSource, RecordedSource, report_address
 from cosim.lab.file_menu import FileMenu
 from cosim.lab.lab_services import ANSWER_S, LabServices, PageCalls, Session
 from cosim.lab.page_parts import PageParts, TextPanel, controls_part, figure_part, form_part, value_text
-from cosim.output.run_verdict import BAD, DOUBTFUL, GOOD, VerdictLine
+from cosim.output.run_verdict import Tone, VerdictLine
 from noack.core.errors import NoackError
 
 _FOLDER = Path(__file__).parent
 EXPLORE, LIVE, RECORDED = "explore", "live", "recorded"
 _KEEP, _FORGET = "keep for comparison", "forget the kept run"
-_TONES = {GOOD: "good", DOUBTFUL: "doubt", BAD: "bad"}
 _POLL_S = 0.25
 _GESTURE_S = 1.0
 """Changes of one key follow each other within this time while a slider is dragged."""
@@ -227,16 +226,15 @@ class _Page:
             run = session.results.run if session.results else None
         return None if run is None else Reference(name, run)
 
-    def _verdict(self) -> list["_TonedLine"]:
-        lines: Sequence[VerdictLine] = ()
+    def _verdict(self) -> list[VerdictLine]:
         if self._source == LIVE:
-            lines = self._live.verdict
-        elif self._source == RECORDED and (view := self._recorded.view) is not None:
-            lines = [*view.verdict, *(VerdictLine(text, "") for text in view.remarks)]
-        elif self._source == EXPLORE and (results := self._session.results) is not None:
+            return self._live.verdict
+        if self._source == RECORDED and (view := self._recorded.view) is not None:
+            return [*view.verdict, *(VerdictLine(text, Tone.NEUTRAL) for text in view.remarks)]
+        if self._source == EXPLORE and (results := self._session.results) is not None:
             known = CERTIFICATE in results.known
-            lines = verdict_of(results.run, results.certificate if known else None)
-        return [_TonedLine(line.text, _TONES.get(line.style, "")) for line in lines]
+            return [*verdict_of(results.run, results.certificate if known else None)]
+        return []
 
     # What the visitor does
 
@@ -376,13 +374,6 @@ class _LastChange(NamedTuple):
 
     key: str
     at_s: float
-
-
-class _TonedLine(NamedTuple):
-    """A line of the verdict, with the class of its colours in lab.css."""
-
-    text: str
-    tone: str
 
 
 class TutorialStep(NamedTuple):

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 from cosim.interactive.scenario_draft import Draft
 from cosim.live.launcher import launch
 from cosim.live.monitoring.run_watcher import Watcher
-from cosim.output.run_verdict import VerdictLine
+from cosim.output.run_verdict import Tone, VerdictLine
 from cosim.output.viewer.rerun_program import is_installed
 from netem.shell import process
 from noack.core.errors import ExitStatus, NoackError
@@ -153,7 +153,7 @@ class LiveRun:
             case "ended":
                 self.state, self.ok = "ended", message["ok"]
                 self.run_dir = Path(message["run_dir"])
-                self.verdict = [VerdictLine(text, style) for text, style in message["verdict"]]
+                self.verdict = [VerdictLine(text, Tone(tone)) for text, tone in message["verdict"]]
                 self._add(f"recorded in {self.run_dir}")
             case _:
                 self.state, self.ok = "failed", False

@@ -275,7 +275,7 @@ class Coordinator:
         if role not in ROLES:
             raise PeerError("a run has no such process")
         self._require_token(role, request.join_token)
-        before, failure = self._vacant(role), self._replaceable.get(role)
+        before, failure = self._finished_predecessor(role), self._replaceable.get(role)
         if self._clock is not None and (before is None or failure is None):
             raise PeerError("the run has started without it")
         admission = _admission(before, failure, self._clock)
@@ -285,9 +285,9 @@ class Coordinator:
         self._admitted[role, request.instance] = member
         self.plane.answer(query, admission)
 
-    def _require_token(self, role: str, shown: str) -> None:
+    def _require_token(self, role: str, join_token: str) -> None:
         """Raise PeerError unless a join token admits a role now."""
-        scope = self.join_tokens.get(shown)
+        scope = self.join_tokens.get(join_token)
         if scope is None:
             raise PeerError("its run descriptor or invitation is not of this run")
         if role not in scope.roles:
@@ -304,7 +304,7 @@ class Coordinator:
         member = self._admitted.get((role, request.instance))
         current = self._members.get(role)
         if current is not member:
-            current = self._vacant(role)
+            current = self._finished_predecessor(role)
         other = None if current is member else current
         if member is None or (other is not None and member.generation <= other.generation):
             raise PeerError("it was not admitted")
@@ -321,7 +321,7 @@ class Coordinator:
             self._replaceable.pop(role, None)
             self._let_pass(member)
 
-    def _vacant(self, role: str) -> _Member | None:
+    def _finished_predecessor(self, role: str) -> _Member | None:
         """Return the process that had the role before, which must be over.
 
         Raise PeerError if it is not over.

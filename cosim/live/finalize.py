@@ -82,41 +82,71 @@ def finalize(ending: RunEnding, *, report: bool = True, view: bool = True, again
             stack.enter_context(closing(prepared))
         if not (scenario_file := run_dir / SCENARIO_FILE).exists():
             raise MachineError(f"{scenario_file}: no such file")  # the run directory was replaced
-        unfinished = (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir()
+        is_complete = not (run_dir / SPOOL).is_dir() and (run_dir / RECORD).is_dir()
         # A recorder that completed its recording writes the reports afterwards.
-        is_shown = not unfinished or (run_dir / REPORTS_FILE).is_file()
-        is_shown = is_shown and (run_dir / RECORDING_FILE).is_file()
+        is_recorded = is_complete or (run_dir / REPORTS_FILE).is_file()
+        is_recorded = is_recorded and (run_dir / RECORDING_FILE).is_file()
         scenario, _ = scenarios_of(run_dir)
         helpers = stack.enter_context(closing(prepared or FinalizeHelpers(scenario)))
         helpers.start()
-        with work_bar("the record of the run") as show:
-            each = partial(helpers.each, show=show)
-            run = finish_record(run_dir, each, helpers.early) if unfinished else load_run(run_dir)
+        run = load_run(run_dir) if is_complete else _complete_record(run_dir, helpers)
         summary, over_time = _evaluate_run(run, ending, helpers)
         _write_summary(run_dir, summary)
-        status, reason = ExitStatus(summary.exit.status), summary.exit.reason
-        if view and (again or not is_shown):
-            # That of an earlier attempt may be complete: it stays if there is no space for another.
-            quiet = (MachineError,) if is_shown else ()
-            with _is_optional(run_dir / RECORDING_FILE), suppress(*quiet):
-                require_viewer()
-                if len(run.loops) > 1 and helpers.count:  # they have imported the viewer
-                    # The worst loop is the only one whose summary is shown.
-                    worst = [summary.loops[worst_loop(summary.loops).number]]
-                    brief = summary.model_copy(update={"loops": worst})
-                    helpers.call(_record_stored, run_dir, brief, over_time)
-                else:
-                    _write_recording(run, summary, run_dir, None, over_time)
+        if view:
+            _write_recording_if_missing(
+                run, summary, run_dir, over_time, helpers, is_recorded=is_recorded, again=again
+            )
         if report:
-            names = run.names if 1 < len(run.names) <= _FEW_LOOPS else []
-            for name in (*names, None):
-                with _is_optional(run_dir / file_of_loop(REPORT_FILE, name)):
-                    _write_report(run, summary, run_dir, name, over_time)
-    return Outcome(run_dir, status, reason, summary)
+            _write_reports(run, summary, run_dir, over_time)
+    return Outcome(run_dir, ExitStatus(summary.exit.status), summary.exit.reason, summary)
+
+
+def _complete_record(run_dir: Path, helpers: FinalizeHelpers) -> RecordedRun:
+    """Write what is missing of the record; return the run."""
+    with work_bar("the record of the run") as show:
+        return finish_record(run_dir, partial(helpers.each, show=show), helpers.early)
+
+
+def _write_recording_if_missing(
+    run: RecordedRun,
+    summary: RunSummary,
+    run_dir: Path,
+    over_time: Sequence[LoopOverTime] | None,
+    helpers: FinalizeHelpers,
+    *,
+    is_recorded: bool,
+    again: bool,
+) -> None:
+    """Write the recording of the run, unless the recorder has written it.
+
+    That of an earlier attempt may be complete: it stays if there is no space for another.
+    """
+    if is_recorded and not again:
+        return
+    quiet = (MachineError,) if is_recorded else ()
+    with _warning_if_not_written(run_dir / RECORDING_FILE), suppress(*quiet):
+        require_viewer()
+        if len(run.loops) > 1 and helpers.count:  # they have imported the viewer
+            # The worst loop is the only one whose summary is shown.
+            worst = [summary.loops[worst_loop(summary.loops).number]]
+            brief = summary.model_copy(update={"loops": worst})
+            helpers.call(_record_stored, run_dir, brief, over_time)
+        else:
+            _write_recording(run, summary, run_dir, None, over_time)
+
+
+def _write_reports(
+    run: RecordedRun, summary: RunSummary, run_dir: Path, over_time: Sequence[LoopOverTime] | None
+) -> None:
+    """Write the report of the run, and those of a few loops."""
+    names = run.names if 1 < len(run.names) <= _FEW_LOOPS else []
+    for name in (*names, None):
+        with _warning_if_not_written(run_dir / file_of_loop(REPORT_FILE, name)):
+            _write_report(run, summary, run_dir, name, over_time)
 
 
 @contextmanager
-def _is_optional(path: Path) -> Iterator[None]:
+def _warning_if_not_written(path: Path) -> Iterator[None]:
     """Warn if a file cannot be written, whatever the error is: the run is not affected."""
     try:
         yield
@@ -221,9 +251,9 @@ _stored_run = cache(load_run)
 
 @np.errstate(all="ignore")
 def _evaluate_stored_loops(
-    ending: RunEnding, block: range, known: Sequence[Expectations] | None
+    ending: RunEnding, block: range, expectations: Sequence[Expectations] | None
 ) -> list[_LoopResults]:
-    return _evaluate_loops(_stored_run(ending.run_dir), ending, None, block, known)
+    return _evaluate_loops(_stored_run(ending.run_dir), ending, None, block, expectations)
 
 
 def _record_stored(run_dir: Path, summary: RunSummary, over_time: Sequence[LoopOverTime] | None) -> None:
@@ -235,11 +265,11 @@ def _evaluate_loops(
     ending: RunEnding,
     replay_in_helper: "ReplayInHelper | None",
     block: range,
-    known: Sequence[Expectations] | None,
+    expectations: Sequence[Expectations] | None,
 ) -> list[_LoopResults]:
-    """Evaluate some loops, of which expectations may be known; a helper may replay the only one."""
+    """Evaluate some loops, whose ``expectations`` may be given; a helper may replay the only one."""
     records = run.together(block)
-    expected = known or _expectations([record.scenario for record in records])
+    expected = expectations or _expectations([record.scenario for record in records])
     shared = SharedMachines(records if len(block) > 1 else ())
     results, claims = [], [*map(claims_of, records)]
     for claims_of_loop, own in zip(claims, expected, strict=True):
@@ -301,11 +331,11 @@ def _with_results(
     results: dict[str, Any] = {"fidelity": fidelity_for_summary(record, len(run.loops))}
     try:
         results["linearisation"] = linearisation(record.scenario)
-    except Exception as error:  # likewise
+    except Exception as error:  # a failed analysis must not cost the run its summary
         print(f"noack: warning: the plant was not linearised: {error!r}", file=sys.stderr)
     try:
         results |= _claim_results(claims, summary)
-    except Exception as error:  # likewise
+    except Exception as error:  # a failed analysis must not cost the run its summary
         print(f"noack: warning: the claims were not evaluated: {error!r}", file=sys.stderr)
     if record.kind == "live":
         replayed = (replay_in_helper and replay_in_helper.part()) or _replay(record, shared)
@@ -437,11 +467,11 @@ def _write_recording(
     summary: RunSummary,
     run_dir: Path,
     loop: str | None,
-    known: Sequence[LoopOverTime] | None = None,
+    over_time: Sequence[LoopOverTime] | None = None,
 ) -> None:
     from cosim.output.viewer.run_recording import write_view  # imports rerun
 
-    write_view(run, summary, run_dir, loop, known)
+    write_view(run, summary, run_dir, loop, over_time)
 
 
 def _write_report(
@@ -449,8 +479,8 @@ def _write_report(
     summary: RunSummary,
     run_dir: Path,
     loop: str | None,
-    known: Sequence[LoopOverTime] | None = None,
+    over_time: Sequence[LoopOverTime] | None = None,
 ) -> Path:
     from cosim.output.report_page import write_report  # imports matplotlib
 
-    return write_report(run, summary, run_dir, loop, known)
+    return write_report(run, summary, run_dir, loop, over_time)

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from cosim.lazy_modules import lazy_modules
 from cosim.measurement.interval_estimates import LEVEL
+from noack.core.clock import NEVER_NS
 from noack.traces.packet_trace import LOST_NS, Int64s, PacketTrace
 
 with lazy_modules():  # the library imports this module, and seldom needs it
     from scipy import stats
 
 Flags = NDArray[np.bool_]
-_NEVER_NS = np.iinfo(np.int64).max
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +52,8 @@ def outcomes(trace: PacketTrace, deadline_ns: int | None = None) -> Outcomes:
     packets make others stale makes no difference.
     """
     lost = trace.received_ns == LOST_NS
-    received_ns = np.where(lost, _NEVER_NS, trace.received_ns)
-    newer_ns = np.append(np.minimum.accumulate(received_ns[::-1])[::-1][1:], _NEVER_NS)
+    received_ns = np.where(lost, NEVER_NS, trace.received_ns)
+    newer_ns = np.append(np.minimum.accumulate(received_ns[::-1])[::-1][1:], NEVER_NS)
     out_of_order = ~lost & (received_ns > newer_ns)
     late = np.zeros(len(lost), bool)
     if deadline_ns is not None:

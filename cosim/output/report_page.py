@@ -31,14 +31,14 @@ from cosim.output.run_tables import (
     shares_network,
     timing_table,
 )
-from cosim.output.run_verdict import BAD, GOOD, NEUTRAL, remarks, verdict
+from cosim.output.run_verdict import Tone, remarks, verdict
 from cosim.record.run_directory import ENVIRONMENT_FILE, REPORT_FILE, SCENARIO_FILE, file_of_loop, read_object
 from cosim.record.run_record import RecordedRun
 from noack.core.file_access import write_whole
 from noack.core.number_format import seconds
 from noack.scenario.scenario import Scenario
 
-TIMING_FIGURES = ("lateness", "latency", "clocks")
+PROCESS_FIGURES = ("lateness", "latency", "clocks")
 """These have a section of their own, after the signals."""
 
 Content = Mapping[str, object]
@@ -103,11 +103,11 @@ def write_report(
     summary: RunSummary,
     run_dir: Path,
     loop: str | None = None,
-    known: Sequence[LoopOverTime] | None = None,
+    over_time: Sequence[LoopOverTime] | None = None,
 ) -> Path:
     """Write the report of a run, or of one of its loops; replace an existing one.
 
-    ``known`` is how each loop of the run went, if that is known.
+    ``over_time`` is how each loop of the run went, if that is known.
 
     Returns:
         The report's path.
@@ -125,14 +125,14 @@ def write_report(
         worst.number,
         worst.why,
         figures=[describe() for describe in described.values()],
-        network_figures=network_figures(run, shown, known) if shown.loops[1:] else (),
+        network_figures=network_figures(run, shown, over_time) if shown.loops[1:] else (),
         description=(run if shown.loops[1:] else record).scenario.description,
         scenario_toml=(run_dir / SCENARIO_FILE).read_text(encoding="utf-8"),
         environment=read_object(run_dir / ENVIRONMENT_FILE),
         links={
-            loop.name: quote(file)
-            for loop in shown.loops
-            if (run_dir / (file := file_of_loop(REPORT_FILE, loop.name))).is_file()
+            each.name: quote(file)
+            for each in shown.loops
+            if (run_dir / (file := file_of_loop(REPORT_FILE, each.name))).is_file()
         },
     )
     return write_whole(run_dir / file_of_loop(REPORT_FILE, loop), page(report))
@@ -154,11 +154,11 @@ def section(content: "Callable[[Report], Content | None]") -> None:
 def _verdict(report: Report) -> Content:
     lines = verdict(report.summary)
     notes = [remark.text for remark in remarks(report.detail)]
-    styles = {line.style for line in lines} - {NEUTRAL}
-    is_good = styles == {GOOD} and (report.shares_network or not notes)
+    tones = {line.tone for line in lines} - {Tone.NEUTRAL}
+    is_good = tones == {Tone.GOOD} and (report.shares_network or not notes)
     return {
         "lines": [line.text for line in lines],
-        "tone": "bad" if BAD in styles else "good" if is_good else "doubt",
+        "tone": Tone.BAD if Tone.BAD in tones else Tone.GOOD if is_good else Tone.DOUBTFUL,
         "remarks": [] if report.shares_network else notes,
     }
 
@@ -204,7 +204,7 @@ def _numbers(report: Report) -> Content:
 
 @section
 def _signals(report: Report) -> Content:
-    return {"figures": [figure for figure in report.figures if figure.name not in TIMING_FIGURES]}
+    return {"figures": [figure for figure in report.figures if figure.name not in PROCESS_FIGURES]}
 
 
 @section
@@ -220,7 +220,7 @@ def _assumptions(report: Report) -> Content | None:
 
 @section
 def _timing(report: Report) -> Content | None:
-    figures = [figure for figure in report.figures if figure.name in TIMING_FIGURES]
+    figures = [figure for figure in report.figures if figure.name in PROCESS_FIGURES]
     table = timing_table(report.loop)
     return {"table": table, "figures": figures} if table.rows or figures else None
 

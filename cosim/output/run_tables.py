@@ -322,7 +322,7 @@ def schedule_tables(loop: LoopSummary) -> Iterator[ResultTable]:
     """Yield the table of the times on which certificates depend, if the loop can have any."""
     if (allowed := loop.allowed) is None or (observed := loop.conditions) is None:
         return
-    exists = any("certificate" in claim.source and claim.bound != "none" for claim in loop.claims)
+    exists = any(claim.is_certified and claim.has_bound for claim in loop.claims)
     covered = (loop.certified_for or allowed) if exists else None
     rows = []
     for name, words in _SCHEDULE.items():

@@ -6,6 +6,7 @@ The terminal (:mod:`cosim.output.terminal_output`), the report and the lab page 
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from enum import StrEnum
 from typing import NamedTuple
 
 from cosim.analysis.claims.observed_conditions import BEYOND_CERTIFICATE, CAUSES, SCHEDULE, worst_time
@@ -15,7 +16,6 @@ from noack.core.errors import ExitStatus
 from noack.runtime.life_cycle import HORIZON
 from noack.theory.certificates.assumptions import AssumptionStatus
 
-GOOD, DOUBTFUL, BAD, NEUTRAL = "green", "yellow", "bold red", ""
 _NAMED = 3
 """Largest number of claims of a verdict that are named."""
 _SETTLED = 0.1
@@ -24,12 +24,20 @@ _MOST_VIOLATIONS = 5
 _MOST_GROWTH, _MOST_LATE = 10.0, 0.01
 
 
+class Tone(StrEnum):
+    """What a line of the verdict means for the run; each output has its own look for it."""
+
+    GOOD = "good"
+    DOUBTFUL = "doubt"
+    BAD = "bad"
+    NEUTRAL = ""
+
+
 class VerdictLine(NamedTuple):
     """A line of the verdict."""
 
     text: str
-    style: str
-    """Name of a style of rich."""
+    tone: Tone
 
 
 def verdict(summary: RunSummary) -> tuple[VerdictLine, ...]:
@@ -57,12 +65,12 @@ def ending_line(end: ExitPart, reached_s: float, horizon_s: float, states: str =
     reached = f"{reached_s:g} s"
     reached_of = f"{reached} of {horizon_s:g} s"
     reason = "" if end.status == ExitStatus.OK and end.reason == HORIZON else end.reason
-    how, style = {
-        ExitStatus.OK: (f"completed {reached}", GOOD),
-        ExitStatus.FAILED: (f"failed after {reached_of}", BAD),
-    }.get(ExitStatus(end.status), (f"stopped after {reached_of}", DOUBTFUL))
+    how, tone = {
+        ExitStatus.OK: (f"completed {reached}", Tone.GOOD),
+        ExitStatus.FAILED: (f"failed after {reached_of}", Tone.BAD),
+    }.get(ExitStatus(end.status), (f"stopped after {reached_of}", Tone.DOUBTFUL))
     details = "; ".join(filter(None, (reason.removeprefix("stopped "), states)))
-    return VerdictLine(f"{how}: {details}" if details else how, style)
+    return VerdictLine(f"{how}: {details}" if details else how, tone)
 
 
 def state_of(largest: float | None, final: float | None, diverged_at_s: float | None) -> str:
@@ -112,18 +120,20 @@ def transmission_line(events: int, deliveries: int, ideal: int | None = None) ->
     """Return the numbers of transmissions and deliveries, and that of the ideal loop."""
     beside = "" if ideal is None else f" ({ideal} in the ideal loop)"
     sent = "1 transmission" if events == 1 else f"{events} transmissions"
-    return VerdictLine(f"{sent}{beside}, {deliveries} delivered", NEUTRAL)
+    return VerdictLine(f"{sent}{beside}, {deliveries} delivered", Tone.NEUTRAL)
 
 
 class GuaranteeVerdict(NamedTuple):
     """Whether the claims about a loop held."""
 
-    style: str
-    """``GOOD``: kept; ``DOUBTFUL``: not checkable; ``BAD``: broken."""
+    tone: Tone
+    """Good: kept; doubtful: not checkable; bad: broken."""
     since_s: float = 0.0
     """From when on it is not."""
     why: str = ""
     """Why it is not; if it is kept, what limits it."""
+    lacks_loop_gain: bool = False
+    """Whether there is no certificate because the loop gain is not below 1."""
 
 
 def guarantee_of(loop: LoopSummary) -> GuaranteeVerdict:
@@ -132,42 +142,75 @@ def guarantee_of(loop: LoopSummary) -> GuaranteeVerdict:
     A claim that assumes an ideal loop cannot be broken by a run. Where a certificate covers the
     lateness of the run, lateness breaks nothing.
     """
-    violated = [claim for claim in loop.claims if claim.verdict == "violated"]
+    return _if_broken(loop) or _if_kept(loop) or _if_not_checkable(loop)
+
+
+def _if_broken(loop: LoopSummary) -> GuaranteeVerdict | None:
+    """Return since when and why the guarantee is broken; None if it is not."""
     broken = [(part.t_s, part.what) for part in loop.assumption_violations if part.cause not in CAUSES]
+    violated = [claim for claim in loop.claims if claim.verdict == "violated"]
     if violated:
         named = list(dict.fromkeys(claim.what for claim in violated))
         more = [f"{len(named) - _NAMED} more"] if len(named) > _NAMED else []
         since_s = min(claim.since_s or 0.0 for claim in violated)
         broken.append((since_s, "violated: " + "; ".join([*named[:_NAMED], *more])))
-    if broken:
-        return GuaranteeVerdict(BAD, *min(broken))
-    certified = [claim for claim in loop.claims if "certificate" in claim.source]
+    return GuaranteeVerdict(Tone.BAD, *min(broken)) if broken else None
+
+
+def _if_kept(loop: LoopSummary) -> GuaranteeVerdict | None:
+    """Return what limits the guarantee that was kept; None if it was not checked to the end."""
+    certified = [claim for claim in loop.claims if claim.is_certified]
     if not certified:
-        why = next((claim.why for claim in loop.claims if claim.verdict == "void"), "")
-        return GuaranteeVerdict(DOUBTFUL, 0.0, why or "no certificate covers this loop")
-    void = [claim for claim in loop.claims if claim.verdict == "void"]
+        return None
     late, covered = _lateness(loop), ""
     if late and _covers_lateness(loop):
         covered = f"certificate recomputed for the lateness of this run: {'; '.join(dict.fromkeys(late))}"
-    if not void:
-        return GuaranteeVerdict(GOOD, 0.0, covered)
-    # Each part of the run between changes of settings needs a certificate that held.
+    if not (void := _void_claims(loop)):
+        return GuaranteeVerdict(Tone.GOOD, 0.0, covered)
+    if _without_certificate(loop) or not any(claim.verdict == "held" for claim in certified):
+        return None
+    unchecked = f"{len(void)} {'claim' if len(void) == 1 else 'claims'} not checkable: {_reason(loop).why}"
+    return GuaranteeVerdict(Tone.GOOD, 0.0, "; ".join(filter(None, (covered, unchecked))))
+
+
+def _if_not_checkable(loop: LoopSummary) -> GuaranteeVerdict:
+    """Return from when on and why the guarantee cannot be checked."""
+    if any(claim.is_certified for claim in loop.claims):
+        return _reason(loop)
+    why = next((claim.why for claim in _void_claims(loop)), "")
+    return GuaranteeVerdict(Tone.DOUBTFUL, 0.0, why or "no certificate covers this loop")
+
+
+def _void_claims(loop: LoopSummary) -> list[Claim]:
+    return [claim for claim in loop.claims if claim.verdict == "void"]
+
+
+def _without_certificate(loop: LoopSummary) -> list[Claim]:
+    """Return the void claims of the parts of the run in which no certificate held.
+
+    Each part of the run between changes of settings needs a certificate that held.
+    """
+    certified = [claim for claim in loop.claims if claim.is_certified]
     parts = {claim.from_s for claim in certified if claim.verdict == "held"}
-    rest = [claim for claim in void if claim in certified and claim.from_s not in parts]
+    return [claim for claim in certified if claim.verdict == "void" and claim.from_s not in parts]
+
+
+def _reason(loop: LoopSummary) -> GuaranteeVerdict:
+    """Return from when on, and why, the first of the void claims of a loop cannot be checked."""
+    rest = _without_certificate(loop)
     # A certificate that covered a part for some time says more than one that does not exist.
-    concerned = [claim for claim in rest if claim.bound != "none"] or rest or void
-    since_s, why = min(
-        (claim.since_s or 0.0, ("no certificate: " if claim.bound == "none" else "") + claim.why)
-        for claim in concerned
-    )
+    concerned = [claim for claim in rest if claim.has_bound] or rest or _void_claims(loop)
+    claim = min(concerned, key=lambda claim: (claim.since_s or 0.0, _why(claim)))
+    why, late = _why(claim), _lateness(loop)
     if why.endswith(BEYOND_CERTIFICATE):
         why = f"at worst {why}"
     elif late and late[0] == why and not loop.missing_samples:
         why = f"at worst {why}; no certificate covers that"
-    if parts and not rest:
-        unchecked = f"{len(void)} {'claim' if len(void) == 1 else 'claims'} not checkable: {why}"
-        return GuaranteeVerdict(GOOD, 0.0, "; ".join(filter(None, (covered, unchecked))))
-    return GuaranteeVerdict(DOUBTFUL, since_s, why)
+    return GuaranteeVerdict(Tone.DOUBTFUL, claim.since_s or 0.0, why, claim.lacks_loop_gain)
+
+
+def _why(claim: Claim) -> str:
+    return claim.why if claim.has_bound else f"no certificate: {claim.why}"
 
 
 def _lateness(loop: LoopSummary) -> list[str]:
@@ -182,8 +225,8 @@ def _is_late(loop: LoopSummary, claim: Claim) -> bool:
 
 def _covers_lateness(loop: LoopSummary) -> bool:
     """Whether certificates of its lateness cover the whole run."""
-    void = [claim for claim in loop.claims if claim.verdict == "void"]
-    return loop.certified_for is not None and not any(_is_late(loop, claim) for claim in void)
+    late = any(_is_late(loop, claim) for claim in _void_claims(loop))
+    return loop.certified_for is not None and not late
 
 
 def _guarantee_line(loops: Sequence[LoopSummary]) -> VerdictLine:
@@ -191,19 +234,19 @@ def _guarantee_line(loops: Sequence[LoopSummary]) -> VerdictLine:
     guarantees = [(guarantee_of(loop), loop) for loop in loops]
     held = sum(claim.verdict == "held" for loop in loops for claim in loop.claims)
     claims = f"{held} {'claim' if held == 1 else 'claims'} held, none violated"
-    styles = {kept.style for kept, _ in guarantees}
-    worst = next((style for style in (BAD, DOUBTFUL) if style in styles), GOOD)
-    concerned = [(kept, loop) for kept, loop in guarantees if kept.style == worst]
+    tones = {kept.tone for kept, _ in guarantees}
+    worst = next((tone for tone in (Tone.BAD, Tone.DOUBTFUL) if tone in tones), Tone.GOOD)
+    concerned = [(kept, loop) for kept, loop in guarantees if kept.tone == worst]
     kept, loop = min(concerned, key=lambda pair: pair[0].since_s if pair[0].why else math.inf)
     name, count = "" if len(loops) == 1 else f"{loop.name}: ", f"{len(concerned)} of {len(loops)}"
     why = f": {name}{kept.why}" if kept.why else ""
     since = f"{kept.since_s:.3f} s"
-    if worst == GOOD:
+    if worst == Tone.GOOD:
         where = "" if len(loops) == 1 else f" in all {len(loops)} loops"
         more_loops = sum(bool(other.why) for other, _ in concerned) - 1
         more = f" (and {more_loops} more {'loop' if more_loops == 1 else 'loops'})" if more_loops > 0 else ""
         text = f"guarantee kept{where}: {claims}" + (f"; {name}{kept.why}{more}" if kept.why else "")
-    elif worst == BAD:
+    elif worst == Tone.BAD:
         where = "" if len(loops) == 1 else f" in {count} loops,"
         text = f"guarantee broken{where} since {since}{why}"
     elif len(loops) > 1:
@@ -279,18 +322,17 @@ def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
         else:
             yield f"{lost} (kernel): {where}"
     for restart in loop.restarts:
-        void = any(claim.verdict == "void" for claim in loop.claims)
-        consequence = "; claims are void from then on" if void else ""
+        consequence = "; claims are void from then on" if _void_claims(loop) else ""
         yield f"{restart.process} was restarted, {downtime_text(restart)}{consequence}"
     for role, reasons in loop.rejected_datagrams.items():
         counts = ", ".join(f"{reason.replace('_', ' ')} {n}" for reason, n in reasons.items())
         yield f"{role} rejected datagrams: {counts}"
-    if guarantee_of(loop).why.startswith("no certificate: the loop gain"):
+    if guarantee_of(loop).lacks_loop_gain:
         yield (
             "no bound of ‖x‖ is certified: noack certify shows what would have to change; "
             "noack margin, whether a time-triggered loop is proven stable"
         )
-    unchecked = any(claim.verdict == "void" and _is_late(loop, claim) for claim in loop.claims)
+    unchecked = any(_is_late(loop, claim) for claim in _void_claims(loop))
     ended_well = summary.exit.status != ExitStatus.FAILED and not loop.missing_samples
     if unchecked and ended_well and summary.kind == "live" and not loop.restarts:
         culprit = "A host or the network between hosts" if _has_clocks(loop) else "This machine"

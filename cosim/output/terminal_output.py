@@ -29,12 +29,14 @@ from cosim.output.run_tables import (
     short_numbers,
     summary_tables,
 )
-from cosim.output.run_verdict import BAD, DOUBTFUL, GOOD, remarks, verdict
+from cosim.output.run_verdict import Tone, VerdictLine, remarks, verdict
 from cosim.record.run_directory import RECORDING_FILE, REPORT_FILE, file_of_loop
 from noack.core.number_format import NONE, percent
 from noack.theory.certificates.assumptions import Assumption, AssumptionStatus
 
-_CLAIM_STYLES = {"held": GOOD, "violated": BAD, "void": DOUBTFUL, "not applicable": "dim"}
+_GOOD, _DOUBTFUL, _BAD = "green", "yellow", "bold red"
+_TONE_STYLES = {Tone.GOOD: _GOOD, Tone.DOUBTFUL: _DOUBTFUL, Tone.BAD: _BAD, Tone.NEUTRAL: ""}
+_CLAIM_STYLES = {"held": _GOOD, "violated": _BAD, "void": _DOUBTFUL, "not applicable": "dim"}
 _ASSUMPTION_STYLES: dict[str, str] = {
     AssumptionStatus.HOLDS: "green",
     AssumptionStatus.VIOLATED: "bold yellow",
@@ -58,13 +60,18 @@ def print_outcome(console: Console, outcome: Outcome, *, verbose: bool = False) 
     """
     summary = outcome.summary
     for line in verdict(summary):
-        console.print(Text(line.text, line.style), soft_wrap=True)
+        print_line(console, line)
     if shares_network(summary):
         _print_loops(console, summary, verbose=verbose)
     else:
         _print_loop(console, summary, verbose=verbose)
     for where in _where(outcome, verbose=verbose):
         console.print(where, highlight=False, soft_wrap=True, markup=False)
+
+
+def print_line(console: Console, line: VerdictLine) -> None:
+    """Print a line of a verdict."""
+    console.print(Text(line.text, _TONE_STYLES[line.tone]), soft_wrap=True)
 
 
 def _print_loop(console: Console, summary: RunSummary, *, verbose: bool) -> None:
@@ -74,7 +81,7 @@ def _print_loop(console: Console, summary: RunSummary, *, verbose: bool) -> None
         print_numbers(console, run_title(summary), short_numbers(summary))
     for remark in remarks(summary):
         start = "" if remark.neutral else "[bold yellow]warning:[/] "
-        start = f"[{BAD}]" if remark.severe else start
+        start = f"[{_BAD}]" if remark.severe else start
         console.print(start + escape(remark.text), highlight=False, soft_wrap=True)
 
 

@@ -40,7 +40,6 @@ from noack.protocol.record_tables import (
     SENSOR_MEASUREMENT,
 )
 from noack.protocol.roles import GENERATION
-from noack.scenario.estimation import steady_state
 from noack.scenario.resolution import LoopMatrices, loop_of, policy_of
 from noack.scenario.scenario import Scenario
 from noack.theory.paper import ErrorMonitor
@@ -70,7 +69,7 @@ class AlignedRun(NamedTuple):
     """(k,) ‖e_c‖_W."""
     received: NDArray[np.int64]
     """(k,) sequence number of the controller's newest update at t, −1 for none."""
-    sensor: NDArray[np.int64]
+    sensor_generation: NDArray[np.int64]
     """(k,) generation of the sensor."""
 
     def since_delivery(self, scenario: Scenario) -> NDArray[np.bool_]:
@@ -96,13 +95,14 @@ class ControllerTrack(NamedTuple):
         )
 
 
-def in_common(scenario: Scenario, aligned: AlignedRun) -> NDArray[np.bool_]:
+def shares_update(scenario: Scenario, aligned: AlignedRun) -> NDArray[np.bool_]:
     """Return where x_c is recorded, and sensor and controller share an update, (k,).
 
     After a restart of the sensor they share none until an update of the restarted one is delivered.
     """
     known = scenario.network.initial_sync == "known_state"
-    first = np.where(known & (aligned.sensor == 0), NO_SEQUENCE, aligned.sensor * GENERATION)
+    generation = aligned.sensor_generation
+    first = np.where(known & (generation == 0), NO_SEQUENCE, generation * GENERATION)
     return np.asarray(all_entries(~np.isnan(aligned.x_c)) & (aligned.received >= first))
 
 
@@ -176,7 +176,7 @@ def align_measurements(
     x_s = measurements["x_s"].copy()
     x_s[reset] = measurements["x"][reset]
     flow = ModelFlow(loop.H, loop.setpoint) if flow is None else flow
-    x_c, received = _at(flow, track, t_ns, until_ns)
+    x_c, received = _controller_states_at(flow, track, t_ns, until_ns)
     e_c = x_c - measurements["x"]
     if loop.weight is not None:
         e_c = e_c @ loop.weight.T
@@ -206,7 +206,7 @@ def _threshold(measurements: Rows) -> Reals:
         return np.asarray(np.where(left == norms, right, right * (norms / left)))
 
 
-def _at(
+def _controller_states_at(
     flow: ModelFlow, track: ControllerTrack, t_ns: Times, until_ns: int
 ) -> tuple[Reals, NDArray[np.int64]]:
     index = np.searchsorted(track.model_ns, t_ns, side="right") - 1
@@ -289,7 +289,7 @@ class BoundedPart(NamedTuple):
     """An aligned part with bounds of the controller's error; k measurements."""
 
     part: AlignedPart
-    shared: NDArray[np.bool_]
+    is_bounded: NDArray[np.bool_]
     """(k,) where sensor and controller share an update, and ‖e_c‖ is finite: it is bounded there."""
     error_bounds: tuple[Reals, Reals]
     """Bounds of ‖e_c‖_W from (I1) and from eq:LossEv3, (k,) each; NaN where it is not bounded."""
@@ -318,16 +318,16 @@ def _add_bounds(record: RunRecord) -> Iterator[BoundedPart]:
         rows, aligned = part.rows, part.aligned
         e_s = rows["x_s"] - rows["x"]
         errors = monitor.take(rows["t_ns"], e_s, rows["event"], aligned.received)
-        shared = shares_update(scenario, aligned)
-        identity, printed = (np.where(shared, bound, np.nan) for bound in (errors.identity, errors.printed))
+        bounded = is_bounded(scenario, aligned)
+        identity, printed = (np.where(bounded, bound, np.nan) for bound in (errors.identity, errors.printed))
         residual = identity_residual(scenario, aligned, errors.missed)
-        yield BoundedPart(part, shared, (identity, printed), residual)
+        yield BoundedPart(part, bounded, (identity, printed), residual)
 
 
-def shares_update(scenario: Scenario, aligned: AlignedRun) -> NDArray[np.bool_]:
+def is_bounded(scenario: Scenario, aligned: AlignedRun) -> NDArray[np.bool_]:
     """Return where sensor and controller share an update, and ‖e_c‖ is finite, (k,)."""
     finite = np.isfinite(aligned.e_c_norm) & all_entries(np.isfinite(aligned.x_s))
-    return np.asarray(finite & in_common(scenario, aligned))
+    return np.asarray(finite & shares_update(scenario, aligned))
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -342,7 +342,7 @@ def identity_residual(scenario: Scenario, aligned: AlignedRun, missed: Reals) ->
     if scenario.protocol.acknowledges or not len(aligned.t_ns):
         return np.full(len(aligned.t_ns), np.nan)
     residual = largest_sizes(aligned.x_c - aligned.x_s - missed)
-    return np.where(in_common(scenario, aligned), residual, np.nan)
+    return np.where(shares_update(scenario, aligned), residual, np.nan)
 
 
 def true_states(steps: Rows, t_ns: NDArray[np.int64], column: str = "x") -> Reals:
@@ -358,34 +358,7 @@ def true_states(steps: Rows, t_ns: NDArray[np.int64], column: str = "x") -> Real
     return states
 
 
-def expected_rms(resolved: Scenario) -> float:
-    """Return the steady-state RMS of ‖x̂ − x‖ from noise and disturbances, for an exact model."""
-    return float(np.sqrt(np.trace(steady_state(resolved).covariance)))
-
-
-class SizeStatistics:
-    """Root mean square and maximum of finite norms, part by part."""
-
-    def __init__(self) -> None:
-        self._squares, self._count = 0.0, 0
-        self.max: float | None = None
-
-    def add(self, norms: Reals) -> None:
-        """Add norms, (k,); those that are not finite are ignored."""
-        norms = norms[np.isfinite(norms)]
-        if len(norms):
-            self._squares += float(np.square(norms).sum())
-            self._count += len(norms)
-            largest = float(norms.max())
-            self.max = largest if self.max is None else max(self.max, largest)
-
-    @property
-    def rms(self) -> float | None:
-        """Their root mean square; None without values."""
-        return float(np.sqrt(self._squares / self._count)) if self._count else None
-
-
-UNKNOWN = 2**62
+NOT_SHARED = 2**62
 """Number of missing events where sensor and controller share no update."""
 
 
@@ -423,7 +396,7 @@ class EventFollower:
         age_ns = rows["t_ns"] - event_ns[newest]
         predicted = self._propagate.leaps(x.take(newest, axis=0), age_ns // period_ns, period_ns)
         age_s = np.where(events[newest] == NO_SEQUENCE, np.nan, age_ns * 1e-9)
-        shared = in_common(self._scenario, aligned)
-        missing = np.where(shared, events[newest] - aligned.received, UNKNOWN)
+        shared = shares_update(self._scenario, aligned)
+        missing = np.where(shared, events[newest] - aligned.received, NOT_SHARED)
         self._event, self._event_ns, self._x = int(events[-1]), int(event_ns[-1]), x[-1]
         return SinceEvent(age_s, predicted, missing)

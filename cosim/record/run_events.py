@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.record.run_record import Rows, RunRecord
-from noack.core.clock import NS_PER_S
+from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import ModelFlow
 from noack.protocol.record_tables import (
@@ -27,8 +27,6 @@ from noack.scenario.parameter_changes import ChangeSchedule, ParameterChange, se
 from noack.scenario.resolution import loop_of
 from noack.scenario.runtime_parameters import is_of_loss_alone
 from noack.scenario.scenario import Scenario
-
-NEVER_NS = 2**63 - 1
 
 
 class RecordedChange(NamedTuple):
@@ -197,7 +195,7 @@ def _released(record: RunRecord, flow: Flow) -> tuple[NDArray[np.int64], NDArray
 def _outcomes(
     packets: Rows, flow: Flow, forwarded: NDArray[np.int64], was_stale: NDArray[np.bool_]
 ) -> PacketOutcome:
-    rows, sequence, event_ns = updates_in(packets, flow)
+    rows, sequence, event_ns = messages_in(packets, flow)
     # Of a datagram and its copy, the first intact one counts; it may be the copy.
     copy = (rows["bit"] >= 0).astype(np.int64)
     numbers = 2 * rows["sequence"] + copy
@@ -210,7 +208,7 @@ def _outcomes(
     return PacketOutcome(sequence, event_ns, rows["now_ns"].copy(), fate, lost, in_flight, due_ns)
 
 
-def updates_in(packets: Rows, flow: Flow = Flow.UPDATE) -> tuple[Rows, NDArray[np.int64], NDArray[np.int64]]:
+def messages_in(packets: Rows, flow: Flow = Flow.UPDATE) -> tuple[Rows, NDArray[np.int64], NDArray[np.int64]]:
     """Select the loop's messages of a flow from the packets that reached the network emulator.
 
     The emulator reads no payload, so the packets' headers are read here.

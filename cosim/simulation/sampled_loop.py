@@ -128,7 +128,8 @@ class SampledLoop:
             signal.width = values.shape[1] if given else 0
             signal.first, signal.rows = 0, len(values)
             signal.values = pointer_to(values, "double *")
-        self._plant, self._kept = plant, (arrays, at_state, noises)
+        self._plant = plant
+        self._keep_alive = (arrays, at_state, noises)  # arrays that the core points to
 
     @property
     def known_start(self) -> bool:

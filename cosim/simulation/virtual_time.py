@@ -88,14 +88,15 @@ class RecordCollector:
     def __init__(self, types: Mapping[str, np.dtype[np.void]], loops: int) -> None:
         self._types, self._loops = types, loops
         self._batches: dict[str, list[Rows]] = {}
-        self._settings: dict[str, list[tuple[object, ...]]] = {}
+        self._setting_rows: dict[str, list[tuple[object, ...]]] = {}
+        """Rows of the settings tables; the machines write all others in batches."""
         self._by_loop: dict[str, list[Rows]] = {}
         self._notices: list[tuple[Notice, str]] = []
 
     def take(self, role: str, output: Record | Notice) -> None:
-        """Take a row or a notice of a role."""
+        """Take a row of a settings table, or a notice of a role."""
         if isinstance(output, Record):
-            self._settings.setdefault(output.table, []).append(output.row)
+            self._setting_rows.setdefault(output.table, []).append(output.row)
         else:
             self._notices.append((output, role))
 
@@ -106,15 +107,15 @@ class RecordCollector:
     def counts(self, table: str) -> NDArray[np.int64]:
         """Return the number of rows of each loop in a table of the machines, shape (loops,)."""
         numbers = [rows[LOOP] for rows in self._batches.get(table, [])]
-        numbers.append(np.array([row[0] for row in self._settings.get(table, [])], np.uint16))
+        numbers.append(np.array([row[0] for row in self._setting_rows.get(table, [])], np.uint16))
         return np.bincount(np.concatenate(numbers), minlength=self._loops)
 
     def whole(self, table: str) -> Rows:
         """Return all rows of a table, and keep them no longer."""
         dtype = self._types[table]
         batches = self._batches.pop(table, [])
-        if settings := self._settings.pop(table, []):
-            batches = [np.array(settings, dtype), *batches]
+        if setting_rows := self._setting_rows.pop(table, []):
+            batches = [np.array(setting_rows, dtype), *batches]
         return concatenate_rows(batches or [np.zeros(0, dtype)], dtype)
 
     def of_loop(self, table: str, number: int) -> Rows:

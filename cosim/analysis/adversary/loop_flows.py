@@ -1,7 +1,7 @@
 """The loops of the search, followed from event to event, and the objective on the way.
 
-z = (x, e_s, e_c) as in :mod:`cosim.simulation.continuous`. The level decays like
-the threshold, t_0 < t_1 < … are the run's events, and T is the horizon. The adversary maximises
+z = (x, e_s, e_c) as in :mod:`cosim.simulation.continuous`. The level decays like the threshold,
+t_0 < t_1 < … are the events of the run, and T is the horizon. The adversary maximises
 
 * error: sup_{t ≤ T} ‖W e_c(t)‖ / level(t), the observed Δ;
 * state: sup_{t ≤ T} ‖x(t)‖ β / level(t), the observed X;

@@ -9,7 +9,8 @@
   automaton and their part of the window; from each group first the best run is selected, then the
   second best, and so on. One half of the selection ranks runs by their value so far, the other half
   by the value ahead: what the loop would reach over the next window without events.
-* :func:`guess` values given patterns, and :func:`improve` changes single decisions of one.
+* :func:`try_likely_patterns` values given patterns, and :func:`improve` changes single decisions of
+  one.
 """
 
 from collections.abc import Callable, Sequence
@@ -149,34 +150,39 @@ class PatternSearch:
         delivered = np.repeat([False, True], [int(can_be_lost.sum()), len(events)])
         after_delivery = self.automaton.after_delivery(nodes.state[events])
         state = np.concatenate([after_loss[can_be_lost], after_delivery])
-        return after_events(self.flow, nodes, segments, value, continued, delivered, state, self._log)
+        step = Step(nodes, segments, value, continued, delivered, state)
+        return after_events(self.flow, step, self._log)
 
 
-def after_events(
-    flow: PatternFlow,
-    nodes: Nodes,
-    segments: SegmentEnds,
-    value: Vector,
-    continued: Indices,
-    delivered: Flags,
-    state: Indices,
-    log: DecisionLog,
-) -> Nodes:
-    """Return the runs ``continued``, (k,), just after the events at the end of their segments.
+class Step(NamedTuple):
+    """N runs followed to the ends of their segments, and k decisions about the events there."""
 
-    ``delivered``, (k,), tells whether the update of each run arrives; the ``log`` receives that.
-    ``state``, (k,), is the automaton's state after it. ``value``, (N,), has the values of the runs
-    at the end of the segments.
+    nodes: Nodes
+    """The runs at the starts of the segments."""
+    segments: SegmentEnds
+    value: Vector
+    """Values of the runs at the ends of the segments, (N,)."""
+    continued: Indices
+    """The run of each decision, (k,)."""
+    delivered: Flags
+    """Whether the update of the event arrives, (k,)."""
+    state: Indices
+    """The automaton's state after it, (k,)."""
+
+
+def after_events(flow: PatternFlow, step: Step, log: DecisionLog) -> Nodes:
+    """Return the runs just after the events of a step, (k,); its decisions are added to the log.
 
     Raises:
         TooManyEventsError: two events at the same time.
     """
-    t_s = segments.end_s[continued]
+    nodes, continued, delivered = step.nodes, step.continued, step.delivered
+    t_s = step.segments.end_s[continued]
     stuck = t_s <= nodes.t_s[continued]
     if (stuck & (nodes.entry[continued] != START)).any():
         raise TooManyEventsError(f"trigger: the events accumulate at {t_s[stuck][0]:.9g} s")
-    z = flow.after_events(t_s, segments.z[continued], delivered)
-    return Nodes(t_s, z, state, value[continued], log.add(nodes.entry[continued], delivered))
+    z = flow.after_events(t_s, step.segments.z[continued], delivered)
+    return Nodes(t_s, z, step.state, step.value[continued], log.add(nodes.entry[continued], delivered))
 
 
 Ceiling = Callable[[Nodes], Vector]
@@ -185,9 +191,10 @@ _BLOCK = 4096
 
 
 def search_tree(search: PatternSearch, most_nodes: int, ceiling: Ceiling | None = None) -> bool:
-    """Search all patterns; return whether every one was covered within ``most_nodes`` nodes.
+    """Search all patterns, within ``most_nodes`` nodes; return whether the maximum was found.
 
-    The ``ceiling`` prunes branches that cannot exceed the largest value so far.
+    It was if all patterns were covered, or if one of them diverges. The ``ceiling`` prunes branches
+    that cannot exceed the largest value so far.
 
     Raises:
         TooManyEventsError: two events at the same time.
@@ -220,7 +227,10 @@ def _top(pile: list[Nodes]) -> Nodes:
 
 
 _ALIKE = 1e-4
+"""Runs nearly coincide if their times, in windows, and their features, of size 1, round to the same
+multiples of this: far above the errors of rounding."""
 _PARTS = 2
+"""Parts of a window whose runs are ranked apart: an earlier run has had less time for its value."""
 _WIDTH_WITHIN_WINDOW = 8
 """Runs that continue within a window, for each one that continues to the next window."""
 
@@ -259,16 +269,16 @@ class _RunSelection:
         if len(nodes.t_s) <= width:
             return nodes
         nodes = nodes.take(self._distinct(nodes))
-        kind = self._kind(nodes)
+        group = self._group(nodes)
         ahead = self._flow.value_ahead(nodes.t_s, nodes.z, self._window_s)
         if self._flow.objective.additive:
-            return nodes.take(_turns(nodes.value + ahead, kind)[:width])
-        by_value = _turns(nodes.value, kind, ahead)[: width // 2]
-        by_value_ahead = _turns(ahead, kind)
+            return nodes.take(_round_robin(nodes.value + ahead, group)[:width])
+        by_value = _round_robin(nodes.value, group, ahead)[: width // 2]
+        by_value_ahead = _round_robin(ahead, group)
         chosen = np.concatenate([by_value, by_value_ahead[~np.isin(by_value_ahead, by_value)]])
         return nodes.take(chosen[:width])
 
-    def _kind(self, nodes: Nodes) -> Indices:
+    def _group(self, nodes: Nodes) -> Indices:
         since_s = nodes.t_s - nodes.t_s.min()
         section = np.minimum(since_s * _PARTS / self._window_s, _PARTS).astype(int)
         return np.asarray(nodes.state * (_PARTS + 1) + section)
@@ -282,20 +292,24 @@ class _RunSelection:
         return np.asarray(order[np.sort(first)])
 
 
-def _turns(score: Vector, kind: Indices, second_score: Vector | None = None) -> Indices:
-    """Return indices in selection order: first the best of each kind, then the second best, etc."""
+def _round_robin(score: Vector, group: Indices, second_score: Vector | None = None) -> Indices:
+    """Return indices in selection order: first the best of each group, then the second best, etc."""
     second_score = score if second_score is None else second_score
-    order = np.lexsort((-second_score, -score, kind))
-    starts = firsts_of_equal(kind[order])
+    order = np.lexsort((-second_score, -score, group))
+    starts = firsts_of_equal(group[order])
     rank = np.empty(len(order), int)
     rank[order] = np.arange(len(order)) - np.repeat(starts, np.diff(starts, append=len(order)))
     return np.asarray(np.lexsort((-second_score, -score, rank)))
 
 
 _RANDOM = 64
+"""Random patterns: their shares of losses are spread over 0 to 1, on average 1.5 % apart."""
 _IMPROVED = 3
-_NODES_FOR_A_GUESS = 20_000
+"""Patterns that are improved, since the best one may lead to a local maximum only."""
+_NODES_PER_IMPROVEMENT = 20_000
+"""Segments that the improvement of a pattern may compute."""
 _LONGEST = 1000
+"""Consecutive events whose updates are lost wherever possible; few runs have more events."""
 _PERIODS = 24
 """Longest period of the regular patterns of a constraint."""
 
@@ -327,13 +341,18 @@ def follow(
         after_loss = automaton.after_loss(nodes.state[going])
         delivered = planned[run[going], min(event, longest)] | (after_loss < 0)
         state = np.where(delivered, automaton.after_delivery(nodes.state[going]), after_loss)
-        following = after_events(flow, nodes, segments, value[run], going, delivered, state, log)
+        step = Step(nodes, segments, value[run], going, delivered, state)
+        following = after_events(flow, step, log)
         run, nodes = run[going], following
     raise TooManyEventsError(f"trigger: more than {MAX_EVENTS} events: they accumulate")
 
 
-def guess(search: PatternSearch, scenario_pattern: Pattern, rng: np.random.Generator) -> float:
-    """Try the scenario's, regular and random patterns; return an inter-event time in s."""
+def try_likely_patterns(search: PatternSearch, scenario_pattern: Pattern, rng: np.random.Generator) -> float:
+    """Try the scenario's, regular and random patterns.
+
+    Returns:
+        The mean inter-event time if all losses that the guarantee allows occur, in s.
+    """
     search.step = "guesses"
     flow, automaton = search.flow, search.automaton
     events = len(follow(flow, automaton, [(False,) * _LONGEST])[1][0])
@@ -342,7 +361,7 @@ def guess(search: PatternSearch, scenario_pattern: Pattern, rng: np.random.Gener
     search.nodes += events + sum(map(len, patterns))
     search.runs += len(patterns)
     for i in np.argsort(-values, kind="stable")[:_IMPROVED]:
-        improve(search, patterns[i], float(values[i]), _NODES_FOR_A_GUESS)
+        improve(search, patterns[i], float(values[i]), _NODES_PER_IMPROVEMENT)
     return flow.horizon_s / (events + 1)
 
 

@@ -31,10 +31,10 @@ from cosim.analysis.adversary.pattern_search import (
     Nodes,
     PatternSearch,
     SearchReport,
-    guess,
     improve,
     search_beam,
     search_tree,
+    try_likely_patterns,
 )
 from cosim.analysis.adversary.worst_disturbances import (
     DisturbanceBounds,
@@ -231,9 +231,9 @@ def _find_continuous(
 
 
 def _search(search: PatternSearch, scenario_pattern: Pattern, beam: int, most_nodes: int) -> bool:
-    """Run all search steps; return whether they covered every pattern."""
+    """Run all search steps; return whether the maximum was found, as :func:`search_tree` does."""
     flow = search.flow
-    window_s = guess(search, scenario_pattern, stream(0, "adversary"))
+    window_s = try_likely_patterns(search, scenario_pattern, stream(0, "adversary"))
     if beam > 0:
         search_beam(search, beam, window_s)
     if most_nodes > 0:

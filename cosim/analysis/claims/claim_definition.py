@@ -105,7 +105,7 @@ def controller_error_bound(
     void: VoidFrom | None = None,
 ) -> Bound:
     """Return a bound of ‖e_c‖_W at the measurements, (k,); it is void from a record's first gap."""
-    here = samples.in_common
+    here = samples.is_bounded
     # Allow for the rounding of x, which matters for a bound of that size.
     slack = run.rounding(samples.aligned.x_norm[here])
     shares = upper_shares(samples.aligned.e_c_norm[here], values[here] + slack)

@@ -37,11 +37,11 @@ from cosim.analysis.claims.observed_conditions import AssumptionViolation, VoidF
 from cosim.analysis.claims.run_certificates import late_certificates
 from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples
 from cosim.analysis.claims.run_parts import RunPart, common_end_ns, cut_part, start_error, up_to_common_end
-from cosim.analysis.summary.summary_model import Claim, ClaimVerdict, ViolationPart
+from cosim.analysis.summary.summary_model import NO_BOUND, Claim, ClaimVerdict, ViolationPart
 from cosim.record.decimation import decimate
-from cosim.record.run_events import NEVER_NS, RecordedChange, changes_of
+from cosim.record.run_events import RecordedChange, changes_of
 from cosim.record.run_record import RunRecord
-from noack.core.clock import NS_PER_S
+from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.linear_systems import Vector
 from noack.core.number_format import at_least, at_most
 from noack.protocol.record_tables import CONTROLLER_DELIVERY
@@ -75,7 +75,7 @@ def definitions(kind: type[_Kind]) -> list[_Kind]:
 def void_claim(claimed: str, source: str, since_s: float, why: str, until_s: float | None = None) -> Claim:
     """Return a claim that cannot be checked because there is no bound."""
     return Claim(
-        what=claimed, source=source, bound="none", certified=None, observed=None, ratio=None,
+        what=claimed, source=source, bound=NO_BOUND, certified=None, observed=None, ratio=None,
         verdict=ClaimVerdict.VOID, since_s=since_s, why=why, from_s=since_s, until_s=until_s,
     )  # fmt: skip
 
@@ -167,7 +167,7 @@ class _ClaimInstance(NamedTuple):
     def take(self, run: RunEvidence, samples: Samples) -> None:
         """Check the next samples, and add to the curve, which is thinned if the run is long."""
         bound, envelope = self.find(run, samples)
-        if run.facts.any_in_common and bound is not None:
+        if run.facts.is_ever_bounded and bound is not None:
             if self.outside is not None:
                 bound = bound._replace(void=VoidFrom(0.0, self.outside))
             self.check.add(bound)
@@ -184,7 +184,7 @@ class ClaimEvaluation(RunEvidence):
 
     def evaluate(self) -> list[Claim]:
         """Return every claim with its verdict, in the run's time."""
-        if not self.facts.any_in_common:
+        if not self.facts.is_ever_bounded:
             return []
         void = partial(void_claim, since_s=self.part.from_s, until_s=_end_s(self.part))
         if self.record.scenario.protocol.acknowledges:

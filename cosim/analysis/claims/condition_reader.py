@@ -36,7 +36,7 @@ from cosim.analysis.claims.observed_conditions import (
     combine,
     lost_cause,
 )
-from cosim.record.run_events import updates_in
+from cosim.record.run_events import messages_in
 from cosim.record.run_record import Rows, RunRecord
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import (
@@ -127,7 +127,7 @@ class _Updates:
         self._events.extend(zip(events["event"].tolist(), events["t_ns"].tolist(), strict=True))
 
     def add_packets(self, rows: Rows) -> None:
-        rows, sequences, _ = updates_in(rows)
+        rows, sequences, _ = messages_in(rows)
         forwarded = effective(rows["fate"]).tolist()
         for sequence, passed in zip(sequences.tolist(), forwarded, strict=True):
             self._passed[sequence] = self._passed.get(sequence, False) or passed

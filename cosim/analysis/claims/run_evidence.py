@@ -27,7 +27,7 @@ from cosim.analysis.claims.run_certificates import LateSchedules, late_certifica
 from cosim.analysis.claims.run_parts import RunPart
 from cosim.analysis.claims.trajectory_delta import trajectory_delta
 from cosim.analysis.summary.signal_statistics import SampleFacts, SampleFactsReader, signal_statistics
-from cosim.record.align import UNKNOWN, AlignedRun, EventFollower, SinceEvent, aligned_parts, bounded_parts
+from cosim.record.align import NOT_SHARED, AlignedRun, EventFollower, SinceEvent, aligned_parts, bounded_parts
 from cosim.record.run_record import RunRecord
 from noack.core.linear_systems import all_entries
 from noack.protocol.record_tables import NO_SEQUENCE
@@ -53,7 +53,7 @@ class Samples:
     """Consecutive measurements of a run, (k,), aligned, with bounds of the controller's error."""
 
     aligned: AlignedRun
-    in_common: NDArray[np.bool_]
+    is_bounded: NDArray[np.bool_]
     """Where sensor and controller share an update, so that ‖e_c‖ is bounded, (k,)."""
     error_bounds: Sequence[Reals]
     """Bounds of ‖e_c‖_W from (I1) and from eq:LossEv3, (k,) each; NaN before the start."""
@@ -99,14 +99,14 @@ class RunEvidence:
         last_ns, follower = np.zeros(0, np.int64), None
         if any(map(self.known_state_bounds, self.certificates)):
             follower = EventFollower(scenario)
-        for part, shared, both, residual in bounded_parts(self.record):
+        for part, bounded, both, residual in bounded_parts(self.record):
             rows, aligned = part.rows, part.aligned
             event_ns = np.append(last_ns, rows["t_ns"][rows["event"] != NO_SEQUENCE])
             passed = event_ns[1:] * 1e-9, np.diff(event_ns) * 1e-9
             last_ns = event_ns[-1:]
             true_x = aligned.x if part.true_x is None else part.true_x
             since = None if follower is None else follower.take(rows, aligned)
-            yield Samples(aligned, shared, both, residual, true_x, passed, since)
+            yield Samples(aligned, bounded, both, residual, true_x, passed, since)
 
     @cached_property
     def lost_in_rounding(self) -> VoidFrom | None:
@@ -293,7 +293,7 @@ class RunEvidence:
         """
         event_s = samples.t_s - since.age_s
         early = event_s + bounds.delay_s < self.started_s - 1e-9
-        return np.asarray(np.where(early, UNKNOWN, since.missing))
+        return np.asarray(np.where(early, NOT_SHARED, since.missing))
 
     def known_state_bounds(self, certificate: ScenarioCertificate) -> KnownStateBounds | None:
         """Return the bounds from the newest event of a certificate; None if it has none."""

@@ -20,8 +20,9 @@ from cosim.analysis.summary.summary_model import (
     ViolationPart,
     WatchdogPart,
 )
-from cosim.record.run_events import NEVER_NS, ActuationTimes, PacketOutcome, changes_of, packet_outcomes
+from cosim.record.run_events import ActuationTimes, PacketOutcome, changes_of, packet_outcomes
 from cosim.record.run_record import RunRecord
+from noack.core.clock import NEVER_NS
 from noack.impairments.loss_guarantee import LongestBurst
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -88,7 +89,7 @@ def latency_us(record: RunRecord) -> tuple[NDArray[np.int64], NDArray[np.float64
 
 
 def latency(record: RunRecord) -> LatencyPart:
-    """Quantiles of the latency."""
+    """Return quantiles of the latency."""
     _, passed_us = latency_us(record)
     sketch = QuantileSketch()
     sketch.add(passed_us)
@@ -126,8 +127,8 @@ _SENT_RECEIVED = {
 """The tables with one row for each message sent, and for each message received."""
 
 
-def from_controller(record: RunRecord, flow: Flow) -> FlowPart | None:
-    """The outcome of a flow from the controller; None if it does not cross the network."""
+def flow_outcome(record: RunRecord, flow: Flow) -> FlowPart | None:
+    """Return the outcome of a flow from the controller; None if it does not cross the network."""
     if flow not in record.scenario.network.flows:
         return None
     outcomes, (sent, received) = packet_outcomes(record, flow), _SENT_RECEIVED[flow]
@@ -172,11 +173,11 @@ def unintended_losses(record: RunRecord) -> dict[str, int]:
         )
     complete = all(record.reports.get(role, {}).get("ended") == HORIZON for role in LOOP_ROLES)
     counts = {hop: unmatched.count(complete=complete) for hop, unmatched in hops.items()}
-    return {hop: max(count - _not_finite(record, hop), 0) for hop, count in counts.items()}
+    return {hop: max(count - _count_not_finite(record, hop), 0) for hop, count in counts.items()}
 
 
-def _not_finite(record: RunRecord, hop: str) -> int:
-    """The number of datagrams that a hop's receiver rejected because an entry is not finite."""
+def _count_not_finite(record: RunRecord, hop: str) -> int:
+    """Return the number of datagrams that a hop's receiver rejected because an entry is not finite."""
     receiver = _RECEIVERS.get(hop, hop.rpartition(" ")[2])
     channel = record.reports.get(receiver, {}).get("channel") or {}
     return int((channel.get("rejected") or {}).get(Rejection.NOT_FINITE, 0))

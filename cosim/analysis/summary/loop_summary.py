@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cosim.analysis.summary.loop_statistics import (
     drops_by_cause,
-    from_controller,
+    flow_outcome,
     latency,
     lateness,
     missing_rows,
@@ -73,8 +73,8 @@ def summarise_loop(
         reached_s=_seconds(record.last_ns(PLANT_STEP)) or 0.0,
         **_transmissions(record),
         link_share=None,  # of the network's bytes, which the record of the loop does not have
-        acknowledgements=from_controller(record, Flow.ACKNOWLEDGEMENT),
-        actuations=from_controller(record, Flow.ACTUATION),
+        acknowledgements=flow_outcome(record, Flow.ACKNOWLEDGEMENT),
+        actuations=flow_outcome(record, Flow.ACTUATION),
         **signals.for_summary(),
         assumption_violations=reported_violations(record),
         assumptions=[AssumptionPart(**status._asdict()) for status in assumed or assumptions(scenario)],

@@ -53,18 +53,18 @@ class LoopsOverTime(NamedTuple):
         return ends_s, sums / np.where(sums.sum(axis=0) > 0, sums.sum(axis=0), np.nan)
 
 
-def loops_over_time(run: RecordedRun, known: Sequence[LoopOverTime] | None = None) -> LoopsOverTime:
-    """Return how the loops of a run went, from what is ``known`` of each, or from their records."""
-    if known is None:
-        known = [
+def loops_over_time(run: RecordedRun, over_time: Sequence[LoopOverTime] | None = None) -> LoopsOverTime:
+    """Return how the loops of a run went, from ``over_time`` of each, or from their records."""
+    if over_time is None:
+        over_time = [
             loop_over_time(record, phase_ns)
             for record, phase_ns in zip(run.loops, phases_ns(run.scenario), strict=True)
         ]
-    over_time = empty_over_time(run.scenario)
-    for number, (errors, states) in enumerate(known):
-        over_time.errors[number], over_time.states[number] = errors, states
-    add_link_bytes(over_time.link_bytes, run.network[NETEM_PACKET], run.scenario.timing.horizon_ns)
-    return over_time
+    together = empty_over_time(run.scenario)
+    for number, (errors, states) in enumerate(over_time):
+        together.errors[number], together.states[number] = errors, states
+    add_link_bytes(together.link_bytes, run.network[NETEM_PACKET], run.scenario.timing.horizon_ns)
+    return together
 
 
 @np.errstate(all="ignore")  # a loop may diverge
@@ -75,9 +75,9 @@ def loop_over_time(record: RunRecord, phase_ns: int) -> LoopOverTime:
     for part in aligned_parts(record):
         aligned = part.aligned
         columns = intervals_of(aligned.t_ns + phase_ns, horizon_ns)
-        common = aligned.since_delivery(record.scenario)
+        delivered = aligned.since_delivery(record.scenario)
         _update_largest(states, columns, aligned.x_norm)
-        _update_largest(errors, columns[common], aligned.e_c_norm[common])
+        _update_largest(errors, columns[delivered], aligned.e_c_norm[delivered])
     return LoopOverTime(errors, states)
 
 

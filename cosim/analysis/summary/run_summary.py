@@ -54,7 +54,7 @@ def outcome_of_loop(outcome: Outcome, loop: str | None) -> Outcome:
     """
     if loop is None:
         return outcome
-    names = [loop.name for loop in outcome.summary.loops]
+    names = [each.name for each in outcome.summary.loops]
     if loop not in names:
         raise no_such_loop(loop, names)
     summary = outcome.summary.of_loop(loop)
@@ -242,9 +242,7 @@ def _share_used(claims: Sequence[Claim]) -> float:
         (
             claim.ratio
             for claim in claims
-            if "certificate" in claim.source
-            and claim.ratio is not None
-            and claim.bound.startswith(("‖e_c‖ ≤", "‖W e_c‖ ≤", "‖x‖ ≤"))
+            if claim.is_certified and claim.bounds_norm and claim.ratio is not None
         ),
         default=0.0,
     )

@@ -13,21 +13,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.summary.summary_model import DisturbancePart, EstimationPart
-from cosim.record.align import (
-    AlignedPart,
-    AlignedRun,
-    Reals,
-    SizeStatistics,
-    bounded_parts,
-    expected_rms,
-    shares_update,
-)
+from cosim.record.align import AlignedPart, AlignedRun, Reals, bounded_parts, is_bounded
 from cosim.record.run_events import changes_of
 from cosim.record.run_record import RunRecord
 from noack.core.linear_systems import Matrix, row_norms
 from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
+from noack.scenario.estimation import steady_state
 from noack.scenario.resolution import loop_of, setpoint_of
 from noack.scenario.scenario import Scenario
+
+
+def expected_rms(resolved: Scenario) -> float:
+    """Return the steady-state RMS of ‖x̂ − x‖ from noise and disturbances, for an exact model."""
+    return float(np.sqrt(np.trace(steady_state(resolved).covariance)))
+
+
+class SizeStatistics:
+    """Root mean square and maximum of finite norms, part by part."""
+
+    def __init__(self) -> None:
+        self._squares, self._count = 0.0, 0
+        self.max: float | None = None
+
+    def add(self, norms: Reals) -> None:
+        """Add norms, (k,); those that are not finite are ignored."""
+        norms = norms[np.isfinite(norms)]
+        if len(norms):
+            self._squares += float(np.square(norms).sum())
+            self._count += len(norms)
+            largest = float(norms.max())
+            self.max = largest if self.max is None else max(self.max, largest)
+
+    @property
+    def rms(self) -> float | None:
+        """Their root mean square; None without values."""
+        return float(np.sqrt(self._squares / self._count)) if self._count else None
 
 
 def _setpoints(record: RunRecord) -> tuple[list[int], Matrix]:
@@ -50,7 +70,8 @@ def _larger(before: float | None, values: Reals) -> float | None:
 class SampleFacts(NamedTuple):
     """What claims need to know about all samples of a run before they are checked."""
 
-    any_in_common: bool = False
+    is_ever_bounded: bool = False
+    """Whether the error of the controller is bounded at any time."""
     gap_s: float | None = None
     """First time at which the controller's error is not known, although it was before."""
     largest_state: float = 0.0
@@ -68,18 +89,18 @@ class SampleFactsReader:
         self._fresh_ns: int | None = None
         self._newest, self._last_ns = -1, 0
 
-    def take(self, aligned: AlignedRun, common: NDArray[np.bool_] | None = None) -> None:
-        """Add the next measurements; it may be known where sensor and controller share an update."""
+    def take(self, aligned: AlignedRun, bounded: NDArray[np.bool_] | None = None) -> None:
+        """Add the next measurements; where ‖e_c‖ is ``bounded`` may be known."""
         if not len(aligned.t_ns):
             return
-        common = shares_update(self._scenario, aligned) if common is None else common
+        bounded = is_bounded(self._scenario, aligned) if bounded is None else bounded
         facts, t_s = self._facts, aligned.t_ns * 1e-9
-        started = np.logical_or.accumulate(common) | facts.any_in_common
-        gaps = np.flatnonzero(started & ~common)
+        started = np.logical_or.accumulate(bounded) | facts.is_ever_bounded
+        gaps = np.flatnonzero(started & ~bounded)
         gap_s = float(t_s[gaps[0]]) if facts.gap_s is None and len(gaps) else facts.gap_s
         until = t_s < self._until_s
         both = np.concatenate(
-            [aligned.x_s.compress(until, axis=0), aligned.x_c.compress(common & until, axis=0)]
+            [aligned.x_s.compress(until, axis=0), aligned.x_c.compress(bounded & until, axis=0)]
         )
         largest = float(np.abs(both[np.isfinite(both)]).max(initial=facts.largest_state))
         changes = aligned.t_ns[np.flatnonzero(np.diff(aligned.received, prepend=self._newest))]
@@ -130,7 +151,7 @@ class SignalStatistics:
         for bounded in bounded_parts(record):
             part, residual = bounded.part, bounded.residual
             self._add(part)
-            facts.take(part.aligned, bounded.shared)
+            facts.take(part.aligned, bounded.is_bounded)
             self._residual = _larger(self._residual, residual[~np.isnan(residual)])
             self._estimation_error(part)
             self._read += len(part.rows)
@@ -139,8 +160,8 @@ class SignalStatistics:
 
     def _add(self, part: AlignedPart) -> None:
         aligned = part.aligned
-        common = aligned.since_delivery(self._record.scenario)
-        t_s, e_c = aligned.t_ns[common] * 1e-9, aligned.e_c_norm[common]
+        delivered = aligned.since_delivery(self._record.scenario)
+        t_s, e_c = aligned.t_ns[delivered] * 1e-9, aligned.e_c_norm[delivered]
         self._sup_e_s = _larger(self._sup_e_s, aligned.e_s_norm)
         if len(e_c) and (self._sup_e_c is None or e_c.max() > self._sup_e_c):
             self._sup_e_c, self._sup_e_c_at_s = float(e_c.max()), float(t_s[np.argmax(e_c)])

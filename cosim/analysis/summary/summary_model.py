@@ -228,6 +228,10 @@ class ClaimVerdict(StrEnum):
     refute it."""
 
 
+NO_BOUND = "none"
+"""The formula of a claim that has no bound."""
+
+
 class Claim(SummaryPart):
     """A claim, checked against the run."""
 
@@ -251,11 +255,36 @@ class Claim(SummaryPart):
     """The claim ends here, at a change of settings; None: at the end of the run."""
 
     @property
+    def is_certified(self) -> bool:
+        """Whether it is a claim of a certificate; others follow from the definitions of the loop."""
+        return "certificate" in self.source
+
+    @property
+    def has_bound(self) -> bool:
+        """Whether there is a bound; else ``why`` is the reason for having none."""
+        return self.bound != NO_BOUND
+
+    @property
+    def lacks_loop_gain(self) -> bool:
+        """Whether there is no certificate because the loop gain is not below 1."""
+        return not self.has_bound and self.why.startswith("the loop gain")
+
+    @property
+    def bounds_norm(self) -> bool:
+        """Whether the bound is one of ‖e_c‖ or of ‖x‖."""
+        return self.bound.startswith(("‖e_c‖ ≤", "‖W e_c‖ ≤", "‖x‖ ≤"))
+
+    @property
+    def is_lower_bound(self) -> bool:
+        """Whether the claimed constant is a lower bound."""
+        return "≥" in self.bound
+
+    @property
     def certified_text(self) -> str | None:
         """The claimed constant, rounded up, or down if it is a lower bound."""
         if self.certified is None:
             return None
-        return at_least(self.certified) if "≥" in self.bound else at_most(self.certified)
+        return at_least(self.certified) if self.is_lower_bound else at_most(self.certified)
 
 
 class ConditionsPart(SummaryPart):

@@ -183,8 +183,6 @@ def _print_run(
     console: "Console", run: "continuous.ContinuousRun", summary: "continuous.ContinuousSummary"
 ) -> None:
     """Print how the run ended, its key numbers, and its first 40 events."""
-    from rich.text import Text  # help and completion need none
-
     ended = summary_model.ExitPart(status=int(summary.exit_status), reason=summary.reason)
     state = (
         ""
@@ -195,7 +193,7 @@ def _print_run(
     )
     ending = run_verdict.ending_line(ended, summary.reached_s, summary.horizon_s, state)
     for line in (ending, run_verdict.transmission_line(summary.events, summary.deliveries)):
-        console.print(Text(line.text, line.style), soft_wrap=True)
+        terminal_output.print_line(console, line)
     rows = (
         run_tables.lost_row(summary.drops, summary.deliveries),
         run_tables.longest_burst(summary.mansd, (), summary.longest_loss_burst),

@@ -166,7 +166,7 @@ class StudyOptions(opt.ScenarioOptions):
 
     def plan(self) -> "capacity_plan.CapacityPlan":
         """Return what is run; raise CallerError if an option is wrong."""
-        depth = self._depth()
+        defaults = self._defaults()
         path = opt.find_scenario(self.scenario)
         loaded = scenario_file.load(path, self.settings or ())
         settings: dict[str, Any] = dict(map(scenario_file.setting_of, self.settings or ()))
@@ -188,7 +188,7 @@ class StudyOptions(opt.ScenarioOptions):
         least = capacity_plan.smallest_mixture(kinds)
         if self.loops is None:
             carried = capacity_plan.periodic_loops(loaded, kinds)
-            counts = capacity_plan.default_counts(carried, least, depth)
+            counts = capacity_plan.default_counts(carried, least, defaults)
         else:
             try:
                 given_counts = [int(count) for count in self.loops.split(",")]
@@ -203,20 +203,20 @@ class StudyOptions(opt.ScenarioOptions):
             deadline_s=deadline_s,
             counts=counts,
             policies=capacity_plan.policies_of(kinds) | self._policies(kinds),
-            amplitude=depth.amplitude,
-            draws=depth.draws,
+            amplitude=defaults.amplitude,
+            draws=defaults.draws,
             seed=self.seed,
         )
 
-    def _depth(self) -> "capacity_plan.Depth":
-        depth = capacity_plan.THOROUGH if self.thorough else capacity_plan.QUICK
+    def _defaults(self) -> "capacity_plan.StudyDefaults":
+        defaults = capacity_plan.THOROUGH if self.thorough else capacity_plan.QUICK
         if self.draws is not None:
-            depth = depth._replace(draws=self.draws)
+            defaults = defaults._replace(draws=self.draws)
         if self.disturbance is not None:
             if not math.isfinite(self.disturbance):
                 raise CallerError(f"--disturbance {self.disturbance}: expected a finite number")
-            depth = depth._replace(amplitude=self.disturbance)
-        return depth
+            defaults = defaults._replace(amplitude=self.disturbance)
+        return defaults
 
     def _policies(self, kinds: "Sequence[capacity_plan.LoopKind]") -> dict[str, dict[str, Any]]:
         """Return the settings of the policies that are compared, too, by name."""
@@ -292,7 +292,7 @@ def _announce(
 ) -> float:
     """Print on standard error what is computed and about how long it takes; return the seconds."""
     points = campaign_grid.grid(plan.campaign(), Path("noack capacity"))
-    longer = plan if study.thorough else plan.with_depth(capacity_plan.THOROUGH)
+    longer = plan if study.thorough else plan.with_defaults(capacity_plan.THOROUGH)
     missing = capacity_result.missing_loops(plan, points, folder)
     if not missing:
         return 0.0

@@ -90,8 +90,8 @@ class RunLog:
         if time.monotonic() < self._due_s:
             return
         self._due_s = time.monotonic() + _EVERY_S
-        fields = report.model_dump(exclude={"live", "warnings", "changes"})
-        log_event("info", _SOURCE, f"simulated {report.t_s:.1f} s", event="progress", **fields)
+        progress_fields = report.model_dump(exclude={"live", "warnings", "changes"})
+        log_event("info", _SOURCE, f"simulated {report.t_s:.1f} s", event="progress", **progress_fields)
 
 
 def log_end(status: int, reason: str, run_dir: Path) -> None:

@@ -197,7 +197,8 @@ class ForkServer:
         its_stdin, own_stdin = os.pipe()
         try:
             request = json.dumps([module, arguments]).encode()
-            with suppress(BrokenPipeError, ConnectionResetError):  # likewise no answer
+            # The server has ended; the empty answer below says so.
+            with suppress(BrokenPipeError, ConnectionResetError):
                 socket.send_fds(self._socket, [request], [its_stdin, log.fileno()])
             pid = int(self._socket.recv(_MOST_BYTES) or 0)
             if pid < 0:

@@ -23,7 +23,7 @@ from cosim.live.recording.telemetry_store import TelemetryStore
 from cosim.record.decimation import is_long
 from cosim.record.processes import report_of, write_reports
 from cosim.record.run_directory import RECORDING_FILE, active_run
-from cosim.record.run_events import updates_in
+from cosim.record.run_events import messages_in
 from cosim.record.run_record import Rows
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core
@@ -150,7 +150,7 @@ class ProgressReport(RunProgress):
             # Includes stale updates, which the emulator cannot know in advance.
             self._count_losses(rows["dropouts"])
         elif table == NETEM_PACKET:
-            rows = updates_in(rows)[0]
+            rows = messages_in(rows)[0]
             self._count_losses(rows["consecutive_losses"][~effective(rows["fate"])])
 
     def _count_losses(self, consecutive: NDArray[np.int64]) -> None:

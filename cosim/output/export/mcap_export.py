@@ -240,6 +240,8 @@ def _write_ros(run: ExportedRun, path: Path) -> None:
 
 
 class _Bag:
+    """The topics of a file with ROS 2 messages, registered when their first message is written."""
+
     def __init__(self, writer: "Writer") -> None:
         self._writer, self._channels, self._schemas = writer, dict[str, int](), dict[str, int]()
 

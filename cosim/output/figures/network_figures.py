@@ -65,14 +65,14 @@ def page_figures(
 
 
 def network_figures(
-    run: RecordedRun, summary: RunSummary, known: Sequence[LoopOverTime] | None = None
+    run: RecordedRun, summary: RunSummary, over_time: Sequence[LoopOverTime] | None = None
 ) -> list[FigureDescription]:
-    """Describe the figures of all loops; ``known`` is how each loop went, if that is known.
+    """Describe the figures of all loops; ``over_time`` is how each loop went, if that is known.
 
     Raises:
         CallerError: a table of the record is damaged.
     """
-    over_time = loops_over_time(run, known)
+    together = loops_over_time(run, over_time)
     names = [plain(loop.name) for loop in summary.loops]
     stayed = np.array([loop.diverged_at_s is None for loop in summary.loops])
     in_flight = summary.network.in_flight
@@ -81,23 +81,23 @@ def network_figures(
         curves = "Bands: quantiles over the loops; dashed: the largest value."
     diverged = "" if stayed.all() else " A loop that diverged leaves the range of the axis."
     order = "" if len(names) <= _MOST_ROWS else " Loops are numbered from 0, as in the scenario."
-    largest = over_time.errors[np.isfinite(over_time.errors)].max(initial=0.0)
+    largest = together.errors[np.isfinite(together.errors)].max(initial=0.0)
     return [
         FigureDescription(
             name="network",
-            rows=_link_rows(over_time, names, in_flight),
+            rows=_link_rows(together, names, in_flight),
             caption="Above: datagrams that wait, are sent or are delayed in the network. Below: "
             f"each loop's share of the bytes that the network forwarded. {curves}",
             description=f"Above, the number of datagrams in the network over time, up to "
             f"{in_flight.max}. Below, the shares of {len(names)} loops in the bytes that the "
             "network forwarded.",
         ),
-        norms_figure(over_time, names, stayed).captioned(
+        norms_figure(together, names, stayed).captioned(
             "Largest error ‖e_c‖ of the controller's model, and largest norm ‖x‖ of the plant's "
-            f"state, in each of {len(over_time.middles_s)} intervals. {curves}{diverged}",
+            f"state, in each of {len(together.middles_s)} intervals. {curves}{diverged}",
             f"Norms of {len(names)} loops over time on logarithmic axes; ‖e_c‖ is at most {number(largest)}.",
         ),
-        error_map(over_time, names, stayed).captioned(
+        error_map(together, names, stayed).captioned(
             f"Largest ‖e_c‖ of each loop in each interval; no colour before its first delivery.{order}",
             f"A row of colours for each of {len(names)} loops: ‖e_c‖ over time.",
         ),

@@ -17,6 +17,14 @@ from numpy.typing import NDArray
 from cosim.analysis.claims.claim_evaluation import claims_of
 from cosim.analysis.fidelity import Fidelity
 from cosim.output.figures import palette
+from cosim.output.figures.event_and_process_times import (
+    clock_errors,
+    clocks_figure,
+    inter_event_figure,
+    largest_text,
+    latency_figure,
+    lateness_figure,
+)
 from cosim.output.figures.figure_description import (
     DASHES,
     Axis,
@@ -37,14 +45,6 @@ from cosim.output.figures.figure_description import (
     time_axis,
 )
 from cosim.output.figures.palette import CONTROLLER, FORCED, LOST, PLANT, SENSOR, THRESHOLD, Colour
-from cosim.output.figures.timing_figures import (
-    clock_errors,
-    clocks_figure,
-    inter_event_figure,
-    largest_text,
-    latency_figure,
-    lateness_figure,
-)
 from cosim.record.align import AlignedRun, Reals, aligned_parts
 from cosim.record.decimation import decimate_all
 from cosim.record.run_events import packet_outcomes

@@ -93,7 +93,7 @@ def clock_path(process: str) -> str:
 
 
 @dataclass(frozen=True)
-class ShownLoop:
+class LoopLayout:
     """What the viewer shows of a loop."""
 
     about: str
@@ -159,7 +159,7 @@ class ShownLoop:
         return view
 
 
-def _styles(shown: ShownLoop) -> dict[str, Static]:
+def _styles(shown: LoopLayout) -> dict[str, Static]:
     """Return name, colour and width of every series, by entity."""
     input_names, m = shown.input_names, len(shown.input_names)
     triple = rr.SeriesLines(
@@ -262,7 +262,7 @@ def _norms() -> rrb.Container:
     return rrb.Tabs(plot("log10 ‖e‖", ERROR_LOG10), plot("‖e‖", ERROR), plot("log10 ‖x‖", SIZE_LOG10))
 
 
-def _texts(shown: ShownLoop) -> rrb.Container:
+def _texts(shown: LoopLayout) -> rrb.Container:
     """Return the tabs: the colour key, the text about the run, lateness, clocks, the log."""
     everything = ["$origin/**"]
     timing = [plot("Lateness [µs]", "lateness", everything)] if shown.processes else []

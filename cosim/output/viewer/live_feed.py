@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from cosim.analysis.summary.loops_over_time import INTERVALS, add_link_bytes, empty_over_time, intervals_of
 from cosim.analysis.summary.run_summary import counts_inside, times_inside
-from cosim.output.viewer.loop_feed import LAG_S, SHOWN, LoopFeed, log_level
+from cosim.output.viewer.loop_feed import LAG_S, SHOWN_TABLES, LoopFeed, log_level
 from cosim.output.viewer.run_recording import ERROR, SIZE, RunRecording
 from cosim.record.record_source import rows_by_loop
 from cosim.record.run_record import Rows
-from noack.core.clock import NS_PER_S
+from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.linear_systems import Propagator, row_norms
 from noack.protocol.record_tables import (
     CLOCK_TABLES,
@@ -39,7 +39,6 @@ _NAMED_S, _PATIENCE_S = 3.0, 10.0
 _MAP_EVERY_S = 2.0
 Reals = NDArray[np.float64]
 Numbers = NDArray[np.int64]
-_NEVER_NS = 2**63 - 1
 _LONGEST_NS = 2**50
 """Longer than any run; 2**13 loops have keys of 63 bits."""
 
@@ -63,7 +62,7 @@ class LiveFeed:
             number: LoopFeed(loops[number], loop_view, certified=not view.is_shared)
             for number, loop_view in view.views.items()
         }
-        self._tables = SHOWN if view.is_shared else (*SHOWN, *CLOCK_TABLES)
+        self._tables = SHOWN_TABLES if view.is_shared else (*SHOWN_TABLES, *CLOCK_TABLES)
         self._waiting: dict[str, list[Rows]] = {}
         self._due: list[int] = []
         self._handed_ns = self._shown_ns = 0
@@ -169,7 +168,7 @@ class _AllLoops:
         self._measured: list[Rows] = []
         self._models: list[Rows] = []
         knows_state = loops[0].network.initial_sync == "known_state"
-        self._first_ns = np.full(len(loops), -1 if knows_state else _NEVER_NS)
+        self._first_ns = np.full(len(loops), -1 if knows_state else NEVER_NS)
         """When each loop's controller received its first state."""
         self._over_time = empty_over_time(scenario)
         self._inside = np.zeros(0, np.int64), np.zeros(0, np.int64)

@@ -15,13 +15,13 @@ from cosim.record.align import (
     EventFollower,
     align_measurements,
     controller_track,
-    in_common,
     initial_track,
+    shares_update,
     true_states,
 )
 from cosim.record.decimation import decimate_all
 from cosim.record.record_source import concatenate_rows
-from cosim.record.run_events import claimed_until_s, model_flow, updates_in
+from cosim.record.run_events import claimed_until_s, messages_in, model_flow
 from cosim.record.run_record import Rows
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import row_norms
@@ -55,7 +55,7 @@ LAG_S = 0.2
 _PATIENCE_S = 1.0
 """Maximum wall time to wait for a controller that sends no rows."""
 
-SHOWN = (
+SHOWN_TABLES = (
     CONTROLLER_STEP,
     CONTROLLER_DELIVERY,
     CONTROLLER_SETTING,
@@ -102,7 +102,7 @@ class LoopFeed:
         # Other tables are not shown.
         self._types = tables_of(scenario)
         self._clock_tables = [table for table in CLOCK_TABLES if table in self._types]
-        self._pending: dict[str, list[Rows]] = {table: [] for table in (*SHOWN, *self._clock_tables)}
+        self._pending: dict[str, list[Rows]] = {table: [] for table in (*SHOWN_TABLES, *self._clock_tables)}
         self._track: ControllerTrack = initial_track(scenario)
         self._undrawn: list[Rows] = []
         self._forced: set[int] = set()
@@ -192,7 +192,7 @@ class LoopFeed:
         t_s = np.asarray(aligned.t_ns * 1e-9)
         bounds = np.column_stack([self._bounds(rows, aligned), self._certified(t_s, "controller_error")])
         if not self._scenario.protocol.acknowledges:
-            bounds[~in_common(self._scenario, aligned)] = np.nan
+            bounds[~shares_update(self._scenario, aligned)] = np.nan
         curves = [aligned.x, aligned.x_s, aligned.x_c, aligned.e_s_norm, aligned.e_c_norm, bounds]
         kept = self._rows_to_show(aligned.t_ns, np.column_stack(curves))
         thin = AlignedRun._make(values[kept] for values in aligned)
@@ -288,9 +288,9 @@ class LoopFeed:
         if not len(rows):
             return
         for flow in self._scenario.network.flows[1:]:
-            reverse = updates_in(rows, flow)[0]
+            reverse = messages_in(rows, flow)[0]
             self._view.packets(reverse["t_ns"], reverse["release_ns"], reverse["fate"], reverse=True)
-        rows, sequence, event_ns = updates_in(rows)
+        rows, sequence, event_ns = messages_in(rows)
         self._view.packets(event_ns, rows["release_ns"], rows["fate"])
         self._forced.update(sequence[rows["fate"] == Fate.FORCED].tolist())
         dropped = ~effective(rows["fate"])

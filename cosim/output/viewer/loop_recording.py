@@ -183,7 +183,7 @@ class LoopView:
         shown: what is shown; its static data are written here.
     """
 
-    def __init__(self, file: RecordingFile, shown: bp.ShownLoop) -> None:
+    def __init__(self, file: RecordingFile, shown: bp.LoopLayout) -> None:
         self._file, self._shown = file, shown
         self._states = [bp.state_path(name) for name in shown.state_names]
         self._frame = -1

@@ -199,10 +199,10 @@ to the right.
 
 def _shown_loop(
     scenario: Scenario, kind: Kind, folder: str, phase_ns: int, *, animated: bool
-) -> bp.ShownLoop:
+) -> bp.LoopLayout:
     """Describe what is shown of a loop; lateness only if the processes have no other loop."""
     loop, is_timed = loop_of(scenario), kind == "live" and not folder
-    return bp.ShownLoop(
+    return bp.LoopLayout(
         run_text(scenario, kind),
         loop.state_names,
         loop.input_names,
@@ -215,7 +215,7 @@ def _shown_loop(
     )
 
 
-def _layout(loops: Mapping[str, bp.ShownLoop], count: int, worst: WorstLoop | None) -> rrb.Container:
+def _layout(loops: Mapping[str, bp.LoopLayout], count: int, worst: WorstLoop | None) -> rrb.Container:
     """Lay out a page of all ``count`` loops, and one for each that is shown."""
     kind = "" if count <= len(SERIES) else ", quantiles over the loops"
     plots = [
@@ -284,17 +284,17 @@ def write_view(
     summary: RunSummary,
     run_dir: Path,
     loop: str | None,
-    known: Sequence[LoopOverTime] | None = None,
+    over_time: Sequence[LoopOverTime] | None = None,
 ) -> None:
     """Write the recording of a run, or of one of its loops, from its record and its summary.
 
-    ``known`` is how each loop of the run went, if that is known.
+    ``over_time`` is how each loop of the run went, if that is known.
 
     Raises:
         ViewError: the recording cannot be written.
     """
     if loop is None and len(run.loops) > 1:
-        _write_network_view(run, summary, run_dir, loops_over_time(run, known))
+        _write_network_view(run, summary, run_dir, loops_over_time(run, over_time))
     else:
         write_loop_view(run.loop(loop), run_dir / file_of_loop(RECORDING_FILE, loop))
 

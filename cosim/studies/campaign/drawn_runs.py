@@ -20,7 +20,7 @@ from scipy.linalg import expm
 
 from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.analysis.summary.summary_model import ClaimVerdict
-from cosim.record.align import align_tables, in_common
+from cosim.record.align import align_tables, shares_update
 from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.exact_simulation import DIVERGED, OK, ROW, TOO_MANY_EVENTS
@@ -109,7 +109,7 @@ class SampledWork:
         aligned = align_tables(record)
         decay_per_s = policy_of(record.scenario).fading_per_s
         scaled = aligned.e_c_norm * np.exp(decay_per_s * aligned.t_ns / NS_PER_S)
-        row["sup_e_c_scaled"] = scaled[in_common(record.scenario, aligned)].max(initial=0.0)
+        row["sup_e_c_scaled"] = scaled[shares_update(record.scenario, aligned)].max(initial=0.0)
 
     def _cost(self, record: RunRecord) -> float:
         loop, steps = record.loop, record[PLANT_STEP]

@@ -163,8 +163,8 @@ OWN, COMMON = "as in the scenario", "common"
 """Values of the axis of disturbances."""
 
 
-class Depth(NamedTuple):
-    """Defaults of a study."""
+class StudyDefaults(NamedTuple):
+    """Defaults of a quick or a thorough study."""
 
     shares: tuple[float, ...]
     """Numbers of loops, as shares of the periodic loops that the link carries."""
@@ -173,8 +173,8 @@ class Depth(NamedTuple):
     """Amplitude of the common disturbance; 0: no such runs."""
 
 
-QUICK = Depth((0.5, 1.0, 1.5), 6, 0.0)
-THOROUGH = Depth((0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0), 10, 1.0)
+QUICK = StudyDefaults((0.5, 1.0, 1.5), 6, 0.0)
+THOROUGH = StudyDefaults((0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0), 10, 1.0)
 _PULSE_S = 0.5
 _QUEUE = 10
 """Queue of a bottleneck that the scenario does not have."""
@@ -229,10 +229,10 @@ class CapacityPlan:
         """The columns of the runs with the mean cost of the loops of each kind."""
         return ["cost"] if self.is_one_kind else [cost_of(kind.name) for kind in self.kinds]
 
-    def with_depth(self, depth: Depth) -> "CapacityPlan":
-        """Return the plan with the defaults of a depth."""
-        counts = default_counts(self.periodic_loops, smallest_mixture(self.kinds), depth)
-        return replace(self, counts=counts, draws=depth.draws, amplitude=depth.amplitude)
+    def with_defaults(self, defaults: StudyDefaults) -> "CapacityPlan":
+        """Return the plan with other defaults."""
+        counts = default_counts(self.periodic_loops, smallest_mixture(self.kinds), defaults)
+        return replace(self, counts=counts, draws=defaults.draws, amplitude=defaults.amplitude)
 
     @property
     def sizes(self) -> list[int]:
@@ -384,15 +384,15 @@ def with_rate(scenario: Scenario, rate_bps: int) -> Scenario:
     return scenario.model_copy(update={"network": network})
 
 
-def default_counts(periodic: float, least: int, depth: Depth) -> tuple[int, ...]:
+def default_counts(periodic: float, least: int, defaults: StudyDefaults) -> tuple[int, ...]:
     """Return numbers of loops around that of the periodic loops that the link carries.
 
     Args:
         periodic: number of periodic loops that the link carries.
         least: number of loops of the smallest mixture.
-        depth: how thorough the study is.
+        defaults: those of the study.
     """
-    multiples = {max(round(share * periodic / least), 1) for share in depth.shares}
+    multiples = {max(round(share * periodic / least), 1) for share in defaults.shares}
     return require_counts([least * multiple for multiple in multiples], least)
 
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -60,7 +60,9 @@ class LinearModel:
     at: Vector
     input: Vector
     drift: Vector
-    source: str  # "derivative" or "motion"; "exact": the plant's own A and B; "known": the loop's Â and B̂
+    source: Literal["derivative", "motion", "exact", "known"]
+    """Where A and B are from, in this order: differences of the plant's derivative, the logarithm of
+    its motion over a step, its own matrices, or the loop's Â and B̂."""
     errors: tuple[SampledError, ...]
 
     @property

@@ -51,6 +51,9 @@ _EXACT_MODEL_S, _SAMPLED_S = 300.0, 20.0
 """Lengths of the run with an exact model, and of the one whose trigger is sampled."""
 _SAMPLES = 101
 """Samples of an interval between two events."""
+_SAMPLES_FOR_BOUNDS, _SAMPLES_FOR_OVERSHOOT = 4001, 2001
+"""Samples of a run in which ‖e_c‖ and ‖x‖ are compared with their bounds; and of a longer one in which
+the largest ‖x‖ is looked for."""
 _ROUNDING = 1e-12
 """Smaller numbers are rounding errors, which depend on the machine."""
 _ZERO = 1e-6
@@ -89,9 +92,7 @@ def evidence(
         "eigenvalues": _eigenvalues(),
         "plants": _plants(scenario, draws),
         "growth": _growth(scenario, min(draws, _DELIVERY_DRAWS)),
-        "certificates": _certificates(
-            scenario, [*(draw for draw in certified if draw < draws), representative]
-        ),
+        "certificates": _certificates(scenario, [draw for draw in certified if draw < draws], representative),
         "loss": _loss(M),
         "exact_model": _exact_model(scenario),
         "without_growth": _without_growth(scenario),
@@ -143,16 +144,20 @@ def _growth(scenario: Scenario, draws: int) -> Numbers:
     return growth
 
 
-def _certificates(scenario: Scenario, draws: Sequence[int]) -> Numbers:
-    """Return how near MB-ET comes to its certified bounds, and Theorem 2's δ̲; the last is ours."""
+def _certificates(scenario: Scenario, draws: Sequence[int], representative: int) -> Numbers:
+    """Return how near MB-ET comes to its certified bounds, and Theorem 2's δ̲.
+
+    Raises:
+        CallerError: the representative draw has no certificate.
+    """
     rows, theorems = dict[int, dict[str, float]](), list[dict[str, float]]()
-    for draw in draws:
+    for draw in dict.fromkeys([*draws, representative]):
         resolved = resolved_draw(scenario, draw, "model")
         constants = certify(resolved, ideal_conditions(resolved)).constants
         if constants is None:
             continue
         run, trigger = run_continuous(resolved), resolved.decaying
-        samples = run.at(np.linspace(0.0, run.reached_s, 4001))
+        samples = run.at(np.linspace(0.0, run.reached_s, _SAMPLES_FOR_BOUNDS))
         growth = np.exp(trigger.alpha_per_s * samples.t_s)
         # e_c jumps at a delivery, so its largest value may come just before.
         e_c_before = np.array([state.e_c for state in run.before[1:]]).reshape(-1, run.system.loop.n)
@@ -165,7 +170,8 @@ def _certificates(scenario: Scenario, draws: Sequence[int]) -> Numbers:
             "inter_event": np.diff(run.event_s).min() / (constants.inter_event_s or math.nan),
         }
         theorems += _theorem_2(resolved, constants)
-    representative = draws[-1]
+    if representative not in rows:
+        raise CallerError(f"{scenario.name}: the representative draw {representative} has no certificate")
     return {
         "draws": len(rows.keys() - {representative}),
         "error": max(row["error"] / row["delta"] for row in rows.values()),
@@ -342,7 +348,7 @@ def _overshoot(scenario: Scenario, representative: int) -> dict[str, list[float]
         start = tuple(scale * value for value in resolved.plant.initial_state)
         plant = resolved.plant.model_copy(update={"initial_state": start})
         run = run_continuous(resolved.model_copy(update={"plant": plant}))
-        norms = np.linalg.norm(run.at(np.linspace(0, run.reached_s, 2001)).x, axis=1)
+        norms = np.linalg.norm(run.at(np.linspace(0, run.reached_s, _SAMPLES_FOR_OVERSHOOT)).x, axis=1)
         overshoots[mode].append(float(norms.max() / norms[0]))
     return overshoots
 

@@ -14,6 +14,7 @@ a system with more states than x is described as far as the loop sees it.
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -55,7 +56,7 @@ class LinearMotion:
     A: Matrix  # (n, n), per second
     B: Matrix  # (n, m)
     drift: Vector  # f₀ at the point, (n,), per second; 0 at an equilibrium
-    source: str  # "derivative" or "motion", from which A and B are computed
+    source: Literal["derivative", "motion"]  # from which A and B are computed
     void: str | None = None
 
 

@@ -34,9 +34,9 @@ def record(request: pytest.FixtureRequest, content: dict[str, Any]) -> RunRecord
         content["network"] |= {"protocol": "ack"}
     if request.param == "changed":
         content["changes"] = [{"at_s": 1.0, "set": {"trigger.floor": 0.05}}]
-    found = simulate(resolve(validate(content, "test")))
-    assert len(found[PLANT_STEP]) > 5 * PART_ROWS
-    return found
+    long_run = simulate(resolve(validate(content, "test")))
+    assert len(long_run[PLANT_STEP]) > 5 * PART_ROWS
+    return long_run
 
 
 def results(record: RunRecord) -> dict[str, Any]:
@@ -47,7 +47,9 @@ def results(record: RunRecord) -> dict[str, Any]:
         "claims": [claim.model_dump(mode="json") for claim in claims.evaluate()],
         "violations": claims.violations(),
         "conditions": claims.conditions,
-        "envelopes": [(one.label, one.t_s.tobytes(), one.values.tobytes()) for one in claims.envelopes()],
+        "envelopes": [
+            (curve.label, curve.t_s.tobytes(), curve.values.tobytes()) for curve in claims.envelopes()
+        ],
         "inter_event_s": [
             passed_s
             for part in ClaimEvaluation(record).samples()
@@ -57,10 +59,10 @@ def results(record: RunRecord) -> dict[str, Any]:
     }
 
 
-def without_sums(found: Any) -> Any:
-    if isinstance(found, dict):
-        return {k: without_sums(v) for k, v in found.items() if k not in ROUNDED}
-    return [without_sums(one) for one in found] if isinstance(found, list) else found
+def without_sums(content: Any) -> Any:
+    if isinstance(content, dict):
+        return {k: without_sums(v) for k, v in content.items() if k not in ROUNDED}
+    return [without_sums(entry) for entry in content] if isinstance(content, list) else content
 
 
 def test_the_results_do_not_depend_on_the_parts(record: RunRecord, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ def test_a_held_integrator_with_independent_losses_by_hand() -> None:
     """x⁺ = x + T(u + d), u⁺ = K x⁺ or u⁺ = u: the equations for E x², E xu and E u² = K² E x²."""
     T, K, sigma, p = 0.5, -0.8, 0.3, 0.4
     model = {"A": [[0.0]], "B": [[1.0]], "gain": [[K]]}
-    found = find_mean_cost(
+    cost = find_mean_cost(
         scenario(
             model=model, mode="zoh",
             network={"mansd": 4, "loss": {"model": "bernoulli", "probability": p}},
@@ -29,11 +29,11 @@ def test_a_held_integrator_with_independent_losses_by_hand() -> None:
     # A tick's input is applied a step later: u⁺ = K x if the update before was delivered.
     matrix = np.array([[0.0, 2 * T, T**2], [q * K, q * K * T + p - 1, p * T], [q * K**2, 0, p - 1]])
     a, b, c = np.linalg.solve(matrix, [-(T**2) * sigma**2, 0.0, 0.0])
-    assert isinstance(found, CostUnder)
-    assert found.stationary.state_rms_at_transmissions == pytest.approx([a**0.5], rel=1e-9)
-    assert found.stationary.input_rms == pytest.approx([c**0.5], rel=1e-9)
+    assert isinstance(cost, CostUnder)
+    assert cost.stationary.state_rms_at_transmissions == pytest.approx([a**0.5], rel=1e-9)
+    assert cost.stationary.input_rms == pytest.approx([c**0.5], rel=1e-9)
     over_time = a + T * b + (T**2) * (c + sigma**2) / 3
-    assert found.stationary.cost_per_s == pytest.approx(over_time + c, rel=1e-9)
+    assert cost.stationary.cost_per_s == pytest.approx(over_time + c, rel=1e-9)
 
 
 def patterns(packets: int, longest: int, forced: int) -> dict[tuple[bool, ...], float]:
@@ -43,15 +43,15 @@ def patterns(packets: int, longest: int, forced: int) -> dict[tuple[bool, ...], 
     """
     chain = np.array([[0.7, 0.3], [0.4, 0.6]])
     lost = np.array([0.1, 0.9])
-    found = {}
+    shares = {}
     for pattern in product([False, True], repeat=packets - forced):
         states, outcomes = np.eye(2)[0] @ (chain if forced else np.eye(2)), [False] * forced
         for is_lost in pattern:
             allowed = sum(outcomes[-3:]) < longest
             states = (states @ chain) * (lost * allowed if is_lost else 1 - lost * allowed)
             outcomes.append(is_lost)
-        found[tuple(outcomes)] = float(states.sum())
-    return {outcomes: share for outcomes, share in found.items() if share}
+        shares[tuple(outcomes)] = float(states.sum())
+    return {outcomes: share for outcomes, share in shares.items() if share}
 
 
 @pytest.mark.parametrize(
@@ -63,26 +63,26 @@ def test_the_mean_cost_is_that_of_all_patterns_of_simulated_runs(mode: str, sync
     timing = {"mode": mode, "controller.rate_hz": 16.0, "horizon_s": 1.4}
     always = {"mansd": 5, "initial_sync": sync, "impairments": [{"kind": "delay", "delay_s": 0.03}]}
     network = {**always, "loss": BURSTS, "constraints": [constraint]}
-    found = find_mean_cost(scenario(**timing, network=network)).with_guarantee
+    cost = find_mean_cost(scenario(**timing, network=network)).with_guarantee
     mean, forced = 0.0, int(sync == "first_packet")
     for outcomes, share in patterns(5 + forced, 2, forced).items():
         lost = [number for number, is_lost in enumerate(outcomes) if is_lost]
         scripted = {**always, "loss": {"model": "scripted", "lost": lost}}
         run = scenario(**timing, network=scripted)
         mean += share * SampledWork(run, 0, None, None, 0.1, 10**6).run(range(1))["cost"][0]
-    assert isinstance(found, CostUnder)
-    assert found.horizon_cost == pytest.approx(mean, rel=1e-9)
+    assert isinstance(cost, CostUnder)
+    assert cost.horizon_cost == pytest.approx(mean, rel=1e-9)
 
 
 def test_the_mean_cost_of_noisy_runs_is_that_of_a_campaign() -> None:
     """A campaign of 200 draws; by chance 5.5 standard errors are exceeded once in 10⁷."""
     given = scenario(**NOISE, network={"mansd": 2, "loss": BURSTS})
     Q, R = np.array([[2.0, 0.5], [0.5, 1.0]]), np.array([[0.3]])
-    found = find_mean_cost(given, Q, R).with_guarantee
+    cost = find_mean_cost(given, Q, R).with_guarantee
     costs = SampledWork(given, 3, Q, R, 0.1, 10**6).run(range(200))["cost"]
-    assert isinstance(found, CostUnder)
-    assert abs(costs.mean() - found.horizon_cost) < 5.5 * costs.std() / np.sqrt(len(costs))
-    assert costs.std() / np.sqrt(len(costs)) < 0.05 * found.horizon_cost
+    assert isinstance(cost, CostUnder)
+    assert abs(costs.mean() - cost.horizon_cost) < 5.5 * costs.std() / np.sqrt(len(costs))
+    assert costs.std() / np.sqrt(len(costs)) < 0.05 * cost.horizon_cost
 
 
 def test_the_transient_and_the_stationary_part_are_limits() -> None:
@@ -101,7 +101,7 @@ def test_the_transient_and_the_stationary_part_are_limits() -> None:
 def test_costs_that_do_not_depend_on_what_grows_are_those_of_the_loop_without_it() -> None:
     """x_2 drives itself only, and nothing but the weight Q_22 depends on it."""
 
-    def found(states: int, *weights: float) -> CostUnder:
+    def stationary_cost(states: int, *weights: float) -> CostUnder:
         A, B, gain = np.diag([-1.0, 0.5]), np.array([[1.0], [0.0]]), np.array([[-2.0, 0.0]])
         model = {"A": A[:states, :states], "B": B[:states], "gain": gain[:, :states], "allow_unstable": True}
         plant = {"initial_state": [1.0, 0.3][:states], "rate_hz": 40.0,
@@ -111,7 +111,11 @@ def test_costs_that_do_not_depend_on_what_grows_are_those_of_the_loop_without_it
         assert isinstance(cost, CostUnder)
         return cost
 
-    alone, beside, weighed = found(1, 1.0), found(2, 1.0, 0.0), found(2, 1.0, 1e-12)
+    alone, beside, weighed = (
+        stationary_cost(1, 1.0),
+        stationary_cost(2, 1.0, 0.0),
+        stationary_cost(2, 1.0, 1e-12),
+    )
     assert not alone.grows
     assert beside.growth == pytest.approx(np.exp(0.5 * 0.25))
     assert beside.stationary.state_rms == (pytest.approx(alone.stationary.state_rms[0]), None)

@@ -48,15 +48,15 @@ def plant(A: Any, B: Any, gain: Any, factor: float = 1.02) -> dict[str, Any]:
 
 def require_sound(record: RunRecord, status: ExitStatus = ExitStatus.OK) -> dict[str, Any]:
     """Replay, summary and claims of a run: bit-exact, valid JSON, and no false violation."""
-    found = summarise_loop(record, 0, "horizon").to_json()
-    json.dumps(found, allow_nan=False)
-    assert found["exit"]["status"] == status, found["exit"]
+    summarised = summarise_loop(record, 0, "horizon").to_json()
+    json.dumps(summarised, allow_nan=False)
+    assert summarised["exit"]["status"] == status, summarised["exit"]
     assert replay(record).bit_exact is True
     with np.errstate(all="ignore"):
         claims = ClaimEvaluation(record).evaluate()
     assert claims
     assert [c for c in claims if c.verdict is ClaimVerdict.VIOLATED] == []
-    return found
+    return summarised
 
 
 @pytest.mark.parametrize(
@@ -120,9 +120,9 @@ def test_unusual_loops_are_judged_and_replayed(content: dict[str, Any], name: st
 
 def test_a_loop_that_overflows_is_refused_or_has_diverged(content: dict[str, Any]) -> None:
     resolved = scenario(content, 20.0, horizon_s=20.0, **plant([[50.0]], [[1.0]], [[-0.1]]))
-    found = require_sound(simulate(resolved), ExitStatus.FAILED)
-    assert 10 < found["diverged_at_s"] < 20
-    assert found["exit"]["reason"].startswith("diverged: x is not finite at")
+    summarised = require_sound(simulate(resolved), ExitStatus.FAILED)
+    assert 10 < summarised["diverged_at_s"] < 20
+    assert summarised["exit"]["reason"].startswith("diverged: x is not finite at")
     with pytest.raises(CallerError, match="take one step to infinity"):
         simulate(scenario(content, **plant([[-1.0]], [[1.0]], [[1e308]])))
 
@@ -139,8 +139,8 @@ def test_a_non_finite_input_is_not_applied(content: dict[str, Any]) -> None:
     # The plant rejects non-finite inputs and holds the applied one; here there is none.
     assert np.isfinite(record["plant_step"]["u"]).all()
     assert np.isfinite(record["plant_step"]["x"]).all()
-    found = summarise_loop(record, 0, "horizon").to_json()
-    assert found["rejected_datagrams"]["plant"]["not_finite"] == sent.sum()
+    summarised = summarise_loop(record, 0, "horizon").to_json()
+    assert summarised["rejected_datagrams"]["plant"]["not_finite"] == sent.sum()
 
 
 # --- a diverging run is not a disturbed, saturated, short or oscillating one ----------------------
@@ -164,31 +164,31 @@ def exponential(rate_per_s: float) -> Matrix:
 
 def diverged(x: Matrix, scenarios: list[Scenario]) -> Divergence | None:
     """The result must not depend on the parts in which the samples are read."""
-    found = [
+    divergences = [
         divergence(zip(np.split(T_S, cuts), np.split(x, cuts), strict=True), len(T_S), scenarios)
         for cuts in ([], [50, 700, 705])
     ]
-    assert found[0] == found[1]
-    return found[0]
+    assert divergences[0] == divergences[1]
+    return divergences[0]
 
 
 @pytest.mark.parametrize("rate_per_s", [1.0, 4.64, 30.0])
 def test_an_unstable_loop_has_diverged(content: dict[str, Any], rate_per_s: float) -> None:
-    found = diverged(exponential(rate_per_s), [loop(content)])
-    assert found is not None
-    assert 0 < found.at_s < 10
-    assert "still growing at the end" in found.text
-    assert "\n" not in found.text
+    result = diverged(exponential(rate_per_s), [loop(content)])
+    assert result is not None
+    assert 0 < result.at_s < 10
+    assert "still growing at the end" in result.text
+    assert "\n" not in result.text
     x = exponential(-rate_per_s)
     x[300:, 1] = np.inf
-    found = diverged(x, [loop(content)])
-    assert found is not None
-    assert (found.at_s, found.text) == (3.0, "diverged: x is not finite at 3 s")
+    result = diverged(x, [loop(content)])
+    assert result is not None
+    assert (result.at_s, result.text) == (3.0, "diverged: x is not finite at 3 s")
 
 
 def shapes() -> dict[str, Matrix]:
     rng = np.random.default_rng(0)
-    one, wave = np.ones_like(T_S), np.sin(3 * T_S)
+    ones, wave = np.ones_like(T_S), np.sin(3 * T_S)
     rows: dict[str, Vector] = {
         "stable": np.exp(-T_S),
         "slowly unstable, so that the run is short": np.exp(0.6 * T_S),
@@ -196,7 +196,7 @@ def shapes() -> dict[str, Matrix]:
         "a limit cycle from next to nothing": 1e-9 + np.minimum(np.exp(6 * T_S - 30), 1) * wave,
         "saturated far away": 1e-6 + 1e5 * np.minimum(T_S / 5, 1),
         "noise": rng.normal(size=len(T_S)),
-        "at rest": 0 * one,
+        "at rest": 0 * ones,
     }
     return {name: values[:, None] * [1.0, 0.1] for name, values in rows.items()}
 
@@ -231,10 +231,10 @@ def test_a_simulated_run_that_diverges_fails(content: dict[str, Any]) -> None:
     resolved = unstable(content, 8.0)
     sampled = summarise_loop(simulate(resolved), 0, "horizon").to_json()
     continuous = summary(run_continuous(resolved), resolved).to_json()
-    for found in (sampled, continuous):
-        assert found["exit"]["status"] == 1
-        assert found["exit"]["reason"].startswith("diverged: ‖x‖ passed ")
-        assert 1e6 < found["final_state_norm"] < np.inf
+    for summarised in (sampled, continuous):
+        assert summarised["exit"]["status"] == 1
+        assert summarised["exit"]["reason"].startswith("diverged: ‖x‖ passed ")
+        assert 1e6 < summarised["final_state_norm"] < np.inf
     assert sampled["diverged_at_s"] == pytest.approx(continuous["diverged_at_s"], abs=0.1)
     stopped = summarise_loop(simulate(resolved), 130, "stopped by the user (SIGINT)").to_json()
     assert stopped["exit"] == {"status": 130, "reason": "stopped by the user (SIGINT)"}

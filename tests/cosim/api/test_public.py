@@ -19,7 +19,7 @@ HEAVY = ("cosim", "matplotlib", "numba", "numpy", "pyarrow", "pydantic", "rerun"
 
 
 def loaded_by(program: str) -> set[str]:
-    names = "[name for name, one in sys.modules.items() if type(one).__name__ != '_LazyModule']"
+    names = "[name for name, module in sys.modules.items() if type(module).__name__ != '_LazyModule']"
     code = f"{program}\nimport json, sys\nprint(json.dumps({names}))"
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return set(json.loads(process.stdout.splitlines()[-1]))

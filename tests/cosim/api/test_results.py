@@ -62,11 +62,11 @@ def test_numbers_may_be_those_of_numpy(result: noack.CampaignResult) -> None:
     again = noack.campaign(plan, draws=np.int64(30), workers=np.int64(1))
     assert again.summary == result.summary
     assert again.draws(mode="hold", loss=np.float64(0.8)).num_rows == 30
-    found, same = (
+    first, same = (
         noack.margin("lane_periodic", most_m=m, accuracy=accuracy, period=False).caps[-1].stability.lower
         for m, accuracy in ((np.int64(2), np.float64(1e-3)), (2, 1e-3))
     )
-    assert found == same
+    assert first == same
 
 
 def test_what_is_not_there_is_named(result: noack.CampaignResult) -> None:

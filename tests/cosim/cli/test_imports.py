@@ -17,7 +17,7 @@ from cosim.lazy_modules import lazy_modules
 _SHOW = """
 import json, sys
 def show(*_):
-    names = [name for name, one in sys.modules.items() if type(one).__name__ != "_LazyModule"]
+    names = [name for name, module in sys.modules.items() if type(module).__name__ != "_LazyModule"]
     print(json.dumps(names), file=sys.stderr, flush=True)
     sys.exit()
 """
@@ -133,13 +133,13 @@ def test_a_package_is_loaded_before_a_module_that_is_not_imported_lazily(package
 
 
 def test_another_thread_waits_until_it_is_loaded(package: str) -> None:
-    module, found = lazily_imported(package, "slow"), []
-    threads = [threading.Thread(target=lambda: found.append(module.second)) for _ in range(3)]
+    module, values = lazily_imported(package, "slow"), []
+    threads = [threading.Thread(target=lambda: values.append(module.second)) for _ in range(3)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert found == [2, 2, 2]
+    assert values == [2, 2, 2]
     assert sys.argv == [package, f"{package}.slow"]
 
 

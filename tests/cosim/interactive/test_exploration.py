@@ -22,17 +22,17 @@ from noack.scenario.resolution import resolve
 def test_a_run_is_drawn_as_simulated_with_both_sides_of_each_event() -> None:
     scenario = noack.load("lane_following")
     run = run_continuous(resolve(scenario))
-    found = exploration.explore(scenario)
-    assert found.kind == exploration.EXACT
-    assert (np.diff(found.t_s) >= 0).all()
-    assert found.event_s.tolist() == run.event_s.tolist()
-    assert found.delivered.tolist() == run.delivered.tolist()
+    explored = exploration.explore(scenario)
+    assert explored.kind == exploration.EXACT
+    assert (np.diff(explored.t_s) >= 0).all()
+    assert explored.event_s.tolist() == run.event_s.tolist()
+    assert explored.delivered.tolist() == run.delivered.tolist()
     for before, after in zip(run.before, run.after, strict=True):
-        first = int(np.searchsorted(found.t_s, before.t_s))
-        np.testing.assert_array_equal(found.x[first], before.x)
-        assert found.e_s_norm[first] == pytest.approx(np.linalg.norm(before.e_s))
-        assert found.e_c_norm[first + 1] == pytest.approx(np.linalg.norm(after.e_c))
-        assert found.e_s_norm[first + 1] == 0.0
+        first = int(np.searchsorted(explored.t_s, before.t_s))
+        np.testing.assert_array_equal(explored.x[first], before.x)
+        assert explored.e_s_norm[first] == pytest.approx(np.linalg.norm(before.e_s))
+        assert explored.e_c_norm[first + 1] == pytest.approx(np.linalg.norm(after.e_c))
+        assert explored.e_s_norm[first + 1] == 0.0
     known = noack.load("lane_following", {"network.initial_sync": "known_state"})
     shown = ExploredRun(exploration.explore(known), 0)._replace(guarantee=guarantee.certify(known))
     figure = exploration_figure(shown)
@@ -42,7 +42,7 @@ def test_a_run_is_drawn_as_simulated_with_both_sides_of_each_event() -> None:
     assert [entry["label"] for entry in part["panels"][1]["legend"]] == [*errors]
     numbers = np.frombuffer(base64.b64decode(part["numbers"]), "<f4")
     ends = np.cumsum(part["lengths"])
-    item = next(one for one in part["panels"][2]["items"] if one["label"] == "‖x‖")
+    item = next(item for item in part["panels"][2]["items"] if item["label"] == "‖x‖")
     sent = np.split(numbers, ends[:-1])[item["y"]]
     np.testing.assert_allclose(sent, shown.run.x_norm, rtol=1e-6)
 
@@ -52,10 +52,10 @@ def test_a_run_that_diverges_is_drawn_up_to_that_time_and_widens_the_band() -> N
         "mode": "zoh", "network.mansd": 20, "network.loss": {"model": "worst_case"},
         "trigger": {"policy": "periodic", "period_s": 1.0}, "horizon_s": 3000.0,
     })  # fmt: skip
-    found = exploration.explore(scenario)
-    assert found.diverged_at_s is not None
-    assert found.t_s[-1] <= 3000.0
-    assert found.numbers[0][1].startswith("diverged at")
+    explored = exploration.explore(scenario)
+    assert explored.diverged_at_s is not None
+    assert explored.t_s[-1] <= 3000.0
+    assert explored.numbers[0][1].startswith("diverged at")
     draws = exploration.explore_ensemble(scenario, draws=8)
     assert draws.diverged == 8
     assert not math.isfinite(draws.x_norm.high[-1])
@@ -132,7 +132,7 @@ def test_a_comparison_ends_where_one_of_the_runs_does() -> None:
         exploration.explore(noack.load("lane_following", {"horizon_s": horizon_s}))
         for horizon_s in (5.0, 20.0)
     )
-    found = compare(Reference("the whole", whole), short)
-    assert found.title == "compared with the whole, until 5 s"
-    assert found.settings == "Settings that differ: horizon_s 20.0 → 5.0."
-    assert {row[3] for row in found.rows} <= {"the same", "nearly the same"}
+    comparison = compare(Reference("the whole", whole), short)
+    assert comparison.title == "compared with the whole, until 5 s"
+    assert comparison.settings == "Settings that differ: horizon_s 20.0 → 5.0."
+    assert {row[3] for row in comparison.rows} <= {"the same", "nearly the same"}

@@ -19,16 +19,16 @@ LANE = {"lane_following": "lane_following"}
 
 def test_the_model_error_multiplies_both_boxes() -> None:
     draft = open_draft("lane_following")
-    (slider,) = [one for one in controls_of(draft).sliders if one.scaled]
+    (slider,) = [part for part in controls_of(draft).sliders if part.scaled]
     assert slider.value == 1.0
     wide = drag(drag(draft, slider, 3.0), slider, 12.0)
     assert "# M - 1: at most four consecutive losses" in wide.text
     assert wide.value("plant.uncertainty_A")[0] == [1.2, 1.2, 0.0, 0.0]
     assert wide.value("plant.uncertainty_B")[1] == [0.0, 0.6]
-    assert [one.value for one in controls_of(wide).sliders if one.scaled] == [12.0]
+    assert [part.value for part in controls_of(wide).sliders if part.scaled] == [12.0]
     assert drag(wide, slider, 1.0).text.count("0.1, 0.1") == 2
     nominal = draft.with_value("plant.draw", "nominal")
-    assert not any(one.scaled for one in controls_of(nominal).sliders)
+    assert not any(part.scaled for part in controls_of(nominal).sliders)
 
 
 @given(value=st.one_of(st.floats(0.01, 1.0), st.integers(0, 10**6), st.booleans(), st.text()))
@@ -49,7 +49,7 @@ def test_mistakes_are_shown_at_their_keys() -> None:
     wrong = draft.with_value("network.loss.probability", 2.0).with_value("trigger.beta", -1.0)
     with pytest.raises(DraftError) as error:
         _ = wrong.scenario
-    assert [one.key for one in error.value.mistakes] == ["trigger.beta", "network.loss.probability"]
+    assert [mistake.key for mistake in error.value.mistakes] == ["trigger.beta", "network.loss.probability"]
     with pytest.raises(DraftError) as error:
         _ = draft.with_text("name = ").scenario
     assert error.value.mistakes[0].key == ""

@@ -20,7 +20,7 @@ pytest.importorskip("nicegui", reason="the extra `lab` is not installed")
 
 VERDICT = "document.getElementById('lab-verdict').innerText"
 COMPARED = "document.getElementById('lab-compare').innerText"
-PIXELS = "LAB.figure.panels.map(one => one.canvas.toDataURL()).join()"
+PIXELS = "LAB.figure.panels.map(panel => panel.canvas.toDataURL()).join()"
 
 
 def test_dragging_changes_the_run_and_the_address(browser: Browser, address: str) -> None:
@@ -108,13 +108,13 @@ SOURCES = ("explore", "live", "recorded")
 WIDTHS = {"light": (390, 600, 801, 1000, 1400), "dark": (390,)}
 """The layout does not depend on the colours."""
 SMALL = """(() => {
-  const texts = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT), found = [];
+  const texts = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT), small = [];
   while (texts.nextNode()) {
     const {parentElement: at, data} = texts.currentNode;
     if (!data.trim() || !at.checkVisibility?.() || at.closest('script, style')) continue;
-    if (parseFloat(getComputedStyle(at).fontSize) < 13) found.push(data.trim());
+    if (parseFloat(getComputedStyle(at).fontSize) < 13) small.push(data.trim());
   }
-  return found;
+  return small;
 })()"""
 ACCESSIBLE = ("wcag2a", "wcag2aa", "wcag21a", "wcag21aa")
 RULES = {"light": ACCESSIBLE, "dark": ("color-contrast",)}
@@ -127,11 +127,11 @@ def violations(page: Page, *rules: str, except_in: str = "iframe") -> list[str]:
     if not page.js("!!window.axe"):
         page.js(files("axe_core_python").joinpath("axe.min.js").read_text("utf-8"))
     options = json.dumps({"runOnly": rules, "iframes": False})
-    found = page.js(
+    texts = page.js(
         f"axe.run({{exclude: [['iframe'], ['{except_in}']]}}, {options}).then(r => r.violations.flatMap("
         "v => v.nodes.map(n => v.id + ' ' + n.target + ': ' + n.failureSummary)))"
     )
-    return [] if found is None else list(found)
+    return [] if texts is None else list(texts)
 
 
 @pytest.mark.parametrize(("scheme", "size"), [("light", (1280, 900)), ("dark", (390, 844))])
@@ -269,7 +269,7 @@ def test_clicks_reach_a_run_while_the_viewer_draws_and_ctrl_c_keeps_the_record_o
         page.wait(f"{log}.includes('controller died: killed by SIGKILL')")
         # The viewer has a process of its own, whose drawing does not keep the page from its clicks.
         targets = with_card.call("Target.getTargets")["targetInfos"]
-        assert any(one["url"].startswith(viewer) for one in targets if one["type"] == "iframe")
+        assert any(target["url"].startswith(viewer) for target in targets if target["type"] == "iframe")
         page.press_button("stop")
         page.wait(f"{TEXT}.includes('stopped after ')")
         page.press_button("run live")

@@ -350,13 +350,13 @@ def test_what_a_live_run_reports_sets_its_state_and_its_lines() -> None:
     report_event(run, "finalising", reason="horizon")
     assert run.state == "finalising"
     assert not run.is_over
-    lines = [["completed 20 s", "green"], ["3 transmissions, 2 delivered", ""]]
+    lines = [["completed 20 s", "good"], ["3 transmissions, 2 delivered", ""]]
     report_event(run, "ended", run_dir="/runs/one", reason="horizon", ok=True, verdict=lines)
     assert run.is_over
     assert run.ok
     assert run.progress is not None
     assert run.progress.events == 3
-    assert run.verdict == [("completed 20 s", "green"), ("3 transmissions, 2 delivered", "")]
+    assert run.verdict == [("completed 20 s", "good"), ("3 transmissions, 2 delivered", "")]
     failed = LiveRun(20.0)
     report_event(failed, "error", text="the port is taken")
     assert failed.is_over

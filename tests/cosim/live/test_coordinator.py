@@ -41,11 +41,11 @@ def ask(
     what: str,
     instance: str = "one",
     role: str = "sensor",
-    shown: str = _DESCRIPTOR.join_token,
+    join_token: str = _DESCRIPTOR.join_token,
 ) -> Query:
     address = None if role == RECORDER else ["127.0.0.1", 5 + ROLES.index(role)]
-    hello: dict[str, Any] = {"instance": instance, "address": address, "join_token": shown}
-    plane.put(what, query := Query(f"noack/0/{what}/{role}", json.dumps(hello).encode()))
+    request: dict[str, Any] = {"instance": instance, "address": address, "join_token": join_token}
+    plane.put(what, query := Query(f"noack/0/{what}/{role}", json.dumps(request).encode()))
     barrier.poll()
     return query
 
@@ -129,7 +129,7 @@ def test_a_running_process_is_lost_only_if_its_connection_does_not_come_back(
 
 
 @pytest.mark.parametrize(
-    ("known", "shown", "role", "reason"),
+    ("known", "join_token", "role", "reason"),
     [
         (TokenScope(), "ab" * 16, "sensor", None),
         (TokenScope(), "", "sensor", "its run descriptor or invitation is not of this run"),
@@ -139,12 +139,12 @@ def test_a_running_process_is_lost_only_if_its_connection_does_not_come_back(
         (TokenScope(until_s=-1.0), "ab" * 16, "sensor", "its invitation has expired"),
     ],
 )
-def test_a_pass_admits_its_roles_until_it_expires(
-    plane: FakePlane, barrier: Coordinator, known: TokenScope, shown: str, role: str,
+def test_a_join_token_admits_its_roles_until_it_expires(
+    plane: FakePlane, barrier: Coordinator, known: TokenScope, join_token: str, role: str,
     reason: str | None,
 ) -> None:  # fmt: skip
     barrier.join_tokens["ab" * 16] = known
-    asked = ask(plane, barrier, "admit", role=role, shown=shown)
+    asked = ask(plane, barrier, "admit", role=role, join_token=join_token)
     assert asked.error == (None if reason is None else f"cannot join: {reason}")
     joined = ask(plane, barrier, "join", role=role)
     assert joined.error == (None if reason is None else "cannot join: it was not admitted")
@@ -183,6 +183,6 @@ def test_a_refused_change_has_no_effect_on_the_next_one() -> None:
         requested(requests, {"network.mansd": 10, "network.loss": kept})
     loss = kept | {"probability": 0.2}
     assert requested(requests, {"network.loss": loss})["from_s"] > 0
-    found = requested(requests, {})["runtime_parameters"]
-    assert (found["network.mansd"], found["network.loss"]["probability"]) == (2, 0.2)
-    assert [one.number for one in requests.announced] == [0, 1]
+    parameters = requested(requests, {})["runtime_parameters"]
+    assert (parameters["network.mansd"], parameters["network.loss"]["probability"]) == (2, 0.2)
+    assert [announcement.number for announcement in requests.announced] == [0, 1]

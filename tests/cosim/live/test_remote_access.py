@@ -18,19 +18,19 @@ ROBOT = '[controller]\nssh = "robot"\n'
 def test_a_run_listens_at_addresses_that_others_can_reach() -> None:
     """A port may be missing."""
 
-    def found(text: str) -> list[str]:
+    def addresses(text: str) -> list[str]:
         try:
             return ["{} port {}".format(*remote_access.listen_address(json.loads(text)))]
         except CallerError as error:
             return [str(error).partition(" (")[0]]
 
-    compare_lines(Path(__file__).with_name("addresses.txt"), found)
+    compare_lines(Path(__file__).with_name("addresses.txt"), addresses)
 
 
 def test_one_loop_records_the_bounds_of_its_clocks() -> None:
-    one = load(Path("scenarios/lane_following.toml"))
-    assert remote_access.with_clocks(one).clocks == ClocksSection()
-    strict = one.model_copy(update={"clocks": ClocksSection(largest_error_us=5.0)})
+    given = load(Path("scenarios/lane_following.toml"))
+    assert remote_access.with_clocks(given).clocks == ClocksSection()
+    strict = given.model_copy(update={"clocks": ClocksSection(largest_error_us=5.0)})
     assert remote_access.with_clocks(strict) is strict
 
 
@@ -67,10 +67,10 @@ def hosts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_processes_without_a_table_run_on_this_host(hosts: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     hosts.write_text(f'listen = "192.0.2.1:7400"\n{ROBOT}')
-    found = remote_access.listening_for(hosts)
-    assert found.address == ("192.0.2.1", 7400)
-    assert found.invitation is None
-    assert {role: host.ssh for role, host in found.hosts.items()} == {"controller": "robot"}
+    remote = remote_access.listening_for(hosts)
+    assert remote.address == ("192.0.2.1", 7400)
+    assert remote.invitation is None
+    assert {role: host.ssh for role, host in remote.hosts.items()} == {"controller": "robot"}
     monkeypatch.setenv("PATH", str(hosts.parent))
     with pytest.raises(CallerError, match="no ssh client is installed"):
         remote_access.listening_for(hosts)

@@ -27,17 +27,17 @@ def forward(lost: list[bool], rates: ChainRates) -> float:
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.booleans(), min_size=1, max_size=40), rates, st.data())
 def test_the_likelihood_is_that_of_the_forward_algorithm(
-    lost: list[bool], one: ChainRates, data: st.DataObject
+    lost: list[bool], chain: ChainRates, data: st.DataObject
 ) -> None:
     bursts = loss_bursts(~np.array(lost))
-    assert LossLikelihood(bursts)(one) == pytest.approx(forward(lost, one), abs=1e-9)
+    assert LossLikelihood(bursts)(chain) == pytest.approx(forward(lost, chain), abs=1e-9)
     chosen = data.draw(st.lists(st.booleans(), min_size=len(bursts.length), max_size=len(bursts.length)))
     left_out, expected, begin = np.array(chosen, bool), 0.0, 0
     for first, end in zip(bursts.first[left_out], bursts.end[left_out], strict=True):
-        expected += forward(lost[begin:first], one)
+        expected += forward(lost[begin:first], chain)
         begin = end
-    expected += forward(lost[begin:], one)
-    assert LossLikelihood(bursts, left_out)(one) == pytest.approx(expected, abs=1e-9)
+    expected += forward(lost[begin:], chain)
+    assert LossLikelihood(bursts, left_out)(chain) == pytest.approx(expected, abs=1e-9)
 
 
 def test_the_fitted_chain_has_the_matrices_of_the_emulators() -> None:

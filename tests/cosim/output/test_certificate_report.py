@@ -86,9 +86,9 @@ SLOW = (
 def chosen() -> Certificates:
     """The slow loop in a norm that noack chooses, after seconds of search."""
     shares: list[float] = []
-    found = certificates_of(shipped("lane_following", *SLOW), "chosen", progress=shares.append)
+    certificates = certificates_of(shipped("lane_following", *SLOW), "chosen", progress=shares.append)
     assert shares[-1] == 1.0
-    return found
+    return certificates
 
 
 def test_the_chosen_weight_makes_the_model_contract_and_keeps_the_volume(chosen: Certificates) -> None:
@@ -102,12 +102,12 @@ def test_the_chosen_weight_makes_the_model_contract_and_keeps_the_volume(chosen:
     better, plain = constants(chosen.paper), constants(unweighted.paper)
     assert better.delta <= 5.0
     # In the Euclidean norm: an event's error, at most β in the chosen one, followed by e^{Hτ}.
-    found, G = constants(chosen.schedule), loop_of(chosen.scenario).H + 0.25 * np.eye(2)
-    assert found.inter_event_s is not None
+    scheduled, G = constants(chosen.schedule), loop_of(chosen.scenario).H + 0.25 * np.eye(2)
+    assert scheduled.inter_event_s is not None
     gains = [np.linalg.norm(expm(G * t) @ np.linalg.inv(W), 2) for t in np.arange(0.0, 20.0, 0.01)]
-    ages = [int(100 * found.inter_event_s * j) for j in range(found.missing_events)]
-    followed = found.overshoot * (gains[0] + sum(max(gains[age:]) for age in ages))
-    expected = min(followed, gains[0] * found.delta)
+    ages = [int(100 * scheduled.inter_event_s * j) for j in range(scheduled.missing_events)]
+    followed = scheduled.overshoot * (gains[0] + sum(max(gains[age:]) for age in ages))
+    expected = min(followed, gains[0] * scheduled.delta)
     assert chosen.error_in_given_norm == pytest.approx(expected, rel=1e-2)
     assert unweighted.error_in_given_norm is None
     assert better.inter_event_s >= plain.inter_event_s
@@ -140,9 +140,9 @@ def test_numbers_that_overflow_give_no_certificate(settings: list[str]) -> None:
         if certificate.constants is None:
             assert certificate.void
         else:
-            found = certificate.constants._asdict()
-            found.pop("inter_event_s")
-            assert all(np.isfinite(value) for value in found.values())
+            values = certificate.constants._asdict()
+            values.pop("inter_event_s")
+            assert all(np.isfinite(value) for value in values.values())
 
 
 BOXED = (
@@ -204,27 +204,27 @@ def without_a_cap() -> Certificates:
 def test_without_a_cap_the_mean_at_events_in_the_chosen_norm_is_beta_over_1_minus_p(
     without_a_cap: Certificates,
 ) -> None:
-    found = without_a_cap.unlimited
-    assert found is not None
-    mean, root_mean_square = found.at_events
+    unlimited = without_a_cap.unlimited
+    assert unlimited is not None
+    mean, root_mean_square = unlimited.at_events
     assert mean == pytest.approx(1 / (1 - P), rel=1e-6)
     assert root_mean_square == pytest.approx((1 + P) ** 0.5 / (1 - P), rel=1e-6)
-    for shorter, longer in pairwise(found.bursts):
+    for shorter, longer in pairwise(unlimited.bursts):
         assert shorter.probability < longer.probability
         assert shorter.state < longer.state
     gain = "the loop gain of the mean squares is 1.32, not below 1"
-    texts = list(sentences(replace(found, mean_squares=None, void=gain, sure_rate_per_s=None)))
+    texts = list(sentences(replace(unlimited, mean_squares=None, void=gain, sure_rate_per_s=None)))
     assert f"At every time no mean is certified: {gain}." in texts
 
 
 def test_the_bounds_of_means_are_one_table_with_rounding_up(without_a_cap: Certificates) -> None:
-    found = without_a_cap.unlimited
-    assert found is not None
-    runs = tuple(run._replace(controller_error=1.00001 + run.order) for run in found.runs)
-    assert found.mean_squares is not None
-    fixed = found.mean_squares._replace(rate_per_s=0.125, state=7.00001)
-    found = replace(found, runs=runs, mean_squares=fixed, at_events=(1.5, 2.00001))
-    table = moments_table(found, "‖W e_c‖", beta=0.5)
+    unlimited = without_a_cap.unlimited
+    assert unlimited is not None
+    runs = tuple(run._replace(controller_error=1.00001 + run.order) for run in unlimited.runs)
+    assert unlimited.mean_squares is not None
+    fixed = unlimited.mean_squares._replace(rate_per_s=0.125, state=7.00001)
+    unlimited = replace(unlimited, runs=runs, mean_squares=fixed, at_events=(1.5, 2.00001))
+    table = moments_table(unlimited, "‖W e_c‖", beta=0.5)
     assert table.headings == (
         "", "rate,\n1/s", "mean\n‖x‖", "rms\n‖x‖", "mean\n‖W e_c‖", "rms\n‖W e_c‖",
     )  # fmt: skip
@@ -239,14 +239,14 @@ def test_a_run_of_the_largest_number_of_events_keeps_the_assumption_as_often_as_
     without_a_cap: Certificates,
 ) -> None:
     """By 4000 sequences of losses that are drawn here."""
-    found = without_a_cap.schedule
-    assert found.inter_event_s is not None
-    packets = most_events(resolved("lane_weighted"), found.inter_event_s)
+    scheduled = without_a_cap.schedule
+    assert scheduled.inter_event_s is not None
+    packets = most_events(resolved("lane_weighted"), scheduled.inter_event_s)
     lost = np.random.default_rng(1).uniform(size=(4000, packets)) < P
     lost[:, 0] = False
     bursts = np.lib.stride_tricks.sliding_window_view(lost, MANSD + 1, axis=1)
     kept = int((~bursts.all(axis=2).any(axis=1)).sum())
-    (why,) = (one.why for one in found.assumptions if "not enforced" in one.why)
+    (why,) = (assumption.why for assumption in scheduled.assumptions if "not enforced" in assumption.why)
     stated = float(why.split("probability ")[1].split()[0])
     assert abs(kept / 4000 - stated) < 5 * (stated * (1 - stated) / 4000) ** 0.5
 
@@ -255,9 +255,9 @@ def test_there_is_no_statement_where_losses_depend_on_times_and_the_reason_is_na
     weighted: Certificates,
 ) -> None:
     limited = "network.impairments=[{kind='rate', rate_bps=1_000_000}]"
-    found = Certificates(resolved("double_integrator", *WITHOUT_CAP, limited), 2)
-    assert found.unlimited is None
-    assert found.unpredictable is not None
+    certificates = Certificates(resolved("double_integrator", *WITHOUT_CAP, limited), 2)
+    assert certificates.unlimited is None
+    assert certificates.unpredictable is not None
     assert weighted.unlimited is None
 
 
@@ -287,9 +287,9 @@ def test_a_norm_with_certificates_is_found_and_can_be_pasted(
     shows = list[Any]()
     monkeypatch.setattr("cosim.analysis.certificates.choose_weight", lambda *_: chosen.weight)
     monkeypatch.setattr("cosim.cli.command.show", lambda *given: shows.append(given))
-    invoke("certify", "lane_following", *(f"--set={one}" for one in SLOW))
-    ((_, to_json, print_text, *found),) = shows
-    print_text(Console(file=(out := StringIO()), width=100), *found)
+    invoke("certify", "lane_following", *(f"--set={setting}" for setting in SLOW))
+    ((_, to_json, print_text, *arguments),) = shows
+    print_text(Console(file=(out := StringIO()), width=100), *arguments)
     shown, document = out.getvalue(), to_json()
     pasted = shown[shown.index("\nweight = [") :].splitlines()[1:]
     rows = "".join(line.strip() for line in pasted)

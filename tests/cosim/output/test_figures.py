@@ -16,6 +16,7 @@ from matplotlib.text import Text
 import noack
 from cosim.analysis.summary.quantiles import QuantileSketch
 from cosim.output.figures import palette
+from cosim.output.figures.event_and_process_times import later_than
 from cosim.output.figures.figure_description import (
     Axis,
     FigureDescription,
@@ -31,7 +32,6 @@ from cosim.output.figures.figure_files import inline, save_figure, save_figures
 from cosim.output.figures.figure_format import figure_files
 from cosim.output.figures.figure_layout import figure_width
 from cosim.output.figures.run_figures import Trajectory, Transmissions, run_figures, states_figure
-from cosim.output.figures.timing_figures import later_than
 from cosim.output.run_tables import key_numbers
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
@@ -67,13 +67,13 @@ def described(case: str) -> dict[str, FigureDescription]:
         ("certified for every plant of the uncertainty box", "x", T_S, T_S, "certified"),
         ("printed", "inter_event", T_S, T_S, "printed"),
     ]
-    found = run_figures(CASES[case](), envelopes, timed=True)
-    return {name: describe() for name, describe in found.items()}
+    figures = run_figures(CASES[case](), envelopes, timed=True)
+    return {name: describe() for name, describe in figures.items()}
 
 
 def legends(axes: Axes) -> list[Legend]:
     """The rows of the legend of axes, each of which is a legend of matplotlib."""
-    return [one for one in axes.get_children() if isinstance(one, Legend)]
+    return [child for child in axes.get_children() if isinstance(child, Legend)]
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -111,14 +111,14 @@ def test_intervals_and_fates_are_drawn_at_their_times() -> None:
     _, above, below = draw(figure).axes
     assert labels(above) == ["sent", "sent, lost"]
     assert labels(below) == ["received", "received, forced", "lost"]
-    found = {
+    points = {
         line.get_marker(): dict(zip(line.get_xdata(), line.get_ydata(), strict=True))
         for axes in (above, below)
         for line in axes.lines
         if line.get_marker() != "None"
     }
-    assert found["D"] == {3.25: 1.75}  # the first event, at 0, has no interval
-    assert found["o"] == {1.5: 1.5}  # the received update that was not forced
+    assert points["D"] == {3.25: 1.75}  # the first event, at 0, has no interval
+    assert points["o"] == {1.5: 1.5}  # the received update that was not forced
     sent, lost_ones = above.lines[1], above.lines[3]
     assert sent.get_xdata().tolist() == [1.5, 3.25]
     assert lost_ones.get_ydata().tolist() == [1.0, 1.5]
@@ -150,12 +150,12 @@ def test_the_distribution_of_lateness_is_exact_at_its_ends() -> None:
 
 @pytest.mark.parametrize("ending", ["svg", "png", "pdf"])
 def test_the_same_figure_gives_the_same_bytes(tmp_path: Path, ending: str) -> None:
-    path, found = tmp_path / f"figure.{ending}", set()
+    path, contents = tmp_path / f"figure.{ending}", set()
     for own in ({}, {"lines.linewidth": 9, "axes.titlepad": 40, "svg.hashsalt": "other"}):
         with mpl.rc_context(own):
             save_figure(norms(line(T_S, T_S)), path)
-        found.add(path.read_bytes())
-    (content,) = found
+        contents.add(path.read_bytes())
+    (content,) = contents
     for trace in (b"http://purl", b"matplotlib.org", b"dc:date", b"Software"):
         assert trace not in content
 
@@ -185,10 +185,10 @@ def clocked(content: dict[str, Any]) -> RunRecord:
 def test_the_figure_has_the_bound_the_limit_and_a_cross_where_the_bound_is_lost(
     clocked: RunRecord,
 ) -> None:
-    found = run_figures(clocked)["clocks"]()
-    assert "Largest: sensor 63.2 µs." in found.caption
-    assert "the bound was lost (sensor)" in found.caption
-    curve, cross, limit = draw(found).axes[0].lines
+    described_clocks = run_figures(clocked)["clocks"]()
+    assert "Largest: sensor 63.2 µs." in described_clocks.caption
+    assert "the bound was lost (sensor)" in described_clocks.caption
+    curve, cross, limit = draw(described_clocks).axes[0].lines
     assert np.nanmax(curve.get_ydata()) == pytest.approx(SENSOR_NS * 1e-3)
     assert cross.get_xdata().tolist() == pytest.approx([FIRST_LOST * 0.05])
     assert set(limit.get_ydata()) == {ALLOWED_US}

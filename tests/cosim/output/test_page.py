@@ -90,9 +90,9 @@ def written(record: RunRecord, run_dir: Path, **more: Any) -> tuple[Page, RunSum
 def shown(record: RunRecord, **more: Any) -> str:
     """The text of a report without figures, which take most of the time."""
     html = page(Report(summary_of(record, **more), record.scenario, 0))
-    found = Page(html)
-    check(found, html)
-    return found.text
+    parsed = Page(html)
+    check(parsed, html)
+    return parsed.text
 
 
 def check(parsed: Page, html: str) -> None:
@@ -108,10 +108,10 @@ def check(parsed: Page, html: str) -> None:
                 assert value is not None
                 assert value.startswith(("#", "data:image/png")), value
             if value is not None:
-                for found in re.findall(r"url\(([^)]*)\)", value):
-                    assert found.startswith("#"), found
-                for found in re.findall(r"(?:url\(|^)#([^)]+)", value if name != "style" else ""):
-                    assert found in ids, found
+                for address in re.findall(r"url\(([^)]*)\)", value):
+                    assert address.startswith("#"), address
+                for target in re.findall(r"(?:url\(|^)#([^)]+)", value if name != "style" else ""):
+                    assert target in ids, target
     assert not re.search(r"@import|url\(", html.partition("<style>")[2].partition("</style>")[0])
     for attributes in parsed.attributes("svg"):
         assert attributes["role"] == "img"
@@ -179,8 +179,8 @@ def test_nothing_is_cut_or_too_small_to_read_on_any_screen(record: RunRecord, tm
         for width in (390, 768, 847, 849, 1366, 1920):
             size = {"width": width, "height": 844, "deviceScaleFactor": 1, "mobile": False}
             browser.call("Emulation.setDeviceMetricsOverride", **size)
-            found = browser.call("Runtime.evaluate", expression=OUTSIDE, returnByValue=True)["result"]
-            assert found["value"] == [len(FIGURES + TIMED), 0, 0, 0, 0, ""], width
+            outside = browser.call("Runtime.evaluate", expression=OUTSIDE, returnByValue=True)["result"]
+            assert outside["value"] == [len(FIGURES + TIMED), 0, 0, 0, 0, ""], width
 
 
 def test_user_text_is_escaped(content: dict[str, Any], tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from cosim.analysis.summary.run_summary import Outcome
 from cosim.analysis.summary.summary_model import Claim
 from cosim.live.finalize import finalize
 from cosim.output.run_tables import short_numbers
-from cosim.output.run_verdict import BAD, remarks, state_text, verdict
+from cosim.output.run_verdict import Tone, remarks, state_text, verdict
 from cosim.simulation.virtual_time import simulate_run
 from tests.helpers.approved import compare_lines
 from tests.helpers.shipped import shipped
@@ -33,9 +33,9 @@ def test_the_second_line_states_whether_the_guarantee_was_kept(outcome: Outcome)
 
     def stated(line: str) -> list[str]:
         changed = json.loads(line)
-        changed["claims"] = [claim(**one) for one in changed["claims"]]
-        text, style = verdict(with_values(outcome.summary, **changed))[1]
-        return [f"{style}: {text}"]
+        changed["claims"] = [claim(**changes) for changes in changed["claims"]]
+        text, tone = verdict(with_values(outcome.summary, **changed))[1]
+        return [f"{tone}: {text}"]
 
     compare_lines(Path(__file__).with_name("approved") / "verdicts.txt", stated)
 
@@ -82,14 +82,14 @@ def test_the_verdict_of_several_loops_counts_them() -> None:
     name = loops[2].name
     assert broken == (
         f"guarantee broken in 1 of 4 loops, since 1.000 s: {name}: violated: a",
-        BAD,
+        Tone.BAD,
     )
 
 
 def test_a_run_across_hosts_names_the_firewall_the_network_and_what_to_collect(
     outcome: Outcome,
 ) -> None:
-    found: dict[str, Any] = {
+    values: dict[str, Any] = {
         "kind": "live", "unintended_losses": 3, "unintended_losses_by_leg": {"actuation": 3},
         "assumption_violations": [LATE],
         "claims": [claim("void", why=LATE["what"])], "replay": {"complete": False, "bit_exact": None},
@@ -98,9 +98,9 @@ def test_a_run_across_hosts_names_the_firewall_the_network_and_what_to_collect(
     def texts(clock_error_s: float | None) -> str:
         conditions = dict.fromkeys(("dropouts", "sampling_s", "delay_s", "hold_s", "start_s"))
         summary = with_values(
-            outcome.summary, conditions=conditions | {"clock_error_s": clock_error_s}, **found
+            outcome.summary, conditions=conditions | {"clock_error_s": clock_error_s}, **values
         )
-        return "\n".join(one.text for one in remarks(summary))
+        return "\n".join(remark.text for remark in remarks(summary))
 
     across, alone = texts(1e-4), texts(None)
     for named in ("firewalls must pass", "the network between hosts was later", "noack collect"):

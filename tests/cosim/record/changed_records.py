@@ -36,4 +36,4 @@ def flipped(record: RunRecord, table: str, row: int, column: str, bit: int) -> R
 
 def identity_residual(record: RunRecord) -> Reals:
     """The residual of (I1) at each measurement of a run, (k,)."""
-    return np.concatenate([one.residual for one in bounded_parts(record)])
+    return np.concatenate([part.residual for part in bounded_parts(record)])

@@ -53,8 +53,8 @@ def test_the_cap_in_force_holds_for_losses_that_change() -> None:
     changes = [(0, often), (500 * MS, {"network.mansd": 1}), (1_003 * MS, worst)]
     record = run_with([*changes, (1_500 * MS, {"network.mansd": 5}), (2_000 * MS, often)])
     assert len(changes_of(record)) == 5
-    found = replay(record)
-    assert (found.bit_exact, found.gaps) == (True, [])
+    replayed = replay(record)
+    assert (replayed.bit_exact, replayed.gaps) == (True, [])
     scale = float(np.abs(align_tables(record).x_s).max())
     assert np.nanmax(identity_residual(record)) <= 1e-12 * max(scale, 1.0)
     assert summarise_loop(record, 0, "horizon").to_json()["assumption_violations"] == []
@@ -72,7 +72,7 @@ def test_dropouts_are_compared_with_the_cap_of_their_time() -> None:
 
     def delivered(sequence: int, t_ns: int) -> list[str]:
         message = Message(Flow.UPDATE, sequence, t_ns, np.zeros(2))
-        return [one.text for one in controller.handle(message, t_ns) if isinstance(one, Notice)]
+        return [output.text for output in controller.handle(message, t_ns) if isinstance(output, Notice)]
 
     assert delivered(0, 0) == []
     controller.announce(ParameterChange(0, 50 * MS, {"network.mansd": 1}), 0)
@@ -92,7 +92,7 @@ def test_a_restarted_process_applies_the_parameters_in_force() -> None:
     x = np.array([1.0, 0.0])
     sensor.handle(Message(Flow.MEASUREMENT, 0, 2_000 * MS, x), 2_000 * MS)
     outputs = sensor.handle(Message(Flow.MEASUREMENT, 1, 2_010 * MS, x), 2_010 * MS)
-    (row,) = [one.row for one in outputs if isinstance(one, Record)]
+    (row,) = [output.row for output in outputs if isinstance(output, Record)]
     loop, x_r = loop_of(resolved), np.array([2.0, 0.0])
     assert row[8] == pytest.approx(0.5 * np.exp(-0.25 * 2.01))
     rate = (row[5] - x) / 0.01
@@ -103,13 +103,13 @@ def test_a_change_received_too_late_is_reported_and_voids_its_claims() -> None:
     """The controller receives at 1 s a change that applies from 0.9 s on."""
     resolved = resolve(validate(CONTENT, "here"))
     change = ParameterChange(0, 900 * MS, {"controller.setpoint": [2.0, 0.0]})
-    told_ns = {"sensor": 500 * MS, "netem": 500 * MS, "controller": 1_000 * MS}
+    announced_ns = {"sensor": 500 * MS, "netem": 500 * MS, "controller": 1_000 * MS}
     scheduler = EventScheduler(resolved, (resolved,))
     for now_ns in scheduler.steps():
-        for role in [role for role, at_ns in told_ns.items() if at_ns <= now_ns]:
+        for role in [role for role, at_ns in announced_ns.items() if at_ns <= now_ns]:
             machine: Any = scheduler.machines[role]
             scheduler.emit(role, machine.announce(change, now_ns))
-            del told_ns[role]
+            del announced_ns[role]
     record = scheduler.record()
     assert replay(record).bit_exact
     (made,) = changes_of(record)
@@ -118,8 +118,8 @@ def test_a_change_received_too_late_is_reported_and_voids_its_claims() -> None:
     (violation,) = summarise_loop(record, 0, "horizon").to_json()["assumption_violations"]
     assert "change received too late" in violation["what"]
     assert violation["process"] == "controller"
-    claims = [one for one in RunClaims(record).evaluate() if one.source == "(I1)"]
-    assert [one.verdict for one in claims] == [ClaimVerdict.HELD] * 4
+    claims = [claim for claim in RunClaims(record).evaluate() if claim.source == "(I1)"]
+    assert [claim.verdict for claim in claims] == [ClaimVerdict.HELD] * 4
     assert claims[0].until_s == 0.9
     assert claims[-1].from_s > made.everywhere_ns * 1e-9
     # In between, only one of the two models had the change.
@@ -137,6 +137,6 @@ def test_a_network_that_knows_of_no_change_or_of_another_is_found() -> None:
     settings = record[NETEM_SETTING].copy()
     settings["t_ns"] += 1
     settings["since_ns"] += 1
-    found = replay(changed(record, {NETEM_SETTING: settings})).first_difference
-    assert found is not None
-    assert found.what == "another process received another change"
+    difference = replay(changed(record, {NETEM_SETTING: settings})).first_difference
+    assert difference is not None
+    assert difference.what == "another process received another change"

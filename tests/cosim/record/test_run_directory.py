@@ -175,7 +175,7 @@ TEXT = " ".join(DOCS.read_text(encoding="utf-8").split())
 
 
 def markdown(columns: tuple[Column, ...]) -> str:
-    lines = [f"| `{one.name}` | {one.unit} | {one.meaning} |" for one in columns]
+    lines = [f"| `{column.name}` | {column.unit} | {column.meaning} |" for column in columns]
     return " ".join(" ".join(["| column | unit | meaning |", "|---|---|---|", *lines]).split())
 
 

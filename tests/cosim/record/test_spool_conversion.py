@@ -39,10 +39,10 @@ def shared(content: dict[str, Any]) -> RecordedRun:
 
 def mixed_rows(shared: RecordedRun) -> Mapping[str, Rows]:
     """All rows by table, as the processes emit them: with the loop's number, in order of time."""
-    found = {}
+    by_table = {}
     for table, dtype in run_tables(shared.scenario).items():
         if table in network_tables():
-            found[table] = shared.network[table]
+            by_table[table] = shared.network[table]
             continue
         parts = []
         for number, loop in enumerate(shared.loops):
@@ -52,8 +52,8 @@ def mixed_rows(shared: RecordedRun) -> Mapping[str, Rows]:
                 rows[name] = loop[table][name]
             parts.append(rows)
         rows = np.concatenate(parts)
-        found[table] = rows[np.argsort(rows["now_ns"], kind="stable")]
-    return found
+        by_table[table] = rows[np.argsort(rows["now_ns"], kind="stable")]
+    return by_table
 
 
 def spool(run_dir: Path, table: str, rows: Rows, *, writer: str = "recorder") -> None:
@@ -78,9 +78,9 @@ def same_rows(run_dir: Path, shared: RecordedRun, early: Mapping[str, int] | Non
         written.extend(tables)
         return map(function, tables)
 
-    found = finish_record(run_dir, each, early)
+    finished = finish_record(run_dir, each, early)
     for record, expected in zip(
-        (found.network, *load_run(run_dir).loops), (shared.network, *shared.loops), strict=True
+        (finished.network, *load_run(run_dir).loops), (shared.network, *shared.loops), strict=True
     ):
         for table in expected.tables:
             assert record[table].tobytes() == expected[table].tobytes(), table
@@ -112,7 +112,7 @@ def test_every_row_and_line_reaches_the_record_of_its_loop(shared: RecordedRun, 
     for record, expected in zip(run.loops, shared.loops, strict=True):
         assert (record.kind, record.number) == ("live", expected.number)
         assert record.scenario == expected.scenario
-    lines = [[line["text"] for line in one.notices] for one in run.loops]
+    lines = [[line["text"] for line in loop.notices] for loop in run.loops]
     assert lines == [["all"], ["mine", "all"], ["all"]]
     assert [line["text"] for line in run.network.notices] == ["all"]
     assert not (run_dir / SPOOL).exists()
@@ -123,18 +123,18 @@ def test_an_interrupted_attempt_is_repeated_and_later_rows_are_added(
 ) -> None:
     run_dir = opened(shared, tmp_path / "run")
     rows = mixed_rows(shared)
-    later = {table: found[len(found) // 2 :] for table, found in rows.items()}
-    for table, found in rows.items():
-        spool(run_dir, table, found[: len(found) // 2])
+    later = {table: batch[len(batch) // 2 :] for table, batch in rows.items()}
+    for table, batch in rows.items():
+        spool(run_dir, table, batch[: len(batch) // 2])
     with monkeypatch.context() as patch:
         patch.setattr("cosim.record.table_files.write_table", _fail)
         with pytest.raises(MachineError, match="is kept in"):
             finish_record(run_dir)
     finish_record(run_dir)
-    counts = [one.count(PLANT_STEP) for one in load_run(run_dir).loops]
+    counts = [loop.count(PLANT_STEP) for loop in load_run(run_dir).loops]
     assert sum(counts) == len(rows[PLANT_STEP]) // 2
-    for table, found in later.items():  # a process that was frozen spools its rows after the end
-        spool(run_dir, table, found, writer="frozen")
+    for table, batch in later.items():  # a process that was frozen spools its rows after the end
+        spool(run_dir, table, batch, writer="frozen")
     same_rows(run_dir, shared)
 
 
@@ -155,8 +155,8 @@ def test_tables_written_during_the_run_have_the_same_rows(
             (run_dir / SPOOL / EARLY / EARLY_ENDED).touch()
             return
         until = 10**6 if first == 300 and kind != "rows afterwards" else first + 50
-        for table, found in rows.items():
-            out.append(table, first, found[first:until].tobytes())
+        for table, batch in rows.items():
+            out.append(table, first, batch[first:until].tobytes())
 
     monkeypatch.setattr("cosim.record.spool_conversion.time.sleep", more)
     monkeypatch.setattr("cosim.record.spool_conversion._SLICE_BYTES", 10_000)
@@ -166,14 +166,14 @@ def test_tables_written_during_the_run_have_the_same_rows(
         with pytest.raises(ValueError, match="missing"):
             write_early(run_dir)
         assert not [*(run_dir / SPOOL / EARLY).iterdir()]
-        for table, found in rows.items():
-            spool(run_dir, table, found[100:150], writer="sensor")
+        for table, batch in rows.items():
+            spool(run_dir, table, batch[100:150], writer="sensor")
     else:
         early = write_early(run_dir)
         assert {file.stem for file in (run_dir / SPOOL / EARLY).iterdir()} > early.keys()
     if kind == "rows afterwards":
-        for table, found in rows.items():
-            spool(run_dir, table, found[350:], writer="frozen")
+        for table, batch in rows.items():
+            spool(run_dir, table, batch[350:], writer="frozen")
     out.close()
     written = same_rows(run_dir, shared, early)
     assert (PLANT_STEP in written) == (kind in ("a batch less", "rows afterwards"))
@@ -192,9 +192,9 @@ def test_a_loops_reports_count_its_own_rows_and_datagrams(shared: RecordedRun, t
     run_dir = opened(shared, tmp_path / "run")
     rows = dict(mixed_rows(shared))
     rows[NETEM_PACKET] = rows[NETEM_PACKET][:-1]
-    for table, found in rows.items():
-        spool(run_dir, table, found)
-    steps = [one.count(PLANT_STEP) for one in shared.loops]
+    for table, batch in rows.items():
+        spool(run_dir, table, batch)
+    steps = [loop.count(PLANT_STEP) for loop in shared.loops]
     own = [{"accepted": number, "rejected": {"stale": number}} for number in range(LOOPS)]
     plant = {
         "ended": "horizon",

@@ -172,7 +172,7 @@ class EventScheduler:
         }
         reports: dict[str, Any] = {}
         for role in LOOP_ROLES:
-            owned = {table: len(found) for table, found in rows.items() if OWNER[table] == role}
+            owned = {table: len(batch) for table, batch in rows.items() if OWNER[table] == role}
             channel = {"rejected": {}} if role == "netem" else self.decoders[role][0].report()
             reports[role] = {"ended": HORIZON, "channel": channel, "rows": owned}
         if scenario.protocol.acknowledges:

@@ -168,8 +168,8 @@ def value_of(form: QuadraticForm, z: Vector) -> float:
 def pieces(run: ContinuousRun) -> list[tuple[Any, float, float]]:
     """State after the last event, start time and end time of each piece."""
     spans_s = pairwise([0.0, *run.event_s, run.reached_s])
-    found = zip((run.start, *run.after), spans_s, strict=True)
-    return [(state, begin_s, end_s) for state, (begin_s, end_s) in found if end_s > begin_s]
+    segments = zip((run.start, *run.after), spans_s, strict=True)
+    return [(state, begin_s, end_s) for state, (begin_s, end_s) in segments if end_s > begin_s]
 
 
 def cost_of(run: ContinuousRun, setting: Setting) -> float:

@@ -54,7 +54,7 @@ class Frozen:
         return self._machine.handle(message, now_ns)
 
     def on_timer(self, now_ns: int) -> Sequence[Any]:
-        late = [out for one in self._waiting for out in self._machine.handle(one, now_ns)]
+        late = [out for message in self._waiting for out in self._machine.handle(message, now_ns)]
         self._waiting = []
         return [*late, *self._machine.on_timer(now_ns)]
 
@@ -118,7 +118,7 @@ def simulate_with(
 def with_outage(resolved: Scenario, from_s: float, until_s: float) -> RunRecord:
     """Simulate a scenario; its controller stands still from ``from_s`` to ``until_s``."""
     from_ns, until_ns = round(from_s * 1e9), round(until_s * 1e9)
-    return simulate_with(resolved, "controller", lambda one: Frozen(one, from_ns, until_ns))
+    return simulate_with(resolved, "controller", lambda machine: Frozen(machine, from_ns, until_ns))
 
 
 def at_the_end(name: str, mode: str, policy: str, lasts_s: float) -> float:
@@ -137,8 +137,8 @@ def at_the_end(name: str, mode: str, policy: str, lasts_s: float) -> float:
 
 def row(name: str, mode: str, lasts_s: float) -> str:
     """A row of the table: an outage of ``lasts_s`` under each policy."""
-    found = [at_the_end(name, mode, policy, lasts_s) for policy in (NO_OUTAGE, *POLICIES)]
-    numbers = " | ".join(f"{norm:.2g}" for norm in found)
+    norms = [at_the_end(name, mode, policy, lasts_s) for policy in (NO_OUTAGE, *POLICIES)]
+    numbers = " | ".join(f"{norm:.2g}" for norm in norms)
     return f"| `{name}`, `{mode}` | {lasts_s:g} s | {numbers} |"
 
 

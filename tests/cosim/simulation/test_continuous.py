@@ -186,19 +186,19 @@ def test_samples_at_the_time_of_an_event_are_those_after_it() -> None:
 
 def test_a_loop_that_cannot_be_simulated_to_the_end_is_reported() -> None:
     """ẋ = 100 x, equal to the model: no event; e^{100t} = 1e100 · 0.5 e^{−0.25t} at the end."""
-    one = np.ones((1, 1))
-    loop = loop_with(100 * one, one, 0 * one, 100 * one, np.ones(1))
+    unit = np.ones((1, 1))
+    loop = loop_with(100 * unit, unit, 0 * unit, 100 * unit, np.ones(1))
     run = Case(loop, decaying_rule(0.5, 0.25, n=1), [False], True, 50.0).run()
     assert run.diverged_at_s == pytest.approx(math.log(0.5e100) / 100.25, rel=1e-12)
     assert run.event_s.size == 0
     assert np.isfinite(run.at([0.0, run.reached_s]).x).all()
-    growing = loop_with(one, one, 0 * one, 0 * one, np.ones(1))
+    growing = loop_with(unit, unit, 0 * unit, 0 * unit, np.ones(1))
     with pytest.raises(TooManyEventsError, match="accumulate"):
         simulate_continuous(
             ContinuousLoop(growing, decaying_rule(0.5, 1.0, n=1)), horizon_s=1e6, delivered=[],
             known_start=True, max_events=50,
         )  # fmt: skip
-    decaying = loop_with(-one, one, 0 * one, -one, np.ones(1))
+    decaying = loop_with(-unit, unit, 0 * unit, -unit, np.ones(1))
     with pytest.raises(CallerError, match="floor"):  # the threshold vanishes
         Case(decaying, decaying_rule(0.5, 1.0, n=1), [False], True, 1e4).run()
     floored = Case(decaying, decaying_rule(0.5, 1.0, 1e-9, n=1), [False], True, 1e4)
@@ -226,8 +226,8 @@ def test_the_fates_are_those_of_the_simulated_network(resolved: Scenario) -> Non
 
 def test_the_json_document_agrees_with_the_run(resolved: Scenario) -> None:
     run = run_continuous(resolved)
-    found = json.loads(json.dumps(document(run, resolved), allow_nan=False))
-    summary, events, samples = found["summary"], found["events"], found["samples"]
+    content = json.loads(json.dumps(document(run, resolved), allow_nan=False))
+    summary, events, samples = content["summary"], content["events"], content["samples"]
     assert summary["events"] == len(events) == len(run.before) > 5
     assert summary["deliveries"] == sum(event["delivered"] for event in events)
     assert summary["drops"] == summary["events"] - summary["deliveries"]

@@ -70,7 +70,7 @@ def test_loops_of_different_sizes_run_as_by_the_plain_driver() -> None:
         "impairments": [rate, IMPAIRMENTS[1]], "actuation": {"impairments": IMPAIRMENTS},
     }  # fmt: skip
     scenario = validate(given | {"network": network, "loops": LOOPS}, "")
-    scheduler = EventScheduler(scenario, [resolve(one) for one in loops_of(scenario)], numbered=True)
+    scheduler = EventScheduler(scenario, [resolve(loop) for loop in loops_of(scenario)], numbered=True)
     scheduler.run()
     simulated = simulate_loops(scenario)
     for table in ("netem_packet", "netem_release"):

@@ -38,7 +38,7 @@ def runs(simulated: list[noack.Run]) -> list[Path]:
 
 
 @pytest.fixture(scope="module")
-def found(runs: list[Path]) -> RunComparison:
+def comparison(runs: list[Path]) -> RunComparison:
     return compare_runs(runs)
 
 
@@ -46,30 +46,30 @@ def compare(*words: object) -> Result:
     return invoke("compare", *words)
 
 
-def number(found: RunComparison, name: str) -> KeyNumber:
-    return next(one for one in found.numbers if one.name == name)
+def number(comparison: RunComparison, name: str) -> KeyNumber:
+    return next(key_number for key_number in comparison.numbers if key_number.name == name)
 
 
 def test_numbers_are_those_of_the_summaries_with_differences_to_the_first_run(
-    found: RunComparison,
+    comparison: RunComparison,
 ) -> None:
-    assert found.settings["mode"] == ("model", "zoh", "model")
-    assert found.settings["plant.rate_hz"] == ("500.0", "500.0", "250.0")
-    assert "trigger.beta" not in found.settings
-    events = tuple(run.loop.events for run in found.runs)
-    assert number(found, "transmissions").values == events
-    assert number(found, "transmissions").differences == (0, *(n - events[0] for n in events[1:]))
-    for run, share in zip(found.runs, number(found, "loss rate, %").values, strict=True):
+    assert comparison.settings["mode"] == ("model", "zoh", "model")
+    assert comparison.settings["plant.rate_hz"] == ("500.0", "500.0", "250.0")
+    assert "trigger.beta" not in comparison.settings
+    events = tuple(run.loop.events for run in comparison.runs)
+    assert number(comparison, "transmissions").values == events
+    assert number(comparison, "transmissions").differences == (0, *(n - events[0] for n in events[1:]))
+    for run, share in zip(comparison.runs, number(comparison, "loss rate, %").values, strict=True):
         crossed = run.loop.drops + run.loop.deliveries
         assert share == pytest.approx(100 * run.loop.drops / crossed)
 
 
-def test_the_distance_is_over_the_common_times(found: RunComparison) -> None:
+def test_the_distance_is_over_the_common_times(comparison: RunComparison) -> None:
     """The third run takes every second step of the first, for two of its three seconds."""
-    first, _, third = (run.record[PLANT_STEP] for run in found.runs)
+    first, _, third = (run.record[PLANT_STEP] for run in comparison.runs)
     assert len(third) == 501
     apart = np.linalg.norm(third["x"] - first["x"][:1001:2], axis=1)
-    rms, largest = (number(found, f"distance in x to A, {name}") for name in ("RMS", "maximum"))
+    rms, largest = (number(comparison, f"distance in x to A, {name}") for name in ("RMS", "maximum"))
     assert rms.values[0] is largest.values[0] is None
     assert rms.values[2] == pytest.approx(np.sqrt(np.mean(apart**2)))
     assert largest.values[2] == pytest.approx(apart.max())
@@ -116,8 +116,8 @@ def test_runs_that_cannot_be_compared_give_one_line(runs: list[Path], tmp_path: 
 
 
 def test_a_diverged_run_is_overlaid_up_to_its_end(runs: list[Path], tmp_path: Path) -> None:
-    found = compare_runs(runs[:2])
-    found.runs[1].record[PLANT_STEP]["x"][700:] = np.nan
-    assert all(one.name != "distance in x to A, RMS" for one in found.numbers)
-    found.save(tmp_path / "a.png")
+    comparison = compare_runs(runs[:2])
+    comparison.runs[1].record[PLANT_STEP]["x"][700:] = np.nan
+    assert all(key_number.name != "distance in x to A, RMS" for key_number in comparison.numbers)
+    comparison.save(tmp_path / "a.png")
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")

@@ -49,10 +49,10 @@ def controller_error_from_events(
     missing = f"(1 + Σ_(i<j) sup_(τ≥iδ) {growth}) β̃e^(−αt), j events missing"
     formula = f"{norm_text(run, 'e_c')} ≤ {missing}"
     void = run.violation_of(certificate)
-    label, common = "bound, given the updates missing now", samples.in_common
+    label = "bound, given the updates missing now"
     return ClaimBound(
         controller_error_bound(run, samples, formula, values, void=void),
-        Envelope(label, "e_c", samples.t_s, np.where(common, values, np.nan)),
+        Envelope(label, "e_c", samples.t_s, np.where(samples.is_bounded, values, np.nan)),
     )
 
 

@@ -44,7 +44,7 @@ def i1_controller_error(run: RunEvidence, samples: Samples) -> ClaimBound:
 @claim("x_c − x_s is the sum of the missed jumps", "(I1)", _COMPLETE)
 def i1_model_difference(run: RunEvidence, samples: Samples) -> ClaimBound:
     """(I1) itself, up to rounding."""
-    here, margin = samples.in_common, _margin(run)
+    here, margin = samples.is_bounded, _margin(run)
     residual = samples.residual[here]
     # Use the larger model state, since a missed update may have moved x_c far from x_s.
     scale = max(run.facts.largest_state + run.part.offset, float(np.finfo(float).tiny))

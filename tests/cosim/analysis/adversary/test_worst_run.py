@@ -59,9 +59,9 @@ def test_the_certified_cost_is_the_integral_of_the_squared_bound(floor: float) -
     scenario, horizon_s = resolved("double_integrator", f"trigger.floor={floor}"), 30.0
     certificate = certify(scenario, ideal_conditions(scenario))
     measure = measure_of(continuous_loop_of(scenario), Objective.COST)
-    found = certified_value(certificate, measure, horizon_s, ObjectiveValue(1.0, None))
+    certified = certified_value(certificate, measure, horizon_s, ObjectiveValue(1.0, None))
     kink_s = [certificate.floor_from_s] if floor else None
     expected, error = quad(
         lambda t: certificate.state(np.array([t]))[0] ** 2, 0, horizon_s, points=kink_s, limit=200
     )
-    assert found == pytest.approx(expected, abs=10 * error)
+    assert certified == pytest.approx(expected, abs=10 * error)

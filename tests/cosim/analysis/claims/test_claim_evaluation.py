@@ -189,7 +189,7 @@ def test_no_claim_is_violated_at_a_set_point(name: str, settings: list[str]) -> 
     verdicts = {claim.verdict for claim in claims}
     assert VIOLATED not in verdicts
     assert HELD in verdicts
-    if any(policy in one for one in settings for policy in ("periodic", "relative", "mixed")):
+    if any(policy in setting for setting in settings for policy in ("periodic", "relative", "mixed")):
         certified = [claim.verdict for claim in claims if claim.source == "certificate"]
         assert set(certified) == {HELD}
 
@@ -302,19 +302,19 @@ def test_a_plant_that_does_not_rest_at_the_set_point_has_a_constant_disturbance(
 def test_formulas_have_the_weight_of_the_triggers_norm(name: str, norms: set[str]) -> None:
     claims = RunClaims(simulate(resolved(name, "horizon_s=2"))).evaluate()
     bounded = [re.match(r"‖(W?) ?e_[cs]‖ ≤", claim.bound) for claim in claims]
-    found = [match[1] for match in bounded if match]
-    assert len(found) > 5
-    assert set(found) == norms
+    bounded_norms = [match[1] for match in bounded if match]
+    assert len(bounded_norms) > 5
+    assert set(bounded_norms) == norms
 
 
 def test_a_part_is_void_with_the_reason() -> None:
     late = run_with((5.995, {"trigger.beta": 0.04}))
-    deaf = run_with((2.005, {"trigger.beta": 0.04}))
-    deaf = changed(deaf, {CONTROLLER_SETTING: deaf[CONTROLLER_SETTING][:0]})
+    not_announced = run_with((2.005, {"trigger.beta": 0.04}))
+    not_announced = changed(not_announced, {CONTROLLER_SETTING: not_announced[CONTROLLER_SETTING][:0]})
     far = run_with((2.005, {"trigger.beta": 1e-6}))
     for record, since_s, why in (
         (late, 5.995, "no update was delivered after it"),
-        (deaf, 2.005, "not every process received the change"),
+        (not_announced, 2.005, "not every process received the change"),
         (far, None, "from Kx"),
     ):
         after = [claim for claim in RunClaims(record).evaluate() if claim.from_s > 0]

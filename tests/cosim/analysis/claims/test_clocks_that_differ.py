@@ -79,7 +79,7 @@ def test_every_claim_holds_whatever_the_clocks(make: Make, delay_s: float) -> No
         }
         record = simulated(scenario, clocks)
         claims = ClaimEvaluation(record)
-        verdicts = {one.verdict for one in claims.evaluate() if one.source == "certificate"}
+        verdicts = {claim.verdict for claim in claims.evaluate() if claim.source == "certificate"}
         assert verdicts == {ClaimVerdict.HELD}, clocks
         seen.add(claims.certified_for is not None)
         assert replay(record).bit_exact
@@ -185,8 +185,8 @@ def test_each_of_several_loops_has_the_rows_in_its_own_time() -> None:
     table, phases_ns = CLOCK_TABLES[0], (0, 7)
     rows = np.zeros(2, tables(1, 1, clocks=True)[table])
     rows["t_ns"] = 10, 20
-    found = dict(rows_by_loop(table, rows, phases_ns, [{table: rows.dtype}] * 2))
-    assert [one["t_ns"].tolist() for one in found.values()] == [[10, 20], [3, 13]]
+    by_loop = dict(rows_by_loop(table, rows, phases_ns, [{table: rows.dtype}] * 2))
+    assert [loop_rows["t_ns"].tolist() for loop_rows in by_loop.values()] == [[10, 20], [3, 13]]
 
 
 def test_the_claims_of_a_stopped_run_end_with_it(clocked: RunRecord) -> None:
@@ -198,5 +198,5 @@ def test_the_claims_of_a_stopped_run_end_with_it(clocked: RunRecord) -> None:
     late = changed(with_errors(clocked, {("sensor_clock", 100): LOST_NS}), reports=reports)
     assert RunClaims(late).violations() == []
     early = changed(with_errors(clocked, {("sensor_clock", 50): LOST_NS}), reports=reports)
-    (one,) = RunClaims(early).violations()
-    assert one.cause == "sensor clock lost"
+    (violation,) = RunClaims(early).violations()
+    assert violation.cause == "sensor clock lost"

@@ -251,7 +251,9 @@ def test_an_update_before_the_first_tick_of_a_restarted_controller_is_replayed(
     resolved = resolve(validate(content | {"network": {"mansd": 0, "loss": {"model": "lossless"}}}, ""))
     at_ns = 500_000_000 - 300_000  # between ticks, just before an update
     successor = controller_of(resolved, Start(1, at_ns))
-    record = simulate_with(resolved, "controller", lambda one: RestartedMachine(one, successor, at_ns))
+    record = simulate_with(
+        resolved, "controller", lambda machine: RestartedMachine(machine, successor, at_ns)
+    )
     rows = {table: record[table] for table in record.tables}
     taken, again = rows[CONTROLLER_DELIVERY], rows[CONTROLLER_STEP]["input"] >= GENERATION
     first = taken[taken["input"] == GENERATION]

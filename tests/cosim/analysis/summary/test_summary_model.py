@@ -81,8 +81,8 @@ def test_a_damaged_summary_is_shown_or_detected(record: RunRecord, summary: dict
     for place in places(summary):
         for value in VALUES if place[0] != "exit" else ():  # which is read first (test_finalize)
             damaged = changed(summary, place, value)
-            if (found := read_summary(damaged)) is not None:
-                show(record, found)
+            if (readable := read_summary(damaged)) is not None:
+                show(record, readable)
                 shown += 1
     assert shown > 100  # numbers that may be missing, keys that are not shown
 
@@ -95,14 +95,14 @@ def places(value: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
         inner = value.items()
     elif isinstance(value, list):
         inner = enumerate(value[:1])
-    for key, one in inner:
-        yield from places(one, (*at, key))
+    for key, part in inner:
+        yield from places(part, (*at, key))
 
 
 def changed(summary: dict[str, Any], place: tuple[Any, ...], value: Any) -> dict[str, Any]:
     """The summary with one key replaced, removed or renamed."""
-    found: dict[str, Any] = json.loads(json.dumps(summary))  # a copy, sooner than copy.deepcopy's
-    table: Any = found
+    copied: dict[str, Any] = json.loads(json.dumps(summary))  # a copy, sooner than copy.deepcopy's
+    table: Any = copied
     for key in place[:-1]:
         table = table[key]
     before = table.pop(place[-1])
@@ -112,7 +112,7 @@ def changed(summary: dict[str, Any], place: tuple[Any, ...], value: Any) -> dict
         table[place[-1]] = value
     elif value is not DELETED:
         table.insert(place[-1], value)
-    return found
+    return copied
 
 
 def show(record: RunRecord, summary: RunSummary) -> None:
@@ -162,9 +162,10 @@ def test_restarts_and_their_missing_first_rows_are_listed(content: dict[str, Any
         {"process": "sensor", "level": RESTART, "t_ns": k * 10_000_000, "text": f"after {k}"} for k in (2, 3)
     ]
     restarted = altered(record, {SENSOR_MEASUREMENT: rows}, notices=notices, reports={})
-    found = summarise_loop(restarted, 0, "").to_json()
-    assert found["missing_by_table"]["sensor"] == 7
+    summary = summarise_loop(restarted, 0, "").to_json()
+    assert summary["missing_by_table"]["sensor"] == 7
     first_s = (rows["now_ns"][[50, 80]] * 1e-9).tolist()
-    assert {one["generation"]: (one["first_s"], one["what"]) for one in found["restarts"]} == {
+    restarts = {part["generation"]: (part["first_s"], part["what"]) for part in summary["restarts"]}
+    assert restarts == {
         1: (first_s[0], None), 2: (None, "after 2"), 3: (first_s[1], "after 3"),
     }  # fmt: skip

@@ -90,7 +90,7 @@ def test_a_live_run_serves_its_metrics_and_logs_its_events(tmp_path: Path) -> No
     assert 0 < metrics["noack_run_simulated_seconds"] <= summary["reached_s"]
     assert metrics["noack_run_events_total"] <= summary["loops"][0]["events"]
     assert metrics["noack_run_state_norm"] > 0
-    events = {one["event"]: one for one in objects(finished.stderr) if "event" in one}
+    events = {line["event"]: line for line in objects(finished.stderr) if "event" in line}
     (run_dir,) = (path for path in tmp_path.iterdir() if not path.is_symlink())
     assert events["run"]["directory"] == events["end"]["directory"] == str(run_dir)
     assert (events["end"]["status"], events["end"]["reason"]) == (0, "horizon")

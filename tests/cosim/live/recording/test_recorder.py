@@ -268,7 +268,7 @@ def test_a_violation_found_at_the_end_is_reported_unless_the_run_was_stopped(
     late.send_until(outage, 1_200_000_000)
     notices = late.finished().notices
     assert len(notices) == (not is_stopping)
-    assert [one for one in late.warnings if one] == [[one["text"]] for one in notices]
+    assert [notice for notice in late.warnings if notice] == [[notice["text"]] for notice in notices]
 
 
 def test_the_summary_lists_every_violated_assumption(outage: RunRecord) -> None:

@@ -39,40 +39,40 @@ def loops() -> noack.Run:
 
 
 def vector(table: pa.Table, name: str) -> np.ndarray:
-    names = [one for one in table.column_names if one.startswith(f"{name}_")]
-    return np.column_stack([table[one].to_numpy() for one in names])
+    names = [column for column in table.column_names if column.startswith(f"{name}_")]
+    return np.column_stack([table[column].to_numpy() for column in names])
 
 
 def messages(path: Path) -> dict[str, list[tuple[int, int, dict[str, Any]]]]:
     """Log time, publish time and content of the messages by topic, each valid by its schema."""
-    found: dict[str, list[tuple[int, int, dict[str, Any]]]] = {}
+    by_topic: dict[str, list[tuple[int, int, dict[str, Any]]]] = {}
     with path.open("rb") as file:
         for schema, channel, message in make_reader(file).iter_messages():
             assert schema is not None
             assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
             content = json.loads(message.data)
-            if not found.setdefault(channel.topic, []):
+            if not by_topic.setdefault(channel.topic, []):
                 jsonschema.validate(content, json.loads(schema.data))
-            found[channel.topic].append((message.log_time, message.publish_time, content))
-    return found
+            by_topic[channel.topic].append((message.log_time, message.publish_time, content))
+    return by_topic
 
 
 def test_a_mat_file_has_the_record(run: noack.Run, tmp_path: Path) -> None:
     path = tmp_path / "run.mat"
     assert run.export(path) == [path]
-    found = loadmat(path, simplify_cells=True)
+    stored = loadmat(path, simplify_cells=True)
     for name in run.tables:
         table = run.table(name)
         if table.num_rows:
-            assert np.array_equal(np.ravel(found[name]["t_ns"]), table["t_ns"].to_numpy())
+            assert np.array_equal(np.ravel(stored[name]["t_ns"]), table["t_ns"].to_numpy())
     steps = run.table("plant_step")
-    assert found["plant_step"]["x"].tobytes() == vector(steps, "x").tobytes()
-    assert found["plant_step"]["t_ns"].dtype == np.int64
-    assert np.array_equal(found["samples"]["e_c_norm"], run.samples()["e_c_norm"], equal_nan=True)
-    assert list(np.atleast_1d(found["events"]["fate"])) == run.events()["fate"].to_pylist()
-    assert found["summary"]["loops"]["events"] == run.summary.loops[0].events
-    assert found["loop"]["A"].shape == (4, 4)
-    assert found["certificates"]["none"].startswith("changes: needs settings that stay the same")
+    assert stored["plant_step"]["x"].tobytes() == vector(steps, "x").tobytes()
+    assert stored["plant_step"]["t_ns"].dtype == np.int64
+    assert np.array_equal(stored["samples"]["e_c_norm"], run.samples()["e_c_norm"], equal_nan=True)
+    assert list(np.atleast_1d(stored["events"]["fate"])) == run.events()["fate"].to_pylist()
+    assert stored["summary"]["loops"]["events"] == run.summary.loops[0].events
+    assert stored["loop"]["A"].shape == (4, 4)
+    assert stored["certificates"]["none"].startswith("changes: needs settings that stay the same")
     assert run.export(path)[0].read_bytes() == path.read_bytes()
 
 
@@ -83,36 +83,36 @@ def test_any_document_becomes_structures_of_a_mat_file(tmp_path: Path) -> None:
         "mixed": [[1, 2], [3]], "empty": [], "objects": [{"k": 1}, {"k": "x"}], "text": "‖x‖ é",
     }  # fmt: skip
     save_mat(content, tmp_path / "d.mat")
-    found = loadmat(tmp_path / "d.mat", simplify_cells=True)
-    assert found["a_b"].size == 0
-    assert found["a_b_2"].tolist() == [1, 2.5]
-    assert found["f_1"].tolist() == [[1, 2], [3, 4]]
-    assert found["objects"][1]["k"] == "x"
-    assert found["text"] == "‖x‖ é"
-    assert found["n" * 31] == 1
-    assert found["n" * 27 + "_2"] == 2
-    assert found["n" * 27 + "_3"] == 3
-    assert max(map(len, found)) <= 31
+    stored = loadmat(tmp_path / "d.mat", simplify_cells=True)
+    assert stored["a_b"].size == 0
+    assert stored["a_b_2"].tolist() == [1, 2.5]
+    assert stored["f_1"].tolist() == [[1, 2], [3, 4]]
+    assert stored["objects"][1]["k"] == "x"
+    assert stored["text"] == "‖x‖ é"
+    assert stored["n" * 31] == 1
+    assert stored["n" * 27 + "_2"] == 2
+    assert stored["n" * 27 + "_3"] == 3
+    assert max(map(len, stored)) <= 31
 
 
 def test_an_mcap_file_has_the_record(run: noack.Run, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     run.export(path)
-    found = messages(path)
+    by_topic = messages(path)
     for name in run.tables:
         owner, _, rest = name.partition("_")
-        assert len(found.get(f"/{owner}/{rest}", ())) == run.table(name).num_rows
+        assert len(by_topic.get(f"/{owner}/{rest}", ())) == run.table(name).num_rows
     steps = run.table("plant_step")
-    x = np.array([content["x"] for *_, content in found["/plant/step"]])
+    x = np.array([content["x"] for *_, content in by_topic["/plant/step"]])
     assert x.tobytes() == vector(steps, "x").tobytes()
-    assert [log for log, *_ in found["/plant/step"]] == steps["now_ns"].to_pylist()
-    assert [publish for _, publish, _ in found["/plant/step"]] == steps["t_ns"].to_pylist()
-    (change,) = [content["change"] for *_, content in found["/sensor/setting"]]
+    assert [log for log, *_ in by_topic["/plant/step"]] == steps["now_ns"].to_pylist()
+    assert [publish for _, publish, _ in by_topic["/plant/step"]] == steps["t_ns"].to_pylist()
+    (change,) = [content["change"] for *_, content in by_topic["/sensor/setting"]]
     assert json.loads(change)
     head = run.table("netem_packet")["head"][0].as_py().hex()
-    assert found["/netem/packet"][0][2]["head"] == head
+    assert by_topic["/netem/packet"][0][2]["head"] == head
     samples = run.samples().to_pylist()
-    for (log_ns, _, content), row in zip(found["/loop/errors"], samples, strict=True):
+    for (log_ns, _, content), row in zip(by_topic["/loop/errors"], samples, strict=True):
         assert (log_ns, content["e_s_norm"]) == (row["t_ns"], row["e_s_norm"])
         assert content["e_c_norm"] == (None if np.isnan(row["e_c_norm"]) else row["e_c_norm"])
 
@@ -138,20 +138,20 @@ def test_rerun_finds_no_fault_in_an_mcap_file(run: noack.Run, tmp_path: Path) ->
 
 
 def test_channels_of_several_loops_have_the_loops_names(loops: noack.Run, tmp_path: Path) -> None:
-    found = messages(loops.export(tmp_path / "a.mcap")[0])
+    by_topic = messages(loops.export(tmp_path / "a.mcap")[0])
     name, loop = list(loops.loops.items())[-1]
     steps = loop.table("plant_step")["now_ns"].to_pylist()
     phase_ns = phases_ns(loops.scenario)[-1]
-    times = [log - phase_ns for log, *_ in found[f"/{name}/plant/step"]]
+    times = [log - phase_ns for log, *_ in by_topic[f"/{name}/plant/step"]]
     assert phase_ns > 0
     assert times == steps
-    assert len(found["/netem/packet"]) == loops.table("netem_packet").num_rows
+    assert len(by_topic["/netem/packet"]) == loops.table("netem_packet").num_rows
     mat = loadmat(loops.export(tmp_path / "a.mat", certificates=False)[0], simplify_cells=True)
     assert mat["loops"][name.replace("-", "_")]["plant_step"]["now_ns"].tolist() == steps
     assert Path(tmp_path / "loops.csv") in loops.save_tables(tmp_path)
     plain = noack.simulate(noack.load("double_integrator", {"horizon_s": 0.1}))
-    found_mat = loadmat(plain.export(tmp_path / "plain.mat")[0], simplify_cells=True)
-    assert found_mat["certificates"]["certificates"][0]["constants"]["state"] > 0
+    plain_mat = loadmat(plain.export(tmp_path / "plain.mat")[0], simplify_cells=True)
+    assert plain_mat["certificates"]["certificates"][0]["constants"]["state"] > 0
     files = loops.export(tmp_path / "csv")
     assert tmp_path / f"csv/{name}/plant_step.csv" in files
 
@@ -162,8 +162,8 @@ def test_csv_files_have_the_tables(run: noack.Run, tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     names = {Path(file).stem for file in json.loads(done.stdout)["files"]}
     assert names == {*run.tables, "samples", "events"}
-    found = csv.read_csv(tmp_path / "csv/plant_step.csv")
-    assert found.equals(run.loops[run.scenario.name].table("plant_step"))
+    steps = csv.read_csv(tmp_path / "csv/plant_step.csv")
+    assert steps.equals(run.loops[run.scenario.name].table("plant_step"))
 
 
 def test_another_ending_and_a_missing_package_are_named(

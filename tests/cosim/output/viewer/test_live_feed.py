@@ -49,10 +49,10 @@ def shown(folder: Path, count: int, *settings: str) -> tuple[RecordedRun, Chunks
 @pytest.mark.parametrize("count", [3, 30])
 @pytest.mark.parametrize("phase", ["0.0", "0.3"])
 def test_all_loops_are_shown_as_from_the_record(tmp_path: Path, count: int, phase: str) -> None:
-    run, found, said = shown(tmp_path, count, f"controller.phase={phase}")
+    run, chunks, said = shown(tmp_path, count, f"controller.phase={phase}")
     expected = loops_over_time(run)
     for entity, values in ((ERROR, expected.errors), (SIZE, expected.states)):
-        t_ns, drawn = series(found, entity)
+        t_ns, drawn = series(chunks, entity)
         assert (np.diff(t_ns) > 0).all()
         assert len(t_ns) == INTERVALS
         curves = (values if count == 3 else quantiles(values)).T
@@ -64,13 +64,13 @@ def test_all_loops_are_shown_as_from_the_record(tmp_path: Path, count: int, phas
     horizon_ns = run.network.scenario.timing.horizon_ns
     edges_ns = np.linspace(0, horizon_ns, INTERVALS + 1)
     means, largest = counts_inside(*times_inside(run.network[NETEM_PACKET]), edges_ns)
-    np.testing.assert_allclose(series(found, QUEUE)[1], np.column_stack([largest, means]), atol=1e-6)
+    np.testing.assert_allclose(series(chunks, QUEUE)[1], np.column_stack([largest, means]), atol=1e-6)
     shares = 100 * expected.shares()[1]
     curves = (shares if count == 3 else quantiles(shares)).T
-    np.testing.assert_allclose(series(found, SHARE)[1], curves, rtol=1e-6)
-    assert (MAP in found) == (count == 30)
+    np.testing.assert_allclose(series(chunks, SHARE)[1], curves, rtol=1e-6)
+    assert (MAP in chunks) == (count == 30)
     assert not said
-    assert bp.LOG in found
+    assert bp.LOG in chunks
 
 
 def test_loops_in_detail_that_cannot_keep_up_are_given_up_and_named(
@@ -80,11 +80,11 @@ def test_loops_in_detail_that_cannot_keep_up_are_given_up_and_named(
     monkeypatch.setattr("cosim.output.viewer.live_feed._NAMED_S", 0.05)
     monkeypatch.setattr("cosim.output.viewer.live_feed._PATIENCE_S", 0.5)
     monkeypatch.setattr("cosim.output.viewer.live_feed._SHARE", 1e-4)
-    _, found, said = shown(tmp_path, 3)
+    _, chunks, said = shown(tmp_path, 3)
     assert "in detail end here" in said[-1]
-    assert len(series(found, ERROR)[0]) == INTERVALS
+    assert len(series(chunks, ERROR)[0]) == INTERVALS
     with pytest.raises(ValueError, match="at least one array"):  # nothing but static data
-        series(found, f"{bp.loop_folder('p-1')}{bp.state_path('angle')}")
+        series(chunks, f"{bp.loop_folder('p-1')}{bp.state_path('angle')}")
 
 
 SCENARIO = resolved("lane_following")
@@ -102,7 +102,7 @@ def ticks(first: int, count: int) -> np.ndarray:
 
 def received(view: Mock) -> list[tuple[int, bool]]:
     calls = [call.args for call in view.receptions.call_args_list]
-    return [one for t_ns, _, forced in calls for one in zip(t_ns, forced, strict=True)]
+    return [delivery for t_ns, _, forced in calls for delivery in zip(t_ns, forced, strict=True)]
 
 
 def test_a_delivery_is_drawn_once_the_networks_row_has_arrived() -> None:

@@ -175,8 +175,8 @@ def listening(viewer: "subprocess.Popen[str]") -> list[str]:
     process = psutil.Process(viewer.pid)
     return [
         address.laddr.ip
-        for one in (process, *process.children())
-        for address in one.net_connections("inet")
+        for member in (process, *process.children())
+        for address in member.net_connections("inet")
         if address.status == psutil.CONN_LISTEN
     ]
 

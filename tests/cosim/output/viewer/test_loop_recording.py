@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import rerun.chunk
 
-from cosim.output.viewer.blueprint import ShownLoop, over_time
+from cosim.output.viewer.blueprint import LoopLayout, over_time
 from cosim.output.viewer.loop_recording import APPLICATION_ID, LoopView, RecordingFile, ViewError
 from cosim.output.viewer.pictures.picture import Frames
 from tests.cosim.output.test_texts import compare
@@ -95,7 +95,7 @@ def test_a_disk_that_fills_during_the_run_is_reported_by_the_closing(tmp_path: P
 
 def test_a_loop_without_a_picture_has_a_panel_for_every_coordinate(tmp_path: Path) -> None:
     """Names with special characters give different entities, too."""
-    path, shown = tmp_path / "recording.rrd", ShownLoop("", ["a/b", "a b", "ψ"], ["u"])
+    path, shown = tmp_path / "recording.rrd", LoopLayout("", ["a/b", "a b", "ψ"], ["u"])
     with RecordingFile(path, "1", over_time(shown.panels(), 1.0), indexed=True) as file:
         LoopView(file, shown)
     entities = {entity for entity in read(path) if entity.startswith("state/")}

@@ -49,9 +49,9 @@ def arrays(columns: Columns) -> dict[str, list[Any]]:
 
 def pose(columns: Columns) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Positions (k, 2) with +y upwards, and counterclockwise rotation angles (k,) of a shape."""
-    found = arrays(columns)
-    place = np.array(found["translation"], dtype=float)[:, 0, :2] * (1, -1)
-    quaternion = np.array(found.get("quaternion", [[(0, 0, 0, 1)]] * len(place)))[:, 0, :]
+    values = arrays(columns)
+    place = np.array(values["translation"], dtype=float)[:, 0, :2] * (1, -1)
+    quaternion = np.array(values.get("quaternion", [[(0, 0, 0, 1)]] * len(place)))[:, 0, :]
     return place, -2 * np.arctan2(quaternion[:, 2], quaternion[:, 3])
 
 
@@ -99,15 +99,15 @@ def test_the_car_is_drawn_in_its_direction_of_travel() -> None:
 
 def rows_of(diagram: NetworkDiagram, ends_ns: list[int]) -> dict[str, dict[int, list[Any]]]:
     """The visible rows of each entity at each time."""
-    found: dict[str, dict[int, list[Any]]] = {}
+    by_entity: dict[str, dict[int, list[Any]]] = {}
     for until_ns in ends_ns:
         for entity, moving in diagram.advance(until_ns).items():
             ((values),) = arrays(moving.columns).values()
             assert (moving.t_ns <= until_ns).all()
-            rows = found.setdefault(entity, {})
+            rows = by_entity.setdefault(entity, {})
             assert not rows.keys() & set(moving.t_ns.tolist())
             rows |= dict(zip(moving.t_ns.tolist(), values, strict=True))
-    return found
+    return by_entity
 
 
 def sent(diagram: NetworkDiagram, packets: list[tuple[float, Fate]], delay_s: float = 0.0) -> NetworkDiagram:

@@ -39,13 +39,13 @@ def test_the_front_is_what_nothing_dominates(drawn: list[tuple[int, int]]) -> No
 
 
 def test_figures_and_texts_accept_infinite_single_and_many_values() -> None:
-    never, one = estimate(np.full(4, math.inf)), estimate(np.array([2.0]))
+    never, single = estimate(np.full(4, math.inf)), estimate(np.array([2.0]))
     assert estimate_text(never) == "never"
     assert estimate_text(estimate(np.array([1.0, 3.0]))) == "2 ± 13"
     assert estimate_text(estimate(np.array([-1.0, math.inf]))) == "−1 (50 % of runs)"
     many = estimate(np.geomspace(1e-9, 1e9, 50))
     drawn = []
-    for values in ([never], [never, one, many]):
+    for values in ([never], [never, single, many]):
         labels = [str(i) for i in range(len(values))]
         series = {f"series {i}": values for i in range(12)}
         pairs = {name: (values, list(reversed(values))) for name in series}
@@ -53,7 +53,7 @@ def test_figures_and_texts_accept_infinite_single_and_many_values() -> None:
             pareto_figure(pairs, "transmissions", "cost"),
             curve_figure(None, labels, series, HOSTILE, "cost"),
         ]
-    drawn.append(curve_figure(np.array([1.0]), ["1"], {"a": [one]}, "x", "settling_s"))
+    drawn.append(curve_figure(np.array([1.0]), ["1"], {"a": [single]}, "x", "settling_s"))
     for matrix in (np.full((2, 3), np.nan), np.array([[1.0, np.nan, 1e9]])):
         rows = (("x", ["a", "b", "c"]), ("y", ["d", "e"][: len(matrix)]))
         drawn.append(heat_map_figure({f"map {i}": matrix for i in range(4)}, *rows, "cost"))

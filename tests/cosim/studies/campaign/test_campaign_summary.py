@@ -20,10 +20,10 @@ from tests.helpers.approved import compare_lines, lines_of_error
 def test_a_summary_covers_all_draws_and_pairs_them(full: Store, campaign: Few) -> None:
     summary = summarise(campaign[0], full)
     rows = [point.work.run(range(7)) for point in campaign[1]]
-    for found, row in zip(summary.results, rows, strict=True):
-        assert found.estimates["cost"].mean == pytest.approx(row["cost"].mean(), rel=1e-12)
-        assert found.ended == {"finished": 7}
-    assert ["certificate_used" in found.estimates for found in summary.results] == [
+    for result, row in zip(summary.results, rows, strict=True):
+        assert result.estimates["cost"].mean == pytest.approx(row["cost"].mean(), rel=1e-12)
+        assert result.ended == {"finished": 7}
+    assert ["certificate_used" in result.estimates for result in summary.results] == [
         True, True, False, False
     ]  # fmt: skip
     assert summary.breaches == 0
@@ -47,8 +47,8 @@ def evaluated(write: Write, plan: dict[str, Any], claim: dict[str, Any], zoh: Ve
         mb = np.full(len(zoh), 10.0)
         return {"transmissions": zoh if first else mb + 5 * (point.labels["policy"] == "ZOH")}
 
-    (found,) = evaluate_claims(campaign, points, values)
-    return found
+    (claim,) = evaluate_claims(campaign, points, values)
+    return claim
 
 
 @pytest.mark.parametrize(
@@ -59,19 +59,19 @@ def test_a_verdict_follows_from_the_share_of_the_draws(
     write: Write, plan: dict[str, Any], share: float, verdict: str
 ) -> None:
     zoh = np.where(np.arange(100) < 100 * share, 11.0, 9.0)
-    found = evaluated(write, plan, MORE, zoh)
-    assert (found.share, found.verdict) == (share, verdict)
-    assert found.least_at == "beta 0.1"
-    assert "transmissions at ZOH 11" in found.medians or share <= 0.5
+    claim = evaluated(write, plan, MORE, zoh)
+    assert (claim.share, claim.verdict) == (share, verdict)
+    assert claim.least_at == "beta 0.1"
+    assert "transmissions at ZOH 11" in claim.medians or share <= 0.5
 
 
 def test_the_least_favourable_grid_point_counts_unless_it_is_left_out(
     write: Write, plan: dict[str, Any]
 ) -> None:
     fewer = MORE | {"holds": ["transmissions @ ZOH < transmissions @ MB"]}
-    found = evaluated(write, plan, fewer, np.full(4, 9.0))
-    assert (found.share, found.least, found.least_at) == (1.0, 0.0, "beta 0.3")
-    assert found.verdict == "partly"
+    claim = evaluated(write, plan, fewer, np.full(4, 9.0))
+    assert (claim.share, claim.least, claim.least_at) == (1.0, 0.0, "beta 0.3")
+    assert claim.verdict == "partly"
     plan["claims_at"] = {"beta": [0.1]}
     assert evaluated(write, plan, fewer, np.full(4, 9.0)).verdict == "confirmed"
 

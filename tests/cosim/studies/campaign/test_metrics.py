@@ -62,27 +62,27 @@ def test_metrics_without_a_value_and_of_failed_runs_are_infinite(failure: int) -
         "sup_e_c_scaled": np.array([0.5, 0.25, 0.1]),
         "status": np.array([OK, OK, failure]),
     }
-    found = compute_metrics(columns, 2.0)
-    assert found["transmissions"].tolist() == [10.0, 1.0, math.inf]
-    assert found["lost_share"].tolist() == [0.6, 0.0, math.inf]
-    assert found["settling_s"].tolist() == [1.5, math.inf, math.inf]
-    assert found["certificate_used"].tolist() == [0.25, 0.125, math.inf]
+    metrics = compute_metrics(columns, 2.0)
+    assert metrics["transmissions"].tolist() == [10.0, 1.0, math.inf]
+    assert metrics["lost_share"].tolist() == [0.6, 0.0, math.inf]
+    assert metrics["settling_s"].tolist() == [1.5, math.inf, math.inf]
+    assert metrics["certificate_used"].tolist() == [0.25, 0.125, math.inf]
     assert "certificate_used" not in compute_metrics(columns, None)
 
 
 def test_the_interval_of_a_mean_is_the_textbooks() -> None:
     values = np.array([1.0, 2.0, 4.0, 9.0])
-    found = estimate(values)
-    assert found.mean == 4.0
+    estimated = estimate(values)
+    assert estimated.mean == 4.0
     deviation = math.sqrt(((values - 4.0) ** 2).sum() / 3)
-    assert found.halfwidth == pytest.approx(student.ppf(0.975, 3) * deviation / 2, rel=1e-12)
-    assert (found.median, found.q05, found.q95, found.largest) == (2.0, 1.0, 9.0, 9.0)
+    assert estimated.halfwidth == pytest.approx(student.ppf(0.975, 3) * deviation / 2, rel=1e-12)
+    assert (estimated.median, estimated.q05, estimated.q95, estimated.largest) == (2.0, 1.0, 9.0, 9.0)
 
 
 def test_infinite_values_count_for_quantiles_and_not_for_the_mean() -> None:
-    found = estimate(np.array([3.0, math.inf, 1.0, math.inf, math.inf]))
-    assert (found.draws, found.finite, found.mean) == (5, 2, 2.0)
-    assert found.median == found.largest == math.inf
+    estimated = estimate(np.array([3.0, math.inf, 1.0, math.inf, math.inf]))
+    assert (estimated.draws, estimated.finite, estimated.mean) == (5, 2, 2.0)
+    assert estimated.median == estimated.largest == math.inf
     single = estimate(np.array([1.0]))
     assert single.halfwidth == single.median_high == math.inf
     assert estimate(np.arange(6.0)).median_high == 5.0  # 1 − 2 · 2⁻⁶ > 0.95
@@ -93,12 +93,12 @@ def test_infinite_values_count_for_quantiles_and_not_for_the_mean() -> None:
 def test_differences_are_taken_draw_by_draw() -> None:
     reference = np.array([1.0, 5.0, math.inf, math.inf, 2.0])
     values = np.array([2.0, 4.0, math.inf, 3.0, 2.0])
-    found = difference(values, reference)
-    assert found.estimate.mean == 0.0
-    assert found.estimate.finite == 3
-    assert (found.larger, found.smaller) == (0.2, 0.4)
-    assert found.estimate.q05 == -math.inf
-    assert found.estimate.median == 0.0
+    differences = difference(values, reference)
+    assert differences.estimate.mean == 0.0
+    assert differences.estimate.finite == 3
+    assert (differences.larger, differences.smaller) == (0.2, 0.4)
+    assert differences.estimate.q05 == -math.inf
+    assert differences.estimate.median == 0.0
 
 
 def at_most(j: int, count: int, share: float) -> float:
@@ -119,11 +119,11 @@ def test_the_share_of_runs_with_long_bursts_is_compared_with_its_probability() -
     loss = 'network.loss={model="bernoulli", probability=0.3}'
     settings = ("network.mansd=0", loss, "network.enforce_mansd=false")
     bursts = np.array([0.0, 1.0, 0.0, 3.0, np.inf])
-    found = burst_frequency(
+    frequency = burst_frequency(
         load_scenario(find_shipped("lane_following", "scenarios"), settings),
         {"longest_loss_burst": bursts, "transmissions": np.array([2.0, 3.0, 4.0, 5.0, np.inf])},
     )
-    assert found is not None
-    assert (found.longer, found.runs, found.packets) == (2, 4, 5)
-    assert found.predicted == pytest.approx(1 - 0.7**4)  # the first packet is delivered
-    assert found.low < 0.5 < found.high
+    assert frequency is not None
+    assert (frequency.longer, frequency.runs, frequency.packets) == (2, 4, 5)
+    assert frequency.predicted == pytest.approx(1 - 0.7**4)  # the first packet is delivered
+    assert frequency.low < 0.5 < frequency.high

@@ -41,11 +41,11 @@ print(hashlib.sha256(transition(generator, 2_000_000).tobytes()).hexdigest())
 
 def test_large_matrices_are_rounded_as_in_the_processes_of_a_run() -> None:
     """The exponential of a 66 x 66 matrix has different last bits on several threads."""
-    found = set()
+    outputs = set()
     for script, threads in ((f"import cosim.cli\n{COMPUTE}", "4"), (COMPUTE, "1")):
         environment = os.environ | {"OPENBLAS_NUM_THREADS": threads}
-        found.add(subprocess.check_output([sys.executable, "-c", script], env=environment))
-    assert len(found) == 1
+        outputs.add(subprocess.check_output([sys.executable, "-c", script], env=environment))
+    assert len(outputs) == 1
 
 
 def test_the_digest_of_the_code_has_every_package_that_a_run_imports() -> None:

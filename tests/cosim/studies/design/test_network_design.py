@@ -162,7 +162,7 @@ def test_quick_bounds_are_those_of_the_exact_maps() -> None:
         exact = LossMargin(resolve(search.scenario))
         bursts = exact.bursts(search.requirements[4].guarantee)
         quick = search.quick_loop(search.original, exact.longest_ns).maps(bursts)
-        maps = np.array([exact.maps(one.slot, one.usable_ns, one.losses).middle for one in bursts])
+        maps = np.array([exact.maps(burst.slot, burst.usable_ns, burst.losses).middle for burst in bursts])
         if not more or more == timeouts[0]:
             np.testing.assert_allclose(quick, maps, rtol=0, atol=1e-11 * np.abs(maps).max())
         stability = exact.coarse_bounds(search.requirements[4].guarantee)
