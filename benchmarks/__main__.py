@@ -1,9 +1,8 @@
 """Benchmarks, one table each: ``python -m benchmarks [NAME ...] [--json FILE]``.
 
 The modules in ``cases/`` declare them (:func:`benchmarks.report.benchmark`). ``--list`` lists
-them. The name ``goals`` stands for those with the goals of the project
-(:data:`GOAL_ROWS`); their rows are printed once more at the end, and ``--docs docs/benchmarks.md`` writes
-them into the page, between two marks.
+them. The name ``goals`` stands for those with the goals of the project (:data:`GOAL_ROWS`); their rows are printed once more at the end, and
+``--docs docs/benchmarks.md`` writes them into the page, between two marks.
 """
 
 import argparse
