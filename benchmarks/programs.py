@@ -153,7 +153,7 @@ class Sample(NamedTuple):
     """Monotonic clock."""
     rss_kib: float
     uss_kib: float
-    """Private memory, which is judged; shared memory is no leak of this process."""
+    """Private memory, which is checked; shared memory is no leak of this process."""
     fds: int
     sockets: int
     threads: int

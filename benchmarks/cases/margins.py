@@ -91,7 +91,7 @@ def random_loop(seed: int) -> RandomLoop:
         matrix = original(slot, usable_ns, losses)
         return matrix @ exactly(np.eye(len(matrix.middle[0])) * scale ** (losses + 1))
 
-    margin.maps = scaled  # type: ignore[assignment]
+    margin.maps = scaled
     return RandomLoop(margin, guarantee, f"{mode}, {GUARANTEES[number]}", wanted, scale)
 
 

@@ -129,7 +129,7 @@ def rows_of(ends: Mapping[float, End]) -> Iterator[Row]:
 def long_run(options: argparse.Namespace) -> Iterator[Row]:
     """Complete runs of several lengths, by ``noack summary``.
 
-    This writes the record, recording, summary and report, replays the run and judges its claims.
+    This writes the record, recording, summary and report, replays the run and checks its claims.
     The alternative is the end of a short run: memory should not grow with the length.
     """
     with tempfile.TemporaryDirectory(prefix="noack-long-run-") as folder:
