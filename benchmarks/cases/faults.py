@@ -36,7 +36,7 @@ from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, Message
 from noack.runtime.address import LOOPBACK
 from noack.runtime.control_messages import RunProgress
 from noack.scenario.scenario_file import load
-from tests.integration.conftest import processes_of, udp_port
+from tests.helpers.live_runs import processes_of, udp_port
 
 STEPS = {"plant": PLANT_STEP, "sensor": SENSOR_MEASUREMENT, "controller": CONTROLLER_STEP}
 """Table of each process's steps."""

@@ -24,7 +24,7 @@ from noack.protocol.roles import ROLES
 from tests.command_line import invoke
 from tests.cosim.output.viewer.recordings import read
 from tests.helpers.waiting import is_left
-from tests.integration import conftest as live
+from tests.helpers import live_runs as live
 
 Start = Callable[..., live.Running]
 LONG = [*live.AT_RATE, *live.settings(speed=4.0, horizon_s=400.0)]

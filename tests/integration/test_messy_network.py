@@ -11,8 +11,8 @@ from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import RunRecord, load_record
 from noack.protocol import record_tables
 from noack.protocol.wire_format import Flow, read_header
-from tests.integration import conftest as live
-from tests.integration.conftest import AT_RATE, Finished, assert_complete, run_scenario, settings
+from tests.helpers import live_runs as live
+from tests.helpers.live_runs import AT_RATE, Finished, assert_complete, run_scenario, settings
 
 MANSD = 2
 IMPAIRMENTS = [

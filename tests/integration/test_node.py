@@ -32,7 +32,7 @@ from noack.runtime.udp_sockets import bind
 from noack.settings.user_files import located
 from tests.command_line import invoke
 from tests.helpers.approved import lines_of_error
-from tests.integration import conftest as live
+from tests.helpers import live_runs as live
 from tests.integration.test_restarts import goes_on, spooled
 from tests.noack.runtime.drivers.live_loops import KEY, RUN_ID, Rows, scenario
 

@@ -14,7 +14,7 @@ from noack.runtime.spool import read_chunks
 from noack.scenario.resolution import run_tables
 from noack.scenario.scenario_file import load
 from noack.theory.certificates.conditions import allowed_conditions
-from tests.integration import conftest as live
+from tests.helpers import live_runs as live
 
 LOOP = ("plant_step", "sensor_measurement", "controller_step")
 KEEPS = {

@@ -35,7 +35,7 @@ from noack.protocol.record_tables import (
 from noack.protocol.roles import LOOP_ROLES
 from tests.command_line import invoke
 from tests.cosim.output.viewer.recordings import read, series
-from tests.integration.conftest import (
+from tests.helpers.live_runs import (
     AT_RATE,
     Finished,
     Running,

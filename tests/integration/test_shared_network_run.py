@@ -9,7 +9,7 @@ import pytest
 from cosim.analysis.replay import replay
 from cosim.record.run_record import load_run
 from noack.protocol.wire_format import read_header
-from tests.integration import conftest as live
+from tests.helpers import live_runs as live
 
 DIFFERENT = ("lane", "pendulum-1", "pendulum-2", "mass")
 SIZES = {"lane": 4, "pendulum-1": 2, "pendulum-2": 2, "mass": 2}

@@ -18,7 +18,7 @@ from packaging.requirements import Requirement
 
 from cosim.doctor.machine_measures import EXTRAS
 from native.build import HEADER, INTO, LIBRARY
-from tests.integration.conftest import EPHEMERAL, PATIENCE_S
+from tests.helpers.live_runs import EPHEMERAL, PATIENCE_S
 
 pytestmark = pytest.mark.builds
 ROOT = Path(__file__).parents[2]

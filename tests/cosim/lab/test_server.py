@@ -35,8 +35,8 @@ from noack.scenario.scenario_file import dumps
 from tests.cosim.record.test_spool_conversion import mixed_rows
 from tests.helpers.shipped import resolved
 from tests.helpers.summaries import alone
-from tests.integration import conftest as live
-from tests.integration.conftest import WITHOUT_VIEWER
+from tests.helpers import live_runs as live
+from tests.helpers.live_runs import WITHOUT_VIEWER
 
 UNANSWERED = {
     "computes": "while True: pass",
