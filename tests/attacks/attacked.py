@@ -145,7 +145,7 @@ def have_read(targets: list[Target], processes: Mapping[str, "subprocess.Popen[s
     """Wait until the processes have read what was sent; whether none has ended before."""
 
     def all_read() -> bool:
-        return not any(unread_bytes(processes[one.role].pid)[one.port] for one in targets)
+        return not any(unread_bytes(processes[target.role].pid)[target.port] for target in targets)
 
     try:
         wait_for(all_read)
@@ -231,7 +231,7 @@ def no_claim_is_violated(run: Attacked) -> Iterator[str]:
         yield "no envelope of the state is claimed"
     yield from (str(claim) for claim in claims if claim["verdict"] == "violated")
     violations = run.summary["loops"][0]["assumption_violations"]
-    yield from (str(one) for one in violations if one["cause"] == "dropouts")
+    yield from (str(violation) for violation in violations if violation["cause"] == "dropouts")
 
 
 CHECKS: Mapping[str, Callable[[Attacked], Iterator[str]]] = {

@@ -10,11 +10,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import psutil
 import pytest
 
-from noack.protocol.roles import LOOP_ROLES, ROLES
+from cosim.record.run_record import Rows
+from noack.protocol.roles import GENERATION, LOOP_ROLES, ROLES
 from noack.runtime.run_descriptor import RunDescriptor, loads
+from noack.runtime.spool import read_chunks
+from noack.scenario.resolution import run_tables
+from noack.scenario.scenario_file import load
 from tests.command_line import invoke
 from tests.helpers.two_hosts import TwoHosts
 from tests.helpers.waiting import PATIENCE_S, wait_for
@@ -241,6 +246,31 @@ def begun(folder: Path) -> Iterator[Callable[..., Running]]:
             return Running(runs, start(*command, *common, *arguments, runtime=folder, **more))
 
         yield begin
+
+
+KEEPS = {
+    "sensor": "sensor_measurement",
+    "controller": "controller_delivery",
+    "netem": "netem_packet",
+    "recorder": "plant_step",
+}
+
+
+def spooled(running: Running, table: str) -> Rows:
+    """Return the rows of a table that are on disk."""
+    spool = running.runs / "latest" / "spool"
+    dtype = run_tables(load(running.runs / "latest" / "scenario.toml"))[table]
+    found = [np.frombuffer(data, dtype) for _, data in read_chunks(spool, table)]
+    return np.concatenate([np.zeros(0, dtype), *found])
+
+
+def goes_on(running: Running, role: str) -> bool:
+    """Whether the restarted process of a role has recorded rows; fail if the run has ended."""
+    assert running.process.poll() is None, running.process.communicate()
+    if role == "recorder":
+        written = (running.runs / "latest" / "spool").glob("plant_step.*")
+        return sum(path.stat().st_size > 0 for path in written) > 1
+    return bool((spooled(running, KEEPS[role])["input"] >= GENERATION).any())
 
 
 AWAY = "controller"

@@ -44,8 +44,8 @@ from tests.helpers.live_runs import (
     run_scenario,
     settings,
     wait_for,
+    spooled,
 )
-from tests.integration.test_restarts import spooled
 
 CERTIFIED = "certified for the scenario's plant"
 

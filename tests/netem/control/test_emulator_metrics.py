@@ -25,24 +25,7 @@ from noack.runtime.address import address_text
 from noack.runtime.connections import metrics_server as servers
 from tests.helpers.waiting import wait_for
 from tests.netem.control.fake_relay import FakeRelay, options, press_q, read_until, terminal
-from tests.noack.runtime.connections.test_metrics_server import read, slow_reader
-
-Values = dict[str, float]
-
-
-def values_of(text: str) -> Values:
-    """The value of each sample, by its name and its labels."""
-    return {
-        ",".join([sample.name, *sorted(sample.labels.values())]): sample.value
-        for family in text_string_to_metric_families(text)
-        for sample in family.samples
-    }
-
-
-def exposed(collector: object) -> str:
-    registry = CollectorRegistry()
-    registry.register(collector)  # type: ignore[arg-type]
-    return str(generate_latest(registry).decode())
+from tests.helpers.metrics_readers import exposed, read, slow_reader, values_of
 
 
 class Fixed:

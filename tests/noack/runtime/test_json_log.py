@@ -12,16 +12,7 @@ import pytest
 from noack.core.errors import ExitStatus
 from noack.runtime.command_line import LogFormat, failed, log_event, log_format, print_to_stderr
 from tests.command_line import invoke
-
-Object = dict[str, Any]
-
-
-def objects(text: str) -> list[Object]:
-    found = [json.loads(line) for line in text.splitlines()]
-    for one in found:
-        assert {"time", "level", "source", "message"} <= one.keys()
-        assert one["time"].endswith("Z")
-    return found
+from tests.helpers.json_log import objects
 
 
 def standard_error(monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
