@@ -79,7 +79,7 @@ def doctor(
     required = machine_measures.requirements_of(resolved)
     with cli.status("measuring"):
         machine = machine_measures.measure(resolved, required, runs, seconds)
-    results = findings.judge(machine, required)
+    results = findings.find_all(machine, required)
     cli.show(
         json,
         lambda: findings.document(machine, required, results),
