@@ -22,7 +22,7 @@ from benchmarks.programs import imported_s
 from benchmarks.report import Figures, MeasurementError, Peer, Rounds, Row, benchmark, median, say
 from cosim.analysis.summary.loop_statistics import lateness_us
 from cosim.analysis.summary.summary_model import LoopSummary
-from cosim.cli import find_scenario
+from cosim.cli.options import find_scenario
 from cosim.live.finalize import finalize
 from cosim.live.launcher import launch
 from cosim.live.monitoring.run_watcher import Watcher

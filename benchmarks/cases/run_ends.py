@@ -21,7 +21,7 @@ import numpy as np
 from benchmarks.programs import NOACK, in_new_process
 from benchmarks.report import Goal, MeasurementError, Peer, Row, benchmark, say
 from cosim.analysis.replay.run_replay import stored_verdict
-from cosim.cli import find_scenario
+from cosim.cli.options import find_scenario
 from cosim.record.record_source import concatenate_rows
 from cosim.record.run_directory import RECORD, write_environment
 from cosim.record.table_files import TableFile

@@ -37,7 +37,7 @@ from benchmarks.report import (
     say,
 )
 from cosim.analysis.replay import replay
-from cosim.cli import find_scenario
+from cosim.cli.options import find_scenario
 from cosim.simulation.exact_simulation import Population, Setting, run_batch, run_with_events, setting_of
 from cosim.simulation.sampled_loop import SampledLoop, Scales
 from cosim.simulation.virtual_time import simulate, simulate_loops
