@@ -1,9 +1,9 @@
 """Benchmarks, one table each: ``python -m benchmarks [NAME ...] [--json FILE]``.
 
 The modules in ``cases/`` declare them (:func:`benchmarks.report.benchmark`). ``--list`` lists
-them. The name ``goals`` stands for those with the goals of the project
-(:data:`GOAL_ROWS`); their rows are printed once more at the end, and ``--docs docs/benchmarks.md`` writes
-them into the page, between two marks.
+them. The name ``goals`` stands for those with the goals of the project (:data:`GOAL_ROWS`);
+their rows are printed once more at the end, and ``--docs docs/benchmarks.md`` writes them into
+the page, between two marks.
 """
 
 import argparse
@@ -46,6 +46,10 @@ class GoalRow(NamedTuple):
     name: str = ""
     """Replaces the row's name."""
 
+    def matches(self, row: Row) -> bool:
+        """Whether a row of the benchmark has a matching name."""
+        return re.fullmatch(self.rows, row.name) is not None
+
 
 GOAL_ROWS = (
     GoalRow("latency", r"event → update, .*, p(50|99)"),
@@ -80,7 +84,7 @@ def all_benchmarks() -> Mapping[str, Benchmark]:
 
 
 def run(benchmarks: Mapping[str, Benchmark], arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; return 0 if all could be measured."""
+    """Run the command line; return 0 if all could be measured and all goals have rows."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("--list", action="store_true", help="list the benchmarks, and end")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows to FILE")
@@ -102,7 +106,10 @@ def run(benchmarks: Mapping[str, Benchmark], arguments: Sequence[str] | None = N
     for benchmark in (benchmark for name, benchmark in benchmarks.items() if name in chosen):
         rows_of_one, failed = _measure(benchmark, options)
         rows += [(benchmark.name, row) for row in rows_of_one]
-        failures += failed
+        lost_goals = [] if failed else goals_without_row(benchmark.name, rows_of_one)
+        for goal_row in lost_goals:
+            print(f"{benchmark.name}: no row is named like the goal {goal_row.rows!r}", file=sys.stderr)
+        failures += failed or bool(lost_goals)
     if options.json is not None:
         write_json(options.json, (row.to_json() | {"benchmark": name} for name, row in rows))
     goals = rows_of_goals(rows)
@@ -125,7 +132,7 @@ def _measure(benchmark: Benchmark, options: argparse.Namespace) -> tuple[list[Ro
         rows = [*benchmark.measure(options)]
     except (MeasurementError, NoackError, AssertionError) as error:  # assertions of the tests' helpers
         failed = True
-        rows = [Row(benchmark.name, None, "", unjudged=f"could not be measured: {error}")]
+        rows = [Row(benchmark.name, None, "", unchecked_because=f"could not be measured: {error}")]
     rows += [*load.rows()]
     print_table(f"{benchmark.title} ({time.monotonic() - began_s:.0f} s)", rows)
     return rows, failed
@@ -138,8 +145,17 @@ def rows_of_goals(rows: Sequence[tuple[str, Row]]) -> list[tuple[str, Row]]:
         for goal_row in GOAL_ROWS
         for benchmark, row in rows
         if benchmark == goal_row.benchmark
-        and re.fullmatch(goal_row.rows, row.name)
+        and goal_row.matches(row)
         and (row.goal is not None or row.value is None)
+    ]
+
+
+def goals_without_row(benchmark: str, rows: Sequence[Row]) -> list[GoalRow]:
+    """Return the goals of a benchmark that match none of its rows, as after a row was renamed."""
+    return [
+        goal_row
+        for goal_row in GOAL_ROWS
+        if goal_row.benchmark == benchmark and not any(map(goal_row.matches, rows))
     ]
 
 

@@ -26,7 +26,7 @@ import psutil
 from benchmarks.report import MeasurementError
 from noack.protocol.roles import LOOP_ROLES
 from tests.helpers.waiting import PATIENCE_S
-from tests.integration.conftest import begun, is_over, processes_of
+from tests.helpers.live_runs import begun, is_over, processes_of
 
 PROGRESS = re.compile(r"^([0-9.]+)/[0-9.e+]+ s\b")
 """A progress line of a run; the group is the time in the run, s."""
@@ -153,7 +153,7 @@ class Sample(NamedTuple):
     """Monotonic clock."""
     rss_kib: float
     uss_kib: float
-    """Private memory, which is judged; shared memory is no leak of this process."""
+    """Private memory, which is checked; shared memory is no leak of this process."""
     fds: int
     sockets: int
     threads: int

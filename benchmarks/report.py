@@ -65,8 +65,8 @@ class Row:
     goal: Goal | None = None
     """A condition on the ratio to the peer; without a peer, on the value."""
     note: str | None = None
-    unjudged: str | None = None
-    """Why the goal cannot be judged although there is a figure."""
+    unchecked_because: str | None = None
+    """Why the goal cannot be checked although there is a figure."""
     paired_ratio: float | None = None
     """If both sides were measured in turn, the median of the rounds' ratios; replaces the ratio of
     the two figures."""
@@ -82,16 +82,16 @@ class Row:
 
     @property
     def holds(self) -> bool | None:
-        """Whether the goal was reached; None if there is none or it cannot be judged."""
-        judged = self.value if self.peer is None else self.ratio
-        if self.goal is None or judged is None or self.unjudged is not None:
+        """Whether the goal was reached; None if there is none or it cannot be checked."""
+        figure = self.value if self.peer is None else self.ratio
+        if self.goal is None or figure is None or self.unchecked_because is not None:
             return None
-        return bool(_COMPARISONS[self.goal.comparison](judged, self.goal.limit))
+        return bool(_COMPARISONS[self.goal.comparison](figure, self.goal.limit))
 
     @property
     def notes(self) -> str:
-        """Why it is not judged, and the note."""
-        return "; ".join(filter(None, (self.unjudged, self.note)))
+        """Why it is not checked, and the note."""
+        return "; ".join(filter(None, (self.unchecked_because, self.note)))
 
     @property
     def cells(self) -> tuple[str, ...]:
@@ -269,7 +269,7 @@ def compare(
     goal: Goal | None = None,
     *,
     note: str | None = None,
-    unjudged: str | None = None,
+    unchecked_because: str | None = None,
     rounds: int = 5,
 ) -> Row:
     """Measure our side and the alternative in turn; the ratio is the median of the rounds' ratios.
@@ -278,11 +278,11 @@ def compare(
     """
     say(name)
     if not isinstance(peer, tuple) or isinstance(peer, Peer):
-        return Row(name, median(ours() for _ in range(rounds)), unit, peer, goal, note, unjudged)
+        return Row(name, median(ours() for _ in range(rounds)), unit, peer, goal, note, unchecked_because)
     pairs = [(ours(), peer[1]()) for _ in range(rounds)]
     value, other = (median(side) for side in zip(*pairs, strict=True))
     ratio = median(a / b for a, b in pairs)
-    return Row(name, value, unit, Peer(peer[0], other), goal, note, unjudged, ratio)
+    return Row(name, value, unit, Peer(peer[0], other), goal, note, unchecked_because, ratio)
 
 
 def cpu_ms(call: Callable[[], object]) -> Side:

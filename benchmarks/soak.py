@@ -16,7 +16,7 @@ windows may be outliers or missing. Memory may gain
 * 9.5 MiB in a run of less than half an hour, since the recorder's memory varies by 9 MiB. In the
   four minutes that a run of five minutes leaves, at 500 Hz, this is 83 bytes per step, so that a
   leak of one row per step is detected. A leak per event needs a longer run. With less than two
-  minutes after the warm-up, memory is not judged.
+  minutes after the warm-up, memory is not checked.
 """
 
 import argparse
@@ -82,12 +82,12 @@ class Trend(NamedTuple):
 
 
 def warm_up_s(length_s: float) -> float:
-    """Return the length of the warm-up, which is not judged."""
+    """Return the length of the warm-up, which is not checked."""
     return min(WARM_UP_SHARE * length_s, LONGEST_WARM_UP_S)
 
 
 def trend(at_s: Sequence[float], kib: Sequence[float], length_s: float) -> Trend | None:
-    """Judge memory over a run; return None if it is too short for that.
+    """Check memory over a run; return None if it is too short for that.
 
     Args:
         at_s: times of the samples since the run's start, ascending, (k,).
@@ -98,32 +98,32 @@ def trend(at_s: Sequence[float], kib: Sequence[float], length_s: float) -> Trend
         MeasurementError: there are too few samples.
     """
     begin_s = warm_up_s(length_s)
-    judged_s = length_s - begin_s
-    if judged_s < LEAST_S:
+    checked_s = length_s - begin_s
+    if checked_s < LEAST_S:
         return None
     samples = np.array([at_s, kib], dtype=np.float64).T
     samples = samples[(samples[:, 0] >= begin_s) & (samples[:, 0] <= length_s)]
-    windows = ((samples[:, 0] - begin_s) / judged_s * WINDOWS).astype(int).clip(max=WINDOWS - 1)
+    windows = ((samples[:, 0] - begin_s) / checked_s * WINDOWS).astype(int).clip(max=WINDOWS - 1)
     medians = [
         np.quantile(samples[windows == window], 0.5, axis=0, method="lower") for window in np.unique(windows)
     ]
     if len(medians) < LEAST_WINDOWS:
-        raise MeasurementError("memory was sampled too rarely to judge it")
+        raise MeasurementError("memory was sampled too rarely to check it")
     times_s, sizes_kib = np.transpose(medians)
     slope = float(theilslopes(sizes_kib, times_s).slope)
     rising = np.mean([later > earlier for earlier, later in combinations(sizes_kib, 2)])
-    hours = max(judged_s / 3600, 1.0)
+    hours = max(checked_s / 3600, 1.0)
     if length_s < SHORT_S:
         allowed_kib = SHORT_KIB
     else:
         allowed_kib = hours * (STEADY_KIB if rising >= STEADY_SHARE else ALLOWED_KIB)
-    return Trend(slope * judged_s, allowed_kib, 3600 * slope)
+    return Trend(slope * checked_s, allowed_kib, 3600 * slope)
 
 
 def constant(at_s: Sequence[float], counts: Sequence[int], length_s: float) -> tuple[int, int]:
     """Return minimum and maximum of a count after the warm-up, ignoring single outliers."""
-    judged = [count for at, count in zip(at_s, counts, strict=True) if warm_up_s(length_s) <= at <= length_s]
-    lasting = [a for a, b in pairwise(judged) if a == b] or judged
+    checked = [count for at, count in zip(at_s, counts, strict=True) if warm_up_s(length_s) <= at <= length_s]
+    lasting = [a for a, b in pairwise(checked) if a == b] or checked
     return (min(lasting), max(lasting)) if lasting else (0, 0)
 
 
@@ -135,7 +135,7 @@ def process_rows(role: str, samples: Sequence[Sample], began_s: float, length_s:
     memory = trend(at_s, [sample.uss_kib for sample in samples], length_s)
     name, size = f"{role}: private memory gained", f"{samples[-1].uss_kib / 1024:.1f} MiB"
     if memory is None:
-        yield Row(name, None, "KiB", note=f"{size}; not judged: too short")
+        yield Row(name, None, "KiB", note=f"{size}; not checked: too short")
     else:
         note = f"{size}; {memory.slope_kib_per_h:+.0f} KiB per hour"
         yield Row(name, memory.growth_kib, "KiB", goal=Goal("<=", memory.allowed_kib), note=note)
@@ -173,7 +173,7 @@ def end_rows(summary: Mapping[str, Any], delivered_out_of_order: int) -> Iterato
     yield Row("longest loss burst", loop["longest_loss_burst"], "")
     yield Row("replayed bit for bit and completely", bool(replay.get("bit_exact") and replay.get("complete")),
               "", goal=Goal("==", 1), note=f"{replay.get('inputs') or 0:,} inputs")  # fmt: skip
-    yield Row("claims judged", len(claims), "", goal=Goal(">=", 1))
+    yield Row("claims checked", len(claims), "", goal=Goal(">=", 1))
     yield Row("claims violated", len(violated), "", goal=NONE, note="; ".join(violated))
 
 

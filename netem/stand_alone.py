@@ -1,32 +1,24 @@
 """A stand-alone emulator: runs a relay, with what watches, changes and records it; prints totals.
 
-:func:`run_stand_alone` reads the command line, :func:`relay` relays until Ctrl-C, :func:`watch_relay`
-adds live control, statistics lines, metrics and the live screen.
+:func:`run_stand_alone` reads the command line, :func:`relay` relays until Ctrl-C.
 """
 
 import argparse
 import json
-import math
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 from rich.console import Console
 
 from netem.capture import CaptureWriter
-from netem.control.control_server import ControlServer, starting
-from netem.control.emulator_statistics import (
-    CommandQueue,
-    Statistics,
-    StatisticsThread,
-    statistics,
-    unintended_losses,
-)
-from netem.control.statistics_view import Screen, picture_of
+from netem.control.control_server import starting
+from netem.control.emulator_statistics import Statistics, statistics, unintended_losses
+from netem.control.statistics_view import picture_of
 from netem.emulator_options import command_line_parser, parse_options, specs_of
 from netem.explanation import explain
 from netem.fates import FateRecorder, read_fates
@@ -35,12 +27,11 @@ from netem.relay.link_sockets import raise_file_limit
 from netem.relay.relay import Relay
 from netem.relay.relay_links import LinkSpec
 from netem.relay.relay_reports import DIRECTIONS, Direction, Tap, report_line
+from netem.relay_watch import add_watching_options, check_watching_options, watch_relay
 from noack.core.errors import CallerError, ExitStatus, MachineError, NoackError, why
-from noack.core.file_access import open_growing
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import address_text
-from noack.runtime.command_line import LogFormat, Signals, discard_output, failed, log_event, log_format
-from noack.runtime.connections.metrics_server import OPTION, metrics_server, require_package
+from noack.runtime.command_line import Signals, failed, log_event, log_format
 from noack.runtime.drivers.realtime_settings import realtime
 
 _FIFO_PRIORITY = 50
@@ -255,131 +246,3 @@ def _report_ready(opened: Relay, *, print_it: bool, as_json: bool) -> None:
     if print_it and sys.stdout is not None:
         with suppress(OSError, ValueError):  # no reader: the relay continues
             os.write(sys.stdout.fileno(), f"{line}\n".encode())
-
-
-_VIEW_S = 1.0
-_POLL_S = 0.05
-_SWITCH_S = 0.0002
-"""Maximum time for which another thread holds the interpreter lock before the relay's thread."""
-
-
-def add_watching_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options for what watches and changes a relay while it runs."""
-    group = parser.add_argument_group("statistics and changes during operation")
-    group.add_argument("--control", metavar="NAME", help="accept `noack netem show|set|watch NAME`")
-    group.add_argument(
-        "--stats",
-        metavar="SECONDS",
-        type=float,
-        help="print statistics as JSON lines every SECONDS",
-    )
-    group.add_argument("--stats-file", metavar="FILE", type=Path, help="write these lines to FILE instead")
-    group.add_argument(
-        OPTION,
-        metavar="[HOST]:PORT",
-        help="serve the statistics for Prometheus (OpenMetrics); the loopback without a HOST",
-    )
-    group.add_argument(
-        "--log-format",
-        choices=[*LogFormat],
-        type=LogFormat,
-        default=LogFormat.TEXT,
-        help="format of standard error: text, or JSON Lines for log collectors (text)",
-    )
-    group.add_argument("--view", action="store_true", help="show live statistics in this terminal")
-
-
-def check_watching_options(options: argparse.Namespace) -> None:
-    """Check the options of :func:`add_watching_options`; a file alone gets a line each second.
-
-    Raises:
-        CallerError: two options contradict each other.
-    """
-    if options.stats is not None and not (math.isfinite(options.stats) and options.stats >= 0.01):
-        raise CallerError(f"--stats {options.stats:g}: must be 0.01 s or more")
-    if options.stats is None and options.stats_file is not None:
-        options.stats = 1.0
-    if options.view and options.stats is not None and options.stats_file is None:
-        raise CallerError("--view and --stats both use standard output; add --stats-file FILE")
-
-
-class RelayWatch(NamedTuple):
-    """The relay thread's access to the threads that watch the relay."""
-
-    commands: CommandQueue  # To be run in the relay's thread, at least every 50 ms
-    screen: Screen | None
-
-    @property
-    def quit_requested(self) -> bool:
-        """Whether the user has pressed q on the live screen."""
-        return self.screen is not None and self.screen.quit_requested
-
-
-@contextmanager
-def watch_relay(relay: Relay, options: argparse.Namespace) -> Iterator[RelayWatch]:
-    """Watch a relay within the context; the relay runs within it and is closed after it.
-
-    Enter the context before the relay's thread applies real-time settings: new threads would
-    inherit them.
-
-    Raises:
-        CallerError: an option is wrong.
-        MachineError: live control cannot be opened.
-    """
-    commands = CommandQueue(relay)
-    screen = None
-    with ExitStack() as stack:
-        if options.stats is not None:
-            stack.enter_context(_statistics_lines(commands, options.stats, options.stats_file))
-        if options.metrics is not None:
-            stack.enter_context(_metrics(commands, options.metrics))
-        if options.control is not None:
-            stack.enter_context(ControlServer(options.control, commands))
-        if options.view:
-            screen = stack.enter_context(Screen(f"noack netem {options.control or ''}".strip()))
-            stack.enter_context(
-                StatisticsThread(commands, _VIEW_S, screen.show, poll=screen.poll, poll_s=_POLL_S)
-            )
-        stack.callback(commands.close)
-        stack.callback(sys.setswitchinterval, sys.getswitchinterval())
-        sys.setswitchinterval(_SWITCH_S)
-        yield RelayWatch(commands, screen)
-
-
-@contextmanager
-def _metrics(commands: CommandQueue, host_port: str) -> Iterator[None]:
-    require_package()
-    from netem.control.emulator_metrics import EmulatorMetrics  # an optional package
-
-    with metrics_server(host_port, EmulatorMetrics(commands).collect) as address:
-        report_line(f"metrics: http://{address_text(address)}/metrics")
-        yield
-
-
-@contextmanager
-def _statistics_lines(commands: CommandQueue, period_s: float, path: Path | None) -> Iterator[None]:
-    """Write JSON lines to a file, or to standard output, until the relay has ended.
-
-    If a line cannot be written, a message on standard error reports it, and the relay continues.
-    """
-    try:
-        file = sys.stdout if path is None else os.fdopen(open_growing(path, follow=True), "w")
-    except (OSError, ValueError) as error:
-        raise CallerError(f"--stats-file {path}: cannot be written ({why(error)})") from None
-
-    def write(document: Statistics) -> None:
-        try:
-            file.write(json.dumps(document) + "\n")
-            file.flush()
-        except OSError as error:
-            name = "standard output" if path is None else path
-            report_line(f"statistics cannot be written to {name} ({error.strerror}); the relay continues")
-            # Also, closing the file writes the buffer once more; this must not fail.
-            discard_output(file.fileno())
-
-    try:
-        with StatisticsThread(commands, period_s, write, at_end=True):
-            yield
-    finally:
-        if path is not None:
-            file.close()

@@ -67,7 +67,8 @@ class LinkWords(NamedTuple):
     """Settings in words."""
 
     settings: LinkSettings
-    seed: int | None  # Seed of the random streams, if the words contain one
+    seed: int | None
+    """Seed of the random streams, if the words contain one."""
 
 
 def parse(words: str | Sequence[str]) -> LinkWords:

@@ -16,7 +16,7 @@ import pytest
 
 from tests.command_line import invoke
 from tests.helpers.pages import PAGES, ROOT, blocks, fences, fill, target_exists
-from tests.integration.conftest import WITHOUT_VIEWER, wait_for
+from tests.helpers.live_runs import WITHOUT_VIEWER, wait_for
 
 EXAMPLES = ROOT / "docs/examples"
 FIGURES = {

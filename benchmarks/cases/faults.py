@@ -22,7 +22,7 @@ from benchmarks.programs import imported_s
 from benchmarks.report import Figures, MeasurementError, Peer, Rounds, Row, benchmark, median, say
 from cosim.analysis.summary.loop_statistics import lateness_us
 from cosim.analysis.summary.summary_model import LoopSummary
-from cosim.cli import find_scenario
+from cosim.cli.options import find_scenario
 from cosim.live.finalize import finalize
 from cosim.live.launcher import launch
 from cosim.live.monitoring.run_watcher import Watcher
@@ -36,7 +36,7 @@ from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, Message
 from noack.runtime.address import LOOPBACK
 from noack.runtime.control_messages import RunProgress
 from noack.scenario.scenario_file import load
-from tests.integration.conftest import processes_of, udp_port
+from tests.helpers.live_runs import processes_of, udp_port
 
 STEPS = {"plant": PLANT_STEP, "sensor": SENSOR_MEASUREMENT, "controller": CONTROLLER_STEP}
 """Table of each process's steps."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from benchmarks.report import Goal, Peer, Row, benchmark, option, say
 from cosim.analysis.adversary import Objective, WorstRun, conditions_of, find_worst
-from cosim.cli import find_scenario
+from cosim.cli.options import find_scenario
 from netem.link_state import LinkState
 from netem.tc_words import settings_of
 from noack.core.linear_systems import Matrix

@@ -14,7 +14,6 @@ import socket
 import struct
 import tempfile
 import time
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from functools import partial
@@ -29,9 +28,8 @@ from noack.runtime.address import Address
 from noack.runtime.drivers.realtime_settings import realtime
 from noack.runtime.host_clocks.clock_offset import ClockOffset
 from noack.runtime.host_clocks.time_exchange import TimeClient, TimeReference, answering
-from tests.attacks.attacked import Run
-from tests.attacks.kinds import enter_namespace
-from tests.helpers.two_hosts import DrivenClocks, TwoHosts, two_hosts
+from tests.helpers.live_runs import RunByHand
+from tests.helpers.two_hosts import DrivenClocks, TwoHosts, enter_namespace, two_hosts
 
 KEY = bytes(range(32))
 CHECKS_AT_ONCE = 25
@@ -227,7 +225,7 @@ def run_by_hand(hosts: TwoHosts | None) -> Figures:
     """Return the latency of a run with the controller on the second host, or all on this one."""
     settings = (word for change in _CHANGES for word in ("--set", change))
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        run = Run(stack, Path(folder), hosts, *settings).finish(Counter())
+        run = RunByHand(stack, Path(folder), hosts, *settings).finish()
     if run.status:
         raise MeasurementError(run.stderr.strip().splitlines()[-1])
     latency_us = run.summary["loops"][0]["latency_us"]

@@ -1,6 +1,6 @@
 """The lab page in a headless browser: a live run beside it, and a slider that is dragged.
 
-Page and server are those of the tests (``tests/cosim/lab``).
+Page and server are those of the tests (``tests/helpers/lab_browser.py``).
 """
 
 import argparse
@@ -20,7 +20,7 @@ from typing import Any
 
 from benchmarks.programs import FREE_PORTS, noack
 from benchmarks.report import Figures, Goal, MeasurementError, Rounds, Row, benchmark, median, say
-from tests.cosim.lab.conftest import TEXT, Page, Served
+from tests.helpers.lab_browser import TEXT, Page, Served
 from tools.screenshot_recording import BROWSERS, EMULATED_CARD, Browser
 
 ROUNDS = 1

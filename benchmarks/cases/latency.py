@@ -66,8 +66,8 @@ def updates(case: LatencyCase, refused: set[str]) -> Figures:
     horizon = ("--set", f"horizon_s={case.round_s}")
     (loop,) = noack("run", "lane_following", *horizon, *_LOSSLESS, *case.arguments).summary["loops"]
     latency = loop["latency_us"]
-    for granted in loop["realtime"].values():
-        refused |= {setting for setting, answer in granted.items() if answer.startswith("not permitted")}
+    for answers in loop["realtime"].values():
+        refused |= {setting for setting, answer in answers.items() if answer.startswith("not permitted")}
     return {"p50": latency["p50"], "p99": latency["p99"], "count": latency["updates"]}
 
 

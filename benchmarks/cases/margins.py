@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import block_diag, solve_continuous_are
 
 from benchmarks.report import Goal, Row, benchmark, median, option, say
-from cosim.cli import find_scenario
+from cosim.cli.options import find_scenario
 from noack.core.linear_systems import Matrix
 from noack.impairments.loss_guarantee import (
     DeliveriesBetweenBursts,
@@ -91,7 +91,7 @@ def random_loop(seed: int) -> RandomLoop:
         matrix = original(slot, usable_ns, losses)
         return matrix @ exactly(np.eye(len(matrix.middle[0])) * scale ** (losses + 1))
 
-    margin.maps = scaled  # type: ignore[assignment]
+    margin.maps = scaled
     return RandomLoop(margin, guarantee, f"{mode}, {GUARANTEES[number]}", wanted, scale)
 
 

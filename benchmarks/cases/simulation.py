@@ -37,7 +37,7 @@ from benchmarks.report import (
     say,
 )
 from cosim.analysis.replay import replay
-from cosim.cli import find_scenario
+from cosim.cli.options import find_scenario
 from cosim.simulation.exact_simulation import Population, Setting, run_batch, run_with_events, setting_of
 from cosim.simulation.sampled_loop import SampledLoop, Scales
 from cosim.simulation.virtual_time import simulate, simulate_loops
@@ -163,7 +163,7 @@ def simulation(options: argparse.Namespace) -> Iterator[Row]:
         per_cpu_s(_REPLAYED_S, lambda: replay(record)),
         goal=Goal(">=", 2000),
         rounds=3,
-        unjudged=None if replayed.bit_exact else "the replay is not bit-exact",
+        unchecked_because=None if replayed.bit_exact else "the replay is not bit-exact",
     )
 
     def certificate() -> None:
@@ -213,7 +213,7 @@ def batch_rows(mode: str) -> list[Row]:
         peer = f"solve_ivp, {method}, rtol 1e-8", per_cpu_s(len(few), integrate)
         note = f"event times differ by {error_s:.1g} s from those of {method}"
         doubt = None if error_s <= _AGREEMENT_S else "the two do not agree"
-        results.append(compare(name, "runs/s", engine, peer, goal, note=note, unjudged=doubt))
+        results.append(compare(name, "runs/s", engine, peer, goal, note=note, unchecked_because=doubt))
     value = median(row.value for row in results if row.value is not None)
     note = f"{rows['transmissions'].mean():.0f} events a run"
     return [Row(name, value, "runs/s", goal=Goal(">=", _FASTEST[mode]), note=note), *results]

@@ -1,5 +1,6 @@
 """Runs: functions that run a scenario live or in virtual time, or open an earlier run."""
 
+import os
 import shutil
 import tempfile
 import threading
@@ -7,7 +8,6 @@ import weakref
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property
-from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from cosim.analysis.summary.summary_model import Claim, RunSummary
     from cosim.output.figures.figure_description import FigureDescription
 
-Folder = str | PathLike[str]
+PathLike = str | os.PathLike[str]
 
 
 class Run:
@@ -214,7 +214,7 @@ class Run:
         figures = (describe() for describe in self._figures(bounded=True).values())
         return figure_files.save_figures(figures, page, files)
 
-    def save_tables(self, folder: Folder) -> list[Path]:
+    def save_tables(self, folder: PathLike) -> list[Path]:
         """Write the tables of the summary: :func:`noack.save_tables` of this run.
 
         Raises:
@@ -231,7 +231,7 @@ class Run:
         """
         return run_end.run_report(self.directory, self._loop, again=True)
 
-    def export(self, path: Folder, *, certificates: bool = True) -> list[Path]:
+    def export(self, path: PathLike, *, certificates: bool = True) -> list[Path]:
         """Write the run for other programs; return the written files.
 
         Args:
@@ -246,7 +246,7 @@ class Run:
         self.summary  # noqa: B018  # of a temporary run, it is computed now
         return exports.export_run(self.directory, Path(path), loop=self._loop, certificates=certificates)
 
-    def archive(self, path: Folder) -> Path:
+    def archive(self, path: PathLike) -> Path:
         """Write the run as one file, which :func:`noack.reproduce` repeats; return its path.
 
         Raises:
@@ -301,7 +301,7 @@ class Run:
         return as_html(self._facts())
 
 
-def simulate(scenario: Source, *, runs: Folder | None = None) -> Run:
+def simulate(scenario: Source, *, runs: PathLike | None = None) -> Run:
     """Run a scenario in virtual time: the same machines and losses, no sockets, never late.
 
     >>> import noack
@@ -328,7 +328,7 @@ def simulate(scenario: Source, *, runs: Folder | None = None) -> Run:
     return simulated
 
 
-def run(scenario: Source, *, runs: Folder | None = None, progress: bool = False) -> Run:
+def run(scenario: Source, *, runs: PathLike | None = None, progress: bool = False) -> Run:
     """Run a scenario live: real processes over real UDP sockets on this machine.
 
     It takes the scenario's ``horizon_s`` divided by its ``speed``, plus a start of some seconds. If
@@ -355,7 +355,7 @@ def run(scenario: Source, *, runs: Folder | None = None, progress: bool = False)
         return Run(ending.run_dir, lambda: outcome, temporary)
 
 
-def open_run(directory: Folder = "runs/latest") -> Run:
+def open_run(directory: PathLike = "runs/latest") -> Run:
     """Open an earlier run, live or simulated; finalise an interrupted run first.
 
     Args:
@@ -372,7 +372,7 @@ def open_run(directory: Folder = "runs/latest") -> Run:
     return Run(outcome.run_dir, lambda: outcome)
 
 
-def reproduce(path: Folder, *, run_code: bool = False, long: bool = False) -> "run_archive.Repetition":
+def reproduce(path: PathLike, *, run_code: bool = False, long: bool = False) -> "run_archive.Repetition":
     """Repeat an archived run, and compare it bit for bit.
 
     Args:
@@ -392,7 +392,7 @@ def reproduce(path: Folder, *, run_code: bool = False, long: bool = False) -> "r
     return run_archive.repeat_archive(Path(path), run_code=run_code, long=long)
 
 
-def compare(*runs: Run | Folder) -> "run_comparison.RunComparison":
+def compare(*runs: Run | PathLike) -> "run_comparison.RunComparison":
     """Compare two or more runs; :meth:`Run.fidelity` compares a run with the ideal loop.
 
     Args:
@@ -414,7 +414,7 @@ def compare(*runs: Run | Folder) -> "run_comparison.RunComparison":
 
 
 @contextmanager
-def _folder(runs: Folder | None) -> Iterator[tuple[Path, Path | None]]:
+def _folder(runs: PathLike | None) -> Iterator[tuple[Path, Path | None]]:
     """Yield the folder for a run directory, twice if it is temporary; after an error, remove it."""
     if runs is not None:
         yield Path(runs), None

@@ -16,7 +16,7 @@ with lazy_modules():
     from cosim.live.processes import fork_server
 
 if TYPE_CHECKING:
-    from cosim.cli.command import app, find_scenario
+    from cosim.cli.command import app
 else:
 
     def __getattr__(name: str) -> Any:
@@ -27,7 +27,7 @@ else:
         return getattr(command, name)
 
 
-__all__ = ["app", "find_scenario", "main"]
+__all__ = ["app", "main"]
 _LIVE = ("run", "demo", "record")
 _NEW_OBJECTS = 100_000
 """Objects between two garbage collections. With Python's 700, the imports take 0.06 s longer."""

@@ -22,11 +22,8 @@ from typer import Option
 from typer.core import TyperGroup, TyperOption
 
 from cosim.cli import commands
-from cosim.cli.options import find_scenario as find_scenario
 from cosim.lazy_modules import lazy_modules
-from cosim.record.run_directory import DEFAULT_RUNS as DEFAULT_RUNS
 from noack.core.errors import ExitStatus, NoackError, plain_mistake, printable, why
-from noack.core.process_limits import cores as cores
 from noack.core.process_limits import exhausted_limit
 from noack.runtime.command_line import StopRequestError, failed, stop_requests_raised
 
@@ -215,7 +212,7 @@ PANELS = (RUNS, THEORY, CAMPAIGNS, MEASURING, FILES, PROCESSES)
 
 P = ParamSpec("P")
 Result = TypeVar("Result")
-_order: dict[object, tuple[int, int]] = {}
+_help_positions: dict[object, tuple[int, int]] = {}
 """By command function: panel, and place in the panel."""
 durations: dict[str, str] = {}
 """By command: how long it takes."""
@@ -262,7 +259,7 @@ def _version(requested: bool) -> None:
 
 
 @app.callback()
-def options(
+def global_options(
     _: Annotated[
         bool, Option("--version", callback=_version, is_eager=True, help="Show the version.")
     ] = False,
@@ -290,24 +287,18 @@ def command(
     def register(function: Callable[..., int | None]) -> Callable[..., None]:
         text, examples = _describe_options(function)
         text += f"\n\nTakes {takes}." if takes else ""
-        parameters, groups = _parameters(function)
+        grouped = _with_option_groups(function)
 
-        @wraps(function)
+        @wraps(grouped)
         def reported(**arguments: Any) -> None:
-            as_json = bool(arguments.get("json"))
-            for name, group in groups.items():
-                arguments[name] = group(**{field.name: arguments.pop(field.name) for field in fields(group)})
-
             def call() -> int | None:
                 if on_linux:
                     core_library.require_live_runs()
-                return function(**arguments)
+                return grouped(**arguments)
 
-            raise typer.Exit(_status_of(call, as_json=as_json))
+            raise typer.Exit(_status_of(call, as_json=bool(arguments.get("json"))))
 
-        reported.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        reported.__annotations__ = {option.name: option.annotation for option in parameters}
-        _order[reported] = PANELS.index(panel), position
+        _help_positions[reported] = PANELS.index(panel), position
         if takes:
             durations[settings.get("name", function.__name__)] = takes
         epilog = "\n".join(["\b", "Examples:", *_columns(examples)]) if examples else None
@@ -317,6 +308,21 @@ def command(
         return registered
 
     return register
+
+
+def _with_option_groups(function: Callable[..., int | None]) -> Callable[..., int | None]:
+    """Return a command whose options are the fields of its parameters that are dataclasses."""
+    parameters, groups = _parameters(function)
+
+    @wraps(function)
+    def grouped(**options: object) -> int | None:
+        for name, group in groups.items():
+            options[name] = group(**{field.name: options.pop(field.name) for field in fields(group)})
+        return function(**options)
+
+    grouped.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    grouped.__annotations__ = {option.name: option.annotation for option in parameters}
+    return grouped
 
 
 def _status_of(call: Callable[[], int | None], *, as_json: bool) -> int:
@@ -396,7 +402,7 @@ def register_commands(name: str = "") -> None:
     declaring = [module for module in modules if any(line in texts[module] for line in declarations)]
     for module in declaring or modules:
         import_module(f"{commands.__name__}.{module}")
-    app.registered_commands.sort(key=lambda command: _order[command.callback])
+    app.registered_commands.sort(key=lambda command: _help_positions[command.callback])
 
 
 def console() -> "Console":

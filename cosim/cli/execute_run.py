@@ -15,7 +15,9 @@ from typer import Option
 from cosim.cli import command as cli
 from cosim.cli import options as opt
 from cosim.lazy_modules import lazy_modules
+from cosim.record.run_directory import DEFAULT_RUNS
 from noack.core.errors import CallerError, PeerError
+from noack.core.process_limits import cores
 from noack.runtime.command_line import LogFormat, log_format, print_to_stderr
 
 with lazy_modules():
@@ -75,7 +77,7 @@ class LiveOptions(OutputOptions):
         log_format: Format of standard error: text, or JSON Lines for log collectors.
     """
 
-    runs: opt.RunsOption = cli.DEFAULT_RUNS
+    runs: opt.RunsOption = DEFAULT_RUNS
     live: Annotated[bool, Option("--live")] = False
     metrics: Annotated[str | None, Option(metavar="[HOST]:PORT")] = None
     log_format: Annotated[LogFormat, Option(callback=_log_format, is_eager=True)] = LogFormat.TEXT
@@ -215,8 +217,8 @@ def worker_pool(workers: int | None, scheduler: str | None = None) -> StartWorke
         if workers is not None:
             raise CallerError("--workers: with --scheduler the cluster's workers are used")
         return lambda print_line: campaign_workers.cluster_runner(scheduler, print_line)
-    number = workers or cli.cores()
-    if number > (limit := _PER_CORE * cli.cores()):
+    number = workers or cores()
+    if number > (limit := _PER_CORE * cores()):
         raise CallerError(f"--workers {number}: on this machine at most {limit}")
     return lambda print_line: campaign_workers.local_runner(number)
 

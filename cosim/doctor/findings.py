@@ -87,7 +87,7 @@ def _check(title: str) -> Callable[[Callable[[MachineFacts, RunRequirements], It
     return register
 
 
-def judge(machine: MachineFacts, required: RunRequirements) -> list[MachineFinding]:
+def find_all(machine: MachineFacts, required: RunRequirements) -> list[MachineFinding]:
     """Return the findings for a scenario's runs on this machine."""
     return [finding for check in _checks for finding in check(machine, required)]
 
@@ -205,7 +205,7 @@ def _buffer(machine: MachineFacts, required: RunRequirements) -> Iterator[Outcom
     if isinstance(buffer := machine.buffer, str):
         yield BAD, buffer, "no process of a run can receive"
         return
-    text = f"{buffer.datagrams:,} datagrams ({buffer.granted_bytes // 1024:,} KiB)"
+    text = f"{buffer.datagrams:,} datagrams ({buffer.buffer_bytes // 1024:,} KiB)"
     if buffer.most_bytes is not None:
         text += f"; net.core.rmem_max is {buffer.most_bytes:,} bytes"
     stall_s = buffer.datagrams / required.rate_hz

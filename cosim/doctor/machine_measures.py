@@ -124,7 +124,7 @@ class Buffer:
 
     datagrams: int
     """Number of a run's datagrams that it holds."""
-    granted_bytes: int
+    buffer_bytes: int
     most_bytes: int | None
     """Largest size without privileges; None if unknown."""
 
@@ -307,9 +307,9 @@ def _measure_buffer() -> Buffer:
             while received < _FLOOD_DATAGRAMS:
                 endpoint.recv(len(_DATAGRAM) + 1)
                 received += 1
-        granted = endpoint.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+        buffer_bytes = endpoint.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
     limit = _read(Path("/proc/sys/net/core/rmem_max"))
-    return Buffer(received, granted, int(limit) if limit else None)
+    return Buffer(received, buffer_bytes, int(limit) if limit else None)
 
 
 def _list_taken_ports(required: RunRequirements) -> Iterable[str]:

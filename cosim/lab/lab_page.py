@@ -57,6 +57,8 @@ async def show_page(services: LabServices) -> None:
 
 
 class _Page:
+    """The page of one visitor: its elements, and what they show of its session."""
+
     def __init__(self, services: LabServices, draft: Draft) -> None:
         self._services, self._client = services, ui.context.client
         self._calls = PageCalls(services)
@@ -99,7 +101,7 @@ class _Page:
             )
             ui.space()
             FileMenu(self._services, self._calls, self._session, self._explored_run)
-            ui.button(icon="contrast", on_click=self._toggle).props(
+            ui.button(icon="contrast", on_click=self._toggle_dark).props(
                 'flat color=white dense aria-label="dark or light"'
             )
         with ui.element("main").classes("lab-body w-full"):
@@ -356,7 +358,7 @@ class _Page:
         self._comparing = bool(event.value)
         await self._show()
 
-    async def _toggle(self) -> None:
+    async def _toggle_dark(self) -> None:
         self._is_dark = not self._is_dark
         self._dark.set_value(self._is_dark)
         self._text.show_dark(dark=self._is_dark)

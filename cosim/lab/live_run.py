@@ -14,7 +14,7 @@ import sys
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from cosim.interactive.scenario_draft import Draft
 from cosim.live.launcher import launch
@@ -42,8 +42,7 @@ class LiveRun:
     """The state of a live run; :meth:`follow` keeps it current until the run has ended."""
 
     horizon_s: float
-    state: str = "starting"
-    """starting, running, finalising, ended or failed."""
+    state: Literal["starting", "running", "finalising", "ended", "failed"] = "starting"
     run_dir: Path | None = None
     viewer: str | None = None
     """Address of the rerun viewer."""

@@ -363,7 +363,7 @@ def _correlation(measurement: NetworkMeasurement) -> Panel:
         )
         if correlation.lags
     ]
-    limits = [Rule(at=level, colour=_LIMIT, width=1.0) for level in (delays.white, -delays.white)]
+    limits = [Rule(at=level, colour=_LIMIT, width=1.0) for level in (delays.white_noise_limit, -delays.white_noise_limit)]
     return Panel(
         title="Correlation",
         items=[*items, *limits],

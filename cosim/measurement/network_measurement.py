@@ -33,8 +33,21 @@ QUANTILES = (0.5, 0.9, 0.99, 0.999)
 SHARES = (0.0, 0.05, 0.5, 0.9, 0.95, 0.99, 0.999, 1.0)
 _MOST_LAGS, _LARGEST_LAG = 40, 1000
 _FEWEST_PAIRS = 30
+_FEW_BURSTS = 20
 _MOST_RANKED = 1_000_000
 """Number of packets, the first ones, of which correlations are computed."""
+
+
+class Correlation(NamedTuple):
+    """The correlation of the normal scores of two packets' values, at some distances.
+
+    Scores have only the ranks of the values, so that a few very large ones do not outweigh all
+    others.
+    """
+
+    lags: tuple[int, ...]
+    """Distances in packets."""
+    at_lags: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -44,9 +57,9 @@ class DelayStatistics:
     received: int
     quantiles_s: dict[float, float]
     """By share of the received packets."""
-    correlation: "Correlation"
+    correlation: Correlation
     """Of the delays of two packets. The emulator's ``delay … CORRELATION`` is that at lag 1."""
-    white: float
+    white_noise_limit: float
     """Size below which 95 % of the correlations of independent delays are."""
 
 
@@ -63,18 +76,6 @@ def delay_statistics(trace: PacketTrace) -> DelayStatistics:
         autocorrelation(trace.delay_ns, arrived),
         1.96 / np.sqrt(len(delays_ns)),
     )
-
-
-class Correlation(NamedTuple):
-    """The correlation of the normal scores of two packets' values, at some distances.
-
-    Scores have only the ranks of the values, so that a few very large ones do not outweigh all
-    others.
-    """
-
-    lags: tuple[int, ...]
-    """Distances in packets."""
-    at_lags: tuple[float, ...]
 
 
 def normal_scores(values: NDArray[np.int64]) -> Reals:
@@ -311,9 +312,6 @@ class NetworkMeasurement:
             "begin_s": float(begin_s[index]),
             "duration_s": float(duration_s[index]),
         }
-
-
-_FEW_BURSTS = 20
 
 
 def _interval(estimate: IntervalEstimate | None) -> dict[str, float] | None:

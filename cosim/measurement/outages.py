@@ -58,13 +58,13 @@ def find_outages(bursts: LossBursts) -> OutageRule:
     count = len(bursts.length)
     order = np.argsort(-bursts.length, kind="stable")
     lengths = bursts.length[order]
-    geometric = _geometric(lengths)[: min(MOST_TESTED, count)]
-    for k in np.flatnonzero(geometric < OUTAGE_LEVEL)[::-1].tolist():
+    bounds = _longest_burst_bounds(lengths)[: min(MOST_TESTED, count)]
+    for k in np.flatnonzero(bounds < OUTAGE_LEVEL)[::-1].tolist():
         if k + 1 < count and lengths[k + 1] == lengths[k]:
             continue  # equal bursts are outages together, or not at all
         flags = np.zeros(count, bool)
         flags[order[: k + 1]] = True
-        if _elliott(bursts, flags, int(lengths[k]), count - k) < OUTAGE_LEVEL:
+        if _longest_burst_probability(bursts, flags, int(lengths[k]), count - k) < OUTAGE_LEVEL:
             return OutageRule(
                 flags,
                 f"bursts of {lengths[k]} or more losses: this has a probability below "
@@ -76,7 +76,7 @@ def find_outages(bursts: LossBursts) -> OutageRule:
     return OutageRule(flags, "no burst is too long for the fitted chain")
 
 
-def _geometric(lengths: NDArray[np.int64]) -> NDArray[np.float64]:
+def _longest_burst_bounds(lengths: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return a bound of P(longest ≥ ℓ) for each of descending lengths among those from it on."""
     total = np.cumsum(lengths[::-1])[::-1].astype(float)
     count = np.arange(len(lengths), 0, -1).astype(float)
@@ -92,7 +92,7 @@ def _geometric(lengths: NDArray[np.int64]) -> NDArray[np.float64]:
     return np.where(spare < 0, 0.0, np.exp(np.minimum(log, 0.0)))
 
 
-def _elliott(bursts: LossBursts, left_out: Flags, length: int, count: int) -> float:
+def _longest_burst_probability(bursts: LossBursts, left_out: Flags, length: int, count: int) -> float:
     """Return P(longest of ``count`` bursts ≥ length) under the fit without some bursts."""
     fits = ChainFits(bursts, left_out)
     tail = fits.elliott_rates.survival(lost=True)(np.array([length]))[0]

@@ -62,7 +62,8 @@ class Snapshot(NamedTuple):
 
     links: Sequence[LinkReport]
     applied: Mapping[tuple[str, Direction], AppliedSettings]
-    elapsed_ns: int  # Time since the relay started
+    elapsed_ns: int
+    """Time since the relay was opened, shortly before it runs."""
     unix_ns: int
 
 

@@ -20,7 +20,7 @@ from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import Address, packed_name
 
 _PERIOD_NS = 40_000_000
-_RARE_PERIOD_NS = 250_000_000
+_CHECK_PERIOD_NS = 250_000_000
 _REPORTED_FLOWS = 16
 _PR_SET_TIMERSLACK, _PR_GET_TIMERSLACK = 29, 30
 
@@ -61,7 +61,7 @@ class Relay:
         )
         self._warnings = [LinkWarnings(spec) for spec in self.specs]
         self._losses = [UnintendedLosses(spec.name, side) for spec in specs for side in DIRECTIONS]
-        self._epoch_ns = self._rarely_ns = 0
+        self._epoch_ns = self._next_check_ns = 0
         self._taps = tuple(taps)
         payloads = any(tap.wants_data for tap in self._taps)
         self._memory = RelayMemory(
@@ -90,7 +90,7 @@ class Relay:
         return {link.spec.name: link.address for link in self._open_links}
 
     def run(self, stop: Callable[[], bool], housekeeping: Callable[[], None]) -> None:
-        """Relay until ``stop()``; both are called at least every 100 ms, in this thread.
+        """Relay until ``stop()``; both are called at least every 50 ms, in this thread.
 
         Meanwhile, the thread's timer slack is 1 ns.
         """
@@ -194,8 +194,8 @@ class Relay:
         """Remove idle clients, open return paths again, check for losses."""
         self._memory.core.no_memory = 0  # check again
         self._clients.query_some_drops()
-        if now_ns >= self._rarely_ns:
-            self._rarely_ns = now_ns + _RARE_PERIOD_NS
+        if now_ns >= self._next_check_ns:
+            self._next_check_ns = now_ns + _CHECK_PERIOD_NS
             self._update_losses()
             self._clients.expire(now_ns)
             self._clients.reconnect()

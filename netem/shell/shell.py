@@ -84,27 +84,37 @@ class _Program:
         addresses = {"NOACK_OUTSIDE": spec.to[0]}
         if self.devices.outside6 is not None:
             addresses["NOACK_OUTSIDE6"] = self.devices.outside6
+        with self._start_all(addresses) as main:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+            ends = f"inside {spec.listen[0]}, outside {' and '.join(addresses.values())}"
+            report_line(f"{ends}; the emulator is process {os.getpid()}")
+            yield lambda: main.poll() is not None
+        returncode = -signal.SIGKILL if main.returncode is None else main.returncode
+        self.status = returncode if returncode >= 0 else 128 - returncode
+        if signals.received is not None:
+            self.status = signals.status
+
+    @contextmanager
+    def _start_all(self, addresses: dict[str, str]) -> Iterator[subprocess.Popen[bytes]]:
+        """Start the commands, and end them after the context, or if one cannot start.
+
+        Yields the command inside.
+        """
         earlier_children = process.children(os.getpid())
         process.adopt_orphans()
-        processes = [_start(command) for command in self._outside]
-        with inside(self.devices):
-            main = _start(self._command, addresses)
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        ends = f"inside {spec.listen[0]}, outside {' and '.join(addresses.values())}"
-        report_line(f"{ends}; the emulator is process {os.getpid()}")
+        programs: list[subprocess.Popen[bytes]] = []
         try:
-            yield lambda: main.poll() is not None
+            programs.extend(_start(command) for command in self._outside)
+            with inside(self.devices):
+                programs.append(_start(self._command, addresses))
+            yield programs[-1]
         finally:
-            for program in (main, *processes):
+            for program in programs:
                 program.terminate()
-            for program in (main, *processes):
+            for program in programs:
                 with suppress(subprocess.TimeoutExpired):  # end_children kills it
                     program.wait(_ENDS_S)
             process.end_children(earlier_children)  # of a guard that was killed
-            returncode = -signal.SIGKILL if main.returncode is None else main.returncode
-            self.status = returncode if returncode >= 0 else 128 - returncode
-            if signals.received is not None:
-                self.status = signals.status
 
 
 def _start(command: Sequence[str], variables: dict[str, str] | None = None) -> subprocess.Popen[bytes]:

@@ -3,8 +3,6 @@
 The checks of such a run each yield one line per failure.
 """
 
-import json
-import os
 import socket
 import subprocess
 import time
@@ -29,16 +27,13 @@ from noack.protocol.record_tables import (
 from noack.protocol.roles import LOOP_ROLES, RECEIVES, sender_to
 from noack.protocol.wire_format import Flow, Rejection
 from noack.runtime.address import LOOPBACK
-from noack.runtime.run_descriptor import RunDescriptor, loads
 from noack.runtime.udp_sockets import DROPPED_IN_FLOOD
 from noack.scenario.resolution import loop_of
 from tests.attacks.kinds import Plan, Sent, Target, carry_out
 from tests.helpers.two_hosts import TwoHosts
-from tests.helpers.waiting import PATIENCE_S, wait_for
-from tests.integration.conftest import starting, udp_port
+from tests.helpers.waiting import wait_for
+from tests.helpers.live_runs import AWAY, RunByHand, udp_port
 
-AWAY = "controller"
-"""The process on the second host."""
 _ATTEMPTS = 3
 
 
@@ -79,72 +74,28 @@ def may_forge_addresses() -> bool:
     return True
 
 
-class Run:
-    """An active run, started one process at a time; ``stack`` ends what remains."""
-
-    def __init__(self, stack: ExitStack, folder: Path, hosts: TwoHosts | None, *arguments: str) -> None:
-        self._folder, self._hosts = folder, hosts
-        self._begin = stack.enter_context(starting())
-        invitation = str(folder / "invitation.json")
-        network = (
-            ("--set", "ports={}") if hosts is None
-            else ("--listen", _addresses(hosts)[0], "--invitation", invitation)
-        )  # fmt: skip
-        self._recording = self._start(
-            0, "record", "lane_following", "--runs", str(folder / "runs"), "--no-report",
-            *network, *arguments,
-        )  # fmt: skip
-        self.processes = {
-            role: self._start(1, role, "--invitation", invitation)
-            if hosts is not None and role == AWAY
-            else self._start(0, role)
-            for role in LOOP_ROLES
-        }
-
-    def _start(self, host: int, *command: str) -> "subprocess.Popen[str]":
-        before = () if self._hosts is None else self._hosts.inside(host)
-        return self._begin(*command, "--json", before=before, runtime=self._folder)
-
-    def targets(self) -> list[Target]:
-        """Wait until the loop runs; return its processes with their ports."""
-        descriptor = self._descriptor()
-        run_dir = Path(descriptor.run_dir)
-        for table in (PLANT_ACTUATION, SENSOR_MEASUREMENT, CONTROLLER_DELIVERY):
-            spooled = run_dir / "spool" / f"{table}.recorder"
-            self._wait(lambda spooled=spooled: spooled.exists() and spooled.stat().st_size > 0)
-        ports = {
-            role: getattr(descriptor.scenario.ports, role) or udp_port(psutil.Process(process.pid))
-            for role, process in self.processes.items()
-        }
-        loop = loop_of(descriptor.scenario)
-        one_host = self._hosts is None
-        home, away = (LOOPBACK, LOOPBACK) if self._hosts is None else _addresses(self._hosts)
-        return [
-            Target(
-                role, ports[role], ports[sender_to(role, flow)], flow,
-                loop.m if flow is Flow.ACTUATION else loop.n, descriptor.run_id, descriptor.key,
-                away if role == AWAY else home, one_host or sender_to(role, flow) == AWAY,
-            )
-            for role, flow in RECEIVES.items()
-        ]  # fmt: skip
-
-    def finish(self, sent: Sent) -> Attacked:
-        """Wait for the end of the run; return its result."""
-        stdout, stderr = self._recording.communicate(timeout=PATIENCE_S + 600)
-        for process in self.processes.values():
-            process.communicate(timeout=PATIENCE_S)
-        statuses = [self._recording.returncode, *(p.returncode for p in self.processes.values())]
-        record = load_record((self._folder / "runs" / "latest").resolve())
-        return Attacked(max(statuses), json.loads(stdout), stderr, record, sent)
-
-    def _descriptor(self) -> RunDescriptor:
-        path = self._folder / f"noack-{os.getuid()}" / "default.json"
-        self._wait(path.exists)
-        return loads(path.read_text())
-
-    def _wait(self, condition: Callable[[], bool]) -> None:
-        wait_for(lambda: condition() or self._recording.poll() is not None)
-        assert self._recording.poll() is None, self._recording.communicate()
+def targets_of(run: RunByHand) -> list[Target]:
+    """Wait until the loop runs; return its processes with their ports."""
+    descriptor = run.descriptor()
+    run_dir = Path(descriptor.run_dir)
+    for table in (PLANT_ACTUATION, SENSOR_MEASUREMENT, CONTROLLER_DELIVERY):
+        spooled = run_dir / "spool" / f"{table}.recorder"
+        run.wait(lambda spooled=spooled: spooled.exists() and spooled.stat().st_size > 0)
+    ports = {
+        role: getattr(descriptor.scenario.ports, role) or udp_port(psutil.Process(process.pid))
+        for role, process in run.processes.items()
+    }
+    loop = loop_of(descriptor.scenario)
+    one_host = run.hosts is None
+    home, away = (LOOPBACK, LOOPBACK) if run.hosts is None else _addresses(run.hosts)
+    return [
+        Target(
+            role, ports[role], ports[sender_to(role, flow)], flow,
+            loop.m if flow is Flow.ACTUATION else loop.n, descriptor.run_id, descriptor.key,
+            away if role == AWAY else home, one_host or sender_to(role, flow) == AWAY,
+        )
+        for role, flow in RECEIVES.items()
+    ]  # fmt: skip
 
 
 def attack(
@@ -176,24 +127,25 @@ def attack(
             horizon_s = 3**attempt * speed * (1.5 * sending_s + 4.0)
             options = ("--set", f"speed={speed}", "--set", f"horizon_s={horizon_s:.0f}")
             with ExitStack() as stack:
-                run = Run(stack, folder / str(attempt), hosts, *options)
-                targets = run.targets()
+                run = RunByHand(stack, folder / str(attempt), hosts, *options)
+                targets = targets_of(run)
                 until_s = time.monotonic() + 1.5 * sending_s + 3.0
                 namespace = None if hosts is None else hosts.names[1]
                 plan = Plan(targets, per_port, rate_hz, forge_addresses, until_s, namespace)
                 sent = pool.submit(carry_out, plan).result()
                 all_received = have_read(targets, run.processes)
-                attacked = run.finish(sent)
+                finished = run.finish()
             if all_received:
                 break
-    return attacked
+    record = load_record(finished.run_dir)
+    return Attacked(finished.status, finished.summary, finished.stderr, record, sent)
 
 
 def have_read(targets: list[Target], processes: Mapping[str, "subprocess.Popen[str]"]) -> bool:
     """Wait until the processes have read what was sent; whether none has ended before."""
 
     def all_read() -> bool:
-        return not any(unread_bytes(processes[one.role].pid)[one.port] for one in targets)
+        return not any(unread_bytes(processes[target.role].pid)[target.port] for target in targets)
 
     try:
         wait_for(all_read)
@@ -279,7 +231,7 @@ def no_claim_is_violated(run: Attacked) -> Iterator[str]:
         yield "no envelope of the state is claimed"
     yield from (str(claim) for claim in claims if claim["verdict"] == "violated")
     violations = run.summary["loops"][0]["assumption_violations"]
-    yield from (str(one) for one in violations if one["cause"] == "dropouts")
+    yield from (str(violation) for violation in violations if violation["cause"] == "dropouts")
 
 
 CHECKS: Mapping[str, Callable[[Attacked], Iterator[str]]] = {

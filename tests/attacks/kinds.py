@@ -1,6 +1,5 @@
 """Hostile datagrams, one function per kind; the attacker sends each kind to each port in turn."""
 
-import ctypes
 import random
 import socket
 import struct
@@ -8,13 +7,13 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from noack.protocol.wire_format import HEADER_BYTES, KEY_BYTES, TAG_BYTES, Encoder, Flow, Message
 from noack.runtime.address import LOOPBACK
+from tests.helpers.two_hosts import enter_namespace
 
 FUTURE = 2**40
 """A sequence number that no run reaches: greater than every accepted number."""
@@ -135,7 +134,6 @@ STRANGER, PEER = "stranger", "forged address"
 _LONGEST_BURST_S = 0.02
 _DISTINCT = 5000
 """Number of distinct datagrams per kind, sender and port."""
-_CLONE_NEWNET = 0x40000000
 _UDP_HEADER = struct.Struct("!HHHH")
 
 Sent = Counter[tuple[str, str, str]]
@@ -196,13 +194,6 @@ def _paced(count: int, rate_hz: float, until_s: float) -> Iterator[int]:
         due_s = max(due_s, now_s - _LONGEST_BURST_S)
         yield number
         due_s += 1 / rate_hz
-
-
-def enter_namespace(namespace: str) -> None:
-    """Move this process to a network namespace."""
-    with Path(f"/var/run/netns/{namespace}").open() as file:
-        if ctypes.CDLL(None, use_errno=True).setns(file.fileno(), _CLONE_NEWNET):
-            raise OSError(ctypes.get_errno(), "setns failed")
 
 
 def carry_out(plan: Plan) -> Sent:

@@ -38,7 +38,7 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from tests.attacks.other_user import NOBODY, needs_root
 from tests.command_line import invoke
-from tests.noack.runtime.test_run_descriptor import INVITED
+from tests.helpers.run_descriptors import INVITED
 
 OWN = f"noack-{os.getuid()}"
 EMULATOR = "lab"
@@ -245,8 +245,8 @@ def common(tmp_path: Path) -> Path:
 def planted(plant: str, common: Path, names: Sequence[Path], private: Path) -> None:
     for name in names:
         old = name.with_suffix(name.suffix + ".partial")
-        for one in (name, old.with_name(f".{old.name}"), name.with_suffix(".partial")):
-            path = common / one
+        for planted_name in (name, old.with_name(f".{old.name}"), name.with_suffix(".partial")):
+            path = common / planted_name
             path.parent.mkdir(parents=True, exist_ok=True)
             if not os.path.lexists(path):
                 PLANTS[plant](path, private)
@@ -271,7 +271,7 @@ def test_a_command_follows_no_planted_name(
         return done.exit_code
 
     assert status_of_command() == 0
-    names = [one.relative_to(common) for one in common.rglob("*") if one.is_file()]
+    names = [path.relative_to(common) for path in common.rglob("*") if path.is_file()]
     assert names
     # Hard links, FIFOs and folders: one command shows them, and each writer below.
     for plant in PLANTS if command == COMMANDS[0] else ("symbolic link",):
@@ -316,9 +316,9 @@ def test_a_file_that_grows_or_is_locked_follows_no_planted_name(
     name: str, plant: str, common: Path, private: Path
 ) -> None:
     planted(plant, common, [Path(name)], private)
-    for one in common.iterdir():
+    for path in common.iterdir():
         if plant != "hard link":
-            os.chown(one, NOBODY, NOBODY, follow_symlinks=False)
+            os.chown(path, NOBODY, NOBODY, follow_symlinks=False)
     with suppress(NoackError, OSError):
         WRITERS[name](common / name)
         assert name == ".lock" or not (common / name).is_symlink()

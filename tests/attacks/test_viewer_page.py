@@ -88,9 +88,9 @@ def test_only_the_printed_address_serves_the_page(server: RecordingServer) -> No
 def test_without_the_exact_secret_every_path_is_404(server: RecordingServer) -> None:
     secret = secret_of(server)
     similar = (secret[:-1], f"{secret}x", secret.swapcase(), "", "x", "%2e")
-    for one in (*(f"{similar_one}/" for similar_one in similar), secret):
+    for path in (*(f"{text}/" for text in similar), secret):
         for name in ("", RECORDING, "re_viewer.js"):
-            assert ask(f"{server.origin}/{one}{name}")[0] == 404
+            assert ask(f"{server.origin}/{path}{name}")[0] == 404
 
 
 def test_the_secret_is_new_each_time_long_and_on_no_command_line(server: RecordingServer) -> None:

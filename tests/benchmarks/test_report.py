@@ -2,6 +2,7 @@
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -20,14 +21,14 @@ HALF = Goal("<=", 0.5)
         (Row("a", 3.0, "s", goal=Goal("<", 3)), False),
         (Row("a", 99.9, "%", goal=Goal(">=", 99.9)), True),
         (Row("a", 1, "", goal=Goal("==", 0)), False),
-        (Row("a", 30.0, "µs", Peer("ping", 12.0), Goal("<=", 3)), True),  # the ratio is judged
+        (Row("a", 30.0, "µs", Peer("ping", 12.0), Goal("<=", 3)), True),  # the ratio is checked
         (Row("nothing asked", 1.0, "s"), None),
         (Row("not measured", None, "s", goal=Goal("<", 3)), None),
         (Row("no peer to compare with", 1.0, "s", Peer("cyclictest", None), Goal("<", 3)), None),
-        (Row("a", 1.0, "s", Peer("p", 1.0), Goal("<", 3), unjudged="no SCHED_FIFO"), None),
+        (Row("a", 1.0, "s", Peer("p", 1.0), Goal("<", 3), unchecked_because="no SCHED_FIFO"), None),
     ],
 )
-def test_a_row_holds_fails_or_cannot_be_judged(row: Row, holds: bool | None) -> None:
+def test_a_row_holds_fails_or_cannot_be_checked(row: Row, holds: bool | None) -> None:
     assert row.holds is holds
 
 
@@ -60,6 +61,13 @@ def test_rows_and_reasons_are_printed_and_written_as_json(
     assert "no such program" in output
 
 
+def test_a_goal_whose_row_was_renamed_fails(capsys: pytest.CaptureFixture[str]) -> None:
+    row = Row("event → update, no emulator, p50", 30.0, "µs")
+    assert run(by_name(named("latency", row)), []) == 0
+    assert run(by_name(named("latency", replace(row, name="from event to update, p50"))), []) == 1
+    assert "latency: no row is named like the goal 'event → update" in capsys.readouterr().err
+
+
 def rounds_of(ours: list[float], theirs: list[float]) -> Rounds:
     rounds = Rounds()
     for side, values in (("ours", ours), ("theirs", theirs)):
@@ -82,7 +90,7 @@ def test_a_row_has_the_medians_of_the_rounds_or_the_median_of_their_ratios() -> 
 
 
 @pytest.mark.parametrize("side", ["ours", "theirs"])
-def test_a_side_without_measurements_is_named_and_not_judged(side: str) -> None:
+def test_a_side_without_measurements_is_named_and_not_checked(side: str) -> None:
     rounds = rounds_of([1.0, 2.0], [1.0])
     rounds.add(side, "lost a datagram")
     row = rounds.row("cost", "µs", "us", "ours", "theirs", HALF, paired=True)

@@ -1,4 +1,4 @@
-"""The judgement of a soak test; `.ci/run` makes one of three minutes."""
+"""The check of a soak test; `.ci/run` makes one of three minutes."""
 
 import math
 from collections.abc import Callable
@@ -48,7 +48,7 @@ def test_stale_rejections_must_equal_the_packets_delivered_out_of_order() -> Non
         ({"replay": {"bit_exact": False, "complete": True}}, "replayed bit for bit and completely"),
         ({"replay": {"bit_exact": True, "complete": False}}, "replayed bit for bit and completely"),
         ({"replay": None}, "replayed bit for bit and completely"),
-        ({"claims": []}, "claims judged"),
+        ({"claims": []}, "claims checked"),
         ({"claims": [GOOD["claims"][1] | {"verdict": "violated"}]}, "claims violated"),
     ],
 )
@@ -66,7 +66,7 @@ def noise(t: float) -> float:
     return 300 * math.sin(t) * math.cos(0.37 * t)
 
 
-def judged(kib_of_s: Callable[[float], float], length_s: float = HOUR_S) -> Trend:
+def checked_trend(kib_of_s: Callable[[float], float], length_s: float = HOUR_S) -> Trend:
     at_s = np.arange(0.0, length_s, 5.0 if length_s <= HOUR_S else 60.0)
     fitted = trend(at_s.tolist(), [80_000.0 + kib_of_s(t) for t in at_s], length_s)
     assert fitted is not None
@@ -77,14 +77,14 @@ def judged(kib_of_s: Callable[[float], float], length_s: float = HOUR_S) -> Tren
     ("kib_of_s", "length_s", "flat", "allowed_kib"),
     [
         (noise, HOUR_S, True, 1024),
-        (lambda t: 50 * min(t, 300.0), HOUR_S, True, 1024),  # the warm-up is not judged
+        (lambda t: 50 * min(t, 300.0), HOUR_S, True, 1024),  # the warm-up is not checked
         (lambda t: 20_000 if t % 600 < 60 else 0, HOUR_S, True, 1024),  # temporary memory
         (lambda t: noise(t) + 500 * t * 2 / 1024, HOUR_S, False, 256),  # two bytes a step
         (lambda t: 0.1 * t, HOUR_S, False, 256),  # 0.8 events per second, 128 bytes each
         # Five minutes suffice for a leak per step but not for slower leaks.
         (lambda t: LEAK_KIB_PER_S * t, 300.0, False, 9728),
         (lambda t: 0.1 * t, 300.0, True, 9728),
-        # A longer run is judged by its growth rate.
+        # A longer run is checked by its growth rate.
         (lambda t: noise(t) + 0.2 * t, 24 * HOUR_S, False, 256 * (24 - 1 / 12)),
         (lambda t: noise(t) + 0.05 * t, 24 * HOUR_S, True, 256 * (24 - 1 / 12)),
     ],
@@ -92,13 +92,13 @@ def judged(kib_of_s: Callable[[float], float], length_s: float = HOUR_S) -> Tren
 def test_memory_may_grow_by_its_noise_and_not_more(
     kib_of_s: Callable[[float], float], length_s: float, flat: bool, allowed_kib: float
 ) -> None:
-    fitted = judged(kib_of_s, length_s)
+    fitted = checked_trend(kib_of_s, length_s)
     assert fitted.allowed_kib == pytest.approx(allowed_kib)
     assert (fitted.growth_kib <= fitted.allowed_kib) == flat
 
 
 def test_a_trend_needs_time_and_samples() -> None:
-    fitted = judged(lambda t: noise(t) + LEAK_KIB_PER_S * t)
+    fitted = checked_trend(lambda t: noise(t) + LEAK_KIB_PER_S * t)
     assert fitted.slope_kib_per_h == pytest.approx(3600 * LEAK_KIB_PER_S, rel=0.1)
     assert warm_up_s(HOUR_S) == 300.0
     assert trend([0.0, 30.0], [1.0, 2.0], 60.0) is None

@@ -49,7 +49,7 @@ def after(t_ms: float) -> np.ndarray:
 
 def inputs(outputs: Sequence[Output]) -> np.ndarray:
     """The inputs of an actuation, one per row."""
-    (message,) = [one for one in outputs if isinstance(one, Message)]
+    (message,) = [output for output in outputs if isinstance(output, Message)]
     return message.vector.reshape(-1, len(K))
 
 
@@ -59,7 +59,7 @@ def test_a_late_update_restores_the_sensors_model() -> None:
     for t_ms in range(0, 8, PERIOD_MS):
         np.testing.assert_array_equal(inputs(controller.on_timer(t_ms * MS)), [SAFE])
     *records, notice = controller.handle(update(2, 3), 7 * MS)
-    (row,) = np.array([one.row for one in records if isinstance(one, Record)],
+    (row,) = np.array([record.row for record in records if isinstance(record, Record)],
                       tables(2, 3)[CONTROLLER_DELIVERY])  # fmt: skip
     assert (row["t_ns"], row["model_t_ns"], row["dropouts"]) == (3 * MS, 6 * MS, 2)
     np.testing.assert_allclose(row["x_c"], after(3), rtol=1e-13)

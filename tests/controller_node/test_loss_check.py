@@ -23,8 +23,8 @@ def check_of(mansd: int, *constraints: LossRule, known_start: bool = True) -> Lo
 def violations(check: LossCheck, sequence: int, losses: int) -> Sequence[str]:
     """Add an update that was sent at ``sequence`` milliseconds."""
     found = check.add(sequence, sequence - losses - 1, losses, sequence * MS, sequence * MS)
-    assert all((one.t_ns, one.level) == (sequence * MS, "violation") for one in found)
-    return [one.text for one in found]
+    assert all((notice.t_ns, notice.level) == (sequence * MS, "violation") for notice in found)
+    return [notice.text for notice in found]
 
 
 @given(st.lists(st.booleans(), max_size=25))
@@ -36,7 +36,7 @@ def test_further_constraints_are_checked_over_all_updates_so_far(delivered: list
     for i in (number for number, arrives in enumerate(delivered) if arrives):
         found = violations(check, i, i - last - 1)
         ends = range(last + 1, i)  # the losses that this update shows
-        too_many = any(sum(not one for one in delivered[max(j - 4, 0) : j + 1]) > 2 for j in ends)
+        too_many = any(sum(not arrives for arrives in delivered[max(j - 4, 0) : j + 1]) > 2 for j in ends)
         too_soon = i - last > 1 and delivered[last - 1 : last + 1] == [False, True]
         assert [text.partition(" violated")[0] for text in found] == [
             rule.name for rule, broken in ((window, too_many), (recovery, too_soon)) if broken

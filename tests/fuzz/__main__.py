@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 
-from tests.fuzz.harness import FOLDER, kept, parsers, to_line
+from tests.fuzz.harness import FOLDER, kept_inputs, parsers, to_line
 from tests.native import sanitized_core
 
 ROOT = FOLDER.parents[1]
@@ -30,7 +30,7 @@ def fuzz(name: str, seconds: int) -> tuple[bool, str]:
     corpus.mkdir(parents=True, exist_ok=True)
     for old in _findings_in(folder):
         old.replace(corpus / old.name)  # try old findings first
-    for number, data in enumerate([*under_test.seeds, *kept(name)]):
+    for number, data in enumerate([*under_test.seeds, *kept_inputs(name)]):
         (corpus / f"kept-{number}").write_bytes(data)
     words, log = folder / "words.dict", folder / "log.txt"
     lines = ('"' + "".join(f"\\x{byte:02x}" for byte in word) + '"' for word in under_test.words)

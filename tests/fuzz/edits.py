@@ -63,7 +63,7 @@ class Choices:
         size = 1 if limit <= 256 else 2
         return int.from_bytes(self.take(size), "little") % limit
 
-    def one(self, of: Sequence[T]) -> T:
+    def choose(self, of: Sequence[T]) -> T:
         """Return one of these options."""
         return of[self.below(len(of))]
 
@@ -75,7 +75,7 @@ class Choices:
         """Return an integer: a boundary value, a small one, or any of 64 bits."""
         match self.below(3):
             case 0:
-                return self.one(INTEGERS)
+                return self.choose(INTEGERS)
             case 1:
                 return self.below(256)
             case _:
@@ -85,7 +85,7 @@ class Choices:
         """Return a float: a boundary value, or any 64 bits."""
         if self.flag():
             return float(struct.unpack("<d", self.take(8))[0])
-        return self.one(FLOATS)
+        return self.choose(FLOATS)
 
     def text(self) -> str:
         """Return a short text of any UTF-8 characters."""
@@ -118,22 +118,22 @@ def vocabulary(schema: Mapping[str, Any], *, dates: bool = False) -> Vocabulary:
         if isinstance(part, Mapping):
             keys |= dict.fromkeys(part.get("properties", {}))
             constants = [part.get("const"), part.get("default"), *part.get("enum", ())]
-            words |= dict.fromkeys(one for one in constants if isinstance(one, str))
+            words |= dict.fromkeys(constant for constant in constants if isinstance(constant, str))
             parts += part.values()
         elif isinstance(part, list):
             parts += part
     return Vocabulary(tuple(keys), tuple(words), dates)
 
 
-def edited(choices: Choices, tree: Any, known: Vocabulary, most: int = 6) -> Any:
+def edited(choices: Choices, tree: Any, vocabulary: Vocabulary, most: int = 6) -> Any:
     """Return a copy of a tree of dicts and lists with some edits."""
     root = {"": copy.deepcopy(tree)}
     for _ in range(choices.below(most)):
-        _edit(choices, root[""], known)
+        _edit(choices, root[""], vocabulary)
     return root[""]
 
 
-def value(choices: Choices, known: Vocabulary, depth: int = 0) -> Any:
+def value(choices: Choices, vocabulary: Vocabulary, depth: int = 0) -> Any:
     """Return a value of any type."""
     match choices.below(9 if depth < 3 else 6):
         case 0:
@@ -143,45 +143,45 @@ def value(choices: Choices, known: Vocabulary, depth: int = 0) -> Any:
         case 2:
             return choices.flag()
         case 3:
-            return choices.one(known.words) if known.words else ""
+            return choices.choose(vocabulary.words) if vocabulary.words else ""
         case 4:
             return choices.text()
         case 5:
-            return datetime.date(1970, 1, 1) if known.dates else None
+            return datetime.date(1970, 1, 1) if vocabulary.dates else None
         case 6:
-            return [value(choices, known, depth + 1) for _ in range(choices.below(4))]
+            return [value(choices, vocabulary, depth + 1) for _ in range(choices.below(4))]
         case 7:
-            return {key(choices, known): value(choices, known, depth + 1) for _ in range(choices.below(4))}
+            return {key(choices, vocabulary): value(choices, vocabulary, depth + 1) for _ in range(choices.below(4))}
         case _:
-            nested: Any = value(choices, known, depth + 1)
+            nested: Any = value(choices, vocabulary, depth + 1)
             for _ in range(choices.below(20)):
                 nested = [nested]
             return nested
 
 
-def key(choices: Choices, known: Vocabulary) -> str:
+def key(choices: Choices, vocabulary: Vocabulary) -> str:
     """Return a key of the format or any other key."""
-    return choices.one(known.keys) if known.keys and choices.below(8) else choices.text()
+    return choices.choose(vocabulary.keys) if vocabulary.keys and choices.below(8) else choices.text()
 
 
-def _edit(choices: Choices, tree: Any, known: Vocabulary) -> None:
+def _edit(choices: Choices, tree: Any, vocabulary: Vocabulary) -> None:
     places = list(_containers(tree))
     if not places:
         return
-    container = choices.one(places)
+    container = choices.choose(places)
     at: Any
     if isinstance(container, dict):
-        at = choices.one(list(container)) if container and choices.below(3) else key(choices, known)
+        at = choices.choose(list(container)) if container and choices.below(3) else key(choices, vocabulary)
     elif container:
         at = choices.below(len(container))
     else:
-        container.append(value(choices, known))
+        container.append(value(choices, vocabulary))
         return
     match choices.below(5):
         case 0 | 1:
-            container[at] = value(choices, known)
+            container[at] = value(choices, vocabulary)
         case 2:
-            container[at] = copy.deepcopy(choices.one(places))
+            container[at] = copy.deepcopy(choices.choose(places))
         case 3 if isinstance(container, list):
             container.insert(at, copy.deepcopy(container[at]))
         case _ if isinstance(container, dict):
@@ -194,12 +194,12 @@ def _containers(tree: Any) -> Any:
     """Return the tables and lists of a tree; of a long list, only the first entries."""
     if isinstance(tree, dict):
         yield tree
-        for one in tree.values():
-            yield from _containers(one)
+        for entry in tree.values():
+            yield from _containers(entry)
     elif isinstance(tree, list):
         yield tree
-        for one in tree[:4]:
-            yield from _containers(one)
+        for entry in tree[:4]:
+            yield from _containers(entry)
 
 
 def write_named(folder: Path, name: str, data: bytes) -> Path:
@@ -222,9 +222,9 @@ def bases(folder: str, *more: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
     return [*(tomllib.loads(path.read_text(encoding="utf-8")) for path in paths), *more]
 
 
-def quoted(known: Vocabulary) -> Sequence[bytes]:
+def quoted(vocabulary: Vocabulary) -> Sequence[bytes]:
     """Return plain keys, quoted words and some numbers, for a fuzzer that makes text."""
-    words: Iterable[str] = (*known.keys, *(json.dumps(word) for word in known.words))
+    words: Iterable[str] = (*vocabulary.keys, *(json.dumps(word) for word in vocabulary.words))
     return [word.encode() for word in (*words, "1e400", "nan", "-inf", "[[", "]]", "{", "}", "=")]
 
 
@@ -234,7 +234,7 @@ _IN_64_BITS = [number for number in INTEGERS if -(2**63) <= number < 2**63]
 def edited_table(choices: Choices, table: pa.Table) -> pa.Table:
     """Return a copy of a table with some edits."""
     for _ in range(choices.below(4)):
-        name = choices.one(table.column_names) if table.num_columns else ""
+        name = choices.choose(table.column_names) if table.num_columns else ""
         at = table.schema.get_field_index(name)
         if at < 0:
             break
@@ -300,11 +300,11 @@ def _one_changed(choices: Choices, column: pa.ChunkedArray) -> Any:
     value: Any = None
     if choices.below(8):
         if pa.types.is_integer(column.type):
-            value = choices.one(_IN_64_BITS) if choices.flag() else choices.below(256) - 128
+            value = choices.choose(_IN_64_BITS) if choices.flag() else choices.below(256) - 128
         elif pa.types.is_floating(column.type):
             value = choices.real()
         elif pa.types.is_dictionary(column.type):
-            value = choices.one(["forward", "reverse", "up", "", "other"])
+            value = choices.choose(["forward", "reverse", "up", "", "other"])
         elif isinstance(values[at], bytes):
             value = bytes(damaged(choices, values[at])).ljust(len(values[at]), b"\0")
     values[at] = value

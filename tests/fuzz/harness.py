@@ -67,7 +67,7 @@ def parsers() -> Mapping[str, Harness]:
     return found
 
 
-def kept(name: str) -> list[bytes]:
+def kept_inputs(name: str) -> list[bytes]:
     """Return the kept inputs of a parser."""
     path = CORPUS / f"{name}.txt"
     lines = path.read_text(encoding="ascii").splitlines() if path.is_file() else []

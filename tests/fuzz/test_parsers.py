@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.fuzz.harness import kept, parsers
+from tests.fuzz.harness import kept_inputs, parsers
 
 EXAMPLES = {"record": 10, "telemetry": 15, "campaign": 15}
 """Number of examples for slow parsers; 25 for the others. The long run is `make fuzz`."""
@@ -21,7 +21,7 @@ splices = st.lists(
 @pytest.mark.parametrize("name", NAMES)
 def test_every_input_of_the_corpus_is_read_or_refused_in_one_line(name: str) -> None:
     under_test = parsers()[name]
-    inputs = [*under_test.seeds, *kept(name)]
+    inputs = [*under_test.seeds, *kept_inputs(name)]
     assert len(inputs) > 3
     for data in inputs:
         under_test.run(data)
@@ -30,7 +30,7 @@ def test_every_input_of_the_corpus_is_read_or_refused_in_one_line(name: str) -> 
 @pytest.mark.parametrize("name", NAMES)
 def test_inputs_near_the_corpus_are_read_or_refused_in_one_line(name: str) -> None:
     under_test = parsers()[name]
-    inputs = st.sampled_from([*under_test.seeds, *kept(name)])
+    inputs = st.sampled_from([*under_test.seeds, *kept_inputs(name)])
 
     @settings(max_examples=EXAMPLES.get(name, 25), database=None)
     @given(inputs, inputs, splices)

@@ -4,6 +4,7 @@
 """
 
 import os
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -11,12 +12,23 @@ import pytest
 
 from noack.core.errors import NoackError
 
+_OUTPUTS = Path(__file__).parents[1] / "cosim" / "output" / "approved"
+_STARTED = re.compile(r"started [\w:+-]+")
+_ROUNDING = re.compile(r"[ \d]\d?\.?\d*e-(0[7-9]|1\d)")
+"""Differences of rounding, which depend on the processor."""
+
 
 def compare_text(path: Path, text: str) -> None:
     """Compare a text with the approved one."""
     if os.environ.get("APPROVE"):
         path.write_text(text, encoding="utf-8")
     assert text == path.read_text(encoding="utf-8")
+
+
+def compare_output(name: str, text: str) -> None:
+    """Compare a text of noack with the approved one, except for start times and rounding errors."""
+    text = _ROUNDING.sub(" tiny", _STARTED.sub("started …", text)).rstrip() + "\n"
+    compare_text(_OUTPUTS / name, text)
 
 
 def compare_lines(path: Path, lines_of: Callable[[str], Sequence[str]]) -> None:

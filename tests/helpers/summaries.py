@@ -8,7 +8,7 @@ from cosim.analysis.summary.summary_model import ExitPart, LoopSummary, RunSumma
 from cosim.record.run_record import NETWORK_ROLES, RecordedRun, RunRecord
 
 
-def alone(record: RunRecord) -> RecordedRun:
+def run_of_one_loop(record: RunRecord) -> RecordedRun:
     """Return the record of a run whose only loop has the network for itself."""
     network = RunRecord(
         record.scenario, record.source, [], record.reports, record.kind, record.earlier,
@@ -20,7 +20,7 @@ def alone(record: RunRecord) -> RecordedRun:
 def summary_of(record: RunRecord, **more: Any) -> RunSummary:
     """The summary of a completed run whose only loop has this record, with other values."""
     end = ExitPart(status=0, reason="horizon")
-    run = summarise_run(alone(record).network, [summarise_loop(record, 0, "horizon")], end)
+    run = summarise_run(run_of_one_loop(record).network, [summarise_loop(record, 0, "horizon")], end)
     return with_values(run, **more)
 
 

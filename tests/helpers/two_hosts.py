@@ -1,14 +1,18 @@
 """Two hosts for tests and benchmarks: network namespaces that a link connects (needs root); clocks."""
 
+import ctypes
 import os
 import shutil
 import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import NamedTuple
 
 from noack.core.errors import MachineError
 from noack.runtime.host_clocks.time_exchange import HostClocks
+
+_CLONE_NEWNET = 0x40000000
 
 
 class TwoHosts(NamedTuple):
@@ -51,6 +55,13 @@ def two_hosts() -> Iterator[TwoHosts]:
     finally:
         for name in names:
             subprocess.run(["ip", "netns", "del", name], capture_output=True, check=False)
+
+
+def enter_namespace(namespace: str) -> None:
+    """Move this thread to a network namespace."""
+    with Path(f"/var/run/netns/{namespace}").open() as file:
+        if ctypes.CDLL(None, use_errno=True).setns(file.fileno(), _CLONE_NEWNET):
+            raise OSError(ctypes.get_errno(), "setns failed")
 
 
 class DrivenClocks(HostClocks):

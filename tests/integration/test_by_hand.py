@@ -18,7 +18,7 @@ from cosim.live.finalize import reopen
 from cosim.record.run_record import load_record
 from noack.protocol.roles import LOOP_ROLES
 from noack.runtime.run_descriptor import loads
-from tests.integration import conftest as live
+from tests.helpers import live_runs as live
 
 Start = Callable[..., live.Running]
 ByHand = Callable[[str], subprocess.Popen[str]]

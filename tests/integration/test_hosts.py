@@ -22,8 +22,8 @@ from noack.protocol.roles import LOOP_ROLES
 from noack.scenario.scenario import phases_ns
 from tests.command_line import invoke
 from tests.helpers.two_hosts import TwoHosts, two_hosts
-from tests.integration import conftest as live
-from tests.integration.conftest import Start, ended
+from tests.helpers import live_runs as live
+from tests.helpers.live_runs import Start, ended
 
 INVITED = ("--invitation", "invitation.json")
 ROOMY = "clocks.largest_error_us=1000000"

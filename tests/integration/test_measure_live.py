@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from noack.traces.packet_trace import read_trace
-from tests.integration.conftest import Start, starting
+from tests.helpers.live_runs import Start, starting
 
 LONG_S = 120
 

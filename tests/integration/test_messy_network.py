@@ -11,8 +11,8 @@ from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import RunRecord, load_record
 from noack.protocol import record_tables
 from noack.protocol.wire_format import Flow, read_header
-from tests.integration import conftest as live
-from tests.integration.conftest import AT_RATE, Finished, assert_complete, run_scenario, settings
+from tests.helpers import live_runs as live
+from tests.helpers.live_runs import AT_RATE, Finished, assert_complete, run_scenario, settings
 
 MANSD = 2
 IMPAIRMENTS = [
@@ -26,8 +26,8 @@ IMPAIRMENTS = [
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     tables = "{" + "}, {".join(
-        ", ".join(f"{key} = {json.dumps(value)}" for key, value in one.items())
-        for one in IMPAIRMENTS
+        ", ".join(f"{key} = {json.dumps(value)}" for key, value in impairment.items())
+        for impairment in IMPAIRMENTS
     ) + "}"  # fmt: skip
     values = {
         "horizon_s": 8.0,
@@ -115,7 +115,7 @@ ACTUATION = (
 
 def test_actuations_are_lost_within_their_guarantee(tmp_path: Path) -> None:
     sets = ("horizon_s=4", ACTUATION, "controller.predictions=5", "trigger.beta=0.02")
-    options = [word for one in sets for word in ("--set", one)]
+    options = [word for setting in sets for word in ("--set", setting)]
     finished = run_scenario(tmp_path, *AT_RATE, *options)
     assert finished.status == 0, finished.stderr
     live.assert_complete(finished.loop)

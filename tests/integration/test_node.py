@@ -32,8 +32,7 @@ from noack.runtime.udp_sockets import bind
 from noack.settings.user_files import located
 from tests.command_line import invoke
 from tests.helpers.approved import lines_of_error
-from tests.integration import conftest as live
-from tests.integration.test_restarts import goes_on, spooled
+from tests.helpers import live_runs as live
 from tests.noack.runtime.drivers.live_loops import KEY, RUN_ID, Rows, scenario
 
 Start = Callable[..., live.Running]
@@ -137,12 +136,12 @@ def test_a_stopped_program_ends_with_its_process_and_another_goes_on(start: Star
     options = by(node, speed=2.0, horizon_s=60.0, recovery__rejoin_within_s=60.0)
     running = start(*options)
     running.wait_recording()
-    live.wait_for(lambda: len(spooled(running, "controller_delivery")) > 0)
+    live.wait_for(lambda: len(live.spooled(running, "controller_delivery")) > 0)
     program = program_of(running)
     program.send_signal(signal.SIGSTOP)
     running.child("controller").kill()
     live.wait_for(lambda: live.is_over(program))
-    live.wait_for(lambda: goes_on(running, "controller"))
+    live.wait_for(lambda: live.goes_on(running, "controller"))
     running.process.send_signal(signal.SIGINT)
     finished = running.finish()
     assert finished.loop["replay"]["bit_exact"], finished.loop["replay"]

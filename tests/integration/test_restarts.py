@@ -14,54 +14,31 @@ from noack.runtime.spool import read_chunks
 from noack.scenario.resolution import run_tables
 from noack.scenario.scenario_file import load
 from noack.theory.certificates.conditions import allowed_conditions
-from tests.integration import conftest as live
+from tests.helpers import live_runs as live
 
 LOOP = ("plant_step", "sensor_measurement", "controller_step")
-KEEPS = {
-    "sensor": "sensor_measurement",
-    "controller": "controller_delivery",
-    "netem": "netem_packet",
-    "recorder": "plant_step",
-}
 RESTARTED = ("recorder", "controller", "sensor", "netem")
-
-
-def spooled(running: live.Running, table: str) -> Rows:
-    """Return the rows of a table that are on disk."""
-    spool = running.runs / "latest" / "spool"
-    dtype = run_tables(load(running.runs / "latest" / "scenario.toml"))[table]
-    found = [np.frombuffer(data, dtype) for _, data in read_chunks(spool, table)]
-    return np.concatenate([np.zeros(0, dtype), *found])
 
 
 def is_whole(running: live.Running, table: str) -> bool:
     """Whether a table has no gaps."""
-    inputs = spooled(running, table)["sequence"] % GENERATION
+    inputs = live.spooled(running, table)["sequence"] % GENERATION
     return bool((np.diff(np.unique(inputs)) == 1).all())
-
-
-def goes_on(running: live.Running, role: str) -> bool:
-    """Whether the restarted process of a role has recorded rows; fail if the run has ended."""
-    assert running.process.poll() is None, running.process.communicate()
-    if role == "recorder":
-        written = (running.runs / "latest" / "spool").glob("plant_step.*")
-        return sum(path.stat().st_size > 0 for path in written) > 1
-    return bool((spooled(running, KEEPS[role])["input"] >= GENERATION).any())
 
 
 def kill(running: live.Running, role: str) -> None:
     """Kill a process that has rows on disk; wait until its replacement has, too."""
-    table = KEEPS[role]
-    live.wait_for(lambda: len(spooled(running, table)) > 0)
+    table = live.KEEPS[role]
+    live.wait_for(lambda: len(live.spooled(running, table)) > 0)
     before = live.child_of(running.process, role)
     assert before is not None
     before.kill()
-    live.wait_for(lambda: goes_on(running, role))
+    live.wait_for(lambda: live.goes_on(running, role))
 
 
 def let_run(running: live.Running, simulated_s: float) -> None:
     def now_ns() -> int:
-        return int(spooled(running, "plant_step")["t_ns"].max())
+        return int(live.spooled(running, "plant_step")["t_ns"].max())
 
     until_ns = now_ns() + simulated_s * 1e9
     live.wait_for(lambda: now_ns() > until_ns)
@@ -95,12 +72,12 @@ def restarted(tmp_path_factory: pytest.TempPathFactory) -> live.Finished:
 def test_the_run_continues_and_lists_its_restarts(restarted: live.Finished) -> None:
     assert restarted.status == 130, restarted.stderr
     assert restarted.summary["exit"]["reason"] == "stopped by the user (SIGINT)"
-    restarts = {one["process"]: one for one in restarted.loop["restarts"]}
+    restarts = {restart["process"]: restart for restart in restarted.loop["restarts"]}
     assert restarts.keys() == set(RESTARTED)
-    for role, one in restarts.items():
-        assert one["generation"] == 1
-        assert one["what"] == f"restarted: {role} died: killed by SIGKILL"
-        assert role == "recorder" or one["last_s"] < one["first_s"]
+    for role, restart in restarts.items():
+        assert restart["generation"] == 1
+        assert restart["what"] == f"restarted: {role} died: killed by SIGKILL"
+        assert role == "recorder" or restart["last_s"] < restart["first_s"]
     for role in RESTARTED:
         assert f"{role} died: killed by SIGKILL at " in restarted.stderr
         assert f"{role} runs again at " in restarted.stderr

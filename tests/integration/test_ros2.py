@@ -14,7 +14,7 @@ import pytest
 import noack
 from noack.core.errors import CallerError
 from tests.command_line import invoke
-from tests.integration.conftest import AT_RATE
+from tests.helpers.live_runs import AT_RATE
 
 pytest.importorskip("rosbags", reason="the extra `ros` is not installed")
 pytest.importorskip("zenoh_ros2_sdk", reason="zenoh-ros2-sdk is not installed")

@@ -35,7 +35,7 @@ from noack.protocol.record_tables import (
 from noack.protocol.roles import LOOP_ROLES
 from tests.command_line import invoke
 from tests.cosim.output.viewer.recordings import read, series
-from tests.integration.conftest import (
+from tests.helpers.live_runs import (
     AT_RATE,
     Finished,
     Running,
@@ -44,8 +44,8 @@ from tests.integration.conftest import (
     run_scenario,
     settings,
     wait_for,
+    spooled,
 )
-from tests.integration.test_restarts import spooled
 
 CERTIFIED = "certified for the scenario's plant"
 

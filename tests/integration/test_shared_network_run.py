@@ -9,7 +9,7 @@ import pytest
 from cosim.analysis.replay import replay
 from cosim.record.run_record import load_run
 from noack.protocol.wire_format import read_header
-from tests.integration import conftest as live
+from tests.helpers import live_runs as live
 
 DIFFERENT = ("lane", "pendulum-1", "pendulum-2", "mass")
 SIZES = {"lane": 4, "pendulum-1": 2, "pendulum-2": 2, "mass": 2}
@@ -42,5 +42,5 @@ def test_all_loops_reach_the_horizon_at_their_rates_and_are_replayed(
         assert (len(steps), steps["x"].shape[1]) == (STEPS[name], SIZES[name])
         assert len(record["sensor_setting"]) == 1
         headers = [read_header(head.tobytes()) for head in record["netem_packet"]["head"]]
-        assert all(one is not None and one.version == 2 and one.error_level > 0 for one in headers)
+        assert all(header is not None and header.version == 2 and header.error_level > 0 for header in headers)
     assert all(loop["exit"]["status"] == 0 for loop in different.summary["loops"])

@@ -18,7 +18,7 @@ from packaging.requirements import Requirement
 
 from cosim.doctor.machine_measures import EXTRAS
 from native.build import HEADER, INTO, LIBRARY
-from tests.integration.conftest import EPHEMERAL, PATIENCE_S
+from tests.helpers.live_runs import EPHEMERAL, PATIENCE_S
 
 pytestmark = pytest.mark.builds
 ROOT = Path(__file__).parents[2]
@@ -97,13 +97,13 @@ def requirements(wheel: Path) -> list[Distribution]:
     needed: dict[str, Distribution] = {}
     waiting = [(Requirement(text), "") for text in texts]
     while waiting:
-        one, extra = waiting.pop()
-        if one.marker is not None and not one.marker.evaluate({"extra": extra}):
+        requirement, extra = waiting.pop()
+        if requirement.marker is not None and not requirement.marker.evaluate({"extra": extra}):
             continue
-        new = one.name not in needed
-        found = needed.setdefault(one.name, distribution(one.name))
-        assert one.specifier.contains(found.version), one
-        extras = [*([""] if new else []), *one.extras]
+        new = requirement.name not in needed
+        found = needed.setdefault(requirement.name, distribution(requirement.name))
+        assert requirement.specifier.contains(found.version), requirement
+        extras = [*([""] if new else []), *requirement.extras]
         waiting += [(Requirement(text), of) for text in found.requires or () for of in extras]
     return [*needed.values()]
 
@@ -117,9 +117,9 @@ def noack(dist: Path, tmp_path_factory: pytest.TempPathFactory) -> Installed:
     made = uv("venv", "--python", sys.executable, place / "env")
     assert made.returncode == 0, made.stderr
     (packages,) = (place / "env").glob("lib/python*/site-packages")
-    for one in requirements(wheel):
-        for name in {path.parts[0] for path in one.files or ()} - {"..", "__pycache__"}:
-            (packages / name).symlink_to(Path(str(one.locate_file(name))))
+    for package in requirements(wheel):
+        for name in {path.parts[0] for path in package.files or ()} - {"..", "__pycache__"}:
+            (packages / name).symlink_to(Path(str(package.locate_file(name))))
     done = uv("pip", "install", "--python", python, "--offline", "--no-deps", wheel)
     assert done.returncode == 0, done.stderr
     (place / "work").mkdir()

@@ -187,5 +187,5 @@ def datagram(frame: bytes) -> Datagram:
     pseudo = addresses + struct.pack(">IHH", size, 0, 17)
     assert ones_complement(pseudo + udp) == 0xFFFF
     half = len(addresses) // 2
-    source, destination = (ipaddress.ip_address(one) for one in (addresses[:half], addresses[half:]))
+    source, destination = (ipaddress.ip_address(address) for address in (addresses[:half], addresses[half:]))
     return Datagram(str(source), str(destination), source_port, destination_port, udp[8:])

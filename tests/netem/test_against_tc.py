@@ -120,7 +120,7 @@ def test_words_that_only_tc_has_are_refused(tc: Tc) -> None:
 @given(settings=any_settings)
 def test_each_setting_is_in_the_command_or_named(settings: LinkSettings) -> None:
     command = tc_command(settings)
-    wanted = [one for one in settings.impairments if one != LossOf(loss=NoLoss())]
+    wanted = [impairment for impairment in settings.impairments if impairment != LossOf(loss=NoLoss())]
     kept = 0
     if command.words is not None:
         kinds = ("loss", "delay", "duplicate", "corrupt", "reorder", "rate")

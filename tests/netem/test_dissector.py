@@ -95,7 +95,7 @@ def test_the_dissector_shows_every_field(tshark: Tshark, tmp_path: Path, encrypt
         assert "noack.version.unknown" not in fields
         content = fields.get("noack.encrypted" if encrypted else "noack.vector", [])
         assert ("noack.vector" in fields) == (bool(content) and not encrypted)
-        assert "".join(one["value"] for one in content) == datagram[HEADER_BYTES:-TAG_BYTES].hex()
+        assert "".join(entry["value"] for entry in content) == datagram[HEADER_BYTES:-TAG_BYTES].hex()
 
 
 WHOLE = Encoder(RUN, bytes(32)).encode(Message(Flow.UPDATE, 7, -5, np.ones(3)))

@@ -15,7 +15,7 @@ def test_words_are_the_approved_impairments() -> None:
         parsed, seed = parse(words)
         assert seed is None
         assert settings_of(words_of(parsed)) == parsed
-        return [one.model_dump_json(exclude_unset=True) for one in parsed.impairments]
+        return [impairment.model_dump_json(exclude_unset=True) for impairment in parsed.impairments]
 
     compare_lines(Path(__file__).with_name("word_settings.txt"), impairments)
 
@@ -24,7 +24,7 @@ def test_settings_may_come_anywhere_and_impairments_keep_their_order() -> None:
     words = "mansd 4 delay 10ms limit 50 loss 5% seed 7 delay 1ms first"
     settings, seed = parse(words)
     assert (settings.mansd, settings.limit, settings.first_delivered, seed) == (4, 50, True, 7)
-    assert [one.kind for one in settings.impairments] == ["delay", "loss", "delay"]
+    assert [impairment.kind for impairment in settings.impairments] == ["delay", "loss", "delay"]
     assert words_of(settings) == "delay 10ms loss 5% delay 1ms mansd 4 first limit 50"
     text = "loss trace 'my file' mansd 4"
     for listed in (["loss", "trace", "my file", "mansd", "4"], ["loss trace 'my file'", "mansd 4"]):

@@ -10,6 +10,7 @@ from typer import Option
 from cosim.cli import command as cli
 from cosim.cli import options as opt
 from cosim.lazy_modules import lazy_modules
+from cosim.record.run_directory import DEFAULT_RUNS
 from noack.core.errors import CallerError, ExitStatus
 from noack.core.file_access import write_whole
 from noack.runtime.command_line import print_to_stderr
@@ -193,7 +194,7 @@ class DesignFiles:
             except CallerError:
                 message = f"--out {self.out}: exists, and is no scenario; give another name"
                 raise CallerError(message) from None
-        return self.page or cli.DEFAULT_RUNS / "design" / f"{name}.html"
+        return self.page or DEFAULT_RUNS / "design" / f"{name}.html"
 
     def write(self, scenario_toml: str) -> list[Path]:
         """Write the chosen scenario, if it is wanted; return the written files."""

@@ -14,6 +14,7 @@ from cosim.cli import command as cli
 from cosim.cli import options as opt
 from cosim.cli.execute_run import LiveOptions, run_processes
 from cosim.lazy_modules import lazy_modules
+from cosim.record.run_directory import DEFAULT_RUNS
 from noack.core.errors import CallerError
 
 with lazy_modules():
@@ -87,7 +88,7 @@ class JoinOptions:
 
     session: SessionOption = "default"
     invitation: Annotated[Path | None, Option("--invitation", metavar="FILE")] = None
-    runs: opt.RunsOption = cli.DEFAULT_RUNS
+    runs: opt.RunsOption = DEFAULT_RUNS
     json: opt.JsonOption = False
 
 

@@ -12,7 +12,7 @@ from cosim.cli import options as opt
 from cosim.cli.execute_run import reopen_run
 from cosim.lazy_modules import lazy_modules
 from cosim.output.export import FORMATS, export_run, export_scenario, export_suffix, needs_run
-from cosim.record.run_directory import RECORDING_FILE, SCENARIO_FILE, chosen_run, file_of_loop
+from cosim.record.run_directory import DEFAULT_RUNS, RECORDING_FILE, SCENARIO_FILE, chosen_run, file_of_loop
 from noack.core.errors import CallerError, ExitStatus, NoackError
 from noack.runtime.command_line import print_to_stderr
 
@@ -69,7 +69,7 @@ def _record_status(run_dir: Path) -> int:
 def view(
     recording: opt.RunArgument = None,
     *,
-    runs: opt.RunsOption = cli.DEFAULT_RUNS,
+    runs: opt.RunsOption = DEFAULT_RUNS,
     loop: opt.LoopOption = None,
     web: Annotated[bool, Option("--web")] = False,
     json: opt.JsonOption = False,
@@ -313,7 +313,7 @@ def collect(
         noack collect runs/latest robot:noack/runs/RUN   by scp from the host robot
         noack collect runs/latest copy   from a folder that was copied here
     """
-    run_dir = chosen_run(run_dir, cli.DEFAULT_RUNS)
+    run_dir = chosen_run(run_dir, DEFAULT_RUNS)
     outcome = reopen_run(run_dir)  # refuses a run that is under way
     for source in sources:
         merged, roles = collection.collect(run_dir, source, finalize.reopen)
@@ -326,7 +326,7 @@ def collect(
 def compare(
     directories: Annotated[list[Path], Argument(metavar="RUN...", autocompletion=opt.complete_runs)],
     *,
-    out: Path = cli.DEFAULT_RUNS / "comparison.html",
+    out: Path = DEFAULT_RUNS / "comparison.html",
     width: opt.WidthOption = None,
     json: opt.JsonOption = False,
 ) -> None:

@@ -12,6 +12,7 @@ from cosim.cli import command as cli
 from cosim.cli import options as opt
 from cosim.cli.execute_run import LiveOptions, OutputOptions, finalize_run, run_processes, warn_of_violations
 from cosim.lazy_modules import lazy_modules
+from cosim.record.run_directory import DEFAULT_RUNS
 from noack.core.errors import CallerError
 from noack.core.number_format import number
 
@@ -36,7 +37,7 @@ _EVENTS_SHOWN = 40
 def lab(
     source: opt.ExampleOptions,
     *,
-    runs: opt.RunsOption = cli.DEFAULT_RUNS,
+    runs: opt.RunsOption = DEFAULT_RUNS,
     port: Annotated[int, Option(min=0, max=65535)] = 0,
     browser: bool = True,
     json: opt.JsonOption = False,
@@ -148,7 +149,7 @@ def simulate(
     source: opt.ScenarioOptions,
     *,
     trigger: opt.TriggerOption = opt.TriggerMode.SAMPLED,
-    runs: opt.RunsOption = cli.DEFAULT_RUNS,
+    runs: opt.RunsOption = DEFAULT_RUNS,
     options: OutputOptions,
 ) -> int:
     """Run a scenario in virtual time: no sockets, no deadlines missed.

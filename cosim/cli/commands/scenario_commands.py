@@ -14,6 +14,7 @@ from typer import Argument, Option
 from cosim.cli import command as cli
 from cosim.cli import options as opt
 from cosim.lazy_modules import lazy_modules
+from cosim.record.run_directory import DEFAULT_RUNS
 from cosim.shipped_files import KINDS, ShippedFile, all_shipped, text_of
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, ExitStatus, MachineError, why
@@ -57,7 +58,7 @@ def doctor(
     source: opt.ExampleOptions,
     *,
     seconds: Annotated[float, Option(min=0.1, max=3600)] = 2.0,
-    runs: opt.RunsOption = cli.DEFAULT_RUNS,
+    runs: opt.RunsOption = DEFAULT_RUNS,
     json: opt.JsonOption = False,
 ) -> int:
     """Check this machine: real-time settings, timers, ports, disk.
@@ -79,7 +80,7 @@ def doctor(
     required = machine_measures.requirements_of(resolved)
     with cli.status("measuring"):
         machine = machine_measures.measure(resolved, required, runs, seconds)
-    results = findings.judge(machine, required)
+    results = findings.find_all(machine, required)
     cli.show(
         json,
         lambda: findings.document(machine, required, results),

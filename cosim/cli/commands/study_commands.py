@@ -13,8 +13,10 @@ from cosim.cli import command as cli
 from cosim.cli import options as opt
 from cosim.cli.execute_run import Workers, execute_campaign, worker_pool
 from cosim.lazy_modules import lazy_modules
+from cosim.record.run_directory import DEFAULT_RUNS
 from cosim.shipped_files import find_shipped
 from noack.core.errors import CallerError, ExitStatus
+from noack.core.process_limits import cores
 from noack.runtime.command_line import print_to_stderr
 
 with lazy_modules():
@@ -60,7 +62,7 @@ def campaign(
     plan = campaign_file.load(path)
     if figure_files is not None and not plan.figures:
         raise CallerError(f"--format: there is no figure; {path} has no [[figures]]")
-    folder = out or cli.DEFAULT_RUNS / "campaigns" / plan.name
+    folder = out or DEFAULT_RUNS / "campaigns" / plan.name
     summary, _, _, new_runs, files = execute_campaign(
         plan, path, start, folder=folder, draws=draws, figure_files=figure_files
     )
@@ -112,9 +114,9 @@ def paper(
         cli.show(json, result.to_json, published_result.print_rows, result)
         cli.write_tables([result.table], tables, json=json)
         return ExitStatus.OK if result.as_expected else ExitStatus.FAILED
-    out = out or cli.DEFAULT_RUNS / "paper"
+    out = out or DEFAULT_RUNS / "paper"
     paper_page.make_folder(out)
-    path, folder = find_shipped("paper", "campaigns"), cli.DEFAULT_RUNS / "campaigns" / "paper"
+    path, folder = find_shipped("paper", "campaigns"), DEFAULT_RUNS / "campaigns" / "paper"
     plan = campaign_file.load(path)
     finished = execute_campaign(plan, path, worker_pool(None), folder=folder, draws=draws)
     with cli.status("computing the examples"):
@@ -269,8 +271,8 @@ def capacity(
     plan = study.plan()
     chosen = capacity_result.chosen_points(confirm, plan)
     name = f"{plan.scenario.name}-thorough" if study.thorough else plan.scenario.name
-    folder = out or cli.DEFAULT_RUNS / "capacity" / name
-    estimated_s = _announce(study, plan, folder, workers or cli.cores(), len(chosen))
+    folder = out or DEFAULT_RUNS / "capacity" / name
+    estimated_s = _announce(study, plan, folder, workers or cores(), len(chosen))
     finished = execute_campaign(plan.campaign(), Path("noack capacity"), start, folder=folder)
     points = []
     for policy, count in chosen:

@@ -10,6 +10,7 @@ from cosim.cli import command as cli
 from cosim.cli import options as opt
 from cosim.cli.execute_run import LiveOptions, run_processes
 from cosim.lazy_modules import lazy_modules
+from cosim.record.run_directory import DEFAULT_RUNS
 from noack.core.errors import CallerError, ExitStatus
 
 with lazy_modules():
@@ -86,16 +87,15 @@ def margin(
     guarantee: Annotated[list[str] | None, Option("--guarantee", metavar="WORDS")] = None,
     effort: float = 1.0,
     play: Annotated[bool, Option("--play")] = False,
-    runs: opt.RunsOption = cli.DEFAULT_RUNS,
+    runs: opt.RunsOption = DEFAULT_RUNS,
     tables: opt.TablesOption = None,
     json: opt.JsonOption = False,
 ) -> int:
     """Find the largest M for which a loop is stable under every loss pattern.
 
     The trigger policy must have a longest time between two events, as periodic and deadline have.
-    The verdict holds for all times of events that the policy
-    allows. Exit status 1: the loop is not proven stable for
-    any M.
+    The verdict holds for all times of events that the policy allows. Exit status 1: the loop is not
+    proven stable for any M.
 
     Options:
         most: Largest M to examine.

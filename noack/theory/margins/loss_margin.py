@@ -10,6 +10,7 @@ pattern of losses, and of such times, is a path. The edges, with the loop's maps
 """
 
 import time
+from collections.abc import Callable
 from functools import cache
 from typing import NamedTuple
 
@@ -20,6 +21,7 @@ from noack.core.errors import CallerError
 from noack.impairments.loss_guarantee import LongestBurst, LossAutomaton, LossGuarantee, outcome_letters
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
+from noack.theory.margins.exact_matrices import IntervalMatrix
 from noack.theory.margins.joint_spectral_radius import ACCURACY, MOST_VERTICES, joint_spectral_radius
 from noack.theory.margins.scenario_times import intervals_ns, loop_times, require_covered
 from noack.theory.margins.switched_system import Edge
@@ -230,7 +232,7 @@ class LossMargin:
         # A controller that knows x(0) gets its first update after a period.
         knows_start = resolved.network.initial_sync == "known_state"
         self._first_slot = int(knows_start) % self.loop.times.slots
-        self.maps = cache(self.loop.map)
+        self.maps: Callable[[int, int, int], IntervalMatrix] = cache(self.loop.map)
         """The loop's maps by slot, use of the update before, and number of lost updates."""
 
     def bursts(self, guarantee: LossGuarantee) -> list[Burst]:

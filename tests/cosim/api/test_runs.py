@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 import noack
 from cosim.record.align import align_tables
 from cosim.record.run_record import load_record
-from tests.integration.conftest import WITHOUT_VIEWER
+from tests.helpers.live_runs import WITHOUT_VIEWER
 
 
 def test_a_run_gives_its_results(simulated: noack.Run) -> None:

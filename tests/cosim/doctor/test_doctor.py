@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from typer.testing import Result
 
-from cosim.doctor.findings import MachineFinding, MachineVerdict, judge, worst
+from cosim.doctor.findings import MachineFinding, MachineVerdict, find_all, worst
 from cosim.doctor.machine_measures import (
     Buffer,
     Disk,
@@ -41,13 +41,13 @@ IDEAL = MachineFacts(
 
 def about(title: str, required: RunRequirements = WANTED, **changed: Any) -> MachineFinding:
     """The first finding of a kind that is not good, or the first one if all are good."""
-    findings = judge(replace(IDEAL, **changed), required)
+    findings = find_all(replace(IDEAL, **changed), required)
     of_kind = [finding for finding in findings if finding.what.startswith(title)]
     return next((finding for finding in of_kind if finding.verdict is not MachineVerdict.GOOD), of_kind[0])
 
 
 def test_a_machine_without_limits_is_good() -> None:
-    findings = judge(IDEAL, WANTED)
+    findings = find_all(IDEAL, WANTED)
     assert worst(findings) is MachineVerdict.GOOD
     assert not [finding for finding in findings if finding.remedy]
 
@@ -83,7 +83,7 @@ def test_each_finding_has_a_verdict_and_a_remedy(
     if verdict is not MachineVerdict.GOOD:
         assert finding.means
         assert finding.remedy or isinstance(next(iter(changed.values())), str)
-        assert worst(judge(replace(IDEAL, **changed), WANTED)) is verdict
+        assert worst(find_all(replace(IDEAL, **changed), WANTED)) is verdict
 
 
 def test_lateness_is_compared_with_the_allowance_of_the_certificates() -> None:
@@ -105,7 +105,7 @@ def test_every_finding_is_documented() -> None:
     text = (Path(__file__).parents[3] / "docs/command-line.md").read_text()
     rows = re.findall(r"^\| `([^`]+)` \|", text.partition("| finding |")[2], re.MULTILINE)
     named = [row.removesuffix(" ...").removesuffix(" of").removesuffix(":") for row in rows]
-    titles = {finding.what for finding in judge(IDEAL, WANTED)}
+    titles = {finding.what for finding in find_all(IDEAL, WANTED)}
     assert all(any(title.startswith(name) for name in named) for title in titles)
     assert all(any(title.startswith(name) for title in titles) for name in named)
 

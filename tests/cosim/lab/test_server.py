@@ -32,11 +32,11 @@ from cosim.simulation.virtual_time import simulate
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.runtime.spool import SPOOL, SpoolWriter
 from noack.scenario.scenario_file import dumps
-from tests.cosim.record.test_spool_conversion import mixed_rows
+from tests.helpers.rows_of_loops import mixed_rows
 from tests.helpers.shipped import resolved
-from tests.helpers.summaries import alone
-from tests.integration import conftest as live
-from tests.integration.conftest import WITHOUT_VIEWER
+from tests.helpers.summaries import run_of_one_loop
+from tests.helpers import live_runs as live
+from tests.helpers.live_runs import WITHOUT_VIEWER
 
 UNANSWERED = {
     "computes": "while True: pass",
@@ -217,7 +217,7 @@ def test_the_newest_run_that_has_ended_is_known(tmp_path: Path) -> None:
 def test_a_run_without_a_recorded_measurement_is_not_drawn_yet(tmp_path: Path) -> None:
     """On a busy machine the controller's rows may come first."""
     record = simulate(resolved("double_integrator", "horizon_s=0.1"))
-    rows = mixed_rows(alone(record))
+    rows = mixed_rows(run_of_one_loop(record))
     (tmp_path / SCENARIO_FILE).write_text(dumps(record.scenario))
     writer = SpoolWriter(tmp_path / SPOOL, "recorder")
     for table in (CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT):

@@ -13,13 +13,9 @@ from cosim.live.coordinator import ChangeRequests, Coordinator, TokenScope
 from noack.core.errors import CallerError
 from noack.protocol.roles import LOOP_ROLES, RECORDER, ROLES
 from noack.scenario.scenario_file import load
-from tests.fuzz.parsers.run_descriptor import _DESCRIPTOR
 from tests.fuzz.plane import FakePlane, Query, Sample
+from tests.helpers.run_descriptors import JUNK, RUN_DESCRIPTOR
 
-JUNK: list[bytes | None] = [
-    None, b"", b"{", b"\xff", b"[]", b"{}", b"null", b'{"rows": 1}', b"[" * 100_000,
-    b'{"pid": 1, "address": ["127.0.0.1", 0]}', b'{"pid": 1, "address": null}',
-]  # fmt: skip
 SHARED = Path(__file__).parents[3] / "scenarios" / "shared_bottleneck.toml"
 
 
@@ -32,7 +28,7 @@ def plane() -> FakePlane:
 def barrier(plane: FakePlane, monkeypatch: pytest.MonkeyPatch) -> Coordinator:
     monkeypatch.setattr(coordinator, "ControlPlane", lambda *_, **__: plane)
     monkeypatch.setattr(coordinator, "_REPORT_GRACE_S", -1.0)  # do not wait for reports
-    return Coordinator(_DESCRIPTOR)
+    return Coordinator(RUN_DESCRIPTOR)
 
 
 def ask(
@@ -41,7 +37,7 @@ def ask(
     what: str,
     instance: str = "one",
     role: str = "sensor",
-    join_token: str = _DESCRIPTOR.join_token,
+    join_token: str = RUN_DESCRIPTOR.join_token,
 ) -> Query:
     address = None if role == RECORDER else ["127.0.0.1", 5 + ROLES.index(role)]
     request: dict[str, Any] = {"instance": instance, "address": address, "join_token": join_token}

@@ -41,7 +41,7 @@ from noack.runtime.spool import SPOOL, SpoolWriter
 from noack.scenario.scenario_file import dumps, load
 from tests.cosim.record.changed_records import changed
 from tests.helpers.shipped import resolved, shipped
-from tests.helpers.summaries import alone
+from tests.helpers.summaries import run_of_one_loop
 
 pytestmark = pytest.mark.usefixtures("no_report")
 
@@ -55,7 +55,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_environment(folder, "live")
     reports = {role: report | {"realtime": {}} for role, report in record.reports.items()}
     (folder / REPORTS_FILE).write_text(json.dumps(reports))
-    write_run(alone(record), folder)
+    write_run(run_of_one_loop(record), folder)
     return folder
 
 
@@ -73,7 +73,7 @@ def summary_of(run_dir: Path) -> dict[str, Any]:
 def test_a_difference_in_the_replay_does_not_fail_the_run(run_dir: Path) -> None:
     record = load_record(run_dir)
     record[PLANT_STEP]["u"][9, 0] = np.nan
-    write_run(alone(record), run_dir)
+    write_run(run_of_one_loop(record), run_dir)
     outcome = finalize(ended_well(run_dir), report=False, view=False)
     assert outcome.status == ExitStatus.OK
     assert outcome.summary.to_json() == summary_of(run_dir)
@@ -88,13 +88,13 @@ def ended_well(run_dir: Path) -> RunEnding:
 def no_rows(run_dir: Path) -> None:
     record = load_record(run_dir)
     empty = {table: record[table][:0] for table in record.tables}
-    write_run(alone(changed(record, empty, reports={})), run_dir)
+    write_run(run_of_one_loop(changed(record, empty, reports={})), run_dir)
     (run_dir / REPORTS_FILE).unlink()  # the total number of rows is unknown
 
 
 def missing_rows(run_dir: Path, cut: slice) -> None:
     record = load_record(run_dir)
-    write_run(alone(changed(record, {PLANT_STEP: np.delete(record[PLANT_STEP], cut)})), run_dir)
+    write_run(run_of_one_loop(changed(record, {PLANT_STEP: np.delete(record[PLANT_STEP], cut)})), run_dir)
 
 
 def more_rows(run_dir: Path) -> None:

@@ -52,7 +52,7 @@ def test_the_bound_for_geometric_bursts_counts_the_ways_to_divide_the_losses() -
     total, count = lengths.sum(), len(lengths)
     divisions = [np.diff([0, *cuts, total]) for cuts in combinations(range(1, total), count - 1)]
     exact = np.mean([np.max(division) >= lengths[0] for division in divisions])
-    bound = outages._geometric(lengths)[0]
+    bound = outages._longest_burst_bounds(lengths)[0]
     assert exact == pytest.approx(bound)  # two parts of 7 or more do not fit into 11
 
 

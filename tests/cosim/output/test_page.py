@@ -22,9 +22,9 @@ from cosim.record.run_record import RunRecord
 from noack.core.errors import ExitStatus
 from noack.scenario.scenario_file import dumps as scenario_toml
 from tests.command_line import invoke
-from tests.cosim.lab.conftest import started
+from tests.helpers.lab_browser import started
 from tests.cosim.output.conftest import CASES, HOSTILE, make_record, scenario_of
-from tests.helpers.summaries import alone, summary_of
+from tests.helpers.summaries import run_of_one_loop, summary_of
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
 FIGURES = ["states", "errors", "state-norm", "input", "inter-event", "losses"]
@@ -80,7 +80,7 @@ def written(record: RunRecord, run_dir: Path, **more: Any) -> tuple[Page, RunSum
     """Write a report and check it."""
     (run_dir / "scenario.toml").write_text(scenario_toml(record.scenario), encoding="utf-8")
     summary = summary_of(record, **more)
-    html = write_report(alone(record), summary, run_dir).read_text(encoding="utf-8")
+    html = write_report(run_of_one_loop(record), summary, run_dir).read_text(encoding="utf-8")
     assert html.startswith("<!DOCTYPE html>")
     parsed = Page(html)
     check(parsed, html)

@@ -17,12 +17,8 @@ from cosim.output.run_tables import summary_tables
 from noack.core.errors import CallerError
 from tests.command_line import invoke
 from tests.cosim.output.test_page import Page
-from tests.helpers.approved import compare_text
+from tests.helpers.approved import compare_output
 
-APPROVED = Path(__file__).with_name("approved")
-_STARTED = re.compile(r"started [\w:+-]+")
-_ROUNDING = re.compile(r"[ \d]\d?\.?\d*e-(0[7-9]|1\d)")
-"""Differences of rounding, which depend on the processor."""
 
 
 @pytest.fixture(scope="module")
@@ -55,19 +51,14 @@ def test_the_terminal_shows_what_was_approved(
     monkeypatch.setattr("sys.argv", ["noack"])
     done = invoke(*(run if word == "RUN" else word for word in words))
     assert done.exit_code == 0, done.output
-    compare(f"{name}.txt", done.stdout.replace(str(run), "RUN"))
+    compare_output(f"{name}.txt", done.stdout.replace(str(run), "RUN"))
 
 
 def test_the_report_shows_what_was_approved(simulated: noack.Run) -> None:
     page = Page(simulated.report().read_text(encoding="utf-8"))
     _, _, body = page.text.rpartition("}\n")  # without the style
     text, _, _ = body.partition("Scenario and environment")
-    compare("report.txt", "\n".join(line for line in text.splitlines() if line.strip()))
-
-
-def compare(name: str, text: str) -> None:
-    text = _ROUNDING.sub(" tiny", _STARTED.sub("started …", text)).rstrip() + "\n"
-    compare_text(APPROVED / name, text)
+    compare_output("report.txt", "\n".join(line for line in text.splitlines() if line.strip()))
 
 
 # --- tables for papers ----------------------------------------------------------------------------

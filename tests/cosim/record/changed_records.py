@@ -9,6 +9,21 @@ from cosim.record.align import Reals, bounded_parts
 from cosim.record.run_record import Rows, RunRecord
 
 NO_CHANGE: Mapping[str, Rows] = {}
+CONTENT: dict[str, Any] = {
+    "name": "changing",
+    "horizon_s": 3.0,
+    "model": {"name": "double_integrator"},
+    "plant": {
+        "initial_state": [1.0, 0.0],
+        "rate_hz": 100.0,
+        "draw": "uniform",
+        "uncertainty_A": [[0.0, 0.0], [0.0, 0.5]],
+    },
+    "controller": {"rate_hz": 100.0},
+    "trigger": {"beta": 0.02, "alpha_per_s": 0.25},
+    "network": {"mansd": 3, "loss": {"model": "bernoulli", "probability": 0.8}},
+}
+"""Of a run whose runtime parameters change."""
 
 
 def copied(record: RunRecord) -> dict[str, Rows]:

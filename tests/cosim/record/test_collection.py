@@ -24,7 +24,7 @@ from noack.runtime.spool import SPOOL, SpoolWriter, writer_of
 from noack.runtime.telemetry import OwnSpool
 from noack.scenario.resolution import resolve, run_tables
 from noack.scenario.scenario_file import validate
-from tests.helpers.summaries import alone
+from tests.helpers.summaries import run_of_one_loop
 
 RUN = "0123456789abcdef"
 SECRETS = {"controller": "known to the controller", "plant": "known to the plant"}
@@ -55,7 +55,7 @@ def run_dir(full_record: RunRecord, tmp_path: Path) -> Path:
     (folder / run_directory.PROCESSES_FILE).write_text(json.dumps(joined))
     tables = {table: full_record[table] for table in full_record.tables}
     tables[CONTROLLER_STEP] = tables[CONTROLLER_STEP][:100]
-    write_run(alone(RunRecord(full_record.scenario, tables, [], reports)), folder)
+    write_run(run_of_one_loop(RunRecord(full_record.scenario, tables, [], reports)), folder)
     return folder
 
 

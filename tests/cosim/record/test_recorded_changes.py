@@ -20,25 +20,11 @@ from noack.protocol.wire_format import Flow, Message
 from noack.scenario.parameter_changes import ParameterChange
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario_file import validate
-from tests.cosim.record.changed_records import changed, identity_residual
+from tests.cosim.record.changed_records import CONTENT, changed, identity_residual
 from tests.cosim.simulation.event_scheduler import EventScheduler
 from tests.helpers.machine_parts import controller_of, sensor_of
 
 MS = 1_000_000
-CONTENT: dict[str, Any] = {
-    "name": "changing",
-    "horizon_s": 3.0,
-    "model": {"name": "double_integrator"},
-    "plant": {
-        "initial_state": [1.0, 0.0],
-        "rate_hz": 100.0,
-        "draw": "uniform",
-        "uncertainty_A": [[0.0, 0.0], [0.0, 0.5]],
-    },
-    "controller": {"rate_hz": 100.0},
-    "trigger": {"beta": 0.02, "alpha_per_s": 0.25},
-    "network": {"mansd": 3, "loss": {"model": "bernoulli", "probability": 0.8}},
-}
 
 
 def run_with(changes: list[tuple[int, dict[str, Any]]], **more: Any) -> RunRecord:

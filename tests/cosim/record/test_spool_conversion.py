@@ -22,6 +22,7 @@ from noack.protocol.roles import Notice
 from noack.runtime.spool import EARLY, EARLY_ENDED, SPOOL, SpoolWriter, notices_of
 from noack.scenario.resolution import run_tables
 from noack.scenario.scenario_file import validate
+from tests.helpers.rows_of_loops import mixed_rows
 
 LOOPS = 3
 
@@ -35,25 +36,6 @@ def shared(content: dict[str, Any]) -> RecordedRun:
     content["network"]["impairments"] = [{"kind": "delay", "delay_s": 0.012, "jitter_s": 0.009}]
     content["loops"] = [{"name": "a", "count": 2}, {"name": "b"}]
     return simulate_loops(validate(content, "here"))
-
-
-def mixed_rows(shared: RecordedRun) -> Mapping[str, Rows]:
-    """All rows by table, as the processes emit them: with the loop's number, in order of time."""
-    by_table = {}
-    for table, dtype in run_tables(shared.scenario).items():
-        if table in network_tables():
-            by_table[table] = shared.network[table]
-            continue
-        parts = []
-        for number, loop in enumerate(shared.loops):
-            rows = np.zeros(loop.count(table), dtype)
-            rows[LOOP] = number
-            for name in loop.tables[table].names or ():
-                rows[name] = loop[table][name]
-            parts.append(rows)
-        rows = np.concatenate(parts)
-        by_table[table] = rows[np.argsort(rows["now_ns"], kind="stable")]
-    return by_table
 
 
 def spool(run_dir: Path, table: str, rows: Rows, *, writer: str = "recorder") -> None:

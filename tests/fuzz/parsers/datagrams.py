@@ -22,7 +22,7 @@ def wire_input(data: bytes) -> None:
     _junk(data)
     choices = Choices(data)
     dimension = 1 + choices.below(4)
-    flow = choices.one([Flow.MEASUREMENT, Flow.UPDATE, Flow.ACTUATION, Flow.ACKNOWLEDGEMENT])
+    flow = choices.choose([Flow.MEASUREMENT, Flow.UPDATE, Flow.ACTUATION, Flow.ACKNOWLEDGEMENT])
     if flow is Flow.ACKNOWLEDGEMENT:
         dimension = 0
     receivers, encoder, seen = BothReceivers(flow, dimension, run_id=RUN), Encoder(RUN, KEY), b""
@@ -57,20 +57,20 @@ def _sound(choices: Choices, encoder: Encoder, flow: Flow, dimension: int) -> by
     sequence, t_ns = choices.integer() % 2**64, choices.integer()
     t_ns = (t_ns + 2**63) % 2**64 - 2**63
     vector = np.array([choices.real() for _ in range(dimension)])
-    return encoder.encode(Message(flow, sequence, t_ns, vector, error_level=choices.one([0, 128])))
+    return encoder.encode(Message(flow, sequence, t_ns, vector, error_level=choices.choose([0, 128])))
 
 
 def _odd(choices: Choices, dimension: int) -> bytes:
     """Return a datagram with the correct key but any header or any content length."""
-    magic, version = choices.one([b"NA", b"NB", b"\0\0"]), choices.one([1, 0, 2, 255])
-    flow, n = choices.one([1, 2, 3, 4, 0, 5, 255]), choices.one([dimension, 0, 1, 64, 65, 255])
-    loop, run = choices.one([0, 1, 65_535]), choices.one([RUN, RUN ^ 1, 0])
-    level = choices.one([0, 1, 255])
+    magic, version = choices.choose([b"NA", b"NB", b"\0\0"]), choices.choose([1, 0, 2, 255])
+    flow, n = choices.choose([1, 2, 3, 4, 0, 5, 255]), choices.choose([dimension, 0, 1, 64, 65, 255])
+    loop, run = choices.choose([0, 1, 65_535]), choices.choose([RUN, RUN ^ 1, 0])
+    level = choices.choose([0, 1, 255])
     sequence, t_ns = choices.integer() % 2**64, choices.integer() % 2**63
-    numbers = choices.one([dimension, n % 65, 0])
+    numbers = choices.choose([dimension, n % 65, 0])
     content = struct.pack("<2sBBBBHQQq", magic, version, flow, n, level, loop, run, sequence, t_ns)
     content += struct.pack(f"<{numbers}d", *(choices.real() for _ in range(numbers)))
-    content += choices.take(choices.one([0, 0, 1, 8]))
+    content += choices.take(choices.choose([0, 0, 1, 8]))
     return content + tag(content)
 
 
@@ -97,8 +97,8 @@ def times_input(data: bytes) -> None:
     for kind in TimeKind:
         assert isinstance(form.decode(data, kind), Rejection)
     while choices.left:
-        magic, version = choices.one([b"NC", b"NA", b"\0\0"]), choices.one([1, 0, 255])
-        number, reserved = choices.one([1, 2, 0, 255]), choices.one([0, 0, 1])
+        magic, version = choices.choose([b"NC", b"NA", b"\0\0"]), choices.choose([1, 0, 255])
+        number, reserved = choices.choose([1, 2, 0, 255]), choices.choose([0, 0, 1])
         times = [(choices.integer() + 2**63) % 2**64 - 2**63 for _ in range(2)]
         nonce, clock = choices.take(16), choices.integer() % 2**64
         content = struct.pack(_CONTENT, magic, version, number, reserved, nonce, clock, *times)
@@ -147,17 +147,17 @@ def probes_input(data: bytes) -> None:
             found = [sender.finish(0), receiver.finish(0)]
         except ValueError as error:
             raise PeerError(str(error)) from None
-        for one in found:
-            assert one is None or one.trace is None or len(one.trace) < 10**7
+        for report in found:
+            assert report is None or report.trace is None or len(report.trace) < 10**7
 
 
 def _datagram(choices: Choices, place: int) -> bytes:
-    kind = choices.one([ProbeKind.PROBE, *ProbeKind])
+    kind = choices.choose([ProbeKind.PROBE, *ProbeKind])
     content = ProbeDatagram(
         kind, 1, 5, place % 4, max(place, 4) * _PERIOD_NS, 0, _PERIOD_NS, 20, place, place
     )
     for _ in range(choices.below(3)):
-        name = choices.one(_FIELDS)
+        name = choices.choose(_FIELDS)
         value = choices.integer() & (2**63 - 1 if name != "seen" else 2**128 - 1)
         sign = -1 if name in _SIGNED and choices.flag() else 1
         content = content._replace(**{name: sign * value})

@@ -49,10 +49,10 @@ def fates_input(data: bytes) -> None:
     document: Any = edited(choices, DOCUMENT, KNOWN) if choices.flag() else DOCUMENT
     text = json.dumps(document)
     if choices.below(8) == 1:
-        text = choices.one(["", "[]", "null", "{", text[:-1]])
+        text = choices.choose(["", "[]", "null", "{", text[:-1]])
     metadata = {METADATA: text} if choices.below(8) != 1 else {}
     path = workspace() / "fates.parquet"
-    links = choices.one([None, ["up"], ["up", "nobody"], ["down"]])
+    links = choices.choose([None, ["up"], ["up", "nobody"], ["down"]])
     path.write_bytes(written(choices, edited_table(choices, TABLE), metadata))
     with refusal(str(path)):
         _replay(path, links)

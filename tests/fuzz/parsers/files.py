@@ -84,7 +84,7 @@ def scenario_input(data: bytes) -> None:
     overrides: list[str] = []
     if data[:1] == b"\0":
         choices = Choices(data[1:])
-        base = choices.one(SCENARIO_BASES)
+        base = choices.choose(SCENARIO_BASES)
         for _ in range(choices.below(3)):
             name = ".".join(key(choices, SCENARIO_KNOWN) for _ in range(1 + choices.below(3)))
             overrides.append(f"{name}={_written(choices)}" if choices.below(8) else name)
@@ -132,7 +132,7 @@ _MOST_POINTS = 8
 def campaign_input(data: bytes) -> None:
     if data[:1] == b"\0":
         choices = Choices(data[1:])
-        data = tomli_w.dumps(edited(choices, choices.one(CAMPAIGN_BASES), CAMPAIGN_KNOWN)).encode()
+        data = tomli_w.dumps(edited(choices, choices.choose(CAMPAIGN_BASES), CAMPAIGN_KNOWN)).encode()
     path = write_named(workspace(), "campaign.toml", data)
     with refusal(str(path), lines=True):
         campaign = campaign_file.load(path)
@@ -156,7 +156,7 @@ def campaign_input(data: bytes) -> None:
 
 def _saved(**arrays: object) -> bytes:
     file = io.BytesIO()
-    np.savez(file, allow_pickle=False, **{key: np.array(one) for key, one in arrays.items()})
+    np.savez(file, allow_pickle=False, **{key: np.array(array) for key, array in arrays.items()})
     return file.getvalue()
 
 
@@ -181,7 +181,7 @@ def matrices_input(data: bytes) -> None:
     with refusal('run.toml: model.file = "any.npz"'):
         found = read_matrices(NamedFile("any.npz", workspace(), "run.toml: model"))
         assert found.keys() <= {"A", "B", "gain"}
-        assert all(one.ndim == 2 and np.isfinite(one).all() for one in found.values())
+        assert all(matrix.ndim == 2 and np.isfinite(matrix).all() for matrix in found.values())
 
 
 TRACES_SEEDS = [
@@ -217,7 +217,7 @@ def traces_input(data: bytes) -> None:
 
 _PERIOD_NS = 20_000_000
 _SENT = [Sent(10**18 + k * _PERIOD_NS, struct.pack(">I", k)) for k in range(6)]
-_ARRIVED = [one._replace(t_ns=one.t_ns + 5_000_000, interface=1, source_port=7) for one in _SENT[1:]]
+_ARRIVED = [packet._replace(t_ns=packet.t_ns + 5_000_000, interface=1, source_port=7) for packet in _SENT[1:]]
 _PROBES = [
     Sent(
         10**18 + k * _PERIOD_NS,
@@ -225,7 +225,7 @@ _PROBES = [
     )
     for k in (0, 1, 3, 2, 5)
 ]
-_V6 = [one._replace(source="2001:db8::1", destination="2001:db8::2") for one in _SENT]
+_V6 = [packet._replace(source="2001:db8::1", destination="2001:db8::2") for packet in _SENT]
 _IRTT = json.dumps({
     "version": {"irtt": "0.9.0"},
     "round_trips": [
@@ -251,11 +251,11 @@ def captures_input(data: bytes) -> None:
     choices = Choices(data)
     path, other = workspace() / "one.pcap", workspace() / "other.pcap"
     options = SourceOptions(
-        clocks_differ=choices.one([None, False, True]),
-        flow=choices.one([1, 2, 3]),
-        sequence_at=choices.one(_FIELDS),
+        clocks_differ=choices.choose([None, False, True]),
+        flow=choices.choose([1, 2, 3]),
+        sequence_at=choices.choose(_FIELDS),
     )
-    path.write_bytes(_damaged(choices, choices.one(_FILES)))
+    path.write_bytes(_damaged(choices, choices.choose(_FILES)))
     paths = [path]
     if choices.flag():
         other.write_bytes(pcapng_of(*_ARRIVED) if choices.flag() else path.read_bytes())
@@ -318,7 +318,7 @@ def archives_input(data: bytes) -> None:
         path.write_bytes(data)
         with refusal((f"{path}: ", f"{folder}: ")):
             manifest = unpack(path, folder)
-            written = {one for one in folder.rglob("*") if one.is_file()}
+            written = {path for path in folder.rglob("*") if path.is_file()}
             assert written == {folder / name for name in manifest.files}
         inside = {path, folder.parent, *folder.parent.rglob("*")}
         assert set(Path(place).rglob("*")) <= inside, "a file outside the folder"

@@ -20,7 +20,7 @@ SEEDS = (
     *(bytes([*range(at, at + 40)]) * 4 for at in range(0, 200, 11)),
 )  # fmt: skip
 
-_COMPUTABLE = [one for one in IMPAIRED if not names_file(one) and not keeps_loss(one)]
+_COMPUTABLE = [impairment for impairment in IMPAIRED if not names_file(impairment) and not keeps_loss(impairment)]
 _RECORDED = (RecordedDecision(0, 10, 20, 3, -1), RecordedDecision(3, 5, -1, 900, 7))
 _FIELDS = [(name, of.type.cname) for name, of in ffi.typeof("noack_link").fields]
 _SCALARS = [name for name, kind in _FIELDS if kind == "int64_t"]
@@ -71,12 +71,13 @@ def _decide(link: Any, choices: Choices) -> None:
 def _link(choices: Choices) -> tuple[Any, dict[str, Any]] | None:
     """Return a link of numbers that the core accepts, and the arrays that it has; or None."""
     recorded = _RECORDED if choices.below(4) == 1 else ()
-    chain = [choices.one(_COMPUTABLE) for _ in range(choices.below(4))]
-    chosen = [one for one in chain if getattr(one, "scheduler", None)][1:]  # a link has one at most
+    chain = [choices.choose(_COMPUTABLE) for _ in range(choices.below(4))]
+    # A link has one scheduler at most.
+    chosen = [impairment for impairment in chain if getattr(impairment, "scheduler", None)][1:]
     settings = LinkSettings.model_construct(
-        impairments=tuple(one for one in chain if one not in chosen),
-        constraints=tuple(choices.one(CONSTRAINED) for _ in range(choices.below(3))),
-        mansd=choices.one((None, 0, 1, 5)),
+        impairments=tuple(impairment for impairment in chain if impairment not in chosen),
+        constraints=tuple(choices.choose(CONSTRAINED) for _ in range(choices.below(3))),
+        mansd=choices.choose((None, 0, 1, 5)),
     )
     state = LinkState(settings, 1, "fuzz", decisions=(recorded,), rows=1 + choices.below(3))
     valid = state.core
@@ -98,7 +99,7 @@ def _link(choices: Choices) -> tuple[Any, dict[str, Any]] | None:
             if len(words):
                 words[choices.below(1 << 16) % len(words)] = number
         else:
-            setattr(link, choices.one(_SCALARS), number)
+            setattr(link, choices.choose(_SCALARS), number)
     kept = _allocate(link, tables)
     wrong = core.noack_link_check(link)
     if wrong == ffi.NULL:

@@ -36,7 +36,7 @@ from tests.noack.impairments.any_link_settings import words_can_say
 from tests.noack.impairments.feature_examples import CONSTRAINED, IMPAIRED
 
 EXAMPLES = (
-    *(one.text() for one in (*IMPAIRED, *CONSTRAINED)),
+    *(example.text() for example in (*IMPAIRED, *CONSTRAINED)),
     "mansd 4", "first", "limit 100", "seed 7", "slot 1ms", "ecn",
 )  # fmt: skip
 TOKENS = (
@@ -45,24 +45,24 @@ TOKENS = (
     "1mbit", "10tbps", "1/2", "3,4", "0s-1s", "1s-0s", "18446744073709551615", "1e-400", "'", '"',
     "a b", "\\", "",
 )  # fmt: skip
-WORDS_SEEDS = [*EDITS, *(one.encode() for one in EXAMPLES)]
+WORDS_SEEDS = [*EDITS, *(example.encode() for example in EXAMPLES)]
 WORDS_WORDS = [token.encode() for token in TOKENS if token]
 
 
 def sentence(choices: Choices) -> str:
     """Return some examples with some words replaced."""
-    words = [word for _ in range(1 + choices.below(4)) for word in choices.one(EXAMPLES).split()]
+    words = [word for _ in range(1 + choices.below(4)) for word in choices.choose(EXAMPLES).split()]
     for _ in range(choices.below(4)):
         at = choices.below(len(words))
         match choices.below(5):
             case 0:
-                words[at] = choices.one(TOKENS)
+                words[at] = choices.choose(TOKENS)
             case 1:
-                words.insert(at, choices.one(TOKENS))
+                words.insert(at, choices.choose(TOKENS))
             case 2 if len(words) > 1:
                 del words[at]
             case 3:
-                words[at] = words[at][: choices.below(8)] + choices.one(TOKENS)
+                words[at] = words[at][: choices.below(8)] + choices.choose(TOKENS)
             case _:
                 words[at] = choices.text()
     return " ".join(words)
@@ -186,7 +186,7 @@ class _AtOnce:
 def control_input(data: bytes) -> None:
     if data[:1] == b"\0":
         choices = Choices(data[1:])
-        base = json.loads(json.dumps(choices.one(BASES)))
+        base = json.loads(json.dumps(choices.choose(BASES)))
         if "words" in base and choices.flag():
             base["words"] = sentence(choices)
         data = damaged(choices, json.dumps(edited(choices, base, CONTROL_KNOWN)).encode())

@@ -42,7 +42,7 @@ from noack.scenario.scenario_file import dumps, validate
 from tests.fuzz.edits import Choices, Vocabulary, damaged, edited, edited_table, written
 from tests.fuzz.harness import Harness, refusal, workspace
 from tests.fuzz.plane import FakePlane, Query, Sample
-from tests.helpers.summaries import alone
+from tests.helpers.summaries import run_of_one_loop
 
 SCENARIO = {
     "name": "short", "horizon_s": 0.05, "model": {"name": "double_integrator"},
@@ -92,7 +92,7 @@ def files(acknowledged: bool, live: bool) -> Mapping[str, bytes]:
         for role, report in record.reports.items()
     }
     kind = "live" if live else "simulated"
-    run = alone(RunRecord(resolved, record.source, record.notices, reports, "live" if live else "simulated"))
+    run = run_of_one_loop(RunRecord(resolved, record.source, record.notices, reports, "live" if live else "simulated"))
     own = summarise_loop(run.loop(), 0, "finished").to_json()
     own |= {
         "replay": replay(record).verdict().model_dump(),
@@ -125,7 +125,7 @@ def record_input(data: bytes) -> None:
             del content[name]
     whole = list(content)
     for _ in range(choices.below(4)):
-        whole.remove(name := choices.one(whole))
+        whole.remove(name := choices.choose(whole))
         changed = _changed(choices, name, content[name])
         if changed is None:
             del content[name]
@@ -171,8 +171,8 @@ def _spool(choices: Choices, name: str, data: bytes) -> bytes:
         numbers = np.frombuffer(data[16 : 16 + (len(data) - 16) // 8 * 8], "<i8").copy()
         for _ in range(choices.below(4)):
             numbers[choices.below(len(numbers))] = int(np.int64(choices.integer() % 2**63))
-        payload = numbers.tobytes()[: choices.one([len(data) - 16, 0, 8, 33])]
-    head = choices.integer() % 2**64, choices.one([len(payload), choices.integer() % 2**64])
+        payload = numbers.tobytes()[: choices.choose([len(data) - 16, 0, 8, 33])]
+    head = choices.integer() % 2**64, choices.choose([len(payload), choices.integer() % 2**64])
     chunk = np.array(head, "<u8").tobytes() + payload
     return data + chunk if choices.flag() else chunk
 
@@ -236,7 +236,7 @@ def telemetry_input(data: bytes) -> None:
                 queries.append(_report(choices))
                 plane.put("report", queries[-1])
             case 1:
-                plane.put("alive", Sample(f"noack/0/alive/{choices.one([*OWNER.values(), ''])}/one"))
+                plane.put("alive", Sample(f"noack/0/alive/{choices.choose([*OWNER.values(), ''])}/one"))
             case _:
                 plane.put("telemetry", _batch(choices))
     with redirect_stderr(io.StringIO()) as errors:
@@ -254,8 +254,8 @@ def telemetry_input(data: bytes) -> None:
 
 
 def _batch(choices: Choices) -> Sample:
-    table = choices.one([*OWNER, NOTICES, "", "nothing"])
-    role = choices.one([OWNER.get(table, "plant"), "nobody"])
+    table = choices.choose([*OWNER, NOTICES, "", "nothing"])
+    role = choices.choose([OWNER.get(table, "plant"), "nobody"])
     if table == NOTICES:
         lines = [edited(choices, NOTICE, TELEMETRY_KNOWN) for _ in range(1 + choices.below(3))]
         payload = batch_of(json.dumps(line).encode() for line in lines)
@@ -275,7 +275,7 @@ def _batch(choices: Choices) -> Sample:
 def _report(choices: Choices) -> Query:
     report: Any = edited(choices, REPORT, TELEMETRY_KNOWN)
     payload = None if choices.below(8) == 1 else damaged(choices, json.dumps(report).encode())
-    return Query(f"noack/0/report/{choices.one([*OWNER.values(), 'nobody'])}", payload)
+    return Query(f"noack/0/report/{choices.choose([*OWNER.values(), 'nobody'])}", payload)
 
 
 PARSERS = {

@@ -23,14 +23,9 @@ from noack.scenario.toml_file import json_schema
 from tests.fuzz.edits import EDITS, Choices, Vocabulary, bases, damaged, edited, vocabulary
 from tests.fuzz.harness import Harness, refusal, workspace
 from tests.fuzz.plane import FakePlane, Query, Sample
+from tests.helpers.run_descriptors import RUN_DESCRIPTOR
 
-_DESCRIPTOR = run_descriptor.new_descriptor(
-    resolve(validate(bases("scenarios")[0], "base")), Path("run"),
-    launched=True,
-).model_copy(
-    update={"run_id": 7, "key": bytes(32), "join_token": "0" * 32, "clock": "one"}
-)  # fmt: skip
-DESCRIPTOR: dict[str, Any] = json.loads(_DESCRIPTOR.model_dump_json())
+DESCRIPTOR: dict[str, Any] = json.loads(RUN_DESCRIPTOR.model_dump_json())
 _SCENARIO = vocabulary(json_schema(Scenario))
 DESCRIPTOR_KNOWN = Vocabulary((*DESCRIPTOR, *_SCENARIO.keys), (*_SCENARIO.words, "00" * 31, "0g"))
 SEEDS = [json.dumps(DESCRIPTOR).encode(), *EDITS]
@@ -51,7 +46,7 @@ def descriptor_input(data: bytes) -> None:
         assert isinstance(found.launched, bool)
 
 
-TOKEN = _DESCRIPTOR.join_token
+TOKEN = RUN_DESCRIPTOR.join_token
 HELLO = {"pid": 1, "instance": "one", "address": ["127.0.0.1", 47001], "join_token": TOKEN}
 PROGRESS = {
     "t_s": 0.0, "events": 0, "deliveries": 0, "longest_loss_burst": 0, "x_norm": None, "live": None,
@@ -63,11 +58,11 @@ def barrier_input(data: bytes) -> None:
     choices = Choices(data)
     plane = FakePlane()
     with patch.object(coordinator, "ControlPlane", lambda *_, **__: plane):
-        barrier = coordinator.Coordinator(_DESCRIPTOR)
+        barrier = coordinator.Coordinator(RUN_DESCRIPTOR)
     queries: dict[str, list[Query]] = {}
     admissions: list[Query] = []
     for _ in range(choices.below(12)):
-        role = choices.one([*ROLES, "nobody", ""])
+        role = choices.choose([*ROLES, "nobody", ""])
         match choices.below(6):
             case 0:
                 plane.put("ended", Sample(f"noack/0/ended/{role}/one", _barrier_bytes(choices, "gone")))
@@ -151,7 +146,7 @@ def _request(content: bytes) -> None:
     """The coordinator replies, and every process can apply the announced changes."""
     plane = FakePlane()
     with patch.object(coordinator, "ControlPlane", lambda *_, **__: plane):
-        centre = coordinator.Coordinator(_DESCRIPTOR)
+        centre = coordinator.Coordinator(RUN_DESCRIPTOR)
     centre._clock = RunClock(0, 1.0, lambda: 0)
     query = Query("noack/0/runtime_parameters", content)
     plane.put("runtime_parameters", query)
@@ -159,8 +154,8 @@ def _request(content: bytes) -> None:
     assert query.answered == 1
     assert query.error is None or query.error.strip()
     for announced in plane.announced:
-        one = parse_message(ChangeAnnouncement, json.dumps(announced))
-        ChangeSchedule(_DESCRIPTOR.scenario).announce("t", one.change, 0, 0, -1)
+        announcement = parse_message(ChangeAnnouncement, json.dumps(announced))
+        ChangeSchedule(RUN_DESCRIPTOR.scenario).announce("t", announcement.change, 0, 0, -1)
     try:
         settings = parse_message(ChangeRequest, content).settings
     except PeerError:
@@ -172,13 +167,13 @@ def _request(content: bytes) -> None:
 def _announce(content: bytes) -> None:
     """A process applies the change, or refuses it in one line and stays unchanged."""
     with refusal("not a valid change announcement"):
-        one = parse_message(ChangeAnnouncement, content)
-        schedule = ChangeSchedule(_DESCRIPTOR.scenario)
+        announcement = parse_message(ChangeAnnouncement, content)
+        schedule = ChangeSchedule(RUN_DESCRIPTOR.scenario)
         with refusal(("the change", "a change"), lines=True):
-            schedule.announce("t", one.change, 0, 0, -1)
-            assert settings_of(settings_bytes(one.settings)) == one.settings
+            schedule.announce("t", announcement.change, 0, 0, -1)
+            assert settings_of(settings_bytes(announcement.settings)) == announcement.settings
             return
-        assert schedule.last is _DESCRIPTOR.scenario
+        assert schedule.last is RUN_DESCRIPTOR.scenario
 
 
 def _find(data: bytes) -> None:

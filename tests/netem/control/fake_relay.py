@@ -21,7 +21,7 @@ from netem.control.time_histogram import BUCKETS
 from netem.relay.relay import Relay
 from netem.relay.relay_links import LinkSpec
 from netem.relay.relay_reports import DIRECTIONS, Direction, DirectionReport, FlowReport, LinkReport
-from netem.stand_alone import add_watching_options, check_watching_options
+from netem.relay_watch import add_watching_options, check_watching_options
 from netem.tc_words import settings_of
 from noack.core.core_library import core
 from noack.impairments.link_settings import Counters, LinkSettings

@@ -14,35 +14,18 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.openmetrics.exposition import generate_latest
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
 
-from netem import stand_alone
+from netem import relay_watch
 from netem.control.control_server import running
 from netem.control.emulator_metrics import EmulatorMetrics, metrics
 from netem.control.emulator_statistics import CommandQueue, statistics
-from netem.stand_alone import watch_relay
+from netem.relay_watch import watch_relay
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError, PeerError
 from noack.runtime.address import address_text
 from noack.runtime.connections import metrics_server as servers
 from tests.helpers.waiting import wait_for
 from tests.netem.control.fake_relay import FakeRelay, options, press_q, read_until, terminal
-from tests.noack.runtime.connections.test_metrics_server import read, slow_reader
-
-Values = dict[str, float]
-
-
-def values_of(text: str) -> Values:
-    """The value of each sample, by its name and its labels."""
-    return {
-        ",".join([sample.name, *sorted(sample.labels.values())]): sample.value
-        for family in text_string_to_metric_families(text)
-        for sample in family.samples
-    }
-
-
-def exposed(collector: object) -> str:
-    registry = CollectorRegistry()
-    registry.register(collector)  # type: ignore[arg-type]
-    return str(generate_latest(registry).decode())
+from tests.helpers.metrics_readers import exposed, read, slow_reader, values_of
 
 
 class Fixed:
@@ -76,7 +59,7 @@ def test_an_emulator_serves_its_metrics_and_ends_beside_a_slow_reader(
     threads = threading.active_count()
     monkeypatch.setattr(servers, "_REQUEST_S", 3600.0)
     asked: list[tuple[str, int]] = []
-    monkeypatch.setattr(stand_alone, "address_text", lambda at: asked.append(at) or address_text(at))
+    monkeypatch.setattr(relay_watch, "address_text", lambda at: asked.append(at) or address_text(at))
     with (
         ExitStack() as stack,
         watch_relay(relay, options("--metrics", ":0")) as side,

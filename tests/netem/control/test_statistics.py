@@ -165,7 +165,6 @@ def sample(elapsed_s: float, rate: float | None, seconds: float = 1.0) -> Statis
 
 
 def test_a_sample_of_the_history_applies_to_the_time_since_the_one_before() -> None:
-    """A sample applies to the time since the previous one."""
     every_second, every_ten = History(), History()
     assert series(every_second, 3) == [None] * 3
     for second in range(1, 101):

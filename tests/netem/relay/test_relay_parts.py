@@ -113,7 +113,7 @@ def test_the_relay_reuses_memory_of_datagrams_and_clients_that_left(
 ) -> None:
     """Half of the datagrams are delayed or copied; clients appear and expire."""
     rounds, size, most_clients = 8, 300, 5
-    monkeypatch.setattr("netem.relay.relay._RARE_PERIOD_NS", 0)
+    monkeypatch.setattr("netem.relay.relay._CHECK_PERIOD_NS", 0)
     harsh = settings_of("loss 30% duplicate 30% delay 1ms 1ms mansd 3")
     with (
         endpoints(HOSTS[4]) as (server,),

@@ -11,13 +11,18 @@ import sys
 from functools import cache
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import pyarrow.parquet as pq
 import pytest
 
 from netem.__main__ import main
+from netem.relay.device_link import DeviceLink
+from netem.relay.relay_links import LinkSpec
+from netem.shell import process, shell
+from noack.impairments.link_settings import LinkSettings
 from noack.protocol.record_tables import Fate
+from noack.runtime.command_line import Signals
 from tests.netem.capture_reader import read
 
 ENDS = str(Path(__file__).with_name("ends.py"))
@@ -212,3 +217,18 @@ def test_the_shell_leaves_no_process_behind(killed: str) -> None:
         assert process.stdout.read() == ""
     expected = {"relay": -9, "all": -9, "guard": 128 + 9, "group": 130, "terminated": 143}
     assert process.returncode == expected[killed]
+
+
+def test_the_commands_outside_end_if_the_one_inside_cannot_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(_devices: DeviceLink) -> NoReturn:
+        raise OSError("no namespace")
+
+    monkeypatch.setattr(shell, "inside", refuse)
+    monkeypatch.setattr(process, "adopt_orphans", lambda: None)  # pytest stays no reaper
+    spec = LinkSpec("shell", ("198.18.0.2", 0), ("198.18.0.1", 0), LinkSettings(), LinkSettings())
+    devices = DeviceLink(spec, (-1, -1), (-1, -1), ("", ""), -1, None)
+    earlier_children = process.children(os.getpid())
+    program = shell._Program(devices, ["true"], [["sleep", "1000"]])
+    with pytest.raises(OSError, match="no namespace"), program.running(Signals()):
+        pass
+    assert process.children(os.getpid()) <= earlier_children

@@ -12,16 +12,7 @@ import pytest
 from noack.core.errors import ExitStatus
 from noack.runtime.command_line import LogFormat, failed, log_event, log_format, print_to_stderr
 from tests.command_line import invoke
-
-Object = dict[str, Any]
-
-
-def objects(text: str) -> list[Object]:
-    lines = [json.loads(line) for line in text.splitlines()]
-    for line in lines:
-        assert {"time", "level", "source", "message"} <= line.keys()
-        assert line["time"].endswith("Z")
-    return lines
+from tests.helpers.json_log import objects
 
 
 def standard_error(monkeypatch: pytest.MonkeyPatch) -> io.StringIO:

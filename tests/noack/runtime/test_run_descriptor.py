@@ -28,13 +28,8 @@ from noack.runtime.run_descriptor import (
 )
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
-from tests.fuzz.parsers.run_descriptor import _DESCRIPTOR
+from tests.helpers.run_descriptors import INVITED, RUN_DESCRIPTOR
 
-REMOTE = RemoteAccess(
-    host="127.0.0.1", port=7000, coordinator="A", certificate="C", private_key="K",
-    valid_until="2030-01-01T00:00:00+00:00",
-)  # fmt: skip
-INVITED: RunDescriptor = _DESCRIPTOR.model_copy(update={"remote": REMOTE, "run_dir": "/elsewhere/runs/one"})
 INVITED_AS = INVITED.model_dump_json()
 
 
@@ -76,7 +71,7 @@ def _fifo(path: Path) -> None:
             "not an invitation: its run directory has no name",
         ),
         (
-            lambda path: path.write_text(_DESCRIPTOR.model_dump_json()),
+            lambda path: path.write_text(RUN_DESCRIPTOR.model_dump_json()),
             "not an invitation, but a run descriptor for this host",
         ),
     ],

@@ -15,9 +15,8 @@ from cosim.live.monitoring.progress import work_bar
 from cosim.live.monitoring.run_watcher import RunMetrics, Watcher, joint_watcher
 from noack.runtime.control_messages import RunProgress
 from tests.command_line import invoke
-from tests.netem.control.test_emulator_metrics import exposed, values_of
-from tests.noack.runtime.connections.test_metrics_server import read, slow_reader
-from tests.noack.runtime.test_json_log import objects
+from tests.helpers.json_log import objects
+from tests.helpers.metrics_readers import exposed, read, slow_reader, values_of
 
 PROGRESS: dict[str, Any] = {
     "t_s": 2.5, "events": 7, "deliveries": 3, "longest_loss_burst": 4, "x_norm": None, "live": None,

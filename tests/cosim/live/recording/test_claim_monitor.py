@@ -15,9 +15,9 @@ from noack.protocol.record_tables import LOOP, NETEM_PACKET, OWNER
 from noack.scenario.resolution import run_tables, tables_of
 from noack.scenario.scenario import phases_ns
 from noack.scenario.scenario_file import validate
+from tests.helpers.rows_of_loops import live_rows
 
 Content = dict[str, Any]
-BATCH_NS = 100_000_000
 
 
 @pytest.fixture
@@ -32,30 +32,6 @@ def content(content: Content) -> Content:
     wild = {"draw": "given", "A": [[3.0, 0.0], [0.0, 3.0]], "B": [[0.0], [0.0]]}
     content["loops"] = [{"name": "good", "count": 2}, {"name": "wild", "plant": wild}]
     return content
-
-
-def live_rows(run: RecordedRun) -> Iterator[tuple[str, Rows]]:
-    """Yield the rows as the processes send them: those of all loops mixed, batch by batch."""
-    network = run.network
-    every = {NETEM_PACKET: network[NETEM_PACKET]}
-    for table, dtype in run_tables(network.scenario).items():
-        if OWNER[table] != "netem":
-            of_loops = [numbered(record, i, table, dtype) for i, record in enumerate(run.loops)]
-            every[table] = np.concatenate(of_loops)
-    for begin_ns in range(0, 2 * network.scenario.timing.horizon_ns, BATCH_NS):
-        for table, rows in every.items():
-            now_ns = rows["now_ns"]
-            chosen = rows[(now_ns >= begin_ns) & (now_ns < begin_ns + BATCH_NS)]
-            if len(chosen):
-                yield table, chosen
-
-
-def numbered(record: RunRecord, number: int, table: str, dtype: np.dtype[np.void]) -> Rows:
-    rows = np.zeros(record.count(table), dtype)
-    rows[LOOP] = number
-    for name in record[table].dtype.names or ():
-        rows[name] = record[table][name]
-    return rows
 
 
 def found_by(monitor: ClaimMonitor, run: RecordedRun) -> list[Finding]:

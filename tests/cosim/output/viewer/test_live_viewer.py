@@ -33,7 +33,7 @@ from tests.cosim.output.viewer.recordings import K, add_samples, another_process
 from tests.helpers.shipped import resolved
 from tests.helpers.summaries import summary_of
 from tests.helpers.waiting import is_left, wait_for
-from tests.integration.conftest import noack_command
+from tests.helpers.live_runs import noack_command
 
 pytestmark = pytest.mark.skipif(
     not hasattr(os, "killpg"), reason="tells by process groups what is left behind"

@@ -9,7 +9,6 @@ import rerun.chunk
 from cosim.output.viewer.blueprint import LoopLayout, over_time
 from cosim.output.viewer.loop_recording import APPLICATION_ID, LoopView, RecordingFile, ViewError
 from cosim.output.viewer.pictures.picture import Frames
-from tests.cosim.output.test_texts import compare
 from tests.cosim.output.viewer.recordings import (
     K,
     add_samples,
@@ -20,6 +19,7 @@ from tests.cosim.output.viewer.recordings import (
     series,
     times,
 )
+from tests.helpers.approved import compare_output
 
 STATES = ["V", "r", "psi", "Y_g"]
 
@@ -69,7 +69,7 @@ def test_the_recording_shows_what_was_approved(tmp_path: Path) -> None:
         for value in batch.column(name).to_pylist()
     ]
     shown += sorted(of_views(read(path, "blueprint"), "ViewBlueprint:display_name"))
-    compare("recording.txt", "\n".join(shown))
+    compare_output("recording.txt", "\n".join(shown))
 
 
 def test_a_file_that_cannot_be_created_is_named(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEA
 from tests.cosim.output.viewer.recordings import read, series
 from tests.cosim.record.changed_records import changed, copied
 from tests.helpers.shipped import resolved
-from tests.helpers.summaries import alone
+from tests.helpers.summaries import run_of_one_loop
 
 PART_STEPS, COLUMNS = 500, 10
 S = 1_000_000_000
@@ -64,7 +64,7 @@ def test_each_envelope_holds_all_samples_of_its_bin(tmp_path: Path, monkeypatch:
     record = with_peaks(simulate(resolved("double_integrator", "horizon_s=20")))
     write_scenario(record.scenario, tmp_path)
     write_environment(tmp_path, "live")
-    write_run(alone(record), tmp_path)
+    write_run(run_of_one_loop(record), tmp_path)
     steps = record.count(PLANT_STEP)
     monkeypatch.setattr(decimation, "_MOST_STEPS", steps // 2)
     monkeypatch.setattr(run_record, "BATCH_ROWS", PART_STEPS)

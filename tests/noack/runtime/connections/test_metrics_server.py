@@ -20,8 +20,7 @@ from noack.runtime.connections import connection_gate
 from noack.runtime.connections import metrics_server as servers
 from noack.runtime.connections.metrics_server import metrics_server
 from tests.helpers.approved import lines_of_error
-
-OPENMETRICS = "application/openmetrics-text; version=1.0.0"
+from tests.helpers.metrics_readers import read, slow_reader
 
 
 def collect() -> Iterator[Metric]:
@@ -40,35 +39,6 @@ def answered(reader: socket.socket) -> bytes:
         while part := reader.recv(2**20):
             received += part
     return received
-
-
-@contextmanager
-def slow_reader(address: Address) -> Iterator[threading.Thread]:
-    """Send a request of endless length, byte by byte; yield the thread, which ends with the
-    connection."""
-
-    def send() -> None:
-        with suppress(OSError):
-            while not select.select([connection], [], [], 0.01)[0]:
-                connection.send(b"G")
-
-    with socket.create_connection(address) as connection:
-        thread = threading.Thread(target=send)
-        thread.start()
-        try:
-            yield thread
-        finally:
-            with suppress(OSError):
-                connection.shutdown(socket.SHUT_RDWR)
-            thread.join()
-
-
-def read(address: Address, accept: str = OPENMETRICS, method: str = "GET") -> str:
-    request = urllib.request.Request(
-        f"http://{address[0]}:{address[1]}/metrics", headers={"Accept": accept}, method=method
-    )
-    with urllib.request.urlopen(request, timeout=30) as answer:
-        return str(answer.read().decode())
 
 
 def test_metrics_are_read_in_both_formats() -> None:

@@ -21,7 +21,7 @@ import numpy as np
 from benchmarks.programs import NOACK, in_new_process
 from benchmarks.report import Goal, MeasurementError, Peer, Row, benchmark, say
 from cosim.analysis.replay.run_replay import stored_verdict
-from cosim.cli import find_scenario
+from cosim.cli.options import find_scenario
 from cosim.record.record_source import concatenate_rows
 from cosim.record.run_directory import RECORD, write_environment
 from cosim.record.table_files import TableFile
@@ -129,7 +129,7 @@ def rows_of(ends: Mapping[float, End]) -> Iterator[Row]:
 def long_run(options: argparse.Namespace) -> Iterator[Row]:
     """Complete runs of several lengths, by ``noack summary``.
 
-    This writes the record, recording, summary and report, replays the run and judges its claims.
+    This writes the record, recording, summary and report, replays the run and checks its claims.
     The alternative is the end of a short run: memory should not grow with the length.
     """
     with tempfile.TemporaryDirectory(prefix="noack-long-run-") as folder:

@@ -1,0 +1,54 @@
+"""The rows of a run of several loops, mixed as its processes send them."""
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from cosim.record.run_record import RecordedRun, Rows, RunRecord
+from noack.protocol.record_tables import LOOP, NETEM_PACKET, OWNER, network_tables
+from noack.scenario.resolution import run_tables
+
+BATCH_NS = 100_000_000
+
+
+def mixed_rows(shared: RecordedRun) -> Mapping[str, Rows]:
+    """All rows by table, as the processes emit them: with the loop's number, in order of time."""
+    found = {}
+    for table, dtype in run_tables(shared.scenario).items():
+        if table in network_tables():
+            found[table] = shared.network[table]
+            continue
+        parts = []
+        for number, loop in enumerate(shared.loops):
+            rows = np.zeros(loop.count(table), dtype)
+            rows[LOOP] = number
+            for name in loop.tables[table].names or ():
+                rows[name] = loop[table][name]
+            parts.append(rows)
+        rows = np.concatenate(parts)
+        found[table] = rows[np.argsort(rows["now_ns"], kind="stable")]
+    return found
+
+
+def live_rows(run: RecordedRun) -> Iterator[tuple[str, Rows]]:
+    """Yield the rows as the processes send them: those of all loops mixed, batch by batch."""
+    network = run.network
+    every = {NETEM_PACKET: network[NETEM_PACKET]}
+    for table, dtype in run_tables(network.scenario).items():
+        if OWNER[table] != "netem":
+            of_loops = [numbered(record, i, table, dtype) for i, record in enumerate(run.loops)]
+            every[table] = np.concatenate(of_loops)
+    for begin_ns in range(0, 2 * network.scenario.timing.horizon_ns, BATCH_NS):
+        for table, rows in every.items():
+            now_ns = rows["now_ns"]
+            chosen = rows[(now_ns >= begin_ns) & (now_ns < begin_ns + BATCH_NS)]
+            if len(chosen):
+                yield table, chosen
+
+
+def numbered(record: RunRecord, number: int, table: str, dtype: np.dtype[np.void]) -> Rows:
+    rows = np.zeros(record.count(table), dtype)
+    rows[LOOP] = number
+    for name in record[table].dtype.names or ():
+        rows[name] = record[table][name]
+    return rows
