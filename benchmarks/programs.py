@@ -25,8 +25,8 @@ import psutil
 
 from benchmarks.report import MeasurementError
 from noack.protocol.roles import LOOP_ROLES
-from tests.helpers.waiting import PATIENCE_S
 from tests.helpers.live_runs import begun, is_over, processes_of
+from tests.helpers.waiting import PATIENCE_S
 
 PROGRESS = re.compile(r"^([0-9.]+)/[0-9.e+]+ s\b")
 """A progress line of a run; the group is the time in the run, s."""

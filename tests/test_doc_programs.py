@@ -15,8 +15,8 @@ from typing import NamedTuple
 import pytest
 
 from tests.command_line import invoke
-from tests.helpers.pages import PAGES, ROOT, blocks, fences, fill, target_exists
 from tests.helpers.live_runs import WITHOUT_VIEWER, wait_for
+from tests.helpers.pages import PAGES, ROOT, blocks, fences, fill, target_exists
 
 EXAMPLES = ROOT / "docs/examples"
 FIGURES = {

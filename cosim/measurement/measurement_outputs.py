@@ -363,7 +363,10 @@ def _correlation(measurement: NetworkMeasurement) -> Panel:
         )
         if correlation.lags
     ]
-    limits = [Rule(at=level, colour=_LIMIT, width=1.0) for level in (delays.white_noise_limit, -delays.white_noise_limit)]
+    limits = [
+        Rule(at=level, colour=_LIMIT, width=1.0)
+        for level in (delays.white_noise_limit, -delays.white_noise_limit)
+    ]
     return Panel(
         title="Correlation",
         items=[*items, *limits],

@@ -30,9 +30,9 @@ from noack.runtime.address import LOOPBACK
 from noack.runtime.udp_sockets import SHED
 from noack.scenario.resolution import loop_of
 from tests.attacks.kinds import Plan, Sent, Target, carry_out
+from tests.helpers.live_runs import AWAY, RunByHand, udp_port
 from tests.helpers.two_hosts import TwoHosts
 from tests.helpers.waiting import wait_for
-from tests.helpers.live_runs import AWAY, RunByHand, udp_port
 
 _ATTEMPTS = 3
 

@@ -151,7 +151,10 @@ def value(choices: Choices, vocabulary: Vocabulary, depth: int = 0) -> Any:
         case 6:
             return [value(choices, vocabulary, depth + 1) for _ in range(choices.below(4))]
         case 7:
-            return {key(choices, vocabulary): value(choices, vocabulary, depth + 1) for _ in range(choices.below(4))}
+            return {
+                key(choices, vocabulary): value(choices, vocabulary, depth + 1)
+                for _ in range(choices.below(4))
+            }
         case _:
             nested: Any = value(choices, vocabulary, depth + 1)
             for _ in range(choices.below(20)):

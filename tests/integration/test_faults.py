@@ -23,8 +23,8 @@ from noack.core.errors import MachineError
 from noack.protocol.roles import ROLES
 from tests.command_line import invoke
 from tests.cosim.output.viewer.recordings import read
-from tests.helpers.waiting import is_left
 from tests.helpers import live_runs as live
+from tests.helpers.waiting import is_left
 
 Start = Callable[..., live.Running]
 LONG = [*live.AT_RATE, *live.settings(speed=4.0, horizon_s=400.0)]

@@ -21,9 +21,9 @@ from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER
 from noack.protocol.roles import LOOP_ROLES
 from noack.scenario.scenario import phases_ns
 from tests.command_line import invoke
-from tests.helpers.two_hosts import TwoHosts, two_hosts
 from tests.helpers import live_runs as live
 from tests.helpers.live_runs import Start, ended
+from tests.helpers.two_hosts import TwoHosts, two_hosts
 
 INVITED = ("--invitation", "invitation.json")
 ROOMY = "clocks.largest_error_us=1000000"

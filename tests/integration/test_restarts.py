@@ -10,9 +10,6 @@ from cosim.record.processes import generation_indices
 from cosim.record.run_record import Rows, RunRecord, load_record
 from noack.protocol.record_tables import OWNER
 from noack.protocol.roles import GENERATION
-from noack.runtime.spool import read_chunks
-from noack.scenario.resolution import run_tables
-from noack.scenario.scenario_file import load
 from noack.theory.certificates.conditions import allowed_conditions
 from tests.helpers import live_runs as live
 

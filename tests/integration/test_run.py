@@ -43,8 +43,8 @@ from tests.helpers.live_runs import (
     begun,
     run_scenario,
     settings,
-    wait_for,
     spooled,
+    wait_for,
 )
 
 CERTIFIED = "certified for the scenario's plant"

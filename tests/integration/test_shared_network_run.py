@@ -42,5 +42,7 @@ def test_all_loops_reach_the_horizon_at_their_rates_and_are_replayed(
         assert (len(steps), steps["x"].shape[1]) == (STEPS[name], SIZES[name])
         assert len(record["sensor_setting"]) == 1
         headers = [read_header(head.tobytes()) for head in record["netem_packet"]["head"]]
-        assert all(header is not None and header.version == 2 and header.error_level > 0 for header in headers)
+        assert all(
+            header is not None and header.version == 2 and header.error_level > 0 for header in headers
+        )
     assert all(loop["exit"]["status"] == 0 for loop in different.summary["loops"])

@@ -11,8 +11,8 @@ import pytest
 import noack
 from cosim.simulation.continuous import run_continuous
 from noack.scenario.resolution import resolve
-from tests.helpers.lab_browser import TEXT, Page, Served
 from tests.helpers import live_runs as live
+from tests.helpers.lab_browser import TEXT, Page, Served
 from tools.screenshot_recording import Browser
 
 pytest.importorskip("nicegui", reason="the extra `lab` is not installed")

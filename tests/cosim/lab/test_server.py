@@ -32,11 +32,11 @@ from cosim.simulation.virtual_time import simulate
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.runtime.spool import SPOOL, SpoolWriter
 from noack.scenario.scenario_file import dumps
+from tests.helpers import live_runs as live
+from tests.helpers.live_runs import WITHOUT_VIEWER
 from tests.helpers.rows_of_loops import mixed_rows
 from tests.helpers.shipped import resolved
 from tests.helpers.summaries import run_of_one_loop
-from tests.helpers import live_runs as live
-from tests.helpers.live_runs import WITHOUT_VIEWER
 
 UNANSWERED = {
     "computes": "while True: pass",

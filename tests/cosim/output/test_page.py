@@ -22,8 +22,8 @@ from cosim.record.run_record import RunRecord
 from noack.core.errors import ExitStatus
 from noack.scenario.scenario_file import dumps as scenario_toml
 from tests.command_line import invoke
-from tests.helpers.lab_browser import started
 from tests.cosim.output.conftest import CASES, HOSTILE, make_record, scenario_of
+from tests.helpers.lab_browser import started
 from tests.helpers.summaries import run_of_one_loop, summary_of
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}

@@ -5,7 +5,6 @@
 
 import csv
 import io
-import re
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ from noack.core.errors import CallerError
 from tests.command_line import invoke
 from tests.cosim.output.test_page import Page
 from tests.helpers.approved import compare_output
-
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,6 @@ from noack.core.errors import MachineError
 from noack.protocol.record_tables import LOOP, NETEM_PACKET, PLANT_STEP, network_tables
 from noack.protocol.roles import Notice
 from noack.runtime.spool import EARLY, EARLY_ENDED, SPOOL, SpoolWriter, notices_of
-from noack.scenario.resolution import run_tables
 from noack.scenario.scenario_file import validate
 from tests.helpers.rows_of_loops import mixed_rows
 

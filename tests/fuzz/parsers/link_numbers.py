@@ -20,7 +20,9 @@ SEEDS = (
     *(bytes([*range(at, at + 40)]) * 4 for at in range(0, 200, 11)),
 )  # fmt: skip
 
-_COMPUTABLE = [impairment for impairment in IMPAIRED if not names_file(impairment) and not keeps_loss(impairment)]
+_COMPUTABLE = [
+    impairment for impairment in IMPAIRED if not names_file(impairment) and not keeps_loss(impairment)
+]
 _RECORDED = (RecordedDecision(0, 10, 20, 3, -1), RecordedDecision(3, 5, -1, 900, 7))
 _FIELDS = [(name, of.type.cname) for name, of in ffi.typeof("noack_link").fields]
 _SCALARS = [name for name, kind in _FIELDS if kind == "int64_t"]

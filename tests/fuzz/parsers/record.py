@@ -92,7 +92,9 @@ def files(acknowledged: bool, live: bool) -> Mapping[str, bytes]:
         for role, report in record.reports.items()
     }
     kind = "live" if live else "simulated"
-    run = run_of_one_loop(RunRecord(resolved, record.source, record.notices, reports, "live" if live else "simulated"))
+    run = run_of_one_loop(
+        RunRecord(resolved, record.source, record.notices, reports, "live" if live else "simulated")
+    )
     own = summarise_loop(run.loop(), 0, "finished").to_json()
     own |= {
         "replay": replay(record).verdict().model_dump(),

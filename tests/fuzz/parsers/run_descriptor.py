@@ -3,7 +3,6 @@
 import fcntl
 import json
 import os
-from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
@@ -15,12 +14,10 @@ from noack.runtime import active_runs, run_descriptor
 from noack.runtime.control_messages import ChangeAnnouncement, ChangeReply, ChangeRequest, parse_message
 from noack.runtime.private_folder import open_private
 from noack.scenario.parameter_changes import ChangeSchedule, settings_bytes, settings_of
-from noack.scenario.resolution import resolve
 from noack.scenario.runtime_parameters import SHORT
 from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_file import validate
 from noack.scenario.toml_file import json_schema
-from tests.fuzz.edits import EDITS, Choices, Vocabulary, bases, damaged, edited, vocabulary
+from tests.fuzz.edits import EDITS, Choices, Vocabulary, damaged, edited, vocabulary
 from tests.fuzz.harness import Harness, refusal, workspace
 from tests.fuzz.plane import FakePlane, Query, Sample
 from tests.helpers.run_descriptors import RUN_DESCRIPTOR

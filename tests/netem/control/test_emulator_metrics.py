@@ -10,9 +10,6 @@ from contextlib import ExitStack, redirect_stderr
 from pathlib import Path
 
 import pytest
-from prometheus_client import CollectorRegistry
-from prometheus_client.openmetrics.exposition import generate_latest
-from prometheus_client.openmetrics.parser import text_string_to_metric_families
 
 from netem import relay_watch
 from netem.control.control_server import running
@@ -23,9 +20,9 @@ from netem.tc_words import settings_of
 from noack.core.errors import CallerError, PeerError
 from noack.runtime.address import address_text
 from noack.runtime.connections import metrics_server as servers
+from tests.helpers.metrics_readers import exposed, read, slow_reader, values_of
 from tests.helpers.waiting import wait_for
 from tests.netem.control.fake_relay import FakeRelay, options, press_q, read_until, terminal
-from tests.helpers.metrics_readers import exposed, read, slow_reader, values_of
 
 
 class Fixed:

@@ -1,11 +1,9 @@
 """Standard error as JSON Lines."""
 
 import io
-import json
 import math
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 

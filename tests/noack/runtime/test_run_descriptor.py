@@ -15,8 +15,6 @@ import pytest
 from noack.core.errors import CallerError, PeerError
 from noack.runtime.private_folder import private_folder
 from noack.runtime.run_descriptor import (
-    RemoteAccess,
-    RunDescriptor,
     descriptor_file,
     find_descriptor,
     invitation_file,

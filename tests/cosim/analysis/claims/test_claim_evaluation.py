@@ -26,8 +26,8 @@ from noack.protocol.roles import LOOP_ROLES
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from tests.cosim.analysis.claims.conftest import MS, Make, event_s, without
-from tests.cosim.record.changed_records import changed
 from tests.cosim.record.changed_records import CONTENT as CHANGING
+from tests.cosim.record.changed_records import changed
 from tests.helpers.shipped import resolved
 from tests.oracles.random_scenarios import POLICIES, random_scenario
 

@@ -1,6 +1,5 @@
 """The monitor of several loops during a run, against the monitor of each loop alone."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -8,11 +7,10 @@ import pytest
 
 from cosim.analysis.claims.condition_reader import AssumptionMonitor
 from cosim.live.recording.claim_monitor import MOST_CHECKED, ClaimMonitor, Finding
-from cosim.record.run_record import RecordedRun, Rows, RunRecord
+from cosim.record.run_record import RecordedRun
 from cosim.simulation.virtual_time import simulate_loops
 from noack.core.clock import NS_PER_S
-from noack.protocol.record_tables import LOOP, NETEM_PACKET, OWNER
-from noack.scenario.resolution import run_tables, tables_of
+from noack.scenario.resolution import tables_of
 from noack.scenario.scenario import phases_ns
 from noack.scenario.scenario_file import validate
 from tests.helpers.rows_of_loops import live_rows

@@ -31,9 +31,9 @@ from noack.runtime.spool import NOTICES, SPOOL, batch_of, read_chunks
 from noack.scenario.resolution import resolve, run_tables
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import dumps, validate
-from tests.helpers.run_descriptors import JUNK
 from tests.cosim.simulation.outage import with_outage
 from tests.fuzz.plane import FakePlane, Query, Sample
+from tests.helpers.run_descriptors import JUNK
 from tests.helpers.shipped import resolved
 
 

@@ -19,8 +19,8 @@ from noack.protocol.record_tables import NETEM_PACKET, PACKET_HEAD_BYTES, Fate, 
 from noack.protocol.roles import Notice
 from noack.protocol.wire_format import Encoder, Flow, Message
 from noack.scenario.resolution import loop_of
-from tests.helpers.rows_of_loops import live_rows
 from tests.cosim.output.viewer.recordings import Chunks, read, series
+from tests.helpers.rows_of_loops import live_rows
 from tests.helpers.shipped import resolved, shipped
 
 

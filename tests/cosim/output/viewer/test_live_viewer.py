@@ -30,10 +30,10 @@ from cosim.output.viewer.live_viewer import (
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError, ExitStatus
 from tests.cosim.output.viewer.recordings import K, add_samples, another_process, new_view, read
+from tests.helpers.live_runs import noack_command
 from tests.helpers.shipped import resolved
 from tests.helpers.summaries import summary_of
 from tests.helpers.waiting import is_left, wait_for
-from tests.helpers.live_runs import noack_command
 
 pytestmark = pytest.mark.skipif(
     not hasattr(os, "killpg"), reason="tells by process groups what is left behind"

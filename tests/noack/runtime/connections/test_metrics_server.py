@@ -1,13 +1,11 @@
 """Metrics over HTTP, read by the parser of prometheus_client."""
 
-import select
 import socket
 import sys
-import threading
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 
 import pytest
 from prometheus_client import Metric
@@ -15,7 +13,6 @@ from prometheus_client.metrics_core import GaugeMetricFamily
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
 from prometheus_client.parser import text_string_to_metric_families as prometheus_families
 
-from noack.runtime.address import Address
 from noack.runtime.connections import connection_gate
 from noack.runtime.connections import metrics_server as servers
 from noack.runtime.connections.metrics_server import metrics_server
