@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 from pydantic import BaseModel
 
-from cosim.interactive.scenario_draft import Draft
+from cosim.interactive.scenario_draft import Draft, DraftError
 from noack.core.clock import NS_PER_S
 from noack.scenario.runtime_parameters import trigger_parameters
 from noack.scenario.scenario import Scenario
@@ -125,9 +126,9 @@ def controls_of(draft: Draft) -> Controls:
         DraftError: the draft is not valid.
     """
     scenario = draft.scenario
-    base = _base_of(draft).scenario
+    base = _base_scenario(draft)
     sliders = (
-        *_loss_sliders(scenario),
+        *_loss_sliders(scenario, base),
         *_guarantee_sliders(scenario),
         *_trigger_sliders(scenario, base),
         *_plant_sliders(scenario, base),
@@ -186,6 +187,19 @@ def _base_of(draft: Draft) -> Draft:
     return Draft(draft.base, draft.folder, draft.base_text, draft.base_text)
 
 
+def _base_scenario(draft: Draft) -> Scenario:
+    """Return the base's scenario with the draft's trigger policy and loss model, if these fit it."""
+    base, scenario = _base_of(draft), draft.scenario
+    usual = base.scenario
+    if usual.trigger.policy != scenario.trigger.policy:
+        base = choose(base, "trigger", scenario.trigger.policy)
+    if usual.network.loss.model != scenario.network.loss.model:
+        base = choose(base, "network.loss", scenario.network.loss.model)
+    with suppress(DraftError):
+        usual = base.scenario
+    return usual
+
+
 def example_of(draft: Draft, key: str, kind: str) -> Table | None:
     """Return an example of a table of a kind; None if there is none.
 
@@ -200,8 +214,8 @@ def example_of(draft: Draft, key: str, kind: str) -> Table | None:
     return None
 
 
-def _loss_sliders(scenario: Scenario) -> list[Slider]:
-    loss = scenario.network.loss
+def _loss_sliders(scenario: Scenario, base: Scenario) -> list[Slider]:
+    loss, usual = scenario.network.loss, base.network.loss
     values = loss.model_dump(mode="json", exclude_none=True)
     # The mean loss and burst are those of Gilbert's chain, which loses in the bad state only.
     fixed = ("loss_in_good", "loss_in_bad") if "mean_loss" in values else ()
@@ -214,7 +228,8 @@ def _loss_sliders(scenario: Scenario) -> list[Slider]:
             label = "loss probability" if name == "probability" else label
             slider = Slider(key, label, value, 0.0, 1.0, 0.01, live=True)
         elif value > 0:
-            slider = _decades(key, label, value, value)
+            like = getattr(usual, name, None) if usual.model == loss.model else None
+            slider = _decades(key, label, value, like or value)
         else:
             continue
         sliders.append(_within_field(slider, type(loss), name))
