@@ -298,7 +298,8 @@ class OwnSpool:
         return _kept_folder(self._run_dir, self._remote_run_name)
 
     @cached_property
-    def _files(self) -> SpoolWriter:
+    def files(self) -> SpoolWriter:
+        """The files of the spool."""
         files = SpoolWriter(self.folder / SPOOL, writer_of(self._secret))
         if self._remote_run_name is not None:
             files.append(KEPT_KEY, 0, self._secret.encode())
@@ -309,11 +310,11 @@ class OwnSpool:
         generation, first = first_row(header)
         if table == NOTICES:
             table, first = notices_of(self._role), notice_number(generation, first)
-        self._files.append(table, first, payload)
+        self.files.append(table, first, payload)
 
     def keep_report(self, report: Mapping[str, object]) -> None:
         """Write the final report; raise MachineError if it cannot be written."""
-        self._files.append(KEPT_REPORT, 0, json.dumps({**report, "process": self._role}).encode())
+        self.files.append(KEPT_REPORT, 0, json.dumps({**report, "process": self._role}).encode())
 
 
 def _kept_folder(run_dir: Path, name: str) -> Path:

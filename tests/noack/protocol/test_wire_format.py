@@ -265,8 +265,8 @@ def test_the_published_file_is_what_both_receivers_do() -> None:
         }
         for version in (1, 2)
     ]  # fmt: skip
-    results = {entry["result"] for receiver in receivers for entry in receiver["datagrams"]}
-    assert len(results) == 11  # each reason but `shed`, and accepted
+    seen = {entry["result"] for receiver in receivers for entry in receiver["datagrams"]}
+    assert len(seen) == 11  # each reason but `shed`, and accepted
     about = "Datagrams in the order in which a receiver gets them; see wire.md, Test vectors"
     text = json.dumps({"about": about, "key": KEY.hex(), "receivers": receivers}, indent=1) + "\n"
     compare_text(DOCS / "wire-vectors.json", text)

@@ -174,6 +174,7 @@ def test_what_two_runs_with_one_directory_keep_stays_apart(tmp_path: Path) -> No
     assert not (tmp_path / "run").exists()  # nothing is left of a run that kept nothing
     for spool in (first, again, other):
         spool.append("sensor_event", header, b"rows")
+        spool.files.close()
     assert first.folder == again.folder == tmp_path / "run"
     assert other.folder == tmp_path / "run-0002"
     assert [kept_run_name(spool) for spool in (first.folder, other.folder)] == ["0001", "0002"]
