@@ -219,13 +219,8 @@ def test_batches_with_impossible_numbers_or_sizes_are_refused() -> None:
     for field, value in (
         ("level", -1.0), ("level", np.nan), ("rate_per_s", np.inf), ("floor", -1.0),
         ("positive_rows", 257), ("positive_rows", -1), ("negative_rows", 2), ("grid_ns", -1),
-<<<<<<< HEAD
-        ("shortest_ns", -1), ("longest_ns", -1), ("longest_ns", 2**63 - 1),
-        ("idle_ns", -(2**63)), ("decay_per_s", -1.0),
-=======
         ("shortest_ns", -1), ("longest_ns", -1), ("longest_ns", 2**63 - 1), ("idle_ns", -(2**63)),
         ("decay_per_s", -1.0),
->>>>>>> g3
     ):  # fmt: skip
         simulation = ExactSimulation(identity, identity, trigger, **plain)
         setattr(simulation.core.rule, field, value)
