@@ -258,7 +258,7 @@ def following(stack: ExitStack, clocks: HostClocks, settings: ClocksSection = RO
     return clock
 
 
-def polled(clock: ReferenceClock, readings: int = 20) -> ClockReport:
+def polled(clock: ReferenceClock, count: int = 20) -> ClockReport:
     """Read the clock, then poll; fail if a reading was outside of the bound, or backward."""
     readings, newest_ns = [], clock.monotonic_ns()
     for _ in range(count):
