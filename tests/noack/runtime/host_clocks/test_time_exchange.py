@@ -258,10 +258,10 @@ def following(stack: ExitStack, clocks: HostClocks, settings: ClocksSection = RO
     return clock
 
 
-def polled(clock: ReferenceClock, readings: int = 20) -> ClockReport:
+def polled(clock: ReferenceClock, count: int = 20) -> ClockReport:
     """Read the clock, then poll; fail if a reading was outside of the bound, or backward."""
     readings, newest_ns = [], clock.monotonic_ns()
-    for _ in range(readings):
+    for _ in range(count):
         before_ns = time.monotonic_ns()
         own_ns = clock.monotonic_ns()
         readings.append((before_ns, own_ns, time.monotonic_ns()))
