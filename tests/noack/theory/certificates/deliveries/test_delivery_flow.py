@@ -25,12 +25,9 @@ def exactly_after(generator: Matrix, t_s: float) -> Matrix:
 def test_the_error_of_the_flow_is_far_below_what_its_bounds_are_enlarged_by(
     system: System,
 ) -> None:
-    """It is an estimate, not a proof: 1e-12 of the norm of e^{Fτ}, which is up to 1e6."""
+    """It is an estimate, not a proof: at most a tenth of what bounds are enlarged by."""
     flow = DeliveryPropagation(gains_of(system))
-    largest = 0.0
     for node in np.linspace(1, len(flow.edges_s) - 1, 6).astype(int):
         exact = exactly_after(flow.generator, float(flow.edges_s[node]))
-        largest = max(largest, float(np.linalg.norm(exact, 2)), 1.0)
         error = np.linalg.norm(flow.states[node] - exact[:, : flow.n], 2)
-        assert error <= 1e-12 * largest
-    assert FLOW_ROUNDING - 1 > 1e6 * 1e-12
+        assert error <= (FLOW_ROUNDING - 1) / 10
