@@ -75,7 +75,7 @@ def test_the_dissector_shows_every_field(tshark: Tshark, tmp_path: Path, encrypt
     messages = [
         Message(Flow.UPDATE, 2**64 - 1, -1, np.array([-0.0, 5e-324, -1.5e308]), error_level=255),
         Message(Flow.ACTUATION, 0, -(2**63), np.array([1.0])),
-        Message(Flow.MEASUREMENT, 1, 2**63 - 1, np.full(64, 0.1), 2**16 - 1),
+        Message(Flow.MEASUREMENT, 1, 2**63 - 1, np.full(64, 0.1), 2**16 - 2),
         Message(Flow.ACKNOWLEDGEMENT, 17, 1_234_000_000, np.zeros(0)),
     ]
     encoder = Encoder(RUN, bytes(32), encrypted=encrypted)

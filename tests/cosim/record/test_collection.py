@@ -88,7 +88,7 @@ class HostFiles:
 def host_files(full_record: RunRecord, tmp_path: Path) -> Iterator[HostFiles]:
     host_files = HostFiles(tmp_path / "kept", full_record)
     yield host_files
-    host_files.spool._files.close()
+    host_files.spool.files.close()
 
 
 def contents(folder: Path) -> dict[str, bytes]:

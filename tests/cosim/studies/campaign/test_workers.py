@@ -26,6 +26,7 @@ from cosim.studies.campaign.chunk_store import Store, run_campaign
 from noack.core.errors import CallerError, PeerError
 from tests.cosim.studies.campaign.conftest import Command, Write, few_of
 from tests.cosim.studies.campaign.test_chunk_store import files
+from tests.helpers.live_runs import command_of
 from tests.helpers.waiting import wait_for
 
 Start = Callable[[], "subprocess.Popen[str]"]
@@ -77,7 +78,7 @@ def test_a_killed_worker_gives_one_line_and_no_byte_depends_on_the_workers(
     def progress(done: int, total: int) -> None:
         if done == 5:
             children = psutil.Process().children(recursive=True)
-            workers.extend(p for p in children if "spawn_main" in " ".join(p.cmdline()))
+            workers.extend(child for child in children if "spawn_main" in " ".join(command_of(child)))
             workers[0].kill()
 
     with pytest.raises(LostWorkersError) as lost, campaign_workers.local_runner(2) as runner:

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from cosim.cli import command
 from cosim.studies.campaign.campaign_file import load
 from cosim.studies.campaign.campaign_grid import grid
 from cosim.studies.paper import paper_evidence, paper_page
@@ -177,8 +176,8 @@ def test_the_committed_campaign_is_complete() -> None:
 def test_the_command_runs_the_campaign_and_writes_the_page(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(command, "cores", lambda: 1)
-    monkeypatch.setattr(command, "DEFAULT_RUNS", tmp_path / "runs")
+    monkeypatch.setattr("cosim.cli.execute_run.cores", lambda: 1)
+    monkeypatch.setattr("cosim.cli.commands.study_commands.DEFAULT_RUNS", tmp_path / "runs")
     # test_evidence.py computes it
     monkeypatch.setattr(paper_page, "evidence", lambda *_: COMMITTED["evidence"])
     done = invoke("paper", "--draws", "5", "--out", tmp_path, "--json")
