@@ -53,7 +53,7 @@ LINES = {
     "controller_node": 420,
     "benchmarks": 3730,
     "native": 11445,
-    "tests": 50320,
+    "tests": 50335,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 

@@ -108,6 +108,8 @@ def test_only_active_runs_can_be_changed(coordinator: Coordinator) -> None:
     result = invoke("set", "loss.p", "0.5")
     assert result.exit_code == 2
     assert "no run is active" in result.stderr
+    with pytest.raises(CallerError, match=r"the run runs/ended is not active, and no run is active"):
+        active_runs.find_run(run_dir=Path("runs/ended"))
     change = Query("", b'{"settings": {"network.mansd": 1}}')
     question = Query("", b"{}")
     coordinator._answer_change(change)  # type: ignore[arg-type]

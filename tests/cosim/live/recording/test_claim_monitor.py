@@ -66,6 +66,11 @@ def test_each_loop_is_checked_as_by_its_own_monitor(content: Content) -> None:
             assert finding.text.startswith(f"{name}: {what[finding.notice.level]} from {at_s:.3f} s on")
         voids += len(own)
     assert voids > 0
+    at_once = ClaimMonitor(scenario)
+    for table, rows in live_rows(run):
+        at_once.take(table, rows)
+    times_ns = [finding.notice.t_ns for finding in at_once.end()]
+    assert times_ns == sorted(times_ns)
 
 
 def test_a_diverging_loop_is_named_once_also_among_many(content: Content) -> None:

@@ -44,6 +44,12 @@ def test_an_axis_of_a_table_is_applied_before_an_axis_of_its_keys(write: Write, 
         load(write(plan, axes=[key, tables], **ALONE))
 
 
+@pytest.mark.parametrize(("time", "chunk"), [("continuous", 2000), ("sampled", 20)])
+def test_a_file_of_results_takes_seconds(write: Write, plan: dict[str, Any], time: str, chunk: int) -> None:
+    del plan["chunk"]
+    assert load(write(plan, time=time)).chunk == chunk
+
+
 def test_a_mistake_gives_the_approved_line(write: Write, plan: dict[str, Any]) -> None:
     def mistake(line: str) -> list[str]:
         spoilt: Any = copy.deepcopy(plan)
