@@ -124,10 +124,12 @@ def random_disturbed_policy(
 
 
 def _observed(rng: np.random.Generator, *, policies: tuple[str, ...] = (), **fixed: Any) -> ObservedLoop:
-    usual = _usual(rng)
+    values = _usual(rng)
     # The gain of a Kalman filter with short steps changes too long.
-    filters = {"kalman": False} if "step_share" in usual else {}
-    loop = replace(random_observed_loop(rng, **{**usual, **filters, **fixed}), floor=0.0)
+    values |= ({"kalman": False} if "step_share" in values else {}) | fixed
+    # The filter knows the input of a step's begin only, so it has to be held.
+    values["hold_steps"] = max(1, values.get("hold_steps", int(rng.integers(1, 4))))
+    loop = replace(random_observed_loop(rng, **values), floor=0.0)
     settings, rule = _policy(loop.system, rng, policies)
     return replace(loop, settings=settings, rule=rule)
 
