@@ -52,9 +52,7 @@ def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> NetworkCond
     in_flight_ns = network_delay_ns(resolved, late_periods)
     if in_flight_ns > 0:  # an update in flight for up to this time may just miss a tick
         wait_ns = in_flight_ns + tick_ns - 1
-    gap_ns = resolved.timing.actuation_gap_ns
-    if gap_ns is None:
-        gap_ns = resolved.timing.horizon_ns
+    gap_ns = _actuation_gap_ns(resolved)
     delay_ns, first_ns = (((t_ns + gap_ns) // step_ns + 1) * step_ns for t_ns in (wait_ns, phase_ns))
     # With a delay, the newest actuation that has arrived may just be one tick older than that.
     oldest_ns = gap_ns + (newest_ns if gap_ns % tick_ns == 0 else tick_ns)
@@ -68,6 +66,27 @@ def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> NetworkCond
         hold_s=(age_ns + step_ns + late_ns) / NS_PER_S,
         start_s=start_ns / NS_PER_S,
     )
+
+
+def _actuation_gap_ns(resolved: Scenario) -> int:
+    """Return the longest time by which the newest actuation is held up; without a bound, the run's length."""
+    gap_ns, horizon_ns = resolved.timing.actuation_gap_ns, resolved.timing.horizon_ns
+    return horizon_ns if gap_ns is None else gap_ns
+
+
+def void_by_safe_input(resolved: Scenario, conditions: NetworkConditions) -> str | None:
+    """Return why there is no certificate if a safe input other than 0 may come before the first update.
+
+    If the input of the first tick is in time for ``conditions.start_s``, none comes.
+    """
+    if not any(resolved.controller.safe_input or ()) or resolved.network.initial_sync == "known_state":
+        return None
+    timing = resolved.timing
+    first_ns = timing.controller_phase_ns + _actuation_gap_ns(resolved)
+    first_ns += timing.plant_period_ns - first_ns % timing.plant_period_ns
+    if conditions.start_s <= first_ns / NS_PER_S:
+        return None
+    return "controller.safe_input: before the first update the input may be it, and not 0"
 
 
 def certified_delay_s(resolved: Scenario) -> float:

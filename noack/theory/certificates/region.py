@@ -42,7 +42,7 @@ from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.certificates.assumptions import Assumption, AssumptionStatus
 from noack.theory.certificates.certified_bounds import Region, ScenarioCertificate
-from noack.theory.certificates.conditions import REGION
+from noack.theory.certificates.conditions import REGION, void_by_safe_input
 from noack.theory.certificates.scenario_certificates import (
     CertificateScope,
     Phases,
@@ -149,9 +149,11 @@ class RegionScope(_Box):
         model = Inclusion(loop.A_model, loop.B_model, 0 * loop.A_model, 0 * loop.B_model)
         super().__init__(resolved, model, start_error, start)
 
-    def search(self, conditions: NetworkConditions) -> Search[ScenarioCertificate]:
+    def search(
+        self, conditions: NetworkConditions, *, beforehand: bool = False
+    ) -> Search[ScenarioCertificate]:
         """Search for the certificate under some conditions, and its region."""
-        certificate = yield from super().search(conditions)
+        certificate = yield from super().search(conditions, beforehand=beforehand)
         if certificate.constants is None:
             return certificate
         region = self._proven[conditions].region
@@ -175,6 +177,8 @@ class RegionScope(_Box):
 
     def loop_gain(self, conditions: NetworkConditions) -> float:
         """Return the loop gain on the region; at least 1, perhaps infinite, if there is none."""
+        if void_by_safe_input(self._resolved, conditions) is not None:
+            return math.inf
         try:
             phases = completed_alone(self.all_phases(conditions, longest=False, near=True))
         except NoCertificateError as error:

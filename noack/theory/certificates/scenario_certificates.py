@@ -28,7 +28,7 @@ from noack.theory.bounds.gains import ErrorGains, PlantGains, error_gains, first
 from noack.theory.bounds.trigger_bounds import TriggerBounds
 from noack.theory.certificates.assumptions import below, certificate_assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.conditions import BOX, OWN_PLANT, kept_probability
+from noack.theory.certificates.conditions import BOX, OWN_PLANT, kept_probability, void_by_safe_input
 from noack.theory.certificates.deliveries.due_deliveries import Deliveries
 from noack.theory.certificates.persistent_bounds import DisturbedCertificate, PlantAt, choose_rate
 from noack.theory.certificates.solution import Problem, Search, completed_alone, sharpened
@@ -167,15 +167,22 @@ class CertificateScope:
 
     def certificate(self, conditions: NetworkConditions) -> ScenarioCertificate:
         """Return the certificate under some conditions; a void certificate has the reason."""
-        return completed_alone(self.search(conditions))
+        return completed_alone(self.search(conditions, beforehand=True))
 
-    def search(self, conditions: NetworkConditions) -> Search[ScenarioCertificate]:
-        """Search for the certificate under some conditions, perhaps together with others."""
+    def search(
+        self, conditions: NetworkConditions, *, beforehand: bool = False
+    ) -> Search[ScenarioCertificate]:
+        """Search for the certificate under some conditions, perhaps together with others.
+
+        ``beforehand``: no run shows whether its input was 0 at the start.
+        """
         trigger = self._trigger
         # The constants, or the reason for having none.
         void: NotDecayingError | NoCertificateError | None = None
         phases: Sequence[tuple[Constants | None, ...]] = [(None, None, None)]
         try:
+            if beforehand and (why := void_by_safe_input(self._resolved, conditions)) is not None:
+                raise NoCertificateError(why)
             phases = yield from self.all_phases(conditions)
         except (NotDecayingError, NoCertificateError) as error:
             void = error
@@ -221,6 +228,8 @@ class CertificateScope:
 
     def loop_gain(self, conditions: NetworkConditions) -> float:
         """Return the loop gain of a certificate; at least 1, perhaps infinite, if there is none."""
+        if void_by_safe_input(self._resolved, conditions) is not None:
+            return math.inf
         # Whether inputs of an earlier run are covered depends on the constants.
         try:
             search = self._solve_inequalities(conditions, longest=self._start_error > 0)

@@ -29,7 +29,7 @@ from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertifica
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, Output, PlantGains, error_gains
 from noack.theory.certificates.assumptions import below
-from noack.theory.certificates.conditions import most_events
+from noack.theory.certificates.conditions import most_events, void_by_safe_input
 from noack.theory.certificates.scenario_certificates import CertificateScope
 from noack.theory.random_losses.mean_square_bounds import MeanSquares, mean_squares
 
@@ -226,6 +226,8 @@ def _at_fixed_times(
     """Return mean squares at the first rate with a small loop gain, or else at the lowest; or why not."""
     if not _is_covered(resolved):
         return None, "this needs the paper's trigger, and no disturbance, noise or observer"
+    if (why := void_by_safe_input(resolved, conditions)) is not None:
+        return None, why
     loop, trigger = loop_of(resolved), resolved.decaying
     decay = -max(spectral_abscissa(loop.H), spectral_abscissa(loop.A + loop.B @ loop.K))
     if decay <= 0:

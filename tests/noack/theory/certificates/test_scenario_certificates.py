@@ -172,6 +172,32 @@ def test_the_networks_delay_adds_to_the_delay_of_updates(content: dict[str, Any]
     assert any("up to 30 ms" in assumption.why for assumption in assumptions(resolved))
 
 
+DELAYED = 'network.impairments=[{kind="delay",delay_s=0.2}]'
+
+
+@pytest.mark.parametrize(
+    ("overrides", "exists"),
+    [
+        ((DELAYED,), True),
+        (("controller.safe_input=[5.0]",), True),
+        (("controller.safe_input=[0.0]", DELAYED), True),
+        (("controller.safe_input=[5.0]", DELAYED), False),  # ‖e_c‖ was 2.0 times its bound
+        (("controller.safe_input=[5.0]", DELAYED, 'network.initial_sync="known_state"'), True),
+    ],
+)
+def test_no_safe_input_may_come_before_the_first_update(overrides: tuple[str, ...], exists: bool) -> None:
+    loop = shipped("double_integrator", *overrides)
+    conditions = nominal_conditions(loop)
+    scopes = own_plant_scope(loop), box_scope(loop)
+    for scope in scopes:
+        assert scope is not None
+        assert scope.certificate(conditions).exists is exists
+        assert (scope.loop_gain(conditions) < 1) is exists
+        assert scope.certificate(ideal_conditions(loop)).exists
+    certificate = certify(loop, conditions)
+    assert exists or "controller.safe_input" in str(certificate.void)
+
+
 def test_events_that_are_due_may_come_as_soon_as_they_are_due() -> None:
     """Where measurements may be missing, the longest time between two events is longer."""
     trigger = 'trigger={policy="deadline", interval_s=0.04, rule={policy="absolute", delta=5.0}}'
