@@ -76,9 +76,9 @@ def certificates_together(
         if not scenario.coverage.can_be_certified:
             continue
         limits = allowed_conditions(scenario) if conditions is None else conditions[number]
-        error = 0.0
-        if start_errors is not None and (given := start_errors[number]) is not None:
-            limits, error = limits._replace(start_s=0.0), given
+        error = None if start_errors is None else start_errors[number]
+        if error is not None:
+            limits = limits._replace(start_s=0.0)
         for scope in scopes(scenario, error):
             searches.append(scope.search(limits))
             numbers.append(number)

@@ -63,7 +63,7 @@ _TIMES = ("sampling_s", "spacing_s", "delay_s", "hold_s", "start_s")
 """The times of conditions with which the bounds increase."""
 
 
-def scopes(resolved: Scenario, start_error: float = 0.0) -> list[CertificateScope]:
+def scopes(resolved: Scenario, start_error: float | None = None) -> list[CertificateScope]:
     """Return the plants of a resolved scenario for which certificates can exist.
 
     These are its own plant and the box around it, if it is linear; otherwise its plant on a region.
@@ -78,7 +78,7 @@ class _Box(CertificateScope):
     """The plants of an inclusion."""
 
     def __init__(
-        self, resolved: Scenario, inclusion: Inclusion, start_error: float, start: Matrix | None
+        self, resolved: Scenario, inclusion: Inclusion, start_error: float | None, start: Matrix | None
     ) -> None:
         A, B, half_A, half_B = inclusion
 
@@ -142,9 +142,11 @@ class _ProvenRegion(NamedTuple):
 class RegionScope(_Box):
     """A nonlinear plant within a region; see :class:`CertificateScope`."""
 
-    def __init__(self, resolved: Scenario, start_error: float = 0.0, start: Matrix | None = None) -> None:
+    def __init__(
+        self, resolved: Scenario, start_error: float | None = None, start: Matrix | None = None
+    ) -> None:
         loop, self._proven = loop_of(resolved), dict[NetworkConditions, _ProvenRegion]()
-        self._other_start = start
+        self._given_error, self._other_start = start_error, start
         # The plants of the model; those of each region take their place.
         model = Inclusion(loop.A_model, loop.B_model, 0 * loop.A_model, 0 * loop.B_model)
         super().__init__(resolved, model, start_error, start)
@@ -202,7 +204,7 @@ class RegionScope(_Box):
         for _ in range(_ATTEMPTS):
             try:
                 inclusion = self._motion.over(widths)
-                plants = _Box(self._resolved, inclusion, self._start_error, self._other_start)
+                plants = _Box(self._resolved, inclusion, self._given_error, self._other_start)
                 phases, reached = yield from plants.bounded(conditions)
             except (NotEnclosedError, SystemFailedError) as error:  # also from a user's class
                 if isinstance(error, NotInstalledError):

@@ -53,12 +53,12 @@ class Phases(NamedTuple):
     """Those to be added under persistent disturbances."""
 
 
-def trigger_bounds(resolved: Scenario) -> TriggerBounds:
+def trigger_bounds(resolved: Scenario, *, starts_on_grid: bool = True) -> TriggerBounds:
     """Return what a certificate uses of a resolved scenario's trigger."""
     loop = loop_of(resolved)
     weight = np.eye(loop.n) if loop.weight is None else loop.weight
     fastest = float(np.abs(np.linalg.eigvals(loop.A_model + loop.B_model @ loop.K)).max()) or 1.0
-    return TriggerBounds(rule_of(resolved), weight, fastest)
+    return TriggerBounds(rule_of(resolved), weight, fastest, starts_on_grid=starts_on_grid)
 
 
 def certify(resolved: Scenario, conditions: NetworkConditions) -> ScenarioCertificate:
@@ -72,7 +72,7 @@ def certify_box(resolved: Scenario, conditions: NetworkConditions) -> ScenarioCe
     return None if scope is None else scope.certificate(conditions)
 
 
-def own_plant_scope(resolved: Scenario, start_error: float = 0.0) -> "CertificateScope":
+def own_plant_scope(resolved: Scenario, start_error: float | None = None) -> "CertificateScope":
     """Return a scenario's own plant."""
     loop = loop_of(resolved)
 
@@ -82,7 +82,7 @@ def own_plant_scope(resolved: Scenario, start_error: float = 0.0) -> "Certificat
     return CertificateScope(OWN_PLANT, resolved, loop.A + loop.B @ loop.K, plant_at, start_error)
 
 
-def box_scope(resolved: Scenario, start_error: float = 0.0) -> "CertificateScope | None":
+def box_scope(resolved: Scenario, start_error: float | None = None) -> "CertificateScope | None":
     """Return all plants in the scenario's uncertainty box; None if it has none."""
     loop, plant = loop_of(resolved), resolved.plant
     if plant.uncertainty_A is None and plant.uncertainty_B is None:
@@ -130,7 +130,7 @@ class CertificateScope:
         plant_at: returns the plants' gains.
         start_error: sup‖u − Kx‖, scaled, while the plant still applies inputs of an earlier run
             at the start. The certificate exists only if its own π is at least that large, so that
-            it covers these inputs.
+            it covers these inputs. None: no run came before.
         start: x(0), or a matrix that maps the unit ball to a set of x(0), (n, k); by default that
             of the scenario.
     """
@@ -141,15 +141,15 @@ class CertificateScope:
         resolved: Scenario,
         closed_loop: Matrix,
         plant_at: PlantAt,
-        start_error: float = 0.0,
+        start_error: float | None = None,
         start: Matrix | None = None,
     ) -> None:
-        self._start_error = start_error
+        self._start_error = start_error or 0.0
         self.name = name
         self._resolved = resolved
         self._loop = loop_of(resolved)
         self._start = self._loop.x0[:, None] if start is None else start
-        self._trigger = trigger_bounds(resolved)
+        self._trigger = trigger_bounds(resolved, starts_on_grid=start_error is None)
         # Where events have a due time, a missed update is missed for a limited time.
         due = self._trigger.has_due_time
         self._models_hold = not self._loop.H.any() and not due

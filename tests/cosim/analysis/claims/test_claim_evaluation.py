@@ -285,6 +285,29 @@ def test_the_part_after_a_change_is_judged_as_a_separate_run() -> None:
     assert missing[1].missing_events == missing[0].missing_events + 1
 
 
+def test_events_that_are_due_after_a_change_may_lie_beside_the_new_grid() -> None:
+    """With the period of 80 ms events are due at 1.06 s, 1.22 s, ..., and a gust makes one at 2.08 s."""
+    gust = {"kind": "step", "at": "state", "amplitude": [0.0, 5.0], "from_s": 2.07, "until_s": 2.2}
+    model = {"A": [[0.0, 1.0], [0.0, 0.0]], "B": [[0.0], [1.0]]}
+    record = run_with(
+        (0.96, {"trigger.period_s": 0.08}),
+        horizon_s=3.0,
+        model=model | {"gain": [[-1.0, -1.4]]},
+        plant=model | {"draw": "given", "initial_state": [0.1, 0.0], "rate_hz": 100, "disturbances": [gust]},
+        controller={"rate_hz": 100},
+        trigger={"policy": "quadratic", "Q": np.diag([0.0, 0.0, 1.0, 1.0]).tolist(),
+                 "epsilon": 9e-4, "period_s": 0.05, "heartbeat": 2},
+        network={"mansd": 1, "loss": {"model": "bernoulli", "probability": 0.0}},
+    )  # fmt: skip
+    events = record[SENSOR_MEASUREMENT]
+    event_ns = events["t_ns"][events["event"] >= 0]
+    assert np.diff(event_ns[event_ns > 1_000_000_000]).min() == 60 * MS
+    claims = [claim for claim in RunClaims(record).evaluate() if claim.source == "certificate"]
+    assert {claim.verdict for claim in claims} == {HELD}
+    certified = [claim.certified for claim in claims if claim.what == "minimum inter-event time"]
+    assert certified == [pytest.approx(0.05), pytest.approx(0.01)]
+
+
 def test_a_plant_that_does_not_rest_at_the_set_point_has_a_constant_disturbance() -> None:
     plant = CONTENT["plant"] | {"uncertainty_A": [[0.0, 0.0], [0.3, 0.0]]}
     record = run_with((2.005, {"controller.setpoint": [3.0, 0.0]}), plant=plant)
