@@ -103,9 +103,10 @@ def controller_error_bound(
     values: Reals,
     constant: float | None = None,
     void: VoidFrom | None = None,
+    since_s: float = 0.0,
 ) -> Bound:
-    """Return a bound of ‖e_c‖_W at the measurements, (k,); it is void from a record's first gap."""
-    here = samples.is_bounded
+    """Return a bound of ‖e_c‖_W at the measurements from a time on; void from a record's first gap."""
+    here = samples.is_bounded & (samples.t_s >= since_s - 1e-9)
     # Allow for the rounding of x, which matters for a bound of that size.
     slack = run.rounding(samples.aligned.x_norm[here])
     shares = upper_shares(samples.aligned.e_c_norm[here], values[here] + slack)

@@ -27,11 +27,11 @@ from noack.theory.certificates.certified_bounds import ScenarioCertificate, enve
 def controller_error(
     run: RunEvidence, samples: Samples, certificate: ScenarioCertificate, constants: Constants
 ) -> ClaimBound:
-    """‖e_c‖_W over time."""
+    """‖e_c‖_W from when the plant applies the controller's input on."""
     formula = envelope_formula(norm_text(run, "e_c"), certificate, "delta")
     values, void = certificate.controller_error(samples.t_s), run.violation_of(certificate)
     return ClaimBound(
-        controller_error_bound(run, samples, formula, values, constants.delta, void),
+        controller_error_bound(run, samples, formula, values, constants.delta, void, run.started_s),
         Envelope(f"certified for {certificate.scope}", "e_c", samples.t_s, values),
     )
 
@@ -51,7 +51,7 @@ def controller_error_from_events(
     void = run.violation_of(certificate)
     label = "bound, given the updates missing now"
     return ClaimBound(
-        controller_error_bound(run, samples, formula, values, void=void),
+        controller_error_bound(run, samples, formula, values, void=void, since_s=run.started_s),
         Envelope(label, "e_c", samples.t_s, np.where(samples.is_bounded, values, np.nan)),
     )
 

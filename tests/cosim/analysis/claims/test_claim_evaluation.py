@@ -13,6 +13,7 @@ from cosim.analysis.claims import catalogue
 from cosim.analysis.claims.claim_definition import CertifiedClaim, ClaimDefinition
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, RunClaims, definitions
 from cosim.analysis.summary.summary_model import Claim, ClaimVerdict
+from cosim.record.align import aligned_parts
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.protocol.record_tables import (
@@ -23,6 +24,7 @@ from noack.protocol.record_tables import (
     SENSOR_MEASUREMENT,
 )
 from noack.protocol.roles import LOOP_ROLES
+from noack.protocol.wire_format import read_header
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from tests.cosim.analysis.claims.conftest import MS, Make, event_s, without
@@ -231,6 +233,40 @@ def test_a_claim_is_not_held_where_the_record_has_no_rows(run: RunRecord) -> Non
         assert claim.verdict is not HELD
         assert claim.since_s is not None
         assert claim.since_s <= 2.02
+
+
+def test_nothing_is_claimed_of_the_controllers_error_before_its_first_input_acts() -> None:
+    """All updates until 0.35 s are late, and five actuations lost: then 34 updates are missing for 40 ms.
+
+    They act together, so their delays are a part of the start. ‖e_c‖ was larger than its bound until then.
+    """
+    plant = {"A": [[0.0, 1.0], [0.0, 0.0]], "B": [[0.0], [1.0]]}
+    lost = {"mansd": 5, "loss": {"model": "scripted", "lost": [30, 31, 32, 33, 34]}}
+    content = {
+        "name": "late_start", "horizon_s": 2.0, "model": plant | {"gain": [[-1.0, -1.4]]},
+        "plant": plant | {"draw": "given", "initial_state": [1.0, 0.0], "rate_hz": 100.0},
+        "controller": {"rate_hz": 100.0, "predictions": 7},
+        "trigger": {"beta": 0.002, "alpha_per_s": 0.25},
+        "network": {"mansd": 0, "loss": {"model": "lossless"}, "actuation": lost},
+        "certificate": {"late_periods": 0},
+    }  # fmt: skip
+
+    def network(data: bytes, now_ns: int) -> int:
+        header = read_header(data)
+        assert header is not None
+        return max((348 if header.sequence else 300) * MS - now_ns, 0)
+
+    record = simulate(resolve(validate(content, "here")), network)
+    claims = ClaimEvaluation(record)
+    assert claims.certified_for is not None
+    assert claims.certified_for.start_s == pytest.approx(0.36)
+    assert claims.certified_for.delay_s == pytest.approx(0.06)
+    assert {claim.verdict for claim in certified(record).values()} == {HELD}
+    (certificate,) = claims.certificates
+    (part,) = aligned_parts(record)
+    t_s, errors = part.aligned.t_ns * 1e-9, part.aligned.e_c_norm
+    exceeds = errors > certificate.controller_error(t_s)
+    assert t_s[exceeds].max() == pytest.approx(0.34)
 
 
 # --- parts of runs: before and after changes of parameters, and up to a common stop ---------------
