@@ -62,6 +62,8 @@ class Constants(NamedTuple):
     """‖x̂ − x‖_W at the measurements. Where it is not 0, e_s and e_c are x_s − x̂ and x_c − x̂."""
     received_input_error: float = 0.0
     """The same as π while the controller has every update: ‖KW^{−1}‖β̃ + q."""
+    present_input_error: float = 0.0
+    """A bound of ‖K e_s‖ + q at all times: the part of π that does not come from missing events."""
 
 
 class NoCertificateError(ArithmeticError):

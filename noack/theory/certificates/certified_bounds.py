@@ -239,7 +239,8 @@ class KnownStatePart:
     def input_errors(self) -> tuple[Vector, float]:
         """Scaled bounds of ‖u − Kx‖ by the number of missing events, and one for any number."""
         constants = self.constants
-        by_missing = self._by_missing(Output.GAIN, constants.received_input_error)
+        by_missing = self._by_missing(Output.GAIN, constants.present_input_error)
+        by_missing[0] = constants.received_input_error
         return by_missing, max(constants.input_error, constants.start_error)
 
     @property

@@ -164,6 +164,7 @@ class LoopConstants(NamedTuple):
         """Return the constants of one loop."""
         fields = {name: values[loop].item() for name, values in self._asdict().items()}
         del fields["exists"], fields["earlier_input_error"]
+        fields["present_input_error"] = fields["received_input_error"]
         return Constants(rate_per_s=rate_per_s, inter_event_s=inter_event_s, **fields)
 
 

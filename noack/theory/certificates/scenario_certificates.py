@@ -421,7 +421,14 @@ class CertificateScope:
         )
 
 
-_BOUNDS = ("input_error", "state", "state_weighted", "mismatch", "received_input_error")
+_BOUNDS = (
+    "input_error",
+    "state",
+    "state_weighted",
+    "mismatch",
+    "received_input_error",
+    "present_input_error",
+)
 """Constants that bound a signal themselves, not in units of the threshold."""
 
 

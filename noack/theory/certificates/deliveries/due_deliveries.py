@@ -114,6 +114,7 @@ class Deliveries:
             inter_event_s=apart_s,
             loop_gain=0.0,
             received_input_error=sup[INPUT],
+            present_input_error=sup[INPUT],
         )
 
     def _output_bounds(self) -> Vector:

@@ -214,6 +214,8 @@ class KnownBounds:
     """Of the part of ‖u − Kx‖ that does not come from the present e_s."""
     received_input_error: float = math.inf
     """Of ‖u − Kx‖ while no event is missing."""
+    present_input_error: float = math.inf
+    """Of ‖K e_s‖ and the part of the age of the input together, whatever is missing."""
     after_losses: Vector = field(default_factory=lambda: np.array(math.inf))
     """Of ‖e_c‖_W after at most 0, 1, … lost events, from when an update acts until the next event."""
     sensor_after_losses: Vector = field(default_factory=lambda: np.array(math.inf))
@@ -289,9 +291,10 @@ class InsertedInequalities(ErrorInequalities):
                 bounds.earlier_input_error = min(
                     bounds.earlier_input_error, float(whole[gain, -1] - parts[gain, 0]) + age_input
                 )
-                bounds.received_input_error = min(
-                    bounds.received_input_error, float(whole[gain, 0]) + age_input
+                bounds.present_input_error = min(
+                    bounds.present_input_error, float(whole[gain, 0]) + age_input
                 )
+                bounds.received_input_error = min(bounds.received_input_error, bounds.present_input_error)
                 bounds.after_losses = np.minimum(
                     bounds.after_losses, whole[weighted, : self._conditions.dropouts + 1]
                 )

@@ -86,6 +86,7 @@ def sharpened_constants(
         "state_weighted": bounds.states[Output.WEIGHTED],
         "mismatch": bounds.states[Output.MISMATCH],
         "received_input_error": bounds.received_input_error,
+        "present_input_error": bounds.present_input_error,
     }
     smaller = {name: min(value, getattr(constants, name)) for name, value in sharpened.items()}
     later_s = constants.inter_event_s and max(sharpening.spacing_s, constants.inter_event_s)
