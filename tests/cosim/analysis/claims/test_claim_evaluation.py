@@ -264,7 +264,7 @@ def test_nothing_is_claimed_of_the_controllers_error_before_its_first_input_acts
     assert {claim.verdict for claim in certified(record).values()} == {HELD}
     (certificate,) = claims.certificates
     (part,) = aligned_parts(record)
-    t_s, errors = part.aligned.t_ns * 1e-9, part.aligned.e_c_norm
+    t_s, errors = np.array(part.aligned.t_ns * 1e-9, dtype=np.float64), part.aligned.e_c_norm
     exceeds = errors > certificate.controller_error(t_s)
     assert t_s[exceeds].max() == pytest.approx(0.34)
 

@@ -376,7 +376,7 @@ def with_trigger(kind: type[TriggerBounds]) -> Callable[[Scenario, Conditions], 
         true = trigger_bounds(resolved)
         wrong = kind(true.rule, true.weight, true.fastest_per_s)
         with (
-            patch.object(scenario_certificates, "trigger_bounds", lambda resolved: wrong),
+            patch.object(scenario_certificates, "trigger_bounds", lambda *_, **__: wrong),
             # What follows from times alone uses no bound of e_s.
             patch.object(scenario_certificates, "_TIMED_RATES", ()),
         ):
