@@ -257,7 +257,8 @@ def test_clicks_reach_a_run_while_the_viewer_draws_and_ctrl_c_keeps_the_record_o
     with_card: Browser, tmp_path: Path
 ) -> None:
     with Served(tmp_path) as server:
-        page = Page(with_card, server.address.partition("?")[0] + "?scenario=lane_following&horizon_s=100")
+        address = server.address.partition("?")[0] + "?scenario=lane_following&horizon_s=100"
+        page = Page(with_card, address, size=(640, 360))  # the viewer's drawing costs by the pixel
         page.click("live", "button")
         page.press_button("run live")
         page.wait(f"{TEXT}.includes('of 100 s')")
