@@ -38,14 +38,16 @@ class Ball(NamedTuple):
     """In steps of the gaps."""
 
     @property
-    def corners(self) -> Matrix:
+    def corners(self) -> list[list[float]]:
         """ρ and S where linear functions of both, that do not fall, are largest, (2, corners)."""
         radius = min(self.radius, self.weighted_sum)
         late_effects = min(self.late_effects, self.weighted_sum / self.theta)
         late_effects_at_radius = max(min(late_effects, (self.weighted_sum - radius) / self.theta), 0.0)
         radius_at_late_effects = max(min(radius, self.weighted_sum - self.theta * late_effects), 0.0)
-        corners = [[radius, radius_at_late_effects], [late_effects_at_radius, late_effects]]
-        return np.array(corners) * ROUNDING
+        return [
+            [radius * ROUNDING, radius_at_late_effects * ROUNDING],
+            [late_effects_at_radius * ROUNDING, late_effects * ROUNDING],
+        ]
 
 
 class BallHistory(NamedTuple):
@@ -62,10 +64,10 @@ class BallHistory(NamedTuple):
 
     def add(self, balls: Sequence[Ball]) -> None:
         """Add balls at their times."""
-        for ball in balls:
-            self.centres[ball.time] = ball.centre
-            self.late_effects[ball.time] = ball.late_effects
-            self.weighted_sums[ball.time] = ball.weighted_sum
+        times = [ball.time for ball in balls]
+        self.centres[times] = [ball.centre for ball in balls]
+        self.late_effects[times] = [ball.late_effects for ball in balls]
+        self.weighted_sums[times] = [ball.weighted_sum for ball in balls]
 
     def last_return(self, last: slice) -> tuple[float, float] | None:
         """Return |κ|, and ‖r‖ + ρ + θS at most, of ξ(t) = κ c(t − m) + r at the last times t.
@@ -102,32 +104,49 @@ class RecentBalls:
     """The balls after each gap from the last times, as far back as the longest gap."""
 
     def __init__(self, counts: NDArray[np.int64], start_balls: BallsAfterGaps) -> None:
-        self._counts = counts
-        slots = int(counts[-1]) + 1
+        self._counts, self._gaps = counts, np.arange(len(counts))
+        self._longest = int(counts[-1])
+        slots = self._longest + 1
+        self._slots_after_gaps = np.add.outer(np.arange(slots), counts) % slots
         self._balls = BallsAfterGaps(*(np.zeros((slots, *array.shape[1:])) for array in start_balls))
-        """By their time modulo the number of slots."""
-        self._has_balls = np.zeros(slots, dtype=bool)
+        """By the time to which they lead, modulo the number of slots."""
+        self._has_balls = [False] * slots
+        """By the time from which balls lead on, likewise."""
+        self._last_time_without = -1
         self.store([0], start_balls)
 
     def leading_to(self, time: int) -> tuple[Matrix, Matrix] | None:
-        """Return centres and extents of the balls at a time, one for each gap; None if there is none."""
-        slots = (time - self._counts) % len(self._has_balls)
-        gaps = np.flatnonzero(self._has_balls[slots])
-        if not len(gaps):
-            return None
-        return self._balls.centres[slots[gaps], gaps], self._balls.extents[slots[gaps], gaps]
+        """Return centres and extents of the balls at a time, one for each gap; None if there is none.
 
-    def forget(self, times: range) -> None:
-        """Remove the balls after gaps from some times."""
-        self._has_balls[np.array(times) % len(self._has_balls)] = False
+        They may be changed, as they are used once.
+        """
+        slots = len(self._has_balls)
+        centres, extents = self._balls.centres[time % slots], self._balls.extents[time % slots]
+        if time - self._longest > self._last_time_without:
+            return centres, extents
+        has_balls = [self._has_balls[(time - count) % slots] for count in self._counts.tolist()]
+        return (centres[has_balls], extents[has_balls]) if any(has_balls) else None
+
+    def forget(self, times: Sequence[int]) -> None:
+        """Remove the balls after gaps from some times, which have no balls now."""
+        for time in times:
+            self._has_balls[time % len(self._has_balls)] = False
+            self._last_time_without = time
 
     def store(self, times: list[int], balls: BallsAfterGaps) -> None:
         """Store the balls after gaps from some times."""
-        slots = np.array(times) % len(self._has_balls)
-        self._balls.centres[slots], self._balls.extents[slots] = balls
-        self._has_balls[slots] = True
+        slots = [time % len(self._has_balls) for time in times]
+        places = self._slots_after_gaps[slots], self._gaps
+        self._balls.centres[places], self._balls.extents[places] = balls
+        for slot in slots:
+            self._has_balls[slot] = True
 
 
 def lengths(vectors: Stack) -> Stack:
     """Return ‖·‖ of vectors, (…, n)."""
     return np.asarray(np.sqrt(np.einsum("...n,...n->...", vectors, vectors)))
+
+
+def squared_lengths(vectors: Stack) -> Stack:
+    """Return ‖·‖² of vectors, (…, n)."""
+    return np.asarray(np.einsum("...n,...n->...", vectors, vectors))

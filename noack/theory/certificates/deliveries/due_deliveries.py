@@ -40,6 +40,7 @@ from noack.theory.certificates.deliveries.delivery_balls import (
     BallsAfterGaps,
     RecentBalls,
     lengths,
+    squared_lengths,
 )
 from noack.theory.certificates.deliveries.delivery_gaps import ERROR, INPUT, GapGains, GapLoop, Gaps
 
@@ -128,17 +129,17 @@ class Deliveries:
         highest = self._outputs_from_start()
         later = np.full_like(highest, np.inf)
         for times, balls in self.balls():
-            history.add(balls)
             pending += balls
             is_last = times.stop >= MOST_TIMES
             if len(pending) >= BALLS_AT_ONCE or is_last:
+                history.add(pending)
                 highest = np.maximum(highest, self.outputs_until_next_delivery(pending))
                 pending.clear()
                 if times[-1] >= settled:
                     last = slice(times[-1] - longest, times[-1] + 1)
                     later = self._outputs_of_rest(history, last, highest)
-            if is_last or (later <= highest).all():
-                break
+                if is_last or (later <= highest).all():
+                    break
         return np.asarray(np.maximum(later, highest) * ROUNDING)
 
     def balls(self) -> Iterator[tuple[range, list[Ball]]]:
@@ -151,34 +152,47 @@ class Deliveries:
         for first_time in itertools.count(1, batch):
             times = range(first_time, first_time + batch)
             balls = [self._enclosing(*parts, time) for time in times if (parts := recent.leading_to(time))]
-            recent.forget(times)
+            with_balls = [ball.time for ball in balls]
+            if len(balls) < batch:
+                recent.forget([time for time in times if time not in with_balls])
             if balls:
-                recent.store([ball.time for ball in balls], self._after_gaps(balls))
+                recent.store(with_balls, self._after_gaps(balls))
             yield times, balls
 
     def _enclosing(self, centres: Matrix, extents: Matrix, time: int) -> Ball:
         """Return a small ball around balls with these centres, (k, n), and extents, (k, 3)."""
-        # The middle of the centres moves towards the ball that is furthest from it.
         middle = np.add.reduce(centres) / len(centres)
-        rounding = 1e-12 * float(lengths(centres).max())
-        for number in range(1, _CENTRING_ROUNDS + 1):
-            furthest = int((lengths(centres - middle) + extents[:, 2]).argmax())
-            middle = middle + (centres[furthest] - middle) / (number + 2)
-        extents[:, ::2] += (lengths(centres - middle) + rounding)[:, None]  # ρ, and ρ + θS
-        radius, late_effects, weighted_sum = extents.max(axis=0).tolist()
+        rounding = 1e-12 * math.sqrt(squared_lengths(centres).max())
+        # The middle of several centres moves towards the ball that is furthest from it.
+        weighted_sums = extents[:, 2]
+        for number in range(1, _CENTRING_ROUNDS + 1) if len(centres) > 1 else ():
+            offsets = centres - middle
+            furthest = (lengths(offsets) + weighted_sums).argmax()
+            middle = middle + offsets[furthest] / (number + 2)
+        added = lengths(centres - middle) + rounding
+        radius_and_sum = extents[:, ::2]  # ρ, and ρ + θS
+        np.add(radius_and_sum, added[:, None], out=radius_and_sum)
+        radius, late_effects, weighted_sum = np.maximum.reduce(extents).tolist()
         return Ball(middle, radius * ROUNDING, late_effects, weighted_sum * ROUNDING, self.gains.theta, time)
 
     def _after_gaps(self, balls: Sequence[Ball]) -> BallsAfterGaps:
         """Return what follows from balls after each gap, (k, gaps)."""
         centres = np.array([ball.centre for ball in balls])
-        by_age = self._age_inputs(centres)
         later_centres, late_at_nodes, late_sags = self._centre_maps.apply(centres)
-        # From ‖w‖, from c, and from ρ and S.
-        radius, late_effects = np.split(self._inputs(balls, by_age) @ self._from_input, 2, axis=1)
-        late_effects = late_effects + (lengths(late_at_nodes).max(axis=1) + lengths(late_sags)) * ROUNDING
+        # From ρ and S, from c, and from ‖w‖.
         corners = np.array([ball.corners for ball in balls])[:, None]  # (k, 1, 2, corners)
-        extents = (self._from_extent @ corners).max(axis=-1)  # (k, 3, gaps)
-        extents += np.stack([radius, late_effects, radius + self.gains.theta * late_effects], axis=1)
+        extents = np.maximum.reduce(self._from_extent @ corners, axis=-1)  # (k, 3, gaps)
+        at_nodes = np.sqrt(np.maximum.reduce(squared_lengths(late_at_nodes), axis=1))
+        late_effects = (at_nodes + lengths(late_sags)) * ROUNDING
+        if self.loop.conditions.hold_s > 0 or self._is_start(balls):
+            by_input = self._inputs(balls, self._age_inputs(centres)) @ self._from_input
+            gaps = len(self.gains.state_from_state)
+            radius, late_effects = by_input[:, :gaps], by_input[:, gaps:] + late_effects
+        else:  # ‖w‖ is 0
+            radius = np.zeros(1)
+        extents[:, 0] += radius
+        extents[:, 1] += late_effects
+        extents[:, 2] += radius + self.gains.theta * late_effects
         return BallsAfterGaps(later_centres, extents.swapaxes(1, 2))
 
     def outputs_until_next_delivery(self, balls: Sequence[Ball]) -> Vector:
@@ -229,17 +243,22 @@ class Deliveries:
         if self.loop.conditions.hold_s == 0:
             return np.zeros((len(centres), self.loop.grid.cells))
         (nodes,) = self._age_maps.apply(centres)
-        at_nodes = larger_ends(lengths(nodes).max(axis=-1))
+        at_nodes = np.sqrt(larger_ends(np.maximum.reduce(squared_lengths(nodes), axis=-1)))
         return np.asarray((at_nodes + self.gains.age_sags * lengths(centres)[:, None]) * ROUNDING)
 
     def _inputs(self, balls: Sequence[Ball], by_age: Matrix) -> Matrix:
         """Bound ‖w‖ over each cell for ξ = c of each ball, without S, (k, cells)."""
-        if not self._start_input:
+        if not self._is_start(balls):
             return by_age
         gaps, grid = self.loop.gaps, self.loop.grid
         times = np.array([ball.time for ball in balls])[:, None]
         cells_s = times * gaps.step_s + grid.cell_s * np.arange(grid.cells)
         return np.asarray(by_age + self._start_input * (cells_s < self.loop.conditions.start_s))
+
+    def _is_start(self, balls: Sequence[Ball]) -> bool:
+        """Return whether ‖w‖ from the start goes on at the first of these balls."""
+        loop = self.loop
+        return self._start_input > 0 and balls[0].time * loop.gaps.step_s < loop.conditions.start_s
 
     @property
     def _start_ball(self) -> Ball:
