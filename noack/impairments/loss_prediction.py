@@ -270,7 +270,8 @@ class LossProcess:
             probability, given any past, that the next ``count`` packets are all lost.
         """
         lost, weights, tails = self.moves * self.lost, np.ones(len(self.start)), []
-        stationary = np.abs(self.start @ self.moves - self.start).max() <= _ROUNDING
+        # One step would not show that a slow chain is far from its mean distribution.
+        stationary = np.abs(_stationary(self.start, self.moves) - self.start).max() <= _ROUNDING
         for _ in range(count):
             weights = lost @ weights
             tails.append(self.start @ weights if stationary else weights.max())

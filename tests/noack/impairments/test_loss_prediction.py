@@ -247,6 +247,13 @@ def test_tails_of_bursts_cover_every_packet_and_the_largest_probability_every_pa
         assert all_lost <= longest * (1 + 1e-9)
 
 
+def test_tails_of_a_chain_that_hardly_moves_are_those_of_every_packet() -> None:
+    """In the long run it is in its bad state half of the time, though it begins in the good one."""
+    slow = {"model": "gilbert_elliott", "good_to_bad": 1e-13, "bad_to_good": 1e-13}
+    tails, _ = process({"kind": "loss", "loss": slow}).tails(3)
+    assert tails.min() >= 0.5 * (1 - 1e-9)
+
+
 def test_a_kept_rate_is_that_of_the_losses_under_the_guarantee() -> None:
     """p(1 − p²)/(1 − p³) = 0.4 for the probability p of the losses without the guarantee."""
     kept = {"kind": "loss", "loss": {"model": "bernoulli", "probability": 0.4, "keep": True}}
