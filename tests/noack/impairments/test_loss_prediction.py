@@ -19,6 +19,7 @@ from noack.impairments.loss_guarantee import (
     LossHistory,
 )
 from noack.impairments.loss_prediction import (
+    LossPrediction,
     LossProcess,
     ProbabilityCache,
     expected_loss,
@@ -32,7 +33,7 @@ from noack.impairments.loss_prediction import (
 from noack.impairments.markov_chain import NotPredictableError
 from noack.protocol.record_tables import Fate
 from tests.helpers.approved import compare_lines, lines_of_error
-from tests.oracles.link import Link
+from tests.oracles.link import Datagram, Link
 
 DECISIONS = 400_000
 EXACT = {
@@ -259,6 +260,21 @@ def test_a_kept_rate_is_that_of_the_losses_under_the_guarantee() -> None:
     kept = {"kind": "loss", "loss": {"model": "bernoulli", "probability": 0.4, "keep": True}}
     p = loss_process(LinkSettings.model_validate({"impairments": (kept,), "mansd": 2})).largest_probability
     assert p * (1 - p**2) / (1 - p**3) == pytest.approx(0.4, rel=1e-9)
+
+
+def test_losses_are_not_predicted_if_few_packets_may_be_delayed_at_once() -> None:
+    """A copy that finds no place is dropped: without the limit a quarter of the packets is lost."""
+    settings = settings_of("duplicate 100% corrupt 50% delay 10ms").model_copy(update={"limit": 1})
+    note = "as long as no more than 1 packets are delayed at once"
+    assert predict(settings) == LossPrediction(0.25, note)
+    with pytest.raises(NotPredictableError, match=note):
+        loss_process(settings)
+    link, corrupted = Link(settings, 1, "a"), 0
+    for t_ns in range(0, 1000 * 10**9, 10**9):
+        link.handle(Datagram(0, bytes(72)), t_ns)
+        corrupted += link.decision.fate == Fate.CORRUPTED
+        link.on_timer(t_ns)
+    assert corrupted == pytest.approx(500, abs=60)
 
 
 def test_losses_of_which_no_rate_can_be_kept_have_no_prediction() -> None:
