@@ -105,7 +105,11 @@ def predict(settings: LinkSettings) -> LossPrediction:
     """
     impairments = settings.impairments
     try:
-        parts = [part for impairment in impairments for part in impairment.chains()]
+        parts = [
+            part._replace(begin=0) if isinstance(part, PeriodicLosses) else part  # in the long run
+            for impairment in impairments
+            for part in impairment.chains()
+        ]
         if settings.constraints:
             rate = _constrained_rate(parts, join_guarantee(settings.mansd, settings.constraints))
         else:
@@ -186,7 +190,7 @@ def _lost_by_any(patterns: Sequence[NDArray[np.bool_]]) -> NDArray[np.bool_]:
 
 def _joint_chain(parts: Sequence[Chain | PeriodicLosses]) -> tuple[Array, Array, Array]:
     """Return the joint chain: start, matrix, probability of no effective delivery."""
-    states = math.prod(len(part.lost if isinstance(part, PeriodicLosses) else part.start) for part in parts)
+    states = math.prod(part.states if isinstance(part, PeriodicLosses) else len(part.start) for part in parts)
     if states > MOST_STATES:
         raise NotPredictableError(f"together the impairments have {states} states, too many to compute with")
     start: Array = np.ones(1)

@@ -248,6 +248,38 @@ def test_tails_of_bursts_cover_every_packet_and_the_largest_probability_every_pa
         assert all_lost <= longest * (1 + 1e-9)
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        "loss periodic 2/3 from 1",
+        "loss periodic 2/3 from 2",
+        "loss periodic 3/4 from 40",
+        "loss periodic 1/5 from 3 loss periodic 2/9 from 31",
+        "replay records 0+5ms,1ms+5ms,2ms+lost,3ms+lost,4ms+5ms from 3ms",
+        "replay records 0+5ms,1ms+5ms,2ms+lost,3ms+lost,4ms+5ms",
+    ],
+)
+def test_certain_losses_begin_where_the_link_begins_them(words: str) -> None:
+    """No packet before the first one of a periodic loss is lost; a trace begins at its offset."""
+    link, losses = Link(settings_of(words), 1, "a"), loss_process(settings_of(words))
+    lost = tuple(link.decide(0, 72, t_ns * 10**9).fate == Fate.DROPPED for t_ns in range(60))
+    chain = losses.outcomes(LossGuarantee())
+    shares = np.eye(len(chain.lost))[-1]
+    for is_lost in lost:
+        assert (shares @ chain.lost).sum() == is_lost
+        shares = shares @ (chain.lost + chain.delivered)
+    for packets in range(60):
+        for guarantee in KEPT:
+            assert losses.keeps(guarantee, packets) == is_kept(guarantee, lost[:packets])
+
+
+def test_losses_that_begin_anywhere_in_a_trace_are_not_predicted() -> None:
+    settings = settings_of("replay records 0+5ms,1ms+lost from random")
+    assert predict(settings).rate == 0.5
+    with pytest.raises(NotPredictableError, match="a seed chooses"):
+        loss_process(settings)
+
+
 def test_tails_of_a_chain_that_hardly_moves_are_those_of_every_packet() -> None:
     """In the long run it is in its bad state half of the time, though it begins in the good one."""
     slow = {"model": "gilbert_elliott", "good_to_bad": 1e-13, "bad_to_good": 1e-13}
