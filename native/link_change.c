@@ -103,7 +103,8 @@ static int is_same_guarantee(const noack_link *a, const noack_link *b) {
     return 1;
 }
 
-/* Transfer the release times that the guarantee needs. If the guarantee differs (or there is none
+/* Transfer the release times that the guarantee needs. A delivered packet without a known time has
+   the time 0, and so does one with an unknown outcome. If the guarantee differs (or there is none
    any more), or a queue chooses before or after the change, later packets leave only after the
    packets that are in flight at the change. */
 static void change_releases(
@@ -111,20 +112,20 @@ static void change_releases(
     noack_flow *flow = &after->flows[row];
     int64_t *times_ns = after->recent_ns + row * after->recent_width;
     const int64_t *older_ns = before->recent_ns + row * before->recent_width;
-    int64_t mask = after->recent_width - 1, width = after->mansd + 1;
-    if (before->tracks) {
-        if (before->mansd >= 0 && after->mansd >= 0) {
-            int64_t kept = min_of(width, before->mansd + 1);
-            for (int64_t number = max_of(flow->packets - kept, 0); number < flow->packets; number++)
-                times_ns[number & mask] = older_ns[number & (before->recent_width - 1)];
-        }
-        if (!is_same_guarantee(before, after) || before->scheduler >= 0 || after->scheduler >= 0)
-            flow->first_release_ns = max_of(flow->first_release_ns, latest_ns);
-    } else if (after->mansd >= 0) {
-        int64_t delivered = flow->packets - 1 - flow->consecutive_losses;
-        if (delivered >= 0 && flow->consecutive_losses < width)
-            times_ns[delivered & mask] = 0;
+    int64_t mask = after->recent_width - 1, kept = 0;
+    if (before->tracks && before->mansd >= 0)
+        kept = min_of(after->mansd, before->mansd) + 1;
+    int64_t known = flow->packets - kept, lost = flow->packets - flow->consecutive_losses;
+    for (int64_t number = max_of(flow->packets - after->mansd - 1, 0); number < flow->packets;
+         number++) {
+        if (number >= known)
+            times_ns[number & mask] = older_ns[number & (before->recent_width - 1)];
+        else if (number < lost)
+            times_ns[number & mask] = 0;
     }
+    if (before->tracks
+        && (!is_same_guarantee(before, after) || before->scheduler >= 0 || after->scheduler >= 0))
+        flow->first_release_ns = max_of(flow->first_release_ns, latest_ns);
 }
 
 void noack_link_change(const noack_link *before, noack_link *after, const int64_t *latest_ns) {

@@ -23,6 +23,8 @@ from noack.impairments.kinds.rate import Rate
 from noack.settings.section import ScenarioSection
 
 Mansd = Annotated[int, Field(ge=0, le=1_000_000)]
+USUAL_LIMIT = 16_384
+"""Packets that may be delayed at once, by default: far more than loops ever have in flight."""
 Constraints = Annotated[tuple[AnyConstraint, ...], Field(max_length=8)]
 
 
@@ -37,7 +39,7 @@ class LinkSettings(ScenarioSection):
     """Further constraints on the losses of a flow; with mansd they are the guarantee."""
     first_delivered: bool = False
     """Deliver the first packet of each flow, regardless of the impairments."""
-    limit: Annotated[int, Field(ge=1, le=1_000_000)] = 16_384
+    limit: Annotated[int, Field(ge=1, le=1_000_000)] = USUAL_LIMIT
     """Maximum number of packets delayed at once; further packets are dropped."""
 
     @property

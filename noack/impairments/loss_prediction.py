@@ -38,7 +38,7 @@ from noack.core.errors import CallerError
 from noack.impairments.constraints import join_guarantee
 from noack.impairments.feature import Impairment, PacketOrder
 from noack.impairments.kinds.loss import LossOf
-from noack.impairments.link_settings import LinkSettings
+from noack.impairments.link_settings import USUAL_LIMIT, LinkSettings
 from noack.impairments.loss_guarantee import LossGuarantee
 from noack.impairments.loss_models.bernoulli import BernoulliLoss
 from noack.impairments.markov_chain import (
@@ -100,27 +100,37 @@ class LossPrediction(NamedTuple):
 def predict(settings: LinkSettings) -> LossPrediction:
     """Predict the loss rate of a direction; the settings must not name files.
 
-    Packets that overflow a queue or are delivered out of order do not count, since their number
-    depends on the arrival times.
+    Packets that overflow a queue or the limit, or are delivered out of order, do not count, since
+    their number depends on the arrival times.
     """
     impairments = settings.impairments
     try:
-        parts = [part for impairment in impairments for part in impairment.chains()]
+        parts = [
+            part._replace(begin=0) if isinstance(part, PeriodicLosses) else part  # in the long run
+            for impairment in impairments
+            for part in impairment.chains()
+        ]
         if settings.constraints:
             rate = _constrained_rate(parts, join_guarantee(settings.mansd, settings.constraints))
         else:
             rate = _capped_rate(parts, settings.mansd)
     except NotPredictableError as error:
         return LossPrediction(None, str(error))
-    notes = list(
-        dict.fromkeys(impairment.prediction_note for impairment in impairments if impairment.prediction_note)
-    )
-    order = PacketOrder()
-    for impairment in impairments:
-        order = impairment.order_after(order)
+    order, notes = _order_and_notes(settings)
     if settings.longest_burst != 0 and order.reordered:
         notes.append("not counting packets delivered out of order (stale)")
     return LossPrediction(rate, "; ".join(notes))
+
+
+def _order_and_notes(settings: LinkSettings) -> tuple[PacketOrder, list[str]]:
+    """Return the order in which packets arrive, and the conditions under which a rate holds."""
+    order, notes = PacketOrder(), list[str]()
+    for impairment in settings.impairments:
+        order = impairment.order_after(order)
+        notes.append(impairment.prediction_note)
+    if order.delayed and settings.limit < USUAL_LIMIT:
+        notes.append(f"as long as no more than {settings.limit} packets are delayed at once")
+    return order, [note for note in dict.fromkeys(notes) if note]
 
 
 def joint_chain(settings: LinkSettings) -> tuple[Array, Array, Array]:
@@ -180,7 +190,7 @@ def _lost_by_any(patterns: Sequence[NDArray[np.bool_]]) -> NDArray[np.bool_]:
 
 def _joint_chain(parts: Sequence[Chain | PeriodicLosses]) -> tuple[Array, Array, Array]:
     """Return the joint chain: start, matrix, probability of no effective delivery."""
-    states = math.prod(len(part.lost if isinstance(part, PeriodicLosses) else part.start) for part in parts)
+    states = math.prod(part.states if isinstance(part, PeriodicLosses) else len(part.start) for part in parts)
     if states > MOST_STATES:
         raise NotPredictableError(f"together the impairments have {states} states, too many to compute with")
     start: Array = np.ones(1)
@@ -270,7 +280,8 @@ class LossProcess:
             probability, given any past, that the next ``count`` packets are all lost.
         """
         lost, weights, tails = self.moves * self.lost, np.ones(len(self.start)), []
-        stationary = np.abs(self.start @ self.moves - self.start).max() <= _ROUNDING
+        # One step would not show that a slow chain is far from its mean distribution.
+        stationary = np.abs(_stationary(self.start, self.moves) - self.start).max() <= _ROUNDING
         for _ in range(count):
             weights = lost @ weights
             tails.append(self.start @ weights if stationary else weights.max())
@@ -390,11 +401,9 @@ def loss_process(settings: LinkSettings) -> LossProcess:
     Raises:
         NotPredictableError: they cannot be computed; the message is the reason.
     """
-    order = PacketOrder()
-    for impairment in settings.impairments:
-        order = impairment.order_after(order)
-        if impairment.prediction_note:
-            raise NotPredictableError(f"the losses are known only {impairment.prediction_note}")
+    order, notes = _order_and_notes(settings)
+    if notes:
+        raise NotPredictableError(f"the losses are known only {notes[0]}")
     if order.reordered:
         raise NotPredictableError("packets may arrive out of order, which counts as a loss")
     try:

@@ -47,15 +47,32 @@ class PeriodicLosses(NamedTuple):
     """A periodic loss pattern."""
 
     lost: NDArray[np.bool_]  # (period,)
+    begin: int | None = 0  # No packet with a smaller number is lost; None: the phase is random
+
+    @property
+    def states(self) -> int:
+        """Number of states of the chain.
+
+        Raises:
+            NotPredictableError: its start is not known.
+        """
+        if self.begin is None:
+            raise NotPredictableError("a seed chooses where the recorded losses begin")
+        return len(self.lost) + (self.begin + 1 if self.begin else 0)
 
     @property
     def chain(self) -> Chain:
         """Return the pattern as a Markov chain."""
         period = len(self.lost)
-        return Chain(np.eye(period)[-1], np.roll(np.eye(period), 1, axis=1), self.lost.astype(float))
+        if not self.begin:
+            return Chain(np.eye(period)[-1], np.roll(np.eye(period), 1, axis=1), self.lost.astype(float))
+        moves = np.eye(self.states, k=1)
+        moves[-1, -period] = 1.0
+        acts = np.concatenate([np.zeros(self.begin + 1), np.roll(self.lost, -(self.begin % period))])
+        return Chain(np.eye(self.states)[0], moves, acts)
 
 
-def pattern(period: int, lost: Iterable[int]) -> PeriodicLosses:
+def pattern(period: int, lost: Iterable[int], begin: int = 0) -> PeriodicLosses:
     """Return the pattern in which these packet numbers of every ``period`` packets are lost.
 
     Raises:
@@ -65,7 +82,7 @@ def pattern(period: int, lost: Iterable[int]) -> PeriodicLosses:
         raise NotPredictableError(f"the loss pattern repeats only after {period} packets")
     flags = np.zeros(period, bool)
     flags[np.fromiter(lost, np.int64)] = True
-    return PeriodicLosses(flags)
+    return PeriodicLosses(flags, begin)
 
 
 def chance_chain(probability: float, correlation: float, action: str) -> Chain:

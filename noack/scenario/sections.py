@@ -17,7 +17,14 @@ from noack.disturbances.disturbance_settings import DisturbanceSettings, Place
 from noack.impairments.constraints import join_guarantee, require_consistent
 from noack.impairments.kinds import AnyImpairment
 from noack.impairments.kinds.loss import LossOf
-from noack.impairments.link_settings import Constraints, LinkSettings, Mansd, require_order, require_scores
+from noack.impairments.link_settings import (
+    USUAL_LIMIT,
+    Constraints,
+    LinkSettings,
+    Mansd,
+    require_order,
+    require_scores,
+)
 from noack.impairments.loss_guarantee import LossGuarantee
 from noack.impairments.loss_models import Loss
 from noack.impairments.loss_models.lossless import NoLoss
@@ -337,7 +344,7 @@ class DirectionSection(ScenarioSection):
     guarantee."""
     impairments: tuple[AnyImpairment, ...] = ()
     """Further impairments, applied in this order, after the loss."""
-    limit: Annotated[int, Field(ge=1, le=1_000_000)] = 16_384
+    limit: Annotated[int, Field(ge=1, le=1_000_000)] = USUAL_LIMIT
     """Largest number of delayed packets at a time; further packets are dropped."""
 
     @model_validator(mode="after")

@@ -195,7 +195,11 @@ class Replay(FileFeature, Impairment):
             raise NotPredictableError("recorded losses by time depend on when packets arrive")
         if not self.repeat:
             raise NotPredictableError("a trace that is replayed once has no long-run loss rate")
-        return (PeriodicLosses(np.array(self.delays_ns) < 0),)
+        lost = np.array(self.delays_ns) < 0
+        if self.offset_s == "random":
+            return (PeriodicLosses(lost, begin=None),)
+        first_ns = round(self.offset_s * NS_PER_S)
+        return (PeriodicLosses(np.roll(lost, -bisect_left(self.sent_ns or (), first_ns))),)
 
     def read_file(self, file: NamedFile) -> Self:
         path = find_trace(file.name, file.folder, file.named)

@@ -57,4 +57,5 @@ class PeriodicLoss(LossModel):
 
     def chains(self) -> Sequence[PeriodicLosses]:
         lost = range(self.first, self.first + min(self.burst, LONGEST_PATTERN))
-        return (pattern(self.period, (number % self.period for number in lost)),)
+        begin = self.first if lost.stop > self.period else 0
+        return (pattern(self.period, (number % self.period for number in lost), begin),)

@@ -19,6 +19,7 @@ from noack.impairments.loss_guarantee import (
     LossHistory,
 )
 from noack.impairments.loss_prediction import (
+    LossPrediction,
     LossProcess,
     ProbabilityCache,
     expected_loss,
@@ -32,7 +33,7 @@ from noack.impairments.loss_prediction import (
 from noack.impairments.markov_chain import NotPredictableError
 from noack.protocol.record_tables import Fate
 from tests.helpers.approved import compare_lines, lines_of_error
-from tests.oracles.link import Link
+from tests.oracles.link import Datagram, Link
 
 DECISIONS = 400_000
 EXACT = {
@@ -247,11 +248,65 @@ def test_tails_of_bursts_cover_every_packet_and_the_largest_probability_every_pa
         assert all_lost <= longest * (1 + 1e-9)
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        "loss periodic 2/3 from 1",
+        "loss periodic 2/3 from 2",
+        "loss periodic 3/4 from 40",
+        "loss periodic 1/5 from 3 loss periodic 2/9 from 31",
+        "replay records 0+5ms,1ms+5ms,2ms+lost,3ms+lost,4ms+5ms from 3ms",
+        "replay records 0+5ms,1ms+5ms,2ms+lost,3ms+lost,4ms+5ms",
+    ],
+)
+def test_certain_losses_begin_where_the_link_begins_them(words: str) -> None:
+    """No packet before the first one of a periodic loss is lost; a trace begins at its offset."""
+    link, losses = Link(settings_of(words), 1, "a"), loss_process(settings_of(words))
+    lost = tuple(link.decide(0, 72, t_ns * 10**9).fate == Fate.DROPPED for t_ns in range(60))
+    chain = losses.outcomes(LossGuarantee())
+    shares = np.eye(len(chain.lost))[-1]
+    for is_lost in lost:
+        assert (shares @ chain.lost).sum() == is_lost
+        shares = shares @ (chain.lost + chain.delivered)
+    for packets in range(60):
+        for guarantee in KEPT:
+            assert losses.keeps(guarantee, packets) == is_kept(guarantee, lost[:packets])
+
+
+def test_losses_that_begin_anywhere_in_a_trace_are_not_predicted() -> None:
+    settings = settings_of("replay records 0+5ms,1ms+lost from random")
+    assert predict(settings).rate == 0.5
+    with pytest.raises(NotPredictableError, match="a seed chooses"):
+        loss_process(settings)
+
+
+def test_tails_of_a_chain_that_hardly_moves_are_those_of_every_packet() -> None:
+    """In the long run it is in its bad state half of the time, though it begins in the good one."""
+    slow = {"model": "gilbert_elliott", "good_to_bad": 1e-13, "bad_to_good": 1e-13}
+    tails, _ = process({"kind": "loss", "loss": slow}).tails(3)
+    assert tails.min() >= 0.5 * (1 - 1e-9)
+
+
 def test_a_kept_rate_is_that_of_the_losses_under_the_guarantee() -> None:
     """p(1 − p²)/(1 − p³) = 0.4 for the probability p of the losses without the guarantee."""
     kept = {"kind": "loss", "loss": {"model": "bernoulli", "probability": 0.4, "keep": True}}
     p = loss_process(LinkSettings.model_validate({"impairments": (kept,), "mansd": 2})).largest_probability
     assert p * (1 - p**2) / (1 - p**3) == pytest.approx(0.4, rel=1e-9)
+
+
+def test_losses_are_not_predicted_if_few_packets_may_be_delayed_at_once() -> None:
+    """A copy that finds no place is dropped: without the limit a quarter of the packets is lost."""
+    settings = settings_of("duplicate 100% corrupt 50% delay 10ms").model_copy(update={"limit": 1})
+    note = "as long as no more than 1 packets are delayed at once"
+    assert predict(settings) == LossPrediction(0.25, note)
+    with pytest.raises(NotPredictableError, match=note):
+        loss_process(settings)
+    link, corrupted = Link(settings, 1, "a"), 0
+    for t_ns in range(0, 1000 * 10**9, 10**9):
+        link.handle(Datagram(0, bytes(72)), t_ns)
+        corrupted += link.decision.fate == Fate.CORRUPTED
+        link.on_timer(t_ns)
+    assert corrupted == pytest.approx(500, abs=60)
 
 
 def test_losses_of_which_no_rate_can_be_kept_have_no_prediction() -> None:

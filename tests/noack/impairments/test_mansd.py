@@ -212,6 +212,20 @@ def test_a_restarted_link_keeps_the_guarantee_behind_any_history(words: str) -> 
     )
 
 
+@pytest.mark.sanitized
+@pytest.mark.parametrize("first", ["mansd 4", "", "delay 1ms", "delay 1ms mansd 1"])
+@pytest.mark.parametrize("lost", [0, 1])
+def test_datagrams_delivered_before_two_changes_count_as_delivered(first: str, lost: int) -> None:
+    """Also those of which the link between knows no release time."""
+    link = Link(settings_of(f"loss script {9 if lost else 'none'} {first}"), 1, "a")
+    for number in range(10):
+        link.decide(0, 100, number * 10 * MS)
+    for words in ("delay 1ms mansd 4", "loss worst atmost 2 in 10"):
+        link.change(settings_of(words))
+    fates = [link.decide(0, 100, t * 10 * MS).fate for t in range(10, 14)]
+    assert [fate == core.NOACK_DROPPED for fate in fates] == [True, lost == 0, False, False]
+
+
 def lost_of(releases: Sequence[int | None]) -> list[bool]:
     """Return the outcomes for the given release times, by brute force."""
     return [
