@@ -135,7 +135,7 @@ def test_every_option_is_documented_and_no_other(command: str) -> None:
     rows = [line.split("|")[1] for line in text.splitlines() if line.startswith("| `")]
     documented = {name for row in rows for name in re.findall("--[A-Za-z-]+", row)}
     parameters = get_command(app).commands[command].params  # type: ignore[attr-defined]
-    known = {name for one in parameters for name in one.opts if name.startswith("--")}
+    known = {name for parameter in parameters for name in parameter.opts if name.startswith("--")}
     assert documented | {"--help"} == known | {"--help"}
 
 
@@ -153,7 +153,7 @@ def test_the_network_in_the_how_to_page_is_valid(tmp_path: Path) -> None:
     text = (ROOT / "scenarios/unstable_pendulum.toml").read_text()
     path = tmp_path / "pendulum.toml"
     path.write_text(re.sub(r"^\[network\]\n.*?\n\n", network + "\n", text, flags=re.DOTALL | re.M))
-    assert [one.kind for one in load(path).network.impairments] == ["delay", "rate"]
+    assert [impairment.kind for impairment in load(path).network.impairments] == ["delay", "rate"]
 
 
 TEXTS = sorted({*(ROOT / "docs").glob("*.md"), *map(ROOT.joinpath, PAGES), *ROOT.glob("*.md")})
@@ -165,7 +165,7 @@ def anchors(page: Path) -> set[str]:
     """The names that GitHub and the site give to the sections of a page."""
     text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
     headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
-    return {re.sub(r"[^\w\- ]", "", one.lower()).replace(" ", "-") for one in headings}
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
 @pytest.mark.parametrize("page", TEXTS, ids=lambda page: page.name)
@@ -202,7 +202,7 @@ def test_the_citation_agrees_with_the_package() -> None:
     assert citation["title"].startswith(project["name"] + ":")
     (paper,) = citation["references"]
     assert paper["title"] in " ".join((ROOT / "README.md").read_text().split())
-    assert [one["family-names"] for one in paper["authors"]] == ["Garcia", "Antsaklis"]
+    assert [author["family-names"] for author in paper["authors"]] == ["Garcia", "Antsaklis"]
     assert re.fullmatch(r"\d{4}", paper["year"])
 
 

@@ -390,7 +390,7 @@ def constant_rows(
     yield f"Δ, bound of ‖{w}e_c‖{unit}", constant("delta"), delta_2
     yield f"bound of ‖{w}e_s‖{unit}", constant("overshoot"), "1"
     yield "bound of ‖u − Kx‖", constant("input_error"), NONE
-    yield "· none undelivered", constant("received_input_error"), NONE
+    yield "· all arrived", constant("received_input_error"), NONE
     yield "X, bound of ‖x‖", constant("state"), state_2
     yield "inter-event time, s", row(lambda c: c.inter_event_s, at_least), spacing_2
     yield "loop gain (< 1)", constant("loop_gain"), NONE

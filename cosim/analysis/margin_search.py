@@ -7,7 +7,7 @@ them imply others.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import combinations, permutations
+from itertools import combinations, pairwise, permutations
 from typing import NamedTuple
 
 from netem.tc_words import guarantee_words, settings_of
@@ -342,6 +342,13 @@ def find_margin(
         every_m = other_rules.longest_burst is not None and other_rules.longest_burst < m
         if every_m or caps[-1].stability.verdict == "destabilised":
             break
+    # A larger M allows all patterns of a smaller one.
+    for smaller, larger in pairwise(range(len(caps))):
+        stability = caps[larger].stability.with_lower_of(caps[smaller].stability)
+        caps[larger] = caps[larger]._replace(stability=stability)
+    for smaller, larger in reversed([*pairwise(range(len(caps)))]):
+        stability = caps[smaller].stability.with_upper_of(caps[larger].stability)
+        caps[smaller] = caps[smaller]._replace(stability=stability)
     compared = _NOT_COMPARED
     if others_read:
         compared = compare_guarantees([network.guarantee, *others_read], examine)

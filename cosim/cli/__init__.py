@@ -1,68 +1,32 @@
-"""The command line ``noack``; its commands are in :mod:`cosim.cli.commands`."""
+"""The command line ``noack``; its commands are in :mod:`cosim.cli.commands`.
 
-import gc
-import os
-import sys
-from contextlib import ExitStack, closing, suppress
-from typing import TYPE_CHECKING, Any
+:func:`main` lets Ctrl-C end the process at once before it imports anything: a shell's status is 130.
+"""
 
-from cosim.lazy_modules import lazy_modules
-from noack.core.errors import NoackError
-from noack.core.process_limits import exhausted_limit
-from noack.runtime.command_line import failed, stoppable_imports
+import signal
 
-with lazy_modules():
-    from cosim.cli import command
-    from cosim.live.processes import fork_server
-
+TYPE_CHECKING = False  # importing typing takes longer than all else before the handler
 if TYPE_CHECKING:
     from cosim.cli.command import app
 else:
 
-    def __getattr__(name: str) -> Any:
+    def __getattr__(name: str) -> object:
         """Import the program with all its commands when a name of it is first used (PEP 562)."""
         if name not in __all__:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        from cosim.cli import command  # `main` imports nothing before its handler
+
         command.register_commands()
         return getattr(command, name)
 
 
 __all__ = ["app", "main"]
-_LIVE = ("run", "demo", "record")
-_NEW_OBJECTS = 100_000
-"""Objects between two garbage collections. With Python's 700, the imports take 0.06 s longer."""
 
 
 def main() -> None:
     """Entry point."""
-    gc.set_threshold(_NEW_OBJECTS)
-    words = sys.argv[1:]
-    as_json = "--json" in words
-    with stoppable_imports(), ExitStack() as stack:
-        try:
-            if (server := _fork_server(words)) is not None:
-                stack.enter_context(closing(server))
-            command.register_commands(*(words or _completed_words())[:1])
-            command.run_program(server)  # a command handles signals itself
-        except NoackError as error:
-            sys.exit(failed(str(error), error.exit_status, source="noack", as_json=as_json))
-        except Exception as error:
-            if (line := exhausted_limit(error)) is None:
-                raise
-            sys.exit(failed(line, NoackError.exit_status, source="noack", as_json=as_json))
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    from cosim.cli import entry_point  # Ctrl-C would print a traceback from within these imports
 
-
-def _completed_words() -> list[str]:
-    """Return the words before which a shell asks for completions; none if it does not ask."""
-    line = os.environ.get("_TYPER_COMPLETE_ARGS", os.environ.get("COMP_WORDS", ""))
-    return line.split()[1:] if "_NOACK_COMPLETE" in os.environ else []
-
-
-def _fork_server(words: list[str]) -> "fork_server.ForkServer | None":
-    """Fork the fork server of a live run, which imports while this process does."""
-    if sys.platform != "linux" or "--help" in words or not words or words[0] not in _LIVE:
-        return None
-    os.environ.update(fork_server.QUICK_IMPORTS)
-    with suppress(OSError):  # the command reports it
-        return fork_server.ForkServer(of_itself=True)
-    return None
+    entry_point.run()

@@ -102,7 +102,27 @@ SetOption = Annotated[
         autocompletion=complete_settings,
     ),
 ]
-OutOption = Annotated[Path | None, Option("--out")]
+
+
+def _usable_folder(folder: Path | None) -> Path | None:
+    """Refuse a folder in which nothing can be written, before anything is computed."""
+    if folder is not None:
+        existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+        if not (existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)):
+            reason = "may not be written to" if existing.is_dir() else "is not a folder"
+            raise typer.BadParameter(f"{existing} {reason}")
+    return folder
+
+
+def _usable_path(path: Path | None) -> Path | None:
+    """Refuse a file or folder that cannot be written, before anything is computed."""
+    if path is not None:
+        _usable_folder(path if path.is_dir() else path.parent)
+    return path
+
+
+OutOption = Annotated[Path | None, Option("--out", callback=_usable_path)]
+OutWithDefault = Annotated[Path, Option("--out", callback=_usable_path)]
 
 
 class TriggerMode(StrEnum):
@@ -126,16 +146,6 @@ WidthOption = Annotated[
         "column for pdf, 10 in for svg and png.",
     ),
 ]
-
-
-def _usable_folder(folder: Path | None) -> Path | None:
-    """Refuse a folder in which nothing can be written, before anything is computed."""
-    if folder is not None:
-        existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-        if not (existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)):
-            reason = "may not be written to" if existing.is_dir() else "is not a folder"
-            raise typer.BadParameter(f"{existing} {reason}")
-    return folder
 
 
 TablesOption = Annotated[

@@ -179,9 +179,10 @@ def _print_notes(console: Console, results: Certificates) -> None:
     if any(certificate.constants for certificate in certificates):
         console.print(
             "[dim]Each bound of a norm is multiplied by e^(−rate·t). paper: no sampling, no delay, "
-            "no hold. schedule: the scenario's rates, plus the lateness that it allows. plant: the "
+            "no hold. schedule: the scenario's rates, plus the lateness that it allows. Its inter-event "
+            "time can be the larger one: events are at measurements only. plant: the "
             "scenario's plant. box: every plant of the uncertainty box. undelivered updates: "
-            "updates not yet delivered (lost or in flight), maximum. none undelivered: the bound "
+            "updates not yet delivered (lost or in flight), maximum. all arrived: the bound "
             "while every update has arrived. inter-event time: minimum.[/]"
         )
     if any(certificate.persistent_constants for certificate in certificates):

@@ -50,7 +50,7 @@ _FEW = 3
 _SHORT = (
     "lost in the network", "actuations lost", "longest loss burst (", "deliveries forced",
     "shortest inter-event", "median ", "‖x‖", "maximum ‖e_s‖", "sensor-to-controller",
-    "deadlines missed", "most deadlines missed", "largest bound of a clock", "replay",
+    "deadlines missed", "deadlines missed, worst process", "largest bound of a clock", "replay",
     "difference to the ideal loop, RMS",
 )  # fmt: skip
 """How the most important numbers of a loop begin, which a terminal of 80 columns shows."""
@@ -228,7 +228,7 @@ def _lateness(loop: LoopSummary) -> Iterator[tuple[str, str]]:
         worst = max(late, key=lambda role: late[role].late_steps)
         missed, steps = late[worst].late_steps, late[worst].steps
         if missed:
-            yield "most deadlines missed", f"{worst}, {missed} of {steps}"
+            yield "deadlines missed, worst process", f"{worst}: {missed} of {steps} steps"
         else:
             yield "deadlines missed", "none"
 

@@ -42,7 +42,7 @@ def compare_lines(path: Path, lines_of: Callable[[str], Sequence[str]]) -> None:
             continue
         found.append(line)
         if not line.startswith("#"):
-            found += [f"    {one}" for one in lines_of(line)]
+            found += [f"    {output_line}" for output_line in lines_of(line)]
     compare_text(path, "\n".join(found) + "\n")
 
 

@@ -62,8 +62,8 @@ def answers(tmp_path_factory: pytest.TempPathFactory) -> Answers:
         document, end = decoder.raw_decode(text)
         found.append(document)
         text = text[end:].lstrip()
-    documents = [one for one in found if isinstance(one, dict)]
-    ends = [one for one in found if isinstance(one, list)]
+    documents = [document for document in found if isinstance(document, dict)]
+    ends = [document for document in found if isinstance(document, list)]
     return Answers(folder, documents, ends, done.stderr.splitlines())
 
 

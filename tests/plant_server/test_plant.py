@@ -34,10 +34,10 @@ def test_the_watchdog_trips_when_the_actuation_is_older_than_the_timeout(
     plant.handle(Message(Flow.ACTUATION, 0, sent_ns, np.array([2.0])), sent_ns)
     for t_ns in range(0, 70 * MS, 10 * MS):
         outputs += plant.on_timer(t_ns)
-    rows = [one.row for one in outputs if isinstance(one, Record)]
+    rows = [output.row for output in outputs if isinstance(output, Record)]
     u = np.array(rows, tables_of(scenario)["plant_step"])["u"][:, 0]
     assert (u[5], u[6]) == (2.0, then if trips else 2.0)
-    notices = [(one.t_ns, one.level) for one in outputs if isinstance(one, Notice)]
+    notices = [(output.t_ns, output.level) for output in outputs if isinstance(output, Notice)]
     assert notices == [(60 * MS, "watchdog")] * trips
 
 
@@ -53,13 +53,13 @@ def run(request: pytest.FixtureRequest) -> RunRecord:
 
 def test_a_trip_before_the_first_actuation_is_in_the_summary() -> None:
     run = with_outage(resolved("lane_following", "horizon_s=2"), 0.0, 0.4)
-    assert next(one["t_ns"] for one in run.notices if one["level"] == "watchdog") == 102_000_000
+    assert next(notice["t_ns"] for notice in run.notices if notice["level"] == "watchdog") == 102_000_000
     watchdog = summarise_loop(run, 0, "horizon").watchdog
     assert (watchdog.trips, watchdog.first_s) == (1, pytest.approx(0.102))
 
 
 def test_the_beginning_and_end_of_a_trip_are_reported_and_replayed(run: RunRecord) -> None:
-    trips = [(one["t_ns"], one["process"]) for one in run.notices if one["level"] == "watchdog"]
+    trips = [(notice["t_ns"], notice["process"]) for notice in run.notices if notice["level"] == "watchdog"]
     assert trips == [(1_100_000_000, "plant"), (1_402_000_000, "plant")]
     policy = run.scenario.plant.watchdog.policy
     assert summarise_loop(run, 0, "horizon").to_json()["watchdog"] == {

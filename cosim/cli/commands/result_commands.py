@@ -326,7 +326,7 @@ def collect(
 def compare(
     directories: Annotated[list[Path], Argument(metavar="RUN...", autocompletion=opt.complete_runs)],
     *,
-    out: Path = DEFAULT_RUNS / "comparison.html",
+    out: opt.OutWithDefault = DEFAULT_RUNS / "comparison.html",
     width: opt.WidthOption = None,
     json: opt.JsonOption = False,
 ) -> None:

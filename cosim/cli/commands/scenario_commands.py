@@ -17,8 +17,8 @@ from cosim.lazy_modules import lazy_modules
 from cosim.record.run_directory import DEFAULT_RUNS
 from cosim.shipped_files import KINDS, ShippedFile, all_shipped, text_of
 from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError, ExitStatus, MachineError, why
-from noack.core.file_access import new_file
+from noack.core.errors import CallerError, ExitStatus
+from noack.core.file_access import write_whole
 from noack.core.number_format import at_least, at_most
 
 with lazy_modules():
@@ -431,9 +431,5 @@ def _show(
         label = result.to_json()["plant"]
         if out.exists() and (other_plant := linear_model.read_document(out)["plant"]) != label:
             raise CallerError(f"--out {out}: has the model of {other_plant}; give another name")
-        try:
-            with new_file(out, make_folder=False) as file:
-                file.write(json_format.dumps(result.to_json(), indent=2).encode())
-        except OSError as error:
-            raise MachineError(f"--out {out}: cannot be written: {why(error)}") from None
+        write_whole(out, json_format.dumps(result.to_json(), indent=2))
     cli.print_lines(json, result.to_json(), repr(result))

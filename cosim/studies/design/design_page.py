@@ -132,7 +132,8 @@ def rows(result: DesignResult) -> list[tuple[str, ...]]:
             f"{trial.candidate.alpha_per_s:.4g}",
             f"{trial.candidate.beta:.4g}",
             result.space.families[trial.candidate.family].weight,
-            result.space.families[trial.candidate.family].gain,
+            result.space.families[trial.candidate.family].gain
+            + " ← chosen" * (result.feasible and trial is result.best),
         )
         for trial in result.front
     ]

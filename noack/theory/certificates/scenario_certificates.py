@@ -41,6 +41,8 @@ has a certificate is used."""
 _SHARES_OF_ALPHA = (0.8, 0.6, 0.4, 0.2)
 """Rates that are tried for a box, as shares of α."""
 _TOO_LARGE = "intermediate results are too large or too small for floating point"
+_LARGEST_START = 1e150
+"""The squares of larger entries of x(0) may overflow."""
 
 
 class Phases(NamedTuple):
@@ -185,7 +187,13 @@ class CertificateScope:
                 raise NoCertificateError(why)
             phases = yield from self.all_phases(conditions)
         except (NotDecayingError, NoCertificateError) as error:
+            largest = float(np.abs(self._loop.x0).max())
             void = error
+            if largest > _LARGEST_START:
+                void = NoCertificateError(
+                    f"plant.initial_state is too large for floating point: an entry of x(0) is {largest:g}; "
+                    f"bounds are computed up to {_LARGEST_START:g}"
+                )
         reason = None if void is None else str(void)
 
         def certificate(

@@ -11,7 +11,7 @@ from cosim.cli.options import load_scenario
 from noack.core.linear_systems import discretise
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
-from noack.theory.margins.loss_margin import Stability
+from noack.theory.margins.loss_margin import LossMargin, Stability
 from tests.command_line import invoke
 
 HELD = {
@@ -64,6 +64,14 @@ def test_verdicts_agree_with_the_bounds() -> None:
     assert margin.destabilised is not None
     assert margin.destabilised.stability.lower > 1
     assert f"M ≤ {margin.stable_m}; this pattern destabilises M = {len(growth)}: D" in str(margin)
+
+
+def test_a_bound_of_one_m_holds_for_the_others_that_it_implies(monkeypatch: pytest.MonkeyPatch) -> None:
+    bounds = (0.5, 0.9), (0.7, 0.95), (0.6, 0.8)
+    found = iter([Stability(lower, upper, (True,), (1.0,), 0) for lower, upper in bounds])
+    monkeypatch.setattr(LossMargin, "stability", lambda *_, **__: next(found))
+    margin = find_margin(resolve(held_integrator()), most_m=3, with_period=False)
+    assert [cap.stability[:2] for cap in margin.caps] == [(0.5, 0.8), (0.7, 0.8), (0.7, 0.8)]
 
 
 def test_constraints_that_limit_the_losses_alone_make_every_m_stable() -> None:

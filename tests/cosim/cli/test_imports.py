@@ -3,6 +3,7 @@
 import importlib
 import json
 import re
+import signal
 import subprocess
 import sys
 import threading
@@ -35,6 +36,26 @@ def imported(*words: str, program: str = _PROGRAM) -> set[str]:
     command = [sys.executable, "-c", f"{_SHOW}{program}", *words]
     process = subprocess.run(command, capture_output=True, text=True, check=True, timeout=150)
     return set(json.loads(process.stderr.splitlines()[-1]))
+
+
+_INTERRUPTED = """
+import os, signal
+from cosim.cli import main
+before = {name for name in sys.modules if name.startswith(("cosim.", "noack", "typing"))}
+class Interrupt:
+    def find_spec(self, *_):
+        os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Interrupt())
+print(*sorted(before), flush=True)
+main()
+"""
+
+
+def test_ctrl_c_during_the_imports_of_a_command_is_quiet() -> None:
+    command = [sys.executable, "-S", "-c", f"import sys{_INTERRUPTED}", "check", "lane_following"]
+    process = subprocess.run(command, capture_output=True, text=True, timeout=150)
+    assert (process.returncode, process.stderr) == (-signal.SIGINT, "")  # to a shell: 130
+    assert process.stdout == "cosim.cli\n"
 
 
 @pytest.mark.parametrize("words", [["--help"], ["run", "--help"], ["certify", "--help"]])

@@ -113,6 +113,15 @@ def test_the_chosen_weight_makes_the_model_contract_and_keeps_the_volume(chosen:
     assert better.inter_event_s >= plain.inter_event_s
 
 
+def test_a_start_that_overflows_is_named() -> None:
+    certificates = certificates_of(shipped("double_integrator", "plant.initial_state=[1e200, 0]"))
+    reasons = {certificate.void for _, certificate in certificates}
+    assert reasons == {
+        "plant.initial_state is too large for floating point: an entry of x(0) is 1e+200; bounds are "
+        "computed up to 1e+150"
+    }
+
+
 def test_no_weight_improves_a_hold_and_identity_removes_the_weight() -> None:
     with pytest.raises(CallerError, match=r"weight chosen: α = 0\.25 /s is not below"):
         with_weight(resolved("lane_following", 'mode="zoh"'), "chosen")
