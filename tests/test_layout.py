@@ -19,32 +19,32 @@ from native.build import HEADER
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("noack", "plant_server", "sensor_node", "controller_node", "netem", "cosim")
 EXEMPT = ("__init__", "__main__")
-MOST_MODULES = 473
+MOST_MODULES = 474
 LINES = {
-    "noack/scenario": 4145,
+    "noack/scenario": 4150,
     "noack/controllers": 270,
     "noack/core": 1450,
     "noack/disturbances": 220,
-    "noack/impairments": 4370,
+    "noack/impairments": 4405,
     "noack/machines": 400,
     "noack/observers": 395,
     "noack/plants": 3425,
     "noack/protocol": 1265,
     "noack/runtime": 5790,
     "noack/settings": 600,
-    "noack/theory": 13115,
+    "noack/theory": 13220,
     "noack/traces": 1320,
     "noack/trigger": 1075,
     "netem": 6610,
-    "cosim/analysis": 8440,
+    "cosim/analysis": 8455,
     "cosim/api": 1685,
-    "cosim/cli": 3435,
+    "cosim/cli": 3460,
     "cosim/doctor": 810,
     "cosim/interactive": 1830,
     "cosim/lab": 1995,
     "cosim/live": 4020,
     "cosim/measurement": 2975,
-    "cosim/output": 8695,
+    "cosim/output": 8700,
     "cosim/record": 3695,
     "cosim/simulation": 1990,
     "cosim/studies": 9555,
@@ -53,7 +53,7 @@ LINES = {
     "controller_node": 420,
     "benchmarks": 3730,
     "native": 11445,
-    "tests": 50335,
+    "tests": 50530,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 
@@ -65,7 +65,7 @@ MARKS = {
     "benchmarks": (29, 7, 0),
     "cosim": (2, 0, 0),
     "cosim/analysis": (7, 3, 0),
-    "cosim/cli": (14, 0, 0),
+    "cosim/cli": (12, 0, 0),
     "cosim/interactive": (2, 4, 0),
     "cosim/lab": (2, 0, 0),
     "cosim/live": (6, 0, 0),

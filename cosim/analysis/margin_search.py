@@ -7,7 +7,7 @@ them imply others.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import combinations, pairwise, permutations
+from itertools import combinations, permutations
 from typing import NamedTuple
 
 from netem.tc_words import guarantee_words, settings_of
@@ -342,13 +342,6 @@ def find_margin(
         every_m = other_rules.longest_burst is not None and other_rules.longest_burst < m
         if every_m or caps[-1].stability.verdict == "destabilised":
             break
-    # A larger M allows all patterns of a smaller one.
-    for smaller, larger in pairwise(range(len(caps))):
-        stability = caps[larger].stability.with_lower_of(caps[smaller].stability)
-        caps[larger] = caps[larger]._replace(stability=stability)
-    for smaller, larger in reversed([*pairwise(range(len(caps)))]):
-        stability = caps[smaller].stability.with_upper_of(caps[larger].stability)
-        caps[smaller] = caps[smaller]._replace(stability=stability)
     compared = _NOT_COMPARED
     if others_read:
         compared = compare_guarantees([network.guarantee, *others_read], examine)
@@ -361,13 +354,27 @@ def find_margin(
         shortest_s=margin.shortest_ns / NS_PER_S,
         period_s=margin.longest_ns / NS_PER_S,
         delay_s=margin.loop.times.delay_ns / NS_PER_S,
-        caps=tuple(caps),
+        caps=_with_implied_bounds(caps),
         every_m=every_m,
         period=find_longest_period(resolved, progress) if with_period else None,
         without_guarantee=_without_guarantee(resolved, progress),
         effort=effort,
         compared=compared,
     )
+
+
+def _with_implied_bounds(caps: Sequence[LossCap]) -> tuple[LossCap, ...]:
+    """Return the results for M = 1, 2, … with what follows from each other.
+
+    A larger M allows all patterns of a smaller one: it has its lower bound, and this one the upper
+    bound of the larger one.
+    """
+    of_each = [cap.stability for cap in caps]
+    for place in range(1, len(caps)):
+        of_each[place] = of_each[place].with_lower_of(of_each[place - 1])
+    for place in reversed(range(1, len(caps))):
+        of_each[place - 1] = of_each[place - 1].with_upper_of(of_each[place])
+    return tuple(cap._replace(stability=of_it) for cap, of_it in zip(caps, of_each, strict=True))
 
 
 def _require_in_range(most_m: int, accuracy: float, effort: float) -> None:

@@ -187,13 +187,7 @@ class CertificateScope:
                 raise NoCertificateError(why)
             phases = yield from self.all_phases(conditions)
         except (NotDecayingError, NoCertificateError) as error:
-            largest = float(np.abs(self._loop.x0).max())
-            void = error
-            if largest > _LARGEST_START:
-                void = NoCertificateError(
-                    f"plant.initial_state is too large for floating point: an entry of x(0) is {largest:g}; "
-                    f"bounds are computed up to {_LARGEST_START:g}"
-                )
+            void = self._overflow() or error
         reason = None if void is None else str(void)
 
         def certificate(
@@ -233,6 +227,16 @@ class CertificateScope:
             probability=probability,
         )
         return replace(unchecked, assumptions=tuple(assumptions))
+
+    def _overflow(self) -> NoCertificateError | None:
+        """Return the reason for having no certificate if x(0) is too large."""
+        largest = float(np.abs(self._loop.x0).max())
+        if largest <= _LARGEST_START:
+            return None
+        return NoCertificateError(
+            f"plant.initial_state is too large for floating point: an entry of x(0) is {largest:g}; "
+            f"bounds are computed up to {_LARGEST_START:g}"
+        )
 
     def loop_gain(self, conditions: NetworkConditions) -> float:
         """Return the loop gain of a certificate; at least 1, perhaps infinite, if there is none."""
