@@ -50,7 +50,7 @@ _FEW = 3
 _SHORT = (
     "lost in the network", "actuations lost", "longest loss burst (", "deliveries forced",
     "shortest inter-event", "median ", "‖x‖", "maximum ‖e_s‖", "sensor-to-controller",
-    "deadlines missed", "deadlines missed, worst process", "largest bound of a clock", "replay",
+    "deadlines missed", "largest bound of a clock", "replay",
     "difference to the ideal loop, RMS",
 )  # fmt: skip
 """How the most important numbers of a loop begin, which a terminal of 80 columns shows."""

@@ -86,7 +86,7 @@ def void_by_safe_input(resolved: Scenario, conditions: NetworkConditions) -> str
     first_ns += timing.plant_period_ns - first_ns % timing.plant_period_ns
     if conditions.start_s <= first_ns / NS_PER_S:
         return None
-    return "controller.safe_input: before the first update the input may be it, and not 0"
+    return "controller.safe_input: it may be the input before the first update, where bounds assume 0"
 
 
 def certified_delay_s(resolved: Scenario) -> float:

@@ -144,7 +144,7 @@ class RecentBalls:
 
 def lengths(vectors: Stack) -> Stack:
     """Return ‖·‖ of vectors, (…, n)."""
-    return np.asarray(np.sqrt(np.einsum("...n,...n->...", vectors, vectors)))
+    return np.asarray(np.sqrt(squared_lengths(vectors)))
 
 
 def squared_lengths(vectors: Stack) -> Stack:
