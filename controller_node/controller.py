@@ -17,7 +17,7 @@ from noack.controllers.linear_feedback import LinearFeedback
 from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.core_library import CData, CoreMemory, core, reals_at
 from noack.core.linear_systems import Matrix, Vector
-from noack.impairments.loss_guarantee import LossGuarantee
+from noack.guarantee.loss_guarantee import LossGuarantee
 from noack.machines.loop_machines import LoopMachines, MachinePart, Role, parts_of, set_machine, take_changes
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_SETTING, CONTROLLER_STEP, RecordShape
 from noack.protocol.roles import BEGINNING, FAILED, External, Notice, Start

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, LossHistory, LossRule
+from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee, LossHistory, LossRule
 from noack.protocol.roles import Notice
 from noack.scenario.parameter_changes import ChangeSchedule
 

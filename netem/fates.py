@@ -40,9 +40,9 @@ from netem.relay.relay_reports import DIRECTIONS, EVENT, Bytes, Direction, repor
 from noack.core.core_library import StructRows, dtype_of
 from noack.core.errors import CallerError, one_line
 from noack.core.file_access import open_growing, open_regular
+from noack.guarantee.loss_guarantee import LossHistory
 from noack.impairments.constraints import require_consistent
 from noack.impairments.link_settings import Constraints, Decisions, Mansd
-from noack.impairments.loss_guarantee import LossHistory
 from noack.protocol.record_tables import Fate
 
 FORMAT = 2

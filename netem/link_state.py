@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from noack.core.core_library import AnyArray, CData, core, dtype_of, ffi, pointer_to
 from noack.core.random_streams import stream_key
+from noack.guarantee.loss_guarantee import DeliveriesBetweenBursts, LossesInWindow
 from noack.impairments.feature import Stage, StageTables
 from noack.impairments.link_settings import Counters, Decisions, LinkSettings
-from noack.impairments.loss_guarantee import DeliveriesBetweenBursts, LossesInWindow
 from noack.impairments.loss_prediction import with_target_loss
 
 Integers = NDArray[np.int64]

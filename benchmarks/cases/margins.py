@@ -12,7 +12,7 @@ from scipy.linalg import block_diag, solve_continuous_are
 from benchmarks.report import Goal, Row, benchmark, median, option, say
 from cosim.cli.options import find_scenario
 from noack.core.linear_systems import Matrix
-from noack.impairments.loss_guarantee import (
+from noack.guarantee.loss_guarantee import (
     DeliveriesBetweenBursts,
     LongestBurst,
     LossesInWindow,

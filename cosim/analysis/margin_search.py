@@ -14,14 +14,9 @@ from netem.tc_words import guarantee_words, settings_of
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.number_format import at_least, at_most, duration
+from noack.guarantee.loss_guarantee import LossGuarantee, OutcomePattern, find_pattern_beyond, outcome_letters
 from noack.impairments.constraints import join_guarantee
 from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_guarantee import (
-    LossGuarantee,
-    OutcomePattern,
-    find_pattern_beyond,
-    outcome_letters,
-)
 from noack.impairments.loss_prediction import loss_process
 from noack.impairments.markov_chain import NotPredictableError
 from noack.scenario.scenario import Scenario

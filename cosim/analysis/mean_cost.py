@@ -12,8 +12,8 @@ from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.core.number_format import number
+from noack.guarantee.loss_guarantee import LossGuarantee
 from noack.impairments.constraints import join_guarantee
-from noack.impairments.loss_guarantee import LossGuarantee
 from noack.impairments.loss_prediction import loss_process
 from noack.impairments.markov_chain import NotPredictableError
 from noack.scenario.resolution import loop_of

@@ -8,8 +8,8 @@ what they import. What stands around them, in the order in which one reads it:
 * ``feature.py``: the base classes, and what several features share;
 * ``clauses.py``: the words of a feature as data, from which its reading, writing and help follow;
 * ``words.py``: words of the command line, and quantities in the syntax of ``tc``;
-* ``loss_guarantee.py``: the rules that a network keeps, as counters over the outcomes of packets;
-* ``link_settings.py``: the settings of one direction of a link, made of all these;
+* ``link_settings.py``: the settings of one direction of a link, made of all these and of the
+  guarantee (``noack/guarantee/``);
 * ``markov_chain.py``, ``loss_prediction.py``: the expected loss rate, with and without a guarantee.
 
 Predictions import scipy in the functions that use it: an emulator without them starts faster.

@@ -21,8 +21,8 @@ from pydantic import Field, FiniteFloat
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core
 from noack.core.random_streams import uniform_pair
+from noack.guarantee.loss_guarantee import LossRule
 from noack.impairments.clauses import Clause, Part
-from noack.impairments.loss_guarantee import LossRule
 from noack.impairments.markov_chain import Chain, PeriodicLosses, chance_chain
 from noack.impairments.words import CORRELATION, OWN_TIME_S, PERCENT, Quantity, brief_percent, time_text
 from noack.settings.section import Correlation, Probability, ScenarioSection

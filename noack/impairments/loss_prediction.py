@@ -35,11 +35,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.errors import CallerError
+from noack.guarantee.loss_guarantee import LossGuarantee
 from noack.impairments.constraints import join_guarantee
 from noack.impairments.feature import Impairment, PacketOrder
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import USUAL_LIMIT, LinkSettings
-from noack.impairments.loss_guarantee import LossGuarantee
 from noack.impairments.loss_models.bernoulli import BernoulliLoss
 from noack.impairments.markov_chain import (
     LONGEST_PATTERN,

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.core_library import core
-from noack.impairments.loss_guarantee import LossAutomaton, LossGuarantee, Moves, list_moves
+from noack.guarantee.loss_guarantee import LossAutomaton, LossGuarantee, Moves, list_moves
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array  # slow to import

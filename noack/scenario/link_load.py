@@ -26,13 +26,13 @@ from typing import NamedTuple
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.number_format import at_least, at_most
+from noack.guarantee.loss_guarantee import LossWindow
 from noack.impairments.constraints import join_guarantee
 from noack.impairments.disciplines.tail_drop import TailDrop
 from noack.impairments.feature import Impairment, Scheduler
 from noack.impairments.kinds.opportunities import Opportunities
 from noack.impairments.kinds.rate import Rate
 from noack.impairments.kinds.schedule import Schedule
-from noack.impairments.loss_guarantee import LossWindow
 from noack.protocol.wire_format import Flow, datagram_bytes
 from noack.scenario.response_times import Sender, response_ns
 from noack.scenario.run_sections import ProvenDelay

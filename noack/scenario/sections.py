@@ -14,6 +14,7 @@ from noack.controllers.controller_settings import ControllerSettings
 from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.disturbances.disturbance_settings import DisturbanceSettings, Place
+from noack.guarantee.loss_guarantee import LossGuarantee
 from noack.impairments.constraints import join_guarantee, require_consistent
 from noack.impairments.kinds import AnyImpairment
 from noack.impairments.kinds.loss import LossOf
@@ -25,7 +26,6 @@ from noack.impairments.link_settings import (
     require_order,
     require_scores,
 )
-from noack.impairments.loss_guarantee import LossGuarantee
 from noack.impairments.loss_models import Loss
 from noack.impairments.loss_models.lossless import NoLoss
 from noack.observers.observer_settings import NoiseVariances, ObserverSettings

@@ -15,7 +15,7 @@ from scipy.linalg import expm
 
 from controller_node.controller import Controller
 from noack.controllers.linear_feedback import LinearFeedback
-from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
+from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, tables
 from noack.protocol.roles import Notice, Output, Record
 from noack.protocol.wire_format import Flow, Message

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from controller_node.loss_check import LossCheck
-from noack.impairments.loss_guarantee import (
+from noack.guarantee.loss_guarantee import (
     DeliveriesBetweenBursts,
     LongestBurst,
     LossesInWindow,

@@ -23,7 +23,7 @@ from cosim.analysis.adversary.loop_flows import Flags, Pattern, PatternFlow, Seg
 from cosim.simulation.continuous import TooManyEventsError
 from cosim.simulation.exact_simulation import MAX_EVENTS
 from noack.core.linear_systems import Matrix, Vector, firsts_of_equal
-from noack.impairments.loss_guarantee import LossAutomaton, LossGuarantee
+from noack.guarantee.loss_guarantee import LossAutomaton, LossGuarantee
 
 Indices = NDArray[np.int64]
 SearchReport = Callable[[str, int, float], None]

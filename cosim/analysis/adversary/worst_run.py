@@ -10,7 +10,7 @@ from rich.table import Table
 
 from cosim.analysis.adversary.loop_flows import Measure, Objective, ObjectiveValue, Pattern
 from noack.core.number_format import at_least, at_most, number
-from noack.impairments.loss_guarantee import outcome_letters
+from noack.guarantee.loss_guarantee import outcome_letters
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import Constants
 from noack.theory.certificates.certified_bounds import ScenarioCertificate

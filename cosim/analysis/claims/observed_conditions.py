@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.impairments.loss_guarantee import LongestBurst, LossRule
+from noack.guarantee.loss_guarantee import LongestBurst, LossRule
 from noack.protocol.roles import LOOP_ROLES
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import NetworkConditions

@@ -23,7 +23,7 @@ from cosim.analysis.summary.summary_model import (
 from cosim.record.run_events import ActuationTimes, PacketOutcome, changes_of, packet_outcomes
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NEVER_NS
-from noack.impairments.loss_guarantee import LongestBurst
+from noack.guarantee.loss_guarantee import LongestBurst
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,

@@ -18,7 +18,7 @@ from scipy.special import stdtrit
 
 from cosim.simulation.exact_simulation import OK
 from noack.core.linear_systems import Vector
-from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
+from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee
 from noack.impairments.loss_prediction import loss_process
 from noack.impairments.markov_chain import NotPredictableError
 from noack.scenario.resolution import loop_of

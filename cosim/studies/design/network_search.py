@@ -28,8 +28,8 @@ from cosim.studies.design.simplex_search import nelder_mead, step_sizes
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
+from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee
 from noack.impairments.constraints.at_most import AtMost
-from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.settings.section import MatrixRows, rows_of

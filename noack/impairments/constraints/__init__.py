@@ -6,8 +6,8 @@ A constraint allows every delivery, whatever was lost before. So a network can a
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee
 from noack.impairments.feature import Constraint
-from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.settings.section import kinds_in, union_of
 
 _KINDS = kinds_in(__name__, Constraint)

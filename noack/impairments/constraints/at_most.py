@@ -4,9 +4,9 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
+from noack.guarantee.loss_guarantee import LossesInWindow
 from noack.impairments.clauses import Clause, Part
 from noack.impairments.feature import Constraint
-from noack.impairments.loss_guarantee import LossesInWindow
 from noack.impairments.words import COUNT
 
 

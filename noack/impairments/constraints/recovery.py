@@ -4,9 +4,9 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
+from noack.guarantee.loss_guarantee import DeliveriesBetweenBursts
 from noack.impairments.clauses import Clause, Part
 from noack.impairments.feature import Constraint
-from noack.impairments.loss_guarantee import DeliveriesBetweenBursts
 from noack.impairments.words import COUNT
 
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
-from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, LossRule
+from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee, LossRule
 from noack.theory.bounds.gains import ErrorGains, PlantGains
 
 

@@ -1,5 +1,7 @@
 """Certificates: the bounds that hold for a loop before it runs, their conditions and proof.
 
+``noack certify lane_following`` prints those of the paper's example.
+
 From (I1) to a certificate (docs/theory.md, "Certificates"; docs/derivations.md, "Closing the
 loop"):
 

@@ -14,7 +14,7 @@ from noack.core.cached_method import cached_method
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Vector
 from noack.disturbances.step import StepDisturbance
-from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
+from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee
 from noack.impairments.loss_prediction import loss_process
 from noack.impairments.markov_chain import NotPredictableError
 from noack.scenario.resolution import loop_of, setpoint_of

@@ -18,7 +18,7 @@ import numpy as np
 
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
-from noack.impairments.loss_guarantee import LongestBurst, LossAutomaton, LossGuarantee, outcome_letters
+from noack.guarantee.loss_guarantee import LongestBurst, LossAutomaton, LossGuarantee, outcome_letters
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.margins.exact_matrices import IntervalMatrix

@@ -19,7 +19,7 @@ import numpy as np
 from noack.core.clock import NEVER_NS
 from noack.core.linear_systems import Vector
 from noack.core.number_format import at_most
-from noack.impairments.loss_guarantee import LossGuarantee
+from noack.guarantee.loss_guarantee import LossGuarantee
 from noack.impairments.loss_prediction import LossProcess, OutcomeChain
 from noack.impairments.markov_chain import Array, NotPredictableError
 from noack.scenario.resolution import loop_of

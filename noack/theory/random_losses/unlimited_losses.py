@@ -20,7 +20,7 @@ import numpy as np
 
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import spectral_abscissa
-from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
+from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee
 from noack.impairments.loss_prediction import LossProcess, loss_process
 from noack.impairments.markov_chain import NotPredictableError
 from noack.scenario.resolution import LoopMatrices, loop_of

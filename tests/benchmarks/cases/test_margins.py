@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.cases.margins import random_loop
-from noack.impairments.loss_guarantee import LossHistory
+from noack.guarantee.loss_guarantee import LossHistory
 
 
 @pytest.mark.parametrize("seed", [3, 5, 7, 9, 10, 13, 14, 15])  # others take up to a minute

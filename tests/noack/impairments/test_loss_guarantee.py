@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from netem.tc_words import settings_of
-from noack.impairments.kinds.loss import LossOf
-from noack.impairments.loss_guarantee import (
+from noack.guarantee.loss_guarantee import (
     DeliveriesBetweenBursts,
     LongestBurst,
     LossAutomaton,
@@ -21,6 +20,7 @@ from noack.impairments.loss_guarantee import (
     LossRule,
     find_pattern_beyond,
 )
+from noack.impairments.kinds.loss import LossOf
 from noack.impairments.loss_models.scripted import ScriptedLoss
 from noack.protocol.record_tables import Fate
 from tests.oracles.loss_language import allowed_rows

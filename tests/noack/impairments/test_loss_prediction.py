@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from netem.tc_words import settings_of
-from noack.impairments import loss_prediction
-from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_guarantee import (
+from noack.guarantee.loss_guarantee import (
     DeliveriesBetweenBursts,
     LongestBurst,
     LossesInWindow,
     LossGuarantee,
     LossHistory,
 )
+from noack.impairments import loss_prediction
+from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_prediction import (
     LossPrediction,
     LossProcess,

@@ -14,7 +14,7 @@ from noack.controllers.linear_feedback import LinearFeedback
 from noack.core.clock import NEVER_NS
 from noack.core.core_library import core, ffi
 from noack.core.linear_systems import Matrix, Vector, norm, product
-from noack.impairments.loss_guarantee import (
+from noack.guarantee.loss_guarantee import (
     DeliveriesBetweenBursts,
     LongestBurst,
     LossesInWindow,

@@ -24,7 +24,7 @@ from cosim.studies.design.event_design import (
 from cosim.studies.design.hold_strategies import read_holds
 from cosim.studies.design.network_search import CertifiedLoop, DesignRequest, NetworkSearch
 from cosim.studies.design.quick_estimate import PatternGraph
-from noack.impairments.loss_guarantee import LossesInWindow
+from noack.guarantee.loss_guarantee import LossesInWindow
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate

@@ -2,7 +2,7 @@
 
 from hypothesis import assume
 
-from noack.impairments.loss_guarantee import (
+from noack.guarantee.loss_guarantee import (
     DeliveriesBetweenBursts,
     LongestBurst,
     LossesInWindow,

@@ -9,7 +9,7 @@ from scipy.linalg import expm
 
 from cosim.simulation.virtual_time import simulate
 from noack.core.linear_systems import Vector
-from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
+from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load

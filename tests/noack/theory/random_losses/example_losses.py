@@ -3,7 +3,7 @@
 import numpy as np
 
 import noack
-from noack.impairments.loss_guarantee import LossGuarantee
+from noack.guarantee.loss_guarantee import LossGuarantee
 from noack.impairments.loss_prediction import LossProcess, OutcomeChain
 from noack.impairments.markov_chain import Array
 from noack.scenario.resolution import resolve

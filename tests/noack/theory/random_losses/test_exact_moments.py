@@ -8,8 +8,8 @@ import pytest
 from scipy.linalg import solve_discrete_lyapunov
 
 from noack.core.linear_systems import Matrix
+from noack.guarantee.loss_guarantee import LossGuarantee
 from noack.impairments.constraints import join_guarantee
-from noack.impairments.loss_guarantee import LossGuarantee
 from noack.impairments.loss_prediction import loss_process
 from noack.scenario.resolution import loop_of
 from noack.theory.margins.exact_matrices import exactly

@@ -12,7 +12,7 @@ from unittest.mock import patch
 import numpy as np
 
 from noack.core.linear_systems import spectral_abscissa
-from noack.impairments.loss_guarantee import LossGuarantee
+from noack.guarantee.loss_guarantee import LossGuarantee
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.theory.margins import loss_margin

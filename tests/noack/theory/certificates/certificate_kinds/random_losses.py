@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
+from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee
 from noack.impairments.loss_prediction import LossProcess
 from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertificateError
 from noack.theory.bounds.enclosure import NotDecayingError
