@@ -19,24 +19,25 @@ from native.build import HEADER
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("noack", "plant_server", "sensor_node", "controller_node", "netem", "cosim")
 EXEMPT = ("__init__", "__main__")
-MOST_MODULES = 474
+MOST_MODULES = 475
 LINES = {
     "noack/scenario": 4150,
     "noack/controllers": 270,
     "noack/core": 1450,
     "noack/disturbances": 220,
-    "noack/impairments": 4405,
+    "noack/guarantee": 380,
+    "noack/impairments": 4030,
     "noack/machines": 400,
     "noack/observers": 395,
     "noack/plants": 3425,
     "noack/protocol": 1265,
     "noack/runtime": 5790,
     "noack/settings": 600,
-    "noack/theory": 13220,
+    "noack/theory": 13225,
     "noack/traces": 1320,
     "noack/trigger": 1075,
     "netem": 6610,
-    "cosim/analysis": 8455,
+    "cosim/analysis": 8450,
     "cosim/api": 1685,
     "cosim/cli": 3460,
     "cosim/doctor": 810,
