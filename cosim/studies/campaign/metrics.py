@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtrit
+from scipy.special import bdtr, stdtrit
 
 from cosim.simulation.exact_simulation import OK
 from noack.core.linear_systems import Vector
@@ -242,11 +242,10 @@ def interval_ranks(count: int, share: float) -> tuple[int, int]:
 
     They are −1 and ``count`` if no draw bounds the quantile.
     """
-    from scipy.stats import binom  # slow to import
-
     # The j-th smallest draw, from 1, exceeds the quantile if fewer than j draws lie below it.
     tail = (1.0 - CONFIDENCE) / 2
-    low, high = (int(binom.ppf(level, count, share)) for level in (tail, 1.0 - tail))
+    fewer = bdtr(np.arange(count + 1), count, share)
+    low, high = np.searchsorted(fewer, (tail, 1.0 - tail)).tolist()
     return low - 1, min(high, count)
 
 
@@ -279,8 +278,6 @@ class BurstFrequency(NamedTuple):
 
 def burst_frequency(scenario: Scenario, metrics: Mapping[Metric, Vector]) -> BurstFrequency | None:
     """Compare; None if the network enforces the guarantee or the losses cannot be predicted."""
-    from scipy.stats import binomtest  # slow to import
-
     network = scenario.network
     if network.enforce_mansd or scenario.loops:
         return None
@@ -289,6 +286,8 @@ def burst_frequency(scenario: Scenario, metrics: Mapping[Metric, Vector]) -> Bur
     longer, runs = int((bursts[finished] > network.mansd).sum()), int(finished.sum())
     if not runs:
         return None
+    from scipy.stats import binomtest  # slow to import
+
     interval = binomtest(longer, runs).proportion_ci(CONFIDENCE)
     most = int(packets[finished].max())
     try:
