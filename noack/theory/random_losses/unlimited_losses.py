@@ -29,6 +29,7 @@ from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertifica
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, Output, PlantGains, error_gains
 from noack.theory.certificates.assumptions import below
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import most_events, void_by_safe_input
 from noack.theory.certificates.scenario_certificates import CertificateScope
 from noack.theory.random_losses.mean_square_bounds import MeanSquares, mean_squares
@@ -209,15 +210,29 @@ def _bursts(
             probability = losses.keeps(LossGuarantee((LongestBurst(longest),)), events)
         except NotPredictableError:
             break
-        persists = certificate.floor_constants or certificate.persistent_constants
-        rate_per_s = 0.0 if persists else constants.rate_per_s
         bounds = (float(bound(np.zeros(1))[0]) for bound in (certificate.controller_error, certificate.state))
         certificates.append(
-            BurstCertificate(longest, probability, events, constants.delta, rate_per_s, *bounds)
+            BurstCertificate(
+                longest, probability, events, constants.delta, _slowest_rate(certificate), *bounds
+            )
         )
         if probability > _CERTAIN:
             break
     return certificates
+
+
+def _slowest_rate(certificate: ScenarioCertificate) -> float:
+    """Return a rate ρ at which each bound decays, so that its value at 0 bounds its e^{ρt}-fold.
+
+    Where there are several bounds, the value at 0 may be that of one that decays more slowly.
+    """
+    rates: list[float] = []
+    part: ScenarioCertificate | None = certificate
+    while part is not None and part.constants is not None:
+        persists = part.floor_constants or part.persistent_constants
+        rates.append(0.0 if persists else part.constants.rate_per_s)
+        part = part.other
+    return min(rates)
 
 
 def _at_fixed_times(
