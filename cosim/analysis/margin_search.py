@@ -238,7 +238,7 @@ class MarginResult:
         """The margin in words."""
         stable_m = self.stable_m
         parts = []
-        if stable_m is not None and self.every_m:
+        if stable_m == self.caps[-1].m and self.every_m:
             parts = [
                 f"proven stable for every loss pattern that the constraints allow, with every M ≥ {stable_m}"
             ]

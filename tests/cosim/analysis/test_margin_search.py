@@ -86,6 +86,20 @@ def test_constraints_that_limit_the_losses_alone_make_every_m_stable() -> None:
         noack.margin("lane_periodic", most_m=0)
 
 
+@pytest.mark.parametrize(("lower", "verdict"), [(1.1, "destabilises M = 2"), (0.9, "M = 2 is undecided")])
+def test_what_constraints_allow_with_every_m_is_stable_only_if_their_longest_burst_is(
+    lower: float, verdict: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    longest = Stability(lower, 1.2, (True, False), (1.0, 1.0), 0)
+    found = iter([Stability(0.5, 0.8, (True,), (1.0,), 0), longest])
+    monkeypatch.setattr(LossMargin, "stability", lambda *_, **__: next(found))
+    constraints = [{"kind": "at_most", "losses": 1, "window": 4}]
+    margin = find_margin(resolve(held_integrator(**{"network.constraints": constraints})), with_period=False)
+    assert margin.every_m
+    assert margin.verdict.startswith("proven stable for every loss pattern with M ≤ 1;")
+    assert verdict in margin.verdict
+
+
 def test_a_loop_with_events_has_a_margin_for_all_times_between_them() -> None:
     result = invoke("margin", "double_integrator", *DEADLINE, "--json")
     assert result.exit_code == 0, result.output
