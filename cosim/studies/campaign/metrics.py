@@ -278,11 +278,11 @@ class BurstFrequency(NamedTuple):
 
 
 def burst_frequency(scenario: Scenario, metrics: Mapping[Metric, Vector]) -> BurstFrequency | None:
-    """Compare; None if the network enforces the guarantee or the losses cannot be predicted."""
+    """Compare; None if the network enforces the guarantee, or the losses change or cannot be predicted."""
     from scipy.stats import binomtest  # slow to import
 
     network = scenario.network
-    if network.enforce_mansd or scenario.loops:
+    if network.enforce_mansd or scenario.loops or scenario.changes:
         return None
     bursts, packets = metrics["longest_loss_burst"], metrics["transmissions"]
     finished = np.isfinite(bursts)
