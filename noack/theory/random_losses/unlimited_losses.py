@@ -90,7 +90,7 @@ class BurstCertificate(NamedTuple):
     events: int
     """Upper bound of the number of events in a run."""
     delta: float
-    """Δ."""
+    """Δ; of several bounds, or of a sum, that of ‖e_c‖_W at 0 in units of the threshold."""
     rate_per_s: float
     """ρ; 0 if one of the bounds does not decay."""
     controller_error: float
@@ -210,11 +210,15 @@ def _bursts(
             probability = losses.keeps(LossGuarantee((LongestBurst(longest),)), events)
         except NotPredictableError:
             break
-        bounds = (float(bound(np.zeros(1))[0]) for bound in (certificate.controller_error, certificate.state))
+        controller_error, state = (
+            float(bound(np.zeros(1))[0]) for bound in (certificate.controller_error, certificate.state)
+        )
+        delta = constants.delta
+        if certificate.persistent_constants is not None or certificate.other is not None:
+            delta = controller_error / (max(certificate.beta, certificate.floor) or 1.0)
+        rate_per_s = _slowest_rate(certificate)
         certificates.append(
-            BurstCertificate(
-                longest, probability, events, constants.delta, _slowest_rate(certificate), *bounds
-            )
+            BurstCertificate(longest, probability, events, delta, rate_per_s, controller_error, state)
         )
         if probability > _CERTAIN:
             break

@@ -63,3 +63,18 @@ def test_the_largest_value_of_a_run_decays_as_slowly_as_the_bound_that_it_is_tak
     rates_and_states += [(bounds.rate_per_s, bounds.state) for bounds in unlimited.bursts]
     for rate_per_s, state in rates_and_states:
         assert (norms * np.exp(rate_per_s * samples["t_s"].to_numpy())).max() <= state
+
+
+def test_delta_of_a_constant_threshold_bounds_the_whole_error() -> None:
+    """Of the error that decays and the one that does not, Δ was the first alone: 0.03 thresholds."""
+    settings = {
+        "trigger": {"policy": "absolute", "delta": 0.2},
+        "plant.initial_state": [5.0, 0.0],
+        "network.enforce_mansd": False,
+        "network.loss": {"model": "bernoulli", "probability": 1e-6},
+    }
+    scenario = noack.load("double_integrator", settings)
+    unlimited = noack.certify(scenario).unlimited
+    assert unlimited is not None
+    errors = noack.simulate(scenario).samples()["e_c_norm"].to_numpy()
+    assert 0.9 * 0.2 < np.nanmax(errors) <= unlimited.bursts[0].delta * 0.2
