@@ -26,6 +26,7 @@ from noack.impairments.markov_chain import NotPredictableError
 from noack.scenario.resolution import LoopMatrices, loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertificateError
+from noack.theory.bounds.disturbances import normal_bounds
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, Output, PlantGains, error_gains
 from noack.theory.certificates.assumptions import below
@@ -148,7 +149,7 @@ class UnlimitedLosses:
     bursts: tuple[BurstCertificate, ...]
     """For increasing m, as long as there are certificates."""
     runs: tuple[RunMoments, ...]
-    """For r = 1 and 2; none if there is no certificate."""
+    """For r = 1 and 2; none if there is no certificate, or if something is normally distributed."""
     mean_squares: MeanSquares | None
     """At every fixed time, under the schedule's conditions."""
     at_events: tuple[float, ...]
@@ -187,7 +188,8 @@ def unlimited_losses(
         losses.is_independent,
         resolved.timing.horizon_ns / NS_PER_S,
         tuple(bursts),
-        tuple(moments_of_runs(bursts)),
+        # Normal values exceed the assumed bounds in some runs, and then by any amount.
+        tuple(moments_of_runs(bursts)) if normal_bounds(resolved) is None else (),
         moments,
         at_events,
         moments.rate_per_s if moments and moments.rate_per_s > 0 else None,

@@ -78,3 +78,16 @@ def test_delta_of_a_constant_threshold_bounds_the_whole_error() -> None:
     assert unlimited is not None
     errors = noack.simulate(scenario).samples()["e_c_norm"].to_numpy()
     assert 0.9 * 0.2 < np.nanmax(errors) <= unlimited.bursts[0].delta * 0.2
+
+
+def test_no_mean_of_largest_values_is_stated_for_normal_disturbances() -> None:
+    """A certificate excludes runs with a certain probability; what they add to a mean is not bounded."""
+    settings = {
+        "network.enforce_mansd": False,
+        "network.loss": {"model": "bernoulli", "probability": 1e-6},
+        "plant.disturbances": [{"kind": "gaussian", "std": [0.01]}],
+    }
+    unlimited = noack.certify(noack.load("double_integrator", settings)).unlimited
+    assert unlimited is not None
+    assert unlimited.bursts
+    assert not unlimited.runs
