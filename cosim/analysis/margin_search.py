@@ -413,6 +413,8 @@ def find_longest_period(resolved: Scenario, progress: MarginProgress = lambda te
     is_longest = own_margin.shortest_ns < own_margin.longest_ns
     longest = max(resolved.timing.horizon_ns, own_margin.longest_ns) // step_ns
     shortest = own_margin.loop.times.delay_ns // step_ns + 1
+    if is_longest:  # below the policy's least time, all times between updates would be equal
+        shortest = max(shortest, own_margin.shortest_ns // step_ns)
     stable, unstable = 0, 0
     steps = own_margin.longest_ns // step_ns
     while not stable or not unstable:

@@ -66,6 +66,18 @@ def test_verdicts_agree_with_the_bounds() -> None:
     assert f"M ≤ {margin.stable_m}; this pattern destabilises M = {len(growth)}: D" in str(margin)
 
 
+def test_no_longest_time_between_updates_is_below_the_least_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """There the loop is examined with equal times only, not with all up to the longest one."""
+    unstable = Stability(1.1, 1.2, (True,), (0.2,), 0)
+    monkeypatch.setattr(LossMargin, "coarse_bounds", lambda _: unstable)
+    rule = {"policy": "dwell", "interval_s": 0.2, "rule": {"policy": "absolute", "delta": 0.1}}
+    trigger = {"policy": "deadline", "interval_s": 0.8, "rule": rule}
+    scenario = noack.load("double_integrator", {"trigger": trigger, "plant.measure_every": 10})
+    limit = find_longest_period(resolve(scenario))
+    assert limit.is_longest
+    assert (limit.stable_s, limit.unstable_s) == (None, pytest.approx(0.2))
+
+
 def test_a_bound_of_one_m_holds_for_the_others_that_it_implies(monkeypatch: pytest.MonkeyPatch) -> None:
     bounds = (0.5, 0.9), (0.7, 0.95), (0.6, 0.8)
     found = iter([Stability(lower, upper, (True,), (1.0,), 0) for lower, upper in bounds])
