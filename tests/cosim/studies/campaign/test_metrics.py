@@ -11,6 +11,7 @@ from scipy.stats import t as student
 from cosim.shipped_files import find_shipped
 from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS
 from cosim.studies.campaign.metrics import (
+    Metric,
     burst_frequency,
     certified_error,
     compute_metrics,
@@ -18,6 +19,7 @@ from cosim.studies.campaign.metrics import (
     estimate,
     interval_ranks,
 )
+from noack.core.linear_systems import Vector
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load as load_scenario
@@ -119,7 +121,8 @@ def test_the_share_of_runs_with_long_bursts_is_compared_with_its_probability() -
     loss = 'network.loss={model="bernoulli", probability=0.3}'
     settings = ("network.mansd=0", loss, "network.enforce_mansd=false")
     bursts = np.array([0.0, 1.0, 0.0, 3.0, np.inf])
-    metrics = {"longest_loss_burst": bursts, "transmissions": np.array([2.0, 3.0, 4.0, 5.0, np.inf])}
+    sent = np.array([2.0, 3.0, 4.0, 5.0, np.inf])
+    metrics: dict[Metric, Vector] = {"longest_loss_burst": bursts, "transmissions": sent}
     path = find_shipped("lane_following", "scenarios")
     frequency = burst_frequency(load_scenario(path, settings), metrics)
     assert frequency is not None
