@@ -233,7 +233,7 @@ class MarginResult:
         """The margin in words."""
         stable_m = self.stable_m
         parts = []
-        if stable_m is not None and self.every_m:
+        if stable_m == self.caps[-1].m and self.every_m:
             parts = [
                 f"proven stable for every loss pattern that the constraints allow, with every M ≥ {stable_m}"
             ]
@@ -408,6 +408,8 @@ def find_longest_period(resolved: Scenario, progress: MarginProgress = lambda te
     is_longest = own_margin.shortest_ns < own_margin.longest_ns
     longest = max(resolved.timing.horizon_ns, own_margin.longest_ns) // step_ns
     shortest = own_margin.loop.times.delay_ns // step_ns + 1
+    if is_longest:  # below the policy's least time, all times between updates would be equal
+        shortest = max(shortest, own_margin.shortest_ns // step_ns)
     stable, unstable = 0, 0
     steps = own_margin.longest_ns // step_ns
     while not stable or not unstable:

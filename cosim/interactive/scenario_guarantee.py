@@ -126,6 +126,8 @@ def _reason(certificate: ScenarioCertificate) -> str:
     rate = f"decay at the rate {at_least(constants.rate_per_s, 3)} /s"
     if certificate.persistent_constants is not None:
         return f"{patterns}: all errors stay bounded; what the start causes {rate}"
+    if certificate.floor_constants is not None:
+        return f"{patterns}: all errors {rate} down to what the threshold's floor leaves"
     return f"{patterns}: all errors {rate}"
 
 

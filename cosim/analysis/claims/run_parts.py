@@ -30,6 +30,7 @@ from noack.runtime.life_cycle import HORIZON
 from noack.scenario.resolution import loop_of, policy_of, setpoint_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.disturbances import bound_forcing
+from noack.theory.bounds.enclosure import factors
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import about_setpoint
 
@@ -56,6 +57,8 @@ class RunPart(NamedTuple):
 
 _TIMES = ("t_ns", "now_ns", "model_t_ns", "release_ns", "copy_ns")
 _STATES = ("x", "x_s", "x_c", "x_c_before", "x_s_before")
+_ROUNDED = 1e-9
+"""Share of an input outside of the range of K that is rounding."""
 
 
 def cut_part(record: RunRecord, scenario: Scenario, origin_ns: int, sequence: int | None) -> RunRecord:
@@ -127,6 +130,8 @@ def start_error(part_record: RunRecord, started_s: float) -> float:
 
     u is constant within a step. So ‖u − Kx‖ is at most the larger of its values at both ends, plus
     a term for the curvature of x: Δt²/8 sup‖K A ẋ‖, with ẋ = e^{As}(Ax + Bu + Dw), w constant.
+    Infinite: u is not in the range of K, in which the bounds have it. It may be outside if K has
+    fewer independent rows than there are inputs, and u was that of a set-point with another u_r.
     """
     alpha = policy_of(part_record.scenario).fading_per_s
     largest, last = 0.0, np.zeros(0, part_record.tables[PLANT_STEP])
@@ -145,6 +150,10 @@ def _input_error(part_record: RunRecord, steps: Rows, alpha_per_s: float) -> flo
     """Return the bound of ‖u − Kx‖ e^{αt} over at least two steps."""
     loop = part_record.loop
     x, u, dt_s = steps["x"], steps["u"][:-1], part_record.scenario.timing.plant_period_ns * 1e-9
+    basis, _ = factors(loop.K)
+    outside = row_norms(u - u @ basis @ basis.T)
+    if (outside > _ROUNDED * (row_norms(u) + row_norms(x[:-1] @ loop.K.T))).any():
+        return math.inf
     ends = np.maximum(row_norms(u - x[:-1] @ loop.K.T), row_norms(u - x[1:] @ loop.K.T))
     speed = x[:-1] @ loop.A.T + u @ loop.B.T
     grown = math.exp(min(float(np.linalg.norm(loop.A, 2)) * dt_s, 700.0))

@@ -277,9 +277,9 @@ class BurstFrequency(NamedTuple):
 
 
 def burst_frequency(scenario: Scenario, metrics: Mapping[Metric, Vector]) -> BurstFrequency | None:
-    """Compare; None if the network enforces the guarantee or the losses cannot be predicted."""
+    """Compare; None if the network enforces the guarantee, or the losses change or cannot be predicted."""
     network = scenario.network
-    if network.enforce_mansd or scenario.loops:
+    if network.enforce_mansd or scenario.loops or scenario.changes:
         return None
     bursts, packets = metrics["longest_loss_burst"], metrics["transmissions"]
     finished = np.isfinite(bursts)

@@ -69,7 +69,7 @@ class BoxGains(PlantGains):
     def start_up(self, start_s: float) -> tuple[Vector, Mapping[str, Vector]]:
         """Return the effect of zero input before ``start_s``: p = −K x, x' = A x for every A.
 
-        With zero input w = Ã x, which the bound of w covers.
+        With zero input w = Ã x, and B̃ times its disturbance, which the bound of w covers.
         """
         if start_s == 0:
             return np.zeros(()), dict.fromkeys(self.outputs, np.zeros(()))
@@ -83,12 +83,15 @@ class BoxGains(PlantGains):
         R, box = self.error.split_K[1], spectral_norm(self.halfwidth_A)
         # ‖e^{As}‖ ≤ e^{μs}; the logarithmic norm μ of a sum is at most the sum of both norms.
         mu = max(float(logarithmic_norm(self.A) + box), 0.0) + self.alpha_per_s
-        limited = self._forcing.limited
-        size = spectral_norm(self.start) + start_s * np.linalg.norm(limited, axis=0).sum()
+        # A disturbance of the input enters through B̂, and through B̃.
+        limited, added = self._forcing.limited, self.halfwidth_B @ self._forcing.at_input
+        entering = np.linalg.norm(limited, axis=0).sum() + np.linalg.norm(added)
+        size = spectral_norm(self.start) + start_s * entering
         size = size * math.exp(mu * start_s)
         rate = spectral_norm(R @ self.A) + spectral_norm(R) * box
         at_start = spectral_norm(R @ self.start) * math.exp(self.alpha_per_s * start_s)
-        error = at_start + start_s * (rate * size + np.linalg.norm(R @ limited, axis=0).sum())
+        entering = np.linalg.norm(R @ limited, axis=0).sum() + np.linalg.norm(np.abs(R) @ added)
+        error = at_start + start_s * (rate * size + entering)
         impulse = error * start_s
         peaks_of = np.array([peaks.impulse for peaks in self._coordinates])
         return error, impulse, self._bound_of_w(impulse[..., None] * peaks_of)

@@ -41,6 +41,7 @@ has a certificate is used."""
 _SHARES_OF_ALPHA = (0.8, 0.6, 0.4, 0.2)
 """Rates that are tried for a box, as shares of α."""
 _TOO_LARGE = "intermediate results are too large or too small for floating point"
+_OUTSIDE_RANGE = "at its start the input was not in the range of K, where the bounds have it"
 _LARGEST_START = 1e150
 """The squares of larger entries of x(0) may overflow."""
 
@@ -132,7 +133,8 @@ class CertificateScope:
         plant_at: returns the plants' gains.
         start_error: sup‖u − Kx‖, scaled, while the plant still applies inputs of an earlier run
             at the start. The certificate exists only if its own π is at least that large, so that
-            it covers these inputs. None: no run came before.
+            it covers these inputs. Infinite: they are not in the range of K. None: no run came
+            before.
         start: x(0), or a matrix that maps the unit ball to a set of x(0), (n, k); by default that
             of the scenario.
     """
@@ -185,6 +187,8 @@ class CertificateScope:
         try:
             if beforehand and (why := void_by_safe_input(self._resolved, conditions)) is not None:
                 raise NoCertificateError(why)
+            if math.isinf(self._start_error):
+                raise NoCertificateError(_OUTSIDE_RANGE)
             phases = yield from self.all_phases(conditions)
         except (NotDecayingError, NoCertificateError) as error:
             void = self._overflow() or error

@@ -26,9 +26,11 @@ from noack.impairments.markov_chain import NotPredictableError
 from noack.scenario.resolution import LoopMatrices, loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertificateError
+from noack.theory.bounds.disturbances import normal_bounds
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, Output, PlantGains, error_gains
 from noack.theory.certificates.assumptions import below
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import most_events, void_by_safe_input
 from noack.theory.certificates.scenario_certificates import CertificateScope
 from noack.theory.random_losses.mean_square_bounds import MeanSquares, mean_squares
@@ -89,7 +91,7 @@ class BurstCertificate(NamedTuple):
     events: int
     """Upper bound of the number of events in a run."""
     delta: float
-    """Δ."""
+    """Δ; of several bounds, or of a sum, that of ‖e_c‖_W at 0 in units of the threshold."""
     rate_per_s: float
     """ρ; 0 if one of the bounds does not decay."""
     controller_error: float
@@ -147,7 +149,7 @@ class UnlimitedLosses:
     bursts: tuple[BurstCertificate, ...]
     """For increasing m, as long as there are certificates."""
     runs: tuple[RunMoments, ...]
-    """For r = 1 and 2; none if there is no certificate."""
+    """For r = 1 and 2; none if there is no certificate, or if something is normally distributed."""
     mean_squares: MeanSquares | None
     """At every fixed time, under the schedule's conditions."""
     at_events: tuple[float, ...]
@@ -186,7 +188,8 @@ def unlimited_losses(
         losses.is_independent,
         resolved.timing.horizon_ns / NS_PER_S,
         tuple(bursts),
-        tuple(moments_of_runs(bursts)),
+        # Normal values exceed the assumed bounds in some runs, and then by any amount.
+        tuple(moments_of_runs(bursts)) if normal_bounds(resolved) is None else (),
         moments,
         at_events,
         moments.rate_per_s if moments and moments.rate_per_s > 0 else None,
@@ -209,15 +212,33 @@ def _bursts(
             probability = losses.keeps(LossGuarantee((LongestBurst(longest),)), events)
         except NotPredictableError:
             break
-        persists = certificate.floor_constants or certificate.persistent_constants
-        rate_per_s = 0.0 if persists else constants.rate_per_s
-        bounds = (float(bound(np.zeros(1))[0]) for bound in (certificate.controller_error, certificate.state))
+        controller_error, state = (
+            float(bound(np.zeros(1))[0]) for bound in (certificate.controller_error, certificate.state)
+        )
+        delta = constants.delta
+        if certificate.persistent_constants is not None or certificate.other is not None:
+            delta = controller_error / (max(certificate.beta, certificate.floor) or 1.0)
+        rate_per_s = _slowest_rate(certificate)
         certificates.append(
-            BurstCertificate(longest, probability, events, constants.delta, rate_per_s, *bounds)
+            BurstCertificate(longest, probability, events, delta, rate_per_s, controller_error, state)
         )
         if probability > _CERTAIN:
             break
     return certificates
+
+
+def _slowest_rate(certificate: ScenarioCertificate) -> float:
+    """Return a rate ρ at which each bound decays, so that its value at 0 bounds its e^{ρt}-fold.
+
+    Where there are several bounds, the value at 0 may be that of one that decays more slowly.
+    """
+    rates: list[float] = []
+    part: ScenarioCertificate | None = certificate
+    while part is not None and part.constants is not None:
+        persists = part.floor_constants or part.persistent_constants
+        rates.append(0.0 if persists else part.constants.rate_per_s)
+        part = part.other
+    return min(rates)
 
 
 def _at_fixed_times(

@@ -66,6 +66,19 @@ def test_verdicts_agree_with_the_bounds() -> None:
     assert f"M ≤ {margin.stable_m}; this pattern destabilises M = {len(growth)}: D" in str(margin)
 
 
+def test_no_longest_time_between_updates_is_below_the_least_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """There the loop is examined with equal times only, not with all up to the longest one."""
+    unstable = Stability(1.1, 1.2, (True,), (0.2,), 0)
+    monkeypatch.setattr(LossMargin, "coarse_bounds", lambda _: unstable)
+    rule = {"policy": "dwell", "interval_s": 0.2, "rule": {"policy": "absolute", "delta": 0.1}}
+    trigger = {"policy": "deadline", "interval_s": 0.8, "rule": rule}
+    scenario = noack.load("double_integrator", {"trigger": trigger, "plant.measure_every": 10})
+    limit = find_longest_period(resolve(scenario))
+    assert limit.is_longest
+    assert limit.stable_s is None
+    assert limit.unstable_s == pytest.approx(0.2)
+
+
 def test_a_bound_of_one_m_holds_for_the_others_that_it_implies(monkeypatch: pytest.MonkeyPatch) -> None:
     bounds = (0.5, 0.9), (0.7, 0.95), (0.6, 0.8)
     found = iter([Stability(lower, upper, (True,), (1.0,), 0) for lower, upper in bounds])
@@ -84,6 +97,20 @@ def test_constraints_that_limit_the_losses_alone_make_every_m_stable() -> None:
     assert margin.to_json()["period"] is None
     with pytest.raises(noack.NoackError, match="most_m 0: expected"):
         noack.margin("lane_periodic", most_m=0)
+
+
+@pytest.mark.parametrize(("lower", "verdict"), [(1.1, "destabilises M = 2"), (0.9, "M = 2 is undecided")])
+def test_what_constraints_allow_with_every_m_is_stable_only_if_their_longest_burst_is(
+    lower: float, verdict: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    longest = Stability(lower, 1.2, (True, False), (1.0, 1.0), 0)
+    found = iter([Stability(0.5, 0.8, (True,), (1.0,), 0), longest])
+    monkeypatch.setattr(LossMargin, "stability", lambda *_, **__: next(found))
+    constraints = [{"kind": "at_most", "losses": 1, "window": 4}]
+    margin = find_margin(resolve(held_integrator(**{"network.constraints": constraints})), with_period=False)
+    assert margin.every_m
+    assert margin.verdict.startswith("proven stable for every loss pattern with M ≤ 1;")
+    assert verdict in margin.verdict
 
 
 def test_a_loop_with_events_has_a_margin_for_all_times_between_them() -> None:

@@ -99,6 +99,14 @@ def test_without_ipywidgets_one_line_says_what_to_install(monkeypatch: pytest.Mo
         noack.explore("double_integrator").widget()
 
 
+def test_errors_are_said_to_decay_as_far_as_the_threshold_does() -> None:
+    """With a floor of 0.02 ‖x‖ is 0.0065 after 60 s, and not e^(−0.3 t) = 1.5e-8."""
+    explorer = noack.explore("double_integrator", {"trigger.floor": 0.0})
+    assert explorer.certificate.reason.endswith("all errors decay at the rate 0.3 /s")
+    explorer.set({"trigger.floor": 0.02})
+    assert explorer.certificate.reason.endswith("down to what the threshold's floor leaves")
+
+
 def test_a_loop_that_is_unstable_says_why_and_is_drawn() -> None:
     explorer = noack.explore("lane_following")
     A, B = explorer.scenario.plant.uncertainty_A, explorer.scenario.plant.uncertainty_B

@@ -357,6 +357,29 @@ def test_a_plant_that_does_not_rest_at_the_set_point_has_a_constant_disturbance(
     assert identity.verdict is ClaimVerdict.HELD
 
 
+@pytest.mark.parametrize("changes", [(), ((1.001, {"controller.setpoint": [0.0, 2.0]}),)])
+def test_an_input_outside_the_range_of_the_gain_has_no_certificate(changes: tuple[Any, ...]) -> None:
+    """Only the set-point's u_r uses the second input, which no bound of p = U Uᵀ p knows.
+
+    Without the condition ‖e_s‖ is 2.7 times its bound, and events are 390 times as close as certified.
+    """
+    content = {
+        "name": "redundant", "horizon_s": 2.0,
+        "model": {"A": [[0.5, 0.0], [0.0, -1.0]], "B": [[1e-3, 0.0], [0.0, 1.0]],
+                  "gain": [[-1500.0, 0.0], [0.0, 0.0]]},
+        "plant": {"initial_state": [1e-4, 0.0], "rate_hz": 500.0},
+        "controller": {"rate_hz": 100.0, "setpoint": [0.0, 1.0]},
+        "trigger": {"beta": 1e-3, "alpha_per_s": 0.3},
+        "network": {"mansd": 0, "loss": {"model": "bernoulli", "probability": 0.0}},
+        "changes": [{"at_s": at_s, "set": values} for at_s, values in changes],
+    }  # fmt: skip
+    claims = RunClaims(simulate(resolve(validate(content, "redundant")))).evaluate()
+    assert VIOLATED not in {claim.verdict for claim in claims}
+    reasons = [claim.why for claim in claims if claim.source == "certificate"]
+    assert len(reasons) == 1 + len(changes)
+    assert all("not in the range of K" in why for why in reasons)
+
+
 @pytest.mark.parametrize(("name", "norms"), [("lane_weighted", {"W"}), ("double_integrator", {""})])
 def test_formulas_have_the_weight_of_the_triggers_norm(name: str, norms: set[str]) -> None:
     claims = RunClaims(simulate(resolved(name, "horizon_s=2"))).evaluate()

@@ -11,6 +11,7 @@ from scipy.stats import t as student
 from cosim.shipped_files import find_shipped
 from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS
 from cosim.studies.campaign.metrics import (
+    Metric,
     burst_frequency,
     certified_error,
     compute_metrics,
@@ -18,6 +19,7 @@ from cosim.studies.campaign.metrics import (
     estimate,
     interval_ranks,
 )
+from noack.core.linear_systems import Vector
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load as load_scenario
@@ -119,11 +121,14 @@ def test_the_share_of_runs_with_long_bursts_is_compared_with_its_probability() -
     loss = 'network.loss={model="bernoulli", probability=0.3}'
     settings = ("network.mansd=0", loss, "network.enforce_mansd=false")
     bursts = np.array([0.0, 1.0, 0.0, 3.0, np.inf])
-    frequency = burst_frequency(
-        load_scenario(find_shipped("lane_following", "scenarios"), settings),
-        {"longest_loss_burst": bursts, "transmissions": np.array([2.0, 3.0, 4.0, 5.0, np.inf])},
-    )
+    sent = np.array([2.0, 3.0, 4.0, 5.0, np.inf])
+    metrics: dict[Metric, Vector] = {"longest_loss_burst": bursts, "transmissions": sent}
+    path = find_shipped("lane_following", "scenarios")
+    frequency = burst_frequency(load_scenario(path, settings), metrics)
     assert frequency is not None
     assert (frequency.longer, frequency.runs, frequency.packets) == (2, 4, 5)
     assert frequency.predicted == pytest.approx(1 - 0.7**4)  # the first packet is delivered
     assert frequency.low < 0.5 < frequency.high
+    # The losses from a change on are not those of the scenario's start.
+    changes = 'changes=[{at_s=1.0, set={"network.loss.probability"=0.9}}]'
+    assert burst_frequency(load_scenario(path, (*settings, changes)), metrics) is None

@@ -6,7 +6,7 @@ import pytest
 from noack.theory.bounds.box import BoxGains
 from noack.theory.bounds.certificate_terms import Constants, NetworkConditions, TriggerBound
 from noack.theory.bounds.enclosure import NotDecayingError
-from noack.theory.bounds.gains import ErrorGains
+from noack.theory.bounds.gains import ErrorGains, Forcing
 from noack.theory.certificates.solution import solve
 
 
@@ -40,3 +40,16 @@ def test_a_scalar_box_is_as_large_as_it_can_be(alpha: float, share_of_A: float) 
         # w of the state and of the corresponding input.
         w = size * (half_A * state + half_B * (-k * state + p))
         assert constants.mismatch == pytest.approx(w, rel=1e-3)
+
+
+@pytest.mark.parametrize("start_s", [0.1, 1.0, 5.0])
+def test_before_the_first_input_a_disturbance_of_the_input_enters_through_the_whole_of_b(
+    start_s: float,
+) -> None:
+    """An integrator with b up to 1.5 and a disturbance of 1 is at 1.5 t before its first input."""
+    unit = np.eye(1)
+    forcing = Forcing(unit, np.array([np.inf]), np.ones(1))
+    zero, models = 0 * unit, ErrorGains(-unit, -unit, unit, 0.0)
+    plant = BoxGains(models, zero, unit, zero, 0.0, zero, 0.5 * unit, forcing=forcing)
+    input_error, _ = plant.start_up(start_s)
+    assert float(input_error) >= 1.5 * start_s

@@ -1,7 +1,9 @@
 """Moments at events and of a run's largest values: closed forms, and sums by hand."""
 
+import numpy as np
 import pytest
 
+import noack
 from noack.theory.random_losses import unlimited_losses
 from noack.theory.random_losses.unlimited_losses import BurstCertificate, moment_at_events, moments_of_runs
 from tests.noack.theory.random_losses.example_losses import BURSTY, independent, scalar_loop
@@ -39,3 +41,53 @@ def test_the_mean_of_the_largest_values_of_runs_by_hand() -> None:
     assert root_mean_square.state == pytest.approx(10 * root_mean_square.controller_error)
     assert (mean.most, mean.probability, mean.rate_per_s) == (2, 1.0, 0.5)
     assert moments_of_runs([]) == []
+
+
+def test_the_largest_value_of_a_run_decays_as_slowly_as_the_bound_that_it_is_taken_from() -> None:
+    """A deadline has bounds with a rate and smaller ones without: they must not be mixed.
+
+    Hardly any update is lost, so a lossless run shows the mean of all runs.
+    """
+    rule = {"policy": "absolute", "delta": 0.05}
+    settings = {
+        "trigger": {"policy": "deadline", "interval_s": 0.2, "rule": rule},
+        "network.enforce_mansd": False,
+        "network.loss": {"model": "bernoulli", "probability": 1e-6},
+    }
+    scenario = noack.load("double_integrator", settings)
+    unlimited = noack.certify(scenario).unlimited
+    assert unlimited is not None
+    samples = noack.simulate(scenario).samples()
+    norms = np.hypot(samples["x_1"].to_numpy(), samples["x_2"].to_numpy())
+    rates_and_states = [(bounds.rate_per_s, bounds.state) for bounds in unlimited.runs]
+    rates_and_states += [(bounds.rate_per_s, bounds.state) for bounds in unlimited.bursts]
+    for rate_per_s, state in rates_and_states:
+        assert (norms * np.exp(rate_per_s * samples["t_s"].to_numpy())).max() <= state
+
+
+def test_delta_of_a_constant_threshold_bounds_the_whole_error() -> None:
+    """Of the error that decays and the one that does not, Δ was the first alone: 0.03 thresholds."""
+    settings = {
+        "trigger": {"policy": "absolute", "delta": 0.2},
+        "plant.initial_state": [5.0, 0.0],
+        "network.enforce_mansd": False,
+        "network.loss": {"model": "bernoulli", "probability": 1e-6},
+    }
+    scenario = noack.load("double_integrator", settings)
+    unlimited = noack.certify(scenario).unlimited
+    assert unlimited is not None
+    errors = noack.simulate(scenario).samples()["e_c_norm"].to_numpy()
+    assert 0.9 * 0.2 < np.nanmax(errors) <= unlimited.bursts[0].delta * 0.2
+
+
+def test_no_mean_of_largest_values_is_stated_for_normal_disturbances() -> None:
+    """A certificate excludes runs with a certain probability; what they add to a mean is not bounded."""
+    settings = {
+        "network.enforce_mansd": False,
+        "network.loss": {"model": "bernoulli", "probability": 1e-6},
+        "plant.disturbances": [{"kind": "gaussian", "std": [0.01]}],
+    }
+    unlimited = noack.certify(noack.load("double_integrator", settings)).unlimited
+    assert unlimited is not None
+    assert unlimited.bursts
+    assert not unlimited.runs
