@@ -117,10 +117,9 @@ class Controller(MachinePart):
             flow=Flow.UPDATE,
             first_number=start.first_number,
             period_ns=period_ns,
-            first_ns=self.first_ns,
             horizon_ns=self.horizon_ns,
-            step=step,
         )
+        controller.machine.first_ns, controller.machine.step = self.first_ns, step
         steps_ns = (period_ns, self.first_ns, period_ns - self.first_ns)
         transitions = memory.transitions(self.H, steps_ns)
         memory.set_model(controller.model, transitions, (), self._points)

@@ -55,8 +55,8 @@ settings.load_profile("noack")
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     def place(item: pytest.Item) -> int:
-        found = (place for place, begin in enumerate(FIRST) if item.nodeid.startswith(begin))
-        return next(found, len(FIRST))
+        places = (place for place, begin in enumerate(FIRST) if item.nodeid.startswith(begin))
+        return next(places, len(FIRST))
 
     items.sort(key=place)
     if settings().derandomize:

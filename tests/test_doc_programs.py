@@ -77,8 +77,8 @@ def test_every_command_works(command: str, run_folder: Path, monkeypatch: pytest
 def snippets() -> list[str]:
     """Return programs; a snippet that begins with a file name is a file instead."""
     pages = ("docs/plants.md", "docs/record.md", "docs/library.md", "docs/howto.md")
-    found = [code for page in pages for code in blocks(page, "python")]
-    return [snippet for snippet in found if not snippet.startswith("#")]
+    programs = [code for page in pages for code in blocks(page, "python")]
+    return [snippet for snippet in programs if not snippet.startswith("#")]
 
 
 @pytest.mark.usefixtures("without_viewer")
@@ -143,7 +143,7 @@ def shape(line: str) -> str:
 
 
 def numbers(line: str) -> list[float]:
-    return [float(found[0].strip(".").replace(",", "")) for found in NUMBER.finditer(line)]
+    return [float(match[0].strip(".").replace(",", "")) for match in NUMBER.finditer(line)]
 
 
 def alike(line: str, other: str) -> bool:

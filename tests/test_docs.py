@@ -98,12 +98,12 @@ def test_every_word_of_the_emulator_is_documented_and_understood() -> None:
 def documented_keys(text: str) -> set[str]:
     """Names in the left column of tables; a leading dot: the section of the row's first name."""
     rows = [line.split("|")[1] for line in text.splitlines() if line.startswith("| `")]
-    found: set[str] = set()
+    keys: set[str] = set()
     for row in rows:
         names = re.findall(r"`([^`]+)`", row)
         section = names[0].partition(".")[0]
-        found |= {name if not name.startswith(".") else section + name for name in names}
-    return found
+        keys |= {name if not name.startswith(".") else section + name for name in names}
+    return keys
 
 
 def test_every_key_of_a_campaign_is_documented_and_no_other() -> None:
@@ -235,14 +235,14 @@ def texts() -> list[Path]:
 
 
 def test_no_phrase_of_the_list_is_left() -> None:
-    found = [
+    phrases = [
         f"{path.relative_to(ROOT)}: {phrase}"
         for path in texts()
         if path.is_file()
         for phrase in PHRASES
         if phrase in path.read_text(encoding="utf-8")
     ]
-    assert found == []
+    assert phrases == []
 
 
 def test_the_glossary_of_the_documentation_is_that_of_the_program() -> None:
@@ -261,8 +261,8 @@ def test_each_process_has_a_container_with_a_command_of_noack(name: str) -> None
         add_options(parser := Parser(allow_abbrev=False))
         assert parser.parse_args(arguments).invitation
         return
-    one = typer.main.get_command(app).commands[command]  # type: ignore[attr-defined]
-    context = one.make_context(command, arguments)
+    typer_command = typer.main.get_command(app).commands[command]  # type: ignore[attr-defined]
+    context = typer_command.make_context(command, arguments)
     assert str(context.params["invitation"]) == "/invitation/run.json"
 
 

@@ -123,11 +123,11 @@ class Module:
         """The numbers that MARKS limits, in alphabetical order."""
         lines = ["", *self.text.splitlines()]
         unexplained = {
-            one.lineno
+            node.lineno
             for function in self.functions
-            for one in statements(function)
-            if isinstance(one, ast.Import | ast.ImportFrom)
-            and "#" not in lines[one.lineno] + lines[one.lineno - 1]
+            for node in statements(function)
+            if isinstance(node, ast.Import | ast.ImportFrom)
+            and "#" not in lines[node.lineno] + lines[node.lineno - 1]
         }
         return {
             "Any": sum(bool(re.search(r"\bAny\b", line)) for line in lines),
@@ -138,7 +138,7 @@ class Module:
     @cached_property
     def functions(self) -> list[ast.FunctionDef | ast.AsyncFunctionDef]:
         kinds = (ast.FunctionDef, ast.AsyncFunctionDef)
-        return [one for one in statements(self.tree) if isinstance(one, kinds)]
+        return [node for node in statements(self.tree) if isinstance(node, kinds)]
 
 
 def statements(node: ast.AST) -> Iterator[ast.AST]:
@@ -159,9 +159,9 @@ def modules() -> list[Module]:
     )
     texts = ((path, path.read_text(encoding="utf-8")) for path in paths)
     gc.disable()  # of a million new objects none is garbage, and the search for some takes 5 s
-    found = [Module(path, text, ast.parse(text)) for path, text in texts]
+    parsed = [Module(path, text, ast.parse(text)) for path, text in texts]
     gc.enable()
-    return found
+    return parsed
 
 
 def test_base_names_of_modules_are_unique() -> None:
@@ -171,8 +171,8 @@ def test_base_names_of_modules_are_unique() -> None:
 
 
 def test_names_of_classes_are_unique() -> None:
-    names = Counter(one.name for module in modules() for one in statements(module.tree)
-                    if isinstance(one, ast.ClassDef))  # fmt: skip
+    names = Counter(node.name for module in modules() for node in statements(module.tree)
+                    if isinstance(node, ast.ClassDef))  # fmt: skip
     assert len(names) > 700
     assert [name for name, count in names.items() if count > 1] == []
 
@@ -196,12 +196,12 @@ def test_there_are_not_more_modules() -> None:
 
 
 def test_no_folder_has_more_marks_than_its_budget() -> None:
-    found: dict[str, Counter[str]] = {}
+    marks: dict[str, Counter[str]] = {}
     for module in modules():
-        found.setdefault(module.folder, Counter()).update(module.marks)
+        marks.setdefault(module.folder, Counter()).update(module.marks)
     larger = {
         f"{folder}: {kind}": number
-        for folder, numbers in found.items()
+        for folder, numbers in marks.items()
         for budget, (kind, number) in zip(MARKS.get(folder, (0, 0, 0)), sorted(numbers.items()), strict=True)
         if number > budget
     }
@@ -210,10 +210,10 @@ def test_no_folder_has_more_marks_than_its_budget() -> None:
 
 def test_functions_have_at_most_60_lines() -> None:
     long = {
-        one.name
+        function.name
         for module in modules()
-        for one in module.functions
-        if (one.end_lineno or one.lineno) - one.lineno >= 60
+        for function in module.functions
+        if (function.end_lineno or function.lineno) - function.lineno >= 60
     }
     assert long <= LONG_FUNCTIONS
 
@@ -221,7 +221,7 @@ def test_functions_have_at_most_60_lines() -> None:
 def test_a_folder_has_few_modules() -> None:
     files = Counter(str(module.path.parent.relative_to(ROOT)) for module in modules()
                     if module.path.stem not in EXEMPT)  # fmt: skip
-    assert {one: n for one, n in files.items() if n > FILES.get(one, MOST_FILES)} == {}
+    assert {folder: n for folder, n in files.items() if n > FILES.get(folder, MOST_FILES)} == {}
 
 
 def test_no_modules_import_each_other_in_a_circle() -> None:

@@ -123,15 +123,13 @@ def set_machine(
     flow: Flow,
     first_number: int = 0,
     period_ns: int = 0,
-    first_ns: int = 0,
     horizon_ns: int,
-    step: int = 0,
 ) -> None:
-    """Fill a ``noack_machine`` at its start."""
+    """Fill a new ``noack_machine``; its ticks begin at time 0."""
     machine.n, machine.m = n, m
     machine.first_number = machine.inputs = first_number
-    machine.period_ns, machine.first_ns, machine.horizon_ns = period_ns, first_ns, horizon_ns
-    machine.step, machine.reached_ns, machine.change_ns = step, -1, NEVER_NS
+    machine.period_ns, machine.horizon_ns = period_ns, horizon_ns
+    machine.reached_ns, machine.change_ns = -1, NEVER_NS
     machine.received.flow, machine.received.entries = flow, entries
     machine.acknowledgements.flow = Flow.ACKNOWLEDGEMENT
     for reception in (machine.received, machine.acknowledgements):

@@ -156,13 +156,13 @@ def have_read(targets: list[Target], processes: Mapping[str, "subprocess.Popen[s
 
 def unread_bytes(pid: int) -> dict[int, int]:
     """Return the bytes that wait in the UDP sockets of a process's host, by port."""
-    found: dict[int, int] = {}
+    unread: dict[int, int] = {}
     for name in ("udp", "udp6"):
         for line in Path(f"/proc/{pid}/net/{name}").read_text().splitlines()[1:]:
             _, local, _, _, queues, *_ = line.split()
             port, waiting_bytes = (int(word.rpartition(":")[2], 16) for word in (local, queues))
-            found[port] = found.get(port, 0) + waiting_bytes
-    return found
+            unread[port] = unread.get(port, 0) + waiting_bytes
+    return unread
 
 
 def _addresses(hosts: TwoHosts) -> tuple[str, str]:

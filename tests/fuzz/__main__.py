@@ -48,9 +48,9 @@ def fuzz(name: str, seconds: int) -> tuple[bool, str]:
     executions, _, features = map(int, reports[-1]) if reports else (0, 0, 0)
     findings = _findings_in(folder)
     is_bad = bool(findings or done.returncode or not executions)
-    found = f"status {done.returncode}, see {log}" if is_bad else "no finding"
+    outcome = f"status {done.returncode}, see {log}" if is_bad else "no finding"
     shown = [f"    python -m tests.fuzz show {name} {path.relative_to(ROOT)}" for path in findings]
-    said = f"  {name}: {executions:,} executions, {features:,} features, {found}"
+    said = f"  {name}: {executions:,} executions, {features:,} features, {outcome}"
     return is_bad, "\n".join([said, *shown])
 
 

@@ -61,10 +61,10 @@ class Harness:
 @cache
 def parsers() -> Mapping[str, Harness]:
     """Return all parsers by name."""
-    found: dict[str, Harness] = {}
+    harnesses: dict[str, Harness] = {}
     for path in sorted((FOLDER / "parsers").glob("[a-z]*.py")):
-        found |= importlib.import_module(f"tests.fuzz.parsers.{path.stem}").PARSERS
-    return found
+        harnesses |= importlib.import_module(f"tests.fuzz.parsers.{path.stem}").PARSERS
+    return harnesses
 
 
 def kept_inputs(name: str) -> list[bytes]:

@@ -36,14 +36,14 @@ def compare_lines(path: Path, lines_of: Callable[[str], Sequence[str]]) -> None:
 
     An input is a line of its own, and what it gives is indented below it; ``#`` begins a heading.
     """
-    found: list[str] = []
+    lines: list[str] = []
     for line in path.read_text(encoding="utf-8").splitlines():
         if line.startswith("    "):
             continue
-        found.append(line)
+        lines.append(line)
         if not line.startswith("#"):
-            found += [f"    {output_line}" for output_line in lines_of(line)]
-    compare_text(path, "\n".join(found) + "\n")
+            lines += [f"    {output_line}" for output_line in lines_of(line)]
+    compare_text(path, "\n".join(lines) + "\n")
 
 
 def lines_of_error(call: Callable[[], object], **places: Path) -> list[str]:

@@ -72,15 +72,15 @@ TABLES: dict[str, Table] = {
 
 def drawn(table: Table, rng: np.random.Generator, n: int = 2, weight: Matrix | None = None) -> Table:
     """A table for n states; "quadratic" gets a random matrix."""
-    found = {
+    values = {
         key: rng.choice(value).item() if isinstance(value, tuple) else value for key, value in table.items()
     }
-    if "rule" in found:
-        return found | {"rule": drawn(found["rule"], rng, n, weight)}
-    if found["policy"] == "quadratic":
+    if "rule" in values:
+        return values | {"rule": drawn(values["rule"], rng, n, weight)}
+    if values["policy"] == "quadratic":
         apart = 0.05 * rng.uniform(-1, 1, (2 * n, 2 * n))
-        found["Q"] = (np.diag([-0.02] * n + [1.0] * n) + apart + apart.T).tolist()
-    return found if weight is None else found | {"weight": weight.tolist()}
+        values["Q"] = (np.diag([-0.02] * n + [1.0] * n) + apart + apart.T).tolist()
+    return values if weight is None else values | {"weight": weight.tolist()}
 
 
 def rule_from(table: Table, model: ModelMatrices) -> TriggerRule:

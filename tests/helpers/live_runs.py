@@ -260,8 +260,8 @@ def spooled(running: Running, table: str) -> Rows:
     """Return the rows of a table that are on disk."""
     spool = running.runs / "latest" / "spool"
     dtype = run_tables(load(running.runs / "latest" / "scenario.toml"))[table]
-    found = [np.frombuffer(data, dtype) for _, data in read_chunks(spool, table)]
-    return np.concatenate([np.zeros(0, dtype), *found])
+    chunks = [np.frombuffer(data, dtype) for _, data in read_chunks(spool, table)]
+    return np.concatenate([np.zeros(0, dtype), *chunks])
 
 
 def goes_on(running: Running, role: str) -> bool:

@@ -13,10 +13,10 @@ BATCH_NS = 100_000_000
 
 def mixed_rows(shared: RecordedRun) -> Mapping[str, Rows]:
     """All rows by table, as the processes emit them: with the loop's number, in order of time."""
-    found = {}
+    mixed = {}
     for table, dtype in run_tables(shared.scenario).items():
         if table in network_tables():
-            found[table] = shared.network[table]
+            mixed[table] = shared.network[table]
             continue
         parts = []
         for number, loop in enumerate(shared.loops):
@@ -26,8 +26,8 @@ def mixed_rows(shared: RecordedRun) -> Mapping[str, Rows]:
                 rows[name] = loop[table][name]
             parts.append(rows)
         rows = np.concatenate(parts)
-        found[table] = rows[np.argsort(rows["now_ns"], kind="stable")]
-    return found
+        mixed[table] = rows[np.argsort(rows["now_ns"], kind="stable")]
+    return mixed
 
 
 def live_rows(run: RecordedRun) -> Iterator[tuple[str, Rows]]:

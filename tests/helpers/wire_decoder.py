@@ -44,17 +44,17 @@ class Decoder:
 
         From any source but the peer's address even an authentic datagram is a replay.
         """
-        found = self._examine(datagram, from_peer, opened=False)
-        if found == core.NOACK_ENCRYPTED:
-            found = core.NOACK_BAD_TAG
+        result = self._examine(datagram, from_peer, opened=False)
+        if result == core.NOACK_ENCRYPTED:
+            result = core.NOACK_BAD_TAG
             assert self._wire.seal is not None
             content = self._wire.seal.decrypt(datagram, wire_format.HEADER_BYTES)
             if content is not None:
                 readable = datagram[: wire_format.HEADER_BYTES] + content + datagram[-wire_format.TAG_BYTES :]
-                found = self._examine(readable, from_peer, opened=True)
+                result = self._examine(readable, from_peer, opened=True)
         message = self._message
-        core.noack_wire_count(self._reception, found, message)
-        if found != core.NOACK_ACCEPTED:
+        core.noack_wire_count(self._reception, result, message)
+        if result != core.NOACK_ACCEPTED:
             return None
         vector = np.array(ffi.unpack(message.vector, message.entries), np.float64)
         return wire_format.Message(

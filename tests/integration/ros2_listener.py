@@ -12,7 +12,7 @@ from zenoh_ros2_sdk.session import ZenohSession
 KIND = "sensor_msgs/msg/JointState"
 store, port, last = get_typestore(Stores.ROS2_JAZZY), int(sys.argv[1]), threading.Event()
 session = ZenohSession.get_instance("127.0.0.1", port)
-found: list[tuple[int, float, float]] = []
+messages: list[tuple[int, float, float]] = []
 
 
 def definition(kind: str) -> str:
@@ -21,8 +21,8 @@ def definition(kind: str) -> str:
 
 def on_state(message) -> None:  # type: ignore[no-untyped-def]
     stamp = message.header.stamp
-    found.append((stamp.sec * 10**9 + stamp.nanosec, *map(float, message.position[[0, -1]])))
-    if found[-1][0] >= 3 * 10**9:
+    messages.append((stamp.sec * 10**9 + stamp.nanosec, *map(float, message.position[[0, -1]])))
+    if messages[-1][0] >= 3 * 10**9:
         last.set()
 
 
@@ -52,5 +52,5 @@ joined = threading.Event()
 graph = session.liveliness.declare_subscriber("@ros2_lv/**", on_token, history=True)
 last.wait()
 joined.wait()
-print(json.dumps({"messages": found, "tokens": tokens, "attachments": attachments}), flush=True)
+print(json.dumps({"messages": messages, "tokens": tokens, "attachments": attachments}), flush=True)
 threading.Event().wait()

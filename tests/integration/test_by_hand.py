@@ -81,12 +81,12 @@ def test_the_loop_outlives_the_coordinator(start: Start, by_hand: ByHand) -> Non
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    found = {}
+    contents = {}
     for path in folder.rglob("*"):
         with contextlib.suppress(FileNotFoundError):
             if path.is_file():
-                found[str(path)] = path.read_bytes()
-    return found
+                contents[str(path)] = path.read_bytes()
+    return contents
 
 
 def visible_in_processes(recording: live.Running, processes: list[subprocess.Popen[str]]) -> dict[str, bytes]:

@@ -272,11 +272,11 @@ def disturbed_run(folder: Path) -> Disturbed:
 def disturbed(tmp_path_factory: pytest.TempPathFactory) -> Disturbed:
     """A run that the machine has not stalled at its horizon, where no step can be made up for."""
     for _ in range(3):
-        found = disturbed_run(tmp_path_factory.mktemp("disturbed"))
-        if ": overrun: " not in found.finished.summary["exit"]["reason"]:
+        run = disturbed_run(tmp_path_factory.mktemp("disturbed"))
+        if ": overrun: " not in run.finished.summary["exit"]["reason"]:
             break
-    assert found.finished.status == 0, found.finished.stderr
-    return found
+    assert run.finished.status == 0, run.finished.stderr
+    return run
 
 
 def test_every_step_is_executed_recorded_and_replayed(disturbed: Disturbed) -> None:
@@ -342,10 +342,10 @@ def test_no_time_of_a_run_is_read_from_the_wall_clock() -> None:
     root = Path(__file__).parents[2]
     folders = (*PACKAGES, "native")
     reads = re.compile(r"\btime\.time(_ns)?\(|CLOCK_REALTIME\)|datetime\.(now|today)\(|utcnow")
-    found = {
+    readers = {
         str(path.relative_to(root))
         for folder in folders
         for path in (root / folder).rglob("*.[pc]*")
         if path.suffix in (".py", ".c") and reads.search(path.read_text())
     }
-    assert found == WALL_CLOCK.keys()
+    assert readers == WALL_CLOCK.keys()

@@ -39,12 +39,12 @@ def test_periodic_losses_are_measured_exactly(start: Start, tmp_path: Path) -> N
     assert sender.wait(LONG_S) == 0
     out, err = process.communicate(timeout=LONG_S)
     assert process.returncode == 0, err
-    found = json.loads(out)
+    report = json.loads(out)
     trace = read_trace(tmp_path / "received.csv")
     assert len(trace) == 500
     # The emulator's first datagram of each period of five is lost, whatever the machine does.
     first = int(np.flatnonzero(trace.lost)[0])
     assert np.flatnonzero(trace.lost).tolist() == list(range(first, 500, 5))
-    assert found["lost"] == 100
+    assert report["lost"] == 100
     sent = (tmp_path / "sent.csv").read_text().splitlines()
     assert len(sent) == 501

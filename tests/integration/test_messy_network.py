@@ -64,8 +64,8 @@ def test_the_run_is_complete_and_replayed_bit_for_bit(finished: Finished, record
     answers = finished.loop["acknowledgements"]
     assert answers["sent"] == finished.loop["deliveries"] > 10
     assert 0 <= answers["sent"] - answers["lost"] - answers["received"] <= 2  # in flight
-    found = replay(record)
-    compared = {hop.hop: hop.compared for hop in found.messages}
+    replayed = replay(record)
+    compared = {hop.hop: hop.compared for hop in replayed.messages}
     assert compared["controller → netem"] == len(record[record_tables.CONTROLLER_DELIVERY])
     assert compared["netem → sensor"] == len(record[record_tables.SENSOR_ACKNOWLEDGEMENT])
     logs = [log.read_text() for log in (finished.run_dir / "logs").iterdir()]
@@ -120,10 +120,10 @@ def test_actuations_are_lost_within_their_guarantee(tmp_path: Path) -> None:
     assert finished.status == 0, finished.stderr
     live.assert_complete(finished.loop)
     record = load_record(finished.run_dir)
-    found, outcomes = finished.loop["actuations"], packet_outcomes(record, Flow.ACTUATION)
-    assert found["sent"] == len(record[record_tables.CONTROLLER_STEP])
-    assert found["lost"] > 0.2 * found["sent"]
-    assert found["longest_loss_burst"] == outcomes.longest_loss_burst() <= 3
-    assert found["received"] == outcomes.forwarded.sum()
+    actuations, outcomes = finished.loop["actuations"], packet_outcomes(record, Flow.ACTUATION)
+    assert actuations["sent"] == len(record[record_tables.CONTROLLER_STEP])
+    assert actuations["lost"] > 0.2 * actuations["sent"]
+    assert actuations["longest_loss_burst"] == outcomes.longest_loss_burst() <= 3
+    assert actuations["received"] == outcomes.forwarded.sum()
     channels = {role: report["channel"] for role, report in record.reports.items()}
     assert set(channels["plant"]["received_from"]) == {channels["netem"]["local"]}

@@ -111,15 +111,15 @@ def test_an_independent_client_receives_a_live_run(port: int, tmp_path: Path) ->
         done = invoke("bridge", "lane_following", "--set", "horizon_s=3", *AT_RATE, *words)
         assert done.exit_code == 0, done.output
         assert listener.stdout is not None
-        found = json.loads(listener.stdout.readline())
+        received = json.loads(listener.stdout.readline())
     steps = noack.open_run(next(tmp_path.glob("*lane_following"))).table("plant_step")
     recorded = {t_ns: (a, b) for t_ns, a, b in zip(
         steps["t_ns"].to_pylist(), steps["x_1"].to_pylist(), steps["x_4"].to_pylist(), strict=True
     )}  # fmt: skip
-    assert found["messages"][-1][0] == 3 * 10**9
-    for t_ns, first, last in found["messages"]:
+    assert received["messages"][-1][0] == 3 * 10**9
+    for t_ns, first, last in received["messages"]:
         assert recorded[t_ns] == (first, last)
-    sent = [number for number, _ in found["attachments"]]
+    sent = [number for number, _ in received["attachments"]]
     assert sent == sorted(set(sent))
-    assert {gid_bytes for _, gid_bytes in found["attachments"]} == {16}
-    assert any("/MP/%/%/noack/%noack%state/" in token for token in found["tokens"])
+    assert {gid_bytes for _, gid_bytes in received["attachments"]} == {16}
+    assert any("/MP/%/%/noack/%noack%state/" in token for token in received["tokens"])

@@ -101,10 +101,10 @@ def requirements(wheel: Path) -> list[Distribution]:
         if requirement.marker is not None and not requirement.marker.evaluate({"extra": extra}):
             continue
         new = requirement.name not in needed
-        found = needed.setdefault(requirement.name, distribution(requirement.name))
-        assert requirement.specifier.contains(found.version), requirement
+        installed = needed.setdefault(requirement.name, distribution(requirement.name))
+        assert requirement.specifier.contains(installed.version), requirement
         extras = [*([""] if new else []), *requirement.extras]
-        waiting += [(Requirement(text), of) for text in found.requires or () for of in extras]
+        waiting += [(Requirement(text), of) for text in installed.requires or () for of in extras]
     return [*needed.values()]
 
 

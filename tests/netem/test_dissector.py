@@ -124,8 +124,8 @@ def test_a_damaged_datagram_is_shown_with_its_fault(tshark: Tshark, tmp_path: Pa
         assert not any(name.startswith("noack") for name in fields)
     for fields, (_, faults) in zip(packets[len(OTHERS) :], DAMAGED, strict=True):
         assert shown(fields, "sequence") == "7"
-        found = [n for n in fields if n.endswith((".unknown", ".wrong")) and "noack" in n]
-        assert found == faults
+        shown_faults = [n for n in fields if n.endswith((".unknown", ".wrong")) and "noack" in n]
+        assert shown_faults == faults
         assert ("noack.vector" in fields) == (faults != ["noack.length.wrong"])
 
 

@@ -57,13 +57,13 @@ def answers(tmp_path_factory: pytest.TempPathFactory) -> Answers:
         cwd=folder, env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)}, capture_output=True,
         text=True, check=False, timeout=500,
     )  # fmt: skip
-    found, decoder, text = [], json.JSONDecoder(), done.stdout.strip()
+    answers, decoder, text = [], json.JSONDecoder(), done.stdout.strip()
     while text:
         document, end = decoder.raw_decode(text)
-        found.append(document)
+        answers.append(document)
         text = text[end:].lstrip()
-    documents = [document for document in found if isinstance(document, dict)]
-    ends = [document for document in found if isinstance(document, list)]
+    documents = [document for document in answers if isinstance(document, dict)]
+    ends = [document for document in answers if isinstance(document, list)]
     return Answers(folder, documents, ends, done.stderr.splitlines())
 
 

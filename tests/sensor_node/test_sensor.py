@@ -34,8 +34,8 @@ def updates(outputs: Sequence[Output]) -> list[Message]:
 
 
 def rows(outputs: Sequence[Output], n: int) -> Any:
-    found = [output.row for output in outputs if isinstance(output, Record)]
-    return np.array(found, tables(n, 1)[SENSOR_MEASUREMENT])
+    records = [output.row for output in outputs if isinstance(output, Record)]
+    return np.array(records, tables(n, 1)[SENSOR_MEASUREMENT])
 
 
 def test_an_error_equal_to_the_threshold_is_no_event() -> None:
@@ -78,7 +78,7 @@ def test_a_measurement_after_the_runs_end_is_rejected(content: dict[str, Any]) -
         (10**15, core.NOACK_BAD_RANGE),
     ):  # fmt: skip
         datagram = encoder.encode(Message(Flow.MEASUREMENT, 1, t_ns, values))
-        found = core.noack_wire_examine(
+        result = core.noack_wire_examine(
             wire.core, ffi.addressof(reception), 0, datagram, len(datagram), True, False, message
         )
-        assert found == expected
+        assert result == expected

@@ -30,10 +30,10 @@ _DIGITS = 384
 """Binary digits after the point: products of hundreds of steps lose far fewer."""
 _ONE = 1 << _DIGITS
 """The number 1 in these units."""
-_LARGEST = int(np.finfo(np.float64).max)
-"""In double precision."""
-_TERMS = 60
-"""Of Taylor's series of an exponential with a norm up to 1/16: the remainder is below 2⁻⁵⁰⁰."""
+_LARGEST_DOUBLE = int(np.finfo(np.float64).max)
+"""The largest number in double precision."""
+_TAYLOR_TERMS = 60
+"""Terms of Taylor's series of an exponential with a norm up to 1/16: the remainder is below 2⁻⁵⁰⁰."""
 
 
 class IntervalMatrix(NamedTuple):
@@ -167,13 +167,13 @@ def exponential(generator: Matrix, dt_ns: int) -> FixedPointMatrix:
     entries.ravel()[:] = [value >> halvings for value in scaled]
     step = FixedPointMatrix(entries, dt_ns // NS_PER_S + 3)
     total = term = fixed(np.eye(len(generator)))
-    for order in range(1, _TERMS):
+    for order in range(1, _TAYLOR_TERMS):
         term = term @ step
         term = FixedPointMatrix(term.entries // order, term.error // order + 2)
         total = total + term
     total = FixedPointMatrix(total.entries, total.error + 1)
     for _ in range(halvings):
         total = total @ total
-        if max(int(abs(total.entries).max()), total.error) >> _DIGITS > _LARGEST:
+        if max(int(abs(total.entries).max()), total.error) >> _DIGITS > _LARGEST_DOUBLE:
             raise OverflowError  # further squares would take more and more memory
     return total

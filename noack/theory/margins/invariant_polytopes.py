@@ -22,19 +22,19 @@ from noack.theory.margins.exact_matrices import ENLARGED, IntervalMatrix, exactl
 from noack.theory.margins.switched_system import Cycle, SwitchedSystem
 
 _MOST_EXCHANGES = 400
-"""Of the simplex method; a basis before the optimal one bounds the norm, too."""
+"""Limit of the exchanges of the simplex method; a basis before the optimal one bounds the norm, too."""
 _IMPROVEMENT, _PIVOT = 1e-11, 1e-9
 """Smaller violations of the dual's inequalities, and smaller entries of a column, are rounding."""
-_PRODUCTS = 250_000
-"""Of a product of matrices: the BLAS uses several threads for larger ones, which is slower here."""
+_MOST_MULTIPLICATIONS = 250_000
+"""Multiplications in a product of matrices: for more, the BLAS uses several threads, which is slower here."""
 UNIT = 0.1
 """Length of the unit vectors among the first vertices: they are there only to span the space."""
-_INSIDE = 1 - 1e-9
+_LARGEST_INSIDE_NORM = 1 - 1e-9
 """Norm up to which an image is inside, although it is rounded."""
 _MOST_ROUNDS, _WORK_PER_VERTEX = 60, 1_000_000
 """Limits: rounds in which images are added; entries that are compared, for each vertex that is allowed."""
-_FARTHEST = 1e3
-"""Entries of a vertex, whose first ones have at most 1; products are rarely that much larger."""
+_LARGEST_ENTRY = 1e3
+"""Limit of the entries of a vertex: those of the first ones are at most 1, products are rarely this large."""
 
 
 class Combinations(NamedTuple):
@@ -70,7 +70,7 @@ class PolytopeNorm:
 
     def combinations(self, points: Matrix, enough: float = 0.0) -> Combinations:
         """Return combinations for points, (k, n), of the smallest norm, or at most ``enough``."""
-        chunk = max(_PRODUCTS // self.vertices.size, 16)
+        chunk = max(_MOST_MULTIPLICATIONS // self.vertices.size, 16)
         parts = [self._combinations(points[i : i + chunk], enough) for i in range(0, len(points), chunk)]
         return Combinations(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
@@ -144,7 +144,7 @@ class InvariantPolytopes:
     system: SwitchedSystem
     growth: float
     vertices: list[Matrix]
-    """Of each node, (m, n)."""
+    """The vertices of each node, (m, n)."""
     _work: int = 0
 
     @property
@@ -174,8 +174,8 @@ class InvariantPolytopes:
                     pending[node] = added
             if not pending:
                 return True
-            farthest = max(float(np.abs(points).max()) for points in pending.values())
-            if self.count > most_vertices or self._work > most_work or not farthest < _FARTHEST:
+            largest = max(float(np.abs(points).max()) for points in pending.values())
+            if self.count > most_vertices or self._work > most_work or not largest < _LARGEST_ENTRY:
                 break
         return False
 
@@ -184,10 +184,10 @@ class InvariantPolytopes:
         before = len(self.vertices[node])
         while len(points):
             norm = PolytopeNorm(self.vertices[node])
-            norms = norm.combinations(points, enough=_INSIDE).norms
+            norms = norm.combinations(points, enough=_LARGEST_INSIDE_NORM).norms
             self._work += norm.work
             order = np.argsort(-norms)
-            order = order[norms[order] > _INSIDE]
+            order = order[norms[order] > _LARGEST_INSIDE_NORM]
             largest, points = np.split(points[order], [max(4, len(order) // 4)])
             self.vertices[node] = np.concatenate([self.vertices[node], largest])
         return self.vertices[node][before:]

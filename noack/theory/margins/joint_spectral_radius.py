@@ -50,11 +50,11 @@ MOST_VERTICES = 800
 """Vertices that are added to polytopes to sharpen the bounds; their cost grows with the square."""
 _FEW_VERTICES, _MORE_VERTICES = 300, 4000
 """Limits of the two attempts to compare with a threshold."""
-_PRODUCTS, _MORE_PRODUCTS = 30_000, 300_000
+_FEW_PRODUCTS, _MORE_PRODUCTS = 30_000, 300_000
 """Limits of both attempts by products."""
 MOST_LEAVING = 60
 """Largest number of edges that leave a node for which polytopes are tried."""
-_REMEMBERED = 3
+_EDGE_CLASSES = 3
 """Classes of edges that a node remembers in the second search for quadratic norms."""
 _LEAST_GROWTH = 1e-3
 """Growth of the polytopes if no cycle grows, relative to the largest norm of a matrix."""
@@ -66,7 +66,7 @@ _LARGEST_EXPONENT, _NEAR_1 = 600.0, 1e-6
 """Limits of a geometric sum: larger powers count as infinite, and such ratios as 1."""
 _SEARCH, _LONG_SEARCH = (20, 100), (40, 300)
 """Length of the cycles that are tried, at least the number of nodes, and the width of the beam."""
-_WITHIN = 0.1
+_THRESHOLD_SHARE = 0.1
 """A growth below the threshold by this share of its distance from the lower bound is proven."""
 
 
@@ -154,7 +154,7 @@ class _Enclosure:
     def _with_history(self) -> SwitchedSystem:
         """The same system with more nodes, if they are not too many for the search for norms."""
         reaching = int(np.bincount(self._system.graph.targets).max())
-        for classes in (_REMEMBERED,) if self._is_large else (reaching, _REMEMBERED):
+        for classes in (_EDGE_CLASSES,) if self._is_large else (reaching, _EDGE_CLASSES):
             system = with_history(self._system, classes)
             if number_of_entries(system) <= FEW_ENTRIES:
                 return system
@@ -182,12 +182,12 @@ class _Enclosure:
         attempts: tuple[Callable[[float], float], ...] = (
             lambda growth: self._prove_by_polytopes(growth, int(_FEW_VERTICES * effort)),
             self._search_longer,
-            lambda growth: self._prove_by_norms(growth, int(_PRODUCTS * effort)),
+            lambda growth: self._prove_by_norms(growth, int(_FEW_PRODUCTS * effort)),
             lambda growth: self._prove_by_polytopes(growth, int(_MORE_VERTICES * effort)),
             lambda growth: self._prove_by_norms(growth, int(_MORE_PRODUCTS * effort), True),
         )
         for attempt in attempts:
-            needed_effort = attempt(threshold - _WITHIN * (threshold - self.cycle.growth))
+            needed_effort = attempt(threshold - _THRESHOLD_SHARE * (threshold - self.cycle.growth))
             if self.is_decided(threshold):
                 return 0.0
         return needed_effort * effort
@@ -208,7 +208,7 @@ class _Enclosure:
                 self._search_longer(growth)
                 if self.cycle.growth > before * (1 + accuracy / 2):
                     continue
-                self._prove_by_norms(growth, _PRODUCTS, remembers=self._is_large)
+                self._prove_by_norms(growth, _FEW_PRODUCTS, remembers=self._is_large)
             if self._is_large:
                 break
             accuracy *= _COARSER
@@ -229,7 +229,7 @@ class _Enclosure:
                 self._improve(polytopes.bound(), polytopes.count)
         return math.inf
 
-    def _prove_by_norms(self, growth: float, entries: int, remembers: bool = False) -> float:
+    def _prove_by_norms(self, growth: float, most_products: int, remembers: bool = False) -> float:
         """Try to prove a growth; return the effort that this is estimated to need, 1: the limit."""
         norms = self._search(remembers).improve(growth)
         self._improve(norms.upper)
@@ -238,11 +238,11 @@ class _Enclosure:
         if norms.system is None:
             return math.inf
         try:
-            bound = bound_by_products(norms.system, growth, entries, slowest=self.cycle.growth)
+            bound = bound_by_products(norms.system, growth, most_products, slowest=self.cycle.growth)
         except FloatingPointError:  # an overflow, where the caller has asked for it
             return math.inf
         self._improve(bound.upper)
-        return bound.needed_products / entries
+        return bound.needed_products / most_products
 
 
 def _best_cycle(system: SwitchedSystem, balanced: SwitchedSystem, search: tuple[int, int]) -> Cycle:

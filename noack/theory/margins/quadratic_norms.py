@@ -42,7 +42,7 @@ _FIRST_DISTANCE = 0.3
 _GAP = 2e-5
 """Stages end if log γ is nearer to the smallest one than this, per longest duration."""
 _LARGEST_LOGARITHM = 300.0
-"""Of γ^−d: its square, by which P is multiplied, must not overflow."""
+"""Largest logarithm of γ^−d, whose square, by which P is multiplied, must not overflow."""
 _SMALLEST = 1e-300
 """Smallest norm of a matrix, whose logarithm is taken."""
 

@@ -24,7 +24,7 @@ from noack.theory.margins.exact_matrices import IntervalMatrix, exactly, inverse
 Numbers = NDArray[np.int64]
 """Numbers of nodes or of edges, or durations, (k,)."""
 _ITERATIONS = 60
-"""Of the search for balanced coordinates, which need not be exact."""
+"""Rounds of the search for balanced coordinates, which need not be exact."""
 _ROUNDEST = 1e-6
 """Smallest eigenvalue of a quadratic form, relative to the largest one."""
 _TINY = float(np.finfo(np.float64).tiny)
@@ -175,7 +175,7 @@ class SwitchedSystem:
 
     graph: Graph
     matrices: IntervalMatrix
-    """Of its edges, (k, n, n)."""
+    """The matrices of its edges, (k, n, n)."""
 
     @classmethod
     def of(cls, edges: Sequence[Edge]) -> "SwitchedSystem":

@@ -163,7 +163,7 @@ class TimeTriggeredLoop:
             times, lambda dt_ns: exponential(generator, dt_ns), *(fixed(np.vstack(o)) for o in occurrences)
         ).between
         self._states: dict[tuple[int, int], list[FixedPointMatrix]] = {}
-        """By slot and use of x_c: (x, x_c, u, w) after 1, 2, … periods, as functions of z."""
+        """States by slot and use of x_c: (x, x_c, u, w) after 1, 2, … periods, as functions of z."""
         since_ns = [times.since_tick_ns(k * times.period_ns) for k in range(times.slots)]
         follows = max(since_ns) <= times.period_ns - times.delay_ns and times.timeout_ns == NEVER_NS
         if times.delay_ns == 0:

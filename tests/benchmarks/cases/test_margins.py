@@ -13,7 +13,7 @@ from noack.guarantee.loss_guarantee import LossHistory
 def test_patterns_of_random_loops_grow_as_proven(seed: int) -> None:
     """Patterns are played step by step, without the maps between deliveries or their graph."""
     random = random_loop(seed)
-    found = random.margin.stability(random.guarantee)
+    stability = random.margin.stability(random.guarantee)
     loop, slots = random.margin.loop, random.margin.loop.times.slots
     steps = [[loop.period(slot, fate).middle for fate in (False, True)] for slot in range(slots)]
     fastest, longest = 0.0, 9
@@ -28,8 +28,8 @@ def test_patterns_of_random_loops_grow_as_proven(seed: int) -> None:
                 Π = steps[k % slots][pattern[k % length]] @ Π
             radius = np.abs(np.linalg.eigvals(Π)).max() ** (1 / repeated) * random.scale
             fastest = max(fastest, float(radius))
-    assert found.verdict == ("stable" if random.growth < 1 else "destabilised")
-    assert fastest <= found.upper * (1 + 1e-9)
-    if len(found.pattern) <= longest:
-        assert fastest == pytest.approx(found.lower, rel=1e-6)
-    assert found.lower >= random.growth * (1 - 1e-9)
+    assert stability.verdict == ("stable" if random.growth < 1 else "destabilised")
+    assert fastest <= stability.upper * (1 + 1e-9)
+    if len(stability.pattern) <= longest:
+        assert fastest == pytest.approx(stability.lower, rel=1e-6)
+    assert stability.lower >= random.growth * (1 - 1e-9)

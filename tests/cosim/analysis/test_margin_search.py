@@ -81,8 +81,8 @@ def test_no_longest_time_between_updates_is_below_the_least_one(monkeypatch: pyt
 
 def test_a_bound_of_one_m_holds_for_the_others_that_it_implies(monkeypatch: pytest.MonkeyPatch) -> None:
     bounds = (0.5, 0.9), (0.7, 0.95), (0.6, 0.8)
-    found = iter([Stability(lower, upper, (True,), (1.0,), 0) for lower, upper in bounds])
-    monkeypatch.setattr(LossMargin, "stability", lambda *_, **__: next(found))
+    stabilities = iter([Stability(lower, upper, (True,), (1.0,), 0) for lower, upper in bounds])
+    monkeypatch.setattr(LossMargin, "stability", lambda *_, **__: next(stabilities))
     margin = find_margin(resolve(held_integrator()), most_m=3, with_period=False)
     assert [cap.stability[:2] for cap in margin.caps] == [(0.5, 0.8), (0.7, 0.8), (0.7, 0.8)]
 

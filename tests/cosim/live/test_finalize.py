@@ -302,6 +302,36 @@ def test_the_end_does_not_wait_for_a_preparation_that_gets_no_time(
     assert len(finalize(ending, report=False, view=False).summary.loops) == LOOPS
 
 
+def test_the_end_waits_for_who_writes_the_rest_of_the_tables(
+    many_loops: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It has been told of the end, and is no longer at idle priority."""
+    begun, told = Event(), Event()
+
+    def write(helpers: FinalizeHelpers, *_: object) -> None:
+        helpers._end_file, helpers._writer = many_loops / "ended", current_thread()
+        begun.set()
+        told.wait()
+        time.sleep(20 * finalize_helpers._POLL_S)
+
+    def tell(_: FinalizeHelpers) -> bool:
+        told.set()
+        return True
+
+    for method, replacement in (("_write_early", write), ("_make_end_file", tell)):
+        monkeypatch.setattr(FinalizeHelpers, method, replacement)
+    for method in ("_prepare_loops", "_call_at_idle_priority"):
+        monkeypatch.setattr(FinalizeHelpers, method, lambda *_: None)
+    monkeypatch.setattr(finalize_helpers, "_GRACE_S", 0.0)
+    helpers = FinalizeHelpers(load(many_loops / SCENARIO_FILE))
+    helpers.prepare(many_loops)
+    begun.wait()
+    with patch.object(helpers, "_abort") as aborted:
+        helpers.start()
+    helpers.close()
+    assert not aborted.called
+
+
 def _killed(*_: object) -> None:
     raise MemoryError
 

@@ -114,7 +114,7 @@ def test_a_change_received_too_late_is_reported_and_voids_its_claims() -> None:
     assert np.nanmax(identity_residual(record)[between]) > 1e-3
 
 
-def test_a_network_that_knows_of_no_change_or_of_another_is_found() -> None:
+def test_a_network_that_knows_of_no_change_or_of_another_is_reported() -> None:
     listed = [{"at_s": 1.0, "set": {"network.mansd": 1}}]
     resolved = resolve(validate(CONTENT | {"changes": listed}, "here"))
     with pytest.raises(CallerError, match="settings that stay the same"):

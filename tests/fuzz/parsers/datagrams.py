@@ -113,11 +113,11 @@ def times_input(data: bytes) -> None:
                 datagram += choices.take(1 + choices.below(16))
         is_sound = datagram == whole and (magic, version, reserved) == (b"NC", 1, 0)
         for kind in TimeKind:
-            found = form.decode(datagram, kind)
+            decoded = form.decode(datagram, kind)
             expected = is_sound and number == kind and 0 <= times[0] <= times[1] < 2**62
-            assert isinstance(found, TimeDatagram) == expected
-            if isinstance(found, TimeDatagram):
-                assert form.encode(found) == datagram
+            assert isinstance(decoded, TimeDatagram) == expected
+            if isinstance(decoded, TimeDatagram):
+                assert form.encode(decoded) == datagram
 
 
 _PERIOD_NS = 20_000_000
@@ -144,10 +144,10 @@ def probes_input(data: bytes) -> None:
         receiver.is_over(now_ns)
     with refusal():
         try:
-            found = [sender.finish(0), receiver.finish(0)]
+            reports = [sender.finish(0), receiver.finish(0)]
         except ValueError as error:
             raise PeerError(str(error)) from None
-        for report in found:
+        for report in reports:
             assert report is None or report.trace is None or len(report.trace) < 10**7
 
 

@@ -179,9 +179,9 @@ MATRICES_WORDS = [
 def matrices_input(data: bytes) -> None:
     (workspace() / "any.npz").write_bytes(data)
     with refusal('run.toml: model.file = "any.npz"'):
-        found = read_matrices(NamedFile("any.npz", workspace(), "run.toml: model"))
-        assert found.keys() <= {"A", "B", "gain"}
-        assert all(matrix.ndim == 2 and np.isfinite(matrix).all() for matrix in found.values())
+        matrices = read_matrices(NamedFile("any.npz", workspace(), "run.toml: model"))
+        assert matrices.keys() <= {"A", "B", "gain"}
+        assert all(matrix.ndim == 2 and np.isfinite(matrix).all() for matrix in matrices.values())
 
 
 TRACES_SEEDS = [

@@ -200,9 +200,9 @@ def _read(run_dir: Path) -> None:
     cut_short = (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir()
     record = finish_record(run_dir).loop() if cut_short else load_record(run_dir)
     json.loads(summarise_loop(record, 0, "finished").model_dump_json())
-    found = replay(record)
-    found.verdict().model_dump_json()
-    json.dumps(found.to_json())
+    replayed = replay(record)
+    replayed.verdict().model_dump_json()
+    json.dumps(replayed.to_json())
     if cut_short:
         again = load_record(run_dir)  # a finalised record can be read
         assert all(record[table].tobytes() == again[table].tobytes() for table in record.tables)

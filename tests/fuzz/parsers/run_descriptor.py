@@ -35,12 +35,12 @@ def descriptor_input(data: bytes) -> None:
         content = edited(choices, DESCRIPTOR, DESCRIPTOR_KNOWN)
         data = json.dumps(content).encode()
     with refusal("not a valid run descriptor"):
-        found = run_descriptor.loads(data.decode("utf-8", "replace"))
-        assert run_descriptor.loads(found.model_dump_json()) == found
-        assert len(found.key) == 32
-        assert 0 <= found.run_id < 2**64
-        assert isinstance(found.run_dir, str)
-        assert isinstance(found.launched, bool)
+        descriptor = run_descriptor.loads(data.decode("utf-8", "replace"))
+        assert run_descriptor.loads(descriptor.model_dump_json()) == descriptor
+        assert len(descriptor.key) == 32
+        assert 0 <= descriptor.run_id < 2**64
+        assert isinstance(descriptor.run_dir, str)
+        assert isinstance(descriptor.launched, bool)
 
 
 TOKEN = RUN_DESCRIPTOR.join_token

@@ -87,9 +87,9 @@ REACH = """
 import os, socket, sys
 path = sys.argv[1]
 for attempt in ("connect", "bind"):
-    with socket.socket(socket.AF_UNIX) as one:
+    with socket.socket(socket.AF_UNIX) as endpoint:
         try:
-            getattr(one, attempt)(path + (".other" if attempt == "bind" else ""))
+            getattr(endpoint, attempt)(path + (".other" if attempt == "bind" else ""))
             print(attempt, "succeeded")
         except PermissionError:
             print(attempt, "refused")

@@ -71,7 +71,7 @@ def _compiled(version: int) -> bytes:
 
 
 def _description(version: int) -> str:
-    variables = "\n".join(_variable(version, number, *one) for number, one in enumerate(VARIABLES))
+    variables = "\n".join(_variable(version, number, *variable) for number, variable in enumerate(VARIABLES))
     identity, structure = {
         2: ("guid", '<Outputs><Unknown index="1"/><Unknown index="2"/></Outputs>'),
         3: ("instantiationToken", '<Output valueReference="0"/><Output valueReference="1"/>'),

@@ -5,7 +5,7 @@ system without an input, from (ξ, 0) with the state ξ at the delivery:
 
     x' = (A + BK + αI) x + BK e_c,    e_c' = −E x + (H − BK + αI) e_c,    z(τ) = e^{Fτ} (ξ, 0)
 
-:class:`DeliveryPropagation` has e^{Fτ} at the nodes of a grid, in coordinates in which W is the identity.
+:class:`DeliveryFlow` has e^{Fτ} at the nodes of a grid, in coordinates in which W is the identity.
 Between two nodes the bounds are those of :mod:`noack.theory.bounds.enclosure`.
 
 **Delayed and held inputs.** If inputs are delayed or held, z begins with an e_c that is not 0, and
@@ -31,7 +31,7 @@ _FIRST_STEP = 0.005
 """First step of the grid, in time constants of the fastest mode: e^{Fτ} is then nearly straight."""
 _CELLS_PER_STEP = 32
 """After so many cells the step is doubled, as fast modes have decayed."""
-_MOST_STEP = 0.02
+_LONGEST_STEP = 0.02
 """Limit of a step, in time constants of the fastest growing mode, which never decays."""
 _MOST_GROWTH = 1e6
 """The grid ends where ‖e^{Fτ} (I, 0)‖ exceeds this, so that ``FLOW_ROUNDING`` covers its errors."""
@@ -70,7 +70,7 @@ NO_EFFECTS = InputEffects()
 """Inputs are neither delayed nor held."""
 
 
-class DeliveryPropagation:
+class DeliveryFlow:
     """e^{Fτ} (ξ, 0) at the nodes of a grid, for a known plant; W is the identity."""
 
     def __init__(self, plant: PlantGains) -> None:
@@ -107,7 +107,7 @@ class DeliveryPropagation:
             growth = np.linalg.norm(state[:, : self.n])
             if growth > _MOST_GROWTH or math.exp(-slowest * t_s) < _SETTLED:
                 break
-            if cell % _CELLS_PER_STEP == 0 and 2 * step_s * unstable < _MOST_STEP:
+            if cell % _CELLS_PER_STEP == 0 and 2 * step_s * unstable < _LONGEST_STEP:
                 step_s, propagator = 2 * step_s, propagator @ propagator
         return np.array(edges), np.array(states)
 
@@ -186,13 +186,13 @@ def bend_terms(
     return terms[:-1], growth[:, None, None] * terms[-1]
 
 
-def bend_rows(flow: DeliveryPropagation) -> Matrix:
+def bend_rows(flow: DeliveryFlow) -> Matrix:
     """Return the matrix of the part of e_s'' that follows from z."""
     n, F, H = flow.n, flow.generator, flow.H
     return np.asarray((F @ F)[n:] - np.hstack([np.zeros((n, n)), H @ H]))
 
 
-def error_since_event(flow: DeliveryPropagation, time_s: float) -> Matrix:
+def error_since_event(flow: DeliveryFlow, time_s: float) -> Matrix:
     """Return C_r: e_s a time after an event is C_r z."""
     rows = np.asarray(exponential(flow.generator * time_s)[flow.n :])
     rows[:, flow.n :] -= exponential(flow.H * time_s)

@@ -35,7 +35,7 @@ from noack.theory.bounds.stacked_norms import Stack, largest_eigenvalues, spectr
 from noack.theory.certificates.deliveries.delivery_flow import (
     FLOW_ROUNDING,
     NO_EFFECTS,
-    DeliveryPropagation,
+    DeliveryFlow,
     InputEffects,
     bend_terms,
 )
@@ -47,17 +47,17 @@ from noack.theory.certificates.deliveries.ellipsoid_intersections import (
     weights_favouring,
 )
 
-_ONLY_LAST_DELIVERY = 40.0
+_LARGEST_LOGIT = 40.0
 """The logit of a λ of 1, to rounding: only ‖Λξ‖ ≤ 1 is used."""
-_LOGITS = np.append(np.arange(-12.0, 13.0, 2.0), _ONLY_LAST_DELIVERY)
+_LOGITS = np.append(np.arange(-12.0, 13.0, 2.0), _LARGEST_LOGIT)
 """Logits of λ, ln λ/(1 − λ), that are tried first in each cell: from 6e-6 to 1."""
-_WIDTHS = np.array([1.5, 0.75, 0.37, 0.18, 0.09])
+_LOGIT_CHANGES = np.array([1.5, 0.75, 0.37, 0.18, 0.09])
 """Changes of the logit in each round of the search: they fill the gaps of 2 between the first ones."""
 _NEIGHBOURS = np.array([-1.0, 0.0, 1.0])
 """Multiples of the change that are compared in each round."""
 _CELLS_AT_ONCE = 16
 """Cells with the highest bounds, which are improved together: one product for all of them."""
-_MOST_JOINT = 3
+_MOST_JOINT_ROUNDS = 3
 """The conditions of earlier times are used in so many rounds at most: each takes long."""
 _CLEARLY_ENOUGH = 0.98
 """Share of a sufficient bound from which on a bound at one end of a cell is not improved: the other end
@@ -82,7 +82,7 @@ _FIRST_WEIGHTS = np.array(
 _WEIGHTED_FORMS = [0, 1, 2 * _EARLIER_TIMES + 1, 2]
 """The forms of :meth:`Reach._rows_in` to which ``_FIRST_WEIGHTS`` belong."""
 _HALVINGS = 12
-"""Of the interval of the largest ‖p‖: it is found to 1/4096 from below."""
+"""Halvings of the interval of the largest ‖p‖, which is found to 1/4096 from below."""
 
 
 class _Window(NamedTuple):
@@ -105,7 +105,7 @@ class _Window(NamedTuple):
 class DeliveryEllipsoid:
     """The states ξ at a delivery with ‖Λξ‖ ≤ 1."""
 
-    flow: DeliveryPropagation
+    flow: DeliveryFlow
     shape: Matrix
     """Λ, (n, n), invertible."""
 
@@ -196,7 +196,7 @@ class DeliveryEllipsoid:
                 high = np.where(grows, middle, high)
             largest = float(low.max())
         cells = _CellBounds(self, np.hstack([np.zeros_like(flow.gain), flow.gain]))
-        input_errors = cells.frobenius_bounds(np.ones(1), np.array([_ONLY_LAST_DELIVERY]))[:, 0]
+        input_errors = cells.frobenius_bounds(np.ones(1), np.array([_LARGEST_LOGIT]))[:, 0]
         return largest, input_errors, cells
 
 
@@ -371,7 +371,7 @@ class _CellBounds:
 
     @cached_property
     def unit_effects(self) -> tuple[Vector, Vector]:
-        """See :meth:`DeliveryPropagation.unit_effects`."""
+        """See :meth:`DeliveryFlow.unit_effects`."""
         return self._flow.unit_effects(self.C)
 
     def sup(
@@ -392,27 +392,27 @@ class _CellBounds:
         joint_rounds = 0
         while True:  # the highest bounds become better, until that of the highest is settled
             cells = np.argsort(highest)[-_CELLS_AT_ONCE:]
-            is_last = rounds[cells[-1]] > len(_WIDTHS) or joint_rounds == _MOST_JOINT
+            is_last = rounds[cells[-1]] > len(_LOGIT_CHANGES) or joint_rounds == _MOST_JOINT_ROUNDS
             if is_last or highest[cells[-1]] * FLOW_ROUNDING <= enough:
                 return float(highest[cells[-1]]) * FLOW_ROUNDING
-            has_best_share = rounds[cells] == len(_WIDTHS)
+            has_best_share = rounds[cells] == len(_LOGIT_CHANGES)
             if has_best_share.any():
                 cells = cells[has_best_share]
                 wanted = (enough - added[cells]).clip(min=0.0)
                 values = self._joint_bounds(errors, states, cells, logits[cells, None], wanted)
                 joint_rounds += 1
             else:
-                cells = cells[rounds[cells] < len(_WIDTHS)]
-                widths = _WIDTHS[rounds[cells], None]
-                values, logits[cells] = self._better_shares(errors, cells, logits[cells], widths)
+                cells = cells[rounds[cells] < len(_LOGIT_CHANGES)]
+                logit_changes = _LOGIT_CHANGES[rounds[cells], None]
+                values, logits[cells] = self._better_shares(errors, cells, logits[cells], logit_changes)
             highest[cells] = np.minimum(highest[cells], values + added[cells])
             rounds[cells] += 1
 
     def _better_shares(
-        self, errors: Vector, cells: NDArray[np.int64], logits: Vector, widths: Matrix
+        self, errors: Vector, cells: NDArray[np.int64], logits: Vector, logit_changes: Matrix
     ) -> tuple[Vector, Vector]:
         """Return the bounds of cells by the best of three λ each, and its logit, (k,)."""
-        candidates = logits[:, None] + widths * _NEIGHBOURS
+        candidates = logits[:, None] + logit_changes * _NEIGHBOURS
         values = self._spectral_bounds(errors, cells, candidates)
         best = np.arange(len(cells)), values.argmin(axis=1)
         return values[best], candidates[best]

@@ -155,7 +155,7 @@ class _OpenLoopGains:
         return np.array([kept, of_lost, *entered_by])
 
 
-class _OpenLoopErrors:
+class OpenLoopErrors:
     """Bounds of e_c in open loop, by :class:`_OpenLoopGains`, for events ``spacing_s`` apart."""
 
     def __init__(
@@ -396,9 +396,9 @@ class InsertedInequalities(ErrorInequalities):
         }
 
     @cached_method
-    def _open_loop_errors(self, spacing_s: float) -> _OpenLoopErrors:
+    def _open_loop_errors(self, spacing_s: float) -> OpenLoopErrors:
         gains = self._open_loop_gains
-        return _OpenLoopErrors(self._plant, self._growths, gains, self._conditions, spacing_s)
+        return OpenLoopErrors(self._plant, self._growths, gains, self._conditions, spacing_s)
 
     @cached_property
     def _open_loop_gains(self) -> _OpenLoopGains:

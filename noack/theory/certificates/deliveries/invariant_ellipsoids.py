@@ -22,7 +22,7 @@ from noack.theory.bounds.stacked_norms import Stack
 from noack.theory.certificates.deliveries.delivery_flow import (
     FLOW_ROUNDING,
     NO_EFFECTS,
-    DeliveryPropagation,
+    DeliveryFlow,
     InputEffects,
 )
 from noack.theory.certificates.deliveries.delivery_reach import DeliveryEllipsoid, Reach
@@ -38,8 +38,8 @@ _FIRST_PARAMETERS = [(-1.5, -2.0, -7.0), (0.0, -7.0, -7.0), (-1.5, 0.0, -1.0), (
 of the shares of I and of x(0) x(0)ᵀ in Q."""
 _DIRECTIONS = np.vstack([np.eye(3), -np.eye(3)])
 """In each round one of these parameters is changed, up or down."""
-_WIDTHS = (1.5, 1.5, 1.5, 0.8, 0.8, 0.4, 0.4, 0.2)
-"""Its change in each round, from coarse to fine."""
+_PARAMETER_CHANGES = (1.5, 1.5, 1.5, 0.8, 0.8, 0.4, 0.4, 0.2)
+"""Change of the parameter in each round, from coarse to fine."""
 _COARSE, _FINE = np.exp(np.arange(-9.0, 13.0, 3.0)), np.exp(np.linspace(-2.0, 2.0, 9))
 """Multipliers μ: all of them, and around the best one."""
 _NODES = 16
@@ -99,9 +99,9 @@ class InvariantEllipsoids:
         return None
 
     @cached_property
-    def flow(self) -> DeliveryPropagation:
+    def flow(self) -> DeliveryFlow:
         """The flow between two deliveries."""
-        return DeliveryPropagation(self.plant)
+        return DeliveryFlow(self.plant)
 
     @cached_property
     def _first_event_cell(self) -> int:
@@ -115,8 +115,8 @@ class InvariantEllipsoids:
             candidates = np.array(_FIRST_PARAMETERS)
             merits = self._merits(candidates)
             best, merit = candidates[merits.argmin()], merits.min()
-            for width in _WIDTHS:
-                candidates = best + width * _DIRECTIONS
+            for change in _PARAMETER_CHANGES:
+                candidates = best + change * _DIRECTIONS
                 merits = self._merits(candidates)
                 if merits.min() < merit:
                     best, merit = candidates[merits.argmin()], merits.min()

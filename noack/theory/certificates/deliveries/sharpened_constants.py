@@ -42,7 +42,7 @@ _LEAST_SHARE = 1e-6
 _LEAST_BOUND = 1e-200
 """Least bound by which an output is divided: a bound may be 0."""
 _SHORTEST_STEP, _MOST_STEPS = 0.005, 16
-"""Of the search for the next event: the shortest step as a share of the time, and the most steps.
+"""Limits of the search for the next event: the shortest step as a share of the time, and the most steps.
 Each step takes as long as a bound for one output."""
 
 
@@ -65,7 +65,7 @@ def sharpened_constants(
     spacing_s = constants.inter_event_s or conditions.spacing_s
     if spacing_s == 0 and conditions.delay_s > 0:
         return constants
-    sharpening = _SharpenedBounds(part, conditions, spacing_s)
+    sharpening = SharpenedBounds(part, conditions, spacing_s)
     bounds = sharpening.bounds
     if not np.isfinite(bounds.signals).all():
         return constants
@@ -93,7 +93,7 @@ def sharpened_constants(
     return constants._replace(**smaller, inter_event_s=later_s)
 
 
-class _SharpenedBounds:
+class SharpenedBounds:
     """The bounds of one loop, made smaller in turns; events are ``spacing_s`` apart."""
 
     def __init__(self, part: CertificatePart, conditions: NetworkConditions, spacing_s: float) -> None:

@@ -83,7 +83,7 @@ def test_a_run_is_replayed_bit_for_bit() -> None:
 @pytest.mark.parametrize(("table", "column"), list(columns()))
 @settings(max_examples=4)  # for each of about forty columns
 @given(st.data())
-def test_a_flipped_bit_is_found_and_named(table: str, column: str, data: st.DataObject) -> None:
+def test_a_flipped_bit_is_reported_and_named(table: str, column: str, data: st.DataObject) -> None:
     rows = RECORD[table]
     row = data.draw(st.integers(0, len(rows) - 1))
     byte = data.draw(st.integers(0, rows.dtype[column].itemsize - 1))
@@ -114,7 +114,7 @@ def test_a_flipped_bit_is_found_and_named(table: str, column: str, data: st.Data
         (ACTUATIONS, PLANT_STEP, ("entry", "actuation")),
     ],
 )
-def test_a_flipped_bit_of_a_loop_of_another_kind_is_found(
+def test_a_flipped_bit_of_a_loop_of_another_kind_is_reported(
     record: RunRecord, table: str, columns: tuple[str, ...]
 ) -> None:
     assert replay(record).bit_exact
@@ -129,7 +129,7 @@ def test_a_flipped_bit_of_a_loop_of_another_kind_is_found(
 @pytest.mark.parametrize("table", FILLED)
 @settings(max_examples=6)
 @given(st.data())
-def test_a_wrong_input_number_is_found(table: str, data: st.DataObject) -> None:
+def test_a_wrong_input_number_is_reported(table: str, data: st.DataObject) -> None:
     row = data.draw(st.integers(0, len(RECORD[table]) - 1))
     bit = data.draw(st.integers(0, 63))
     result = replay(flipped(RECORD, table, row, "input", bit))
@@ -142,7 +142,7 @@ def test_a_wrong_input_number_is_found(table: str, data: st.DataObject) -> None:
 
 
 @pytest.mark.parametrize("table", FILLED)
-def test_a_time_that_decreases_is_found(table: str) -> None:
+def test_a_time_that_decreases_is_reported(table: str) -> None:
     result = replay(flipped(RECORD, table, len(RECORD[table]) - 1, "now_ns", 63))
     assert result.first_difference is not None
     assert result.first_difference.column in ("now_ns", "t_ns")  # netem's t_ns is its now_ns
@@ -181,7 +181,7 @@ def test_rows_missing_at_the_end_are_reported(role: str) -> None:
         assert result.gaps == [gap]
 
 
-def test_a_message_that_no_process_sent_is_found() -> None:
+def test_a_message_that_no_process_sent_is_reported() -> None:
     """The plant applies a forged actuation, so only the sender's rows reveal it."""
     rows = RECORD[PLANT_ACTUATION].copy()
     last = len(rows) - 1
@@ -194,7 +194,7 @@ def test_a_message_that_no_process_sent_is_found() -> None:
     assert first.what == "was never sent"
 
 
-def test_a_delivery_of_a_dropped_update_is_found() -> None:
+def test_a_delivery_of_a_dropped_update_is_reported() -> None:
     """The record shows the arrival of an update that was sent and then dropped."""
     events = RECORD[SENSOR_MEASUREMENT][RECORD[SENSOR_MEASUREMENT]["event"] >= 0]
     deliveries = RECORD[CONTROLLER_DELIVERY].copy()

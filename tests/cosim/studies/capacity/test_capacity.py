@@ -1,9 +1,11 @@
 """How many loops a link carries: against R h / bits, with its limits, figures and mistakes."""
 
 import json
+import math
 import re
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -14,10 +16,17 @@ from cosim.studies.campaign.campaign_summary import summarise
 from cosim.studies.campaign.campaign_workers import run_in_process
 from cosim.studies.campaign.chunk_store import Store, run_campaign
 from cosim.studies.campaign.drawn_runs import used_up
+from cosim.studies.campaign.metrics import estimate
 from cosim.studies.capacity import capacity_plan as plans
-from cosim.studies.capacity.capacity_page import CapacityResult
+from cosim.studies.capacity.capacity_page import CapacityResult, comparisons
 from cosim.studies.capacity.capacity_plan import kinds_of, policies_of
-from cosim.studies.capacity.capacity_result import PolicyCapacity, capacities, capacity_of
+from cosim.studies.capacity.capacity_result import (
+    Capacity,
+    PolicyCapacity,
+    capacities,
+    capacity_of,
+    prediction_interval,
+)
 from noack.protocol.record_tables import Fate
 from noack.scenario.scenario_file import load
 from tests.command_line import invoke
@@ -83,6 +92,36 @@ def test_a_policy_must_keep_the_cost_of_each_kind_of_loop() -> None:
     own = {"2 unshared": runs(1.0, 100.0), "4 unshared": runs(1.0, 90.0)}
     policy_capacity = capacity_of(plan, "model", "own", {"2": runs(1.9, 110.0), "4": runs(2.1, 110.0)} | own)
     assert (policy_capacity.any_limit.median, policy_capacity.limited_by) == (2, "cost")
+
+
+@pytest.mark.parametrize(
+    ("ends", "outcome"),
+    [
+        ((7, 9), "wins"),
+        ((np.inf, np.inf), "wins"),
+        ((1, 2), "loses"),
+        ((6, 9), "undecided"),
+        ((2, 3), "undecided"),
+    ],
+)
+def test_a_policy_wins_or_loses_only_if_the_intervals_do_not_overlap(
+    ends: tuple[float, float], outcome: str
+) -> None:
+    kinds = kinds_of(load(FILE, [LOOP]), PERIOD_S)
+    plan = plans.CapacityPlan(load(FILE), kinds, FILE, {}, 0.1, (1, 9), policies_of(kinds), 0.0, 6, 0)
+    carried = {"periodic": Capacity(4.0, 3.0, 6.0), "model": Capacity(ends[0], *ends)}
+    both = [PolicyCapacity(policy, plans.OWN, {}, capacity) for policy, capacity in carried.items()]
+    (sentence,) = comparisons(CapacityResult(plan, Mock(), both, []))
+    assert sentence.startswith(f"model against periodic, as in the scenario: {outcome}")
+
+
+def test_95_of_100_further_draws_are_in_the_prediction_interval() -> None:
+    """Of normal values; their number is within four standard deviations."""
+    draws = np.random.default_rng(4).normal(3.0, 2.0, (4000, 5))
+    ends = np.array([prediction_interval(estimate(draw[:4])) for draw in draws])
+    inside = (ends[:, 0] <= draws[:, 4]) & (draws[:, 4] <= ends[:, 1])
+    assert inside.mean() == pytest.approx(0.95, abs=4 * math.sqrt(0.95 * 0.05 / len(draws)))
+    assert prediction_interval(estimate(draws[0, :1])) == (-math.inf, math.inf)
 
 
 def test_the_guarantee_is_used_up_by_a_burst_with_a_full_queue() -> None:

@@ -18,11 +18,11 @@ from noack.theory.bounds.certificate_terms import Constants, NetworkConditions, 
 from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError
 from noack.theory.bounds.gains import PlantGains
 from noack.theory.certificates.deliveries import sharpened_constants
-from noack.theory.certificates.deliveries.delivery_flow import NO_EFFECTS, DeliveryPropagation
+from noack.theory.certificates.deliveries.delivery_flow import NO_EFFECTS, DeliveryFlow
 from noack.theory.certificates.deliveries.delivery_reach import Reach
-from noack.theory.certificates.deliveries.inserted_bounds import _OpenLoopErrors
+from noack.theory.certificates.deliveries.inserted_bounds import OpenLoopErrors
 from noack.theory.certificates.deliveries.invariant_ellipsoids import InvariantEllipsoids
-from noack.theory.certificates.deliveries.sharpened_constants import _SharpenedBounds
+from noack.theory.certificates.deliveries.sharpened_constants import SharpenedBounds
 from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificates.certificate_kinds.decaying import (
     bounds_of,
@@ -58,29 +58,29 @@ def no_lost_updates() -> AbstractContextManager[Any]:
 
 def no_mismatch(*, at_nodes: bool) -> AbstractContextManager[Any]:
     """The plant follows its model, at the nodes of the flow, too, or from them on only."""
-    exact = DeliveryPropagation.__init__
+    exact = DeliveryFlow.__init__
 
-    def without(flow: DeliveryPropagation, plant: PlantGains) -> None:
+    def without(flow: DeliveryFlow, plant: PlantGains) -> None:
         exact(flow, replace(plant, A=plant.error.H - plant.B @ plant.error.K) if at_nodes else plant)
         flow.generator[flow.n :, : flow.n] = 0.0
 
-    return patch.object(DeliveryPropagation, "__init__", without)
+    return patch.object(DeliveryFlow, "__init__", without)
 
 
 def no_age_of_inputs() -> AbstractContextManager[Any]:
     """Inputs that are held and late do not change the flow."""
-    return patch.object(_SharpenedBounds, "_input_effects", lambda *_: NO_EFFECTS)
+    return patch.object(SharpenedBounds, "_input_effects", lambda *_: NO_EFFECTS)
 
 
 def no_lost_errors() -> AbstractContextManager[Any]:
     """In open loop a lost update has left nothing."""
-    exact = _OpenLoopErrors.bound
+    exact = OpenLoopErrors.bound
 
-    def bound(errors: _OpenLoopErrors, *known: Any) -> tuple[Vector, Matrix]:
+    def bound(errors: OpenLoopErrors, *known: Any) -> tuple[Vector, Matrix]:
         between, whole = exact(errors, *known)
         return np.full_like(between, between[0]), np.repeat(whole[:, :1], 2, axis=1)
 
-    return patch.object(_OpenLoopErrors, "bound", bound)
+    return patch.object(OpenLoopErrors, "bound", bound)
 
 
 def no_time_to_drive() -> AbstractContextManager[Any]:

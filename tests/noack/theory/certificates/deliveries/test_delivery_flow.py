@@ -7,7 +7,7 @@ from hypothesis import given, settings
 
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
-from noack.theory.certificates.deliveries.delivery_flow import FLOW_ROUNDING, DeliveryPropagation
+from noack.theory.certificates.deliveries.delivery_flow import FLOW_ROUNDING, DeliveryFlow
 from noack.theory.margins.exact_matrices import exponential
 from tests.noack.theory.certificates.certified_loops import gains_of
 from tests.oracles.lossy_loops import SEARCH, System, systems
@@ -26,7 +26,7 @@ def test_the_error_of_the_flow_is_far_below_what_its_bounds_are_enlarged_by(
     system: System,
 ) -> None:
     """It is an estimate, not a proof: at most a tenth of what bounds are enlarged by."""
-    flow = DeliveryPropagation(gains_of(system))
+    flow = DeliveryFlow(gains_of(system))
     for node in np.linspace(1, len(flow.edges_s) - 1, 6).astype(int):
         exact = exactly_after(flow.generator, float(flow.edges_s[node]))
         error = np.linalg.norm(flow.states[node] - exact[:, : flow.n], 2)
