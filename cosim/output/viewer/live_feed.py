@@ -32,11 +32,12 @@ from noack.protocol.record_tables import (
 from noack.scenario.resolution import loop_of, resolved_loops, tables_of
 from noack.scenario.scenario import Scenario, phases_ns
 
-_TURN_S, _SHARE = 0.03, 0.3
-"""CPU time of a turn; share of a core."""
-_NAMED_S, _PATIENCE_S = 3.0, 10.0
+_TURN_S, _CORE_SHARE = 0.03, 0.3
+"""CPU time of a turn; share of a core that all turns take."""
+_WARNED_LAG_S, _LONGEST_LAG_S = 3.0, 10.0
 """Wall time by which the loops in detail may lag before a warning, and before they are dropped."""
 _MAP_EVERY_S = 2.0
+"""Wall time between two pictures of the map."""
 Reals = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 _LONGEST_NS = 2**50
@@ -57,7 +58,7 @@ class LiveFeed:
         self._view, self._warn = view, warn
         self._wall_ns = NS_PER_S * scenario.speed
         self._phases_ns, self._types = phases_ns(scenario), [tables_of(loop) for loop in loops]
-        self._together = _AllLoops(scenario, loops, view) if view.is_shared else None
+        self._all_loops = _AllLoops(scenario, loops, view) if view.is_shared else None
         self._feeds = {
             number: LoopFeed(loops[number], loop_view, certified=not view.is_shared)
             for number, loop_view in view.views.items()
@@ -65,20 +66,20 @@ class LiveFeed:
         self._tables = SHOWN_TABLES if view.is_shared else (*SHOWN_TABLES, *CLOCK_TABLES)
         self._waiting: dict[str, list[Rows]] = {}
         self._due: list[int] = []
-        self._handed_ns = self._shown_ns = 0
-        self._named, self._next_s = False, 0.0
+        self._round_ns = self._shown_ns = 0
+        self._has_warned, self._next_s = False, 0.0
 
     def add(self, table: str, rows: Rows) -> None:
         """Add rows that follow the previously added ones."""
-        if self._together is not None:
-            self._together.add(table, rows)
+        if self._all_loops is not None:
+            self._all_loops.add(table, rows)
         if self._feeds and table in self._tables and len(rows):
             self._waiting.setdefault(table, []).append(rows)
 
     def log(self, notice: Mapping[str, Any]) -> None:
         """Add a line of the run's log, with the name of its loop; also to that of the loop."""
         loop, text, t_ns = notice.get(LOOP), str(notice["text"]), int(notice["t_ns"])
-        if self._together is None:
+        if self._all_loops is None:
             self._feeds[0].log(notice)
             return
         if loop is not None and loop < len(self._view.names):
@@ -92,33 +93,33 @@ class LiveFeed:
 
         The recording of a single loop is that of the run: all of it is passed on.
         """
-        if self._together is None:
-            self._hand_out()
+        if self._all_loops is None:
+            self._begin_round()
             self._feeds[0].advance(final=final)
             self._view.flush()
             return
         if not final:
-            self._watch_lag(self._together.newest_ns)
+            self._watch_lag(self._all_loops.newest_ns)
             if time.monotonic() < self._next_s:
                 return
         began_s = time.thread_time()
-        self._together.advance(final=final)
+        self._all_loops.advance(final=final)
         if final:
-            self._hand_out()
+            self._begin_round()
         while self._due or not final:
             if not self._due:
-                self._hand_out()
+                self._begin_round()
             if not self._due:
                 break
             self._feeds[self._due.pop(0)].advance(final=final)
             if not self._due:
-                self._shown_ns = self._handed_ns
+                self._shown_ns = self._round_ns
             if not final and (not self._due or time.thread_time() - began_s > _TURN_S):
                 break
         self._view.flush()
-        self._next_s = time.monotonic() + (time.thread_time() - began_s) * (1 / _SHARE - 1)
+        self._next_s = time.monotonic() + (time.thread_time() - began_s) * (1 / _CORE_SHARE - 1)
 
-    def _hand_out(self) -> None:
+    def _begin_round(self) -> None:
         """Begin a round: give each loop its rows."""
         waiting, self._waiting = self._waiting, {}
         for table, batches in waiting.items():
@@ -126,22 +127,22 @@ class LiveFeed:
                 if loop in self._feeds:
                     self._feeds[loop].add(table, rows)
         self._due = [*self._feeds]
-        if self._together is not None:
-            self._handed_ns = self._together.newest_ns
+        if self._all_loops is not None:
+            self._round_ns = self._all_loops.newest_ns
 
     def _watch_lag(self, newest_ns: int) -> None:
-        """Name a lag of the loops in detail; give them up if it grows."""
+        """Warn of a lag of the loops in detail; give them up if it grows."""
         lag_s = (newest_ns - self._shown_ns) / self._wall_ns
-        if not self._feeds or lag_s < _NAMED_S:
+        if not self._feeds or lag_s < _WARNED_LAG_S:
             return
-        if lag_s > _PATIENCE_S:
+        if lag_s > _LONGEST_LAG_S:
             self._feeds, self._due, self._waiting = {}, [], {}
             self._warn(
                 f"live view: the loops in detail end here, they were {lag_s:.0f} s late; all loops "
                 "together go on, and the record is complete"
             )
-        elif not self._named:
-            self._named = True
+        elif not self._has_warned:
+            self._has_warned = True
             self._warn(f"live view: the loops in detail are {lag_s:.1f} s late")
 
 
@@ -183,11 +184,11 @@ class _AllLoops:
             begin_ns, end_ns = map(np.concatenate, zip(self._inside, times_inside(rows), strict=True))
             self._inside = begin_ns, end_ns
         elif table == SENSOR_MEASUREMENT:
-            self._measured.append(self._reduced(rows, "t_ns", "x"))
+            self._measured.append(self._needed_columns(rows, "t_ns", "x"))
             of_run_ns = rows["t_ns"] + self._phases_ns[rows[LOOP]]
             self.newest_ns = max(self.newest_ns, int(of_run_ns.max()))
         elif table in (CONTROLLER_STEP, CONTROLLER_DELIVERY):
-            self._models.append(self._reduced(rows, "model_t_ns", "x_c"))
+            self._models.append(self._needed_columns(rows, "model_t_ns", "x_c"))
             if table == CONTROLLER_DELIVERY:
                 of_run_ns = rows["model_t_ns"] + self._phases_ns[rows[LOOP]]
                 np.minimum.at(self._first_ns, rows[LOOP], of_run_ns)
@@ -262,13 +263,13 @@ class _AllLoops:
         waiting[:] = [rows[~ready]]
         return rows[ready], of_run_ns[ready]
 
-    def _reduced(self, rows: Rows, time_name: str, vector_name: str) -> Rows:
+    def _needed_columns(self, rows: Rows, time_name: str, vector_name: str) -> Rows:
         """Return the needed columns of rows."""
-        reduced = np.empty(len(rows), self._none.dtype)
-        reduced[LOOP], reduced["input"] = rows[LOOP], rows["input"]
-        reduced["t_ns"] = rows[time_name]
-        reduced["x"] = np.where(self._entries[rows[LOOP]], rows[vector_name], 0.0)
-        return reduced
+        needed = np.empty(len(rows), self._none.dtype)
+        needed[LOOP], needed["input"] = rows[LOOP], rows["input"]
+        needed["t_ns"] = rows[time_name]
+        needed["x"] = np.where(self._entries[rows[LOOP]], rows[vector_name], 0.0)
+        return needed
 
 
 def _keys(rows: Rows) -> Numbers:

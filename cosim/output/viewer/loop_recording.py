@@ -180,23 +180,23 @@ class LoopView:
 
     Args:
         file: the recording.
-        shown: what is shown; its static data are written here.
+        layout: what is shown; its static data are written here.
     """
 
-    def __init__(self, file: RecordingFile, shown: bp.LoopLayout) -> None:
-        self._file, self._shown = file, shown
-        self._states = [bp.state_path(name) for name in shown.state_names]
+    def __init__(self, file: RecordingFile, layout: bp.LoopLayout) -> None:
+        self._file, self._layout = file, layout
+        self._states = [bp.state_path(name) for name in layout.state_names]
         self._frame = -1
         self._waiting: list[tuple[Nanoseconds, Frames]] = []
-        file.add_static(shown.static())
+        file.add_static(layout.static())
 
     def _send(self, entity: str, t_ns: Nanoseconds, values: Floats) -> None:
-        at_ns = np.asarray(t_ns) + self._shown.phase_ns
-        self._file.send(f"{self._shown.folder}{entity}", at_ns, values)
+        at_ns = np.asarray(t_ns) + self._layout.phase_ns
+        self._file.send(f"{self._layout.folder}{entity}", at_ns, values)
 
     def _send_columns(self, entity: str, t_ns: Nanoseconds, columns: Iterable[rr.ComponentColumn]) -> None:
-        at_ns = np.asarray(t_ns) + self._shown.phase_ns
-        self._file.send_columns(f"{self._shown.folder}{entity}", at_ns, columns)
+        at_ns = np.asarray(t_ns) + self._layout.phase_ns
+        self._file.send_columns(f"{self._layout.folder}{entity}", at_ns, columns)
 
     def _send_stems(self, entity: str, t_ns: Nanoseconds, height: Floats) -> None:
         """Add lines from 0 to each height (k,) at times (k,), with a gap after each."""
@@ -205,7 +205,7 @@ class LoopView:
 
     def log(self, t_ns: int, level: str, text: str) -> None:
         """Add one line to the loop's log; ``level`` is one of rerun's, such as INFO or WARN."""
-        self._file.log(t_ns + self._shown.phase_ns, level, text, self._shown.folder)
+        self._file.log(t_ns + self._layout.phase_ns, level, text, self._layout.folder)
 
     def samples(self, aligned: AlignedRun, e_c_bounds: Floats, x_bounds: Floats) -> None:
         """Add k samples.
@@ -230,9 +230,9 @@ class LoopView:
 
     def move(self, t_ns: Nanoseconds, frames: Frames) -> None:
         """Add states at times (k,) to the plant's picture, at its frame rate."""
-        if self._shown.picture is None:
+        if self._layout.picture is None:
             return
-        frame = t_ns // round(NS_PER_S / self._shown.picture.rate_hz)
+        frame = t_ns // round(NS_PER_S / self._layout.picture.rate_hz)
         new = np.diff(frame, prepend=self._frame) > 0
         if not new.any():
             return
@@ -243,12 +243,12 @@ class LoopView:
 
     def draw(self) -> None:
         """Write the waiting frames of the picture."""
-        if self._shown.picture is None or not self._waiting:
+        if self._layout.picture is None or not self._waiting:
             return
         t_ns = np.concatenate([times for times, _ in self._waiting])
         frames = concatenate_frames([frames for _, frames in self._waiting])
         self._waiting = []
-        for entity, columns in self._shown.picture.frames(frames).items():
+        for entity, columns in self._layout.picture.frames(frames).items():
             self._send_columns(f"{PICTURE}/{entity}", t_ns, columns)
 
     def packets(
@@ -260,14 +260,14 @@ class LoopView:
         reverse: bool = False,
     ) -> None:
         """Add packets (p,) to the network's diagram; see :meth:`NetworkDiagram.add`."""
-        if self._shown.diagram is not None:
-            self._shown.diagram.add(t_ns, release_ns, fate, reverse=reverse)
+        if self._layout.diagram is not None:
+            self._layout.diagram.add(t_ns, release_ns, fate, reverse=reverse)
 
     def travel(self, until_ns: int) -> None:
         """Animate the packets up to a time by which all of them were added."""
-        if self._shown.diagram is None:
+        if self._layout.diagram is None:
             return
-        for entity, moving in self._shown.diagram.advance(until_ns).items():
+        for entity, moving in self._layout.diagram.advance(until_ns).items():
             self._send_columns(f"{DIAGRAM}/{entity}", moving.t_ns, moving.columns)
 
     def certified_interval(self, interval_s: float, until_ns: int) -> None:
@@ -302,12 +302,12 @@ class LoopView:
 
     def lateness(self, process: str, t_ns: Nanoseconds, lateness_us: Floats) -> None:
         """Add a process's lateness in µs (k,) at times (k,), if it is shown."""
-        if process in self._shown.processes:
+        if process in self._layout.processes:
             self._send(bp.lateness_path(process), t_ns, lateness_us)
 
     def clock_errors(self, process: str, t_ns: Nanoseconds, error_us: Floats) -> None:
         """Add bounds of the error of a process's clock in µs (k,) at times (k,); NaN: lost."""
-        if process in self._shown.processes:
+        if process in self._layout.processes:
             self._send(bp.clock_path(process), t_ns, error_us)
 
 
