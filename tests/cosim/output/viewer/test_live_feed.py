@@ -79,7 +79,7 @@ def test_loops_in_detail_that_cannot_keep_up_are_given_up_and_named(
     monkeypatch.setattr("cosim.output.viewer.live_feed._TURN_S", -1.0)  # one loop a turn
     monkeypatch.setattr("cosim.output.viewer.live_feed._WARNED_LAG_S", 0.05)
     monkeypatch.setattr("cosim.output.viewer.live_feed._LONGEST_LAG_S", 0.5)
-    monkeypatch.setattr("cosim.output.viewer.live_feed._SHARE", 1e-4)
+    monkeypatch.setattr("cosim.output.viewer.live_feed._CORE_SHARE", 1e-4)
     _, chunks, said = shown(tmp_path, 3)
     assert "in detail end here" in said[-1]
     assert len(series(chunks, ERROR)[0]) == INTERVALS
