@@ -17,6 +17,7 @@ from cosim.analysis.summary.loops_over_time import INTERVALS, add_link_bytes, em
 from cosim.analysis.summary.run_summary import counts_inside, times_inside
 from cosim.output.viewer.loop_feed import LAG_S, SHOWN_TABLES, LoopFeed, log_level
 from cosim.output.viewer.run_recording import ERROR, SIZE, RunRecording
+from cosim.record.align import Reals
 from cosim.record.record_source import rows_by_loop
 from cosim.record.run_record import Rows
 from noack.core.clock import NEVER_NS, NS_PER_S
@@ -38,10 +39,9 @@ _WARNED_LAG_S, _LONGEST_LAG_S = 3.0, 10.0
 """Wall time by which the loops in detail may lag before a warning, and before they are dropped."""
 _MAP_EVERY_S = 2.0
 """Wall time between two pictures of the map."""
-Reals = NDArray[np.float64]
-Numbers = NDArray[np.int64]
 _LONGEST_NS = 2**50
 """Longer than any run; 2**13 loops have keys of 63 bits."""
+Numbers = NDArray[np.int64]
 
 
 class LiveFeed:
@@ -223,7 +223,7 @@ class _AllLoops:
     def _add_norms(self, until_ns: int) -> None:
         """Add the norms of the measurements up to a time of the run."""
         measured, at_ns = self._take(self._measured, until_ns)
-        self._largest(self._over_time.states, measured[LOOP], at_ns, row_norms(measured["x"]))
+        self._raise_largest(self._over_time.states, measured[LOOP], at_ns, row_norms(measured["x"]))
         # x_c at each measurement follows from the newest row of the controller before it.
         models = np.append(self._newest, self._take(self._models, until_ns)[0])
         models = models[np.lexsort((models["input"], models["t_ns"], models[LOOP]))]
@@ -237,11 +237,11 @@ class _AllLoops:
         measured, age_ns, x_c = measured[known], age_ns[known], models["x"][row[known]]
         for dt_ns in np.unique(age_ns).tolist():
             aged = age_ns == dt_ns
-            x_c[aged] = self._flow(dt_ns, measured[LOOP][aged], x_c[aged])
+            x_c[aged] = self._propagate(dt_ns, measured[LOOP][aged], x_c[aged])
         errors = row_norms(x_c - measured["x"])
-        self._largest(self._over_time.errors, measured[LOOP], at_ns[known], errors)
+        self._raise_largest(self._over_time.errors, measured[LOOP], at_ns[known], errors)
 
-    def _flow(self, dt_ns: int, loops: Numbers, x_c: Reals) -> Reals:
+    def _propagate(self, dt_ns: int, loops: Numbers, x_c: Reals) -> Reals:
         """Return models of controllers, (k, n), a time later, with the set-points of the start."""
         if dt_ns not in self._transitions:
             transitions = np.zeros((*self._entries.shape, self._entries.shape[1]))
@@ -252,7 +252,8 @@ class _AllLoops:
         moved: Reals = np.einsum("kij,kj->ki", self._transitions[dt_ns][loops], x_c - rest)
         return rest + moved
 
-    def _largest(self, values: Reals, loops: Numbers, t_ns: Numbers, norms: Reals) -> None:
+    def _raise_largest(self, values: Reals, loops: Numbers, t_ns: Numbers, norms: Reals) -> None:
+        """Enter norms into the largest values of their loops and intervals."""
         np.fmax.at(values, (loops, intervals_of(t_ns, self._horizon_ns)), norms)
 
     def _take(self, waiting: list[Rows], until_ns: int) -> tuple[Rows, Numbers]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from cosim.output.figures.palette import CONTROLLER, FORCED, LOST, NETWORK, PLANT, SENSOR
 from cosim.output.viewer.pictures.picture import STILL, Columns, Shape, label, lines, style, upright
+from cosim.record.align import Reals, Times
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import Fate, effective
 from noack.protocol.wire_format import Flow
@@ -39,9 +40,6 @@ _REVERSE_Y = -0.4
 _INPUT_Y = -2.5
 """Height of the way from the controller to the plant."""
 _DOT_RADIUS = 0.17
-
-Times = NDArray[np.int64]
-Reals = NDArray[np.float64]
 
 
 class Moving(NamedTuple):

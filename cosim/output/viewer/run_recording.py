@@ -45,11 +45,12 @@ from cosim.analysis.summary.summary_model import RunSummary
 from cosim.output.figures.palette import CONTROLLER, LOST, NETWORK, SERIES
 from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.loop_feed import LoopFeed, log_level
-from cosim.output.viewer.loop_recording import LoopView, Nanoseconds, RecordingFile, ViewError, run_text
+from cosim.output.viewer.loop_recording import LoopView, RecordingFile, ViewError, run_text
 from cosim.output.viewer.network_diagram import NetworkDiagram
 from cosim.output.viewer.pictures.picture import picture_of
 from cosim.output.viewer.recording_viewer import LiveView
-from cosim.record.decimation import Reals, is_long
+from cosim.record.align import Reals, Times
+from cosim.record.decimation import is_long
 from cosim.record.run_directory import RECORDING_FILE, Kind, file_of_loop
 from cosim.record.run_record import RecordedRun, RunRecord
 from noack.core.clock import NS_PER_S
@@ -156,15 +157,15 @@ to the right.
             },
         )
 
-    def queue(self, t_ns: Nanoseconds, largest: Reals | NDArray[np.int64], mean: Reals) -> None:
+    def queue(self, t_ns: Times, largest: Reals | NDArray[np.int64], mean: Reals) -> None:
         """Add the numbers of datagrams in the network, (k,)."""
         self.send(QUEUE, t_ns, np.column_stack([largest, mean]))
 
-    def share(self, t_ns: Nanoseconds, shares: Reals) -> None:
+    def share(self, t_ns: Times, shares: Reals) -> None:
         """Add the share of the link of each loop, (L, k)."""
         self.send(SHARE, t_ns, 100 * _curves_or_quantiles(shares).T)
 
-    def norms(self, entity: str, t_ns: Nanoseconds, values: Reals) -> None:
+    def norms(self, entity: str, t_ns: Times, values: Reals) -> None:
         """Add norms of each loop, (L, k), to ``ERROR`` or ``SIZE``.
 
         Their logarithm is cut off some decades from the usual largest value so far: a norm may be
