@@ -36,6 +36,7 @@ INK, GRID, PAPER = "#1b1f24", "#d9dde3", "#fefefe"
 """Text and frames, grid lines, background, as in the style files; a page replaces them."""
 
 _EM_PER_CHARACTER = 0.6
+"""Mean width of a character of a legend."""
 POINTS_PER_IN = 72
 _STYLES = Path(__file__).with_name("styles")
 
@@ -91,6 +92,7 @@ _LAYOUT: ContextVar[FigureLayout] = ContextVar("figure_layout", default=_SCREEN)
 _ROOM_BESIDE_TITLE_IN = 5.0
 """Least width of a figure in which legends are beside titles."""
 _LEAST_SCALE, _LEAST_BESIDE_SCALE = 0.6, 0.4
+"""Least factors of the heights of axes, and of the widths of panels beside others."""
 
 
 def layout() -> FigureLayout:

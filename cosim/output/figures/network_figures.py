@@ -43,6 +43,7 @@ _MOST_NAMED_ROWS = 24
 _BANDS = ((0, 4, 0.25, "5 to 95 % of the loops"), (1, 3, 0.45, "25 to 75 %"))
 """Places of two quantiles among QUANTILES, opacity and label of the band between them."""
 _MEDIAN, _LARGEST = 2, 5
+"""Their places among QUANTILES."""
 
 
 def page_figures(

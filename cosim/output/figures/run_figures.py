@@ -63,8 +63,9 @@ Envelope = tuple[str, Literal["e_c", "x", "inter_event"], Reals, Reals, BoundKin
 BOUNDED = ("errors", "state-norm", "inter-event")
 """The figures that show certified bounds."""
 _STATES_NARROWEST_IN, _LOSSES_NARROWEST_IN, _LOSSES_WIDEST_IN = 1.7, 2.2, 5.0
+"""Widths of a panel of these figures, in inches."""
 _MOST_STATES = 16
-_LONGEST_TITLE = 40
+_LONGEST_TITLE = 40  # characters
 _DECADES = 6
 """Maximum decades of an axis of norms."""
 _FAR_RATIO, _FAR_OPACITY = 20.0, 0.45

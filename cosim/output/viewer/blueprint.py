@@ -337,6 +337,7 @@ COLOUR_KEY = "key"
 """Parent of all entities of the key."""
 
 _KEY_WIDTH, _ROW_HEIGHT = 18.0, 1.2
+"""Lengths in the key have a unit of their own."""
 _ENTRIES_PER_ROW = 6
 """Most inputs in a row of the key."""
 _HALF_STROKE, _STROKE_WIDTH = 0.7, 0.16

@@ -54,11 +54,12 @@ RECORDING = "recording.rrd"
 """Last part of the address of a recording."""
 _MAGIC = b"RRF"
 """First bytes of a recording."""
-_BLOCK = 1 << 18
+_BLOCK_BYTES = 1 << 18
 _POLL_S = 0.1
 _START_S = 10.0
 """Maximum time to wait until a new window requests the recording."""
 _DRAIN_S = 2.0
+"""Maximum time to wait for downloads of a finished file."""
 _END_S = 5.0
 """Maximum time to wait until the serving process has ended."""
 _SECRET_BYTES = 32
@@ -246,7 +247,7 @@ class _Handler(BaseHTTPRequestHandler):
             while True:
                 # Checked before reading, so that data written before it was set are still sent.
                 finished = recording.finished.is_set()
-                if block := file.read(_BLOCK):
+                if block := file.read(_BLOCK_BYTES):
                     self.wfile.write(block)
                 elif finished:
                     break
@@ -265,7 +266,7 @@ class _Handler(BaseHTTPRequestHandler):
                     if (value := answer.getheader(header)) is not None:
                         self.send_header(header, value)
                 self.end_headers()
-                while block := answer.read(_BLOCK):
+                while block := answer.read(_BLOCK_BYTES):
                     self.wfile.write(block)
                 t_ns = opening_time_ns(self.server.recording.path) if name == "" else None
                 if t_ns is not None:

@@ -36,8 +36,8 @@ HOST = "127.0.0.1"
 OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?")
 """The host in a request's header; another name would be that of a foreign page (DNS rebinding)."""
 _WEB_START_S = 10.0
-_TIMEOUT_S = 10.0
-_SOCKETS = Path("/proc/net/tcp")
+_ANSWER_S = 10.0
+_SOCKET_LIST = Path("/proc/net/tcp")
 _TRIES = 3
 """Maximum tries: the kernel's list may miss a socket while others open and close."""
 _SERVED_AT = re.compile(rb"(?<!\+)http://127\.0\.0\.1:(\d+)")
@@ -190,7 +190,7 @@ class WebViewer:
         Raises:
             PeerError: the program has ended, or the answering process is not this user's.
         """
-        source = http.client.HTTPConnection(HOST, self.port, timeout=_TIMEOUT_S)
+        source = http.client.HTTPConnection(HOST, self.port, timeout=_ANSWER_S)
         with contextlib.closing(source):
             try:
                 source.connect()
@@ -229,7 +229,7 @@ def socket_user(own: tuple[str, int], peer: tuple[str, int]) -> int | None:
     try:
         wanted = [_listed_address(own), _listed_address(peer)]
         for _ in range(_TRIES):
-            for line in _SOCKETS.read_text().splitlines()[1:]:
+            for line in _SOCKET_LIST.read_text().splitlines()[1:]:
                 fields = line.split()
                 user, inode = fields[7], fields[9]
                 if fields[1:3] == wanted and inode != "0":

@@ -86,7 +86,7 @@ class RunRecording(RecordingFile):
         kind: live or simulated.
         worst: the worst loop; None in a run that goes on.
         live: live viewer, which shows the file while it is written.
-        at_once: whether the run has ended, and its whole record is written.
+        complete: whether the run has ended: its whole record is written.
 
     Raises:
         ViewError: the file cannot be created.
@@ -102,11 +102,11 @@ class RunRecording(RecordingFile):
         *,
         worst: WorstLoop | None = None,
         live: LiveView | None = None,
-        at_once: bool = False,
+        complete: bool = False,
     ) -> None:
         self.names, phases = loop_names(run), phases_ns(run)
         self.is_shared = len(self.names) > 1
-        animated = len(shown) <= _ANIMATED and not (at_once and is_long(run))
+        animated = len(shown) <= _ANIMATED and not (complete and is_long(run))
         loops = {
             number: _loop_layout(
                 loop,
@@ -119,7 +119,7 @@ class RunRecording(RecordingFile):
         }
         panels = {self.names[number]: loop for number, loop in loops.items()}
         container = _tabs(panels, len(self.names), worst) if self.is_shared else loops[0].panels()
-        indexed = at_once or run.horizon_s <= _INDEXED_S * run.speed
+        indexed = complete or run.horizon_s <= _INDEXED_S * run.speed
         over_time = bp.over_time(container, run.horizon_s)
         super().__init__(path, f"{run_id:016x}", over_time, indexed=indexed)
         self._live, self._usual = live, float(np.finfo(float).tiny)
@@ -305,7 +305,7 @@ def write_loop_view(record: RunRecord, path: Path) -> None:
     """Write the recording of one loop; that of a long run shows extremes only."""
     require_space(path.parent)
     scenario, kind = record.scenario, record.kind
-    with RunRecording(scenario, path, _new_id(), {0: scenario}, kind, at_once=True) as recording:
+    with RunRecording(scenario, path, _new_id(), {0: scenario}, kind, complete=True) as recording:
         _feed_record(record, recording)
 
 
@@ -321,7 +321,7 @@ def _write_network_view(
     worst, count, path = worst_loop(summary.loops), len(run.loops), run_dir / RECORDING_FILE
     numbers = range(count) if count <= PICTURED else [worst.number]
     loops = {number: run.loops[number].scenario for number in numbers}
-    with RunRecording(run.scenario, path, _new_id(), loops, run.kind, worst=worst, at_once=True) as whole:
+    with RunRecording(run.scenario, path, _new_id(), loops, run.kind, worst=worst, complete=True) as whole:
         flying = summary.network.in_flight
         largest = np.array(flying.max_by_interval, np.float64)
         queue_ns = (np.arange(len(largest)) + 0.5) * flying.width_s * NS_PER_S
