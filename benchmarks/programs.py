@@ -39,8 +39,8 @@ FREE_PORTS = ("--set", "ports={}")
 NOACK = (sys.executable, "-m", "cosim.cli")
 LAUNCHER = "launcher"
 _Result = TypeVar("_Result")
-_LOOK_S = 0.1
-_END_PATIENCE = 6.0
+_POLL_S = 0.1
+_PATIENCE_RATIO = 6.0
 """A run and its end may take this multiple of the run's length."""
 PRIORITY = 50
 """SCHED_FIFO priority of a run's processes, by default."""
@@ -71,7 +71,7 @@ class OutputLine(NamedTuple):
     text: str
 
 
-class Finished(NamedTuple):
+class FinishedProgram(NamedTuple):
     """A program that has ended with exit status 0."""
 
     began_s: float
@@ -79,7 +79,7 @@ class Finished(NamedTuple):
     stdout: str
 
 
-def execute(command: Sequence[str]) -> Finished:
+def execute(command: Sequence[str]) -> FinishedProgram:
     """Run a program to its end, recording the time of each line of its standard error."""
     with tempfile.TemporaryFile("w+") as stdout:
         began_s = time.monotonic()
@@ -98,7 +98,7 @@ def execute(command: Sequence[str]) -> Finished:
             messages = [line.text for line in lines if not PROGRESS.match(line.text)]
             last = messages[-1] if messages else "no message"
             raise MeasurementError(f"{command[0]} ended with {process.returncode}: {last}")
-        return Finished(began_s, lines, stdout.read())
+        return FinishedProgram(began_s, lines, stdout.read())
 
 
 def imported_s(modules: str) -> float:
@@ -175,7 +175,7 @@ class Sample(NamedTuple):
             )
 
 
-class Observed(NamedTuple):
+class ObservedRun(NamedTuple):
     """A run of noack that has ended, observed from outside; times are of the monotonic clock."""
 
     summary: dict[str, Any]
@@ -199,7 +199,7 @@ class Observed(NamedTuple):
         return [sample for sample in self.samples.get(role, ()) if begin_s <= sample.at_s <= end_s]
 
 
-def observed_run(arguments: Sequence[str], folder: Path, length_s: float, pause_s: float) -> Observed:
+def observed_run(arguments: Sequence[str], folder: Path, length_s: float, pause_s: float) -> ObservedRun:
     """Run ``noack run ARGUMENTS`` to its end, and sample its processes.
 
     Args:
@@ -214,7 +214,7 @@ def observed_run(arguments: Sequence[str], folder: Path, length_s: float, pause_
     def observe() -> None:
         nonlocal ended_s
         sampled_s = -math.inf
-        while not closed.wait(_LOOK_S):
+        while not closed.wait(_POLL_S):
             now_s = time.monotonic()
             if not all(is_over(processes[role]) for role in LOOP_ROLES):
                 ended_s = now_s
@@ -233,18 +233,21 @@ def observed_run(arguments: Sequence[str], folder: Path, length_s: float, pause_
         observer = threading.Thread(target=observe)
         observer.start()
         try:
-            finished = run.finish(_END_PATIENCE * length_s + PATIENCE_S)
+            finished = run.finish(_PATIENCE_RATIO * length_s + PATIENCE_S)
         finally:
             closed_s = time.monotonic()
             closed.set()
             observer.join()
         left = [process.name() for process in run.left_behind()]
     horizon_s = min(ended_s, began_s + length_s)
-    return Observed(finished.summary, finished.run_dir, samples, began_s, horizon_s, ended_s, closed_s, left)
+    return ObservedRun(
+        finished.summary, finished.run_dir, samples, began_s, horizon_s, ended_s, closed_s, left
+    )
 
 
 _CORES = sorted(os.sched_getaffinity(0))
 RELAY_CORE, LOAD_CORE = _CORES[0], _CORES[-1]
+"""Where relays run, and where their load does."""
 
 
 @contextmanager

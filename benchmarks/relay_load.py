@@ -30,7 +30,8 @@ from noack.runtime.address import LOOPBACK
 DATAGRAM_BYTES = 72
 BURST = 8000
 """Datagrams in a burst, if the relay's receive buffer holds that many."""
-_PROBE = 20_000
+_PROBE_DATAGRAMS = 20_000
+"""Datagrams of a first burst, by which the capacity of a relay's buffer is measured."""
 _LOSSY_SLACK = 16
 """With 5 % loss, this number of consecutive losses does not occur within a benchmark."""
 _READY_S, _END_S = 120.0, 30.0
@@ -47,7 +48,7 @@ Nanoseconds = npt.NDArray[np.int64]
 Addresses = npt.NDArray[np.uint32]
 
 
-class Built(NamedTuple):
+class CompiledCode(NamedTuple):
     """The code compiled for a benchmark: the library of ``load.c``, and ``relay.c``."""
 
     load: Any
@@ -55,11 +56,11 @@ class Built(NamedTuple):
 
 
 @contextmanager
-def built() -> Iterator[Built]:
+def compiled_code() -> Iterator[CompiledCode]:
     """Compile the load and the C relay; they exist within the context."""
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
         load = compile_program("load.c", Path(folder), "-shared", "-fPIC")
-        yield Built(_FFI.dlopen(str(load)), compile_program("relay.c", Path(folder)))
+        yield CompiledCode(_FFI.dlopen(str(load)), compile_program("relay.c", Path(folder)))
 
 
 def sources(count: int) -> Addresses:
@@ -161,10 +162,10 @@ class RelayKind(NamedTuple):
 _MODES = {"segment": "segments", "names": "senders' addresses", "paths": "a socket per client"}
 
 
-def c_relay(built: Built, *words: str) -> RelayKind:
+def c_relay(code: CompiledCode, *words: str) -> RelayKind:
     """Return ``relay.c`` in one of its modes, ``segment``, ``names`` and ``paths``."""
     name = ", ".join(["C relay", *(_MODES[word] for word in words)])
-    return RelayKind(name, lambda port, to: [str(built.relay), str(port), str(to), *words])
+    return RelayKind(name, lambda port, to: [str(code.relay), str(port), str(to), *words])
 
 
 def socat() -> RelayKind:
@@ -215,16 +216,16 @@ class LoadedRelay:
             continuation on; ``cpu_us``: CPU time for each.
         """
         if not self._burst:
-            capacity = self.ends.burst(self.pid, _PROBE, 0, addresses).last + 1
+            capacity = self.ends.burst(self.pid, _PROBE_DATAGRAMS, 0, addresses).last + 1
             self._burst = min(BURST, capacity * 9 // 10)
             if not self._burst:
                 raise MeasurementError(f"{self.name} forwards nothing")
         sent, before_s = self._burst, self.cpu_s
-        found = self.ends.burst(self.pid, sent, self._slack, addresses)
-        cpu_s, decided = self.cpu_s - before_s, found.last + 1
-        if decided < sent - self._slack or (self._slack == 0 and found.received != sent):
-            raise MeasurementError(f"{self.name}: of a burst of {sent} only {found.received} arrived")
-        return {"per_s": decided / found.wall_ns * 1e9, "cpu_us": cpu_s / sent * 1e6}
+        result = self.ends.burst(self.pid, sent, self._slack, addresses)
+        cpu_s, decided = self.cpu_s - before_s, result.last + 1
+        if decided < sent - self._slack or (self._slack == 0 and result.received != sent):
+            raise MeasurementError(f"{self.name}: of a burst of {sent} only {result.received} arrived")
+        return {"per_s": decided / result.wall_ns * 1e9, "cpu_us": cpu_s / sent * 1e6}
 
     def totals(self) -> dict[str, int]:
         """End our relay as Ctrl-C does; return its counts of the datagrams towards the sink."""
@@ -236,12 +237,12 @@ class LoadedRelay:
 
 
 @contextmanager
-def running(kind: RelayKind, built: Built) -> Iterator[LoadedRelay]:
+def running(kind: RelayKind, code: CompiledCode) -> Iterator[LoadedRelay]:
     """Run a relay on its core, between sender and sink."""
     with socket.socket(type=socket.SOCK_DGRAM) as probe:
         probe.bind((LOOPBACK, 0))
         port = int(probe.getsockname()[1])
-    with closing(PathEnds(built.load)) as ends, ExitStack() as stack:
+    with closing(PathEnds(code.load)) as ends, ExitStack() as stack:
         command = kind.command(port, ends.sink.getsockname()[1])
         with on_core(RELAY_CORE):
             process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -264,21 +265,21 @@ def _is_bound(port: int) -> bool:
 
 
 @contextmanager
-def started(kinds: Iterable[RelayKind], built: Built) -> Iterator[tuple[Rounds, list[LoadedRelay]]]:
+def started(kinds: Iterable[RelayKind], code: CompiledCode) -> Iterator[tuple[Rounds, list[LoadedRelay]]]:
     """Run relays within the context; the rounds say which ones did not start, and why."""
     rounds, relays = Rounds(), list[LoadedRelay]()
     with ExitStack() as stack:
         for kind in kinds:
             try:
-                relays.append(stack.enter_context(running(kind, built)))
+                relays.append(stack.enter_context(running(kind, code)))
             except MeasurementError as error:
                 rounds.add(kind.name, str(error))
         yield rounds, relays
 
 
 @contextmanager
-def direct_ends(built: Built) -> Iterator[PathEnds]:
+def direct_ends(code: CompiledCode) -> Iterator[PathEnds]:
     """Give a sender whose datagrams go directly to the sink."""
-    with closing(PathEnds(built.load)) as ends:
+    with closing(PathEnds(code.load)) as ends:
         ends.out.connect(ends.sink.getsockname())
         yield ends

@@ -52,6 +52,10 @@ class Goal(NamedTuple):
         return f"{self.comparison} {self.limit:g}"
 
 
+ZERO = Goal("==", 0)
+"""The goal of what must not occur."""
+
+
 @dataclass(frozen=True)
 class Row:
     """One figure."""
@@ -220,15 +224,15 @@ class Rounds:
     ) -> None:
         """Measure the sides in turn, in some rounds; one that fails is missing from then on."""
         for number in range(count):
-            say(f"{head}round {number + 1} of {count}")
+            announce(f"{head}round {number + 1} of {count}")
             for side in [side for side in sides if side not in self.missing]:
                 try:
                     self.add(side, sides[side]())
                 except MeasurementError as error:
                     self.add(side, str(error))
 
-    def of(self, side: str, quantity: str) -> list[float]:
-        """Return the rounds of a quantity; empty if the side was not measured."""
+    def values(self, side: str, quantity: str) -> list[float]:
+        """Return the values of a quantity, one of each round; empty if the side was not measured."""
         return [figures[quantity] for figures in self._figures[side]]
 
     def row(
@@ -241,7 +245,7 @@ class Rounds:
         both sides of a round; else it is the ratio of the medians.
         """
         reasons = [f"{side}: {self.missing[side]}" for side in (ours, peer or "") if side in self.missing]
-        value, alternative = self.of(ours, quantity), self.of(peer or "", quantity)
+        value, alternative = self.values(ours, quantity), self.values(peer or "", quantity)
         ratio = None
         if paired and not reasons:
             ratio = median(own / other for own, other in zip(value, alternative, strict=True))
@@ -276,7 +280,7 @@ def compare(
 
     The alternative may also be a known figure.
     """
-    say(name)
+    announce(name)
     if not isinstance(peer, tuple) or isinstance(peer, Peer):
         return Row(name, median(ours() for _ in range(rounds)), unit, peer, goal, note, unchecked_because)
     pairs = [(ours(), peer[1]()) for _ in range(rounds)]
@@ -301,7 +305,7 @@ def _cpu_s(call: Callable[[], object]) -> float:
     return max(time.process_time() - began_s, 1e-9)
 
 
-def say(text: str) -> None:
+def announce(text: str) -> None:
     """Print what is being measured."""
     print(f"  {text} ...", file=sys.stderr, flush=True)
 

@@ -31,8 +31,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.stats import theilslopes
 
-from benchmarks.programs import LAUNCHER, Observed, Sample, observed_run
-from benchmarks.report import Goal, MeasurementError, Row, print_table
+from benchmarks.programs import LAUNCHER, ObservedRun, Sample, observed_run
+from benchmarks.report import ZERO, Goal, MeasurementError, Row, print_table
 from cosim.output.figures import palette
 from cosim.output.figures.figure_description import Axis, FigureDescription, Line, Panel, PanelRow, time_axis
 from cosim.output.figures.figure_files import save_figure
@@ -46,10 +46,13 @@ from noack.scenario.scenario_file import load
 
 WARM_UP_SHARE, LONGEST_WARM_UP_S = 0.2, 300.0
 WINDOWS, LEAST_WINDOWS = 12, 8
+"""Windows of a run, and those of them that must have samples."""
 ALLOWED_KIB, STEADY_KIB, SHORT_KIB = 1024.0, 256.0, 9728.0
 """Allowed growth per hour, and at least in total: in general, if it is steady, in a short run."""
 SHORT_S, LEAST_S = 1800.0, 120.0
+"""Length of a short run; time after the warm-up without which memory is not checked."""
 STEADY_SHARE = 0.9
+"""Share of the pairs of windows that rise if the growth is steady."""
 KINDS: Mapping[str, Sequence[str]] = {
     "hour": (),
     # 20 Hz at speed 48 are 960 steps per second. Some updates are delayed, so that they are in flight
@@ -68,9 +71,8 @@ _SCENARIO = Path(__file__).with_name("soak_hour.toml")
 ROLES = (*LOOP_ROLES, RECORDER, LAUNCHER)
 COUNTS = {"fds": "file descriptors", "sockets": "sockets", "threads": "threads"}
 _LEAST_MINUTES = 0.2
-_LEAST_LOOKS, _LONGEST_PAUSE_S = 150, 5.0
-"""Each window has several samples."""
-NONE = Goal("==", 0)
+_LEAST_SAMPLES, _LONGEST_PAUSE_S = 150, 5.0
+"""Samples of a run, so that each window has several, and the longest time between two."""
 
 
 class Trend(NamedTuple):
@@ -86,7 +88,7 @@ def warm_up_s(length_s: float) -> float:
     return min(WARM_UP_SHARE * length_s, LONGEST_WARM_UP_S)
 
 
-def trend(at_s: Sequence[float], kib: Sequence[float], length_s: float) -> Trend | None:
+def memory_trend(at_s: Sequence[float], kib: Sequence[float], length_s: float) -> Trend | None:
     """Check memory over a run; return None if it is too short for that.
 
     Args:
@@ -120,7 +122,7 @@ def trend(at_s: Sequence[float], kib: Sequence[float], length_s: float) -> Trend
     return Trend(slope * checked_s, allowed_kib, 3600 * slope)
 
 
-def constant(at_s: Sequence[float], counts: Sequence[int], length_s: float) -> tuple[int, int]:
+def lasting_range(at_s: Sequence[float], counts: Sequence[int], length_s: float) -> tuple[int, int]:
     """Return minimum and maximum of a count after the warm-up, ignoring single outliers."""
     checked = [count for at, count in zip(at_s, counts, strict=True) if warm_up_s(length_s) <= at <= length_s]
     lasting = [a for a, b in pairwise(checked) if a == b] or checked
@@ -132,7 +134,7 @@ def process_rows(role: str, samples: Sequence[Sample], began_s: float, length_s:
     if not samples:
         raise MeasurementError(f"{role}: was never seen")
     at_s = [sample.at_s - began_s for sample in samples]
-    memory = trend(at_s, [sample.uss_kib for sample in samples], length_s)
+    memory = memory_trend(at_s, [sample.uss_kib for sample in samples], length_s)
     name, size = f"{role}: private memory gained", f"{samples[-1].uss_kib / 1024:.1f} MiB"
     if memory is None:
         yield Row(name, None, "KiB", note=f"{size}; not checked: too short")
@@ -140,9 +142,9 @@ def process_rows(role: str, samples: Sequence[Sample], began_s: float, length_s:
         note = f"{size}; {memory.slope_kib_per_h:+.0f} KiB per hour"
         yield Row(name, memory.growth_kib, "KiB", goal=Goal("<=", memory.allowed_kib), note=note)
     for count, meaning in COUNTS.items():
-        least, most = constant(at_s, [getattr(sample, count) for sample in samples], length_s)
+        least, most = lasting_range(at_s, [getattr(sample, count) for sample in samples], length_s)
         # On an overloaded machine, control-plane sessions reconnect, which adds threads.
-        goal = None if count == "threads" and length_s < SHORT_S else NONE
+        goal = None if count == "threads" and length_s < SHORT_S else ZERO
         yield Row(f"{role}: variation of {meaning}", most - least, "", goal=goal, note=f"{least} to {most}")
 
 
@@ -163,21 +165,21 @@ def end_rows(summary: Mapping[str, Any], delivered_out_of_order: int) -> Iterato
     stale = rejected.pop(("controller", "stale"), 0)
     violated = [f"{claim['what']} ({claim['source']})" for claim in claims if claim["verdict"] == "violated"]
     bursts = [part for part in loop["assumption_violations"] if part["cause"] == "dropouts"]
-    yield Row("exit status", ending["status"], "", goal=NONE, note=ending["reason"])
-    yield Row("missing samples", loop["missing_samples"], "", goal=NONE)
-    yield Row("unintended losses", loop["unintended_losses"], "", goal=NONE)
-    yield Row("rejected datagrams", sum(rejected.values()), "", goal=NONE, note=f"{rejected}")
+    yield Row("exit status", ending["status"], "", goal=ZERO, note=ending["reason"])
+    yield Row("missing samples", loop["missing_samples"], "", goal=ZERO)
+    yield Row("unintended losses", loop["unintended_losses"], "", goal=ZERO)
+    yield Row("rejected datagrams", sum(rejected.values()), "", goal=ZERO, note=f"{rejected}")
     yield Row("rejected as stale, without those delivered out of order", stale - delivered_out_of_order, "",
-              goal=NONE)  # fmt: skip
-    yield Row("loss bursts beyond the guarantee", len(bursts), "", goal=NONE)
+              goal=ZERO)  # fmt: skip
+    yield Row("loss bursts beyond the guarantee", len(bursts), "", goal=ZERO)
     yield Row("longest loss burst", loop["longest_loss_burst"], "")
     yield Row("replayed bit for bit and completely", bool(replay.get("bit_exact") and replay.get("complete")),
               "", goal=Goal("==", 1), note=f"{replay.get('inputs') or 0:,} inputs")  # fmt: skip
     yield Row("claims checked", len(claims), "", goal=Goal(">=", 1))
-    yield Row("claims violated", len(violated), "", goal=NONE, note="; ".join(violated))
+    yield Row("claims violated", len(violated), "", goal=ZERO, note="; ".join(violated))
 
 
-def run_rows(run: Observed) -> Iterator[Row]:
+def run_rows(run: ObservedRun) -> Iterator[Row]:
     """Yield the rows of a finished run."""
     length_s = run.horizon_s - run.began_s - 2
     for role in ROLES:
@@ -192,11 +194,11 @@ def run_rows(run: Observed) -> Iterator[Row]:
         yield Row(f"{role}: memory at the end, at most", max(at_end, default=None), "MiB")
     yield Row("wall time of the end", run.closed_s - run.ended_s, "s")
     unfinished = not (run.run_dir / RECORD).is_dir() or (run.run_dir / SPOOL).exists()
-    yield Row("unfinished records", unfinished, "", goal=NONE)
-    yield Row("processes left behind", len(run.left_behind), "", goal=NONE, note=", ".join(run.left_behind))
+    yield Row("unfinished records", unfinished, "", goal=ZERO)
+    yield Row("processes left behind", len(run.left_behind), "", goal=ZERO, note=", ".join(run.left_behind))
 
 
-def memory_figure(run: Observed) -> FigureDescription:
+def memory_figure(run: ObservedRun) -> FigureDescription:
     """Describe each process's private memory minus its first value, in KiB, over the run."""
     rows = []
     for i, role in enumerate(ROLES):
@@ -223,7 +225,7 @@ def soak(path: Path, settings: Sequence[str], runs: Path) -> list[Row]:
     runs.mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(prefix="soak-", dir=runs))
     changes = [word for setting in settings for word in ("--set", setting)]
-    pause_s = min(length_s / _LEAST_LOOKS, _LONGEST_PAUSE_S)
+    pause_s = min(length_s / _LEAST_SAMPLES, _LONGEST_PAUSE_S)
     run = observed_run([str(path), "--report", *changes], folder, length_s, pause_s)
     rows = [*run_rows(run)]
     content = {

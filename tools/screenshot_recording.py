@@ -20,7 +20,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from cosim.output.viewer.live_viewer import RecordingServer
+from cosim.output.viewer.recording_viewer import RecordingServer
 from noack.core.errors import CallerError, MachineError, NoackError
 from noack.core.process_limits import python_command
 

@@ -19,7 +19,7 @@ import numpy as np
 import psutil
 
 from benchmarks.programs import imported_s
-from benchmarks.report import Figures, MeasurementError, Peer, Rounds, Row, benchmark, median, say
+from benchmarks.report import Figures, MeasurementError, Peer, Rounds, Row, announce, benchmark, median
 from cosim.analysis.summary.loop_statistics import lateness_us
 from cosim.analysis.summary.summary_model import LoopSummary
 from cosim.cli.options import find_scenario
@@ -68,7 +68,7 @@ def faulted_run(name: str, settings: Sequence[str], act: Act) -> FaultedRun:
         settings: changes to the scenario.
         act: called in a thread.
     """
-    say(name)
+    announce(name)
     scenario = load(find_scenario("lane_following"), ["ports={}", *settings])
     threads, fault_s = list[threading.Thread](), list[float]()
 
@@ -212,6 +212,7 @@ MARGIN_S = 0.1
 """Omitted at both ends of a flood: its time in the run is known to this accuracy."""
 LOOP_HZ = 500.0
 _SEGMENTS, _SENDERS, _LONGEST_SLEEP_S = 64, 4, 0.01
+"""Datagrams of one call in a flood without a rate; sockets that send it; pause of a slow one."""
 _UDP_SEGMENT = 103
 
 

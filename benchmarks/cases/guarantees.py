@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.report import Goal, Peer, Row, benchmark, option, say
+from benchmarks.report import ZERO, Goal, Peer, Row, announce, benchmark, option
 from cosim.analysis.adversary import Objective, WorstRun, conditions_of, find_worst
 from cosim.cli.options import find_scenario
 from netem.link_state import LinkState
@@ -35,6 +35,7 @@ COMBINATIONS = (
 CAP = 3
 _LOSS, _DELAY = "loss 30%", "delay 10ms 10ms distribution normal reorder 10% limit 1000000"
 _SPACING_NS = 2_000_000
+"""Time between two packets."""
 
 
 class Decider:
@@ -55,11 +56,11 @@ class Decider:
 def check_rows(before: str, guarantee: str, count: int) -> Iterator[Row]:
     """Yield the flows with a violation in so many decisions; and the loss rate, if it can be predicted."""
     words, allowed = f"{before} {guarantee}", settings_of(guarantee)
-    say(f"{count:,} decisions, {words}")
+    announce(f"{count:,} decisions, {words}")
     decider = Decider(f"{words} limit 1000000")
     flows = [outcomes_of(decider.decide()) for _ in range(count // _BATCH)]
     number = sum(not is_allowed(lost, allowed) for lost in flows)
-    yield Row(f"{words}: flows with a violation", number, "", goal=Goal("==", 0), note=f"{count:,} decisions")
+    yield Row(f"{words}: flows with a violation", number, "", goal=ZERO, note=f"{count:,} decisions")
     if "delay" not in words and (expected := expected_loss(settings_of(words)).rate):
         yield Row(f"{words}: lost", 100 * float(np.mean(flows)), "%", Peer("predicted", 100 * expected))
 
@@ -168,7 +169,7 @@ def loop_named(name: str, horizon_s: float, norm: str) -> Scenario:
 def tightness_rows(loop: Scenario, policy: str, trigger: Mapping[str, Any]) -> Iterator[Row]:
     """Search one loop under one policy."""
     name = f"{loop.name}, {policy}"
-    say(name)
+    announce(name)
     content = loop.model_dump(mode="json", exclude_none=True) | {"trigger": trigger}
     resolved = resolve(validate(content, name))
     certificate = certify(resolved, conditions_of(resolved, continuous=False))
@@ -217,7 +218,7 @@ def tightness(options: argparse.Namespace) -> Iterator[Row]:
     """
     rows = []
     for name in options.loop or LOOPS:
-        say(f"{name}: the norm")
+        announce(f"{name}: the norm")
         loop = loop_named(name, options.search_s, options.norm)
         paper = loop.decaying.model_dump(include={"beta", "alpha_per_s", "floor"})
         for policy, trigger in triggers(paper, np.array(loop.decaying.weight)).items():

@@ -23,7 +23,17 @@ from pathlib import Path
 from typing import NamedTuple
 
 from benchmarks.programs import in_new_process
-from benchmarks.report import Figures, Goal, MeasurementError, Rounds, Row, benchmark, quantiles_us, say
+from benchmarks.report import (
+    ZERO,
+    Figures,
+    Goal,
+    MeasurementError,
+    Rounds,
+    Row,
+    announce,
+    benchmark,
+    quantiles_us,
+)
 from noack.runtime.address import Address
 from noack.runtime.drivers.realtime_settings import realtime
 from noack.runtime.host_clocks.clock_offset import ClockOffset
@@ -36,6 +46,7 @@ CHECKS_AT_ONCE = 25
 _PRIORITY = 40
 _WAKE_S = 0.001
 _START_NS, _LENGTH_NS = 500_000_000, 6_000_000_000
+"""Time of an exchange before it is checked, and while it is."""
 _PACKET = struct.Struct("<qqq24x")  # 48 bytes, as NTP's
 
 
@@ -193,18 +204,18 @@ def clock_offset_bound(options: argparse.Namespace) -> Iterator[Row]:
     rounds, alternatives = Rounds(), [(case, Rounds()) for case in CASES]
     with two_hosts() as hosts:
         for clock in CLOCKS:
-            say(f"client {clock.ahead_ns / 1e9:+.0f} s, {clock.drift_ppb / 1000:+.0f} ppm")
+            announce(f"client {clock.ahead_ns / 1e9:+.0f} s, {clock.drift_ppb / 1000:+.0f} ppm")
             rounds.add(BARE, measured(hosts, clock, MAIN, bare=True))
             rounds.add(OURS, measured(hosts, clock, MAIN))
         for case, own in alternatives:
-            say(case.name)
+            announce(case.name)
             own.add(OURS, measured(hosts, CLOCKS[0], case))
     cases = [(MAIN, rounds), *alternatives]
-    checks, outside = (sum(sum(own.of(OURS, name)) for _, own in cases) for name in ("checks", "outside"))
+    checks, outside = (sum(sum(own.values(OURS, name)) for _, own in cases) for name in ("checks", "outside"))
     yield Row("checks of the bound against the true offset", checks, "", goal=Goal(">=", 1e5))
-    yield Row("true offset outside the bound", outside, "", goal=Goal("==", 0))
+    yield Row("true offset outside the bound", outside, "", goal=ZERO)
     for case, own in cases:
-        note = f"largest: {max(own.of(OURS, 'error_max')):.0f} µs"
+        note = f"largest: {max(own.values(OURS, 'error_max')):.0f} µs"
         for q in ("p50", "p99"):
             name = f"error bound, {q}, {case.name}"
             yield own.row(name, "µs", f"error_{q}", OURS, goal=case.goal, note=note)
@@ -243,7 +254,7 @@ def across_hosts(options: argparse.Namespace) -> Iterator[Row]:
     with two_hosts() as hosts:
         sides = {ON_LOOPBACK: partial(run_by_hand, None), ACROSS: partial(run_by_hand, hosts)}
         rounds.measure_in_turn(ROUNDS, sides)
-    note = f"{sum(rounds.of(ACROSS, 'updates')):.0f} updates"
+    note = f"{sum(rounds.values(ACROSS, 'updates')):.0f} updates"
     for quantile in ("p50", "p99"):
         yield rounds.row(f"event → update, {quantile}", "µs", quantile, ACROSS, ON_LOOPBACK,
                          Goal("<=", 1.5), note=note, paired=True)  # fmt: skip

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.programs import FREE_PORTS, noack
-from benchmarks.report import Figures, Goal, MeasurementError, Rounds, Row, benchmark, median, say
+from benchmarks.report import Figures, Goal, MeasurementError, Rounds, Row, announce, benchmark, median
 from tests.helpers.lab_browser import TEXT, Page, Served
 from tools.screenshot_recording import BROWSERS, EMULATED_CARD, Browser
 
@@ -28,9 +28,10 @@ HORIZON_S = 10.0
 ALONE, OPEN = "run without the page", "page open"
 DRAGGED, VIEWED = "a slider moves", "viewer open"
 _MOVE_S = 0.05
+"""Time between two moves of the slider."""
 _KEYS = [("ArrowLeft", 37)] * 20 + [("ArrowRight", 39)] * 20
 _SLIDER = "document.getElementById('lab-set-network.loss.probability')"
-_BUSY = 4
+_BUSY_PROCESSES = 4
 _STROKES, _STROKE_S = 40, 0.15
 _DRAGGED = "document.getElementById('lab-set-trigger.beta')"
 _BOX = f"""(slider => {{
@@ -130,8 +131,11 @@ def stroke(options: argparse.Namespace) -> Iterator[Row]:
     A frame of the browser is 17 ms. It draws by the processor, as it does without a graphics card;
     none is emulated, as the viewer would need.
     """
-    for name, processes, goal_ms in (("idle", 0, 60), (f"{_BUSY} busy processes", _BUSY, 120)):
-        say(name)
+    for name, processes, goal_ms in (
+        ("idle", 0, 60),
+        (f"{_BUSY_PROCESSES} busy processes", _BUSY_PROCESSES, 120),
+    ):
+        announce(name)
         with (
             tempfile.TemporaryDirectory(prefix="noack-bench-", ignore_cleanup_errors=True) as folder,
             _open_page(Path(folder), "--set", "horizon_s=20", card=()) as page,

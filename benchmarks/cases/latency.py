@@ -87,7 +87,7 @@ def latency(options: argparse.Namespace) -> Iterator[Row]:
             rounds, refused = Rounds(), set[str]()
             pinged, run = partial(ping, program, case, refused), partial(updates, case, refused)
             rounds.measure_in_turn(ROUNDS, {PING: pinged, OURS: run}, f"{name}, ")
-            counts = (sum(rounds.of(side, "count")) for side in (OURS, PING))
+            counts = (sum(rounds.values(side, "count")) for side in (OURS, PING))
             note = "{:.0f} updates, {:.0f} pings".format(*counts)
             note += f"; not applied: {', '.join(sorted(refused))}" if refused else ""
             row = partial(rounds.row, unit="µs", ours=OURS, peer=PING)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import block_diag, solve_continuous_are
 
-from benchmarks.report import Goal, Row, benchmark, median, option, say
+from benchmarks.report import ZERO, Goal, Row, announce, benchmark, median, option
 from cosim.cli.options import find_scenario
 from noack.core.linear_systems import Matrix
 from noack.guarantee.loss_guarantee import (
@@ -122,8 +122,8 @@ def margins(options: argparse.Namespace) -> Iterator[Row]:
             times_s[kind].append(took_s)
         bounds = f"{stability.lower:.6f} to {stability.upper:.6f}"
         text = f"growth {loop.growth:.6f}: {stability.verdict}, {bounds}, {took_s:.2f} s"
-        say(f"{seed}: {loop.kind}, {text}, {loop.guarantee.meaning}")
+        announce(f"{seed}: {loop.kind}, {text}, {loop.guarantee.meaning}")
     for kind in sorted(verdicts, key=lambda kind: (kind == "all", kind)):
         note = f"{len(verdicts[kind])} loops, worst {max(times_s[kind]):.1f} s"
-        yield Row(f"{kind}: undecided", verdicts[kind].count("undecided"), "", goal=Goal("==", 0), note=note)
+        yield Row(f"{kind}: undecided", verdicts[kind].count("undecided"), "", goal=ZERO, note=note)
         yield Row(f"{kind}: CPU time, median", median(times_s[kind]), "s", goal=Goal("<=", MEDIAN_S))

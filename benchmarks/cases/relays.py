@@ -28,17 +28,18 @@ from benchmarks import relay_load
 from benchmarks.cases.latency import KERNEL, cyclictest
 from benchmarks.programs import LOAD_CORE, RELAY_CORE, compile_program, on_core, program_path, raise_priority
 from benchmarks.report import (
+    ZERO,
     Figures,
     Goal,
     MeasurementError,
     Peer,
     Rounds,
     Row,
+    announce,
     benchmark,
     median,
     option,
     quantiles_us,
-    say,
 )
 from netem.relay.relay_links import LinkSpec
 from netem.shell.devices import inside, open_devices
@@ -62,7 +63,7 @@ RATES = (
 @benchmark("relays", "Relays: drained datagrams")
 def drained(options: argparse.Namespace) -> Iterator[Row]:
     """Send bursts to each relay in turn; yield rates and costs."""
-    with relay_load.built() as tools, on_core(LOAD_CORE), raise_priority():
+    with relay_load.compiled_code() as tools, on_core(LOAD_CORE), raise_priority():
         ours = relay_load.our_relay(PLAIN, WORDS), relay_load.our_relay(SEGMENTS, WORDS, "--segment")
         kinds = relay_load.socat(), *(relay_load.c_relay(tools, *modes) for modes in C_MODES), *ours
         with relay_load.started(kinds, tools) as (rounds, relays):
@@ -87,7 +88,7 @@ def flows(options: argparse.Namespace) -> Iterator[Row]:
     and returns them. (To wait for a socket by epoll costs when sending, too.)
     """
     single, many = relay_load.sources(1), relay_load.sources(FLOWS)
-    with relay_load.built() as tools, on_core(LOAD_CORE), raise_priority():
+    with relay_load.compiled_code() as tools, on_core(LOAD_CORE), raise_priority():
         kinds = (
             relay_load.c_relay(tools),
             relay_load.c_relay(tools, "paths"),
@@ -144,7 +145,7 @@ def delay(options: argparse.Namespace) -> Iterator[Row]:
     at the sink (same clock), which excludes the sink's wake-up. Compared with cyclictest on the
     relay's core.
     """
-    with relay_load.built() as tools:
+    with relay_load.compiled_code() as tools:
         added, late = _added(tools), _late(tools)
     yield added.row(f"{DIRECT}: one way, p50", "µs", "p50", DIRECT)
     for peer in ("socat", "C relay"):
@@ -163,7 +164,7 @@ def quantiles_of(name: str, delays_ns: relay_load.Nanoseconds, base_us: float = 
     return quantiles_us(delays_ns - 1e3 * base_us)
 
 
-def _added(tools: relay_load.Built) -> Rounds:
+def _added(tools: relay_load.CompiledCode) -> Rounds:
     ours = relay_load.our_relay(PLAIN, "loss 5% mansd 0 seed 7", lossy=False)
     base_us = 0.0
 
@@ -187,7 +188,7 @@ def _added(tools: relay_load.Built) -> Rounds:
     return rounds
 
 
-def _late(tools: relay_load.Built) -> Rounds:
+def _late(tools: relay_load.CompiledCode) -> Rounds:
     def kernel() -> Figures:
         if not os.access(_LATENCY, os.W_OK):
             raise MeasurementError(f"{_LATENCY} cannot be written")
@@ -229,7 +230,7 @@ def steady_load(options: argparse.Namespace) -> Iterator[Row]:
     ``--soak-s 600`` is the full test.
     """
     kind = relay_load.our_relay(PLAIN, f"loss 5% mansd {MANSD} seed 7")
-    with relay_load.built() as tools, on_core(LOAD_CORE), raise_priority():
+    with relay_load.compiled_code() as tools, on_core(LOAD_CORE), raise_priority():
         with relay_load.running(kind, tools) as relay:
             maximum_per_s = median([relay.burst()["per_s"] for _ in range(_BURSTS)])
         with relay_load.running(kind, tools) as relay:
@@ -245,13 +246,13 @@ def _soak_rows(relay: relay_load.LoadedRelay, seconds: int, maximum_per_s: float
     began_s = time.monotonic()
     for number in range(seconds):
         if number % 60 == 0:
-            say(f"{group * groups_per_s:,} datagrams/s, {number} of {seconds} s")
+            announce(f"{group * groups_per_s:,} datagrams/s, {number} of {seconds} s")
         relay.ends.soak(counts, groups_per_s, group, period_ns)
         resident_kib.append(psutil.Process(relay.pid).memory_info().rss / 1024)
     elapsed_s = time.monotonic() - began_s
     # Empty groups: receive the datagrams still in flight.
     relay.ends.soak(counts, round(_LAST_S / _GROUP_S), 0, period_ns)
-    totals, none, quarter = relay.totals(), Goal("==", 0), max(seconds // 4, 1)
+    totals, quarter = relay.totals(), max(seconds // 4, 1)
     growth_kib = median(resident_kib[-quarter:]) - median(resident_kib[quarter : 2 * quarter])
     peer, note = Peer("drained maximum", maximum_per_s), f"for {elapsed_s:.0f} s"
     yield Row("load", counts.sent / elapsed_s, "datagrams/s", peer, note=note)
@@ -261,7 +262,7 @@ def _soak_rows(relay: relay_load.LoadedRelay, seconds: int, maximum_per_s: float
         ("lost in the relay's receive buffer", totals["lost_in_kernel"]),
         ("received out of order", counts.disordered),
     ):
-        yield Row(name, number, "datagrams", goal=none)
+        yield Row(name, number, "datagrams", goal=ZERO)
     yield Row("longest loss burst", counts.longest_gap, "datagrams", goal=Goal("<=", MANSD))
     note = f"of {resident_kib[-1] / 1024:.0f} MiB"
     yield Row("memory, last quarter beyond second", growth_kib, "KiB", goal=MEMORY_GOAL, note=note)

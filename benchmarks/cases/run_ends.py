@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.programs import NOACK, in_new_process
-from benchmarks.report import Goal, MeasurementError, Peer, Row, benchmark, say
+from benchmarks.report import Goal, MeasurementError, Peer, Row, announce, benchmark
 from cosim.analysis.replay.run_replay import stored_verdict
 from cosim.cli.options import find_scenario
 from cosim.record.record_source import concatenate_rows
@@ -95,7 +95,7 @@ def completed(run_dir: Path) -> tuple[float, resource.struct_rusage]:
 
 def end_of(horizon_s: float, folder: Path) -> End:
     """Simulate, spool and complete a run; replay it once more."""
-    say(f"a run of {horizon_s:g} s")
+    announce(f"a run of {horizon_s:g} s")
     run_dir = in_new_process(spooled_run, horizon_s, folder)
     wall_s, usage = in_new_process(completed, run_dir)
     cpu_s = usage.ru_utime + usage.ru_stime

@@ -18,7 +18,7 @@ import psutil
 from benchmarks.programs import (
     NOACK,
     PRIORITY,
-    Observed,
+    ObservedRun,
     Sample,
     compile_program,
     execute,
@@ -27,18 +27,19 @@ from benchmarks.programs import (
     observed_run,
 )
 from benchmarks.report import (
+    ZERO,
     Figures,
     Goal,
     MeasurementError,
     Peer,
     Rounds,
     Row,
+    announce,
     benchmark,
     compare,
     median,
     option,
     own_cpu_s,
-    say,
 )
 from noack.protocol.roles import LOOP_ROLES, WITH_DEADLINES
 
@@ -57,7 +58,6 @@ _LATE_MS = {50.0: Goal("<=", 1.0), 500.0: Goal("<=", 0.3)}
 _BARE_S, _MOST_COALESCING_S, _MOST_BURST = 5.0, 0.0008, 64
 """Length of a bare exchange; how long a run coalesces steps, at most; datagrams in one message."""
 _LIBRARIES = "import numpy, zenoh; print(); input()"
-_NOTHING = Goal("==", 0)
 
 
 class LoopLoad(NamedTuple):
@@ -91,7 +91,7 @@ class LoopLoad(NamedTuple):
         return [str(_SCENARIO), *(word for setting in settings for word in ("--set", setting))]
 
 
-def run(load: LoopLoad, folder: Path) -> Observed:
+def run(load: LoopLoad, folder: Path) -> ObservedRun:
     """Run the loops as a user does."""
     observed = observed_run(load.arguments, folder, load.horizon_s, _POLL_S)
     if (ending := observed.summary["exit"])["status"]:
@@ -128,7 +128,7 @@ def bare_step_us(load: LoopLoad) -> float:
         return 2e6 * cpu_s([str(program), *arguments]) / (count * burst)
 
 
-def figures(load: LoopLoad, run: Observed, bare_us: float) -> Iterator[Row]:
+def figures(load: LoopLoad, run: ObservedRun, bare_us: float) -> Iterator[Row]:
     """Yield the figures of a run; ``bare_us`` is a step of the bare exchange."""
 
     def row(name: str, value: float, unit: str = "", **more: Any) -> Row:
@@ -137,7 +137,7 @@ def figures(load: LoopLoad, run: Observed, bare_us: float) -> Iterator[Row]:
     network, loops = run.summary["network"], run.summary["loops"]
     samples = {role: run.in_loops(role) for role in LOOP_ROLES}
     for key in ("missing_samples", "unintended_losses"):
-        yield row(key.replace("_", " "), sum(loop[key] for loop in loops), goal=_NOTHING)
+        yield row(key.replace("_", " "), sum(loop[key] for loop in loops), goal=ZERO)
     burst = max(loop["longest_loss_burst"] for loop in loops)
     yield row("longest loss burst", burst, goal=Goal("<=", CAP))
     yield row("updates", network["datagrams"] / load.horizon_s, "/s")
@@ -145,7 +145,7 @@ def figures(load: LoopLoad, run: Observed, bare_us: float) -> Iterator[Row]:
         late_ms = max(loop["lateness_us"][role]["p99"] for loop in loops) / 1e3
         yield row(f"{role} lateness p99, worst loop", late_ms, "ms", goal=_LATE_MS[load.rate_hz])
     different = sum(not loop["replay"]["bit_exact"] for loop in (network, *loops))
-    yield row("loops and network not replayed bit for bit", different, goal=_NOTHING)
+    yield row("loops and network not replayed bit for bit", different, goal=ZERO)
     used_us = {role: 1e6 * cpu_share(samples[role]) / (load.loops * load.rate_hz) for role in samples}
     note = ", ".join(f"{role} {used:.2f} µs" for role, used in used_us.items())
     step_us = sum(used_us.values())
@@ -155,7 +155,7 @@ def figures(load: LoopLoad, run: Observed, bare_us: float) -> Iterator[Row]:
     yield row("end of the run", end_s, "s", peer=peer, goal=_END_SHARE)
 
 
-def memory(load: LoopLoad, run: Observed) -> Iterator[Row]:
+def memory(load: LoopLoad, run: ObservedRun) -> Iterator[Row]:
     """Yield the private memory of the processes of one loop: the median over its run."""
     used = {role: median(sample.uss_kib for sample in run.in_loops(role)) / _KIBI for role in LOOP_ROLES}
     name, total = f"{load}: private memory of {', '.join(used)}", sum(used.values())
@@ -198,8 +198,8 @@ def many_loops(options: argparse.Namespace) -> Iterator[Row]:
     loop, beside as many Pythons that import the libraries of each process.
     """
 
-    def measured(load: LoopLoad) -> Observed:
-        say(str(load))
+    def measured(load: LoopLoad) -> ObservedRun:
+        announce(str(load))
         with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
             return run(load, Path(folder))
 
@@ -236,8 +236,8 @@ def demo_rows(summary: Mapping[str, Any]) -> Iterator[Row]:
     (loop,) = summary["loops"]
     late = loop["lateness_us"]["plant"]
     in_time = 100 * (1 - late["late_steps"] / late["steps"])
-    yield Row("demo: missing samples", loop["missing_samples"], "samples", goal=_NOTHING)
-    yield Row("demo: unintended losses", loop["unintended_losses"], "datagrams", goal=_NOTHING)
+    yield Row("demo: missing samples", loop["missing_samples"], "samples", goal=ZERO)
+    yield Row("demo: unintended losses", loop["unintended_losses"], "datagrams", goal=ZERO)
     yield Row("demo: plant steps within one period", in_time, "%", goal=Goal(">=", 99.9))
     for name in ("p50", "p99", "max"):
         yield Row(f"demo: plant lateness, {name}", late[name], "µs")
@@ -268,13 +268,13 @@ def startup(options: argparse.Namespace) -> Iterator[Row]:
         ("Python that imports python-control", lambda: cpu_s(_IMPORT_CONTROL)),
         Goal("<", 1),
     )
-    say("20 loops")
+    announce("20 loops")
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
         began_s = time.monotonic()
         run(_LOOPS, Path(folder))
         loops_s = time.monotonic() - began_s
     yield Row("the first run of 20 loops, 5 s, without report", loops_s, "s", goal=Goal("<=", 15))
-    say("noack demo, 20 s")
+    announce("noack demo, 20 s")
     yield from demo_rows(noack("demo").summary)
 
 
@@ -312,7 +312,7 @@ def size(options: argparse.Namespace) -> Iterator[Row]:
         "of it, numba and llvmlite",
         installed_bytes(default & {"numba", "llvmlite"}) / 1e6,
         "MB",
-        goal=_NOTHING,
+        goal=ZERO,
     )
     yield Row("Python outside tests", python, "lines", goal=Goal("<=", 75_000))
     yield Row(
@@ -325,7 +325,7 @@ def size(options: argparse.Namespace) -> Iterator[Row]:
 def clone(options: argparse.Namespace) -> Iterator[Row]:
     """Clone the last commit, install, and run the demo to its verdict; 20 s of it are the run."""
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
-        say("make demo from a clean clone")
+        announce("make demo from a clean clone")
         subprocess.run(["git", "clone", "-q", str(ROOT), folder], check=True)
         began_s = time.monotonic()
         execute(["env", "--unset=VIRTUAL_ENV", "make", "-C", folder, "demo"])

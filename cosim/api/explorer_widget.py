@@ -21,7 +21,7 @@ from cosim.interactive.exploration_figure import (
 from cosim.interactive.scenario_draft import Draft
 from cosim.interactive.sliders import Choice, Slider, choose, controls_of, drag
 from cosim.output.figures.figure_drawing import draw
-from cosim.output.figures.figure_layout import settings
+from cosim.output.figures.figure_layout import matplotlib_settings
 from noack.core.errors import NoackError
 from noack.core.number_format import as_html
 
@@ -181,7 +181,7 @@ class ExplorerWidget:
 
 def _png(results: DraftResults, state: int) -> bytes:
     buffer = io.BytesIO()
-    with settings():
+    with matplotlib_settings():
         figure = draw(exploration_figure(results.explored_run(state)))
         figure.savefig(buffer, format="png", dpi=_DPI, pil_kwargs=_QUICK)
     return buffer.getvalue()

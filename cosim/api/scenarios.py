@@ -10,7 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cosim.shipped_files import find_shipped
-from cosim.studies.new_loop import ALPHA_SHARE, BETA_SHARE, LOSS_PROBABILITY, MANSD, SETTLED
+from cosim.studies.new_loop import (
+    ALPHA_SHARE,
+    BETA_SHARE,
+    DEFAULT_LOSS_PROBABILITY,
+    DEFAULT_MANSD,
+    HORIZON_DECAY,
+)
 from noack.core.errors import CallerError
 from noack.core.linear_systems import spectral_abscissa
 from noack.core.number_format import to_digits
@@ -117,7 +123,7 @@ def from_system(
         true_plant |= {"draw": "given", "A": true["A"].tolist(), "B": true["B"].tolist()}
     content: Table = {
         "name": name,
-        "horizon_s": to_digits(math.log(1 / SETTLED) / alpha_per_s),
+        "horizon_s": to_digits(math.log(1 / HORIZON_DECAY) / alpha_per_s),
         "model": model.model_dump(mode="json", exclude_none=True),
         "plant": true_plant,
         "trigger": {
@@ -126,8 +132,8 @@ def from_system(
             "alpha_per_s": alpha_per_s,
         },
         "network": {
-            "mansd": MANSD,
-            "loss": {"model": "bernoulli", "probability": LOSS_PROBABILITY},
+            "mansd": DEFAULT_MANSD,
+            "loss": {"model": "bernoulli", "probability": DEFAULT_LOSS_PROBABILITY},
         },
     }
     return _complete(content, settings, Path("from_system"))

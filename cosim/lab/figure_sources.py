@@ -25,6 +25,7 @@ from noack.runtime.active_runs import find_run, request_change
 
 Changed = Callable[[], Awaitable[None]]
 _REJOIN_S = 5.0
+"""Time within which a killed process rejoins the run."""
 _KILLABLE = ("sensor", "netem", "controller")
 _ABOUT = (
     "“run live” starts plant, sensor, network emulator (netem), controller and recorder as five "
@@ -49,17 +50,23 @@ class LiveSource:
         self._live: LiveRun | None = None
         """The run that is shown, with its version and the number of its lines that are shown."""
         self._version = self._lines = 0
-        self._start = ui.button("run live", icon="play_arrow", on_click=self._begin).props("no-caps dense")
-        self._stop = ui.button("stop", icon="stop", on_click=self._end).props("outline no-caps dense")
-        self._again = ui.button("replay this run", icon="replay", on_click=self._open).props("no-caps dense")
-        self._stop.disable()
-        self._again.set_visibility(False)
+        self._start_button = ui.button("run live", icon="play_arrow", on_click=self._start_run).props(
+            "no-caps dense"
+        )
+        self._stop_button = ui.button("stop", icon="stop", on_click=self._stop_run).props(
+            "outline no-caps dense"
+        )
+        self._replay_button = ui.button("replay this run", icon="replay", on_click=self._replay_run).props(
+            "no-caps dense"
+        )
+        self._stop_button.disable()
+        self._replay_button.set_visibility(False)
 
     def build_details(self) -> None:
         """Build kill buttons, log and viewer, which are below the words about the run."""
         with ui.row().classes("items-center gap-2"):
             self._restarts = ui.checkbox("restart killed processes", value=True).props("dense")
-            self._kill = [
+            self._kill_buttons = [
                 ui.button(f"kill {role}", icon="dangerous", on_click=self._killer(role)).props(
                     "outline color=negative no-caps dense"
                 )
@@ -67,7 +74,7 @@ class LiveSource:
             ]
         self._log = ui.log(max_lines=MOST_LINES).classes("w-full h-40 lab-log")
         self._log.props('tabindex=0 role=region aria-label="log of the run"')
-        self._viewer = ui.button("show the rerun viewer", on_click=self._show_viewer).props(
+        self._viewer_button = ui.button("show the rerun viewer", on_click=self._show_viewer).props(
             'outline no-caps dense title="In a browser without a graphics card it takes the '
             'processor from the loop."'
         )
@@ -101,7 +108,7 @@ class LiveSource:
             return [VerdictLine(_ABOUT, Tone.NEUTRAL)]
         if live.verdict:
             return live.verdict
-        lines = [VerdictLine(_words(live), Tone.NEUTRAL)]
+        lines = [VerdictLine(_status_text(live), Tone.NEUTRAL)]
         if (progress := live.progress) is not None:
             kept = progress.warnings[-1:] or ["guarantee kept so far"]
             tone = Tone.DOUBTFUL if progress.warnings else Tone.NEUTRAL
@@ -128,13 +135,13 @@ class LiveSource:
             self._log.push(line)
         self._lines = live.first_line + len(live.lines)
         for button, enabled in (
-            (self._start, live.is_over),
-            (self._stop, not live.is_over),
-            *((button, live.state == "running") for button in self._kill),
-            (self._viewer, live.state == "running" and live.viewer is not None),
+            (self._start_button, live.is_over),
+            (self._stop_button, not live.is_over),
+            *((button, live.state == "running") for button in self._kill_buttons),
+            (self._viewer_button, live.state == "running" and live.viewer is not None),
         ):
             button.set_enabled(enabled)
-        self._again.set_visibility(bool(self.report))
+        self._replay_button.set_visibility(bool(self.report))
         if live.state != "running":
             self._frame.clear()  # its server ends with the loop
         return True
@@ -153,7 +160,7 @@ class LiveSource:
         except NoackError as error:
             ui.notify(str(error), type="warning")
 
-    async def _begin(self) -> None:
+    async def _start_run(self) -> None:
         draft = self._draft()
         try:
             if draft.value("ports") is not None:
@@ -164,14 +171,14 @@ class LiveSource:
         except DraftError as error:
             ui.notify(str(error), type="negative")
             return
-        self._start.disable()
+        self._start_button.disable()
         await self._services.run_live(draft.text, horizon_s, draft.folder)
 
-    async def _open(self) -> None:
+    async def _replay_run(self) -> None:
         if self.report:
             await self._replay(self.report)
 
-    def _end(self) -> None:
+    def _stop_run(self) -> None:
         if self._services.live is not None:
             self._services.live.stop()
 
@@ -191,7 +198,7 @@ class LiveSource:
             ui.element("iframe").props(f'src="{address}" title="rerun viewer"').classes("w-full lab-viewer")
 
 
-def _words(live: LiveRun) -> str:
+def _status_text(live: LiveRun) -> str:
     if (progress := live.progress) is None:
         return live.state
     state = f"{live.state}: {progress.t_s:.1f} of {live.horizon_s:g} s"
@@ -210,19 +217,19 @@ class RecordedSource:
         self.view: RunView | None = None
         self.note = ""
         self._newest: str | None = None
-        self._replays = False
+        self._is_replay_asked = False
         """Whether the run is replayed once its record is read."""
-        self._select = ui.select([], label="run", on_change=self._open).classes("w-72")
+        self._select = ui.select([], label="run", on_change=self._read_record).classes("w-72")
         self._select.props("dense options-dense")
-        self._loop = ui.select([], label="loop", on_change=self._open).props("dense options-dense")
+        self._loop = ui.select([], label="loop", on_change=self._read_record).props("dense options-dense")
         ui.button(icon="refresh", on_click=self.refresh).props('flat dense aria-label="look for new runs"')
 
     def build_details(self) -> None:
         """Build the buttons for a run, below the words about it."""
         for text, function in (("replay", replay_run), ("compare with the ideal loop", compare_with_ideal)):
-            ui.button(text, on_click=partial(self._ask, function)).props("outline no-caps dense").classes(
-                "mr-2"
-            )
+            ui.button(text, on_click=partial(self._show_answer, function)).props(
+                "outline no-caps dense"
+            ).classes("mr-2")
 
     @property
     def chosen(self) -> str:
@@ -245,19 +252,19 @@ class RecordedSource:
 
     async def replay(self, name: str) -> None:
         """Choose a run, and replay it."""
-        self._replays = True
+        self._is_replay_asked = True
         self.refresh()
         if self.chosen != name:
             self._select.set_value(name)
         elif self.view is not None:
-            await self._replay()
+            await self._replay_if_asked()
 
-    async def _replay(self) -> None:
-        if self._replays:
-            self._replays = False
-            await self._ask(replay_run)
+    async def _replay_if_asked(self) -> None:
+        if self._is_replay_asked:
+            self._is_replay_asked = False
+            await self._show_answer(replay_run)
 
-    async def _ask(self, function: Callable[[Path], str]) -> None:
+    async def _show_answer(self, function: Callable[[Path], str]) -> None:
         """Show the words that a function returns about the chosen run."""
         if not self.chosen:
             return
@@ -269,7 +276,7 @@ class RecordedSource:
             self.note = str(error)
         await self._changed()
 
-    async def _open(self, event: ValueChangeEventArguments[str]) -> None:
+    async def _read_record(self, event: ValueChangeEventArguments[str]) -> None:
         if not self.chosen:
             return
         if event.sender is self._select:
@@ -288,7 +295,7 @@ class RecordedSource:
             self._loop.set_visibility(len(view.loops) > 1)
             self._loop.set_options([*view.loops], value=loop if loop in view.loops else None)
         await self._changed()
-        await self._replay()
+        await self._replay_if_asked()
 
 
 def report_address(name: str) -> str:

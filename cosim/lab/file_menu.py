@@ -19,7 +19,7 @@ from noack.core.errors import NoackError
 from noack.core.file_access import write_whole
 from noack.core.linear_systems import Vector
 
-_NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,63}\.toml")
+_FILE_NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,63}\.toml")
 
 
 class FileMenu:
@@ -36,39 +36,39 @@ class FileMenu:
         self._explored = explored
         opener = ui.button(icon="more_vert").props('flat color=white dense aria-label="files"')
         with opener, ui.menu():
-            ui.menu_item("save as scenario …", self._ask)
-            ui.menu_item("copy link to these settings", self._share)
-            ui.menu_item("data of the figure (CSV)", self._data)
+            ui.menu_item("save as scenario …", self._open_save_dialog)
+            ui.menu_item("copy link to these settings", self._copy_link)
+            ui.menu_item("data of the figure (CSV)", self._download_data)
             for kind in (FigureFormat.SVG, FigureFormat.PDF):
-                ui.menu_item(f"figure ({kind.upper()})", partial(self._figure, kind))
-            ui.menu_item("glossary", self._open_words)
-        with ui.dialog() as self._words, ui.card(), ui.element("dl").classes("lab-words"):
+                ui.menu_item(f"figure ({kind.upper()})", partial(self._download_figure, kind))
+            ui.menu_item("glossary", self._open_glossary)
+        with ui.dialog() as self._glossary, ui.card(), ui.element("dl").classes("lab-words"):
             for term, meaning in TERMS:
                 for tag, text in (("dt", term), ("dd", meaning)):
                     with ui.element(tag):
                         ui.label(text)
-        with ui.dialog() as self._dialog, ui.card():
+        with ui.dialog() as self._save_dialog, ui.card():
             ui.label(f"Save in {services.folder}")
-            self._name = ui.input(
+            self._file_name = ui.input(
                 "file name",
                 value="my_loop.toml",
-                validation={"a name like my_loop.toml": lambda text: bool(_NAME.fullmatch(text))},
+                validation={"a name like my_loop.toml": lambda text: bool(_FILE_NAME.fullmatch(text))},
             ).classes("w-64")
             self._replace = ui.checkbox("replace a file of this name")
             with ui.row():
                 ui.button("save", on_click=self._save)
-                ui.button("cancel", on_click=self._dialog.close).props("flat")
+                ui.button("cancel", on_click=self._save_dialog.close).props("flat")
 
-    def _open_words(self) -> None:
-        self._words.open()
+    def _open_glossary(self) -> None:
+        self._glossary.open()
 
-    def _ask(self) -> None:
-        self._dialog.open()
+    def _open_save_dialog(self) -> None:
+        self._save_dialog.open()
 
     def _save(self) -> None:
-        if not _NAME.fullmatch(self._name.value):
+        if not _FILE_NAME.fullmatch(self._file_name.value):
             return
-        path = self._services.folder / self._name.value
+        path = self._services.folder / self._file_name.value
         if path.exists() and not self._replace.value:
             ui.notify(f"{path.name} exists; tick the box to replace it", type="warning")
             return
@@ -77,19 +77,19 @@ class FileMenu:
         except NoackError as error:
             ui.notify(str(error), type="negative")
             return
-        self._dialog.close()
+        self._save_dialog.close()
         ui.notify(f"saved as {path.name}; noack run {path.name}", type="positive")
 
-    async def _share(self) -> None:
+    async def _copy_link(self) -> None:
         address = await ui.run_javascript("location.href", timeout=ANSWER_S)
         ui.clipboard.write(address)
         ui.notify("copied; it opens as long as this page runs", type="positive")
 
-    def _data(self) -> None:
+    def _download_data(self) -> None:
         if (explored := self._explored()) is not None:
             ui.download(csv_of(explored.run), "exploration.csv", "text/csv")
 
-    async def _figure(self, kind: FigureFormat) -> None:
+    async def _download_figure(self, kind: FigureFormat) -> None:
         if (explored := self._explored()) is not None:
             content = await self._calls.compute(figure_file, explored, kind)
             ui.download(content, f"exploration.{kind}")

@@ -29,8 +29,9 @@ from noack.core.errors import NoackError
 
 _FOLDER = Path(__file__).parent
 EXPLORE, LIVE, RECORDED = "explore", "live", "recorded"
-_KEEP, _FORGET = "keep for comparison", "forget the kept run"
+_KEEP_TEXT, _FORGET_TEXT = "keep for comparison", "forget the kept run"
 _POLL_S = 0.25
+"""Time between two looks at the live run."""
 _GESTURE_S = 1.0
 """Changes of one key follow each other within this time while a slider is dragged."""
 
@@ -66,7 +67,7 @@ class _Page:
         self._parts = PageParts(self._client)
         self._dark = ui.dark_mode(None)
         self._is_dark = False
-        self._source, self._state, self._comparing = EXPLORE, 0, True
+        self._source, self._drawn_state, self._comparing = EXPLORE, 0, True
         self._kept: Reference | None = None
         self._controls: Controls | None = None
         self._form = form_of(draft)
@@ -94,7 +95,7 @@ class _Page:
                     sorted(self._services.known),
                     value=self._session.draft.base,
                     label="scenario",
-                    on_change=self._choose,
+                    on_change=self._choose_scenario,
                 )
                 .props("dense options-dense dark standout")
                 .classes("lab-scenario")
@@ -108,7 +109,7 @@ class _Page:
             with ui.element("aside").props("id=lab-drawer aria-label=settings tabindex=-1"):
                 for name in ("guide hidden", "controls", "form"):
                     ui.element("div").props(f"id=lab-{name}")
-                self._text = TextPanel(self._session.draft, self._apply)
+                self._text_panel = TextPanel(self._session.draft, self._apply)
             with ui.element("div").classes("lab-main"):
                 self._build_bar()
                 self._build_stage()
@@ -116,17 +117,17 @@ class _Page:
 
     def _build_bar(self) -> None:
         with ui.element("div").classes("lab-bar"):
-            self._sources = ui.toggle([EXPLORE, LIVE, RECORDED], value=EXPLORE, on_change=self._switch).props(
-                "no-caps dense"
-            )
+            self._source_toggle = ui.toggle(
+                [EXPLORE, LIVE, RECORDED], value=EXPLORE, on_change=self._switch_source
+            ).props("no-caps dense")
             with ui.element("div").classes("lab-of lab-of-live"):
                 self._live = LiveSource(self._services, lambda: self._session.draft, self._replay)
             with ui.element("div").classes("lab-of lab-of-recorded"):
                 self._recorded = RecordedSource(self._services, self._calls, self._show)
-            self._keep = ui.button(_KEEP, icon="compare", on_click=self._keep_run).props(
+            self._keep_button = ui.button(_KEEP_TEXT, icon="compare", on_click=self._keep_run).props(
                 "outline no-caps dense"
             )
-            ui.checkbox("compare", value=True, on_change=self._compare).props("dense")
+            ui.checkbox("compare", value=True, on_change=self._switch_comparison).props("dense")
             with ui.element("label").props("hidden"):
                 ui.label("drawn state ").classes("inline")
                 ui.element("select").props('id=lab-state aria-label="drawn state"')
@@ -149,7 +150,7 @@ class _Page:
         """Draw for the first time."""
         await self._client.connected()
         self._is_dark = await ui.run_javascript("labBegin()", timeout=ANSWER_S)
-        self._text.show_dark(dark=self._is_dark)
+        self._text_panel.show_dark(dark=self._is_dark)
         steps = [{"title": step.title, "text": step.text, "drag": step.drag} for step in STEPS]
         await self._parts.show(source=EXPLORE, steps=steps)
         await self._session.change(self._session.draft)
@@ -213,7 +214,7 @@ class _Page:
             explored = ExploredRun(view.run, 0, guarantee=view.bounds)
         if explored is None:
             return None
-        state = min(self._state, explored.run.x.shape[1] - 1)
+        state = min(self._drawn_state, explored.run.x.shape[1] - 1)
         return explored._replace(state=state, reference=reference and reference.run)
 
     def _reference(self) -> Reference | None:
@@ -245,45 +246,45 @@ class _Page:
         message = event.args
         match message["what"]:
             case "slide":
-                await self._slide(message["key"], float(message["position"]))
+                await self._move_slider(message["key"], float(message["position"]))
             case "fill":
-                await self._fill(message["key"], str(message["text"]).strip())
+                await self._fill_field(message["key"], str(message["text"]).strip())
             case "choose":
                 key, value = message["key"], str(message["value"])
                 await self._apply(lambda draft: choose(draft, key, value), key)
             case "state":
-                self._state = int(message["number"])
+                self._drawn_state = int(message["number"])
                 await self._show()
             case "step":
-                await self._begin_step(STEPS[int(message["number"])])
+                await self._begin_tutorial_step(STEPS[int(message["number"])])
 
-    async def _slide(self, key: str, position: float) -> None:
+    async def _move_slider(self, key: str, position: float) -> None:
         sliders = self._controls.sliders if self._controls else ()
         if slider := next((slider for slider in sliders if slider.key == key), None):
             value = slider.value_at(position)
             self._moved = _MovedSlider(key, value_text(value))
             await self._apply(lambda draft: drag(draft, slider, value), key)
 
-    async def _fill(self, key: str, text: str) -> None:
+    async def _fill_field(self, key: str, text: str) -> None:
         field = next((field for field in self._form.all_fields() if field.key == key), None)
         # The form may have been made anew without the field.
         if field is not None and text != field.text(self._session.draft):
             await self._apply(lambda draft: fill_in(draft, field, text), key)
 
-    async def _begin_step(self, step: "TutorialStep") -> None:
+    async def _begin_tutorial_step(self, step: "TutorialStep") -> None:
         draft = open_draft(step.scenario)
         for key, setting in step.settings.items():
             draft = draft.with_value(key, setting)
-        await self._open(draft)
+        await self._open_draft(draft)
 
-    async def _switch(self, event: ValueChangeEventArguments[str]) -> None:
+    async def _switch_source(self, event: ValueChangeEventArguments[str]) -> None:
         self._source = event.value
         if self._source == RECORDED:
             self._recorded.refresh()
         await self._show()
 
     async def _replay(self, name: str) -> None:
-        self._sources.set_value(RECORDED)
+        self._source_toggle.set_value(RECORDED)
         await self._recorded.replay(name)
 
     async def _follow(self) -> None:
@@ -305,7 +306,7 @@ class _Page:
         with self._client:
             if keys:
                 mistakes = self._session.mistakes
-                self._text.show(draft, mistakes)
+                self._text_panel.show(draft, mistakes)
                 with suppress(DraftError):  # the text is no TOML; the form stays
                     self._form = form_of(draft)
                     form = form_part(self._form, draft, by_field(self._form, mistakes))
@@ -327,7 +328,7 @@ class _Page:
         gesture = key != last.key or now_s - last.at_s > _GESTURE_S
         return self._session.change(draft, gesture=gesture)
 
-    async def _choose(self, event: ValueChangeEventArguments[str]) -> None:
+    async def _choose_scenario(self, event: ValueChangeEventArguments[str]) -> None:
         if event.value == self._session.draft.base:
             return
         try:
@@ -335,14 +336,14 @@ class _Page:
         except NoackError as error:
             ui.notify(str(error), type="negative")
             return
-        await self._open(draft)
+        await self._open_draft(draft)
 
-    async def _open(self, draft: Draft) -> None:
+    async def _open_draft(self, draft: Draft) -> None:
         self._session.results = self._session.before = None
         self._session.draft = draft
         self._unsettled.add("")
         self._scenarios.set_value(draft.base)
-        self._sources.set_value(EXPLORE)
+        self._source_toggle.set_value(EXPLORE)
         await self._session.change(draft)
 
     async def _keep_run(self) -> None:
@@ -351,17 +352,17 @@ class _Page:
             self._kept = None
         else:
             self._kept = Reference(f"the kept run ({explored.run.kind})", explored.run)
-        self._keep.set_text(_KEEP if self._kept is None else _FORGET)
+        self._keep_button.set_text(_KEEP_TEXT if self._kept is None else _FORGET_TEXT)
         await self._show()
 
-    async def _compare(self, event: ValueChangeEventArguments[bool | None]) -> None:
+    async def _switch_comparison(self, event: ValueChangeEventArguments[bool | None]) -> None:
         self._comparing = bool(event.value)
         await self._show()
 
     async def _toggle_dark(self) -> None:
         self._is_dark = not self._is_dark
         self._dark.set_value(self._is_dark)
-        self._text.show_dark(dark=self._is_dark)
+        self._text_panel.show_dark(dark=self._is_dark)
 
 
 class _MovedSlider(NamedTuple):

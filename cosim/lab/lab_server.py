@@ -36,6 +36,36 @@ from cosim.lab.recorded_views import report_page
 from cosim.output.viewer.rerun_program import HOST, OWN_HOST, socket_user
 from noack.core.errors import MachineError, NoackError, one_line, printable, shortened
 
+_END_S = 60.0
+"""Time limit for the end. A live run is a process of its own and continues."""
+_CAN_CHECK = sys.platform == "linux"
+"""Whether the user of a connection can be seen."""
+_RECONNECT_S = 60.0
+"""A page that is silent for less than 0.4 of this is not cut off: a busy machine may stall."""
+_SECRET_BYTES = 32
+_HEADERS = {
+    "referrer-policy": "no-referrer",
+    "x-frame-options": "SAMEORIGIN",
+    "x-content-type-options": "nosniff",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    # The rerun viewer, which is in a frame, draws in another process of the browser: while it
+    # draws without a graphics card, it would keep this page from handling clicks for seconds.
+    "origin-agent-cluster": "?1",
+    # The framework compiles its templates in the browser, which needs unsafe-eval.
+    "content-security-policy": "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; "
+    "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; "
+    "connect-src 'self'; worker-src 'self' blob:; frame-src 'self' http://127.0.0.1:* "
+    "http://localhost:*; frame-ancestors 'self'; base-uri 'self'; form-action 'self'",
+}
+_UNKNOWN_ADDRESS = (
+    "noack lab: this is not the address of the page. Each start of noack lab has another address:"
+    " open the one that its terminal shows. What follows the '?' are the settings; add it there.\n"
+)
+_REPORT_POLICY = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:; font-src data:"
+"""A run directory may come from somebody else; a report needs no scripts."""
+_POLICY_VIOLATION = WebSocketClose(code=1008)
+
 
 @dataclass(frozen=True)
 class LabOptions:
@@ -61,7 +91,7 @@ def serve(options: LabOptions, announce: Callable[[str], None]) -> None:
         MachineError: the port is in use.
     """
     secret, opening = new_secret(), new_secret()
-    listener = _listener(options.port)
+    listener = _listen(options.port)
     origin, query = f"http://{HOST}:{listener.getsockname()[1]}", f"?{options.settings}".rstrip("?")
     with LabServices(options.scenario, options.folder, options.runs) as services:
         application = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
@@ -91,14 +121,14 @@ def serve(options: LabOptions, announce: Callable[[str], None]) -> None:
             server_header=False,
         )
 
-        def announced() -> None:
+        def announce_address() -> None:
             announce(f"{origin}/{secret}/{query}")
             if options.open_browser:
                 webbrowser.open(f"{origin}/{opening if _CAN_CHECK else secret}/{query}")
 
         for logger in ("engineio.server", "asyncio"):
             logging.getLogger(logger).addFilter(refused_message)
-        server = _LabServer(config, announced, reports.give_up)
+        server = _LabServer(config, announce_address, reports.give_up)
         with listener, suppress(KeyboardInterrupt):  # Ctrl-C is how it ends
             asyncio.run(server.serve(sockets=[listener]))
 
@@ -116,14 +146,6 @@ def refused_message(record: logging.LogRecord) -> bool:
     return True
 
 
-_END_S, _STDERR = 60.0, 2
-"""Time limit for the end, and standard error. A live run is a process of its own and continues."""
-_CAN_CHECK = sys.platform == "linux"
-"""Whether the user of a connection can be seen."""
-_RECONNECT_S = 60.0
-"""A page that is silent for less than 0.4 of this is not cut off: a busy machine may stall."""
-
-
 class _LabServer(uvicorn.Server):
     """A server that reports once it listens, and when it begins to end."""
 
@@ -135,7 +157,7 @@ class _LabServer(uvicorn.Server):
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Cancel what would delay the end, and end; if that takes too long, print a traceback and exit."""
-        faulthandler.dump_traceback_later(_END_S, exit=True, file=_STDERR)
+        faulthandler.dump_traceback_later(_END_S, exit=True, file=2)  # standard error
         self._on_end()
         await super().shutdown(sockets)
 
@@ -146,7 +168,7 @@ class _LabServer(uvicorn.Server):
             self._on_start()
 
 
-def _listener(port: int) -> socket.socket:
+def _listen(port: int) -> socket.socket:
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -155,28 +177,6 @@ def _listener(port: int) -> socket.socket:
         listener.close()
         raise MachineError(f"port {port} cannot be used: {error.strerror}") from None
     return listener
-
-
-_SECRET_BYTES = 32
-_HEADERS = {
-    "referrer-policy": "no-referrer",
-    "x-frame-options": "SAMEORIGIN",
-    "x-content-type-options": "nosniff",
-    "cross-origin-opener-policy": "same-origin",
-    "cross-origin-resource-policy": "same-origin",
-    # The rerun viewer, which is in a frame, draws in another process of the browser: while it
-    # draws without a graphics card, it would keep this page from handling clicks for seconds.
-    "origin-agent-cluster": "?1",
-    # The framework compiles its templates in the browser, which needs unsafe-eval.
-    "content-security-policy": "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; "
-    "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; "
-    "connect-src 'self'; worker-src 'self' blob:; frame-src 'self' http://127.0.0.1:* "
-    "http://localhost:*; frame-ancestors 'self'; base-uri 'self'; form-action 'self'",
-}
-_UNKNOWN = (
-    "noack lab: this is not the address of the page. Each start of noack lab has another address:"
-    " open the one that its terminal shows. What follows the '?' are the settings; add it there.\n"
-)
 
 
 def new_secret() -> str:
@@ -222,14 +222,14 @@ class AddressGuard:
         # A browser names the origin of a socket; nothing else needs this socket.
         if not is_own or (is_socket and not origins):
             return _POLICY_VIOLATION if is_socket else Response(None, 403, _HEADERS)
-        if _begins(scope, self._root):
+        if _begins_with(scope, self._root):
             return None
         if is_socket:
             return _POLICY_VIOLATION
-        if _begins(scope, self._opening) and self._is_of_this_user(scope):
+        if _begins_with(scope, self._opening) and self._is_of_this_user(scope):
             query = scope["query_string"].decode("latin-1")
             return RedirectResponse(f"{self._root}/?{query}", 303, _HEADERS)
-        return PlainTextResponse(_UNKNOWN, 404, _HEADERS)
+        return PlainTextResponse(_UNKNOWN_ADDRESS, 404, _HEADERS)
 
     @staticmethod
     def _is_of_this_user(scope: Scope) -> bool:
@@ -237,16 +237,9 @@ class AddressGuard:
         return socket_user(scope["client"], scope["server"]) == os.getuid()
 
 
-_POLICY_VIOLATION = WebSocketClose(code=1008)
-
-
-def _begins(scope: Scope, root: str) -> bool:
+def _begins_with(scope: Scope, root: str) -> bool:
     first = "/" + scope["path"].removeprefix("/").partition("/")[0]
     return secrets.compare_digest(first.encode(), root.encode())
-
-
-# A run directory may come from somebody else; a report needs no scripts.
-_POLICY = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:; font-src data:"
 
 
 def serve_reports(application: FastAPI, services: LabServices) -> PageCalls:
@@ -267,7 +260,7 @@ def serve_reports(application: FastAPI, services: LabServices) -> PageCalls:
             return PlainTextResponse("noack lab has ended", 503)
         except NoackError as error:
             return PlainTextResponse(str(error), 409)
-        headers = {"content-security-policy": _POLICY, "cache-control": "no-store"}
+        headers = {"content-security-policy": _REPORT_POLICY, "cache-control": "no-store"}
         return HTMLResponse(page, headers=headers)
 
     return calls

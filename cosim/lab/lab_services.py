@@ -35,7 +35,14 @@ _GIVE_UP_S = 3.0
 """Time limit for a call whose page no longer needs it; then the worker is replaced."""
 _MANAGER_ENDS_S = 5.0
 """Time limit at the end for the thread of the pool, whose worker is killed."""
-_LOOK_S = 0.4
+_POLL_S = 0.4
+"""Least time between two readings of what a live run has recorded."""
+_QUIET_S = 0.15
+"""Time after the last change until what takes longer than a redraw is computed."""
+_MARGIN_S = 0.6
+"""Further time until the margin is computed, which takes longest."""
+_SLOW_S = 1.0
+"""Time without a result after which the page shows that it waits."""
 _NICE = 10
 """The worker yields to a live run and to the page."""
 
@@ -46,7 +53,7 @@ class LabServices:
     def __init__(self, scenario: str, folder: Path, runs: Path) -> None:
         self.scenario, self.folder, self.runs = scenario, folder, runs
         self.live: LiveRun | None = None
-        self._pool = _new_pool()
+        self._pool = _start_worker()
         self._turn = asyncio.Lock()
         self._following: asyncio.Task[None] | None = None
         self._watching: asyncio.Task[None] | None = None
@@ -56,7 +63,7 @@ class LabServices:
 
     def __exit__(self, *_: object) -> None:
         manager = self._pool._executor_manager_thread  # None: nothing was computed
-        _end(self._pool)
+        _end_worker(self._pool)
         if manager is not None:
             # The interpreter would wake it up at its exit, perhaps while it closes its pipe.
             manager.join(_MANAGER_ENDS_S)  # type: ignore[attr-defined] # it is a thread
@@ -104,8 +111,8 @@ class LabServices:
 
     def _replace_worker(self) -> None:
         """Begin a new worker process; a call in the old one is broken."""
-        old, self._pool = self._pool, _new_pool()
-        _end(old)
+        old, self._pool = self._pool, _start_worker()
+        _end_worker(old)
 
     async def run_live(self, text: str, horizon_s: float, folder: Path) -> LiveRun:
         """Start a live run, after the end of the one before."""
@@ -121,7 +128,7 @@ class LabServices:
         """Read what a live run has recorded, again and again, for a quarter of the time at most."""
         took_s = 0.0
         while not live.is_over:
-            await asyncio.sleep(max(_LOOK_S, 3 * took_s))
+            await asyncio.sleep(max(_POLL_S, 3 * took_s))
             if live.state != "running" or live.run_dir is None or not live.watched:
                 continue
             live.watched, began_s = False, time.perf_counter()
@@ -168,7 +175,7 @@ class PageCalls:
             call.cancel()
 
 
-def _end(pool: ProcessPoolExecutor) -> None:
+def _end_worker(pool: ProcessPoolExecutor) -> None:
     """End a worker at once, whatever it does: it may compute for seconds.
 
     If it dies in the middle of an answer, a thread of the pool waits for the rest. The pool itself
@@ -182,21 +189,14 @@ def _end(pool: ProcessPoolExecutor) -> None:
     answers._writer.close()  # type: ignore[attr-defined] # its other end then reads that it ended
 
 
-def _new_pool() -> ProcessPoolExecutor:
+def _start_worker() -> ProcessPoolExecutor:
     context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(1, mp_context=context, initializer=_prepare)
+    return ProcessPoolExecutor(1, mp_context=context, initializer=_prepare_worker)
 
 
-def _prepare() -> None:
+def _prepare_worker() -> None:
     """Yield to others. To find this function the worker has loaded what the first answer needs."""
     os.nice(_NICE)
-
-
-_QUIET_S = 0.15
-"""Time after the last change until what takes longer than a redraw is computed."""
-_MARGIN_S = 0.6
-_SLOW_S = 1.0
-"""Time without a result after which the page shows that it waits."""
 
 
 @dataclass
@@ -221,12 +221,12 @@ class Session:
     _wanted: int = 0
     _drawn: int = 0
     _busy: bool = False
-    _later: asyncio.Task[None] | None = None
+    _rest_task: asyncio.Task[None] | None = None
 
     def end(self) -> None:
         """Compute nothing more: the page was closed."""
-        if self._later is not None:
-            self._later.cancel()
+        if self._rest_task is not None:
+            self._rest_task.cancel()
         self.calls.give_up()
 
     @property
@@ -245,8 +245,8 @@ class Session:
             self.before = self.results.run
         self.draft = draft
         self._wanted += 1
-        if self._later is not None:
-            self._later.cancel()
+        if self._rest_task is not None:
+            self._rest_task.cancel()
         if self._busy:
             return
         self._busy = True
@@ -257,7 +257,7 @@ class Session:
                 await self.on_drawn()
         finally:
             self._busy = False
-        self._later = asyncio.create_task(self._compute_rest())
+        self._rest_task = asyncio.create_task(self._compute_rest())
 
     async def _explore(self) -> None:
         self.results, self.mistakes, self.note = None, [], ""

@@ -30,11 +30,13 @@ from noack.runtime.control_messages import RunProgress, parse_message
 if TYPE_CHECKING:
     from cosim.interactive.exploration import Exploration
 
-_ADDRESS = re.compile(r"http://\S+")
+_WEB_ADDRESS = re.compile(r"http://\S+")
 MOST_LINES = 200
-"""Of the log."""
+"""Lines of the log that are kept."""
 _STOP_S = 20.0
-_DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
+"""Time limit for a loop that is asked to end."""
+_DISPLAY_VARIABLES = ("DISPLAY", "WAYLAND_DISPLAY")
+"""Removed from the environment: the viewer is shown in the page, not in a window."""
 
 
 @dataclass
@@ -52,7 +54,7 @@ class LiveRun:
     first_line: int = 0
     """Number of lines that happened before these."""
     verdict: list[VerdictLine] = field(default_factory=list)
-    """At the end."""
+    """The verdict at the end; empty before."""
     ok: bool | None = None
     exploration: "Exploration | None" = None
     """What is drawn of it: what was recorded when a page last asked for it."""
@@ -72,7 +74,7 @@ class LiveRun:
 
         The text goes through a pipe: another user may be able to replace a file.
         """
-        environment = {key: value for key, value in os.environ.items() if key not in _DISPLAYS}
+        environment = {key: value for key, value in os.environ.items() if key not in _DISPLAY_VARIABLES}
         self._process = await asyncio.create_subprocess_exec(
             *python_command("-m", "cosim.lab.live_run", folder.absolute(), runs.absolute()),
             stdout=asyncio.subprocess.PIPE,
@@ -90,12 +92,12 @@ class LiveRun:
         assert self._process is not None
         assert self._process.stdout is not None
         async for line in self._process.stdout:
-            self._take(line.decode(errors="replace").strip())
+            self._handle_line(line.decode(errors="replace").strip())
             self.version += 1
         status = await self._process.wait()
         if not self.is_over:
             self.state, self.ok = "failed", False
-            self._add(f"the run ended with status {status}")
+            self._add_line(f"the run ended with status {status}")
         self.version += 1
 
     def stop(self) -> None:
@@ -129,46 +131,46 @@ class LiveRun:
                     return True
         return False
 
-    def _take(self, line: str) -> None:
+    def _handle_line(self, line: str) -> None:
         try:
             message = json.loads(line)
             event = message.pop("event")
         except (ValueError, AttributeError, KeyError, TypeError):
-            self._add(line)  # a message of a library, or of the compiler
+            self._add_line(line)  # a message of a library, or of the compiler
             return
         match event:
             case "started":
                 self.state, self.run_dir = "running", Path(message["run_dir"])
-                self._add("all processes run")
+                self._add_line("all processes run")
             case "progress":
-                self._progress(parse_message(RunProgress, line))
+                self._handle_progress(parse_message(RunProgress, line))
             case "failed":
-                self._add(f"{message['why']} at {message['t_s']:.1f} s; it is restarted")
+                self._add_line(f"{message['why']} at {message['t_s']:.1f} s; it is restarted")
             case "restarted":
-                self._add(f"{message['role']} runs again at {message['t_s']:.1f} s")
+                self._add_line(f"{message['role']} runs again at {message['t_s']:.1f} s")
             case "finalising":
                 self.state = "finalising"
-                self._add(f"ended: {message['reason']}; replaying it and checking its claims")
+                self._add_line(f"ended: {message['reason']}; replaying it and checking its claims")
             case "ended":
                 self.state, self.ok = "ended", message["ok"]
                 self.run_dir = Path(message["run_dir"])
                 self.verdict = [VerdictLine(text, Tone(tone)) for text, tone in message["verdict"]]
-                self._add(f"recorded in {self.run_dir}")
+                self._add_line(f"recorded in {self.run_dir}")
             case _:
                 self.state, self.ok = "failed", False
-                self._add(message.get("text", line))
+                self._add_line(message.get("text", line))
 
-    def _progress(self, report: RunProgress) -> None:
+    def _handle_progress(self, report: RunProgress) -> None:
         before = self.progress
         for text in report.warnings[len(before.warnings) if before else 0 :]:
-            self._add(text)
+            self._add_line(text)
         for text in report.changes[len(before.changes) if before else 0 :]:
-            self._add(f"changed: {text}")
-        if self.viewer is None and (match := _ADDRESS.search(report.live or "")):
+            self._add_line(f"changed: {text}")
+        if self.viewer is None and (match := _WEB_ADDRESS.search(report.live or "")):
             self.viewer = match[0]
         self.progress = report
 
-    def _add(self, line: str) -> None:
+    def _add_line(self, line: str) -> None:
         if line:
             self.lines.append(line)
             more = max(len(self.lines) - MOST_LINES, 0)

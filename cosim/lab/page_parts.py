@@ -35,7 +35,8 @@ Apply = Callable[[Callable[[Draft], Draft], str], Awaitable[None]]
 Json = dict[str, Any]
 
 _PIXELS_PER_POINT = 4 / 3
-_MARGIN = 0.06
+_AXIS_MARGIN = 0.06
+"""Space above and below the curves, as a share of their range."""
 _DRAWN_S = 10.0
 """Parts that the browser has not answered within this time are sent again with the next ones."""
 
@@ -146,7 +147,7 @@ def _ends(panel: Panel) -> tuple[float, float]:
     if axis.logarithmic:
         return log_ends(numbers, about, axis.decades or 99) or (0.1, 1.0)
     low, high = (float(numbers.min()), float(numbers.max())) if len(numbers) else (0.0, 1.0)
-    room = _MARGIN * (high - low) or 0.5
+    room = _AXIS_MARGIN * (high - low) or 0.5
     if axis.about is not None:
         low, high = near_ends((low, high), about)
     first, last = axis.ends

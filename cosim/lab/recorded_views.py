@@ -31,7 +31,7 @@ with lazy_modules():  # the worker alone needs them
     from cosim.live import finalize
     from cosim.output.figures import run_figures
 
-_READ = (SENSOR_MEASUREMENT, CONTROLLER_STEP, CONTROLLER_DELIVERY, CONTROLLER_SETTING, PLANT_STEP)
+_READ_TABLES = (SENSOR_MEASUREMENT, CONTROLLER_STEP, CONTROLLER_DELIVERY, CONTROLLER_SETTING, PLANT_STEP)
 
 
 class RunView(NamedTuple):
@@ -53,7 +53,7 @@ def live_view(run_dir: Path) -> Exploration | None:
     types, own, tables = run_tables(scenario), tables_of(loop), dict[str, np.ndarray]()
     for table, dtype in own.items():
         rows = np.zeros(0, dtype)
-        if table in _READ:
+        if table in _READ_TABLES:
             batches = merge_segments(spool_segments(run_dir / SPOOL, table, types[table]), types[table])
             recorded = concatenate_rows([*batches], types[table])
             rows = dict(rows_by_loop(table, recorded, phases_ns(scenario), [own])).get(0, rows)

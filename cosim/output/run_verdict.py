@@ -18,7 +18,7 @@ from noack.theory.certificates.assumptions import AssumptionStatus
 
 _NAMED = 3
 """Largest number of claims of a verdict that are named."""
-_SETTLED = 0.1
+SETTLED_SHARE = 0.1
 """A loop is stable if ‖x‖ falls to this share of its largest value."""
 _MOST_VIOLATIONS = 5
 _MOST_GROWTH, _MOST_LATE = 10.0, 0.01
@@ -82,7 +82,7 @@ def state_of(largest: float | None, final: float | None, diverged_at_s: float | 
         return "diverged"
     if largest is None or final is None:
         return ""
-    return "stable" if final <= _SETTLED * largest else "bounded"
+    return "stable" if final <= SETTLED_SHARE * largest else "bounded"
 
 
 def state_text(

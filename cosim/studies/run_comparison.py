@@ -21,7 +21,7 @@ from cosim.output.figures.figure_description import (
     Marks,
     Panel,
     PanelRow,
-    plain,
+    label_text,
     series_colour,
     time_axis,
 )
@@ -289,8 +289,8 @@ def overlay_figure(runs: Sequence[ComparedRun]) -> FigureDescription:
     numbered = list(enumerate(zip(runs, times, aligned, strict=True)))
     panels = [
         # Each run's line is thinner than the line below it.
-        Panel(x=longest, y=Axis(label=plain(name)), legend=() if i else None, items=[
-            Line(x=t_s, y=samples.x[:, i], label=f"{run.label}: {plain(run.title, 60)}",
+        Panel(x=longest, y=Axis(label=label_text(name)), legend=() if i else None, items=[
+            Line(x=t_s, y=samples.x[:, i], label=f"{run.label}: {label_text(run.title, 60)}",
                  colour=series_colour(k), width=max(_WIDEST * _NARROWER**k, 0.8))
             for k, (run, t_s, samples) in numbered
         ])

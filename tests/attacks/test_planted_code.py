@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from cosim.output.viewer.live_viewer import LiveView
+from cosim.output.viewer.recording_viewer import LiveView
 from noack.plants.systems.code_cache import cache_folder, compiler
 from tests.attacks.other_user import NOBODY, needs_root
 

@@ -11,7 +11,7 @@ from urllib.parse import parse_qs, urlsplit
 import psutil
 import pytest
 
-from cosim.output.viewer.live_viewer import RECORDING, RecordingServer
+from cosim.output.viewer.recording_viewer import RECORDING, RecordingServer
 from cosim.output.viewer.rerun_program import HOST, peer_user
 from tests.attacks.other_user import NOBODY, as_another_user, needs_root, output_of_another_user
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.report import MeasurementError
-from benchmarks.soak import Trend, constant, end_rows, trend, warm_up_s
+from benchmarks.soak import Trend, end_rows, lasting_range, memory_trend, warm_up_s
 
 GOOD: dict[str, Any] = {
     "missing_samples": 0,
@@ -68,7 +68,7 @@ def noise(t: float) -> float:
 
 def checked_trend(kib_of_s: Callable[[float], float], length_s: float = HOUR_S) -> Trend:
     at_s = np.arange(0.0, length_s, 5.0 if length_s <= HOUR_S else 60.0)
-    fitted = trend(at_s.tolist(), [80_000.0 + kib_of_s(t) for t in at_s], length_s)
+    fitted = memory_trend(at_s.tolist(), [80_000.0 + kib_of_s(t) for t in at_s], length_s)
     assert fitted is not None
     return fitted
 
@@ -101,13 +101,13 @@ def test_a_trend_needs_time_and_samples() -> None:
     fitted = checked_trend(lambda t: noise(t) + LEAK_KIB_PER_S * t)
     assert fitted.slope_kib_per_h == pytest.approx(3600 * LEAK_KIB_PER_S, rel=0.1)
     assert warm_up_s(HOUR_S) == 300.0
-    assert trend([0.0, 30.0], [1.0, 2.0], 60.0) is None
+    assert memory_trend([0.0, 30.0], [1.0, 2.0], 60.0) is None
     with pytest.raises(MeasurementError, match="too rarely"):
-        trend([0.0, 900.0, 1800.0], [1.0] * 3, HOUR_S)
+        memory_trend([0.0, 900.0, 1800.0], [1.0] * 3, HOUR_S)
 
 
 def test_changes_of_a_count_are_found_after_the_warm_up_only() -> None:
     at_s = [30.0, 40.0, 70.0, 80.0, 99.0]
-    assert constant(at_s, [9, 9, 7, 7, 7], 100.0) == (7, 9)
-    assert constant(at_s, [7, 7, 8, 7, 7], 100.0) == (7, 7)
-    assert constant([0.0, *at_s[1:]], [3, 7, 7, 7, 7], 100.0) == (7, 7)
+    assert lasting_range(at_s, [9, 9, 7, 7, 7], 100.0) == (7, 9)
+    assert lasting_range(at_s, [7, 7, 8, 7, 7], 100.0) == (7, 7)
+    assert lasting_range([0.0, *at_s[1:]], [3, 7, 7, 7, 7], 100.0) == (7, 7)

@@ -238,7 +238,7 @@ def viewers_of(running: live.Running) -> list[psutil.Process]:
     return [
         child
         for child in running.child("recorder").children(recursive=True)
-        if "cosim.output.viewer.live_viewer" in live.command_of(child) or is_rerun(child)
+        if "cosim.output.viewer.recording_viewer" in live.command_of(child) or is_rerun(child)
     ]
 
 

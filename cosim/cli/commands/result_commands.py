@@ -25,7 +25,7 @@ with lazy_modules():
     from cosim.live import finalize
     from cosim.output import result_tables, run_tables, terminal_output
     from cosim.output.figures import figure_files, run_figures
-    from cosim.output.viewer import live_viewer, rerun_program
+    from cosim.output.viewer import recording_viewer, rerun_program
     from cosim.record import collection, run_directory, run_record
     from cosim.studies import run_archive, run_comparison
 
@@ -96,7 +96,7 @@ def view(
         cli.print_json({"recording": str(path), "exists": path.is_file()})
         return ExitStatus.OK if path.is_file() else ExitStatus.CALLER
     rerun_program.require_viewer()
-    live_viewer.view_recording(path, native=False if web else None)
+    recording_viewer.view_recording(path, native=False if web else None)
     return ExitStatus.OK
 
 

@@ -51,12 +51,12 @@ from noack.scenario.scenario import Scenario, loop_names
 
 with lazy_modules():
     from cosim.live.recording import claim_monitor
-    from cosim.output.viewer import live_feed, live_viewer, rerun_program, run_recording
+    from cosim.output.viewer import live_feed, recording_viewer, rerun_program, run_recording
 
 if TYPE_CHECKING:
     from cosim.live.recording.claim_monitor import ClaimMonitor, Finding
     from cosim.output.viewer.live_feed import LiveFeed
-    from cosim.output.viewer.live_viewer import LiveView
+    from cosim.output.viewer.recording_viewer import LiveView
     from cosim.output.viewer.run_recording import RunRecording
 
 _DISCOVERY_S = 5.0
@@ -380,7 +380,7 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
         stack.enter_context(active_run(Path(process.descriptor.run_dir)))
         live_view = None
         if live and not process.start.is_restart:
-            live_view = live_viewer.LiveView()
+            live_view = recording_viewer.LiveView()
             stack.callback(live_view.close)  # it would not exit by itself
         _record(process, live_view)
     return ExitStatus.OK

@@ -32,15 +32,16 @@ if TYPE_CHECKING:
     from cosim.output.export import ExportedRun
 
 SUFFIX = ".fmu"
-_PACKETS = 8
+_PACKETS_PER_STEP = 8
 """Most packets that can arrive in a communication step."""
-_DOUBLED = 4
-"""How often the room for delayed packets is doubled."""
-_NO_HORIZON_NS = 2**60
+_MEMORY_DOUBLINGS = 4
+"""How often the memory for delayed packets is doubled."""
+_NO_HORIZON_NS = 2**60  # later than any simulation
 _SYSTEMS = {"linux": ("linux", ".so"), "darwin": ("darwin", ".dylib"), "win32": ("windows", ".dll")}
 _PROCESSORS = {"amd64": "x86_64", "arm64": "aarch64"}
-_DATE = (1980, 1, 1, 0, 0, 0)
-"""Of all files, so that the same scenario gives the same bytes."""
+"""Names of FMI for systems, with the endings of their libraries, and for processors."""
+_FILE_DATE = (1980, 1, 1, 0, 0, 0)
+"""Date of all files in the archive, so that the same scenario gives the same bytes."""
 _INDEPENDENT, _INPUT, _OUTPUT = "independent", "input", "output"
 
 
@@ -53,7 +54,7 @@ class _Variable(NamedTuple):
     controller: str
     is_real: bool
     shape: str
-    """Of n, m and p = :data:`_PACKETS`."""
+    """Of n, m and p = :data:`_PACKETS_PER_STEP`."""
     description: str
 
 
@@ -129,7 +130,7 @@ def write_scenario(scenario: Scenario, path: Path) -> list[Path]:
 def _archive(resolved: Scenario, role: str) -> bytes:
     """Return the file of an FMU."""
     loop, image, variables = loop_of(resolved), _Image(), dict[int, tuple[_Variable, list[int]]]()
-    sizes = {"n": len(loop.H), "m": loop.m, "p": _PACKETS}
+    sizes = {"n": len(loop.H), "m": loop.m, "p": _PACKETS_PER_STEP}
     for reference, variable in enumerate(_VARIABLES):
         if getattr(variable, role):
             variables[reference] = variable, [sizes[name] for name in variable.shape]
@@ -139,7 +140,7 @@ def _archive(resolved: Scenario, role: str) -> bytes:
         image.head.controller_at = _add_controller(image, resolved)
     image.head.n = len(loop.H)
     for reference, (variable, shape) in variables.items():
-        numbers = [_start(variable)] * math.prod(shape)
+        numbers = [-1 if variable.name == "received" else 0] * math.prod(shape)
         is_input = getattr(variable, role) == _INPUT
         image.add_variable(reference, numbers, is_real=variable.is_real, is_input=is_input)
     content = image.content()
@@ -152,7 +153,7 @@ def _archive(resolved: Scenario, role: str) -> bytes:
         identifier=identifier,
         stop_s=resolved.timing.horizon_ns / NS_PER_S,
         step_s=resolved.timing.plant_period_ns / NS_PER_S,
-        variables="\n".join(_element(role, ref, *variable) for ref, variable in variables.items()),
+        variables="\n".join(_variable_xml(role, ref, *variable) for ref, variable in variables.items()),
         structure="\n".join(
             f'    <{tag} valueReference="{reference}"/>'
             for tag in ("Output", "InitialUnknown")
@@ -170,16 +171,12 @@ def _archive(resolved: Scenario, role: str) -> bytes:
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in files.items():
-            archive.writestr(zipfile.ZipInfo(name, _DATE), data, zipfile.ZIP_DEFLATED)
+            archive.writestr(zipfile.ZipInfo(name, _FILE_DATE), data, zipfile.ZIP_DEFLATED)
     return buffer.getvalue()
 
 
-def _start(variable: _Variable) -> int:
-    return -1 if variable.name == "received" else 0
-
-
-def _element(role: str, reference: int, variable: _Variable, shape: list[int]) -> str:
-    """Return the element of a variable."""
+def _variable_xml(role: str, reference: int, variable: _Variable, shape: list[int]) -> str:
+    """Return the element of a variable in the description of the model."""
     causality, tag = getattr(variable, role), "Float64" if variable.is_real else "Int64"
     variability = "continuous" if variable.name in ("time", "x") else "discrete"
     start = " ".join(["0"] * math.prod(shape))
@@ -196,7 +193,7 @@ class _Image:
     """The bytes of an image, and its pointers."""
 
     def __init__(self) -> None:
-        self.head = ffi.new("noack_fmu_image *", {"sources": SOURCES.encode(), "packets": _PACKETS})
+        self.head = ffi.new("noack_fmu_image *", {"sources": SOURCES.encode(), "packets": _PACKETS_PER_STEP})
         self._data, self._pointers = bytearray(ffi.buffer(self.head)), list[tuple[int, int]]()
 
     def content(self) -> bytes:
@@ -253,7 +250,7 @@ def _add_channel(image: _Image, resolved: Scenario) -> int:
     """Append the network of the updates, with nothing in flight."""
     state = LinkState(resolved.network.link, resolved.seeds.loss, UPDATE_LINK)
     channel, link = Channel([state]), state.core
-    for _ in range(_DOUBLED):
+    for _ in range(_MEMORY_DOUBLINGS):
         channel.answer(core.NOACK_ASK_PLACES)
     channel.core.row_places = 1  # there is no record
     stages, places = link.stage_count, channel.core.places

@@ -19,7 +19,7 @@ from noack.scenario.scenario import Scenario
 
 SUFFIX = ".mat"
 _LONGEST_NAME = 31  # of the format of version 5
-_INVALID = re.compile(r"\W", re.ASCII)
+_INVALID_CHARACTER = re.compile(r"\W", re.ASCII)
 
 
 def write(run: ExportedRun, path: Path, *, certificates: bool = True) -> list[Path]:
@@ -95,13 +95,15 @@ def _columns(rows: Rows) -> dict[str, object]:
 
 
 def _array(values: NDArray[np.generic]) -> NDArray[np.generic]:
+    """Return a column as :func:`scipy.io.savemat` takes it; texts are a cell array."""
     return values.astype(object) if values.dtype.kind in "OU" else values
 
 
 def _fields(content: Mapping[str, object]) -> dict[str, object]:
+    """Return the fields of a structure, under names of MATLAB."""
     fields: dict[str, object] = {}
     for key, entry in content.items():
-        fields[_free_name(_name(key), fields)] = _structure(entry)
+        fields[_unused_name(_valid_name(key), fields)] = _structure(entry)
     return fields
 
 
@@ -131,15 +133,16 @@ def _array_or_cells(values: Sequence[object]) -> NDArray[np.generic]:
     return cells
 
 
-def _name(key: str) -> str:
+def _valid_name(key: str) -> str:
     """Return a key as a name of MATLAB: letters, digits and _, beginning with a letter."""
-    name = _INVALID.sub("_", str(key))
+    name = _INVALID_CHARACTER.sub("_", str(key))
     return (name if name[:1].isalpha() else f"f_{name}")[:_LONGEST_NAME]
 
 
-def _free_name(name: str, taken: Mapping[str, object]) -> str:
-    number, free = 1, name
-    while free in taken:
+def _unused_name(name: str, taken: Mapping[str, object]) -> str:
+    """Return the name, with a number if it is taken."""
+    number, unused = 1, name
+    while unused in taken:
         number += 1
-        free = f"{name[: _LONGEST_NAME - 4]}_{number}"
-    return free
+        unused = f"{name[: _LONGEST_NAME - 4]}_{number}"
+    return unused

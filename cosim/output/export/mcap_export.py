@@ -10,7 +10,7 @@ time, publish time and topics are the same; the stamp in a message is its nomina
 """
 
 import json
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,22 +30,24 @@ from noack.protocol.record_tables import COMMON, OWNER, TABLES
 if TYPE_CHECKING:
     from mcap.writer import Writer
 
-_LEVELS = {"info": 2, "restart": 3, "warning": 3, "error": 4}
-"""Numbers of the levels of foxglove.Log."""
 SUFFIX = ".mcap"
 _CHUNK_BYTES = 2**20
+_SEQUENCE_MASK = 0xFFFF_FFFF  # MCAP's sequence numbers have 32 bits
+_LEVELS = {"info": 2, "restart": 3, "warning": 3, "error": 4}
+"""Numbers of the levels of foxglove.Log."""
 ERRORS, LOG = "/loop/errors", "/log"
-_DIALECT = "https://json-schema.org/draft/2020-12/schema"
-_HEX = "^([0-9a-f]{2})*$"
-_REAL: dict[str, object] = {"type": ["number", "null"]}  # null: not finite
+_SCHEMA_DIALECT = "https://json-schema.org/draft/2020-12/schema"
+_HEX_PATTERN = "^([0-9a-f]{2})*$"
+_REAL_TYPE: dict[str, object] = {"type": ["number", "null"]}  # null: not finite
 _TABLES = {table.name: table for table in TABLES}
 _SCHEMAS = json.loads(Path(__file__).with_name("mcap_schemas.json").read_bytes())
-"""Of the messages that are no rows of a table."""
+"""Schemas of the messages that are no rows of a table."""
 Message = tuple[int, int, int, bytes]
 """Log time, publish time, sequence, and content."""
 _ROS_SUFFIX = ".ros2.mcap"
 _ROS_LEVELS = {"warning": 30, "restart": 30, "error": 40}
-_INFO = 20
+_ROS_INFO = 20
+"""Numbers of the levels of ROS 2; the second is that of all others."""
 
 
 def write(run: ExportedRun, path: Path, *, certificates: bool = True) -> list[Path]:
@@ -68,7 +70,7 @@ def write(run: ExportedRun, path: Path, *, certificates: bool = True) -> list[Pa
         with new_file(path) as file:
             writer = Writer(file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
             writer.start(profile="", library="noack")
-            _write(writer, run)
+            _write_content(writer, run)
             writer.finish()  # type: ignore[no-untyped-call]
         if not ros2.is_installed():
             return [path]
@@ -79,7 +81,7 @@ def write(run: ExportedRun, path: Path, *, certificates: bool = True) -> list[Pa
     return [path, written]
 
 
-def _write(writer: "Writer", run: ExportedRun) -> None:
+def _write_content(writer: "Writer", run: ExportedRun) -> None:
     record = run.record
     writer.add_metadata(
         "noack",
@@ -116,7 +118,8 @@ def _write_tables(writer: "Writer", run: ExportedRun, tables: list[str]) -> None
     """Write the rows of some tables in the order of their log time."""
     record = run.record
     channels = {
-        table: _channel(writer, run, _topic(table), _schema(table, record.tables[table])) for table in tables
+        table: _channel(writer, run, _table_topic(table), _table_schema(table, record.tables[table]))
+        for table in tables
     }
     for part in record.slices(*tables):
         merged = [
@@ -132,15 +135,16 @@ def _write_tables(writer: "Writer", run: ExportedRun, tables: list[str]) -> None
 def _messages(rows: Rows, phase_ns: int) -> Iterator[Message]:
     """Yield the rows of a table; their times are those of the run."""
     names = rows.dtype.names or ()
-    columns = {name: _values(name, rows[name]) for name in names}
+    columns = {name: _column_reader(name, rows[name]) for name in names}
     for i in range(len(rows)):
         content = {name: column(i) for name, column in columns.items()}
         times = (max(int(rows[name][i]) + phase_ns, 0) for name in ("now_ns", "t_ns"))
-        sequence = int(rows["sequence"][i]) & 0xFFFF_FFFF  # MCAP's has 32 bits
+        sequence = int(rows["sequence"][i]) & _SEQUENCE_MASK
         yield (*times, sequence, to_json(content, inf_nan_mode="null"))  # type: ignore[misc]
 
 
-def _values(name: str, column: Rows) -> Callable[[int], object]:
+def _column_reader(name: str, column: Rows) -> Callable[[int], object]:
+    """Return a function that gives the entry of a row as a value for JSON."""
     if column.dtype.kind != "V":
         values = column.tolist()
         return lambda i: values[i]
@@ -178,20 +182,20 @@ def _write_errors(writer: "Writer", run: ExportedRun) -> None:
             keys = ("t_ns", "e_s_norm", "threshold", "e_c_norm")
             content = to_json(dict(zip(keys, (t_ns, *norms), strict=True)), inf_nan_mode="null")
             at_ns = max(t_ns + run.phase_ns, 0)  # damaged records have others
-            writer.add_message(channel, at_ns, content, at_ns, number & 0xFFFF_FFFF)
+            writer.add_message(channel, at_ns, content, at_ns, number & _SEQUENCE_MASK)
             number += 1
 
 
 # Topics and schemas
 
 
-def _topic(table: str) -> str:
+def _table_topic(table: str) -> str:
     """Return the topic of a table's messages: ``plant_step`` is ``/plant/step``."""
     owner = OWNER[table]
     return f"/{owner}/{table.removeprefix(f'{owner}_')}"
 
 
-def _schema(table: str, rows: np.dtype[np.void]) -> dict[str, object]:
+def _table_schema(table: str, rows: np.dtype[np.void]) -> dict[str, object]:
     """Return the JSON Schema of a table's messages; a vector is an array.
 
     Args:
@@ -203,9 +207,9 @@ def _schema(table: str, rows: np.dtype[np.void]) -> dict[str, object]:
     for name in rows.names or ():
         unit = described[name].unit
         text = described[name].meaning + (f" [{unit}]" if unit else "")
-        properties[name] = {**_type(name, rows[name]), "description": text}
+        properties[name] = {**_json_type(name, rows[name]), "description": text}
     return {
-        "$schema": _DIALECT,
+        "$schema": _SCHEMA_DIALECT,
         "title": f"noack.{table}",
         "description": _TABLES[table].row,
         "type": "object",
@@ -214,10 +218,11 @@ def _schema(table: str, rows: np.dtype[np.void]) -> dict[str, object]:
     }
 
 
-def _type(name: str, field: np.dtype[np.generic]) -> dict[str, object]:
+def _json_type(name: str, field: np.dtype[np.generic]) -> dict[str, object]:
+    """Return the JSON Schema of a column."""
     if field.kind == "V" and field.subdtype is None:
-        return {"type": "string"} if name == "change" else {"type": "string", "pattern": _HEX}
-    entry = _REAL if field.base.kind == "f" else {"type": "integer"}
+        return {"type": "string"} if name == "change" else {"type": "string", "pattern": _HEX_PATTERN}
+    entry = _REAL_TYPE if field.base.kind == "f" else {"type": "integer"}
     if not field.shape:
         return dict(entry)
     size = field.shape[0]
@@ -266,20 +271,18 @@ class _Bag:
                 for row, topic, entries in ros2.row_entries(table, rows, loop.state_names, loop.input_names):
                     log_ns = max(int(rows["now_ns"][row]) + run.phase_ns, 0)
                     stamped = entries._replace(stamp_ns=entries.stamp_ns + run.phase_ns)
-                    number = int(rows["sequence"][row]) & 0xFFFF_FFFF
-                    message = ros2.joint_state(stamped, name)
-                    messages.append((log_ns, stamped.stamp_ns, f"{prefix}/{topic}", message, number))
-            self._add(sorted(messages, key=lambda message: message[0]))
-
-    def _add(self, messages: Iterable[tuple[int, int, str, bytes, int]]) -> None:
-        for log_ns, publish_ns, topic, message, number in messages:
-            channel = self._channel(topic, ros2.JOINT_STATE)
-            self._writer.add_message(channel, log_ns, message, max(publish_ns, 0), number)
+                    number = int(rows["sequence"][row]) & _SEQUENCE_MASK
+                    content = ros2.joint_state(stamped, name)
+                    messages.append((log_ns, stamped.stamp_ns, f"{prefix}/{topic}", content, number))
+            messages.sort(key=lambda message: message[0])
+            for log_ns, publish_ns, topic, content, number in messages:
+                channel = self._channel(topic, ros2.JOINT_STATE)
+                self._writer.add_message(channel, log_ns, content, max(publish_ns, 0), number)
 
     def write_log(self, run: ExportedRun) -> None:
         """Write the lines of the run's log to ``/rosout``."""
         for number, notice in enumerate(run.record.notices):
-            t_ns, level = max(int(notice["t_ns"]), 0), _ROS_LEVELS.get(notice["level"], _INFO)
+            t_ns, level = max(int(notice["t_ns"]), 0), _ROS_LEVELS.get(notice["level"], _ROS_INFO)
             line = ros2.log_line(t_ns, level, notice["process"], notice["text"])
             channel = self._channel("/rosout", ros2.LOG)
             self._writer.add_message(channel, t_ns, line, t_ns, number)

@@ -1,7 +1,7 @@
 """Figures: described once, and drawn by matplotlib or, on the lab page, in the browser.
 
 ``figure_description.py`` has the parts of a description. Those of a run are made in
-``run_figures.py``, ``event_and_process_times.py`` and ``network_figures.py``, those of a study beside it.
+``run_figures.py``, ``timing_figures.py`` and ``network_figures.py``, those of a study beside it.
 ``figure_layout.py`` gives all parts their places, ``figure_drawing.py`` draws them,
 ``figure_files.py`` writes files.
 """

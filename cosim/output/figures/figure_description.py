@@ -331,7 +331,7 @@ def histogram(values: Reals, bins: int = 30) -> tuple[Reals, Reals]:
     return edges, np.histogram(drawn, edges)[0].astype(np.float64)
 
 
-def plain(name: str, longest: int = 16) -> str:
+def label_text(name: str, longest: int = 16) -> str:
     """Return a user's name for a label: no mathematical markup, one line, limited length."""
     line = " ".join(name.split())
     if len(line) > longest:

@@ -48,9 +48,9 @@ from cosim.output.figures.figure_layout import (
     layout,
     legend_rows,
     legend_text,
+    matplotlib_settings,
     place_panels,
     rgb,
-    settings,
     turned_in,
 )
 from cosim.record.align import Reals
@@ -60,7 +60,7 @@ _NARROW_IN = 2.5
 """A shorter axis has few numbers."""
 _COLUMNS = 600
 """Pixel columns of a panel, to which lines are reduced."""
-_MARKS, _CROWDED_MARKERS = 120, 80
+_MARKER_COLUMNS, _CROWDED_MARKERS = 120, 80
 """Columns of markers in a panel, which are wider than a pixel; more markers than
 ``_CROWDED_MARKERS`` are drawn smaller."""
 _FEW_NUMBERS_RATIO = 6.0
@@ -74,15 +74,16 @@ _MARK_HEIGHT = 0.97
 _DARK_CELL = 0.6
 """A cell of a map with a lower value, as a share of the largest, has white numbers."""
 _EM_PER_CHARACTER_OF_LABEL = 0.5  # a label of an axis may be a little longer than the axis
-_SHORTEST_LINE = 8
+_SHORTEST_LINE = 8  # characters
 _UNIT, _NO_BREAK = re.compile(r"\[[^]]*\]"), "\N{NO-BREAK SPACE}"
 _DOLLAR = re.compile(r"(?<!\\)\$")
-_BOLD = ["cmb10", "DejaVu Serif"]
-_ELSEWHERE = str.maketrans(
+_BOLD_FONTS = ["cmb10", "DejaVu Serif"]
+_COMPUTER_MODERN_CHARACTERS = str.maketrans(
     {"_": r"$\_$", "<": "$<$", ">": "$>$", "|": "$|$", "{": r"$\{$", "}": r"$\}$", '"': "''"}
     | {"µ": r"$\mu$", "°": r"$^\circ$", "¹": "$^1$", "²": "$^2$", "³": "$^3$"}
 )
 """Characters at whose places Computer Modern has others; its mathematical fonts have them."""
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 class LegendItem(NamedTuple):
@@ -92,23 +93,19 @@ class LegendItem(NamedTuple):
     label: str
 
 
+@matplotlib_settings()
 def draw(described: FigureDescription) -> Figure:
-    """Draw a figure for the width of :func:`cosim.output.figures.figure_layout.figure_width`."""
-    with settings():
-        return _drawn(described)
-
-
-def _drawn(described: FigureDescription) -> Figure:
+    """Draw a figure for the width of :func:`cosim.output.figures.figure_layout.use_figure_width`."""
     places, size_in = place_panels(described)
     figure, norm = NotebookFigure(figsize=size_in), _norm(described.scale)
     for number, place in enumerate(places):
         axes = _axes(figure, place, figure.axes[-1] if place.is_beside else None)
-        shown = _draw_panel(axes, place, norm)
+        legend_items = _draw_panel(axes, place, norm)
         box, title = place.box, place.panel.title
         if described.heading and not number:
             width_in = layout().width_in - layout().right_in - box.left
             box, title = box._replace(width=width_in), described.heading
-        _head(axes, figure, box, title, shown)
+        _draw_heading(axes, figure, box, title, legend_items)
     if described.scale is not None:
         _colour_bar(figure, described.scale, norm, places)
     figure.align_ylabels()
@@ -118,7 +115,7 @@ def _drawn(described: FigureDescription) -> Figure:
             assert isinstance(text, Text)
             text.set_text(_for_font(text.get_text()))
             if text.get_fontweight() == "bold":
-                text.set_fontfamily(_BOLD)
+                text.set_fontfamily(_BOLD_FONTS)
     return figure
 
 
@@ -138,7 +135,7 @@ def _axes(figure: Figure, place: Place, beside: Axes | None = None) -> Axes:
         if axis.logarithmic:
             _make_logarithmic(axes, letter)  # type: ignore[arg-type]
         else:
-            (axes.xaxis if letter == "x" else axes.yaxis).set_major_formatter(_Plain())
+            (axes.xaxis if letter == "x" else axes.yaxis).set_major_formatter(_PlainFormatter())
         if None not in axis.ends:
             _set_ends(axes, letter, axis)  # type: ignore[arg-type]
         if not axis.grid:
@@ -150,7 +147,7 @@ def _draw_panel(axes: Axes, place: Place, norm: Normalize | None) -> list[Legend
     """Draw a panel; return what its legend shows."""
     panel, drawn = place.panel, dict[str, Artist]()
     for item in panel.items:
-        if (artist := _draw(item, axes, norm)) is not None:
+        if (artist := _draw_item(item, axes, norm)) is not None:
             drawn.setdefault(getattr(item, "label", ""), artist)
     _finish_axis(axes, "x", panel.x, has_numbers=place.has_x)
     _finish_axis(axes, "y", panel.y, has_numbers=place.has_y)
@@ -160,18 +157,20 @@ def _draw_panel(axes: Axes, place: Place, norm: Normalize | None) -> list[Legend
     return [LegendItem(drawn[label], label) for label in panel.labels if label in drawn]
 
 
-def _head(axes: Axes, figure: Figure, box: FigureBox, title: str, shown: Sequence[LegendItem]) -> None:
+def _draw_heading(
+    axes: Axes, figure: Figure, box: FigureBox, title: str, items: Sequence[LegendItem]
+) -> None:
     """Write a title and a legend above a box, where there are no data."""
     space, bottom_in = layout(), figure.get_figheight() - box.top
-    rows = legend_rows([item.label for item in shown], box.width)
+    rows = legend_rows([item.label for item in items], box.width)
     right_in, title_in = box.left + box.width, 0.0
     if not space.beside_title:  # the legend is below the title, and ends where all axes end
         right_in, title_in = space.width_in - space.right_in, space.legend_row_in * len(rows)
     for number, entries in enumerate(rows):
         above = len(rows) - 1 - number
         legend = axes.legend(
-            [shown[i].drawn for i in entries],
-            [legend_text(shown[i].label) for i in entries],
+            [items[i].drawn for i in entries],
+            [legend_text(items[i].label) for i in entries],
             loc="lower right",
             bbox_to_anchor=(right_in, bottom_in + above * space.legend_row_in),
             bbox_transform=figure.dpi_scale_trans,
@@ -184,12 +183,12 @@ def _head(axes: Axes, figure: Figure, box: FigureBox, title: str, shown: Sequenc
 
 
 @singledispatch
-def _draw(item: object, axes: Axes, norm: Normalize | None) -> Artist | None:
+def _draw_item(item: object, axes: Axes, norm: Normalize | None) -> Artist | None:
     """Draw an item; return what represents it in the legend, None if there is nothing."""
     raise TypeError(type(item))
 
 
-@_draw.register
+@_draw_item.register
 def _(item: Line, axes: Axes, norm: Normalize | None) -> Artist | None:
     style: dict[str, Any] = {
         "color": rgb(item.colour),
@@ -217,7 +216,7 @@ def _curve(axes: Axes, x: Reals, y: Reals, **style: Any) -> Artist:
     return drawn
 
 
-@_draw.register
+@_draw_item.register
 def _(item: Band, axes: Axes, norm: Normalize | None) -> Artist | None:
     low, high = (finite(curve, positive=axes.get_yscale() == "log") for curve in (item.low, item.high))
     if not (np.isfinite(low) & np.isfinite(high)).any():
@@ -228,7 +227,7 @@ def _(item: Band, axes: Axes, norm: Normalize | None) -> Artist | None:
     )
 
 
-@_draw.register
+@_draw_item.register
 def _(item: Marks, axes: Axes, norm: Normalize | None) -> Artist | None:
     x = finite(item.x, positive=axes.get_xscale() == "log")
     y = finite(item.y, positive=axes.get_yscale() == "log")
@@ -252,7 +251,7 @@ def _(item: Marks, axes: Axes, norm: Normalize | None) -> Artist | None:
         axes.errorbar(x, y, y_error, x_error, elinewidth=1.0, markersize=size, **style)
         return Line2D([], [], markersize=size, **style)
     if item.reduced:
-        keep = decimate(x, y, _MARKS)
+        keep = decimate(x, y, _MARKER_COLUMNS)
         x, y = x[keep], y[keep]
         size *= min(max(math.sqrt(_CROWDED_MARKERS / len(keep)), 0.4), 1.0)
     if item.stems is not None:
@@ -266,7 +265,7 @@ def _(item: Marks, axes: Axes, norm: Normalize | None) -> Artist | None:
     return drawn
 
 
-@_draw.register
+@_draw_item.register
 def _(item: Bars, axes: Axes, norm: Normalize | None) -> Artist | None:
     widths = np.diff(item.edges) * item.share
     middles = (item.edges[1:] + item.edges[:-1]) / 2
@@ -285,21 +284,21 @@ def _(item: Bars, axes: Axes, norm: Normalize | None) -> Artist | None:
     return axes.bar(middles, item.heights, widths, **style).patches[0]
 
 
-@_draw.register
+@_draw_item.register
 def _(item: Rule, axes: Axes, norm: Normalize | None) -> Artist | None:
     draw_rule = axes.axvline if item.vertical else axes.axhline
     dash = (0, item.dash) if item.dash else "-"
     return draw_rule(item.at, color=rgb(item.colour), linestyle=dash, linewidth=item.width, zorder=item.order)
 
 
-@_draw.register
+@_draw_item.register
 def _(item: Spans, axes: Axes, norm: Normalize | None) -> Artist | None:
     for begin, end in zip(item.begin, item.end, strict=True):
         axes.axvspan(begin, end, color=rgb(item.colour), alpha=item.opacity, linewidth=0)
     return None
 
 
-@_draw.register
+@_draw_item.register
 def _(item: Heat, axes: Axes, norm: Normalize | None) -> Artist | None:
     rows, columns = item.values.shape
     (left, right), values = item.x_ends, np.ma.masked_invalid(item.values)
@@ -392,14 +391,16 @@ def _for_font(text: str) -> str:
     if not layout().latex:
         return text
     parts = _DOLLAR.split(text)
-    return "$".join(part if i % 2 else part.translate(_ELSEWHERE) for i, part in enumerate(parts))
+    return "$".join(
+        part if i % 2 else part.translate(_COMPUTER_MODERN_CHARACTERS) for i, part in enumerate(parts)
+    )
 
 
 def _set_ends(axes: Axes, letter: Literal["x", "y"], described: Axis) -> None:
     (axes.set_xlim if letter == "x" else axes.set_ylim)(*described.ends)
 
 
-class _Plain(ScalarFormatter):
+class _PlainFormatter(ScalarFormatter):
     """Writes numbers as plain text: typesetting is slow. The fonts of LaTeX lack the minus sign."""
 
     def __call__(self, x: float, pos: int | None = None) -> str:
@@ -407,7 +408,7 @@ class _Plain(ScalarFormatter):
         return text if layout().latex else text.removeprefix(r"$\mathdefault{").removesuffix("}$")
 
 
-class _Numbers(LogFormatter):
+class _LogFormatter(LogFormatter):
     """Writes 0.2 and 200, but 10⁻⁵ as plain text: typeset powers would be slow.
 
     The fonts of LaTeX have other characters at the places of ¹, ² and ³.
@@ -422,7 +423,7 @@ class _Numbers(LogFormatter):
         if layout().latex:
             factor = "" if digits == "1" else rf"{digits}\cdot"
             return f"${factor}10^{{{int(exponent)}}}$"
-        power = "10" + str(int(exponent)).translate(_RAISED)
+        power = "10" + str(int(exponent)).translate(_SUPERSCRIPTS)
         return power if digits == "1" else f"{digits}·{power}"
 
     def _is_crowded(self) -> bool:
@@ -431,15 +432,12 @@ class _Numbers(LogFormatter):
         return layout().is_paper and self.axis.axis_name == "x" and high > _FEW_NUMBERS_RATIO * low  # type: ignore[union-attr]
 
 
-_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-
-
 def _make_logarithmic(axes: Axes, letter: Literal["x", "y"]) -> None:
     """Make an axis logarithmic, with numbers that are easy to read."""
     axes.set(**{f"{letter}scale": "log"})
     axis = axes.xaxis if letter == "x" else axes.yaxis
-    axis.set_major_formatter(_Numbers())
-    axis.set_minor_formatter(_Numbers(labelOnlyBase=False, minor_thresholds=(1.2, 0.5)))
+    axis.set_major_formatter(_LogFormatter())
+    axis.set_minor_formatter(_LogFormatter(labelOnlyBase=False, minor_thresholds=(1.2, 0.5)))
 
 
 def _fit_to_paper(figure: Figure) -> None:

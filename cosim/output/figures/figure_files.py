@@ -12,19 +12,21 @@ from matplotlib.figure import Figure
 from cosim.output.figures.figure_description import FigureDescription
 from cosim.output.figures.figure_drawing import draw
 from cosim.output.figures.figure_format import FigureFiles, FigureFormat, figure_width_in
-from cosim.output.figures.figure_layout import GRID, INK, PAPER, figure_width, settings
+from cosim.output.figures.figure_layout import GRID, INK, PAPER, matplotlib_settings, use_figure_width
 from noack.core.errors import CallerError
 from noack.core.file_access import write_whole
 
-_UNDATED: dict[FigureFormat, dict[str, str | None]] = {
+_WITHOUT_DATE: dict[FigureFormat, dict[str, str | None]] = {
     FigureFormat.SVG: {"Date": None, "Creator": None, "Format": None, "Type": None},
     FigureFormat.PNG: {"Software": None},
     FigureFormat.PDF: {"Creator": None, "Producer": None, "CreationDate": None},
 }
-_HEAVY_CHARACTERS = 400_000
+"""Metadata that are left out: they differ between days, and between versions of matplotlib."""
+_MOST_SVG_CHARACTERS = 400_000
 _REFERENCE = re.compile(r"(?<=#)[^)]+")
-_TAIL = re.compile(r"(\.\d\d)\d+")
-_BY_PAGE = {INK: "var(--ink)", GRID: "var(--grid)", PAPER: "var(--paper)"}
+"""The id to which an attribute refers."""
+_FURTHER_DIGITS = re.compile(r"(\.\d\d)\d+")
+_PAGE_COLOURS = {INK: "var(--ink)", GRID: "var(--grid)", PAPER: "var(--paper)"}
 
 FIGURE_SUFFIXES = tuple(f".{kind}" for kind in FigureFormat)
 
@@ -69,14 +71,14 @@ def save_figures(figures: Iterable[FigureDescription], page: Path, files: Figure
 
 def file_content(figure: FigureDescription, kind: FigureFormat, width_in: float) -> bytes:
     """Return a figure as the content of a file; a PDF has the fonts of LaTeX."""
-    with figure_width(width_in, latex=kind is FigureFormat.PDF):
+    with use_figure_width(width_in, latex=kind is FigureFormat.PDF):
         return _saved(draw(figure), kind)
 
 
 def _saved(drawn: Figure, kind: FigureFormat) -> bytes:
     buffer = io.BytesIO()
-    with settings():
-        drawn.savefig(buffer, format=kind, metadata=_UNDATED[kind])
+    with matplotlib_settings():
+        drawn.savefig(buffer, format=kind, metadata=_WITHOUT_DATE[kind])
     return buffer.getvalue()
 
 
@@ -87,7 +89,7 @@ def inline(figure: FigureDescription) -> str:
     """
     drawn, description = draw(figure), figure.description or figure.caption
     text = _page_svg(_saved(drawn, FigureFormat.SVG), figure.name, description)
-    if len(text) <= _HEAVY_CHARACTERS:
+    if len(text) <= _MOST_SVG_CHARACTERS:
         return text
     picture = base64.b64encode(_saved(drawn, FigureFormat.PNG)).decode()
     image = ET.Element("img", {"src": f"data:image/png;base64,{picture}", "alt": description})
@@ -116,11 +118,11 @@ def _page_svg(drawn: bytes, name: str, description: str) -> str:
                 if value in referred:
                     element.set(key, f"{name}-{value}")
             elif key == "style":
-                for ink, own in _BY_PAGE.items():
+                for ink, own in _PAGE_COLOURS.items():
                     value = value.replace(ink, own)
                 element.set(key, value)
             elif key == "d":
-                element.set(key, _TAIL.sub(r"\1", value).replace("\n", ""))
+                element.set(key, _FURTHER_DIGITS.sub(r"\1", value).replace("\n", ""))
             else:
                 element.set(key, _REFERENCE.sub(lambda match: f"{name}-{match[0]}", value))
     view = root.attrib["viewBox"]

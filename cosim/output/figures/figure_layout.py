@@ -36,6 +36,7 @@ INK, GRID, PAPER = "#1b1f24", "#d9dde3", "#fefefe"
 """Text and frames, grid lines, background, as in the style files; a page replaces them."""
 
 _EM_PER_CHARACTER = 0.6
+"""Mean width of a character of a legend."""
 POINTS_PER_IN = 72
 _STYLES = Path(__file__).with_name("styles")
 
@@ -68,7 +69,7 @@ class FigureLayout(NamedTuple):
 
     @property
     def character_in(self) -> float:
-        """Mean width of a character of a legend, within :func:`settings`."""
+        """Mean width of a character of a legend, within :func:`matplotlib_settings`."""
         return _EM_PER_CHARACTER * float(mpl.rcParams["legend.fontsize"]) / POINTS_PER_IN
 
     @property
@@ -89,7 +90,9 @@ class FigureLayout(NamedTuple):
 _SCREEN = FigureLayout(SCREEN_IN)
 _LAYOUT: ContextVar[FigureLayout] = ContextVar("figure_layout", default=_SCREEN)
 _ROOM_BESIDE_TITLE_IN = 5.0
-_LEAST_SCALE, _LEAST_BESIDE = 0.6, 0.4
+"""Least width of a figure in which legends are beside titles."""
+_LEAST_SCALE, _LEAST_BESIDE_SCALE = 0.6, 0.4
+"""Least factors of the heights of axes, and of the widths of panels beside others."""
 
 
 def layout() -> FigureLayout:
@@ -98,10 +101,10 @@ def layout() -> FigureLayout:
 
 
 @contextmanager
-def figure_width(width_in: float, *, latex: bool = False) -> Iterator[None]:
+def use_figure_width(width_in: float, *, latex: bool = False) -> Iterator[None]:
     """Draw and save figures of this width, perhaps with the fonts of LaTeX, within the context."""
     is_paper = width_in < SCREEN_IN
-    wanted = _of_paper(width_in) if is_paper else _SCREEN._replace(width_in=width_in)
+    wanted = _paper_layout(width_in) if is_paper else _SCREEN._replace(width_in=width_in)
     token = _LAYOUT.set(wanted._replace(latex=latex))
     try:
         yield
@@ -109,7 +112,7 @@ def figure_width(width_in: float, *, latex: bool = False) -> Iterator[None]:
         _LAYOUT.reset(token)
 
 
-def _of_paper(width_in: float) -> FigureLayout:
+def _paper_layout(width_in: float) -> FigureLayout:
     """Return the layout of a figure in a paper, with texts of 8 points."""
     return FigureLayout(
         width_in,
@@ -122,13 +125,13 @@ def _of_paper(width_in: float) -> FigureLayout:
         handle_in=0.4,
         scale=min(max(width_in / SCREEN_IN, _LEAST_SCALE), 1.0),
         line_scale=0.65,
-        beside_scale=max(width_in / SCREEN_IN, _LEAST_BESIDE),
+        beside_scale=max(width_in / SCREEN_IN, _LEAST_BESIDE_SCALE),
         beside_title=width_in >= _ROOM_BESIDE_TITLE_IN,
     )
 
 
 @contextmanager
-def settings() -> Iterator[None]:
+def matplotlib_settings() -> Iterator[None]:
     """Apply the layout's style files only, not the user's matplotlibrc, within the context."""
     with mpl.rc_context(), warnings.catch_warnings():
         mpl.rcdefaults()
@@ -149,7 +152,7 @@ class NotebookFigure(Figure):
 
     def _repr_png_(self) -> bytes:
         buffer = io.BytesIO()
-        with settings():
+        with matplotlib_settings():
             self.savefig(buffer, format="png")
         return buffer.getvalue()
 
@@ -164,15 +167,18 @@ def rgb(colour: Colour) -> Rgb:
 
 BAR_IN = 0.2
 """Width of the bar that explains the colours."""
-_BESIDE_IN, _BESIDE_GAP_IN, _UNTITLED_IN = 2.0, 0.27, 0.08
+_BESIDE_IN, _BESIDE_GAP_IN = 2.0, 0.27
+"""Width of a panel beside another one, and the gap between them."""
+_UNTITLED_IN = 0.08
+"""Height above axes without title and legend."""
 _TITLE_CHARACTERS = 31
 """Room for a title beside a legend."""
-_IN_SHORT = (
+_SHORT_LABELS = (
     ("certified for every plant of the uncertainty ", "certified: "),
     ("certified for the scenario's ", "certified: "),
     ("bound, given ", "given "),
 )
-"""What the legends of papers leave out of the labels of bounds."""
+"""Parts of the labels of bounds, and what the legends of papers have instead."""
 _MARKUP = re.compile(r"[$\\{}^_]|(?<=\\)\w+")
 
 
@@ -237,7 +243,7 @@ def _place_line(
         top_in += max(_panel_head_in(panel, width_in, is_first=not first) for panel in panels)
     places = []
     for i, panel in enumerate(panels):
-        begin_in, main_in = left_in + i * (share_in + further_in), _main_in(panel, width_in)
+        begin_in, main_in = left_in + i * (share_in + further_in), _main_width_in(panel, width_in)
         is_last = first + i + columns >= len(row.panels)
         has_x = panel.x.numbers and (is_last or not row.common)
         has_y = panel.y.numbers and (i == 0 or row.common != "xy")
@@ -253,10 +259,10 @@ def _panel_head_in(panel: Panel, width_in: float, *, is_first: bool) -> float:
     """Return the height above a panel; none below another one, without title and legend."""
     if not (panel.title or panel.labels or is_first):
         return 0.0
-    return _head_in(panel.labels, _main_in(panel, width_in), titled=bool(panel.title))
+    return _head_in(panel.labels, _main_width_in(panel, width_in), titled=bool(panel.title))
 
 
-def _main_in(panel: Panel, width_in: float) -> float:
+def _main_width_in(panel: Panel, width_in: float) -> float:
     """Return the width of a panel without the one beside it."""
     if panel.beside is None:
         return width_in
@@ -308,6 +314,6 @@ def legend_rows(labels: Iterable[str], width_in: float) -> list[list[int]]:
 
 def legend_text(label: str) -> str:
     """Return a label as legends have it: in papers, that of a bound is shorter."""
-    for long, brief in _IN_SHORT if layout().is_paper else ():
+    for long, brief in _SHORT_LABELS if layout().is_paper else ():
         label = label.replace(long, brief)
     return label

@@ -21,7 +21,7 @@ from cosim.output.figures.figure_description import (
     Panel,
     PanelRow,
     Steps,
-    plain,
+    label_text,
     time_axis,
 )
 from cosim.output.figures.run_figures import envelopes, run_figures
@@ -31,15 +31,19 @@ from noack.core.number_format import number
 
 Bools = NDArray[np.bool_]
 
-NAMED = len(palette.SERIES)
+MOST_CURVES = len(palette.SERIES)
 """Up to so many loops have a curve each, in a colour of its own; more are drawn as bands."""
 _PANEL_IN = 1.7
 _ROW_IN, _LOWEST_IN, _HIGHEST_IN = 0.22, 1.2, 4.5
-_MAP_DECADES = 5
-_MOST_ROWS = 24
+"""Height of a row of the map, and limits of the height of the map."""
+_DECADES = 5
+"""Maximum decades of norms that are shown."""
+_MOST_NAMED_ROWS = 24
 """Up to so many rows of the map have the names of their loops."""
 _BANDS = ((0, 4, 0.25, "5 to 95 % of the loops"), (1, 3, 0.45, "25 to 75 %"))
+"""Places of two quantiles among QUANTILES, opacity and label of the band between them."""
 _MEDIAN, _LARGEST = 2, 5
+"""Their places among QUANTILES."""
 
 
 def page_figures(
@@ -73,14 +77,14 @@ def network_figures(
         CallerError: a table of the record is damaged.
     """
     together = loops_over_time(run, over_time)
-    names = [plain(loop.name) for loop in summary.loops]
+    names = [label_text(loop.name) for loop in summary.loops]
     stayed = np.array([loop.diverged_at_s is None for loop in summary.loops])
     in_flight = summary.network.in_flight
     curves = "Each loop has a curve."
-    if len(names) > NAMED:
+    if len(names) > MOST_CURVES:
         curves = "Bands: quantiles over the loops; dashed: the largest value."
     diverged = "" if stayed.all() else " A loop that diverged leaves the range of the axis."
-    order = "" if len(names) <= _MOST_ROWS else " Loops are numbered from 0, as in the scenario."
+    order = "" if len(names) <= _MOST_NAMED_ROWS else " Loops are numbered from 0, as in the scenario."
     largest = together.errors[np.isfinite(together.errors)].max(initial=0.0)
     return [
         FigureDescription(
@@ -135,7 +139,7 @@ def norms_figure(over_time: LoopsOverTime, names: Sequence[str], stayed: Bools) 
         (r"$\|x\|$ plant", over_time.states),
     ):
         about = _not_diverged(values, stayed).ravel()
-        axis = Axis(label="norm", logarithmic=True, about=about, decades=_MAP_DECADES)
+        axis = Axis(label="norm", logarithmic=True, about=about, decades=_DECADES)
         panels.append((title, _curves(over_time.middles_s, values, names), axis))
     return FigureDescription(name="loops", rows=_rows(over_time, *panels))
 
@@ -153,7 +157,7 @@ def _rows(over_time: LoopsOverTime, *panels: tuple[str, Sequence[Item], Axis]) -
 
 def _curves(t_s: Reals, values: Reals, names: Sequence[str], steps: Steps = "") -> list[Item]:
     """Describe a curve for each of a few loops, (L, k) over (k,), or quantiles over many."""
-    if len(names) <= NAMED:
+    if len(names) <= MOST_CURVES:
         return [
             Line(x=t_s, y=curve, label=name, colour=colour, steps=steps)
             for name, colour, curve in zip(names, palette.SERIES, values, strict=False)
@@ -189,7 +193,7 @@ def error_map(over_time: LoopsOverTime, names: Sequence[str], stayed: Bools) -> 
     if np.isfinite(values).any():
         measured = _not_diverged(values, stayed)
         most = float(np.nanmax(measured))
-        least = max(float(np.nanmin(measured)), most / 10**_MAP_DECADES)
+        least = max(float(np.nanmin(measured)), most / 10**_DECADES)
         values[over_time.errors == 0] = least  # just after an update
         scale = ColourScale(
             low=least,
@@ -198,7 +202,7 @@ def error_map(over_time: LoopsOverTime, names: Sequence[str], stayed: Bools) -> 
             exceeded=float(np.nanmax(values)) > most,
         )
     heat = Heat(values=values, x_ends=(0.0, float(over_time.edges_s[-1])), downwards=True)
-    are_named = count <= _MOST_ROWS
+    are_named = count <= _MOST_NAMED_ROWS
     panel = Panel(
         title=r"$\|e_c\|$ of each loop",
         items=[] if scale is None else [heat],

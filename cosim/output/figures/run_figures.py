@@ -17,14 +17,6 @@ from numpy.typing import NDArray
 from cosim.analysis.claims.claim_evaluation import claims_of
 from cosim.analysis.fidelity import Fidelity
 from cosim.output.figures import palette
-from cosim.output.figures.event_and_process_times import (
-    clock_errors,
-    clocks_figure,
-    inter_event_figure,
-    largest_text,
-    latency_figure,
-    lateness_figure,
-)
 from cosim.output.figures.figure_description import (
     DASHES,
     Axis,
@@ -39,12 +31,20 @@ from cosim.output.figures.figure_description import (
     Rule,
     bound_lines,
     finite,
+    label_text,
     one_panel,
-    plain,
     series_colour,
     time_axis,
 )
 from cosim.output.figures.palette import CONTROLLER, FORCED, LOST, PLANT, SENSOR, THRESHOLD, Colour
+from cosim.output.figures.timing_figures import (
+    clock_errors,
+    clocks_figure,
+    inter_event_figure,
+    largest_text,
+    latency_figure,
+    lateness_figure,
+)
 from cosim.record.align import AlignedRun, Reals, aligned_parts
 from cosim.record.decimation import decimate_all
 from cosim.record.run_events import packet_outcomes
@@ -63,12 +63,14 @@ Envelope = tuple[str, Literal["e_c", "x", "inter_event"], Reals, Reals, BoundKin
 BOUNDED = ("errors", "state-norm", "inter-event")
 """The figures that show certified bounds."""
 _STATES_NARROWEST_IN, _LOSSES_NARROWEST_IN, _LOSSES_WIDEST_IN = 1.7, 2.2, 5.0
+"""Widths of a panel of these figures, in inches."""
 _MOST_STATES = 16
-_LONGEST_TITLE = 40
+_LONGEST_TITLE = 40  # characters
 _DECADES = 6
-_FAR, _LIGHT = 20.0, 0.45
+"""Maximum decades of an axis of norms."""
+_FAR_RATIO, _FAR_OPACITY = 20.0, 0.45
 """Bounds that are mostly over so many times the curves are drawn with this opacity."""
-_MOST_LABELS = 12
+_MOST_NUMBERED_BARS = 12
 
 
 def run_figures(
@@ -149,7 +151,7 @@ def _from_first_update(run: AlignedRun, record: RunRecord) -> AlignedRun:
 
 
 @np.errstate(all="ignore")  # a run may diverge
-def _reduced(
+def _decimated(
     record: RunRecord, table: str, column: str, curves: Callable[[Reals], Reals] = np.asarray
 ) -> tuple[Reals, Reals]:
     """Return times in s (k,) and curves of a vector column (k, …), reduced like the samples."""
@@ -227,7 +229,7 @@ def states_figure(
         Panel(
             items=states.items(i),
             x=time_axis(t_s),
-            y=Axis(label=plain(states.names[i])),
+            y=Axis(label=label_text(states.names[i])),
             legend=() if i else None,
         )
         for i in range(drawn)
@@ -261,7 +263,7 @@ def states_figure(
     )
     return FigureDescription(
         name="states",
-        heading=": ".join(filter(None, (head, plain(title, _LONGEST_TITLE)))) + note,
+        heading=": ".join(filter(None, (head, label_text(title, _LONGEST_TITLE)))) + note,
         rows=[of_states, *(PanelRow(panels=[panel], height_in=1.2) for panel in intervals)],
     )
 
@@ -330,7 +332,7 @@ def _norms(
     """Describe a figure of norms; its axis is limited: resets fall to rounding errors."""
     measured = np.concatenate([line.y for line in lines])
     y = Axis(label="norm", logarithmic=True, about=measured, decades=_DECADES)
-    drawn = [replace(bound, opacity=_LIGHT) if _is_far(bound, lines) else bound for bound in bounds]
+    drawn = [replace(bound, opacity=_FAR_OPACITY) if _is_far(bound, lines) else bound for bound in bounds]
     panel = Panel(title=title, items=[*lines, *drawn], x=time_axis(lines[0].x), y=y)
     return one_panel(name, panel, height_in)
 
@@ -343,7 +345,7 @@ def _is_far(bound: Line, curves: Sequence[Line]) -> bool:
     at_bound = [np.interp(bound.x, curve.x, curve.y) for curve in curves]
     ratios = bound.y / np.fmax.reduce(at_bound)
     known = ratios[np.isfinite(ratios)]
-    return len(known) > 0 and bool(np.median(known) > _FAR)
+    return len(known) > 0 and bool(np.median(known) > _FAR_RATIO)
 
 
 def _errors(scenario: Scenario, run: AlignedRun, bounds: list[Line]) -> FigureDescription:
@@ -364,7 +366,7 @@ def _errors(scenario: Scenario, run: AlignedRun, bounds: list[Line]) -> FigureDe
 
 
 def _state_norm(record: RunRecord, bounds: list[Line]) -> FigureDescription:
-    t_s, norm = _reduced(record, PLANT_STEP, "x", row_norms)
+    t_s, norm = _decimated(record, PLANT_STEP, "x", row_norms)
     line = Line(x=t_s, y=norm, label=r"$\|x\|$ plant", colour=PLANT, width=2.4)
     ends = f", from {norm[0]:.3g} to {norm[-1]:.3g}" if len(norm) else ""
     return _norms("state-norm", "Norm of the state", [line], 2.1, bounds).captioned(
@@ -380,7 +382,7 @@ def fidelity_figure(fidelity: Fidelity) -> FigureDescription:
         Line(x=t_s, y=y, label=part.name, colour=series_colour(i), dash=DASHES[i], width=1.6)
         for i, (part, y) in enumerate(stages)
     ]
-    title = f"{plain(fidelity.scenario, _LONGEST_TITLE)}: effects on x"
+    title = f"{label_text(fidelity.scenario, _LONGEST_TITLE)}: effects on x"
     return _norms("fidelity", title, lines, 2.7)
 
 
@@ -393,13 +395,13 @@ def _input(record: RunRecord) -> FigureDescription:
     if record.scenario.network.actuation is not None:
         table, title = PLANT_STEP, "Applied input"
         caption = "Input that the plant applied, also while actuations were missing."
-    t_s, u = _reduced(record, table, "u")
+    t_s, u = _decimated(record, table, "u")
     m, colours = len(names), len(palette.SERIES)
     lines = [
         Line(
             x=t_s,
             y=u[:, i],
-            label=plain(name) or f"u_{i + 1}",
+            label=label_text(name) or f"u_{i + 1}",
             colour=series_colour(i),
             dash=DASHES[i // colours % len(DASHES)],
             steps="post",
@@ -418,7 +420,7 @@ def _input(record: RunRecord) -> FigureDescription:
 def _dashed(curves: Sequence[Line]) -> str:
     if not curves:
         return ""
-    return f" Dashed: claimed bounds; a pale one is mostly over {_FAR:g} times the curves."
+    return f" Dashed: claimed bounds; a pale one is mostly over {_FAR_RATIO:g} times the curves."
 
 
 def _seconds(t_ns: NDArray[np.int64]) -> Reals:
@@ -462,7 +464,7 @@ def _loss_panel(title: str, label: str, counted: str, values: NDArray[np.int64],
         heights=np.array([counts[number] for number in range(low, high + 1)], np.float64),
         colour=LOST,
         share=0.8,
-        numbers=len(counts) <= _MOST_LABELS,
+        numbers=len(counts) <= _MOST_NUMBERED_BARS,
     )
     items: list[Item] = [bars]
     if limit is not None:

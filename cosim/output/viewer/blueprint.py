@@ -66,6 +66,7 @@ RECEPTION, FORCED, RECEPTION_STEM = "reception/interval", "reception/forced", "r
 DROP = "drop"
 
 _PAGE_OF_FEW, _PAGE_OF_MANY, _MANY = 4, 9, 16
+"""States on a page, of up to :data:`_MANY` states and of more."""
 _BEFORE, _AFTER = 0.02, 0.06
 """Margins of the time axis, as shares of the run's length."""
 _GLOBAL_VIEW = UUID("5c0dca6a-e63f-9cf7-f657-2602590474cc")
@@ -142,13 +143,13 @@ class LoopLayout:
             left: rrb.Container = rrb.Vertical(*drawings, texts, row_shares=shares)
             below = rrb.Horizontal(norms, inputs)
             right = rrb.Vertical(states, below, intervals, row_shares=[2, 1, 1])
-            shown = rrb.Horizontal(left, right, column_shares=[1, 1])
+            container = rrb.Horizontal(left, right, column_shares=[1, 1])
         else:
             left = rrb.Vertical(states, intervals, row_shares=[2, 1])
             right = rrb.Vertical(norms, inputs, texts)
-            shown = rrb.Horizontal(left, right, column_shares=[2, 1])
-        move_below(shown, self.folder)
-        return shown
+            container = rrb.Horizontal(left, right, column_shares=[2, 1])
+        move_below(container, self.folder)
+        return container
 
     def small_picture(self) -> rrb.View:
         """Return the panel of the picture, without its legend: the panel is small."""
@@ -159,9 +160,9 @@ class LoopLayout:
         return view
 
 
-def _styles(shown: LoopLayout) -> dict[str, Static]:
+def _styles(layout: LoopLayout) -> dict[str, Static]:
     """Return name, colour and width of every series, by entity."""
-    input_names, m = shown.input_names, len(shown.input_names)
+    input_names, m = layout.input_names, len(layout.input_names)
     triple = rr.SeriesLines(
         names=["x plant", "x_s sensor model", "x_c controller model"],
         colors=[PLANT, SENSOR, CONTROLLER],
@@ -171,10 +172,10 @@ def _styles(shown: LoopLayout) -> dict[str, Static]:
     errors = ["bound (I1)", "‖e_s‖ sensor", "threshold", "‖e_c‖ controller", "certified"]
     colours = [IDENTITY, SENSOR, THRESHOLD, CONTROLLER, CERTIFIED]
     widths = [3.5, 1.5, 2.0, 1.5, 2.0]
-    lateness = {lateness_path(process): line for process, line in _of_processes(shown.processes).items()}
-    clocks = {clock_path(process): line for process, line in _of_processes(shown.processes).items()}
+    lateness = {lateness_path(process): line for process, line in _process_styles(layout.processes).items()}
+    clocks = {clock_path(process): line for process, line in _process_styles(layout.processes).items()}
     return {
-        **{state_path(name): triple for name in shown.state_names},
+        **{state_path(name): triple for name in layout.state_names},
         ERROR: rr.SeriesLines(names=errors[:4], colors=colours[:4], widths=widths[:4]),
         ERROR_LOG10: rr.SeriesLines(names=errors, colors=colours, widths=widths),
         SIZE_LOG10: rr.SeriesLines(
@@ -196,11 +197,11 @@ def _styles(shown: LoopLayout) -> dict[str, Static]:
         FORCED: _mark("received (forced)", FORCED_COLOUR, "diamond", 6.0),
         DROP: _mark("lost", LOST, "cross", 5.0),
         **lateness,
-        **(clocks if shown.has_clocks else {}),
+        **(clocks if layout.has_clocks else {}),
     }
 
 
-def _of_processes(processes: Sequence[str]) -> dict[str, rr.SeriesLines]:
+def _process_styles(processes: Sequence[str]) -> dict[str, rr.SeriesLines]:
     return {
         process: rr.SeriesLines(
             names=process,
@@ -225,28 +226,28 @@ def _mark(
     return rr.SeriesPoints(names=name, colors=colour, markers=marker, marker_sizes=size)
 
 
-def over_time(shown: rrb.Container, horizon_s: float) -> rrb.Blueprint:
+def over_time(container: rrb.Container, horizon_s: float) -> rrb.Blueprint:
     """Return the layout of panels that share the time axis of a run."""
     return rrb.Blueprint(
-        rrb.Horizontal(shown, _common_time_axis(horizon_s)),
+        rrb.Horizontal(container, _common_time_axis(horizon_s)),
         rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
         collapse_panels=True,
     )
 
 
-def move_below(shown: rrb.Container | rrb.View, folder: str) -> None:
+def move_below(part: rrb.Container | rrb.View, folder: str) -> None:
     """Let panels show the entities below a folder instead of those at the root."""
-    if isinstance(shown, rrb.View):
-        shown.origin = f"{folder}{shown.origin}"
-        given = shown.contents
+    if isinstance(part, rrb.View):
+        part.origin = f"{folder}{part.origin}"
+        given = part.contents
         paths = [given] if isinstance(given, str) else [*cast(Sequence[str], given)]
-        shown.contents = [p if p.startswith("$") else f"/{folder}{p.lstrip('/')}" for p in paths]
-        overrides = shown.visualizer_overrides
-        shown.visualizer_overrides = {f"{folder}{path}": override for path, override in overrides.items()}
+        part.contents = [p if p.startswith("$") else f"/{folder}{p.lstrip('/')}" for p in paths]
+        overrides = part.visualizer_overrides
+        part.visualizer_overrides = {f"{folder}{path}": override for path, override in overrides.items()}
         return
-    for part in shown.contents:
-        if isinstance(part, (rrb.Container, rrb.View)):
-            move_below(part, folder)
+    for inner in part.contents:
+        if isinstance(inner, (rrb.Container, rrb.View)):
+            move_below(inner, folder)
 
 
 def _intervals() -> rrb.Container:
@@ -262,12 +263,12 @@ def _norms() -> rrb.Container:
     return rrb.Tabs(plot("log10 ‖e‖", ERROR_LOG10), plot("‖e‖", ERROR), plot("log10 ‖x‖", SIZE_LOG10))
 
 
-def _texts(shown: LoopLayout) -> rrb.Container:
+def _texts(layout: LoopLayout) -> rrb.Container:
     """Return the tabs: the colour key, the text about the run, lateness, clocks, the log."""
     everything = ["$origin/**"]
-    timing = [plot("Lateness [µs]", "lateness", everything)] if shown.processes else []
-    timing += [plot("Clock error [µs]", "clock", everything)] if shown.has_clocks else []
-    key, text = colour_key_panel(shown.input_names), about_view()
+    timing = [plot("Lateness [µs]", "lateness", everything)] if layout.processes else []
+    timing += [plot("Clock error [µs]", "clock", everything)] if layout.has_clocks else []
+    key, text = colour_key_panel(layout.input_names), about_view()
     return rrb.Tabs(key, text, *timing, log_view())
 
 
@@ -335,12 +336,14 @@ def plot(name: str, origin: str, contents: Sequence[str] = ("$origin",)) -> rrb.
 COLOUR_KEY = "key"
 """Parent of all entities of the key."""
 
-_WIDE, _HIGH = 18.0, 1.2
-_MOST_IN_A_ROW = 6
-_HALF, _THICK = 0.7, 0.16
+_KEY_WIDTH, _ROW_HEIGHT = 18.0, 1.2
+"""Lengths in the key have a unit of their own."""
+_ENTRIES_PER_ROW = 6
+"""Most inputs in a row of the key."""
+_HALF_STROKE, _STROKE_WIDTH = 0.7, 0.16
 _DIAMOND = ((0.0, 0.3), (0.2, 0.1), (0.0, -0.1), (-0.2, 0.1), (0.0, 0.3))
 _CROSS = ((-0.16, 0.26), (0.16, -0.06), (0.0, 0.1), (0.16, 0.26), (-0.16, -0.06))
-_STROKE = ((-_HALF, 0.0), (_HALF, 0.0))
+_STROKE = ((-_HALF_STROKE, 0.0), (_HALF_STROKE, 0.0))
 _Entry = tuple[str, palette.Colour, Sequence[tuple[float, float]]]
 """Name, colour, and line of the sample."""
 _ROWS: tuple[tuple[_Entry, ...], ...] = (
@@ -371,14 +374,14 @@ def _key_rows(input_names: Sequence[str]) -> list[Sequence[_Entry]]:
     """Return the rows of the key; a single input needs no entry."""
     names = input_names if len(input_names) > 1 else ()
     inputs = [(name, input_colour(i), _STROKE) for i, name in enumerate(names)]
-    most = _MOST_IN_A_ROW
-    return [*_ROWS, *(inputs[i : i + most] for i in range(0, len(inputs), most))]
+    size = _ENTRIES_PER_ROW
+    return [*_ROWS, *(inputs[i : i + size] for i in range(0, len(inputs), size))]
 
 
 def colour_key_panel(input_names: Sequence[str]) -> rrb.Spatial2DView:
     """Return the panel that explains the colours."""
-    high = len(_key_rows(input_names)) * _HIGH
-    bounds = rrb.VisualBounds2D(x_range=[0.0, _WIDE], y_range=[-0.4, high])
+    height = len(_key_rows(input_names)) * _ROW_HEIGHT
+    bounds = rrb.VisualBounds2D(x_range=[0.0, _KEY_WIDTH], y_range=[-0.4, height])
     return rrb.Spatial2DView(origin=COLOUR_KEY, name="Colours", visual_bounds=bounds)
 
 
@@ -387,8 +390,8 @@ def colour_key(input_names: Sequence[str]) -> Mapping[str, Shape]:
     shapes: dict[str, Shape] = {}
     for i, row in enumerate(_key_rows(input_names)):
         for j, (name, colour, sample) in enumerate(row):
-            x, y = (j + 0.5) * _WIDE / len(row), -i * _HIGH
+            x, y = (j + 0.5) * _KEY_WIDTH / len(row), -i * _ROW_HEIGHT
             moved = [(x + dx, y + dy) for dx, dy in sample]
-            shapes[f"{i}/{j}/sample"] = lines([moved], colour, _THICK)
+            shapes[f"{i}/{j}/sample"] = lines([moved], colour, _STROKE_WIDTH)
             shapes[f"{i}/{j}/name"] = label(name, (x, y - 0.2), colour)
     return shapes

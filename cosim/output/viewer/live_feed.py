@@ -17,6 +17,7 @@ from cosim.analysis.summary.loops_over_time import INTERVALS, add_link_bytes, em
 from cosim.analysis.summary.run_summary import counts_inside, times_inside
 from cosim.output.viewer.loop_feed import LAG_S, SHOWN_TABLES, LoopFeed, log_level
 from cosim.output.viewer.run_recording import ERROR, SIZE, RunRecording
+from cosim.record.align import Reals
 from cosim.record.record_source import rows_by_loop
 from cosim.record.run_record import Rows
 from noack.core.clock import NEVER_NS, NS_PER_S
@@ -32,15 +33,15 @@ from noack.protocol.record_tables import (
 from noack.scenario.resolution import loop_of, resolved_loops, tables_of
 from noack.scenario.scenario import Scenario, phases_ns
 
-_TURN_S, _SHARE = 0.03, 0.3
-"""CPU time of a turn; share of a core."""
-_NAMED_S, _PATIENCE_S = 3.0, 10.0
+_TURN_S, _CORE_SHARE = 0.03, 0.3
+"""CPU time of a turn; share of a core that all turns take."""
+_WARNED_LAG_S, _LONGEST_LAG_S = 3.0, 10.0
 """Wall time by which the loops in detail may lag before a warning, and before they are dropped."""
 _MAP_EVERY_S = 2.0
-Reals = NDArray[np.float64]
-Numbers = NDArray[np.int64]
+"""Wall time between two pictures of the map."""
 _LONGEST_NS = 2**50
 """Longer than any run; 2**13 loops have keys of 63 bits."""
+Numbers = NDArray[np.int64]
 
 
 class LiveFeed:
@@ -57,7 +58,7 @@ class LiveFeed:
         self._view, self._warn = view, warn
         self._wall_ns = NS_PER_S * scenario.speed
         self._phases_ns, self._types = phases_ns(scenario), [tables_of(loop) for loop in loops]
-        self._together = _AllLoops(scenario, loops, view) if view.is_shared else None
+        self._all_loops = _AllLoops(scenario, loops, view) if view.is_shared else None
         self._feeds = {
             number: LoopFeed(loops[number], loop_view, certified=not view.is_shared)
             for number, loop_view in view.views.items()
@@ -65,20 +66,20 @@ class LiveFeed:
         self._tables = SHOWN_TABLES if view.is_shared else (*SHOWN_TABLES, *CLOCK_TABLES)
         self._waiting: dict[str, list[Rows]] = {}
         self._due: list[int] = []
-        self._handed_ns = self._shown_ns = 0
-        self._named, self._next_s = False, 0.0
+        self._round_ns = self._shown_ns = 0
+        self._has_warned, self._next_s = False, 0.0
 
     def add(self, table: str, rows: Rows) -> None:
         """Add rows that follow the previously added ones."""
-        if self._together is not None:
-            self._together.add(table, rows)
+        if self._all_loops is not None:
+            self._all_loops.add(table, rows)
         if self._feeds and table in self._tables and len(rows):
             self._waiting.setdefault(table, []).append(rows)
 
     def log(self, notice: Mapping[str, Any]) -> None:
         """Add a line of the run's log, with the name of its loop; also to that of the loop."""
         loop, text, t_ns = notice.get(LOOP), str(notice["text"]), int(notice["t_ns"])
-        if self._together is None:
+        if self._all_loops is None:
             self._feeds[0].log(notice)
             return
         if loop is not None and loop < len(self._view.names):
@@ -92,33 +93,33 @@ class LiveFeed:
 
         The recording of a single loop is that of the run: all of it is passed on.
         """
-        if self._together is None:
-            self._hand_out()
+        if self._all_loops is None:
+            self._begin_round()
             self._feeds[0].advance(final=final)
             self._view.flush()
             return
         if not final:
-            self._watch_lag(self._together.newest_ns)
+            self._watch_lag(self._all_loops.newest_ns)
             if time.monotonic() < self._next_s:
                 return
         began_s = time.thread_time()
-        self._together.advance(final=final)
+        self._all_loops.advance(final=final)
         if final:
-            self._hand_out()
+            self._begin_round()
         while self._due or not final:
             if not self._due:
-                self._hand_out()
+                self._begin_round()
             if not self._due:
                 break
             self._feeds[self._due.pop(0)].advance(final=final)
             if not self._due:
-                self._shown_ns = self._handed_ns
+                self._shown_ns = self._round_ns
             if not final and (not self._due or time.thread_time() - began_s > _TURN_S):
                 break
         self._view.flush()
-        self._next_s = time.monotonic() + (time.thread_time() - began_s) * (1 / _SHARE - 1)
+        self._next_s = time.monotonic() + (time.thread_time() - began_s) * (1 / _CORE_SHARE - 1)
 
-    def _hand_out(self) -> None:
+    def _begin_round(self) -> None:
         """Begin a round: give each loop its rows."""
         waiting, self._waiting = self._waiting, {}
         for table, batches in waiting.items():
@@ -126,22 +127,22 @@ class LiveFeed:
                 if loop in self._feeds:
                     self._feeds[loop].add(table, rows)
         self._due = [*self._feeds]
-        if self._together is not None:
-            self._handed_ns = self._together.newest_ns
+        if self._all_loops is not None:
+            self._round_ns = self._all_loops.newest_ns
 
     def _watch_lag(self, newest_ns: int) -> None:
-        """Name a lag of the loops in detail; give them up if it grows."""
+        """Warn of a lag of the loops in detail; give them up if it grows."""
         lag_s = (newest_ns - self._shown_ns) / self._wall_ns
-        if not self._feeds or lag_s < _NAMED_S:
+        if not self._feeds or lag_s < _WARNED_LAG_S:
             return
-        if lag_s > _PATIENCE_S:
+        if lag_s > _LONGEST_LAG_S:
             self._feeds, self._due, self._waiting = {}, [], {}
             self._warn(
                 f"live view: the loops in detail end here, they were {lag_s:.0f} s late; all loops "
                 "together go on, and the record is complete"
             )
-        elif not self._named:
-            self._named = True
+        elif not self._has_warned:
+            self._has_warned = True
             self._warn(f"live view: the loops in detail are {lag_s:.1f} s late")
 
 
@@ -183,11 +184,11 @@ class _AllLoops:
             begin_ns, end_ns = map(np.concatenate, zip(self._inside, times_inside(rows), strict=True))
             self._inside = begin_ns, end_ns
         elif table == SENSOR_MEASUREMENT:
-            self._measured.append(self._reduced(rows, "t_ns", "x"))
+            self._measured.append(self._needed_columns(rows, "t_ns", "x"))
             of_run_ns = rows["t_ns"] + self._phases_ns[rows[LOOP]]
             self.newest_ns = max(self.newest_ns, int(of_run_ns.max()))
         elif table in (CONTROLLER_STEP, CONTROLLER_DELIVERY):
-            self._models.append(self._reduced(rows, "model_t_ns", "x_c"))
+            self._models.append(self._needed_columns(rows, "model_t_ns", "x_c"))
             if table == CONTROLLER_DELIVERY:
                 of_run_ns = rows["model_t_ns"] + self._phases_ns[rows[LOOP]]
                 np.minimum.at(self._first_ns, rows[LOOP], of_run_ns)
@@ -222,7 +223,7 @@ class _AllLoops:
     def _add_norms(self, until_ns: int) -> None:
         """Add the norms of the measurements up to a time of the run."""
         measured, at_ns = self._take(self._measured, until_ns)
-        self._largest(self._over_time.states, measured[LOOP], at_ns, row_norms(measured["x"]))
+        self._raise_largest(self._over_time.states, measured[LOOP], at_ns, row_norms(measured["x"]))
         # x_c at each measurement follows from the newest row of the controller before it.
         models = np.append(self._newest, self._take(self._models, until_ns)[0])
         models = models[np.lexsort((models["input"], models["t_ns"], models[LOOP]))]
@@ -236,11 +237,11 @@ class _AllLoops:
         measured, age_ns, x_c = measured[known], age_ns[known], models["x"][row[known]]
         for dt_ns in np.unique(age_ns).tolist():
             aged = age_ns == dt_ns
-            x_c[aged] = self._flow(dt_ns, measured[LOOP][aged], x_c[aged])
+            x_c[aged] = self._propagate(dt_ns, measured[LOOP][aged], x_c[aged])
         errors = row_norms(x_c - measured["x"])
-        self._largest(self._over_time.errors, measured[LOOP], at_ns[known], errors)
+        self._raise_largest(self._over_time.errors, measured[LOOP], at_ns[known], errors)
 
-    def _flow(self, dt_ns: int, loops: Numbers, x_c: Reals) -> Reals:
+    def _propagate(self, dt_ns: int, loops: Numbers, x_c: Reals) -> Reals:
         """Return models of controllers, (k, n), a time later, with the set-points of the start."""
         if dt_ns not in self._transitions:
             transitions = np.zeros((*self._entries.shape, self._entries.shape[1]))
@@ -251,7 +252,8 @@ class _AllLoops:
         moved: Reals = np.einsum("kij,kj->ki", self._transitions[dt_ns][loops], x_c - rest)
         return rest + moved
 
-    def _largest(self, values: Reals, loops: Numbers, t_ns: Numbers, norms: Reals) -> None:
+    def _raise_largest(self, values: Reals, loops: Numbers, t_ns: Numbers, norms: Reals) -> None:
+        """Enter norms into the largest values of their loops and intervals."""
         np.fmax.at(values, (loops, intervals_of(t_ns, self._horizon_ns)), norms)
 
     def _take(self, waiting: list[Rows], until_ns: int) -> tuple[Rows, Numbers]:
@@ -262,13 +264,13 @@ class _AllLoops:
         waiting[:] = [rows[~ready]]
         return rows[ready], of_run_ns[ready]
 
-    def _reduced(self, rows: Rows, time_name: str, vector_name: str) -> Rows:
+    def _needed_columns(self, rows: Rows, time_name: str, vector_name: str) -> Rows:
         """Return the needed columns of rows."""
-        reduced = np.empty(len(rows), self._none.dtype)
-        reduced[LOOP], reduced["input"] = rows[LOOP], rows["input"]
-        reduced["t_ns"] = rows[time_name]
-        reduced["x"] = np.where(self._entries[rows[LOOP]], rows[vector_name], 0.0)
-        return reduced
+        needed = np.empty(len(rows), self._none.dtype)
+        needed[LOOP], needed["input"] = rows[LOOP], rows["input"]
+        needed["t_ns"] = rows[time_name]
+        needed["x"] = np.where(self._entries[rows[LOOP]], rows[vector_name], 0.0)
+        return needed
 
 
 def _keys(rows: Rows) -> Numbers:

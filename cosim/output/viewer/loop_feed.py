@@ -13,6 +13,8 @@ from cosim.record.align import (
     AlignedRun,
     ControllerTrack,
     EventFollower,
+    Reals,
+    Times,
     align_measurements,
     controller_track,
     initial_track,
@@ -63,10 +65,6 @@ SHOWN_TABLES = (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
-
-Times = NDArray[np.int64]
-Reals = NDArray[np.float64]
-
 
 _WARNINGS = ("failed", "violation", "void", "late", "diverges", "watchdog", "clock lost")
 
@@ -148,26 +146,27 @@ class LoopFeed:
             wall_ns = NS_PER_S * self._scenario.speed
             until_ns = max(reach_ns, newest_ns - int(_PATIENCE_S * wall_ns))
             until_ns -= int(LAG_S * wall_ns)
-        self._packets(self._take(NETEM_PACKET, None))
+        self._show_packets(self._take(NETEM_PACKET, None))
         self._view.travel(self._scenario.timing.horizon_ns if until_ns is None else until_ns)
-        self._inputs(steps)
+        self._show_inputs(steps)
         self._undrawn.append(deliveries)
-        self._deliveries(until_ns)
+        self._show_deliveries(until_ns)
         taken = self._take(PLANT_STEP, None)
         if self._has_internal_state or not self._scenario.coverage.knows_state:
             self._steps = concatenate_rows([self._steps, taken], self._steps.dtype)
-        self._lateness("plant", taken)
-        self._measurements(self._take(SENSOR_MEASUREMENT, until_ns), reach_ns)
+        self._show_lateness("plant", taken)
+        self._show_measurements(self._take(SENSOR_MEASUREMENT, until_ns), reach_ns)
         for table in self._clock_tables:
-            self._clock_errors(table, self._take(table, None))
+            self._show_clock_errors(table, self._take(table, None))
 
-    def _clock_errors(self, table: str, rows: Rows) -> None:
+    def _show_clock_errors(self, table: str, rows: Rows) -> None:
         if len(rows):
             error_us = np.where(rows["error_ns"] == LOST_NS, np.nan, rows["error_ns"] * 1e-3)
             keep = self._rows_to_show(rows["now_ns"], error_us)
             self._view.clock_errors(OWNER[table], rows["now_ns"][keep], error_us[keep])
 
     def _take(self, table: str, until_ns: int | None) -> Rows:
+        """Return the waiting rows of a table up to a time; they wait no longer."""
         waiting = self._pending[table]
         rows = concatenate_rows(waiting, self._types[table])
         if until_ns is None:
@@ -177,7 +176,7 @@ class LoopFeed:
         self._pending[table] = [rows[ready:]] if ready < len(rows) else []
         return rows[:ready]
 
-    def _measurements(self, rows: Rows, reach_ns: int) -> None:
+    def _show_measurements(self, rows: Rows, reach_ns: int) -> None:
         if not len(rows):
             return
         acknowledged = self._scenario.protocol.acknowledges
@@ -199,14 +198,14 @@ class LoopFeed:
         of_state = np.column_stack([self._certified(t_s, "state"), self._from_event(rows, aligned)])
         self._view.samples(thin, bounds[kept], of_state[kept])
         frames = Frames(t_s, aligned.x, aligned.x_s, aligned.x_c, z)
-        shown = self._kept_frames(len(t_s))
+        shown = self._frames_to_show(len(t_s))
         self._view.move(aligned.t_ns[shown], frames.at(shown))
         keep = max(int(np.searchsorted(self._track.model_ns, rows["t_ns"][-1], "right")) - 1, 0)
         self._track = self._track.since(keep)
-        self._events(rows["t_ns"][rows["event"] != NO_SEQUENCE])
-        self._lateness("sensor", rows)
+        self._show_events(rows["t_ns"][rows["event"] != NO_SEQUENCE])
+        self._show_lateness("sensor", rows)
 
-    def _events(self, event_ns: Times) -> None:
+    def _show_events(self, event_ns: Times) -> None:
         if len(event_ns):
             passed_s = _intervals_s(event_ns, self._last_event_ns)
             keep = self._rows_to_show(event_ns, passed_s)
@@ -223,9 +222,7 @@ class LoopFeed:
             self._view.certified_interval(certificate.inter_event_s, self._scenario.timing.horizon_ns)
         return certificate
 
-    def _certified(
-        self, t_s: NDArray[np.float64], quantity: Literal["controller_error", "state"]
-    ) -> NDArray[np.float64]:
+    def _certified(self, t_s: Reals, quantity: Literal["controller_error", "state"]) -> Reals:
         if self._certificate is None:
             return np.full(len(t_s), np.nan)
         bound = getattr(self._certificate, quantity)(t_s)
@@ -237,7 +234,7 @@ class LoopFeed:
             return None
         return known_state_bounds(self._scenario, self._certificate)
 
-    def _from_event(self, rows: Rows, aligned: AlignedRun) -> NDArray[np.float64]:
+    def _from_event(self, rows: Rows, aligned: AlignedRun) -> Reals:
         """Return the certified bound of ‖x‖ from the newest event on, (k,); NaN for none."""
         if (known := self._known_state) is None:
             return np.full(len(rows), np.nan)
@@ -246,7 +243,7 @@ class LoopFeed:
         bound = np.fmin(row_norms(since.predicted) + moved, self._certified(t_s, "state"))
         return np.asarray(np.where(t_s < self._claimed_until_s, bound, np.nan))
 
-    def _bounds(self, rows: Rows, aligned: AlignedRun) -> NDArray[np.float64]:
+    def _bounds(self, rows: Rows, aligned: AlignedRun) -> Reals:
         """Return the bound of ‖e_c‖ from (I1), (k,); NaN if updates are acknowledged."""
         if self._scenario.protocol.acknowledges:
             return np.full(len(rows), np.nan)
@@ -260,14 +257,14 @@ class LoopFeed:
         t_s = np.asarray(t_ns * 1e-9, np.float64)
         return decimate_all(t_s, values.reshape(len(t_ns), -1), self._columns)
 
-    def _kept_frames(self, count: int) -> NDArray[np.bool_]:
+    def _frames_to_show(self, count: int) -> NDArray[np.bool_]:
         """Return at which of some measurements the plant's picture is drawn."""
         shown = np.ones(count, np.bool_)
         if self._columns is not None:
             shown[np.arange(count) % max(count // self._columns, 1) != 0] = False
         return shown
 
-    def _deliveries(self, until_ns: int | None) -> None:
+    def _show_deliveries(self, until_ns: int | None) -> None:
         """Draw deliveries once the rows of the network process about them must have arrived."""
         waiting = np.concatenate(self._undrawn)
         ready = np.full(len(waiting), True) if until_ns is None else waiting["t_ns"] <= until_ns
@@ -284,7 +281,7 @@ class LoopFeed:
         self._view.receptions(event_ns[keep], passed_s[keep], forced[keep])
         self._last_delivery_ns = int(event_ns[-1])
 
-    def _packets(self, rows: Rows) -> None:
+    def _show_packets(self, rows: Rows) -> None:
         if not len(rows):
             return
         for flow in self._scenario.network.flows[1:]:
@@ -297,15 +294,15 @@ class LoopFeed:
         if dropped.any():
             lost_ns = event_ns[dropped]
             self._view.drops(lost_ns[self._rows_to_show(lost_ns, np.zeros(len(lost_ns)))])
-        self._lateness("netem", rows)
+        self._show_lateness("netem", rows)
 
-    def _inputs(self, steps: Rows) -> None:
+    def _show_inputs(self, steps: Rows) -> None:
         if len(steps):
             keep = self._rows_to_show(steps["t_ns"], steps["u"])
             self._view.inputs(steps["t_ns"][keep], steps["u"][keep])
-            self._lateness("controller", steps)
+            self._show_lateness("controller", steps)
 
-    def _lateness(self, process: str, rows: Rows) -> None:
+    def _show_lateness(self, process: str, rows: Rows) -> None:
         if len(rows):
             t_ns, late_ns = rows["t_ns"], rows["now_ns"] - rows["t_ns"]
             late_us = np.asarray(late_ns / (1e3 * self._scenario.speed), dtype=np.float64)
@@ -313,7 +310,7 @@ class LoopFeed:
             self._view.lateness(process, t_ns[keep], late_us[keep])
 
 
-def _intervals_s(t_ns: Times, before_ns: int | None) -> NDArray[np.float64]:
+def _intervals_s(t_ns: Times, before_ns: int | None) -> Reals:
     """Return the times since the previous one, NaN for the first."""
     first = np.nan if before_ns is None else (t_ns[0] - before_ns) * 1e-9
     return np.concatenate([[first], np.diff(t_ns) * 1e-9])

@@ -18,17 +18,19 @@ import rerun.blueprint as rrb
 from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.network_diagram import DIAGRAM, LEG_S
 from cosim.output.viewer.pictures.picture import PICTURE, TIMELINE, Frames, concatenate_frames
-from cosim.record.align import AlignedRun
+from cosim.record.align import AlignedRun, Reals, Times
 from cosim.record.run_directory import Kind
 from noack.core.clock import NS_PER_S
 from noack.core.errors import MachineError, why
 from noack.core.file_access import open_growing
 from noack.scenario.scenario import Scenario
 
-Floats = npt.NDArray[np.float64]
-Nanoseconds = npt.NDArray[np.int64]
-
 APPLICATION_ID = "noack"
+_LOG_DEPTH, _LOG_FLOOR = 1e-3, 1e-12
+"""Errors, which are reset to 0, are cut off at this share of the threshold, or at the second number if
+that is larger: the logarithm of 0 cannot be drawn."""
+_FRAMES_AT_ONCE = 12
+"""Frames per batch; a batch needs more than a kilobyte for each moving entity."""
 
 
 class ViewError(MachineError):
@@ -77,13 +79,13 @@ class RecordingFile:
         for entity, shape in static.items():
             self._stream.log(entity, shape, static=True)
 
-    def send(self, entity: str, t_ns: Nanoseconds, values: Floats) -> None:
+    def send(self, entity: str, t_ns: Times, values: Reals) -> None:
         """Add scalars (k,) or (k, series) at times (k,); a value that is not finite is a gap."""
         if len(values):
             finite = np.where(np.isfinite(values), values, np.nan)
             self.send_columns(entity, t_ns, rr.Scalars.columns(scalars=finite))
 
-    def send_columns(self, entity: str, t_ns: Nanoseconds, columns: Iterable[rr.ComponentColumn]) -> None:
+    def send_columns(self, entity: str, t_ns: Times, columns: Iterable[rr.ComponentColumn]) -> None:
         """Add columns of any components at times (k,).
 
         Raises:
@@ -165,14 +167,6 @@ The network ({network.loss.model.replace("_", "-")} loss) guarantees:
 """
 
 
-# The logarithm of an error that is reset to zero cannot be plotted: errors are cut off at this
-# fraction of the threshold, or at the smallest error of interest, if that is larger.
-_LOG_DEPTH = 1e-3
-_LOG_FLOOR = 1e-12
-_FRAMES_AT_ONCE = 12
-"""Frames per batch; a batch needs more than a kilobyte for each moving entity."""
-
-
 class LoopView:
     """Writes what is shown of one loop. Every method takes a batch of one kind, ordered in time.
 
@@ -180,34 +174,34 @@ class LoopView:
 
     Args:
         file: the recording.
-        shown: what is shown; its static data are written here.
+        layout: what is shown; its static data are written here.
     """
 
-    def __init__(self, file: RecordingFile, shown: bp.LoopLayout) -> None:
-        self._file, self._shown = file, shown
-        self._states = [bp.state_path(name) for name in shown.state_names]
+    def __init__(self, file: RecordingFile, layout: bp.LoopLayout) -> None:
+        self._file, self._layout = file, layout
+        self._states = [bp.state_path(name) for name in layout.state_names]
         self._frame = -1
-        self._waiting: list[tuple[Nanoseconds, Frames]] = []
-        file.add_static(shown.static())
+        self._waiting: list[tuple[Times, Frames]] = []
+        file.add_static(layout.static())
 
-    def _send(self, entity: str, t_ns: Nanoseconds, values: Floats) -> None:
-        at_ns = np.asarray(t_ns) + self._shown.phase_ns
-        self._file.send(f"{self._shown.folder}{entity}", at_ns, values)
+    def _send(self, entity: str, t_ns: Times, values: Reals) -> None:
+        at_ns = np.asarray(t_ns) + self._layout.phase_ns
+        self._file.send(f"{self._layout.folder}{entity}", at_ns, values)
 
-    def _send_columns(self, entity: str, t_ns: Nanoseconds, columns: Iterable[rr.ComponentColumn]) -> None:
-        at_ns = np.asarray(t_ns) + self._shown.phase_ns
-        self._file.send_columns(f"{self._shown.folder}{entity}", at_ns, columns)
+    def _send_columns(self, entity: str, t_ns: Times, columns: Iterable[rr.ComponentColumn]) -> None:
+        at_ns = np.asarray(t_ns) + self._layout.phase_ns
+        self._file.send_columns(f"{self._layout.folder}{entity}", at_ns, columns)
 
-    def _send_stems(self, entity: str, t_ns: Nanoseconds, height: Floats) -> None:
+    def _send_stems(self, entity: str, t_ns: Times, height: Reals) -> None:
         """Add lines from 0 to each height (k,) at times (k,), with a gap after each."""
         line = np.stack((np.zeros_like(height), height, np.full_like(height, np.nan)), axis=1)
         self._send(entity, np.repeat(t_ns, 3), line.ravel())
 
     def log(self, t_ns: int, level: str, text: str) -> None:
         """Add one line to the loop's log; ``level`` is one of rerun's, such as INFO or WARN."""
-        self._file.log(t_ns + self._shown.phase_ns, level, text, self._shown.folder)
+        self._file.log(t_ns + self._layout.phase_ns, level, text, self._layout.folder)
 
-    def samples(self, aligned: AlignedRun, e_c_bounds: Floats, x_bounds: Floats) -> None:
+    def samples(self, aligned: AlignedRun, e_c_bounds: Reals, x_bounds: Reals) -> None:
         """Add k samples.
 
         Args:
@@ -228,11 +222,11 @@ class LoopView:
         sizes = np.column_stack([x_bounds, np.linalg.norm(aligned.x, axis=1)])
         self._send(bp.SIZE_LOG10, t_ns, _log10(sizes, aligned.threshold))
 
-    def move(self, t_ns: Nanoseconds, frames: Frames) -> None:
+    def move(self, t_ns: Times, frames: Frames) -> None:
         """Add states at times (k,) to the plant's picture, at its frame rate."""
-        if self._shown.picture is None:
+        if self._layout.picture is None:
             return
-        frame = t_ns // round(NS_PER_S / self._shown.picture.rate_hz)
+        frame = t_ns // round(NS_PER_S / self._layout.picture.rate_hz)
         new = np.diff(frame, prepend=self._frame) > 0
         if not new.any():
             return
@@ -243,48 +237,48 @@ class LoopView:
 
     def draw(self) -> None:
         """Write the waiting frames of the picture."""
-        if self._shown.picture is None or not self._waiting:
+        if self._layout.picture is None or not self._waiting:
             return
         t_ns = np.concatenate([times for times, _ in self._waiting])
         frames = concatenate_frames([frames for _, frames in self._waiting])
         self._waiting = []
-        for entity, columns in self._shown.picture.frames(frames).items():
+        for entity, columns in self._layout.picture.frames(frames).items():
             self._send_columns(f"{PICTURE}/{entity}", t_ns, columns)
 
     def packets(
         self,
-        t_ns: Nanoseconds,
-        release_ns: Nanoseconds,
+        t_ns: Times,
+        release_ns: Times,
         fate: npt.NDArray[np.int64],
         *,
         reverse: bool = False,
     ) -> None:
         """Add packets (p,) to the network's diagram; see :meth:`NetworkDiagram.add`."""
-        if self._shown.diagram is not None:
-            self._shown.diagram.add(t_ns, release_ns, fate, reverse=reverse)
+        if self._layout.diagram is not None:
+            self._layout.diagram.add(t_ns, release_ns, fate, reverse=reverse)
 
     def travel(self, until_ns: int) -> None:
         """Animate the packets up to a time by which all of them were added."""
-        if self._shown.diagram is None:
+        if self._layout.diagram is None:
             return
-        for entity, moving in self._shown.diagram.advance(until_ns).items():
+        for entity, moving in self._layout.diagram.advance(until_ns).items():
             self._send_columns(f"{DIAGRAM}/{entity}", moving.t_ns, moving.columns)
 
     def certified_interval(self, interval_s: float, until_ns: int) -> None:
         """Draw the certified minimum inter-event time, from 0 to ``until_ns``."""
         self._send(bp.EVENT_CERTIFIED, np.array([0, until_ns]), np.full(2, interval_s))
 
-    def inputs(self, t_ns: Nanoseconds, u: Floats) -> None:
+    def inputs(self, t_ns: Times, u: Reals) -> None:
         """Add the control input u (k, m) at times (k,)."""
         self._send(bp.INPUT, t_ns, u)
 
-    def broadcasts(self, t_ns: Nanoseconds, interval_s: Floats) -> None:
+    def broadcasts(self, t_ns: Times, interval_s: Reals) -> None:
         """Add events: times t_i (k,) and t_i − t_{i−1} in seconds (k,), NaN (drawn 0) for none."""
         interval_s = np.nan_to_num(interval_s)
         self._send_stems(bp.EVENT_STEM, t_ns, interval_s)
         self._send(bp.EVENT, t_ns, interval_s)
 
-    def receptions(self, t_ns: Nanoseconds, interval_s: Floats, forced: npt.NDArray[np.bool_]) -> None:
+    def receptions(self, t_ns: Times, interval_s: Reals, forced: npt.NDArray[np.bool_]) -> None:
         """Add deliveries: times (k,), seconds since the previous one (k,), forced (k,).
 
         A delivery is forced if M − 1 consecutive updates were lost before it. An interval that is
@@ -296,22 +290,22 @@ class LoopView:
         self._send(bp.RECEPTION, t_ns[~forced], interval_s[~forced])
         self._send(bp.FORCED, t_ns[forced], interval_s[forced])
 
-    def drops(self, t_ns: Nanoseconds) -> None:
+    def drops(self, t_ns: Times) -> None:
         """Add the times (k,) at which an update was lost."""
         self._send(bp.DROP, t_ns, np.zeros(len(t_ns)))
 
-    def lateness(self, process: str, t_ns: Nanoseconds, lateness_us: Floats) -> None:
+    def lateness(self, process: str, t_ns: Times, lateness_us: Reals) -> None:
         """Add a process's lateness in µs (k,) at times (k,), if it is shown."""
-        if process in self._shown.processes:
+        if process in self._layout.processes:
             self._send(bp.lateness_path(process), t_ns, lateness_us)
 
-    def clock_errors(self, process: str, t_ns: Nanoseconds, error_us: Floats) -> None:
+    def clock_errors(self, process: str, t_ns: Times, error_us: Reals) -> None:
         """Add bounds of the error of a process's clock in µs (k,) at times (k,); NaN: lost."""
-        if process in self._shown.processes:
+        if process in self._layout.processes:
             self._send(bp.clock_path(process), t_ns, error_us)
 
 
-def _log10(norms: Floats, threshold: Floats) -> Floats:
+def _log10(norms: Reals, threshold: Reals) -> Reals:
     """Return the decimal logarithm of norms (k, series), cut off below the threshold (k,)."""
     level = np.nan_to_num(threshold, nan=0.0, posinf=0.0)[:, None]
     floor = np.maximum(_LOG_DEPTH * level, _LOG_FLOOR)

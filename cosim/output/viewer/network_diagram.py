@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from cosim.output.figures.palette import CONTROLLER, FORCED, LOST, NETWORK, PLANT, SENSOR
 from cosim.output.viewer.pictures.picture import STILL, Columns, Shape, label, lines, style, upright
+from cosim.record.align import Reals, Times
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import Fate, effective
 from noack.protocol.wire_format import Flow
@@ -24,21 +25,21 @@ DIAGRAM = "network"
 LEG_S = 0.15
 """Drawn duration, in simulated time, from the sensor to the network, and from there onward."""
 _FALL_S = 0.45
-_APART_S = 0.025
-_LEG_NS, _FALL_NS, _APART_NS = (round(s * NS_PER_S) for s in (LEG_S, _FALL_S, _APART_S))
+"""Drawn duration of the fall of a lost packet."""
+_SPACING_S = 0.025
+"""Least time between the broadcasts of two packets that are drawn."""
+_LEG_NS, _FALL_NS, _SPACING_NS = (round(s * NS_PER_S) for s in (LEG_S, _FALL_S, _SPACING_S))
 _FRAME_NS = round(NS_PER_S / 60)
 
-_APART = 4.4
-_BOXES = {name: i * _APART for i, name in enumerate(("plant", "sensor", "network", "controller"))}
+_BOX_DISTANCE = 4.4
+_BOXES = {name: i * _BOX_DISTANCE for i, name in enumerate(("plant", "sensor", "network", "controller"))}
 _, _SENSOR, _NETWORK, _CONTROLLER = _BOXES.values()
 _HALF_WIDE, _HALF_HIGH = 1.6, 0.62
 _REVERSE_Y = -0.4
 """Height of acknowledgements, a little below the updates."""
-_LOW = -2.5
-_SIZE = 0.17
-
-Times = NDArray[np.int64]
-Reals = NDArray[np.float64]
+_INPUT_Y = -2.5
+"""Height of the way from the controller to the plant."""
+_DOT_RADIUS = 0.17
 
 
 class Moving(NamedTuple):
@@ -65,7 +66,7 @@ class NetworkDiagram:
         self._reverse = reverse
         self._in_flight = np.zeros(0, _PACKET)
         self._drawn_ns = -1
-        self._last_ns = {False: -_APART_NS, True: -_APART_NS}
+        self._last_ns = {False: -_SPACING_NS, True: -_SPACING_NS}
         self._shown: dict[str, int] = {}
 
     @staticmethod
@@ -74,7 +75,9 @@ class NetworkDiagram:
         return rrb.Spatial2DView(
             origin=DIAGRAM,
             name=f"Packets (animated {LEG_S:g} s per hop)",
-            visual_bounds=rrb.VisualBounds2D(x_range=[-1.9, _CONTROLLER + 1.9], y_range=[-1.7, -_LOW + 0.6]),
+            visual_bounds=rrb.VisualBounds2D(
+                x_range=[-1.9, _CONTROLLER + 1.9], y_range=[-1.7, -_INPUT_Y + 0.6]
+            ),
         )
 
     def scenery(self) -> Mapping[str, Shape]:
@@ -94,22 +97,22 @@ class NetworkDiagram:
                 for a, b in ((_CONTROLLER, _NETWORK), (_NETWORK, _SENSOR))
             ]
         shapes["arrows"] = lines([line for arrow in arrows for line in arrow], STILL, 0.03)
-        home = [(_CONTROLLER, -_HALF_HIGH), (_CONTROLLER, _LOW), (0.0, _LOW), (0.0, -_HALF_HIGH)]
+        home = [(_CONTROLLER, -_HALF_HIGH), (_CONTROLLER, _INPUT_Y), (0.0, _INPUT_Y), (0.0, -_HALF_HIGH)]
         head = [(-0.14, -_HALF_HIGH - 0.2), (0.0, -_HALF_HIGH), (0.14, -_HALF_HIGH - 0.2)]
         inputs = [home, head]
         if self._reverse is Flow.ACTUATION:  # they cross the network
-            inputs.append([(_NETWORK, -_HALF_HIGH), (_NETWORK, _LOW)])
+            inputs.append([(_NETWORK, -_HALF_HIGH), (_NETWORK, _INPUT_Y)])
         shapes["input"] = lines(inputs, STILL, 0.03)
-        shapes["input/word"] = label("u = K x_c", (_SENSOR, _LOW + 0.4), STILL)
+        shapes["input/word"] = label("u = K x_c", (_SENSOR, _INPUT_Y + 0.4), STILL)
         shapes["lost/word"] = label("lost", (_NETWORK + 1.1, -1.0), LOST)
-        shapes["forced/word"] = label("forced", (_NETWORK + _APART / 2, 1.55), FORCED)
+        shapes["forced/word"] = label("forced", (_NETWORK + _BOX_DISTANCE / 2, 1.55), FORCED)
         for entity, colour in (
             ("broadcast", SENSOR),
             ("delivered", CONTROLLER),
             ("reverse", NETWORK),
         ):
             shapes[entity] = rr.Points2D.from_fields(
-                radii=_SIZE if entity != "reverse" else 0.6 * _SIZE,
+                radii=_DOT_RADIUS if entity != "reverse" else 0.6 * _DOT_RADIUS,
                 colors=colour,
                 draw_order=5.0,
             )
@@ -130,7 +133,7 @@ class NetworkDiagram:
         """
         drawn = np.zeros(len(t_ns), np.bool_)
         for i, sent_ns in enumerate(t_ns.tolist()):
-            if sent_ns - self._last_ns[reverse] >= _APART_NS:
+            if sent_ns - self._last_ns[reverse] >= _SPACING_NS:
                 drawn[i] = True
                 self._last_ns[reverse] = sent_ns
         packets = np.zeros(int(drawn.sum()), _PACKET)
@@ -166,7 +169,7 @@ class NetworkDiagram:
         survives, leaves = effective(pairs["fate"]), now_ns >= out_ns
         reached = np.clip((now_ns - t_ns) / _LEG_NS, 0.0, 1.0)
         onward = (now_ns - out_ns) / _LEG_NS
-        gap = _APART - 2 * _HALF_WIDE
+        gap = _BOX_DISTANCE - 2 * _HALF_WIDE
         x = _NETWORK - _HALF_WIDE - gap * (1.0 - reached)
         # A waiting packet is drawn inside the network; a released one at its other side.
         x = np.where(reached >= 1.0, _NETWORK, x)
@@ -175,8 +178,8 @@ class NetworkDiagram:
         y = np.where(leaves & ~survives, -_HALF_HIGH - 0.2 - 1.3 * fall, 0.0)
         forced = pairs["fate"] == Fate.FORCED
         if self._reverse is Flow.ACTUATION:
-            back = np.where(leaves & survives, _NETWORK * (1 - onward), _CONTROLLER - _APART * reached)
-            x, y = np.where(reverse, back, x), np.where(reverse, _LOW + 0.4 * y, y)
+            back = np.where(leaves & survives, _NETWORK * (1 - onward), _CONTROLLER - _BOX_DISTANCE * reached)
+            x, y = np.where(reverse, back, x), np.where(reverse, _INPUT_Y + 0.4 * y, y)
         else:
             x = np.where(reverse, 2 * _NETWORK - x, x)
             y = np.where(reverse & (survives | ~leaves), _REVERSE_Y, y)
@@ -200,8 +203,8 @@ class NetworkDiagram:
         return moving
 
 
-_DIAMOND = 1.3 * _SIZE * np.array([[0, -1], [1, 0], [0, 1], [-1, 0], [0, -1], [1, 0]])
-_CROSS = _SIZE * np.array([[-1, -1], [1, 1], [0, 0], [-1, 1], [1, -1]])
+_DIAMOND = 1.3 * _DOT_RADIUS * np.array([[0, -1], [1, 0], [0, 1], [-1, 0], [0, -1], [1, 0]])
+_CROSS = _DOT_RADIUS * np.array([[-1, -1], [1, 1], [0, 0], [-1, 1], [1, -1]])
 """One line that passes its middle twice."""
 
 

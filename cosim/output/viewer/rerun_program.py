@@ -3,6 +3,10 @@
 The program serves the web viewer's files on a port of its own. Any user of the machine could listen
 on that port once the program has ended. Therefore the kernel selects the port, and an answer is
 used only if it comes from a process of this user.
+
+Neither a layout in a recording nor the address of a recording can set the viewer's time cursor; only
+requests to a running viewer can. The web viewer accepts a protobuf message ``ViewerControlRequest``,
+the window the requests of rerun's client.
 """
 
 import contextlib
@@ -22,11 +26,36 @@ from functools import partial
 from pathlib import Path
 from typing import IO
 
+from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, MachineError, PeerError
 
 NOT_INSTALLED = "the viewer's package is not installed: pip install 'noack[viewer]'"
 _PR_SET_PDEATHSIG = 1
 _POLL_S = 0.02
+HOST = "127.0.0.1"
+OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?")
+"""The host in a request's header; another name would be that of a foreign page (DNS rebinding)."""
+_WEB_START_S = 10.0
+_ANSWER_S = 10.0
+_SOCKET_LIST = Path("/proc/net/tcp")
+_TRIES = 3
+"""Maximum tries: the kernel's list may miss a socket while others open and close."""
+_SERVED_AT = re.compile(rb"(?<!\+)http://127\.0\.0\.1:(\d+)")
+_RETRY_S = 0.25
+_LOAD_S = 60.0
+"""Maximum time until a window accepts requests."""
+_TAKES_REQUESTS_AT = re.compile(rb"rerun\+http://127\.0\.0\.1:(\d+)")
+_SET_TIME_CURSOR, _TIMELINE, _TIME, _PLAY_STATE, _FIRST = 6, 2, 3, 5, 1
+"""Numbers of the message's fields; nested messages have only a first field."""
+_PAUSED = 1
+_SCRIPT = """<script>
+(function openAt() {{
+  const retry = () => setTimeout(openAt, {retry_ms});
+  if (window._handle === undefined) return retry();
+  window._handle.viewer_control(new Uint8Array({request})).catch(retry);
+}})();
+</script>
+"""
 
 
 def is_installed() -> bool:
@@ -69,7 +98,7 @@ def start_rerun(
     """
     tied = sys.platform == "linux" and not start_new_session
     return subprocess.Popen(
-        [_path(), *arguments],
+        [_program_path(), *arguments],
         # CI disables other output; the log contains the address at which it serves.
         env=os.environ | {"CI": "1", "RUST_LOG": "info"},
         stdin=subprocess.DEVNULL,
@@ -121,7 +150,7 @@ def _prctl() -> Callable[[int, int], int]:
     return prctl
 
 
-def _path() -> str:
+def _program_path() -> str:
     """Return the path of rerun's own program; the ``rerun`` script is a wrapper and orphans it."""
     if chosen := os.environ.get("RERUN_CLI_PATH"):
         return chosen
@@ -132,18 +161,6 @@ def _path() -> str:
             if (folder / name).is_file():
                 return str(folder / name)
     raise MachineError(NOT_INSTALLED)
-
-
-HOST = "127.0.0.1"
-OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?")
-"""The host in a request's header; another name would be that of a foreign page (DNS rebinding)."""
-
-_WEB_START_S = 10.0
-_TIMEOUT_S = 10.0
-_SOCKETS = Path("/proc/net/tcp")
-_TRIES = 3
-"""Maximum tries: the kernel's list may miss a socket while others open and close."""
-_SERVED_AT = re.compile(rb"(?<!\+)http://127\.0\.0\.1:(\d+)")
 
 
 class WebViewer:
@@ -173,7 +190,7 @@ class WebViewer:
         Raises:
             PeerError: the program has ended, or the answering process is not this user's.
         """
-        source = http.client.HTTPConnection(HOST, self.port, timeout=_TIMEOUT_S)
+        source = http.client.HTTPConnection(HOST, self.port, timeout=_ANSWER_S)
         with contextlib.closing(source):
             try:
                 source.connect()
@@ -210,9 +227,9 @@ def socket_user(own: tuple[str, int], peer: tuple[str, int]) -> int | None:
     Linux's list of sockets has the user of each.
     """
     try:
-        wanted = [_written(own), _written(peer)]
+        wanted = [_listed_address(own), _listed_address(peer)]
         for _ in range(_TRIES):
-            for line in _SOCKETS.read_text().splitlines()[1:]:
+            for line in _SOCKET_LIST.read_text().splitlines()[1:]:
                 fields = line.split()
                 user, inode = fields[7], fields[9]
                 if fields[1:3] == wanted and inode != "0":
@@ -222,7 +239,60 @@ def socket_user(own: tuple[str, int], peer: tuple[str, int]) -> int | None:
     return None
 
 
-def _written(address: tuple[str, int]) -> str:
-    """Return an address in the list's format."""
+def _listed_address(address: tuple[str, int]) -> str:
+    """Return an address in the format of Linux's list of sockets."""
     host, port = address
     return f"{int.from_bytes(socket.inet_aton(host), sys.byteorder):08X}:{port:04X}"
+
+
+def script_to_open_at(timeline: str, t_ns: int) -> bytes:
+    """Return HTML for the web viewer's page: it moves the cursor once the recording is loaded."""
+    request = list(_cursor_request(timeline, t_ns))
+    return _SCRIPT.format(retry_ms=round(1e3 * _RETRY_S), request=request).encode()
+
+
+def move_window_to(timeline: str, t_ns: int, window: "subprocess.Popen[bytes]", output: IO[bytes]) -> None:
+    """Move the cursor of a window once the recording is loaded, unless the window closes before.
+
+    Args:
+        timeline: name of the recording's timeline.
+        t_ns: time on it.
+        window: the viewer's process.
+        output: its log, which contains the address at which it accepts requests.
+    """
+    from rerun.experimental import ViewerClient  # slow to import
+
+    with output:
+        port = logged_port(window, output, _TAKES_REQUESTS_AT, _LOAD_S)
+    while port is not None and window.poll() is None:
+        try:
+            client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+            client.set_time(timeline, duration=t_ns / NS_PER_S, play_state="paused")
+        except OSError:  # it is still loading
+            time.sleep(_RETRY_S)
+        else:
+            return
+
+
+def _cursor_request(timeline: str, t_ns: int) -> bytes:
+    """Return a ViewerControlRequest in protobuf's encoding."""
+    cursor = (
+        _nested_field(_TIMELINE, _nested_field(_FIRST, timeline.encode()))
+        + _nested_field(_TIME, _number_field(_FIRST, t_ns))
+        + _number_field(_PLAY_STATE, _PAUSED)
+    )
+    return _nested_field(_SET_TIME_CURSOR, cursor)
+
+
+def _nested_field(field: int, content: bytes) -> bytes:
+    """Return a length-delimited field in protobuf's encoding."""
+    return _varint(field << 3 | 2) + _varint(len(content)) + content
+
+
+def _number_field(field: int, value: int) -> bytes:
+    return _varint(field << 3) + _varint(value)
+
+
+def _varint(value: int) -> bytes:
+    low, rest = value & 0x7F, value >> 7
+    return bytes([low | 0x80]) + _varint(rest) if rest else bytes([low])

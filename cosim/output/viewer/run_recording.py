@@ -44,12 +44,13 @@ from cosim.analysis.summary.run_summary import WorstLoop, worst_loop
 from cosim.analysis.summary.summary_model import RunSummary
 from cosim.output.figures.palette import CONTROLLER, LOST, NETWORK, SERIES
 from cosim.output.viewer import blueprint as bp
-from cosim.output.viewer.live_viewer import LiveView
 from cosim.output.viewer.loop_feed import LoopFeed, log_level
-from cosim.output.viewer.loop_recording import LoopView, Nanoseconds, RecordingFile, ViewError, run_text
+from cosim.output.viewer.loop_recording import LoopView, RecordingFile, ViewError, run_text
 from cosim.output.viewer.network_diagram import NetworkDiagram
 from cosim.output.viewer.pictures.picture import picture_of
-from cosim.record.decimation import Reals, is_long
+from cosim.output.viewer.recording_viewer import LiveView
+from cosim.record.align import Reals, Times
+from cosim.record.decimation import is_long
 from cosim.record.run_directory import RECORDING_FILE, Kind, file_of_loop
 from cosim.record.run_record import RecordedRun, RunRecord
 from noack.core.clock import NS_PER_S
@@ -63,6 +64,7 @@ _ANIMATED = 4
 """Up to so many loops have a diagram of their packets, which is most of a recording."""
 QUEUE, SHARE, ERROR, SIZE, MAP = "link/queue", "link/share", "all/error", "all/size", "all/map"
 _DECADES = 5
+"""Decades of a norm that the curves show to each side of its usual largest value, and the map below."""
 _RANGE = 100.0
 """Errors above the usual largest one by this factor have the same colour: a loop may diverge."""
 _ROW_PIXELS = 600
@@ -84,7 +86,7 @@ class RunRecording(RecordingFile):
         kind: live or simulated.
         worst: the worst loop; None in a run that goes on.
         live: live viewer, which shows the file while it is written.
-        at_once: whether the run has ended, and its whole record is written.
+        complete: whether the run has ended: its whole record is written.
 
     Raises:
         ViewError: the file cannot be created.
@@ -100,13 +102,13 @@ class RunRecording(RecordingFile):
         *,
         worst: WorstLoop | None = None,
         live: LiveView | None = None,
-        at_once: bool = False,
+        complete: bool = False,
     ) -> None:
         self.names, phases = loop_names(run), phases_ns(run)
         self.is_shared = len(self.names) > 1
-        animated = len(shown) <= _ANIMATED and not (at_once and is_long(run))
+        animated = len(shown) <= _ANIMATED and not (complete and is_long(run))
         loops = {
-            number: _shown_loop(
+            number: _loop_layout(
                 loop,
                 kind,
                 bp.loop_folder(self.names[number]) if self.is_shared else "",
@@ -116,9 +118,9 @@ class RunRecording(RecordingFile):
             for number, loop in shown.items()
         }
         panels = {self.names[number]: loop for number, loop in loops.items()}
-        layout = _layout(panels, len(self.names), worst) if self.is_shared else loops[0].panels()
-        indexed = at_once or run.horizon_s <= _INDEXED_S * run.speed
-        over_time = bp.over_time(layout, run.horizon_s)
+        container = _tabs(panels, len(self.names), worst) if self.is_shared else loops[0].panels()
+        indexed = complete or run.horizon_s <= _INDEXED_S * run.speed
+        over_time = bp.over_time(container, run.horizon_s)
         super().__init__(path, f"{run_id:016x}", over_time, indexed=indexed)
         self._live, self._usual = live, float(np.finfo(float).tiny)
         if self.is_shared:
@@ -155,21 +157,21 @@ to the right.
             },
         )
 
-    def queue(self, t_ns: Nanoseconds, largest: Reals | NDArray[np.int64], mean: Reals) -> None:
+    def queue(self, t_ns: Times, largest: Reals | NDArray[np.int64], mean: Reals) -> None:
         """Add the numbers of datagrams in the network, (k,)."""
         self.send(QUEUE, t_ns, np.column_stack([largest, mean]))
 
-    def share(self, t_ns: Nanoseconds, shares: Reals) -> None:
+    def share(self, t_ns: Times, shares: Reals) -> None:
         """Add the share of the link of each loop, (L, k)."""
-        self.send(SHARE, t_ns, 100 * _reduced(shares).T)
+        self.send(SHARE, t_ns, 100 * _curves_or_quantiles(shares).T)
 
-    def norms(self, entity: str, t_ns: Nanoseconds, values: Reals) -> None:
+    def norms(self, entity: str, t_ns: Times, values: Reals) -> None:
         """Add norms of each loop, (L, k), to ``ERROR`` or ``SIZE``.
 
         Their logarithm is cut off some decades from the usual largest value so far: a norm may be
         0, and a loop that diverges would hide the others.
         """
-        curves = _reduced(values)
+        curves = _curves_or_quantiles(values)
         self._usual = max(self._usual, usual_largest(curves))
         least, most = self._usual / 10**_DECADES, self._usual * 10**_DECADES
         self.send(entity, t_ns, np.log10(np.clip(curves, least, most)).T)
@@ -197,7 +199,7 @@ to the right.
                 self._live = None
 
 
-def _shown_loop(
+def _loop_layout(
     scenario: Scenario, kind: Kind, folder: str, phase_ns: int, *, animated: bool
 ) -> bp.LoopLayout:
     """Describe what is shown of a loop; lateness only if the processes have no other loop."""
@@ -215,7 +217,7 @@ def _shown_loop(
     )
 
 
-def _layout(loops: Mapping[str, bp.LoopLayout], count: int, worst: WorstLoop | None) -> rrb.Container:
+def _tabs(loops: Mapping[str, bp.LoopLayout], count: int, worst: WorstLoop | None) -> rrb.Container:
     """Lay out a page of all ``count`` loops, and one for each that is shown."""
     kind = "" if count <= len(SERIES) else ", quantiles over the loops"
     plots = [
@@ -247,7 +249,7 @@ def _series(names: Sequence[str]) -> rr.SeriesLines:
     return rr.SeriesLines(names=labels, colors=colours, widths=widths)
 
 
-def _reduced(values: Reals) -> Reals:
+def _curves_or_quantiles(values: Reals) -> Reals:
     """Return the curves to show, (curves, k): each loop's, or quantiles over many loops."""
     return values if len(values) <= len(SERIES) else quantiles(values)
 
@@ -303,7 +305,7 @@ def write_loop_view(record: RunRecord, path: Path) -> None:
     """Write the recording of one loop; that of a long run shows extremes only."""
     require_space(path.parent)
     scenario, kind = record.scenario, record.kind
-    with RunRecording(scenario, path, _new_id(), {0: scenario}, kind, at_once=True) as recording:
+    with RunRecording(scenario, path, _new_id(), {0: scenario}, kind, complete=True) as recording:
         _feed_record(record, recording)
 
 
@@ -319,7 +321,7 @@ def _write_network_view(
     worst, count, path = worst_loop(summary.loops), len(run.loops), run_dir / RECORDING_FILE
     numbers = range(count) if count <= PICTURED else [worst.number]
     loops = {number: run.loops[number].scenario for number in numbers}
-    with RunRecording(run.scenario, path, _new_id(), loops, run.kind, worst=worst, at_once=True) as whole:
+    with RunRecording(run.scenario, path, _new_id(), loops, run.kind, worst=worst, complete=True) as whole:
         flying = summary.network.in_flight
         largest = np.array(flying.max_by_interval, np.float64)
         queue_ns = (np.arange(len(largest)) + 0.5) * flying.width_s * NS_PER_S

@@ -21,8 +21,8 @@ from cosim.output.figures.figure_description import (
     Marks,
     Panel,
     PanelRow,
+    label_text,
     one_panel,
-    plain,
     series_colour,
 )
 from cosim.output.figures.palette import Colour
@@ -109,7 +109,7 @@ def curve_figure(
             Line(x=xs[order], y=mean, label=_name(name), colour=colour, size=4, marker=marker, dash=dash),
             Band(x=xs[order], low=mean - half, high=mean + half, colour=colour),
         ]
-    ticks = dict(zip(xs.tolist(), map(plain, labels), strict=True)) if x is None else None
+    ticks = dict(zip(xs.tolist(), map(label_text, labels), strict=True)) if x is None else None
     means = [e.mean for estimates in series.values() for e in estimates if e]
     x_axis = Axis(label=_name(axis), ticks=ticks, logarithmic=x is not None and _is_geometric(x))
     panel = Panel(items=items, x=x_axis, y=_axis(metric, means))
@@ -138,7 +138,7 @@ def heat_map_figure(
             logarithmic=METRICS[metric].logarithmic and _is_wide(finite),
         )
     axes = [
-        Axis(label=_name(name), ticks=dict(enumerate(map(plain, labels))), grid=False)
+        Axis(label=_name(name), ticks=dict(enumerate(map(label_text, labels))), grid=False)
         for name, labels in (x, y)
     ]
     panels = [
@@ -267,7 +267,7 @@ def _style(i: int) -> tuple[Colour, str, Dash]:
 
 
 def _name(text: str) -> str:
-    return plain(text, _LONGEST_LABEL)
+    return label_text(text, _LONGEST_LABEL)
 
 
 def _means(estimates: Sequence[Estimate | None]) -> tuple[Vector, Vector]:

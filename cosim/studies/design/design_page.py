@@ -19,8 +19,8 @@ from cosim.output.figures.figure_description import (
     Marks,
     Panel,
     Rule,
+    label_text,
     one_panel,
-    plain,
     series_colour,
 )
 from cosim.output.figures.figure_files import save_figures
@@ -92,7 +92,7 @@ def trade_off(result: DesignResult) -> FigureDescription:
             Marks(
                 x=np.array([m.transmissions for m in family_measures]),
                 y=np.array([m.settling_s for m in family_measures]),
-                label=plain(f"W {family.name}", 24),
+                label=label_text(f"W {family.name}", 24),
                 colour=series_colour(i),
                 marker=MARKERS[i % len(MARKERS)],
                 size=3.5,

@@ -7,9 +7,9 @@ BETA_SHARE = 0.1
 """β as a share of ‖x(0)‖, or β if x(0) = 0."""
 ALPHA_SHARE = 0.5
 """α as a share of the decay rate of Â + B̂K."""
-SETTLED = 0.01
+HORIZON_DECAY = 0.01
 """The horizon is the time in which e^(−αt) falls to this."""
-MANSD = 4
+DEFAULT_MANSD = 4
 """M − 1, the maximum number of consecutive losses; less if nothing is certified with it."""
-LOSS_PROBABILITY = 0.5
-"""Of each update, before this maximum is applied."""
+DEFAULT_LOSS_PROBABILITY = 0.5
+"""Loss probability of an update before this maximum is applied."""

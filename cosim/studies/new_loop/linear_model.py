@@ -27,11 +27,15 @@ _PROJECTION_ROUNDING = 1e-14
 """Rounding of a projection, relative to what is projected."""
 _DRIFT_ROUNDING = 1e-6
 """A drift below this share of the largest entry of A and B is rounding."""
-_NOT_SMOOTH, _SMALL_ERROR = 0.5, 1e-3
-"""A plant is not smooth if in a tenth of a neighbourhood its error is more than this share of that in all
-of it, where a tenth is expected; an error below the second number may be rounding."""
-_REAL, _ZERO = 1e-7, 1e-12
-"""Sizes, relative to the largest eigenvalue, below which imaginary parts and numbers are 0."""
+_ROUGH_SHARE = 0.5
+"""A plant is not smooth if its error in a tenth of a neighbourhood is more than this share of that in all
+of it; a tenth is expected."""
+_SMALL_ERROR = 1e-3
+"""An error below this may be rounding."""
+_IMAGINARY_ROUNDING = 1e-7
+"""Imaginary parts below this share of the largest eigenvalue are 0."""
+_EIGENVALUE_ROUNDING = 1e-12
+"""Eigenvalues below this share of the largest one are 0."""
 _GAIN_DIGITS = 10
 """Significant digits of the entries of K: what remains is below the errors of any model."""
 Complex = NDArray[np.complex128]
@@ -150,7 +154,7 @@ class LinearModel:
     @staticmethod
     def _is_rough(wide: Vector, narrow: Vector) -> bool:
         """Return whether the errors of the states hardly shrink with the neighbourhood."""
-        return bool((narrow > np.maximum(_NOT_SMOOTH * wide, _SMALL_ERROR)).any())
+        return bool((narrow > np.maximum(_ROUGH_SHARE * wide, _SMALL_ERROR)).any())
 
 
 @dataclass(frozen=True)
@@ -375,10 +379,10 @@ def eigenvalue_text(values: Complex) -> str:
     """Return eigenvalues as text, conjugate pairs as one: "-0.81±0.5j, -5.8"."""
     scale, texts = max(1.0, float(np.abs(values).max(initial=0.0))), list[str]()
     for value in values:
-        if value.imag > _REAL * scale:
+        if value.imag > _IMAGINARY_ROUNDING * scale:
             texts.append(f"{value.real:.4g}±{value.imag:.4g}j")
-        elif value.imag >= -_REAL * scale:
-            texts.append(f"{value.real if abs(value.real) > _ZERO * scale else 0.0:.4g}")
+        elif value.imag >= -_IMAGINARY_ROUNDING * scale:
+            texts.append(f"{value.real if abs(value.real) > _EIGENVALUE_ROUNDING * scale else 0.0:.4g}")
     return ", ".join(texts)
 
 

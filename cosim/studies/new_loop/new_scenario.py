@@ -18,8 +18,15 @@ from pathlib import Path
 import numpy as np
 
 from cosim.analysis.certificates import with_linear_plant, with_weight
+from cosim.output.run_verdict import SETTLED_SHARE
 from cosim.simulation.virtual_time import simulate_loops
-from cosim.studies.new_loop import ALPHA_SHARE, BETA_SHARE, LOSS_PROBABILITY, MANSD, SETTLED
+from cosim.studies.new_loop import (
+    ALPHA_SHARE,
+    BETA_SHARE,
+    DEFAULT_LOSS_PROBABILITY,
+    DEFAULT_MANSD,
+    HORIZON_DECAY,
+)
 from cosim.studies.new_loop.linear_model import (
     LinearModel,
     LoopGain,
@@ -54,17 +61,15 @@ _RATES_HZ = (1.0, 2.0, 5.0, 10.0, 20.0, 25.0, 50.0, 100.0, 200.0, 250.0, 500.0)
 _FASTEST_EIGENVALUE_PER_S = 1000.0
 """Faster eigenvalues do not determine the rate: no loop can follow them."""
 _STEPS_PER_TIME_CONSTANT = 50
-"""The least, for the fastest eigenvalue of the loop."""
+"""Least number of steps of the plant in the time constant of the loop's fastest eigenvalue."""
 _INPUT_WEIGHTS = (1.0, 10.0, 100.0)
 """r of the regulators that are tried: with a larger one the gain is slower."""
-_LOOSE = 200.0
+_LOOSE_BOUND_RATIO = 200.0
 """A bound of ‖x‖ above this multiple of ‖x(0)‖ is used only if there is no other."""
 _DEFAULT_START = 0.1
 """x(0) of a state, if the plant has none."""
-_SMALLER, _MOST_SMALLER_DEFAULT_STARTS = 0.5, 5
-"""If the loop does not return, x(0) is multiplied by this, so often at most."""
-_RETURNED = 0.1
-"""Share of ‖x(0)‖ below which the loop has returned."""
+_START_FACTOR, _MOST_REDUCTIONS = 0.5, 5
+"""If the loop does not return, x(0) is multiplied by this factor, at most this number of times."""
 _LONGEST_RUN_S = 20.0
 """Wall time of a live run; a longer horizon runs faster."""
 _LONGEST_HORIZON_S, _HIGHEST_SPEED = 1e7, 1000.0
@@ -145,10 +150,10 @@ def new(
     best = trials.search(list(_list_trials(plant_model, _initial_state(model, fixed_state))), report)
     report("simulating")
     returns = trials.returns(best)
-    for _ in range(_MOST_SMALLER_DEFAULT_STARTS):
+    for _ in range(_MOST_REDUCTIONS):
         if returns or fixed_state is not None:
             break
-        best = replace(best, x0=best.x0 * _SMALLER)
+        best = replace(best, x0=best.x0 * _START_FACTOR)
         returns = trials.returns(best)
     certificate, _ = trials.certify(best)
     notes = tuple(_notes(best, certificate, returns, trials.is_linear))
@@ -194,7 +199,7 @@ def _list_trials(model: LinearModel | LoopGain, x0: Vector) -> Iterator[_Trial]:
         usual_hz = loop_gain.model.plant.rates.get("rate_hz", usual_hz)
         is_fixed = loop_gain.model.plant.system.has_own_step
         for rate_hz in (usual_hz,) if is_fixed else (usual_hz, 2 * usual_hz):
-            for mansd in range(MANSD, 0, -1):
+            for mansd in range(DEFAULT_MANSD, 0, -1):
                 for share in (ALPHA_SHARE, ALPHA_SHARE / 2):
                     alpha = to_digits(min(share * loop_gain.decay_per_s, _FASTEST_ALPHA_PER_S))
                     yield _Trial(loop_gain, rate_hz, mansd, alpha, x0)
@@ -212,7 +217,7 @@ class _TrialScenarios:
         model, reference = self._model, self._model.plant
         start = trial.x0 if trial.weight is None else trial.weight @ trial.x0
         beta, alpha = to_digits(BETA_SHARE * norm(start) or BETA_SHARE), trial.alpha_per_s
-        horizon_s = min(to_digits(math.log(1 / SETTLED) / alpha), _LONGEST_HORIZON_S)
+        horizon_s = min(to_digits(math.log(1 / HORIZON_DECAY) / alpha), _LONGEST_HORIZON_S)
         weight = None
         if trial.weight is not None:
             weight = [[to_digits(entry, 6) for entry in row] for row in trial.weight]
@@ -244,7 +249,7 @@ class _TrialScenarios:
             },
             "network": {
                 "mansd": trial.mansd,
-                "loss": {"model": "bernoulli", "probability": LOSS_PROBABILITY},
+                "loss": {"model": "bernoulli", "probability": DEFAULT_LOSS_PROBABILITY},
             },
             "seeds": {"loss": 1},
         }
@@ -299,7 +304,7 @@ class _TrialScenarios:
                 closest = min(closest, (loop_gain, trial), key=lambda entry: entry[0])
                 continue
             certified.append((certificate.constants.state / (norm(trial.x0) or 1.0), trial))
-            if certified[-1][0] <= _LOOSE:
+            if certified[-1][0] <= _LOOSE_BOUND_RATIO:
                 return trial
         if certified:
             return min(certified, key=lambda entry: entry[0])[1]
@@ -318,10 +323,10 @@ class _TrialScenarios:
         return weighted if self.certify(weighted)[0].exists else None
 
     def returns(self, trial: _Trial) -> bool:
-        """Whether ‖x‖ ends below a tenth of its maximum, in virtual time."""
+        """Whether the loop settles in virtual time, as the verdict of a run has it."""
         run = simulate_loops(resolve_run(self.scenario(trial)))
         sizes = np.linalg.norm(run.loop().columns("plant_step", "x")["x"], axis=1)
-        return bool(np.isfinite(sizes).all() and sizes[-1] <= _RETURNED * (sizes.max() or 1.0))
+        return bool(np.isfinite(sizes).all() and sizes[-1] <= SETTLED_SHARE * sizes.max())
 
 
 def _notes(trial: _Trial, certificate: ScenarioCertificate, returns: bool, is_linear: bool) -> Iterator[str]:
@@ -371,8 +376,7 @@ _COMMENTS = {
     "network.loss": "Losses, before this limit is applied.",
     "seeds": "Another number: other losses.",
 }
-
-
+"""Comments of the file, by table and key."""
 _REASONS = {
     "horizon_s": " Until its end e^(−alpha_per_s t) falls to a hundredth.",
     "trigger.beta": " It is a tenth of the norm of x(0).",

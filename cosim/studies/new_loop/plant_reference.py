@@ -27,9 +27,10 @@ from noack.settings.user_files import located
 
 _GYMNASIUM = "gymnasium:"
 """What the name of an environment begins with."""
-_MOST_TRIED = 16
+_LARGEST_TRIED_SIZE = 16
 """Largest number of states and of inputs that is tried with a class that names neither."""
 _KINDS = sorted(kind for kind, plant in PLANTS.items() if plant.scenario and plant is not LinearSettings)
+"""Kinds that name a plant by themselves."""
 _FORMS = (
     f"PLANT is FILE.py:Class, FILE.fmu, gymnasium:ID, a kind of plant ({', '.join(_KINDS)}), a "
     "scenario, or a file that `noack linearise` or `noack gain` wrote"
@@ -209,7 +210,7 @@ def _sizes_of_class(
     system: PythonPlantSettings, label: str, sizes: tuple[int | None, int | None]
 ) -> tuple[int, int]:
     """Return the smallest numbers of states and inputs that a user's class accepts."""
-    ranges = [range(1, _MOST_TRIED + 1) if size is None else (size,) for size in sizes]
+    ranges = [range(1, _LARGEST_TRIED_SIZE + 1) if size is None else (size,) for size in sizes]
     refusals: dict[str, tuple[int, int]] = {}
     for n, m in product(*ranges):
         start = PlantStart(np.zeros(n), np.zeros((n, n)), np.zeros((n, m)), STEP_NS)
@@ -224,6 +225,6 @@ def _sizes_of_class(
     if not further_refusals:
         raise CallerError(first)
     raise CallerError(
-        f"{label}: no number of states and inputs up to {_MOST_TRIED} is accepted at x = 0, u = 0; "
+        f"{label}: no number of states and inputs up to {_LARGEST_TRIED_SIZE} is accepted at x = 0, u = 0; "
         f"--at and --input give the numbers. With one of each: {first}"
     )

@@ -120,8 +120,8 @@ def known(session: Session, name: str) -> bool:
 
 async def settled(lab_session: Session) -> None:
     await lab_session.change(lab_session.draft)
-    assert lab_session._later is not None
-    await lab_session._later
+    assert lab_session._rest_task is not None
+    await lab_session._rest_task
 
 
 class Watched(Inline):
@@ -328,7 +328,7 @@ def test_the_browser_is_started_with_the_address_for_command_lines(
 
 
 def report_event(run: LiveRun, event: str, **fields: object) -> None:
-    run._take(json.dumps({"event": event, **fields}))
+    run._handle_line(json.dumps({"event": event, **fields}))
 
 
 REPORT = {
@@ -367,7 +367,7 @@ def test_what_a_live_run_reports_sets_its_state_and_its_lines() -> None:
 @pytest.mark.parametrize("line", ["", "compiling ...", "{", "[1]", '{"x": 1}', "7"])
 def test_other_output_is_a_line_of_the_log(line: str) -> None:
     run = LiveRun(20.0)
-    run._take(line)
+    run._handle_line(line)
     assert run.lines == [line] * bool(line)
     assert run.state == "starting"
 

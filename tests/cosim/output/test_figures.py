@@ -16,22 +16,22 @@ from matplotlib.text import Text
 import noack
 from cosim.analysis.summary.quantiles import QuantileSketch
 from cosim.output.figures import palette
-from cosim.output.figures.event_and_process_times import later_than
 from cosim.output.figures.figure_description import (
     Axis,
     FigureDescription,
     Line,
     Panel,
     bound_lines,
+    label_text,
     one_panel,
-    plain,
     time_axis,
 )
 from cosim.output.figures.figure_drawing import draw
 from cosim.output.figures.figure_files import inline, save_figure, save_figures
 from cosim.output.figures.figure_format import figure_files
-from cosim.output.figures.figure_layout import figure_width
+from cosim.output.figures.figure_layout import use_figure_width
 from cosim.output.figures.run_figures import Trajectory, Transmissions, run_figures, states_figure
+from cosim.output.figures.timing_figures import later_than
 from cosim.output.run_tables import key_numbers
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
@@ -127,7 +127,7 @@ def test_intervals_and_fates_are_drawn_at_their_times() -> None:
 def test_signal_names_are_drawn_literally() -> None:
     """Not parsed as mathematics, and not hidden for a leading underscore."""
     names = [HOSTILE, "_hidden", "a$b$c", "日本"]
-    lines = [replace(line(T_S, T_S), label=plain(name)) for name in names]
+    lines = [replace(line(T_S, T_S), label=label_text(name)) for name in names]
     figure = norms(*lines)
     assert len(labels(draw(figure).axes[0])) == len(names)
     assert "<script" not in inline(figure.captioned(HOSTILE))
@@ -204,7 +204,7 @@ def test_characters_that_the_fonts_of_latex_replace_are_written_as_mathematics(f
     """Computer Modern has a macron, a ligature and a dotless i in the place of ¹, ² and ³."""
     y = Axis(label="age [µs], turn [°], force [N/m²]", logarithmic=True)
     panel = Panel(title="m³", items=[line(T_S, factor * 10 ** (T_S - 2))], x=time_axis(T_S), y=y)
-    with figure_width(3.5, latex=True):
+    with use_figure_width(3.5, latex=True):
         figure = draw(one_panel("norms", panel, 2.0))
         labels = [*figure.axes[0].get_yticklabels(), *figure.findobj(Text)]
         texts = [text.get_text() for text in labels if isinstance(text, Text)]

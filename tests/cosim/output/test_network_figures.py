@@ -5,7 +5,7 @@ import pytest
 
 from cosim.analysis.summary.loops_over_time import LoopsOverTime
 from cosim.output.figures.figure_description import Band, FigureDescription, Heat, Item, Line
-from cosim.output.figures.network_figures import NAMED, error_map, norms_figure
+from cosim.output.figures.network_figures import MOST_CURVES, error_map, norms_figure
 
 INTERVALS = 40
 RNG = np.random.default_rng(1)
@@ -26,18 +26,18 @@ def items(figure: FigureDescription, row: int = 0) -> list[Item]:
 
 
 def test_each_of_a_few_loops_has_a_curve() -> None:
-    loops = over_time(NAMED)
-    figure = norms_figure(loops, names(NAMED), np.ones(NAMED, bool))
+    loops = over_time(MOST_CURVES)
+    figure = norms_figure(loops, names(MOST_CURVES), np.ones(MOST_CURVES, bool))
     for row, values in enumerate((loops.errors, loops.states)):
-        for curve, name, expected in zip(items(figure, row), names(NAMED), values, strict=True):
+        for curve, name, expected in zip(items(figure, row), names(MOST_CURVES), values, strict=True):
             assert isinstance(curve, Line)
             assert curve.label == name
             np.testing.assert_array_equal(curve.y, expected)
 
 
 def test_many_loops_are_drawn_as_quantiles() -> None:
-    loops = over_time(NAMED + 20)
-    figure = norms_figure(loops, names(NAMED + 20), np.ones(NAMED + 20, bool))
+    loops = over_time(MOST_CURVES + 20)
+    figure = norms_figure(loops, names(MOST_CURVES + 20), np.ones(MOST_CURVES + 20, bool))
     wide, narrow, median, largest = items(figure)
     for band, shares in ((wide, (0.05, 0.95)), (narrow, (0.25, 0.75))):
         assert isinstance(band, Band)

@@ -240,7 +240,7 @@ def test_a_large_figure_becomes_a_bitmap(monkeypatch: pytest.MonkeyPatch) -> Non
     figure = one_panel("a", Panel(items=[line], x=Axis(), y=Axis()), 1.0)
     figure = figure.captioned("", 'named "so"')
     assert not Page(inline(figure)).attributes("img")
-    monkeypatch.setattr("cosim.output.figures.figure_files._HEAVY_CHARACTERS", 10)
+    monkeypatch.setattr("cosim.output.figures.figure_files._MOST_SVG_CHARACTERS", 10)
     (image,) = Page(inline(figure)).attributes("img")
     assert image["alt"] == 'named "so"'
     assert (image["src"] or "").startswith("data:image/png;base64,")

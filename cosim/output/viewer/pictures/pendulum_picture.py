@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from cosim.output.viewer.pictures import picture as draw
+from cosim.record.align import Reals
 from noack.plants.cart_pole import CartPoleSettings
 
 _CART, _CART_HIGH = 0.5, 0.22
@@ -95,7 +96,7 @@ class PendulumPicture(draw.Picture):
         columns: dict[str, draw.Columns] = {}
         for who in draw.WHO:
             x = frames.of(who)
-            zero: draw.Reals = np.zeros(len(x))
+            zero: Reals = np.zeros(len(x))
             if self._position is not None:
                 columns[who] = draw.poses(x[:, self._position], zero)
             if self._angle is not None:

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from cosim.output.viewer.pictures import picture as draw
+from cosim.record.align import Reals
 
 _RING = 0.035
 _WIDTHS: Mapping[str, float] = {"plant": 0.022, "sensor": 0.009, "controller": 0.014}
@@ -24,14 +25,14 @@ class PhasePicture(draw.Picture):
 
     draws_any = True
 
-    def __init__(self, names: Sequence[str], reach: draw.Reals) -> None:
+    def __init__(self, names: Sequence[str], reach: Reals) -> None:
         self._names = list(names[:2])
         self._reach = np.asarray(reach, dtype=float)[:2]
         self.title = " against ".join(reversed(self._names)) + ": phase plot"
         if len(self._names) == 1:
             self.title = f"{self._names[0]} of plant and models"
         self.trails = tuple(f"{who}/trail" for who in draw.WHO) if len(self._names) == 2 else ()
-        self._last: dict[str, draw.Reals] = {}
+        self._last: dict[str, Reals] = {}
 
     @classmethod
     def of(cls, plant: draw.DrawnPlant) -> "PhasePicture":
@@ -76,7 +77,7 @@ class PhasePicture(draw.Picture):
                 self._last[who] = points[-1:]
         return columns
 
-    def _scaled(self, states: draw.Reals, row: float) -> draw.Reals:
+    def _scaled(self, states: Reals, row: float) -> Reals:
         if len(self._names) == 1:
             x = states[:, 0] / self._reach[0]
             return np.column_stack([x, np.full_like(x, row)])

@@ -21,11 +21,10 @@ from numpy.typing import NDArray
 
 from cosim.lazy_modules import load_module
 from cosim.output.figures.palette import CONTROLLER, PLANT, SENSOR, Colour
+from cosim.record.align import Reals
 from noack.core.linear_systems import Propagator
 from noack.scenario.resolution import LoopMatrices, loop_of
 from noack.scenario.scenario import Scenario
-
-Reals = NDArray[np.float64]
 
 TIMELINE = "t"
 PICTURE = "picture"
@@ -38,9 +37,14 @@ STILL: Colour = (128, 132, 138)
 """Colour of static shapes: roads, rails, axes."""
 
 TRAIL_S = 3.0
-
+"""Simulated time for which a trail is visible."""
 _FAR = 1e4
+"""A coordinate that is never visible."""
 _FRONT = 10.0
+"""Order of texts, which are in front of all shapes."""
+_SAMPLES = 400
+"""Times at which the closed loop is computed for its reach."""
+_REACH_MARGIN = 1.25
 
 Columns = rr.ComponentColumnList
 Shape = rr.LineStrips2D | rr.Points2D | rr.Boxes2D
@@ -237,10 +241,6 @@ def outline(corners: Sequence[Sequence[float]], dash: float | None = None) -> li
     return pieces
 
 
-_SAMPLES = 400
-_ROOM = 1.25
-
-
 def picture_of(scenario: Scenario) -> Picture:
     """Return the picture of a resolved scenario's plant: of the first file that draws such plants.
 
@@ -273,4 +273,4 @@ def reach_of(loop: LoopMatrices, horizon_ns: int) -> Reals:
             deviation = step @ deviation
             reach = np.fmax(reach, np.abs(at_rest + deviation))
     known = np.isfinite(reach) & (reach > 0)
-    return np.where(known, _ROOM * reach, 1.0)
+    return np.where(known, _REACH_MARGIN * reach, 1.0)

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from cosim.output.viewer.pictures import picture as draw
+from cosim.record.align import Reals
 
 _WIDE, _HIGH = 1.0, 1.6
 _PLACES = ((-0.9, 0.0), (0.9, 0.0), (-0.9, 2.3), (0.9, 2.3))
@@ -63,7 +64,7 @@ class TanksPicture(draw.Picture):
         return columns
 
 
-def _level(who: str, left: float, low: float, height: draw.Reals) -> draw.Reals:
+def _level(who: str, left: float, low: float, height: Reals) -> Reals:
     """Return the line of a level (k, p, 2): a hatched bar, or a stroke."""
     k = len(height)
     if who == "plant":

@@ -14,8 +14,8 @@ import rerun.chunk
 from numpy.typing import NDArray
 from rerun.error_utils import RerunWarning
 
-from cosim.output.viewer.live_viewer import LiveView
 from cosim.output.viewer.pictures.picture import TIMELINE
+from cosim.output.viewer.recording_viewer import LiveView
 from cosim.output.viewer.run_recording import RunRecording
 from cosim.record.align import AlignedRun
 from tests.helpers.shipped import resolved

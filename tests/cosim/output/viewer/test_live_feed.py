@@ -27,7 +27,7 @@ from tests.helpers.shipped import resolved, shipped
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Loops are not given up, and no lag is named, on a busy machine."""
-    for name in ("_NAMED_S", "_PATIENCE_S"):
+    for name in ("_WARNED_LAG_S", "_LONGEST_LAG_S"):
         monkeypatch.setattr(f"cosim.output.viewer.live_feed.{name}", np.inf)
 
 
@@ -77,9 +77,9 @@ def test_loops_in_detail_that_cannot_keep_up_are_given_up_and_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("cosim.output.viewer.live_feed._TURN_S", -1.0)  # one loop a turn
-    monkeypatch.setattr("cosim.output.viewer.live_feed._NAMED_S", 0.05)
-    monkeypatch.setattr("cosim.output.viewer.live_feed._PATIENCE_S", 0.5)
-    monkeypatch.setattr("cosim.output.viewer.live_feed._SHARE", 1e-4)
+    monkeypatch.setattr("cosim.output.viewer.live_feed._WARNED_LAG_S", 0.05)
+    monkeypatch.setattr("cosim.output.viewer.live_feed._LONGEST_LAG_S", 0.5)
+    monkeypatch.setattr("cosim.output.viewer.live_feed._CORE_SHARE", 1e-4)
     _, chunks, said = shown(tmp_path, 3)
     assert "in detail end here" in said[-1]
     assert len(series(chunks, ERROR)[0]) == INTERVALS

@@ -8,10 +8,7 @@ no data are dropped.
 Every user of the machine can connect. Therefore all content is under a path that begins with a
 secret; other paths do not exist.
 
-A finished run opens at the time of the largest ‖e_c‖. Neither a layout in a recording nor the
-address of a recording can set rerun's time cursor; only requests to a running viewer can. The web
-viewer accepts a protobuf message ``ViewerControlRequest``, the window the requests of rerun's
-client.
+A finished run opens at the time of the largest ‖e_c‖.
 """
 
 import contextlib
@@ -31,7 +28,7 @@ from http.client import HTTPException
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from types import FrameType
-from typing import IO, Self
+from typing import Self
 from urllib.parse import parse_qs, quote
 
 from cosim.analysis.summary.run_summary import worst_loop
@@ -43,8 +40,9 @@ from cosim.output.viewer.rerun_program import (
     WebViewer,
     end_process,
     has_display,
-    logged_port,
+    move_window_to,
     peer_user,
+    script_to_open_at,
     start_rerun,
 )
 from cosim.record.run_directory import RECORDING_FILE, SUMMARY_FILE, loop_of_file, read_object
@@ -53,13 +51,22 @@ from noack.core.errors import CallerError, ExitStatus, MachineError, PeerError
 from noack.core.process_limits import python_command
 
 RECORDING = "recording.rrd"
-
-_BLOCK = 1 << 18
+"""Last part of the address of a recording."""
+_MAGIC = b"RRF"
+"""First bytes of a recording."""
+_BLOCK_BYTES = 1 << 18
 _POLL_S = 0.1
 _START_S = 10.0
+"""Maximum time to wait until a new window requests the recording."""
 _DRAIN_S = 2.0
+"""Maximum time to wait for downloads of a finished file."""
+_END_S = 5.0
+"""Maximum time to wait until the serving process has ended."""
 _SECRET_BYTES = 32
 _PATH = re.compile(r"/([^/]+)/(.*)")
+"""A path of the server: the secret, and what is requested."""
+_WINDOW = "window"
+"""What the serving process prints if it has opened a window."""
 
 
 class RecordingServer:
@@ -123,7 +130,7 @@ class RecordingServer:
         else:
             output = tempfile.TemporaryFile()  # noqa: SIM115 - the thread closes it
             window = start_rerun(arguments, output=output, start_new_session=True)
-            move = partial(move_window_to, t_ns, window, output)
+            move = partial(move_window_to, TIMELINE, t_ns, window, output)
             threading.Thread(target=move, daemon=True).start()
         deadline = time.monotonic() + _START_S
         while not self.requested.wait(0.02) and time.monotonic() < deadline:
@@ -157,9 +164,9 @@ class RecordingServer:
             secret: first part of the path.
             user: returns the user id of the requesting process.
         """
-        if _same(secret, self._secret):
+        if _are_equal(secret, self._secret):
             return True
-        return _same(secret, self._window_secret) and user() == os.getuid()
+        return _are_equal(secret, self._window_secret) and user() == os.getuid()
 
     @contextlib.contextmanager
     def download(self) -> Iterator[None]:
@@ -174,7 +181,7 @@ class RecordingServer:
                 self._downloads -= 1
 
 
-def _same(secret: str, wanted: str) -> bool:
+def _are_equal(secret: str, wanted: str) -> bool:
     """Whether two secrets are equal, compared in constant time."""
     return secrets.compare_digest(secret.encode(), wanted.encode())
 
@@ -240,7 +247,7 @@ class _Handler(BaseHTTPRequestHandler):
             while True:
                 # Checked before reading, so that data written before it was set are still sent.
                 finished = recording.finished.is_set()
-                if block := file.read(_BLOCK):
+                if block := file.read(_BLOCK_BYTES):
                     self.wfile.write(block)
                 elif finished:
                     break
@@ -259,18 +266,13 @@ class _Handler(BaseHTTPRequestHandler):
                     if (value := answer.getheader(header)) is not None:
                         self.send_header(header, value)
                 self.end_headers()
-                while block := answer.read(_BLOCK):
+                while block := answer.read(_BLOCK_BYTES):
                     self.wfile.write(block)
                 t_ns = opening_time_ns(self.server.recording.path) if name == "" else None
                 if t_ns is not None:
-                    self.wfile.write(script_to_open_at(t_ns))
+                    self.wfile.write(script_to_open_at(TIMELINE, t_ns))
         except PeerError as error:
             self.send_error(502, str(error))
-
-
-_MAGIC = b"RRF"
-_PATIENCE_S = 5.0
-_WINDOW = "window"
 
 
 class LiveView:
@@ -289,19 +291,19 @@ class LiveView:
         self.url: str | None = None
         self.status = "no live view yet"
         self._native = has_display() if native is None else native
-        self._host: subprocess.Popen[str] | None = None
+        self._process: subprocess.Popen[str] | None = None
 
     @property
     def pid(self) -> int | None:
         """Process that serves the recording, leader of its process group; None if there is none."""
-        return None if self._host is None else self._host.pid
+        return None if self._process is None else self._process.pid
 
     def show(self, path: Path) -> None:
         """Start to show the file, which exists and may grow; ``status`` reports a failure."""
-        command = python_command("-m", "cosim.output.viewer.live_viewer", path)
+        command = python_command("-m", "cosim.output.viewer.recording_viewer", path)
         if self._native:
             command.append("--native")
-        self._host = subprocess.Popen(
+        self._process = subprocess.Popen(
             command,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -309,8 +311,8 @@ class LiveView:
             # Ctrl-C ends the run only; the viewer ends on request, or when this process has ended.
             start_new_session=True,
         )
-        assert self._host.stdout is not None
-        answer = self._host.stdout.readline().strip()
+        assert self._process.stdout is not None
+        answer = self._process.stdout.readline().strip()
         if answer == _WINDOW:
             self.status = "live view: in a window"
         elif answer.startswith("http://"):
@@ -330,27 +332,27 @@ class LiveView:
         Args:
             keep: continue to serve until SIGTERM ends the process ``pid``.
         """
-        if self._host is None:
+        if self._process is None:
             return
         self._send_command("keep" if keep else "finish")
-        for pipe in (self._host.stdin, self._host.stdout):
+        for pipe in (self._process.stdin, self._process.stdout):
             assert pipe is not None
             with contextlib.suppress(OSError):
                 pipe.close()
         if not keep:
-            end_process(self._host, patience_s=_PATIENCE_S)
-            self._host = None
+            end_process(self._process, patience_s=_END_S)
+            self._process = None
             self.url = None
             self.status = "the live view is closed"
 
     def _send_command(self, word: str) -> None:
-        if self._host is None:
+        if self._process is None:
             return
-        assert self._host.stdin is not None
+        assert self._process.stdin is not None
         # A viewer that crashed or was ended by the user does not affect the run.
         with contextlib.suppress(OSError, ValueError):
-            self._host.stdin.write(word + "\n")
-            self._host.stdin.flush()
+            self._process.stdin.write(word + "\n")
+            self._process.stdin.flush()
 
 
 def view_recording(path: Path, *, native: bool | None = None) -> None:
@@ -383,7 +385,24 @@ def view_recording(path: Path, *, native: bool | None = None) -> None:
         threading.Event().wait()
 
 
-def _host(path: Path, *, native: bool, commands: Iterable[str]) -> None:
+def opening_time_ns(recording: Path) -> int | None:
+    """Return the time of the largest ‖e_c‖ from the recording's summary; None without a summary.
+
+    In the recording of the run, it is that of the worst loop.
+    """
+    name = loop_of_file(recording.name, RECORDING_FILE)
+    summary = read_summary(read_object(recording.parent / SUMMARY_FILE))
+    if summary is None or name not in (None, *(loop.name for loop in summary.loops)):
+        return None
+    loops = {loop.number: loop for loop in summary.loops if name in (None, loop.name)}
+    loop = loops[worst_loop([*loops.values()]).number]
+    if loop.sup_e_c_at_s is None:
+        return None
+    begin_s = loop.phase_s if name is None else 0.0
+    return round((begin_s + loop.sup_e_c_at_s) * NS_PER_S)
+
+
+def _serve_growing(path: Path, *, native: bool, commands: Iterable[str]) -> None:
     """Serve a growing file: print where it is shown, then execute ``commands`` until their end."""
     signal.signal(signal.SIGTERM, _exit)
     if hasattr(os, "nice"):
@@ -407,95 +426,11 @@ def _exit(_number: int, _frame: FrameType | None) -> None:
 
 def _main() -> int:
     try:
-        _host(Path(sys.argv[1]), native="--native" in sys.argv[2:], commands=sys.stdin)
+        _serve_growing(Path(sys.argv[1]), native="--native" in sys.argv[2:], commands=sys.stdin)
     except MachineError as error:
         print(error, flush=True)
         return error.exit_status
     return 0
-
-
-_RETRY_S = 0.25
-_LOAD_S = 60.0
-_TAKES_REQUESTS_AT = re.compile(rb"rerun\+http://127\.0\.0\.1:(\d+)")
-_SET_TIME_CURSOR, _TIMELINE, _TIME, _PLAY_STATE, _FIRST = 6, 2, 3, 5, 1
-"""Numbers of the message's fields; nested messages have only a first field."""
-_PAUSED = 1
-_SCRIPT = """<script>
-(function openAt() {{
-  const retry = () => setTimeout(openAt, {retry_ms});
-  if (window._handle === undefined) return retry();
-  window._handle.viewer_control(new Uint8Array({request})).catch(retry);
-}})();
-</script>
-"""
-
-
-def opening_time_ns(recording: Path) -> int | None:
-    """Return the time of the largest ‖e_c‖ from the recording's summary; None without a summary.
-
-    In the recording of the run, it is that of the worst loop.
-    """
-    name = loop_of_file(recording.name, RECORDING_FILE)
-    summary = read_summary(read_object(recording.parent / SUMMARY_FILE))
-    if summary is None or name not in (None, *(loop.name for loop in summary.loops)):
-        return None
-    loops = {loop.number: loop for loop in summary.loops if name in (None, loop.name)}
-    loop = loops[worst_loop([*loops.values()]).number]
-    if loop.sup_e_c_at_s is None:
-        return None
-    begin_s = loop.phase_s if name is None else 0.0
-    return round((begin_s + loop.sup_e_c_at_s) * NS_PER_S)
-
-
-def script_to_open_at(t_ns: int) -> bytes:
-    """Return HTML for the web viewer's page: it moves the cursor once the recording is loaded."""
-    request = list(_request(t_ns))
-    return _SCRIPT.format(retry_ms=round(1e3 * _RETRY_S), request=request).encode()
-
-
-def move_window_to(t_ns: int, window: "subprocess.Popen[bytes]", output: IO[bytes]) -> None:
-    """Move the cursor of a window once the recording is loaded, unless the window closes before.
-
-    Args:
-        t_ns: time on the recording's timeline.
-        window: the viewer's process.
-        output: its log, which contains the address at which it accepts requests.
-    """
-    from rerun.experimental import ViewerClient  # slow to import
-
-    with output:
-        port = logged_port(window, output, _TAKES_REQUESTS_AT, _LOAD_S)
-    while port is not None and window.poll() is None:
-        try:
-            client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
-            client.set_time(TIMELINE, duration=t_ns / NS_PER_S, play_state="paused")
-        except OSError:  # it is still loading
-            time.sleep(_RETRY_S)
-        else:
-            return
-
-
-def _request(t_ns: int) -> bytes:
-    cursor = (
-        _message(_TIMELINE, _message(_FIRST, TIMELINE.encode()))
-        + _message(_TIME, _number(_FIRST, t_ns))
-        + _number(_PLAY_STATE, _PAUSED)
-    )
-    return _message(_SET_TIME_CURSOR, cursor)
-
-
-def _message(field: int, content: bytes) -> bytes:
-    """Return a length-delimited field in protobuf's encoding."""
-    return _varint(field << 3 | 2) + _varint(len(content)) + content
-
-
-def _number(field: int, value: int) -> bytes:
-    return _varint(field << 3) + _varint(value)
-
-
-def _varint(value: int) -> bytes:
-    low, rest = value & 0x7F, value >> 7
-    return bytes([low | 0x80]) + _varint(rest) if rest else bytes([low])
 
 
 if __name__ == "__main__":

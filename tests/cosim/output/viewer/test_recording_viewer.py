@@ -17,16 +17,15 @@ import pytest
 import rerun.chunk
 import rerun.experimental
 
-from cosim.output.viewer.live_viewer import (
+from cosim.output.viewer.pictures.picture import TIMELINE
+from cosim.output.viewer.recording_viewer import (
     RECORDING,
     LiveView,
     RecordingServer,
-    has_display,
-    move_window_to,
     opening_time_ns,
-    script_to_open_at,
     view_recording,
 )
+from cosim.output.viewer.rerun_program import has_display, move_window_to, script_to_open_at
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError, ExitStatus
 from tests.cosim.output.viewer.recordings import K, add_samples, another_process, new_view, read
@@ -111,7 +110,7 @@ def test_a_live_view_ends_when_the_recorder_is_killed(tmp_path: Path) -> None:
     path = tmp_path / "recording.rrd"
     path.write_bytes(b"RRF2")
     code = (
-        "import time; from cosim.output.viewer.live_viewer import LiveView;"
+        "import time; from cosim.output.viewer.recording_viewer import LiveView;"
         "live = LiveView(native=False); live.show(path);"
         "print(live.pid, flush=True); time.sleep(1000)"
     )
@@ -247,12 +246,12 @@ def test_the_time_is_sent_until_the_window_has_the_recording(
     log, address = tmp_path / "log", "rerun+http://127.0.0.1:1234/proxy"
     log.write_text(f"Listening. Connect by running `rerun --connect {address}`")
     with subprocess.Popen(["sleep", "600"]) as window:
-        move_window_to(T_NS, window, log.open("rb"))
+        move_window_to(TIMELINE, T_NS, window, log.open("rb"))
         window.kill()
     wanted = ("t", {"duration": 4.244, "play_state": "paused"})
     connected = ("connect", address)
     assert asked == [connected, connected, wanted, connected, wanted]
-    move_window_to(T_NS, window, log.open("rb"))  # closed: no further request
+    move_window_to(TIMELINE, T_NS, window, log.open("rb"))  # closed: no further request
     assert len(asked) == 5
 
 
@@ -268,7 +267,7 @@ def test_only_the_page_of_a_finished_run_moves_the_cursor(tmp_path: Path) -> Non
             assert b"openAt" not in get(page)[1]
         (tmp_path / "summary.json").write_text(summary_at(4.244))
         assert opening_time_ns(path) == T_NS
-        assert get(page)[1].endswith(script_to_open_at(T_NS))
+        assert get(page)[1].endswith(script_to_open_at(TIMELINE, T_NS))
         assert b"openAt" not in get(page + "re_viewer.js")[1]
 
 

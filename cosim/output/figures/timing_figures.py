@@ -36,6 +36,7 @@ from noack.scenario.scenario import Scenario
 
 Flags = NDArray[np.bool_]
 _RANKS = 120
+"""Points of a distribution, with a logarithmic and again with a linear spacing."""
 _SHORTEST_US = 0.1  # a logarithmic axis has no zero
 
 
