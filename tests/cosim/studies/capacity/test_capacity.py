@@ -18,7 +18,7 @@ from cosim.studies.campaign.chunk_store import Store, run_campaign
 from cosim.studies.campaign.drawn_runs import used_up
 from cosim.studies.campaign.metrics import estimate
 from cosim.studies.capacity import capacity_plan as plans
-from cosim.studies.capacity.capacity_page import CapacityResult, comparisons
+from cosim.studies.capacity.capacity_page import CapacityResult, comparisons, mixtures
 from cosim.studies.capacity.capacity_plan import kinds_of, policies_of
 from cosim.studies.capacity.capacity_result import (
     Capacity,
@@ -92,6 +92,14 @@ def test_a_policy_must_keep_the_cost_of_each_kind_of_loop() -> None:
     own = {"2 unshared": runs(1.0, 100.0), "4 unshared": runs(1.0, 90.0)}
     policy_capacity = capacity_of(plan, "model", "own", {"2": runs(1.9, 110.0), "4": runs(2.1, 110.0)} | own)
     assert (policy_capacity.any_limit.median, policy_capacity.limited_by) == (2, "cost")
+    for median, expected in (
+        (2.0, "1 × the given mixture (1 a, 1 b)"),
+        (np.inf, "at least 2 × the given mixture (2 a, 2 b)"),
+        (0.0, "0 × the given mixture; 1 a, 1 b already reach a limit"),
+    ):
+        carried = policy_capacity._replace(any_limit=Capacity(median, 0.0, np.inf))
+        (sentence,) = mixtures(CapacityResult(plan, Mock(), [carried], []))
+        assert sentence == f"model, disturbance own: {expected}"
 
 
 @pytest.mark.parametrize(
