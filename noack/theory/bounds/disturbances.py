@@ -81,6 +81,11 @@ def normal_bounds(resolved: Scenario) -> NormalBounds | None:
     return NormalBounds(resolved.certificate.exceedance_probability / (steps * (values + 2)))
 
 
+def excluded_probability(resolved: Scenario) -> float:
+    """Return the largest probability that a run exceeds the bounds of normal values."""
+    return 0.0 if normal_bounds(resolved) is None else resolved.certificate.exceedance_probability
+
+
 def bound_forcing(resolved: Scenario, B: Matrix) -> Forcing | None:
     """Return the disturbances of a plant with the input matrix B, (n, m); None if it has none."""
     disturbances = resolved.plant.disturbances

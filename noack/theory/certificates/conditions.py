@@ -20,6 +20,7 @@ from noack.impairments.markov_chain import NotPredictableError
 from noack.scenario.resolution import loop_of, setpoint_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import NetworkConditions
+from noack.theory.bounds.disturbances import excluded_probability
 
 OWN_PLANT = "the scenario's plant"
 BOX = "every plant of the uncertainty box"
@@ -162,16 +163,18 @@ def kept_probability(
 ) -> float | None:
     """Bound the probability that a run's losses keep a guarantee that nothing enforces.
 
-    Until the first loss too many, events are at least ``inter_event_s`` apart. None: there is no
-    such bound, or the losses are no Markov chain over the packets.
+    Until the first loss too many, events are at least ``inter_event_s`` apart, but for runs whose
+    normal values exceed their bounds. None: there is no such bound, or the losses are no Markov
+    chain over the packets.
     """
     if not inter_event_s:
         return None
     try:
         losses = loss_process(resolved.network.link)
-        return losses.keeps(guarantee, most_events(resolved, inter_event_s))
+        kept = losses.keeps(guarantee, most_events(resolved, inter_event_s))
     except NotPredictableError:
         return None
+    return max(kept - excluded_probability(resolved), 0.0)
 
 
 def about_setpoint(resolved: Scenario) -> Scenario:

@@ -22,16 +22,15 @@ from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import spectral_abscissa
 from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee
 from noack.impairments.loss_prediction import LossProcess, loss_process
-from noack.impairments.markov_chain import NotPredictableError
 from noack.scenario.resolution import LoopMatrices, loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertificateError
-from noack.theory.bounds.disturbances import normal_bounds
+from noack.theory.bounds.disturbances import excluded_probability
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, Output, PlantGains, error_gains
 from noack.theory.certificates.assumptions import below
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.conditions import most_events, void_by_safe_input
+from noack.theory.certificates.conditions import kept_probability, most_events, void_by_safe_input
 from noack.theory.certificates.scenario_certificates import CertificateScope
 from noack.theory.random_losses.mean_square_bounds import MeanSquares, mean_squares
 
@@ -189,7 +188,7 @@ def unlimited_losses(
         resolved.timing.horizon_ns / NS_PER_S,
         tuple(bursts),
         # Normal values exceed the assumed bounds in some runs, and then by any amount.
-        tuple(moments_of_runs(bursts)) if normal_bounds(resolved) is None else (),
+        tuple(moments_of_runs(bursts)) if excluded_probability(resolved) == 0.0 else (),
         moments,
         at_events,
         moments.rate_per_s if moments and moments.rate_per_s > 0 else None,
@@ -207,10 +206,8 @@ def _bursts(
         constants, spacing_s = certificate.constants, certificate.inter_event_s
         if constants is None or not spacing_s:
             break
-        events = most_events(resolved, spacing_s)
-        try:
-            probability = losses.keeps(LossGuarantee((LongestBurst(longest),)), events)
-        except NotPredictableError:
+        probability = kept_probability(resolved, LossGuarantee((LongestBurst(longest),)), spacing_s)
+        if probability is None:
             break
         controller_error, state = (
             float(bound(np.zeros(1))[0]) for bound in (certificate.controller_error, certificate.state)
@@ -220,9 +217,17 @@ def _bursts(
             delta = controller_error / (max(certificate.beta, certificate.floor) or 1.0)
         rate_per_s = _slowest_rate(certificate)
         certificates.append(
-            BurstCertificate(longest, probability, events, delta, rate_per_s, controller_error, state)
+            BurstCertificate(
+                longest,
+                probability,
+                most_events(resolved, spacing_s),
+                delta,
+                rate_per_s,
+                controller_error,
+                state,
+            )
         )
-        if probability > _CERTAIN:
+        if probability > _CERTAIN - excluded_probability(resolved):
             break
     return certificates
 
