@@ -452,9 +452,17 @@ def _purpose(section: type[ScenarioSection] | None, key: str) -> str:
     return f" ({purpose})" if purpose else ""
 
 
+_SYMBOLS = {
+    "M": "M is network.mansd + 1; set network.mansd",
+    "K": "K is model.gain",
+    "x0": "x(0) is plant.initial_state",
+}
+"""Keys that people write as the paper's symbols."""
+
+
 def _nearest(key: str, section: type[ScenarioSection] | None) -> str:
-    if key == "M":
-        return "M is network.mansd + 1; set network.mansd"
+    if key in _SYMBOLS:
+        return _SYMBOLS[key]
     section_keys = sorted(section.model_fields) if section is not None else []
     close = difflib.get_close_matches(key, section_keys, n=1)
     return f"did you mean {close[0]}?" if close else f"the keys here are {', '.join(section_keys)}"
