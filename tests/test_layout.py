@@ -21,7 +21,7 @@ PACKAGES = ("noack", "plant_server", "sensor_node", "controller_node", "netem", 
 EXEMPT = ("__init__", "__main__")
 MOST_MODULES = 475
 LINES = {
-    "noack/scenario": 4150,
+    "noack/scenario": 4160,
     "noack/controllers": 270,
     "noack/core": 1450,
     "noack/disturbances": 220,
@@ -33,7 +33,7 @@ LINES = {
     "noack/protocol": 1265,
     "noack/runtime": 5790,
     "noack/settings": 600,
-    "noack/theory": 13250,
+    "noack/theory": 13265,
     "noack/traces": 1320,
     "noack/trigger": 1075,
     "netem": 6610,
@@ -54,7 +54,7 @@ LINES = {
     "controller_node": 420,
     "benchmarks": 3760,
     "native": 11445,
-    "tests": 50735,
+    "tests": 50745,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 
