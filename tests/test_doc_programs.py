@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import pytest
 
-from tests.command_line import invoke
+from tests.helpers.command_line import invoke
 from tests.helpers.live_runs import WITHOUT_VIEWER, wait_for
 from tests.helpers.pages import PAGES, ROOT, blocks, fences, fill, target_exists
 

@@ -208,7 +208,7 @@ class Run:
             NoackError: there is no such format, width or figure, or a file cannot be written.
         """
         page = self.directory / file_of_loop(REPORT_FILE, self._loop)
-        files = figure_format.figure_files(format, width)
+        files = figure_format.requested_files(format, width)
         if figure is not None:
             return figure_files.save_figures([self._describe(figure)], page, files)
         figures = (describe() for describe in self._figures(bounded=True).values())

@@ -12,7 +12,7 @@ import typer
 from typer import Argument, Option
 
 from cosim.lazy_modules import lazy_modules
-from cosim.output.figures.figure_format import FigureFiles, FigureFormat, figure_files
+from cosim.output.figures.figure_format import FigureFiles, FigureFormat, requested_files
 from cosim.record.run_directory import DEFAULT_RUNS, LATEST, SCENARIO_FILE, chosen_run
 from cosim.shipped_files import find_shipped, shipped_names
 from noack.core.errors import CallerError
@@ -274,4 +274,4 @@ class FigureOptions:
     @property
     def files(self) -> FigureFiles | None:
         """The files of the figures, if any; raise CallerError if the width is wrong."""
-        return figure_files(self.figure_format, self.width)
+        return requested_files(self.figure_format, self.width)

@@ -31,8 +31,8 @@ UserCode = Any
 MOST_BYTES = 64 * 2**20
 """Largest size of a file that is read completely."""
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
-Settings = TypeVar("Settings", bound="FileSettings")
-Table = TypeVar("Table", bound=BaseModel)
+FileSettingsT = TypeVar("FileSettingsT", bound="FileSettings")
+SectionT = TypeVar("SectionT", bound=BaseModel)
 
 PLACES = ("plant.system", "trigger", "controller")
 """The tables of a scenario that may name such a file."""
@@ -100,7 +100,7 @@ def file_tables(scenario: BaseModel) -> Iterator[tuple[str, FileSettings]]:
             yield place, table
 
 
-def with_tables(section: Table, tables: Mapping[str, BaseModel]) -> Table:
+def with_tables(section: SectionT, tables: Mapping[str, BaseModel]) -> SectionT:
     """Return a scenario or section with other tables at the given places."""
     update: dict[str, BaseModel] = {}
     for place, table in tables.items():
@@ -110,7 +110,7 @@ def with_tables(section: Table, tables: Mapping[str, BaseModel]) -> Table:
     return section.model_copy(update=update)
 
 
-def located(settings: Settings, folder: Path, place: str) -> Settings:
+def located(settings: FileSettingsT, folder: Path, place: str) -> FileSettingsT:
     """Return settings with the absolute path of their file (relative to a folder), and its SHA-256.
 
     If a SHA-256 is already given, it is used and the file is not read: so the record of a run can

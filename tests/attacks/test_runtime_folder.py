@@ -37,7 +37,7 @@ from noack.scenario.matrix_files import write_matrices
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from tests.attacks.other_user import NOBODY, needs_root
-from tests.command_line import invoke
+from tests.helpers.command_line import invoke
 from tests.helpers.run_descriptors import INVITED
 
 OWN = f"noack-{os.getuid()}"

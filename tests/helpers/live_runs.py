@@ -20,7 +20,7 @@ from noack.runtime.run_descriptor import RunDescriptor, loads
 from noack.runtime.spool import read_chunks
 from noack.scenario.resolution import run_tables
 from noack.scenario.scenario_file import load
-from tests.command_line import invoke
+from tests.helpers.command_line import invoke
 from tests.helpers.two_hosts import TwoHosts
 from tests.helpers.waiting import PATIENCE_S, wait_for
 

@@ -6,7 +6,7 @@ import subprocess
 from contextlib import chdir
 from pathlib import Path
 
-from tests.command_line import invoke
+from tests.helpers.command_line import invoke
 
 ROOT = Path(__file__).parents[2]
 PAGES = (

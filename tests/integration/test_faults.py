@@ -21,9 +21,9 @@ from cosim.live.finalize import reopen
 from cosim.record.run_record import RunRecord, load_record
 from noack.core.errors import MachineError
 from noack.protocol.roles import ROLES
-from tests.command_line import invoke
 from tests.cosim.output.viewer.recordings import read
 from tests.helpers import live_runs as live
+from tests.helpers.command_line import invoke
 from tests.helpers.waiting import is_left
 
 Start = Callable[..., live.Running]

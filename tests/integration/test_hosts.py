@@ -20,8 +20,8 @@ from noack.core.errors import MachineError
 from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER
 from noack.protocol.roles import LOOP_ROLES
 from noack.scenario.scenario import phases_ns
-from tests.command_line import invoke
 from tests.helpers import live_runs as live
+from tests.helpers.command_line import invoke
 from tests.helpers.live_runs import Start, ended
 from tests.helpers.two_hosts import TwoHosts, two_hosts
 

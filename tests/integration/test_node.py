@@ -30,9 +30,9 @@ from noack.runtime.drivers.live_driver import LoopChannel
 from noack.runtime.drivers.node_driver import NodeDriver
 from noack.runtime.udp_sockets import bind
 from noack.settings.user_files import located
-from tests.command_line import invoke
 from tests.helpers import live_runs as live
 from tests.helpers.approved import lines_of_error
+from tests.helpers.command_line import invoke
 from tests.noack.runtime.drivers.live_loops import KEY, RUN_ID, Rows, scenario
 
 Start = Callable[..., live.Running]

@@ -13,7 +13,7 @@ import pytest
 
 import noack
 from noack.core.errors import CallerError
-from tests.command_line import invoke
+from tests.helpers.command_line import invoke
 from tests.helpers.live_runs import AT_RATE
 
 pytest.importorskip("rosbags", reason="the extra `ros` is not installed")

@@ -33,8 +33,8 @@ from noack.protocol.record_tables import (
     tables,
 )
 from noack.protocol.roles import LOOP_ROLES
-from tests.command_line import invoke
 from tests.cosim.output.viewer.recordings import read, series
+from tests.helpers.command_line import invoke
 from tests.helpers.live_runs import (
     AT_RATE,
     Finished,

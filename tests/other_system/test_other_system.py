@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import pytest
 
-from tests.command_line import invoke
+from tests.helpers.command_line import invoke
 
 pytestmark = pytest.mark.builds
 ROOT = Path(__file__).parents[2]

@@ -102,7 +102,7 @@ class ForkedProcess:
         """Kill the process."""
         if self.poll() is None:
             with suppress(ProcessLookupError):
-                os.kill(self.pid, 9)
+                os.kill(self.pid, signal.SIGKILL)
 
     def _wait(self, options: int) -> int | None:
         if self._status is None:
@@ -132,14 +132,14 @@ class ForkServer:
 
     def __init__(self, *, of_itself: bool = False) -> None:
         require_limits()
-        self._socket, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._socket, server_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._socket.settimeout(_START_TIMEOUT_S)
-        with its, ExitStack() as on_error:
+        with server_end, ExitStack() as on_error:
             on_error.callback(self._socket.close)
-            forked = self._fork_program(its) if of_itself else None
+            forked = self._fork_program(server_end) if of_itself else None
             self._process = forked or subprocess.Popen(
-                python_command("-m", "cosim.live.processes.fork_server", its.fileno()),
-                pass_fds=[its.fileno()],
+                python_command("-m", "cosim.live.processes.fork_server", server_end.fileno()),
+                pass_fds=[server_end.fileno()],
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,  # the launcher handles Ctrl-C
                 env=os.environ | ENVIRONMENT,
@@ -147,7 +147,7 @@ class ForkServer:
             on_error.pop_all()
         _adopt_orphans(True)
 
-    def _fork_program(self, its: socket.socket) -> ForkedProcess | None:
+    def _fork_program(self, server_end: socket.socket) -> ForkedProcess | None:
         """Fork the server; None if only a program of its own would work as every process must.
 
         That is one thread, open standard streams, and UTF-8 for files and streams.
@@ -173,7 +173,7 @@ class ForkServer:
             for parameter, value in _MALLOPT.items():
                 ctypes.CDLL(None).mallopt(parameter, value)
         gc.set_threshold(*_PYTHONS_GC_THRESHOLDS)
-        _run(its)
+        _run(server_end)
         sys.exit()
 
     def close(self) -> None:

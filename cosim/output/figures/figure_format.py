@@ -27,7 +27,7 @@ class FigureFiles(NamedTuple):
     width_in: float
 
 
-def figure_files(kind: str | None, width: str | float | None = None) -> FigureFiles | None:
+def requested_files(kind: str | None, width: str | float | None = None) -> FigureFiles | None:
     """Return format and width of figures; None without a format.
 
     Raises:

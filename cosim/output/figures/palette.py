@@ -1,8 +1,8 @@
 """The colours of the viewer, the reports and the library's figures. One concept, one colour.
 
 Every colour has a contrast of at least 3 to 1 with a light and with a dark background. Colours in
-one panel can be distinguished by colour-blind people as well; a test computes both. Lines and marks
-also differ in width, dash or marker.
+one panel can be distinguished by colour-blind people as well. Lines and marks also differ in width,
+dash or marker.
 """
 
 Colour = tuple[int, int, int]

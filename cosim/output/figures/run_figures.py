@@ -74,13 +74,13 @@ _MOST_NUMBERED_BARS = 12
 
 
 def run_figures(
-    record: RunRecord, envelopes: Sequence[Envelope] = (), *, timed: bool | None = None
+    record: RunRecord, certified: Sequence[Envelope] = (), *, timed: bool | None = None
 ) -> dict[str, Callable[[], FigureDescription]]:
     """Return functions that describe the figures of a loop, by name.
 
     Args:
         record: the loop's record, of any length, including 0.
-        envelopes: certified bounds, drawn with the quantities that they bound.
+        certified: bounds, drawn with the quantities that they bound.
         timed: whether to show lateness, which does not exist in virtual time.
     """
 
@@ -90,7 +90,7 @@ def run_figures(
             return _thinned(record)
 
     def bounds(quantity: str) -> list[Line]:
-        curves = (curve for curve in envelopes if curve[1] == quantity)
+        curves = (curve for curve in certified if curve[1] == quantity)
         return bound_lines((label, t_s, values, kind) for label, _, t_s, values, kind in curves)
 
     described = {

@@ -48,7 +48,6 @@ from cosim.output.figures.palette import (
     THRESHOLD,
     Colour,
 )
-from cosim.output.figures.palette import FORCED as FORCED_COLOUR
 from cosim.output.viewer.network_diagram import DIAGRAM, NetworkDiagram
 from cosim.output.viewer.pictures.picture import PICTURE, TIMELINE, Picture, Shape, label, lines, panel
 
@@ -62,7 +61,7 @@ ERROR_LOG10 = "error/log10"
 SIZE_LOG10 = "size/log10"
 INPUT = "input"
 EVENT, EVENT_STEM, EVENT_CERTIFIED = "event/interval", "event/stem", "event/certified"
-RECEPTION, FORCED, RECEPTION_STEM = "reception/interval", "reception/forced", "reception/stem"
+RECEPTION, RECEPTION_FORCED, RECEPTION_STEM = "reception/interval", "reception/forced", "reception/stem"
 DROP = "drop"
 
 _PAGE_OF_FEW, _PAGE_OF_MANY, _MANY = 4, 9, 16
@@ -194,7 +193,7 @@ def _styles(layout: LoopLayout) -> dict[str, Static]:
         EVENT: _mark("sent", SENSOR, "circle", 4.0),
         RECEPTION_STEM: _stem("received", CONTROLLER),
         RECEPTION: _mark("received", CONTROLLER, "circle", 4.0),
-        FORCED: _mark("received (forced)", FORCED_COLOUR, "diamond", 6.0),
+        RECEPTION_FORCED: _mark("received (forced)", palette.FORCED, "diamond", 6.0),
         DROP: _mark("lost", LOST, "cross", 5.0),
         **lateness,
         **(clocks if layout.has_clocks else {}),
@@ -252,7 +251,7 @@ def move_below(part: rrb.Container | rrb.View, folder: str) -> None:
 
 def _intervals() -> rrb.Container:
     sent = [EVENT_STEM, EVENT, DROP, EVENT_CERTIFIED]
-    received = [RECEPTION_STEM, RECEPTION, FORCED, DROP]
+    received = [RECEPTION_STEM, RECEPTION, RECEPTION_FORCED, DROP]
     return rrb.Horizontal(
         plot("Broadcasting intervals [s]", "event", sent),
         plot("Receiving intervals [s]", "reception", received),

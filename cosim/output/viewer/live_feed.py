@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cosim.analysis.summary.loops_over_time import INTERVALS, add_link_bytes, empty_over_time, intervals_of
 from cosim.analysis.summary.run_summary import counts_inside, times_inside
 from cosim.output.viewer.loop_feed import LAG_S, SHOWN_TABLES, LoopFeed, log_level
-from cosim.output.viewer.run_recording import ERROR, SIZE, RunRecording
+from cosim.output.viewer.run_recording import ALL_ERRORS, ALL_SIZES, RunRecording
 from cosim.record.align import Reals
 from cosim.record.record_source import rows_by_loop
 from cosim.record.run_record import Rows
@@ -203,8 +203,8 @@ class _AllLoops:
             return
         new, self._sent = slice(self._sent, done), done
         middles_ns = (self._over_time.middles_s[new] * NS_PER_S).astype(np.int64)
-        self._view.norms(ERROR, middles_ns, self._over_time.errors[:, new])
-        self._view.norms(SIZE, middles_ns, self._over_time.states[:, new])
+        self._view.norms(ALL_ERRORS, middles_ns, self._over_time.errors[:, new])
+        self._view.norms(ALL_SIZES, middles_ns, self._over_time.states[:, new])
         edges_ns = self._over_time.edges_s[new.start : done + 1] * NS_PER_S
         means, largest = counts_inside(*self._inside, edges_ns)
         self._view.queue(middles_ns, largest, means)

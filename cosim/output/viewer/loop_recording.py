@@ -288,7 +288,7 @@ class LoopView:
         forced = np.asarray(forced, dtype=bool)
         self._send_stems(bp.RECEPTION_STEM, t_ns, interval_s)
         self._send(bp.RECEPTION, t_ns[~forced], interval_s[~forced])
-        self._send(bp.FORCED, t_ns[forced], interval_s[forced])
+        self._send(bp.RECEPTION_FORCED, t_ns[forced], interval_s[forced])
 
     def drops(self, t_ns: Times) -> None:
         """Add the times (k,) at which an update was lost."""

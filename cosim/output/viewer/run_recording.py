@@ -62,7 +62,7 @@ PICTURED = 12
 """Up to so many loops are shown one by one, with their pictures."""
 _ANIMATED = 4
 """Up to so many loops have a diagram of their packets, which is most of a recording."""
-QUEUE, SHARE, ERROR, SIZE, MAP = "link/queue", "link/share", "all/error", "all/size", "all/map"
+QUEUE, SHARE, ALL_ERRORS, ALL_SIZES, MAP = "link/queue", "link/share", "all/error", "all/size", "all/map"
 _DECADES = 5
 """Decades of a norm that the curves show to each side of its usual largest value, and the map below."""
 _RANGE = 100.0
@@ -153,7 +153,7 @@ to the right.
             {
                 bp.ABOUT: rr.TextDocument(text, media_type="text/markdown"),
                 QUEUE: queue,
-                **dict.fromkeys((SHARE, ERROR, SIZE), _series(self.names)),
+                **dict.fromkeys((SHARE, ALL_ERRORS, ALL_SIZES), _series(self.names)),
             },
         )
 
@@ -166,7 +166,7 @@ to the right.
         self.send(SHARE, t_ns, 100 * _curves_or_quantiles(shares).T)
 
     def norms(self, entity: str, t_ns: Times, values: Reals) -> None:
-        """Add norms of each loop, (L, k), to ``ERROR`` or ``SIZE``.
+        """Add norms of each loop, (L, k), to ``ALL_ERRORS`` or ``ALL_SIZES``.
 
         Their logarithm is cut off some decades from the usual largest value so far: a norm may be
         0, and a loop that diverges would hide the others.
@@ -221,7 +221,7 @@ def _tabs(loops: Mapping[str, bp.LoopLayout], count: int, worst: WorstLoop | Non
     """Lay out a page of all ``count`` loops, and one for each that is shown."""
     kind = "" if count <= len(SERIES) else ", quantiles over the loops"
     plots = [
-        bp.plot(f"log10 ‖e_c‖{kind}", ERROR),
+        bp.plot(f"log10 ‖e_c‖{kind}", ALL_ERRORS),
         bp.plot("Datagrams in the network", QUEUE),
         bp.plot(f"Share of the link [%]{kind}", SHARE),
     ]
@@ -235,7 +235,7 @@ def _tabs(loops: Mapping[str, bp.LoopLayout], count: int, worst: WorstLoop | Non
     pictures: rrb.Container = rrb.Grid(*left, grid_columns=columns)
     if count > PICTURED:
         of_map = rrb.Spatial2DView(origin=MAP, name="log10 ‖e_c‖ of each loop, a row, over time")
-        pictures = rrb.Vertical(of_map, bp.plot(f"log10 ‖x‖{kind}", SIZE), row_shares=[2, 1])
+        pictures = rrb.Vertical(of_map, bp.plot(f"log10 ‖x‖{kind}", ALL_SIZES), row_shares=[2, 1])
     everything = rrb.Horizontal(pictures, rrb.Vertical(*plots), name="all loops")
     return rrb.Tabs(everything, *pages, bp.log_view(), bp.about_view(), active_tab=0)
 
@@ -327,8 +327,8 @@ def _write_network_view(
         queue_ns = (np.arange(len(largest)) + 0.5) * flying.width_s * NS_PER_S
         whole.queue(queue_ns.astype(np.int64), largest, np.array(flying.mean_by_interval))
         middles_ns = (over_time.middles_s * NS_PER_S).astype(np.int64)
-        whole.norms(ERROR, middles_ns, over_time.errors)
-        whole.norms(SIZE, middles_ns, over_time.states)
+        whole.norms(ALL_ERRORS, middles_ns, over_time.errors)
+        whole.norms(ALL_SIZES, middles_ns, over_time.states)
         whole.map(over_time.errors)
         ends_s, shares = over_time.shares()
         whole.share(((ends_s - ends_s[0] / 2) * NS_PER_S).astype(np.int64), shares)

@@ -77,7 +77,7 @@ class CapacityResult(NamedTuple):
             "disturbance": plan.amplitude,
             "seed": plan.seed,
             "capacities": [capacity.to_json(plan) for capacity in self.capacities],
-            "comparisons": list(comparisons(self)),
+            "comparisons": list(comparison_sentences(self)),
             "points": self.summary.to_json()["points"],
             "live": [point.to_json() for point in self.live],
         }
@@ -107,8 +107,13 @@ def page(result: CapacityResult) -> str:
         .render(
             title=plan.scenario.name,
             subtitle=f"{plan.link}, {plan.draws:,} draws at each number of loops, seed {plan.seed}",
-            verdict=f"{by_rate(plan).capitalize()}.",
-            comparisons=[*comparisons(result), *mixtures(result), *waiting(result), *caveats(plan)],
+            verdict=f"{rate_sentence(plan).capitalize()}.",
+            comparisons=[
+                *comparison_sentences(result),
+                *mixture_sentences(result),
+                *waiting_sentences(result),
+                *caveat_sentences(plan),
+            ],
             counts=", ".join(map(str, plan.counts)),
             deadline=f"{plan.deadline_s:g} s",
             from_s=f"{plan.counted_from_s:g} s",
@@ -133,7 +138,7 @@ def rows(result: CapacityResult) -> Iterator[tuple[str, ...]]:
         yield case.policy, case.disturbance, carried, case.limited_by or "–", *limits
 
 
-def by_rate(plan: CapacityPlan) -> str:
+def rate_sentence(plan: CapacityPlan) -> str:
     """Say how many periodic loops the rate carries, or the slots."""
     carrier = "the slots carry" if plan.rate_bps is None else "the rate carries"
     if plan.is_one_kind:
@@ -144,7 +149,7 @@ def by_rate(plan: CapacityPlan) -> str:
     return f"{carrier} {factor:.2f} × the given mixture, {plan.periodic_loops:.1f} loops, periodic: {periods}"
 
 
-def mixtures(result: CapacityResult) -> Iterator[str]:
+def mixture_sentences(result: CapacityResult) -> Iterator[str]:
     """Yield the median capacities as multiples of the mixture that the scenario has."""
     plan = result.plan
     for capacity in () if plan.is_one_kind else result.capacities:
@@ -172,7 +177,7 @@ def delay_bounds_s(result: CapacityResult) -> dict[str, list[float]]:
     }
 
 
-def waiting(result: CapacityResult) -> Iterator[str]:
+def waiting_sentences(result: CapacityResult) -> Iterator[str]:
     """Yield the bounds of each policy that has one."""
     for policy, bounds_s in delay_bounds_s(result).items():
         if any(map(math.isfinite, bounds_s)):
@@ -181,7 +186,7 @@ def waiting(result: CapacityResult) -> Iterator[str]:
             yield f"{policy}: updates of {counts} loops wait at most {times_text} s in virtual time"
 
 
-def caveats(plan: CapacityPlan) -> Iterator[str]:
+def caveat_sentences(plan: CapacityPlan) -> Iterator[str]:
     """Yield what a thorough study has, and this one has not."""
     if plan.draws < _FINITE_FROM:
         number = "one draw" if plan.draws == 1 else f"{plan.draws} draws"
@@ -197,7 +202,7 @@ def _listed(composition: Mapping[str, int]) -> str:
     return ", ".join(f"{count} {name}" for name, count in composition.items())
 
 
-def comparisons(result: CapacityResult) -> Iterator[str]:
+def comparison_sentences(result: CapacityResult) -> Iterator[str]:
     """Yield for each event-triggered policy whether it carries more loops than the periodic one."""
     limits = {(capacity.policy, capacity.disturbance): capacity.any_limit for capacity in result.capacities}
     last = result.plan.counts[-1]
@@ -295,11 +300,11 @@ def print_result(console: Console, result: CapacityResult) -> None:
     console.print(terminal_table(table, left=range(4)))
     lines = [
         f"loops carried: median [95 % interval] of {', '.join(map(str, plan.counts))} loops",
-        by_rate(plan),
-        *mixtures(result),
-        *comparisons(result),
-        *waiting(result),
-        *caveats(plan),
+        rate_sentence(plan),
+        *mixture_sentences(result),
+        *comparison_sentences(result),
+        *waiting_sentences(result),
+        *caveat_sentences(plan),
         *(f"live: {point.policy}, {point.loops} loops: {live_row(point)[-1]}" for point in result.live),
     ]
     for line in lines:

@@ -1,6 +1,7 @@
-"""From a plant to a scenario: its linear model, a gain, and the scenario file of the loop.
+"""From a plant to a scenario.
 
-What is chosen unless it is given:
+``plant_reference.py`` reads which plant is meant, ``linear_model.py`` has its linear model and gain,
+``new_scenario.py`` writes the scenario of the loop. What is chosen unless it is given:
 """
 
 BETA_SHARE = 0.1

@@ -22,8 +22,8 @@ from cosim.simulation.virtual_time import Network, simulate, simulate_run
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
-from tests.command_line import invoke
 from tests.cosim.record.changed_records import changed
+from tests.helpers.command_line import invoke
 
 LANE = Path(__file__).parents[3] / "scenarios" / "lane_following.toml"
 

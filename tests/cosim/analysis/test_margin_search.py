@@ -12,7 +12,7 @@ from noack.core.linear_systems import discretise
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.theory.margins.loss_margin import LossMargin, Stability
-from tests.command_line import invoke
+from tests.helpers.command_line import invoke
 
 HELD = {
     "mode": "zoh",

@@ -7,7 +7,7 @@ import pytest
 
 from cosim.analysis.mean_cost import CostUnder, find_mean_cost
 from cosim.studies.campaign.drawn_runs import SampledWork
-from tests.command_line import invoke
+from tests.helpers.command_line import invoke
 from tests.noack.theory.random_losses.example_losses import BURSTS, NOISE, scenario
 
 

@@ -12,7 +12,7 @@ import tomli_w
 from cosim.cli import options
 from cosim.live import finalize
 from cosim.record.run_directory import SUMMARY_FILE
-from tests.command_line import invoke
+from tests.helpers.command_line import invoke
 
 
 def test_check_prints_the_defaults_that_depend_on_other_keys(tmp_path: Path, content: dict[str, Any]) -> None:

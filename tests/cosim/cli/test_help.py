@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 from cosim.cli import app
 from cosim.cli.command import examples_of
 from netem.control.emulator_commands import COMMANDS as EMULATOR_COMMANDS
-from tests.command_line import invoke
 from tests.helpers.approved import compare_lines
+from tests.helpers.command_line import invoke
 
 PROGRAM: Any = get_command(app)
 COMMANDS: dict[str, Any] = dict(PROGRAM.commands)

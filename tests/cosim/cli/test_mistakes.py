@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from click.testing import Result
 
-from tests.command_line import invoke
 from tests.helpers.approved import compare_lines
+from tests.helpers.command_line import invoke
 
 
 def noack(line: str) -> Result:

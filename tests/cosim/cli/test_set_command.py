@@ -19,9 +19,9 @@ from noack.scenario.parameter_changes import changed
 from noack.scenario.resolution import resolve
 from noack.scenario.runtime_parameters import SHORT
 from noack.scenario.scenario_file import load, validate
-from tests.command_line import invoke
 from tests.fuzz.plane import Query
 from tests.helpers.approved import compare_lines, lines_of_error
+from tests.helpers.command_line import invoke
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import pytest
 import noack
 from noack.scenario.resolution import resolved_loops
 from noack.scenario.scenario_file import load
-from tests.command_line import invoke
+from tests.helpers.command_line import invoke
 
 ROOT = Path(__file__).parents[3]
 SCENARIOS = sorted(file.stem for file in (ROOT / "scenarios").glob("*.toml"))

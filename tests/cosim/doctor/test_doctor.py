@@ -20,7 +20,7 @@ from cosim.doctor.machine_measures import (
     RunRequirements,
     lateness,
 )
-from tests.command_line import invoke
+from tests.helpers.command_line import invoke
 
 WANTED = RunRequirements(
     name="loop", duration_s=20.0, period_ns=2_000_000, allowance_ns=4_000_000, realtime=True,

@@ -36,9 +36,9 @@ from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from noack.scenario.sections import NetworkSection
 from noack.traces.packet_trace import LOST_NS, PacketTrace, packet_trace, read_trace
-from tests.command_line import invoke
 from tests.cosim.measurement.chains import PERIOD_NS, chain_losses, trace_of
 from tests.fuzz.parsers.fates import SPECS, TABLE
+from tests.helpers.command_line import invoke
 from tests.oracles.link import Link
 
 RURAL = Path(__file__).parents[3] / "noack/traces/shipped/cicv5g" / "rural_n8_10kmh.csv"

@@ -23,7 +23,7 @@ from noack.theory.bounds.certificate_terms import Constants
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import most_events
 from noack.theory.certificates.scenario_certificates import outside_box
-from tests.command_line import invoke
+from tests.helpers.command_line import invoke
 from tests.helpers.shipped import resolved, shipped
 
 ROOT = Path(__file__).parents[3]

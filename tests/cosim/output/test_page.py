@@ -21,8 +21,8 @@ from cosim.record.run_directory import REPORT_FILE, RunEnding
 from cosim.record.run_record import RunRecord
 from noack.core.errors import ExitStatus
 from noack.scenario.scenario_file import dumps as scenario_toml
-from tests.command_line import invoke
 from tests.cosim.output.conftest import CASES, HOSTILE, make_record, scenario_of
+from tests.helpers.command_line import invoke
 from tests.helpers.lab_browser import started
 from tests.helpers.summaries import run_of_one_loop, summary_of
 

@@ -14,9 +14,9 @@ import noack
 from cosim.output import result_tables
 from cosim.output.run_tables import summary_tables
 from noack.core.errors import CallerError
-from tests.command_line import invoke
 from tests.cosim.output.test_page import Page
 from tests.helpers.approved import compare_output
+from tests.helpers.command_line import invoke
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ from noack.protocol.record_tables import tables
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
-from tests.command_line import invoke
+from tests.helpers.command_line import invoke
 
 PATH = Path(__file__).parents[3] / "scenarios" / "shared_bottleneck.toml"
 LOOPS = 11

@@ -17,7 +17,7 @@ import noack
 from cosim.studies.run_archive import MANIFEST, write_archive
 from noack.core.errors import CallerError
 from noack.protocol.record_tables import OWNER
-from tests.command_line import invoke
+from tests.helpers.command_line import invoke
 
 PLANT = """\
 class Lag:

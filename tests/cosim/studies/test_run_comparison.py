@@ -11,7 +11,7 @@ from click.testing import Result
 import noack
 from cosim.studies.run_comparison import KeyNumber, RunComparison, compare_runs
 from noack.protocol.record_tables import PLANT_STEP
-from tests.command_line import invoke
+from tests.helpers.command_line import invoke
 
 SETTINGS: list[dict[str, Any]] = [
     {"horizon_s": 3.0},

@@ -16,8 +16,8 @@ from noack.plants.gymnasium import GymnasiumSettings
 from noack.plants.plant_settings import PlantStart
 from noack.scenario.resolution import resolve
 from noack.scenario.toml_file import validated
-from tests.command_line import invoke
 from tests.helpers.approved import compare_lines, lines_of_error
+from tests.helpers.command_line import invoke
 from tests.helpers.shipped import skip_without_plant
 
 gymnasium = pytest.importorskip("gymnasium", reason="the extra `gymnasium` is not installed")

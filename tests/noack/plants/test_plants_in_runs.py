@@ -18,7 +18,7 @@ from noack.core.errors import CallerError
 from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
-from tests.command_line import invoke
+from tests.helpers.command_line import invoke
 from tests.plant_server.fmus.build import build
 
 PLANT_SCENARIO = """

@@ -9,7 +9,7 @@ import pytest
 
 from noack.core.errors import ExitStatus
 from noack.runtime.command_line import LogFormat, failed, log_event, log_format, print_to_stderr
-from tests.command_line import invoke
+from tests.helpers.command_line import invoke
 from tests.helpers.json_log import objects
 
 

@@ -24,8 +24,8 @@ from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from noack.theory.certificates.conditions import ideal_conditions
 from noack.theory.certificates.scenario_certificates import certify
-from tests.command_line import invoke
 from tests.cosim.analysis.adversary.scenarios import every_run, flow_of, scenarios, simulate
+from tests.helpers.command_line import invoke
 
 MANY = settings(suppress_health_check=list(HealthCheck), phases=[Phase.generate])
 

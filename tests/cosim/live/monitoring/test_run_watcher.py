@@ -14,7 +14,7 @@ import noack
 from cosim.live.monitoring.progress import work_bar
 from cosim.live.monitoring.run_watcher import RunMetrics, Watcher, joint_watcher
 from noack.runtime.control_messages import RunProgress
-from tests.command_line import invoke
+from tests.helpers.command_line import invoke
 from tests.helpers.json_log import objects
 from tests.helpers.metrics_readers import exposed, read, slow_reader, values_of
 

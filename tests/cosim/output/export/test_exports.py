@@ -21,7 +21,7 @@ from cosim.output.export.mat_export import save_mat
 from cosim.output.viewer.rerun_program import start_rerun
 from noack.core.errors import CallerError
 from noack.scenario.scenario import phases_ns
-from tests.command_line import invoke
+from tests.helpers.command_line import invoke
 
 SCENARIO: dict[str, Any] = {
     "horizon_s": 1.0, "changes": [{"at_s": 0.5, "set": {"trigger.beta": 0.05}}],

@@ -19,7 +19,7 @@ from noack.protocol.record_tables import Fate
 from noack.protocol.wire_format import Flow, Message
 from noack.scenario.resolution import resolved_loops
 from noack.scenario.scenario import Scenario
-from tests.command_line import invoke
+from tests.helpers.command_line import invoke
 from tests.helpers.machine_parts import plant_of, sensor_of
 
 fmpy = pytest.importorskip("fmpy", reason="the extra `fmi` is not installed")

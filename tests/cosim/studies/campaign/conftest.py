@@ -12,7 +12,7 @@ from cosim.studies.campaign.campaign_file import Campaign, load
 from cosim.studies.campaign.campaign_grid import Point, grid
 from cosim.studies.campaign.campaign_workers import run_in_process
 from cosim.studies.campaign.chunk_store import Store, run_campaign
-from tests.command_line import invoke
+from tests.helpers.command_line import invoke
 
 Write = Callable[..., Path]
 Command = Callable[..., Result]

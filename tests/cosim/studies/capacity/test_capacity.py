@@ -18,7 +18,7 @@ from cosim.studies.campaign.chunk_store import Store, run_campaign
 from cosim.studies.campaign.drawn_runs import used_up
 from cosim.studies.campaign.metrics import estimate
 from cosim.studies.capacity import capacity_plan as plans
-from cosim.studies.capacity.capacity_page import CapacityResult, comparisons, mixtures
+from cosim.studies.capacity.capacity_page import CapacityResult, comparison_sentences, mixture_sentences
 from cosim.studies.capacity.capacity_plan import kinds_of, policies_of
 from cosim.studies.capacity.capacity_result import (
     Capacity,
@@ -29,7 +29,7 @@ from cosim.studies.capacity.capacity_result import (
 )
 from noack.protocol.record_tables import Fate
 from noack.scenario.scenario_file import load
-from tests.command_line import invoke
+from tests.helpers.command_line import invoke
 
 FILE = Path(__file__).parents[4] / "scenarios" / "shared_bottleneck.toml"
 PERIOD_S = 0.1
@@ -98,7 +98,7 @@ def test_a_policy_must_keep_the_cost_of_each_kind_of_loop() -> None:
         (0.0, "0 × the given mixture; 1 a, 1 b already reach a limit"),
     ):
         carried = policy_capacity._replace(any_limit=Capacity(median, 0.0, np.inf))
-        (sentence,) = mixtures(CapacityResult(plan, Mock(), [carried], []))
+        (sentence,) = mixture_sentences(CapacityResult(plan, Mock(), [carried], []))
         assert sentence == f"model, disturbance own: {expected}"
 
 
@@ -119,7 +119,7 @@ def test_a_policy_wins_or_loses_only_if_the_intervals_do_not_overlap(
     plan = plans.CapacityPlan(load(FILE), kinds, FILE, {}, 0.1, (1, 9), policies_of(kinds), 0.0, 6, 0)
     carried = {"periodic": Capacity(4.0, 3.0, 6.0), "model": Capacity(ends[0], *ends)}
     both = [PolicyCapacity(policy, plans.OWN, {}, capacity) for policy, capacity in carried.items()]
-    (sentence,) = comparisons(CapacityResult(plan, Mock(), both, []))
+    (sentence,) = comparison_sentences(CapacityResult(plan, Mock(), both, []))
     assert sentence.startswith(f"model against periodic, as in the scenario: {outcome}")
 
 

@@ -33,9 +33,9 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import dumps, load
 from noack.theory.certificates.conditions import ideal_conditions
 from noack.theory.certificates.scenario_certificates import certify_box
-from tests.command_line import invoke
 from tests.cosim.studies.design.conftest import LIMITS
 from tests.helpers.approved import compare_lines
+from tests.helpers.command_line import invoke
 
 ONE = """
 name = "one"

@@ -31,8 +31,8 @@ from noack.scenario.scenario_file import validate
 from noack.theory.certificates.conditions import nominal_conditions
 from noack.theory.certificates.scenario_certificates import certify_box
 from noack.theory.margins.loss_margin import LossMargin
-from tests.command_line import invoke
 from tests.helpers.approved import compare_lines
+from tests.helpers.command_line import invoke
 from tests.helpers.shipped import shipped
 
 ROOT = Path(__file__).parents[4]

@@ -17,8 +17,8 @@ import noack
 from cosim.studies.new_loop.linear_model import controllable_states
 from noack.core.errors import CallerError
 from noack.scenario.resolution import loop_of, resolve
-from tests.command_line import invoke
 from tests.helpers.approved import compare_lines
+from tests.helpers.command_line import invoke
 from tests.plant_server.fmus.build import build
 
 POLE = '''

@@ -19,7 +19,7 @@ from cosim.studies.paper.paper_page import render, rounded_numbers
 from noack.core.errors import CallerError
 from noack.plants.linear import lane_following
 from noack.scenario.resolution import loop_of
-from tests.command_line import invoke
+from tests.helpers.command_line import invoke
 
 ROOT = Path(__file__).parents[4]
 CAMPAIGN = ROOT / "campaigns" / "paper.toml"

@@ -20,7 +20,7 @@ from cosim.studies.paper.results import (
     umsonst_barbosa,
 )
 from noack.core.errors import ExitStatus
-from tests.command_line import invoke
+from tests.helpers.command_line import invoke
 from tests.helpers.pages import ROOT
 
 PAGE = (ROOT / "docs/published.md").read_text()

@@ -9,7 +9,6 @@ import socket
 import struct
 from collections.abc import Sequence
 from contextlib import closing
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,6 @@ from noack.runtime.drivers.live_driver import LiveDriver
 from tests.helpers.wire_decoder import NO_VECTOR
 from tests.noack.runtime.drivers.live_loops import HOUR_NS, Live, measurement, plain, received, scenario
 
-SCENARIOS = Path(__file__).parents[3] / "scenarios"
 NOW = "now_ns"
 
 

@@ -28,7 +28,7 @@ from cosim.output.figures.figure_description import (
 )
 from cosim.output.figures.figure_drawing import draw
 from cosim.output.figures.figure_files import inline, save_figure, save_figures
-from cosim.output.figures.figure_format import figure_files
+from cosim.output.figures.figure_format import requested_files
 from cosim.output.figures.figure_layout import use_figure_width
 from cosim.output.figures.run_figures import Trajectory, Transmissions, run_figures, states_figure
 from cosim.output.figures.timing_figures import later_than
@@ -225,7 +225,7 @@ def test_the_figures_of_a_report_are_written_as_wide_as_a_paper_wants(tmp_path: 
     with pytest.raises(CallerError, match=r"figure\.eps: a figure is saved as \.svg"):
         save_figure(norms(line(T_S, T_S)), tmp_path / "figure.eps")
     for width, points in ((None, 252.0), ("page", 515.52), (5, 360.0)):
-        files = figure_files("pdf", width)
+        files = requested_files("pdf", width)
         (path,) = save_figures([norms(line(T_S, T_S))], tmp_path / "page.html", files)
         content = path.read_bytes()
         box = re.search(rb"/MediaBox \[ ?0 0 ([\d.]+) ", content)
