@@ -19,7 +19,7 @@ from native.build import HEADER
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("noack", "plant_server", "sensor_node", "controller_node", "netem", "cosim")
 EXEMPT = ("__init__", "__main__")
-MOST_MODULES = 475
+MOST_MODULES = 476
 LINES = {
     "noack/scenario": 4160,
     "noack/controllers": 270,
@@ -43,7 +43,7 @@ LINES = {
     "cosim/doctor": 810,
     "cosim/interactive": 1835,
     "cosim/lab": 2005,
-    "cosim/live": 4025,
+    "cosim/live": 4040,
     "cosim/measurement": 2975,
     "cosim/output": 8720,
     "cosim/record": 3695,

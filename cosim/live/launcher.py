@@ -21,9 +21,10 @@ from threading import Thread
 from cosim.lazy_modules import lazy_modules
 from cosim.live.coordinator import Coordinator
 from cosim.live.monitoring.run_watcher import Watcher, joint_watcher
-from cosim.live.processes.child_processes import ChildProcesses, EndReason, RemoteStart, RestartPolicy
+from cosim.live.processes.child_processes import ChildProcesses, EndReason, RestartPolicy
 from cosim.live.processes.finalize_helpers import RunEndingWithHelpers, lasting_helpers
 from cosim.live.processes.fork_server import ForkServer, fork_server
+from cosim.live.processes.remote_hosts import RemoteStart
 from cosim.record.run_directory import (
     LEAST_FREE_BYTES,
     PROCESSES_FILE,

@@ -24,7 +24,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 from cosim.live.coordinator import Coordinator, TokenScope
-from cosim.live.processes.child_processes import Host, load_hosts
+from cosim.live.processes.remote_hosts import Host, load_hosts
 from noack.core.errors import CallerError, PeerError, why
 from noack.protocol.roles import LOOP_ROLES
 from noack.runtime.active_runs import RUNS, run_name

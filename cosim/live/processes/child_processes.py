@@ -1,41 +1,30 @@
 """The processes that a launcher starts: start, exit status, reason of a failure, restart, end.
 
-They run on this host, or over ssh on others. ``ssh`` asks for nothing: a key, or an agent, must be
-set up, and the host's key known. The invitation goes through ssh to the process's standard input,
-and is in no file. :class:`RestartPolicy` says which failed processes are restarted or waited for,
-and which failures end the run.
+They run on this host, or over ssh on others (``remote_hosts.py``). :class:`RestartPolicy` says which
+failed processes are restarted or waited for, and which failures end the run.
 """
 
 import contextlib
 import os
-import shlex
-import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Annotated, NamedTuple, Self
-
-from pydantic import AfterValidator, Field, model_validator
+from typing import IO, NamedTuple
 
 from cosim.live.coordinator import Coordinator
 from cosim.live.monitoring.run_watcher import Watcher
 from cosim.live.processes.fork_server import ENVIRONMENT, ForkedProcess, ForkServer
-from noack.core.errors import CallerError, ExitStatus, MachineError
+from cosim.live.processes.remote_hosts import SSH_FAILED, RemoteStart, start_over_ssh
+from noack.core.errors import ExitStatus, MachineError
 from noack.core.file_access import open_append
 from noack.core.process_limits import python_command
-from noack.protocol.roles import LOOP_ROLES, PLANT, RECORDER
+from noack.protocol.roles import PLANT, RECORDER
 from noack.runtime.run_descriptor import RunDescriptor
-from noack.scenario import toml_file
 from noack.scenario.scenario import Scenario
-from noack.settings.section import ScenarioSection
 
-SSH_FAILED = 255
-"""Exit status of ssh when its connection cannot be made, or breaks."""
-_CONNECT_WITHIN_S = 10
-_OPTIONS = ("-T", "-o", "BatchMode=yes", "-o", f"ConnectTimeout={_CONNECT_WITHIN_S}")
 MODULES = {
     "recorder": "cosim.live.recording.recorder",
     "netem": "netem.__main__",
@@ -53,89 +42,6 @@ class EndReason(NamedTuple):
 
     status: ExitStatus
     reason: str
-
-
-def _require_printable(text: str) -> str:
-    if not text.isprintable():  # no argument of a command has a zero character
-        raise ValueError("has a control character")
-    return text
-
-
-_Word = Annotated[str, Field(min_length=1), AfterValidator(_require_printable)]
-
-
-class Host(ScenarioSection):
-    """Where a process runs."""
-
-    ssh: Annotated[_Word, Field(pattern=r"^[^-\s]\S*$")]
-    """The host, as the command ssh takes it: a name of ~/.ssh/config, HOST or USER@HOST."""
-    command: _Word = "noack"
-    """How noack is called there, e.g. "noack/.venv/bin/noack"; the shell of that host reads it."""
-    runs: _Word = "runs"
-    """Folder there for rows that cannot be sent to the recorder."""
-
-
-class Hosts(ScenarioSection):
-    """The hosts of a run: processes without a table run on the host of the recorder."""
-
-    listen: str
-    """Address of this host at which the others reach it: ADDRESS or ADDRESS:PORT."""
-    plant: Host | None = None
-    """Where the plant runs."""
-    sensor: Host | None = None
-    """Where the sensor runs."""
-    netem: Host | None = None
-    """Where the network emulator runs."""
-    controller: Host | None = None
-    """Where the controller runs."""
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if not self.by_role:
-            raise ValueError(f"no process is on another host; name one of {', '.join(LOOP_ROLES)}")
-        return self
-
-    @property
-    def by_role(self) -> Mapping[str, Host]:
-        """The hosts of the processes that do not run here."""
-        given = {role: getattr(self, role) for role in LOOP_ROLES}
-        return {role: host for role, host in given.items() if host is not None}
-
-
-def load_hosts(path: Path) -> Hosts:
-    """Read a file of hosts; raise CallerError if it is wrong, or no ssh client is installed."""
-    hosts = toml_file.validated(Hosts, toml_file.read(path, Hosts), str(path))
-    if shutil.which("ssh") is None:
-        raise CallerError("--hosts: no ssh client is installed; install openssh-client")
-    return hosts
-
-
-class RemoteStart(NamedTuple):
-    """What is needed to start the processes on other hosts."""
-
-    hosts: Mapping[str, Host]
-    invitation: str
-    """The content of the invitation."""
-
-
-def start_over_ssh(role: str, host: Host, invitation: str, log: IO[str]) -> subprocess.Popen[str]:
-    """Start a process on another host, which ends by itself, with the run.
-
-    Raise OSError if ssh cannot be started.
-    """
-    remote = f"{host.command} {role} --invitation - --runs {shlex.quote(host.runs)}"
-    child = subprocess.Popen(
-        ["ssh", *_OPTIONS, "--", host.ssh, remote],
-        stdin=subprocess.PIPE,
-        stdout=log,
-        stderr=log,
-        encoding="utf-8",
-        start_new_session=True,  # the launcher handles Ctrl-C
-    )
-    assert child.stdin is not None
-    with suppress(BrokenPipeError), child.stdin:
-        child.stdin.write(invitation)
-    return child
 
 
 _NOT_EXECUTABLE, _NOT_FOUND = 126, 127

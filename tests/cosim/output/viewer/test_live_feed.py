@@ -11,7 +11,7 @@ from cosim.analysis.summary.run_summary import counts_inside, times_inside
 from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.live_feed import LiveFeed
 from cosim.output.viewer.loop_feed import LoopFeed
-from cosim.output.viewer.run_recording import ERROR, MAP, QUEUE, SHARE, SIZE, open_recording
+from cosim.output.viewer.run_recording import ALL_ERRORS, ALL_SIZES, MAP, QUEUE, SHARE, open_recording
 from cosim.record.run_directory import RECORDING_FILE
 from cosim.record.run_record import RecordedRun
 from cosim.simulation.virtual_time import simulate_loops
@@ -51,7 +51,7 @@ def shown(folder: Path, count: int, *settings: str) -> tuple[RecordedRun, Chunks
 def test_all_loops_are_shown_as_from_the_record(tmp_path: Path, count: int, phase: str) -> None:
     run, chunks, said = shown(tmp_path, count, f"controller.phase={phase}")
     expected = loops_over_time(run)
-    for entity, values in ((ERROR, expected.errors), (SIZE, expected.states)):
+    for entity, values in ((ALL_ERRORS, expected.errors), (ALL_SIZES, expected.states)):
         t_ns, drawn = series(chunks, entity)
         assert (np.diff(t_ns) > 0).all()
         assert len(t_ns) == INTERVALS
@@ -82,7 +82,7 @@ def test_loops_in_detail_that_cannot_keep_up_are_given_up_and_named(
     monkeypatch.setattr("cosim.output.viewer.live_feed._CORE_SHARE", 1e-4)
     _, chunks, said = shown(tmp_path, 3)
     assert "in detail end here" in said[-1]
-    assert len(series(chunks, ERROR)[0]) == INTERVALS
+    assert len(series(chunks, ALL_ERRORS)[0]) == INTERVALS
     with pytest.raises(ValueError, match="at least one array"):  # nothing but static data
         series(chunks, f"{bp.loop_folder('p-1')}{bp.state_path('angle')}")
 
