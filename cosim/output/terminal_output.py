@@ -4,6 +4,7 @@
 """
 
 import re
+import shlex
 import shutil
 import sys
 from collections import defaultdict
@@ -258,18 +259,19 @@ def _event(number: int | None) -> str:
 def _where(outcome: Outcome, *, verbose: bool) -> Iterator[str]:
     """Yield the files of a run, or one line with the commands that show them."""
     run_dir, loop = outcome.run_dir, outcome.loop
+    argument = shlex.quote(str(run_dir))
     report = run_dir / file_of_loop(REPORT_FILE, loop)
     of_loop = "" if loop is None else f" --loop {loop}"
     if shares_network(outcome.summary):
-        yield f"one loop: {_program()} summary {run_dir} --loop NAME"
+        yield f"one loop: {_program()} summary {argument} --loop NAME"
     if not verbose:
         page = f"{report} and " if report.is_file() else ""
-        yield f"more: {page}{_program()} summary {run_dir}{of_loop} --verbose"
+        yield f"more: {page}{_program()} summary {argument}{of_loop} --verbose"
         return
     yield f"run directory  {run_dir}"
     if report.is_file():
         yield f"report         {report}"
-    shown = run_dir / RECORDING_FILE if loop is None else f"{run_dir}{of_loop}"
+    shown = run_dir / RECORDING_FILE if loop is None else f"{argument}{of_loop}"
     if (run_dir / RECORDING_FILE).is_file():
         yield f"view           {_program()} view {shown}"
 

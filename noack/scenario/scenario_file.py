@@ -197,7 +197,8 @@ def _attributed(lines: str, path: Path, keys: Sequence[str]) -> str:
             section, dot, _ = name.partition(".")
             if assignment.startswith(f"{section} = "):
                 nearest_name = nearest_key(name, (*SHORT, *known_keys(Scenario)))
-                hint = f"did you mean {nearest_name}?" if nearest_name else hint
+                if nearest_name and section not in toml_file.SYMBOLS:
+                    hint = f"did you mean {nearest_name}?"
                 return f"--set {name if dot else assignment}: unknown key; {hint}"
         if any(re.match(rf"{re.escape(name)}[.:=\s]", line["rest"]) for name in names):
             return f"--set {line['rest']}"

@@ -452,17 +452,18 @@ def _purpose(section: type[ScenarioSection] | None, key: str) -> str:
     return f" ({purpose})" if purpose else ""
 
 
-_SYMBOLS = {
+SYMBOLS = {
     "M": "M is network.mansd + 1; set network.mansd",
     "K": "K is model.gain",
     "x0": "x(0) is plant.initial_state",
+    "seed": "each random part has its own, in seeds",
 }
-"""Keys that people write as the paper's symbols."""
+"""Keys that people write, such as the paper's symbols."""
 
 
 def _nearest(key: str, section: type[ScenarioSection] | None) -> str:
-    if key in _SYMBOLS:
-        return _SYMBOLS[key]
+    if key in SYMBOLS:
+        return SYMBOLS[key]
     section_keys = sorted(section.model_fields) if section is not None else []
     close = difflib.get_close_matches(key, section_keys, n=1)
     return f"did you mean {close[0]}?" if close else f"the keys here are {', '.join(section_keys)}"

@@ -261,6 +261,8 @@ class _SmallestConstants(NamedTuple):
         gain = float(self.loop_gain[loop])
         if math.isinf(gain) and not self.is_spaced[loop]:
             return NoCertificateError("events may be arbitrarily close, so that any number may be in flight")
+        if gain < 1:
+            return NoCertificateError("its bounds are too large for floating point")
         return NoCertificateError(f"the loop gain of the errors is {gain:.3g}, not below 1", gain)
 
 
