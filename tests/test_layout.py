@@ -45,7 +45,7 @@ LINES = {
     "cosim/lab": 2005,
     "cosim/live": 4040,
     "cosim/measurement": 2975,
-    "cosim/output": 8720,
+    "cosim/output": 8725,
     "cosim/record": 3695,
     "cosim/simulation": 1990,
     "cosim/studies": 9570,
