@@ -138,6 +138,16 @@ def test_a_loop_at_its_setpoint_breaks_no_guarantee() -> None:
     assert verdict_of(run, certified)[1].text.startswith("guarantee kept: ")
 
 
+def test_more_losses_than_assumed_break_a_guarantee_that_is_not_enforced() -> None:
+    """Within the bound all the same: it was called kept, where a run's summary calls it broken."""
+    scenario = noack.load("lane_following", {"network.enforce_mansd": False, "network.mansd": 3})
+    run = exploration.explore(scenario)
+    fourth = next(i for i in range(3, len(run.delivered)) if not run.delivered[i - 3 : i + 1].any())
+    said = verdict_of(run, guarantee.certify(scenario))[1].text
+    at_s = run.event_s[fourth]
+    assert said == f"guarantee broken since {at_s:.3f} s: 4 consecutive updates lost, 3 allowed"
+
+
 def test_a_comparison_ends_where_one_of_the_runs_does() -> None:
     short, whole = (
         exploration.explore(noack.load("lane_following", {"horizon_s": horizon_s}))
