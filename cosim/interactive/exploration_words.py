@@ -12,6 +12,7 @@ from cosim.interactive.scenario_guarantee import CERTIFIED, VOID, Guarantee
 from cosim.output.run_verdict import Tone, VerdictLine, ending_line, state_text, transmission_line
 from noack.core.errors import ExitStatus
 from noack.core.number_format import number, percent
+from noack.guarantee.loss_guarantee import LossHistory
 from noack.runtime.life_cycle import HORIZON
 
 _MOST_SETTINGS, _LONGEST = 4, 28
@@ -137,6 +138,8 @@ def _guarantee_line(run: Exploration, guarantee: Guarantee | None) -> VerdictLin
     if guarantee.verdict != CERTIFIED:
         why = guarantee.reason if guarantee.verdict != VOID else f"{VOID}: {guarantee.reason}"
         return VerdictLine(f"guarantee not checkable: {why}", Tone.DOUBTFUL)
+    if not run.scenario.network.enforce_mansd and (broken := _loss_too_many(run)):
+        return VerdictLine(f"guarantee broken since {broken}", Tone.BAD)
     with np.errstate(all="ignore"):
         used = [
             values / np.exp(np.interp(run.t_s, guarantee.t_s, np.log(bound)))
@@ -150,3 +153,12 @@ def _guarantee_line(run: Exploration, guarantee: Guarantee | None) -> VerdictLin
         return VerdictLine(f"guarantee broken since {run.t_s[above][0]:.3f} s", Tone.BAD)
     share = percent(float(np.nanmax(np.append(used[0], 0.0))))
     return VerdictLine(f"guarantee kept: ‖e_c‖ was at most {share} of its bound", Tone.GOOD)
+
+
+def _loss_too_many(run: Exploration) -> str:
+    """Return when and how the losses first exceed what the bounds assume; empty if they never do."""
+    history = LossHistory(run.scenario.network.guarantee.rules)
+    for at_s, delivered in zip(run.event_s, run.delivered, strict=True):
+        for rule, value in history.add(not delivered):
+            return f"{at_s:.3f} s: {rule.violation(value)}"
+    return ""

@@ -11,7 +11,7 @@ from cosim.interactive.exploration import Exploration, Fact
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
 from noack.core.number_format import at_least, at_most, number
-from noack.scenario.resolution import resolve
+from noack.scenario.resolution import resolve, setpoint_of
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.assumptions import AssumptionStatus
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
@@ -51,6 +51,7 @@ class Guarantee:
     """Bound of ‖e_s‖; NaN without a certificate."""
     e_c: Vector
     x: Vector
+    """Bound of ‖x‖; at a set-point that of ‖x − x_r‖ plus ‖x_r‖."""
 
 
 class MarginRow(NamedTuple):
@@ -93,6 +94,8 @@ def certify(scenario: Scenario) -> Guarantee:
         if assumption.verdict != AssumptionStatus.HOLDS and assumption.why != reason
     )
     rows = () if certificate.constants is None else constant_rows([certificate], None, 0)
+    setpoint = setpoint_of(resolved)
+    distance = 0.0 if setpoint is None else float(np.linalg.norm(setpoint[0]))
     with np.errstate(all="ignore"):
         return Guarantee(
             VOID if certificate.constants is None else CERTIFIED,
@@ -102,7 +105,7 @@ def certify(scenario: Scenario) -> Guarantee:
             t_s,
             certificate.sensor_error(t_s),
             certificate.controller_error(t_s),
-            certificate.state(t_s),
+            certificate.state(t_s) + distance,
         )
 
 

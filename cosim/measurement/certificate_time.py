@@ -82,8 +82,13 @@ class CertificateTime:
 
 
 def certificate_time(trace: PacketTrace, scenario: Scenario) -> CertificateTime:
-    """Return for which share of the time the certificates of a scenario would have been void."""
+    """Return for which share of the time the certificates of a scenario would have been void.
+
+    Raises:
+        CallerError: the scenario changes settings during the run, on which the conditions depend.
+    """
     resolved = resolve(scenario)
+    resolved.coverage.require_constant()
     certificates: dict[str, str | None] = {}
     if not causes_of(resolved):
         certificates["any plant"] = "a loop with acknowledgements cannot have one"

@@ -159,7 +159,7 @@ def _losses(summary: RunSummary, loop: LoopSummary) -> Iterator[tuple[str, str]]
     yield "deliveries forced by the guarantee", str(loop.forced_deliveries)
     yield lost_row(loop.drops, loop.deliveries)
     if (rate := loop.loss_expected) is not None:
-        yield "  expected loss rate with the cap", f"{100 * rate:.3g} %"
+        yield "  expected loss rate", f"{100 * rate:.3g} %"
     causes = loop.drops_by_cause
     if set(causes) - {"dropped"}:
         for cause, count in causes.items():

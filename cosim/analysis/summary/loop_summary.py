@@ -120,7 +120,7 @@ class _Transmissions(TypedDict):
 
 def _transmissions(record: RunRecord) -> _Transmissions:
     """Counts and intervals of transmissions."""
-    scenario, events, outcomes = record.scenario, record.events(), packet_outcomes(record)
+    events, outcomes = record.events(), packet_outcomes(record)
     deliveries = record.columns(CONTROLLER_DELIVERY, "t_ns", "dropouts")
     intervals_s = np.diff(events["t_ns"]) * 1e-9
     longest = int(deliveries["dropouts"].max(initial=0))
@@ -129,7 +129,7 @@ def _transmissions(record: RunRecord) -> _Transmissions:
         "events": len(events),
         "deliveries": len(deliveries),
         "drops": int(outcomes.lost.sum()),
-        "loss_expected": None if changes_of(record) else expected_loss(scenario.network.link).rate,
+        "loss_expected": _expected_loss(record),
         "drops_by_cause": drops_by_cause(outcomes),
         "forced_deliveries": int((outcomes.fate == Fate.FORCED).sum()),
         "longest_loss_burst": max([*bursts, longest]),
@@ -140,6 +140,14 @@ def _transmissions(record: RunRecord) -> _Transmissions:
         "inter_event_median_s": _or_none(np.median, intervals_s),
         "inter_delivery_median_s": _or_none(np.median, np.diff(deliveries["t_ns"]) * 1e-9),
     }
+
+
+def _expected_loss(record: RunRecord) -> float | None:
+    """Return the predicted loss rate; None if it is not that of all losses of the whole run."""
+    if changes_of(record):
+        return None
+    expected = expected_loss(record.scenario.network.link)
+    return None if expected.note else expected.rate
 
 
 def _delays_s(record: RunRecord) -> Vector:

@@ -50,7 +50,7 @@ class SizeStatistics:
         return float(np.sqrt(self._squares / self._count)) if self._count else None
 
 
-def _setpoints(record: RunRecord) -> tuple[list[int], Matrix]:
+def setpoints_of(record: RunRecord) -> tuple[list[int], Matrix]:
     """Return when the set point changed, (k,), and the set points x_r, (k + 1, n); 0 is a row."""
     changes = changes_of(record)
     given = (setpoint_of(change) for change in (record.scenario, *(change.scenario for change in changes)))
@@ -183,7 +183,7 @@ class SignalStatistics:
     def for_summary(self) -> SignalFields:
         """Return norms of the state, of the errors, and of the residual of (I1)."""
         first, last, largest = None, None, None
-        since_ns, points = _setpoints(self._record)
+        since_ns, points = setpoints_of(self._record)
         for steps in self._record.source.batches(PLANT_STEP, ("t_ns", "x")):
             x = steps["x"]
             if points.any():

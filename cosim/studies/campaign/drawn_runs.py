@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from cosim.analysis.claims.claim_evaluation import RunClaims
+from cosim.analysis.summary.signal_statistics import setpoints_of
 from cosim.analysis.summary.summary_model import ClaimVerdict
 from cosim.record.align import align_tables, shares_update
 from cosim.record.run_events import packet_outcomes
@@ -62,7 +63,7 @@ class SampledWork:
         seed: of the draws.
         Q: weight of the state in the cost, (n, n); None: the identity.
         R: weight of the input, (m, m); None: the identity.
-        settle: a run has settled when ‖x‖ stays at or below this share of ‖x(0)‖.
+        settle: a run has settled when ‖x − x_r‖ stays at or below this share of its first value.
         most_events: a run with more events is stopped.
     """
 
@@ -102,8 +103,14 @@ class SampledWork:
             row["status"] = TOO_MANY_EVENTS
             return
         row["status"] = OK
-        if norms[-1] <= self.settle * norms[0]:
-            row["settling_s"] = t_s[norms > self.settle * norms[0]].max(initial=0.0)
+        since_ns, points = setpoints_of(record)
+        from_setpoint = norms
+        if points.any():
+            own_points = points[np.searchsorted(since_ns, steps["t_ns"], "right")]
+            from_setpoint = np.linalg.norm(steps["x"] - own_points, axis=1)
+        settled = self.settle * from_setpoint[0]
+        if from_setpoint[-1] <= settled:
+            row["settling_s"] = t_s[from_setpoint > settled].max(initial=0.0)
         row["final_norm"] = norms[-1]
         row["cost"] = self._cost(record)
         aligned = align_tables(record)

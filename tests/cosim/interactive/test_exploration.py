@@ -127,6 +127,27 @@ def test_a_verdict_says_what_became_of_the_run_and_of_its_guarantee() -> None:
     assert said == f"guarantee not checkable: {missing.reason}"
 
 
+def test_a_loop_at_its_setpoint_breaks_no_guarantee() -> None:
+    """The certificate bounds ‖x − x_r‖, which decays; ‖x‖ stays near ‖x_r‖ = 20."""
+    run = exploration.explore_or_simulate(
+        noack.load("lane_following", {"controller.setpoint": [0.0, 0.0, 0.0, 20.0]})
+    )
+    certified = guarantee.certify(run.scenario)
+    assert run.x_norm[-1] == pytest.approx(20.0, rel=0.01)
+    assert 20.0 < certified.x[-1] < 25.0
+    assert verdict_of(run, certified)[1].text.startswith("guarantee kept: ")
+
+
+def test_more_losses_than_assumed_break_a_guarantee_that_is_not_enforced() -> None:
+    """Within the bound all the same: it was called kept, where a run's summary calls it broken."""
+    scenario = noack.load("lane_following", {"network.enforce_mansd": False, "network.mansd": 3})
+    run = exploration.explore(scenario)
+    fourth = next(i for i in range(3, len(run.delivered)) if not run.delivered[i - 3 : i + 1].any())
+    said = verdict_of(run, guarantee.certify(scenario))[1].text
+    at_s = run.event_s[fourth]
+    assert said == f"guarantee broken since {at_s:.3f} s: 4 consecutive updates lost, 3 allowed"
+
+
 def test_a_comparison_ends_where_one_of_the_runs_does() -> None:
     short, whole = (
         exploration.explore(noack.load("lane_following", {"horizon_s": horizon_s}))

@@ -346,3 +346,15 @@ def test_the_certificates_of_the_scenario_are_named() -> None:
     assert slow_void.kept[DELAY].startswith("kept: an update was in the network for 9.744 s, 9.8")
     acknowledged = certificate_time(trace, noack.load("lane_acknowledged"))
     assert all(reason is not None for reason in acknowledged.certificates.values())
+
+
+def test_conditions_that_change_during_the_run_are_not_compared_with_a_trace() -> None:
+    """With M − 1 = 8 at the start and 2 from 1 s on, 4 losses at 3 s were 'kept: 8 allowed'."""
+    sent_ns = np.arange(100) * 100_000_000
+    received_ns = sent_ns + 1_000_000
+    received_ns[30:34] = LOST_NS
+    trace = PacketTrace(np.arange(100), sent_ns, received_ns)
+    changes = [{"at_s": 1.0, "set": {"network.mansd": 2}}]
+    scenario = noack.load("lane_following", {"network.mansd": 8, "changes": changes})
+    with pytest.raises(CallerError, match="changes: needs settings that stay the same"):
+        certificate_time(trace, scenario)

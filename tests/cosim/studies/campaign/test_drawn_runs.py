@@ -51,6 +51,17 @@ def record_of(sampled: SampledWork, draw: int) -> RunRecord:
     return simulate(drawn_scenario(sampled.scenario, sampled.seed, draw))
 
 
+def test_a_run_settles_at_its_setpoint() -> None:
+    """‖x‖ stays near ‖x_r‖ = 20, so no such run settled by ‖x‖."""
+    sampled = work("controller.setpoint=[0.0, 0.0, 0.0, 20.0]", "horizon_s=20.0")
+    (row,) = sampled.run(range(1))
+    steps = record_of(sampled, 0)["plant_step"]
+    distances = np.linalg.norm(steps["x"] - [0.0, 0.0, 0.0, 20.0], axis=1)
+    above = steps["t_ns"][distances > 0.5 * distances[0]]
+    assert row["settling_s"] == above[-1] / 1e9
+    assert row["final_norm"] == pytest.approx(20.0, rel=0.01)
+
+
 @pytest.mark.parametrize("overrides", [(), (LATE,), NEVER, ("mode=zoh",)])
 def test_a_row_agrees_with_the_summary_of_the_run(overrides: tuple[str, ...]) -> None:
     sampled = work(*overrides)
