@@ -59,7 +59,7 @@ from noack.theory.certificates.conditions import allowed_conditions
 
 
 class _ClockErrors:
-    """Gathers the recorded bounds of the clocks' errors; each holds from the time of its row on."""
+    """Gathers the recorded bounds of the clocks' errors; each holds from ``t_ns`` of its row on."""
 
     def __init__(self, settings: ClocksSection) -> None:
         self.largest_s = settings.largest_error_us * 1e-6

@@ -169,7 +169,7 @@ class Metrics(ScenarioSection):
     R: MatrixRows | None = None
     """Weight of the input in the cost, by rows; by default the identity."""
     settle: Annotated[FiniteFloat, Field(gt=0, lt=1)] = 0.02
-    """A run has settled when ‖x‖ stays below this share of ‖x(0)‖."""
+    """A run has settled when ‖x − x_r‖ stays below this share of its first value; x_r is 0 by default."""
     most_events: Annotated[int, Field(ge=1, le=10_000_000)] = 100_000
     """A run with more transmissions is stopped."""
     count_from_s: NonNegative = 0.0
