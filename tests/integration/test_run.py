@@ -116,7 +116,7 @@ def test_the_recording_shows_the_record(finished: Finished, live: RunRecord) -> 
         if blueprint.TIMELINE in batch.schema.names:
             rows[chunk.entity_path.removeprefix("/")] += batch.num_rows
     (summary,) = finished.summary["loops"]
-    assert rows[blueprint.FORCED] == summary["forced_deliveries"]
+    assert rows[blueprint.RECEPTION_FORCED] == summary["forced_deliveries"]
     assert rows[blueprint.RECEPTION] == summary["deliveries"] - summary["forced_deliveries"]
     assert rows[blueprint.DROP] == summary["drops"]
     assert rows[blueprint.EVENT] == summary["events"]
