@@ -456,9 +456,9 @@ SYMBOLS = {
     "M": "M is network.mansd + 1; set network.mansd",
     "K": "K is model.gain",
     "x0": "x(0) is plant.initial_state",
-    "seed": "each random part has its own, in seeds",
+    "seed": "seeds has one for each random part",
 }
-"""Keys that people write, such as the paper's symbols."""
+"""What is said of unknown keys that people write, such as the paper's symbols."""
 
 
 def _nearest(key: str, section: type[ScenarioSection] | None) -> str:

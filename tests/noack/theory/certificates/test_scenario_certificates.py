@@ -113,6 +113,8 @@ def test_a_void_certificate_gives_the_reason_and_no_bounds() -> None:
         "there is a certificate", AssumptionStatus.VIOLATED,
     )  # fmt: skip
     assert "not below 1" in str(certify(shipped(), NetworkConditions(4, 0.5, 0.5)).void)
+    enormous = shipped("lane_following", "trigger.beta=1e308")
+    assert "too large for floating point" in str(certify(enormous, ideal_conditions(enormous)).void)
 
 
 LOOPS = 'loops=[{name="loop", count=2}]'
