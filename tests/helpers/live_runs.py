@@ -221,12 +221,11 @@ class Running:
         summary = json.loads(stdout)
         return Finished(self.process.returncode, summary, stderr, (self.runs / "latest").resolve())
 
-    def finish_unstarted(self) -> str | None:
-        """Return the error of a run that never started; None: it started."""
+    def finish_unstarted(self) -> str:
+        """Return the error of a run that never started."""
         stdout, _ = self.process.communicate(timeout=PATIENCE_S)
         assert self.process.returncode == 1
-        error: str | None = json.loads(stdout).get("error")
-        return error
+        return str(json.loads(stdout)["error"])
 
     def left_behind(self) -> list[psutil.Process]:
         _, alive = psutil.wait_procs(self._children, timeout=PATIENCE_S)

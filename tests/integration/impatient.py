@@ -1,14 +1,28 @@
 """``python -m tests.integration.impatient COMMAND…``: noack with short time-outs.
 
-For tests of what follows a time-out; noack's own are long, because machines stall.
+For tests of what follows a time-out; noack's own are long, because machines stall. The process of the
+role in the environment's ``FROZEN``, if any, stops before it requests admission.
 """
 
-from noack.runtime import life_cycle
+import os
+import signal
 
+from noack.runtime import join_run, life_cycle
+
+
+def stop_if_frozen(title: str) -> None:
+    """Set the title of a process, and stop it if it is the frozen one."""
+    _setproctitle(title)
+    if title == f"noack {os.environ.get('FROZEN')}":
+        os.kill(os.getpid(), signal.SIGSTOP)
+
+
+_setproctitle = join_run.setproctitle
 
 def main() -> None:
     """Run a command; the processes that it forks have the same time-outs."""
     life_cycle.LOST_AFTER_S, life_cycle.LAUNCHED_LOST_S = 4.0, 8.0
+    join_run.setproctitle = stop_if_frozen
     from cosim.cli import main as noack  # it copies the time-outs
     from cosim.live import launcher  # the same
 

@@ -258,7 +258,7 @@ def test_clicks_reach_a_run_while_the_viewer_draws_and_ctrl_c_keeps_the_record_o
 ) -> None:
     with Served(tmp_path) as server:
         address = server.address.partition("?")[0] + "?scenario=lane_following&horizon_s=100"
-        page = Page(with_card, address, size=(640, 360))  # the viewer's drawing costs by the pixel
+        page = Page(with_card, address, size=(320, 200))  # the viewer's drawing costs by the pixel
         page.click("live", "button")
         page.press_button("run live")
         page.wait(f"{TEXT}.includes('of 100 s')")
