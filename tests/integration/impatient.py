@@ -19,6 +19,7 @@ def stop_if_frozen(title: str) -> None:
 
 _setproctitle = join_run.setproctitle
 
+
 def main() -> None:
     """Run a command; the processes that it forks have the same time-outs."""
     life_cycle.LOST_AFTER_S, life_cycle.LAUNCHED_LOST_S = 4.0, 8.0
