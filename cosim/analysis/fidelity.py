@@ -53,6 +53,7 @@ from noack.protocol.record_tables import (
 )
 
 _LEAST_MEASUREMENTS = 10
+"""Fewer measurements than these are not compared."""
 _AFTER_ANY_TIME_NS = 2**62
 """Later than any time of a run; differences of times still fit 64 bits."""
 
@@ -208,6 +209,7 @@ rounding does so too."""
 _SPLIT_PERIODS = 10
 """Two event sequences differ from the first event that is further apart, in measurements."""
 _LARGEST = 1e100
+"""Largest entry of x of a run that did not diverge: its square is finite."""
 _STEPS_AT_THE_END, _EVENTS_AT_THE_END = 100_000, 10_000
 """Longer runs are compared only on request: a comparison keeps over a kilobyte for each step."""
 _STAGES = ("sampling", "delay", "held actuation", "residual")

@@ -223,6 +223,7 @@ _LIMIT = 18.0
 _STARTS = ((0.02, 0.5), (0.2, 0.8), (0.0, 0.5), (0.0, 0.95), (0.05, 0.999))
 """Loss probabilities of the two states, from which the search starts."""
 _SEARCHES = 5
+"""Starting points, the likeliest ones, from which the likelihood is maximised."""
 
 
 @dataclass(frozen=True)

@@ -49,11 +49,15 @@ from noack.theory.certificates.scenario_certificates import certify, certify_box
 from noack.trigger.decaying import DecayingSettings
 
 DRAWS = 200
+"""Draws of which the mean cost is estimated."""
 _ALPHAS = (1.0, 0.5)
 """Factors of α of the starts."""
 _STARTS = 3
+"""Best candidates from which the search descends."""
 _FORBIDDEN = 1e3
+"""Objective of a loop that may not be chosen; those of others are smaller."""
 _MOST_M = 1000
+"""Largest M that is examined by default."""
 
 
 class EventLoop(NamedTuple):

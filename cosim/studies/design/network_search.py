@@ -45,11 +45,15 @@ COSTS_OF_INPUT = np.geomspace(1e-3, 1e3, 13)
 _LONGER = 1.02
 """Ratio of successive required periods, where measurements are close enough."""
 _MOST_PERIODS = 400
+"""Most periods that are tried."""
 _MOST_M = 16
+"""Largest M that is examined by default."""
 _SLACK = 0.002
 """The search wants log growth below −_SLACK: the margin of a loop at the limit takes long."""
 _STARTS = 4
+"""Best candidates from which the search descends."""
 _UNSTABLE = 1e3
+"""Scale of the objective of loops that are not stable; those of others are smaller."""
 
 
 class GainCandidate(NamedTuple):
