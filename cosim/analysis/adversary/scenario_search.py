@@ -125,6 +125,7 @@ def _find_sampled(
     most_nodes: int,
     report: SearchReport,
 ) -> WorstRun:
+    """Search the loop as the processes run it; with bounded disturbances, alternate with these."""
     began_s = time.monotonic()
     flow = SampledFlow(SampledLoop(resolved), objective, certificate)
     own_run = run_sampled(flow, network_fates(resolved))
@@ -200,6 +201,7 @@ def _find_continuous(
     most_nodes: int,
     report: SearchReport,
 ) -> WorstRun:
+    """Search the paper's loop, and confirm the worst pattern by an exact run."""
     began_s, horizon_s = time.monotonic(), resolved.horizon_s
     constants = certificate.constants
     system = continuous_loop_of(resolved)
