@@ -30,7 +30,7 @@ from noack.traces.packet_trace import PacketTrace
 
 Reals = NDArray[np.float64]
 QUANTILES = (0.5, 0.9, 0.99, 0.999)
-"""Shares of the windows or bursts for which an M is given."""
+"""Shares of bursts and packets for which an M is given."""
 SHARES = (0.0, 0.05, 0.5, 0.9, 0.95, 0.99, 0.999, 1.0)
 """Shares of the packets for which a delay is given."""
 _MOST_LAGS, _LARGEST_LAG = 40, 1000
