@@ -1,6 +1,5 @@
 """The documentation: its words and tables against the code, CITATION.cff, and the built site."""
 
-import ipaddress
 import json
 import re
 import subprocess
@@ -11,7 +10,6 @@ from pathlib import Path
 from typing import Any, get_args
 
 import pytest
-import typer
 import yaml
 from pydantic import BaseModel
 from typer.main import get_command
@@ -30,9 +28,6 @@ from noack.impairments.constraints import CONSTRAINTS
 from noack.impairments.disciplines import DISCIPLINES
 from noack.impairments.kinds import IMPAIRMENTS
 from noack.impairments.loss_models import LOSS_MODELS
-from noack.protocol.roles import LOOP_ROLES
-from noack.runtime.command_line import Parser
-from noack.runtime.join_run import add_options
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from noack.scenario.sections import POLICIES, AnyDisturbance, AnyObserver
@@ -247,45 +242,6 @@ def test_no_phrase_of_the_list_is_left() -> None:
 
 def test_the_glossary_of_the_documentation_is_that_of_the_program() -> None:
     assert glossary() in (ROOT / "docs/glossary.md").read_text(encoding="utf-8")
-
-
-COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "compose.yaml").read_text())
-SERVICES: dict[str, Any] = COMPOSE["services"]
-
-
-@pytest.mark.parametrize("name", ["recorder", *LOOP_ROLES])
-def test_each_process_has_a_container_with_a_command_of_noack(name: str) -> None:
-    command, *arguments = SERVICES[name]["command"]
-    assert command == {"recorder": "record"}.get(name, name)
-    if command == "netem":
-        add_options(parser := Parser(allow_abbrev=False))
-        assert parser.parse_args(arguments).invitation
-        return
-    typer_command = typer.main.get_command(app).commands[command]  # type: ignore[attr-defined]
-    context = typer_command.make_context(command, arguments)
-    assert str(context.params["invitation"]) == "/invitation/run.json"
-
-
-def test_the_recorder_listens_on_its_own_address() -> None:
-    recorder, (config,) = SERVICES["recorder"], COMPOSE["networks"]["loop"]["ipam"]["config"]
-    own = recorder["networks"]["loop"]["ipv4_address"]
-    command = recorder["command"]
-    assert command[command.index("--listen") + 1].partition(":")[0] == own
-    assert ipaddress.ip_address(own) in ipaddress.ip_network(config["subnet"])
-
-
-def test_volumes_and_folders_are_those_of_the_image() -> None:
-    image = (ROOT / "Containerfile").read_text()
-    for service in SERVICES.values():
-        for volume in service["volumes"]:
-            name, _, folder = volume.partition(":")
-            assert name in COMPOSE["volumes"]
-            assert re.search(rf"mkdir -p.* {folder}\b", image)
-    for copied in re.findall(r"^COPY (\S+) ", image, re.MULTILINE):
-        assert (ROOT / copied).exists()
-    python = re.search(r"^FROM \S+/python:(\d+)\.(\d+)", image, re.MULTILINE)
-    assert python is not None
-    assert tuple(map(int, python.groups())) >= (3, 11)
 
 
 # --- the site -------------------------------------------------------------------------------------

@@ -42,6 +42,7 @@ SCHEDULE = "schedule"
 """The scenario's rates, and the lateness that it allows."""
 
 MOST_LATE = 1000
+"""Most steps of lateness that may be allowed."""
 
 
 class Certificates:
@@ -372,8 +373,8 @@ def constant_rows(
     def constant(name: str, text: Callable[[float | None], str] = at_most) -> list[str]:
         return row(lambda c: getattr(c.constants, name), text)
 
-    def after(name: str, norm_name: str) -> list[str]:
-        return row(lambda c: getattr(getattr(c, norm_name), name, None))
+    def part(name: str, part_name: str) -> list[str]:
+        return row(lambda c: getattr(getattr(c, part_name), name, None))
 
     delta_2 = state_2 = spacing_2 = NONE
     if theorem is not None:
@@ -398,8 +399,8 @@ def constant_rows(
         for quantity, name in _PERSISTENT.items():
             if any(getattr(c.persistent_constants, name, None) for c in certificates):
                 norm = f"‖{w}{quantity}‖" if w and quantity in _WEIGHTED else f"‖{quantity.strip('()')}‖"
-                yield f"+ without decay: {norm}", after(name, "persistent_constants"), NONE
+                yield f"+ without decay: {norm}", part(name, "persistent_constants"), NONE
     if any(c.floor_constants for c in certificates):
         yield "floor reached at, s", row(lambda c: c.floor_from_s), NONE
-        yield f"bound of ‖{w}e_c‖/ε from then on", after("delta", "floor_constants"), NONE
-        yield "bound of ‖x‖ from then on", after("state", "floor_constants"), NONE
+        yield f"bound of ‖{w}e_c‖/ε from then on", part("delta", "floor_constants"), NONE
+        yield "bound of ‖x‖ from then on", part("state", "floor_constants"), NONE

@@ -53,6 +53,7 @@ from noack.protocol.record_tables import (
 )
 
 _LEAST_MEASUREMENTS = 10
+"""Fewer measurements than these are not compared."""
 _AFTER_ANY_TIME_NS = 2**62
 """Later than any time of a run; differences of times still fit 64 bits."""
 
@@ -208,6 +209,7 @@ rounding does so too."""
 _SPLIT_PERIODS = 10
 """Two event sequences differ from the first event that is further apart, in measurements."""
 _LARGEST = 1e100
+"""Largest entry of x of a run that did not diverge: its square is finite."""
 _STEPS_AT_THE_END, _EVENTS_AT_THE_END = 100_000, 10_000
 """Longer runs are compared only on request: a comparison keeps over a kilobyte for each step."""
 _STAGES = ("sampling", "delay", "held actuation", "residual")
@@ -344,12 +346,14 @@ def compute_fidelity(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelit
     system = continuous_loop_of(scenario)
     period_s = schedule.period_ns * 1e-9
     t_s = np.flatnonzero(schedule.measured).astype(np.float64) * period_s
+    # The chain of simulations, from the ideal loop to the live run.
     ideal = _ideal(system, live, float(t_s[-1]), max_events, known_start=known)
     simulated, event_times_s = _simulate_stages(system, schedule, known)
     states = [ideal.at(t_s).x, *simulated, live.x]
     events_s = [ideal.event_s, *event_times_s, live.event_s]
     if not all(np.abs(x).max() < _LARGEST for x in states):
         raise IncomparableError("a simulation of the run diverges")
+    # What each one changes, and what is left at the end.
     whole, effects = live.x - states[0], [after - before for before, after in pairwise(states)]
     total, residual = _difference(whole), _difference(effects[-1])
     if residual.rms > EXPLAINED * total.rms:

@@ -25,7 +25,9 @@ from noack.theory.margins.loss_margin import LossMargin, Stability, capped, unca
 from noack.theory.random_losses.almost_sure_growth import RandomGrowth, random_growth
 
 MOST_M = 16
+"""Largest M that is examined by default."""
 _LARGEST_EFFORT = 1e6
+"""Largest factor of the work that may be asked for."""
 
 MarginProgress = Callable[[str], None]
 """Receives what is examined next."""

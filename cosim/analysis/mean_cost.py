@@ -151,6 +151,7 @@ def find_mean_cost(resolved: Scenario, Q: Matrix | None = None, R: Matrix | None
 
 
 def _cost_under(resolved: Scenario, periods: LoopPeriods, guarantee: LossGuarantee) -> CostUnder:
+    """Return the moments under a guarantee; raise NotPredictableError if the losses are no chain."""
     outcomes = loss_process(resolved.network.link).outcomes(guarantee)
     if resolved.network.initial_sync == "known_state":  # nothing is sent at t = 0
         outcomes = outcomes.after_pause()

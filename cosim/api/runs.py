@@ -26,8 +26,8 @@ with lazy_modules():
     from cosim.live import finalize as run_end
     from cosim.live import launcher
     from cosim.live.monitoring import progress as progress_display
-    from cosim.output import export as exports
     from cosim.output import result_tables, run_tables
+    from cosim.output.export import export_formats
     from cosim.output.figures import figure_drawing, figure_files, figure_format, network_figures, run_figures
     from cosim.record import data_frames, run_record, table_files
     from cosim.simulation import virtual_time
@@ -244,7 +244,9 @@ class Run:
             NoackError: the path has another ending, or a file cannot be written.
         """
         self.summary  # noqa: B018  # of a temporary run, it is computed now
-        return exports.export_run(self.directory, Path(path), loop=self._loop, certificates=certificates)
+        return export_formats.export_run(
+            self.directory, Path(path), loop=self._loop, certificates=certificates
+        )
 
     def archive(self, path: PathLike) -> Path:
         """Write the run as one file, which :func:`noack.reproduce` repeats; return its path.

@@ -20,7 +20,9 @@ LOOP_PROCESSES = 5
 PLENTY_OF_DATAGRAMS = 4096
 """A receive buffer of this size covers a stall of seconds at any rate of the shipped scenarios."""
 LEAST_WRITE_BYTES_PER_S = 20e6
+"""A slower disk may not keep up with the record of a run."""
 _SLOW_TIMER_NS = 1_000_000
+"""A timer with this resolution is too coarse for periods of milliseconds."""
 _SETTINGS = {
     "sched_fifo": "SCHED_FIFO",
     "memory_lock": "locked memory",

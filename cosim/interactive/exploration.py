@@ -58,7 +58,9 @@ DRAWS = 200
 LOW, HIGH = 0.05, 0.95
 """Quantiles at the edges of a band."""
 _BAND_POINTS = 121
+"""Times at which the bands over the draws are computed."""
 _MOST_DRAW_EVENTS = 20_000
+"""A draw with more events than these is given up."""
 
 
 class Fact(NamedTuple):

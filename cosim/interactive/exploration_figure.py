@@ -42,6 +42,7 @@ _SMALLEST = 1e-6
 _DECADES = 7
 """Below and above the largest value on a logarithmic axis; a bound may be far above the run."""
 _HEIGHTS_IN = (1.96, 1.96, 1.4, 1.68)
+"""Heights of the panels, from the top."""
 
 
 class ExploredRun(NamedTuple):

@@ -16,7 +16,9 @@ from noack.guarantee.loss_guarantee import LossHistory
 from noack.runtime.life_cycle import HORIZON
 
 _MOST_SETTINGS, _LONGEST = 4, 28
+"""Settings that are named, and characters of a value that is shown."""
 _NEARLY = 1.001
+"""Runs whose ends differ by a smaller factor are compared as equally long."""
 _END = "‖x‖ at the end"
 _NOT_COMPARED = ("name", "ports", "recovery", "realtime")
 """Tables and keys that do not change what the loop does."""

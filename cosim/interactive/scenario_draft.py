@@ -30,6 +30,7 @@ _SOURCE = "scenario"
 _LINE = re.compile(rf"^{_SOURCE}: ([\w.-]+)(?:: | = )")
 _BASE = "scenario"
 _MOST_QUERY = 16_384
+"""Most characters of an address."""
 _ABSENT = object()
 
 

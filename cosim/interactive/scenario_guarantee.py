@@ -25,6 +25,7 @@ from noack.theory.certificates.scenario_certificates import own_plant_scope
 
 CERTIFIED, VOID, NOT_COVERED = "certified", "no certificate", "not covered"
 _POINTS = 121
+"""Times at which the bounds are drawn."""
 
 
 class OpenAssumption(NamedTuple):

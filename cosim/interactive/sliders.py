@@ -17,12 +17,17 @@ from noack.scenario.sections import POLICIES
 from noack.settings.section import Table
 
 _STEPS = 200
+"""Steps of a logarithmic slider."""
 _DECADE = 10.0
+"""Factor from the middle of a slider to its ends."""
 _MOST_LOSSES, _MOST_WINDOW = 20, 40
+"""Ends of the sliders for consecutive losses, and for the window of a constraint."""
 _BELOW = 0.99
 """The largest share of a limit that must not be reached."""
 _SEEDS = 200
+"""Largest seed of a slider."""
 _MOST_MODEL_ERROR = 20.0
+"""Largest multiple of the uncertainty."""
 _NUMBERS = ("number", "integer")
 _LOSSES: Mapping[str, Mapping[str, object]] = {
     "bernoulli": {"probability": 0.5},

@@ -53,9 +53,11 @@ with lazy_modules():  # asyncio and TLS
     from cosim.live import remote_access
 
 _STOP_TIMEOUT_S = 15.0
+"""Wall time that the processes of a stopped run have to end."""
 DEFAULT_START_S = 30.0
 """Wall time within which all processes have to be ready, if the scenario gives none."""
 _MOST_SLOWED = 20.0
+"""Factor by which a loaded machine extends a limit at most."""
 _OVERLOADED = 1.5
 """From this slow-down on, the message names the load as the likely cause."""
 _UNTIL_THE_END = 3

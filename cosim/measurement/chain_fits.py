@@ -117,6 +117,7 @@ class LossLikelihood:
         lost = np.array(losses)
         moves = np.array([[1 - to_bad, to_bad], [to_good, 1 - to_good]])
         start = np.array([to_good, to_bad]) / (to_bad + to_good)
+        # A factor for each stretch of deliveries and the burst after it, apart from its scale.
         log_delivering, delivering = _powers(moves * (1 - lost), self._deliveries.astype(float))
         log_losing, losing = _powers(moves * lost, self._losses.astype(float))
         log_loss, loss = log_losing[:, self._loss_of], losing[..., self._loss_of]
@@ -125,6 +126,7 @@ class LossLikelihood:
             loss = np.where(self._left_out, start[None, :, :, None], loss)
         factors = _products(delivering[..., self._delivery_of[:-1]], loss)
         total = log_delivering[:, self._delivery_of].sum(axis=1) + log_loss.sum(axis=1)
+        # Their product, by pairs: it would underflow, so each round is scaled.
         with np.errstate(divide="ignore", invalid="ignore"):
             while (count := factors.shape[-1]) > 1:
                 odd = factors[..., count - count % 2 :]
@@ -223,6 +225,7 @@ _LIMIT = 18.0
 _STARTS = ((0.02, 0.5), (0.2, 0.8), (0.0, 0.5), (0.0, 0.95), (0.05, 0.999))
 """Loss probabilities of the two states, from which the search starts."""
 _SEARCHES = 5
+"""Starting points, the likeliest ones, from which the likelihood is maximised."""
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,9 @@ LEVEL = 0.95
 _ALLOWED = float(chdtri(1, 1 - LEVEL)) / 2
 """Loss of log-likelihood at the ends of an interval."""
 _TOLERANCE = 0.01
+"""Tolerance of an end of an interval, in the units of the search."""
 _LONGEST_STEP = 4.0
+"""Largest step outwards of the search for an end."""
 _DIFFERENCE = 1e-5
 """Distance of the points from which a gradient is computed."""
 

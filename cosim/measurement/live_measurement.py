@@ -118,6 +118,7 @@ def _log(line: str) -> None:
 
 _LONGEST_WAIT_S = 0.1
 _BATCH = 256
+"""Most datagrams that are read at once."""
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
 
 

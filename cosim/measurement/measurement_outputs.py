@@ -270,6 +270,7 @@ _BURSTS, _OUTAGES, _DELAYS = palette.SENSOR, palette.CONTROLLER, palette.PLANT
 _LOST, _LIMIT = palette.LOST, palette.CERTIFIED
 _HEIGHT_IN = 2.4
 _WINDOWS = 40
+"""Most bars of a histogram, and most windows of a curve."""
 _LONGEST_WINDOW = 1000
 
 

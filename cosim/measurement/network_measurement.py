@@ -30,10 +30,15 @@ from noack.traces.packet_trace import PacketTrace
 
 Reals = NDArray[np.float64]
 QUANTILES = (0.5, 0.9, 0.99, 0.999)
+"""Shares of bursts and packets for which an M is given."""
 SHARES = (0.0, 0.05, 0.5, 0.9, 0.95, 0.99, 0.999, 1.0)
+"""Shares of the packets for which a delay is given."""
 _MOST_LAGS, _LARGEST_LAG = 40, 1000
+"""Number of distances of a correlation, and the largest one, in packets."""
 _FEWEST_PAIRS = 30
+"""Pairs of packets below which no correlation is given."""
 _FEW_BURSTS = 20
+"""Fewer bursts than these are called few."""
 _MOST_RANKED = 1_000_000
 """Number of packets, the first ones, of which correlations are computed."""
 

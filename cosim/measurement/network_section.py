@@ -20,6 +20,7 @@ Form = Literal["trace", "model"]
 _SAMPLES = 101
 """Number of delay quantiles of a model."""
 _MOST_CORRELATION = 0.99
+"""The emulator requires less than 1."""
 
 
 def write_network(measurement: NetworkMeasurement, path: Path, form: Form) -> list[Path]:

@@ -61,8 +61,10 @@ def late_sends(sent: int, late: int, longest_ns: int) -> str:
 
 
 _ENDS = 20
+"""Number of times that END is sent; some may be lost."""
 _END_PERIOD_NS = NS_PER_S // 10
 _LATE_NS = 1_000_000
+"""A datagram that leaves later than this after its time is reported."""
 _FORWARD, _REVERSE, _UNKNOWN = "forward", "reverse", "unknown"
 _ANSWERS_AT_ONCE = 10_000
 

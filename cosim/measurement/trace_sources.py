@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 _HEAD_BYTES = 64
+"""Bytes by which a file is recognised."""
 _OTHERS = ("fate files", "run directories", "delivery opportunities")
 
 
@@ -146,6 +147,7 @@ def _from_captures(paths: Sequence[Path], options: SourceOptions) -> PacketTrace
 _FLOW = ("link", "direction", "flow")
 _COLUMNS = (*_FLOW, "packet", "arrival_ns", "fate", "delay_ns", "copy_delay_ns", "bit", "copy_bit")
 _LATEST_NS = 2**61
+"""Later times, whose differences may not fit 64 bits, are refused."""
 
 
 def is_fate_file(head: bytes) -> bool:

@@ -47,6 +47,7 @@ _TYPESET = re.compile(
     r"|(?<=(?<![A-Za-z0-9_])[A-Za-z])_(?P<letter>[A-Za-z0-9])(?!\w)"
 )
 _DEEPEST, _LONGEST_SCRIPT = 4, 200
+"""Limits of nested and of long sub- and superscripts; beyond, the text stays as it is."""
 
 
 class ResultTable(NamedTuple):

@@ -47,6 +47,7 @@ _SCHEDULE = {
     "start_s": "until the first input",
 }
 _FEW = 3
+"""Rows about the network in a table of a run's loops."""
 _SHORT = (
     "lost in the network", "actuations lost", "longest loss burst (", "deliveries forced",
     "shortest inter-event", "median ", "‖x‖", "maximum ‖e_s‖", "sensor-to-controller",

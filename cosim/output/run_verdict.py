@@ -21,7 +21,9 @@ _NAMED = 3
 SETTLED_SHARE = 0.1
 """A loop is stable if ‖x‖ falls to this share of its largest value."""
 _MOST_VIOLATIONS = 5
+"""Violations that are listed."""
 _MOST_GROWTH, _MOST_LATE = 10.0, 0.01
+"""‖x‖ at the end over that at the start, and share of late steps, from which on a run is warned of."""
 
 
 class Tone(StrEnum):

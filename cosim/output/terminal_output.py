@@ -47,6 +47,7 @@ _ASSUMPTION_STYLES: dict[str, str] = {
     AssumptionStatus.ASSUMED: "cyan",
 }
 _MOST_LOOPS, _MOST_REASONS = 12, 3
+"""Loops in the table, and reasons below it, without --verbose."""
 _NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 """A number in a reason."""
 

@@ -209,6 +209,7 @@ def _threshold(measurements: Rows) -> Reals:
 def _controller_states_at(
     flow: ModelFlow, track: ControllerTrack, t_ns: Times, until_ns: int
 ) -> tuple[Reals, NDArray[np.int64]]:
+    """Return x_c, (k, n), and the number of its newest update, (k,), at k times."""
     index = np.searchsorted(track.model_ns, t_ns, side="right") - 1
     known = (index >= 0) & (t_ns <= until_ns)
     received = np.where(known, track.received[index], NO_SEQUENCE)
@@ -250,6 +251,7 @@ def _short_run(record: RunRecord) -> Sequence[AlignedPart]:
 
 
 def _align(record: RunRecord) -> Iterator[AlignedPart]:
+    """Align measurements as soon as the controller's states up to their time are there."""
     scenario, loop, flow = record.scenario, record.loop, model_flow_of(record)
     acknowledged = scenario.protocol.acknowledges
     track = initial_track(scenario)

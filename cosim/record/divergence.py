@@ -29,7 +29,9 @@ from noack.scenario.scenario import Scenario
 
 GROWTH = 1000.0
 _STILL_GROWING = 2.0
+"""Factor by which the last tenth must exceed the middle of the run."""
 _LEAST_SAMPLES = 20
+"""Shorter records are not judged."""
 
 
 class Divergence(NamedTuple):

@@ -25,12 +25,19 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.roles import GENERATION
 
+if TYPE_CHECKING:
+    from cosim.record.table_files import StoredTables
+
 Rows = NDArray[np.void]
 Slice = Mapping[str, Rows]
 """Consecutive rows of several tables, up to the same time."""
 
 BATCH_ROWS = 16_384
 """A table with at most so many rows is read as a whole; of a longer one, so many at a time."""
+_TIMES = ("t_ns", "now_ns", "since_ns", "release_ns", "copy_ns")
+"""Columns with times, which are those of the run or of a loop."""
+_NEVER = ("release_ns", "copy_ns")
+"""Those in which −1 is no time."""
 
 
 class Segment(NamedTuple):
@@ -197,14 +204,6 @@ class _TableReader:
         if not parts:
             return self._rows[:0]
         return concatenate_rows(parts, parts[0].dtype)
-
-
-if TYPE_CHECKING:
-    from cosim.record.table_files import StoredTables
-
-_TIMES = ("t_ns", "now_ns", "since_ns", "release_ns", "copy_ns")
-_NEVER = ("release_ns", "copy_ns")
-"""Columns in which −1 is no time."""
 
 
 def with_loop(rows: Rows, number: int, dtype: np.dtype[np.void]) -> Rows:

@@ -43,7 +43,9 @@ with lazy_modules():  # pyarrow takes 0.1 s: a run does not wait for it
     from cosim.record import table_files
 
 _SEGMENT_BYTES = 1024 * 1024
+"""Bytes of consecutive batches that are read at once."""
 _SLICE_BYTES = 32 * 1024 * 1024
+"""Bytes of a table that are sorted by loops at once, during the run."""
 _MOST_SLICES = 32
 """Of a longer table, the rows of a loop would be in too many places."""
 _POLL_S = 0.05

@@ -30,6 +30,7 @@ from noack.trigger.trigger_rule import TriggerRule, fill_rule, rule_rows
 NO_ACTUATION = -1
 """Model time of a step without any actuation yet."""
 _BLOCK = 64
+"""Steps that are computed at once."""
 
 
 @dataclass(frozen=True)

@@ -55,8 +55,11 @@ _ROLES: Mapping[str, Callable[..., LoopMachines]] = {
 """In the order of ``noack_role``."""
 _REASONS = tuple(reason.value for reason in Rejection)
 _INPUTS_PER_PROGRESS = 2048
+"""Inputs between two reports of progress."""
 _SENT_PLACES = 64
+"""Datagrams that one step may send."""
 _PIECE_BYTES = 2**24
+"""Bytes of rows that are allocated at once."""
 
 
 class RowMemory:

@@ -223,6 +223,7 @@ def _copy_out(archive: zipfile.ZipFile, info: zipfile.ZipInfo, target: Path, ent
 
 
 _MOST_STEPS = 1_000_000
+"""A run with more steps is repeated on request only."""
 _US_PER_STEP = 100.0
 """Of simulation, record, summary and comparison together."""
 

@@ -17,8 +17,7 @@ from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.analysis.claims.condition_reader import read_conditions
 from cosim.analysis.claims.run_certificates import scheduled_certificates
 from cosim.analysis.summary.loop_summary import summarise_loop
-from cosim.analysis.summary.plant_linearisation import linearisation, linearisation_rows
-from cosim.analysis.summary.summary_model import ClaimVerdict, LinearisationPart, NoLinearisationPart
+from cosim.analysis.summary.summary_model import ClaimVerdict
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from noack.core.linear_systems import Matrix
@@ -229,29 +228,3 @@ def test_a_quadrotor_in_free_fall_without_drag_keeps_its_energy_and_its_angular_
     assert energy(system.x) == pytest.approx(energy(start), rel=1e-8)
     np.testing.assert_allclose(spin(system.x), spin(start), rtol=1e-7)
     assert np.abs(system.x[3:6] - start[3:6]).max() > 0.3
-
-
-# The linearisation in the summary of a run with a nonlinear plant.
-
-
-def test_a_summary_compares_the_cars_linearisation_with_the_model() -> None:
-    linearised = linearisation(resolved("lane_vehicle"))
-    assert isinstance(linearised, LinearisationPart)
-    assert linearised.in_box is True
-    assert max(real for real, _ in linearised.eigenvalues) == pytest.approx(-1.157, abs=2e-3)
-    believed = loop("lane_vehicle")
-    np.testing.assert_allclose(np.array(linearised.A) - linearised.off_A, believed.A_model, atol=1e-12)
-    np.testing.assert_allclose(np.array(linearised.B) - linearised.off_B, believed.B_model, atol=1e-12)
-    assert linearisation_rows(linearised)[1][1].endswith("inside the box")
-    other = linearisation(resolved("lane_vehicle", "plant.system.parameters=vw_vanagon"))
-    assert isinstance(other, LinearisationPart)
-    assert other.in_box is False
-    worst = np.abs(np.array(other.off_B)).max()
-    assert linearisation_rows(other)[1][1] == f"B[2, 1], by {worst:.3g}, outside the box"
-    without = linearisation(resolved("cart_pole"))
-    assert isinstance(without, LinearisationPart)
-    assert without.in_box is None
-    assert linearisation(resolved("lane_following")) is None
-    none = linearisation(resolved("lane_vehicle", "plant.system.model=kinematic"))
-    assert isinstance(none, NoLinearisationPart)
-    assert linearisation_rows(none)[0][1].startswith("none: x is not its whole state")

@@ -18,14 +18,8 @@ def mixed_rows(shared: RecordedRun) -> Mapping[str, Rows]:
         if table in network_tables():
             mixed[table] = shared.network[table]
             continue
-        parts = []
-        for number, loop in enumerate(shared.loops):
-            rows = np.zeros(loop.count(table), dtype)
-            rows[LOOP] = number
-            for name in loop.tables[table].names or ():
-                rows[name] = loop[table][name]
-            parts.append(rows)
-        rows = np.concatenate(parts)
+        of_loops = (numbered(loop, number, table, dtype) for number, loop in enumerate(shared.loops))
+        rows = np.concatenate([*of_loops])
         mixed[table] = rows[np.argsort(rows["now_ns"], kind="stable")]
     return mixed
 
@@ -47,6 +41,7 @@ def live_rows(run: RecordedRun) -> Iterator[tuple[str, Rows]]:
 
 
 def numbered(record: RunRecord, number: int, table: str, dtype: np.dtype[np.void]) -> Rows:
+    """Return the rows of a loop in a table, with the loop's number."""
     rows = np.zeros(record.count(table), dtype)
     rows[LOOP] = number
     for name in record[table].dtype.names or ():

@@ -40,6 +40,7 @@ from noack.core.linear_systems import Matrix, Vector
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 
 _GRAMIAN_POINTS = 12
+"""Points of the quadrature (Gauss and Legendre) of the integral over a window."""
 
 
 class Objective(StrEnum):

@@ -188,6 +188,7 @@ def after_events(flow: PatternFlow, step: Step, log: DecisionLog) -> Nodes:
 Ceiling = Callable[[Nodes], Vector]
 """Returns an upper bound on the value that the rest of each run can add, (N,)."""
 _BLOCK = 4096
+"""Runs that :func:`search_tree` follows at a time."""
 
 
 def search_tree(search: PatternSearch, most_nodes: int, ceiling: Ceiling | None = None) -> bool:

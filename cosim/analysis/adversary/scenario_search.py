@@ -61,9 +61,13 @@ from noack.theory.certificates.conditions import ideal_conditions, nominal_condi
 from noack.theory.certificates.scenario_certificates import certify
 
 NODES = 500_000
+"""Most segments that the search through all patterns computes by default."""
 BEAM = 512
+"""Runs that the beam search continues by default."""
 _NODES_TO_IMPROVE = 200_000
+"""Segments that the improvement of the worst pattern may compute."""
 _CONFIRMED = 1e-5
+"""Relative difference of search and exact run up to which the value is confirmed."""
 _MOST_ROUNDS = 10
 """Largest number of times that the disturbances are made worse."""
 _TIMES_PER_ROUND = 6
@@ -121,6 +125,7 @@ def _find_sampled(
     most_nodes: int,
     report: SearchReport,
 ) -> WorstRun:
+    """Search the loop as the processes run it; with bounded disturbances, alternate with these."""
     began_s = time.monotonic()
     flow = SampledFlow(SampledLoop(resolved), objective, certificate)
     own_run = run_sampled(flow, network_fates(resolved))
@@ -196,6 +201,7 @@ def _find_continuous(
     most_nodes: int,
     report: SearchReport,
 ) -> WorstRun:
+    """Search the paper's loop, and confirm the worst pattern by an exact run."""
     began_s, horizon_s = time.monotonic(), resolved.horizon_s
     constants = certificate.constants
     system = continuous_loop_of(resolved)

@@ -6,7 +6,7 @@
 2. ``run_evidence.py``: signals, conditions and certificates, against which claims are checked;
    ``run_certificates.py`` searches for the certificates of several runs together;
    ``trajectory_delta.py``: Theorem 1's Δ from a trajectory.
-3. ``claim_definition.py``: the form of a claim; ``catalogue`` has the claims.
+3. ``claim_catalogue.py``: the claims.
 4. ``claim_evaluation.py``: checks all of them, for each part of a run; ``run_parts.py`` cuts its
    record into these parts.
 """

@@ -15,9 +15,7 @@ The processes of a stopped run end some milliseconds apart. Claims and condition
 the last time that all of them reached, because the loop is incomplete after it.
 """
 
-import importlib
 import math
-import pkgutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache, partial
@@ -25,14 +23,8 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from cosim.analysis.claims import catalogue
-from cosim.analysis.claims.claim_definition import (
-    Bound,
-    CertifiedClaim,
-    ClaimBound,
-    ClaimDefinition,
-    Envelope,
-)
+from cosim.analysis.claims import claim_catalogue
+from cosim.analysis.claims.claim_catalogue import Bound, CertifiedClaim, ClaimBound, ClaimDefinition, Envelope
 from cosim.analysis.claims.observed_conditions import AssumptionViolation, VoidFrom
 from cosim.analysis.claims.run_certificates import late_certificates
 from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples
@@ -63,13 +55,11 @@ _Kind = TypeVar("_Kind", ClaimDefinition, CertifiedClaim)
 
 @cache
 def definitions(kind: type[_Kind]) -> list[_Kind]:
-    """Return the claims of a kind in the modules of ``catalogue/``, in their order there.
+    """Return the claims of a kind, in the order of the catalogue.
 
     Certified claims are those of a certificate; the others need none.
     """
-    names = sorted(module.name for module in pkgutil.iter_modules(catalogue.__path__))
-    modules = [importlib.import_module(f"{catalogue.__name__}.{name}") for name in names]
-    return [claim for module in modules for claim in vars(module).values() if isinstance(claim, kind)]
+    return [claim for claim in vars(claim_catalogue).values() if isinstance(claim, kind)]
 
 
 def void_claim(claimed: str, source: str, since_s: float, why: str, until_s: float | None = None) -> Claim:

@@ -14,6 +14,7 @@ from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.certificates.conditions import ideal_conditions
 
 _TOLERANCE_S = 1e-9
+"""Times in seconds have rounding errors below this."""
 
 Reals = NDArray[np.float64]
 

@@ -30,7 +30,9 @@ from noack.impairments.kinds.rate import Rate
 from noack.protocol.record_tables import NETEM_PACKET, Fate
 
 _BINS = 200
+"""Intervals of the datagrams in flight."""
 _MOST_NAMED = 3
+"""Failed loops that are named in the reason."""
 _COLUMNS = ("sequence", "now_ns", "flow", "fate", "release_ns", "copy_ns", "size_bytes")
 
 

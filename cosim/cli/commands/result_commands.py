@@ -11,7 +11,7 @@ from cosim.cli import command as cli
 from cosim.cli import options as opt
 from cosim.cli.execute_run import reopen_run
 from cosim.lazy_modules import lazy_modules
-from cosim.output.export import FORMATS, export_run, export_scenario, export_suffix, needs_run
+from cosim.output.export.export_formats import FORMATS, ScenarioFormat, export_run, find_format
 from cosim.record.run_directory import DEFAULT_RUNS, RECORDING_FILE, SCENARIO_FILE, chosen_run, file_of_loop
 from noack.core.errors import CallerError, ExitStatus, NoackError
 from noack.runtime.command_line import print_to_stderr
@@ -217,12 +217,13 @@ def export(
         noack export runs/latest --format csv --json   a folder of CSV files
         noack export lane_following --format fmu   FMUs of its channel and its controller
     """
-    if needs_run(file_format):
+    chosen_format = find_format(file_format)
+    if not isinstance(chosen_format, ScenarioFormat):
         if settings:
             raise CallerError(f"--set: a run has its settings; {file_format} is a format of runs")
         reopen_run(chosen := run.path)
         name = run.loop or chosen.resolve().name
-        path = out or Path(f"{name}{export_suffix(file_format)}")
+        path = out or Path(f"{name}{chosen_format.SUFFIX}")
         with cli.status("exporting"):
             written = export_run(chosen, path, file_format, loop=run.loop, certificates=certificates)
     else:
@@ -230,8 +231,8 @@ def export(
             option = "--loop" if run.loop else "--no-certificates"
             raise CallerError(f"{option}: not with {file_format}, which is made of a scenario")
         scenario = opt.load_scenario(_scenario_name(run), settings)
-        path = out or Path(f"{scenario.name}{export_suffix(file_format)}")
-        written = export_scenario(scenario, path, file_format)
+        path = out or Path(f"{scenario.name}{chosen_format.SUFFIX}")
+        written = chosen_format.write_scenario(scenario, path)
     cli.print_lines(json, {"files": [str(path) for path in written]}, *written)
 
 

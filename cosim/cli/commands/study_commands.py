@@ -22,7 +22,7 @@ from noack.runtime.command_line import print_to_stderr
 with lazy_modules():
     from cosim.output import result_tables
     from cosim.studies.campaign import campaign_file, campaign_grid, campaign_report
-    from cosim.studies.capacity import capacity_page, capacity_plan, capacity_result
+    from cosim.studies.capacity import capacity_page, capacity_plan, capacity_result, study_time
     from cosim.studies.paper import paper_page, published_result
     from cosim.studies.paper import results as paper_results
     from noack.scenario import run_sections, scenario_file
@@ -295,19 +295,19 @@ def _announce(
     """Print on standard error what is computed and about how long it takes; return the seconds."""
     points = campaign_grid.grid(plan.campaign(), Path("noack capacity"))
     longer = plan if study.thorough else plan.with_defaults(capacity_plan.THOROUGH)
-    missing = capacity_result.missing_loops(plan, points, folder)
+    missing = study_time.missing_loops(plan, points, folder)
     if not missing:
         return 0.0
-    cpu_s = capacity_result.cpu_per_loop_s(points)
-    estimated_s = capacity_result.estimated_s(missing, cpu_s, workers)
-    longer_s = capacity_result.estimated_s(sum(longer.sizes) * longer.draws, cpu_s, workers)
+    cpu_s = study_time.cpu_per_loop_s(points)
+    estimated_s = study_time.estimated_s(missing, cpu_s, workers)
+    longer_s = study_time.estimated_s(sum(longer.sizes) * longer.draws, cpu_s, workers)
     of_live = f", and {live} live" if live else ""
     sizes = " to ".join(f"{size:,}" for size in sorted({min(plan.sizes), max(plan.sizes)}))
     idle = "an idle core" if workers == 1 else f"{workers} idle cores"
     print_to_stderr(
         f"noack capacity: {len(plan.sizes) * plan.draws:,} runs of {plan.scenario.horizon_s:g} s "
         f"with {sizes} loops{of_live}; the simulation takes "
-        f"about {capacity_result.rough_time(estimated_s)} on {idle}"
-        + ("" if longer == plan else f"; --thorough: {capacity_result.rough_time(longer_s)}")
+        f"about {study_time.rough_time(estimated_s)} on {idle}"
+        + ("" if longer == plan else f"; --thorough: {study_time.rough_time(longer_s)}")
     )
     return estimated_s

@@ -33,7 +33,9 @@ from noack.scenario.scenario import phases_ns
 
 _WAITING_BATCHES = 4096
 _POLL_S, _LOOK_S = 0.005, 0.5
+"""Waits for rows, and for the end of the run."""
 _START_S, _END_S = 30.0, 10.0
+"""Time for the run to start, and for the bridge to end."""
 _READY = "ready\n"
 
 

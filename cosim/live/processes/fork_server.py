@@ -78,6 +78,7 @@ _MALLOPT = {-8: 2, -3: 131_072, -1: 131_072}
 """The last three of them, as glibc's mallopt takes them: it reads the environment only once."""
 _PYTHONS_GC_THRESHOLDS = (700, 10, 10)
 _MOST_BYTES = 65_536
+"""Most bytes of a request or an answer."""
 _START_TIMEOUT_S = 120.0
 _PR_SET_CHILD_SUBREAPER = 36
 

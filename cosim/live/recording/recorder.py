@@ -62,16 +62,19 @@ if TYPE_CHECKING:
 _DISCOVERY_S = 5.0
 """By then a restarted recorder has received the tokens of all running processes."""
 _MOST_LINES = 30
+"""Warnings in the progress report."""
 _POLL_FOR_S = 0.2
+"""Longest time for which batches are handled before anything else is done."""
 _WAITING_BATCHES = 4096
 """A minute of batches; each place of the ring takes 256 bytes once it has been used."""
 _LEAST_BATCHES = 512
 """Some seconds of batches, each with some hundred kilobytes; a lost one is sent again."""
 _ROWS_IN_FLIGHT_S = 0.3
-_POLL_S = 0.02
-_SHOW_S = 0.1
-_ACKNOWLEDGE_S = 1.0
+"""Longest time by which batches may come after the report of their process."""
+_POLL_S, _SHOW_S, _ACKNOWLEDGE_S = 0.02, 0.1, 1.0
+"""Wall times between two looks for messages, two updates of the view, two acknowledgements."""
 _STOP_TIMEOUT_S = 8.0
+"""Wall time that the processes of a stopped run have to report."""
 
 
 class ProcessTokens:

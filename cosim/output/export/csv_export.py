@@ -7,7 +7,7 @@ from pathlib import Path
 import pyarrow as pa
 from pyarrow import csv
 
-from cosim.output.export import ExportedRun
+from cosim.output.export.export_formats import ExportedRun
 from cosim.record.data_frames import events, samples, with_seconds
 from cosim.record.table_files import arrow_table
 from noack.core.file_access import write_whole

@@ -29,7 +29,7 @@ from noack.scenario.resolution import loop_of, resolved_loops
 from noack.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
-    from cosim.output.export import ExportedRun
+    from cosim.output.export.export_formats import ExportedRun
 
 SUFFIX = ".fmu"
 _PACKETS_PER_STEP = 8

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.certificates import certificates_of
-from cosim.output.export import ExportedRun
+from cosim.output.export.export_formats import ExportedRun
 from cosim.record.data_frames import events, samples
 from cosim.record.record_source import Rows
 from noack.core.errors import CallerError, MachineError

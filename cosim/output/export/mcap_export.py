@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic_core import to_json
 
-from cosim.output.export import ExportedRun
+from cosim.output.export.export_formats import ExportedRun
 from cosim.record.align import aligned_parts
 from cosim.record.record_source import Rows
 from cosim.record.run_directory import SCENARIO_FILE, SUMMARY_FILE

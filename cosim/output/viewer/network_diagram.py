@@ -35,6 +35,7 @@ _BOX_DISTANCE = 4.4
 _BOXES = {name: i * _BOX_DISTANCE for i, name in enumerate(("plant", "sensor", "network", "controller"))}
 _, _SENSOR, _NETWORK, _CONTROLLER = _BOXES.values()
 _HALF_WIDE, _HALF_HIGH = 1.6, 0.62
+"""Half-sizes of a box."""
 _REVERSE_Y = -0.4
 """Height of acknowledgements, a little below the updates."""
 _INPUT_Y = -2.5

@@ -35,6 +35,7 @@ from noack.core.linear_systems import Matrix, Vector
 _HEIGHT_IN = 3.4
 _MAP_HEIGHT_IN, _MAPS_IN_A_ROW, _NARROWEST_MAP_IN = 2.2, 3, 2.2
 _QUANTILES = 400
+"""Points of a distribution."""
 _FAR = 10.0
 """A metric with values at least this factor apart gets a logarithmic axis."""
 _LONGEST_LABEL = 28

@@ -30,9 +30,11 @@ from noack.runtime.command_line import stop_requests_raised
 PAGE, SUMMARY = "campaign.html", "summary.json"
 _NONE = "–"
 _MOST_ROWS = 40
+"""Rows of a table in the terminal."""
 _APART = 3
 """Largest distance between columns, margins included."""
 _MOST_REMARKS = 5
+"""Remarks in the terminal."""
 
 
 def write_report(

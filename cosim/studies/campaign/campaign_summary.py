@@ -30,6 +30,7 @@ from noack.core.linear_systems import Vector
 from noack.core.number_format import number
 
 CONFIRMED_FROM, PARTLY_FROM = 0.95, 0.5
+"""Shares of the runs from which on a claim is confirmed, and partly confirmed."""
 _POINTS_AT_ONCE = 4
 """Number of grid points whose runs are in memory."""
 Values = Callable[[Point], Mapping[Metric, Vector]]
@@ -123,6 +124,7 @@ def _side(term: Term, claim: CampaignClaim, group: Sequence[Point], values: Valu
 
 
 _ROUNDING = 1e-9
+"""A bound is exceeded only by a larger share of it than this."""
 _ENDED = {
     OK: "finished",
     DIVERGED: "diverged",

@@ -123,6 +123,7 @@ Runner = Callable[[Sequence[Work], Iterable[Chunk]], Iterator[Finished]]
 _AHEAD = 2
 """Chunks in flight per worker: one is computed and one waits."""
 _LOOK_EVERY_S, _PATIENCE_S = 1.0, 30.0
+"""Time between two looks at the cluster, and time that it may be without a worker."""
 _CONNECT_S, _CONNECT_TRIES = 10.0, 3
 
 

@@ -34,6 +34,7 @@ from noack.core.file_access import PARTIAL, locked, write_whole
 RUNS, MANIFEST = "runs", "campaign.json"
 _LOCK = ".lock"
 _FORMAT = 1
+"""Version of the files; those of another one are not read."""
 MOST_FILES = 1_000_000
 
 

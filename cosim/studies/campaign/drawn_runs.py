@@ -84,6 +84,8 @@ class SampledWork:
         return rows
 
     def _measure(self, record: RunRecord, row: np.void) -> None:
+        """Fill the row of a run; what is unknown of one that did not end well stays NaN."""
+        # Counts and intervals, which every run has.
         measurements, steps = record[SENSOR_MEASUREMENT], record[PLANT_STEP]
         events_s = measurements["t_ns"][measurements["event"] != NO_SEQUENCE] / NS_PER_S
         gaps_s = np.diff(events_s)
@@ -94,6 +96,7 @@ class SampledWork:
             row[name] = np.nan
         if len(gaps_s):
             row["inter_event_min_s"], row["inter_event_mean_s"] = gaps_s.min(), gaps_s.mean()
+        # How the run ended.
         norms, t_s = np.linalg.norm(steps["x"], axis=1), steps["t_ns"] / NS_PER_S
         lost = np.flatnonzero(~np.isfinite(norms))
         if len(lost):
@@ -103,6 +106,7 @@ class SampledWork:
             row["status"] = TOO_MANY_EVENTS
             return
         row["status"] = OK
+        # Settling, about the set-point.
         since_ns, points = setpoints_of(record)
         from_setpoint = norms
         if points.any():
@@ -113,12 +117,14 @@ class SampledWork:
             row["settling_s"] = t_s[from_setpoint > settled].max(initial=0.0)
         row["final_norm"] = norms[-1]
         row["cost"] = self._cost(record)
+        # The controller's error, where it shares an update with the sensor.
         aligned = align_tables(record)
         decay_per_s = policy_of(record.scenario).fading_per_s
         scaled = aligned.e_c_norm * np.exp(decay_per_s * aligned.t_ns / NS_PER_S)
         row["sup_e_c_scaled"] = scaled[shares_update(record.scenario, aligned)].max(initial=0.0)
 
     def _cost(self, record: RunRecord) -> float:
+        """Return ∫ xᵀQx + uᵀRu dt, exactly, as inputs are held (Van Loan 1978)."""
         loop, steps = record.loop, record[PLANT_STEP]
         n, m = loop.n, loop.m
         if not record.scenario.coverage.is_linear:

@@ -135,6 +135,7 @@ def certified_error(resolved: Scenario) -> float | None:
 
 
 CONFIDENCE = 0.95
+"""Of all intervals."""
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 """A quantile is the smallest value that at least this share of the draws does not exceed."""
 

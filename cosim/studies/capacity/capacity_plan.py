@@ -176,6 +176,7 @@ class StudyDefaults(NamedTuple):
 QUICK = StudyDefaults((0.5, 1.0, 1.5), 6, 0.0)
 THOROUGH = StudyDefaults((0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0), 10, 1.0)
 _PULSE_S = 0.5
+"""Length of the common disturbance."""
 _QUEUE = 10
 """Queue of a bottleneck that the scenario does not have."""
 

@@ -35,6 +35,7 @@ Progress = Callable[[float], None]
 _SMALLEST_STEP = 0.04
 """Smallest step of the refinement, as a share of the grid's steps."""
 _MOST_ROUNDS = 24
+"""Most rounds of the refinement."""
 _SCREENING = 4
 """Screening uses the number of draws divided by this."""
 _DESIGNED = "_designed"

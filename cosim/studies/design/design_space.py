@@ -142,6 +142,7 @@ NORMS = ("identity", "given", "chosen")
 COSTS_OF_INPUT = (0.1, 1.0, 10.0)
 """Factors of R: three regulators, from large to small inputs."""
 _LEVEL = 0.1
+"""β for which a norm is chosen, as a share of ‖x(0)‖."""
 
 
 def families_of(

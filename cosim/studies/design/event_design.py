@@ -49,11 +49,17 @@ from noack.theory.certificates.scenario_certificates import certify, certify_box
 from noack.trigger.decaying import DecayingSettings
 
 DRAWS = 200
+"""Draws of which the mean cost is estimated."""
 _ALPHAS = (1.0, 0.5)
 """Factors of α of the starts."""
 _STARTS = 3
+"""Best candidates from which the search descends."""
 _FORBIDDEN = 1e3
+"""Objective of a loop that may not be chosen; those of others are smaller."""
+_LARGEST_LOG_BOUND = 50.0
+"""Larger logarithms of a bound of the state are not distinguished."""
 _MOST_M = 1000
+"""Largest M that is examined by default."""
 
 
 class EventLoop(NamedTuple):
@@ -193,14 +199,14 @@ class EventSearch:
             bound = 0.0 if math.isfinite(self.state_bound(loop, least)) else 1.0
             if over or bound:
                 return min(1.0 + over + bound, _FORBIDDEN)
-            return math.log(measured.transmissions / 1e6)
+            return math.log(measured.transmissions / 1e6)  # below 0: no run has a million
         over += _log_over(measured.transmissions, self.limits.transmissions)
         if over:
             return min(1.0 + over, _FORBIDDEN)
         m = self.largest_m(loop)
         # Between loops of the same M, a smaller bound is closer to the next M.
-        bound = min(math.log1p(self.state_bound(loop, m)), 50.0) if m else 50.0
-        return -math.log1p(m) - 0.01 * (1 - bound / 50.0)
+        bound = min(math.log1p(self.state_bound(loop, m)), _LARGEST_LOG_BOUND) if m else _LARGEST_LOG_BOUND
+        return -math.log1p(m) - 0.01 * (1 - bound / _LARGEST_LOG_BOUND)
 
     def run(self, progress: Progress = lambda share: None) -> tuple[CertifiedEventLoop, CertifiedEventLoop]:
         """Return the given loop and the best one found."""

@@ -11,6 +11,7 @@ from noack.theory.margins.time_triggered_loop import LoopTimes
 _LENGTHS = (2, 4, 8)
 """Numbers of predictions that are tried, if none is given."""
 _MOST = 64
+"""Largest number of predictions."""
 
 
 @dataclass(frozen=True)

@@ -45,11 +45,15 @@ COSTS_OF_INPUT = np.geomspace(1e-3, 1e3, 13)
 _LONGER = 1.02
 """Ratio of successive required periods, where measurements are close enough."""
 _MOST_PERIODS = 400
+"""Most periods that are tried."""
 _MOST_M = 16
+"""Largest M that is examined by default."""
 _SLACK = 0.002
 """The search wants log growth below −_SLACK: the margin of a loop at the limit takes long."""
 _STARTS = 4
+"""Best candidates from which the search descends."""
 _UNSTABLE = 1e3
+"""Scale of the objective of loops that are not stable; those of others are smaller."""
 
 
 class GainCandidate(NamedTuple):
@@ -168,23 +172,28 @@ def _periods(scenario: Scenario, margin: LossMargin) -> Iterator[Requirement]:
             return
 
 
+def _require_possible(scenario: Scenario, request: DesignRequest) -> None:
+    """Raise CallerError unless a scenario can be searched with this request."""
+    if not scenario.coverage.is_linear:
+        raise CallerError(
+            f'plant.system.kind = "{scenario.plant.system.kind}": the plant is not linear; '
+            "--set 'plant.system={kind=\"linear\"}' designs for its model"
+        )
+    without_timeout(scenario).coverage.require_exact()
+    scenario.coverage.require_unchanging()
+    if request.bounds:
+        raise CallerError("--bound: is for a loop with events, not for periodic updates")
+    if request.most is not None and (request.goal == "transmissions" or request.window is not None):
+        raise CallerError("--most: is for --for network without --window")
+    if not request.cost >= 1:
+        raise CallerError(f"--cost: 1 or more times that of the given loop, not {request.cost:g}")
+
+
 class NetworkSearch:
     """All that is known about the loops of a scenario with other gains."""
 
     def __init__(self, scenario: Scenario, request: DesignRequest) -> None:
-        if not scenario.coverage.is_linear:
-            raise CallerError(
-                f'plant.system.kind = "{scenario.plant.system.kind}": the plant is not linear; '
-                "--set 'plant.system={kind=\"linear\"}' designs for its model"
-            )
-        without_timeout(scenario).coverage.require_exact()
-        scenario.coverage.require_unchanging()
-        if request.bounds:
-            raise CallerError("--bound: is for a loop with events, not for periodic updates")
-        if request.most is not None and (request.goal == "transmissions" or request.window is not None):
-            raise CallerError("--most: is for --for network without --window")
-        if not request.cost >= 1:
-            raise CallerError(f"--cost: 1 or more times that of the given loop, not {request.cost:g}")
+        _require_possible(scenario, request)
         self.request, self.scenario = request, time_triggered(scenario, request.period_s)
         resolved = resolve(self.scenario)
         self.plant, margin = loop_of(resolved), LossMargin(resolved)

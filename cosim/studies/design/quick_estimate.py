@@ -21,7 +21,10 @@ from noack.theory.margins.loss_margin import Burst
 from noack.theory.margins.switched_system import Graph, spectral_radii
 from noack.theory.margins.time_triggered_loop import LoopTimes, Timeline
 
-_ROUNDS, _MOST_ROUNDS, _BEAM, _BALANCING = 5, 40, 24, 12
+_FURTHER_EDGES, _MOST_EDGES = 5, 40
+"""Edges of the longest cycles, beyond the number of nodes, and in all."""
+_BEAM, _BALANCING_STEPS = 24, 12
+"""Paths that the search for a cycle continues, and iterations of its coordinates."""
 _TINY = 1e-300
 
 
@@ -122,7 +125,7 @@ class PatternGraph:
         self.bursts = bursts
         ends = (np.array(part) for part in zip(*((b.source, b.target, b.steps) for b in bursts), strict=True))
         self._graph = Graph(*ends)
-        self._rounds = min(_ROUNDS + self._graph.nodes, _MOST_ROUNDS)
+        self._most_edges = min(_FURTHER_EDGES + self._graph.nodes, _MOST_EDGES)
         self._known: dict[tuple[int, ...], None] = {}
 
     def growth(self, maps: Stack) -> float:
@@ -133,13 +136,13 @@ class PatternGraph:
         if not np.isfinite(maps).all() or np.abs(maps).max() > 1e150:
             return math.inf
         nowhere = np.zeros_like(self._graph.sources)
-        (T,) = replace(self._graph, sources=nowhere, targets=nowhere).balancing(maps, _BALANCING)
+        (T,) = replace(self._graph, sources=nowhere, targets=nowhere).balancing(maps, _BALANCING_STEPS)
         turned, best = T @ maps @ np.linalg.inv(T), -math.inf
         for cycle in self._known:
             product = reduce(lambda before, edge: turned[edge] @ before, cycle, np.eye(len(T)))
             duration = self._graph.durations[list(cycle)].sum()
             best = max(best, float(np.log(spectral_radii(product) + _TINY) / duration))
-        best, faster = self._graph.fastest_cycle(turned, self._rounds, _BEAM, best)
+        best, faster = self._graph.fastest_cycle(turned, self._most_edges, _BEAM, best)
         if faster:
             self._known[faster] = None
         return best

@@ -1,14 +1,24 @@
-"""A published result, beside what noack computes for it: its rows, its tables, its document."""
+"""A published result, beside what noack computes for it: its rows, its tables, its document.
 
+At the end are exact runs of shipped scenarios, from which several results are reproduced.
+"""
+
+import math
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from cosim.output.result_tables import ResultTable, terminal_table
+from cosim.shipped_files import find_shipped
+from cosim.simulation.continuous import ContinuousLoop, continuous_loop_of
+from cosim.simulation.exact_simulation import EventLog
+from noack.core.errors import MachineError
 from noack.core.linear_systems import Matrix
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import load
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -115,3 +125,34 @@ def stored_matrices(name: str) -> dict[str, dict[str, Matrix]]:
     path = Path(__file__).parent / "results" / f"{name}.toml"
     tables = tomllib.loads(path.read_text(encoding="utf-8"))
     return {key: {entry: np.array(rows) for entry, rows in table.items()} for key, table in tables.items()}
+
+
+def shipped_loop(name: str, settings: Iterable[str] = ()) -> ContinuousLoop:
+    """Return the exact loop of a shipped scenario, with settings as for ``--set``."""
+    return continuous_loop_of(resolve(load(find_shipped(name, "scenarios"), list(settings))))
+
+
+def unit_states(draws: int, n: int) -> Matrix:
+    """Return initial states of length 1: evenly spaced for two states, else random, (draws, n)."""
+    if n == 2:
+        angles = np.linspace(0.0, math.pi, draws, endpoint=False)
+        return np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    states = np.random.default_rng(1).normal(size=(draws, n))
+    return np.asarray(states / np.linalg.norm(states, axis=1, keepdims=True), np.float64)
+
+
+def run_from_each(loop: ContinuousLoop, x0: Matrix, horizon_s: float, most_events: int = 2000) -> EventLog:
+    """Return the events of a run from each initial state; every update arrives.
+
+    Raise MachineError if a run has more events than ``most_events``.
+    """
+    k = len(x0)
+    A, B = (np.broadcast_to(part, (k, *part.shape)) for part in (loop.loop.A, loop.loop.B))
+    simulation = loop.simulation(
+        horizon_s, known_start=True, delivered=np.zeros(0, np.bool_), most_events=most_events
+    )
+    rows, log = simulation.runs(A, B, x0, places=most_events, states=True)
+    if rows["status"].any():
+        raise MachineError(f"a run did not reach its end within {most_events} events")
+    log.event_s[np.arange(most_events) >= rows["transmissions"][:, None]] = np.nan
+    return log

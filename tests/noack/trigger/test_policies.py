@@ -2,7 +2,7 @@
 
 Each policy is compared with the rule as it is stated: at measurements in
 tests/cosim/simulation/test_whole_loop.py, in continuous time in .../test_exact_simulation.py,
-and by the search for the worst pattern in tests/cosim/analysis/adversary/test_worst_patterns.py.
+and by the search for the worst pattern in tests/cosim/analysis/adversary/test_sampled_search.py.
 """
 
 import json

@@ -11,6 +11,7 @@ _WIDE, _HIGH = 1.0, 1.6
 _PLACES = ((-0.9, 0.0), (0.9, 0.0), (-0.9, 2.3), (0.9, 2.3))
 """Lower left corners of the tanks 1 to 4; the upper two are 3 and 4."""
 _HATCH, _TALLEST_CM = 7, 20.0
+"""Lines of a hatched tank, and the level at which it is full."""
 _STYLES: Mapping[str, tuple[float, float]] = {
     "plant": (0.07, 2.0),
     "sensor": (0.06, 4.0),

@@ -5,8 +5,14 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from cosim.simulation.continuous import ContinuousLoop
-from cosim.studies.paper.published_result import ComparedValue, PublishedResult, stored_matrices
-from cosim.studies.paper.reproduction_runs import run_from_each, shipped_loop, unit_states
+from cosim.studies.paper.published_result import (
+    ComparedValue,
+    PublishedResult,
+    run_from_each,
+    shipped_loop,
+    stored_matrices,
+    unit_states,
+)
 from noack.core.linear_systems import Matrix
 
 _PERIOD_S = 0.01

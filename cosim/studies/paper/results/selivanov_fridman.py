@@ -11,8 +11,14 @@ from collections.abc import Mapping
 import numpy as np
 
 from cosim.simulation.continuous import ContinuousLoop
-from cosim.studies.paper.published_result import ComparedValue, PublishedResult, stored_matrices
-from cosim.studies.paper.reproduction_runs import run_from_each, shipped_loop, unit_states
+from cosim.studies.paper.published_result import (
+    ComparedValue,
+    PublishedResult,
+    run_from_each,
+    shipped_loop,
+    stored_matrices,
+    unit_states,
+)
 from noack.core.linear_systems import Matrix
 
 Blocks = Mapping[tuple[int, int], Matrix]

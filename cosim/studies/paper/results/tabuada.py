@@ -4,8 +4,13 @@ import numpy as np
 from scipy.integrate import quad
 
 from cosim.simulation.continuous import ContinuousLoop
-from cosim.studies.paper.published_result import ComparedValue, PublishedResult
-from cosim.studies.paper.reproduction_runs import run_from_each, shipped_loop, unit_states
+from cosim.studies.paper.published_result import (
+    ComparedValue,
+    PublishedResult,
+    run_from_each,
+    shipped_loop,
+    unit_states,
+)
 
 _WHERE = "Corollary IV.1"
 _HOW = "shortest inter-event time of exact runs of 2 s; τ is the corollary's integral"

@@ -16,7 +16,7 @@ from pyarrow import csv
 from scipy.io import loadmat
 
 import noack
-from cosim.output.export import export_run
+from cosim.output.export.export_formats import export_run
 from cosim.output.export.mat_export import save_mat
 from cosim.output.viewer.rerun_program import start_rerun
 from noack.core.errors import CallerError

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import noack
-from cosim.output.export import export_scenario
+from cosim.output.export.fmu_export import write_scenario
 from noack.core.errors import CallerError
 from noack.protocol.record_tables import Fate
 from noack.protocol.wire_format import Flow, Message
@@ -108,7 +108,7 @@ def folders(tmp_path: Path) -> Folders:
     """Writes the FMUs of a scenario, and unzips them: folders of channel and controller."""
 
     def make(scenario: Scenario) -> list[Path]:
-        files = export_scenario(scenario, tmp_path / "a.fmu", "fmu")
+        files = write_scenario(scenario, tmp_path / "a.fmu")
         assert [validate_fmu(str(file)) for file in files] == [[], []]
         return [Path(fmpy.extract(str(file), str(tmp_path / file.stem))) for file in files]
 
@@ -296,7 +296,7 @@ def test_the_command_takes_scenarios_and_runs(tmp_path: Path, monkeypatch: pytes
     """A scenario gives the same bytes in each process: there is no address in them."""
     monkeypatch.chdir(tmp_path)
     scenario = noack.load("double_integrator", {"network.mansd": 2})
-    expected = [path.read_bytes() for path in export_scenario(scenario, Path("a.fmu"), "fmu")]
+    expected = [path.read_bytes() for path in write_scenario(scenario, Path("a.fmu"))]
     command = ("export", "double_integrator", "--format", "fmu", "--set", "network.mansd=2")
     subprocess.run([sys.executable, "-m", "cosim.cli", *command], check=True, capture_output=True)
     names = [f"double_integrator_{role}.fmu" for role in ("channel", "controller")]

@@ -38,6 +38,7 @@ from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
 from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER
 from tests.cosim.output.conftest import CASES, HOSTILE, scenario_of
+from tests.cosim.output.parsed_page import Page
 from tests.cosim.record.changed_records import changed
 from tests.helpers.summaries import summary_of
 
@@ -235,3 +236,14 @@ def test_the_figures_of_a_report_are_written_as_wide_as_a_paper_wants(tmp_path: 
         assert b"/Type3" not in content.replace(b" ", b"")  # refused by publishers
     states = run.directory / "report-figures/states.svg"
     assert states.read_text().count('width="720pt"') == 1
+
+
+def test_a_large_figure_becomes_a_bitmap(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = Line(x=np.arange(3.0), y=np.ones(3), colour=(0, 0, 0))
+    figure = one_panel("a", Panel(items=[line], x=Axis(), y=Axis()), 1.0)
+    figure = figure.captioned("", 'named "so"')
+    assert not Page(inline(figure)).attributes("img")
+    monkeypatch.setattr("cosim.output.figures.figure_files._MOST_SVG_CHARACTERS", 10)
+    (image,) = Page(inline(figure)).attributes("img")
+    assert image["alt"] == 'named "so"'
+    assert (image["src"] or "").startswith("data:image/png;base64,")

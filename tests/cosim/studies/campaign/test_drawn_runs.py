@@ -1,6 +1,7 @@
 """Draws, and the measures of their runs in virtual time, of one loop and of several."""
 
 import math
+import re
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,18 @@ from cosim.simulation.continuous import run_continuous
 from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from cosim.studies.campaign.campaign_grid import row_type
-from cosim.studies.campaign.drawn_runs import LOOPS_ROW, SampledWork, SharedNetworkWork, in_virtual_time
+from cosim.studies.campaign.drawn_runs import (
+    LOOPS_ROW,
+    SampledWork,
+    SharedNetworkWork,
+    in_virtual_time,
+    used_up,
+)
 from cosim.studies.campaign.random_draws import box_of, drawn_scenario, seeds_of
 from noack.core.errors import CallerError, ExitStatus
 from noack.impairments.kinds.replay import Replay
 from noack.impairments.loss_models.lossless import NoLoss
+from noack.protocol.record_tables import Fate
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
@@ -278,3 +286,17 @@ def test_each_draw_has_its_own_window_of_a_trace() -> None:
     ]
     assert len(set(begins_ms)) > 30
     assert min(begins_ms) < 200 < 800 < max(begins_ms)
+
+
+def test_the_guarantee_is_used_up_by_a_burst_with_a_full_queue() -> None:
+    letters = {"d": Fate.DELIVERED, "f": Fate.FORCED, "x": Fate.DROPPED, "o": Fate.OVERFLOWED}
+    random = np.random.default_rng(3)
+    seen = set()
+    for _ in range(300):
+        text = "".join(random.choice([*letters], 12))
+        burst = int(random.integers(1, 5))
+        bursts = re.findall("[xo]+", text)
+        expected = any(len(letter_burst) >= burst and "o" in letter_burst for letter_burst in bursts)
+        assert used_up(np.array([letters[letter] for letter in text]), burst) == expected, (text, burst)
+        seen.add(expected)
+    assert seen == {True, False}

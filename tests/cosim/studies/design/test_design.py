@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import Result
-from scipy.linalg import solve_continuous_lyapunov
 
 from cosim.simulation.continuous import run_continuous
 from cosim.simulation.exact_simulation import run_batch, setting_of
@@ -27,8 +26,6 @@ from cosim.studies.design.design_search import (
 )
 from cosim.studies.design.design_space import families_of, lqr_gain
 from noack.core.errors import CallerError
-from noack.core.linear_systems import spectral_abscissa
-from noack.plants.linear import lane_following
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import dumps, load
 from noack.theory.certificates.conditions import ideal_conditions
@@ -275,31 +272,3 @@ def test_without_randomness_every_draw_is_the_exact_run(scalar_file: Path) -> No
     assert result.fresh.transmissions == len(exact.event_s)
     x = exact.at([result.fresh.settling_s]).x
     assert abs(float(x[0, 0])) == pytest.approx(0.02, rel=1e-6)
-
-
-def test_the_gain_comes_from_a_solution_of_the_riccati_equation() -> None:
-    A, B, *_ = lane_following()
-    Q, R = np.diag([1.0, 2.0, 3.0, 4.0]), np.array([[2.0, 0.5], [0.5, 1.0]])
-    K = lqr_gain(A, B, Q, R)
-    closed = A + B @ K
-    assert spectral_abscissa(closed) < 0
-    # P is the cost of the closed loop by another equation; K must follow from it.
-    cost = Q + K.T @ R @ K
-    P = solve_continuous_lyapunov(closed.T, -cost)
-    np.testing.assert_allclose(R @ K, -B.T @ P, rtol=1e-8, atol=1e-8)
-
-
-@pytest.mark.parametrize(
-    ("A", "Q", "R", "word"),
-    [
-        ([[1, 0], [0, -1]], [[1, 0], [0, 1]], 1, "stabilising"),  # B does not affect state 1
-        ([[0, 1], [0, 0]], [[-1, 0], [0, -1]], 1, "semidefinite"),
-        ([[0, 1], [0, 0]], [[1, 1], [0, 1]], 1, "symmetric"),
-        ([[0, 1], [0, 0]], [[1, 0], [0, 1]], 0, "definite"),
-    ],
-)
-def test_a_system_without_a_regulator_is_refused(
-    A: list[list[float]], Q: list[list[float]], R: float, word: str
-) -> None:
-    with pytest.raises(CallerError, match=word):
-        lqr_gain(np.array(A), np.array([[0.0], [1.0]]), np.array(Q), np.array([[R]]))

@@ -23,7 +23,6 @@ from cosim.studies.design.event_design import (
 )
 from cosim.studies.design.hold_strategies import read_holds
 from cosim.studies.design.network_search import CertifiedLoop, DesignRequest, NetworkSearch
-from cosim.studies.design.quick_estimate import PatternGraph
 from noack.guarantee.loss_guarantee import LossesInWindow
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
@@ -141,28 +140,6 @@ def test_each_hold_strategy_has_the_most_that_its_best_loop_reached() -> None:
     assert of_hold == f"M = {alone.best.level + 1}"
     assert alone.best.level < outcome.best.level
     assert outcome.shown.to_json()["highest_by_hold"] == {hold: of_hold, model: of_model}
-
-
-def test_quick_bounds_are_those_of_the_exact_maps() -> None:
-    settings = ("network.impairments=[{kind='delay', delay_s=0.0333}]", "controller.rate_hz=40")
-    timeouts = [
-        ("mode=zoh", "controller.update_timeout_s=0.31"),
-        (*settings, "controller.update_timeout_s=0.65", 'controller.timeout_input="hold"'),
-        (*settings, "controller.update_timeout_s=0.62", "controller.phase=0.9"),
-    ]
-    for more in ((), settings, (*settings, "mode=zoh"), *timeouts):
-        given = shipped("double_integrator", *more)
-        search = NetworkSearch(given, DesignRequest(period_s=0.31, most=5))
-        exact = LossMargin(resolve(search.scenario))
-        bursts = exact.bursts(search.requirements[4].guarantee)
-        quick = search.quick_loop(search.original, exact.longest_ns).maps(bursts)
-        maps = np.array([exact.maps(burst.slot, burst.usable_ns, burst.losses).middle for burst in bursts])
-        if not more or more == timeouts[0]:
-            np.testing.assert_allclose(quick, maps, rtol=0, atol=1e-11 * np.abs(maps).max())
-        stability = exact.coarse_bounds(search.requirements[4].guarantee)
-        lower = np.exp(PatternGraph(bursts).growth(quick))
-        assert lower <= stability.upper
-        assert lower == pytest.approx(stability.lower, rel=2e-2)
 
 
 def test_the_written_scenario_is_checked_and_decided_as_claimed(tmp_path: Path, pole: Found) -> None:

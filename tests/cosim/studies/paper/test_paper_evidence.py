@@ -178,7 +178,7 @@ def test_the_command_runs_the_campaign_and_writes_the_page(
 ) -> None:
     monkeypatch.setattr("cosim.cli.execute_run.cores", lambda: 1)
     monkeypatch.setattr("cosim.cli.commands.study_commands.DEFAULT_RUNS", tmp_path / "runs")
-    # test_evidence.py computes it
+    # test_paper_evidence.py computes it
     monkeypatch.setattr(paper_page, "evidence", lambda *_: COMMITTED["evidence"])
     done = invoke("paper", "--draws", "5", "--out", tmp_path, "--json")
     assert done.exit_code == 0, done.output

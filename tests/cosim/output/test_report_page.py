@@ -2,19 +2,15 @@
 
 import json
 import re
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from cosim.analysis.replay.replay_result import difference
 from cosim.analysis.summary.summary_model import RunSummary
 from cosim.live import finalize as concluding
 from cosim.output import report_page
-from cosim.output.figures.figure_description import Axis, Line, Panel, one_panel
-from cosim.output.figures.figure_files import inline
 from cosim.output.figures.run_figures import run_figures
 from cosim.output.report_page import Report, page, write_report
 from cosim.record.run_directory import REPORT_FILE, RunEnding
@@ -22,11 +18,11 @@ from cosim.record.run_record import RunRecord
 from noack.core.errors import ExitStatus
 from noack.scenario.scenario_file import dumps as scenario_toml
 from tests.cosim.output.conftest import CASES, HOSTILE, make_record, scenario_of
+from tests.cosim.output.parsed_page import Page
 from tests.helpers.command_line import invoke
 from tests.helpers.lab_browser import started
 from tests.helpers.summaries import run_of_one_loop, summary_of
 
-VOID = {"meta", "img", "br", "hr", "link", "input"}
 FIGURES = ["states", "errors", "state-norm", "input", "inter-event", "losses"]
 TIMED = ["lateness", "latency"]
 CLAIM = {
@@ -39,41 +35,6 @@ CLAIMS = [
     CLAIM | {"verdict": "void", "since_s": 3.25, "why": "7 consecutive losses"},
     CLAIM | {"verdict": "violated", "certified": 0.011, "ratio": None},
 ]
-
-
-class Page(HTMLParser):
-    """A strict parser: every element that opens must close, in order."""
-
-    def __init__(self, html: str) -> None:
-        super().__init__()
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.text = ""
-        self._open: list[str] = []
-        self.feed(html)
-        self.close()
-        assert self._open == []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-        assert len(dict(attrs)) == len(attrs), f"an attribute of {tag} is given twice"
-        if tag not in VOID:
-            self._open.append(tag)
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self._open, f"</{tag}> closes nothing"
-        assert self._open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.text += data
-
-    def attributes(self, tag: str) -> list[dict[str, str | None]]:
-        return [attributes for name, attributes in self.tags if name == tag]
-
-    def ids(self) -> list[str]:
-        return [attributes["id"] or "" for _, attributes in self.tags if "id" in attributes]
 
 
 def written(record: RunRecord, run_dir: Path, **more: Any) -> tuple[Page, RunSummary]:
@@ -233,17 +194,6 @@ def test_every_run_gets_a_report(case: str) -> None:
     record = CASES[case]()
     assert [*run_figures(record)] == FIGURES + TIMED
     shown(record)
-
-
-def test_a_large_figure_becomes_a_bitmap(monkeypatch: pytest.MonkeyPatch) -> None:
-    line = Line(x=np.arange(3.0), y=np.ones(3), colour=(0, 0, 0))
-    figure = one_panel("a", Panel(items=[line], x=Axis(), y=Axis()), 1.0)
-    figure = figure.captioned("", 'named "so"')
-    assert not Page(inline(figure)).attributes("img")
-    monkeypatch.setattr("cosim.output.figures.figure_files._MOST_SVG_CHARACTERS", 10)
-    (image,) = Page(inline(figure)).attributes("img")
-    assert image["alt"] == 'named "so"'
-    assert (image["src"] or "").startswith("data:image/png;base64,")
 
 
 @pytest.fixture

@@ -1,0 +1,380 @@
+"""The claims, after their form and the bounds that several of them share.
+
+The identity (I1) holds for every plant, trigger and network. The paper's theorems assume a
+continuous trigger, and a network without delay. A certificate claims bounds of the errors, the
+state and the inter-event time: each is evaluated for each certificate of the scenario, and is void
+from the first violation of the certificate's conditions on.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from cosim.analysis.claims.observed_conditions import Reals, VoidFrom, earliest
+from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples
+from noack.core.linear_systems import Propagator, row_norms
+from noack.core.number_format import at_most
+from noack.theory.bounds.certificate_terms import Constants
+from noack.theory.certificates.certified_bounds import ScenarioCertificate, envelope_formula
+
+_LEAST_MARGIN, _LARGEST_MARGIN = 1e-9, 1e-6
+"""Limits of the relative rounding error that is allowed in (I1)."""
+_EPSILON = float(np.finfo(float).eps)
+_COMPLETE = "a complete record"
+_CONTINUOUS = "a continuous trigger, a network without delay"
+_CAPPED = "at most M − 1 consecutive losses"
+_IDEAL = f"a continuous trigger, a network and input without delay, {_CAPPED}"
+
+
+class Envelope(NamedTuple):
+    """A curve that bounds a measured one."""
+
+    label: str
+    quantity: Literal["e_c", "x", "inter_event"]
+    """``"e_c"`` for ‖e_c‖_W, ``"x"`` for ‖x‖, ``"inter_event"`` for a lower bound in seconds."""
+    t_s: Reals
+    values: Reals
+    kind: Literal["certified", "identity", "printed"] = "certified"
+    """The source: a certificate, identity (I1), or a formula of the paper."""
+
+
+class Bound(NamedTuple):
+    """The bound that a claim sets for a run, and the share of it that the run reached."""
+
+    formula: str
+    """The bound in words of mathematics; ``{}`` stands for the constant."""
+    t_s: Reals
+    """(k,)"""
+    shares: Reals
+    """Observed value over bound; for lower bounds, bound over observed value. (k,)"""
+    void: VoidFrom | None
+    """The time from which an assumption was violated."""
+    constant: float | None = None
+    is_lower: bool = False
+
+
+class ClaimBound(NamedTuple):
+    """The bound that a claim sets for some samples of a run, and its curve."""
+
+    bound: Bound | None = None
+    """None if there is no claim about this run."""
+    envelope: Envelope | None = None
+    """The bound as a curve."""
+
+
+@dataclass(frozen=True)
+class ClaimDefinition:
+    """A claim that needs no certificate."""
+
+    statement: str
+    source: str
+    assumes: str
+    find: Callable[[RunEvidence, Samples], ClaimBound]
+    needs_ideal_loop: bool
+    """A run that exceeds the bound does not refute it."""
+
+
+@dataclass(frozen=True)
+class CertifiedClaim:
+    """A claim of a certificate with constants; it is evaluated for each one of the scenario."""
+
+    statement: str
+    find: Callable[[RunEvidence, Samples, ScenarioCertificate, Constants], ClaimBound]
+    assumes: str = "the conditions of the certificate"
+
+
+def claim(
+    statement: str, source: str, assumes: str, *, needs_ideal_loop: bool = False
+) -> Callable[[Callable[[RunEvidence, Samples], ClaimBound]], ClaimDefinition]:
+    """Make a function the definition of a claim."""
+    return lambda find: ClaimDefinition(statement, source, assumes, find, needs_ideal_loop)
+
+
+def certified(
+    statement: str,
+) -> Callable[[Callable[[RunEvidence, Samples, ScenarioCertificate, Constants], ClaimBound]], CertifiedClaim]:
+    """Make a function the definition of a claim of certificates."""
+    return lambda find: CertifiedClaim(statement, find)
+
+
+def norm_text(run: RunEvidence, vector: str) -> str:
+    """Return how a formula writes the norm of an error, in the trigger's norm: ‖e_c‖ or ‖W e_c‖."""
+    if run.record.loop.weight is None:
+        return f"‖{vector}‖"
+    return f"‖W({vector})‖" if " − " in vector else f"‖W {vector}‖"
+
+
+def upper_shares(observed: Reals, bound: Reals) -> Reals:
+    """Return the share of an upper bound that was reached, (k,); 0 if both values are 0."""
+    shares = np.zeros(len(observed))
+    return np.divide(observed, bound, out=shares, where=(observed != 0) | ~(bound >= 0))
+
+
+def controller_error_bound(
+    run: RunEvidence,
+    samples: Samples,
+    formula: str,
+    values: Reals,
+    constant: float | None = None,
+    void: VoidFrom | None = None,
+    since_s: float = 0.0,
+) -> Bound:
+    """Return a bound of ‖e_c‖_W at the measurements from a time on; void from a record's first gap."""
+    here = samples.is_bounded & (samples.t_s >= since_s - 1e-9)
+    # Allow for the rounding of x, which matters for a bound of that size.
+    slack = run.rounding(samples.aligned.x_norm[here])
+    shares = upper_shares(samples.aligned.e_c_norm[here], values[here] + slack)
+    return Bound(formula, samples.t_s[here], shares, earliest([void, run.first_gap]), constant)
+
+
+def least_inter_event_time(
+    run: RunEvidence,
+    samples: Samples,
+    least_s: float,
+    void: VoidFrom | None,
+    label: str,
+    kind: Literal["certified", "printed"] = "certified",
+) -> ClaimBound:
+    """Return a lower bound of the inter-event time, and the same as a line over the run."""
+    t_s, passed_s = samples.inter_event_s
+    formula = "t_(i+1) − t_i ≥ {} s"
+    void = earliest([void, run.lost_in_rounding])
+    bound = Bound(formula, t_s, least_s / passed_s, void, least_s, is_lower=True)
+    ends_s = np.array([0.0, run.record.scenario.horizon_s])
+    return ClaimBound(bound, Envelope(label, "inter_event", ends_s, np.full(2, least_s), kind))
+
+
+# Identity (I1), and the paper's theorems.
+
+
+@claim("the controller's error is at most the sensor's error plus the missed jumps", "(I1)", _COMPLETE)
+def i1_controller_error(run: RunEvidence, samples: Samples) -> ClaimBound:
+    """The triangle inequality for (I1)."""
+    error, values = (
+        "e_c" if run.record.scenario.coverage.knows_state else "x_c − x̂",
+        samples.error_bounds[0],
+    )
+    jump = norm_text(run, "e^(H(t−t_k)) e_s(t_k)")
+    formula = f"{norm_text(run, error)} ≤ {norm_text(run, 'e_s')} + Σ {jump}"
+    return ClaimBound(
+        controller_error_bound(run, samples, formula, values),
+        Envelope("bound from (I1)", "e_c", samples.t_s, values, "identity"),
+    )
+
+
+@claim("x_c − x_s is the sum of the missed jumps", "(I1)", _COMPLETE)
+def i1_model_difference(run: RunEvidence, samples: Samples) -> ClaimBound:
+    """(I1) itself, up to rounding."""
+    here, margin = samples.is_bounded, _margin(run)
+    residual = samples.residual[here]
+    # Use the larger model state, since a missed update may have moved x_c far from x_s.
+    scale = max(run.facts.largest_state + run.part.offset, float(np.finfo(float).tiny))
+    formula = "x_c − x_s = Σ e^(H(t−t_k)) e_s(t_k), relative residual ≤ {}"
+    shares = residual / (margin * scale)
+    return ClaimBound(Bound(formula, samples.t_s[here], shares, run.first_gap, margin))
+
+
+def _margin(run: RunEvidence) -> float:
+    """Return the relative rounding error that the models may accumulate between two deliveries.
+
+    It is n ε sup‖e^{Hτ}‖ over the time τ between deliveries, at most 1e-6.
+    """
+    loop, period_ns = run.record.loop, run.record.scenario.timing.measurement_period_ns
+    longest_ns = run.facts.longest_update_ns
+    growth, age_ns, moved = 1.0, period_ns, Propagator(loop.H).transition(period_ns)
+    while age_ns <= longest_ns and growth < 1 / _EPSILON:
+        growth = max(growth, float(np.linalg.norm(moved)))
+        age_ns, moved = 2 * age_ns, moved @ moved
+    rounding = loop.n * _EPSILON * growth
+    return max(_LEAST_MARGIN, min(rounding, _LARGEST_MARGIN))
+
+
+@claim("the paper's bound of the controller's error", "eq:LossEv3", _CONTINUOUS, needs_ideal_loop=True)
+def paper_error_bound(run: RunEvidence, samples: Samples) -> ClaimBound:
+    """(I1) with the threshold in place of e_s at the events."""
+    coverage = run.record.scenario.coverage
+    # Estimates and noise jump at every measurement, so no trigger keeps e_s below a threshold.
+    if not coverage.is_decaying or not coverage.knows_state:
+        return ClaimBound()
+    growth = "‖e^(H(t−t_k))‖" if run.record.loop.weight is None else "‖W e^(H(t−t_k)) W⁻¹‖"
+    formula = f"{norm_text(run, 'e_c')} ≤ βe^(−αt) + Σ βe^(−αt_k) {growth}"
+    return ClaimBound(controller_error_bound(run, samples, formula, samples.error_bounds[1]))
+
+
+@claim(
+    "the controller's error decays",
+    "Theorem 1 (3 for a hold), Δ from this run's trajectory",
+    f"{_CONTINUOUS}, {_CAPPED}",
+    needs_ideal_loop=True,
+)
+def theorem_1_controller_error(run: RunEvidence, samples: Samples) -> ClaimBound:
+    """Theorem 1 with the Δ of the trajectory."""
+    scenario = run.record.scenario
+    coverage = scenario.coverage
+    is_covered = coverage.is_certifiable and coverage.is_undisturbed and coverage.is_decaying
+    if not is_covered or scenario.decaying.floor > 0 or (delta := run.trajectory_delta) is None:
+        return ClaimBound()
+    level = scenario.decaying.beta * np.exp(-scenario.decaying.alpha_per_s * samples.t_s)
+    formula, void = f"{norm_text(run, 'e_c')} ≤ {{}} βe^(−αt)", run.paper_violation
+    return ClaimBound(controller_error_bound(run, samples, formula, delta * level, delta, void))
+
+
+@claim("minimum inter-event time", "Theorem 2, eq:tau", _IDEAL, needs_ideal_loop=True)
+def theorem_2_inter_event_time(run: RunEvidence, samples: Samples) -> ClaimBound:
+    """Theorem 2's τ."""
+    if run.theorem_2 is None:
+        return ClaimBound()
+    least = least_inter_event_time(
+        run,
+        samples,
+        run.theorem_2.inter_event_s,
+        run.paper_violation,
+        "Theorem 2 (eq:tau)",
+        "printed",
+    )
+    knows_state = run.record.scenario.coverage.knows_state
+    return least if knows_state else ClaimBound(None, least.envelope)
+
+
+@claim("the state decays", "Theorem 2, eq:normXt", _IDEAL, needs_ideal_loop=True)
+def theorem_2_state(run: RunEvidence, samples: Samples) -> ClaimBound:
+    """Theorem 2's bound of ‖x‖."""
+    if run.theorem_2 is None:
+        return ClaimBound()
+    values = run.theorem_2.state(samples.t_s, run.record.scenario.decaying.alpha_per_s)
+    envelope = Envelope("Theorem 2 (eq:normXt)", "x", samples.t_s, values, "printed")
+    if not run.record.scenario.coverage.knows_state:
+        return ClaimBound(None, envelope)
+    slack = ROUNDING * run.part.offset
+    shares = upper_shares(samples.aligned.x_norm, values + slack)
+    formula = "‖x‖ ≤ c x₀ e^(−ᾱt) + g (e^(−αt) − e^(−ᾱt))"
+    return ClaimBound(Bound(formula, samples.t_s, shares, run.paper_violation), envelope)
+
+
+# What a certificate claims.
+
+
+@certified("the controller's error is bounded")
+def controller_error(
+    run: RunEvidence, samples: Samples, certificate: ScenarioCertificate, constants: Constants
+) -> ClaimBound:
+    """‖e_c‖_W from when the plant applies the controller's input on."""
+    formula = envelope_formula(norm_text(run, "e_c"), certificate, "delta")
+    values, void = certificate.controller_error(samples.t_s), run.violation_of(certificate)
+    return ClaimBound(
+        controller_error_bound(run, samples, formula, values, constants.delta, void, run.started_s),
+        Envelope(f"certified for {certificate.scope}", "e_c", samples.t_s, values),
+    )
+
+
+@certified("the controller's error is bounded by the events it misses")
+def controller_error_from_events(
+    run: RunEvidence, samples: Samples, certificate: ScenarioCertificate, constants: Constants
+) -> ClaimBound:
+    """‖e_c‖_W, given the number of missing events."""
+    bounds, since = run.known_state_bounds(certificate), samples.since_event
+    if bounds is None or since is None:
+        return ClaimBound()
+    values = bounds.controller_error(samples.t_s, since.missing)
+    growth = "‖e^((H+αI)τ)‖" if run.record.loop.weight is None else "‖W e^((H+αI)τ) W⁻¹‖"
+    missing = f"(1 + Σ_(i<j) sup_(τ≥iδ) {growth}) β̃e^(−αt), j events missing"
+    formula = f"{norm_text(run, 'e_c')} ≤ {missing}"
+    void = run.violation_of(certificate)
+    label = "bound, given the updates missing now"
+    return ClaimBound(
+        controller_error_bound(run, samples, formula, values, void=void, since_s=run.started_s),
+        Envelope(label, "e_c", samples.t_s, np.where(samples.is_bounded, values, np.nan)),
+    )
+
+
+@certified("the estimation error is bounded")
+def estimation_error(
+    run: RunEvidence, samples: Samples, certificate: ScenarioCertificate, constants: Constants
+) -> ClaimBound:
+    """‖x̂ − x‖_W at the measurements."""
+    scenario, loop = run.record.scenario, run.record.loop
+    if scenario.coverage.knows_state:
+        return ClaimBound()
+    weight = np.eye(loop.n) if loop.weight is None else loop.weight
+    here, void = samples.with_x, run.violation_of(certificate)
+    t_s = samples.t_s[here]
+    errors = row_norms((samples.aligned.x - samples.true_x).compress(here, axis=0) @ weight.T)
+    formula = envelope_formula(norm_text(run, "x̂ − x"), certificate, "estimation_error")
+    shares = upper_shares(errors, certificate.estimation_error(t_s))
+    return ClaimBound(Bound(formula, t_s, shares, void, constants.estimation_error))
+
+
+@certified("minimum inter-event time")
+def inter_event_time(
+    run: RunEvidence, samples: Samples, certificate: ScenarioCertificate, constants: Constants
+) -> ClaimBound:
+    """The time between two events."""
+    if certificate.inter_event_s is None:
+        return ClaimBound()
+    void, label = run.violation_of(certificate), f"certified for {certificate.scope}"
+    return least_inter_event_time(run, samples, certificate.inter_event_s, void, label)
+
+
+@certified("the sensor's error is bounded")
+def sensor_error(
+    run: RunEvidence, samples: Samples, certificate: ScenarioCertificate, constants: Constants
+) -> ClaimBound:
+    """‖e_s‖_W before each reset."""
+    formula = envelope_formula(norm_text(run, "e_s"), certificate, "overshoot")
+    slack = run.rounding(samples.aligned.x_norm)
+    shares = upper_shares(samples.aligned.e_s_norm, certificate.sensor_error(samples.t_s) + slack)
+    void = run.violation_of(certificate)
+    return ClaimBound(Bound(formula, samples.t_s, shares, void, constants.overshoot))
+
+
+@certified("the state is bounded")
+def state(
+    run: RunEvidence, samples: Samples, certificate: ScenarioCertificate, constants: Constants
+) -> ClaimBound:
+    """‖x‖ over time."""
+    formula = envelope_formula("‖x‖", certificate, "state")
+    here, values = samples.with_x, certificate.state(samples.t_s)
+    slack = ROUNDING * run.part.offset
+    shares = upper_shares(row_norms(samples.true_x.compress(here, axis=0)), values[here] + slack)
+    void = run.violation_of(certificate)
+    return ClaimBound(
+        Bound(formula, samples.t_s[here], shares, void, constants.state),
+        Envelope(f"certified for {certificate.scope}", "x", samples.t_s, values),
+    )
+
+
+@certified("x stays in the region")
+def region(
+    run: RunEvidence, samples: Samples, certificate: ScenarioCertificate, constants: Constants
+) -> ClaimBound:
+    """The region of a nonlinear plant, coordinate by coordinate."""
+    if certificate.region is None:
+        return ClaimBound()
+    here, limits = samples.with_x, np.array(certificate.region.x)
+    shares = (np.abs(samples.true_x.compress(here, axis=0)) / limits).max(axis=1)
+    names = run.record.loop.state_names
+    formula = ", ".join(f"|{name}| ≤ {at_most(limit)}" for name, limit in zip(names, limits, strict=True))
+    return ClaimBound(Bound(formula, samples.t_s[here], shares, run.violation_of(certificate)))
+
+
+@certified("the state is bounded from the newest event on")
+def state_from_events(
+    run: RunEvidence, samples: Samples, certificate: ScenarioCertificate, constants: Constants
+) -> ClaimBound:
+    """‖x‖ from the newest event on, at which the sensor knows x."""
+    bounds, since, t_s = run.known_state_bounds(certificate), samples.since_event, samples.t_s
+    if bounds is None or since is None:
+        return ClaimBound()
+    most = bounds.state_deviation(t_s, since.age_s, run.missing_events(samples, since, bounds))
+    predicted = row_norms(since.predicted)
+    here = samples.with_x & ~np.isnan(since.age_s)
+    deviation = row_norms((samples.true_x - since.predicted).compress(here, axis=0))
+    shares = upper_shares(deviation, most[here] + run.rounding(predicted[here]))
+    formula = "‖x − e^((A+BK)(t−t_k)) x(t_k)‖ ≤ ∫‖e^((A+BK)s) B‖ ‖u − Kx‖ds, since the event t_k"
+    values = np.fmin(predicted + most, certificate.state(t_s))
+    return ClaimBound(
+        Bound(formula, t_s[here], shares, run.violation_of(certificate)),
+        Envelope("bound, given x at the last event", "x", t_s, values),
+    )

@@ -1,0 +1,130 @@
+"""The formats of exports, and what they write: a run, one of its loops, or a scenario."""
+
+import pkgutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol, cast, runtime_checkable
+
+from cosim.lazy_modules import lazy_modules
+from cosim.record.run_directory import ENVIRONMENT_FILE, SUMMARY_FILE, read_object
+from noack.core.errors import CallerError
+
+with lazy_modules():
+    from cosim.analysis.summary import summary_model
+    from cosim.record import run_record
+
+if TYPE_CHECKING:
+    from cosim.record.run_record import RunRecord
+    from noack.scenario.scenario import Scenario
+
+_ENDING = "_export"
+FORMATS = tuple(
+    module.name.removesuffix(_ENDING)
+    for module in pkgutil.iter_modules([str(Path(__file__).parent)])
+    if module.name.endswith(_ENDING)
+)
+"""Names of the formats; their files are imported when they are used."""
+
+
+class ExportFormat(Protocol):
+    """What a file ``NAME_export.py`` has."""
+
+    SUFFIX: str
+    """Ending of its files; empty: a folder."""
+
+    def write(self, run: "ExportedRun", path: Path, *, certificates: bool) -> list[Path]:
+        """Write a run; return the written files. Raise MachineError if a file cannot be written."""
+
+
+@runtime_checkable
+class ScenarioFormat(ExportFormat, Protocol):
+    """A format that needs no run."""
+
+    def write_scenario(self, scenario: "Scenario", path: Path) -> list[Path]:
+        """Write what is exported of a scenario; return the written files.
+
+        Raises:
+            CallerError: the format cannot have something of the scenario.
+            MachineError: a file cannot be written.
+        """
+
+
+@dataclass(frozen=True)
+class ExportedRun:
+    """A run, or one of the loops of a run."""
+
+    directory: Path
+    record: "RunRecord"
+    """Of the only loop, or of the network that the loops share."""
+    summary: dict[str, object]
+    """The content of ``summary.json``, or its part about the loop."""
+    loops: "Sequence[ExportedRun]" = ()
+    """The loops that share the network."""
+    name: str = ""
+    """Of the loop; empty for the run itself."""
+    phase_ns: int = 0
+    """Time of the run at which the loop's own time begins."""
+
+    @property
+    def environment(self) -> dict[str, object]:
+        """The content of ``environment.json``."""
+        return read_object(self.directory / ENVIRONMENT_FILE) | {"kind": self.record.kind}
+
+
+def export_run(
+    run_dir: Path,
+    path: Path,
+    file_format: str | None = None,
+    *,
+    loop: str | None = None,
+    certificates: bool = True,
+) -> list[Path]:
+    """Export a run; return the written files.
+
+    Args:
+        run_dir: the run directory, which has a summary.
+        path: the file, or the folder.
+        file_format: its name; by default that of the path's ending.
+        loop: name of the loop to export; by default the whole run.
+        certificates: whether a file of MATLAB has the certificates of each loop.
+
+    Raises:
+        CallerError: the ending is not that of a format, it is not a run directory, or the record is
+            damaged.
+        MachineError: a file cannot be written.
+    """
+    suffixes = {name: find_format(name).SUFFIX for name in FORMATS}
+    by_ending = {suffix: name for name, suffix in suffixes.items()}
+    chosen = by_ending.get(path.suffix) if file_format is None else file_format
+    if chosen is None or suffixes[chosen] not in ("", path.suffix):
+        *first, last = (suffix or "a folder" for suffix in suffixes.values())
+        expected = f"{', '.join(first)} or {last}" if file_format is None else suffixes[file_format]
+        raise CallerError(f"{path}: an export is written to {expected}")
+    return find_format(chosen).write(_exported_run(run_dir, loop), path, certificates=certificates)
+
+
+def find_format(file_format: str) -> ExportFormat:
+    """Return a format by its name."""
+    return cast("ExportFormat", import_module(f"{__package__}.{file_format}{_ENDING}"))
+
+
+def _exported_run(run_dir: Path, loop: str | None) -> ExportedRun:
+    """Return a run directory, or one of its loops, for an export.
+
+    Raises:
+        CallerError: it is not a run directory, its record is damaged, or there is no such loop.
+    """
+    run, content = run_record.load_run(run_dir), read_object(run_dir / SUMMARY_FILE)
+    if loop is not None or not run.names[1:]:
+        record = run.loop(loop)
+        summary = summary_model.read_summary(content)
+        own = summary.of_loop(record.scenario.name).to_json() if summary else content
+        return ExportedRun(run_dir, record, own)
+    parts = dict(zip(run.names, content.get("loops", []), strict=False))
+    loops = [
+        ExportedRun(run_dir, record, parts.get(name, {}), (), name, phase_ns)
+        for name, record, phase_ns in zip(run.names, run.loops, run.phases_ns, strict=True)
+    ]
+    return ExportedRun(run_dir, run.network, content, loops)
