@@ -28,6 +28,7 @@ from cosim.simulation.exact_simulation import (
     ExactSimulation,
     Population,
     Setting,
+    left_out,
     run_with_events,
     setting_of,
 )
@@ -158,7 +159,8 @@ def why_not_exact(scenario: Scenario) -> str | None:
         scenario.coverage.require_exact()
     except CallerError as error:
         return str(error)
-    return None
+    kinds = left_out(scenario.network.link)
+    return f"network.impairments: {kinds}: the exact simulation has no delay" if kinds else None
 
 
 def explore(scenario: Scenario) -> Exploration:

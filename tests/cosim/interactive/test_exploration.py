@@ -82,6 +82,19 @@ def test_a_scenario_without_exact_simulation_is_refused_with_the_reason() -> Non
     assert exploration.why_not_exact(noack.load("lane_following")) is None
 
 
+def test_a_run_with_a_delay_is_drawn_with_it() -> None:
+    """In continuous time there is none: it was drawn as if its updates arrived at once."""
+    delay = [{"kind": "delay", "delay_s": 0.5}]
+    scenario = noack.load("lane_following", {"network.impairments": delay, "horizon_s": 6.0})
+    run = exploration.explore_or_simulate(scenario)
+    assert run.kind == exploration.SAMPLED
+    simulated = noack.simulate(scenario).summary.loops[0]
+    assert len(run.event_s) == simulated.events
+    assert run.x_norm[-1] == pytest.approx(simulated.final_state_norm, rel=0.01)
+    reason = exploration.why_not_exact(scenario)
+    assert reason == "network.impairments: delay: the exact simulation has no delay"
+
+
 @pytest.mark.parametrize("name", ["lane_following", "double_integrator"])
 def test_trajectories_of_an_ensemble_are_those_of_the_exact_simulator(name: str) -> None:
     scenario = noack.load(name, {"network.initial_sync": "known_state"})
