@@ -132,6 +132,14 @@ class Exploration:
         norms: Vector = np.linalg.norm(self.x, axis=1)
         return norms
 
+    @property
+    def rest_norm(self) -> tuple[str, Vector]:
+        """‖x‖, (N,), at a set point ‖x − x_r‖; with its name."""
+        setpoint = loop_of(self.scenario).setpoint
+        if setpoint is None:
+            return "‖x‖", self.x_norm
+        return "‖x − x_r‖", np.linalg.norm(self.x - setpoint, axis=1)
+
     @cached_property
     def controller_knows(self) -> NDArray[np.bool_]:
         """Whether the controller has a state: not before its first update, (N,)."""

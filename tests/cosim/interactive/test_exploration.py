@@ -2,6 +2,7 @@
 
 import base64
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -141,14 +142,20 @@ def test_a_verdict_says_what_became_of_the_run_and_of_its_guarantee() -> None:
 
 
 def test_a_loop_at_its_setpoint_breaks_no_guarantee() -> None:
-    """The certificate bounds ‖x − x_r‖, which decays; ‖x‖ stays near ‖x_r‖ = 20."""
+    """The certificate bounds ‖x − x_r‖, which decays; ‖x‖ stays near ‖x_r‖ = 20.
+
+    Such a loop was called bounded, and was said to grow, where a run's summary calls it stable.
+    """
     run = exploration.explore_or_simulate(
         noack.load("lane_following", {"controller.setpoint": [0.0, 0.0, 0.0, 20.0]})
     )
     certified = guarantee.certify(run.scenario)
     assert run.x_norm[-1] == pytest.approx(20.0, rel=0.01)
     assert 20.0 < certified.x[-1] < 25.0
-    assert verdict_of(run, certified)[1].text.startswith("guarantee kept: ")
+    ending, kept, _ = (line.text for line in verdict_of(run, certified))
+    assert kept.startswith("guarantee kept: ")
+    assert re.match(r"completed 20 s: stable, ‖x − x_r‖ rose from 17 to 17\.1, then fell to 0\.", ending)
+    assert guarantee.warning(run, certified, None) == ""
 
 
 def test_more_losses_than_assumed_break_a_guarantee_that_is_not_enforced() -> None:
