@@ -216,9 +216,7 @@ def _print_run(
         ("‖x‖ at the start", number(summary.initial_state_norm)),
         ("‖x‖ at the end", number(summary.final_state_norm)),
     )
-    title = run_tables.title_of(
-        summary.scenario, summary.mode, summary.mansd, constraints, "continuous"
-    )
+    title = run_tables.title_of(summary.scenario, summary.mode, summary.mansd, constraints, "continuous")
     terminal_output.print_numbers(console, title, rows)
     table = _event_table(run)
     console.print(result_tables.terminal_table(table, left=(), styles={"lost": "red"}))
