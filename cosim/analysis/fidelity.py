@@ -103,7 +103,7 @@ def recorded_loop(record: RunRecord) -> RecordedLoop:
     acts_at_tick = np.searchsorted(origins.newest, numbers)
     acts_at_step = np.searchsorted(latched.newest, numbers)
     act_ns = np.append(origins.model_ns, _AFTER_ANY_TIME_NS)[acts_at_tick]
-    network = network_fates(record.scenario)
+    network = network_fates(record.scenario, record.number)
     schedule = StepSchedule(
         period_ns=period_ns,
         measured=measured,
