@@ -156,6 +156,13 @@ def test_an_interrupted_run_is_compared_up_to_its_end(record: RunRecord) -> None
     assert fidelity.explained_relative < 1e-9
 
 
+def test_an_event_at_the_last_measurement_is_one_of_the_ideal_loop() -> None:
+    """An update every 0.1 s: the run had 41, and the ideal loop was said to have 40."""
+    fidelity = compute_fidelity(lane(None, 'trigger={policy="periodic", period_s=0.1}'))
+    assert fidelity.events_live == fidelity.events_ideal == 41
+    assert fidelity.first_different_event is None
+
+
 def test_events_beyond_the_run_have_the_fates_of_their_own_loop(tmp_path: Path) -> None:
     """They had those of the first loop, whose random numbers are others."""
 
