@@ -104,7 +104,7 @@ def recorded_loop(record: RunRecord) -> RecordedLoop:
     acts_at_tick = np.searchsorted(origins.newest, numbers)
     acts_at_step = np.searchsorted(latched.newest, numbers)
     act_ns = np.append(origins.model_ns, _AFTER_ANY_TIME_NS)[acts_at_tick]
-    network = network_fates(record.scenario)
+    network = network_fates(record.scenario, record.number)
     schedule = StepSchedule(
         period_ns=period_ns,
         measured=measured,
@@ -206,6 +206,8 @@ _ROUNDING = 1e-9
 _NUDGE = 1e-13
 """Perturbation of x(0), relative, about the size of rounding. If it changes the events of a run,
 rounding does so too."""
+_AT_THE_END = 1e-11
+"""The ideal loop runs longer, relative: an event at the last measurement may be due after rounding."""
 _SPLIT_PERIODS = 10
 """Two event sequences differ from the first event that is further apart, in measurements."""
 _LARGEST = 1e100
@@ -347,7 +349,8 @@ def compute_fidelity(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelit
     period_s = schedule.period_ns * 1e-9
     t_s = np.flatnonzero(schedule.measured).astype(np.float64) * period_s
     # The chain of simulations, from the ideal loop to the live run.
-    ideal = _ideal(system, live, float(t_s[-1]), max_events, known_start=known)
+    until_s = float(t_s[-1]) * (1 + _AT_THE_END)
+    ideal = _ideal(system, live, until_s, max_events, known_start=known)
     simulated, event_times_s = _simulate_stages(system, schedule, known)
     states = [ideal.at(t_s).x, *simulated, live.x]
     events_s = [ideal.event_s, *event_times_s, live.event_s]

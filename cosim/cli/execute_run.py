@@ -27,6 +27,7 @@ with lazy_modules():
     from cosim.output import terminal_output
     from cosim.output.viewer import rerun_program
     from cosim.record import run_directory
+    from cosim.simulation import exact_simulation
     from cosim.studies.campaign import campaign_file, campaign_report, campaign_workers
     from noack.core import core_library
     from noack.protocol import roles
@@ -167,6 +168,16 @@ def warn_of_violations(loaded: "scenario.Scenario") -> None:
                 print(
                     f"noack: warning: {prefix}violated: {assumption.what}: {assumption.why}", file=sys.stderr
                 )
+
+
+def warn_of_left_out(loaded: "scenario.Scenario") -> None:
+    """Print on standard error which of the network's impairments a continuous simulation leaves out."""
+    if kinds := exact_simulation.left_out(loaded.network.link):
+        print(
+            f"noack: warning: network.impairments: {kinds}: left out, in continuous time the network "
+            "has no delay",
+            file=sys.stderr,
+        )
 
 
 def warn_of_other_runs() -> None:

@@ -28,6 +28,7 @@ from cosim.simulation.exact_simulation import (
     ExactSimulation,
     Population,
     Setting,
+    left_out,
     run_with_events,
     setting_of,
 )
@@ -133,6 +134,14 @@ class Exploration:
         norms: Vector = np.linalg.norm(self.x, axis=1)
         return norms
 
+    @property
+    def rest_norm(self) -> tuple[str, Vector]:
+        """‖x‖, (N,), at a set point ‖x − x_r‖; with its name."""
+        setpoint = loop_of(self.scenario).setpoint
+        if setpoint is None:
+            return "‖x‖", self.x_norm
+        return "‖x − x_r‖", np.linalg.norm(self.x - setpoint, axis=1)
+
     @cached_property
     def controller_knows(self) -> NDArray[np.bool_]:
         """Whether the controller has a state: not before its first update, (N,)."""
@@ -160,7 +169,8 @@ def why_not_exact(scenario: Scenario) -> str | None:
         scenario.coverage.require_exact()
     except CallerError as error:
         return str(error)
-    return None
+    kinds = left_out(scenario.network.link)
+    return f"network.impairments: {kinds}: the exact simulation has no delay" if kinds else None
 
 
 def explore(scenario: Scenario) -> Exploration:

@@ -124,8 +124,9 @@ def verdict_of(run: Exploration, guarantee: Guarantee | None) -> tuple[VerdictLi
         status, reason = ExitStatus.FAILED, f"diverged at {number(run.diverged_at_s, 4)} s"
     elif run.cut:
         status, reason = ExitStatus.INTERRUPTED, run.cut
-    first, largest, last = run.x_norm[0], float(np.nanmax(run.x_norm)), float(run.x_norm[-1])
-    state = state_text(float(first), largest, last, None) if run.diverged_at_s is None else ""
+    name, norm = run.rest_norm
+    first, largest, last = float(norm[0]), float(np.nanmax(norm)), float(norm[-1])
+    state = state_text(first, largest, last, None, name) if run.diverged_at_s is None else ""
     events = len(run.event_s)
     return (
         ending_line(ExitPart(status=status, reason=reason), reached_s, horizon_s, state),

@@ -124,7 +124,7 @@ def _reason(certificate: ScenarioCertificate) -> str:
     constants = certificate.constants
     if constants is None:
         return certificate.void or "no bounds were found"
-    patterns = "every loss pattern allowed by M"
+    patterns = "every loss pattern that the guarantee allows"
     if constants.rate_per_s == 0:
         return f"{patterns}: all errors stay bounded"
     rate = f"decay at the rate {at_least(constants.rate_per_s, 3)} /s"
@@ -158,11 +158,12 @@ def margin_of(scenario: Scenario) -> Margin:
 def warning(run: Exploration, guarantee: Guarantee | None, margin: Margin | None) -> str:
     """Return in words whether a run is unstable, and why nothing is guaranteed; empty if stable."""
     parts = []
+    name, norm = run.rest_norm
     if run.diverged_at_s is not None:
         parts.append(f"The loop is unstable under these losses: it diverged at {run.diverged_at_s:.3g} s.")
-    elif run.x_norm[-1] > run.x_norm[0]:
-        first, last = (number(float(run.x_norm[i]), 3) for i in (0, -1))
-        parts.append(f"‖x‖ grows from {first} to {last}.")
+    elif norm[-1] > norm[0]:
+        first, last = (number(float(norm[i]), 3) for i in (0, -1))
+        parts.append(f"{name} grows from {first} to {last}.")
     if run.cut:
         parts.append(f"{run.cut[0].upper()}{run.cut[1:]}.")
     if parts and guarantee is not None and guarantee.verdict != CERTIFIED:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 from nicegui import ui
 from nicegui.events import GenericEventArguments, ValueChangeEventArguments
 
-from cosim.interactive.exploration import Fact
+from cosim.interactive.exploration import EXACT, Fact
 from cosim.interactive.exploration_figure import CERTIFICATE, ExploredRun, exploration_figure
 from cosim.interactive.exploration_words import Reference, compare, verdict_of
 from cosim.interactive.scenario_draft import Draft, DraftError, draft_of_query, open_draft
@@ -225,8 +225,9 @@ class _Page:
         if self._source == EXPLORE:
             name, run = "the settings before the last change", session.before
         else:
-            name = "the ideal loop with the settings of this page"
             run = session.results.run if session.results else None
+            kind = "ideal loop" if run is None or run.kind == EXACT else "simulation"
+            name = f"the {kind} with the settings of this page"
         return None if run is None else Reference(name, run)
 
     def _verdict(self) -> list[VerdictLine]:

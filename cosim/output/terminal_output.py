@@ -237,8 +237,8 @@ def print_fidelity(console: Console, fidelity: Fidelity) -> None:
     console.print(
         "Each row adds one effect to the rows above. RMS, max: of the norm, in model units. Δt: "
         "largest change of an event's time. split at event: number of the first event that moves "
-        "by more than ten measurement periods; from there on, the recorded losses fall on other "
-        "events. A negative share partly cancels the other effects.",
+        "by more than ten measurement periods, or that one of the two lacks; from there on, the "
+        "recorded losses fall on other events. A negative share partly cancels the other effects.",
         highlight=False,
     )
     colour = "green" if fidelity.explained else "bold red"

@@ -338,15 +338,15 @@ def _read_run(
     return ContinuousRun(system, horizon_s, start, before, after, delivered, diverged_at_s)
 
 
-def network_fates(resolved: Scenario) -> Callable[[int], bool]:
-    """Return whether the scenario's network delivers update i, for i = 0, 1, …, as in a live run.
+def network_fates(resolved: Scenario, loop: int = 0) -> Callable[[int], bool]:
+    """Return whether the network delivers update i of a loop, for i = 0, 1, …, as in a live run.
 
     The emulator's losses and corruption depend only on its seed and on the order of arrival, so
     they can be computed without sending. Delays, rate limits and blackouts do not exist in the
     paper's loop and are ignored. For ``initial_sync = "first_packet"`` update 0 is delivered.
     """
     link = LinkState(timeless(resolved.network.link), resolved.seeds.loss, UPDATE_LINK)
-    link.start_flow(0, 0)
+    link.start_flow(0, loop)
     known: list[bool] = []
 
     def delivered(event: int) -> bool:

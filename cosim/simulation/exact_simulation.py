@@ -250,6 +250,12 @@ def timeless(settings: LinkSettings) -> LinkSettings:
     return settings.model_copy(update={"impairments": kept})
 
 
+def left_out(settings: LinkSettings) -> str:
+    """Return the kinds of a link's impairments that do not exist in the paper's loop, as text."""
+    kept = timeless(settings).impairments
+    return ", ".join(stage.kind for stage in settings.impairments if stage not in kept)
+
+
 class Population(NamedTuple):
     """The data that differ between the runs."""
 

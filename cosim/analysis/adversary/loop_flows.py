@@ -457,5 +457,5 @@ def run_sampled(flow: SampledFlow, delivered: Callable[[int], bool]) -> SampledR
         fates.append(delivered(len(event_s)))
         event_s.append(float(segment.end_s[0]))
         segment = segment._replace(z=flow.after_events(segment.end_s, segment.z, np.array(fates[-1:])))
-    known = flow.objective is not Objective.COST and value > -np.inf
+    known = flow.objective is not Objective.COST and math.isfinite(value)
     return SampledRun(value, at_s if known else None, tuple(fates), tuple(event_s))

@@ -1,7 +1,7 @@
 """The worst run that the adversary found, as values, as a table and as JSON."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 
 import numpy as np
@@ -9,11 +9,14 @@ from rich.console import Console
 from rich.table import Table
 
 from cosim.analysis.adversary.loop_flows import Measure, Objective, ObjectiveValue, Pattern
-from noack.core.number_format import at_least, at_most, number
+from cosim.analysis.adversary.worst_disturbances import disturbance_bounds
+from noack.core.clock import NS_PER_S
+from noack.core.number_format import at_least, at_most, duration, number
 from noack.guarantee.loss_guarantee import outcome_letters
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import Constants
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.conditions import network_delay_ns
 
 _BREACH = 1 + 1e-9
 """Share of the bound from which on a run refutes it; below are rounding errors."""
@@ -38,7 +41,7 @@ class WorstRun:
     event_s: tuple[float, ...]
     """Times of the events."""
     exact: bool
-    """Whether every admissible pattern was covered; otherwise others may be worse."""
+    """Whether every admissible pattern was covered, or this one diverges; else others may be worse."""
     nodes: int
     """Segments between events that were computed."""
     runs: int
@@ -169,8 +172,11 @@ def print_worst(
         speed = (
             f"{worst.runs:,} runs; {worst.nodes:,} segments, {worst.nodes / worst.elapsed_s:,.0f} per second"
         )
-        console.print(f"{worst.objective.value}: {time_text}{coverage} ({speed})")
+        found = "the loop diverges" if worst.diverges else f"{time_text}{coverage} ({speed})"
+        console.print(f"{worst.objective.value}: {found}")
         console.print(f"  {worst.text}", soft_wrap=True, highlight=False)
+    for note in _notes(resolved, trigger):
+        console.print(note)
     if trigger == "sampled" and _is_shaped(certificate):
         console.print("[dim]Scaled: multiplied by bound(0) / bound(t)[/]")
     if certificate.void is not None:
@@ -178,6 +184,20 @@ def print_worst(
     elif trigger == "sampled":
         console.print("[dim]certified: for the scenario's schedule, without lateness[/]")
     console.print("[dim]One letter per event: D delivered, L lost. --json prints their times[/]")
+
+
+def _notes(resolved: Scenario, trigger: str) -> Iterator[str]:
+    """Yield what the values are for besides the losses."""
+    if not resolved.network.enforce_mansd:
+        yield "[yellow]Nothing enforces this limit of the losses: the network may lose more[/]"
+    if trigger != "sampled":
+        return
+    if not resolved.coverage.is_undisturbed:
+        bounded = disturbance_bounds(resolved) is not None
+        worst = "; of the worst error and state, the worst signs of bounded ones, as far as found" * bounded
+        yield f"[dim]Disturbances and noise: as the seeds draw them{worst}[/]"
+    if delay_ns := network_delay_ns(resolved, 0):
+        yield f"[dim]Every delivered update takes the longest delay, {duration(delay_ns / NS_PER_S)}[/]"
 
 
 def _quantity(objective: Objective, certificate: ScenarioCertificate, trigger: str) -> str:

@@ -269,6 +269,7 @@ class ConditionReader:
             self._timeout_s,
             {} if self._clocks is None else self._clocks.take(),
             np.inf if self._clocks is None else self._clocks.largest_s,
+            np.inf if end_ns is None else end_ns * 1e-9,
         )
 
 

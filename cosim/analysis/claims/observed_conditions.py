@@ -196,6 +196,13 @@ class ObservedConditions(NamedTuple):
     """By ``CLOCK_CAUSES``: the bound of the error of a clock, and the times when it was lost; only
     with ``[clocks]``."""
     largest_clock_error_s: float = np.inf
+    reached_s: float = np.inf
+    """The end of the run, once it is known."""
+
+    def _first_input(self, limit_s: float) -> SampledSeries:
+        """The time of the first input, at t = 0; 0 if the run ended before that had to come."""
+        ended_before = self.start_s == np.inf and 0.0 < self.reached_s <= limit_s
+        return SampledSeries(np.zeros(1), np.array([0.0 if ended_before else self.start_s]))
 
     def violations(
         self,
@@ -220,12 +227,11 @@ class ObservedConditions(NamedTuple):
                 violations.append(
                     AssumptionViolation(excess.first_s, rule.name, excess.worst, text, excess.worst_at_s)
                 )
-        start = SampledSeries(np.zeros(1), np.array([self.start_s]))
         every: dict[str, tuple[SampledSeries, float]] = {
             "sampling": (self.sampling, conditions.sampling_s),
             "delay": (self.delay, conditions.delay_s),
             "hold": (self.hold, conditions.hold_s),
-            "start": (start, conditions.start_s),
+            "start": (self._first_input(conditions.start_s), conditions.start_s),
             "watchdog": (self.watchdog, self.timeout_s),
             "safe input": (self.safe_input, -1.0),  # every value is a violation
             "restart": (self.restarts, 0.0),
@@ -252,7 +258,7 @@ class ObservedConditions(NamedTuple):
 
     def later_times(self, allowed: NetworkConditions) -> list[float]:
         """Return when the run became later than ``allowed``, and later than it had been so far."""
-        start = SampledSeries(np.zeros(1), np.array([self.start_s]))
+        start = self._first_input(allowed.start_s)
         every = ((self.delay, allowed.delay_s), (self.hold, allowed.hold_s), (start, allowed.start_s))
         peaks = [(series.peaks(), limit_s + _TOLERANCE_S) for series, limit_s in every]
         return sorted({t_s for series, most_s in peaks for t_s in series.t_s[series.value > most_s].tolist()})
@@ -272,7 +278,7 @@ class ObservedConditions(NamedTuple):
         return allowed._replace(
             delay_s=larger(allowed.delay_s, self.delay),
             hold_s=larger(allowed.hold_s, self.hold),
-            start_s=larger(allowed.start_s, SampledSeries(np.zeros(1), np.array([self.start_s]))),
+            start_s=larger(allowed.start_s, self._first_input(allowed.start_s)),
         )
 
     def summary(self) -> dict[str, float | None]:

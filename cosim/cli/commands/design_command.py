@@ -9,6 +9,7 @@ from typer import Option
 
 from cosim.cli import command as cli
 from cosim.cli import options as opt
+from cosim.cli.execute_run import warn_of_left_out
 from cosim.lazy_modules import lazy_modules
 from cosim.record.run_directory import DEFAULT_RUNS
 from noack.core.errors import CallerError, ExitStatus
@@ -242,6 +243,8 @@ def design(
             raise CallerError(f"--settling, --gain: are not for --for {network.aim.value}")
         page = files.page_of(f"{loaded.name}-network")
         request = network.request(feedback.matrices(loaded), requirements.bounds())
+        if request.period_s is None and loaded.trigger.policy == "decaying":
+            warn_of_left_out(loaded)
         with progress.work_bar("trying gains", lines=True) as bar:
             outcome = event_design.design_for_network(loaded, request, seed, bar)
         written = design_page.write_outcome(outcome, page, figure_files)
@@ -249,6 +252,7 @@ def design(
         cli.show_with_files(json, outcome.to_json(), written, design_page.print_loop_design, outcome)
         return ExitStatus.OK if outcome.is_certified else ExitStatus.FAILED
     network.refuse()
+    warn_of_left_out(loaded)
     page = files.page_of(loaded.name)
     result = _trigger_of(loaded, requirements.limits(), weights, feedback, draws, seed)
     written = design_page.write_page(result, page, figure_files)

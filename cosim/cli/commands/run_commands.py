@@ -10,7 +10,14 @@ from typer import Argument, Option
 
 from cosim.cli import command as cli
 from cosim.cli import options as opt
-from cosim.cli.execute_run import LiveOptions, OutputOptions, finalize_run, run_processes, warn_of_violations
+from cosim.cli.execute_run import (
+    LiveOptions,
+    OutputOptions,
+    finalize_run,
+    run_processes,
+    warn_of_left_out,
+    warn_of_violations,
+)
 from cosim.lazy_modules import lazy_modules
 from cosim.record.run_directory import DEFAULT_RUNS
 from noack.core.errors import CallerError
@@ -173,15 +180,20 @@ def simulate(
 
 def _simulate_continuously(loaded: "scenario.Scenario", *, json: bool) -> int:
     resolved = resolution.resolve(loaded)
+    warn_of_left_out(resolved)
     with cli.status("simulating"):
         run = continuous.run_continuous(resolved)
     summary = continuous.summary(run, resolved)
-    cli.show(json, lambda: continuous.document(run, resolved), _print_run, run, summary)
+    constraints = [rule.text() for rule in resolved.network.constraints]
+    cli.show(json, lambda: continuous.document(run, resolved), _print_run, run, summary, constraints)
     return summary.exit_status
 
 
 def _print_run(
-    console: "Console", run: "continuous.ContinuousRun", summary: "continuous.ContinuousSummary"
+    console: "Console",
+    run: "continuous.ContinuousRun",
+    summary: "continuous.ContinuousSummary",
+    constraints: list[str],
 ) -> None:
     """Print how the run ended, its key numbers, and its first 40 events."""
     ended = summary_model.ExitPart(status=int(summary.exit_status), reason=summary.reason)
@@ -197,14 +209,14 @@ def _print_run(
         terminal_output.print_line(console, line)
     rows = (
         run_tables.lost_row(summary.drops, summary.deliveries),
-        run_tables.longest_burst(summary.mansd, (), summary.longest_loss_burst),
+        run_tables.longest_burst(summary.mansd, constraints, summary.longest_loss_burst),
         *run_tables.interval_rows(
             summary.inter_event_min_s, summary.inter_event_median_s, summary.inter_delivery_median_s
         ),
         ("‖x‖ at the start", number(summary.initial_state_norm)),
         ("‖x‖ at the end", number(summary.final_state_norm)),
     )
-    title = run_tables.title_of(summary.scenario, summary.mode, summary.mansd, (), "continuous")
+    title = run_tables.title_of(summary.scenario, summary.mode, summary.mansd, constraints, "continuous")
     terminal_output.print_numbers(console, title, rows)
     table = _event_table(run)
     console.print(result_tables.terminal_table(table, left=(), styles={"lost": "red"}))

@@ -8,7 +8,7 @@ from typer import Option
 
 from cosim.cli import command as cli
 from cosim.cli import options as opt
-from cosim.cli.execute_run import LiveOptions, run_processes
+from cosim.cli.execute_run import LiveOptions, run_processes, warn_of_left_out
 from cosim.lazy_modules import lazy_modules
 from cosim.record.run_directory import DEFAULT_RUNS
 from noack.core.errors import CallerError, ExitStatus
@@ -205,6 +205,8 @@ def adversary(
     """
     resolved = resolution.resolve(source.load(*([] if horizon is None else [f"horizon_s={horizon}"])))
     continuous = trigger is opt.TriggerMode.CONTINUOUS
+    if continuous:
+        warn_of_left_out(resolved)
     conditions = adversary_search.conditions_of(resolved, continuous=continuous)
     certificate = scenario_certificates.certify(resolved, conditions)
     kinds, is_all = adversary_search.Objective, objective is AdversaryAim.ALL

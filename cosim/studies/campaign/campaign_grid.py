@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.shipped_files import find_shipped
-from cosim.simulation.exact_simulation import ROW, Setting, run_batch, setting_of, timeless
+from cosim.simulation.exact_simulation import ROW, Setting, left_out, run_batch, setting_of
 from cosim.studies.campaign.campaign_file import LOOPS, Campaign, Value, scales_loops
 from cosim.studies.campaign.campaign_workers import Work
 from cosim.studies.campaign.drawn_runs import SampledWork, SharedNetworkWork, in_virtual_time
@@ -205,11 +205,9 @@ def _work(campaign: Campaign, scenario: Scenario) -> tuple[Work, float | None]:
             'network.protocol: continuous time needs the loop without acknowledgements, "none"; '
             'time = "sampled" takes both'
         )
-    allowed = timeless(resolved.network.link).impairments
-    taking_time = [stage.kind for stage in resolved.network.link.impairments if stage not in allowed]
-    if taking_time:
+    if kinds := left_out(resolved.network.link):
         raise CallerError(
-            f"network.impairments: {', '.join(taking_time)}: in continuous time the "
+            f"network.impairments: {kinds}: in continuous time the "
             'network has no delay; leave it out, e.g. settings = { "network.impairments" = [] }, '
             'or use time = "sampled"'
         )

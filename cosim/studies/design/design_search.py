@@ -308,14 +308,11 @@ class DesignResult:
     def scenario(self) -> Scenario:
         """The scenario of the best candidate, under a new name."""
         chosen = self.space.families[self.best.candidate.family].with_trigger(self.best.candidate)
-        return chosen.model_copy(
-            update={
-                "name": designed_name(chosen.name),
-                "description": f"{chosen.name} with the trigger that transmits least while "
-                f"{100 * self.limits.quantile:g} % of draws settle within "
-                f"{self.limits.settling_s:g} s.",
-            }
-        )
+        limits = self.limits
+        wanted = f"{100 * limits.quantile:g} % of draws settle within {limits.settling_s:g} s"
+        trigger = "transmits least, of those tried, while" if self.feasible else "comes closest to this:"
+        description = f"{chosen.name} with the trigger that {trigger} {wanted}."
+        return chosen.model_copy(update={"name": designed_name(chosen.name), "description": description})
 
     @property
     def conditions(self) -> str:

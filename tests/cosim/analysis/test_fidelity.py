@@ -14,10 +14,17 @@ import pyarrow.parquet as pq
 import pytest
 
 import cosim.analysis.fidelity
-from cosim.analysis.fidelity import Fidelity, IncomparableError, compute_fidelity, fidelity_for_summary
+import noack
+from cosim.analysis.fidelity import (
+    Fidelity,
+    IncomparableError,
+    compute_fidelity,
+    fidelity_for_summary,
+    recorded_loop,
+)
 from cosim.analysis.summary.summary_model import NoFidelityPart
 from cosim.live.finalize import finalize
-from cosim.record.run_record import RunRecord
+from cosim.record.run_record import RecordedRun, RunRecord, load_run
 from cosim.simulation.virtual_time import Network, simulate, simulate_run
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.resolution import resolve
@@ -147,6 +154,27 @@ def test_an_interrupted_run_is_compared_up_to_its_end(record: RunRecord) -> None
     fidelity = compute_fidelity(short)
     assert fidelity.samples == 250
     assert fidelity.explained_relative < 1e-9
+
+
+def test_an_event_at_the_last_measurement_is_one_of_the_ideal_loop() -> None:
+    """An update every 0.1 s: the run had 41, and the ideal loop was said to have 40."""
+    fidelity = compute_fidelity(lane(None, 'trigger={policy="periodic", period_s=0.1}'))
+    assert fidelity.events_live == fidelity.events_ideal == 41
+    assert fidelity.first_different_event is None
+
+
+def test_events_beyond_the_run_have_the_fates_of_their_own_loop(tmp_path: Path) -> None:
+    """They had those of the first loop, whose random numbers are others."""
+
+    def run(horizon_s: float) -> RecordedRun:
+        scenario = noack.load("different_loops", {"horizon_s": horizon_s})
+        return load_run(noack.simulate(scenario, runs=tmp_path).directory)
+
+    for short, whole in zip(run(2.0).loops, run(6.0).loops, strict=True):
+        sent = whole.events()["event"]
+        accepted = np.isin(sent, whole.columns(CONTROLLER_DELIVERY, "sequence")["sequence"])
+        assert len(short.events()) < len(sent)
+        assert [*map(recorded_loop(short).schedule.delivered, sent.tolist())] == accepted.tolist()
 
 
 def test_the_summary_has_the_comparison_or_the_reason(

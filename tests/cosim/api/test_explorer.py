@@ -103,6 +103,7 @@ def test_errors_are_said_to_decay_as_far_as_the_threshold_does() -> None:
     """With a floor of 0.02 ‖x‖ is 0.0065 after 60 s, and not e^(−0.3 t) = 1.5e-8."""
     explorer = noack.explore("double_integrator", {"trigger.floor": 0.0})
     assert explorer.certificate.reason.endswith("all errors decay at the rate 0.3 /s")
+    assert explorer.certificate.reason.startswith("every loss pattern that the guarantee allows: ")
     explorer.set({"trigger.floor": 0.02})
     assert explorer.certificate.reason.endswith("down to what the threshold's floor leaves")
 

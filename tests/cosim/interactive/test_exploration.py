@@ -2,6 +2,7 @@
 
 import base64
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -82,6 +83,19 @@ def test_a_scenario_without_exact_simulation_is_refused_with_the_reason() -> Non
     assert exploration.why_not_exact(noack.load("lane_following")) is None
 
 
+def test_a_run_with_a_delay_is_drawn_with_it() -> None:
+    """In continuous time there is none: it was drawn as if its updates arrived at once."""
+    delay = [{"kind": "delay", "delay_s": 0.5}]
+    scenario = noack.load("lane_following", {"network.impairments": delay, "horizon_s": 6.0})
+    run = exploration.explore_or_simulate(scenario)
+    assert run.kind == exploration.SAMPLED
+    simulated = noack.simulate(scenario).summary.loops[0]
+    assert len(run.event_s) == simulated.events
+    assert run.x_norm[-1] == pytest.approx(simulated.final_state_norm, rel=0.01)
+    reason = exploration.why_not_exact(scenario)
+    assert reason == "network.impairments: delay: the exact simulation has no delay"
+
+
 @pytest.mark.parametrize("name", ["lane_following", "double_integrator"])
 def test_trajectories_of_an_ensemble_are_those_of_the_exact_simulator(name: str) -> None:
     scenario = noack.load(name, {"network.initial_sync": "known_state"})
@@ -128,14 +142,20 @@ def test_a_verdict_says_what_became_of_the_run_and_of_its_guarantee() -> None:
 
 
 def test_a_loop_at_its_setpoint_breaks_no_guarantee() -> None:
-    """The certificate bounds ‖x − x_r‖, which decays; ‖x‖ stays near ‖x_r‖ = 20."""
+    """The certificate bounds ‖x − x_r‖, which decays; ‖x‖ stays near ‖x_r‖ = 20.
+
+    Such a loop was called bounded, and was said to grow, where a run's summary calls it stable.
+    """
     run = exploration.explore_or_simulate(
         noack.load("lane_following", {"controller.setpoint": [0.0, 0.0, 0.0, 20.0]})
     )
     certified = guarantee.certify(run.scenario)
     assert run.x_norm[-1] == pytest.approx(20.0, rel=0.01)
     assert 20.0 < certified.x[-1] < 25.0
-    assert verdict_of(run, certified)[1].text.startswith("guarantee kept: ")
+    ending, kept, _ = (line.text for line in verdict_of(run, certified))
+    assert kept.startswith("guarantee kept: ")
+    assert re.match(r"completed 20 s: stable, ‖x − x_r‖ rose from 17 to 17\.1, then fell to 0\.", ending)
+    assert guarantee.warning(run, certified, None) == ""
 
 
 def test_more_losses_than_assumed_break_a_guarantee_that_is_not_enforced() -> None:

@@ -113,6 +113,18 @@ def test_the_chosen_weight_makes_the_model_contract_and_keeps_the_volume(chosen:
     assert better.inter_event_s >= plain.inter_event_s
 
 
+@pytest.mark.parametrize(("gain", "advised"), [("[[-0.2, -0.7]]", True), ("[[0.2, -0.7]]", False)])
+def test_advice_is_for_a_loop_gain_and_no_norm_is_said_to_be_tried(gain: str, advised: bool) -> None:
+    """No rate helps a loop that is unstable without losses, and only "decaying" has other norms."""
+    trigger = 'trigger={policy="absolute", delta=0.1}'
+    settings = [trigger, f"model.gain={gain}", "model.allow_unstable=true"]
+    settings += ["plant.rate_hz=2", "controller.rate_hz=2"]
+    result = invoke("certify", "double_integrator", *(word for s in settings for word in ("--set", s)))
+    _, _, last = " ".join(result.stdout.split()).rpartition("no certificate for the schedule, ")
+    assert last.startswith("so no bound of ‖x‖")
+    assert ("plant.rate_hz" in last) == advised
+
+
 def test_a_start_that_overflows_is_named() -> None:
     certificates = certificates_of(shipped("double_integrator", "plant.initial_state=[1e200, 0]"))
     reasons = {certificate.void for _, certificate in certificates}

@@ -11,8 +11,10 @@ import noack
 from cosim.analysis.summary.run_summary import Outcome
 from cosim.analysis.summary.summary_model import Claim
 from cosim.live.finalize import finalize
+from cosim.output.page_kit import TERMS
 from cosim.output.run_tables import short_numbers
-from cosim.output.run_verdict import Tone, remarks, state_text, verdict
+from cosim.output.run_verdict import SETTLED_SHARE, Tone, remarks, state_text, verdict
+from cosim.record.divergence import GROWTH
 from cosim.simulation.virtual_time import simulate_run
 from tests.helpers.approved import compare_lines
 from tests.helpers.shipped import shipped
@@ -125,3 +127,19 @@ def test_the_table_fits_eighty_columns(scenario: str) -> None:
     assert max(len(name) for name, _ in rows) + max(len(value) for _, value in rows) <= 73
     # There is no other value to compare with.
     assert "ideal loop" not in verdict(run.summary)[2].text
+
+
+def test_the_glossary_has_the_limits_that_decide_the_words() -> None:
+    """It said that a loop diverges if it grows beyond all bounds."""
+    meaning = dict(TERMS)["stable, bounded, diverged"]
+    assert f"{GROWTH:g} times its expected size" in meaning
+    assert SETTLED_SHARE == 0.1
+    assert "at most a tenth of its largest value" in meaning
+
+
+def test_a_run_that_ends_before_its_first_input_is_due_keeps_its_guarantee() -> None:
+    """Of 10 ms, it was said that no input came where the first has to come within 34 ms."""
+    delay = {"network.impairments": [{"kind": "delay", "delay_s": 0.02}]}
+    for horizon_s in (0.01, 0.2):
+        summary = noack.simulate(noack.load("lane_weighted", {"horizon_s": horizon_s, **delay})).summary
+        assert verdict(summary)[1].text == "guarantee kept: 13 claims held, none violated"

@@ -30,6 +30,7 @@ from noack.scenario.resolution import LoopMatrices, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from noack.trigger.trigger_rule import TriggerRule
+from tests.helpers.command_line import invoke
 from tests.helpers.example_rules import decaying_rule
 
 
@@ -240,3 +241,13 @@ def test_the_json_document_agrees_with_the_run(resolved: Scenario) -> None:
     assert np.max(np.array(samples["e_s_norm"]) / samples["threshold"]) <= 1 + 1e-12
     errors = np.array(samples["x_c"]) - np.array(samples["x"])
     np.testing.assert_allclose(np.linalg.norm(errors, axis=1), samples["e_c_norm"], atol=1e-12)
+
+
+def test_the_command_names_what_it_leaves_out_and_all_that_limits_losses() -> None:
+    """It printed the cap M − 1 = 4 where at most 3 may be lost, and dropped a delay without a word."""
+    delay = 'network.impairments=[{kind="delay", delay_s=0.5}]'
+    result = invoke("simulate", "lane_constrained", "--trigger", "continuous", "--set", delay)
+    assert "longest loss burst (at most 3 allowed)" in result.stdout
+    assert result.stderr == (
+        "noack: warning: network.impairments: delay: left out, in continuous time the network has no delay\n"
+    )

@@ -2,15 +2,17 @@
 
 import math
 from dataclasses import replace
+from io import StringIO
 
 import numpy as np
 import pytest
+from rich.console import Console
 from scipy.integrate import quad
 
 from cosim.analysis.adversary.loop_flows import Objective, ObjectiveValue, measure_of
-from cosim.analysis.adversary.worst_run import WorstRun, certified_value, reported_value
+from cosim.analysis.adversary.worst_run import WorstRun, certified_value, print_worst, reported_value
 from cosim.simulation.continuous import continuous_loop_of
-from noack.theory.certificates.conditions import ideal_conditions
+from noack.theory.certificates.conditions import ideal_conditions, nominal_conditions
 from noack.theory.certificates.scenario_certificates import certify
 from tests.helpers.shipped import resolved
 
@@ -65,3 +67,36 @@ def test_the_certified_cost_is_the_integral_of_the_squared_bound(floor: float) -
         lambda t: certificate.state(np.array([t]))[0] ** 2, 0, horizon_s, points=kink_s, limit=200
     )
     assert certified == pytest.approx(expected, abs=10 * error)
+
+
+@pytest.mark.parametrize(
+    ("settings", "found", "expected"),
+    [
+        ((), {}, "state: worst at 1.000000 s; all patterns searched (2 runs"),
+        ((), {"value": math.inf, "at_s": 0.0}, "state: the loop diverges\n"),
+        (("network.enforce_mansd=false",), {}, "Nothing enforces this limit of the losses"),
+        (
+            ('plant.disturbances=[{kind="uniform", at="state", bound=[0.1, 0.1]}]',),
+            {},
+            "as the seeds draw them; of the worst error and state, the worst signs of bounded ones",
+        ),
+        (("plant.measurement.noise_std=[0.1, 0.1]",), {}, "Disturbances and noise: as the seeds draw them\n"),
+        (
+            ('network.impairments=[{kind="delay", delay_s=0.02, jitter_s=0.01}]',),
+            {},
+            "Every delivered update takes the longest delay, 30 ms",
+        ),
+    ],
+)
+def test_it_is_told_what_was_searched(
+    settings: tuple[str, ...], found: dict[str, float], expected: str
+) -> None:
+    """Of a loop that diverges not all patterns are searched, and no time is the worst."""
+    scenario, output = resolved("double_integrator", *settings), StringIO()
+    certificate = certify(scenario, nominal_conditions(scenario))
+    print_worst(Console(file=output, width=200), [replace(WORST, **found)], scenario, certificate, "sampled")
+    text = output.getvalue()
+    assert expected in text
+    if not settings:
+        assert "seeds" not in text
+        assert "delay" not in text
