@@ -23,9 +23,15 @@ from typing import NamedTuple, Self, TypedDict, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.control.time_histogram import coarse_histogram, quantile_ns
 from netem.relay.relay import Relay
-from netem.relay.relay_reports import DIRECTIONS, Direction, DirectionReport, LinkReport
+from netem.relay.relay_reports import (
+    DIRECTIONS,
+    Direction,
+    DirectionReport,
+    LinkReport,
+    coarse_histogram,
+    quantile_ns,
+)
 from netem.tc_words import words_of
 from noack.core.clock import NS_PER_S
 from noack.core.errors import PeerError
@@ -391,7 +397,7 @@ def _share(counters: Counters, lost: int) -> float | None:
 
 
 def quantiles(counts: NDArray[np.int64]) -> DelayQuantiles:
-    """Return quantiles of a histogram of :mod:`netem.control.time_histogram`."""
+    """Return quantiles of a histogram of times."""
     if not counts.any():
         return {"p50": None, "p99": None, "p999": None, "max": None}
     p50, p99, p999, largest = (round(quantile_ns(counts, q)) for q in (0.5, 0.99, 0.999, 1.0))

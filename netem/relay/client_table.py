@@ -8,10 +8,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from netem.relay.device_link import DeviceLink
 from netem.relay.link_sockets import Endpoint, has_data, return_path, stamp_arrivals
 from netem.relay.loss_warnings import LinkWarnings
-from netem.relay.relay_links import OpenLink
+from netem.relay.relay_links import DeviceLink, OpenLink
 from netem.relay.relay_memory import RelayDirection, RelayMemory, name_array
 from noack.core.core_library import core
 from noack.runtime.address import packed_name

@@ -8,10 +8,9 @@ from contextlib import suppress
 import numpy as np
 
 from netem.relay.client_table import ClientTable
-from netem.relay.device_link import DeviceLink
 from netem.relay.link_sockets import set_receive_timeout, stamp_arrivals
 from netem.relay.loss_warnings import LinkWarnings, UnintendedLosses
-from netem.relay.relay_links import LinkSpec, OpenLink, open_links
+from netem.relay.relay_links import DeviceLink, LinkSpec, OpenLink, open_links
 from netem.relay.relay_memory import RelayDirection, RelayMemory
 from netem.relay.relay_reports import DIRECTIONS, Direction, DirectionReport, FlowReport, LinkReport, Tap
 from noack.core.core_library import core, ffi

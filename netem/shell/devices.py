@@ -22,8 +22,7 @@ from ipaddress import IPv4Address, IPv4Interface, IPv4Network, IPv6Address
 from pathlib import Path
 from typing import NoReturn
 
-from netem.relay.device_link import DeviceLink
-from netem.relay.relay_links import LinkSpec
+from netem.relay.relay_links import DeviceLink, LinkSpec
 from netem.shell import process
 from noack.core.errors import CallerError
 from noack.core.process_limits import python_command
