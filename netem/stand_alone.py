@@ -34,6 +34,7 @@ from noack.runtime.command_line import Signals, failed, log_event, log_format
 from noack.runtime.drivers.realtime_settings import realtime
 
 _FIFO_PRIORITY = 50
+"""As the controller of a run has it by default."""
 _SPIN_NS = 50_000
 """Nearly all sleeping threads wake within this time; longer spinning would block the core."""
 

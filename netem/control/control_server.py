@@ -33,6 +33,7 @@ from noack.scenario.toml_file import brief
 EMULATORS = "netem"
 """The folder of the files."""
 _STARTING = "netem_starting"
+"""The folder of the files of emulators that start."""
 
 
 def _in_use(name: str) -> CallerError:
@@ -112,6 +113,7 @@ def _files() -> dict[str, private_folder.LockFile]:
 
 
 _PUBLISH_S = 1.0
+"""Time between two published statistics."""
 _QUERIES = 64
 """Maximum number of waiting queries of each kind; a new query replaces the oldest."""
 

@@ -28,7 +28,9 @@ from noack.runtime.command_line import Parser, Signals, discard_output, failed
 from noack.runtime.connections.zenoh_session import answer_to, cause_of, open_session
 
 _ANSWER_S = 30.0
+"""Longest wait for the answer to a query."""
 _SILENCE_S = 3.0
+"""After so long without statistics it is checked whether the emulator still runs."""
 _POLL_S = 0.02
 
 

@@ -43,6 +43,7 @@ from noack.runtime.address import address_text
 T = TypeVar("T")
 
 _PATIENCE_S = 5.0
+"""Longest wait for the relay's thread, which runs commands every 50 ms."""
 
 
 @dataclass(frozen=True)
@@ -405,6 +406,7 @@ def quantiles(counts: NDArray[np.int64]) -> DelayQuantiles:
 
 
 _JOIN_S = 10.0
+"""Longest wait for the end of the thread."""
 
 
 class StatisticsThread:

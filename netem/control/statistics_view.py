@@ -84,6 +84,7 @@ def bar(share: float, width: int) -> tuple[str, str]:
 
 
 _SPAN_S = 60.0
+"""Time that a chart shows."""
 _ARROWS = {"forward": "forward →", "reverse": "← reverse"}
 _LABEL_WIDTH = 9
 _FRAME_WIDTH = 4

@@ -17,6 +17,7 @@ from noack.runtime.address import packed_name
 from noack.runtime.udp_sockets import drops_of
 
 _QUERIED_AT_ONCE = 64
+"""Return paths whose drop counters are queried in one turn of housekeeping."""
 _STALL_NS = 1_000_000_000
 """A relay that has not checked for idle clients for this time was stopped, or got no CPU time."""
 

@@ -19,8 +19,11 @@ from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import Address, packed_name
 
 _PERIOD_NS = 40_000_000
+"""Time between two turns of housekeeping."""
 _CHECK_PERIOD_NS = 250_000_000
+"""Time between two checks for losses, idle clients and return paths."""
 _REPORTED_FLOWS = 16
+"""Flows of a direction that a report lists: those with most packets."""
 _PR_SET_TIMERSLACK, _PR_GET_TIMERSLACK = 29, 30
 
 

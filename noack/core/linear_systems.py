@@ -26,11 +26,13 @@ MatrixKey = tuple[tuple[int, ...], bytes]
 """Shape and bits of a matrix, by which equal matrices are known."""
 
 _CACHED_STEPS = 4096
+"""Transition matrices that are kept."""
 _SAFE = 1e-140
 """Squares of vectors between this size and its inverse neither underflow nor overflow."""
 _MOST_IN_TURN = 8
 """Of fewer terms, numpy computes a sum in turn; it takes ten times as long for many short rows."""
 _BALANCINGS, _FARTHEST = 20, 200
+"""Most rounds of balancing, and the largest exponent."""
 _MOST_STATES = 12
 """The linear equations of a Lyapunov equation grow with the fourth power of the states."""
 

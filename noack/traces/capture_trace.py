@@ -40,6 +40,7 @@ _KEY = os.urandom(16)
 """Payloads are compared by a keyed hash, so that nobody can make two with the same."""
 _FIELD = re.compile(r"([0-9]{1,5}):([1-8])(:little)?")
 _MOST = 2**62
+"""Upper limit of sequence numbers."""
 
 
 class CapturedDatagram(NamedTuple):

@@ -32,6 +32,7 @@ _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,4})?
 _OTHER = "_other_clock"
 _LOST = re.compile(r"(-1(\.0*)?)?")
 _MOST = 2**62
+"""Upper limit of times in ns and of sequence numbers."""
 _LINE_BYTES = 2**16
 
 

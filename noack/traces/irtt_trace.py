@@ -16,10 +16,13 @@ import numpy as np
 from noack.traces.packet_trace import LOST_NS, PacketTrace, TraceFormat, TraceRecordError, packet_trace
 
 _PIECE = 2**16
+"""Bytes that are read at once."""
 _LONGEST_ENTRY = 2**16
 _LONGEST_BEGINNING = 2**22
+"""Most characters of a round trip, and of what is before the first one."""
 _KEY = '"round_trips"'
 _MOST = 2**62
+"""Upper limit of times in ns."""
 _WAYS = {"true_up": "forward", "true_down": "in reverse", "true": "on an unknown way"}
 
 

@@ -97,7 +97,6 @@ def test_predictions_are_the_inputs_of_the_following_ticks_without_an_update() -
     np.testing.assert_array_equal(inputs(controller.on_timer(4 * MS))[0], predicted[1])
 
 
-
 def check_of(mansd: int, *constraints: LossRule, known_start: bool = True) -> LossCheck:
     return LossCheck(LossGuarantee((LongestBurst(mansd), *constraints)), None, known_start=known_start)
 

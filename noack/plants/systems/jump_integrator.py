@@ -27,12 +27,14 @@ TOO_MANY_STEPS = -2
 TOO_SMALL_STEPS = -3
 """Status codes, those of scipy's "dopri5"."""
 MAX_STEPS = 10_000
+"""Most steps of a call."""
 _MAX_JUMPS = 64
 """Number of changes that are located in a call. After them the error control alone handles the
 jumps, since a value may change its sign infinitely often."""
 _SMALLEST = 1e-14
 """Smallest step, relative to the duration of a call."""
 _LOCATIONS = 20
+"""Most iterations of the search for a change of sign."""
 _BEYOND = 1e-9
 """Distance of a located value beyond 0, relative to its change in the step; afterwards its sign is
 certain."""

@@ -29,14 +29,18 @@ _OFF = 1e-4  # size of a deviation, relative to the component or 1
 _SINGULAR = 1e-9
 """If the smallest singular value of the settled deviations is below this, x is not a state."""
 _AHEAD = 10
+"""Steps after the settling over which a prediction is compared with the motion."""
 _MISSED = 0.05
 """If A and B predict x some steps after any deviation with a larger relative error, x is not a
 state."""
 _WIDEST, _FINER, _STEPS = 0.1, 4.0, 10
+"""Steps of a difference: the widest, relative to the component or 1; the ratio of two; the number."""
 _NOISE = 100.0
 """An entry that is smaller than this multiple of its change from step to step is 0."""
 _ROUNDING = 1e-13
+"""Relative rounding error of what the system computes."""
 _DIGITS = 10
+"""Significant digits of A and B that are kept."""
 _SAMPLES = {"derivative": 1000, "motion": 100}
 _FORGOTTEN = 1e-12
 """If an eigenvalue of a step is below this, a deviation is gone after the step."""

@@ -354,7 +354,9 @@ class GapLoop:
         outputs = Outputs({"τ": self.R @ H @ H, "r": self.R @ H @ G @ G})
         kernels = response_until(G, inverse, grid.until_s, grid.cells).through_each(outputs)
         # e^{−Hτ} commutes with e^{Hr}.
-        models = [response_until(generator, inverse, s).through(scaling).sup_on_grid() for generator in (H, -H)]
+        models = [
+            response_until(generator, inverse, s).through(scaling).sup_on_grid() for generator in (H, -H)
+        ]
         bend_by_age = max(map(float, models)) * kernels["τ"].highest
         bend_by_time = max(map(float, models)) * kernels["r"].highest
         sags = (s / _AGES) ** 2 / 8 * bend_by_age + grid.cell_s**2 / 8 * s * bend_by_time

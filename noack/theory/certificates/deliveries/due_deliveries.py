@@ -262,19 +262,19 @@ class Deliveries:
         return Ball(self.gains.scaling @ self._x0, 0.0, 0.0, 0.0, self.gains.theta)
 
     @cached_property
-    def _start(self) -> "_Start":
+    def _first_gap(self) -> "_FirstGap":
         age_input = self._age_inputs(self._x0[None] @ self.gains.scaling.T)[0]
-        return _Start(self.loop, self.gains, self._output_sags, age_input)
+        return _FirstGap(self.loop, self.gains, self._output_sags, age_input)
 
     def _outputs_from_start(self) -> Vector:
         """Bound all outputs until the next delivery after t = 0, (outputs,)."""
         if self.loop.starts_late:
             return self.outputs_until_next_delivery([self._start_ball])
-        return self._start.outputs()
+        return self._first_gap.outputs()
 
     def _balls_from_start(self) -> BallsAfterGaps:
         """Return the balls after each gap from t = 0."""
-        return self._after_gaps([self._start_ball]) if self.loop.starts_late else self._start.balls()
+        return self._after_gaps([self._start_ball]) if self.loop.starts_late else self._first_gap.balls()
 
 
 def outputs_after_return(kappa: float, highest: Vector, of_rest: Vector) -> Vector:
@@ -282,8 +282,8 @@ def outputs_after_return(kappa: float, highest: Vector, of_rest: Vector) -> Vect
     return np.asarray(np.maximum(kappa * highest + of_rest, of_rest / (1 - kappa)))
 
 
-class _Start:
-    """What follows from t = 0 until the next delivery, if updates act before the next event.
+class _FirstGap:
+    """The gap from t = 0 to the next delivery, if updates act before the next event.
 
     Until some time of at most T the input is 0: w = −K e^{Hr} x(0) until then. What w adds to z, as a
     function of this time, is close to a line from 0 to what a w that ends at T adds.
