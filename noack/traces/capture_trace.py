@@ -109,8 +109,8 @@ class Capture:
         return flow
 
     def reverse_of(self, flow: CapturedFlow) -> list[int]:
-        """Return the places of the flows that go the other way."""
-        return [place for place, name in enumerate(self.flows) if name.is_reverse_of(flow)]
+        """Return the indices of the flows that go the other way."""
+        return [index for index, name in enumerate(self.flows) if name.is_reverse_of(flow)]
 
     def read(self, notes: list[str] | None = None) -> Iterator[CapturedDatagram]:
         """Yield the UDP datagrams, but not the last ones of a probe, which have no numbers."""
