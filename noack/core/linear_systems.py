@@ -1,4 +1,4 @@
-"""Linear time-invariant systems: exact propagation, zero-order hold, exponentials, norms; fast row operations.
+"""Linear time-invariant systems: exact propagation, exponentials, norms; fast operations on rows of tables.
 
 Time steps are integer nanoseconds; matrices are per second. The same step always gives the same
 matrix, bit for bit, whether it was cached or not, and on every processor. A library's matrix
