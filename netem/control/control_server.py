@@ -19,7 +19,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from zenoh import CongestionControl, Priority
 from zenoh.handlers import RingChannel
 
-from netem.control.emulator_statistics import CommandQueue, Statistics, StatisticsThread
+from netem.control.command_queue import CommandQueue
+from netem.control.emulator_statistics import Statistics, StatisticsThread
 from netem.relay.relay_reports import DIRECTIONS, Direction
 from netem.tc_words import settings_of, words_of
 from noack.core.errors import CallerError, MachineError, NoackError, PeerError

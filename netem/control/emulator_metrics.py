@@ -10,7 +10,8 @@ from typing import Any
 from prometheus_client import Metric
 from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily
 
-from netem.control.emulator_statistics import CommandQueue, Statistics, statistics
+from netem.control.command_queue import CommandQueue
+from netem.control.emulator_statistics import Statistics, statistics
 from netem.relay.relay_reports import DIRECTIONS
 from noack.core.clock import NS_PER_S
 from noack.core.errors import PeerError

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from netem.control.emulator_statistics import CommandQueue
+from netem.control.command_queue import CommandQueue
 from netem.relay.relay import Relay
 from netem.relay.relay_links import LinkSpec
 from netem.relay.relay_reports import BUCKETS, DIRECTIONS, Direction, DirectionReport, FlowReport, LinkReport
