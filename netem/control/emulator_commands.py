@@ -165,6 +165,7 @@ def _set(arguments: Sequence[str]) -> ExitStatus:
     options = parser.parse_intermixed_args(arguments)
     options.name, settings = _name_and_settings(options.words)
     settings = read_files(settings, Path())
+    # Change the emulator, and show all settings afterwards.
     with Client(_find_emulator(options)) as client:
         earlier = client.ask("settings")
         answer = client.ask(

@@ -58,18 +58,21 @@ class Relay:
         devices: DeviceLink | None = None,
     ) -> None:
         self.specs: Sequence[LinkSpec] = tuple(specs)
+        # The sockets of the links, or the two devices of a shell.
         self._open_links: Sequence[OpenLink | DeviceLink] = (
             open_links(self.specs) if devices is None else [devices]
         )
         self._warnings = [LinkWarnings(spec) for spec in self.specs]
         self._losses = [UnintendedLosses(spec.name, side) for spec in specs for side in DIRECTIONS]
         self._epoch_ns = self._next_check_ns = 0
+        # Taps see each datagram; without any, the core records no events.
         self._taps = tuple(taps)
         payloads = any(tap.wants_data for tap in self._taps)
         self._memory = RelayMemory(
             len(self.specs), segment=segment, events=bool(self._taps), payloads=payloads
         )
         self._memory.core.spin_ns = spin_ns
+        # Direction 2k is forward of link k, and 2k + 1 is its reverse, as in the core.
         self._directions = [
             RelayDirection(
                 getattr(spec, side),

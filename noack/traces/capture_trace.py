@@ -292,6 +292,7 @@ def trace_of_probe(capture: Capture, flow: CapturedFlow, most_packets: int) -> P
         )
     if len(sessions) > 1:
         raise ValueError(f"the flow has {len(sessions)} probes; capture them one by one")
+    # What is missing among the numbers is lost.
     numbered = _first_of_each(numbered, capture.notes)
     nothing_lost = np.zeros(len(numbered.number), bool)
     trace = packet_trace(
@@ -320,6 +321,7 @@ def trace_of_numbers(
         raise ValueError(
             f"fewer than two datagrams have a sequence number at {field.offset}:{field.size_bytes}"
         )
+    # Numbers that begin again at 0 go on, in the order of the arrivals.
     order = np.argsort(numbered.received_ns, kind="stable")
     number = _unwrapped(numbered.number[order], bits)
     numbered = _first_of_each(
@@ -334,6 +336,7 @@ def trace_of_numbers(
             f"the sequence numbers span {k[-1] + 1} packets; at most {most_packets} can "
             "be; check --sequence-at"
         )
+    # The sending times: those of a constant period, below all arrivals.
     period_ns = max(envelope_slope(k, received_ns), 0.0)
     sent_ns = np.rint(period_ns * k).astype(np.int64)
     capture.notes.append(

@@ -104,6 +104,7 @@ def _read(file: IO[bytes], most_packets: int, clocks_differ: bool) -> tuple[Pack
                 raise ValueError(f"line {line}: has {len(row)} columns; the header has {len(header)}")
             if len(lines) == most_packets:
                 raise ValueError(f"line {line}: has more than {most_packets} packets")
+            # A packet without an arrival is lost.
             arrival = row[received.place].strip()
             lines.append(line)
             lost.append(is_lost := _LOST.fullmatch(arrival) is not None)
