@@ -1,7 +1,8 @@
 """The controller: runs the model x_c, which only a delivered update resets (eq:ModCont).
 
 This file turns a scenario into the core's controller. native/loop/controller.c has its steps, and
-explains them. Losses are compared with the network's guarantee from the recorded rows.
+explains them. :class:`LossCheck` compares the losses that the recorded rows show with the network's
+guarantee.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,13 +12,12 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from controller_node.loss_check import LossCheck
 from noack.controllers.controller_settings import ControlFailedError, ControlLaw, ControlModel
 from noack.controllers.linear_feedback import LinearFeedback
 from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.core_library import CData, CoreMemory, core, reals_at
 from noack.core.linear_systems import Matrix, Vector
-from noack.guarantee.loss_guarantee import LossGuarantee
+from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee, LossHistory, LossRule
 from noack.machines.loop_machines import LoopMachines, MachinePart, Role, parts_of, set_machine, take_changes
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_SETTING, CONTROLLER_STEP, RecordShape
 from noack.protocol.roles import BEGINNING, FAILED, External, Notice, Start
@@ -35,6 +35,106 @@ CONTROLLER = Role(
 )
 Setpoint = tuple[Vector, Vector]
 """x_r and u_r, shapes (n,) and (m,)."""
+
+
+class LossCheck:
+    """Compares the losses of received updates with the guarantee that was in force when they occurred.
+
+    After a change of the guarantee, the rules other than the limit of consecutive losses begin
+    anew, with the first update after one that was sent under the new guarantee.
+
+    Args:
+        guarantee: more losses violate the assumption.
+        schedule: the announced changes of settings; None if there are none.
+        known_start: whether the controller needs no first update.
+    """
+
+    def __init__(
+        self,
+        guarantee: LossGuarantee,
+        schedule: ChangeSchedule[object] | None,
+        *,
+        known_start: bool,
+    ) -> None:
+        self._schedule = schedule
+        self._known_start = known_start
+        self._guarantee = guarantee
+        self._since_ns = 0
+        self._others = _other_rules(guarantee)
+        self._history = LossHistory(self._others)
+        self._newest_ns = 0
+
+    def reach(self, t_ns: int) -> None:
+        """Use the guarantee that is in force at a time of the controller's model."""
+        if self._schedule is not None:
+            now = self._schedule.at(t_ns)
+            self._change(now.scenario.network.guarantee, now.since_ns)
+
+    @property
+    def counts_every_update(self) -> bool:
+        """Whether updates without a loss before them matter, too."""
+        return bool(self._others) or (self._schedule is not None and self._schedule.has_changes)
+
+    def _change(self, guarantee: LossGuarantee, since_ns: int) -> None:
+        """Use another guarantee for what is sent from ``since_ns`` on."""
+        if guarantee != self._guarantee:
+            self._guarantee, self._since_ns = guarantee, since_ns
+            self._others = _other_rules(guarantee)
+            self._history = LossHistory(self._others)
+
+    def add(self, sequence: int, newest: int, losses: int, event_ns: int, now_ns: int) -> Sequence[Notice]:
+        """Add an update that follows ``losses`` losses; return the violations.
+
+        ``newest`` is the number of the update before; −1 if there is none.
+        """
+        newest_ns, self._newest_ns = self._newest_ns, event_ns
+        violation = self._consecutive(sequence, losses, newest_ns, max(now_ns, event_ns))
+        if not violation and newest == -1 and losses > 0 and not self._known_start:
+            violation = f"no delivered t_0: {losses} updates were lost before the first delivery"
+        texts = [violation] if violation else []
+        if newest_ns >= self._since_ns:
+            texts += self._follow_others(sequence, losses)
+        return [Notice(event_ns, "violation", text) for text in texts]
+
+    def _consecutive(self, sequence: int, losses: int, newest_ns: int, now_ns: int) -> str:
+        """Compare with the largest limit in force since the update before."""
+        allowed = _longest_burst(self._guarantee)
+        if losses > allowed and self._schedule is not None:
+            scenarios = self._schedule.between(newest_ns, now_ns)
+            allowed = max(_longest_burst(scenario.network.guarantee) for scenario in scenarios)
+        if losses <= allowed:
+            return ""
+        return (
+            f"MANSD violated: {losses} consecutive losses before update {sequence}, at most {allowed} assumed"
+        )
+
+    def _follow_others(self, sequence: int, losses: int) -> list[str]:
+        """Return the violations of the other rules, of each rule the largest."""
+        if not self._others:
+            return []
+        worst: dict[LossRule, int] = {}
+        # After a whole window of losses, one more changes nothing.
+        for lost in (True,) * min(losses, self._longest_window) + (False,):
+            for rule, value in self._history.add(lost):
+                if lost:
+                    worst[rule] = max(worst.get(rule, 0), value)
+        return [
+            f"{rule.name} violated: {rule.violation(value)}, before update {sequence}"
+            for rule, value in worst.items()
+        ]
+
+    @property
+    def _longest_window(self) -> int:
+        return max(window.packets for window in self._guarantee.windows)
+
+
+def _other_rules(guarantee: LossGuarantee) -> tuple[LossRule, ...]:
+    return tuple(rule for rule in guarantee.rules if not isinstance(rule, LongestBurst))
+
+
+def _longest_burst(guarantee: LossGuarantee) -> int:
+    """The limit of consecutive losses that is set, not what follows from other rules."""
+    return min(rule.limit for rule in guarantee.rules if isinstance(rule, LongestBurst))
 
 
 @dataclass

@@ -174,8 +174,8 @@ int64_t noack_wire_examine_message(
 /* loop/machine_check.c: NULL, or what is wrong with a rule whose times are at most most_ns. */
 const char *noack_check_rule(const noack_trigger_rule *rule, int64_t most_ns);
 
-/* link.c: decide as noack_link_decide does, by a recorded decision unless it is NULL. */
-void link_repeat(
+/* link.c: repeat a recorded decision; if it is NULL, decide by the stages. */
+void decide_or_repeat(
     noack_link *link, int64_t row, int64_t size_bytes, int64_t now_ns,
     const noack_recorded *recorded, noack_decision *decision);
 

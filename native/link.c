@@ -120,8 +120,9 @@ static void keep_limit(int64_t free, noack_decision *decision) {
     }
 }
 
-/* A packet that must pass is exempt from everything that would lose it. */
-void link_repeat(
+/* Repeat a recorded decision; if it is NULL, apply the stages. A packet that must pass is exempt
+   from everything that would lose it. */
+void decide_or_repeat(
     noack_link *link, int64_t row, int64_t size_bytes, int64_t now_ns,
     const noack_recorded *recorded, noack_decision *decision) {
     noack_flow *flow = &link->flows[row];
@@ -166,7 +167,7 @@ void link_repeat(
 void noack_link_decide(
     noack_link *link, int64_t row, int64_t size_bytes, int64_t now_ns, noack_decision *decision) {
     const noack_recorded *recorded = recorded_for(link, &link->flows[row]);
-    link_repeat(link, row, size_bytes, now_ns, recorded, decision);
+    decide_or_repeat(link, row, size_bytes, now_ns, recorded, decision);
 }
 
 void noack_link_decide_many(

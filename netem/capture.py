@@ -41,10 +41,15 @@ _SNAP_BYTES = 262_144
 """Larger than any datagram: payloads are captured completely."""
 
 _LINKTYPE_RAW = 101
+"""Packets that begin with their IP header."""
 _SECTION, _INTERFACE, _STATISTICS = 0x0A0D0D0A, 1, 5
+"""Types of pcapng's blocks."""
 _HARDWARE, _OS, _APPLICATION = 2, 3, 4
+"""Options of a section header."""
 _NAME, _DESCRIPTION, _RESOLUTION = 2, 3, 9
+"""Options of the description of an interface."""
 _START, _END, _RECEIVED, _DROPPED = 2, 3, 4, 5
+"""Options of the statistics of an interface."""
 
 
 class Interface(NamedTuple):

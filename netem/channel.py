@@ -41,6 +41,7 @@ RUN_ID = 0
 
 A simulation receives no foreign traffic, so its key need not be secret."""
 _PLACES, _ROWS = 64, 4096
+"""Delayed datagrams for which there is room at first, and rows of each table until they are taken."""
 
 
 def link_name(flow: Flow) -> str:

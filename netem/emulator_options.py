@@ -115,6 +115,7 @@ def command_line_parser() -> Parser:
         allow_abbrev=False,
     )
     add_options(parser)
+    # An emulator on its own.
     alone = parser.add_argument_group("links")
     _add_words(alone, "clients", "server")
     alone.add_argument(
@@ -197,12 +198,14 @@ def specs_of(options: argparse.Namespace, *, read: bool = True) -> tuple[LinkSpe
     Raises:
         CallerError: the command line has a mistake.
     """
+    # A file describes its links on its own.
     if options.links is not None:
         for name in ("listen", "to", "words", "reverse", "both", "one_way", "idle", "seed"):
             if getattr(options, name):
                 option = name if name == "words" else f"--{name.replace('_', '-')}"
                 raise CallerError(f"{option}: with --links, set this in the file")
         return load_links(options.links, read=read)
+    # Otherwise there is one link; an explanation needs no addresses.
     if options.explain:
         options.listen = options.listen or _EXAMPLE_LISTEN
         options.to = options.to or _EXAMPLE_TO

@@ -21,6 +21,7 @@ from noack.impairments.words import percent_text
 from noack.runtime.address import address_text
 
 _MAX_TOML = 4000
+"""Longest settings that are printed, in characters."""
 _NARROW_WIDTH, _WIDE_WIDTH = 20, 44
 """Minimum and maximum columns for words."""
 

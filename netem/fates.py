@@ -46,6 +46,7 @@ from noack.impairments.link_settings import Constraints, Decisions, Mansd
 from noack.protocol.record_tables import Fate
 
 FORMAT = 2
+"""Version of the columns and metadata of a trace."""
 METADATA = "noack"
 
 NUMBERS: Mapping[str, str] = {
@@ -93,8 +94,10 @@ _FIELDS = {"arrival_ns": "t_ns"}
 _RAW = np.dtype((np.void, EVENT.itemsize))
 """Events as raw bytes; numpy copies these ten times as fast as records with fields."""
 _GROUP_ROWS = 65_536
+"""Rows of a row group of the file, which are written together."""
 _MAGIC = b"PAR1"
 _MAX_WAITING = 1_000_000
+"""Rows that may wait to be written."""
 
 
 class FateRecorder:

@@ -149,6 +149,7 @@ class LinkState:
 
     def _new_link(self, settings: LinkSettings, rows: int, *, tracks: bool) -> CData:
         """Return a new ``noack_link`` of these settings, which shares the array of flows."""
+        # What the core reads: stages, and the numbers to which they refer.
         settings = with_target_loss(settings)
         tables = StageTables(
             scored=any(getattr(impairment, "loss_correlation", 0) != 0 for impairment in settings.impairments)
@@ -173,6 +174,7 @@ class LinkState:
                 **limits,
             },
         )
+        # Python owns the memory to which the link points; the core checks what is in it.
         read_only = {
             "integers": np.array(tables.integers, np.int64),
             "reals": np.array(tables.reals, np.float64),

@@ -12,13 +12,8 @@ from pathlib import Path
 from threading import Event, Thread
 from typing import Self
 
-from netem.control.emulator_statistics import (
-    CommandQueue,
-    DirectionStatistics,
-    LinkStatistics,
-    Snapshot,
-    statistics,
-)
+from netem.control.command_queue import CommandQueue, Snapshot
+from netem.control.emulator_statistics import DirectionStatistics, LinkStatistics, statistics
 from netem.relay.relay import Relay
 from netem.relay.relay_links import LinkSpec
 from netem.relay.relay_reports import DIRECTIONS, Direction

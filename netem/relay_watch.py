@@ -13,8 +13,9 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
+from netem.control.command_queue import CommandQueue
 from netem.control.control_server import ControlServer
-from netem.control.emulator_statistics import CommandQueue, Statistics, StatisticsThread
+from netem.control.emulator_statistics import Statistics, StatisticsThread
 from netem.control.statistics_view import Screen
 from netem.relay.relay import Relay
 from netem.relay.relay_reports import report_line

@@ -90,12 +90,12 @@ class RunNetwork:
         relay.spin_ns = spin_ns
         self.set_clock(clock)
         self._memory.sockets["fd"][1] = sender.fileno()
-        for place, endpoint in zip((0, self._memory.first_path), receivers.values(), strict=False):
+        for number, endpoint in zip((0, self._memory.first_path), receivers.values(), strict=False):
             stamp_arrivals(endpoint)
             if len(receivers) == 1:
-                self._memory.wait_for_only(endpoint.fileno(), place, set_receive_timeout(endpoint))
+                self._memory.wait_for_only(endpoint.fileno(), number, set_receive_timeout(endpoint))
             else:
-                self._memory.watch(endpoint.fileno(), place)
+                self._memory.watch(endpoint.fileno(), number)
         core.noack_relay_read_stamps(relay)
         self._sensor, name_bytes = packed_name(next(iter(receivers)))
         clients["name_bytes"][: self._loops] = name_bytes
@@ -130,8 +130,8 @@ class RunNetwork:
 
     def handle(self, message: Datagram, now_ns: int) -> Sequence[Record]:
         """Process a datagram as if it had been received now; return its rows."""
-        place = self._memory.first_path if message.flow >= self._loops else 0
-        core.noack_relay_add_datagram(self._relay, place, self._sensor, message.data, len(message.data))
+        number = self._memory.first_path if message.flow >= self._loops else 0
+        core.noack_relay_add_datagram(self._relay, number, self._sensor, message.data, len(message.data))
         return self.on_timer(now_ns)
 
     def on_timer(self, now_ns: int) -> Sequence[Record]:

@@ -22,10 +22,9 @@ from netem.control.statistics_view import picture_of
 from netem.emulator_options import command_line_parser, parse_options, specs_of
 from netem.explanation import explain
 from netem.fates import FateRecorder, read_fates
-from netem.relay.device_link import DeviceLink
 from netem.relay.link_sockets import raise_file_limit
 from netem.relay.relay import Relay
-from netem.relay.relay_links import LinkSpec
+from netem.relay.relay_links import DeviceLink, LinkSpec
 from netem.relay.relay_reports import DIRECTIONS, Direction, Tap, report_line
 from netem.relay_watch import add_watching_options, check_watching_options, watch_relay
 from noack.core.errors import CallerError, ExitStatus, MachineError, NoackError, why
@@ -35,6 +34,7 @@ from noack.runtime.command_line import Signals, failed, log_event, log_format
 from noack.runtime.drivers.realtime_settings import realtime
 
 _FIFO_PRIORITY = 50
+"""As the controller of a run has it by default."""
 _SPIN_NS = 50_000
 """Nearly all sleeping threads wake within this time; longer spinning would block the core."""
 

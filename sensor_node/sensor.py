@@ -49,7 +49,9 @@ SENSOR = Role(
     SENSOR_SETTING,
 )
 _SENT_PLACES = 64
-_ANY_TIME_NS = 2**60  # the latest horizon of a machine
+"""Updates for which there is room at first while they wait for their acknowledgements."""
+_ANY_TIME_NS = 2**60
+"""The latest horizon of a machine."""
 
 
 @dataclass

@@ -1,4 +1,7 @@
 /* The memory of the live driver, and the functions of its sockets. */
+#ifndef NOACK_DRIVER_H
+#define NOACK_DRIVER_H
+
 #define _GNU_SOURCE
 #include "../core.h"
 
@@ -68,3 +71,5 @@ void receive_datagrams(noack_driver *driver, int64_t ready);
 
 /* Take datagrams out of the messages that were received, and count their sources. */
 void take_datagrams(noack_driver *driver);
+
+#endif

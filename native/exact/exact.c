@@ -19,6 +19,7 @@ __attribute__((constructor)) static void ask_processor(void) {
     if (!__get_cpuid(1, &a, &b, &c, &d) || !(c & bit_FMA) || !(c & bit_OSXSAVE))
         return;
     __asm__("xgetbv" : "=a"(kept), "=d"(high) : "c"(0));
+    /* The kernel keeps the registers of AVX2 (bits 1, 2), of AVX-512 too (bits 5 to 7). */
     if ((kept & 6) != 6 || !__get_cpuid_count(7, 0, &a, &b, &c, &d) || !(b & bit_AVX2))
         return;
     instructions = (kept & 0xe6) == 0xe6 && (b & wide) == wide ? 2 : 1;

@@ -15,6 +15,8 @@
    differs from 0 by less than the rounding error. */
 #include "ascent.h"
 
+/* The bound on |g''| is taken again for the next AHEAD steps, if they end before NEARER times the
+   end of the present one. */
 static const double AHEAD = 3.0, NEARER = 0.6;
 
 typedef struct {
@@ -47,7 +49,7 @@ static double curvature_bound(const double *g, int degree, double s) {
     double total = 0.0;
     for (int k = degree; k > 1; k--)
         total = total * s + k * (k - 1.0) * fabs(g[k]);
-    return total * (1.0 + 1e-9);
+    return total * (1.0 + 1e-9); /* more than its rounding */
 }
 
 /* The first s in [0, end_s] from which g(s) >= c e^(-rs), NONE or UNRESOLVED. If h starts above 0,

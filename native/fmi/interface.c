@@ -9,6 +9,7 @@
 
 typedef enum { FMI_OK, FMI_ERROR = 3 } status;
 enum mode { INSTANTIATED, INITIALIZING, STEPPING, TERMINATED };
+enum { DRIFT_NS = 1000 }; /* between a sum of an importer's steps, in double, and ours */
 
 static status fail(const fmu *instance, const char *text) {
     if (instance != NULL && instance->log_message != NULL)
@@ -87,11 +88,11 @@ status fmi3DoStep(
     if (!is_in(instance, STEPPING, STEPPING, __func__))
         return FMI_ERROR;
     noack_fmu_image *image = instance->image;
-    int64_t from_ns = ns_of(from_s), to_ns = ns_of(from_s + step_s), drift_ns = 1000;
+    int64_t from_ns = ns_of(from_s), to_ns = ns_of(from_s + step_s);
     const char *wrong;
     if (from_ns < 0 || to_ns <= image->now_ns)
         wrong = "a step goes forward, at times below 4,000,000 s";
-    else if (!is_between(image->now_ns - drift_ns, from_ns, image->now_ns + drift_ns))
+    else if (!is_between(image->now_ns - DRIFT_NS, from_ns, image->now_ns + DRIFT_NS))
         wrong = "a step begins where the last one has ended";
     else
         wrong = step(instance, to_ns);

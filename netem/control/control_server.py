@@ -19,7 +19,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from zenoh import CongestionControl, Priority
 from zenoh.handlers import RingChannel
 
-from netem.control.emulator_statistics import CommandQueue, Statistics, StatisticsThread
+from netem.control.command_queue import CommandQueue
+from netem.control.emulator_statistics import Statistics, StatisticsThread
 from netem.relay.relay_reports import DIRECTIONS, Direction
 from netem.tc_words import settings_of, words_of
 from noack.core.errors import CallerError, MachineError, NoackError, PeerError
@@ -33,6 +34,7 @@ from noack.scenario.toml_file import brief
 EMULATORS = "netem"
 """The folder of the files."""
 _STARTING = "netem_starting"
+"""The folder of the files of emulators that start."""
 
 
 def _in_use(name: str) -> CallerError:
@@ -112,6 +114,7 @@ def _files() -> dict[str, private_folder.LockFile]:
 
 
 _PUBLISH_S = 1.0
+"""Time between two published statistics."""
 _QUERIES = 64
 """Maximum number of waiting queries of each kind; a new query replaces the oldest."""
 

@@ -28,7 +28,9 @@ from noack.runtime.command_line import Parser, Signals, discard_output, failed
 from noack.runtime.connections.zenoh_session import answer_to, cause_of, open_session
 
 _ANSWER_S = 30.0
+"""Longest wait for the answer to a query."""
 _SILENCE_S = 3.0
+"""After so long without statistics it is checked whether the emulator still runs."""
 _POLL_S = 0.02
 
 
@@ -163,6 +165,7 @@ def _set(arguments: Sequence[str]) -> ExitStatus:
     options = parser.parse_intermixed_args(arguments)
     options.name, settings = _name_and_settings(options.words)
     settings = read_files(settings, Path())
+    # Change the emulator, and show all settings afterwards.
     with Client(_find_emulator(options)) as client:
         earlier = client.ask("settings")
         answer = client.ask(

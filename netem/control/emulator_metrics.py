@@ -10,7 +10,8 @@ from typing import Any
 from prometheus_client import Metric
 from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily
 
-from netem.control.emulator_statistics import CommandQueue, Statistics, statistics
+from netem.control.command_queue import CommandQueue
+from netem.control.emulator_statistics import Statistics, statistics
 from netem.relay.relay_reports import DIRECTIONS
 from noack.core.clock import NS_PER_S
 from noack.core.errors import PeerError
@@ -86,12 +87,14 @@ def metrics(report: Statistics) -> Iterator[Metric]:
     """Yield the metrics of a relay's statistics; ``docs/operations.md`` lists them."""
     links: Any = report["links"]
     sides: Any = [([link["name"], name], link[name]) for link in links for name in DIRECTIONS]
+    # Of the emulator and its links.
     yield _gauge("elapsed_seconds", "time since the emulator started", [], [([], report["elapsed_s"])])
     yield _gauge(
         "clients", "clients of a link", ["link"], [([link["name"]], link["clients"]) for link in links]
     )
     for name, (key, text) in _OF_LINK.items():
         yield _counter(name, text, ["link"], [([link["name"]], link[key]) for link in links])
+    # Of each direction.
     for name, (key, text) in _COUNTERS.items():
         yield _counter(name, text, _LABELS, [(labels, side[key]) for labels, side in sides])
     for name, (key, text) in _GAUGES.items():

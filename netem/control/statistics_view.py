@@ -84,6 +84,7 @@ def bar(share: float, width: int) -> tuple[str, str]:
 
 
 _SPAN_S = 60.0
+"""Time that a chart shows."""
 _ARROWS = {"forward": "forward →", "reverse": "← reverse"}
 _LABEL_WIDTH = 9
 _FRAME_WIDTH = 4
@@ -336,6 +337,7 @@ _OPTIONAL = ("predicted", "p99", "forwarded")
 def _table(history: History, latest: Statistics, width: int, lines: int) -> RenderableType:
     """Return a table with a row for each direction that has received datagrams."""
     rows = _directions_in_use(latest)
+    # All texts, so that the widths of the columns are known.
     listed = rows[:lines]
     names = [f" {'→' if name == 'forward' else '←'} {link['name']}" for link, name in listed]
     name_width = min(max(map(len, names), default=0), width // 3)
@@ -345,6 +347,7 @@ def _table(history: History, latest: Statistics, width: int, lines: int) -> Rend
         widths = [max(map(len, (heading, *texts))) for heading, texts in columns.items()]
         return width - name_width - sum(widths) - len(widths)
 
+    # Leave columns out until the others fit; what is left is for the chart.
     for heading in _OPTIONAL:
         if room() < 0:
             del columns[heading]
@@ -357,6 +360,7 @@ def _table(history: History, latest: Statistics, width: int, lines: int) -> Rend
     table.add_column(" link", no_wrap=True, overflow="ellipsis", width=name_width)
     for heading in columns:
         table.add_column(heading, justify="right", no_wrap=True)
+    # A direction that broke its cap, or lost datagrams unintendedly, is red.
     for row, (link, name) in enumerate(listed):
         side = link[name]
         exceeds = side["mansd"] is not None and side["longest_loss_burst"] > side["mansd"]

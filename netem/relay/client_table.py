@@ -8,16 +8,16 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from netem.relay.device_link import DeviceLink
 from netem.relay.link_sockets import Endpoint, has_data, return_path, stamp_arrivals
 from netem.relay.loss_warnings import LinkWarnings
-from netem.relay.relay_links import OpenLink
+from netem.relay.relay_links import DeviceLink, OpenLink
 from netem.relay.relay_memory import RelayDirection, RelayMemory, name_array
 from noack.core.core_library import core
 from noack.runtime.address import packed_name
 from noack.runtime.udp_sockets import drops_of
 
 _QUERIED_AT_ONCE = 64
+"""Return paths whose drop counters are queried in one turn of housekeeping."""
 _STALL_NS = 1_000_000_000
 """A relay that has not checked for idle clients for this time was stopped, or got no CPU time."""
 

@@ -13,6 +13,7 @@ from noack.runtime.address import Address, SocketName, address_of
 from noack.runtime.udp_sockets import bind_to, enlarge_buffer
 
 _BUFFER_BYTES = 4 * 1024 * 1024
+"""Send buffer of a socket."""
 RECEIVE_WAIT_NS = 8_000_000
 """Much less than the time between two turns of housekeeping."""
 _SO_SNDBUFFORCE = 32

@@ -8,10 +8,9 @@ from contextlib import suppress
 import numpy as np
 
 from netem.relay.client_table import ClientTable
-from netem.relay.device_link import DeviceLink
 from netem.relay.link_sockets import set_receive_timeout, stamp_arrivals
 from netem.relay.loss_warnings import LinkWarnings, UnintendedLosses
-from netem.relay.relay_links import LinkSpec, OpenLink, open_links
+from netem.relay.relay_links import DeviceLink, LinkSpec, OpenLink, open_links
 from netem.relay.relay_memory import RelayDirection, RelayMemory
 from netem.relay.relay_reports import DIRECTIONS, Direction, DirectionReport, FlowReport, LinkReport, Tap
 from noack.core.core_library import core, ffi
@@ -20,8 +19,11 @@ from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import Address, packed_name
 
 _PERIOD_NS = 40_000_000
+"""Time between two turns of housekeeping."""
 _CHECK_PERIOD_NS = 250_000_000
+"""Time between two checks for losses, idle clients and return paths."""
 _REPORTED_FLOWS = 16
+"""Flows of a direction that a report lists: those with most packets."""
 _PR_SET_TIMERSLACK, _PR_GET_TIMERSLACK = 29, 30
 
 
@@ -56,18 +58,21 @@ class Relay:
         devices: DeviceLink | None = None,
     ) -> None:
         self.specs: Sequence[LinkSpec] = tuple(specs)
+        # The sockets of the links, or the two devices of a shell.
         self._open_links: Sequence[OpenLink | DeviceLink] = (
             open_links(self.specs) if devices is None else [devices]
         )
         self._warnings = [LinkWarnings(spec) for spec in self.specs]
         self._losses = [UnintendedLosses(spec.name, side) for spec in specs for side in DIRECTIONS]
         self._epoch_ns = self._next_check_ns = 0
+        # Taps see each datagram; without any, the core records no events.
         self._taps = tuple(taps)
         payloads = any(tap.wants_data for tap in self._taps)
         self._memory = RelayMemory(
             len(self.specs), segment=segment, events=bool(self._taps), payloads=payloads
         )
         self._memory.core.spin_ns = spin_ns
+        # Direction 2k is forward of link k, and 2k + 1 is its reverse, as in the core.
         self._directions = [
             RelayDirection(
                 getattr(spec, side),

@@ -17,8 +17,10 @@ from noack.runtime.address import NAME_BYTES, SocketName, packed_name
 CLIENT, SOCKET, SLOT = map(dtype_of, ("noack_client", "noack_socket", "noack_slot"))
 ENTRY = dtype_of("noack_heap_entry")
 _CLIENTS, _SLOTS, _ROWS = 64, 256, 16
+"""Clients, delayed datagrams, and flows of a direction for which there is room at first."""
 _EVENTS = 8192
 _DATA_BYTES = 16 * 1024 * 1024
+"""Events, and bytes of payloads, for which there is room until taps take them."""
 _TABLE_SHARE = 4
 """Places of the hash table per client."""
 _HEADROOM_BYTES = 48 * 1024 * 1024

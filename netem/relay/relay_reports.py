@@ -1,4 +1,7 @@
-"""What a relay reports: lines for the user, events, which taps receive, and counts of its links."""
+"""What a relay reports: lines for the user, events, which taps receive, and counts of its links.
+
+The core counts times in histograms (``native/relay/events.c``).
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -7,7 +10,7 @@ from typing import Literal, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.core_library import dtype_of
+from noack.core.core_library import core, dtype_of
 from noack.impairments.link_settings import Counters, LinkSettings
 from noack.runtime.address import Address
 from noack.runtime.command_line import print_to_stderr
@@ -23,6 +26,14 @@ offset + size_bytes]``."""
 Direction = Literal["forward", "reverse"]
 DIRECTIONS: tuple[Direction, Direction] = ("forward", "reverse")
 """From client to server, and from server to client."""
+
+_STEP_BITS = 5
+_STEPS = 1 << _STEP_BITS
+"""Buckets for each doubling of the time; times below this number of ns have a bucket each."""
+_JOINED = 8
+"""Buckets that are one bucket of a coarse histogram."""
+BUCKETS: int = core.NOACK_BUCKETS
+"""Number of buckets. The last one also counts all longer times: 4.8 hours and more."""
 
 
 def report_line(line: str) -> None:
@@ -56,8 +67,7 @@ class DirectionReport:
     flows: Sequence[FlowReport]
     """At most 16: the present clients that sent most."""
     delays: NDArray[np.int64]
-    """(k,) Histogram of the time from arrival to departure; see
-    :mod:`netem.control.time_histogram`."""
+    """(k,) Histogram of the time from arrival to departure: counts by :func:`bucket_start_ns`."""
     lateness: NDArray[np.int64]
     """(k,) Histogram of the time from a delayed datagram's release time to its departure."""
 
@@ -94,3 +104,29 @@ class Tap(Protocol):
 
         Both arrays are overwritten after the call.
         """
+
+
+def bucket_start_ns(bucket: int) -> int:
+    """Return the shortest time of a bucket."""
+    if bucket < _STEPS:
+        return bucket
+    shift = (bucket >> _STEP_BITS) - 1
+    return (_STEPS + (bucket & (_STEPS - 1))) << shift
+
+
+def coarse_histogram(counts: NDArray[np.int64]) -> list[list[int]]:
+    """Return a coarser histogram for people and plots: four buckets for each doubling.
+
+    Each entry is the shortest time in ns and the count of a bucket that is not empty.
+    """
+    joined = counts.reshape(-1, _JOINED).sum(axis=1)
+    return [[bucket_start_ns(_JOINED * k), int(joined[k])] for k in np.flatnonzero(joined).tolist()]
+
+
+def quantile_ns(counts: Sequence[int] | NDArray[np.int64], share: float) -> float:
+    """Return the quantile of a level in ns, accurate to 3 %; nan if the histogram is empty."""
+    reached = np.cumsum(counts)
+    if reached[-1] == 0:
+        return float("nan")
+    bucket = int(np.searchsorted(reached, max(share * reached[-1], 1)))
+    return (bucket_start_ns(bucket) + bucket_start_ns(bucket + 1) - 1) / 2

@@ -22,8 +22,7 @@ from ipaddress import IPv4Address, IPv4Interface, IPv4Network, IPv6Address
 from pathlib import Path
 from typing import NoReturn
 
-from netem.relay.device_link import DeviceLink
-from netem.relay.relay_links import LinkSpec
+from netem.relay.relay_links import DeviceLink, LinkSpec
 from netem.shell import process
 from noack.core.errors import CallerError
 from noack.core.process_limits import python_command
@@ -32,11 +31,14 @@ MTU_BYTES = 1500
 _RANGE = IPv4Network("198.18.0.0/16")
 _RANGE6, _RANGE6_BITS = IPv6Address("fd6e:6f61:636b::"), 48
 _STEP_BITS, _MOST_BITS = 4, 28
+"""Each shell divides its range into 2⁴ parts; a range with a prefix of 28 bits is not divided."""
 _QUEUE_PACKETS = 4000
 """Maximum number of packets that wait in a device: 0.1 s at 0.48 Gbit/s."""
 _DEVICE, _INSIDE = "/dev/net/tun", "noack0"
 _SET_INTERFACE, _GET_ADDRESS, _GET_MASK = 0x400454CA, 0x8915, 0x891B
+"""Requests of ioctl: TUNSETIFF, SIOCGIFADDR, SIOCGIFNETMASK."""
 _TUN, _NO_HEADER, _EXCLUSIVE = 0x1, 0x1000, 0x8000
+"""Flags of TUNSETIFF: IFF_TUN, IFF_NO_PI, IFF_TUN_EXCL."""
 _ENTERED = "NOACK_SHELL_OUTSIDE"
 """Environment variable of a process that has entered, or could not enter, its own outside."""
 _RESTRICTIONS = {

@@ -16,9 +16,13 @@ from contextlib import suppress
 from pathlib import Path
 
 NEW_USER, NEW_NETWORK = 0x10000000, 0x40000000
+"""Flags of unshare and setns: CLONE_NEWUSER, CLONE_NEWNET."""
 NOT_FOUND = 127
+"""Exit status of a shell whose program cannot be started."""
 _DEATH_SIGNAL, _SUBREAPER, _AMBIENT = 1, 36, 47
+"""Requests of prctl: PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER, PR_CAP_AMBIENT."""
 _CAPABILITIES, _VERSION = 41, 0x20080522
+"""Number of capabilities of Linux, and the version of the structures of capset."""
 _GRACE_S = 2.0
 """From SIGTERM to SIGKILL."""
 _POLL_S = 0.01

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 
 from netem.emulator_options import parse_options, shell_parser, shell_spec
-from netem.relay.device_link import DeviceLink
+from netem.relay.relay_links import DeviceLink
 from netem.relay.relay_reports import report_line
 from netem.shell import process
 from netem.shell.devices import inside, open_devices

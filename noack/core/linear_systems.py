@@ -1,4 +1,4 @@
-"""Linear time-invariant systems: exact propagation, exact zero-order hold, norms, exponentials.
+"""Linear time-invariant systems: exact propagation, exponentials, norms; fast operations on rows of tables.
 
 Time steps are integer nanoseconds; matrices are per second. The same step always gives the same
 matrix, bit for bit, whether it was cached or not, and on every processor. A library's matrix
@@ -26,11 +26,13 @@ MatrixKey = tuple[tuple[int, ...], bytes]
 """Shape and bits of a matrix, by which equal matrices are known."""
 
 _CACHED_STEPS = 4096
+"""Transition matrices that are kept."""
 _SAFE = 1e-140
 """Squares of vectors between this size and its inverse neither underflow nor overflow."""
 _MOST_IN_TURN = 8
 """Of fewer terms, numpy computes a sum in turn; it takes ten times as long for many short rows."""
 _BALANCINGS, _FARTHEST = 20, 200
+"""Most rounds of balancing, and the largest exponent."""
 _MOST_STATES = 12
 """The linear equations of a Lyapunov equation grow with the fourth power of the states."""
 
@@ -116,21 +118,21 @@ class Propagator:
 
         A number of periods is followed bit by bit, so that a row does not depend on the others.
         """
-        found = np.array(states, np.float64, order="C")
+        advanced = np.array(states, np.float64, order="C")
         bits = int(counts.max(initial=0)).bit_length()
         if bits and not self._static:
             powers = np.array([self.transition(period_ns << bit) for bit in range(bits)])
-            steps, scratch = np.ascontiguousarray(counts, np.int64), np.empty(found.shape[1])
+            steps, scratch = np.ascontiguousarray(counts, np.int64), np.empty(advanced.shape[1])
             core.noack_leaps(
-                found.shape[1],
+                advanced.shape[1],
                 bits,
                 _reals(powers),
-                len(found),
+                len(advanced),
                 pointer_to(steps, "int64_t *"),
-                _reals(found),
+                _reals(advanced),
                 _reals(scratch),
             )
-        return found
+        return advanced
 
 
 def norm(vector: Vector) -> float:

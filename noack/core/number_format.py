@@ -19,6 +19,7 @@ _NOISE = 12
 _WIDE = Context(prec=400, Emin=MIN_EMIN, Emax=MAX_EMAX)
 _FIXED = range(-5, 7)  # powers of ten that are written without exponent notation
 _TIME_DIGITS = 3
+"""Significant digits of a duration."""
 _SIZES = (1e9, 1e6, 1e3)
 TextRows = Sequence[Sequence[str]]
 """The first entry of a row is its name."""

@@ -21,6 +21,7 @@ from noack.core.errors import CallerError
 StateIndices = NDArray[np.int64]
 
 _FORBIDDEN, _UNKNOWN = -1, -2
+"""In place of the number of a next state: the outcome is not allowed, or has not been followed yet."""
 
 
 def outcome_letters(delivered: Iterable[bool]) -> str:
@@ -272,6 +273,7 @@ def list_moves(guarantee: LossGuarantee, most: int) -> Moves | None:
 
 
 _MOST_STATES, _MOST_STEPS = 200_000, 200_000_000
+"""Limits of a comparison: of the states of a guarantee, and of states times packets of a window."""
 OutcomePattern = tuple[bool, ...]
 """Whether each update is delivered, from the first one on."""
 

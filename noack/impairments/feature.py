@@ -36,6 +36,7 @@ MOST_FLOWS = 65_535
 LONGEST_NS = 10**18
 """Longest trace: 31 years."""
 _MOST_SHOWN = 12
+"""Numbers of a list that words show."""
 TC_CORRELATION = "its correlation changes the probability, or the spread, of what it is given"
 """The difference to ``tc netem``."""
 

@@ -59,10 +59,13 @@ from noack.impairments.words import brief_percent
 _MOST_SQUARED = 600
 """States of chain and guarantee up to which powers of their matrix are computed."""
 _MOST_STEPS = 20_000
+"""Most packets, and most states of chain and guarantee, that are followed one by one."""
 _ROUNDING = 1e-12
+"""Probabilities that differ by less are equal."""
 _PARTS = 16
 """In so many parts of the possible probabilities the smallest one is searched."""
 _TINY = 1e-12
+"""Tolerance of a loss rate that is met."""
 _DIGITS = 12
 """The probability is rounded, so that every machine draws the same losses."""
 

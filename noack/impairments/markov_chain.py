@@ -22,9 +22,13 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 MOST_STATES = 256
+"""Most states of a chain of losses."""
 LONGEST_PATTERN = 10_000_000
+"""Longest period of losses, in packets."""
 MOST_JOINT_STATES = 20_000
+"""Most states of a chain and a guarantee together."""
 _MOST_STEPS = 1_000_000
+"""Packets of a periodic pattern that are followed until a state recurs."""
 _WARM_UP = 100
 """Steps of the chain after which a likely state is chosen."""
 

@@ -31,7 +31,9 @@ from noack.scenario.scenario import Scenario
 NewRows = Callable[[int, "np.dtype[np.void]"], StructRows]
 """Returns memory for a number of rows of a type."""
 _ROWS, _ROWS_OF_A_LOOP, _MOST_ROWS = 1024, 256, 16_384
+"""Rows of each table: at least, for each loop, and at most for all loops."""
 _NOTES = 256
+"""Notes for which there is room until rows are taken."""
 
 
 class Role(NamedTuple):
@@ -281,16 +283,16 @@ class LoopMachines:
         for number, rows in self._tables.items():
             table = self.core.tables[number]
             if table.count:
-                found, table.count = rows[: table.count], 0
-                if not last and 2 * len(found) < len(rows):
-                    found = found.copy()
+                new, table.count = rows[: table.count], 0
+                if not last and 2 * len(new) < len(rows):
+                    new = new.copy()
                 elif not last:
                     self._renew_table(number, self._new_rows(len(rows), rows.dtype))
                 name = self.role.tables[number]
                 assert name is not None
-                taken.append((name, found))
+                taken.append((name, new))
                 if number == core.NOACK_MESSAGES:
-                    self._inspect(found)
+                    self._inspect(new)
         for note in self._notes[: self.core.note_count]:
             loop = int(note["loop"])
             self._keep_notices(loop, (self.parts[loop].note(note),))

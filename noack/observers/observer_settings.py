@@ -16,7 +16,9 @@ from noack.core.linear_systems import Matrix, Vector
 from noack.settings.section import Row, ScenarioSection, Table, require_length
 
 _RANK_TOLERANCE = 1e-9
+"""Least singular value of a scaled matrix of full rank; eigenvalues this close to 1 do not decay."""
 _POLE_TOLERANCE = 1e-6
+"""Largest distance of a placed eigenvalue from the one that was asked for."""
 
 
 class NoiseVariances(NamedTuple):
@@ -98,7 +100,7 @@ class ObserverSettings(ScenarioSection):
 
     def fill(self, observer: CData, assumed: EstimationModel, x: Vector, memory: CoreMemory) -> None:
         """Fill all of a ``noack_observer`` but its kind, with x̂ before the first measurement."""
-        (n, n), p = assumed.Ad.shape, len(assumed.C)
+        n, p = len(assumed.Ad), len(assumed.C)
         memory.fill(observer, {
             "p": p, "Ad": assumed.Ad, "Bd": assumed.Bd, "C": assumed.C, "x": x, "t_ns": -1,
             "gain": np.zeros((n, p)), "scratch": np.zeros(3 * n * n + n * p + p * p + 2 * n + p),

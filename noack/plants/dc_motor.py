@@ -22,6 +22,7 @@ from noack.settings.section import NonNegative, Positive
 _MAX_CHANGES = 10_000
 """Largest number of changes of the friction's direction within a step."""
 _BISECTIONS = 100
+"""Most bisections; fewer find a time as exactly as double precision permits."""
 _REAL = 1e-9
 """A time with a larger relative imaginary part is not an extremum."""
 

@@ -29,6 +29,7 @@ Advance = Callable[[Vector, Vector, float, float], tuple[int, float]]
 """Advances z (N,) in place under a constant v from a time by a duration, in seconds; returns a
 status code of scipy's "dopri5", negative for a failure, and the time of the failure."""
 _MAX_STEPS = 10_000
+"""Most steps of the integrator from one sample to the next."""
 _ESCAPE = 1e4
 """If a state grows by this factor within a step of the plant, it has diverged."""
 _GAVE_UP = {

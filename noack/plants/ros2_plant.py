@@ -18,6 +18,7 @@ from noack.settings.ros2_peer import Ros2Peer, Ros2Settings, Topic
 
 _PLACE = "plant.system"
 _START_TOLERANCE = 1e-6
+"""Relative difference of the node's first state from x(0)."""
 
 
 class Ros2PlantSettings(Ros2Settings, PlantSettings):

@@ -28,11 +28,13 @@ from typing import NamedTuple
 MAGIC = b"NAMP"
 VERSION = 1
 SEEN_BITS = 128
+"""Earlier sequence numbers of which an answer says whether they have arrived."""
 SHORTEST_PERIOD_NS = 50_000
 """20,000 datagrams a second."""
 LONGEST_PERIOD_NS = 3600 * 10**9
 MAX_PROBES = 50_000_000
 _LATEST_NS = 2**62
+"""Upper limit of times and numbers: sums of two fit 64 bits."""
 _BEFORE_CRC = struct.Struct("<4sBBH")
 _CRC = struct.Struct("<I")
 _BODY = struct.Struct("<QQQqqQQQQ16s")

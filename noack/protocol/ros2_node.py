@@ -25,8 +25,11 @@ _QOS = "::,10:,:,:,,"
 """Reliable, volatile, the last 10 messages; what is empty is rmw_zenoh's default."""
 _ATTACHMENT, _GID_BYTES = struct.Struct("<qqB"), 16
 _OPEN_MS, _LEASE_MS = 3000, 2000
+"""Longest wait for a connection with the router, and longest silence of it."""
 _WAITING = 256
+"""Messages that wait until they are read; later ones replace the oldest."""
 _POLL_S = 0.0002
+"""Time between two looks for an answer."""
 
 
 def topic_key(domain: int, topic: str) -> str:

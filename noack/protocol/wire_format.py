@@ -37,6 +37,7 @@ _PURPOSE = b"noack datagrams"
 MAGIC = b"NA"
 VERSION = 1
 MAX_DIMENSION = 64
+"""Most entries of a vector in a datagram."""
 MAX_LOOPS = 65_535
 """Maximum number of loops of a run; they are numbered from 0."""
 TIMES_NS = 2**62

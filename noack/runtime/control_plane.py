@@ -35,6 +35,7 @@ from noack.runtime.spool import writer_of
 from noack.scenario.scenario_tables import MOST_CHANGES
 
 _REQUEST_AGAIN_S = 5.0
+"""After this time without an answer a request is sent again."""
 _POLL_S = 0.01
 """Twenty runs that wait at the start barrier are a hundred processes that poll at this rate."""
 

@@ -219,6 +219,7 @@ class RunProcess:
             raise
         finally:
             telemetry.flush()
+            # Also of a process that failed: the report says how far it came.
             self.report = {
                 "pid": os.getpid(),
                 "ended": self.ended,

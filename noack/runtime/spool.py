@@ -32,6 +32,7 @@ RUN_NAME_FILE = "run_name.txt"
 _CHUNK = struct.Struct("<QQ")
 _READ_BYTES = 256 * 1024
 _MOST_NAME_BYTES = 1024
+"""Longest name of a run's directory in its file."""
 NOTICES = "notices"
 _NEWLINE = b"\n"
 

@@ -40,13 +40,16 @@ from noack.runtime.spool import (
 )
 
 _BATCH_ROWS = 256
+"""Rows of a table that are sent together."""
 _MOST_KEPT_BYTES = 64 * 1024 * 1024
+"""Rows that the recorder has not acknowledged yet; more are stored in the process's own spool."""
 _RESENT_AT_ONCE = 8  # batches that are sent again at a time: the loop waits for it
 Publish = Callable[[str, bytes, bytes], None]  # publishes a batch: table, header (JSON), rows
 Ranges = Sequence[tuple[int, int]]
 """Disjoint, ascending, half-open ranges of row numbers."""
 _REPORT_TIMEOUT_S = 5.0
 _REPORT_ATTEMPTS = 3
+"""Longest wait for the answer to the final report, and how often the recorder gets missing rows again."""
 
 
 def contain(ranges: Ranges, first: int, end: int) -> bool:

@@ -30,6 +30,7 @@ datagrams, as many as are read between two turns of housekeeping."""
 _READ_AT_ONCE = 4096
 """Datagrams of that buffer read in one turn, and at the end: all, unless a flood goes on."""
 _SO_MEMINFO = 55
+"""Option of a socket with its memory in words; one of them counts dropped datagrams."""
 _MEMINFO_WORDS = 9
 _MEMINFO_DROPS = 8
 DROPPED_IN_FLOOD = "shed"
@@ -45,8 +46,10 @@ second, which takes a twentieth of a core."""
 IN_A_FLOOD = 16  # datagrams of a flood that are read per interval, to see its sources and its end
 _CALM_INTERVALS = 20
 _MOST_CALM_INTERVALS = 1200
+"""Intervals without a flood after which it is over: at first, and, as each flood doubles it, at most."""
 _REPORTED_SOURCES = 16
 _KNOWN_SOURCES = 256
+"""Unknown sources that a report names, and that are counted one by one."""
 
 
 def bind(port: int, key: str, host: str = LOOPBACK) -> socket.socket:

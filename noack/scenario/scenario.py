@@ -61,6 +61,7 @@ _KINDS: Mapping[str, tuple[str, ...]] = {
 }
 """The tables of a loop, each with the keys that make it replace the table of the top level."""
 _MOST_NAMES = 12
+"""Names of loops that a message lists."""
 _DRAWN = ("plant", "initial_state", "disturbance", "noise")
 """The seeds that each loop has of its own."""
 

@@ -25,7 +25,7 @@ from noack.impairments.loss_prediction import with_target_loss
 from noack.protocol.wire_format import MAX_DIMENSION
 from noack.scenario.runtime_parameters import LOSS, put_settings, require_runtime_parameters
 from noack.scenario.scenario_tables import ScenarioTables
-from noack.scenario.sections import AnyController, AnyTrigger
+from noack.scenario.sections import AnyController, AnyTrigger, NetworkSection
 from noack.scenario.toml_file import explain
 from noack.settings.section import ReadTable, ScenarioSection, Table, require_length, require_shape
 
@@ -65,6 +65,8 @@ def check_sections(scenario: ScenarioTables) -> None:
     _check_program(scenario)
     _check_observer(scenario)
     _check_watchdog(scenario)
+    _check_use_of_gain(scenario)
+    _check_actuation_size(scenario)
     check_trigger(scenario)
     check_target_loss(scenario)
 
@@ -192,30 +194,36 @@ def _check_observer(scenario: ScenarioTables) -> None:
 
 
 def _check_watchdog(scenario: ScenarioTables) -> None:
-    timing, (n, m) = scenario.timing, scenario.model.dimensions
+    """Raise ValueError if inputs that a message carries would be cut off by the timeout."""
+    timing = scenario.timing
     if timing.actuation_timeout_ns < timing.predicted_ns:
         several = "" if scenario.controller.predictions == 1 else " times controller.predictions"
         raise ValueError(
             f"plant.watchdog.timeout_s: shorter than a period of the controller{several} "
             f"({timing.predicted_ns / NS_PER_S} s)"
         )
-    if scenario.controller.predictions > 1 and not scenario.controller.is_linear:
-        raise ValueError(
-            "controller.predictions: needs u = K x_c; "
-            f'not with controller.kind = "{scenario.controller.kind}"'
-        )
-    if scenario.controller.update_timeout_s is not None and not scenario.controller.is_linear:
-        raise ValueError(
-            "controller.update_timeout_s: needs u = K x_c; "
-            f'not with controller.kind = "{scenario.controller.kind}"'
-        )
-    if scenario.message_sizes.carries_model and not scenario.controller.is_linear:
-        raise ValueError(
-            'plant.watchdog.policy: "model" predicts u = K x_c; '
-            f'not with controller.kind = "{scenario.controller.kind}"'
-        )
+
+
+def _check_use_of_gain(scenario: ScenarioTables) -> None:
+    """Raise ValueError if a setting uses u = K x_c and the controller has another law."""
+    controller = scenario.controller
+    if controller.is_linear:
+        return
+    uses = {
+        "controller.predictions: needs": controller.predictions > 1,
+        "controller.update_timeout_s: needs": controller.update_timeout_s is not None,
+        'plant.watchdog.policy: "model" predicts': scenario.message_sizes.carries_model,
+    }
+    for text, is_used in uses.items():
+        if is_used:
+            raise ValueError(f'{text} u = K x_c; not with controller.kind = "{controller.kind}"')
+
+
+def _check_actuation_size(scenario: ScenarioTables) -> None:
+    """Raise ValueError if the numbers of an actuation do not fit into a message."""
     if scenario.message_sizes.actuation_entries <= MAX_DIMENSION:
         return
+    n, m = scenario.model.dimensions
     carries_model = scenario.message_sizes.carries_model
     if (predictions := scenario.controller.predictions) > 1:
         state_text = f" and {n} of x_c" if carries_model else ""
@@ -280,17 +288,22 @@ def with_settings(scenario: S, settings: ReadTable) -> S:
         raise ValueError("\n".join(lines)) from None
     update = {name: getattr(change, name) for name in sections}
     if change.network is not None:
-        if isinstance(change.network.loss, TraceLoss):
-            raise ValueError(
-                "network.loss.model: a trace is read before a run begins; give its losses as "
-                '{ model = "scripted", lost = [...] }'
-            )
-        keys = {name: getattr(change.network, name) for name in change.network.model_fields_set}
-        network = update["network"] = scenario.network.model_copy(update=keys)
-        require_consistent(network.mansd, network.constraints)
-        require_scores(network.impairments, network.loss)
+        update["network"] = _changed_network(scenario.network, change.network)
     changed = scenario.model_copy(update={**update, "changes": ()})
     check_trigger(changed)
     check_setpoint(changed)
     check_target_loss(changed)
+    return changed
+
+
+def _changed_network(network: NetworkSection, change: _ChangedNetwork) -> NetworkSection:
+    """Return the network with the keys that the change sets; raise ValueError if they do not fit."""
+    if isinstance(change.loss, TraceLoss):
+        raise ValueError(
+            "network.loss.model: a trace is read before a run begins; give its losses as "
+            '{ model = "scripted", lost = [...] }'
+        )
+    changed = network.model_copy(update={name: getattr(change, name) for name in change.model_fields_set})
+    require_consistent(changed.mansd, changed.constraints)
+    require_scores(changed.impairments, changed.loss)
     return changed

@@ -156,7 +156,9 @@ def _section_text(section: ScenarioSection, kind: str) -> str:
 
 
 _TIMEOUT_PERIODS = 5
+"""Periods of measurements, beyond the round trip, that the sensor waits for an acknowledgement."""
 _WATCHDOG_PERIODS = 50
+"""Periods of the controller after which actuations are missing."""
 
 
 @dataclass(frozen=True)

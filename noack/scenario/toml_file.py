@@ -50,6 +50,7 @@ _TABLE = re.compile(r"\s*\[+([^\]\n]+)\]")
 _TOO_DEEP = f"tables and lists lie within each other more than {MOST_LEVELS} levels deep"
 _TOO_LARGE = "an integer is too large"
 _MOST_LOOKED_AT = 100
+"""Files beside a missing one that may be suggested instead."""
 _LONG_KEY = re.compile(rf"(?<![\w-])(?:[\w-]++[ \t]*+\.[ \t]*+){{{MOST_LEVELS}}}")
 
 
@@ -192,6 +193,7 @@ _PATTERNS = {
     "^[0-9a-f]{64}$": "use 64 hexadecimal digits, in small letters",
 }
 _MOST_LINES = 50
+"""Mistakes that are reported one by one."""
 _SIMILAR = 0.8
 """Least similarity of a suggested key, or of its last part, as difflib measures it."""
 _MATRIX = "expected a list; a matrix is a list of rows, e.g. [[0.0, 1.0], [2.0, 3.0]]"

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from noack.protocol.ros2_node import TopicExchange
 
 _AGAIN_S = 0.2
+"""Time after which the first question is asked again: the node may start later."""
 
 
 def _require_topic(text: str) -> str:

@@ -136,6 +136,7 @@ MatrixRows = Annotated[tuple[Row, ...], Field(min_length=1, max_length=MAX_DIMEN
 """A matrix by rows."""
 
 _LONGEST_SHOWN = 60
+"""Longest transposed matrix that a message shows, in characters."""
 
 
 def _not_negative(title: str, most: float = math.inf) -> AfterValidator:

@@ -12,11 +12,16 @@ from typing import IO, NamedTuple
 _PCAP = {0xA1B2C3D4: 1000, 0xA1B23C4D: 1}
 """Magic numbers, and the unit of their times in ns."""
 _SECTION, _INTERFACE, _SIMPLE, _PACKET = 0x0A0D0D0A, 1, 3, 6
+"""Types of pcapng's blocks."""
 _BYTE_ORDER = 0x1A2B3C4D
+"""Number in a section header that shows its byte order."""
 _MOST_BYTES = 16 * 2**20
+"""Largest block of a capture."""
 _MOST_INTERFACES = 10_000
 _LATEST_NS = 2**62
+"""Upper limit of times: differences of two fit 64 bits."""
 _RESOLUTION, _OFFSET, _FLAGS = 9, 14, 2
+"""Options of pcapng: of an interface's times, and of a packet."""
 
 
 class CapturedPacket(NamedTuple):
@@ -179,9 +184,11 @@ def _packet(order: str, body: bytes, interfaces: list[_Interface], first: int) -
 _VLAN = (b"\x81\x00", b"\x88\xa8", b"\x91\x00")
 _MOST_VLANS = 4
 _UDP = 17
+"""The protocol's number in an IP header."""
 _IPV6_OPTIONS = (0, 43, 60)
 """Extension headers with a length: hop-by-hop, routing, destination options."""
 _MOST_EXTENSIONS = 8
+"""Extension headers of IPv6 that are followed."""
 
 
 class CapturedFlow(NamedTuple):

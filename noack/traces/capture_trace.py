@@ -40,6 +40,7 @@ _KEY = os.urandom(16)
 """Payloads are compared by a keyed hash, so that nobody can make two with the same."""
 _FIELD = re.compile(r"([0-9]{1,5}):([1-8])(:little)?")
 _MOST = 2**62
+"""Upper limit of sequence numbers."""
 
 
 class CapturedDatagram(NamedTuple):
@@ -108,8 +109,8 @@ class Capture:
         return flow
 
     def reverse_of(self, flow: CapturedFlow) -> list[int]:
-        """Return the places of the flows that go the other way."""
-        return [place for place, name in enumerate(self.flows) if name.is_reverse_of(flow)]
+        """Return the indices of the flows that go the other way."""
+        return [index for index, name in enumerate(self.flows) if name.is_reverse_of(flow)]
 
     def read(self, notes: list[str] | None = None) -> Iterator[CapturedDatagram]:
         """Yield the UDP datagrams, but not the last ones of a probe, which have no numbers."""
@@ -291,6 +292,7 @@ def trace_of_probe(capture: Capture, flow: CapturedFlow, most_packets: int) -> P
         )
     if len(sessions) > 1:
         raise ValueError(f"the flow has {len(sessions)} probes; capture them one by one")
+    # What is missing among the numbers is lost.
     numbered = _first_of_each(numbered, capture.notes)
     nothing_lost = np.zeros(len(numbered.number), bool)
     trace = packet_trace(
@@ -319,6 +321,7 @@ def trace_of_numbers(
         raise ValueError(
             f"fewer than two datagrams have a sequence number at {field.offset}:{field.size_bytes}"
         )
+    # Numbers that begin again at 0 go on, in the order of the arrivals.
     order = np.argsort(numbered.received_ns, kind="stable")
     number = _unwrapped(numbered.number[order], bits)
     numbered = _first_of_each(
@@ -333,6 +336,7 @@ def trace_of_numbers(
             f"the sequence numbers span {k[-1] + 1} packets; at most {most_packets} can "
             "be; check --sequence-at"
         )
+    # The sending times: those of a constant period, below all arrivals.
     period_ns = max(envelope_slope(k, received_ns), 0.0)
     sent_ns = np.rint(period_ns * k).astype(np.int64)
     capture.notes.append(

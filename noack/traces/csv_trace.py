@@ -32,6 +32,7 @@ _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,4})?
 _OTHER = "_other_clock"
 _LOST = re.compile(r"(-1(\.0*)?)?")
 _MOST = 2**62
+"""Upper limit of times in ns and of sequence numbers."""
 _LINE_BYTES = 2**16
 
 
@@ -103,6 +104,7 @@ def _read(file: IO[bytes], most_packets: int, clocks_differ: bool) -> tuple[Pack
                 raise ValueError(f"line {line}: has {len(row)} columns; the header has {len(header)}")
             if len(lines) == most_packets:
                 raise ValueError(f"line {line}: has more than {most_packets} packets")
+            # A packet without an arrival is lost.
             arrival = row[received.place].strip()
             lines.append(line)
             lost.append(is_lost := _LOST.fullmatch(arrival) is not None)

@@ -16,10 +16,13 @@ import numpy as np
 from noack.traces.packet_trace import LOST_NS, PacketTrace, TraceFormat, TraceRecordError, packet_trace
 
 _PIECE = 2**16
+"""Bytes that are read at once."""
 _LONGEST_ENTRY = 2**16
 _LONGEST_BEGINNING = 2**22
+"""Most characters of a round trip, and of what is before the first one."""
 _KEY = '"round_trips"'
 _MOST = 2**62
+"""Upper limit of times in ns."""
 _WAYS = {"true_up": "forward", "true_down": "in reverse", "true": "on an unknown way"}
 
 
@@ -60,19 +63,8 @@ def _texts(file: IO[bytes]) -> Iterator[str]:
 
 
 def _entries(texts: Iterator[str]) -> Iterator[object]:
-    text = ""
-    for piece in texts:
-        text += piece
-        at = text.find(_KEY)
-        if at >= 0 and "[" in text[at:]:
-            break
-        if len(text) > _LONGEST_BEGINNING:
-            raise ValueError(f"has no {_KEY} in its first {_LONGEST_BEGINNING >> 20} MiB")
-    else:
-        raise ValueError(f"has no list {_KEY}")
-    before, _, text = text[at + len(_KEY) :].partition("[")
-    if before.strip() != ":":
-        raise ValueError(f"{_KEY} is not a list")
+    """Yield the entries of the list of round trips, of a document that is read piece by piece."""
+    text = _after_bracket(texts)
     decode = json.JSONDecoder().raw_decode
     while True:
         text = text.lstrip(" \t\r\n,")
@@ -89,6 +81,24 @@ def _entries(texts: Iterator[str]) -> Iterator[object]:
         if len(text) > _LONGEST_ENTRY:
             raise ValueError(f"has a round trip of more than {_LONGEST_ENTRY} characters, or no JSON")
         text += piece
+
+
+def _after_bracket(texts: Iterator[str]) -> str:
+    """Return what has been read behind the bracket with which the list of round trips begins."""
+    text = ""
+    for piece in texts:
+        text += piece
+        at = text.find(_KEY)
+        if at >= 0 and "[" in text[at:]:
+            break
+        if len(text) > _LONGEST_BEGINNING:
+            raise ValueError(f"has no {_KEY} in its first {_LONGEST_BEGINNING >> 20} MiB")
+    else:
+        raise ValueError(f"has no list {_KEY}")
+    before, _, after = text[at + len(_KEY) :].partition("[")
+    if before.strip() != ":":
+        raise ValueError(f"{_KEY} is not a list")
+    return after
 
 
 def _values(entry: Any, index: int) -> tuple[int, int, int, str]:

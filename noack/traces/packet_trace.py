@@ -42,9 +42,13 @@ LONGEST_NS = 10**18
 MOST_DRIFT_PPM = 500.0
 """Clocks differ by less than 200 ppm; NTP slews a clock by at most 500 ppm."""
 _STEP_NS = 1_000_000
+"""A smaller change of the smallest delay is no step of a clock."""
 _FEWEST = 20
+"""With fewer packets nothing is said about the clocks."""
 _BUCKETS = 4096
+"""Parts of the time, of which each has its smallest delay."""
 _HEAD_BYTES = 4096
+"""Beginning of a file, by which its format is known."""
 _GZIP = b"\x1f\x8b"
 _SHIPPED = Path(__file__).parent / "shipped"
 _LONGEST_NAME = 100

@@ -14,6 +14,7 @@ from noack.trigger.policy_settings import ModelMatrices, WeightedSettings
 from noack.trigger.trigger_rule import TriggerRule, error_form
 
 _LEAST_BETA = 1e-300
+"""Least threshold: it stays above 0 for all times."""
 
 
 class DecayingSettings(WeightedSettings):

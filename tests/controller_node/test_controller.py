@@ -1,4 +1,4 @@
-"""The controller's model, inputs and predictions, in closed form.
+"""The controller: its model, inputs and predictions in closed form, and its check of losses.
 
 Whole runs are compared with a reference loop in tests/cosim/simulation/test_whole_loop.py, changes
 during a run are in tests/cosim/record/test_recorded_changes.py, users' control laws in
@@ -11,11 +11,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from controller_node.controller import Controller
+from controller_node.controller import Controller, LossCheck
 from noack.controllers.linear_feedback import LinearFeedback
-from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee
+from noack.guarantee.loss_guarantee import (
+    DeliveriesBetweenBursts,
+    LongestBurst,
+    LossesInWindow,
+    LossGuarantee,
+    LossRule,
+)
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, tables
 from noack.protocol.roles import Notice, Output, Record
 from noack.protocol.wire_format import Flow, Message
@@ -87,3 +95,54 @@ def test_predictions_are_the_inputs_of_the_following_ticks_without_an_update() -
     predicted = inputs(controller.on_timer(2 * MS))
     np.testing.assert_allclose(predicted, [K @ after(1), K @ after(3), K @ after(5), SAFE], rtol=1e-13)
     np.testing.assert_array_equal(inputs(controller.on_timer(4 * MS))[0], predicted[1])
+
+
+def check_of(mansd: int, *constraints: LossRule, known_start: bool = True) -> LossCheck:
+    return LossCheck(LossGuarantee((LongestBurst(mansd), *constraints)), None, known_start=known_start)
+
+
+def violations(check: LossCheck, sequence: int, losses: int) -> Sequence[str]:
+    """Add an update that was sent at ``sequence`` milliseconds."""
+    notices = check.add(sequence, sequence - losses - 1, losses, sequence * MS, sequence * MS)
+    assert all((notice.t_ns, notice.level) == (sequence * MS, "violation") for notice in notices)
+    return [notice.text for notice in notices]
+
+
+@given(st.lists(st.booleans(), max_size=25))
+def test_further_constraints_are_checked_over_all_updates_so_far(delivered: list[bool]) -> None:
+    """At most 2 losses in 5, and 2 deliveries between bursts; each against its definition."""
+    window, recovery = LossesInWindow(2, 5), DeliveriesBetweenBursts(2)
+    check = check_of(30, window, recovery)
+    last = -1
+    for i in (number for number, arrives in enumerate(delivered) if arrives):
+        texts = violations(check, i, i - last - 1)
+        ends = range(last + 1, i)  # the losses that this update shows
+        too_many = any(sum(not arrives for arrives in delivered[max(j - 4, 0) : j + 1]) > 2 for j in ends)
+        too_soon = i - last > 1 and delivered[last - 1 : last + 1] == [False, True]
+        assert sorted(text.partition(" violated")[0] for text in texts) == [
+            rule.name for rule, broken in ((window, too_many), (recovery, too_soon)) if broken
+        ]
+        last = i
+
+
+@pytest.mark.parametrize(
+    ("known", "lost", "expected"),
+    [
+        (False, 0, None),
+        (False, 1, "no delivered t_0: 1 "),
+        (False, 2, "no delivered t_0: 2 "),
+        (False, 3, "MANSD violated: 3 consecutive losses"),
+        (True, 0, None),
+        (True, 2, None),
+        (True, 3, "MANSD violated: 3 consecutive losses"),
+    ],
+)
+def test_lost_first_updates_are_a_violation_without_a_known_start(
+    known: bool, lost: int, expected: str | None
+) -> None:
+    check = check_of(2, known_start=known)
+    texts = violations(check, lost, lost)
+    assert len(texts) == (expected is not None)
+    assert all(text.startswith(str(expected)) for text in texts)
+    # The flow has begun: a gap within the limit is no violation.
+    assert violations(check, lost + 2, 1) == []

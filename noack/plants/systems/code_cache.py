@@ -21,7 +21,9 @@ from typing import Any
 from noack.core.file_access import locked
 
 _ROOM_BYTES = 16 * 1024 * 1024
+"""Room on disk that compiled code needs."""
 _KEPT_S = 30 * 24 * 3600
+"""Age of the code of other versions at which it is removed."""
 Function = Callable[..., object]
 CALLED_BY_CODE: Mapping[str, bool] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 """numba's options of a function that only compiled code calls. It is compiled without the entries

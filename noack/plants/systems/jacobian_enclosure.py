@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 Operand: TypeAlias = "Enclosed | float"
 _SLICES = 8
+"""Parts of an interval over which a derivative is enclosed one by one: the enclosure becomes narrower."""
 _NARROW = 1e-12
 """A derivative that varies by less than this share of itself is not divided into slices."""
 _LONGEST_S = 1e9

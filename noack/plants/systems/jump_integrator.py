@@ -27,12 +27,14 @@ TOO_MANY_STEPS = -2
 TOO_SMALL_STEPS = -3
 """Status codes, those of scipy's "dopri5"."""
 MAX_STEPS = 10_000
+"""Most steps of a call."""
 _MAX_JUMPS = 64
 """Number of changes that are located in a call. After them the error control alone handles the
 jumps, since a value may change its sign infinitely often."""
 _SMALLEST = 1e-14
 """Smallest step, relative to the duration of a call."""
 _LOCATIONS = 20
+"""Most iterations of the search for a change of sign."""
 _BEYOND = 1e-9
 """Distance of a located value beyond 0, relative to its change in the step; afterwards its sign is
 certain."""
@@ -100,6 +102,7 @@ def advance(
         work: buffers, which carry nothing from one call to the next.
     """
     equations = (rates, model, v, parameters)
+    # The signs are those at the beginning; with them the equations are smooth.
     work.signs[:] = 0.0
     rates(model, z, v, parameters, work.signs, work.values, work.slopes[0])
     for k in range(len(work.signs)):
@@ -109,6 +112,7 @@ def advance(
     for _ in range(MAX_STEPS):
         if left_s <= smallest_s:
             return DONE
+        # Choose the step by its error; one that is too inexact is tried again, shorter.
         step_s = min(step_s, left_s)
         error = compute_step(equations, z, step_s, tolerances, work)
         factor = 5.0
@@ -119,6 +123,7 @@ def advance(
             if step_s < smallest_s:
                 return TOO_SMALL_STEPS
             continue
+        # A step in which a sign changes ends there, and the next one has the new sign.
         part_s = step_s
         if least_signed_value(work.signs, work.values) >= 0.0:
             step_s *= factor
@@ -190,6 +195,7 @@ def first_sign_change(
     root of its least signed value is found by the Illinois method (regula falsi, with halved values).
     """
     rates, model, v, parameters = equations
+    # Only the values whose signs change count; the root sought is that of a level beyond 0.
     for k in range(len(work.signs)):
         work.changing[k] = work.signs[k] if work.signs[k] * work.values[k] < 0.0 else 0.0
     at_low = least_signed_value(work.changing, work.start)
@@ -200,6 +206,7 @@ def first_sign_change(
     for _ in range(_LOCATIONS):
         if at_high >= 0.0:
             break
+        # The secant through the bracket, and the state there.
         part = (low * at_high - high * at_low) / (at_high - at_low)
         remaining = 1.0 - part
         for n in range(len(z)):
@@ -212,6 +219,7 @@ def first_sign_change(
         now = least_signed_value(work.changing, work.values) + beyond
         if abs(now) <= close:
             break
+        # Keep the bracket; an end that stays a second time has its value halved.
         if now < 0.0:
             high, at_high = part, now
             at_low *= 0.5 if last < 0 else 1.0

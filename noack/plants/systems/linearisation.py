@@ -29,14 +29,18 @@ _OFF = 1e-4  # size of a deviation, relative to the component or 1
 _SINGULAR = 1e-9
 """If the smallest singular value of the settled deviations is below this, x is not a state."""
 _AHEAD = 10
+"""Steps after the settling over which a prediction is compared with the motion."""
 _MISSED = 0.05
 """If A and B predict x some steps after any deviation with a larger relative error, x is not a
 state."""
 _WIDEST, _FINER, _STEPS = 0.1, 4.0, 10
+"""Steps of a difference: the widest, relative to the component or 1; the ratio of two; the number."""
 _NOISE = 100.0
 """An entry that is smaller than this multiple of its change from step to step is 0."""
 _ROUNDING = 1e-13
+"""Relative rounding error of what the system computes."""
 _DIGITS = 10
+"""Significant digits of A and B that are kept."""
 _SAMPLES = {"derivative": 1000, "motion": 100}
 _FORGOTTEN = 1e-12
 """If an eigenvalue of a step is below this, a deviation is gone after the step."""
@@ -146,6 +150,7 @@ def _by_motion(system_at: SystemAt, x0: Vector, u0: Vector, settling_s: float, s
     def without(reason: str) -> LinearMotion:
         return LinearMotion(np.full((n, n), np.nan), np.full((n, m), np.nan), drift, "motion", reason)
 
+    # Central differences: by how much an offset at the beginning moves the three points.
     start_offs, step_offs, ahead_offs = (np.eye(n + m) for _ in range(3))
     for i, value in enumerate(np.concatenate([x0, u0])):
         off = np.zeros(n + m)
@@ -155,17 +160,20 @@ def _by_motion(system_at: SystemAt, x0: Vector, u0: Vector, settling_s: float, s
             for sign in (1.0, -1.0)
         )
         start_offs[:n, i], step_offs[:n, i], ahead_offs[:n, i] = (plus - minus) / (2 * off[i])
+    # The motion has no linear model unless it is finite and the same each time, and x determines it.
     if not (np.isfinite(start_offs).all() and np.isfinite(ahead_offs).all()):
         return without(NOT_FINITE)
     if not np.array_equal(resting, _trajectory_points(system_at, x0, u0, settling, ahead, step_ns)):
         return without(NOT_REPEATED)
     if np.linalg.svd(start_offs, compute_uv=False)[-1] < _SINGULAR:
         return without(NO_STATE)
+    # The matrix of a step must predict the offsets further ahead.
     step = step_offs @ np.linalg.inv(start_offs)
     errors = np.linalg.matrix_power(step, ahead) @ start_offs - ahead_offs
     sizes = np.maximum(*(np.linalg.norm(deviations[:n], axis=0) for deviations in (start_offs, ahead_offs)))
     if (np.linalg.norm(errors, axis=0) > _MISSED * sizes).any():
         return without(NO_STATE)
+    # Â and B̂ are those of its real logarithm.
     if np.abs(np.linalg.eigvals(step)).min() < _FORGOTTEN:
         return without(NO_LOGARITHM)
     logarithm = _logarithm(step)
@@ -230,6 +238,7 @@ def largest_errors(
     random = np.random.default_rng(0)
     offs = random.uniform(-1.0, 1.0, size=(_SAMPLES[motion.source], len(halfwidths)))
     offs[::2] = np.sign(offs[::2])
+    # The largest error, and the largest change by the linear part, of each state.
     resting, resting_change = change(x0, u0)
     errors, largest = np.zeros(n), np.zeros(n)
     with np.errstate(all="ignore"):

@@ -16,12 +16,15 @@ from functools import partial
 from typing import Any
 
 _MOST_WAITING = 512
+"""Connections that may wait for their first bytes."""
 _ROOM = _MOST_WAITING // 4
 """Number of connections that end when there are too many: choosing them together costs less."""
 _MOST_AT_ONCE = 128
 """Connections accepted before others are served."""
 _NO_DESCRIPTOR_PAUSE_S = 0.05
+"""Pause when no file descriptor is left for a connection."""
 _CHECK_S = 1.0
+"""Time between two checks for connections whose first bytes are overdue."""
 
 Begin = Callable[[socket.socket, bytes, str], Coroutine[Any, Any, None]]
 """Serves a connection, given its first bytes and the other end's host; it is closed afterwards."""

@@ -54,8 +54,10 @@ _ADDRESS_BYTES = 16
 _PROOF_S = 5.0
 _HANDSHAKE_S = 5.0
 _CLOSE_S = 5.0
+"""Longest times for a proof of the key, for a handshake of TLS, and for closing a connection."""
 _MOST_HANDSHAKES = 128
 _MOST_CONNECTIONS = 64
+"""Limits of handshakes and of connections at once."""
 _READ_BYTES = 1 << 16
 Streams = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 OpenTarget = Callable[[], Awaitable[Streams]]
@@ -67,8 +69,10 @@ _LONGEST_WAIT_S = 10.0
 _LINGER_S = 5.0
 """Longest time for which the program, at the end, sends what it has received."""
 _PAUSE_S = 0.2
+"""Time between two attempts to connect."""
 _READY = b"ready\n"
 _BACKLOG = 16
+"""Connections that the kernel keeps until they are accepted."""
 _FOREIGN = (
     "a program listens there, but does not accept this invitation; each run has a new one: copy "
     "that of the open run"

@@ -26,9 +26,11 @@ _REQUEST_S = 5.0
 _ANSWER_S = 5.0
 """Longest time for sending an answer."""
 _MOST_REQUEST_BYTES = 16_384
+"""A longer request is refused."""
 _MOST_ANSWERS = 64
 """Answers that are sent at once; then the oldest ends of the host that has the most."""
 _BACKLOG = 128
+"""Connections that the kernel keeps until they are accepted."""
 _END_S = 2.0
 """At the end: longest wait for an answer that is being computed."""
 _WRONG = b"HTTP/1.0 400 Bad Request\r\n\r\n"

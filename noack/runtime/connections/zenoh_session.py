@@ -22,6 +22,7 @@ _LEASE_MS = 6000
 """A connection whose other end is silent for longer breaks. On a busy machine a process may not run
 for seconds."""
 _CONNECT_MS = 5000
+"""Longest wait for a connection."""
 _RETRY = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5}
 """Of a connection whose other end does not answer."""
 _FIRST_POLL_S, _POLL_SHARE = 0.001, 0.05

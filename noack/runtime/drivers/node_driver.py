@@ -41,10 +41,12 @@ _LONGEST_WAIT_S = 10.0
 _STUCK_S = 1.0
 """A program that is late has stopped its ticks if the last one came longer ago than this."""
 _GREETING_BYTES = 200
+"""Longest first line of a program."""
 _READ_BYTES = 2**20
 _READS = 16
 """Most reads of this size at once: a program may send faster than its frames are processed."""
 _LOOK_S = 0.05
+"""Longest time between two looks at the reasons to stop."""
 _ROWS = (core.NOACK_TICKS, core.NOACK_MESSAGES)
 _COPIED = (
     *("has_point", "acknowledges", "predictions", "carries_model", "timeout_ns", "holds_input"),

@@ -15,7 +15,9 @@ from noack.core.clock import NS_PER_S, RunClock
 from noack.protocol.roles import Notice, Record
 
 _HOUSEKEEPING_S = 0.05
+"""Wall time between two turns of housekeeping."""
 _OVERLOAD_PAUSE_S = 0.002
+"""Pause for other threads, after a turn in which the loop has used nearly all time of its core."""
 _OVERLOAD_SHARE = 0.9  # of CPU time in the time since the last housekeeping
 _TURNS_TO_CATCH_UP = 20
 """Of housekeeping, one second: a machine that is late at its end has this time to catch up."""

@@ -23,6 +23,7 @@ LOST_AFTER_NS = 500_000_000
 _LEAST_EXCHANGES = 8
 """Before a process joins: the first exchanges are slow, since the code is not in the caches."""
 _WAIT_S = 10.0
+"""Longest wait for the first offset."""
 _POLL_S = 0.005
 _PPB_PER_PPM = 1000
 _NS_PER_US = 1000

@@ -66,9 +66,11 @@ _BURST = 2
 """Requests sent together: the first brings the code into the caches of both hosts, so that the time
 between reading the clock and sending is several times shorter in the second."""
 _MOST_OUTSTANDING = 64
+"""Requests that wait for their answer; then the oldest is forgotten."""
 _FLOOD_PAUSE_S = 0.01
 """After a full batch the answering thread pauses: it reads at most 6,400 datagrams a second."""
 _STOP_CHECK_S = 0.2
+"""Longest time until the answering thread sees that it should stop."""
 
 
 class TimeKind(IntEnum):

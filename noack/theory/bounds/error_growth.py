@@ -16,6 +16,7 @@ from noack.theory.bounds.gains import Columns, Growth, Output, PlantGains
 from noack.theory.bounds.stacked_norms import spectral_norm
 
 COARSE_CELLS = 64
+"""Cells of a time between two tests or events, over which growths of errors are bounded."""
 _FINE_CELLS = 256
 """Cells of a window of time: at first, and where the level is reached."""
 _SHORTEST_S, LONGEST_S = 1e-9, 1e6

@@ -305,6 +305,7 @@ def _bounded_disturbances(resolved: Scenario) -> list[Assumption]:
 def _conditions(
     conditions: NetworkConditions, resolved: Scenario, probability: float | None
 ) -> list[Assumption]:
+    # The guarantee on the losses.
     enforced = resolved.network.enforce_mansd
     why = "enforced by the network" if enforced else "not enforced"
     if probability is not None:
@@ -321,6 +322,7 @@ def _conditions(
         AssumptionStatus.HOLDS if enforced else AssumptionStatus.ASSUMED,
         why,
     )
+    # The times of the loop, which each run checks.
     sampling = f"every {1e3 * conditions.sampling_s:g} ms" if conditions.sampling_s else "continuously"
     delay = "".join(network_delay_texts(resolved)) if conditions.delay_s else ""
     network = f"; {delay}" if delay else ""

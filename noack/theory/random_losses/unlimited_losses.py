@@ -202,6 +202,7 @@ def _bursts(
 ) -> list[BurstCertificate]:
     certificates: list[BurstCertificate] = []
     for longest in range(_MOST_BURST + 1):
+        # The certificate of at most so many losses in a row, and how likely a run keeps to that.
         certificate = scope.certificate(conditions._replace(dropouts=longest, constraints=()))
         constants, spacing_s = certificate.constants, certificate.inter_event_s
         if constants is None or not spacing_s:
@@ -212,6 +213,7 @@ def _bursts(
         controller_error, state = (
             float(bound(np.zeros(1))[0]) for bound in (certificate.controller_error, certificate.state)
         )
+        # With persistent terms, or a sharper bound, Δ is taken from the whole bound.
         delta = constants.delta
         if certificate.persistent_constants is not None or certificate.other is not None:
             delta = controller_error / (max(certificate.beta, certificate.floor) or 1.0)

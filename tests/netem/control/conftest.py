@@ -3,8 +3,8 @@ from pathlib import Path
 
 import pytest
 
+from netem.control.command_queue import CommandQueue
 from netem.control.control_server import ControlServer
-from netem.control.emulator_statistics import CommandQueue
 from tests.netem.control.fake_relay import FakeRelay, running
 
 

@@ -16,11 +16,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from netem.control.emulator_statistics import CommandQueue
-from netem.control.time_histogram import BUCKETS
+from netem.control.command_queue import CommandQueue
 from netem.relay.relay import Relay
 from netem.relay.relay_links import LinkSpec
-from netem.relay.relay_reports import DIRECTIONS, Direction, DirectionReport, FlowReport, LinkReport
+from netem.relay.relay_reports import BUCKETS, DIRECTIONS, Direction, DirectionReport, FlowReport, LinkReport
 from netem.relay_watch import add_watching_options, check_watching_options
 from netem.tc_words import settings_of
 from noack.core.core_library import core

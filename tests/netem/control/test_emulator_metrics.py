@@ -12,12 +12,12 @@ from pathlib import Path
 import pytest
 
 from netem import relay_watch
+from netem.control.command_queue import CommandQueue
 from netem.control.control_server import running
 from netem.control.emulator_metrics import EmulatorMetrics, metrics
-from netem.control.emulator_statistics import CommandQueue, statistics
+from netem.control.emulator_statistics import statistics
 from netem.relay_watch import watch_relay
-from netem.tc_words import settings_of
-from noack.core.errors import CallerError, PeerError
+from noack.core.errors import CallerError
 from noack.runtime.address import address_text
 from noack.runtime.connections import metrics_server as servers
 from tests.helpers.metrics_readers import exposed, read, slow_reader, values_of
@@ -130,38 +130,3 @@ def test_the_view_shows_the_relay_and_later_messages_until_q(
             assert drawn.exception() is None
         read_until(user, lambda text: "forward →" in text.partition("\x1b[?1049l")[2])
     assert capsys.readouterr().err == "a message\n"
-
-
-def test_commands_run_in_the_thread_of_the_relay(relay: FakeRelay, commands: CommandQueue) -> None:
-    """Their errors are raised at their callers."""
-    commands.snapshot()
-    commands.change("up", ["forward"], settings_of("loss 50%"))
-    (thread,) = relay.threads
-    assert thread != threading.get_ident()
-    for error in (CallerError("no"), TimeoutError("its own")):
-
-        def refuse(error: Exception = error) -> None:
-            raise error
-
-        with pytest.raises(type(error), match=str(error)):
-            commands.submit(refuse)
-    assert commands.submit(lambda: 7) == 7
-
-
-def test_a_command_fails_at_once_if_the_relay_has_ended(relay: FakeRelay) -> None:
-    commands = CommandQueue(relay)
-    with ThreadPoolExecutor() as threads:
-        asked = threads.submit(commands.snapshot)
-        while not asked.done():
-            commands.close()  # before or after the thread submits its command
-    assert str(asked.exception()) == "the emulator has ended"
-    assert commands.snapshot_here().links[0].name == "up"
-
-
-def test_a_command_to_a_stuck_relay_times_out(relay: FakeRelay, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("netem.control.emulator_statistics._PATIENCE_S", 0.01)
-    commands = CommandQueue(relay)
-    with pytest.raises(PeerError, match="has not answered for"):
-        commands.snapshot()
-    commands.run_pending()  # commands that have timed out do not run
-    assert relay.threads == set()

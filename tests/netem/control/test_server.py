@@ -15,9 +15,9 @@ from zenoh.handlers import FifoChannel
 
 from netem import stand_alone
 from netem.control import control_server, emulator_commands
+from netem.control.command_queue import CommandQueue
 from netem.control.control_server import EMULATORS, ControlServer, find, registered_emulator, running
 from netem.control.emulator_commands import Client
-from netem.control.emulator_statistics import CommandQueue
 from netem.control.statistics_view import Screen
 from netem.fates import FateRecorder
 from netem.tc_words import settings_of

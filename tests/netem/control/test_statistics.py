@@ -15,14 +15,9 @@ from rich.console import Console
 
 from netem.__main__ import main
 from netem.control import emulator_statistics
+from netem.control.command_queue import AppliedSettings, Snapshot
 from netem.control.control_server import ControlServer
-from netem.control.emulator_statistics import (
-    AppliedSettings,
-    DirectionStatistics,
-    Snapshot,
-    Statistics,
-    statistics,
-)
+from netem.control.emulator_statistics import DirectionStatistics, Statistics, statistics
 from netem.control.statistics_view import History, render
 from netem.fates import SCHEMA, FateRecorder
 from netem.relay.relay_reports import FlowReport

@@ -17,8 +17,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from netem.__main__ import main
-from netem.relay.device_link import DeviceLink
-from netem.relay.relay_links import LinkSpec
+from netem.relay.relay_links import DeviceLink, LinkSpec
 from netem.shell import process, shell
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.record_tables import Fate

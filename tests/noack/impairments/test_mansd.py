@@ -1,4 +1,7 @@
-"""The guarantee, checked by an observer at the receiver without access to the link's decisions."""
+"""The guarantee, checked by an observer at the receiver without access to the link's decisions.
+
+At the end: all that the guarantee allows can occur.
+"""
 
 import itertools
 import struct
@@ -14,11 +17,13 @@ from hypothesis import strategies as st
 from netem.link_state import LinkState
 from netem.tc_words import settings_of
 from noack.core.core_library import core, ffi
+from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings, RecordedDecision
+from noack.impairments.loss_models.scripted import ScriptedLoss
 from noack.protocol.record_tables import Fate
 from tests.noack.impairments import any_link_settings as any_settings
 from tests.oracles.link import Datagram, Link
-from tests.oracles.loss_language import is_allowed, longest_burst
+from tests.oracles.loss_language import allowed_rows, is_allowed, longest_burst
 
 MS = 1_000_000
 OUT_OF_ORDER = settings_of("delay 5ms 20ms reorder 50%").impairments
@@ -305,3 +310,33 @@ def test_the_link_decides_the_example_as_documented(words: str, column: int) -> 
         if column == 3:
             assert (decision.hold_back_ns > 0) == ("held back" in row[4])
             assert (decision.fate == Fate.FORCED) == ("forced" in row[4])
+
+
+# --- exactly what the guarantee allows ------------------------------------------------------------
+
+LENGTH = 12
+"""More than the longest window, and than a burst with the deliveries that must follow it."""
+APART = 9
+WISHES = np.array(list(itertools.product([False, True], repeat=LENGTH)))
+LOST = np.flatnonzero(np.pad(WISHES, ((0, 0), (0, APART)))).tolist()
+SCRIPT = (LossOf(loss=ScriptedLoss(lost=tuple(LOST))),)
+WINDOWS = [f"atmost {m} in {k}" for k in range(1, 9) for m in range(k)]
+
+
+@pytest.mark.parametrize("window", [*WINDOWS, "atmost 2 in 4 atmost 3 in 8"])
+def test_exactly_the_allowed_sequences_occur(decide: Any, window: str) -> None:
+    """For each pair (m, K) with K ≤ 8, and two: alone, with a cap, with recovery, and with both."""
+    for cap, recovery in itertools.product(["", "mansd 2"], ["", "recover 3"]):
+        own = settings_of(f"{window} {cap} {recovery}")
+        scripted = own.model_copy(update={"impairments": SCRIPT})
+        fates = decide(scripted, len(WISHES) * (LENGTH + APART)).fates
+        lost = ~np.isin(fates, (Fate.DELIVERED, Fate.FORCED))
+        occurred = lost.reshape(len(WISHES), LENGTH + APART)[:, :LENGTH]
+        allowed, is_wish = allowed_rows(WISHES, own), (occurred == WISHES).all(axis=1)
+        assert allowed_rows(occurred, own).all()
+        # What is allowed occurs, what is not does not; and nothing is changed before it must be.
+        assert (allowed == is_wish).all()
+        first = np.argmax(occurred != WISHES, axis=1)[:, None]
+        assert np.take_along_axis(WISHES, first, axis=1)[~is_wish].all()
+        begun = WISHES & (np.arange(LENGTH) <= first)
+        assert not allowed_rows(begun[~is_wish], own).any()

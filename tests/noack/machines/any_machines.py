@@ -61,12 +61,16 @@ def sizes(draw: st.DrawFn, most: int = 4) -> Sizes:
     carries_model = draw(st.booleans()) and n + m <= 64
     outputs = draw(st.integers(0, min(n, 64 - m)))
     return Sizes(
-        n, m, outputs,
-        draw(st.integers(1, min((64 - outputs) // m, 3))),
-        draw(st.integers(1, min((64 - n * carries_model) // m, 3))),
-        carries_model, draw(st.booleans()), draw(st.integers(0, 3)),
-        draw(st.tuples(st.booleans(), st.booleans())),
-    )  # fmt: skip
+        n,
+        m,
+        outputs=outputs,
+        measure_every=draw(st.integers(1, min((64 - outputs) // m, 3))),
+        predictions=draw(st.integers(1, min((64 - n * carries_model) // m, 3))),
+        carries_model=carries_model,
+        acknowledged=draw(st.booleans()),
+        internal=draw(st.integers(0, 3)),
+        disturbed=draw(st.tuples(st.booleans(), st.booleans())),
+    )
 
 
 def chance(rng: Rng) -> bool:
@@ -146,17 +150,33 @@ def plant(seed: int, of: Sizes, scale: float = 1.0, period_ns: int = 10 * MS) ->
     waves = [_waves(rng, m)] * d, [_waves(rng, n)] * w
     outputs = of.outputs or n
     C = None if outputs == n and chance(rng) else matrix(rng, 1.0, outputs, n)
+    if of.carries_model:
+        watchdog = Watchdog(
+            timeout_ns=int(rng.choice([30 * MS, NEVER_NS])),
+            policy="model",
+            notice_ns=35 * MS,
+            H=matrix(rng, scale, n, n) * chance(rng),
+            K=matrix(rng, scale, m, n),
+        )
+    else:
+        watchdog = Watchdog(
+            timeout_ns=int(rng.choice([0, 30 * MS])),
+            policy=str(rng.choice(["hold", "zero"])),
+            notice_ns=35 * MS,
+        )
     return Plant(
-        system, m, period_ns, 10**12,
-        Watchdog(int(rng.choice([30 * MS, NEVER_NS])), "model", 35 * MS,
-                 matrix(rng, scale, n, n) * chance(rng), matrix(rng, scale, m, n))
-        if of.carries_model else
-        Watchdog(int(rng.choice([0, 30 * MS])), str(rng.choice(["hold", "zero"])), 35 * MS),
-        of.measure_every, of.predictions, int(rng.integers(1, 20)) * MS,
-        Disturbance(*waves, (m * d, n * w)) if d or w else None,
-        MeasurementModel(C, *(chance(rng) * np.ones((2, outputs))), seed),
+        system,
+        m,
+        period_ns=period_ns,
+        horizon_ns=10**12,
+        watchdog=watchdog,
+        measure_every=of.measure_every,
+        predictions=of.predictions,
+        input_period_ns=int(rng.integers(1, 20)) * MS,
+        disturbance=Disturbance(*waves, widths=(m * d, n * w)) if d or w else None,
+        measurement=MeasurementModel(C, *(chance(rng) * np.ones((2, outputs))), seed=seed),
         reports_inputs=of.outputs > 0,
-    )  # fmt: skip
+    )
 
 
 def _waves(rng: Rng, width: int) -> Callable[[range], Matrix]:
@@ -171,24 +191,37 @@ def sensor(seed: int, of: Sizes, form: int, scale: float = 1.0) -> Sensor:
     every = policies(rng, n)
     H = matrix(rng, scale, n, n) * chance(rng)
     return Sensor(
-        H, every[form % len(every)], matrix(rng, scale, n) if chance(rng) else None, m,
-        10 * MS, GENERATION * chance(rng), matrix(rng, scale, n) if chance(rng) else None,
+        H,
+        every[form % len(every)],
+        x0=matrix(rng, scale, n) if chance(rng) else None,
+        inputs=m,
+        period_ns=10 * MS,
+        first_number=GENERATION * chance(rng),
+        setpoint=matrix(rng, scale, n) if chance(rng) else None,
         timeout_ns=int(rng.integers(0, 50)) * MS if of.acknowledged else None,
         observer=observer(rng, of.outputs, n, m, steps, scale) if of.outputs else None,
-    )  # fmt: skip
+    )
 
 
 def observer(rng: Rng, p: int, n: int, m: int, steps: int, scale: float) -> Observer:
-    eye, C = np.eye(n), matrix(rng, 1.0, p, n)
-    Ad, Bd = 0.5 * matrix(rng, scale, n, n), matrix(rng, scale, n, m)
-    model = EstimationModel(Ad, Bd, eye, C, 0.1 * eye, 0.2 * np.eye(p), steps)
+    C, Ad, Bd = matrix(rng, 1.0, p, n), 0.5 * matrix(rng, scale, n, n), matrix(rng, scale, n, m)
+    model = EstimationModel(
+        Ad=Ad, Bd=Bd, Gd=np.eye(n), C=C, Q=0.1 * np.eye(n), R=0.2 * np.eye(p), steps=steps
+    )
     rows = tuple(tuple(row) for row in matrix(rng, scale, n, p).tolist())
     if chance(rng):
         settings: Any = KalmanSettings(kind="kalman", initial_std=(0.5,) * n)
     else:
         settings = LuenbergerSettings(kind="luenberger", gain=rows)
-    x, known = matrix(rng, scale, n), chance(rng)
-    return Observer(settings, model, x, steps * m, 10 * MS, known, restarted=chance(rng))
+    return Observer(
+        settings,
+        model,
+        x=matrix(rng, scale, n),
+        reported=steps * m,
+        period_ns=10 * MS,
+        starts_from_x0=chance(rng),
+        restarted=chance(rng),
+    )
 
 
 def controller(
@@ -202,13 +235,23 @@ def controller(
     chosen = [LongestBurst(int(rng.integers(0, 3))), *constraints[: rng.integers(0, 3)]]
     point = (matrix(rng, scale, n), matrix(rng, scale, m)) if chance(rng) else None
     return Controller(
-        matrix(rng, scale, n, n) * chance(rng), laws[rng.integers(0, 3)], m, period_ns,
-        int(rng.integers(0, 10)) * MS if first_ns is None else first_ns, 10**12,
-        LossGuarantee(tuple(chosen)), matrix(rng, scale, n) if chance(rng) else None,
-        of.acknowledged, Start(int(chance(rng)), 33 * MS), matrix(rng, scale, m),
-        of.carries_model, of.predictions,
-        int(rng.integers(1, 60)) * MS if chance(rng) else NEVER_NS, chance(rng), point,
-    )  # fmt: skip
+        matrix(rng, scale, n, n) * chance(rng),
+        laws[rng.integers(0, 3)],
+        m,
+        period_ns=period_ns,
+        first_ns=int(rng.integers(0, 10)) * MS if first_ns is None else first_ns,
+        horizon_ns=10**12,
+        guarantee=LossGuarantee(tuple(chosen)),
+        x0=matrix(rng, scale, n) if chance(rng) else None,
+        acknowledges=of.acknowledged,
+        start=Start(int(chance(rng)), 33 * MS),
+        safe_input=matrix(rng, scale, m),
+        carries_model=of.carries_model,
+        predictions=of.predictions,
+        timeout_ns=int(rng.integers(1, 60)) * MS if chance(rng) else NEVER_NS,
+        holds_input=chance(rng),
+        setpoint=point,
+    )
 
 
 class Inputs:

@@ -28,7 +28,7 @@ Words of names and fields, and their symbols in the docstrings:
 * ``flow``: z = (x, e_c) from one delivery to the next, scaled by e^{αt}, in coordinates in which
   ‖·‖_W is ‖·‖. ``states`` is e^{Fτ} (I, 0) at the nodes, ``edges_s``, of a grid; between two nodes
   is a ``cell``.
-* ``ellipsoid``, ``shape``: ‖Λξ‖ ≤ 1, and Λ. A ``reach`` is what z can be if ‖Λξ‖ ≤ c at the delivery
+* ``ellipsoid``, ``scaling``: ‖Λξ‖ ≤ 1, and Λ. A ``reach`` is what z can be if ‖Λξ‖ ≤ c at the delivery
   (``scale`` is c) and ‖e_c‖_W ≤ D since then (``error_bound`` is D).
 * ``effects``: what delay and hold change of the flow. ``age_input`` bounds ‖q‖, the part of the
   input that its age adds; ``first_error`` bounds ‖e_c‖_W when an update acts.

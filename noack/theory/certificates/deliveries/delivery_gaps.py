@@ -145,7 +145,7 @@ class GapGains(NamedTuple):
     The gains from ‖Λξ‖ include the age of the input. Arrays are (gaps,), unless a shape is given.
     """
 
-    shape: Matrix
+    scaling: Matrix
     """Λ, (n, n)."""
     age_sags: Vector
     """How far ‖w‖ may lie above its values at nodes, from the age of the input, (cells,)."""
@@ -193,6 +193,8 @@ class GapLoop:
         """C of the outputs C z that are bounded."""
         for name in (Output.STATE, Output.WEIGHTED, Output.MISMATCH):
             self.outputs[name] = np.hstack([plant.outputs[name], 0 * plant.outputs[name]])
+        self.feedthrough = np.array([[float(name == INPUT)] for name in self.outputs])
+        """1 for the output that contains w itself, (outputs, 1)."""
         # What drives z: a w at any time, and the age of the input for each τ from −σ to σ.
         BU = plant.input_matrix
         self._response = response_until(self.F, np.vstack([BU, -BU]), self.grid.until_s, self.grid.cells)
@@ -260,19 +262,19 @@ class GapLoop:
             areas.append(np.where(distances >= 0, largest[distances.clip(min=0)], 0.0))
         return np.array(areas)
 
-    def gains(self, shape: Matrix) -> GapGains:
+    def gains(self, scaling: Matrix) -> GapGains:
         """Return the gains of each gap for a Λ."""
-        grid, inverse = self.grid, np.asarray(np.linalg.inv(shape))
+        grid, inverse = self.grid, np.asarray(np.linalg.inv(scaling))
         # ‖w‖ from the age of the input.
-        age_sags, second_order = self._age_sags(shape, inverse)
+        age_sags, second_order = self._age_sags(scaling, inverse)
         age_input = (
             larger_ends(spectral_norm(self.input_by_age @ inverse).max(axis=1)) + age_sags
         ) * ROUNDING
         # From any w.
-        state_from_input = grid.until_ends(self._response.through(np.hstack([shape, 0 * shape])).area)
+        state_from_input = grid.until_ends(self._response.through(np.hstack([scaling, 0 * scaling])).area)
         late_effect_from_input = grid.until_ends(self.late_effect_areas)
         # From ξ: J is that of the error at the end of the gap, which the next update removes.
-        state_from_state = self._state_gains(shape, inverse) + state_from_input @ second_order
+        state_from_state = self._state_gains(scaling, inverse) + state_from_input @ second_order
         errors = self.flows[grid.ends, self.n :] @ inverse
         nodes, sag = self.late_effect_rows
         without_ages = spectral_norm(nodes @ errors[:, None]).max(axis=1)
@@ -285,7 +287,7 @@ class GapLoop:
             state_from_state, late_effect_from_state, state_by_window, late_effect_by_window, grid.shares_left
         )
         return GapGains(
-            shape=shape,
+            scaling=scaling,
             age_sags=age_sags,
             age_input=age_input,
             state_from_state=state_from_state,
@@ -300,22 +302,22 @@ class GapLoop:
             largest=largest,
         )
 
-    def _state_gains(self, shape: Matrix, inverse: Matrix) -> Vector:
+    def _state_gains(self, scaling: Matrix, inverse: Matrix) -> Vector:
         """Bound ‖Λξ‖ after each gap with ages to first order, (gaps,).
 
         w = −τ KHe^{Hr}ξ. In a few pieces of a gap, Ψ(g − r) KHe^{Hr} is replaced by its mean; then
         only the mean of τ counts, and a norm is largest for means of ±σ.
         """
         grid, F, G = self.grid, self.F, self.scaled_H
-        without_ages = shape @ self.flows[grid.ends, : self.n] @ inverse
+        without_ages = scaling @ self.flows[grid.ends, : self.n] @ inverse
         if self.conditions.hold_s == 0 or not self.H.any():
             return spectral_norm(without_ages) * ROUNDING
         # By how much the products at the nodes may differ from those between them.
         input_rate = self.input_by_state @ self.H
-        row = np.hstack([shape, 0 * shape])
+        row = np.hstack([scaling, 0 * scaling])
         Y = F @ F @ input_rate - 2 * F @ input_rate @ G + input_rate @ G @ G
         bend = response_until(F, Y @ inverse, grid.until_s, grid.cells).through(row).sup_on_grid()
-        models = response_until(G, inverse, grid.until_s, grid.cells).through(shape).sup_on_grid()
+        models = response_until(G, inverse, grid.until_s, grid.cells).through(scaling).sup_on_grid()
         sag = grid.cell_s**2 / 8 * float(bend) * float(models)
         # The products Ψ(g − r) KHe^{Hr} at the nodes of each gap.
         left = row @ self._powers(F) @ input_rate
@@ -343,7 +345,7 @@ class GapLoop:
         ends = without_ages + np.einsum("sp,pij->sij", s * _SIGNS, means)
         return (float(spectral_norm(ends).max()) + deviation) * ROUNDING
 
-    def _age_sags(self, shape: Matrix, inverse: Matrix) -> tuple[Vector, Vector]:
+    def _age_sags(self, scaling: Matrix, inverse: Matrix) -> tuple[Vector, Vector]:
         """Bound, over each cell, how far ‖w‖ may lie above its nodes, and from the first order."""
         s, grid = self.conditions.hold_s, self.grid
         H, G = self.H, self.scaled_H
@@ -352,7 +354,9 @@ class GapLoop:
         outputs = Outputs({"τ": self.R @ H @ H, "r": self.R @ H @ G @ G})
         kernels = response_until(G, inverse, grid.until_s, grid.cells).through_each(outputs)
         # e^{−Hτ} commutes with e^{Hr}.
-        models = [response_until(generator, inverse, s).through(shape).sup_on_grid() for generator in (H, -H)]
+        models = [
+            response_until(generator, inverse, s).through(scaling).sup_on_grid() for generator in (H, -H)
+        ]
         bend_by_age = max(map(float, models)) * kernels["τ"].highest
         bend_by_time = max(map(float, models)) * kernels["r"].highest
         sags = (s / _AGES) ** 2 / 8 * bend_by_age + grid.cell_s**2 / 8 * s * bend_by_time

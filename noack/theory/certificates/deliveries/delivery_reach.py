@@ -106,13 +106,13 @@ class DeliveryEllipsoid:
     """The states ξ at a delivery with ‖Λξ‖ ≤ 1."""
 
     flow: DeliveryFlow
-    shape: Matrix
+    scaling: Matrix
     """Λ, (n, n), invertible."""
 
     @cached_property
     def inverse(self) -> Matrix:
         """Λ⁻¹."""
-        return np.asarray(np.linalg.inv(self.shape))
+        return np.asarray(np.linalg.inv(self.scaling))
 
     @cached_property
     def axes(self) -> tuple[Vector, Stack]:
@@ -135,7 +135,7 @@ class DeliveryEllipsoid:
     @cached_property
     def state_bounds(self) -> "_CellBounds":
         """Bounds of Λx."""
-        return _CellBounds(self, np.hstack([self.shape, np.zeros_like(self.shape)]))
+        return _CellBounds(self, np.hstack([self.scaling, np.zeros_like(self.scaling)]))
 
     @cached_method
     def windows(self, last_node: int) -> list[_Window]:
@@ -179,8 +179,8 @@ class DeliveryEllipsoid:
         """
         flow = self.flow
         # The largest ‖p‖ for each γ, by bisection.
-        S = self.shape @ flow.closed_loop @ self.inverse
-        by_input = self.shape @ flow.input_matrix
+        S = self.scaling @ flow.closed_loop @ self.inverse
+        by_input = self.scaling @ flow.input_matrix
         squares = by_input @ by_input.T / 2
         gain = float(np.linalg.norm(by_input, 2))
         largest = 0.0
@@ -344,7 +344,7 @@ class Reach:
         rows = np.zeros((2 * _EARLIER_TIMES + 2, n, 2 * n))
         rows[0, :, :n] = np.eye(n) / (flow.model_growth * h)
         rows[1::2] = window.flows[:, n:] / errors[:, None, None]
-        rows[2::2] = (ellipsoid.shape @ window.flows[:-1, :n]) / states[:, None, None]
+        rows[2::2] = (ellipsoid.scaling @ window.flows[:-1, :n]) / states[:, None, None]
         return rows
 
 
@@ -352,7 +352,7 @@ class _CellBounds:
     """Bounds of ‖C z‖ over each cell, for ‖Λξ‖ ≤ 1."""
 
     def __init__(self, ellipsoid: DeliveryEllipsoid, C: Matrix) -> None:
-        self.C, self._flow, self._shape = C, ellipsoid.flow, ellipsoid.shape
+        self.C, self._flow, self._scaling = C, ellipsoid.flow, ellipsoid.scaling
         self._singular = ellipsoid.axes[0]
         cells, n = self._singular.shape
         ends, terms, remainder = ellipsoid.cell_terms
@@ -451,12 +451,12 @@ class _CellBounds:
         # The conditions, as rows for ξ: ‖Λξ‖ ≤ 1, ‖e_c‖ ≤ D, ‖Λx‖ ≤ 1; the last ‖e_c‖ has most weight.
         times_s = flow.edges_s[cells, None] * (np.arange(1, _EARLIER_TIMES + 1) / _EARLIER_TIMES)
         nodes = np.minimum(flow.edges_s.searchsorted(times_s, side="right") - 1, cells[:, None])
-        flows, shape = flow.states[nodes], self._shape
+        flows, scaling = flow.states[nodes], self._scaling
         rows = np.concatenate(
             [
-                np.broadcast_to(shape, (len(cells), 1, n, n)),
+                np.broadcast_to(scaling, (len(cells), 1, n, n)),
                 flows[:, :, n:] / errors[nodes][..., None, None],
-                shape @ flows[:, :, :n] / states[nodes][..., None, None],
+                scaling @ flows[:, :, :n] / states[nodes][..., None, None],
             ],
             axis=1,
         )

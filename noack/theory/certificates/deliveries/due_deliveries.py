@@ -19,7 +19,6 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
@@ -74,18 +73,16 @@ class Deliveries:
         if loop.starts_late:
             responses = response_until(loop.scaled_H, plant.start, conditions.start_s)
             self._start_input = float(responses.through(loop.R).sup_on_grid()) * ROUNDING
-        inverse = np.asarray(np.linalg.inv(gains.shape))
+        inverse = np.asarray(np.linalg.inv(gains.scaling))
         # The outputs until the next delivery, for ‖Λξ‖ ≤ 1 and for S = 1, (outputs, cells).
         self._flows = loop.flows @ inverse
-        self._feedthrough = np.array([[float(name == INPUT)] for name in loop.outputs])
-        """1 for the output that contains w itself."""
         without_ages, self._output_sags = _outputs_without_ages(loop, inverse)
         from_ages = loop.input_responses @ gains.age_input
-        self._outputs_from_state = without_ages + self._feedthrough * gains.age_input + from_ages
+        self._outputs_from_state = without_ages + loop.feedthrough * gains.age_input + from_ages
         self._outputs_from_late_effects = loop.grid.within_windows(loop.input_responses).max(axis=-1)
         # What follows after each gap: linear functions of a ball's centre, of ‖w‖, and of ρ and S.
         self._age_maps = _StackedMaps(loop.input_by_age @ inverse)
-        self._centre_maps = _centre_maps(loop, gains.shape, inverse)
+        self._centre_maps = _centre_maps(loop, gains.scaling, inverse)
         self._from_input = np.vstack([gains.state_from_input, gains.late_effect_from_input]).T
         self._from_extent = _maps_of_extents(gains)
 
@@ -212,7 +209,7 @@ class Deliveries:
             from_extent = (from_radius + from_late_effects).max(axis=1)
             cells = cells + self._output_sags[number] * lengths(centres)[:, None] + from_extent
             cells = cells + inputs @ loop.input_responses[number].T
-            highest.append((cells + self._feedthrough[number] * by_age).max())
+            highest.append((cells + loop.feedthrough[number] * by_age).max())
         return np.array(highest)
 
     def _outputs_of_rest(self, history: BallHistory, last: slice, highest: Vector) -> Vector:
@@ -262,84 +259,111 @@ class Deliveries:
 
     @property
     def _start_ball(self) -> Ball:
-        return Ball(self.gains.shape @ self._x0, 0.0, 0.0, 0.0, self.gains.theta)
+        return Ball(self.gains.scaling @ self._x0, 0.0, 0.0, 0.0, self.gains.theta)
 
     @cached_property
-    def _start_flow(self) -> "_StartFlow":
-        """The flow z after t = 0, if updates act before the next event."""
-        loop, x0, T = self.loop, self._x0, self.loop.conditions.start_s
-        # What a w that ends at T has added to z there: z with an input of 0, minus z with w = 0.
-        drift = loop.plant.A + loop.plant.alpha_per_s * np.eye(loop.n)
-        x = exponential(drift * T) @ x0
-        x_c = exponential(loop.scaled_H * T) @ x0
-        added_at_T = np.append(x, x_c - x) - exponential(loop.F * T)[:, : loop.n] @ x0
-        # The same at the nodes from T on.
-        cell_s = loop.grid.cell_s
-        first_node = math.ceil(T / cell_s - 1e-9)
-        step = exponential(loop.F * cell_s)
-        added = [exponential(loop.F * max(first_node * cell_s - T, 0.0)) @ added_at_T]
-        for _ in range(loop.grid.cells - first_node):
-            added.append(step @ added[-1])
-        age_input = self._age_inputs(x0[None] @ self.gains.shape.T)[0]
-        return _StartFlow(loop.flows @ x0, np.array(added), first_node, age_input)
+    def _first_gap(self) -> "_FirstGap":
+        age_input = self._age_inputs(self._x0[None] @ self.gains.scaling.T)[0]
+        return _FirstGap(self.loop, self.gains, self._output_sags, age_input)
 
     def _outputs_from_start(self) -> Vector:
         """Bound all outputs until the next delivery after t = 0, (outputs,)."""
         if self.loop.starts_late:
             return self.outputs_until_next_delivery([self._start_ball])
-        loop, start = self.loop, self._start_flow
-        T, first, cells = loop.conditions.start_s, start.first_node, loop.grid.cells
-        with_input = start.free[first:] + start.added
+        return self._first_gap.outputs()
+
+    def _balls_from_start(self) -> BallsAfterGaps:
+        """Return the balls after each gap from t = 0."""
+        return self._after_gaps([self._start_ball]) if self.loop.starts_late else self._first_gap.balls()
+
+
+def outputs_after_return(kappa: float, highest: Vector, of_rest: Vector) -> Vector:
+    """Bound y ≤ |κ| max(y, h) + τ: all later outputs, for h before and what follows from the rest, τ."""
+    return np.asarray(np.maximum(kappa * highest + of_rest, of_rest / (1 - kappa)))
+
+
+class _FirstGap:
+    """The gap from t = 0 to the next delivery, if updates act before the next event.
+
+    Until some time of at most T the input is 0: w = −K e^{Hr} x(0) until then. What w adds to z, as a
+    function of this time, is close to a line from 0 to what a w that ends at T adds.
+    """
+
+    def __init__(self, loop: GapLoop, gains: GapGains, output_sags: Matrix, age_input: Vector) -> None:
+        self.loop, self.gains, self._x0 = loop, gains, loop.plant.start[:, 0]
+        self._output_sags = output_sags
+        self._age_input = age_input
+        """‖w‖ over each cell from the age of the input."""
+        self._free = loop.flows @ self._x0
+        """z without w at the nodes, (cells + 1, 2n)."""
+        self._bend = loop.F @ loop.input_by_state - loop.input_by_state @ loop.scaled_H
+        """Y: what w has added bends by e^{Fr} Y e^{Hs} x(0) where it ends at s, r ago."""
+        self._first_node = math.ceil(loop.conditions.start_s / loop.grid.cell_s - 1e-9)
+        """The first node from T on."""
+        self._added = self._added_by_input()
+        """What a w that ends at T has added, at the nodes from ``_first_node`` on."""
+
+    def _added_by_input(self) -> Matrix:
+        loop, x0, T = self.loop, self._x0, self.loop.conditions.start_s
+        # At T: z with an input of 0, minus z with w = 0.
+        drift = loop.plant.A + loop.plant.alpha_per_s * np.eye(loop.n)
+        x = exponential(drift * T) @ x0
+        x_c = exponential(loop.scaled_H * T) @ x0
+        added_at_T = np.append(x, x_c - x) - exponential(loop.F * T)[:, : loop.n] @ x0
+        # At the nodes from T on.
+        cell_s = loop.grid.cell_s
+        step = exponential(loop.F * cell_s)
+        added = [exponential(loop.F * max(self._first_node * cell_s - T, 0.0)) @ added_at_T]
+        for _ in range(loop.grid.cells - self._first_node):
+            added.append(step @ added[-1])
+        return np.array(added)
+
+    def outputs(self) -> Vector:
+        """Bound all outputs until the next delivery, (outputs,)."""
+        loop, first = self.loop, self._first_node
+        T, cells = loop.conditions.start_s, loop.grid.cells
+        with_input = self._free[first:] + self._added
         highest = []
         for number, C in enumerate(loop.outputs.values()):
             # At the nodes: without w, and with a w until T.
-            bounds = larger_ends(np.linalg.norm(start.free @ C.T, axis=-1))
+            bounds = larger_ends(np.linalg.norm(self._free @ C.T, axis=-1))
             later = np.linalg.norm(with_input @ C.T, axis=-1)
             bounds[first:] = np.maximum(bounds[first:], larger_ends(later))
             # A w until an earlier time, and times between two nodes.
-            bounds[first:] += T**2 / 8 * self._start_response(C, self._start_bend, cells)
-            second_derivative = self._start_response(C @ loop.F @ loop.F, loop.input_by_state, cells)
+            bounds[first:] += T**2 / 8 * self._response(C, self._bend, cells)
+            second_derivative = self._response(C @ loop.F @ loop.F, loop.input_by_state, cells)
             bounds[first:] += loop.grid.cell_s**2 / 8 * T * second_derivative
-            bounds[:first] += T * self._start_response(C, loop.input_by_state, max(first, 1))
-            bounds += self._output_sags[number] * np.linalg.norm(self.gains.shape @ self._x0)
+            bounds[:first] += T * self._response(C, loop.input_by_state, max(first, 1))
+            bounds += self._output_sags[number] * np.linalg.norm(self.gains.scaling @ self._x0)
             # The age of the input.
-            bounds += loop.input_responses[number] @ start.age_input
-            highest.append((bounds + self._feedthrough[number] * start.age_input).max())
+            bounds += loop.input_responses[number] @ self._age_input
+            highest.append((bounds + loop.feedthrough[number] * self._age_input).max())
         return np.array(highest)
 
-    def _balls_from_start(self) -> BallsAfterGaps:
-        """Return the balls after each gap from t = 0; the middle of the line is their centre."""
-        if self.loop.starts_late:
-            return self._after_gaps([self._start_ball])
-        loop, gains, start = self.loop, self.gains, self._start_flow
+    def balls(self) -> BallsAfterGaps:
+        """Return the balls after each gap; the middle of the line is their centre."""
+        loop, gains = self.loop, self.gains
         T, n, cells = loop.conditions.start_s, loop.n, loop.grid.cells
-        at_ends = start.free[loop.grid.ends]
-        added = start.added[loop.grid.ends - start.first_node]
-        centres = (at_ends[:, :n] + added[:, :n] / 2) @ gains.shape.T
+        at_ends = self._free[loop.grid.ends]
+        added = self._added[loop.grid.ends - self._first_node]
+        centres = (at_ends[:, :n] + added[:, :n] / 2) @ gains.scaling.T
         # ρ: half of the line, its bend, and the age of the input.
-        half = np.linalg.norm(added[:, :n] @ gains.shape.T, axis=-1) / 2
-        shape_rows = np.hstack([gains.shape, 0 * gains.shape])
-        sag = T**2 / 8 * self._start_response(shape_rows, self._start_bend, cells)
-        radius = half * ROUNDING + sag + gains.state_from_input @ start.age_input
+        half = np.linalg.norm(added[:, :n] @ gains.scaling.T, axis=-1) / 2
+        scaling_rows = np.hstack([gains.scaling, 0 * gains.scaling])
+        sag = T**2 / 8 * self._response(scaling_rows, self._bend, cells)
+        radius = half * ROUNDING + sag + gains.state_from_input @ self._age_input
         # S: the larger one of both ends of the line, and the same.
         *late_sags, weighted_sag = (
-            T**2 / 8 * self._start_response(C, self._start_bend, cells)
-            for C in loop.late_effect_outputs.values()
+            T**2 / 8 * self._response(C, self._bend, cells) for C in loop.late_effect_outputs.values()
         )
         without_w, with_w = (loop.late_effects(errors[:, n:]) for errors in (at_ends, at_ends + added))
         late_effects = np.maximum(without_w, with_w)
         late_effects = late_effects + max(late_sags) + weighted_sag
-        late_effects = late_effects + gains.late_effect_from_input @ start.age_input
+        late_effects = late_effects + gains.late_effect_from_input @ self._age_input
         extents = np.stack([radius, late_effects, radius + gains.theta * late_effects], axis=-1)
         return BallsAfterGaps(centres[None], extents[None])
 
-    @property
-    def _start_bend(self) -> Matrix:
-        """Y: what w has added bends by e^{Fr} Y e^{Hs} x(0) where it ends at s, r ago."""
-        loop = self.loop
-        return loop.F @ loop.input_by_state - loop.input_by_state @ loop.scaled_H
-
-    def _start_response(self, C: Matrix, Y: Matrix, cells: int) -> float:
+    def _response(self, C: Matrix, Y: Matrix, cells: int) -> float:
         """Bound ‖C e^{Fr} Y e^{Hs} x(0)‖ over cells of r, and s up to T."""
         loop, T, G = self.loop, self.loop.conditions.start_s, self.loop.scaled_H
         if T == 0:
@@ -354,27 +378,6 @@ class Deliveries:
         model_bend = response_until(G, self._x0[:, None], T).through(G @ G).sup_on_grid()
         gain = response_until(loop.F, Y, until_s, cells).through(C).sup_on_grid()
         return (largest + T**2 / 8 * float(model_bend) * float(gain)) * ROUNDING
-
-
-def outputs_after_return(kappa: float, highest: Vector, of_rest: Vector) -> Vector:
-    """Bound y ≤ |κ| max(y, h) + τ: all later outputs, for h before and what follows from the rest, τ."""
-    return np.asarray(np.maximum(kappa * highest + of_rest, of_rest / (1 - kappa)))
-
-
-class _StartFlow(NamedTuple):
-    """z after t = 0, if the input is 0 until some time of at most T: w = −K e^{Hr} x(0) until then.
-
-    What w adds to z, as a function of this time, is close to a line from 0 to ``added``.
-    """
-
-    free: Matrix
-    """z without w at the nodes, (cells + 1, 2n)."""
-    added: Matrix
-    """What a w that ends at T has added, at the nodes from ``first_node`` on."""
-    first_node: int
-    """The first node from T on."""
-    age_input: Vector
-    """‖w‖ over each cell from the age of the input."""
 
 
 class _StackedMaps:
@@ -393,13 +396,13 @@ class _StackedMaps:
         return [products[:, part].reshape(-1, *shape) for part, shape in parts]
 
 
-def _centre_maps(loop: GapLoop, shape: Matrix, inverse: Matrix) -> _StackedMaps:
+def _centre_maps(loop: GapLoop, scaling: Matrix, inverse: Matrix) -> _StackedMaps:
     """Return the maps of Λξ to Λξ after each gap, and to what bounds J: at nodes, and between them."""
     at_ends = loop.flows[loop.grid.ends]
     nodes, sag = loop.late_effect_rows
     errors = at_ends[:, loop.n :] @ inverse
     return _StackedMaps(
-        shape @ at_ends[:, : loop.n] @ inverse,
+        scaling @ at_ends[:, : loop.n] @ inverse,
         nodes[:, None] @ errors,
         sag * loop.plant.error.weight @ errors,
     )
@@ -437,8 +440,8 @@ def _contracting_gains(loop: GapLoop) -> GapGains:
         NoCertificateError: it grows in all norms that are tried.
     """
     smallest = math.inf
-    for shape in _shapes(loop.plant):
-        gains = loop.gains(shape)
+    for scaling in _scalings(loop.plant):
+        gains = loop.gains(scaling)
         if gains.largest < 1:
             return gains
         smallest = min(smallest, gains.largest)
@@ -447,7 +450,7 @@ def _contracting_gains(loop: GapLoop) -> GapGains:
     )
 
 
-def _shapes(plant: PlantGains) -> Iterator[Matrix]:
+def _scalings(plant: PlantGains) -> Iterator[Matrix]:
     """Yield matrices Λ that may suit: ‖Λx‖ decays while e_c is 0."""
     from scipy.linalg import solve_continuous_lyapunov  # slow to import
 

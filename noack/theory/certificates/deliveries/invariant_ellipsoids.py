@@ -77,15 +77,15 @@ class InvariantEllipsoids:
             start_s: until then the input is 0.
         """
         ellipsoid = self._best_ellipsoid
-        if ellipsoid is None or np.linalg.cond(ellipsoid.shape) > _ILL_CONDITIONED:
+        if ellipsoid is None or np.linalg.cond(ellipsoid.scaling) > _ILL_CONDITIONED:
             return None
         (scale,) = self._invariant_scales(ellipsoid.inverse[None], error_bound)
         if start_s > 0:
             drift = self.plant.A + self.plant.alpha_per_s * np.eye(self.flow.n)
             responses = response_until(drift, self.plant.start, start_s)
-            scale = max(scale, float(responses.through(ellipsoid.shape @ self.flow.weight).sup_on_grid()))
+            scale = max(scale, float(responses.through(ellipsoid.scaling @ self.flow.weight).sup_on_grid()))
         if self._first_event_cell:  # the first delivery
-            Y = np.hstack([ellipsoid.shape, np.zeros_like(ellipsoid.shape)])
+            Y = np.hstack([ellipsoid.scaling, np.zeros_like(ellipsoid.scaling)])
             scale = max(scale, self.flow.from_start(Y, error_bound, self._first_event_cell))
         if not 0 < scale < math.inf:
             return None
@@ -120,12 +120,12 @@ class InvariantEllipsoids:
                 merits = self._merits(candidates)
                 if merits.min() < merit:
                     best, merit = candidates[merits.argmin()], merits.min()
-            (inverse,) = self._inverse_shapes(best[None])
+            (inverse,) = self._inverse_scalings(best[None])
         return DeliveryEllipsoid(self.flow, np.linalg.inv(inverse)) if math.isfinite(merit) else None
 
     def _merits(self, parameters: Matrix) -> Vector:
         """Return the bounds of ‖x‖ that some parameters give, (c,)."""
-        inverses = self._inverse_shapes(parameters)
+        inverses = self._inverse_scalings(parameters)
         usable = np.isfinite(inverses).all(axis=(1, 2))
         merits = np.full(len(parameters), np.inf)
         if usable.any():
@@ -139,10 +139,10 @@ class InvariantEllipsoids:
         """Return about the ‖Λx‖ to which q drives x, (c,), from these Λ⁻¹ and c."""
         if not any(self.age_gains.values()):
             return np.zeros(len(scales))
-        shapes = np.linalg.inv(inverses)
-        closed_loops = shapes @ self.flow.closed_loop @ inverses
+        scalings = np.linalg.inv(inverses)
+        closed_loops = scalings @ self.flow.closed_loop @ inverses
         decay_rates = -np.linalg.eigvalsh(closed_loops + closed_loops.swapaxes(-1, -2))[:, -1] / 2
-        gains = np.linalg.norm(shapes @ self.flow.input_matrix, 2, axis=(1, 2)) / decay_rates
+        gains = np.linalg.norm(scalings @ self.flow.input_matrix, 2, axis=(1, 2)) / decay_rates
         outputs, loop_gains = self.plant.error.outputs, np.zeros(len(scales))
         for output, gain in self.age_gains.items():
             C = outputs[output] @ self.flow.inverse @ inverses
@@ -150,7 +150,7 @@ class InvariantEllipsoids:
         is_stable = (decay_rates > 0) & (loop_gains < 1)
         return np.where(is_stable, loop_gains * scales / (1 - loop_gains), np.inf)
 
-    def _inverse_shapes(self, parameters: Matrix) -> Stack:
+    def _inverse_scalings(self, parameters: Matrix) -> Stack:
         """Return Λ⁻¹ with Λ⁻¹Λ⁻ᵀ = X, (M + νI)X + X(M + νI)ᵀ = −Q, (c, n, n); not finite if none.
 
         M = A + BK, and Q is BK Kᵀ Bᵀ with shares of the identity and of x(0) x(0)ᵀ. Its scale is
@@ -195,11 +195,11 @@ class InvariantEllipsoids:
         At a node it does not exceed c if c² ≥ μ/(1 − λ) for some μ, λ the largest eigenvalue of
         ‖ΛΦξ‖² − μ‖Nξ‖²/D² on ‖Λξ‖ = 1, (Φ, N) ξ = e^{Fτ} (ξ, 0).
         """
-        n, shapes = self.flow.n, np.linalg.inv(inverses)
+        n, scalings = self.flow.n, np.linalg.inv(inverses)
         state, error = (
             np.asarray(Y.swapaxes(-1, -2) @ Y)
             for Y in (
-                shapes[:, None] @ self._nodes[:, :n] @ inverses[:, None],
+                scalings[:, None] @ self._nodes[:, :n] @ inverses[:, None],
                 self._nodes[:, n:] @ inverses[:, None] / error_bound,
             )
         )
@@ -208,7 +208,7 @@ class InvariantEllipsoids:
             if not self._first_event_cell
             else self.flow.start_response[0][self._first_event_cell, :n]
         )
-        largest = np.linalg.norm(shapes @ first_state, axis=1) ** 2 * FLOW_ROUNDING
+        largest = np.linalg.norm(scalings @ first_state, axis=1) ** 2 * FLOW_ROUNDING
         candidates, nodes = np.nonzero(np.linalg.eigvalsh(state)[..., -1] >= 1)
         if len(candidates):
             state, error = state[candidates, nodes], error[candidates, nodes]

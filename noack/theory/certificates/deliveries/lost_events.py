@@ -161,19 +161,19 @@ class _SinceEvent:
         self._age_input = reach.effects.age_input
         self._acts_within_s = reach.effects.acts_within_s
         self._first_error = reach.effects.first_error
-        n, shape, identity = flow.n, reach.ellipsoid.shape, np.eye(2 * flow.n)
+        n, scaling, identity = flow.n, reach.ellipsoid.scaling, np.eye(2 * flow.n)
         to_event = exponential(flow.generator * window_s)
         # What q changes after the event, and has changed before it.
         by_input = flow.error_effects[1][[flow.cell_at(time_s) for time_s in r_s.tolist()]]
         self._input_changes = self._age_input * by_input if self._age_input else np.zeros(len(r_s))
         error_change = self._age_input * self._input_response_before(identity[n:, n:], window_s)
-        state_change = self._age_input * self._input_response_before(shape, window_s)
+        state_change = self._age_input * self._input_response_before(scaling, window_s)
         # Forms of z a time w before the event: of bounds there, at the event, and of its outputs.
         rows = [
             identity[n:] / (error_before + error_change),
-            shape @ identity[:n] / (state_bound + state_change),
+            scaling @ identity[:n] / (state_bound + state_change),
             to_event[n:] / error_before,
-            shape @ to_event[:n] / state_bound,
+            scaling @ to_event[:n] / state_bound,
             *(Y @ to_event for Y in outputs),
         ]
         forms = np.array([row.T @ row for row in rows])

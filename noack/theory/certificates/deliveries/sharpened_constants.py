@@ -70,6 +70,7 @@ def sharpened_constants(
     if not np.isfinite(bounds.signals).all():
         return constants
     sharpening.insert()
+    # Each round's smaller bounds make the next one's smaller, until they hardly do.
     for _ in range(_MOST_ROUNDS):
         earlier = bounds.errors[Output.WEIGHTED], bounds.states[Output.WEIGHTED]
         if not sharpening.sharpen_by_flow():
@@ -77,6 +78,7 @@ def sharpened_constants(
         later = bounds.errors[Output.WEIGHTED], bounds.states[Output.WEIGHTED]
         if all(new > _SETTLED * old for new, old in zip(later, earlier, strict=True)):
             break
+    # A constant is never worse than without the sharpening.
     unit = part.bound.beta if part.bound.unit is None else part.bound.unit
     sharpened = {
         "delta": bounds.errors[Output.WEIGHTED] / unit,

@@ -44,7 +44,7 @@ def only_the_start() -> AbstractContextManager[Any]:
         ellipsoid = ellipsoids._best_ellipsoid
         if ellipsoid is None:
             return None
-        scale = float(np.linalg.norm(ellipsoid.shape @ ellipsoids.flow.start))
+        scale = float(np.linalg.norm(ellipsoid.scaling @ ellipsoids.flow.start))
         effects = NO_EFFECTS if effects_of is None else effects_of(ellipsoid, scale)
         return Reach(ellipsoid, scale, error_bound, effects)
 

@@ -69,18 +69,18 @@ def scaled_after(gap_s: float, xi: Vector, ages_s: Sequence[float]) -> tuple[Vec
 
 
 def test_without_ages_the_gains_are_the_norms_of_the_matrices_by_which_a_gap_multiplies() -> None:
-    loop, shape = loop_with(0.0), np.array([[1.2, 0.3], [0.0, 0.7]])
-    gains = loop.gains(shape)
+    loop, scaling = loop_with(0.0), np.array([[1.2, 0.3], [0.0, 0.7]])
+    gains = loop.gains(scaling)
     for number, gap_s in enumerate((STEP_S, 2 * STEP_S)):
-        columns = [scaled_after(gap_s, xi, [0.0]) for xi in np.linalg.inv(shape).T]
+        columns = [scaled_after(gap_s, xi, [0.0]) for xi in np.linalg.inv(scaling).T]
         states, errors = (np.array(part).T for part in zip(*columns, strict=True))
-        assert gains.state_from_state[number] == pytest.approx(np.linalg.norm(shape @ states, 2))
+        assert gains.state_from_state[number] == pytest.approx(np.linalg.norm(scaling @ states, 2))
         assert gains.late_effect_from_state[number] == pytest.approx(np.linalg.norm(K @ errors, 2))
 
 
 def test_no_age_of_the_input_exceeds_the_gains_and_the_worst_one_comes_close() -> None:
-    loop, shape = loop_with(HOLD_S), np.array([[1.2, 0.3], [0.0, 0.7]])
-    gains, inverse = loop.gains(shape), np.linalg.inv(shape)
+    loop, scaling = loop_with(HOLD_S), np.array([[1.2, 0.3], [0.0, 0.7]])
+    gains, inverse = loop.gains(scaling), np.linalg.inv(scaling)
     rng = np.random.default_rng(1)
     patterns: list[Matrix] = [np.full(8, HOLD_S), np.full(8, -HOLD_S)]
     patterns += [*rng.uniform(-HOLD_S, HOLD_S, (30, 8)), *rng.choice([-HOLD_S, HOLD_S], (30, 8))]
@@ -88,5 +88,5 @@ def test_no_age_of_the_input_exceeds_the_gains_and_the_worst_one_comes_close() -
         largest = 0.0
         for ages_s in patterns:
             states = np.array([scaled_after(gap_s, xi, ages_s)[0] for xi in inverse.T]).T
-            largest = max(largest, float(np.linalg.norm(shape @ states, 2)))
+            largest = max(largest, float(np.linalg.norm(scaling @ states, 2)))
         assert largest <= gains.state_from_state[number] <= 1.01 * largest

@@ -52,7 +52,7 @@ def test_the_balls_of_a_late_scalar_loop_follow_the_recursion_by_hand() -> None:
     late_gain = b * (math.exp(rate * STEP_S) - math.exp(rate * (STEP_S - DELAY_S))) / rate
     removed = math.exp(ALPHA * DELAY_S) * abs(k)
     loop = scalar_loop(DELAY_S)
-    unit = float(abs(loop.gains.shape[0, 0]))
+    unit = float(abs(loop.gains.scaling[0, 0]))
     centre, rho, S = X0, 0.0, 0.0
     for number, (times, balls) in enumerate(islice(loop.balls(), 8), 1):
         rho, S = (
@@ -69,7 +69,7 @@ def test_the_balls_of_a_late_scalar_loop_follow_the_recursion_by_hand() -> None:
 
 def test_the_outputs_of_a_ball_are_those_of_its_largest_state_and_late_update() -> None:
     deliveries, rho, S = scalar_loop(DELAY_S), 1.0, 0.5
-    unit, theta = float(abs(deliveries.gains.shape[0, 0])), deliveries.gains.theta
+    unit, theta = float(abs(deliveries.gains.scaling[0, 0])), deliveries.gains.theta
     ball = Ball(np.zeros(1), unit * rho, S, unit * rho + theta * S, theta)
     bounds = dict(zip(deliveries.loop.outputs, deliveries.outputs_until_next_delivery([ball]), strict=True))
     r_s, rate = np.linspace(0.0, STEP_S + DELAY_S, 2001), a + ALPHA

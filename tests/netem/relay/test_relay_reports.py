@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem.control.time_histogram import BUCKETS, bucket_start_ns, coarse_histogram, quantile_ns
+from netem.relay.relay_reports import BUCKETS, bucket_start_ns, coarse_histogram, quantile_ns
 from noack.core.core_library import core
 
 

@@ -1,0 +1,154 @@
+"""The queue by which other threads reach a relay.
+
+:class:`CommandQueue` runs commands in the relay's thread between two batches of datagrams: the
+packet path never waits, and each command takes microseconds.
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import CancelledError, Future
+from dataclasses import dataclass, replace
+from functools import cached_property
+from queue import SimpleQueue
+from threading import Lock
+from typing import NamedTuple, TypeVar
+
+from netem.relay.relay import Relay
+from netem.relay.relay_reports import DIRECTIONS, Direction, LinkReport
+from netem.tc_words import words_of
+from noack.core.errors import PeerError
+from noack.impairments.link_settings import Counters, LinkSettings
+from noack.impairments.loss_prediction import expected_loss
+
+T = TypeVar("T")
+
+_PATIENCE_S = 5.0
+"""Longest wait for the relay's thread, which runs commands every 50 ms."""
+
+
+@dataclass(frozen=True)
+class AppliedSettings:
+    """The settings of a direction, and its counters when they were applied."""
+
+    settings: LinkSettings
+    since: Counters
+
+    @cached_property
+    def words(self) -> str:
+        """The settings in the words of ``tc netem``."""
+        return words_of(self.settings)
+
+    @cached_property
+    def predicted_loss(self) -> float | None:
+        """See :mod:`noack.impairments.loss_prediction`; this may take seconds."""
+        return expected_loss(self.settings).rate
+
+
+class Snapshot(NamedTuple):
+    """The state of a relay at one time."""
+
+    links: Sequence[LinkReport]
+    applied: Mapping[tuple[str, Direction], AppliedSettings]
+    elapsed_ns: int
+    """Time since the relay was opened, shortly before it runs."""
+    unix_ns: int
+
+
+class CommandQueue:
+    """Runs commands of other threads in the relay's thread."""
+
+    def __init__(self, relay: Relay) -> None:
+        self._relay = relay
+        self._began_ns = time.monotonic_ns()
+        self._waiting: SimpleQueue[tuple[Callable[[], None], Callable[[], bool]]] = SimpleQueue()
+        """What runs a command, and what cancels it."""
+        self._applied: dict[tuple[str, Direction], AppliedSettings] = {
+            (spec.name, direction): AppliedSettings(getattr(spec, direction), Counters())
+            for spec in relay.specs
+            for direction in DIRECTIONS
+        }
+        self._closed = False
+        self._lock = Lock()
+
+    @property
+    def links(self) -> Sequence[str]:
+        """Names of the relay's links."""
+        return [spec.name for spec in self._relay.specs]
+
+    def run_pending(self) -> None:
+        """Run the submitted commands; called in the relay's thread, at least every 50 ms."""
+        for _ in range(self._waiting.qsize()):
+            run, _ = self._waiting.get_nowait()
+            run()
+
+    def close(self) -> None:
+        """Refuse further commands; called in the relay's thread when the relay ends."""
+        with self._lock:
+            self._closed = True
+        while not self._waiting.empty():
+            _, cancel = self._waiting.get_nowait()
+            cancel()
+
+    def submit(self, command: Callable[[], T]) -> T:
+        """Run a command in the relay's thread, from another thread, and return its result.
+
+        Raises:
+            PeerError: the relay has ended, or does not answer.
+        """
+        future: Future[T] = Future()
+
+        def run() -> None:
+            if future.set_running_or_notify_cancel():
+                try:
+                    future.set_result(command())
+                except Exception as error:
+                    future.set_exception(error)
+
+        with self._lock:
+            if self._closed:
+                raise PeerError("the emulator has ended")
+            self._waiting.put((run, future.cancel))
+        try:
+            return future.result(_PATIENCE_S)
+        except CancelledError:
+            raise PeerError("the emulator has ended") from None
+        except TimeoutError:
+            if future.done():  # the command itself raised it
+                raise
+            future.cancel()
+            raise PeerError(f"the emulator has not answered for {_PATIENCE_S:g} s") from None
+
+    def snapshot(self) -> Snapshot:
+        """Return the state of the relay, from another thread.
+
+        Raises:
+            PeerError: the relay has ended, or does not answer.
+        """
+        return self.submit(self.snapshot_here)
+
+    def snapshot_here(self) -> Snapshot:
+        """Return the state of the relay, in its thread or after its end."""
+        return Snapshot(
+            self._relay.report(),
+            dict(self._applied),
+            time.monotonic_ns() - self._began_ns,
+            time.time_ns(),
+        )
+
+    def change(self, link: str, directions: Sequence[Direction], settings: LinkSettings) -> None:
+        """Change directions of a link, from another thread.
+
+        Raises:
+            CallerError: the relay refuses the settings.
+            PeerError: the relay has ended, or does not answer.
+        """
+
+        def command() -> None:
+            for direction in directions:
+                self._relay.change(link, direction, settings)
+            (report,) = (link_report for link_report in self._relay.report() if link_report.name == link)
+            for direction in directions:
+                counters = replace(getattr(report, direction).counters)
+                self._applied[link, direction] = AppliedSettings(settings, counters)
+
+        self.submit(command)
