@@ -121,6 +121,7 @@ class Growth(NamedTuple):
     def means(self, times_s: Vector) -> tuple[Vector, Vector, Vector]:
         """Return the means over some times of the integrals up to each, (…)."""
         cells = self.forced.shape[-1]
+        # A time that is a node but for rounding counts as that node.
         nodes = np.sort(np.ceil(times_s / times_s.max() * cells * (1 - 1e-9)))
         # The share of the times that are after the begin of each cell.
         weights = 1 - np.searchsorted(nodes, np.arange(cells), side="right") / len(nodes)
@@ -451,6 +452,7 @@ class PlantGains:
         bend = 0.5 * h**2 * growth * np.linalg.norm(C, 2) * np.linalg.norm(M @ M @ S, 2)
         spread = np.linalg.norm(C @ S, 2) + h * np.linalg.norm(C @ M @ S, 2) + bend
         entered = np.linalg.norm(normal.columns, axis=0).sum() * np.linalg.norm(C, 2) * growth * h
+        # The inflation exceeds the rounding of the covariance, as estimated.
         return float(normal.radius * spread + normal.limit * entered) * (1 + 1e-6)
 
     @cached_property
