@@ -7,7 +7,7 @@ The order of the words is the order of the impairments; the position of ``mansd`
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
@@ -71,8 +71,10 @@ class LinkWords(NamedTuple):
     """Seed of the random streams, if the words contain one."""
 
 
-def parse(words: str | Sequence[str]) -> LinkWords:
+def parse(words: str | Sequence[str], expected: Collection[str] = KEYWORDS) -> LinkWords:
     """Read the settings of one direction of a link; see :class:`WordReader`.
+
+    ``expected`` has the words that are named in place of an unknown one.
 
     Raises:
         CallerError: one line with the wrong word, the expected words, and the nearest known word.
@@ -87,7 +89,7 @@ def parse(words: str | Sequence[str]) -> LinkWords:
         if word in _AFTER:
             reader.wrong(f"goes right after {_AFTER[word]}")
         if word not in KEYWORDS:
-            reader.unknown(word, KEYWORDS)
+            reader.unknown(word, expected)
         if word in _CLAUSES:
             kind, clause = _CLAUSES[word]
             table = {"kind": kind.model_fields["kind"].default, **clause.read(reader)}
@@ -117,13 +119,13 @@ def parse(words: str | Sequence[str]) -> LinkWords:
         raise CallerError(f"{word}{message}") from None
 
 
-def settings_of(words: str | Sequence[str]) -> LinkSettings:
+def settings_of(words: str | Sequence[str], expected: Collection[str] = KEYWORDS) -> LinkSettings:
     """Read the settings of one direction of a link from words without a seed.
 
     Raises:
         CallerError: as :func:`parse`, or the words contain a seed.
     """
-    settings, seed = parse(words)
+    settings, seed = parse(words, expected)
     if seed is not None:
         raise CallerError(f"seed {seed}: belongs to the link, not to one of its directions")
     return settings

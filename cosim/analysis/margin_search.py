@@ -55,7 +55,7 @@ def read_guarantee(words: str) -> LossGuarantee:
     Raises:
         CallerError: the words are wrong, have other parts, or do not limit consecutive losses.
     """
-    settings = settings_of(words)
+    settings = settings_of(words, ("mansd", "atmost", "recover"))
     if settings != LinkSettings(mansd=settings.mansd, constraints=settings.constraints):
         raise CallerError(
             f'guarantee "{words}": expected only mansd, atmost and recover, e.g. '

@@ -312,7 +312,7 @@ class Ensemble:
         sent = f"{low:.0f} to {high:.0f}, median {middle:.0f}" if math.isfinite(low) else "–"
         left_out = Fact("draws with Zeno-like behaviour, not in the bands", f"{self.failed}")
         return (
-            Fact(f"transmissions in 90 % of {self.draws} draws", sent),
+            Fact(f"transmissions in 90 % of {self.draws - self.failed} draws", sent),
             Fact("draws that diverge", f"{self.diverged} of {self.draws}"),
             *([left_out] if self.failed else []),
         )

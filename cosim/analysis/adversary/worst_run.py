@@ -197,7 +197,8 @@ def _notes(resolved: Scenario, trigger: str) -> Iterator[str]:
         worst = "; of the worst error and state, the worst signs of bounded ones, as far as found" * bounded
         yield f"[dim]Disturbances and noise: as the seeds draw them{worst}[/]"
     if delay_ns := network_delay_ns(resolved, 0):
-        yield f"[dim]Every delivered update takes the longest delay, {duration(delay_ns / NS_PER_S)}[/]"
+        longest = duration(delay_ns / NS_PER_S)
+        yield f"[dim]Every delivered update takes the longest delay that is certified, {longest}[/]"
 
 
 def _quantity(objective: Objective, certificate: ScenarioCertificate, trigger: str) -> str:

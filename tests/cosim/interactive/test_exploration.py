@@ -74,6 +74,17 @@ def test_a_run_with_very_many_events_is_drawn_until_there() -> None:
     assert accumulating.t_s[-1] < 20.0
 
 
+def test_draws_that_are_left_out_are_not_among_those_that_are_counted() -> None:
+    plant = noack.load("lane_following").plant
+    box = {
+        f"plant.{key}": (15 * np.array(getattr(plant, key))).tolist()
+        for key in ("uncertainty_A", "uncertainty_B")
+    }
+    draws = exploration.explore_ensemble(noack.load("lane_following", box), draws=40)
+    assert draws.failed > 0
+    assert draws.numbers[0].label == f"transmissions in 90 % of {40 - draws.failed} draws"
+
+
 def test_a_scenario_without_exact_simulation_is_refused_with_the_reason() -> None:
     scenario = noack.load("lane_vehicle")
     reason = exploration.why_not_exact(scenario)

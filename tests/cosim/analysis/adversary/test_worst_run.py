@@ -84,7 +84,7 @@ def test_the_certified_cost_is_the_integral_of_the_squared_bound(floor: float) -
         (
             ('network.impairments=[{kind="delay", delay_s=0.02, jitter_s=0.01}]',),
             {},
-            "Every delivered update takes the longest delay, 30 ms",
+            "Every delivered update takes the longest delay that is certified, 30 ms",
         ),
     ],
 )
