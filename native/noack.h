@@ -401,7 +401,7 @@ void noack_exponential(int64_t n, const double *matrix, double *result, double *
 
 /* ---- A trigger rule, and its condition since the last event ---------------------------------- */
 
-/* A trigger rule, as noack.trigger.trigger_rule has it. With z = (x, e_s), the sensor transmits as
+/* A trigger rule, as noack.trigger_policies.trigger_rule has it. With z = (x, e_s), the sensor transmits as
    soon as |P z|^2 > max(c e^(-rho (t - t_0)), f)^2 + |N z|^2 + eta. */
 typedef struct {
     double level, rate_per_s, floor; /* c, rho, f */

@@ -39,7 +39,7 @@ from noack.scenario.estimation import assumed_model
 from noack.scenario.parameter_changes import ChangeSchedule
 from noack.scenario.resolution import loop_of, policy_of, setpoint_of
 from noack.scenario.scenario import Scenario
-from noack.trigger.trigger_rule import CodedPolicy, EventTrigger, Policy, fill_rule, rule_rows
+from noack.trigger_policies.trigger_rule import CodedPolicy, EventTrigger, Policy, fill_rule, rule_rows
 
 SENSOR = Role(
     "sensor",

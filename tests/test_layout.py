@@ -19,7 +19,7 @@ from native.build import HEADER
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("noack", "plant_server", "sensor_node", "controller_node", "netem", "cosim")
 EXEMPT = ("__init__", "__main__")
-MOST_MODULES = 472
+MOST_MODULES = 473
 LINES = {
     "noack/scenario": 4180,
     "noack/controllers": 270,
@@ -33,10 +33,10 @@ LINES = {
     "noack/protocol": 1270,
     "noack/runtime": 5820,
     "noack/settings": 605,
-    "noack/theory": 13280,
+    "noack/theory": 13285,
     "noack/traces": 1350,
-    "noack/trigger": 1075,
-    "netem": 6655,
+    "noack/trigger_policies": 1075,
+    "netem": 6660,
     "cosim/analysis": 8480,
     "cosim/api": 1695,
     "cosim/cli": 3490,
@@ -54,7 +54,7 @@ LINES = {
     "controller_node": 410,
     "benchmarks": 3760,
     "native": 11455,
-    "tests": 51280,
+    "tests": 51295,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 
@@ -86,7 +86,7 @@ MARKS = {
     "noack/settings": (2, 0, 0),
     "noack/theory": (5, 1, 0),
     "noack/traces": (4, 0, 0),
-    "noack/trigger": (4, 1, 0),
+    "noack/trigger_policies": (4, 1, 0),
     "plant_server": (0, 1, 0),
     "sensor_node": (0, 1, 0),
 }
@@ -100,8 +100,8 @@ CIRCLES: set[str] = set()
 LONG_FUNCTIONS: set[str] = set()
 """Functions that may have more than 60 lines."""
 MOST_FILES = 15
-FILES = {"noack/trigger": 17}
-"""Largest numbers of modules of folders that have more; a policy of noack/trigger is a file."""
+FILES = {"noack/trigger_policies": 17}
+"""Largest numbers of modules of folders that have more; each trigger policy is a file."""
 
 
 @dataclass(frozen=True)

@@ -33,8 +33,8 @@ from noack.theory.certificates.trigger_weight import choose_weight
 from noack.theory.margins.loss_margin import LossMargin, Stability
 from noack.theory.paper import Theorem2, theorem_2
 from noack.theory.random_losses.unlimited_losses import UnlimitedLosses, unlimited_losses
-from noack.trigger.decaying import DecayingSettings
-from noack.trigger.periodic_trigger import PeriodicSettings
+from noack.trigger_policies.decaying import DecayingSettings
+from noack.trigger_policies.periodic_trigger import PeriodicSettings
 
 IDEAL = "paper"
 """The paper's conditions: no sampling, no delay, no hold."""

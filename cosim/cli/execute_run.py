@@ -21,7 +21,8 @@ from noack.core.process_limits import cores
 from noack.runtime.command_line import LogFormat, log_format, print_to_stderr
 
 with lazy_modules():
-    from cosim.live import finalize, launcher, remote_access
+    from cosim.live import finalize, launcher
+    from cosim.live.coordination import remote_access
     from cosim.live.monitoring import progress, run_watcher
     from cosim.live.processes import fork_server
     from cosim.output import terminal_output

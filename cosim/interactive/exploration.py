@@ -42,7 +42,7 @@ from noack.protocol.record_tables import CONTROLLER_DELIVERY
 from noack.runtime.life_cycle import HORIZON
 from noack.scenario.resolution import loop_of, policy_of, resolve
 from noack.scenario.scenario import Scenario
-from noack.trigger.trigger_rule import TriggerRule
+from noack.trigger_policies.trigger_rule import TriggerRule
 
 POINTS = 400
 """Number of evenly spaced times; each event adds the times just before and after it."""

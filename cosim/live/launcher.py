@@ -19,7 +19,7 @@ from queue import SimpleQueue
 from threading import Thread
 
 from cosim.lazy_modules import lazy_modules
-from cosim.live.coordinator import Coordinator
+from cosim.live.coordination.coordinator import Coordinator
 from cosim.live.monitoring.run_watcher import Watcher, joint_watcher
 from cosim.live.processes.child_processes import ChildProcesses, EndReason, RestartPolicy
 from cosim.live.processes.finalize_helpers import RunEndingWithHelpers, lasting_helpers
@@ -50,7 +50,7 @@ from noack.scenario.resolution import resolve_run, resolved_loops, tables_of
 from noack.scenario.scenario import Scenario
 
 with lazy_modules():  # asyncio and TLS
-    from cosim.live import remote_access
+    from cosim.live.coordination import remote_access
 
 _STOP_TIMEOUT_S = 15.0
 """Wall time that the processes of a stopped run have to end."""

@@ -43,7 +43,7 @@ from noack.core.linear_systems import Matrix, Vector
 from noack.protocol.record_tables import Fate
 from noack.scenario.resolution import LoopMatrices, loop_of, rule_of
 from noack.scenario.scenario import Scenario
-from noack.trigger.trigger_rule import TriggerRule
+from noack.trigger_policies.trigger_rule import TriggerRule
 
 
 class LoopState(NamedTuple):

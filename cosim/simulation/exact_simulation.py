@@ -25,7 +25,7 @@ from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
 from noack.scenario.resolution import loop_of, rule_of
 from noack.scenario.scenario import Scenario
-from noack.trigger.trigger_rule import TriggerRule, fill_rule
+from noack.trigger_policies.trigger_rule import TriggerRule, fill_rule
 
 ROW = dtype_of("noack_exact_row")
 """The row of a run: ``noack_exact_row`` of native/noack.h."""

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from cosim.simulation.continuous import ContinuousLoop
 from noack.core.core_library import CoreMemory, core, ffi, pointer_to
 from noack.core.linear_systems import Matrix, Vector, discretise
-from noack.trigger.trigger_rule import TriggerRule, fill_rule, rule_rows
+from noack.trigger_policies.trigger_rule import TriggerRule, fill_rule, rule_rows
 
 NO_ACTUATION = -1
 """Model time of a step without any actuation yet."""

@@ -3,8 +3,8 @@
 Loop data never travels here, and the loop never waits for it. The coordinator listens on a Unix
 socket in the user's runtime directory, which is closed to other users; all other processes connect
 to it. From another host, a session connects through ``connections/coordinator_link.py`` by TLS to
-:mod:`cosim.live.remote_access`, which forwards to that socket. Both ends have certificates of the
-run.
+:mod:`cosim.live.coordination.remote_access`, which forwards to that socket. Both ends have
+certificates of the run.
 """
 
 import secrets

@@ -39,7 +39,7 @@ from noack.scenario.run_sections import ProvenDelay
 from noack.scenario.scenario import Scenario, loop_names, loop_scenario, loop_sections
 from noack.scenario.scenario_checks import with_settings
 from noack.scenario.sections import DirectionSection
-from noack.trigger.trigger_rule import CodedPolicy
+from noack.trigger_policies.trigger_rule import CodedPolicy
 
 
 class Demand(NamedTuple):

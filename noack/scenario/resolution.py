@@ -23,7 +23,7 @@ from noack.scenario.scenario import Scenario, few_of, loop_names, loop_scenario,
 from noack.scenario.scenario_checks import input_at
 from noack.scenario.sections import AnyObserver, ModelSection, PlantSection
 from noack.settings.section import rows_of
-from noack.trigger.trigger_rule import Policy, TriggerRule, require_rule
+from noack.trigger_policies.trigger_rule import Policy, TriggerRule, require_rule
 
 _SURELY_FINITE = 600.0
 """‖e^{At}‖ ≤ e^{‖A‖t}, and e^700 is finite; above this limit, the exponential itself is

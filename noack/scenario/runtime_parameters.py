@@ -13,7 +13,7 @@ from typing import get_args
 from noack.core.errors import CallerError
 from noack.scenario.toml_file import nearest_key
 from noack.settings.section import ReadTable, Table
-from noack.trigger.policy_settings import PolicySettings
+from noack.trigger_policies.policy_settings import PolicySettings
 
 LOSS, MANSD, SETPOINT = "network.loss", "network.mansd", "controller.setpoint"
 CONSTRAINTS = "network.constraints"

@@ -25,7 +25,7 @@ from noack.scenario.scenario_checks import check_changes, check_sections
 from noack.scenario.scenario_tables import ScenarioTables
 from noack.scenario.toml_file import explain
 from noack.settings.section import ReadTable, ScenarioSection, Table
-from noack.trigger.periodic_trigger import PeriodicSettings
+from noack.trigger_policies.periodic_trigger import PeriodicSettings
 
 
 class Scenario(ScenarioTables):

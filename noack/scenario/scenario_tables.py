@@ -36,7 +36,7 @@ from noack.scenario.sections import (
     PlantSection,
 )
 from noack.settings.section import ScenarioSection, period_ns
-from noack.trigger.decaying import DecayingSettings
+from noack.trigger_policies.decaying import DecayingSettings
 
 MOST_CHANGES = 256  # largest number of scheduled changes in a run
 

@@ -47,14 +47,14 @@ from noack.settings.section import (
     shape,
     union_of,
 )
-from noack.trigger.policy_settings import ModelMatrices, PolicySettings
+from noack.trigger_policies.policy_settings import ModelMatrices, PolicySettings
 
 # Settings classes by kind: a module in the folder adds its kind.
 CONTROLLERS = kinds_in("noack.controllers", ControllerSettings)
 DISTURBANCES = kinds_in("noack.disturbances", DisturbanceSettings)
 OBSERVERS = kinds_in("noack.observers", ObserverSettings)
 PLANTS = kinds_in("noack.plants", PlantSettings)
-POLICIES = kinds_in("noack.trigger", PolicySettings, "policy")
+POLICIES = kinds_in("noack.trigger_policies", PolicySettings, "policy")
 
 if TYPE_CHECKING:
     AnyController = ControllerSettings

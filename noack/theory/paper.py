@@ -62,7 +62,7 @@ from noack.core.linear_systems import (
 from noack.scenario.resolution import LoopMatrices
 from noack.theory.bounds.enclosure import NotDecayingError, response, response_until
 from noack.theory.bounds.stacked_norms import spectral_norms
-from noack.trigger.trigger_rule import Policy, TriggerRule
+from noack.trigger_policies.trigger_rule import Policy, TriggerRule
 
 _PART_NUMBERS = 2**20
 """Numbers in the jumps that are computed at once."""

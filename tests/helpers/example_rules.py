@@ -7,9 +7,9 @@ import numpy as np
 from noack.core.linear_systems import Matrix
 from noack.scenario.sections import POLICIES
 from noack.settings.section import Table
-from noack.trigger.mixed import mixed_rule as given_mixed_rule
-from noack.trigger.policy_settings import ModelMatrices
-from noack.trigger.trigger_rule import TriggerRule, error_form, quadratic_form, require_rule
+from noack.trigger_policies.mixed import mixed_rule as given_mixed_rule
+from noack.trigger_policies.policy_settings import ModelMatrices
+from noack.trigger_policies.trigger_rule import TriggerRule, error_form, quadratic_form, require_rule
 
 EXAMPLES: dict[str, Table] = {
     name: example.model_dump(mode="json", exclude_none=True)

@@ -14,7 +14,7 @@ from noack.core import core_library
 from noack.core.core_library import core, ffi, load_core
 from noack.core.errors import CallerError
 from noack.protocol.wire_format import Flow, Message
-from noack.trigger.trigger_rule import TriggerRule
+from noack.trigger_policies.trigger_rule import TriggerRule
 from tests.cosim.simulation.exact_populations import random_population, random_setting
 from tests.helpers.example_rules import TABLES, area_rule, decaying_rule, random_rule
 from tests.helpers.machine_parts import SteppedMachines

@@ -18,7 +18,7 @@ from cosim.record.run_directory import DEFAULT_RUNS
 from noack.core.errors import CallerError
 
 with lazy_modules():
-    from cosim.live import remote_access
+    from cosim.live.coordination import remote_access
     from cosim.simulation import helics_federate
     from netem import __main__ as emulator
     from noack.protocol import roles

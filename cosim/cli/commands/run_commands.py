@@ -27,7 +27,7 @@ with lazy_modules():
     from cosim.analysis.summary import summary_model
     from cosim.interactive import scenario_draft
     from cosim.lab import lab_server
-    from cosim.live import remote_access
+    from cosim.live.coordination import remote_access
     from cosim.live.monitoring import progress, ros2_bridge
     from cosim.output import result_tables, run_tables, run_verdict, terminal_output
     from cosim.simulation import continuous, virtual_time

@@ -33,7 +33,7 @@ with lazy_modules():
     from netem import links_file
     from noack.scenario import link_load, resolution, scenario, scenario_file, toml_file
     from noack.theory.certificates import assumptions
-    from noack.trigger import periodic_trigger, trigger_rule
+    from noack.trigger_policies import periodic_trigger, trigger_rule
     from plant_server import plant
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from noack.runtime.run_descriptor import DEFAULT_SESSION
 from noack.scenario.scenario import Scenario, loop_names
 
 if TYPE_CHECKING:
-    from cosim.live.remote_access import ListenSettings
+    from cosim.live.coordination.remote_access import ListenSettings
 
 _PLAIN_LINES = 10
 """Progress lines of a run on a terminal that cannot redraw a line."""

@@ -14,7 +14,7 @@ from noack.runtime.control_messages import RunProgress
 if TYPE_CHECKING:
     from prometheus_client import Metric
 
-    from cosim.live.remote_access import ListenSettings
+    from cosim.live.coordination.remote_access import ListenSettings
     from noack.scenario.scenario import Scenario
 
 _SOURCE, _EVERY_S = "noack", 1.0

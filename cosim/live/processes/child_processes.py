@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, NamedTuple
 
-from cosim.live.coordinator import Coordinator
+from cosim.live.coordination.coordinator import Coordinator
 from cosim.live.monitoring.run_watcher import Watcher
 from cosim.live.processes.fork_server import ENVIRONMENT, ForkedProcess, ForkServer
 from cosim.live.processes.remote_hosts import SSH_FAILED, RemoteStart, start_over_ssh

@@ -34,7 +34,7 @@ from noack.protocol.wire_format import datagram_bytes
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.run_sections import LoopSection
 from noack.scenario.scenario import Scenario, loop_scenario
-from noack.trigger.periodic_trigger import PeriodicSettings
+from noack.trigger_policies.periodic_trigger import PeriodicSettings
 
 PERIODIC, ZOH, MODEL = "periodic", "zoh", "model"
 _PERIOD_PER_TIME_CONSTANT = 0.3

@@ -46,7 +46,7 @@ from noack.settings.section import MatrixRows, rows_of
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import nominal_conditions
 from noack.theory.certificates.scenario_certificates import certify, certify_box, outside_box
-from noack.trigger.decaying import DecayingSettings
+from noack.trigger_policies.decaying import DecayingSettings
 
 DRAWS = 200
 """Draws of which the mean cost is estimated."""

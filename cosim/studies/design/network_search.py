@@ -36,7 +36,7 @@ from noack.settings.section import MatrixRows, rows_of
 from noack.theory.margins.loss_margin import LossMargin, Stability, capped, list_bursts, uncapped
 from noack.theory.margins.scenario_times import without_timeout
 from noack.theory.margins.time_triggered_loop import LoopTimes
-from noack.trigger.periodic_trigger import PeriodicSettings
+from noack.trigger_policies.periodic_trigger import PeriodicSettings
 
 Goal = Literal["network", "transmissions"]
 Progress = Callable[[float], None]

@@ -33,7 +33,7 @@ from noack.theory.bounds.certificate_terms import Constants
 from noack.theory.certificates.conditions import ideal_conditions
 from noack.theory.certificates.scenario_certificates import certify
 from noack.theory.paper import InterEventTrajectory, longest_interval_s, theorem_1, theorem_2
-from noack.trigger.trigger_rule import TriggerRule, error_form
+from noack.trigger_policies.trigger_rule import TriggerRule, error_form
 
 Numbers = dict[str, object]
 Mode = Literal["model", "zoh"]

@@ -1,6 +1,6 @@
 """Bounds of a trigger rule for certificates: of e_s after its tests, and of times between events.
 
-Every rule is data (:mod:`noack.trigger.trigger_rule`), so the bounds follow from its fields:
+Every rule is data (:mod:`noack.trigger_policies.trigger_rule`), so the bounds follow from its fields:
 
 * a comparison bounds ‖e_s‖_W ≤ threshold + shares of x (:func:`comparison_bound`);
 * one of the integral, ∫‖e_s‖_W ≤ δ, bounds ‖e_s‖_W ≤ δ/T at some time of the last T, for each T;
@@ -27,7 +27,7 @@ from noack.theory.bounds.certificate_terms import (
     TriggerBound,
 )
 from noack.theory.bounds.stacked_norms import ROUNDING, spectral_norm
-from noack.trigger.trigger_rule import QuadraticForm, TriggerRule
+from noack.trigger_policies.trigger_rule import QuadraticForm, TriggerRule
 
 _RELATIVE, _RESIDUAL = 1e-7, 1e-13
 """Least eigenvalue of a positive definite Q₂₂, and the error of a computed Q, as shares of ‖Q‖."""

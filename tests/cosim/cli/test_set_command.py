@@ -11,7 +11,7 @@ import tomli_w
 
 from cosim.cli.commands.run_commands import parse_settings
 from cosim.cli.execute_run import warn_of_other_runs
-from cosim.live.coordinator import Coordinator
+from cosim.live.coordination.coordinator import Coordinator
 from noack.core.errors import CallerError
 from noack.runtime import active_runs
 from noack.runtime.run_descriptor import RunDescriptor, new_descriptor

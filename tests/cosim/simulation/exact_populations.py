@@ -24,7 +24,7 @@ from noack.impairments.loss_models.scripted import ScriptedLoss
 from noack.impairments.loss_models.worst_case import WorstCaseLoss
 from noack.protocol.record_tables import Fate
 from noack.scenario.resolution import LoopMatrices
-from noack.trigger.trigger_rule import QuadraticForm
+from noack.trigger_policies.trigger_rule import QuadraticForm
 from tests.helpers.example_rules import decaying_rule
 from tests.oracles.link import UPDATE_LINK, Link
 

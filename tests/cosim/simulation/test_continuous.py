@@ -29,7 +29,7 @@ from noack.protocol.record_tables import NETEM_PACKET, Fate
 from noack.scenario.resolution import LoopMatrices, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
-from noack.trigger.trigger_rule import TriggerRule
+from noack.trigger_policies.trigger_rule import TriggerRule
 from tests.helpers.command_line import invoke
 from tests.helpers.example_rules import decaying_rule
 

@@ -14,7 +14,7 @@ from noack.core.linear_systems import Matrix
 from noack.impairments.kinds.delay import Delay
 from noack.impairments.link_settings import LinkSettings
 from noack.scenario.resolution import loop_of
-from noack.trigger.trigger_rule import TriggerRule
+from noack.trigger_policies.trigger_rule import TriggerRule
 from tests.cosim.simulation.exact_populations import (
     check_events,
     check_independence,

@@ -6,7 +6,7 @@ import os
 from typing import Any
 from unittest.mock import patch
 
-from cosim.live import coordinator
+from cosim.live.coordination import coordinator
 from noack.core.clock import RunClock
 from noack.core.errors import PeerError
 from noack.protocol.roles import ROLES

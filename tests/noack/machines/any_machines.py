@@ -28,7 +28,7 @@ from noack.plants.linear import LinearSystem
 from noack.plants.plant_settings import SystemFailedError
 from noack.protocol.roles import GENERATION, Notice, Output, Start
 from noack.protocol.wire_format import Flow, Message
-from noack.trigger.trigger_rule import CodedPolicy, Policy, TriggerDecision
+from noack.trigger_policies.trigger_rule import CodedPolicy, Policy, TriggerDecision
 from plant_server.plant import Disturbance, MeasurementModel, Plant, Watchdog
 from sensor_node.sensor import Observer, Sensor
 from tests.helpers.example_rules import TABLES, random_rule

@@ -17,7 +17,7 @@ from zenoh.handlers import FifoChannel
 import noack.runtime.connections.zenoh_session
 import noack.runtime.control_plane
 import noack.runtime.join_run
-from cosim.live.coordinator import Coordinator
+from cosim.live.coordination.coordinator import Coordinator
 from noack.core.errors import NoAnswerError, PeerError
 from noack.protocol.roles import LOOP_ROLES
 from noack.runtime.active_runs import RUNS, run_name

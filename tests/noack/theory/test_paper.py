@@ -22,7 +22,7 @@ from noack.theory.paper import (
     theorem_1,
     theorem_2,
 )
-from noack.trigger.trigger_rule import TriggerRule
+from noack.trigger_policies.trigger_rule import TriggerRule
 from tests.helpers.example_rules import decaying_rule
 from tests.helpers.shipped import resolved
 from tests.noack.theory.certificates.certificate_kinds.policies import INSTANT

@@ -14,7 +14,7 @@ from contextlib import ExitStack, closing, contextmanager, suppress
 
 import pytest
 
-from cosim.live.remote_access import KeyPair, TlsKeys, coordinator_context, new_tls_keys
+from cosim.live.coordination.remote_access import KeyPair, TlsKeys, coordinator_context, new_tls_keys
 from noack.core.errors import NoAnswerError, PeerError
 from noack.runtime.address import Address
 from noack.runtime.connections import connection_gate

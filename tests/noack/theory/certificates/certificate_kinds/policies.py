@@ -1,6 +1,6 @@
 """The trigger policies besides the paper's: the loops are drawn and simulated as for ``decaying``.
 
-First the rules, written again without ``noack.trigger``. A rule is called at every test of the
+First the rules, written again without ``noack.trigger_policies``. A rule is called at every test of the
 trigger, with the step, the steps since each run's last event, x and e_s, and returns which runs
 have an event. Then random settings of each policy, and the broken copies, which leave out one part
 of what a trigger does.

@@ -6,8 +6,8 @@ inter-event time is positive for bounded states, as e_s grows from 0 at a bounde
 
 from typing import ClassVar, Literal
 
-from noack.trigger.policy_settings import ModelMatrices, Size, WeightedSettings
-from noack.trigger.trigger_rule import TriggerRule, error_form
+from noack.trigger_policies.policy_settings import ModelMatrices, Size, WeightedSettings
+from noack.trigger_policies.trigger_rule import TriggerRule, error_form
 
 
 class AbsoluteSettings(WeightedSettings):

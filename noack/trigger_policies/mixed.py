@@ -12,8 +12,8 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from noack.core.linear_systems import Matrix
-from noack.trigger.policy_settings import ModelMatrices, Ratio, Size, WeightedSettings
-from noack.trigger.trigger_rule import QuadraticForm, TriggerRule, error_map, state_map
+from noack.trigger_policies.policy_settings import ModelMatrices, Ratio, Size, WeightedSettings
+from noack.trigger_policies.trigger_rule import QuadraticForm, TriggerRule, error_map, state_map
 
 
 class MixedSettings(WeightedSettings):

@@ -23,7 +23,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
-from cosim.live.coordinator import Coordinator, TokenScope
+from cosim.live.coordination.coordinator import Coordinator, TokenScope
 from cosim.live.processes.remote_hosts import Host, load_hosts
 from noack.core.errors import CallerError, PeerError, why
 from noack.protocol.roles import LOOP_ROLES

@@ -1,13 +1,13 @@
 """The relative rule: transmit when ‖e_s‖_W > σ‖x‖_W (Tabuada, IEEE TAC 52(9), 2007).
 
-The mixed rule without its constant; see :mod:`noack.trigger.mixed`.
+The mixed rule without its constant; see :mod:`noack.trigger_policies.mixed`.
 """
 
 from typing import ClassVar, Literal
 
-from noack.trigger.mixed import mixed_rule
-from noack.trigger.policy_settings import ModelMatrices, Ratio, WeightedSettings
-from noack.trigger.trigger_rule import TriggerRule
+from noack.trigger_policies.mixed import mixed_rule
+from noack.trigger_policies.policy_settings import ModelMatrices, Ratio, WeightedSettings
+from noack.trigger_policies.trigger_rule import TriggerRule
 
 
 class RelativeSettings(WeightedSettings):

@@ -8,8 +8,8 @@ from typing import Any, cast
 import pytest
 import zenoh
 
-from cosim.live import coordinator
-from cosim.live.coordinator import ChangeRequests, Coordinator, TokenScope
+from cosim.live.coordination import coordinator
+from cosim.live.coordination.coordinator import ChangeRequests, Coordinator, TokenScope
 from noack.core.errors import CallerError
 from noack.protocol.roles import LOOP_ROLES, RECORDER, ROLES
 from noack.scenario.scenario_file import load

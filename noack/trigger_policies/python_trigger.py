@@ -13,8 +13,8 @@ import numpy as np
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
 from noack.settings.user_files import ClassSettings, UserCode, new_instance, read_only, user_code
-from noack.trigger.policy_settings import ModelMatrices, WeightedSettings
-from noack.trigger.trigger_rule import CodedPolicy, TriggerDecision
+from noack.trigger_policies.policy_settings import ModelMatrices, WeightedSettings
+from noack.trigger_policies.trigger_rule import CodedPolicy, TriggerDecision
 
 _BEYOND_EXACT = (
     'trigger.policy: needs a policy that is a rule; this scenario has "python", a class that '

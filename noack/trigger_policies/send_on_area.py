@@ -11,8 +11,8 @@ measurements; exact simulation integrates e_s itself.
 
 from typing import ClassVar, Literal
 
-from noack.trigger.policy_settings import ModelMatrices, Size, WeightedSettings
-from noack.trigger.trigger_rule import TriggerRule, error_form
+from noack.trigger_policies.policy_settings import ModelMatrices, Size, WeightedSettings
+from noack.trigger_policies.trigger_rule import TriggerRule, error_form
 
 
 class SendOnAreaSettings(WeightedSettings):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from cosim.live import remote_access
+from cosim.live.coordination import remote_access
 from noack.core.errors import CallerError
 from noack.scenario.run_sections import ClocksSection
 from noack.scenario.scenario_file import load

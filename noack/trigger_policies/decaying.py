@@ -10,8 +10,8 @@ import math
 from typing import ClassVar, Literal, Self
 
 from noack.settings.section import NonNegative, Positive
-from noack.trigger.policy_settings import ModelMatrices, WeightedSettings
-from noack.trigger.trigger_rule import TriggerRule, error_form
+from noack.trigger_policies.policy_settings import ModelMatrices, WeightedSettings
+from noack.trigger_policies.trigger_rule import TriggerRule, error_form
 
 _LEAST_BETA = 1e-300
 """Least threshold: it stays above 0 for all times."""

@@ -2,8 +2,8 @@
 
 from typing import ClassVar, Literal
 
-from noack.trigger.policy_settings import IntervalS, ModelMatrices, WeightedSettings, nanoseconds
-from noack.trigger.trigger_rule import TriggerRule, no_form
+from noack.trigger_policies.policy_settings import IntervalS, ModelMatrices, WeightedSettings, nanoseconds
+from noack.trigger_policies.trigger_rule import TriggerRule, no_form
 
 
 class PeriodicSettings(WeightedSettings):

@@ -13,8 +13,8 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field, FiniteFloat
 
-from noack.trigger.policy_settings import LyapunovFunctionSettings, ModelMatrices
-from noack.trigger.trigger_rule import DynamicVariable, TriggerRule, quadratic_form
+from noack.trigger_policies.policy_settings import LyapunovFunctionSettings, ModelMatrices
+from noack.trigger_policies.trigger_rule import DynamicVariable, TriggerRule, quadratic_form
 
 
 class DynamicSettings(LyapunovFunctionSettings):

@@ -15,9 +15,9 @@ from typing import ClassVar, Literal, Self
 from pydantic import model_validator
 
 from noack.settings.section import NonNegative, Positive
-from noack.trigger.decaying import decaying_text
-from noack.trigger.policy_settings import IntervalS, ModelMatrices, WeightedSettings, nanoseconds
-from noack.trigger.trigger_rule import Forecast, TriggerRule, no_form
+from noack.trigger_policies.decaying import decaying_text
+from noack.trigger_policies.policy_settings import IntervalS, ModelMatrices, WeightedSettings, nanoseconds
+from noack.trigger_policies.trigger_rule import Forecast, TriggerRule, no_form
 
 
 class SelfTriggeredSettings(WeightedSettings):

@@ -17,7 +17,7 @@ from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.settings.section import MatrixRows, ReadTable, ScenarioSection, require_shape
-from noack.trigger.trigger_rule import Policy, TriggerRule, require_rule
+from noack.trigger_policies.trigger_rule import Policy, TriggerRule, require_rule
 
 Size = Annotated[FiniteFloat, Field(ge=1e-15, le=1e15)]
 Ratio = Annotated[FiniteFloat, Field(gt=0, le=1e9)]

@@ -6,8 +6,8 @@ if the controller receives nothing for T_max, an update was lost. The rule's err
 
 from typing import ClassVar, Literal
 
-from noack.trigger.policy_settings import CombinedSettings
-from noack.trigger.trigger_rule import TriggerRule
+from noack.trigger_policies.policy_settings import CombinedSettings
+from noack.trigger_policies.trigger_rule import TriggerRule
 
 
 class DeadlineSettings(CombinedSettings):

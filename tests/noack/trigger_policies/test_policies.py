@@ -24,9 +24,9 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from noack.scenario.sections import POLICIES
-from noack.trigger.deadline import DeadlineSettings
-from noack.trigger.lyapunov import LyapunovSettings
-from noack.trigger.policy_settings import ModelMatrices
+from noack.trigger_policies.deadline import DeadlineSettings
+from noack.trigger_policies.lyapunov import LyapunovSettings
+from noack.trigger_policies.policy_settings import ModelMatrices
 from tests.helpers.approved import compare_lines, lines_of_error
 from tests.helpers.example_rules import TABLES
 

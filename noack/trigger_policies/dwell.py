@@ -6,8 +6,8 @@ compares may exceed the threshold.
 
 from typing import ClassVar, Literal
 
-from noack.trigger.policy_settings import CombinedSettings
-from noack.trigger.trigger_rule import TriggerRule
+from noack.trigger_policies.policy_settings import CombinedSettings
+from noack.trigger_policies.trigger_rule import TriggerRule
 
 
 class DwellSettings(CombinedSettings):

@@ -12,8 +12,8 @@ from pydantic import Field
 
 from noack.core.clock import NS_PER_S
 from noack.settings.section import MatrixRows, NonNegative, require_shape
-from noack.trigger.policy_settings import IntervalS, ModelMatrices, WeightedSettings, nanoseconds
-from noack.trigger.trigger_rule import TriggerRule, quadratic_form
+from noack.trigger_policies.policy_settings import IntervalS, ModelMatrices, WeightedSettings, nanoseconds
+from noack.trigger_policies.trigger_rule import TriggerRule, quadratic_form
 
 
 class QuadraticSettings(WeightedSettings):
