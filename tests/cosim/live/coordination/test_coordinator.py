@@ -16,7 +16,7 @@ from noack.scenario.scenario_file import load
 from tests.fuzz.plane import FakePlane, Query, Sample
 from tests.helpers.run_descriptors import JUNK, RUN_DESCRIPTOR
 
-SHARED = Path(__file__).parents[3] / "scenarios" / "shared_bottleneck.toml"
+SHARED = Path(__file__).parents[4] / "scenarios" / "shared_bottleneck.toml"
 
 
 @pytest.fixture
