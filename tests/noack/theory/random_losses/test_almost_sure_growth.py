@@ -34,7 +34,7 @@ def test_almost_all_runs_of_random_loops_grow_at_most_by_the_bound(process: Loss
     """40 runs of 2,000 periods, minus six standard errors; the bound is above by 4 % at most."""
     chain, slack, exceeded = unlimited(process), [], False
     fewer = unlimited(replace(process, lost=process.lost / 2))  # a broken copy
-    for seed in (1, 2, 3, 5):  # the search for a bound takes long in others
+    for seed in (1, 5, 8, 9):  # the search for a bound takes long in others
         rng = np.random.default_rng(seed)
         delivered, lost = 0.7 * rng.normal(size=(2, 3, 3))
         maps, n = np.array([delivered, lost]), len(chain.lost)
