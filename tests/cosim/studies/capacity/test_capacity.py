@@ -207,7 +207,8 @@ def test_the_command_compares_the_policies_and_confirms_a_point_live(tmp_path: P
 def test_a_schedule_carries_as_many_loops_as_its_delay_allows(tmp_path: Path) -> None:
     """Loops that transmit every 60 ms, or every 20 ms, in turn in slots of 10 ms; M = 4, Q = 1."""
     result = capacity(
-        "scheduled_channel", "--loops", "2,5,9", "--draws", "2", "--update-period", "0.06", "--late-after", "0.05",
+        "scheduled_channel", "--loops", "2,5,9", "--draws", "2",
+        "--update-period", "0.06", "--late-after", "0.05",
         "--set", "network.impairments.0.slot_s=0.01", "--set", "network.loss.probability=0",
         "--workers", "1", "--json", "--out", str(tmp_path), *SHORT,
     )  # fmt: skip

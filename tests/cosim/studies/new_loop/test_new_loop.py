@@ -71,7 +71,7 @@ class Stepped:
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(linearisation, "_SAMPLES", {"derivative": 100, "motion": 10})  # of the error that is shown
+    monkeypatch.setattr(linearisation, "_SAMPLES", {"derivative": 100, "motion": 10})
     Path("pole.py").write_text(POLE)
     return tmp_path
 
