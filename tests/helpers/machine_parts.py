@@ -45,7 +45,7 @@ class SteppedMachines(LoopMachines):
         return [*outputs, *self._taken()]
 
     def _taken(self) -> list[Output]:
-        records = [Record(table, row) for table, rows in self.take_rows(last=True) for row in rows.tolist()]
+        records = [Record(table, row) for table, rows in self.take_rows() for row in rows.tolist()]
         return [*records, *self.take_notices()]
 
 

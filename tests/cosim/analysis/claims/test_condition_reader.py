@@ -127,7 +127,7 @@ def damaged(record: RunRecord, seed: int) -> RunRecord:
 def test_batches_in_any_order_show_what_the_whole_record_shows(make: Make) -> None:
     causes: set[str] = set()
 
-    @settings(max_examples=30)
+    @settings(max_examples=60)
     @given(scenarios(make), st.integers(0, 2**32))
     def check(resolved: Scenario, seed: int) -> None:
         record = damaged(simulate(resolved, hostile(seed)), seed)
