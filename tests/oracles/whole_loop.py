@@ -90,6 +90,7 @@ class Model:
     def __init__(self, s: Settings) -> None:
         self.s = s
         self.transition = lru_cache(None)(lambda dt_ns: expm(s.H * (dt_ns * 1e-9)))
+        self.rest_input = -np.linalg.pinv(s.B_model) @ s.A_model
 
     def flow(self, x: Array, from_ns: int, to_ns: int) -> Array:
         """Follow the model from one time to another, through all changes of the set point."""
@@ -103,8 +104,7 @@ class Model:
 
     def input(self, x_r: Array, x_c: Array) -> Array:
         """Return u; u_r is the smallest input with Âx_r + B̂u_r = 0."""
-        u_r = -np.linalg.pinv(self.s.B_model) @ self.s.A_model @ x_r
-        return self.s.K @ (x_c - x_r) + u_r
+        return self.s.K @ (x_c - x_r) + self.rest_input @ x_r
 
 
 class Observer:

@@ -58,9 +58,14 @@ def test_a_saved_scenario_has_the_settings_and_the_comments(tmp_path: Path) -> N
     assert noack.load(noack.explore(table).save(path)).name == "double_integrator"
 
 
-def test_sliders_change_the_explorer_and_the_other_way_round(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def few_draws(monkeypatch: pytest.MonkeyPatch) -> None:
     few = partial(exploration_figure.explore_ensemble, draws=20)
     monkeypatch.setattr(exploration_figure, "explore_ensemble", few)
+
+
+@pytest.mark.usefixtures("few_draws")
+def test_sliders_change_the_explorer_and_the_other_way_round(monkeypatch: pytest.MonkeyPatch) -> None:
     ipywidgets = pytest.importorskip("ipywidgets", reason="the extra `notebook` is not installed")
     explorer = noack.explore("lane_following", {"horizon_s": 4.0})
     controls, figure = explorer.widget().children
@@ -108,6 +113,7 @@ def test_errors_are_said_to_decay_as_far_as_the_threshold_does() -> None:
     assert explorer.certificate.reason.endswith("down to what the threshold's floor leaves")
 
 
+@pytest.mark.usefixtures("few_draws")
 def test_a_loop_that_is_unstable_says_why_and_is_drawn() -> None:
     explorer = noack.explore("lane_following")
     A, B = explorer.scenario.plant.uncertainty_A, explorer.scenario.plant.uncertainty_B

@@ -65,6 +65,7 @@ def test_the_written_model_is_a_network_with_the_fitted_parameters(chain_csv: Pa
     assert noack.simulate(noack.with_settings(scenario, {"horizon_s": 1.0})).summary
 
 
+@pytest.mark.usefixtures("no_drawing")
 def test_a_network_without_losses_is_measured(tmp_path: Path) -> None:
     path = tmp_path / "all.csv"
     path.write_text("sent_ms,received_ms\n0,1\n")

@@ -213,7 +213,7 @@ P = 0.05
 MANSD = 2
 WITHOUT_CAP = (
     "network.enforce_mansd=false", f"network.mansd={MANSD}",
-    f'network.loss={{model="bernoulli", probability={P}}}',
+    f'network.loss={{model="bernoulli", probability={P}}}', 'plant.draw="nominal"',
 )  # fmt: skip
 
 

@@ -46,6 +46,7 @@ def test_the_terminal_shows_what_was_approved(
     compare_output(f"{name}.txt", done.stdout.replace(str(run), "RUN"))
 
 
+@pytest.mark.usefixtures("no_drawing")
 def test_the_report_shows_what_was_approved(simulated: noack.Run) -> None:
     page = Page(simulated.report().read_text(encoding="utf-8"))
     _, _, body = page.text.rpartition("}\n")  # without the style

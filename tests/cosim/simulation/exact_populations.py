@@ -148,8 +148,8 @@ def check_events(run: ContinuousRun, setting: Setting) -> int:
         from_s = begin_s + max(rule.idle_ns * 1e-9, 0.0)
         if len(rule.form.positive) and not rule.grid_ns and from_s < end_s - 1e-6:
             inside = np.linspace(from_s, end_s, 203)[1:-1]
-            largest = max(excess(t_s, solved.sol(t_s)) for t_s in inside[inside < end_s - 1e-7])
-            assert largest <= 1e-8
+            inside = inside[inside < end_s - 1e-7]
+            assert max(map(excess, inside, solved.sol(inside).T)) <= 1e-8
             checked += 1
         eta = float(solved.y[-1, -1])
         compares = len(rule.form.positive) > 0 and not rule.grid_ns

@@ -53,7 +53,7 @@ def settings(name: str, seeds: range) -> list[tuple[Setting, Population]]:
 def test_events_fates_and_measures_are_those_of_the_exact_simulator(name: str) -> None:
     events = finished = 0
     for setting, population in settings(
-        name, range(12 if name in ("lyapunov", "decaying", "dynamic") else 4)
+        name, range({"lyapunov": 12, "decaying": 8, "dynamic": 8}.get(name, 4))
     ):
         for i, row in enumerate(run_batch(setting, population)):
             draw = single(population, i)

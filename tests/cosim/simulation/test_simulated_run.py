@@ -166,7 +166,7 @@ def test_a_missing_recording_is_written_when_it_is_viewed(run_dir: Path, loop: s
     assert path.read_bytes().startswith(b"RRF")
 
 
-@pytest.mark.usefixtures("no_recording")
+@pytest.mark.usefixtures("no_recording", "no_drawing")
 def test_the_report_reads_no_loop_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """How each loop went is known at the end of a run; to find it out takes most of the time."""
     monkeypatch.setattr(loops_over_time, "loop_over_time", None)

@@ -143,7 +143,7 @@ def test_the_models_differ_by_the_missed_jumps_whatever_the_network_does(policy:
 
     x_c(t) − x_s(t) = Σ_{k=r+1..q} e^{H(t−t_k)} e_s(t_k⁻).
     """
-    for number in range(POLICIES.index(policy), 8 * len(POLICIES), len(POLICIES)):
+    for number in range(POLICIES.index(policy), 4 * len(POLICIES), len(POLICIES)):
         record = random_run(number)
         scenario = record.scenario
         if not scenario.protocol.acknowledges and scenario.controller.setpoint is None:
@@ -170,7 +170,10 @@ def check_identity(record: RunRecord) -> int:
     for now_ns in np.unique(
         np.concatenate([rows["now_ns"] for rows in (measured, deliveries, steps)])
     ).tolist():
-        row, delivery, step = (rows[rows["now_ns"] <= now_ns][-1:] for rows in (measured, deliveries, steps))
+        row, delivery, step = (
+            rows[: np.searchsorted(rows["now_ns"], now_ns, "right")][-1:]
+            for rows in (measured, deliveries, steps)
+        )
         last = max([*step, *delivery], key=lambda row: row["input"], default=None)
         if last is None or not (len(row) and (settings.known_state or len(delivery))):
             continue  # no common start of the two models yet

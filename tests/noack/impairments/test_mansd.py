@@ -119,7 +119,6 @@ def assert_kept(settings: LinkSettings, link: Link, observer: Observer, sent: An
 
 
 @pytest.mark.parametrize("change", ["no", "with the same guarantee", "with another guarantee"])
-@settings(max_examples=40)
 @given(
     st.lists(links, min_size=2, max_size=4), arrivals, st.integers(0, 2**32),
     st.sampled_from([0.0, 0.3, 0.9]),
@@ -151,7 +150,7 @@ def test_the_guarantee_holds_with_late_timers_and_changes(
         assert all(is_allowed(observer.lost(*of_flow), in_force) for of_flow in sent.items())
 
 
-@settings(max_examples=50)
+@settings(max_examples=30)
 @given(links, st.integers(0, 2**32), st.integers(1, 80))
 def test_the_guarantee_needs_no_clock(settings: LinkSettings, seed: int, count: int) -> None:
     """Arrival times in any order, timers served too early."""
@@ -250,7 +249,7 @@ def settle(link: LinkState, packet: int, release_ns: int | None) -> Any:
     return decision
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(
     st.lists(st.none() | st.integers(0, 12), max_size=24), st.integers(0, 4),
     any_settings.constraints,

@@ -65,7 +65,7 @@ def reference(motor: DcMotorSettings, x: np.ndarray, voltage: float, end_s: floa
 
         change.terminal, change.direction = True, -1 if turning else 1  # type: ignore[attr-defined]
         solution = solve_ivp(
-            derivative, (t_s, end_s), x, events=change, method="Radau", rtol=1e-10, atol=1e-13
+            derivative, (t_s, end_s), x, events=change, method="Radau", rtol=1e-9, atol=1e-12
         )
         t_s, x = solution.t[-1], solution.y[:, -1].copy()
         if solution.status == 1 and turning:

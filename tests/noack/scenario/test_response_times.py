@@ -96,7 +96,7 @@ def scheduler_of(numbers: Any, kind: type[Scheduler]) -> Scheduler:
     return Priority(levels=tuple(numbers))
 
 
-@settings(max_examples=150)
+@settings(max_examples=75)
 @given(
     st.lists(
         st.tuples(st.integers(1, 40), st.integers(60, 200), st.integers(0, 3)),

@@ -47,8 +47,8 @@ class ScheduledLoop(NamedTuple):
         The state is (x, x_f, x_c): plant, filtered estimate, the controller's estimate. After a
         step without transmission x_c follows the model; else it is x_f.
         """
-        A, K, n = self.A, self.filter_gain, len(self.A)
-        BL, KC, none, empty = self.B @ self.gain, K @ self.C, np.zeros((n, n)), np.zeros_like(K)
+        A, L, K, n = self.A, self.gain, self.filter_gain, len(self.A)
+        BL, KC, none, empty = self.B @ L, K @ self.C, np.zeros((n, n)), np.zeros_like(K)
         free = np.block([[A, none, -BL], [KC @ A, A - KC @ A, -BL], [none, none, A - BL]])
         plant, sensor = np.vstack([np.eye(n), KC, none]), np.vstack([empty, K, empty])
         noise = plant @ self.W @ plant.T + sensor @ self.V @ sensor.T
@@ -61,7 +61,7 @@ class ScheduledLoop(NamedTuple):
         moments, total = solve_discrete_lyapunov(period, added), 0.0
         for step, drive in steps:
             moments = step @ moments @ step.T + drive
-            inputs = self.gain @ moments[2 * n :, 2 * n :] @ self.gain.T
+            inputs = L @ moments[2 * n :, 2 * n :] @ L.T
             total += float(np.trace(self.Q @ moments[:n, :n]) + np.trace(self.R @ inputs))
         return total / len(steps)
 

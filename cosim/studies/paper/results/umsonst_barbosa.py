@@ -7,6 +7,7 @@ whatever the disturbances and the losses: x − z ∈ Z = W ⊕ (A − BK)W ⊕ 
 """
 
 import math
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -101,6 +102,7 @@ class Optimisation:
         self._rows = np.vstack([predicted[n:-n], last, np.eye(N, N + 1)])
         self._by_start = np.vstack([self._free[n:-n], end[:, :n] @ self._free[-n:], np.zeros((N, n))])
         self._most = np.concatenate([np.tile(self._limits, N - 1), most_end, np.full(N, most_u)])
+        self._scaled = solve_triangular(self._root, self._rows.T, lower=True).T
 
     def _terminal_set(self, plant: ConstrainedPlant, most_u: float) -> tuple[Matrix, Vector]:
         """Return rows and limits of the largest set of (z, s) in which the feedback to s stays."""
@@ -126,12 +128,11 @@ class Optimisation:
         linear = self._weighted @ (self._free @ start)
         linear[N] -= self._target * TARGET_M
         offset = solve_triangular(self._root, linear, lower=True)
-        scaled = solve_triangular(self._root, self._rows.T, lower=True).T
-        begin = self._by_start @ start - scaled @ offset
+        begin = self._by_start @ start - self._scaled @ offset
         room = np.concatenate([self._most - begin, self._most + begin])
         shortest = np.zeros(N + 1)
         if room.min() < 0:
-            columns = np.vstack([np.vstack([-scaled, scaled]).T, -room])
+            columns = np.vstack([np.vstack([-self._scaled, self._scaled]).T, -room])
             residual = columns @ nnls(columns, np.eye(N + 2)[N + 1])[0] - np.eye(N + 2)[N + 1]
             if abs(residual[-1]) < _SOLVED:
                 return None
@@ -260,13 +261,19 @@ def make_disturbances(optimisation: Optimisation) -> tuple[Matrix, Matrix]:
     return drawn, np.roll(np.sign(turned)[::-1], -1, axis=0) * plant.most_w
 
 
-def _rows() -> list[ComparedValue]:
+@cache
+def optimised() -> tuple[Optimisation, list[RunOutcome]]:
+    """Return the optimisation of the cart-pole, and its runs with all losses and disturbances."""
     optimisation = Optimisation(cart_pole())
-    outcomes = [
+    return optimisation, [
         run(optimisation, lost, disturbances, optimisation.K[0])
         for lost in LOSSES
         for disturbances in make_disturbances(optimisation)
     ]
+
+
+def _rows() -> list[ComparedValue]:
+    _, outcomes = optimised()
     tube, state, most_input, unsolved, distance_m, _ = map(max, zip(*outcomes, strict=True))
     largest = (
         ("share of the tube that x − z reaches", _README, tube),

@@ -29,7 +29,7 @@ OWN = {
     "decaying": {"beta": 0.2},
     "dynamic": {"eta_0": 0.0, "sigma": 0.2},
 }
-STEP_S, MOST_EVENTS = 0.05, 6
+STEP_S, MOST_EVENTS = 0.05, 5
 SURE = 1e-9
 
 

@@ -30,7 +30,7 @@ from tests.helpers.live_runs import command_of
 from tests.helpers.waiting import wait_for
 
 Start = Callable[[], "subprocess.Popen[str]"]
-RUNS = 320
+RUNS = 200
 COMPUTE = """
 import hashlib
 import numpy as np
@@ -65,7 +65,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 @pytest.fixture
 def many(write: Write, plan: dict[str, Any]) -> Path:
     """A campaign with enough chunks to take seconds, even on a fast machine."""
-    return write(plan, draws=80, chunk=1, figures=[])
+    return write(plan, draws=50, chunk=1, figures=[])
 
 
 def test_a_killed_worker_gives_one_line_and_no_byte_depends_on_the_workers(

@@ -29,17 +29,17 @@ def test_the_default_answers_for_the_shipped_mixture_and_says_how_long_it_takes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert plans.QUICK.draws == 6
-    monkeypatch.setattr(plans, "QUICK", plans.QUICK._replace(draws=2))
+    monkeypatch.setattr(plans, "QUICK", plans.QUICK._replace(draws=1))
     out = "--out", str(tmp_path), "--workers", "1", "--json", "--set", "horizon_s=0.2"
     result = capacity("shared_bottleneck", *out, *SHORT[2:])
     assert result.exit_code == 0, result.output
     assert re.search(
-        r"36 runs of 0.2 s with 11 to 33 loops; the simulation takes about \d+ s on an idle core; "
+        r"18 runs of 0.2 s with 11 to 33 loops; the simulation takes about \d+ s on an idle core; "
         r"--thorough: \d+ (s|min)\n",
         result.stderr,
     )
     document = json.loads(result.stdout)
-    assert (document["loops"], document["draws"], document["thorough"]) == ([11, 22, 33], 2, False)
+    assert (document["loops"], document["draws"], document["thorough"]) == ([11, 22, 33], 1, False)
     for row in document["capacities"]:
         if row["median"] is not None:
             assert row["loops_by_kind"]["pendulum"] == 10 * row["factor"] == row["median"] / 1.1
@@ -49,7 +49,7 @@ def test_the_default_answers_for_the_shipped_mixture_and_says_how_long_it_takes(
     assert "takes about" not in again.stderr
 
 
-@pytest.mark.usefixtures("without_viewer")
+@pytest.mark.usefixtures("without_viewer", "no_drawing")
 def test_the_command_compares_the_policies_and_confirms_a_point_live(tmp_path: Path) -> None:
     result = capacity(
         str(FILE), "--set", LOOP, "--loops", "2", "--draws", "1", "--disturbance", "1",
@@ -75,7 +75,8 @@ def test_the_command_compares_the_policies_and_confirms_a_point_live(tmp_path: P
 def test_a_schedule_carries_as_many_loops_as_its_delay_allows(tmp_path: Path) -> None:
     """Loops that transmit every 60 ms, or every 20 ms, in turn in slots of 10 ms; M = 4, Q = 1."""
     result = capacity(
-        "scheduled_channel", "--loops", "2,5,9", "--update-period", "0.06", "--late-after", "0.05",
+        "scheduled_channel", "--loops", "2,5,9", "--draws", "2",
+        "--update-period", "0.06", "--late-after", "0.05",
         "--set", "network.impairments.0.slot_s=0.01", "--set", "network.loss.probability=0",
         "--workers", "1", "--json", "--out", str(tmp_path), *SHORT,
     )  # fmt: skip

@@ -61,8 +61,9 @@ def scalar_file(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def run_design(tmp_path: Path) -> Design:
-    """Runs the command with few draws; its page is ``p.html``."""
+def run_design(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Design:
+    """Runs the command with few draws and rounds; its page is ``p.html``."""
+    monkeypatch.setattr("cosim.studies.design.design_search._MOST_ROUNDS", 3)
 
     def run(scenario: Path, *words: str) -> Result:
         defaults = ("--settling", "9", "--quantile", "0.5", "--draws", "20", "--weights",

@@ -65,7 +65,7 @@ def searched(given: Scenario, request: DesignRequest) -> Found:
 
 
 def searched_events(given: Scenario, request: DesignRequest, seed: int) -> FoundEvents:
-    search = EventSearch(given, request, seed)
+    search = EventSearch(given, request, seed, draws=80)
     loops = search.run()
     return FoundEvents(search, *loops, event_outcome(search, *loops))
 
@@ -102,8 +102,8 @@ def test_the_next_guarantee_is_destabilised_by_the_pattern_that_is_shown(
 @pytest.mark.parametrize(
     ("name", "settings", "design_request"),
     [
-        ("lane_periodic", (), DesignRequest(effort=0, most=8)),
-        ("lane_periodic", (), DesignRequest(effort=0, window=8)),
+        ("lane_periodic", (), DesignRequest(effort=0, most=7)),
+        ("lane_periodic", (), DesignRequest(effort=0, window=7)),
         ("unstable_pendulum", (), DesignRequest(effort=80, period_s=PERIOD_S, holds=read_holds("model"))),
         (
             "unstable_pendulum",
@@ -204,7 +204,7 @@ def test_the_holds_that_are_named_decide_also_about_the_given_timeout() -> None:
 
 
 def test_a_period_between_two_measurements_is_said_to_be_longer() -> None:
-    outcome = searched(shipped("unstable_pendulum"), DesignRequest(period_s=0.2503, effort=0))
+    outcome = searched(shipped("unstable_pendulum"), DesignRequest(period_s=0.2503, effort=0, most=1))
     assert "--period 0.2503: updates are sent at measurements, every 0.252 s" in outcome.shown.notes
 
 
@@ -257,7 +257,7 @@ def test_fewer_transmissions_of_events_for_the_same_network() -> None:
 def test_no_m_is_examined_beyond_what_a_constraint_allows(losses: int, period_s: float | None) -> None:
     constraint = f'network.constraints=[{{kind="at_most", losses={losses}, window=10}}]'
     scenario = shipped("double_integrator", constraint)
-    shown = design_for_network(scenario, DesignRequest(period_s=period_s, effort=0, most=9))
+    shown = design_for_network(scenario, DesignRequest(period_s=period_s, effort=0, most=4))
     assert shown.given.document["certified"] == shown.best.document["certified"] == losses + 1
 
 

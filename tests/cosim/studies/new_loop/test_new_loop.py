@@ -16,6 +16,7 @@ from scipy.linalg import solve_continuous_are
 import noack
 from cosim.studies.new_loop.linear_model import controllable_states
 from noack.core.errors import CallerError
+from noack.plants.systems import linearisation
 from noack.scenario.resolution import loop_of, resolve
 from tests.helpers.approved import compare_lines
 from tests.helpers.command_line import invoke
@@ -70,6 +71,7 @@ class Stepped:
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(linearisation, "_SAMPLES", {"derivative": 100, "motion": 10})
     Path("pole.py").write_text(POLE)
     return tmp_path
 
@@ -100,7 +102,7 @@ def test_three_commands_lead_from_a_class_to_a_certified_run() -> None:
     assert "what follows is certified for the linear plant" in " ".join(
         command("certify", "loop.toml").stdout.split()
     )
-    run = noack.simulate("loop.toml")
+    run = noack.simulate(noack.load("loop.toml", {"horizon_s": 2.0}))
     assert run.ok
     assert run.replay().bit_exact
     # With its linear plant the claims of the certificate are checked, and hold.
@@ -288,7 +290,7 @@ def test_a_damaged_file_of_a_model_is_refused(edit: dict[str, Any], why: str) ->
 
 def test_a_gymnasium_environment_becomes_a_scenario() -> None:
     pytest.importorskip("gymnasium", reason="the extra `gymnasium` is not installed")
-    made = noack.new("gymnasium:Pendulum-v1", "made.toml")
+    made = noack.new("gymnasium:Pendulum-v1", "made.toml", settings={"network.mansd": 0})
     made.save("made.toml")
     assert made.scenario.plant.rate_hz == 20.0
     run = noack.simulate("made.toml")

@@ -111,7 +111,7 @@ def test_the_scaled_eigenvalue_is_that_of_the_matrix() -> None:
 
 @pytest.fixture(scope="module")
 def optimisation() -> umsonst_barbosa.Optimisation:
-    return umsonst_barbosa.Optimisation(umsonst_barbosa.cart_pole())
+    return umsonst_barbosa.optimised()[0]
 
 
 def test_predicted_inputs_are_the_best_within_the_limits(optimisation: umsonst_barbosa.Optimisation) -> None:
@@ -161,11 +161,7 @@ def test_without_the_gain_at_the_plants_side_the_tube_is_left(
 def test_the_plant_is_farther_from_the_target_than_the_nominal_position(
     optimisation: umsonst_barbosa.Optimisation,
 ) -> None:
-    farthest_m = max(
-        umsonst_barbosa.run(optimisation, lost, disturbances, optimisation.K[0]).plant_distance_m
-        for lost in umsonst_barbosa.LOSSES
-        for disturbances in umsonst_barbosa.make_disturbances(optimisation)
-    )
+    farthest_m = max(outcome.plant_distance_m for outcome in umsonst_barbosa.optimised()[1])
     reach_m = optimisation.plant.tube(optimisation.K, np.eye(4)[0])
     for metres in (farthest_m, reach_m):
         assert f"{1000 * metres:.0f} mm" in umsonst_barbosa.RESULT.notes[1]

@@ -14,7 +14,7 @@ from tests.noack.theory.certificates.certificate_kinds.decaying import dominated
 from tests.noack.theory.certificates.certified_loops import certify_loop
 
 MOST = 60
-LOOPS = dict.fromkeys(KINDS, 1) | {"decaying": 4, "continuous time": 4, "self_triggered": 2}
+LOOPS = dict.fromkeys(KINDS, 1) | {"decaying": 2, "continuous time": 2, "self_triggered": 2}
 """Of each kind; `python -m tests.noack.theory.certificates.certificate_kinds` tries thousands."""
 BROKEN = [(name, next(iter(kind.broken))) for name, kind in KINDS.items() if kind.broken]
 """One of each kind; `python -m tests.noack.theory.certificates.certificate_kinds` tries all."""
