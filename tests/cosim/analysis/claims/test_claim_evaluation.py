@@ -77,6 +77,15 @@ def test_certified_claims_hold_in_a_run_that_meets_its_schedule(run: RunRecord) 
             assert claim.observed == pytest.approx(claim.certified * claim.ratio)
 
 
+def test_a_claim_that_no_sample_was_compared_with_is_not_listed() -> None:
+    """A run with a single event has no inter-event time."""
+    record = simulate(resolved("lane_following", "horizon_s=0.3"))
+    claims = RunClaims(record).evaluate()
+    assert len(record.events()) == 1
+    assert "the state is bounded" in {claim.what for claim in claims}
+    assert "minimum inter-event time" not in {claim.what for claim in claims}
+
+
 def test_the_observed_value_is_the_smallest_bound_that_would_hold(run: RunRecord) -> None:
     """Computed from the recorded tables, not from the aligned ones."""
     claims, rows = certified(run), run[SENSOR_MEASUREMENT]
