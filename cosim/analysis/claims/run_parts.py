@@ -131,7 +131,8 @@ def start_error(part_record: RunRecord, started_s: float) -> float:
     u is constant within a step. So ‖u − Kx‖ is at most the larger of its values at both ends, plus
     a term for the curvature of x: Δt²/8 sup‖K A ẋ‖, with ẋ = e^{As}(Ax + Bu + Dw), w constant.
     Infinite: u is not in the range of K, in which the bounds have it. It may be outside if K has
-    fewer independent rows than there are inputs, and u was that of a set-point with another u_r.
+    fewer independent rows than there are inputs, and u was that of a set-point with another u_r; or
+    u is not finite.
     """
     alpha = policy_of(part_record.scenario).fading_per_s
     largest, last = 0.0, np.zeros(0, part_record.tables[PLANT_STEP])
@@ -161,7 +162,8 @@ def _input_error(part_record: RunRecord, steps: Rows, alpha_per_s: float) -> flo
     if forcing is not None:
         forced = float(np.linalg.norm(loop.K @ loop.A @ forcing.limited, axis=0).sum())
     bend = dt_s**2 / 8 * grown * (row_norms(speed @ (loop.K @ loop.A).T) + forced)
-    return float(((ends + bend) * np.exp(alpha_per_s * steps["t_ns"][1:] * 1e-9)).max())
+    largest = float(((ends + bend) * np.exp(alpha_per_s * steps["t_ns"][1:] * 1e-9)).max())
+    return math.inf if math.isnan(largest) else largest
 
 
 def common_end_ns(record: RunRecord) -> int | None:

@@ -21,6 +21,7 @@ from noack.protocol.record_tables import (
     CONTROLLER_SETTING,
     CONTROLLER_STEP,
     OWNER,
+    PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
 from noack.protocol.roles import LOOP_ROLES
@@ -364,6 +365,17 @@ def test_a_plant_that_does_not_rest_at_the_set_point_has_a_constant_disturbance(
     assert {claim.source for claim in void} == {"box certificate"}
     identity = next(claim for claim in after if claim.source == "(I1)")
     assert identity.verdict is ClaimVerdict.HELD
+
+
+def test_a_part_that_starts_with_an_input_that_is_not_finite_has_no_certificate() -> None:
+    record = run_with((1.0, {"trigger.beta": 0.03}))
+    steps = record[PLANT_STEP].copy()
+    (origin_s,) = {claim.from_s for claim in RunClaims(record).evaluate()} - {0.0}
+    assert origin_s is not None
+    steps["u"][steps["t_ns"] == round(origin_s * 1e9)] = np.nan
+    claims = RunClaims(changed(record, {PLANT_STEP: steps})).evaluate()
+    verdicts = {claim.verdict for claim in claims if claim.from_s and claim.is_certified}
+    assert verdicts == {VOID}
 
 
 @pytest.mark.parametrize("changes", [(), ((1.001, {"controller.setpoint": [0.0, 2.0]}),)])
