@@ -132,18 +132,23 @@ def start_error(part_record: RunRecord, started_s: float) -> float:
     a term for the curvature of x: Δt²/8 sup‖K A ẋ‖, with ẋ = e^{As}(Ax + Bu + Dw), w constant.
     Infinite: u is not in the range of K, in which the bounds have it. It may be outside if K has
     fewer independent rows than there are inputs, and u was that of a set-point with another u_r; or
-    u is not finite.
+    u is not finite, or not recorded at each of these steps.
     """
     alpha = policy_of(part_record.scenario).fading_per_s
+    period_ns = part_record.scenario.timing.plant_period_ns
+    before_ns = -period_ns
     largest, last = 0.0, np.zeros(0, part_record.tables[PLANT_STEP])
     for batch in part_record.source.batches(PLANT_STEP):
         steps = np.concatenate([last, batch])
         ended = int(np.searchsorted(steps["t_ns"] * 1e-9, started_s)) + 1
+        if (np.diff(steps["t_ns"][:ended], prepend=before_ns) > period_ns).any():
+            return math.inf
         if len(steps[:ended]) > 1:
             largest = max(largest, _input_error(part_record, steps[:ended], alpha))
         if ended < len(steps):
             break
         last = steps[-1:]
+        before_ns = int(last["t_ns"][0]) if len(last) else before_ns
     return max(largest, float(np.finfo(float).tiny))  # 0 would be that of a run from its start
 
 

@@ -367,12 +367,15 @@ def test_a_plant_that_does_not_rest_at_the_set_point_has_a_constant_disturbance(
     assert identity.verdict is ClaimVerdict.HELD
 
 
-def test_a_part_that_starts_with_an_input_that_is_not_finite_has_no_certificate() -> None:
+@pytest.mark.parametrize("damage", ["not finite", "not recorded"])
+def test_a_part_that_starts_with_an_input_that_is_not_known_has_no_certificate(damage: str) -> None:
     record = run_with((1.0, {"trigger.beta": 0.03}))
     steps = record[PLANT_STEP].copy()
     (origin_s,) = {claim.from_s for claim in RunClaims(record).evaluate()} - {0.0}
     assert origin_s is not None
-    steps["u"][steps["t_ns"] == round(origin_s * 1e9)] = np.nan
+    first = steps["t_ns"] == round(origin_s * 1e9)
+    steps["u"][first] = np.nan
+    steps = steps[~first] if damage == "not recorded" else steps
     claims = RunClaims(changed(record, {PLANT_STEP: steps})).evaluate()
     verdicts = {claim.verdict for claim in claims if claim.from_s and claim.is_certified}
     assert verdicts == {VOID}
