@@ -16,7 +16,7 @@ from cosim.studies.campaign.campaign_summary import summarise
 from cosim.studies.campaign.campaign_workers import run_in_process
 from cosim.studies.campaign.chunk_store import Store, run_campaign
 from cosim.studies.campaign.drawn_runs import used_up
-from cosim.studies.campaign.metrics import estimate
+from cosim.studies.campaign.metrics import METRICS, estimate
 from cosim.studies.capacity import capacity_plan as plans
 from cosim.studies.capacity.capacity_page import CapacityResult, comparison_sentences, mixture_sentences
 from cosim.studies.capacity.capacity_plan import kinds_of, policies_of
@@ -144,6 +144,7 @@ def test_the_guarantee_is_used_up_by_a_burst_with_a_full_queue() -> None:
         assert used_up(np.array([letters[letter] for letter in text]), burst) == expected, (text, burst)
         seen.add(expected)
     assert seen == {True, False}
+    assert "full queue" in METRICS["loops_guarantee_used"].title
 
 
 @pytest.fixture
