@@ -84,8 +84,8 @@ class ClaimCheck:
 
     @property
     def is_claimed(self) -> bool:
-        """Whether there is a claim about the run."""
-        return self._bound is not None
+        """Whether there is a claim about the run: a value was compared, or an assumption violated."""
+        return self._bound is not None and (self._ratio is not None or self._void is not None)
 
     def add(self, bound: Bound) -> None:
         """Add the bound at the next samples; formula and constants are the same in every part."""

@@ -131,18 +131,24 @@ def start_error(part_record: RunRecord, started_s: float) -> float:
     u is constant within a step. So ‖u − Kx‖ is at most the larger of its values at both ends, plus
     a term for the curvature of x: Δt²/8 sup‖K A ẋ‖, with ẋ = e^{As}(Ax + Bu + Dw), w constant.
     Infinite: u is not in the range of K, in which the bounds have it. It may be outside if K has
-    fewer independent rows than there are inputs, and u was that of a set-point with another u_r.
+    fewer independent rows than there are inputs, and u was that of a set-point with another u_r; or
+    u is not finite, or not recorded at each of these steps.
     """
     alpha = policy_of(part_record.scenario).fading_per_s
+    period_ns = part_record.scenario.timing.plant_period_ns
+    before_ns = -period_ns
     largest, last = 0.0, np.zeros(0, part_record.tables[PLANT_STEP])
     for batch in part_record.source.batches(PLANT_STEP):
         steps = np.concatenate([last, batch])
         ended = int(np.searchsorted(steps["t_ns"] * 1e-9, started_s)) + 1
+        if (np.diff(steps["t_ns"][:ended], prepend=before_ns) > period_ns).any():
+            return math.inf
         if len(steps[:ended]) > 1:
             largest = max(largest, _input_error(part_record, steps[:ended], alpha))
         if ended < len(steps):
             break
         last = steps[-1:]
+        before_ns = int(last["t_ns"][0]) if len(last) else before_ns
     return max(largest, float(np.finfo(float).tiny))  # 0 would be that of a run from its start
 
 
@@ -161,7 +167,8 @@ def _input_error(part_record: RunRecord, steps: Rows, alpha_per_s: float) -> flo
     if forcing is not None:
         forced = float(np.linalg.norm(loop.K @ loop.A @ forcing.limited, axis=0).sum())
     bend = dt_s**2 / 8 * grown * (row_norms(speed @ (loop.K @ loop.A).T) + forced)
-    return float(((ends + bend) * np.exp(alpha_per_s * steps["t_ns"][1:] * 1e-9)).max())
+    largest = float(((ends + bend) * np.exp(alpha_per_s * steps["t_ns"][1:] * 1e-9)).max())
+    return math.inf if math.isnan(largest) else largest
 
 
 def common_end_ns(record: RunRecord) -> int | None:

@@ -181,8 +181,9 @@ LOOPS_ROW = np.dtype(
 
 cost_worst: the largest cost of a loop. loops_failed: share of the loops that diverged or exceeded
 the largest number of events. loops_claims_held: share of the loops of which every claim held.
-loops_guarantee_used: share of the loops that used up the guarantee. updates_late: share of the
-delivered updates that were late. delay_max_s: largest time of a delivered update in the network.
+loops_guarantee_used: share of the loops that used up the guarantee in a full queue (see
+:func:`used_up`). updates_late: share of the delivered updates that were late. delay_max_s: largest
+time of a delivered update in the network.
 """
 _OF_ALL: Mapping[str, Callable[[NDArray[np.float64]], float]] = {
     "transmissions": np.sum,

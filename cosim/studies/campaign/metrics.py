@@ -80,7 +80,7 @@ METRICS: Mapping[Metric, Description] = {
     "cost_worst": Description("cost of the worst loop", logarithmic=True),
     "loops_failed": Description("share of loops that failed"),
     "loops_claims_held": Description("share of loops that hold all claims"),
-    "loops_guarantee_used": Description("share of loops that used up the guarantee"),
+    "loops_guarantee_used": Description("share of loops that used up the guarantee in a full queue"),
     "updates_late": Description("share of updates that are late"),
     "delay_max_s": Description("largest delay in the network", "s", logarithmic=True),
     "sup_e_c_scaled": Description("largest error", "", "sup ‖e_c‖ e^(αt)"),

@@ -41,7 +41,7 @@ has a certificate is used."""
 _SHARES_OF_ALPHA = (0.8, 0.6, 0.4, 0.2)
 """Rates that are tried for a box, as shares of α."""
 _TOO_LARGE = "intermediate results are too large or too small for floating point"
-_OUTSIDE_RANGE = "at its start the input was not in the range of K, where the bounds have it"
+_OUTSIDE_RANGE = "at its start the input was not known, or not in the range of K, where the bounds have it"
 _LARGEST_START = 1e150
 """The squares of larger entries of x(0) may overflow."""
 

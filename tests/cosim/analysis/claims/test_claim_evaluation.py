@@ -21,6 +21,7 @@ from noack.protocol.record_tables import (
     CONTROLLER_SETTING,
     CONTROLLER_STEP,
     OWNER,
+    PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
 from noack.protocol.roles import LOOP_ROLES
@@ -75,6 +76,15 @@ def test_certified_claims_hold_in_a_run_that_meets_its_schedule(run: RunRecord) 
         assert 0 <= claim.ratio <= 1
         if claim.certified is not None and claim.what != "minimum inter-event time":
             assert claim.observed == pytest.approx(claim.certified * claim.ratio)
+
+
+def test_a_claim_that_no_sample_was_compared_with_is_not_listed() -> None:
+    """A run with a single event has no inter-event time."""
+    record = simulate(resolved("lane_following", "horizon_s=0.3"))
+    claims = RunClaims(record).evaluate()
+    assert len(record.events()) == 1
+    assert "the state is bounded" in {claim.what for claim in claims}
+    assert "minimum inter-event time" not in {claim.what for claim in claims}
 
 
 def test_the_observed_value_is_the_smallest_bound_that_would_hold(run: RunRecord) -> None:
@@ -355,6 +365,20 @@ def test_a_plant_that_does_not_rest_at_the_set_point_has_a_constant_disturbance(
     assert {claim.source for claim in void} == {"box certificate"}
     identity = next(claim for claim in after if claim.source == "(I1)")
     assert identity.verdict is ClaimVerdict.HELD
+
+
+@pytest.mark.parametrize("damage", ["not finite", "not recorded"])
+def test_a_part_that_starts_with_an_input_that_is_not_known_has_no_certificate(damage: str) -> None:
+    record = run_with((1.0, {"trigger.beta": 0.03}))
+    steps = record[PLANT_STEP].copy()
+    (origin_s,) = {claim.from_s for claim in RunClaims(record).evaluate()} - {0.0}
+    assert origin_s is not None
+    first = steps["t_ns"] == round(origin_s * 1e9)
+    steps["u"][first] = np.nan
+    steps = steps[~first] if damage == "not recorded" else steps
+    claims = RunClaims(changed(record, {PLANT_STEP: steps})).evaluate()
+    verdicts = {claim.verdict for claim in claims if claim.from_s and claim.is_certified}
+    assert verdicts == {VOID}
 
 
 @pytest.mark.parametrize("changes", [(), ((1.001, {"controller.setpoint": [0.0, 2.0]}),)])

@@ -24,6 +24,7 @@ from cosim.studies.campaign.drawn_runs import (
     in_virtual_time,
     used_up,
 )
+from cosim.studies.campaign.metrics import METRICS
 from cosim.studies.campaign.random_draws import box_of, drawn_scenario, seeds_of
 from noack.core.errors import CallerError, ExitStatus
 from noack.impairments.kinds.replay import Replay
@@ -300,3 +301,4 @@ def test_the_guarantee_is_used_up_by_a_burst_with_a_full_queue() -> None:
         assert used_up(np.array([letters[letter] for letter in text]), burst) == expected, (text, burst)
         seen.add(expected)
     assert seen == {True, False}
+    assert "full queue" in METRICS["loops_guarantee_used"].title
