@@ -60,8 +60,8 @@ class LossCheck:
         self._known_start = known_start
         self._guarantee = guarantee
         self._since_ns = 0
-        self._others = _other_rules(guarantee)
-        self._history = LossHistory(self._others)
+        self._further_rules = _further_rules_of(guarantee)
+        self._history = LossHistory(self._further_rules)
         self._newest_ns = 0
 
     def reach(self, t_ns: int) -> None:
@@ -73,14 +73,14 @@ class LossCheck:
     @property
     def counts_every_update(self) -> bool:
         """Whether updates without a loss before them matter, too."""
-        return bool(self._others) or (self._schedule is not None and self._schedule.has_changes)
+        return bool(self._further_rules) or (self._schedule is not None and self._schedule.has_changes)
 
     def _change(self, guarantee: LossGuarantee, since_ns: int) -> None:
         """Use another guarantee for what is sent from ``since_ns`` on."""
         if guarantee != self._guarantee:
             self._guarantee, self._since_ns = guarantee, since_ns
-            self._others = _other_rules(guarantee)
-            self._history = LossHistory(self._others)
+            self._further_rules = _further_rules_of(guarantee)
+            self._history = LossHistory(self._further_rules)
 
     def add(self, sequence: int, newest: int, losses: int, event_ns: int, now_ns: int) -> Sequence[Notice]:
         """Add an update that follows ``losses`` losses; return the violations.
@@ -88,15 +88,15 @@ class LossCheck:
         ``newest`` is the number of the update before; −1 if there is none.
         """
         newest_ns, self._newest_ns = self._newest_ns, event_ns
-        violation = self._consecutive(sequence, losses, newest_ns, max(now_ns, event_ns))
+        violation = self._check_burst(sequence, losses, newest_ns, max(now_ns, event_ns))
         if not violation and newest == -1 and losses > 0 and not self._known_start:
             violation = f"no delivered t_0: {losses} updates were lost before the first delivery"
         texts = [violation] if violation else []
         if newest_ns >= self._since_ns:
-            texts += self._follow_others(sequence, losses)
+            texts += self._check_further_rules(sequence, losses)
         return [Notice(event_ns, "violation", text) for text in texts]
 
-    def _consecutive(self, sequence: int, losses: int, newest_ns: int, now_ns: int) -> str:
+    def _check_burst(self, sequence: int, losses: int, newest_ns: int, now_ns: int) -> str:
         """Compare with the largest limit in force since the update before."""
         allowed = _longest_burst(self._guarantee)
         if losses > allowed and self._schedule is not None:
@@ -108,9 +108,9 @@ class LossCheck:
             f"MANSD violated: {losses} consecutive losses before update {sequence}, at most {allowed} assumed"
         )
 
-    def _follow_others(self, sequence: int, losses: int) -> list[str]:
+    def _check_further_rules(self, sequence: int, losses: int) -> list[str]:
         """Return the violations of the other rules, of each rule the largest."""
-        if not self._others:
+        if not self._further_rules:
             return []
         worst: dict[LossRule, int] = {}
         # After a whole window of losses, one more changes nothing.
@@ -128,7 +128,7 @@ class LossCheck:
         return max(window.packets for window in self._guarantee.windows)
 
 
-def _other_rules(guarantee: LossGuarantee) -> tuple[LossRule, ...]:
+def _further_rules_of(guarantee: LossGuarantee) -> tuple[LossRule, ...]:
     return tuple(rule for rule in guarantee.rules if not isinstance(rule, LongestBurst))
 
 
