@@ -227,7 +227,7 @@ def _write_declarations(into: Path, target: str) -> None:
     ffi.cdef(declarations())
     ffi.set_source("noack.core._core_header", None)
     path = into / HEADER
-    with redirect_stdout(io.StringIO()):  # it says what it does
+    with redirect_stdout(io.StringIO()):  # cffi prints its progress
         ffi.emit_python_code(str(path))
     path.write_text(f"{path.read_text()}SOURCES = {_digest(target)!r}\n")
 
@@ -244,10 +244,10 @@ def main() -> int:
     """Build from the command line; print a line if something is built."""
     parser = argparse.ArgumentParser(description="Build the core in C.")
     parser.add_argument("--into", type=Path, default=INTO, help="folder of the library")
-    parser.add_argument("--check", action="store_true", help="only look: a warning is an error")
+    parser.add_argument("--check", action="store_true", help="compile without output; warnings are errors")
     parser.add_argument("--sanitized", action="store_true", help="with ASan and UBSan; needs --into")
-    parser.add_argument("--library", action="store_true", help="only the library: before cffi is installed")
-    parser.add_argument("--platforms", action="store_true", help="print those of the wheels")
+    parser.add_argument("--library", action="store_true", help="build only the library (cffi is not needed)")
+    parser.add_argument("--platforms", action="store_true", help="print the platforms of the wheels")
     parser.add_argument("--node", type=Path, metavar="FILE", help="build the example of a node")
     parser.add_argument(
         "--machines", type=Path, metavar="FILE.o", help="build what a node needs without a system"

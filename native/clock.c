@@ -51,14 +51,14 @@ int64_t noack_clock_wait_ns(const noack_clock *clock, int64_t simulated_ns) {
 int64_t noack_put_off_ns(
     pauses *pauses, int64_t overdue_ns, int64_t next_ns, int has_more, int is_busy) {
     int64_t left_ns = MOST_PUT_OFF_NS - overdue_ns;
-    pauses->has_followed |= pauses->worked;
-    int settled =
-        is_busy || overdue_ns >= MOST_SETTLE_NS || (pauses->has_followed && !pauses->worked);
+    pauses->worked_since_due |= pauses->worked_since_wait;
+    int settled = is_busy || overdue_ns >= MOST_SETTLE_NS
+                  || (pauses->worked_since_due && !pauses->worked_since_wait);
     if (left_ns <= 0 || (settled && !has_more && next_ns > QUIET_NS)) {
-        pauses->has_followed = 0;
+        pauses->worked_since_due = 0;
         return 0;
     }
     if (has_more)
         return left_ns;
-    return pauses->has_followed || settled ? SETTLE_NS : MOST_SETTLE_NS - overdue_ns;
+    return pauses->worked_since_due || settled ? SETTLE_NS : MOST_SETTLE_NS - overdue_ns;
 }

@@ -90,18 +90,18 @@ int happens(const noack_chance *chance, noack_stage_memory *memory, double u);
 
 /* tail_drop.c: occupy a place in a bottleneck's queue. codel.c: whether its law drops the packet
    that has just entered the queue, and drop it. */
-void queue_occupy(noack_link *link, int64_t number, int64_t until_ns);
-int codel_is_due(const noack_link *link, int64_t number);
-void codel_drop(noack_link *link, int64_t number);
+void queue_occupy(noack_link *link, int64_t stage, int64_t until_ns);
+int codel_is_due(const noack_link *link, int64_t stage);
+void codel_drop(noack_link *link, int64_t stage);
 
 /* clock.c, and driver.c: readings of a clock. */
 int64_t noack_simulated_ns_of(const noack_clock *clock, int64_t wall_ns);
 int64_t clock_ns(int clock);
 int64_t run_time_ns(const noack_clock *clock);
 
-typedef struct {          /* of a driver that returns to Python for housekeeping */
-    int64_t worked;       /* 1: it has done something since it last waited */
-    int64_t has_followed; /* 1: likewise, since housekeeping has been due */
+typedef struct {               /* of a driver that returns to Python for housekeeping */
+    int64_t worked_since_wait; /* 1: it has worked since it last waited */
+    int64_t worked_since_due;  /* 1: it has worked since housekeeping became due */
 } pauses;
 
 /* clock.c: how long to put off housekeeping that has been due for a time; 0: not at all. next_ns:
@@ -112,8 +112,8 @@ int64_t noack_put_off_ns(
 
 /* guarantee.c */
 int counts_losses(const noack_link *link);
-int64_t make_stale(const noack_link *link, int64_t row, int64_t number, int64_t release_ns);
-void note_outcome(const noack_link *link, int64_t row, int64_t number, int lost);
+int64_t make_stale(const noack_link *link, int64_t row, int64_t packet, int64_t release_ns);
+void note_outcome(const noack_link *link, int64_t row, int64_t packet, int lost);
 
 /* departures.c */
 
@@ -145,7 +145,7 @@ int64_t flow_table_entry(const packet *packet, const noack_stage *stage);
    of which those with the same leave in order of arrival. */
 void enter_queue(packet *packet, int64_t key, int is_time);
 /* Complete the decision for a packet that has entered, when all stages have seen it. */
-void leave_queue(noack_decision *decision);
+void complete_waiting_decision(noack_decision *decision);
 /* Let a stored datagram, of whose link the decision is, wait until the link is free. */
 void wait_for_link(
     noack_link *link, int64_t row, noack_waiting *waiting, int64_t place, int64_t order,

@@ -1,5 +1,5 @@
 /* What the relay and the channel of a simulation share: rows of the record, the order of
- * departures. */
+   departures. */
 #include <string.h>
 
 #include "core.h"

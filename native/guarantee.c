@@ -109,19 +109,20 @@ int64_t noack_hold_back_until(
 /* Mark the earlier packets that leave after release_ns as stale; return how many. */
 int64_t make_stale(const noack_link *link, int64_t row, int64_t packet, int64_t release_ns) {
     int64_t *recent_ns = link->recent_ns + row * link->recent_width;
-    int64_t times = link->recent_width - 1, oldest = max_of(packet - link->mansd - 1, 0);
+    int64_t recent_mask = link->recent_width - 1, oldest = max_of(packet - link->mansd - 1, 0);
     int64_t stale = 0, first = packet;
-    int64_t number = newest_below(recent_ns, times, oldest, packet);
-    while (number >= oldest && recent_ns[number & times] > release_ns) {
-        recent_ns[number & times] = NOACK_NEVER_NS;
+    int64_t number = newest_below(recent_ns, recent_mask, oldest, packet);
+    while (number >= oldest && recent_ns[number & recent_mask] > release_ns) {
+        recent_ns[number & recent_mask] = NOACK_NEVER_NS;
         stale++;
         first = number;
-        number = newest_below(recent_ns, times, oldest, number);
+        number = newest_below(recent_ns, recent_mask, oldest, number);
     }
     if (counts_losses(link)) {
-        int64_t *losses = link->losses + row * link->loss_width, mask = link->loss_width - 1;
+        int64_t *losses = link->losses + row * link->loss_width;
+        int64_t loss_mask = link->loss_width - 1;
         for (number = first; number < packet; number++)
-            losses[(number + 1) & mask] = losses[number & mask] + 1;
+            losses[(number + 1) & loss_mask] = losses[number & loss_mask] + 1;
     }
     return stale;
 }

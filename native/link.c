@@ -158,7 +158,7 @@ void decide_or_repeat(
             APPLY[stage->kind](&own, stage, &memory[own.stage]);
         }
         if (decision->waits)
-            leave_queue(decision);
+            complete_waiting_decision(decision);
         keep_limit(link->limit - link->in_flight, decision);
     }
     noack_settle(link, row, decision);
@@ -211,7 +211,7 @@ static void count(noack_counters *counters, const noack_decision *decision) {
 void noack_settle(noack_link *link, int64_t row, noack_decision *decision) {
     noack_flow *flow = &link->flows[row];
     noack_counters *counters = &link->counters;
-    int64_t number = decision->packet, now_ns = decision->arrival_ns;
+    int64_t packet = decision->packet, now_ns = decision->arrival_ns;
     int64_t effective_ns = NOACK_NEVER_NS;
     decision->hold_back_ns = decision->makes_stale = 0;
     if (decision->fate == NOACK_DELIVERED) {
@@ -234,14 +234,14 @@ void noack_settle(noack_link *link, int64_t row, noack_decision *decision) {
         flow->consecutive_losses = 0;
     } else {
         flow->consecutive_losses++;
-        int64_t losses = min_of(flow->consecutive_losses, number + 1 - flow->since);
+        int64_t losses = min_of(flow->consecutive_losses, packet + 1 - flow->since);
         flow->longest_loss_burst = max_of(flow->longest_loss_burst, losses);
         counters->longest_loss_burst = max_of(counters->longest_loss_burst, losses);
     }
     if (link->tracks && link->mansd >= 0)
-        link->recent_ns[row * link->recent_width + (number & (link->recent_width - 1))] =
+        link->recent_ns[row * link->recent_width + (packet & (link->recent_width - 1))] =
             effective_ns;
-    note_outcome(link, row, number, effective_ns == NOACK_NEVER_NS);
+    note_outcome(link, row, packet, effective_ns == NOACK_NEVER_NS);
     decision->consecutive_losses = flow->consecutive_losses;
     count(counters, decision);
     link->in_flight += (decision->release_ns > now_ns) + (decision->copy_ns > now_ns);
@@ -253,7 +253,7 @@ int64_t noack_link_touch(const noack_link *link, int64_t row) {
 }
 
 int64_t noack_link_leave(
-    noack_link *link, int64_t row, int64_t number, int64_t size_bytes, int64_t delayed,
+    noack_link *link, int64_t row, int64_t packet, int64_t size_bytes, int64_t delayed,
     int64_t counts) {
     noack_flow *flow = &link->flows[row];
     noack_counters *counters = &link->counters;
@@ -261,12 +261,12 @@ int64_t noack_link_leave(
     counters->forwarded_bytes += size_bytes;
     if (delayed)
         link->in_flight--;
-    int stale = number < flow->newest;
+    int stale = packet < flow->newest;
     if (counts && stale) {
         counters->delivered_out_of_order++;
     } else if (counts) {
-        int64_t losses = number - max_of(flow->newest, flow->since - 1) - 1;
-        flow->newest = number;
+        int64_t losses = packet - max_of(flow->newest, flow->since - 1) - 1;
+        flow->newest = packet;
         flow->longest_loss_burst = max_of(flow->longest_loss_burst, losses);
         counters->longest_loss_burst = max_of(counters->longest_loss_burst, losses);
     }

@@ -783,8 +783,8 @@ int64_t noack_trigger_test(
     const noack_trigger_rule *rule, noack_trigger_state *state, int64_t n, int64_t t_ns,
     const double *x, const double *e_s, double sides[2], double *scratch);
 
-/* How long after an event at t_s, with |x| = size, the next one is forecast. */
-double noack_forecast_ns(const noack_trigger_rule *rule, double size, double t_s);
+/* How long after an event at t_s, with |x| = norm, the next one is forecast. */
+double noack_forecast_ns(const noack_trigger_rule *rule, double norm, double t_s);
 
 /* The set point x_r at a time, (n,); NULL if it is 0. */
 const double *noack_model_point(const noack_model *model, int64_t t_ns);

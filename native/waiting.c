@@ -78,11 +78,11 @@ void enter_queue(packet *packet, int64_t key, int is_time) {
     int64_t begin_ns = max_of(queue->entry_ns, queue->busy_until_ns);
     decision->waits = 1;
     decision->key = key + (is_time ? queue->entry_ns : 0);
-    decision->after_ns = -(begin_ns + 1);
+    decision->after_ns = -(begin_ns + 1); /* negative until all stages have seen the packet */
     decision->release_ns += begin_ns + 1 - decision->arrival_ns;
 }
 
-void leave_queue(noack_decision *decision) {
+void complete_waiting_decision(noack_decision *decision) {
     int64_t least_ns = -decision->after_ns;
     decision->release_ns = max_of(decision->release_ns, least_ns);
     decision->after_ns = decision->release_ns - least_ns;

@@ -51,7 +51,7 @@ const char *noack_driver_check(const noack_driver *driver) {
 static void put_output(noack_driver *driver) {
     driver_scratch *scratch = scratch_of(driver);
     const noack_output *output = &driver->process->output;
-    scratch->pauses.worked = 1;
+    scratch->pauses.worked_since_wait = 1;
     if (!output->sends)
         return;
     int64_t place = scratch->out_count++;
@@ -196,9 +196,9 @@ static void set_timer(noack_driver *driver, int64_t wall_ns, int64_t at_ns) {
 static int64_t sleep_until_needed(
     noack_driver *driver, int64_t wall_ns, int64_t tick_ns, int64_t wait_ns) {
     driver_scratch *scratch = scratch_of(driver);
-    int coalesces = scratch->pauses.worked && !scratch->has_more && 0 < tick_ns
+    int coalesces = scratch->pauses.worked_since_wait && !scratch->has_more && 0 < tick_ns
                     && tick_ns < driver->coalescing_ns;
-    scratch->pauses.worked = 0;
+    scratch->pauses.worked_since_wait = 0;
     if (coalesces) {
         struct timespec pause = {0, driver->coalescing_ns};
         return clock_nanosleep(CLOCK_MONOTONIC, 0, &pause, NULL) == EINTR

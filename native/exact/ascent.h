@@ -1,4 +1,5 @@
-/* Halley's method where h increases, in a bracket that is bisected to the last bit if need be.
+/* Halley's method where h(s) = g(s) - c e^(-rs) increases (see exact.h), in a bracket that is
+   bisected to the last bit if need be.
 
    With the Newton step n = -h/h' it steps by n/(1 + n h''/(2 h')), and converges cubically. */
 #ifndef NOACK_EXACT_ASCENT_H
@@ -23,8 +24,7 @@ static inline double bracketed(
 }
 
 /* The positive root of value + slope q + curvature_bound q^2/2, given value <= 0, or span if that
- * is smaller.
- */
+   is smaller. */
 static inline double safe_step(double value, double slope, double curvature_bound, double span) {
     if (value + span * (slope + 0.5 * curvature_bound * span) <= 0.0)
         return span;

@@ -106,7 +106,7 @@ extern const exact_code exact_wide_4, exact_wide_8, exact_fused_3, exact_fused_4
 extern const exact_code exact_plain_3, exact_plain_4, exact_plain_8, exact_plain_16, exact_plain_64;
 
 /* exact.c: whether a rule compares more than |W e_s|; whether the next update arrives; a column of
- * STRIDE numbers for each of the matrix. */
+   STRIDE numbers for each of the matrix. */
 int is_quadratic(const noack_exact *exact);
 int arrives(const noack_exact *exact, exact_run *run);
 void pad(int64_t rows, int64_t columns, const double *matrix, int64_t stride, double *result);

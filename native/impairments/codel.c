@@ -29,9 +29,9 @@ static int64_t control_law(const noack_bottleneck *own, int64_t t_ns, int64_t dr
 }
 
 /* Whether the law drops the newly arrived packet. */
-int codel_is_due(const noack_link *link, int64_t number) {
-    const noack_bottleneck *own = &link->stages[number].bottleneck;
-    noack_queue *queue = &link->queues[number];
+int codel_is_due(const noack_link *link, int64_t stage) {
+    const noack_bottleneck *own = &link->stages[stage].bottleneck;
+    noack_queue *queue = &link->queues[stage];
     int64_t now_ns = service_ns(queue), sojourn_ns = now_ns - queue->entry_ns;
     int above_long_enough = 0;
     if (sojourn_ns < own->target_ns || sojourn_ns <= own->mtu_ns)
@@ -53,11 +53,11 @@ int codel_is_due(const noack_link *link, int64_t number) {
 }
 
 /* Drop the newly arrived packet: it keeps its place, and the law's state advances. */
-void codel_drop(noack_link *link, int64_t number) {
-    const noack_bottleneck *own = &link->stages[number].bottleneck;
-    noack_queue *queue = &link->queues[number];
+void codel_drop(noack_link *link, int64_t stage) {
+    const noack_bottleneck *own = &link->stages[stage].bottleneck;
+    noack_queue *queue = &link->queues[stage];
     int64_t now_ns = service_ns(queue);
-    queue_occupy(link, number, now_ns);
+    queue_occupy(link, stage, now_ns);
     if (queue->dropping) {
         queue->drops++;
         queue->dropped_before = 1;

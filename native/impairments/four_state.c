@@ -9,24 +9,24 @@ void apply_four_state(packet *packet, const noack_stage *stage, noack_stage_memo
     double uniform[2];
     draw(packet, stage, 0, uniform);
     double u = uniform[0];
-    int64_t now = memory->state + 1;
-    if (now == 1) {
+    int64_t state = memory->state + 1;
+    if (state == 1) {
         if (u < own->p13)
-            now = 3;
+            state = 3;
         else if (u < own->p13 + own->p14)
-            now = 4;
-    } else if (now == 2) {
+            state = 4;
+    } else if (state == 2) {
         if (u < own->p23)
-            now = 3;
-    } else if (now == 3) {
+            state = 3;
+    } else if (state == 3) {
         if (u < own->p31)
-            now = 1;
+            state = 1;
         else if (u < own->p31 + own->p32)
-            now = 2;
+            state = 2;
     } else {
-        now = 1;
+        state = 1;
     }
-    memory->state = now - 1;
-    if (now >= 3)
+    memory->state = state - 1;
+    if (state >= 3)
         refuse(packet->decision, NOACK_DROPPED);
 }

@@ -15,8 +15,8 @@ enum { DEGREE = 16 };
    its norm (Al-Mohy and Higham, SIAM J. Sci. Comput. 33(2), 2011, table 3.1). */
 static const double LARGEST = 0.78;
 
-/* The largest sum of sizes in a column; not a number if one of them is not. */
-static double largest_column(int64_t n, const double *matrix) {
+/* The 1-norm (largest absolute column sum); NaN if an entry is NaN. */
+static double one_norm(int64_t n, const double *matrix) {
     double largest = 0.0;
     for (int64_t j = 0; j < n; j++) {
         double total = fabs(matrix[j]);
@@ -30,12 +30,12 @@ static double largest_column(int64_t n, const double *matrix) {
     return largest;
 }
 
-/* How often to halve a size until it is at most a limit. */
-static int halvings(double size, double limit) {
-    if (!(0.0 < size && size < INFINITY))
+/* How often to halve a norm until it is at most a limit. */
+static int halvings(double norm, double limit) {
+    if (!(0.0 < norm && norm < INFINITY))
         return 0;
     int exponent;
-    double mantissa = frexp(size / limit, &exponent);
+    double mantissa = frexp(norm / limit, &exponent);
     exponent -= mantissa == 0.5;
     return exponent > 0 ? exponent : 0;
 }
@@ -79,14 +79,14 @@ void noack_exponential(int64_t n, const double *matrix, double *result, double *
     double *powers[4] = {scratch, scratch + size, scratch + 2 * size, scratch + 3 * size};
     double *other = scratch + 4 * size;
     /* Scaled to a norm of at most 1 first: its powers do not overflow. */
-    int halved = halvings(largest_column(n, matrix), 1.0);
+    int halved = halvings(one_norm(n, matrix), 1.0);
     for (int64_t k = 0; k < size; k++)
         powers[0][k] = ldexp(matrix[k], -halved);
     noack_multiply(n, n, n, powers[0], powers[0], 0, powers[1]);
     noack_multiply(n, n, n, powers[1], powers[0], 0, powers[2]);
     noack_multiply(n, n, n, powers[1], powers[1], 0, powers[3]);
-    double cube = noack_cube_root(largest_column(n, powers[2]));
-    double fourth = sqrt(sqrt(largest_column(n, powers[3])));
+    double cube = noack_cube_root(one_norm(n, powers[2]));
+    double fourth = sqrt(sqrt(one_norm(n, powers[3])));
     double alpha = fourth > cube ? fourth : cube;
     int more = halvings(ldexp(alpha, halved), LARGEST) - halved;
     for (int k = 0; k < 4; k++)

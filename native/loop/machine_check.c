@@ -11,7 +11,7 @@ static const int64_t MOST_LENGTH = INT64_C(1) << 32;
 static const int64_t MOST_NS = INT64_C(1) << 60, MOST_NUMBER = INT64_MAX / 2;
 
 /* A time up to which a machine has come: that of a message at most. */
-static int is_reached(int64_t t_ns) { return is_between(0, t_ns, MESSAGE_TIMES_NS); }
+static int is_model_time(int64_t t_ns) { return is_between(0, t_ns, MESSAGE_TIMES_NS); }
 
 static const char *check_machine(const noack_machine *machine) {
     if (!is_between(1, machine->n, NOACK_MAX_ENTRIES)
@@ -89,8 +89,8 @@ static const char *check_plant(const noack_plant *plant) {
         return "a plant receives actuations of another size";
     if (plant->p + (plant->reports_inputs ? plant->measure_every * m : 0) > NOACK_MAX_ENTRIES)
         return "a measurement has more than 64 entries";
-    if (plant->timeout_ns < 0 || plant->notice_ns < 0 || !is_reached(plant->newest_ns)
-        || !is_reached(plant->fallback_ns) || !is_between(0, plant->measurements, MOST_NUMBER))
+    if (plant->timeout_ns < 0 || plant->notice_ns < 0 || !is_model_time(plant->newest_ns)
+        || !is_model_time(plant->fallback_ns) || !is_between(0, plant->measurements, MOST_NUMBER))
         return "a plant has a timeout, a time or a number of measurements out of range";
     if (plant->x == NULL || plant->z == NULL || plant->u == NULL || plant->applied == NULL
         || plant->recent_inputs == NULL || plant->inputs == NULL || plant->scratch == NULL
@@ -129,7 +129,7 @@ static const char *check_observer(const noack_observer *observer, const noack_ma
     if (observer->Ad == NULL || observer->Bd == NULL || observer->C == NULL
         || observer->gain == NULL || observer->x == NULL || observer->scratch == NULL)
         return "an observer has no model";
-    if (observer->t_ns != -1 && !is_reached(observer->t_ns))
+    if (observer->t_ns != -1 && !is_model_time(observer->t_ns))
         return "an observer has a time out of range";
     if (observer->kind == NOACK_KALMAN
         && (observer->P == NULL || observer->Q == NULL || observer->R == NULL))
@@ -152,8 +152,9 @@ static const char *check_sensor(const noack_sensor *sensor) {
     if (sensor->x_s == NULL || sensor->event_x == NULL || sensor->x == NULL || sensor->e_s == NULL
         || sensor->scratch == NULL)
         return "a sensor has no state";
-    if (!is_reached(sensor->model_ns) || !is_reached(sensor->trigger.since_ns)
-        || !is_reached(sensor->trigger.measured_ns) || !is_between(0, sensor->events, MOST_NUMBER))
+    if (!is_model_time(sensor->model_ns) || !is_model_time(sensor->trigger.since_ns)
+        || !is_model_time(sensor->trigger.measured_ns)
+        || !is_between(0, sensor->events, MOST_NUMBER))
         return "a sensor has a time or a number of events out of range";
     if (!sensor->acknowledged)
         return sensor->sent_count == 0 ? NULL : "a sensor waits for acknowledgements and has none";
@@ -176,7 +177,7 @@ static const char *check_controller(const noack_controller *controller) {
         || controller->x == NULL || controller->u == NULL || controller->scratch == NULL
         || (controller->has_point && (controller->x_r == NULL || controller->u_r == NULL)))
         return "a controller has no state";
-    if (!is_reached(controller->model_ns) || !is_reached(controller->update_ns)
+    if (!is_model_time(controller->model_ns) || !is_model_time(controller->update_ns)
         || controller->timeout_ns < 1
         || !is_between(NOACK_UNKNOWN_SEQUENCE, controller->newest, INT64_MAX))
         return "a controller has a time or a newest update out of range";

@@ -157,7 +157,8 @@ static void drop_acknowledged(noack_sensor *sensor, int64_t count) {
         sensor->wait_ns = -1;
 }
 
-/* An acknowledgement is newer than all before it. */
+/* Acknowledgements arrive in order (older ones are rejected): the updates sent before this one are
+   dropped, too. */
 static int64_t handle_acknowledgement(
     noack_sensor *sensor, const noack_message *message, int64_t now_ns, noack_output *output) {
     noack_machine *machine = &sensor->machine;

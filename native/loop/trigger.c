@@ -17,8 +17,8 @@ static void set_z(int64_t n, const double *x, const double *e_s, double *z) {
 }
 
 /* Whether the error may have reached the threshold tau_s after an event at t_s. */
-static int is_reached(const noack_trigger_rule *rule, double size, double t_s, double tau_s) {
-    double speed = rule->mismatch_per_s * size + rule->disturbance_per_s;
+static int is_reached(const noack_trigger_rule *rule, double norm, double t_s, double tau_s) {
+    double speed = rule->mismatch_per_s * norm + rule->disturbance_per_s;
     double exponent = rule->growth_per_s * tau_s;
     if (LARGEST_EXPONENT < exponent)
         exponent = LARGEST_EXPONENT;
@@ -30,17 +30,17 @@ static int is_reached(const noack_trigger_rule *rule, double size, double t_s, d
     return speed * grown >= (rule->forecast_floor > faded ? rule->forecast_floor : faded);
 }
 
-double noack_forecast_ns(const noack_trigger_rule *rule, double size, double t_s) {
+double noack_forecast_ns(const noack_trigger_rule *rule, double norm, double t_s) {
     double shortest_ns = (double)rule->shortest_ns, longest_ns = (double)rule->longest_ns;
     double low_s = shortest_ns * 1e-9, high_s = longest_ns * 1e-9;
-    if (is_reached(rule, size, t_s, low_s))
+    if (is_reached(rule, norm, t_s, low_s))
         return shortest_ns;
-    if (!is_reached(rule, size, t_s, high_s))
+    if (!is_reached(rule, norm, t_s, high_s))
         return longest_ns;
     /* The error grows and the threshold does not, so there is one crossing. */
     for (int k = 0; k < HALVINGS && floor(low_s * 1e9) != floor(high_s * 1e9); k++) {
         double middle_s = (low_s + high_s) / 2;
-        if (is_reached(rule, size, t_s, middle_s))
+        if (is_reached(rule, norm, t_s, middle_s))
             high_s = middle_s;
         else
             low_s = middle_s;
@@ -63,8 +63,8 @@ void noack_trigger_condition(
     state->latest_ns = t_ns + rule->longest_ns;
     if (rule->forecasts) {
         const double *weight = rule->forecast_weight;
-        double size = weight == NULL ? noack_norm(n, x) : image_norm(n, n, weight, x, image);
-        state->latest_ns = t_ns + (int64_t)noack_forecast_ns(rule, size, (double)t_ns * 1e-9);
+        double norm = weight == NULL ? noack_norm(n, x) : image_norm(n, n, weight, x, image);
+        state->latest_ns = t_ns + (int64_t)noack_forecast_ns(rule, norm, (double)t_ns * 1e-9);
     }
 }
 

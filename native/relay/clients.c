@@ -110,9 +110,9 @@ static int32_t row_of(const noack_relay *relay, int64_t k) {
    together. */
 void touch_clients(noack_relay *relay) {
     relay_scratch *scratch = scratch_of(relay);
-    int64_t first_path = 2 * relay->links;
     uint64_t loaded = 0;
-    if (relay->client_rows <= FEW || scratch->batch_socket >= first_path || relay->devices)
+    if (relay->client_rows <= FEW || client_of_socket(relay, scratch->batch_socket) >= 0
+        || relay->devices)
         return;
     const noack_link *link = relay->directions[2 * scratch->batch_socket].link;
     for (int64_t k = scratch->batch_next; k < scratch->batch_end; k++)
@@ -121,7 +121,7 @@ void touch_clients(noack_relay *relay) {
         int64_t row = scratch->hints[k];
         if (row >= 0)
             loaded += (uint64_t)relay->clients[row].key[0] + (uint64_t)relay->clients[row].flow_row
-                      + (uint64_t)relay->sockets[first_path + row].fd;
+                      + (uint64_t)relay->sockets[socket_of_client(relay, row)].fd;
     }
     for (int64_t k = scratch->batch_next; k < scratch->batch_end; k++) {
         int64_t row = scratch->hints[k];

@@ -14,7 +14,7 @@ enum {
     IPV4_BYTES = 20,
     IPV6_BYTES = 40,
     MOST_EXTENSIONS = 8,
-    /* Places in the name of a flow. Near is the end inside. */
+    /* Places in the name of a flow; near: the end inside the shell. */
     VERSION = 0,
     PROTOCOL = 1,
     IS_FRAGMENT = 2,

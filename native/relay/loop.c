@@ -86,7 +86,7 @@ static void enqueue_departure(noack_relay *relay) {
     scratch->leaving_bytes += leaving->datagram.size_bytes;
     int64_t link = leaving->datagram.direction >> 1;
     if (direction->sends == NOACK_OWN_SOCKET)
-        leaving->socket = (int32_t)(2 * relay->links + leaving->datagram.client);
+        leaving->socket = (int32_t)socket_of_client(relay, leaving->datagram.client);
     else if (direction->sends == NOACK_CLIENT_NAME || direction->sends == NOACK_LISTENING_SOCKET)
         leaving->socket = (int32_t)link;
     else
@@ -146,20 +146,19 @@ static int64_t row_of_loop(noack_relay *relay, const uint8_t *data, int64_t size
 
    A datagram is refused if it and its copy might not fit into the store, if it comes from a client
    beyond the maximum number, or if it is of no loop of the run. */
-static int64_t client_of(noack_relay *relay, int64_t number, int64_t size_bytes) {
+static int64_t client_of(noack_relay *relay, int64_t direction, int64_t size_bytes) {
     relay_scratch *scratch = scratch_of(relay);
-    noack_direction *direction = &relay->directions[number];
+    noack_direction *own = &relay->directions[direction];
     const uint8_t *data = scratch->buffers[scratch->batch_next];
-    if (direction->keeps
-        && (relay->free_slots < 2 || relay->free_blocks < 2 * blocks_for(size_bytes))) {
+    if (own->keeps && (relay->free_slots < 2 || relay->free_blocks < 2 * blocks_for(size_bytes))) {
         if (!relay->no_memory)
             return NO_ROOM;
-        direction->errors[ENOMEM]++;
+        own->errors[ENOMEM]++;
         return REFUSED;
     }
-    int64_t row = scratch->batch_socket - 2 * relay->links;
-    if (!(number & 1) || relay->devices) {
-        noack_direction *forward = &relay->directions[number & ~INT64_C(1)];
+    int64_t row = client_of_socket(relay, scratch->batch_socket);
+    if (!(direction & 1) || relay->devices) {
+        noack_direction *forward = &relay->directions[direction & ~INT64_C(1)];
         row = find_sender(relay);
         if (row < 0 && !forward->full)
             return NO_CLIENT;
@@ -235,11 +234,11 @@ static void release(
 }
 
 /* Decide for the current datagram, of a client. */
-static void decide(noack_relay *relay, int64_t number, int64_t row, int64_t size_bytes) {
+static void decide(noack_relay *relay, int64_t direction, int64_t row, int64_t size_bytes) {
     relay_scratch *scratch = scratch_of(relay);
     noack_client *client = &relay->clients[row];
     const uint8_t *data = scratch->buffers[scratch->batch_next];
-    noack_link *link = relay->directions[number].link;
+    noack_link *link = relay->directions[direction].link;
     noack_decision decision;
     client->last_ns = relay->now_ns;
     serve(link, relay->waiting, relay->now_ns, relay->heap, &relay->heap_length);
@@ -249,22 +248,21 @@ static void decide(noack_relay *relay, int64_t number, int64_t row, int64_t size
         link, client->flow_row, max_of(size_bytes - headers_bytes(relay), 0), relay->now_ns,
         &decision);
     if (relay->taps)
-        report_arrival(relay, number, row, data, size_bytes, &decision);
+        report_arrival(relay, direction, row, data, size_bytes, &decision);
     if (relay->records)
-        record_packet(relay, number, row, data, &decision);
+        record_packet(relay, direction, row, data, &decision);
     if (decision.release_ns != NOACK_NEVER_NS)
-        release(relay, number, row, &decision, 0);
+        release(relay, direction, row, &decision, 0);
     if (decision.copy_ns != NOACK_NEVER_NS)
-        release(relay, number, row, &decision, 1);
+        release(relay, direction, row, &decision, 1);
     serve(link, relay->waiting, relay->now_ns, relay->heap, &relay->heap_length);
 }
 
 /* Decide for the datagrams received from one socket; return CARRY_ON, or why this ended. */
 static int64_t decide_batch(noack_relay *relay) {
     relay_scratch *scratch = scratch_of(relay);
-    int64_t link = scratch->batch_socket, reverse = link >= 2 * relay->links;
-    if (reverse)
-        link = relay->clients[scratch->batch_socket - 2 * relay->links].link;
+    int64_t client = client_of_socket(relay, scratch->batch_socket), reverse = client >= 0;
+    int64_t link = reverse ? relay->clients[client].link : scratch->batch_socket;
     if (relay->devices) {
         link = 0;
         reverse = scratch->batch_socket != 0;
@@ -421,7 +419,7 @@ int64_t noack_relay_run(noack_relay *relay, int64_t until_ns) {
         if (reason != NOACK_CARRY_ON || all_taken || BUFFERS - scratch->batch_end < FEW_BUFFERS) {
             if (scratch->leaving_count > 0)
                 sent_ns = send_all(relay);
-            scratch->pauses.worked |= sent_ns >= 0;
+            scratch->pauses.worked_since_wait |= sent_ns >= 0;
             if (reason == NOACK_LEAVING_FULL)
                 continue;
             if (reason != NOACK_CARRY_ON)
@@ -433,7 +431,7 @@ int64_t noack_relay_run(noack_relay *relay, int64_t until_ns) {
             int64_t wait_until_ns = waiting_ends_ns(relay, until_ns);
             if (wait_until_ns == INT64_MIN)
                 return NOACK_HOUSEKEEPING;
-            scratch->pauses.worked = 0;
+            scratch->pauses.worked_since_wait = 0;
             int in_receive = receiving_waits(relay, wait_until_ns);
             if (!(in_receive ? wait_and_receive(relay) : wait_for_datagrams(relay, wait_until_ns)))
                 return NOACK_INTERRUPTED;

@@ -9,10 +9,10 @@
 #include "../core.h"
 
 enum {
-    BUFFERS = 128,
-    READY = 64,
-    LEAVING = 256,
-    ERRORS = 16,
+    BUFFERS = 128,                    /* datagrams received at once */
+    READY = 64,                       /* sockets that one epoll call reports */
+    LEAVING = 256,                    /* datagrams that wait to be sent */
+    ERRORS = 16,                      /* error-queue messages read at once */
     VECTORS = 1024,                   /* maximum number of vectors in one call */
     FEW_BYTES = 256,                  /* copying them costs less than a vector of their own */
     MOST_BYTES = 65536,               /* no received datagram is longer */
@@ -70,6 +70,16 @@ typedef struct {
 } relay_scratch;
 
 static inline relay_scratch *scratch_of(const noack_relay *relay) { return relay->scratch; }
+
+/* The clients' sockets follow those of the links (listening, then sending). */
+static inline int64_t socket_of_client(const noack_relay *relay, int64_t client) {
+    return 2 * relay->links + client;
+}
+
+/* Below 0: the socket is a link's. */
+static inline int64_t client_of_socket(const noack_relay *relay, int64_t socket) {
+    return socket - 2 * relay->links;
+}
 
 /* store.c: delayed datagrams. */
 int64_t blocks_for(int64_t size_bytes);

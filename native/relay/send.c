@@ -55,7 +55,7 @@ static int64_t icmp_error(struct msghdr *message) {
    to find out whether an ICMP error caused the failure. */
 int64_t take_errors(noack_relay *relay, int64_t socket) {
     relay_scratch *scratch = scratch_of(relay);
-    int64_t found = 0;
+    int64_t found = 0, client = client_of_socket(relay, socket);
     int taken = relay->devices ? 0 : ERRORS, fd = relay->sockets[socket].fd;
     while (taken == ERRORS) {
         for (int k = 0; k < ERRORS; k++) {
@@ -67,8 +67,8 @@ int64_t take_errors(noack_relay *relay, int64_t socket) {
         for (int k = 0; k < taken; k++) {
             int64_t error = icmp_error(&scratch->error_headers[k].msg_hdr), link = -1;
             found += error != 0;
-            if (socket >= 2 * relay->links)
-                link = relay->clients[socket - 2 * relay->links].link;
+            if (client >= 0)
+                link = relay->clients[client].link;
             else if (socket >= relay->links)
                 link = socket - relay->links;
             if (error == ECONNREFUSED && link >= 0)
