@@ -99,17 +99,6 @@ int64_t noack_simulated_ns_of(const noack_clock *clock, int64_t wall_ns);
 int64_t clock_ns(int clock);
 int64_t run_time_ns(const noack_clock *clock);
 
-typedef struct {               /* of a driver that returns to Python for housekeeping */
-    int64_t worked_since_wait; /* 1: it has worked since it last waited */
-    int64_t worked_since_due;  /* 1: it has worked since housekeeping became due */
-} pauses;
-
-/* clock.c: how long to put off housekeeping that has been due for a time; 0: not at all. next_ns:
-   the time until the next tick or departure. has_more: datagrams wait. is_busy: no pause is to be
-   expected. All times are those of a clock on the wall. */
-int64_t noack_put_off_ns(
-    pauses *pauses, int64_t overdue_ns, int64_t next_ns, int has_more, int is_busy);
-
 /* guarantee.c */
 int counts_losses(const noack_link *link);
 int64_t make_stale(const noack_link *link, int64_t row, int64_t packet, int64_t release_ns);

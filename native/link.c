@@ -99,7 +99,19 @@ static const noack_recorded *recorded_for(const noack_link *link, const noack_fl
     return place < link->decisions_begin[flow->number + 1] ? &link->decisions[place] : NULL;
 }
 
-/* Drop a delayed packet or its copy if it needs more than the free places in flight. */
+/* Swap a packet and its copy if the copy leaves first. */
+static void order_copies(noack_decision *decision) {
+    if (decision->copy_ns == NOACK_NEVER_NS || decision->copy_ns >= decision->release_ns)
+        return;
+    int64_t time_ns = decision->release_ns, bit = decision->bit;
+    decision->release_ns = decision->copy_ns;
+    decision->copy_ns = time_ns;
+    decision->bit = decision->copy_bit;
+    decision->copy_bit = bit;
+}
+
+/* Drop a delayed packet or its copy if it needs more than the free places in flight. A packet that
+   is lost, by this or before, has neither times nor flipped bits. */
 static void keep_limit(int64_t free, noack_decision *decision) {
     int64_t now_ns = decision->arrival_ns;
     if (decision->release_ns > now_ns && free <= 0)
@@ -107,13 +119,9 @@ static void keep_limit(int64_t free, noack_decision *decision) {
     if (decision->fate != NOACK_DELIVERED) {
         decision->release_ns = decision->copy_ns = NOACK_NEVER_NS;
         decision->bit = decision->copy_bit = -1;
-    } else if (decision->copy_ns != NOACK_NEVER_NS && decision->copy_ns < decision->release_ns) {
-        int64_t time_ns = decision->release_ns, bit = decision->bit;
-        decision->release_ns = decision->copy_ns;
-        decision->copy_ns = time_ns;
-        decision->bit = decision->copy_bit;
-        decision->copy_bit = bit;
+        return;
     }
+    order_copies(decision);
     if (decision->copy_ns > now_ns && free < (decision->release_ns > now_ns ? 2 : 1)) {
         decision->copy_ns = NOACK_NEVER_NS;
         decision->copy_bit = -1;

@@ -819,6 +819,17 @@ int64_t noack_clock_at_ns(const noack_clock *clock, int64_t own_ns);
    clock. */
 int64_t noack_clock_wait_ns(const noack_clock *clock, int64_t simulated_ns);
 
+typedef struct { /* of a driver that returns to Python for housekeeping */
+    int64_t worked_since_wait; /* 1: it has worked since it last waited */
+    int64_t worked_since_due;  /* 1: it has worked since housekeeping became due */
+} noack_pauses;
+
+/* How long to put off housekeeping that has been due for a time; 0: not at all. next_ns: the time
+   until the next tick or departure. has_more: datagrams wait. is_busy: no pause is to be expected.
+   All times are those of a clock on the wall. */
+int64_t noack_put_off_ns(
+    noack_pauses *pauses, int64_t overdue_ns, int64_t next_ns, int64_t has_more, int64_t is_busy);
+
 /* ---- The wire format (docs/wire.md) ---------------------------------------------------------- */
 
 enum {

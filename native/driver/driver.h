@@ -45,7 +45,7 @@ typedef struct {
     int64_t batch;             /* datagrams that one call receives */
     int64_t timer_ns;          /* when the timer expires, on the monotonic clock */
     int8_t out_flows[BUFFERS]; /* the sockets of what waits to be sent */
-    pauses pauses;
+    noack_pauses pauses;
     int64_t has_more;  /* 1: a socket may have more datagrams than were received */
     int64_t first;     /* the socket that is read first the next time */
     int64_t has_asked; /* 1: the present step has asked Python */

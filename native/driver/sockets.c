@@ -135,9 +135,12 @@ void send_datagrams(noack_driver *driver) {
             driver->sent += sent;
             k += sent;
             has_failed = 0;
-        } else if (errno != EINTR && !(has_failed ^= 1)) {
+        } else if (errno != EINTR && !has_failed) {
+            has_failed = 1;
+        } else if (errno != EINTR) {
             driver->errors[errno & (NOACK_ERRNOS - 1)]++;
             k++;
+            has_failed = 0;
         }
     }
     scratch->out_count = scratch->sealed_count = 0;

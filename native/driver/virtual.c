@@ -153,18 +153,16 @@ static int64_t receive(noack_simulation *simulation, int64_t role, noack_datagra
     int64_t examination = noack_wire_examine_message(reception, FROM_PEER, message);
     if (message->entries != reception->entries)
         examination = NOACK_BAD_LENGTH;
+    noack_process *process = simulation->processes[role];
     if (examination == NOACK_ACCEPTED) {
-        noack_process *process = simulation->processes[role];
         int64_t question = noack_process_handle(process, message, simulation->now_ns);
         if (question != NOACK_DONE)
             return ask(simulation, role, question);
-        noack_wire_count(reception, examination, message);
-        remove_first(simulation);
-        send(simulation, &process->output);
-        return NOACK_DONE;
     }
     noack_wire_count(reception, examination, message);
     remove_first(simulation);
+    if (examination == NOACK_ACCEPTED)
+        send(simulation, &process->output);
     return NOACK_DONE;
 }
 

@@ -61,7 +61,7 @@ typedef struct {
     int64_t real_ns;       /* the real-time clock at the last receiving of datagrams */
     int64_t stamps;        /* 1: the kernel adds arrival timestamps */
     int64_t control_bytes; /* buffer for received control messages; 0: none */
-    pauses pauses;         /* work is sending */
+    noack_pauses pauses;   /* work is sending */
     int64_t is_busy;       /* 1: the next datagrams may come together */
     int64_t has_more;      /* 1: as many as could be received were; others may wait */
     int64_t due_since_ns;  /* since when housekeeping has been due; 0: it is not */

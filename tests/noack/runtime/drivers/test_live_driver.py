@@ -47,7 +47,7 @@ def measurements(count: int, loops: int = 1) -> list[Message]:
     ]  # fmt: skip
 
 
-UDP_SEGMENT, UDP_GRO = 103, 104
+SO_NO_CHECK, UDP_SEGMENT, UDP_GRO = 11, 103, 104
 DATAGRAM_BYTES = 32 + 2 * 8 + 16
 
 
@@ -80,6 +80,20 @@ def test_messages_of_loops_that_tick_together_are_sent_together(content: dict[st
         sizes = [len(datagram) for datagram in received(live.peer, 65_536)]
         assert max(sizes) == 64 * DATAGRAM_BYTES
         assert sum(sizes) == live.driver.core.sent * DATAGRAM_BYTES
+
+
+@pytest.mark.sanitized
+def test_they_are_sent_singly_if_the_kernel_refuses_to_segment(content: dict[str, Any]) -> None:
+    """Linux refuses it on a socket that sends without checksums, on every interface."""
+    with closing(Live("plant", [scenario(content)] * 50, since_ns=HOUR_NS)) as live:
+        with socket.socket(fileno=os.dup(live.driver.core.senders[0])) as sender:
+            sender.setsockopt(socket.SOL_SOCKET, SO_NO_CHECK, 1)
+        live.peer.setsockopt(socket.IPPROTO_UDP, UDP_GRO, 1)
+        live.drive(lambda: live.driver.core.sent + sum(live.driver.core.errors) >= 500)
+        sizes = [len(datagram) for datagram in received(live.peer, 65_536)]
+        assert sizes == [DATAGRAM_BYTES] * live.driver.core.sent
+        live.channel.finish(0, live.rows)
+        assert live.channel.report()["send_errors"] == {}
 
 
 @pytest.mark.sanitized
