@@ -292,12 +292,12 @@ def read_fates(path: Path, links: Sequence[str] | None = None) -> Fates:
             is_here = (columns["link"] == link) & (columns["direction"] == direction)
             rows = {name: column[is_here] for name, column in columns.items()}
             decisions[link, direction] = _flows(rows, len(table), f"{path}: {link} {direction}")
-            recorded: _Direction = getattr(settings[link], direction)
-            guarantees[link, direction] = dict(recorded) if _is_kept(recorded, rows) else {}
+            recorded: _RecordedDirection = getattr(settings[link], direction)
+            guarantees[link, direction] = dict(recorded) if _keeps_guarantee(recorded, rows) else {}
     return Fates(decisions, guarantees)
 
 
-def _is_kept(settings: "_Direction", rows: Mapping[str, NDArray[np.int64]]) -> bool:
+def _keeps_guarantee(settings: "_RecordedDirection", rows: Mapping[str, NDArray[np.int64]]) -> bool:
     """Whether the losses of each flow are allowed, not counting those out of order."""
     losses = rows["consecutive_losses"]
     if settings.mansd is not None and losses.max(initial=0) > settings.mansd:
@@ -350,7 +350,7 @@ def _missing(path: Path, count: int | str) -> CallerError:
     return CallerError(f"{path}: {count} events are missing; an incomplete trace cannot be replayed")
 
 
-class _Direction(BaseModel):
+class _RecordedDirection(BaseModel):
     mansd: Mansd | None
     constraints: Constraints = ()
 
@@ -362,8 +362,8 @@ class _Direction(BaseModel):
 
 class _Link(BaseModel):
     name: str
-    forward: _Direction
-    reverse: _Direction
+    forward: _RecordedDirection
+    reverse: _RecordedDirection
 
 
 class _FormatHeader(BaseModel):

@@ -136,7 +136,7 @@ class LinkState:
             settings: the new settings.
             latest_ns: (rows,) last departure time of the packets in flight of each flow; −1: none.
         """
-        earlier = self._memory, self._stages
+        earlier = self._memory, self._stages  # kept alive until the core has read it
         try:
             changed = self._new_link(settings, self.rows, tracks=self.tracks)
         except ValueError:  # the link goes on as it was
@@ -145,7 +145,6 @@ class LinkState:
         core.noack_link_change(self.core, changed, pointer_to(latest_ns, "int64_t *"))
         self.core[0] = changed[0]
         self.settings = settings
-        del earlier  # the core has read the earlier state
 
     def _new_link(self, settings: LinkSettings, rows: int, *, tracks: bool) -> CData:
         """Return a new ``noack_link`` of these settings, which shares the array of flows."""

@@ -40,7 +40,7 @@ _SPIN_NS = 50_000
 
 
 class RelayedProgram(Protocol):
-    """What a relay is for: it runs as long as this does."""
+    """A program that the relay serves: the relay runs until it ends."""
 
     devices: DeviceLink
 

@@ -21,6 +21,7 @@ _FRESH_S = 0.1
 """Newer statistics answer a further request, so that frequent readers do not load the relay."""
 
 _LABELS = ["link", "direction"]
+# By the metric's name: key of the statistics, label of a further key, text.
 _OF_LINK = {
     "refused_datagrams": ("refused", "datagrams of clients beyond the limit"),
     "discarded_datagrams": ("discarded", "datagrams that no client waits for"),
@@ -58,7 +59,6 @@ _TIMES = {
     "delay_seconds": ("delay_ns", "time in the emulator, quantiles since its start"),
     "lateness_seconds": ("lateness_ns", "lateness of the emulator, quantiles since its start"),
 }
-"""By the metric's name: key of the statistics, label of a further key, text."""
 _QUANTILES = {"p50": "0.5", "p99": "0.99", "p999": "0.999", "max": "1"}
 _Rows = Iterable[tuple[list[str], float | None]]
 """Values by their labels; None: not known."""

@@ -21,6 +21,7 @@ NOT_FOUND = 127
 """Exit status of a shell whose program cannot be started."""
 _DEATH_SIGNAL, _SUBREAPER, _AMBIENT = 1, 36, 47
 """Requests of prctl: PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER, PR_CAP_AMBIENT."""
+_AMBIENT_RAISE = 2
 _CAPABILITIES, _VERSION = 41, 0x20080522
 """Number of capabilities of Linux, and the version of the structures of capset."""
 _GRACE_S = 2.0
@@ -68,7 +69,7 @@ def enter_namespaces() -> None:
     call("capset", head, struct.pack("=6I", *words))
     for capability in range(_CAPABILITIES):
         with suppress(OSError):  # the kernel has fewer
-            call("prctl", _AMBIENT, 2, capability, 0, 0)
+            call("prctl", _AMBIENT, _AMBIENT_RAISE, capability, 0, 0)
 
 
 def children(parent: int) -> set[int]:
