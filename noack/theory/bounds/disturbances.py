@@ -249,7 +249,7 @@ class EstimationError:
         """L_k until it has settled, (k, n, p).
 
         Raises:
-            NotDecayingError: it does not settle in so many measurements.
+            NotDecayingError: it does not settle in ``_MOST_GAINS`` measurements.
         """
         assert self._resolved.observer is not None
         gains: list[Matrix] = []

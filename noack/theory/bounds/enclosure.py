@@ -494,7 +494,7 @@ def _propagate(generator: Matrix, state: Matrix, step_s: Stack, cells: int) -> S
 
 @cached_function(8)
 def _powers(generator: Matrix, step_s: Stack, least: int) -> tuple[Stack, Matrix]:
-    """Return e^{G k s} for k < 2^j, at least so many, and e^{G 2^j s}.
+    """Return e^{G k s} for k < 2^j, where 2^j ≥ ``least``, and e^{G 2^j s}.
 
     Several responses follow each other with the same steps.
     """

@@ -36,7 +36,7 @@ from noack.theory.certificates.solution import Problem, Search, sharpened
 PlantAt = Callable[[ErrorGains, Matrix, float], PlantGains]
 """Returns the plant's gains from the gains of the models, the start of x, and α."""
 _CHORD_ROUNDS = 2
-"""So often the chord of a threshold is shortened by the bound of x that it has given."""
+"""Number of rounds that shorten the chord of the threshold by the last bound of x."""
 _RATE_SHARES = (0.7, 0.4, 0.2, 0.05)
 """Rates that are tried, as shares of the loop's decay rate."""
 SHARES = (0.5, 0.2, 0.8)
@@ -130,8 +130,8 @@ class DisturbedCertificate:
         is_divided = not self.trigger.beta and not self.trigger.area and not self.start_error
         divided: list[Added] = []
         if decays and is_divided and longest:
-            apart_s = constants.inter_event_s or 0.0
-            divided = yield from self._of_constant_threshold(conditions, apart_s)
+            inter_event_s = constants.inter_event_s or 0.0
+            divided = yield from self._of_constant_threshold(conditions, inter_event_s)
         return [*divided, Added(constants)]
 
     def with_plants(
@@ -144,15 +144,17 @@ class DisturbedCertificate:
             return [(plant, decaying)]
         return [(self._plant(decaying.rate_per_s), decaying), (self._persistent.plant, persistent)]
 
-    def _of_constant_threshold(self, conditions: NetworkConditions, apart_s: float) -> Search[list[Added]]:
+    def _of_constant_threshold(
+        self, conditions: NetworkConditions, inter_event_s: float
+    ) -> Search[list[Added]]:
         """Search for the constants of what follows from the start, and of what persists, if any.
 
         There is one pair for each bound of e_s that suffices, that with the smallest ultimate bound
-        first. The threshold has no rate; that of :func:`choose_rate` is taken. ``apart_s`` is a
+        first. The threshold has no rate; that of :func:`choose_rate` is taken. ``inter_event_s`` is a
         lower bound of the inter-event time, certified without dividing into parts.
         """
         pairs: list[Added] = []
-        for start_bound, persistent_bound in self.trigger.divide(conditions, apart_s):
+        for start_bound, persistent_bound in self.trigger.divide(conditions, inter_event_s):
             with contextlib.suppress(NoCertificateError, NotDecayingError):
                 pairs.append((yield from self._divided(start_bound, persistent_bound, conditions)))
         return sorted(pairs, key=lambda pair: 0.0 if pair.persistent is None else pair.persistent.state)

@@ -274,15 +274,15 @@ class CertificateScope:
             solved = yield from self._solve_inequalities(conditions, longest=True)
         except (NoCertificateError, NotDecayingError) as error:
             solved, void = [], error
-        apart_s = max((main.inter_event_s or 0.0 for main, *_ in solved), default=0.0)
-        timed = self._constants_from_due_times(conditions, apart_s)
+        inter_event_s = max((main.inter_event_s or 0.0 for main, *_ in solved), default=0.0)
+        timed = self._constants_from_due_times(conditions, inter_event_s)
         if timed is None:
             if not solved:
                 raise void
             return solved
-        apart_s = max(apart_s, timed.inter_event_s or 0.0)
+        inter_event_s = max(inter_event_s, timed.inter_event_s or 0.0)
         useful = [phases for phases in solved if not _is_within(timed, phases.main)]
-        return [Phases(timed._replace(inter_event_s=apart_s)), *useful]
+        return [Phases(timed._replace(inter_event_s=inter_event_s)), *useful]
 
     def _solve_inequalities(self, conditions: NetworkConditions, *, longest: bool) -> Search[list[Phases]]:
         """Search for the constants that solve the inequalities.
@@ -296,16 +296,18 @@ class CertificateScope:
         except (OverflowError, np.linalg.LinAlgError):
             raise NoCertificateError(_TOO_LARGE) from None
 
-    def _constants_from_due_times(self, conditions: NetworkConditions, apart_s: float) -> Constants | None:
+    def _constants_from_due_times(
+        self, conditions: NetworkConditions, inter_event_s: float
+    ) -> Constants | None:
         """Return constants that follow from the times of deliveries alone, if they exist.
 
-        ``apart_s``: events are known to be that far apart.
+        ``inter_event_s`` is a known lower bound of the inter-event time.
         """
-        deliveries = next(self._deliveries(conditions, _TIMED_RATES, apart_s), None)
+        deliveries = next(self._deliveries(conditions, _TIMED_RATES, inter_event_s), None)
         return None if deliveries is None else deliveries.constants(self._trigger.beta or 1.0)
 
     def _deliveries(
-        self, conditions: NetworkConditions, shares: Sequence[float], apart_s: float = 0.0
+        self, conditions: NetworkConditions, shares: Sequence[float], inter_event_s: float = 0.0
     ) -> Iterator[Deliveries]:
         """Yield what is known of the deliveries where events are due, for each rate that is tried."""
         trigger, loop = self._trigger, self._loop
@@ -320,7 +322,7 @@ class CertificateScope:
             if plant.is_one_plant:
                 with contextlib.suppress(NoCertificateError, NotDecayingError, np.linalg.LinAlgError):
                     bound = trigger.bound(tested, 0.0, None)
-                    least_s = max(bound.times.shortest_s, apart_s)
+                    least_s = max(bound.times.shortest_s, inter_event_s)
                     bound = bound._replace(times=bound.times._replace(shortest_s=least_s))
                     yield Deliveries(plant, tested, bound)
 

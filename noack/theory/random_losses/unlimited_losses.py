@@ -51,7 +51,7 @@ _CLEARLY_BELOW_1 = 0.9
 """A loop gain that is clearly below 1."""
 
 
-def moment_at_events(error: ErrorGains, losses: LossProcess, spacing_s: float, order: int) -> float:
+def moment_at_events(error: ErrorGains, losses: LossProcess, inter_event_s: float, order: int) -> float:
     """Bound (E(‖e_c‖_W e^{αt}/β)ʳ)^{1/r} just before an event of the continuous trigger.
 
     If exactly the last J updates are lost, ‖e_c‖_W e^{αt}/β ≤ S_J = 1 + g_1 + … + g_J with g_j =
@@ -62,7 +62,7 @@ def moment_at_events(error: ErrorGains, losses: LossProcess, spacing_s: float, o
     Args:
         error: the gains of the models.
         losses: the losses.
-        spacing_s: δ, a lower bound of the inter-event time; 0 is always valid.
+        inter_event_s: δ, a lower bound of the inter-event time; 0 is always valid.
         order: r.
 
     Raises:
@@ -72,7 +72,7 @@ def moment_at_events(error: ErrorGains, losses: LossProcess, spacing_s: float, o
     tails, longest = losses.tails(_TERMS)
     if not longest < 1:
         raise NoCertificateError("bursts of losses may be arbitrarily long")
-    gains = error.kernels[Output.WEIGHTED].sups(spacing_s * np.arange(1.0, _TERMS + 1))
+    gains = error.kernels[Output.WEIGHTED].sups(inter_event_s * np.arange(1.0, _TERMS + 1))
     sums = 1.0 + np.cumsum(np.append(0.0, gains))
     # Number kN + j, j ≤ N, adds at most r g_N ((k + 1) S_N)^{r−1}; P(J ≥ kN + j) ≤ longestᵏ P(J ≥ j).
     later = (1 - longest) ** -order - 1  # Σ_{k≥1} (k + 1)^{r−1} longestᵏ
@@ -204,10 +204,10 @@ def _bursts(
     for longest in range(_MOST_BURST + 1):
         # The certificate of at most so many losses in a row, and how likely a run keeps to that.
         certificate = scope.certificate(conditions._replace(dropouts=longest, constraints=()))
-        constants, spacing_s = certificate.constants, certificate.inter_event_s
-        if constants is None or not spacing_s:
+        constants, inter_event_s = certificate.constants, certificate.inter_event_s
+        if constants is None or not inter_event_s:
             break
-        probability = kept_probability(resolved, LossGuarantee((LongestBurst(longest),)), spacing_s)
+        probability = kept_probability(resolved, LossGuarantee((LongestBurst(longest),)), inter_event_s)
         if probability is None:
             break
         controller_error, state = (
@@ -222,7 +222,7 @@ def _bursts(
             BurstCertificate(
                 longest,
                 probability,
-                most_events(resolved, spacing_s),
+                most_events(resolved, inter_event_s),
                 delta,
                 rate_per_s,
                 controller_error,
