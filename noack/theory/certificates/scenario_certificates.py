@@ -26,7 +26,7 @@ from noack.theory.bounds.certificate_terms import (
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, PlantGains, error_gains, first_equal
 from noack.theory.bounds.trigger_bounds import TriggerBounds
-from noack.theory.certificates.assumptions import below, certificate_assumptions
+from noack.theory.certificates.assumptions import certificate_assumptions, is_below_decay_rate
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import BOX, OWN_PLANT, kept_probability, void_by_safe_input
 from noack.theory.certificates.deliveries.due_deliveries import Deliveries
@@ -338,7 +338,7 @@ class CertificateScope:
     def _disturbed_phases(self, conditions: NetworkConditions, *, longest: bool) -> Search[list[Phases]]:
         """Search for the constants, and those to be added under persistent disturbances."""
         alpha = self._trigger.alpha_per_s
-        decays = not self._models_hold and below(alpha, min(self.decay_per_s.values()))
+        decays = not self._models_hold and is_below_decay_rate(alpha, min(self.decay_per_s.values()))
         search = self._disturbed.constants(conditions, decays=decays, longest=longest)
         pairs = yield from search
         return [self._checked(Phases(main, persistent=added)) for main, added in pairs]
@@ -373,7 +373,7 @@ class CertificateScope:
                 with contextlib.suppress(NoCertificateError):
                     return (yield from self._solve(conditions, 0.0, 0.0, None, longest=False))
             return (yield from self._fastest(conditions, decay))
-        if not self._models_hold and below(alpha, decay) and floor < beta:
+        if not self._models_hold and is_below_decay_rate(alpha, decay) and floor < beta:
             try:
                 return (yield from self._solve(conditions, alpha, beta, beta, longest=longest))
             except NotDecayingError:
