@@ -123,7 +123,7 @@ class Growth(NamedTuple):
         cells = self.forced.shape[-1]
         # A time that is a node but for rounding counts as that node.
         nodes = np.sort(np.ceil(times_s / times_s.max() * cells * (1 - 1e-9)))
-        # The share of the times that are after the begin of each cell.
+        # The share of the times that are after the start of each cell.
         weights = 1 - np.searchsorted(nodes, np.arange(cells), side="right") / len(nodes)
         by_input, mismatched = (np.asarray(k.area @ weights) for k in (self.input_error, self.mismatch))
         return by_input, mismatched, np.asarray(self.forced @ weights)

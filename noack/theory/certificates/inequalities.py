@@ -83,11 +83,11 @@ def solve_inequalities(F: Matrix, g: Vector) -> Solution:
     # A signal that is 0 affects nothing.
     F = np.where((F.any(axis=-1) | (g > 0))[..., None, :], F, 0.0)
     # A right side of the size of x makes w/x dimensionless.
-    scales = g + _applied(F, g + _applied(F, g))
+    scales = g + _apply(F, g + _apply(F, g))
     least = np.where(scales > 0, scales, np.inf).min(axis=-1, keepdims=True)
     right = np.where(scales > 0, scales, np.where(np.isfinite(least), least, 1.0))
     remainder = np.eye(size) - F
-    minor, x, w = _eliminated(remainder, g, right)
+    minor, x, w = _eliminate(remainder, g, right)
     loop_gain = np.asarray(1 - minor)
     is_small = loop_gain < 1
     if not is_small.all():  # the elimination ends too early there
@@ -100,7 +100,7 @@ def solve_inequalities(F: Matrix, g: Vector) -> Solution:
         loop_gain[large] = np.where(is_finite, np.maximum(gains.max(axis=-1), 1.0), np.inf)
     # F w < w is confirmed with all rounding, and x is raised until x − F x ≥ g.
     rounding = (size + 4) * _EPSILON
-    F_x, F_w = _applied(F, x), _applied(F, w)
+    F_x, F_w = _apply(F, x), _apply(F, w)
     slack = w - F_w - rounding * (w + F_w)
     shortfall = F_x + g - x + rounding * (F_x + g + x)
     largest = np.maximum((shortfall / slack).max(axis=-1, keepdims=True), 0.0)
@@ -109,11 +109,11 @@ def solve_inequalities(F: Matrix, g: Vector) -> Solution:
     return Solution(loop_gain, np.where(confirmed[..., None], bound, np.inf))
 
 
-def _applied(F: Matrix, v: Vector) -> Vector:
+def _apply(F: Matrix, v: Vector) -> Vector:
     return np.asarray((F @ v[..., None])[..., 0])
 
 
-def _eliminated(matrix: Matrix, *right_sides: Vector) -> tuple[Vector, ...]:
+def _eliminate(matrix: Matrix, *right_sides: Vector) -> tuple[Vector, ...]:
     """Return the smallest leading principal minor, (…), and the solutions, (…, k).
 
     Minors after the first one not above 0 are left out; the solutions are then of no use. The
@@ -212,7 +212,7 @@ class ErrorInequalities:
         smallest = np.min([bound for _, _, bound in solved], axis=0)
         gain = np.where(is_counted, np.min([gain for _, gain, _ in solved], axis=0), np.inf)
         by_bound = []
-        for signals, _, bound in solved:  # each b is another one
+        for signals, _, bound in solved:  # b differs from bound to bound
             bound = np.where(_UNIT[Signal.AFTER_TEST] == 1, bound, smallest)
             by_bound.append(self._implied_bounds(signals, events, gain, bound, is_counted))
         exists = np.any([constants.exists for constants in by_bound], axis=0)

@@ -156,10 +156,10 @@ class CertificateScope:
         self._trigger = trigger_bounds(resolved, starts_on_grid=start_error is None)
         # Where events have a due time, a missed update is missed for a limited time.
         due = self._trigger.has_due_time
-        self._models_hold = not self._loop.H.any() and not due
-        decays = math.inf if self._models_hold or due else -spectral_abscissa(self._loop.H)
+        self._models_are_constant = not self._loop.H.any() and not due
+        decays = math.inf if self._models_are_constant or due else -spectral_abscissa(self._loop.H)
         self.decay_per_s = {"the models": decays, "A + BK": -spectral_abscissa(closed_loop)}
-        """Decay rates; that of the models is infinite if they hold."""
+        """Decay rates; that of the models is infinite if they are constant."""
         assert start is None or self.is_simple  # other starts are those of the scenario
         self._plant_at = plant_at
         self._plants: dict[float, PlantGains] = {}
@@ -256,7 +256,7 @@ class CertificateScope:
             gain = math.inf
         else:
             return max(phase.loop_gain for phase in constants[0] if phase is not None)
-        # The slowest rate asks for least.
+        # A certificate exists most easily for the slowest rate.
         return next((deliveries.gain for deliveries in self._deliveries(conditions, _TIMED_RATES[-1:])), gain)
 
     def _decay_under(self, conditions: NetworkConditions) -> Mapping[str, float]:
@@ -338,7 +338,7 @@ class CertificateScope:
     def _disturbed_phases(self, conditions: NetworkConditions, *, longest: bool) -> Search[list[Phases]]:
         """Search for the constants, and those to be added under persistent disturbances."""
         alpha = self._trigger.alpha_per_s
-        decays = not self._models_hold and is_below_decay_rate(alpha, min(self.decay_per_s.values()))
+        decays = not self._models_are_constant and is_below_decay_rate(alpha, min(self.decay_per_s.values()))
         search = self._disturbed.constants(conditions, decays=decays, longest=longest)
         pairs = yield from search
         return [self._checked(Phases(main, persistent=added)) for main, added in pairs]
@@ -373,7 +373,7 @@ class CertificateScope:
                 with contextlib.suppress(NoCertificateError):
                     return (yield from self._solve(conditions, 0.0, 0.0, None, longest=False))
             return (yield from self._fastest(conditions, decay))
-        if not self._models_hold and is_below_decay_rate(alpha, decay) and floor < beta:
+        if not self._models_are_constant and is_below_decay_rate(alpha, decay) and floor < beta:
             try:
                 return (yield from self._solve(conditions, alpha, beta, beta, longest=longest))
             except NotDecayingError:
@@ -381,7 +381,7 @@ class CertificateScope:
                     raise
                 return (yield from self._slower(conditions, alpha))
         # Certify a slower decay or none; the smallest event level is then the floor, if any.
-        slower = 0.0 if self._models_hold or floor > 0 else max(_SLOWER * decay, 0.0)
+        slower = 0.0 if self._models_are_constant or floor > 0 else max(_SLOWER * decay, 0.0)
         level = max(beta, floor)
         return (yield from self._solve(conditions, slower, level, floor or None, longest=longest))
 
@@ -396,7 +396,7 @@ class CertificateScope:
             return ((yield from self._solve(conditions, rate_per_s, 0.0, None)),)
 
         # Inputs of an earlier run are bounded without a rate.
-        if not self._models_hold and 0 < decay < math.inf and self._start_error == 0.0:
+        if not self._models_are_constant and 0 < decay < math.inf and self._start_error == 0.0:
             with contextlib.suppress(NotDecayingError, NoCertificateError):
                 (constants,) = yield from choose_rate(at_rate, decay, self._loop.x0, self._start)
                 return constants

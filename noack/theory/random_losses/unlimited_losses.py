@@ -205,7 +205,7 @@ def _bursts(
 ) -> list[BurstCertificate]:
     certificates: list[BurstCertificate] = []
     for longest in range(_MOST_BURST + 1):
-        # The certificate of at most so many losses in a row, and how likely a run keeps to that.
+        # The certificate for at most ``longest`` consecutive losses, and how likely a run keeps to that.
         certificate = scope.certificate(conditions._replace(dropouts=longest, constraints=()))
         constants, inter_event_s = certificate.constants, certificate.inter_event_s
         if constants is None or not inter_event_s:

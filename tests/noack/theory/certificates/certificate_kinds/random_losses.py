@@ -66,7 +66,7 @@ def certify(loop: RandomLoop, *, share: float = 1.0, **changes: float) -> Bounds
 
 
 def simulate_runs(loop: RandomLoop, rng: np.random.Generator, rate_share: float = 1.0) -> Observed:
-    """The largest mean squares over time, scaled at a share of α, each minus five standard errors."""
+    """The largest root mean squares over time, scaled at a share of α, each minus five standard errors."""
     system = loop.system
     lost = rng.uniform(size=(_RUNS, system.events)) < loop.probability
     if not system.known_start:

@@ -57,7 +57,7 @@ def loop() -> tuple[Reach, np.ndarray, float]:
 
 
 def bounds_of(reach: Reach, inter_event_s: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """The bounds by the flow, those without it, and the time between events."""
+    """The bounds by the flow, those without it, and the inter-event time that they imply."""
     each = np.full(LOSSES + 1, BETA)
     sensor = SensorErrors(each, BETA, 0.0, 0.0, BETA, integrates=False, earliest_due_s=math.inf)
     kernel = reach.ellipsoid.flow.error.kernels[Output.WEIGHTED]
