@@ -366,9 +366,9 @@ def moments_table(unlimited: UnlimitedLosses, error: str, beta: float) -> Result
         beta: β of the trigger, by which the bounds at events are multiplied.
     """
     bounds: list[tuple[str, float, int, float | None, float]] = []
-    if (mean_squares := unlimited.mean_squares) is not None:  # a mean is at most the root mean square
-        values = mean_squares.state, mean_squares.controller_error
-        bounds += [("at every time", mean_squares.rate_per_s, order, *values) for order in _MOMENT]
+    if (moments := unlimited.root_mean_squares) is not None:  # a mean is at most the root mean square
+        values = moments.state, moments.controller_error
+        bounds += [("at every time", moments.rate_per_s, order, *values) for order in _MOMENT]
     bounds += [
         *(("largest of a run", m.rate_per_s, m.order, m.state, m.controller_error) for m in unlimited.runs),
         *(
@@ -411,7 +411,7 @@ def sentences(unlimited: UnlimitedLosses) -> Iterator[str]:
     for conditions, rate_per_s in rates.items():
         if rate_per_s is not None:
             yield f"x decays almost surely{conditions}, at every rate below {at_least(rate_per_s, 3)} /s."
-    if unlimited.mean_squares or unlimited.bursts:
+    if unlimited.root_mean_squares or unlimited.bursts:
         yield (
             "These are statements about many runs: one run cannot violate a mean. The "
             "probabilities are bounds; a campaign shows the frequencies, and with the metrics "

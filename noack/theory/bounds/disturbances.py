@@ -1,9 +1,9 @@
 """Bounds of a scenario's disturbances and noise, and of the estimation error that they cause.
 
-They act as long as the run lasts. Normally distributed values have no bound. All that are used, and
-their sums in the state and in the estimation error, together exceed the assumed bounds in a run
-with at most the probability ``certificate.exceedance_probability``: each with that probability over
-their number.
+They act as long as the run lasts. Normally distributed values have no bound, so bounds are assumed
+for each of them, and for their sums in the state and in the estimation error. A run exceeds any of
+these bounds with at most the probability ``certificate.exceedance_probability``: each of them with
+that probability divided by their number.
 
 With an observer of gains L_k, and s steps of the plant between two measurements, e = x̂ − x is
 
@@ -41,11 +41,11 @@ from noack.theory.bounds.stacked_norms import (
 MISMATCH = "Â − A"
 """Name of the output by which the plant's steps differ from the model's."""
 _MOST_GAINS, _SETTLED = 1500, 1e-9
-"""Gains of an observer that are followed; the relative change of a settled one."""
+"""Maximum number of gains of an observer, and the relative change at which they have settled."""
 _MOST_STEPS, _TAIL_SHARE = 100_000, 1e-4
-"""Measurements over which sources are summed; the share that their remainder may be at the end."""
+"""Maximum number of measurements over which sources are summed, and largest share of the remainder."""
 _ENTRIES = 100_000
-"""Of the effects that are computed together."""
+"""Entries of the effects that are computed together."""
 _ROUNDING = 1 + 1e-6
 """Exceeds the rounding of sums over up to 100,000 measurements, as estimated."""
 
@@ -53,15 +53,15 @@ _ROUNDING = 1 + 1e-6
 class NormalBounds(NamedTuple):
     """Bounds of normal values that a run exceeds with at most some probability."""
 
-    each: float
-    """The probability of each to exceed its bound."""
+    probability: float
+    """The probability that one value exceeds its bound."""
 
     def radius(self, size: int) -> float:
         """Return the bound of ‖v‖ for independent standard normal values v, (size,)."""
         # Imported here because the import is slow.
         from scipy.special import chdtri
 
-        return math.sqrt(float(chdtri(size, self.each)))
+        return math.sqrt(float(chdtri(size, self.probability)))
 
     @property
     def limit(self) -> float:
@@ -184,7 +184,7 @@ class EstimationError:
 
     @cached_property
     def _radius(self) -> float:
-        """Bound of n standard normal values, of which e is a linear function; 0 if not needed."""
+        """Bound of ‖v‖ for n standard normal values v, of which e is a linear function; 0 if not needed."""
         bounds = normal_bounds(self._resolved)
         return 0.0 if bounds is None else bounds.radius(self._loop.n)
 
@@ -249,7 +249,7 @@ class EstimationError:
         """L_k until it has settled, (k, n, p).
 
         Raises:
-            NotDecayingError: it does not settle in so many measurements.
+            NotDecayingError: it does not settle in ``_MOST_GAINS`` measurements.
         """
         assert self._resolved.observer is not None
         gains: list[Matrix] = []
@@ -342,14 +342,14 @@ def _accumulated(C: Matrix, old: Stack, steps: Stack, sources: Stack) -> tuple[S
     Returns:
         Σ‖C S‖ before and after each step, (steps + 1,), and all effects at the end.
     """
-    waiting, sums = [old], []
+    pending, sums = [old], []
     for step, new in zip(steps, sources, strict=True):
         old = np.concatenate([product_along_last(step, old), _last_axis(new)], axis=2)
-        waiting.append(old)
-        if len(waiting) * old.size > _ENTRIES:
-            sums.append(_add_norms(C, waiting))
-            waiting = []
-    return np.concatenate([*sums, _add_norms(C, waiting)]), old
+        pending.append(old)
+        if len(pending) * old.size > _ENTRIES:
+            sums.append(_add_norms(C, pending))
+            pending = []
+    return np.concatenate([*sums, _add_norms(C, pending)]), old
 
 
 def _add_norms(C: Matrix, effects: list[Stack]) -> Stack:

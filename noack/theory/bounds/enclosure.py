@@ -61,7 +61,7 @@ _MOST_ENTRIES = 4_000_000
 """Largest number of entries of all matrices of a response. With many states there are fewer cells,
 and the looser bound beyond the grid applies earlier."""
 _TAIL_SHARE = 1e-5
-"""The grid ends where the bound of the rest is this share of the area so far."""
+"""The grid ends where the bound of the area beyond it is at most this share of its own area."""
 Name = TypeVar("Name", bound=str)
 Groups = Sequence[slice]
 """Groups of columns."""
@@ -101,7 +101,7 @@ class KernelBounds:
 
     @cached_property
     def _from_cell(self) -> Stack:
-        """Sup of k from the begin of each cell on."""
+        """Sup of k from the start of each cell on."""
         tail = np.broadcast_to(self.tail_highest, self.highest.shape[:-1])[..., None]
         values = np.concatenate([self.highest, tail], axis=-1)[..., ::-1]
         return np.maximum.accumulate(values, axis=-1)[..., ::-1]
@@ -141,11 +141,11 @@ def cells_at(edges_s: Stack, t_s: Stack) -> NDArray[np.intp]:
     return cells - 1
 
 
-def take_rows(values: Stack, places: NDArray[np.intp]) -> Stack:
-    """Return the values, (…, k), at places, (…, j), along the last axis."""
+def take_rows(values: Stack, indices: NDArray[np.intp]) -> Stack:
+    """Return the values, (…, k), at some indices, (…, j), along the last axis."""
     if values.ndim == 1:
-        return np.asarray(values[places])
-    return np.take_along_axis(values, places, axis=-1)
+        return np.asarray(values[indices])
+    return np.take_along_axis(values, indices, axis=-1)
 
 
 def constant_kernel(value: float | Stack) -> KernelBounds:
@@ -174,28 +174,28 @@ class Outputs(Generic[Name]):
         """Return ‖C M‖ of each C, (…, outputs)."""
         product = self.stacked if M is None else self.stacked @ M
         norms = np.empty((*product.shape[:-2], len(self.rows)))
-        for places, rows in self._alike:
-            norms[..., places] = spectral_norm(product[..., rows, :])
+        for indices, rows in self._alike:
+            norms[..., indices] = spectral_norm(product[..., rows, :])
         return norms
 
     def each(self, norm: Callable[[Stack], Stack], values: Stack, columns: Groups) -> Stack:
         """Return a norm of each C Y, (…, rows, r, k) → (…, outputs, groups of columns, k)."""
         *lead, _, _, cells = values.shape
         stack = np.empty((*lead, len(self.rows), len(columns), cells))
-        for places, rows in self._alike:
+        for indices, rows in self._alike:
             for number, group in enumerate(columns):
-                stack[..., places, number, :] = norm(values[..., rows, group, :])
+                stack[..., indices, number, :] = norm(values[..., rows, group, :])
         return stack
 
 
 def _grouped(groups: Groups) -> list[tuple[list[int], NDArray[np.intp]]]:
-    """Return the places of groups of equal length, with the rows of each, (groups, rows)."""
+    """Return the indices of groups of equal length, with the rows of each, (groups, rows)."""
     lengths = [group.stop - group.start for group in groups]
     stacks = []
     for length in dict.fromkeys(lengths):
-        places = [index for index, other in enumerate(lengths) if other == length]
-        rows = np.array([range(groups[index].start, groups[index].stop) for index in places])
-        stacks.append((places, rows))
+        indices = [index for index, other in enumerate(lengths) if other == length]
+        rows = np.array([range(groups[index].start, groups[index].stop) for index in indices])
+        stacks.append((indices, rows))
     return stacks
 
 
@@ -211,10 +211,10 @@ class ResponseBounds:
     """(…, cells + 1, n, r), e^{Gτ} D."""
     decay: Decay | None
     """L and ν; None if they are not needed, or if G does not decay."""
-    endless: bool
+    has_tail: bool
     """Whether bounds beyond the grid are requested, for one group of columns."""
     groups: tuple[int, ...] = (0,)
-    """The first column of each group of D's columns that is bounded apart."""
+    """The first column of each group of D's columns that is bounded separately."""
 
     @cached_property
     def _bends(self) -> "_Bends":
@@ -255,7 +255,7 @@ class ResponseBounds:
         areas = (steps_s * middle + steps_s**3 / 12 * bends) * ROUNDING
         highest *= ROUNDING
         rate, tails = np.array(0.0), np.full(norms.shape[:-1], math.inf)
-        if self.endless and self.decay is not None:
+        if self.has_tail and self.decay is not None:
             rate = self.decay.rate_per_s
             last = self.decay.sizes(self.states[..., -1:, :, :])[..., None, :]
             tails = outputs.norms_with(self.decay.inverse)[..., :, None] * last * ROUNDING
@@ -307,10 +307,10 @@ class _Bends:
     """(…, 4, k), s^{j−2}/(j−2)!"""
     nodes: Stack
     """(…, n, r, k), e^{Gτ} D at the left nodes."""
-    rest: Stack
+    remainder: Stack
     """(…, groups, k), factor of ‖C‖ in a bound of the remainder."""
     decay: Decay | None
-    rest_decaying: Stack
+    decaying_remainder: Stack
     """(…, groups, k), factor of ‖C L^{−1}‖ in a bound of the remainder from the decay; infinite
     without one."""
     least: Stack
@@ -326,11 +326,11 @@ class _Bends:
             outputs.each(frobenius_norms_along_last, images, self.columns) * self.scales[..., None, None, :]
         )
         bound = terms_of_bound.sum(axis=-4)
-        remainder = outputs.norms[..., None, None] * self.rest[..., None, :, :]
+        remainder = outputs.norms[..., None, None] * self.remainder[..., None, :, :]
         if self.decay is None:
             return np.asarray(bound + remainder)
         factor = outputs.norms_with(self.decay.inverse)[..., None, None]
-        bound += np.minimum(remainder, factor * self.rest_decaying[..., None, :, :])
+        bound += np.minimum(remainder, factor * self.decaying_remainder[..., None, :, :])
         return np.asarray(np.minimum(factor * self.least[..., None, :, :], bound))
 
 
@@ -350,10 +350,10 @@ def _bound_bends(
         return np.stack([frobenius_norms_along_last(values[..., group, :]) for group in columns], axis=-2)
 
     last = scales[-1][..., None, :]
-    rest_decaying = least = np.zeros(0)
+    decaying_remainder = least = np.zeros(0)
     if decay is not None:
         exists = (decay.rate_per_s > 0)[..., None, None]
-        rest_decaying = np.where(exists, last * norms(decay.factor @ powers[..., -1, :, :]), math.inf)
+        decaying_remainder = np.where(exists, last * norms(decay.factor @ powers[..., -1, :, :]), math.inf)
         least = np.where(exists, norms(decay.factor @ powers[..., 0, :, :]), math.inf)
     return _Bends(
         columns,
@@ -362,7 +362,7 @@ def _bound_bends(
         nodes,
         growth[..., None, :] * last * norms(powers[..., -1, :, :]),
         decay,
-        rest_decaying,
+        decaying_remainder,
         least,
     )
 
@@ -407,7 +407,7 @@ def response(generator: Matrix, D: Matrix) -> ResponseBounds:
 
     def usable_step(step_s: Stack) -> NDArray[np.bool_]:
         is_short = step_s <= usual_s
-        return is_short if is_short.all() else is_short | _straight(generator, state, step_s, decay)
+        return is_short if is_short.all() else is_short | _is_straight(generator, state, step_s, decay)
 
     while True:
         # The next block of cells.
@@ -418,7 +418,7 @@ def response(generator: Matrix, D: Matrix) -> ResponseBounds:
         state = states[..., -1, :, :]
         area = area + step_s * frobenius_norms(parts[-1]).sum(axis=-1)
         cells += _CELLS_PER_BLOCK
-        # The grid ends where the rest is a small share of the area so far.
+        # The grid ends where the area beyond it is a small share of its own.
         remainder = decay.bounds(everything.stacked, state[..., None, :, :])[..., 0] / decay.rate_per_s
         ends = ends | (remainder <= _TAIL_SHARE * area)
         if ends.all() or cells >= most_cells:
@@ -428,10 +428,10 @@ def response(generator: Matrix, D: Matrix) -> ResponseBounds:
             step_s = np.where(usable, step_s, step_s / 2)
         step_s = np.where(ends, 0.0, np.where(usable_step(2 * step_s), 2 * step_s, step_s))
     states = np.concatenate([*parts, state[..., None, :, :]], axis=-3)
-    return ResponseBounds(generator, np.concatenate(edges, axis=-1), states, decay, endless=True)
+    return ResponseBounds(generator, np.concatenate(edges, axis=-1), states, decay, has_tail=True)
 
 
-def _straight(generator: Matrix, state: Matrix, step_s: Stack, decay: Decay) -> NDArray[np.bool_]:
+def _is_straight(generator: Matrix, state: Matrix, step_s: Stack, decay: Decay) -> NDArray[np.bool_]:
     """Return whether e^{Gτ} Y is close to its chord over a step, (…)."""
     everything = Outputs({"": np.eye(generator.shape[-1])})
     size = np.linalg.norm(state, axis=(-2, -1))
@@ -454,7 +454,7 @@ def response_until(
         np.linspace(0.0, until_s, cells + 1, axis=-1),
         _propagate(generator, D, step_s, cells),
         decay,
-        endless=False,
+        has_tail=False,
         groups=groups,
     )
 
@@ -494,7 +494,7 @@ def _propagate(generator: Matrix, state: Matrix, step_s: Stack, cells: int) -> S
 
 @cached_function(8)
 def _powers(generator: Matrix, step_s: Stack, least: int) -> tuple[Stack, Matrix]:
-    """Return e^{G k s} for k < 2^j, at least so many, and e^{G 2^j s}.
+    """Return e^{G k s} for k < 2^j, where 2^j ≥ ``least``, and e^{G 2^j s}.
 
     Several responses follow each other with the same steps.
     """

@@ -123,7 +123,7 @@ class Growth(NamedTuple):
         cells = self.forced.shape[-1]
         # A time that is a node but for rounding counts as that node.
         nodes = np.sort(np.ceil(times_s / times_s.max() * cells * (1 - 1e-9)))
-        # The share of the times that are after the begin of each cell.
+        # The share of the times that are after the start of each cell.
         weights = 1 - np.searchsorted(nodes, np.arange(cells), side="right") / len(nodes)
         by_input, mismatched = (np.asarray(k.area @ weights) for k in (self.input_error, self.mismatch))
         return by_input, mismatched, np.asarray(self.forced @ weights)
@@ -204,12 +204,12 @@ class ErrorGains:
             return 1.0
         return float(norm_bounds(self.outputs[output], self.inverse_weight[None])[0])
 
-    def missing(self, output: Output, events: int | Counts, spacing_s: float | Vector) -> Vector:
+    def missing(self, output: Output, events: int | Counts, inter_event_s: float | Vector) -> Vector:
         """Return Σ_{j<N} sup_{τ ≥ jδ} ‖C e^{(H+αI)τ} W^{−1}‖, the gain of N missing events.
 
         N and δ are those of one loop or of several, (…).
         """
-        return sum_of_sups(self.kernels[output], events, spacing_s)
+        return sum_of_sups(self.kernels[output], events, inter_event_s)
 
     def missing_until(self, output: Output, events: Counts, due_s: float) -> Vector:
         """Return Σ_{j<N} sup_{τ ≤ (j+1)L} ‖C e^{(H+αI)τ} W^{−1}‖, for events at most L apart."""
@@ -287,10 +287,10 @@ class ErrorGains:
         return float(hold_s**3 / 6 * max(sups))
 
 
-def sum_of_sups(kernel: KernelBounds, events: int | Counts, spacing_s: float | Vector) -> Vector:
+def sum_of_sups(kernel: KernelBounds, events: int | Counts, inter_event_s: float | Vector) -> Vector:
     """Return Σ_{j<N} sup_{τ ≥ jδ} k(τ), (…)."""
     numbers = np.arange(np.max(events, initial=0), dtype=np.float64)
-    sups = kernel.sups(np.asarray(spacing_s)[..., None] * numbers)
+    sups = kernel.sups(np.asarray(inter_event_s)[..., None] * numbers)
     missing = numbers < np.asarray(events)[..., None]
     return np.asarray(np.where(missing, sups, 0.0).sum(axis=-1))
 

@@ -239,17 +239,17 @@ class TriggerBounds:
         return bounds[0]._replace(unit=level or 1.0, times=times, further=tuple(bounds[1:]))
 
     def divide(
-        self, conditions: NetworkConditions, apart_s: float
+        self, conditions: NetworkConditions, inter_event_s: float
     ) -> list[tuple[TriggerBound, TriggerBound]]:
         """Return each bound without its constant, and with it, both in units of 1.
 
-        Parts of the signals may be added only if they use the same bound. ``apart_s`` is a known
+        Parts of the signals may be added only if they use the same bound. ``inter_event_s`` is a known
         lower bound of the inter-event time.
 
         Raises: as :meth:`bound`.
         """
         whole = self.bound(conditions, self.floor, self.floor or None)
-        times = whole.times._replace(shortest_s=apart_s)
+        times = whole.times._replace(shortest_s=inter_event_s)
         alone = [
             bound._replace(times=times, unit=1.0, least_event_error=None, further=())
             for bound in whole.all_bounds

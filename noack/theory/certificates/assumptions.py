@@ -262,7 +262,7 @@ def certificate_assumptions(
     why = trigger_bound or "not where it does not transmit"
     checked = [_checked("the trigger bounds ‖e_s‖", "certificate", bool(trigger_bound), why)]
     for matrix, source in (("the models", "(I1)"), ("A + BK", "Theorem 2")) if alpha else ():
-        holds = below(alpha, decay_per_s[matrix])
+        holds = is_below_decay_rate(alpha, decay_per_s[matrix])
         why = f"α = {alpha:g} /s, {_decays(decay_per_s[matrix])}"
         if slower and not holds:
             why += f"; certified instead: bounds with decay rate {at_least(slower, 3)} /s"
@@ -342,6 +342,6 @@ def _conditions(
     ]
 
 
-def below(alpha_per_s: float, decay_per_s: float) -> bool:
+def is_below_decay_rate(alpha_per_s: float, decay_per_s: float) -> bool:
     """Return whether α is below the decay rate by more than rounding."""
     return alpha_per_s < (1 - 1e-9) * decay_per_s

@@ -249,7 +249,7 @@ class KnownStatePart:
         return self.constants.overshoot * self.unit
 
     def _by_missing(self, output: Output, by_received: float) -> Vector:
-        """Return none + Σ_{i<j} sup_{τ≥iδ} ‖C e^{(H+αI)τ} W^{−1}‖ (β̃ + η) for each j."""
+        """Return ``by_received`` + Σ_{i<j} sup_{τ≥iδ} ‖C e^{(H+αI)τ} W^{−1}‖ (β̃ + η) for each j."""
         error, missing_events = self.plant.error, self.constants.missing_events
         if not error.decays:
             return np.array([by_received])
@@ -343,10 +343,9 @@ def _together(parts: Sequence[tuple[Vector, float]]) -> list[Vector]:
     bounds of parts may be added only if they bound the signal in the same way.
     """
     count = min(len(by_missing) for by_missing, _ in parts)
-    is_smaller = np.all([by_missing[:count] <= persisting for by_missing, persisting in parts], axis=0)
+    is_smaller = np.all([by_missing[:count] <= for_any for by_missing, for_any in parts], axis=0)
     return [
-        np.append(np.where(is_smaller, by_missing[:count], persisting), persisting)
-        for by_missing, persisting in parts
+        np.append(np.where(is_smaller, by_missing[:count], for_any), for_any) for by_missing, for_any in parts
     ]
 
 

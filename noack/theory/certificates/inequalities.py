@@ -1,4 +1,4 @@
-"""The inequalities (I1) of a certificate, solved for an assumed spacing of events.
+"""The inequalities (I1) of a certificate, solved for an assumed inter-event time.
 
 Assumptions: the trigger ‖e_s‖_W > βe^{−αt} is tested at least every h seconds, the network keeps
 its guarantee about losses, and the input is held. With all signals scaled by e^{αt}:
@@ -83,11 +83,11 @@ def solve_inequalities(F: Matrix, g: Vector) -> Solution:
     # A signal that is 0 affects nothing.
     F = np.where((F.any(axis=-1) | (g > 0))[..., None, :], F, 0.0)
     # A right side of the size of x makes w/x dimensionless.
-    scales = g + _applied(F, g + _applied(F, g))
+    scales = g + _apply(F, g + _apply(F, g))
     least = np.where(scales > 0, scales, np.inf).min(axis=-1, keepdims=True)
     right = np.where(scales > 0, scales, np.where(np.isfinite(least), least, 1.0))
     remainder = np.eye(size) - F
-    minor, x, w = _eliminated(remainder, g, right)
+    minor, x, w = _eliminate(remainder, g, right)
     loop_gain = np.asarray(1 - minor)
     is_small = loop_gain < 1
     if not is_small.all():  # the elimination ends too early there
@@ -100,7 +100,7 @@ def solve_inequalities(F: Matrix, g: Vector) -> Solution:
         loop_gain[large] = np.where(is_finite, np.maximum(gains.max(axis=-1), 1.0), np.inf)
     # F w < w is confirmed with all rounding, and x is raised until x − F x ≥ g.
     rounding = (size + 4) * _EPSILON
-    F_x, F_w = _applied(F, x), _applied(F, w)
+    F_x, F_w = _apply(F, x), _apply(F, w)
     slack = w - F_w - rounding * (w + F_w)
     shortfall = F_x + g - x + rounding * (F_x + g + x)
     largest = np.maximum((shortfall / slack).max(axis=-1, keepdims=True), 0.0)
@@ -109,11 +109,11 @@ def solve_inequalities(F: Matrix, g: Vector) -> Solution:
     return Solution(loop_gain, np.where(confirmed[..., None], bound, np.inf))
 
 
-def _applied(F: Matrix, v: Vector) -> Vector:
+def _apply(F: Matrix, v: Vector) -> Vector:
     return np.asarray((F @ v[..., None])[..., 0])
 
 
-def _eliminated(matrix: Matrix, *right_sides: Vector) -> tuple[Vector, ...]:
+def _eliminate(matrix: Matrix, *right_sides: Vector) -> tuple[Vector, ...]:
     """Return the smallest leading principal minor, (…), and the solutions, (…, k).
 
     Minors after the first one not above 0 are left out; the solutions are then of no use. The
@@ -169,10 +169,10 @@ class LoopConstants(NamedTuple):
 
 
 class ErrorInequalities:
-    """The inequalities of one part, and their solution for assumed spacings of events.
+    """The inequalities of one part, and their solution for assumed inter-event times.
 
     The part is that of one loop, or of several (:meth:`PlantGains.together`), with the same
-    trigger and conditions; spacings and solutions are those of each loop.
+    trigger and conditions; inter-event times and solutions are those of each loop.
     """
 
     def __init__(self, part: CertificatePart, conditions: NetworkConditions, earlier_error: float) -> None:
@@ -197,35 +197,35 @@ class ErrorInequalities:
         return [BoundMethod.MISSING]
 
     @cached_method
-    def constants(self, spacing_s: Vector, method: BoundMethod) -> LoopConstants:
-        """Return all constants but δ, given inter-event times of at least ``spacing_s``, (loops,).
+    def constants(self, inter_event_s: Vector, method: BoundMethod) -> LoopConstants:
+        """Return all constants but δ, given inter-event times of at least ``inter_event_s``, (loops,).
 
         A loop without a certificate has a loop gain that is not below 1, and perhaps infinite.
         """
         conditions = self._conditions
-        events = np.full(len(spacing_s), conditions.dropouts)
-        is_spaced = spacing_s > 0
-        if conditions.delay_s > 0:  # without a spacing, any number of updates may be in flight
-            events[is_spaced] += np.ceil(conditions.delay_s / spacing_s[is_spaced]).astype(np.int64)
+        events = np.full(len(inter_event_s), conditions.dropouts)
+        is_spaced = inter_event_s > 0
+        if conditions.delay_s > 0:  # of arbitrarily close events, any number of updates may be in flight
+            events[is_spaced] += np.ceil(conditions.delay_s / inter_event_s[is_spaced]).astype(np.int64)
         is_counted = is_spaced | (conditions.delay_s == 0)
-        solved = self._solutions(method, events, spacing_s)
+        solved = self._solutions(method, events, inter_event_s)
         smallest = np.min([bound for _, _, bound in solved], axis=0)
         gain = np.where(is_counted, np.min([gain for _, gain, _ in solved], axis=0), np.inf)
         by_bound = []
-        for signals, _, bound in solved:  # each b is another one
+        for signals, _, bound in solved:  # b differs from bound to bound
             bound = np.where(_UNIT[Signal.AFTER_TEST] == 1, bound, smallest)
             by_bound.append(self._implied_bounds(signals, events, gain, bound, is_counted))
         exists = np.any([constants.exists for constants in by_bound], axis=0)
         return LoopConstants(*map(np.fmin.reduce, zip(*by_bound, strict=True)))._replace(exists=exists)
 
     def _solutions(
-        self, method: BoundMethod, events: Counts, spacing_s: Vector
+        self, method: BoundMethod, events: Counts, inter_event_s: Vector
     ) -> "list[tuple[_Signals, Vector, Matrix]]":
         """Return the signals, the loop gains and the bounds of all signals for each bound of e_s."""
         solved = []
         for growths in self._growths:  # all bounds of e_s hold; of each, one growth applies
             own_growth = growths[0] if len(growths) == 1 and self._error.decays else None
-            signals = self._signals(method, events, spacing_s, own_growth)
+            signals = self._signals(method, events, inter_event_s, own_growth)
             solutions = [self._solve_for_growth(signals, growth, own_growth) for growth in growths]
             gain = np.max([solution.loop_gain for solution in solutions], axis=0)
             solved.append((signals, gain, np.max([solution.bound for solution in solutions], axis=0)))
@@ -266,7 +266,7 @@ class ErrorInequalities:
         return self._bound.beta if self._bound.unit is None else self._bound.unit
 
     def _signals(
-        self, method: BoundMethod, events: Counts, spacing_s: Vector, own_growth: ErrorGrowth | None
+        self, method: BoundMethod, events: Counts, inter_event_s: Vector, own_growth: ErrorGrowth | None
     ) -> "_Signals":
         """Return how all outputs depend on v.
 
@@ -290,9 +290,9 @@ class ErrorInequalities:
         def with_missing(
             output: Output, present: Matrix, count: Counts, stages: _Stages | None = None
         ) -> Matrix:
-            return self._with_missing(output, present, count, spacing_s, own_growth, stages)
+            return self._with_missing(output, present, count, inter_event_s, own_growth, stages)
 
-        stages = self._stages(present[Output.GAIN], counted, spacing_s, own_growth)
+        stages = self._stages(present[Output.GAIN], counted, inter_event_s, own_growth)
         errors = {output: with_missing(output, row, counted, stages) for output, row in present.items()}
         input_error = errors[Output.GAIN]
         earlier = input_error if drifts else with_missing(Output.GAIN, np.zeros(len(Signal)), counted, stages)
@@ -324,7 +324,7 @@ class ErrorInequalities:
         output: Output,
         present: Matrix,
         events: Counts,
-        spacing_s: Vector,
+        inter_event_s: Vector,
         own_growth: ErrorGrowth | None,
         stages: "_Stages | None" = None,
     ) -> Matrix:
@@ -332,20 +332,20 @@ class ErrorInequalities:
 
         The part of e_s that has grown since the last test is followed from where it entered.
         """
-        gain = self._missing_gain(output, events, spacing_s)
+        gain = self._missing_gain(output, events, inter_event_s)
         driven: list[Vector | float] = (
             [0.0] * 3 if own_growth is None else [gain * size for size in own_growth.driven]
         )
         if own_growth is not None and own_growth.longest_s > 0:
             for index, kernel in enumerate(self._plant.driven[output]):
-                followed = own_growth.mean_s * sum_of_sups(kernel, events, spacing_s)
+                followed = own_growth.mean_s * sum_of_sups(kernel, events, inter_event_s)
                 driven[index] = np.minimum(driven[index], followed)
         highest = self._plant.driven[output][0].sup() if self._error.decays else 0.0
         row = self._with_start(present + _signal_row(gain, gain, driven), highest)
         if stages is not None and own_growth is not None:
             row[..., Signal.INPUT_ERROR] = present[..., Signal.INPUT_ERROR]
             row += stages.entered(
-                *self._input_effects(output, len(stages.inputs), spacing_s, own_growth), events
+                *self._input_effects(output, len(stages.inputs), inter_event_s, own_growth), events
             )
         return row
 
@@ -358,7 +358,7 @@ class ErrorInequalities:
         return np.asarray(row + (self._first_input_error * by_first_input)[..., None] * _UNIT[Signal.ONE])
 
     def _input_effects(
-        self, output: Output, count: int, spacing_s: Vector, own_growth: ErrorGrowth
+        self, output: Output, count: int, inter_event_s: Vector, own_growth: ErrorGrowth
     ) -> tuple[Matrix, Matrix]:
         """Bound how inputs before missing events move C e_c, from the newest event on.
 
@@ -366,13 +366,13 @@ class ErrorInequalities:
             Of the inputs since the test before the event, for ‖p‖ ≤ 1, and of those of one second,
             (count, loops) each.
         """
-        ages_s = spacing_s[:, None] * np.arange(count)
+        ages_s = inter_event_s[:, None] * np.arange(count)
         sups = np.broadcast_to(self._plant.driven[output][0].sups(ages_s), ages_s.shape).T
         gains = self._error.kernels[output].sups(ages_s).T
         return np.minimum(gains * own_growth.driven[0], own_growth.mean_s * sups), sups
 
     def _stages(
-        self, present: Matrix, events: Counts, spacing_s: Vector, own_growth: ErrorGrowth | None
+        self, present: Matrix, events: Counts, inter_event_s: Vector, own_growth: ErrorGrowth | None
     ) -> "_Stages | None":
         """Bound ‖p‖ while at most 0, 1, … events are missing; None where π is used instead.
 
@@ -385,20 +385,20 @@ class ErrorInequalities:
             own_growth is None
             or own_growth.longest_s == 0
             or not 0 < count <= MOST_STAGES
-            or not spacing_s.all()
+            or not inter_event_s.all()
         ):
             return None
         # p of each stage: a row of the signals.
-        sizes, sups = self._input_effects(Output.GAIN, count, spacing_s, own_growth)
-        shape = len(spacing_s), len(Signal)
-        late_s = (delay_s - np.arange(count)[:, None] * spacing_s).clip(0.0, own_growth.longest_s)
+        sizes, sups = self._input_effects(Output.GAIN, count, inter_event_s, own_growth)
+        shape = len(inter_event_s), len(Signal)
+        late_s = (delay_s - np.arange(count)[:, None] * inter_event_s).clip(0.0, own_growth.longest_s)
         counts = np.arange(count)[:, None] + np.zeros_like(events)
-        rows = self._with_missing(Output.GAIN, present, counts, spacing_s, own_growth)
+        rows = self._with_missing(Output.GAIN, present, counts, inter_event_s, own_growth)
         rows += _UNIT[Signal.AGE_INPUT]
         # The share of π from updates that act late.
         highest = float(np.max(self._plant.driven[Output.GAIN][0].sup()))
         by_input = present[..., Signal.INPUT_ERROR]
-        input_before_update = np.minimum(by_input, highest * (delay_s - counts * spacing_s).clip(min=0.0))
+        input_before_update = np.minimum(by_input, highest * (delay_s - counts * inter_event_s).clip(min=0.0))
         rows[..., Signal.INPUT_ERROR] = input_before_update
         shares_left = 1 - (by_input - input_before_update)[..., None]
         # Stage by stage; π where its own share is 1 or more.
@@ -444,9 +444,9 @@ class ErrorInequalities:
         right = _columns(*(inequalities[signal][1] for signal in Signal))
         return solve_inequalities(rows, np.broadcast_to(right, rows.shape[:-1]))
 
-    def _missing_gain(self, output: Output, events: Counts, spacing_s: Vector) -> Vector:
+    def _missing_gain(self, output: Output, events: Counts, inter_event_s: Vector) -> Vector:
         if self._error.decays or math.isinf(self._bound.times.longest_s):
-            return self._error.missing(output, events, spacing_s)
+            return self._error.missing(output, events, inter_event_s)
         return self._error.missing_until(output, events, self._bound.times.longest_s)
 
     def inter_event_s(
@@ -504,7 +504,7 @@ class _Stages(NamedTuple):
     not have taken effect yet, (count, loops)."""
 
     def entered(self, sizes: Matrix, sups: Matrix, events: Counts) -> Matrix:
-        """Bound what has entered e_c before up to so many missing events, (loops, 6).
+        """Bound what has entered e_c before up to ``events`` missing events, (loops, 6).
 
         ``sizes`` and ``sups`` are those of :meth:`ErrorInequalities._input_effects`.
         """

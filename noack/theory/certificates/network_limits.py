@@ -20,8 +20,8 @@ _RESOLUTION = 1e-3
 """Relative accuracy of a limit."""
 _WIDER, _NEXT = 4.0, 1.2
 """Factors from a time to the next one until the limit is enclosed: without a guess, and at least."""
-_STEPS = 6
-"""After so many steps the middle is tried, if interpolation has not found the limit."""
+_BISECTION_EVERY = 6
+"""Every sixth step tries the middle, in case interpolation does not find the limit."""
 _Points = Sequence[tuple[float, float]]
 """Logarithms of loop gains, and of their times."""
 
@@ -78,7 +78,7 @@ def largest_stable_time_s(loop_gain: Callable[[float], float], usual_s: float) -
         if low_s == MOST_S:
             break
         step += low_s > 0 and math.isfinite(high_s)
-        tried_s = _next_s(low_s, high_s, known, middle=step % _STEPS == 0)
+        tried_s = _next_s(low_s, high_s, known, middle=step % _BISECTION_EVERY == 0)
     return low_s
 
 

@@ -36,7 +36,7 @@ from noack.theory.certificates.solution import Problem, Search, sharpened
 PlantAt = Callable[[ErrorGains, Matrix, float], PlantGains]
 """Returns the plant's gains from the gains of the models, the start of x, and α."""
 _CHORD_ROUNDS = 2
-"""So often the chord of a threshold is shortened by the bound of x that it has given."""
+"""Number of rounds that shorten the chord of the threshold by the last bound of x."""
 _RATE_SHARES = (0.7, 0.4, 0.2, 0.05)
 """Rates that are tried, as shares of the loop's decay rate."""
 SHARES = (0.5, 0.2, 0.8)
@@ -44,7 +44,7 @@ SHARES = (0.5, 0.2, 0.8)
 ConstantsOfParts = TypeVar("ConstantsOfParts", bound=Sequence[Constants])
 
 
-class Added(NamedTuple):
+class AddedConstants(NamedTuple):
     """Constants whose bounds are added."""
 
     main: Constants
@@ -66,7 +66,7 @@ class DisturbedCertificate:
 
     def constants(
         self, conditions: NetworkConditions, *, decays: bool, longest: bool = True
-    ) -> Search[list[Added]]:
+    ) -> Search[list[AddedConstants]]:
         """Search for the constants that decay and those to be added; without decay only one.
 
         Where there are several such sums, each bounds the run.
@@ -95,7 +95,7 @@ class DisturbedCertificate:
                     structured=structured,
                     shares=SHARES if longest else (),
                 )
-                return [Added(*parts)]
+                return [AddedConstants(*parts)]
             except NotDecayingError:
                 pass
         pairs = yield from self._without_decay(conditions, decays=decays, longest=longest)
@@ -116,23 +116,23 @@ class DisturbedCertificate:
 
     def _without_decay(
         self, conditions: NetworkConditions, *, decays: bool, longest: bool
-    ) -> Search[list[Added]]:
+    ) -> Search[list[AddedConstants]]:
         """Search for the constants of a threshold that does not decay, or more slowly than the loop.
 
         Raises: as :meth:`constants`.
         """
         level, floor = max(self.trigger.beta, self.trigger.floor), self.trigger.floor
         bound = self.trigger.bound(conditions, level, floor or None)
-        part, structured = self._together._replace(bound=bound), self.start_error == 0.0
+        part, structured = self._undivided._replace(bound=bound), self.start_error == 0.0
         problem = Problem((part,), conditions, self.start_error, structured, longest)
         constants = yield from sharpened(problem)
         # The mean of an integral bounds e_s over a time that suits only one of several parts.
         is_divided = not self.trigger.beta and not self.trigger.area and not self.start_error
-        divided: list[Added] = []
+        divided: list[AddedConstants] = []
         if decays and is_divided and longest:
-            apart_s = constants.inter_event_s or 0.0
-            divided = yield from self._of_constant_threshold(conditions, apart_s)
-        return [*divided, Added(constants)]
+            inter_event_s = constants.inter_event_s or 0.0
+            divided = yield from self._of_constant_threshold(conditions, inter_event_s)
+        return [*divided, AddedConstants(constants)]
 
     def with_plants(
         self, decaying: Constants, persistent: Constants | None
@@ -140,26 +140,28 @@ class DisturbedCertificate:
         """Return constants of :meth:`constants` with the plants of their parts."""
         if persistent is None:
             decays = decaying.rate_per_s > 0
-            plant = self._plant(decaying.rate_per_s) if decays else self._together.plant
+            plant = self._plant(decaying.rate_per_s) if decays else self._undivided.plant
             return [(plant, decaying)]
         return [(self._plant(decaying.rate_per_s), decaying), (self._persistent.plant, persistent)]
 
-    def _of_constant_threshold(self, conditions: NetworkConditions, apart_s: float) -> Search[list[Added]]:
+    def _of_constant_threshold(
+        self, conditions: NetworkConditions, inter_event_s: float
+    ) -> Search[list[AddedConstants]]:
         """Search for the constants of what follows from the start, and of what persists, if any.
 
         There is one pair for each bound of e_s that suffices, that with the smallest ultimate bound
-        first. The threshold has no rate; that of :func:`choose_rate` is taken. ``apart_s`` is a
+        first. The threshold has no rate; that of :func:`choose_rate` is taken. ``inter_event_s`` is a
         lower bound of the inter-event time, certified without dividing into parts.
         """
-        pairs: list[Added] = []
-        for start_bound, persistent_bound in self.trigger.divide(conditions, apart_s):
+        pairs: list[AddedConstants] = []
+        for start_bound, persistent_bound in self.trigger.divide(conditions, inter_event_s):
             with contextlib.suppress(NoCertificateError, NotDecayingError):
                 pairs.append((yield from self._divided(start_bound, persistent_bound, conditions)))
         return sorted(pairs, key=lambda pair: 0.0 if pair.persistent is None else pair.persistent.state)
 
     def _divided(
         self, start_bound: TriggerBound, persistent_bound: TriggerBound, conditions: NetworkConditions
-    ) -> Search[Added]:
+    ) -> Search[AddedConstants]:
         """Search for the constants that one bound of e_s gives, divided into those of both parts.
 
         Raises: as :func:`choose_rate`.
@@ -175,7 +177,7 @@ class DisturbedCertificate:
 
         x0 = loop_of(self.resolved).x0
         decaying, *added = yield from choose_rate(solve_at, self.slowest_per_s, x0, x0)
-        return Added(decaying, *added)
+        return AddedConstants(decaying, *added)
 
     @cached_property
     def _decaying(self) -> CertificatePart:
@@ -194,7 +196,7 @@ class DisturbedCertificate:
         return CertificatePart(plant.error, at_rest, bound, self._estimation.persistent())
 
     @cached_property
-    def _together(self) -> CertificatePart:
+    def _undivided(self) -> CertificatePart:
         """Everything without decay; the trigger's bound depends on the conditions."""
         decaying, persistent = self._estimation.decaying(0.0), self._estimation.persistent()
         estimation = persistent._replace(fixed=persistent.fixed + decaying.fixed)
@@ -275,7 +277,10 @@ def solve_two_parts(
 
 
 def choose_rate(
-    solve_at: Callable[[float], Search[ConstantsOfParts]], decay_per_s: float, start: Vector, starts: Matrix
+    solve_at: Callable[[float], Search[ConstantsOfParts]],
+    decay_per_s: float,
+    start: Vector,
+    start_set: Matrix,
 ) -> Search[ConstantsOfParts]:
     """Search for the constants for a rate, where none is given.
 
@@ -285,16 +290,16 @@ def choose_rate(
         solve_at: searches for constants for a rate in 1/s.
         decay_per_s: the decay rate of the loop.
         start: x(0), (n,).
-        starts: x(0), or a matrix that maps the unit ball to a set of x(0), (n, k), that is bounded.
+        start_set: x(0), or a matrix that maps the unit ball to a set of x(0), (n, k), that is bounded.
 
     Raises: what ``solve_at`` raises at the smallest rate.
     """
-    largest_start = float(np.linalg.norm(starts, 2))
+    start_set_norm = float(np.linalg.norm(start_set, 2))
     best, best_s = None, math.inf
     for share in _RATE_SHARES:
         rate_per_s = share * decay_per_s
         # No bound of ‖x‖ is below its first value, so a small rate is often not worth trying.
-        if best is not None and tenth_s(largest_start, rate_per_s, start) > best_s:
+        if best is not None and time_to_tenth_s(start_set_norm, rate_per_s, start) > best_s:
             break
         try:
             constants = yield from solve_at(rate_per_s)
@@ -302,13 +307,13 @@ def choose_rate(
             if best is None and share == _RATE_SHARES[-1]:
                 raise
             continue  # smaller rates have smaller gains
-        if best is None or tenth_s(constants[0].state, rate_per_s, start) <= best_s:
-            best, best_s = constants, tenth_s(constants[0].state, rate_per_s, start)
+        if best is None or time_to_tenth_s(constants[0].state, rate_per_s, start) <= best_s:
+            best, best_s = constants, time_to_tenth_s(constants[0].state, rate_per_s, start)
     assert best is not None
     return best
 
 
-def tenth_s(state: float, rate_per_s: float, start: Vector) -> float:
+def time_to_tenth_s(state: float, rate_per_s: float, start: Vector) -> float:
     """Return when a bound of ‖x‖, ``state`` at first, falls to ‖x(0)‖/10."""
     start_norm = float(np.linalg.norm(start)) or 1.0
     return math.log(max(10 * state / start_norm, 1.0)) / rate_per_s

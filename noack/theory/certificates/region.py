@@ -58,7 +58,7 @@ _LEAST = 1e-9
 _ATTEMPTS = 40
 """Regions that are tried."""
 _MOST_NAMES = 8
-"""Up to so many bounds of a region are named in a reason."""
+"""Maximum number of bounds of a region that a reason names."""
 _TIMES = ("sampling_s", "spacing_s", "delay_s", "hold_s", "start_s")
 """The times of conditions with which the bounds increase."""
 

@@ -26,7 +26,7 @@ from noack.theory.bounds.certificate_terms import (
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, PlantGains, error_gains, first_equal
 from noack.theory.bounds.trigger_bounds import TriggerBounds
-from noack.theory.certificates.assumptions import below, certificate_assumptions
+from noack.theory.certificates.assumptions import certificate_assumptions, is_below_decay_rate
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import BOX, OWN_PLANT, kept_probability, void_by_safe_input
 from noack.theory.certificates.deliveries.due_deliveries import Deliveries
@@ -156,10 +156,10 @@ class CertificateScope:
         self._trigger = trigger_bounds(resolved, starts_on_grid=start_error is None)
         # Where events have a due time, a missed update is missed for a limited time.
         due = self._trigger.has_due_time
-        self._models_hold = not self._loop.H.any() and not due
-        decays = math.inf if self._models_hold or due else -spectral_abscissa(self._loop.H)
+        self._models_are_constant = not self._loop.H.any() and not due
+        decays = math.inf if self._models_are_constant or due else -spectral_abscissa(self._loop.H)
         self.decay_per_s = {"the models": decays, "A + BK": -spectral_abscissa(closed_loop)}
-        """Decay rates; that of the models is infinite if they hold."""
+        """Decay rates; that of the models is infinite if they are constant."""
         assert start is None or self.is_simple  # other starts are those of the scenario
         self._plant_at = plant_at
         self._plants: dict[float, PlantGains] = {}
@@ -256,7 +256,7 @@ class CertificateScope:
             gain = math.inf
         else:
             return max(phase.loop_gain for phase in constants[0] if phase is not None)
-        # The slowest rate asks for least.
+        # A certificate exists most easily for the slowest rate.
         return next((deliveries.gain for deliveries in self._deliveries(conditions, _TIMED_RATES[-1:])), gain)
 
     def _decay_under(self, conditions: NetworkConditions) -> Mapping[str, float]:
@@ -274,15 +274,15 @@ class CertificateScope:
             solved = yield from self._solve_inequalities(conditions, longest=True)
         except (NoCertificateError, NotDecayingError) as error:
             solved, void = [], error
-        apart_s = max((main.inter_event_s or 0.0 for main, *_ in solved), default=0.0)
-        timed = self._constants_from_due_times(conditions, apart_s)
+        inter_event_s = max((main.inter_event_s or 0.0 for main, *_ in solved), default=0.0)
+        timed = self._constants_from_due_times(conditions, inter_event_s)
         if timed is None:
             if not solved:
                 raise void
             return solved
-        apart_s = max(apart_s, timed.inter_event_s or 0.0)
+        inter_event_s = max(inter_event_s, timed.inter_event_s or 0.0)
         useful = [phases for phases in solved if not _is_within(timed, phases.main)]
-        return [Phases(timed._replace(inter_event_s=apart_s)), *useful]
+        return [Phases(timed._replace(inter_event_s=inter_event_s)), *useful]
 
     def _solve_inequalities(self, conditions: NetworkConditions, *, longest: bool) -> Search[list[Phases]]:
         """Search for the constants that solve the inequalities.
@@ -296,16 +296,18 @@ class CertificateScope:
         except (OverflowError, np.linalg.LinAlgError):
             raise NoCertificateError(_TOO_LARGE) from None
 
-    def _constants_from_due_times(self, conditions: NetworkConditions, apart_s: float) -> Constants | None:
+    def _constants_from_due_times(
+        self, conditions: NetworkConditions, inter_event_s: float
+    ) -> Constants | None:
         """Return constants that follow from the times of deliveries alone, if they exist.
 
-        ``apart_s``: events are known to be that far apart.
+        ``inter_event_s`` is a known lower bound of the inter-event time.
         """
-        deliveries = next(self._deliveries(conditions, _TIMED_RATES, apart_s), None)
+        deliveries = next(self._deliveries(conditions, _TIMED_RATES, inter_event_s), None)
         return None if deliveries is None else deliveries.constants(self._trigger.beta or 1.0)
 
     def _deliveries(
-        self, conditions: NetworkConditions, shares: Sequence[float], apart_s: float = 0.0
+        self, conditions: NetworkConditions, shares: Sequence[float], inter_event_s: float = 0.0
     ) -> Iterator[Deliveries]:
         """Yield what is known of the deliveries where events are due, for each rate that is tried."""
         trigger, loop = self._trigger, self._loop
@@ -320,7 +322,7 @@ class CertificateScope:
             if plant.is_one_plant:
                 with contextlib.suppress(NoCertificateError, NotDecayingError, np.linalg.LinAlgError):
                     bound = trigger.bound(tested, 0.0, None)
-                    least_s = max(bound.times.shortest_s, apart_s)
+                    least_s = max(bound.times.shortest_s, inter_event_s)
                     bound = bound._replace(times=bound.times._replace(shortest_s=least_s))
                     yield Deliveries(plant, tested, bound)
 
@@ -336,7 +338,7 @@ class CertificateScope:
     def _disturbed_phases(self, conditions: NetworkConditions, *, longest: bool) -> Search[list[Phases]]:
         """Search for the constants, and those to be added under persistent disturbances."""
         alpha = self._trigger.alpha_per_s
-        decays = not self._models_hold and below(alpha, min(self.decay_per_s.values()))
+        decays = not self._models_are_constant and is_below_decay_rate(alpha, min(self.decay_per_s.values()))
         search = self._disturbed.constants(conditions, decays=decays, longest=longest)
         pairs = yield from search
         return [self._checked(Phases(main, persistent=added)) for main, added in pairs]
@@ -371,7 +373,7 @@ class CertificateScope:
                 with contextlib.suppress(NoCertificateError):
                     return (yield from self._solve(conditions, 0.0, 0.0, None, longest=False))
             return (yield from self._fastest(conditions, decay))
-        if not self._models_hold and below(alpha, decay) and floor < beta:
+        if not self._models_are_constant and is_below_decay_rate(alpha, decay) and floor < beta:
             try:
                 return (yield from self._solve(conditions, alpha, beta, beta, longest=longest))
             except NotDecayingError:
@@ -379,7 +381,7 @@ class CertificateScope:
                     raise
                 return (yield from self._slower(conditions, alpha))
         # Certify a slower decay or none; the smallest event level is then the floor, if any.
-        slower = 0.0 if self._models_hold or floor > 0 else max(_SLOWER * decay, 0.0)
+        slower = 0.0 if self._models_are_constant or floor > 0 else max(_SLOWER * decay, 0.0)
         level = max(beta, floor)
         return (yield from self._solve(conditions, slower, level, floor or None, longest=longest))
 
@@ -394,7 +396,7 @@ class CertificateScope:
             return ((yield from self._solve(conditions, rate_per_s, 0.0, None)),)
 
         # Inputs of an earlier run are bounded without a rate.
-        if not self._models_hold and 0 < decay < math.inf and self._start_error == 0.0:
+        if not self._models_are_constant and 0 < decay < math.inf and self._start_error == 0.0:
             with contextlib.suppress(NotDecayingError, NoCertificateError):
                 (constants,) = yield from choose_rate(at_rate, decay, self._loop.x0, self._start)
                 return constants

@@ -1,4 +1,4 @@
-"""Tight certificates: guaranteed bounds of a loop, for the longest time between events.
+"""Tight certificates: guaranteed bounds of a loop, for the longest inter-event time.
 
 The bounds are the solution of the inequalities of :mod:`noack.theory.certificates.inequalities`.
 The minimum inter-event time δ is the time that ‖e_s‖_W needs from 0 to β under these bounds. If an
@@ -31,7 +31,7 @@ from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.certificates.deliveries.sharpened_constants import can_be_sharpened, sharpened_constants
 from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities, LoopConstants
 
-_SPACING_SETTLED = 1e-3
+_INTER_EVENT_SETTLED = 1e-3
 """Relative change of δ at which the search for it ends."""
 _MOST_ROUNDS = 200
 """Limit of this search; without a consistent δ the least one is used."""
@@ -73,7 +73,7 @@ Search = Generator[Problem, list[Constants], Result]
 An error of a problem is raised where it was yielded.
 """
 _MOST_TOGETHER = 256
-"""So many problems of one state are solved together: the memory grows with the squared states."""
+"""Number of one-state problems that are solved together: the memory grows with the squared states."""
 _UNSOLVED_ERRORS = (NotDecayingError, np.linalg.LinAlgError, OverflowError)
 
 
@@ -186,37 +186,37 @@ def _solve_together(problems: Sequence[Problem]) -> list[list[Constants] | Excep
         together = part._replace(plant=part.plant.together(plants))
         earlier = example.earlier_error if index == 0 else 0.0
         inequalities.append(ErrorInequalities(together, conditions, earlier))
-    apart_s = max(part.bound.times.shortest_s for part in example.parts)
-    least_s = max(conditions.spacing_s, apart_s)
+    guaranteed_s = max(part.bound.times.shortest_s for part in example.parts)
+    least_s = max(conditions.spacing_s, guaranteed_s)
     is_separated = all(
         any(bound.least_event_error is not None for bound in part.bound.all_bounds) for part in example.parts
     )
     searched = np.full(count, is_separated)
     if is_separated and not example.longest:
         searched = ~_smallest_constants(inequalities, np.full(count, least_s)).exists
-    spacing_s = _longest_spacing_s(inequalities, searched, least_s)
-    smallest = _smallest_constants(inequalities, spacing_s)
+    inter_event_s = _longest_inter_event_s(inequalities, searched, least_s)
+    smallest = _smallest_constants(inequalities, inter_event_s)
     rates = [part.error.alpha_per_s for part in example.parts]
-    shortest_s = least_s if is_separated else apart_s
-    between_s = np.where(spacing_s > least_s, spacing_s, shortest_s).tolist()
+    shortest_s = least_s if is_separated else guaranteed_s
+    between_s = np.where(inter_event_s > least_s, inter_event_s, shortest_s).tolist()
     return [smallest.of_loop(loop, rates, between_s[loop] or None) for loop in range(count)]
 
 
-def _longest_spacing_s(
+def _longest_inter_event_s(
     inequalities: Sequence[ErrorInequalities], searched: NDArray[np.bool_], least_s: float
 ) -> Vector:
-    """Return the largest spacing of each loop that is consistent with itself, or ``least_s``.
+    """Return the longest inter-event time of each loop that implies itself, or ``least_s``.
 
     It is ``least_s`` where the loop is not searched, or has no certificate.
     """
-    spacing_s = np.where(searched, LONGEST_S, least_s)
-    is_open = searched & (spacing_s > least_s)
+    inter_event_s = np.where(searched, LONGEST_S, least_s)
+    is_open = searched & (inter_event_s > least_s)
     for _ in range(_MOST_ROUNDS):
         if not is_open.any():
             break
-        smallest = _smallest_constants(inequalities, spacing_s)
-        is_open, implied_s = is_open & smallest.exists, np.full(len(spacing_s), np.inf)
-        spacing_s = np.where(smallest.exists, spacing_s, least_s)
+        smallest = _smallest_constants(inequalities, inter_event_s)
+        is_open, implied_s = is_open & smallest.exists, np.full(len(inter_event_s), np.inf)
+        inter_event_s = np.where(smallest.exists, inter_event_s, least_s)
         for part, constants in zip(reversed(inequalities), reversed(smallest.parts), strict=True):
             # Often what persists, which is the last part, gives a time of at most the least one.
             loops = is_open & (implied_s > least_s)
@@ -228,13 +228,13 @@ def _longest_spacing_s(
                 searched=loops,
             )
             implied_s = np.where(loops, np.minimum(implied_s, passed_s), implied_s)
-        is_open &= implied_s < spacing_s
+        is_open &= implied_s < inter_event_s
         # Iterate from above.
-        shorter = implied_s < (1 - _SPACING_SETTLED) * spacing_s
-        next_s = np.where(shorter, implied_s, (1 - _SPACING_SETTLED) * implied_s)
-        spacing_s = np.where(is_open, np.maximum(next_s, least_s), spacing_s)
-        is_open &= spacing_s > least_s
-    return np.where(is_open, least_s, spacing_s)
+        shorter = implied_s < (1 - _INTER_EVENT_SETTLED) * inter_event_s
+        next_s = np.where(shorter, implied_s, (1 - _INTER_EVENT_SETTLED) * implied_s)
+        inter_event_s = np.where(is_open, np.maximum(next_s, least_s), inter_event_s)
+        is_open &= inter_event_s > least_s
+    return np.where(is_open, least_s, inter_event_s)
 
 
 class _SmallestConstants(NamedTuple):
@@ -247,7 +247,7 @@ class _SmallestConstants(NamedTuple):
     loop_gain: Vector
     """(loops,) that of the first part that has no certificate; the smaller one of both methods."""
     is_spaced: NDArray[np.bool_]
-    """Where events are assumed to be apart, (loops,)."""
+    """Where the assumed inter-event time is above 0, (loops,)."""
 
     def of_loop(
         self, loop: int, rates_per_s: Sequence[float], inter_event_s: float | None
@@ -266,14 +266,16 @@ class _SmallestConstants(NamedTuple):
         return NoCertificateError(f"the loop gain of the errors is {gain:.3g}, not below 1", gain)
 
 
-def _smallest_constants(inequalities: Sequence[ErrorInequalities], spacing_s: Vector) -> _SmallestConstants:
+def _smallest_constants(
+    inequalities: Sequence[ErrorInequalities], inter_event_s: Vector
+) -> _SmallestConstants:
     """Return the constants of all parts with the first method for e_c that has a certificate."""
-    infinite = np.full(len(spacing_s), np.inf)
-    best = _SmallestConstants((), infinite > 0, infinite < 0, infinite, spacing_s > 0)
+    infinite = np.full(len(inter_event_s), np.inf)
+    best = _SmallestConstants((), infinite > 0, infinite < 0, infinite, inter_event_s > 0)
     for method in inequalities[0].methods:
         if not all(method in part.methods for part in inequalities):
             continue
-        parts = [part.constants(spacing_s, method) for part in inequalities]
+        parts = [part.constants(inter_event_s, method) for part in inequalities]
         exists, gain = np.ones(len(infinite), dtype=bool), infinite
         for part in parts:
             gain = np.where(exists & ~part.exists, part.loop_gain, gain)

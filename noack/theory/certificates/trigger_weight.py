@@ -26,7 +26,7 @@ from noack.theory.certificates.solution import solve
 _ROUNDS_PER_SCALE, _ROUNDS, _ROUNDS_PER_ENTRY = 15, 40, 12
 """Evaluations of the merit: for each scale of a state; for the entries of L, and for each of them."""
 _MOST_FREE = 7
-"""Up to so many states all entries of L are varied, else only the diagonal."""
+"""Largest number of states for which all entries of L are varied; beyond it, only the diagonal is."""
 _NODES = 256
 """Nodes at which responses are sampled."""
 _VOID = 1e3

@@ -1,4 +1,4 @@
-"""Matrices with all rounding: enclosures in double precision, and 384 binary digits after the point.
+"""Matrices with bounds of rounding: enclosures in double precision, and 384 binary digits after the point.
 
 :class:`IntervalMatrix`: entries are known up to a radius. A computed product of k terms differs
 from the exact one by at most k u/(1 − k u) times the product of the absolute values, u = 2⁻⁵³, in
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
 
-_UNIT = 2.0**-53
+_UNIT_ROUNDOFF = 2.0**-53
 """u, the largest relative error of an operation in double precision."""
 ENLARGED = 1 + 2.0**-40
 """Exceeds the rounding of a computed radius of up to 8,000 terms."""
@@ -47,13 +47,13 @@ class IntervalMatrix(NamedTuple):
         """Enclose the products."""
         left, right = np.abs(self.middle), np.abs(other.middle)
         terms = left.shape[-1] + 4
-        radius = left @ (other.radius + terms * _UNIT * right) + self.radius @ (right + other.radius)
+        radius = left @ (other.radius + terms * _UNIT_ROUNDOFF * right) + self.radius @ (right + other.radius)
         return IntervalMatrix(self.middle @ other.middle, radius * ENLARGED + terms * _UNDERFLOW)
 
     def __sub__(self, other: "IntervalMatrix") -> "IntervalMatrix":
         """Enclose the differences."""
         middle = self.middle - other.middle
-        radius = self.radius + other.radius + 2 * _UNIT * np.abs(middle)
+        radius = self.radius + other.radius + 2 * _UNIT_ROUNDOFF * np.abs(middle)
         return IntervalMatrix(middle, radius * ENLARGED + _UNDERFLOW)
 
     def scaled(self, exponent: int | NDArray[np.int64]) -> "IntervalMatrix":

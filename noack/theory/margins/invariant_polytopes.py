@@ -27,8 +27,8 @@ _IMPROVEMENT, _PIVOT = 1e-11, 1e-9
 """Smaller violations of the dual's inequalities, and smaller entries of a column, are rounding."""
 _MOST_MULTIPLICATIONS = 250_000
 """Multiplications in a product of matrices: for more, the BLAS uses several threads, which is slower here."""
-UNIT = 0.1
-"""Length of the unit vectors among the first vertices: they are there only to span the space."""
+_FIRST_LENGTH = 0.1
+"""Length of the first vertices along the axes: they are there only to span the space."""
 _LARGEST_INSIDE_NORM = 1 - 1e-9
 """Norm up to which an image is inside, although it is rounded."""
 _MOST_ROUNDS, _WORK_PER_VERTEX = 60, 1_000_000
@@ -100,31 +100,31 @@ class PolytopeNorm:
             # The vertex whose coefficient reaches 0 first leaves it.
             leaving = ratios.argmin(axis=1)
             step = ratios[np.arange(len(active)), leaving]
-            go = (np.abs(value) > 1 + _IMPROVEMENT) & np.isfinite(step)
-            active, step, leaving = active[go], step[go], leaving[go]
-            coefficients[active] = np.maximum(coefficients[active] - step[:, None] * rates[go], 0)
+            improves = (np.abs(value) > 1 + _IMPROVEMENT) & np.isfinite(step)
+            active, step, leaving = active[improves], step[improves], leaving[improves]
+            coefficients[active] = np.maximum(coefficients[active] - step[:, None] * rates[improves], 0)
             coefficients[active, leaving] = step
-            chosen[active, leaving] = entering[go]
-            signs[active, leaving] = sign[go]
+            chosen[active, leaving] = entering[improves]
+            signs[active, leaving] = sign[improves]
         return Combinations(chosen, coefficients * signs)
 
     def bounds(self, points: IntervalMatrix, enough: float = 0.0) -> Vector:
         """Return rigorous upper bounds of the norms of points, (k, n).
 
         A bound that is at most ``enough`` is not improved further.
-        Nothing is assumed about the combinations; what they miss is a combination of unit vectors.
+        Nothing is assumed about the combinations; their residual is a combination of unit vectors.
         """
         combinations = self.combinations(points.middle, enough)
         basis = exactly(self.vertices[combinations.vertices])
         sums = exactly(combinations.coefficients[:, None, :]) @ basis
-        missed = (points - IntervalMatrix(*(part[:, 0] for part in sums))).magnitude
-        bounds = (combinations.norms + (missed / self._units).sum(axis=1)) * ENLARGED
+        residual = (points - IntervalMatrix(*(part[:, 0] for part in sums))).magnitude
+        bounds = (combinations.norms + (residual / self._units).sum(axis=1)) * ENLARGED
         return np.where(np.isnan(bounds), np.inf, bounds)
 
 
 def initial_vertices(system: SwitchedSystem, cycle: Cycle, growth: float) -> list[Matrix]:
-    """Return small unit vectors, and the leading eigenvectors of a cycle, at each node."""
-    vertices = [UNIT * np.eye(system.dimension) for _ in range(system.graph.nodes)]
+    """Return short vectors along the axes, and the leading eigenvectors of a cycle, at each node."""
+    vertices = [_FIRST_LENGTH * np.eye(system.dimension) for _ in range(system.graph.nodes)]
     if cycle.path:
         values, vectors = np.linalg.eig(system.product(cycle.path).middle)
         leading = vectors[:, int(np.abs(values).argmax())]

@@ -27,14 +27,14 @@ FEW_ENTRIES, MOST_ENTRIES = 1200, 2500
 _FASTEST, _SPREAD = 8, 17
 """Edges by which a node is represented: those that grow most, and some spread over all durations."""
 _FIRST_EDGES, _FURTHER_EDGES, _ATTEMPTS = 200, 50, 8
-"""Edges whose inequalities are solved: at first; those that are added because they grow most; how often.
+"""Numbers of edges whose inequalities are solved at first, and of the fastest ones added each time; attempts.
 Few edges decide the norms, and Newton's method takes a time in proportion to their number."""
 _SETTLED = 1e-4
 """No edges are added if the others grow no more than this, in log γ per longest duration."""
 _MOST_STAGES, _HEAVIER = 40, 4.0
 """Stages, and the factor of the weight of log γ from one to the next: some Newton steps suffice then."""
 _MOST_NEWTON_STEPS, _CENTRED = 40, 0.5
-"""Newton steps of a stage; it ends at this decrement, which promises half of it."""
+"""Limit of the Newton steps of a stage, which ends at this decrement: twice the decrease still promised."""
 _ARMIJO_SHARE, _SHORTEST_STEP = 0.1, 1e-6
 """Share of the promised decrease that a step must have, and the shortest part of a step that is tried."""
 _FIRST_DISTANCE = 0.3
@@ -135,62 +135,62 @@ class _EdgeInequalities(NamedTuple):
         """Return P for a smaller log γ, at most ``goal`` if that is found."""
         longest, count = float(self.graph.durations.max()), self.matrices[:, 0].size
         known = float(self.log_growths(P).max())
-        level = known + _FIRST_DISTANCE / longest
+        log_growth = known + _FIRST_DISTANCE / longest
         weight = count * longest
         for _ in range(_MOST_STAGES):
             for _ in range(_MOST_NEWTON_STEPS):
-                moved = self._newton_step(P, level, weight)
+                moved = self._newton_step(P, log_growth, weight)
                 if moved is None:
                     break
-                P, level, decrement = moved
+                P, log_growth, decrement = moved
                 if decrement < _CENTRED:
                     break
-            known = min(float(self.log_growths(P).max()), level)
+            known = min(float(self.log_growths(P).max()), log_growth)
             if known < goal or count / weight < _GAP / longest:
                 break
             weight *= _HEAVIER
         return P
 
-    def _newton_step(self, P: Stack, level: float, weight: float) -> tuple[Stack, float, float] | None:
+    def _newton_step(self, P: Stack, log_growth: float, weight: float) -> tuple[Stack, float, float] | None:
         """Return P and log γ after a step of Newton's method, and twice what it promised.
 
         None: no step along its direction makes the value smaller.
         """
         try:
-            change, further, decrement = self._direction(P, level, weight)
+            change, log_growth_change, decrement = self._direction(P, log_growth, weight)
         except (np.linalg.LinAlgError, RuntimeError):  # singular by rounding
             return None
-        value, share = self._value(P, level, weight), 1.0
+        value, share = self._value(P, log_growth, weight), 1.0
         while share > _SHORTEST_STEP:
-            new = P + share * change, level + share * further
+            new = P + share * change, log_growth + share * log_growth_change
             if self._value(*new, weight) < value - _ARMIJO_SHARE * share * decrement:
                 return *new, decrement
             share /= 2
         return None
 
-    def _value(self, P: Stack, level: float, weight: float) -> float:
+    def _value(self, P: Stack, log_growth: float, weight: float) -> float:
         """Return weight · log γ + Σ tr P − Σ log det F; infinity outside."""
-        if not -level * float(self.graph.durations.max()) < _LARGEST_LOGARITHM:
+        if not -log_growth * float(self.graph.durations.max()) < _LARGEST_LOGARITHM:
             return math.inf
         try:
-            steps = self._steps(level)
+            steps = self._steps(log_growth)
             roots = np.linalg.cholesky(P[self.graph.sources] - self._carried(P, steps))
             np.linalg.cholesky(P)
         except np.linalg.LinAlgError:
             return math.inf
         diagonals = np.diagonal(roots, axis1=1, axis2=2)
         traces = np.trace(P, axis1=1, axis2=2)
-        return float(weight * level + traces.sum() - 2 * np.log(diagonals).sum())
+        return float(weight * log_growth + traces.sum() - 2 * np.log(diagonals).sum())
 
-    def _steps(self, level: float) -> Stack:
+    def _steps(self, log_growth: float) -> Stack:
         """Return N of each edge."""
-        return np.asarray(self.matrices * np.exp(-level * self.graph.durations)[:, None, None])
+        return np.asarray(self.matrices * np.exp(-log_growth * self.graph.durations)[:, None, None])
 
     def _carried(self, P: Stack, steps: Stack) -> Stack:
         """Return NᵀP_wN of each edge."""
         return np.asarray(steps.swapaxes(1, 2) @ P[self.graph.targets] @ steps)
 
-    def _direction(self, P: Stack, level: float, weight: float) -> tuple[Stack, float, float]:
+    def _direction(self, P: Stack, log_growth: float, weight: float) -> tuple[Stack, float, float]:
         """Return Newton's change of P and of log γ, and twice the decrease that it promises.
 
         With G = F^{−1}, the curvature is tr(G dF G dF) with dF = dP_v − NᵀdP_wN + S dlog γ,
@@ -200,7 +200,7 @@ class _EdgeInequalities(NamedTuple):
         from scipy.sparse.linalg import splu
 
         sources, targets, durations = self.graph.sources, self.graph.targets, self.graph.durations
-        (count, n), steps = P.shape[:2], self._steps(level)
+        (count, n), steps = P.shape[:2], self._steps(log_growth)
         basis = _symmetric_basis(n)
         size, carried = basis.shape[1], self._carried(P, steps)
         G = np.asarray(np.linalg.inv(P[sources] - carried), dtype=np.float64)
@@ -238,10 +238,10 @@ class _EdgeInequalities(NamedTuple):
         corner -= float(border @ across)
         if not corner > 0:
             raise np.linalg.LinAlgError
-        further = -(own_slope - float(border @ along)) / corner
-        change = -along - further * across
-        decrement = -float(slope @ change) - own_slope * further
-        return (change.reshape(count, size) @ basis.T).reshape(P.shape), further, decrement
+        log_growth_change = -(own_slope - float(border @ along)) / corner
+        change = -along - log_growth_change * across
+        decrement = -float(slope @ change) - own_slope * log_growth_change
+        return (change.reshape(count, size) @ basis.T).reshape(P.shape), log_growth_change, decrement
 
 
 def _symmetric_basis(n: int) -> Matrix:
@@ -260,13 +260,13 @@ def with_history(system: SwitchedSystem, classes: int) -> SwitchedSystem:
     bound (Ahmadi, Jungers, Parrilo and Roozbehani, *SIAM J. Control Optim.* 52, 2014). Each edge
     becomes ``classes`` successive ones.
     """
-    graph, kinds = system.graph, np.zeros_like(system.graph.sources)
+    graph, edge_classes = system.graph, np.zeros_like(system.graph.sources)
     for node in range(graph.nodes):
         reaching = np.flatnonzero(graph.targets == node)
-        kinds[reaching] = np.arange(len(reaching)) * classes // len(reaching)
+        edge_classes[reaching] = np.arange(len(reaching)) * classes // len(reaching)
     sources = (graph.sources[:, None] * classes + np.arange(classes)).ravel()
-    targets = np.repeat(graph.targets * classes + kinds, classes)
-    numbers = np.repeat(np.arange(len(kinds)), classes)
+    targets = np.repeat(graph.targets * classes + edge_classes, classes)
+    numbers = np.repeat(np.arange(len(edge_classes)), classes)
     return SwitchedSystem(Graph(sources, targets, graph.durations[numbers]), system.matrices.at(numbers))
 
 
@@ -275,8 +275,8 @@ def representatives(graph: Graph, growths: Vector) -> Numbers:
     chosen: list[Numbers] = []
     for edges in graph.leaving:
         by_duration = edges[np.argsort(graph.durations[edges], kind="stable")]
-        places = np.linspace(0, len(by_duration) - 1, min(_SPREAD, len(by_duration))).round().astype(np.int64)
-        chosen += [edges[np.argsort(-growths[edges], kind="stable")][:_FASTEST], by_duration[places]]
+        spread = np.linspace(0, len(by_duration) - 1, min(_SPREAD, len(by_duration))).round().astype(np.int64)
+        chosen += [edges[np.argsort(-growths[edges], kind="stable")][:_FASTEST], by_duration[spread]]
     return np.unique(np.concatenate(chosen))
 
 

@@ -25,7 +25,7 @@ Numbers = NDArray[np.int64]
 """Numbers of nodes or of edges, or durations, (k,)."""
 _ITERATIONS = 60
 """Rounds of the search for balanced coordinates, which need not be exact."""
-_ROUNDEST = 1e-6
+_LEAST_EIGENVALUE = 1e-6
 """Smallest eigenvalue of a quadratic form, relative to the largest one."""
 _TINY = float(np.finfo(np.float64).tiny)
 """Added to a norm whose logarithm is taken, and to a root that may underflow."""
@@ -120,7 +120,7 @@ class Graph:
             size = float(traces.max())
             if not 0 < size < np.inf:
                 return identity
-            forms = (following + _ROUNDEST * traces * identity) / size
+            forms = (following + _LEAST_EIGENVALUE * traces * identity) / size
         try:
             return np.asarray(np.linalg.cholesky(forms).swapaxes(1, 2), np.float64)
         except np.linalg.LinAlgError:
@@ -151,7 +151,7 @@ class Graph:
                 with np.errstate(divide="ignore"):
                     growths = np.log(spectral_radii(products[closed])) / durations[closed]
                 fastest = float(growths.max())
-                if fastest > best + _EQUAL:  # of the rotations of a cycle, take always the same
+                if fastest > best + _EQUAL:  # always take the same rotation of a cycle
                     rotations = paths[closed[growths > fastest - _EQUAL]]
                     best, cycle = fastest, tuple(min(rotations.tolist()))
             rank = durations * (norms - (best if best > _SLOWEST else 0.0))

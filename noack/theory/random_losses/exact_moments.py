@@ -1,4 +1,4 @@
-"""Second moments and quadratic cost of a time-triggered loop under random losses, without bounds.
+"""Second moments and quadratic cost of a time-triggered loop under random losses, not bounded but computed.
 
 From one transmission to the next, z = (x, x_c, u, w) becomes M₀z + v₀ if the update is delivered
 and M₁z + v₁ if it is lost. v has the covariance W₀ or W₁ of what the disturbances and the noise of
@@ -164,12 +164,12 @@ class LoopPeriods:
         self._receive = jump(np.vstack([x, during_delay @ s, u, w, d, s]), count)
 
     def step(self, slot: int, delivered: bool, duration_ns: int | None = None) -> MomentStep:
-        """Return a period, or what of it is before a time, from just before its transmission.
+        """Return a period, or its first part, from just before its transmission.
 
         Args:
             slot: number of the transmission, modulo the number of slots.
             delivered: whether its update arrives.
-            duration_ns: by default the period.
+            duration_ns: length of this part; by default the period.
         """
         from_ns, duration = slot * self.times.period_ns, duration_ns or self.times.period_ns
         until_ns, arrival_ns = from_ns + duration, from_ns + self.times.delay_ns
@@ -293,7 +293,7 @@ class LoopMoments:
         return current, costs
 
     def _after_cycles(self, start: SecondMoments, cycles: int, count: int) -> tuple[SecondMoments, Vector]:
-        """Return the moments after so many cycles, and the costs, by a power of the cycle's map.
+        """Return the moments and costs after a number of cycles, by a power of the cycle's map.
 
         It maps ``count`` numbers: moments, shares, and the costs so far.
         """

@@ -66,7 +66,7 @@ class _SignalRows(NamedTuple):
     """Of p."""
 
 
-class MeanSquares(NamedTuple):
+class RootMeanSquares(NamedTuple):
     """Bounds of √(E‖·‖²), each multiplied by e^{−rate·t}, at every fixed time t."""
 
     rate_per_s: float
@@ -82,7 +82,7 @@ class MeanSquares(NamedTuple):
     """Spectral radius of the inequalities; below 1."""
 
 
-def mean_squares(
+def root_mean_squares(
     error: ErrorGains,
     plant: PlantGains,
     conditions: NetworkConditions,
@@ -90,7 +90,7 @@ def mean_squares(
     largest_probability: float,
     *,
     refined: bool = False,
-) -> MeanSquares:
+) -> RootMeanSquares:
     """Bound all signals at every fixed time; ``conditions.dropouts`` has no effect.
 
     Args:
@@ -115,7 +115,7 @@ def mean_squares(
     if refined:
         bounds = inequalities.refine(bounds)
     e_c, x = bounds.errors[Output.WEIGHTED], bounds.states[Output.STATE]
-    return MeanSquares(error.alpha_per_s, bounds.sensor_error, e_c, bounds.input_error, x, loop_gain)
+    return RootMeanSquares(error.alpha_per_s, bounds.sensor_error, e_c, bounds.input_error, x, loop_gain)
 
 
 class _Bounds(NamedTuple):

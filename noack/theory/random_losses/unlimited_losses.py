@@ -8,8 +8,9 @@ events is known exactly, and (I1) gives a bound by itself: :func:`moment_at_even
 A run ends. Up to its horizon the certificates for at most m consecutive losses bound each run by its
 own longest burst: :func:`moments_of_runs` bounds the mean of the largest ‖e_c‖ and ‖x‖ of a run.
 
-Almost surely, x decays at every rate below that of the mean squares. Under the paper's conditions it does
-so for every loss probability below 1. :func:`unlimited_losses` says all of this of a scenario.
+Almost surely, x decays at every rate below that of the root mean squares. Under the paper's
+conditions it does so for every loss probability below 1. :func:`unlimited_losses` says all of this
+of a scenario.
 """
 
 from collections.abc import Sequence
@@ -28,11 +29,11 @@ from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertifica
 from noack.theory.bounds.disturbances import excluded_probability
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, Output, PlantGains, error_gains
-from noack.theory.certificates.assumptions import below
+from noack.theory.certificates.assumptions import is_below_decay_rate
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import kept_probability, most_events, void_by_safe_input
 from noack.theory.certificates.scenario_certificates import CertificateScope
-from noack.theory.random_losses.mean_square_bounds import MeanSquares, mean_squares
+from noack.theory.random_losses.mean_square_bounds import RootMeanSquares, root_mean_squares
 
 ORDERS = (1, 2)
 """r of the moments at events, and of a run's largest values."""
@@ -45,13 +46,13 @@ _ROUNDING = 1e-9
 _SLOWER = 0.9
 """α that is used if the trigger's is too large, as a share of the decay rate of the loop."""
 _RATES = (1.0, 0.5, 0.25, 1e-3)
-"""Shares of the trigger's rate at which mean squares are tried, until one of the smaller ones has a
+"""Shares of the trigger's rate at which root mean squares are tried, until one of the smaller ones has a
 loop gain that is clearly below 1: near 1 the bounds are large."""
 _CLEARLY_BELOW_1 = 0.9
 """A loop gain that is clearly below 1."""
 
 
-def moment_at_events(error: ErrorGains, losses: LossProcess, spacing_s: float, order: int) -> float:
+def moment_at_events(error: ErrorGains, losses: LossProcess, inter_event_s: float, order: int) -> float:
     """Bound (E(‖e_c‖_W e^{αt}/β)ʳ)^{1/r} just before an event of the continuous trigger.
 
     If exactly the last J updates are lost, ‖e_c‖_W e^{αt}/β ≤ S_J = 1 + g_1 + … + g_J with g_j =
@@ -62,7 +63,7 @@ def moment_at_events(error: ErrorGains, losses: LossProcess, spacing_s: float, o
     Args:
         error: the gains of the models.
         losses: the losses.
-        spacing_s: δ, a lower bound of the inter-event time; 0 is always valid.
+        inter_event_s: δ, a lower bound of the inter-event time; 0 is always valid.
         order: r.
 
     Raises:
@@ -72,7 +73,7 @@ def moment_at_events(error: ErrorGains, losses: LossProcess, spacing_s: float, o
     tails, longest = losses.tails(_TERMS)
     if not longest < 1:
         raise NoCertificateError("bursts of losses may be arbitrarily long")
-    gains = error.kernels[Output.WEIGHTED].sups(spacing_s * np.arange(1.0, _TERMS + 1))
+    gains = error.kernels[Output.WEIGHTED].sups(inter_event_s * np.arange(1.0, _TERMS + 1))
     sums = 1.0 + np.cumsum(np.append(0.0, gains))
     # Number kN + j, j ≤ N, adds at most r g_N ((k + 1) S_N)^{r−1}; P(J ≥ kN + j) ≤ longestᵏ P(J ≥ j).
     later = (1 - longest) ** -order - 1  # Σ_{k≥1} (k + 1)^{r−1} longestᵏ
@@ -149,7 +150,7 @@ class UnlimitedLosses:
     """For increasing m, as long as there are certificates."""
     runs: tuple[RunMoments, ...]
     """For r = 1 and 2; none if there is no certificate, or if something is normally distributed."""
-    mean_squares: MeanSquares | None
+    root_mean_squares: RootMeanSquares | None
     """At every fixed time, under the schedule's conditions."""
     at_events: tuple[float, ...]
     """Bounds of (E(‖e_c‖_W e^{αt}/β)ʳ)^{1/r} at events, r = 1 and 2, the paper's conditions."""
@@ -158,15 +159,17 @@ class UnlimitedLosses:
     paper_rate_per_s: float | None
     """The same under the paper's conditions."""
     void: str | None
-    """Why there are no mean squares; None if there are."""
+    """Why there are no root mean squares; None if there are."""
 
     def to_json(self) -> dict[str, object]:
         """Return all fields for JSON."""
+        values = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        moments: RootMeanSquares | None = values.pop("root_mean_squares")
         return {
-            **{name: getattr(self, name) for name in self.__dataclass_fields__},
+            **values,
             "bursts": [burst._asdict() for burst in self.bursts],
             "runs": [moment._asdict() for moment in self.runs],
-            "mean_squares": self.mean_squares and self.mean_squares._asdict(),
+            "mean_squares": moments and moments._asdict(),
         }
 
 
@@ -202,12 +205,12 @@ def _bursts(
 ) -> list[BurstCertificate]:
     certificates: list[BurstCertificate] = []
     for longest in range(_MOST_BURST + 1):
-        # The certificate of at most so many losses in a row, and how likely a run keeps to that.
+        # The certificate for at most ``longest`` consecutive losses, and how likely a run keeps to that.
         certificate = scope.certificate(conditions._replace(dropouts=longest, constraints=()))
-        constants, spacing_s = certificate.constants, certificate.inter_event_s
-        if constants is None or not spacing_s:
+        constants, inter_event_s = certificate.constants, certificate.inter_event_s
+        if constants is None or not inter_event_s:
             break
-        probability = kept_probability(resolved, LossGuarantee((LongestBurst(longest),)), spacing_s)
+        probability = kept_probability(resolved, LossGuarantee((LongestBurst(longest),)), inter_event_s)
         if probability is None:
             break
         controller_error, state = (
@@ -222,7 +225,7 @@ def _bursts(
             BurstCertificate(
                 longest,
                 probability,
-                most_events(resolved, spacing_s),
+                most_events(resolved, inter_event_s),
                 delta,
                 rate_per_s,
                 controller_error,
@@ -250,8 +253,8 @@ def _slowest_rate(certificate: ScenarioCertificate) -> float:
 
 def _at_fixed_times(
     resolved: Scenario, losses: LossProcess, conditions: NetworkConditions
-) -> tuple[MeanSquares | None, str | None]:
-    """Return mean squares at the first rate with a small loop gain, or else at the lowest; or why not."""
+) -> tuple[RootMeanSquares | None, str | None]:
+    """Return the bounds for the first rate with a small loop gain, else the lowest; or why there are none."""
     if not _is_covered(resolved):
         return None, "this needs the paper's trigger, and no disturbance, noise or observer"
     if (why := void_by_safe_input(resolved, conditions)) is not None:
@@ -260,21 +263,21 @@ def _at_fixed_times(
     decay = -max(spectral_abscissa(loop.H), spectral_abscissa(loop.A + loop.B @ loop.K))
     if decay <= 0:
         return None, "the models or A + BK do not decay"
-    alpha = trigger.alpha_per_s if below(trigger.alpha_per_s, decay) else _SLOWER * decay
+    alpha = trigger.alpha_per_s if is_below_decay_rate(trigger.alpha_per_s, decay) else _SLOWER * decay
     if trigger.floor > 0:
         alpha = 0.0
     beta, p = max(trigger.beta, trigger.floor), losses.largest_probability
     moments, reason = None, None
     for share in _RATES:
         try:
-            moments = mean_squares(*_gains(loop, share * alpha), conditions, beta, p)
+            moments = root_mean_squares(*_gains(loop, share * alpha), conditions, beta, p)
         except (NoCertificateError, NotDecayingError) as error:
             reason = str(error)
         if moments and (share == 1 or moments.loop_gain < _CLEARLY_BELOW_1):
             break
     if moments is None:
         return None, reason
-    return mean_squares(*_gains(loop, moments.rate_per_s), conditions, beta, p, refined=True), None
+    return root_mean_squares(*_gains(loop, moments.rate_per_s), conditions, beta, p, refined=True), None
 
 
 def _gains(loop: LoopMatrices, rate_per_s: float) -> tuple[ErrorGains, PlantGains]:
@@ -288,7 +291,7 @@ def _paper(resolved: Scenario, losses: LossProcess) -> tuple[float | None, tuple
         return None, ()
     loop, alpha = loop_of(resolved), resolved.decaying.alpha_per_s
     decay = -max(spectral_abscissa(loop.H), spectral_abscissa(loop.A + loop.B @ loop.K))
-    if resolved.decaying.floor > 0 or not below(alpha, decay):
+    if resolved.decaying.floor > 0 or not is_below_decay_rate(alpha, decay):
         return None, ()
     error = error_gains(loop, alpha)
     try:

@@ -234,7 +234,7 @@ def test_without_a_cap_the_mean_at_events_in_the_chosen_norm_is_beta_over_1_minu
         assert shorter.probability < longer.probability
         assert shorter.state < longer.state
     gain = "the loop gain of the mean squares is 1.32, not below 1"
-    texts = list(sentences(replace(unlimited, mean_squares=None, void=gain, sure_rate_per_s=None)))
+    texts = list(sentences(replace(unlimited, root_mean_squares=None, void=gain, sure_rate_per_s=None)))
     assert f"At every time no mean is certified: {gain}." in texts
 
 
@@ -242,9 +242,9 @@ def test_the_bounds_of_means_are_one_table_with_rounding_up(without_a_cap: Certi
     unlimited = without_a_cap.unlimited
     assert unlimited is not None
     runs = tuple(run._replace(controller_error=1.00001 + run.order) for run in unlimited.runs)
-    assert unlimited.mean_squares is not None
-    fixed = unlimited.mean_squares._replace(rate_per_s=0.125, state=7.00001)
-    unlimited = replace(unlimited, runs=runs, mean_squares=fixed, at_events=(1.5, 2.00001))
+    assert unlimited.root_mean_squares is not None
+    fixed = unlimited.root_mean_squares._replace(rate_per_s=0.125, state=7.00001)
+    unlimited = replace(unlimited, runs=runs, root_mean_squares=fixed, at_events=(1.5, 2.00001))
     table = moments_table(unlimited, "‖W e_c‖", beta=0.5)
     assert table.headings == (
         "", "rate,\n1/s", "mean\n‖x‖", "rms\n‖x‖", "mean\n‖W e_c‖", "rms\n‖W e_c‖",

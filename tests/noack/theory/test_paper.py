@@ -202,7 +202,7 @@ def histories(draw: st.DrawFn) -> History:
 
 
 def follow(history: History, trigger: TriggerRule, at_once: int = 25) -> list[tuple[float, float, Vector]]:
-    """Return both bounds, and (I1), at each moment; the monitor takes so many moments at once."""
+    """Return both bounds, and (I1), at each moment; the monitor takes ``at_once`` moments each time."""
     monitor, followed = ErrorMonitor(history.H, trigger, PERIOD_NS), []
     for first in range(0, len(history.moments), at_once):
         columns = zip(*history.moments[first : first + at_once], strict=True)

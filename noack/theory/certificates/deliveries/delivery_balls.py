@@ -19,7 +19,7 @@ from noack.core.linear_systems import Matrix, Vector
 from noack.theory.bounds.stacked_norms import ROUNDING, Stack
 
 _LAGS = 64
-"""So many m are tried; the norms of all of them are one product."""
+"""Number of lags m that are tried; the norms of all of them are one product."""
 
 
 class Ball(NamedTuple):

@@ -30,7 +30,7 @@ from noack.theory.bounds.stacked_norms import Stack, larger_ends, spectral_norms
 _FIRST_STEP = 0.005
 """First step of the grid, in time constants of the fastest mode: e^{Fτ} is then nearly straight."""
 _CELLS_PER_STEP = 32
-"""After so many cells the step is doubled, as fast modes have decayed."""
+"""Number of cells after which the step is doubled, as fast modes have decayed."""
 _LONGEST_STEP = 0.02
 """Limit of a step, in time constants of the fastest growing mode, which never decays."""
 _MOST_GROWTH = 1e6

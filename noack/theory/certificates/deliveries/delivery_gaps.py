@@ -32,7 +32,7 @@ _MOST_GAPS, _MOST_CELLS = 256, 640
 _CELL = 0.04
 """Length of a cell, in time constants of the flow."""
 _PIECES = 4
-"""In so many pieces of a gap the ages of the input are averaged: each one doubles the number of signs."""
+"""Pieces of a gap in which the ages of the input are averaged: each one doubles the number of signs."""
 _SIGNS = np.array(list(itertools.product((-1.0, 1.0), repeat=_PIECES)))
 """All signs of the mean ages in the pieces."""
 _AGES = 4

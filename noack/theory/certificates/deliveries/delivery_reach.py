@@ -58,7 +58,7 @@ _NEIGHBOURS = np.array([-1.0, 0.0, 1.0])
 _CELLS_AT_ONCE = 16
 """Cells with the highest bounds, which are improved together: one product for all of them."""
 _MOST_JOINT_ROUNDS = 3
-"""The conditions of earlier times are used in so many rounds at most: each takes long."""
+"""Maximum number of rounds that use the conditions of earlier times: each takes long."""
 _CLEARLY_ENOUGH = 0.98
 """Share of a sufficient bound from which on a bound at one end of a cell is not improved: the other end
 and the sag come on top."""

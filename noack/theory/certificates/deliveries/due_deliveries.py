@@ -44,9 +44,9 @@ from noack.theory.certificates.deliveries.delivery_balls import (
 from noack.theory.certificates.deliveries.delivery_gaps import ERROR, INPUT, GapGains, GapLoop, Gaps
 
 MOST_TIMES = 6000
-"""Balls are followed for so many steps of the gaps at most; then the norm ‖ξ‖ + θS bounds the rest."""
+"""Maximum number of steps for which balls are followed; then the norm ‖ξ‖ + θS bounds the rest."""
 BALLS_AT_ONCE = 64
-"""Outputs are bounded for so many balls at once, and then it is tested whether the bounds have settled."""
+"""Number of balls whose outputs are bounded at once, before a test of whether the bounds have settled."""
 _DECAY_SHARES = (0.9, 0.7, 0.4)
 """Decay rates of Λ that are tried, as shares of that of the scaled A + BK."""
 _LEAST_SHARE = 1e-6
@@ -98,10 +98,10 @@ class Deliveries:
         start_error = float(plant.start_up(conditions.start_s)[0])
         by_input, by_mismatch, _ = ErrorGrowth(plant, bound.times.longest_s, TriggerBound(0.0, None)).driven
         sensor = by_input * max(sup[INPUT], start_error) + by_mismatch * sup[Output.MISMATCH]
-        apart_s = max(bound.times.shortest_s, conditions.spacing_s)
+        inter_event_s = max(bound.times.shortest_s, conditions.spacing_s)
         return Constants(
             rate_per_s=plant.alpha_per_s,
-            missing_events=conditions.dropouts + math.ceil(conditions.delay_s / apart_s - 1e-9),
+            missing_events=conditions.dropouts + math.ceil(conditions.delay_s / inter_event_s - 1e-9),
             delta=sup[ERROR] / unit,
             overshoot=float(sensor) / unit,
             input_error=sup[INPUT],
@@ -109,7 +109,7 @@ class Deliveries:
             state=sup[Output.STATE],
             state_weighted=sup[Output.WEIGHTED],
             mismatch=sup[Output.MISMATCH],
-            inter_event_s=apart_s,
+            inter_event_s=inter_event_s,
             loop_gain=0.0,
             received_input_error=sup[INPUT],
             present_input_error=sup[INPUT],
@@ -140,9 +140,9 @@ class Deliveries:
         return np.asarray(np.maximum(later, highest) * ROUNDING)
 
     def balls(self) -> Iterator[tuple[range, list[Ball]]]:
-        """Yield times, and a ball of each of them at which there may be a delivered event, without end.
+        """Yield successive times, and a ball for each at which an event may be delivered, without end.
 
-        These are so many successive times that they do not depend on each other.
+        Each batch of times is short enough that its balls do not depend on each other.
         """
         batch = int(self.loop.gaps.counts[0])
         recent = RecentBalls(self.loop.gaps.counts, self._balls_from_start())

@@ -35,7 +35,7 @@ def _smallest(values: Matrix, growths: Growths) -> Matrix:
 
 
 class _SumOfErrors:
-    """The gains of the errors of one loop, of events ``spacing_s`` apart, of which ``count`` are missing.
+    """The gains of the errors of one loop, of events ``inter_event_s`` apart, of which ``count`` are missing.
 
     The present e_s is followed for ``later_s``, as if nothing reset it. Axes are named o, output; g,
     growth; i, the present error and those of the missing events, from the newest one on.
@@ -46,7 +46,7 @@ class _SumOfErrors:
         plant: PlantGains,
         growths: Growths,
         begin_s: float,
-        spacing_s: float,
+        inter_event_s: float,
         count: int,
         later_s: float,
     ) -> None:
@@ -54,7 +54,7 @@ class _SumOfErrors:
         all_growths = [growth for row in growths for growth in row]
         self._growths = growths
         self._begin_s = begin_s
-        ages_s = spacing_s * np.arange(count, dtype=np.float64)
+        ages_s = inter_event_s * np.arange(count, dtype=np.float64)
         # Gains of the errors of missing events, and of what had entered before them.
         missing = np.array([error.kernels[C].sups(ages_s) for C in error.outputs])[:, None]
         kernels = [plant.driven[C] for C in error.outputs]
@@ -143,12 +143,15 @@ class _OpenLoopGains:
         return np.array(gains_by_growth).transpose(2, 1, 0)
 
     @cached_method
-    def after(self, later_s: float, apart_s: float) -> Stack:
-        """Return the gains of b, of a lost error, and of q and R_E x, then without means, (6, o, g)."""
+    def after(self, later_s: float, since_lost_s: float) -> Stack:
+        """Return the gains of b, of a lost error, and of q and R_E x, then without means, (6, o, g).
+
+        ``since_lost_s`` is the shortest time since the event of the lost error.
+        """
         error = self._plant.error
         kept, *entered_by = self._without_losses(later_s)
         # A lost error has been followed by its model since, and by the open loop from then on.
-        remaining_s = np.array([max(apart_s - growth.longest_s, 0.0) for growth in self._growths])
+        remaining_s = np.array([max(since_lost_s - growth.longest_s, 0.0) for growth in self._growths])
         remaining = {C: error.kernels[C].sups(remaining_s) for C in error.outputs}
         with_own_direction = np.array([*remaining.values()]) + entered_by[2] * remaining[Output.GAIN]
         of_lost = np.minimum(kept * remaining[Output.WEIGHTED], with_own_direction)
@@ -156,7 +159,7 @@ class _OpenLoopGains:
 
 
 class OpenLoopErrors:
-    """Bounds of e_c in open loop, by :class:`_OpenLoopGains`, for events ``spacing_s`` apart."""
+    """Bounds of e_c in open loop, by :class:`_OpenLoopGains`, for events ``inter_event_s`` apart."""
 
     def __init__(
         self,
@@ -164,10 +167,10 @@ class OpenLoopErrors:
         growths: Growths,
         gains: _OpenLoopGains,
         conditions: NetworkConditions,
-        spacing_s: float,
+        inter_event_s: float,
     ) -> None:
         self._growths, self._lost = growths, conditions.dropouts
-        self._at_next_event = gains.after(0.0, spacing_s)[:, :1]
+        self._at_next_event = gains.after(0.0, inter_event_s)[:, :1]
         self._until_next_event = gains.after(0.0, 0.0)[:, :1]
         self._until_update_acts = gains.after(conditions.delay_s, 0.0)
         until_s = max(conditions.delay_s, conditions.start_s)
@@ -247,16 +250,16 @@ class KnownBounds:
 class InsertedInequalities(ErrorInequalities):
     """The inequalities of one loop without disturbances, into which bounds are inserted."""
 
-    def solved_bounds(self, spacing_s: float) -> KnownBounds:
+    def solved_bounds(self, inter_event_s: float) -> KnownBounds:
         """Return the bounds of one loop; infinite without a certificate."""
-        spacing, events = np.array([spacing_s]), np.array([self._missing_events(spacing_s)])
+        times_s, events = np.array([inter_event_s]), np.array([self._missing_events(inter_event_s)])
         solved = [
-            bound[0] for method in self.methods for _, _, bound in self._solutions(method, events, spacing)
+            bound[0] for method in self.methods for _, _, bound in self._solutions(method, events, times_s)
         ]
         infinite = dict.fromkeys(self._states, math.inf), dict.fromkeys(self._error.outputs, math.inf)
         return KnownBounds(np.min(solved, axis=0), *infinite)
 
-    def insert(self, bounds: KnownBounds, spacing_s: float) -> None:
+    def insert(self, bounds: KnownBounds, inter_event_s: float) -> None:
         """Insert bounds that hold into all inequalities of one loop, to make them smaller."""
         states, errors, (_, input_error, _) = bounds.states, bounds.errors, bounds.driving
         # x from the start on.
@@ -267,9 +270,9 @@ class InsertedInequalities(ErrorInequalities):
         b = np.array([growth.after_test(states) for growth in growths])
         is_last = [growth.longest_s == self._conditions.sampling_s for growth in growths]
         bounds.tested_sensor_error = min([bounds.tested_sensor_error, *b[is_last].tolist()])
-        self._insert_errors(bounds, b, spacing_s)
-        if spacing_s >= self.acts_within_s:
-            self._insert_lost(bounds, b, spacing_s)
+        self._insert_errors(bounds, b, inter_event_s)
+        if inter_event_s >= self.acts_within_s:
+            self._insert_lost(bounds, b, inter_event_s)
         self._insert_sensor(bounds, b)
         new_signals = bounds.signals.copy()
         new_signals[Signal.AGE_INPUT] = sum(
@@ -280,11 +283,11 @@ class InsertedInequalities(ErrorInequalities):
         new_signals[Signal.MISMATCH] = states[Output.MISMATCH]
         bounds.signals = np.minimum(bounds.signals, new_signals)
 
-    def _insert_errors(self, bounds: KnownBounds, b: Vector, spacing_s: float) -> None:
+    def _insert_errors(self, bounds: KnownBounds, b: Vector, inter_event_s: float) -> None:
         """Insert bounds of e_c, given those of e_s after a test: as a sum, and in open loop."""
         age_input, input_error, mismatch = bounds.driving
         weighted, gain = self._rows
-        for method, sums in self._error_sums(spacing_s).items():
+        for method, sums in self._error_sums(inter_event_s).items():
             parts, at_start = sums.bound(b, input_error, mismatch, self.start_error)
             whole = parts.cumsum(axis=1) + at_start
             if method is BoundMethod.MISSING:
@@ -300,12 +303,13 @@ class InsertedInequalities(ErrorInequalities):
                 )
             bounds.reduce_errors(whole[:, -1])
         start_error = max(input_error, self.start_error)
-        between_events, whole = self._open_loop_errors(spacing_s).bound(b, age_input, start_error, mismatch)
+        open_loop_errors = self._open_loop_errors(inter_event_s)
+        between_events, whole = open_loop_errors.bound(b, age_input, start_error, mismatch)
         bounds.reduce_errors(whole[:, -1])
         bounds.received_input_error = min(bounds.received_input_error, float(whole[gain, 0]) + age_input)
         bounds.after_losses = np.minimum(bounds.after_losses, between_events)
 
-    def _insert_lost(self, bounds: KnownBounds, b: Vector, spacing_s: float) -> None:
+    def _insert_lost(self, bounds: KnownBounds, b: Vector, inter_event_s: float) -> None:
         """Insert bounds of e_c after 0, 1, … lost events, if an update acts before the next event."""
         age_input, input_error, mismatch = bounds.driving
         weighted, gain = self._rows
@@ -314,9 +318,9 @@ class InsertedInequalities(ErrorInequalities):
         )
         inputs[0] = min(inputs[0], bounds.received_input_error)
         # While one more event is in flight, π bounds the input that drives the present error.
-        stages = np.append(inputs, input_error)[: self._missing_events(spacing_s) + 1]
+        stages = np.append(inputs, input_error)[: self._missing_events(inter_event_s) + 1]
         start_error = max(input_error, self.start_error)
-        sums = self._error_sums(spacing_s)[BoundMethod.MISSING]
+        sums = self._error_sums(inter_event_s)[BoundMethod.MISSING]
         summed = sums.after_losses(b, stages, mismatch, self.acts_within_s, start_error)
         bounds.reduce_errors(summed[:, -1])
         bounds.after_losses = np.minimum(bounds.after_losses, summed[weighted, : len(inputs)])
@@ -360,7 +364,7 @@ class InsertedInequalities(ErrorInequalities):
 
     @property
     def acts_within_s(self) -> float:
-        """An update acts at most so long after its event, the first one after the start."""
+        """The longest time until an update acts: after its event, or after the start for the first one."""
         return max(self._conditions.delay_s, self._conditions.start_s)
 
     @cached_property
@@ -384,30 +388,30 @@ class InsertedInequalities(ErrorInequalities):
         return np.asarray(errors)
 
     @cached_method
-    def _error_sums(self, spacing_s: float) -> Mapping[BoundMethod, _SumOfErrors]:
+    def _error_sums(self, inter_event_s: float) -> Mapping[BoundMethod, _SumOfErrors]:
         conditions = self._conditions
         numbers = {
             BoundMethod.DRIFTING: (conditions.dropouts, conditions.delay_s),
-            BoundMethod.MISSING: (self._missing_events(spacing_s), 0.0),
+            BoundMethod.MISSING: (self._missing_events(inter_event_s), 0.0),
         }
         return {
-            method: _SumOfErrors(self._plant, self._growths, self._begin_s, spacing_s, *numbers[method])
+            method: _SumOfErrors(self._plant, self._growths, self._begin_s, inter_event_s, *numbers[method])
             for method in self.methods
         }
 
     @cached_method
-    def _open_loop_errors(self, spacing_s: float) -> OpenLoopErrors:
+    def _open_loop_errors(self, inter_event_s: float) -> OpenLoopErrors:
         gains = self._open_loop_gains
-        return OpenLoopErrors(self._plant, self._growths, gains, self._conditions, spacing_s)
+        return OpenLoopErrors(self._plant, self._growths, gains, self._conditions, inter_event_s)
 
     @cached_property
     def _open_loop_gains(self) -> _OpenLoopGains:
         return _OpenLoopGains(self._plant, self._growths)
 
-    def _missing_events(self, spacing_s: float) -> int:
+    def _missing_events(self, inter_event_s: float) -> int:
         """Return how many events may be missing: lost, or in flight."""
         conditions = self._conditions
-        in_flight = math.ceil(conditions.delay_s / spacing_s) if conditions.delay_s > 0 else 0
+        in_flight = math.ceil(conditions.delay_s / inter_event_s) if conditions.delay_s > 0 else 0
         return conditions.dropouts + in_flight
 
     @property

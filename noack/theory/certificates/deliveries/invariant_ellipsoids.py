@@ -43,7 +43,7 @@ _PARAMETER_CHANGES = (1.5, 1.5, 1.5, 0.8, 0.8, 0.4, 0.4, 0.2)
 _COARSE, _FINE = np.exp(np.arange(-9.0, 13.0, 3.0)), np.exp(np.linspace(-2.0, 2.0, 9))
 """Multipliers μ: all of them, and around the best one."""
 _NODES = 16
-"""Nodes of the flow that are sampled: so many evenly spaced, and as many in geometric steps."""
+"""Number of nodes of the flow that are sampled evenly, and of those in geometric steps."""
 _CRITICAL_NODES = 4
 """Nodes with the largest c, where μ is refined."""
 _ILL_CONDITIONED = 1e8

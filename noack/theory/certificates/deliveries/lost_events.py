@@ -62,7 +62,7 @@ class SensorErrors(NamedTuple):
     """The earliest time after an event at which the next one may be due, whatever e_s is."""
 
     def since_event(self, r_s: Vector, lost: int) -> Vector:
-        """Bound ‖e_s‖_W at times after an event, while so many events have been lost, (k,)."""
+        """Bound ‖e_s‖_W at times after an event, while ``lost`` events have been lost, (k,)."""
         tested = np.where(r_s * FLOW_ROUNDING >= self.first_test_s, self.after_test, math.inf)
         return np.asarray(np.minimum(tested, self.after_losses[lost]))
 
@@ -72,7 +72,7 @@ def errors_after_losses(
     without_flow: Vector,
     sensor: SensorErrors,
     outputs: Sequence[Matrix],
-    spacing_s: float,
+    inter_event_s: float,
     bend: float,
 ) -> tuple[Vector, float]:
     """Bound ‖e_c‖_W while at most 0, 1, … events have been lost since the delivery.
@@ -82,45 +82,45 @@ def errors_after_losses(
         without_flow: bounds without the flow, for 0, 1, … events.
         sensor: bounds of e_s.
         outputs: matrices Y with ‖Y z‖ ≤ 1 at all times.
-        spacing_s: the least time between events.
+        inter_event_s: a known lower bound of the inter-event time.
         bend: that of e_s, see :func:`bend_of_error`.
 
     Returns:
-        The bounds, and a time between events that is at least ``spacing_s``.
+        The bounds, and a lower bound of the inter-event time, at least ``inter_event_s``.
     """
     flow = reach.ellipsoid.flow
     errors = without_flow.copy()
     most_s = float(flow.edges_s[-1]) / 4  # e^{Fτ} is accurate until 4 times as late
-    if spacing_s >= most_s or len(without_flow) == 1:
-        return errors, spacing_s
+    if inter_event_s >= most_s or len(without_flow) == 1:
+        return errors, inter_event_s
     # The nodes r after an event, and e^{Fr}.
     kernel = flow.error.kernels[Output.WEIGHTED]
-    r_s = _nodes_s(spacing_s, kernel, 2 * most_s, sensor.grid_s)
+    r_s = _nodes_s(inter_event_s, kernel, 2 * most_s, sensor.grid_s)
     flows = np.array([exponential(flow.generator * time_s) for time_s in r_s.tolist()])
     first_event_s = float(flow.edges_s[reach.first_cell]) if reach.first_cell else math.inf
     # The delivery, then one lost event after the other.
     since_delivery_s = -reach.effects.acts_within_s
-    apart_s = math.inf
+    implied_s = math.inf
     state_bound = reach.scale
     for lost, sensor_error in enumerate(sensor.after_losses.tolist()):
         at_delivery = max(_ERROR_AT_DELIVERY * sensor_error, reach.effects.first_error)
         error_before = float(errors[lost - 1]) if lost else at_delivery
         window_s = min(max(since_delivery_s, 0.0), most_s)
         event = _SinceEvent(reach, window_s, error_before, state_bound, outputs, r_s, flows)
-        if lost:  # e_c until the next delivery, if at most so many events are lost
+        if lost:  # e_c until the next delivery, if at most this many events are lost
             summed = sensor_error + kernel.sups(r_s) * error_before
             largest = event.largest_error(sensor.since_event(r_s, lost), summed)
             errors[lost] = min(without_flow[lost], largest)
             if lost > 1 and errors[lost] > _NEARLY_SUMMED * float(summed[0]):
-                return errors, spacing_s  # after more losses nothing is gained, either
-        later_s = event.next_event_s(sensor, bend, spacing_s, is_delivered=not lost)
+                return errors, inter_event_s  # after more losses nothing is gained, either
+        later_s = event.next_event_s(sensor, bend, inter_event_s, is_delivered=not lost)
         since_delivery_s += later_s
         if not lost:  # x(0) itself may be outside the ellipsoid
             since_delivery_s = min(since_delivery_s, first_event_s)
-            later_s = max(min(later_s, first_event_s), spacing_s)
+            later_s = max(min(later_s, first_event_s), inter_event_s)
             state_bound = reach.largest_state(first_event_s - since_delivery_s)
-        apart_s = min(apart_s, later_s)
-    return errors, apart_s
+        implied_s = min(implied_s, later_s)
+    return errors, implied_s
 
 
 def bend_of_error(reach: Reach, level: float) -> float:
@@ -129,9 +129,9 @@ def bend_of_error(reach: Reach, level: float) -> float:
     return reach.sup(bend_rows(flow)) + float(np.linalg.norm(flow.H @ flow.H, 2)) * level
 
 
-def _nodes_s(spacing_s: float, kernel: KernelBounds, most_s: float, grid_s: float) -> Vector:
+def _nodes_s(inter_event_s: float, kernel: KernelBounds, most_s: float, grid_s: float) -> Vector:
     """Return times r, if possible up to one at which ‖e^{(H+αI)r}‖_W has fallen below a value."""
-    nodes_s = [spacing_s * share for share in _FIRST_NODES]
+    nodes_s = [inter_event_s * share for share in _FIRST_NODES]
     while len(nodes_s) < _MOST_NODES and kernel.sup(nodes_s[-1]) > _DECAYED:
         nodes_s.append(nodes_s[-1] * _NODE_RATIO)
     r_s = np.array([time_s for time_s in nodes_s if time_s <= most_s])
@@ -216,15 +216,15 @@ class _SinceEvent:
         return np.asarray(steps_s**2 / 8 * bends * FLOW_ROUNDING)
 
     def next_event_s(
-        self, sensor: SensorErrors, bend: float, spacing_s: float, *, is_delivered: bool
+        self, sensor: SensorErrors, bend: float, inter_event_s: float, *, is_delivered: bool
     ) -> float:
-        """Return a time before which there is no other event, at least ``spacing_s``."""
-        flow, most_s = self._flow, min(_LATEST * spacing_s, sensor.earliest_due_s)
+        """Return a time before which there is no other event, at least ``inter_event_s``."""
+        flow, most_s = self._flow, min(_LATEST * inter_event_s, sensor.earliest_due_s)
         # After a delivery e_s is at most ‖e^{(H+αI)r}‖ · first_error larger than C_r z.
         late_error = flow.model_growth * self._first_error if is_delivered else 0.0
         level = sensor.level - (late_error * self._acts_within_s if sensor.integrates else late_error)
         if level <= 0:
-            return spacing_s
+            return inter_event_s
         if self._age_input:  # what is followed differs from e_s
             by_input = flow.unit_effects(bend_rows(flow))[1][flow.cell_at(most_s)]
             difference = float(np.linalg.norm(flow.H @ flow.H, 2)) * float(self._input_changes.max())
@@ -242,4 +242,4 @@ class _SinceEvent:
         # Tests may lie beside the nodes if times are not those since an event.
         if late_error and sensor.integrates:
             reached_s -= sensor.grid_s
-        return max(spacing_s, reached_s)
+        return max(inter_event_s, reached_s)

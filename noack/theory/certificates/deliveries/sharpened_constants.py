@@ -36,7 +36,7 @@ _MOST_ROUNDS, _SETTLED = 20, 0.99
 _MOST_INSERTIONS, _INSERTIONS_SETTLED = 60, 0.9999
 """The same of the insertions in a round."""
 _SHORTEST_S = 1e-9
-"""Least time between events with which lost ones are followed, in s: events are resolved to 1 ns."""
+"""Shortest inter-event time with which lost events are followed: events are resolved to 1 ns."""
 _LEAST_SHARE = 1e-6
 """Least bound of ‖e_c‖ at an event, as a share of D: where no event is lost it is 0, but D may not be."""
 _LEAST_BOUND = 1e-200
@@ -62,10 +62,10 @@ def sharpened_constants(
     constants: Constants, part: CertificatePart, conditions: NetworkConditions
 ) -> Constants:
     """Return the constants with the bounds from the flow between updates."""
-    spacing_s = constants.inter_event_s or conditions.spacing_s
-    if spacing_s == 0 and conditions.delay_s > 0:
+    inter_event_s = constants.inter_event_s or conditions.spacing_s
+    if inter_event_s == 0 and conditions.delay_s > 0:
         return constants
-    sharpening = SharpenedBounds(part, conditions, spacing_s)
+    sharpening = SharpenedBounds(part, conditions, inter_event_s)
     bounds = sharpening.bounds
     if not np.isfinite(bounds.signals).all():
         return constants
@@ -91,17 +91,17 @@ def sharpened_constants(
         "present_input_error": bounds.present_input_error,
     }
     smaller = {name: min(value, getattr(constants, name)) for name, value in sharpened.items()}
-    later_s = constants.inter_event_s and max(sharpening.spacing_s, constants.inter_event_s)
+    later_s = constants.inter_event_s and max(sharpening.inter_event_s, constants.inter_event_s)
     return constants._replace(**smaller, inter_event_s=later_s)
 
 
 class SharpenedBounds:
-    """The bounds of one loop, made smaller in turns; events are ``spacing_s`` apart."""
+    """The bounds of one loop, made smaller in turns; δ is ``inter_event_s``."""
 
-    def __init__(self, part: CertificatePart, conditions: NetworkConditions, spacing_s: float) -> None:
-        self._part, self._conditions, self.spacing_s = part, conditions, spacing_s
+    def __init__(self, part: CertificatePart, conditions: NetworkConditions, inter_event_s: float) -> None:
+        self._part, self._conditions, self.inter_event_s = part, conditions, inter_event_s
         self._inequalities = InsertedInequalities(part, conditions, 0.0)
-        self.bounds = self._inequalities.solved_bounds(spacing_s)
+        self.bounds = self._inequalities.solved_bounds(inter_event_s)
         self._acts_within_s = self._inequalities.acts_within_s
 
     @cached_property
@@ -120,7 +120,7 @@ class SharpenedBounds:
         """Insert bounds into the inequalities until they have settled."""
         for _ in range(_MOST_INSERTIONS):
             previous = self.bounds.signals
-            self._inequalities.insert(self.bounds, self.spacing_s)
+            self._inequalities.insert(self.bounds, self.inter_event_s)
             if (self.bounds.signals >= _INSERTIONS_SETTLED * previous).all():
                 break
 
@@ -140,12 +140,13 @@ class SharpenedBounds:
         at_first = float(spectral_norm(gain)) * reach.effects.first_error
         input_error = max(reach.sup(np.hstack([0 * gain, gain])), at_first)
         bounds.errors[Output.GAIN] = min(bounds.errors[Output.GAIN], input_error)
-        if self.spacing_s >= max(self._acts_within_s, _SHORTEST_S):  # an update acts before the next event
+        # Where an update acts before the next event.
+        if self.inter_event_s >= max(self._acts_within_s, _SHORTEST_S):
             error = max(self._after_losses(reach), reach.effects.first_error)
             for output, bound in bounds.errors.items():
                 bounds.errors[output] = min(bound, error * self._part.plant.error.now(output))
         self.insert()
-        self.spacing_s = max(self.spacing_s, self._inequalities.next_event_s(bounds))
+        self.inter_event_s = max(self.inter_event_s, self._inequalities.next_event_s(bounds))
         self.insert()
         return True
 
@@ -178,13 +179,13 @@ class SharpenedBounds:
         if level and reach.effects.is_none:
             at_event = max(float(errors_at_events(bounds.after_losses)[-1]), _LEAST_SHARE * reach.error_bound)
             at_events = replace(reach, error_bound=at_event)
-            later_s = _next_event_s(at_events, level, self.spacing_s, bend)
+            later_s = _next_event_s(at_events, level, self.inter_event_s, bend)
             later_s = min(later_s, self._part.bound.times.earliest_due_s)
-            self.spacing_s = max(self.spacing_s, self._next_test_s(later_s))
-        bounds.after_losses, apart_s = errors_after_losses(
-            reach, bounds.after_losses, sensor, self._unit_outputs, self.spacing_s, bend
+            self.inter_event_s = max(self.inter_event_s, self._next_test_s(later_s))
+        bounds.after_losses, implied_s = errors_after_losses(
+            reach, bounds.after_losses, sensor, self._unit_outputs, self.inter_event_s, bend
         )
-        self.spacing_s = self._next_test_s(apart_s)
+        self.inter_event_s = self._next_test_s(implied_s)
         # An event comes after the first input has been applied.
         _, input_error, mismatch = bounds.driving
         entered = self._inequalities.entered(conditions.delay_s, input_error, mismatch)

@@ -30,8 +30,8 @@ def test_normal_values_of_a_run_share_the_probability_of_exceedance() -> None:
     """At each of 101 steps: the value, their sum in the state, and the estimation error."""
     bounds = normal_bounds(scenario(GAUSSIAN, UNIFORM))
     assert bounds is not None
-    assert bounds.each == pytest.approx(1e-3 / (101 * 3))
-    assert bounds.radius(2) == pytest.approx(math.sqrt(chi2.isf(bounds.each, 2)))
+    assert bounds.probability == pytest.approx(1e-3 / (101 * 3))
+    assert bounds.radius(2) == pytest.approx(math.sqrt(chi2.isf(bounds.probability, 2)))
     assert normal_bounds(scenario(UNIFORM)) is None
 
 

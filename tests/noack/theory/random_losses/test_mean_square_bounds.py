@@ -7,17 +7,17 @@ import pytest
 
 from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertificateError
 from noack.theory.bounds.gains import ErrorGains, PlantGains
-from noack.theory.random_losses.mean_square_bounds import mean_squares
+from noack.theory.random_losses.mean_square_bounds import root_mean_squares
 from tests.noack.theory.certificates.certificate_kinds.random_losses import certify, draw, simulate_runs
 from tests.noack.theory.random_losses.example_losses import scalar_loop
 
 
 @pytest.mark.parametrize("p", [0.0, 0.01, 0.3, 0.9])
-def test_mean_squares_of_a_scalar_loop_are_those_of_the_inequalities_iterated_by_hand(p: float) -> None:
+def test_root_mean_squares_of_a_scalar_loop_are_those_of_the_inequalities_iterated_by_hand(p: float) -> None:
     """π = g|e_c|, |x| = 1 + π/(r + e), |e_c| = β + lost errors, of which all add (e|x| + π)/r."""
     rate, gain, mismatch, beta = 2.0, 1.5, 0.2, 0.1
     plant = scalar_loop(rate, gain, mismatch)
-    bounds = mean_squares(plant.error, plant, NetworkConditions(0), beta, p)
+    bounds = root_mean_squares(plant.error, plant, NetworkConditions(0), beta, p)
     e_c, powers = beta, p ** np.arange(1.0, 2000)
     for _ in range(2000):
         x = 1.0 + gain * e_c / (rate + mismatch)
@@ -39,13 +39,13 @@ def test_mean_squares_of_a_scalar_loop_are_those_of_the_inequalities_iterated_by
     ],
     ids=["events may be arbitrarily close", "all updates are lost", "no function is found"],
 )
-def test_mean_squares_without_a_quadratic_function_are_those_of_the_inequalities(
+def test_root_mean_squares_without_a_quadratic_function_are_those_of_the_inequalities(
     gain: float, unit: float, p: float, conditions: NetworkConditions
 ) -> None:
     error = ErrorGains(-np.eye(1), np.array([[gain / unit]]), np.eye(1), 0.2)
     plant = PlantGains(error, np.array([[-1.2 - gain]]), np.array([[unit]]), np.array([[unit]]), 0.2)
     args = error, plant, conditions, 0.1 * unit, p
-    refined_bounds, first_bounds = mean_squares(*args, refined=True), mean_squares(*args)
+    refined_bounds, first_bounds = root_mean_squares(*args, refined=True), root_mean_squares(*args)
     assert refined_bounds.state <= first_bounds.state
     assert refined_bounds.controller_error <= first_bounds.controller_error
 
@@ -55,7 +55,7 @@ def test_inputs_that_are_too_old_for_the_fastest_mode_have_no_moments() -> None:
     error = ErrorGains(-np.diag([1.0, 1e6]), np.array([[-0.1, -0.1]]), np.eye(2), 0.2)
     plant = PlantGains(error, -np.diag([1.0, 1e6]), np.zeros((2, 1)), np.ones((2, 1)), 0.2)
     with np.errstate(all="ignore"), pytest.raises(NoCertificateError, match="overflow"):
-        mean_squares(error, plant, NetworkConditions(0, hold_s=0.007), 0.1, 0.3)
+        root_mean_squares(error, plant, NetworkConditions(0, hold_s=0.007), 0.1, 0.3)
 
 
 @pytest.mark.parametrize("seed", [5, 6, 12])

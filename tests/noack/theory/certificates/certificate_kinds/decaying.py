@@ -122,7 +122,7 @@ class NoCurvature(ErrorGains):
 class OnlyTheFirstMoment(ErrorGains):
     """Uses ‖C W^{−1}‖, the value at τ = 0, instead of the supremum over τ."""
 
-    def missing(self, output: Output, events: int, spacing_s: float) -> float:
+    def missing(self, output: Output, events: int, inter_event_s: float) -> float:
         return events * self.now(output)
 
 

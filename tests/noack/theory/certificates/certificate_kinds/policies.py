@@ -63,7 +63,7 @@ class Compare:
 
 @dataclass
 class Quadratic:
-    """zᵀQz > ε, every so many steps."""
+    """zᵀQz > ε, tested every ``every`` steps."""
 
     Q: Matrix
     epsilon: float
@@ -98,7 +98,7 @@ class Area:
 
 @dataclass
 class AtLatest:
-    """Any rule, and at the latest so many steps after the last event; without one, periodic."""
+    """Any rule, and at the latest ``steps`` after the last event; without one, periodic."""
 
     steps: int
     rule: EventRule | None = None
@@ -110,7 +110,7 @@ class AtLatest:
 
 @dataclass
 class NotBefore:
-    """Any rule, but not earlier than so many steps after the last event."""
+    """Any rule, but not earlier than ``steps`` after the last event."""
 
     steps: int
     rule: EventRule

@@ -16,7 +16,7 @@ from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee
 from noack.impairments.loss_prediction import LossProcess
 from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertificateError
 from noack.theory.bounds.enclosure import NotDecayingError
-from noack.theory.random_losses.mean_square_bounds import mean_squares
+from noack.theory.random_losses.mean_square_bounds import root_mean_squares
 from noack.theory.random_losses.unlimited_losses import BurstCertificate, moment_at_events, moments_of_runs
 from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificates.certified_loops import certify_loop, conditions_of, gains_of
@@ -56,7 +56,7 @@ def certify(loop: RandomLoop, *, share: float = 1.0, **changes: float) -> Bounds
     gains, conditions = gains_of(system), conditions_of(system)._replace(**changes)
     network = conditions, system.beta, share * loop.probability
     try:
-        bounds = mean_squares(gains.error, gains, *network, refined=True)
+        bounds = root_mean_squares(gains.error, gains, *network, refined=True)
     except (NoCertificateError, NotDecayingError):
         return None
     return {
@@ -66,7 +66,7 @@ def certify(loop: RandomLoop, *, share: float = 1.0, **changes: float) -> Bounds
 
 
 def simulate_runs(loop: RandomLoop, rng: np.random.Generator, rate_share: float = 1.0) -> Observed:
-    """The largest mean squares over time, scaled at a share of α, each minus five standard errors."""
+    """The largest root mean squares over time, scaled at a share of α, each minus five standard errors."""
     system = loop.system
     lost = rng.uniform(size=(_RUNS, system.events)) < loop.probability
     if not system.known_start:

@@ -56,16 +56,16 @@ def loop() -> tuple[Reach, np.ndarray, float]:
     return reach, *simulated(points)
 
 
-def bounds_of(reach: Reach, spacing_s: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """The bounds by the flow, those without it, and the time between events."""
+def bounds_of(reach: Reach, inter_event_s: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """The bounds by the flow, those without it, and the inter-event time that they imply."""
     each = np.full(LOSSES + 1, BETA)
     sensor = SensorErrors(each, BETA, 0.0, 0.0, BETA, integrates=False, earliest_due_s=math.inf)
     kernel = reach.ellipsoid.flow.error.kernels[Output.WEIGHTED]
-    missing = kernel.sups(spacing_s * np.arange(LOSSES))
+    missing = kernel.sups(inter_event_s * np.arange(LOSSES))
     without_flow = BETA * (1 + np.append(0.0, np.cumsum(missing)))
     bend = bend_of_error(reach, BETA)
-    bounds, apart_s = errors_after_losses(reach, without_flow, sensor, [], spacing_s, bend)
-    return bounds, without_flow, apart_s
+    bounds, implied_s = errors_after_losses(reach, without_flow, sensor, [], inter_event_s, bend)
+    return bounds, without_flow, implied_s
 
 
 @pytest.mark.parametrize("share", [0.2, 0.5, 1.0])
@@ -85,5 +85,5 @@ def test_events_are_further_apart_than_was_known_and_as_the_simulation_has_them(
     loop: tuple[Reach, np.ndarray, float],
 ) -> None:
     reach, _, shortest_s = loop
-    _, _, apart_s = bounds_of(reach, 0.2 * shortest_s)
-    assert 0.8 * shortest_s < apart_s <= shortest_s
+    _, _, implied_s = bounds_of(reach, 0.2 * shortest_s)
+    assert 0.8 * shortest_s < implied_s <= shortest_s
