@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 from cosim.lazy_modules import lazy_modules
 from noack.core.errors import CallerError, ExitStatus, MachineError, NoackError, why
 from noack.core.file_access import copy_whole, locked, open_growing, read_regular, write_whole
-from noack.core.process_limits import cores
+from noack.core.system_processes import cores
 
 with lazy_modules():
     from importlib import metadata

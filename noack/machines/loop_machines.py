@@ -204,7 +204,7 @@ class LoopMachines:
         for number, first in enumerate(templates):
             copies.setdefault(first, []).append(number)
         for first, (_, *others) in copies.items():
-            mark = self.memory.size
+            mark = self.memory.mark
             self.parts[first].fill(machines[first], self.memory)
             if others:
                 self.memory.copy(machines, first, others, mark)

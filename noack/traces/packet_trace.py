@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from noack.core.errors import CallerError, one_line, shortened, why
 from noack.core.file_access import open_regular
-from noack.core.linear_systems import firsts_of_equal
+from noack.core.row_operations import firsts_of_equal
 
 Int64s = NDArray[np.int64]
 Times = NDArray[np.float64]

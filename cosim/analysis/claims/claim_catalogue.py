@@ -14,8 +14,9 @@ import numpy as np
 
 from cosim.analysis.claims.observed_conditions import Reals, VoidFrom, earliest
 from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples
-from noack.core.linear_systems import Propagator, row_norms
+from noack.core.linear_systems import Propagator
 from noack.core.number_format import at_most
+from noack.core.row_operations import row_norms
 from noack.theory.bounds.certificate_terms import Constants
 from noack.theory.certificates.certified_bounds import ScenarioCertificate, envelope_formula
 

@@ -18,7 +18,7 @@ from cosim.simulation.continuous import continuous_loop_of
 from cosim.simulation.exact_simulation import setting_of
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
-from noack.core.linear_systems import row_norms
+from noack.core.row_operations import row_norms
 from noack.observers.observer_settings import observer_gain, unobservable_mode
 from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.roles import GENERATION, RESTART, Start
