@@ -319,7 +319,7 @@ class RunEvidence:
         """Theorem 2 with (I1)'s uniform Δ under the paper's conditions; None if there is no Δ."""
         scenario, loop = self.record.scenario, self.record.loop
         if (
-            not scenario.coverage.is_certifiable
+            not scenario.coverage.linear_certificates_apply
             or not scenario.coverage.is_undisturbed
             or not scenario.coverage.is_decaying
             or loop.weight is not None

@@ -93,7 +93,7 @@ class LoopFeed:
         certified: bool = True,
     ) -> None:
         self._columns = columns
-        self._is_certified = certified and scenario.coverage.can_be_certified
+        self._is_certified = certified and scenario.coverage.some_certificate_applies
         self._scenario = scenario
         self._loop = loop_of(scenario)
         self._view = view
