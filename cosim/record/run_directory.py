@@ -111,7 +111,7 @@ def write_scenario(scenario: "Scenario", run_dir: Path) -> "Scenario":
         for key, table in user_files.file_tables(within_scenario):
             if within and table == common.get(key):
                 continue  # the entry does not set it
-            file = user_files.unchanged(table, f"{within}{key}")
+            file = user_files.checked_path(table, f"{within}{key}")
             name = f"{key.split('.')[0]}/{within.replace('.', '_')}{file.name}"
             if not (run_dir / name).is_file():
                 (run_dir / name).parent.mkdir(exist_ok=True)
