@@ -52,6 +52,7 @@ _HEAD_BYTES = 4096
 _GZIP = b"\x1f\x8b"
 _SHIPPED = Path(__file__).parent / "shipped"
 _LONGEST_NAME = 100
+"""Longest name that is looked up among the shipped traces."""
 
 
 class TraceRecordError(ValueError):
