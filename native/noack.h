@@ -383,7 +383,7 @@ void noack_product(
 
 /* Each of `count` states, (count, n), becomes M^j times it, with its own j < 2^bits of `steps`,
    whose bits are followed from the lowest one. powers: M^(2^b), (bits, n, n); scratch: (n). */
-void noack_leaps(
+void noack_advance_by_periods(
     int64_t n, int64_t bits, const double *powers, int64_t count, const int64_t *steps,
     double *states, double *scratch);
 

@@ -12,7 +12,7 @@ from netem.relay.relay_links import LinkSpec
 from netem.tc_words import GRAMMAR, KEYWORDS, parse, require_no_dashes, settings_of
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_prediction import read_files
+from noack.impairments.target_loss import read_files
 from noack.impairments.words import OWN_TIME_S
 from noack.runtime.address import parse_address, parse_destination
 from noack.runtime.command_line import Parser

@@ -16,7 +16,7 @@ from netem.tc_words import words_of
 from noack.core.errors import shortened
 from noack.impairments.feature import Impairment
 from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_prediction import expected_loss, with_target_loss
+from noack.impairments.target_loss import expected_loss, with_target_loss
 from noack.impairments.words import percent_text
 from noack.runtime.address import address_text
 

@@ -17,7 +17,7 @@ from noack.core.random_streams import stream_key
 from noack.guarantee.loss_guarantee import DeliveriesBetweenBursts, LossesInWindow
 from noack.impairments.feature import Stage, StageTables
 from noack.impairments.link_settings import Counters, Decisions, LinkSettings
-from noack.impairments.loss_prediction import with_target_loss
+from noack.impairments.target_loss import with_target_loss
 
 Integers = NDArray[np.int64]
 _COUNTED = dtype_of("noack_counters").names or ()

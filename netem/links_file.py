@@ -10,7 +10,7 @@ from netem.relay.relay_links import LinkSpec
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_prediction import read_files
+from noack.impairments.target_loss import read_files
 from noack.runtime.address import parse_address, parse_destination
 from noack.scenario import toml_file
 from noack.settings.section import ScenarioSection, Seed, Table

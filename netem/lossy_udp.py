@@ -20,7 +20,7 @@ from netem.relay.relay_reports import DIRECTIONS, Direction
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError, why
 from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_prediction import read_files
+from noack.impairments.target_loss import read_files
 from noack.runtime.address import Address, address_text, parse_address, parse_destination
 
 

@@ -20,7 +20,7 @@ from noack.protocol.roles import Notice, Record, Start
 from noack.protocol.wire_format import loop_number
 from noack.runtime.address import Address, SocketName, packed_name
 from noack.runtime.drivers.real_time_loop import RecordSink, RowSink
-from noack.runtime.udp_sockets import MAX_UDP_BYTES, CountingSocket, errors_by_text
+from noack.runtime.udp_sockets import MAX_UDP_BYTES, CountingSockets, errors_by_text
 from noack.scenario.parameter_changes import ChangeSchedule, ParameterChange
 from noack.scenario.scenario import Scenario
 
@@ -204,7 +204,7 @@ class _RowList(list[Record]):
         self.extend(Record(table, row) for row in rows.tolist())
 
 
-class NetworkChannel(CountingSocket):
+class NetworkChannel(CountingSockets):
     """The sockets of a network in the core, which receives the peers' datagrams and sends itself.
 
     Args:

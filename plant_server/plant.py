@@ -44,6 +44,13 @@ from noack.scenario.sections import PlantSection
 PLANT = Role("plant", "noack_plant", Flow.ACTUATION, (PLANT_STEP, PLANT_ACTUATION, None))
 BLOCK = 256
 """Number of steps computed at once. A random value depends on its step's number only."""
+INPUT_NAMES = {"hold": "held", "zero": "0", "model": "the model's"}
+"""The input that each policy applies, in words."""
+_POLICIES = {
+    "hold": core.NOACK_HOLD,
+    "zero": core.NOACK_ZERO,
+    "model": core.NOACK_PREDICT,
+}
 DisturbanceSignal = Callable[[range], Matrix]
 """Steps → the value added during each step, (k, entries)."""
 
@@ -88,15 +95,6 @@ class MeasurementModel:
         unit = uniforms(self._seed, *name, "uniform", rows=rows, width=width)
         noise: Matrix = self._std * normal + self._bound * (2.0 * unit - 1.0)
         return noise
-
-
-INPUT_NAMES = {"hold": "held", "zero": "0", "model": "the model's"}
-"""The input that each policy applies, in words."""
-_POLICIES = {
-    "hold": core.NOACK_HOLD,
-    "zero": core.NOACK_ZERO,
-    "model": core.NOACK_PREDICT,
-}
 
 
 @dataclass(frozen=True)

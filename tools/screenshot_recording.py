@@ -22,7 +22,7 @@ from typing import Any
 
 from cosim.output.viewer.recording_viewer import RecordingServer
 from noack.core.errors import CallerError, MachineError, NoackError
-from noack.core.process_limits import python_command
+from noack.core.system_processes import python_command
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 FLAGS = (

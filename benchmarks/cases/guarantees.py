@@ -14,7 +14,7 @@ from cosim.cli.options import find_scenario
 from netem.link_state import LinkState
 from netem.tc_words import settings_of
 from noack.core.linear_systems import Matrix
-from noack.impairments.loss_prediction import expected_loss
+from noack.impairments.target_loss import expected_loss
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load, validate

@@ -108,7 +108,7 @@ class Certificates:
         self._scopes = [scope for scope in scopes if scope is not None]
         if nonlinear is not None:
             self.nonlinear = f'plant.system.kind = "{nonlinear.plant.system.kind}"'
-            if REGION not in void_at_setpoint(nonlinear) and nonlinear.coverage.can_be_certified:
+            if REGION not in void_at_setpoint(nonlinear) and nonlinear.coverage.some_certificate_applies:
                 self._scopes.append(RegionScope(nonlinear))
         self._certificates = [
             (under, scope.certificate(assumed))

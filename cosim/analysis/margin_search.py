@@ -14,11 +14,11 @@ from netem.tc_words import guarantee_words, settings_of
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.number_format import at_least, at_most, duration
-from noack.guarantee.loss_guarantee import LossGuarantee, OutcomePattern, find_pattern_beyond, outcome_letters
+from noack.guarantee.loss_guarantee import LossGuarantee, OutcomePattern, find_counterexample, outcome_letters
 from noack.impairments.constraints import join_guarantee
 from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_prediction import loss_process
 from noack.impairments.markov_chain import NotPredictableError
+from noack.impairments.target_loss import loss_process
 from noack.scenario.scenario import Scenario
 from noack.theory.margins.joint_spectral_radius import ACCURACY
 from noack.theory.margins.loss_margin import LossMargin, Stability, capped, uncapped
@@ -76,7 +76,7 @@ def compare_guarantees(
         CallerError: a guarantee has too many states to be compared.
     """
     beyond = {
-        (i, j): find_pattern_beyond(guarantees[i], guarantees[j])
+        (i, j): find_counterexample(guarantees[i], guarantees[j])
         for i, j in permutations(range(len(guarantees)), 2)
     }
     stabilities = [examine(guarantee) for guarantee in guarantees]

@@ -14,8 +14,8 @@ from noack.core.linear_systems import Matrix
 from noack.core.number_format import number
 from noack.guarantee.loss_guarantee import LossGuarantee
 from noack.impairments.constraints import join_guarantee
-from noack.impairments.loss_prediction import loss_process
 from noack.impairments.markov_chain import NotPredictableError
+from noack.impairments.target_loss import loss_process
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.random_losses.exact_moments import LoopMoments, LoopPeriods, periods_of, start_of

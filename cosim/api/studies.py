@@ -25,7 +25,7 @@ from cosim.measurement.trace_sources import read_source
 from cosim.shipped_files import find_shipped
 from noack.core.errors import CallerError
 from noack.core.number_format import TextRows, as_html, as_text
-from noack.core.process_limits import cores
+from noack.core.system_processes import cores
 from noack.scenario import toml_file
 from noack.scenario.resolution import resolve
 from noack.theory.margins.joint_spectral_radius import ACCURACY

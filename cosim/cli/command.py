@@ -24,7 +24,7 @@ from typer.core import TyperGroup, TyperOption
 from cosim.cli import commands
 from cosim.lazy_modules import lazy_modules
 from noack.core.errors import ExitStatus, NoackError, plain_mistake, printable, why
-from noack.core.process_limits import exhausted_limit
+from noack.core.system_processes import exhausted_limit
 from noack.runtime.command_line import StopRequestError, failed, stop_requests_raised
 
 with lazy_modules():

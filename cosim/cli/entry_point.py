@@ -7,7 +7,7 @@ from contextlib import ExitStack, closing, suppress
 
 from cosim.lazy_modules import lazy_modules
 from noack.core.errors import NoackError
-from noack.core.process_limits import exhausted_limit
+from noack.core.system_processes import exhausted_limit
 from noack.runtime.command_line import failed, stoppable_imports
 
 with lazy_modules():

@@ -17,7 +17,7 @@ from cosim.cli import options as opt
 from cosim.lazy_modules import lazy_modules
 from cosim.record.run_directory import DEFAULT_RUNS
 from noack.core.errors import CallerError, PeerError
-from noack.core.process_limits import cores
+from noack.core.system_processes import cores
 from noack.runtime.command_line import LogFormat, log_format, print_to_stderr
 
 with lazy_modules():

@@ -27,7 +27,7 @@ from cosim.output.viewer.rerun_program import has_display, is_installed
 from cosim.record.run_directory import environment
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, MachineError, NoackError, one_line, why
-from noack.core.process_limits import python_command
+from noack.core.system_processes import python_command
 from noack.runtime.active_runs import RUNS
 from noack.runtime.address import LOOPBACK
 from noack.runtime.connections.zenoh_session import answer_to, cause_of, open_session

@@ -24,7 +24,7 @@ from noack.scenario import toml_file
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import completed, put, remove, toml_text, value_of
 from noack.settings.section import ReadTable, Table
-from noack.settings.user_files import PLACES
+from noack.settings.user_files import FILE_TABLES
 
 _SOURCE = "scenario"
 _LINE = re.compile(rf"^{_SOURCE}: ([\w.-]+)(?:: | = )")
@@ -217,7 +217,7 @@ def draft_of_query(query: str, default: str, known: Mapping[str, str]) -> Draft:
 
 def _code(content: ReadTable) -> list[object]:
     """Return the tables that name code."""
-    tables = [leaf(content, key) for key in PLACES]
+    tables = [leaf(content, key) for key in FILE_TABLES]
     return [
         table
         for table in tables

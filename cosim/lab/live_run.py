@@ -23,7 +23,7 @@ from cosim.output.run_verdict import Tone, VerdictLine
 from cosim.output.viewer.rerun_program import is_installed
 from netem.shell import process
 from noack.core.errors import ExitStatus, NoackError
-from noack.core.process_limits import python_command
+from noack.core.system_processes import python_command
 from noack.protocol.roles import LOOP_ROLES
 from noack.runtime.control_messages import RunProgress, parse_message
 

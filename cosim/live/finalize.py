@@ -48,7 +48,7 @@ from cosim.record.run_record import RecordedRun, RunRecord, load_run, scenarios_
 from cosim.record.spool_conversion import finish_record
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.core.file_access import write_whole
-from noack.core.process_limits import cores
+from noack.core.system_processes import cores
 from noack.runtime.spool import SPOOL
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import NetworkConditions

@@ -38,7 +38,7 @@ from cosim.record.run_directory import (
 from noack.core.errors import ExitStatus, MachineError, NeverStartedError, NoackError
 from noack.core.file_access import write_whole
 from noack.core.number_format import byte_size
-from noack.core.process_limits import cores as usable_cores
+from noack.core.system_processes import cores as usable_cores
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_ACTUATION, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.roles import PLANT, RECORDER, ROLES
 from noack.runtime.active_runs import registered_run, run_name

@@ -10,7 +10,7 @@ from cosim.measurement.chain_fits import ChainFit
 from cosim.measurement.network_measurement import NetworkMeasurement
 from noack.core.errors import printable
 from noack.core.file_access import require_suffix, write_whole
-from noack.impairments.loss_prediction import read_files
+from noack.impairments.target_loss import read_files
 from noack.scenario import toml_file
 from noack.scenario.scenario_file import toml_text
 from noack.scenario.sections import NetworkSection

@@ -23,15 +23,8 @@ from numpy.typing import NDArray
 from cosim.record.record_source import concatenate_rows
 from cosim.record.run_events import model_flow_of
 from cosim.record.run_record import Rows, RunRecord
-from noack.core.linear_systems import (
-    ModelFlow,
-    Propagator,
-    all_entries,
-    firsts_of_equal,
-    largest_sizes,
-    row_norms,
-    set_rows,
-)
+from noack.core.linear_systems import ModelFlow, Propagator
+from noack.core.row_operations import all_entries, firsts_of_equal, largest_sizes, row_norms, set_rows
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
@@ -396,7 +389,7 @@ class EventFollower:
         newest = np.cumsum(rows["event"] != NO_SEQUENCE)
         period_ns = self._scenario.timing.measurement_period_ns
         age_ns = rows["t_ns"] - event_ns[newest]
-        predicted = self._propagate.leaps(x.take(newest, axis=0), age_ns // period_ns, period_ns)
+        predicted = self._propagate.advance_by_periods(x.take(newest, axis=0), age_ns // period_ns, period_ns)
         age_s = np.where(events[newest] == NO_SEQUENCE, np.nan, age_ns * 1e-9)
         shared = shares_update(self._scenario, aligned)
         missing = np.where(shared, events[newest] - aligned.received, NOT_SHARED)

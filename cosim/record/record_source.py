@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.linear_systems import firsts_of_equal
+from noack.core.row_operations import firsts_of_equal
 from noack.protocol.record_tables import (
     CLOCK_TABLES,
     LOOP,

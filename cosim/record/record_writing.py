@@ -12,7 +12,7 @@ from cosim.record.record_source import Rows, with_loop
 from cosim.record.run_directory import RECORD, REPORTS_FILE
 from cosim.record.run_record import NOTICES_FILE, Notice, RecordedRun
 from noack.core.file_access import PARTIAL, new_file, write_whole
-from noack.core.process_limits import cores
+from noack.core.system_processes import cores
 from noack.protocol.record_tables import CLOCK_TABLES, LOOP, is_of_network
 from noack.scenario.resolution import resolve, run_tables
 from noack.scenario.scenario import Scenario, loop_scenario, loop_sections

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 from cosim.lazy_modules import lazy_modules
 from noack.core.errors import CallerError, ExitStatus, MachineError, NoackError, why
 from noack.core.file_access import copy_whole, locked, open_growing, read_regular, write_whole
-from noack.core.process_limits import cores
+from noack.core.system_processes import cores
 
 with lazy_modules():
     from importlib import metadata
@@ -111,7 +111,7 @@ def write_scenario(scenario: "Scenario", run_dir: Path) -> "Scenario":
         for key, table in user_files.file_tables(within_scenario):
             if within and table == common.get(key):
                 continue  # the entry does not set it
-            file = user_files.unchanged(table, f"{within}{key}")
+            file = user_files.checked_path(table, f"{within}{key}")
             name = f"{key.split('.')[0]}/{within.replace('.', '_')}{file.name}"
             if not (run_dir / name).is_file():
                 (run_dir / name).parent.mkdir(exist_ok=True)

@@ -30,8 +30,8 @@ from cosim.record.run_directory import RECORD
 from cosim.record.run_record import Notice, RecordedRun, load_run, read_notices, scenarios_of
 from noack.core.errors import MachineError, PeerError, why
 from noack.core.file_access import remove_folder
-from noack.core.linear_systems import firsts_of_equal
-from noack.core.process_limits import be_idle, cores
+from noack.core.row_operations import firsts_of_equal
+from noack.core.system_processes import be_idle, cores
 from noack.protocol.record_tables import LOOP, has_loop
 from noack.protocol.roles import LOOP_ROLES, RECORDER
 from noack.runtime.control_messages import LogLine, parse_message

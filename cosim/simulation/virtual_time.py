@@ -31,7 +31,7 @@ from netem.channel import RUN_ID, Network, channel_of
 from noack.core.clock import NEVER_NS
 from noack.core.core_library import CData, core, ffi
 from noack.core.errors import ExitStatus, MachineError, why
-from noack.core.process_limits import require_limits
+from noack.core.system_processes import require_limits
 from noack.machines.loop_machines import LoopMachines, row_types
 from noack.protocol.record_tables import LOOP, OWNER, has_loop, is_of_network, network_tables
 from noack.protocol.roles import CHANGEABLE, LOOP_ROLES, RECORDER, Notice, Record

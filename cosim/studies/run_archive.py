@@ -48,12 +48,12 @@ from noack.core.file_access import new_file, open_regular
 from noack.core.number_format import number
 from noack.scenario.scenario import Scenario, loops_of
 from noack.scenario.scenario_file import MOST_RECORDED_BYTES, load
-from noack.settings.user_files import PLACES, Sha256, file_tables
+from noack.settings.user_files import FILE_TABLES, Sha256, file_tables
 
 MANIFEST = "archive.json"
 SUFFIX = ".noack.zip"
 _FILES = {SCENARIO_FILE, ENVIRONMENT_FILE, REPORTS_FILE, ENDING_FILE, SUMMARY_FILE}
-_FOLDERS = {RECORD, "logs", *(place.split(".")[0] for place in PLACES)}
+_FOLDERS = {RECORD, "logs", *(place.split(".")[0] for place in FILE_TABLES)}
 _MOST_ENTRIES = 1_000_000
 _MOST_MANIFEST_BYTES = 256 * 2**20
 _CHUNK_BYTES = 2**20

@@ -18,7 +18,7 @@ void noack_product(
     }
 }
 
-void noack_leaps(
+void noack_advance_by_periods(
     int64_t n, int64_t bits, const double *powers, int64_t count, const int64_t *steps,
     double *states, double *scratch) {
     for (int64_t row = 0; row < count; row++, states += n)

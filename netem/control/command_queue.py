@@ -18,7 +18,7 @@ from netem.relay.relay_reports import DIRECTIONS, Direction, LinkReport
 from netem.tc_words import words_of
 from noack.core.errors import PeerError
 from noack.impairments.link_settings import Counters, LinkSettings
-from noack.impairments.loss_prediction import expected_loss
+from noack.impairments.target_loss import expected_loss
 
 T = TypeVar("T")
 

@@ -25,7 +25,7 @@ from netem.relay.relay_reports import DIRECTIONS, Direction
 from netem.tc_words import settings_of, words_of
 from noack.core.errors import CallerError, MachineError, NoackError, PeerError
 from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_prediction import with_target_loss
+from noack.impairments.target_loss import with_target_loss
 from noack.runtime import private_folder
 from noack.runtime.connections.zenoh_session import cause_of, open_session
 from noack.runtime.private_folder import require_name

@@ -23,7 +23,7 @@ from netem.relay.relay_reports import DIRECTIONS
 from netem.tc_words import guarantee_words, require_no_dashes, settings_of
 from noack.core.errors import CallerError, ExitStatus, NoackError, PeerError
 from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_prediction import read_files
+from noack.impairments.target_loss import read_files
 from noack.runtime.command_line import Parser, Signals, discard_output, failed
 from noack.runtime.connections.zenoh_session import answer_to, cause_of, open_session
 

@@ -25,7 +25,7 @@ from typing import NoReturn
 from netem.relay.relay_links import DeviceLink, LinkSpec
 from netem.shell import process
 from noack.core.errors import CallerError
-from noack.core.process_limits import python_command
+from noack.core.system_processes import python_command
 
 MTU_BYTES = 1500
 _RANGE = IPv4Network("198.18.0.0/16")

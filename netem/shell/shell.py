@@ -19,7 +19,7 @@ from netem.shell import process
 from netem.shell.devices import inside, open_devices
 from netem.stand_alone import add_recording_options, check_options, relay, report_totals
 from noack.core.errors import CallerError, ExitStatus
-from noack.core.process_limits import python_command
+from noack.core.system_processes import python_command
 from noack.runtime.command_line import Signals, log_format
 
 _ENDS_S = 10.0

@@ -23,14 +23,14 @@ def cached_method(
     results = f"results of {method.__qualname__}"
 
     @wraps(method)
-    def found(self: Owner, /, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        known: dict[object, Result] = self.__dict__.setdefault(results, {})
-        key = (*map(_key, args), *kwargs.items())
+    def wrapper(self: Owner, /, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        known: dict[Hashable, Result] = self.__dict__.setdefault(results, {})
+        key = _bits(*args, **kwargs)
         if key not in known:
             known[key] = method(self, *args, **kwargs)
         return known[key]
 
-    return found
+    return wrapper
 
 
 def _bits(*args: object, **kwargs: object) -> Hashable:
@@ -56,10 +56,10 @@ def cached_function(
             return call.compute()
 
         @wraps(function)
-        def found(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        def wrapper(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
             return result_of(_Call(key(*args, **kwargs), lambda: function(*args, **kwargs)))
 
-        return found
+        return wrapper
 
     return cached
 

@@ -184,8 +184,8 @@ class CoreMemory:
             setattr(structure, name, ffi.NULL if value is None else value)
 
     @property
-    def size(self) -> int:
-        """What is kept: a mark for :meth:`copy`."""
+    def mark(self) -> int:
+        """How much this memory keeps now; :meth:`copy` copies what was added since."""
         return len(self._kept)
 
     def copy(self, structures: CData, first: int, others: Sequence[int], mark: int) -> None:
@@ -195,7 +195,7 @@ class CoreMemory:
             structures: the array of structures.
             first: number of the one that has been filled, since ``mark``.
             others: numbers of those that become like it; they share its transition matrices.
-            mark: the size of this memory before it was filled.
+            mark: that of this memory before it was filled.
         """
         arrays = [kept.reshape(-1) for kept in self._kept[mark:] if isinstance(kept, np.ndarray)]
         ends = [*accumulate(map(len, arrays), initial=0)]

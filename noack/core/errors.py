@@ -82,8 +82,8 @@ def plain_mistake(message: str) -> str:
     return message
 
 
-def one_line(error: BaseException) -> str:
-    """Return the message of an error of another library as one line."""
+def one_line(error: BaseException | str) -> str:
+    """Return the message of an error of another library, or another text, as one line."""
     return " ".join(str(error).split())
 
 

@@ -1,4 +1,4 @@
-"""Linear time-invariant systems: exact propagation, exponentials, norms; fast operations on rows of tables.
+"""Linear time-invariant systems: exact propagation, exponentials, norms, Lyapunov equations.
 
 Time steps are integer nanoseconds; matrices are per second. The same step always gives the same
 matrix, bit for bit, whether it was cached or not, and on every processor. A library's matrix
@@ -12,7 +12,7 @@ bounds, which are enlarged by more than the rounding.
 
 import math
 from bisect import bisect_right
-from functools import lru_cache, reduce
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,10 +27,8 @@ MatrixKey = tuple[tuple[int, ...], bytes]
 
 _CACHED_STEPS = 4096
 """Transition matrices that are kept."""
-_SAFE = 1e-140
-"""Squares of vectors between this size and its inverse neither underflow nor overflow."""
-_MOST_IN_TURN = 8
-"""Of fewer terms, numpy computes a sum in turn; it takes ten times as long for many short rows."""
+_NEGLIGIBLE = 1e-140
+"""Smaller entries have no influence when a matrix is balanced."""
 _BALANCINGS, _FARTHEST = 20, 200
 """Most rounds of balancing, and the largest exponent."""
 _MOST_STATES = 12
@@ -113,7 +111,7 @@ class Propagator:
             return states
         return np.asarray(states @ self.transition(dt_ns).T)
 
-    def leaps(self, states: Matrix, counts: NDArray[np.int64], period_ns: int) -> Matrix:
+    def advance_by_periods(self, states: Matrix, counts: NDArray[np.int64], period_ns: int) -> Matrix:
         """Return e^{G j dt} of each of k states, (k, n), after its own number j of periods, (k,).
 
         A number of periods is followed bit by bit, so that a row does not depend on the others.
@@ -123,7 +121,7 @@ class Propagator:
         if bits and not self._static:
             powers = np.array([self.transition(period_ns << bit) for bit in range(bits)])
             steps, scratch = np.ascontiguousarray(counts, np.int64), np.empty(advanced.shape[1])
-            core.noack_leaps(
+            core.noack_advance_by_periods(
                 advanced.shape[1],
                 bits,
                 _reals(powers),
@@ -150,57 +148,6 @@ def product(matrix: Matrix, vector: Vector) -> Vector:
     return result
 
 
-def row_norms(rows: Matrix) -> Vector:
-    """Return the Euclidean norms of k vectors, (k, n) → (k,), without overflow of squares.
-
-    If the squares are safe, the results equal numpy's bit-exactly.
-    """
-    with np.errstate(over="ignore", under="ignore"):  # affected norms are recomputed below
-        if 0 < rows.shape[1] < _MOST_IN_TURN:
-            norms = np.asarray(np.sqrt(reduce(np.add, (entries * entries for entries in rows.T))))
-        else:
-            norms = np.asarray(np.linalg.norm(rows, axis=1))
-    doubtful = (norms < _SAFE) | ~(norms < 1 / _SAFE)
-    if doubtful.any():
-        sizes = np.abs(rows[doubtful]).max(axis=1, initial=0.0)
-        scales = np.where((sizes > 0) & np.isfinite(sizes), sizes, 1.0)
-        norms[doubtful] = scales * np.linalg.norm(rows[doubtful] / scales[:, None], axis=1)
-    return norms
-
-
-def all_entries(holds: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return where something holds for every entry of a row, (k, n) → (k,).
-
-    numpy's ``all`` takes ten times as long for many short rows, as do ``any`` and ``max``.
-    """
-    return np.asarray(reduce(np.logical_and, holds.T))
-
-
-def set_rows(matrix: Matrix, places: NDArray[np.intp], rows: Matrix) -> None:
-    """Set the rows of a matrix at k places to others, (k, n), entry by entry.
-
-    ``matrix[places] = rows`` takes ten times as long for many short rows. Neither should rows be
-    read so: ``matrix.take(places, axis=0)`` and ``matrix.compress(holds, axis=0)`` are fast.
-    """
-    for column, entries in zip(matrix.T, rows.T, strict=True):
-        column[places] = entries
-
-
-def largest_sizes(rows: Matrix) -> Vector:
-    """Return the size of the largest entry of each row, (k, n) → (k,); NaN if there is a NaN."""
-    return np.asarray(reduce(np.maximum, np.abs(rows).T))
-
-
-def firsts_of_equal(values: NDArray[np.generic]) -> NDArray[np.intp]:
-    """Return the places where consecutive equal values begin, ascending.
-
-    Comparing neighbours takes a fifth of the time of ``np.diff`` with a value before the first.
-    """
-    begins = np.ones(len(values), np.bool_)
-    np.not_equal(values[1:], values[:-1], out=begins[1:])
-    return np.flatnonzero(begins)
-
-
 def spectral_abscissa(matrix: Matrix) -> float:
     """Return the largest real part of the eigenvalues, per second."""
     return float(np.linalg.eigvals(matrix).real.max())
@@ -217,8 +164,8 @@ def balancing_exponents(sizes: Matrix) -> NDArray[np.int64]:
     """
     exponents = np.zeros(len(sizes), np.int64)
     radius = float(np.abs(np.linalg.eigvals(sizes)).max())  # the same in all units
-    radius = radius if radius > _SAFE else 1.0
-    others = np.where(np.eye(len(sizes)) + (sizes < _SAFE), 0.0, sizes)
+    radius = radius if radius > _NEGLIGIBLE else 1.0
+    others = np.where(np.eye(len(sizes)) + (sizes < _NEGLIGIBLE), 0.0, sizes)
     for _ in range(_BALANCINGS):
         before = exponents.copy()
         for i in range(len(sizes)):

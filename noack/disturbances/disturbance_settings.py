@@ -50,7 +50,7 @@ class DisturbanceSettings(ScenarioSection):
         return np.zeros(len(self.entries))
 
     @property
-    def longest_s(self) -> float:
+    def duration_s(self) -> float:
         """The time from the first value other than 0 to the last one; by default infinite."""
         return math.inf
 

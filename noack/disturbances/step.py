@@ -33,7 +33,7 @@ class StepDisturbance(DisturbanceSettings):
         return self
 
     @property
-    def longest_s(self) -> float:
+    def duration_s(self) -> float:
         return math.inf if self.until_s is None else self.until_s - self.from_s
 
     def extent(self) -> Matrix:

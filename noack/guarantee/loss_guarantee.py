@@ -4,7 +4,7 @@ A rule is a counter: from its state and the next outcome follow its next state a
 outcome keeps the rule if the value is at most the rule's limit; a delivery always does. These
 counters are the one definition of the guarantee for the checks of records, for the controller and
 for the adversary; ``native/guarantee.c`` enforces them in the emulator. At the end, from
-:func:`list_moves` on: whether one guarantee implies another.
+:func:`transition_table` on: whether one guarantee implies another.
 """
 
 from abc import ABC, abstractmethod
@@ -139,7 +139,7 @@ class DeliveriesBetweenBursts(LossRule):
         return f"only {least - value:.0f} delivered between two bursts, at least {least} required"
 
 
-class LossWindow(NamedTuple):
+class WindowBound(NamedTuple):
     """At most ``losses`` losses in ``packets`` consecutive packets."""
 
     losses: int
@@ -164,7 +164,7 @@ class LossGuarantee:
         return min(bursts, default=None)
 
     @property
-    def windows(self) -> tuple[LossWindow, ...]:
+    def windows(self) -> tuple[WindowBound, ...]:
         """Bounds of the number of losses in windows; each follows from the rules.
 
         With at most b consecutive losses and h deliveries between bursts, b + h packets contain one
@@ -173,12 +173,12 @@ class LossGuarantee:
         burst = self.longest_burst
         if burst is None:
             return ()
-        windows = [LossWindow(burst, burst + 1)]
+        windows = [WindowBound(burst, burst + 1)]
         for rule in self.rules:
             if isinstance(rule, LossesInWindow):
-                windows.append(LossWindow(rule.limit, rule.window))
+                windows.append(WindowBound(rule.limit, rule.window))
             elif isinstance(rule, DeliveriesBetweenBursts):
-                windows.append(LossWindow(burst, burst + rule.deliveries))
+                windows.append(WindowBound(burst, burst + rule.deliveries))
         return tuple(windows)
 
     @property
@@ -251,7 +251,7 @@ class LossAutomaton:
         return self._numbers[key]
 
 
-class Moves(NamedTuple):
+class TransitionTable(NamedTuple):
     """The a states of a guarantee; state 0 is that before the first packet."""
 
     after_loss: StateIndices  # (a,) −1: a loss is not allowed
@@ -259,7 +259,7 @@ class Moves(NamedTuple):
 
 
 @lru_cache(maxsize=4)
-def list_moves(guarantee: LossGuarantee, most: int) -> Moves | None:
+def transition_table(guarantee: LossGuarantee, most: int) -> TransitionTable | None:
     """Return all states of a guarantee, the nearest ones first; None: there are more than ``most``."""
     automaton = LossAutomaton(guarantee)
     count, lost, delivered = 1, list[int](), list[int]()
@@ -269,7 +269,7 @@ def list_moves(guarantee: LossGuarantee, most: int) -> Moves | None:
         lost += after_loss.tolist()
         delivered += after_delivery.tolist()
         count = max(count, 1 + int(after_loss.max()), 1 + int(after_delivery.max()))
-    return Moves(np.array(lost), np.array(delivered)) if count <= most else None
+    return TransitionTable(np.array(lost), np.array(delivered)) if count <= most else None
 
 
 _MOST_STATES, _MOST_STEPS = 200_000, 200_000_000
@@ -278,7 +278,7 @@ OutcomePattern = tuple[bool, ...]
 """Whether each update is delivered, from the first one on."""
 
 
-def find_pattern_beyond(guarantee: LossGuarantee, implied: LossGuarantee) -> OutcomePattern | None:
+def find_counterexample(guarantee: LossGuarantee, implied: LossGuarantee) -> OutcomePattern | None:
     """Return a shortest pattern that a guarantee allows and another one forbids.
 
     None: there is none, so the guarantee implies the other one. A rule of the other guarantee is
@@ -304,9 +304,9 @@ class _States:
 
     def __init__(self, guarantee: LossGuarantee) -> None:
         self._meaning = guarantee.meaning
-        moves = list_moves(guarantee, _MOST_STATES)
-        self._require(moves is not None)
-        assert moves is not None
+        moves = transition_table(guarantee, _MOST_STATES)
+        if moves is None:
+            raise self._too_many()
         self._after_loss, self._after_delivery = moves
         reached, places = np.unique(np.column_stack(moves), return_index=True)
         self._origins = np.zeros((len(moves.after_loss), 2), int)
@@ -316,9 +316,8 @@ class _States:
         for state, (previous, _) in enumerate(self._origins[1:].tolist(), 1):
             self._depths[state] = self._depths[previous] + 1
 
-    def _require(self, is_small: bool) -> None:
-        if not is_small:
-            raise CallerError(f"{self._meaning}: too many states to compare; use shorter windows")
+    def _too_many(self) -> CallerError:
+        return CallerError(f"{self._meaning}: too many states to compare; use shorter windows")
 
     def pattern_against(self, rule: LossRule) -> OutcomePattern | None:
         """Return a shortest pattern that breaks a rule; None if the rule is implied."""
@@ -334,7 +333,8 @@ class _States:
         """Return a shortest pattern with more losses in a window, which may be cut short."""
         if most >= window:
             return None
-        self._require(len(self._depths) * window < _MOST_STEPS)
+        if len(self._depths) * window >= _MOST_STEPS:
+            raise self._too_many()
         largest = np.zeros(len(self._depths), int)
         is_loss: list[NDArray[np.bool_]] = []
         best: tuple[int, int, int] | None = None  # length, state, packets

@@ -10,7 +10,9 @@ what they import. What stands around them, in the order in which one reads it:
 * ``words.py``: words of the command line, and quantities in the syntax of ``tc``;
 * ``link_settings.py``: the settings of one direction of a link, made of all these and of the
   guarantee (``noack/guarantee/``);
-* ``markov_chain.py``, ``loss_prediction.py``: the expected loss rate, with and without a guarantee.
+* ``trace_offset.py``: where in a trace a feature begins;
+* ``markov_chain.py``, ``loss_prediction.py``: the expected loss rate, with and without a guarantee;
+* ``target_loss.py``: the probability of a loss whose rate is given.
 
 Predictions import scipy in the functions that use it: an emulator without them starts faster.
 """

@@ -2,8 +2,7 @@
 
 A feature is a loss model, a kind of impairment, a queue discipline, or a constraint on losses: one
 class in its own file, derived from one of the classes here. Below them is what several features
-share: random events with a correlation (:class:`CorrelatedChance`), and where in a trace a feature
-begins.
+share: random events with a correlation (:class:`CorrelatedChance`).
 
 A correlated event: the latent variable z_i = ρ z_{i−1} + √(1 − ρ²) g_i is a stationary Gaussian
 process. The event happens to packet i if z_i exceeds the normal quantile of 1 − p, hence with
@@ -14,23 +13,19 @@ import math
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, NamedTuple, TypeVar
+from typing import Annotated, ClassVar, NamedTuple, TypeVar
 
-from pydantic import Field, FiniteFloat
+from pydantic import Field
 
-from noack.core.clock import NS_PER_S
 from noack.core.core_library import core
-from noack.core.random_streams import uniform_pair
 from noack.guarantee.loss_guarantee import LossRule
 from noack.impairments.clauses import Clause, Part
 from noack.impairments.markov_chain import Chain, PeriodicLosses, chance_chain
-from noack.impairments.words import CORRELATION, OWN_TIME_S, PERCENT, Quantity, brief_percent, time_text
+from noack.impairments.words import CORRELATION, PERCENT, brief_percent
 from noack.settings.section import Correlation, Probability, ScenarioSection
 from noack.settings.user_files import NamedFile
 
 T = TypeVar("T")
-Offset = Annotated[FiniteFloat, Field(ge=0, le=1e9)] | Literal["random"]
-"""In seconds after the trace's first packet."""
 MOST_FLOWS = 65_535
 """Maximum number of flows that settings name one by one."""
 LONGEST_NS = 10**18
@@ -317,39 +312,3 @@ class CorrelatedChance(StageFeature):
 
     def tc_notes(self) -> Sequence[str]:
         return (TC_CORRELATION,) if self.correlation else ()
-
-
-def _offset(word: str) -> float | str:
-    return word if word == "random" else OWN_TIME_S.read(word)
-
-
-OFFSET = Quantity(
-    f"{OWN_TIME_S.expected}; or random",
-    _offset,
-    lambda offset: offset if isinstance(offset, str) else time_text(offset),
-)
-"""The place in a trace at which a feature begins."""
-
-
-def offset_meaning(offset: float | str) -> str:
-    """Return where the trace begins, in plain words."""
-    if isinstance(offset, str):
-        return ", from a place that the seed chooses"
-    return f", from {time_text(offset)} after its beginning" if offset else ""
-
-
-def require_inside(offset: float | str, length_ns: int, file: NamedFile | None = None) -> None:
-    """Raise ValueError if an offset is not inside a trace of this length; CallerError of a file."""
-    if not isinstance(offset, str) and round(offset * NS_PER_S) >= max(length_ns, 1):
-        message = f"offset_s: the trace lasts {time_text(length_ns / NS_PER_S)}"
-        if file is not None:
-            file.wrong(message)
-        raise ValueError(message)
-
-
-def offset_ns(offset: float | str, length_ns: int, tables: StageTables) -> int:
-    """Return an offset in ns; a random one is uniform over the trace, for all flows the same."""
-    if isinstance(offset, str):
-        share, _ = uniform_pair(*tables.key)
-        return int(share * length_ns)
-    return round(offset * NS_PER_S)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.core_library import core
-from noack.guarantee.loss_guarantee import LossAutomaton, LossGuarantee, Moves, list_moves
+from noack.guarantee.loss_guarantee import LossAutomaton, LossGuarantee, TransitionTable, transition_table
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array  # slow to import
@@ -131,13 +131,13 @@ def stochastic(matrix: Array) -> Array:
     return rows
 
 
-def reachable_moves(guarantee: LossGuarantee, most: int) -> Moves:
+def reachable_moves(guarantee: LossGuarantee, most: int) -> TransitionTable:
     """Return the moves between all states of a guarantee.
 
     Raises:
         NotPredictableError: there are more than ``most``.
     """
-    if (moves := list_moves(guarantee, most)) is None:
+    if (moves := transition_table(guarantee, most)) is None:
         raise NotPredictableError(
             f"impairments and guarantee together have more than {MOST_JOINT_STATES} states, "
             "too many to compute with"

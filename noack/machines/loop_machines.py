@@ -179,7 +179,7 @@ class LoopMachines:
         self.core: CData = self.memory.keep(ffi.new("noack_process *"))
         """The ``noack_process``; its address does not change."""
         self._fill_machines(templates or range(len(self.parts)))
-        self._counting = {k for k, part in enumerate(self.parts) if part.counts_every_message}
+        self._inspected_loops = {k for k, part in enumerate(self.parts) if part.counts_every_message}
         """Loops of which every message may matter."""
         self._message = ffi.new("noack_message *")
         self._notes = np.zeros(_NOTES, dtype_of("noack_note"))
@@ -204,7 +204,7 @@ class LoopMachines:
         for number, first in enumerate(templates):
             copies.setdefault(first, []).append(number)
         for first, (_, *others) in copies.items():
-            mark = self.memory.size
+            mark = self.memory.mark
             self.parts[first].fill(machines[first], self.memory)
             if others:
                 self.memory.copy(machines, first, others, mark)
@@ -341,15 +341,15 @@ class LoopMachines:
 
     def _update_counting(self, loop: int) -> None:
         if self.parts[loop].counts_every_message:
-            self._counting.add(loop)
+            self._inspected_loops.add(loop)
         else:
-            self._counting.discard(loop)
+            self._inspected_loops.discard(loop)
 
     def _notable(self, rows: StructRows) -> StructRows:
         """Return the rows that a part may have to say something about."""
         notable = np.zeros(len(rows), np.bool_)
-        if self._counting:
-            notable |= np.isin(rows[LOOP], sorted(self._counting))
+        if self._inspected_loops:
+            notable |= np.isin(rows[LOOP], sorted(self._inspected_loops))
         if "dropouts" in (rows.dtype.names or ()):
             notable |= rows["dropouts"] > 0
         return rows[notable]

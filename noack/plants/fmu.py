@@ -26,12 +26,12 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple, NoRe
 import numpy as np
 from pydantic import Field, FiniteFloat
 
-from noack.core.errors import CallerError
+from noack.core.errors import CallerError, one_line, shortened
 from noack.core.file_access import lock
 from noack.core.linear_systems import Vector
 from noack.plants.plant_settings import Names, PlantSettings, PlantStart, PlantSystem, SystemFailedError
 from noack.settings.section import Row, require_length
-from noack.settings.user_files import FileSettings, NamedFile, unchanged
+from noack.settings.user_files import FileSettings, NamedFile, checked_path
 
 if TYPE_CHECKING:  # an extra of noack, and slow to import
     from fmpy.fmi1 import _FMU
@@ -114,7 +114,7 @@ class FmuSystem:
 
     def __init__(self, settings: FmuSettings, x0: Vector) -> None:
         settings.require_installed()
-        path = unchanged(settings, "plant.system")
+        path = checked_path(settings, "plant.system")
         self._place = f'plant.system.file = "{path.name}"'
         self._operating_state = np.array(settings.operating_state or np.zeros_like(x0))
         m = len(settings.input_variables)
@@ -274,7 +274,7 @@ def _described(path: Path) -> "ModelDescription":
         with path.open("rb") as content:  # FMPy does not close a file that it cannot read
             description = fmpy.read_model_description(content, validate=False)
     except Exception as error:  # a file that is not an FMU can raise any error
-        file.wrong(f"is no FMU of FMI 2 or 3, or a damaged one: {_one_line(error)}")
+        file.wrong(f"is no FMU of FMI 2 or 3, or a damaged one: {_short_line(error)}")
     if description.fmiVersion.startswith("1."):
         file.wrong(f"is of FMI {description.fmiVersion}; FMI 2 and 3 are supported")
     if description.coSimulation is None:
@@ -313,11 +313,11 @@ class _Log:
         *_, status, _, message = arguments
         assert isinstance(status, int)
         if status > _WARNING and isinstance(message, bytes):
-            self._last = _one_line(message.decode(errors="replace"))
+            self._last = _short_line(message.decode(errors="replace"))
 
     def why(self, error: Exception) -> str:
         """Return an error's text, with the FMU's last message."""
-        return f"{_one_line(error)} ({self._last})" if self._last else _one_line(error)
+        return f"{_short_line(error)} ({self._last})" if self._last else _short_line(error)
 
 
 class _Variables:
@@ -439,9 +439,8 @@ def _fmpy() -> ModuleType:
         return import_module("fmpy")
 
 
-def _one_line(message: object) -> str:
-    text = " ".join(str(message).split())
-    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
+def _short_line(message: BaseException | str) -> str:
+    return shortened(one_line(message), _LONGEST)
 
 
 @contextmanager

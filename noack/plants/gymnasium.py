@@ -18,12 +18,12 @@ from noack.core.linear_systems import Vector
 from noack.plants.plant_settings import Names, PlantSettings, PlantStart, SystemFailedError
 from noack.protocol.wire_format import MAX_DIMENSION
 from noack.settings.section import MatrixRows, Positive, Row, require_length, require_shape
-from noack.settings.user_files import FileSettings, UserCode, real_vector, unchanged
+from noack.settings.user_files import FileSettings, UserCode, checked_path, real_vector
 
 Indices = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1, max_length=MAX_DIMENSION)]
 _OBSERVATION = "observation"
 _MUJOCO = ("data.qpos", "data.qvel")
-_ALIKE = 1e-6
+_TOLERANCE = 1e-6
 """Largest relative difference between x(0) of the scenario and of the observation, and between the
 quotient of two steps and a whole number."""
 
@@ -123,30 +123,30 @@ class Environment:
         """The prefix of messages."""
         arguments = dict(settings.parameters)
         if settings.file is not None:
-            arguments["xml_file"] = str(unchanged(settings, "plant.system"))
+            arguments["xml_file"] = str(checked_path(settings, "plant.system"))
         gymnasium = import_module("gymnasium")
         try:
-            self._own: UserCode = gymnasium.make(settings.id, **arguments).unwrapped
-            self._observation, _ = self._own.reset(seed=0)
+            self._environment: UserCode = gymnasium.make(settings.id, **arguments).unwrapped
+            self._observation, _ = self._environment.reset(seed=0)
         except Exception as error:  # an environment can raise any error
             self.wrong(f"{type(error).__name__}: {one_line(error)}")
-        space = self._own.action_space
+        space = self._environment.action_space
         if not isinstance(space, gymnasium.spaces.Box):
             self.wrong(
                 f"its actions are {space}, not continuous (Box), which u needs; take an "
                 "environment with continuous actions"
             )
-        is_mujoco = not hasattr(self._own, "state") and hasattr(self._own, "init_qpos")
+        is_mujoco = not hasattr(self._environment, "state") and hasattr(self._environment, "init_qpos")
         self._names = settings.state or (_MUJOCO if is_mujoco else ("state",))
         if self._names == _MUJOCO:
             mujoco = import_module("mujoco")
             # Otherwise MuJoCo starts again from its initial state when a motion diverges.
             disabled = int(getattr(mujoco.mjtDisableBit, "mjDSBL_AUTORESET", 0))
-            self._own.model.opt.disableflags |= disabled
+            self._environment.model.opt.disableflags |= disabled
             # It would print a line for each such step, and write MUJOCO_LOG.TXT into the current
             # folder. That a motion has diverged is reported anyway.
             mujoco.set_mju_user_warning(lambda text: None)
-            self._own.set_state(self._own.init_qpos, self._own.init_qvel)
+            self._environment.set_state(self._environment.init_qpos, self._environment.init_qvel)
         size, actions = len(self._state()), int(np.prod(space.shape))
         self._entries = np.arange(size) if settings.entries is None else np.array(settings.entries)
         if (last := int(self._entries.max())) >= size:
@@ -170,7 +170,7 @@ class Environment:
     @property
     def step_s(self) -> float:
         """The time of a step, s; CallerError if the environment has none."""
-        step_s = self._settings.step_s or own_step_s(self._own)
+        step_s = self._settings.step_s or own_step_s(self._environment)
         if step_s is None:
             self.wrong("it has no time of a step; give plant.system.step_s")
         if not 0 < step_s < math.inf:
@@ -184,9 +184,9 @@ class Environment:
             return
         remedy = f"its step is {own_s:g} s; set plant.rate_hz = {1 / own_s:.9g}"
         longer, shorter = step_ns * 1e-9 / own_s, own_s / (step_ns * 1e-9)
-        if longer > 1 and abs(longer - round(longer)) < _ALIKE:
+        if longer > 1 and abs(longer - round(longer)) < _TOLERANCE:
             remedy += f" and plant.measure_every = {round(longer)} to measure as often as now"
-        elif shorter > 1 and abs(shorter - round(shorter)) < _ALIKE:
+        elif shorter > 1 and abs(shorter - round(shorter)) < _TOLERANCE:
             remedy += f"; it cannot make {round(shorter)} steps of the plant out of its one"
         self.wrong(remedy)
 
@@ -203,7 +203,7 @@ class Environment:
         """
         state = self._state()
         if _OBSERVATION in self._names:
-            if not np.all(np.abs(self.x() - x0) <= _ALIKE * (np.abs(x0) + 1.0)):
+            if not np.all(np.abs(self.x() - x0) <= _TOLERANCE * (np.abs(x0) + 1.0)):
                 observation = self.x().tolist()
                 self.wrong(f"an observation cannot be set; set plant.initial_state = {observation}")
             return
@@ -211,11 +211,11 @@ class Environment:
         name = ""
         try:
             if self._names == _MUJOCO:
-                self._own.set_state(*np.split(state, [self._own.model.nq]))
+                self._environment.set_state(*np.split(state, [self._environment.model.nq]))
                 return
             for name in self._names:
                 path, _, last = name.rpartition(".")
-                owner = attrgetter(path)(self._own) if path else self._own
+                owner = attrgetter(path)(self._environment) if path else self._environment
                 shape = np.shape(getattr(owner, last))
                 part, state = np.split(state, [int(np.prod(shape))])
                 setattr(owner, last, part.reshape(shape) if shape else float(part[0]))
@@ -225,7 +225,7 @@ class Environment:
     def step(self, u: Vector) -> None:
         """Apply an action for a step."""
         action = self._rest + self._actuation @ u
-        self._observation = self._own.step(action.reshape(self._own.action_space.shape))[0]
+        self._observation = self._environment.step(action.reshape(self._environment.action_space.shape))[0]
 
     def _state(self) -> Vector:
         """Return the environment's state."""
@@ -233,7 +233,7 @@ class Environment:
         for name in self._names:
             try:
                 is_seen = name == _OBSERVATION
-                part = np.ravel(self._observation if is_seen else attrgetter(name)(self._own))
+                part = np.ravel(self._observation if is_seen else attrgetter(name)(self._environment))
                 parts.append(real_vector(name, part, part.size))
             except (AttributeError, TypeError, ValueError):
                 self.wrong(

@@ -76,7 +76,7 @@ class ChangeAnnouncement(ControlMessage):
     requested_ns: Nanoseconds  # simulated time of the request
     requested_at: str  # date and time of the request; or that the scenario contains the change
     target_losses: dict[str, FiniteFloat] = {}
-    """Probabilities for :func:`noack.impairments.loss_prediction.store_probabilities`."""
+    """Probabilities for :func:`noack.impairments.target_loss.store_probabilities`."""
 
     @property
     def change(self) -> ParameterChange:

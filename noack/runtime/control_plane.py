@@ -18,7 +18,7 @@ from zenoh import CongestionControl, Priority
 from zenoh.handlers import FifoChannel, RingChannel
 
 from noack.core.errors import NoAnswerError, PeerError
-from noack.impairments.loss_prediction import store_probabilities
+from noack.impairments.target_loss import store_probabilities
 from noack.protocol.roles import COORDINATOR
 from noack.runtime.active_runs import RUNS, run_name
 from noack.runtime.connections.zenoh_session import (

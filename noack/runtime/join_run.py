@@ -18,7 +18,7 @@ from typing import TypeVar
 from setproctitle import setproctitle
 
 from noack.core.errors import ExitStatus, NoackError, NoAnswerError, PeerError
-from noack.core.process_limits import exhausted_limit, require_limits
+from noack.core.system_processes import exhausted_limit, require_limits
 from noack.runtime.address import address_text
 from noack.runtime.command_line import DESCRIPTOR_ON_STDIN, Parser, Signals, failed
 from noack.runtime.control_plane import ControlPlane

@@ -21,7 +21,7 @@ from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat, ValidationE
 from noack.core.clock import clock_identity
 from noack.core.errors import CallerError, PeerError, why
 from noack.core.file_access import new_file, open_regular, read_regular
-from noack.impairments.loss_prediction import found_probabilities, store_probabilities
+from noack.impairments.target_loss import found_probabilities, store_probabilities
 from noack.protocol.wire_format import KEY_BYTES
 from noack.runtime.address import LOOPBACK, Address, address_text, family_of
 from noack.runtime.control_messages import NumericHost, SocketAddress

@@ -53,7 +53,7 @@ from noack.runtime.host_clocks.reference_clock import ClockRecord, ReferenceCloc
 from noack.runtime.life_cycle import HORIZON, LAUNCHER_GONE, LOST_AFTER_S, Event, LifeCycle, Side, State
 from noack.runtime.run_descriptor import RunDescriptor
 from noack.runtime.telemetry import OwnSpool, TelemetryBuffer, deliver_report, persisted_rows
-from noack.runtime.udp_sockets import CountingSocket, bind, enlarge_buffer
+from noack.runtime.udp_sockets import CountingSockets, bind, enlarge_buffer
 from noack.scenario.parameter_changes import ParameterChange
 from noack.scenario.resolution import resolved_loops, run_tables
 from noack.scenario.scenario import Scenario, loops_of, phases_ns
@@ -199,7 +199,7 @@ class RunProcess:
             enlarge_buffer(endpoint, min(size_bytes, _LARGEST_BUFFER_BYTES))
             yield endpoint
 
-    def run(self, driver: Driver, channel: CountingSocket, machine: Reconfigurable) -> None:
+    def run(self, driver: Driver, channel: CountingSockets, machine: Reconfigurable) -> None:
         """Drive the machines to the horizon, hand over the remaining rows, and report.
 
         Args:

@@ -133,7 +133,7 @@ class TelemetryBuffer:
         """The batches that are not known to be on disk, the oldest first."""
         self._to_resend: deque[_RowBatch] = deque()
         self._old = 0
-        """Number of those that were kept at the last confirmation, too."""
+        """Number of batches at the front of `_kept` that were there at the last confirmation, too."""
         self._kept_bytes = 0
 
     def append(self, record: Record) -> None:

@@ -40,10 +40,11 @@ MAX_UDP_BYTES = 65_535
 # overflow is an unintended loss, which breaks the MANSD guarantee.
 _BUFFER_BYTES = 4 * 1024 * 1024
 _SO_RCVBUFFORCE = 33
-IN_AN_INTERVAL = 256
+READ_PER_INTERVAL = 256
 """Datagrams from unknown sources read between two turns of housekeeping, 50 ms: about 5,000 a
 second, which takes a twentieth of a core."""
-IN_A_FLOOD = 16  # datagrams of a flood that are read per interval, to see its sources and its end
+READ_PER_INTERVAL_IN_FLOOD = 16
+"""The same in a flood, of which the sources and the end must be seen."""
 _CALM_INTERVALS = 20
 _MOST_CALM_INTERVALS = 1200
 """Intervals without a flood after which it is over: at first, and, as each flood doubles it, at most."""
@@ -104,7 +105,7 @@ def errors_by_text(errors: Sequence[int]) -> dict[str, int]:
     return {str(OSError(number, os.strerror(number))): n for number, n in enumerate(errors) if n}
 
 
-class CountingSocket(ABC):
+class CountingSockets(ABC):
     """The sockets of a process in the loop, and what they count.
 
     The core reads the socket of each peer, and sends by sockets that are connected to the
@@ -276,10 +277,10 @@ class FloodWatch:
     """
 
     def __init__(self) -> None:
-        self.left = IN_AN_INTERVAL
+        self.left = READ_PER_INTERVAL
         """Number of those that may still be read in this interval; the reader decrements it."""
         self.is_flood = False
-        self._allowed = IN_AN_INTERVAL
+        self._allowed = READ_PER_INTERVAL
         self._dropped = 0
         self._begun_with = 0
         self._calm = 0
@@ -292,7 +293,7 @@ class FloodWatch:
         """
         earlier, self._dropped = self._dropped, dropped
         arrived = self._allowed - self.left + dropped - earlier
-        too_many = arrived > IN_AN_INTERVAL if self.is_flood else dropped > earlier or self.left == 0
+        too_many = arrived > READ_PER_INTERVAL if self.is_flood else dropped > earlier or self.left == 0
         line = None
         if self.is_flood:
             self._calm = 0 if too_many else self._calm + 1
@@ -300,7 +301,7 @@ class FloodWatch:
                 line = self._end()
         elif too_many:
             line = self._begin(earlier)
-        self.left = self._allowed = IN_A_FLOOD if self.is_flood else IN_AN_INTERVAL
+        self.left = self._allowed = READ_PER_INTERVAL_IN_FLOOD if self.is_flood else READ_PER_INTERVAL
         return line
 
     def _begin(self, dropped_before: int) -> str:

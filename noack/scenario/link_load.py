@@ -26,7 +26,7 @@ from typing import NamedTuple
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.number_format import at_least, at_most
-from noack.guarantee.loss_guarantee import LossWindow
+from noack.guarantee.loss_guarantee import WindowBound
 from noack.impairments.constraints import join_guarantee
 from noack.impairments.disciplines.tail_drop import TailDrop
 from noack.impairments.feature import Impairment, Scheduler
@@ -82,7 +82,7 @@ class LinkLoad(NamedTuple):
     """The loop whose slots these are; None: what all loops share."""
     key: str
     flow: Flow
-    window: LossWindow
+    window: WindowBound
     """The successive datagrams of a loop, and those of them that may be lost; the others must pass."""
     rate_bps: float
     """The rate that it carries; a link with recorded opportunities: on average."""
@@ -297,13 +297,13 @@ def _slots(schedule: Schedule, run_parts: Sequence[_RunPart]) -> list[list[int]]
     return [*schedule.slots, *([] for _ in range(loops))][:loops]
 
 
-def _window(direction: DirectionSection) -> LossWindow:
+def _window(direction: DirectionSection) -> WindowBound:
     link = direction.link
     windows = join_guarantee(link.mansd, link.constraints).windows
-    return min(windows, key=lambda window: window.losses / window.packets, default=LossWindow(1, 1))
+    return min(windows, key=lambda window: window.losses / window.packets, default=WindowBound(1, 1))
 
 
-def _share(window: LossWindow) -> float:
+def _share(window: WindowBound) -> float:
     return (window.packets - window.losses) / window.packets
 
 

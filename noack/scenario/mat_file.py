@@ -11,7 +11,7 @@ import warnings
 
 import numpy as np
 
-from noack.core.process_limits import python_command
+from noack.core.system_processes import python_command
 
 _OF_NUMBERS = {
     "double", "single", "sparse", "logical",

@@ -21,7 +21,7 @@ from noack.impairments.constraints import require_consistent
 from noack.impairments.link_settings import Constraints, Mansd, require_scores
 from noack.impairments.loss_models import Loss
 from noack.impairments.loss_models.trace import TraceLoss
-from noack.impairments.loss_prediction import with_target_loss
+from noack.impairments.target_loss import with_target_loss
 from noack.protocol.wire_format import MAX_DIMENSION
 from noack.scenario.runtime_parameters import LOSS, put_settings, require_runtime_parameters
 from noack.scenario.scenario_tables import ScenarioTables

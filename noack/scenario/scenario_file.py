@@ -26,7 +26,7 @@ from noack.scenario.sections import DirectionSection
 from noack.scenario.toml_file import keys as known_keys
 from noack.scenario.toml_file import nearest_key
 from noack.settings.section import ReadTable, Table
-from noack.settings.user_files import FileSettings, file_tables, located, with_tables
+from noack.settings.user_files import FileSettings, file_tables, with_absolute_path, with_tables
 
 _ENTRY = r"""[-+\w.]+|"[^"\\\n]*\""""
 _ROW = re.compile(rf"\[\n((?:\s*(?:{_ENTRY}),\n)+)\s*\]")
@@ -92,7 +92,7 @@ def _with_files(scenario: Scenario, path: Path, source: str) -> Scenario:
 
     def tables(within: str, loop: Scenario) -> dict[str, FileSettings]:
         return {
-            place: located(table, path.parent, f"{source}: {within}{place}")
+            place: with_absolute_path(table, path.parent, f"{source}: {within}{place}")
             for place, table in file_tables(loop)
         }
 
@@ -137,7 +137,10 @@ def _loop_tables(path: Path, setting: str) -> Table:
         raise CallerError(f"{setting}: that file has loops itself; name a file of one loop")
     filled = with_matrices(content, path.parent, str(path))
     file = toml_file.validated(parts_model(frozenset(PARTS), others_optional=True), filled, str(path))
-    tables = {place: located(table, path.parent, f"{path}: {place}") for place, table in file_tables(file)}
+    tables = {
+        place: with_absolute_path(table, path.parent, f"{path}: {place}")
+        for place, table in file_tables(file)
+    }
     parts = set(PARTS)
     return with_tables(file, tables).model_dump(mode="json", exclude_none=True, include=parts)
 

@@ -322,12 +322,12 @@ class TheoryCoverage:
         return self.scenario.observer is None and not self.scenario.plant.measurement.is_noisy
 
     @property
-    def is_certifiable(self) -> bool:
-        """Whether certificates apply; the paper's theorems need its trigger as well."""
-        return self.beyond_theory is None
+    def linear_certificates_apply(self) -> bool:
+        """Whether certificates of linear plants apply; the paper's theorems need its trigger as well."""
+        return self.uncertified_setting is None
 
     @property
-    def can_be_certified(self) -> bool:
+    def some_certificate_applies(self) -> bool:
         """Whether certificates apply: those of linear plants, or that of a plant on a region."""
         return (self._beyond_any_certificate or self.scenario.trigger.beyond_exact) is None
 
@@ -337,8 +337,8 @@ class TheoryCoverage:
         return self.knows_state and not self.scenario.plant.disturbances
 
     @property
-    def beyond_theory(self) -> str | None:
-        """The first setting that certificates do not cover; None if all are."""
+    def uncertified_setting(self) -> str | None:
+        """The first setting that certificates of linear plants do not cover; None if all are covered."""
         return self._beyond_certificates or self.scenario.trigger.beyond_exact
 
     @property
@@ -420,7 +420,7 @@ class TheoryCoverage:
 
     def require_certifiable(self) -> None:
         """Raise CallerError if no certificate covers the scenario."""
-        if (reason := self.beyond_theory) is not None:
+        if (reason := self.uncertified_setting) is not None:
             raise CallerError(f"{reason}; no certificate covers this")
 
     def require_exact(self) -> None:

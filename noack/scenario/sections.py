@@ -105,7 +105,7 @@ class ModelSection(ScenarioSection):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        require_read(self.file, self.names)
+        require_no_file(self.file, self.names)
         if self.name is not None:
             self._check_named(self.name)
         else:
@@ -181,7 +181,7 @@ class ModelSection(ScenarioSection):
         return ModelMatrices(*self.matrices, K)
 
 
-def require_read(file: str | None, names: object | None) -> None:
+def require_no_file(file: str | None, names: object | None) -> None:
     """Raise ValueError if a section still names a file: loading a scenario replaces the name."""
     if file is not None:
         raise ValueError("file: it is read where a scenario file is loaded; give matrices here")
@@ -308,7 +308,7 @@ class PlantSection(ScenarioSection):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        require_read(self.file, self.names)
+        require_no_file(self.file, self.names)
         for key in ("A", "B"):
             matrix = getattr(self, key)
             if self.draw == "given" and matrix is None:

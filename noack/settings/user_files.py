@@ -34,7 +34,7 @@ Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 FileSettingsT = TypeVar("FileSettingsT", bound="FileSettings")
 SectionT = TypeVar("SectionT", bound=BaseModel)
 
-PLACES = ("plant.system", "trigger", "controller")
+FILE_TABLES = ("plant.system", "trigger", "controller")
 """The tables of a scenario that may name such a file."""
 
 
@@ -92,7 +92,7 @@ class FileSettings(ScenarioSection):
 
 def file_tables(scenario: BaseModel) -> Iterator[tuple[str, FileSettings]]:
     """Return the tables of a scenario that name a file, each with its place."""
-    for place in PLACES:
+    for place in FILE_TABLES:
         table: object = scenario
         for part in place.split("."):
             table = getattr(table, part)
@@ -110,7 +110,7 @@ def with_tables(section: SectionT, tables: Mapping[str, BaseModel]) -> SectionT:
     return section.model_copy(update=update)
 
 
-def located(settings: FileSettingsT, folder: Path, place: str) -> FileSettingsT:
+def with_absolute_path(settings: FileSettingsT, folder: Path, place: str) -> FileSettingsT:
     """Return settings with the absolute path of their file (relative to a folder), and its SHA-256.
 
     If a SHA-256 is already given, it is used and the file is not read: so the record of a run can
@@ -124,7 +124,7 @@ def located(settings: FileSettingsT, folder: Path, place: str) -> FileSettingsT:
     return settings.model_copy(update={"file": str(file.path.absolute()), "sha256": sha256})
 
 
-def unchanged(settings: FileSettings, place: str) -> Path:
+def checked_path(settings: FileSettings, place: str) -> Path:
     """Return the path of a loaded setting's file; raise CallerError if missing or changed."""
     file = NamedFile(settings.file or "", Path(), place)
     if (actual := file.sha256()) != settings.sha256:
@@ -215,7 +215,7 @@ def real_vector(title: str, value: UserCode, size: int) -> Vector:
 
 def _class(settings: ClassSettings, place: str) -> tuple[UserCode, str]:
     if settings.file is not None:
-        path = unchanged(settings, place)
+        path = checked_path(settings, place)
         return _attribute(_executed(path), settings.name), f"class {settings.name} of {path.name}"
     module, colon, name = settings.name.partition(":")
     if colon:

@@ -55,10 +55,10 @@ from noack.core.linear_systems import (
     exponential,
     matrix_key,
     matrix_of,
-    row_norms,
     spectral_abscissa,
     transition,
 )
+from noack.core.row_operations import row_norms
 from noack.scenario.resolution import LoopMatrices
 from noack.theory.bounds.enclosure import NotDecayingError, response, response_until
 from noack.theory.bounds.stacked_norms import spectral_norms
@@ -139,7 +139,7 @@ class MissedEvents:
             event = np.repeat(np.arange(begin, last), lengths[begin:last])
             measurement = np.arange(len(event)) - (totals - lengths)[event] + earlier + begins[event]
             periods = (t_ns[measurement] - times_ns[event]) // self._period_ns
-            jumps = self._propagate.leaps(errors.take(event, axis=0), periods, self._period_ns)
+            jumps = self._propagate.advance_by_periods(errors.take(event, axis=0), periods, self._period_ns)
             yield MissedJumps(measurement, times_ns[event], periods, jumps)
             begin = last
 

@@ -21,7 +21,7 @@ from typing import IO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.linear_systems import firsts_of_equal
+from noack.core.row_operations import firsts_of_equal
 from noack.protocol.probe_format import MAGIC, ProbeKind, decode_probe
 from noack.traces.capture_packets import CapturedFlow, CutCaptureError, captured_packets, find_udp, is_capture
 from noack.traces.packet_trace import (

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from noack.core.errors import CallerError, one_line, shortened, why
 from noack.core.file_access import open_regular
-from noack.core.linear_systems import firsts_of_equal
+from noack.core.row_operations import firsts_of_equal
 
 Int64s = NDArray[np.int64]
 Times = NDArray[np.float64]
@@ -52,6 +52,7 @@ _HEAD_BYTES = 4096
 _GZIP = b"\x1f\x8b"
 _SHIPPED = Path(__file__).parent / "shipped"
 _LONGEST_NAME = 100
+"""Longest name that is looked up among the shipped traces."""
 
 
 class TraceRecordError(ValueError):

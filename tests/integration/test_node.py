@@ -29,7 +29,7 @@ from noack.protocol.wire_format import Wire
 from noack.runtime.drivers.live_driver import LoopChannel
 from noack.runtime.drivers.node_driver import NodeDriver
 from noack.runtime.udp_sockets import bind
-from noack.settings.user_files import located
+from noack.settings.user_files import with_absolute_path
 from tests.helpers import live_runs as live
 from tests.helpers.approved import lines_of_error
 from tests.helpers.command_line import invoke
@@ -150,7 +150,9 @@ def test_a_stopped_program_ends_with_its_process_and_another_goes_on(start: Star
 
 def driver_of(program: Path, content: dict[str, Any]) -> NodeDriver:
     """The driver of a program, without a run."""
-    settings = located(ProgramControllerSettings(kind="program", file=str(program)), Path(), "here")
+    settings = with_absolute_path(
+        ProgramControllerSettings(kind="program", file=str(program)), Path(), "here"
+    )
     assert isinstance(settings, ProgramControllerSettings)
     descriptor = SimpleNamespace(key=KEY)
     process: Any = SimpleNamespace(wire=Wire(RUN_ID, KEY), admitted_ns=0, descriptor=descriptor)

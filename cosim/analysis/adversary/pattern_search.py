@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from cosim.analysis.adversary.loop_flows import Flags, Pattern, PatternFlow, SegmentEnds
 from cosim.simulation.continuous import TooManyEventsError
 from cosim.simulation.exact_simulation import MAX_EVENTS
-from noack.core.linear_systems import Matrix, Vector, firsts_of_equal
+from noack.core.linear_systems import Matrix, Vector
+from noack.core.row_operations import firsts_of_equal
 from noack.guarantee.loss_guarantee import LossAutomaton, LossGuarantee
 
 Indices = NDArray[np.int64]

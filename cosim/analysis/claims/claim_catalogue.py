@@ -14,8 +14,9 @@ import numpy as np
 
 from cosim.analysis.claims.observed_conditions import Reals, VoidFrom, earliest
 from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples
-from noack.core.linear_systems import Propagator, row_norms
+from noack.core.linear_systems import Propagator
 from noack.core.number_format import at_most
+from noack.core.row_operations import row_norms
 from noack.theory.bounds.certificate_terms import Constants
 from noack.theory.certificates.certified_bounds import ScenarioCertificate, envelope_formula
 
@@ -213,7 +214,7 @@ def theorem_1_controller_error(run: RunEvidence, samples: Samples) -> ClaimBound
     """Theorem 1 with the Δ of the trajectory."""
     scenario = run.record.scenario
     coverage = scenario.coverage
-    is_covered = coverage.is_certifiable and coverage.is_undisturbed and coverage.is_decaying
+    is_covered = coverage.linear_certificates_apply and coverage.is_undisturbed and coverage.is_decaying
     if not is_covered or scenario.decaying.floor > 0 or (delta := run.trajectory_delta) is None:
         return ClaimBound()
     level = scenario.decaying.beta * np.exp(-scenario.decaying.alpha_per_s * samples.t_s)

@@ -290,7 +290,7 @@ class RunClaims:
     def allowed(self) -> NetworkConditions | None:
         """The conditions of the scenario's certificates; None if it can have none."""
         scenario, first = self.record.scenario, self.parts[0]
-        if not scenario.coverage.can_be_certified:
+        if not scenario.coverage.some_certificate_applies:
             return None
         if isinstance(first, ClaimEvaluation) and first.record is self._checked_record:
             return first.allowed

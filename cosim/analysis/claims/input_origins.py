@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cosim.analysis.claims.observed_conditions import SampledSeries
 from cosim.record.run_events import ActuationTimes
 from cosim.record.run_record import Rows
-from noack.core.linear_systems import largest_sizes
+from noack.core.row_operations import largest_sizes
 from noack.protocol.record_tables import NO_SEQUENCE
 from noack.protocol.roles import GENERATION
 from noack.scenario.scenario import Scenario

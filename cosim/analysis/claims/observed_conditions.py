@@ -330,7 +330,7 @@ def causes_of(scenario: Scenario) -> Collection[str]:
     """
     if scenario.protocol.acknowledges:
         return ()
-    if not scenario.coverage.can_be_certified:
+    if not scenario.coverage.some_certificate_applies:
         return ("sampling", *CLOCK_CAUSES)
     return (*guarantee_causes(scenario), *CAUSES)
 

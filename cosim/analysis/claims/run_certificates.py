@@ -33,7 +33,7 @@ def late_certificates(runs: Sequence[LateRun]) -> list[Sequence[ScenarioCertific
     due: list[tuple[int, LateSchedules, Sequence[ScenarioCertificate] | None]] = [
         (number, run.late_schedules(), None)
         for number, run in enumerate(runs)
-        if run.record.scenario.coverage.can_be_certified
+        if run.record.scenario.coverage.some_certificate_applies
     ]
     while due:
         tried: list[tuple[int, LateSchedules, NetworkConditions]] = []
@@ -73,7 +73,7 @@ def certificates_together(
     searches: list[Search[ScenarioCertificate]] = []
     numbers: list[int] = []
     for number, scenario in enumerate(scenarios):
-        if not scenario.coverage.can_be_certified:
+        if not scenario.coverage.some_certificate_applies:
             continue
         limits = allowed_conditions(scenario) if conditions is None else conditions[number]
         error = None if start_errors is None else start_errors[number]

@@ -29,7 +29,7 @@ from cosim.analysis.claims.trajectory_delta import trajectory_delta
 from cosim.analysis.summary.signal_statistics import SampleFacts, SampleFactsReader, signal_statistics
 from cosim.record.align import NOT_SHARED, AlignedRun, EventFollower, SinceEvent, aligned_parts, bounded_parts
 from cosim.record.run_record import RunRecord
-from noack.core.linear_systems import all_entries
+from noack.core.row_operations import all_entries
 from noack.protocol.record_tables import NO_SEQUENCE
 from noack.protocol.roles import LOOP_ROLES
 from noack.theory.bounds.certificate_terms import NetworkConditions
@@ -319,7 +319,7 @@ class RunEvidence:
         """Theorem 2 with (I1)'s uniform Δ under the paper's conditions; None if there is no Δ."""
         scenario, loop = self.record.scenario, self.record.loop
         if (
-            not scenario.coverage.is_certifiable
+            not scenario.coverage.linear_certificates_apply
             or not scenario.coverage.is_undisturbed
             or not scenario.coverage.is_decaying
             or loop.weight is not None

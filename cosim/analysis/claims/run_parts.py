@@ -13,7 +13,8 @@ import numpy as np
 
 from cosim.record.run_record import Rows, RunRecord
 from noack.core.clock import NS_PER_S
-from noack.core.linear_systems import Vector, row_norms
+from noack.core.linear_systems import Vector
+from noack.core.row_operations import row_norms
 from noack.protocol.record_tables import (
     CLOCK_TABLES,
     CONTROLLER_DELIVERY,

@@ -32,7 +32,7 @@ from cosim.record.run_record import RunRecord
 from noack.core.clock import NS_PER_S
 from noack.core.errors import ExitStatus
 from noack.core.linear_systems import Vector
-from noack.impairments.loss_prediction import expected_loss
+from noack.impairments.target_loss import expected_loss
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     NETEM_PACKET,

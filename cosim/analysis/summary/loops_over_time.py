@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from cosim.analysis.summary.quantiles import quantiles_in
 from cosim.record.align import Reals, aligned_parts
 from cosim.record.run_record import RecordedRun, Rows, RunRecord
-from noack.core.linear_systems import firsts_of_equal
+from noack.core.row_operations import firsts_of_equal
 from noack.protocol.record_tables import NETEM_PACKET
 from noack.scenario.scenario import Scenario, phases_ns
 

@@ -16,7 +16,7 @@ from cosim.lazy_modules import lazy_modules
 from cosim.record.run_directory import DEFAULT_RUNS
 from cosim.shipped_files import find_shipped
 from noack.core.errors import CallerError, ExitStatus
-from noack.core.process_limits import cores
+from noack.core.system_processes import cores
 from noack.runtime.command_line import print_to_stderr
 
 with lazy_modules():

@@ -17,8 +17,8 @@ from zenoh.handlers import FifoChannel, RingChannel
 
 from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import CallerError, PeerError
-from noack.core.process_limits import cores
-from noack.impairments.loss_prediction import found_probabilities
+from noack.core.system_processes import cores
+from noack.impairments.target_loss import found_probabilities
 from noack.protocol.roles import COORDINATOR, LOOP_ROLES, ROLES
 from noack.runtime.connections.zenoh_session import header_of, next_payload
 from noack.runtime.control_messages import (

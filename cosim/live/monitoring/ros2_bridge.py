@@ -20,7 +20,7 @@ from zenoh.handlers import RingChannel
 from cosim.live.monitoring.run_watcher import Watcher
 from cosim.record.run_directory import SCENARIO_FILE
 from noack.core.errors import CallerError, ExitStatus, NoackError, PeerError
-from noack.core.process_limits import python_command
+from noack.core.system_processes import python_command
 from noack.protocol import ros2_messages as ros2
 from noack.protocol.record_tables import LOOP
 from noack.protocol.ros2_node import Node, Publisher

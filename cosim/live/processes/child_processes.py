@@ -20,7 +20,7 @@ from cosim.live.processes.fork_server import ENVIRONMENT, ForkedProcess, ForkSer
 from cosim.live.processes.remote_hosts import SSH_FAILED, RemoteStart, start_over_ssh
 from noack.core.errors import ExitStatus, MachineError
 from noack.core.file_access import open_append
-from noack.core.process_limits import python_command
+from noack.core.system_processes import python_command
 from noack.protocol.roles import PLANT, RECORDER
 from noack.runtime.run_descriptor import RunDescriptor
 from noack.scenario.scenario import Scenario

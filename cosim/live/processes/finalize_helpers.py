@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, TypeVar, cast
 
 from cosim.live.processes.process_pool import at_idle_priority, call_by_name, process_starts, processes
 from cosim.record.run_directory import RunEnding
-from noack.core.process_limits import cores
+from noack.core.system_processes import cores
 from noack.runtime.spool import EARLY, EARLY_ENDED, SPOOL
 from noack.scenario.scenario import Scenario, loop_names
 

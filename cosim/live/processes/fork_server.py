@@ -26,7 +26,7 @@ from typing import IO, TYPE_CHECKING
 
 from cosim.lazy_modules import lazy_modules, load_module
 from noack.core.errors import MachineError
-from noack.core.process_limits import python_command, require_limits
+from noack.core.system_processes import python_command, require_limits
 from noack.runtime.command_line import DESCRIPTOR_ON_STDIN
 
 with lazy_modules():

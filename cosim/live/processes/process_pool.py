@@ -13,7 +13,7 @@ from importlib import import_module
 from multiprocessing.connection import Connection
 from types import ModuleType
 
-from noack.core.process_limits import be_idle
+from noack.core.system_processes import be_idle
 
 _KEPT_BYTES = str(32 * 2**20)
 _ENVIRONMENT = dict.fromkeys(
@@ -23,7 +23,7 @@ _ENVIRONMENT = dict.fromkeys(
     "MALLOC_MMAP_THRESHOLD_": _KEPT_BYTES,
     "MALLOC_TRIM_THRESHOLD_": _KEPT_BYTES,
 }
-"""One thread each, and no imports from the current folder (:mod:`noack.core.process_limits`). They
+"""One thread each, and no imports from the current folder (:mod:`noack.core.system_processes`). They
 keep freed memory: with new memory for each part of a record, half of the time is page faults."""
 
 _STARTS = threading.Lock()

@@ -128,7 +128,7 @@ class ClaimMonitor:
 
         That of a nonlinear plant on its region takes seconds, and is left out.
         """
-        if self._limits_s > _LIMITS_S or not self._loops[loop].coverage.is_certifiable:
+        if self._limits_s > _LIMITS_S or not self._loops[loop].coverage.linear_certificates_apply:
             return ""
         began_s = time.thread_time()
         try:

@@ -50,7 +50,7 @@ from cosim.record.decimation import decimate_all
 from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NS_PER_S
-from noack.core.linear_systems import row_norms
+from noack.core.row_operations import row_norms
 from noack.guarantee.loss_guarantee import LossesInWindow
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, PLANT_STEP, Fate
 from noack.protocol.wire_format import Flow

@@ -21,7 +21,8 @@ from cosim.record.align import Reals
 from cosim.record.record_source import rows_by_loop
 from cosim.record.run_record import Rows
 from noack.core.clock import NEVER_NS, NS_PER_S
-from noack.core.linear_systems import Propagator, row_norms
+from noack.core.linear_systems import Propagator
+from noack.core.row_operations import row_norms
 from noack.protocol.record_tables import (
     CLOCK_TABLES,
     CONTROLLER_DELIVERY,

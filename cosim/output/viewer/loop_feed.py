@@ -26,7 +26,7 @@ from cosim.record.record_source import concatenate_rows
 from cosim.record.run_events import claimed_until_s, messages_in, model_flow
 from cosim.record.run_record import Rows
 from noack.core.clock import NS_PER_S
-from noack.core.linear_systems import row_norms
+from noack.core.row_operations import row_norms
 from noack.protocol.record_tables import (
     CLOCK_TABLES,
     CONTROLLER_DELIVERY,
@@ -93,7 +93,7 @@ class LoopFeed:
         certified: bool = True,
     ) -> None:
         self._columns = columns
-        self._is_certified = certified and scenario.coverage.can_be_certified
+        self._is_certified = certified and scenario.coverage.some_certificate_applies
         self._scenario = scenario
         self._loop = loop_of(scenario)
         self._view = view

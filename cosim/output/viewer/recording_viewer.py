@@ -48,7 +48,7 @@ from cosim.output.viewer.rerun_program import (
 from cosim.record.run_directory import RECORDING_FILE, SUMMARY_FILE, loop_of_file, read_object
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, ExitStatus, MachineError, PeerError
-from noack.core.process_limits import python_command
+from noack.core.system_processes import python_command
 
 RECORDING = "recording.rrd"
 """Last part of the address of a recording."""

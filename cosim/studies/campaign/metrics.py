@@ -19,8 +19,8 @@ from scipy.special import bdtr, stdtrit
 from cosim.simulation.exact_simulation import OK
 from noack.core.linear_systems import Vector
 from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee
-from noack.impairments.loss_prediction import loss_process
 from noack.impairments.markov_chain import NotPredictableError
+from noack.impairments.target_loss import loss_process
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.enclosure import NotDecayingError

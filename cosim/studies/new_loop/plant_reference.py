@@ -23,7 +23,7 @@ from noack.scenario import scenario_file, toml_file
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.sections import PLANTS
 from noack.settings.section import ReadTable, Table
-from noack.settings.user_files import located
+from noack.settings.user_files import with_absolute_path
 
 _GYMNASIUM = "gymnasium:"
 """What the name of an environment begins with."""
@@ -163,7 +163,7 @@ def _validated_settings(table: object, label: str) -> PlantSettings:
     system = toml_file.validated(PLANTS[str(table["kind"])], table, f"{label}: plant.system")
     system.require_installed()
     if isinstance(system, FmuSettings | GymnasiumSettings | PythonPlantSettings):
-        return located(system, Path.cwd(), "plant.system")
+        return with_absolute_path(system, Path.cwd(), "plant.system")
     return system
 
 

@@ -12,18 +12,14 @@ from noack.core.errors import shortened
 from noack.impairments.clauses import Clause, FileOr, Part
 from noack.impairments.feature import (
     LONGEST_NS,
-    OFFSET,
     FileFeature,
     Impairment,
-    Offset,
     PacketOrder,
     Stage,
     StageTables,
     add_numbers,
-    offset_meaning,
-    offset_ns,
-    require_inside,
 )
+from noack.impairments.trace_offset import OFFSET, Offset, offset_meaning, offset_ns, require_inside
 from noack.impairments.words import COUNT, SIGNED_COUNT, brief_number, list_of
 from noack.settings.user_files import NamedFile
 

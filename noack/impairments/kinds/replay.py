@@ -11,19 +11,15 @@ from noack.core.clock import NS_PER_S
 from noack.impairments.clauses import Clause, FileOr, Part, flag
 from noack.impairments.feature import (
     LONGEST_NS,
-    OFFSET,
     FileFeature,
     Impairment,
-    Offset,
     PacketOrder,
     Stage,
     StageTables,
     add_numbers,
-    offset_meaning,
-    offset_ns,
-    require_inside,
 )
 from noack.impairments.markov_chain import NotPredictableError, PeriodicLosses
+from noack.impairments.trace_offset import OFFSET, Offset, offset_meaning, offset_ns, require_inside
 from noack.impairments.words import OWN_TIME_NS, PERCENT, Quantity, brief_number, brief_percent, time_ns_text
 from noack.settings.section import Probability
 from noack.settings.user_files import NamedFile
@@ -206,9 +202,9 @@ class Replay(FileFeature, Impairment):
         trace = read_trace(
             path, place=file.named, clocks_differ=self.clocks_differ, most_packets=MOST_RECORDS
         )
-        return self.of(trace, file)
+        return self.with_trace(trace, file)
 
-    def of(self, trace: PacketTrace, file: NamedFile) -> Self:
+    def with_trace(self, trace: PacketTrace, file: NamedFile) -> Self:
         """Return the settings with a trace, which was in a file."""
         if (trace.delay_ns > LONGEST_DELAY_NS).any():
             file.wrong("has a delay of more than an hour; a replay can have none")

@@ -30,7 +30,7 @@ _SINGULAR = 1e-9
 """If the smallest singular value of the settled deviations is below this, x is not a state."""
 _AHEAD = 10
 """Steps after the settling over which a prediction is compared with the motion."""
-_MISSED = 0.05
+_PREDICTION_TOLERANCE = 0.05
 """If A and B predict x some steps after any deviation with a larger relative error, x is not a
 state."""
 _WIDEST, _FINER, _STEPS = 0.1, 4.0, 10
@@ -42,9 +42,9 @@ _ROUNDING = 1e-13
 _DIGITS = 10
 """Significant digits of A and B that are kept."""
 _SAMPLES = {"derivative": 1000, "motion": 100}
-_FORGOTTEN = 1e-12
+_SMALLEST_EIGENVALUE = 1e-12
 """If an eigenvalue of a step is below this, a deviation is gone after the step."""
-_LOGARITHM = 1e-6
+_LOGARITHM_TOLERANCE = 1e-6
 """Largest relative difference between the step and the exponential of its logarithm."""
 
 NO_STATE = "x is not its whole state, or it is not smooth"
@@ -171,10 +171,10 @@ def _by_motion(system_at: SystemAt, x0: Vector, u0: Vector, settling_s: float, s
     step = step_offs @ np.linalg.inv(start_offs)
     errors = np.linalg.matrix_power(step, ahead) @ start_offs - ahead_offs
     sizes = np.maximum(*(np.linalg.norm(deviations[:n], axis=0) for deviations in (start_offs, ahead_offs)))
-    if (np.linalg.norm(errors, axis=0) > _MISSED * sizes).any():
+    if (np.linalg.norm(errors, axis=0) > _PREDICTION_TOLERANCE * sizes).any():
         return without(NO_STATE)
     # Â and B̂ are those of its real logarithm.
-    if np.abs(np.linalg.eigvals(step)).min() < _FORGOTTEN:
+    if np.abs(np.linalg.eigvals(step)).min() < _SMALLEST_EIGENVALUE:
         return without(NO_LOGARITHM)
     logarithm = _logarithm(step)
     if logarithm is None:
@@ -191,7 +191,7 @@ def _logarithm(step: Matrix) -> Matrix | None:
         logarithm = np.asarray(np.real(logm(step)))
         if not np.isfinite(logarithm).all():
             return None
-        is_inexact = np.abs(expm(logarithm) - step).max() > _LOGARITHM * np.abs(step).max()
+        is_inexact = np.abs(expm(logarithm) - step).max() > _LOGARITHM_TOLERANCE * np.abs(step).max()
     return None if is_inexact else logarithm
 
 

@@ -192,11 +192,11 @@ def _make_compilable(model: str) -> Compiled:
     }
     for function in functions - {lateral}:
         register_jitable(**_OPTIONS)(function)
-    overload(lateral, jit_options=_OPTIONS)(_held)
+    overload(lateral, jit_options=_OPTIONS)(_lateral_force_with_held_camber)
     return compiler(_folder(model), error_model="python")(_integrator(dynamics))
 
 
-def _held(alpha: Any, gamma: Any, F_z: Any, p: Any) -> Any:
+def _lateral_force_with_held_camber(alpha: Any, gamma: Any, F_z: Any, p: Any) -> Any:
     """Return the library's formula for the lateral force, with the sign of the camber held.
 
     The library calls it for one wheel after the other. Its shifts are s (p₁ + p₃ |γ|) with the sign

@@ -42,7 +42,7 @@ from enum import Enum
 from typing import NamedTuple
 
 from noack.core.errors import MachineError, NoAnswerError, PeerError, why
-from noack.core.process_limits import python_command
+from noack.core.system_processes import python_command
 from noack.protocol.wire_format import KEY_BYTES, TAG_BYTES, Tagger
 from noack.runtime.connections.connection_gate import FirstBytes, TaskLimit, accepting
 from noack.runtime.private_folder import open_private

@@ -30,7 +30,7 @@ from noack.protocol.wire_format import (
 from noack.runtime.address import Address, SocketName, packed_name
 from noack.runtime.drivers.real_time_loop import RecordSink
 from noack.runtime.run_process import RunProcess
-from noack.runtime.udp_sockets import CountingSocket, errors_by_text
+from noack.runtime.udp_sockets import CountingSockets, errors_by_text
 
 _UDP_GRO = 104
 _AT_ONCE_NS = -(2**63)
@@ -244,7 +244,7 @@ class LiveDriver:
         memory[:] = seal.encrypt(bytes(memory[:HEADER_BYTES]), bytes(memory[HEADER_BYTES:-TAG_BYTES]))
 
 
-class LoopChannel(CountingSocket):
+class LoopChannel(CountingSockets):
     """The sockets of a process in the loop.
 
     Args:

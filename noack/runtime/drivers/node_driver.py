@@ -33,7 +33,7 @@ from noack.runtime.address import Address, SocketName
 from noack.runtime.drivers.live_driver import LiveDriver, LoopChannel, ends_of
 from noack.runtime.drivers.real_time_loop import RecordSink
 from noack.runtime.run_process import RunProcess
-from noack.settings.user_files import unchanged
+from noack.settings.user_files import checked_path
 
 _PR_SET_PDEATHSIG = 1
 _LONGEST_WAIT_S = 10.0
@@ -90,7 +90,7 @@ class NodeDriver(LiveDriver):
         self._own, peer = socket.socketpair()
         peer.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _READ_BYTES)  # this process may stall
         with peer:
-            self._program = self._start(unchanged(settings, "controller"), settings.runner, peer)
+            self._program = self._start(checked_path(settings, "controller"), settings.runner, peer)
 
     def _start(self, path: Path, runner: Sequence[str], peer: socket.socket) -> "subprocess.Popen[bytes]":
         prctl: Callable[[int, int], int] = ctypes.CDLL(None).prctl

@@ -20,9 +20,9 @@ _OVERLOAD_PAUSE_S = 0.002
 """Pause for other threads, after a turn in which the loop has used nearly all time of its core."""
 _OVERLOAD_SHARE = 0.9  # of CPU time in the time since the last housekeeping
 _TURNS_TO_CATCH_UP = 20
-"""Of housekeeping, one second: a machine that is late at its end has this time to catch up."""
+"""Turns of housekeeping (one second) that a machine which is late at its end has to catch up."""
 _TURNS_TO_WAIT = 2 * _TURNS_TO_CATCH_UP
-"""Of housekeeping, for the others: they may be late, and then report a moment later that they are
+"""Turns of housekeeping that others have: they may be late, and report a moment later that they are
 done."""
 
 

@@ -108,7 +108,7 @@ def bound_forcing(resolved: Scenario, B: Matrix) -> Forcing | None:
         columns.append(extent)
         normal.append(deviations[:, deviations.any(axis=0)])
         # The last step begins before the end.
-        durations_s += [disturbance.longest_s + period_s] * extent.shape[1]
+        durations_s += [disturbance.duration_s + period_s] * extent.shape[1]
     D = np.hstack(normal)
     of_normal = None
     if bounds is not None and D.size:

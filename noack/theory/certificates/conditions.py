@@ -15,8 +15,8 @@ from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Vector
 from noack.disturbances.step import StepDisturbance
 from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee
-from noack.impairments.loss_prediction import loss_process
 from noack.impairments.markov_chain import NotPredictableError
+from noack.impairments.target_loss import loss_process
 from noack.scenario.resolution import loop_of, setpoint_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import NetworkConditions

@@ -68,10 +68,10 @@ def scopes(resolved: Scenario, start_error: float | None = None) -> list[Certifi
 
     These are its own plant and the box around it, if it is linear; otherwise its plant on a region.
     """
-    if resolved.coverage.is_certifiable:
+    if resolved.coverage.linear_certificates_apply:
         linear = own_plant_scope(resolved, start_error), box_scope(resolved, start_error)
         return [scope for scope in linear if scope is not None]
-    return [RegionScope(resolved, start_error)] if resolved.coverage.can_be_certified else []
+    return [RegionScope(resolved, start_error)] if resolved.coverage.some_certificate_applies else []
 
 
 class _Box(CertificateScope):

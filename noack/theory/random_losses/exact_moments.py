@@ -330,7 +330,7 @@ def require_predictable(resolved: Scenario) -> None:
     """Raise CallerError unless the loop's second moments follow linear equations."""
     resolved.coverage.require_direct_inputs()
     resolved.coverage.require_unchanging()
-    if (why := resolved.coverage.beyond_theory) is not None:
+    if (why := resolved.coverage.uncertified_setting) is not None:
         raise CallerError(f"{why}; the mean cost needs a linear plant with u = K x_c")
     if resolved.observer is not None:
         raise CallerError(f'observer.kind = "{resolved.observer.kind}": the mean cost needs none')

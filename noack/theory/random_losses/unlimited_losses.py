@@ -22,7 +22,8 @@ import numpy as np
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import spectral_abscissa
 from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee
-from noack.impairments.loss_prediction import LossProcess, loss_process
+from noack.impairments.loss_prediction import LossProcess
+from noack.impairments.target_loss import loss_process
 from noack.scenario.resolution import LoopMatrices, loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertificateError

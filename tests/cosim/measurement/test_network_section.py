@@ -9,7 +9,7 @@ import noack
 from cosim.measurement.chain_fits import ChainRates
 from cosim.measurement.loss_bursts import histogram
 from cosim.measurement.network_section import trace_csv
-from noack.impairments.loss_prediction import read_files
+from noack.impairments.target_loss import read_files
 from noack.scenario import toml_file
 from noack.scenario.sections import NetworkSection
 from noack.traces.packet_trace import LOST_NS, PacketTrace, packet_trace

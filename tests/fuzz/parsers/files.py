@@ -26,7 +26,7 @@ from noack.impairments.kinds.opportunities import Opportunities
 from noack.impairments.kinds.replay import Replay
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_models.trace import TraceLoss
-from noack.impairments.loss_prediction import read_files
+from noack.impairments.target_loss import read_files
 from noack.protocol.probe_format import ProbeDatagram, ProbeKind, encode_probe
 from noack.scenario.matrix_files import read_matrices
 from noack.scenario.resolution import resolve

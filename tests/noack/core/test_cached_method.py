@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from noack.core.cached_method import cached_function
+from noack.core.cached_method import cached_function, cached_method
 
 
 def test_latest_results_are_kept_by_the_bits_of_the_arguments() -> None:
@@ -28,3 +28,17 @@ def test_results_are_kept_by_a_key_of_the_arguments() -> None:
         return values[0]
 
     assert [first([1, 2]), first([3, 4]), first([5])] == [1, 1, 5]
+
+
+def test_a_method_takes_arrays_by_keyword_too() -> None:
+    computed = list[float]()
+
+    class Totals:
+        @cached_method
+        def total(self, values: np.ndarray) -> float:
+            computed.append(float(values.sum()))
+            return computed[-1]
+
+    totals = Totals()
+    assert [totals.total(values=np.full(4, entry)) for entry in (1.0, 1.0, 0.0)] == [4.0, 4.0, 0.0]
+    assert computed == [4.0, 0.0]

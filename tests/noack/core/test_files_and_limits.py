@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from noack.core.errors import CallerError, MachineError, one_line, printable
 from noack.core.file_access import new_file, write_whole
-from noack.core.process_limits import exhausted_limit
+from noack.core.system_processes import exhausted_limit
 
 
 def test_a_folder_and_a_fifo_are_not_replaced(tmp_path: Path) -> None:

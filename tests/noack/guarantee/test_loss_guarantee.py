@@ -18,7 +18,7 @@ from noack.guarantee.loss_guarantee import (
     LossGuarantee,
     LossHistory,
     LossRule,
-    find_pattern_beyond,
+    find_counterexample,
 )
 
 SEQUENCE_LENGTH = 11
@@ -99,7 +99,7 @@ def test_a_guarantee_implies_another_if_no_pattern_keeps_only_the_first() -> Non
     for _ in range(60):
         known, other = random_guarantee(rng), random_guarantee(rng)
         beyond = (p for p in patterns if allows(known, p) and not allows(other, p))
-        shortest, pattern = next(beyond, None), find_pattern_beyond(known, other)
+        shortest, pattern = next(beyond, None), find_counterexample(known, other)
         if pattern is None:
             implied += 1
             assert shortest is None
@@ -117,5 +117,5 @@ def test_one_window_implies_another_as_the_closed_form_says() -> None:
         most = losses * (other // window) + min(losses, other % window)
         for limit in range(other):
             known = guarantee(LossesInWindow(losses, window))
-            implied = find_pattern_beyond(known, guarantee(LossesInWindow(limit, other))) is None
+            implied = find_counterexample(known, guarantee(LossesInWindow(limit, other))) is None
             assert implied == (limit >= min(most, other)) or losses >= window

@@ -17,7 +17,7 @@ from noack.impairments.kinds.delay import Delay
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_models.trace import TraceLoss
-from noack.impairments.loss_prediction import read_files
+from noack.impairments.target_loss import read_files
 from tests.helpers.approved import compare_lines, lines_of_error
 
 COUNT = 100_000

@@ -16,7 +16,7 @@ from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
 from noack.impairments.loss_models.trace import TraceLoss
-from noack.impairments.loss_prediction import read_files
+from noack.impairments.target_loss import read_files
 from noack.protocol.record_tables import Fate
 from tests.oracles.link import Link
 

@@ -1,6 +1,5 @@
 """Predicted and kept loss rates, and probabilities of bursts, against closed forms and many decisions."""
 
-import json
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -16,21 +15,10 @@ from noack.guarantee.loss_guarantee import (
     LossGuarantee,
     LossHistory,
 )
-from noack.impairments import loss_prediction
 from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_prediction import (
-    LossPrediction,
-    LossProcess,
-    ProbabilityCache,
-    expected_loss,
-    found_probabilities,
-    loss_process,
-    predict,
-    read_files,
-    store_probabilities,
-    with_target_loss,
-)
+from noack.impairments.loss_prediction import LossPrediction, LossProcess, predict
 from noack.impairments.markov_chain import NotPredictableError
+from noack.impairments.target_loss import loss_process, read_files
 from noack.protocol.record_tables import Fate
 from tests.helpers.approved import compare_lines, lines_of_error
 from tests.oracles.link import Datagram, Link
@@ -154,36 +142,6 @@ def makes_stale(settings: LinkSettings) -> bool:
     leaves_ns = [link.decide(0, 100, 10_000 * packet).release_ns for packet in range(2000)]
     left_ns = [t_ns for t_ns in leaves_ns if t_ns >= 0]
     return left_ns != sorted(left_ns)
-
-
-@pytest.mark.parametrize(
-    ("words", "asked"),
-    [
-        ("loss 30% keep mansd 2", 0.3),
-        ("loss 80% keep mansd 4", 0.8),
-        ("loss 30% keep atmost 3 in 10", 0.3),
-        ("loss 25% 50% keep mansd 3 corrupt 5% duplicate 10%", 0.25),
-        ("loss 40% keep loss burst 10% 3 mansd 4 atmost 6 in 9", 0.4),
-    ],
-)
-def test_a_kept_loss_is_predicted_as_it_was_asked(words: str, asked: float) -> None:
-    asking = settings_of(words)
-    assert predict(with_target_loss(asking)).rate == pytest.approx(asked, abs=1e-9)
-    assert expected_loss(asking).rate == pytest.approx(asked, abs=1e-9)
-
-
-def test_a_probability_that_another_process_found_is_not_computed_again(monkeypatch: Any) -> None:
-    """Not even by the loops of a run; but other settings have another probability."""
-    settings = settings_of("loss 10% keep loss 5% mansd 1 delay 1ms")
-    probabilities = found_probabilities(settings, settings_of("delay 1ms"))
-    assert list(probabilities.values()) == [with_target_loss(settings).impairments[0].loss.probability]  # type: ignore[attr-defined]
-    monkeypatch.setattr(loss_prediction, "_probabilities", ProbabilityCache(10))
-    monkeypatch.setattr(loss_prediction, "predict", None)
-    store_probabilities(json.loads(json.dumps(probabilities)))
-    assert found_probabilities(settings_of("loss 10% keep loss 5% delay 9ms mansd 1")) == probabilities
-    for other in ("loss 10% keep loss 5% mansd 2", "loss 10% keep mansd 1"):
-        with pytest.raises(TypeError):
-            with_target_loss(settings_of(other))
 
 
 P = 0.3

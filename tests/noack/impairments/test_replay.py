@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from netem.tc_words import settings_of
 from noack.impairments.kinds.replay import Replay
 from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_prediction import read_files
+from noack.impairments.target_loss import read_files
 from noack.traces.packet_trace import read_trace
 from tests.oracles.link import Link
 

@@ -200,8 +200,8 @@ def test_a_sensor_that_waits_without_acknowledgements_is_refused() -> None:
 
 def test_every_text_of_the_machine_check_is_in_the_approved_file() -> None:
     texts = re.findall(r'(?:return|:) "([^"]+)"', SOURCE.read_text())
-    told = {line.strip() for line in WRONG.read_text().splitlines() if line.startswith("    ")}
-    assert told | {NOT_ACKNOWLEDGED} == {*texts}
+    approved = {line.strip() for line in WRONG.read_text().splitlines() if line.startswith("    ")}
+    assert approved | {NOT_ACKNOWLEDGED} == {*texts}
 
 
 @pytest.mark.parametrize("word", [-3, 11])

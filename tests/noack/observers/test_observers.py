@@ -18,7 +18,7 @@ from cosim.simulation.continuous import continuous_loop_of
 from cosim.simulation.exact_simulation import setting_of
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
-from noack.core.linear_systems import row_norms
+from noack.core.row_operations import row_norms
 from noack.observers.observer_settings import observer_gain, unobservable_mode
 from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.roles import GENERATION, RESTART, Start
@@ -189,17 +189,17 @@ def test_filter_settings_default_to_the_scenarios_noise_and_disturbances(observe
         {"kind": "sine", "amplitude": [5.0], "hz": 1.0},
     ]
     scenario = resolved(observed)
-    believed, h = assumed_model(scenario), 0.01
+    assumed, h = assumed_model(scenario), 0.01
     into = np.array([h**2 / 2, h])  # of the double integrator with a held input
     expected = (0.3**2 + 0.6**2 / 3) * np.outer(into, into)
-    np.testing.assert_allclose(believed.Q, expected, rtol=1e-9)
-    assert believed.R.tolist() == [[0.02**2]]
+    np.testing.assert_allclose(assumed.Q, expected, rtol=1e-9)
+    assert assumed.R.tolist() == [[0.02**2]]
     observed["observer"] = KALMAN | {
         "process_std": [0.0, 0.0], "input_std": [1.0], "noise_std": [0.5],
     }  # fmt: skip
-    told = assumed_model(resolved(observed))
-    np.testing.assert_allclose(told.Q, np.outer(into, into), rtol=1e-9)
-    assert told.R.tolist() == [[0.25]]
+    given = assumed_model(resolved(observed))
+    np.testing.assert_allclose(given.Q, np.outer(into, into), rtol=1e-9)
+    assert given.R.tolist() == [[0.25]]
     np.testing.assert_allclose(true_model(resolved(observed)).Q, expected, rtol=1e-9)
 
 

@@ -15,7 +15,7 @@ from noack.core.errors import CallerError
 from noack.plants.fmu import FmuSettings, FmuSystem
 from noack.plants.linear import LinearSystem
 from noack.plants.plant_settings import OdeSystem, PlantEquations, SystemFailedError
-from noack.settings.user_files import located
+from noack.settings.user_files import with_absolute_path
 from tests.helpers.approved import compare_lines, lines_of_error
 from tests.noack.plants.motion import motion
 from tests.plant_server.fmus.build import build
@@ -34,7 +34,7 @@ def own_folder_for_temporary_files(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def settings(path: Path, **more: Any) -> FmuSettings:
     given = {"state_variables": ("x0", "x1"), "input_variables": ("u",)} | more
-    loaded = located(FmuSettings(kind="fmu", file=str(path), **given), Path(), "scenario.toml")
+    loaded = with_absolute_path(FmuSettings(kind="fmu", file=str(path), **given), Path(), "scenario.toml")
     assert isinstance(loaded, FmuSettings)
     return loaded
 

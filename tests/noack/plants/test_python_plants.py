@@ -15,7 +15,7 @@ from noack.core.errors import CallerError
 from noack.plants.plant_settings import SystemFailedError
 from noack.plants.python_plant import PythonPlantSettings, PythonSystem
 from noack.plants.systems.code_cache import _one_at_a_time, cache_folder, compiler
-from noack.settings.user_files import located
+from noack.settings.user_files import with_absolute_path
 from tests.helpers.approved import compare_lines
 from tests.noack.plants.motion import H_NS, motion
 
@@ -49,7 +49,9 @@ STEPPING = """
 def settings(folder: Path, code: str, name: str, **more: Any) -> PythonPlantSettings:
     path = folder / "mine.py"
     path.write_text(dedent(code))
-    loaded = located(PythonPlantSettings(kind="python", name=name, file=str(path), **more), Path(), "s.toml")
+    loaded = with_absolute_path(
+        PythonPlantSettings(kind="python", name=name, file=str(path), **more), Path(), "s.toml"
+    )
     assert isinstance(loaded, PythonPlantSettings)
     return loaded
 

@@ -122,7 +122,7 @@ def test_exact_and_batch_loops_refuse_a_user_trigger_in_one_line(tmp_path: Path)
         with pytest.raises(CallerError, match="decides at measurements only") as refused:
             refuses(resolved)
         assert "\n" not in str(refused.value)
-    assert resolved.coverage.beyond_theory == resolved.trigger.beyond_exact
+    assert resolved.coverage.uncertified_setting == resolved.trigger.beyond_exact
     rule = '{policy="python", name="a:B"}'
     with pytest.raises(CallerError, match='"python" cannot be combined'):
         load(

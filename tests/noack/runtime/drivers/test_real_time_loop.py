@@ -70,16 +70,16 @@ def test_a_turn_of_housekeeping_follows_each_drive(busy: bool, monkeypatch: pyte
     monkeypatch.setattr(time, "thread_time", lambda: next(cpu_s))
     driven = Driven(RunClock(time.monotonic_ns(), 3.0))
 
-    def news(now_ns: int) -> Sequence[Record | Notice]:
-        driven.steps.append("news")
+    def external_inputs(now_ns: int) -> Sequence[Record | Notice]:
+        driven.steps.append("external inputs")
         return (Record("row", ()), Notice(now_ns, "info", "line"))
 
     late_ns = run_loop(
         driven, driven, driven.clock, log, end_ns=None,
-        stop=lambda: driven.steps.append("stop") or len(driven.steps) > 11, external_inputs=news,
+        stop=lambda: driven.steps.append("stop") or len(driven.steps) > 11, external_inputs=external_inputs,
     )  # fmt: skip
-    turn = ["drive", "housekeeping", "news", "clock", "stop"]
-    assert driven.steps == ["clock", "news", "housekeeping", *turn, *turn]
+    turn = ["drive", "housekeeping", "external inputs", "clock", "stop"]
+    assert driven.steps == ["clock", "external inputs", "housekeeping", *turn, *turn]
     assert log.rows == [1, 2]
     assert log.lines == ["row", "line", *["row", "line", "flush"] * 2]
     assert all(period_ns <= 0.05e9 * 3.0 for period_ns in driven.until_ns)
@@ -121,15 +121,15 @@ def test_a_machine_that_is_late_at_its_end_catches_up_for_a_while(
 
 @pytest.mark.parametrize("others_turns", [0, 7, 10**9])
 def test_a_machine_that_is_done_waits_for_the_others_for_a_while(others_turns: int) -> None:
-    told = list[bool]()
+    given = list[bool]()
     driven = Slow(0, served=STEPS)
 
     def all_done(done: bool) -> bool:
-        told.append(done)
-        return done and told.count(True) > others_turns
+        given.append(done)
+        return done and given.count(True) > others_turns
 
     run_loop(driven, driven, driven.clock, Log(), end_ns=0, stop=never, turns_after_end=3, all_done=all_done)
-    assert told.count(True) == min(others_turns + 4, real_time_loop._TURNS_TO_WAIT + 1)
+    assert given.count(True) == min(others_turns + 4, real_time_loop._TURNS_TO_WAIT + 1)
 
 
 def test_a_deadline_after_the_end_is_not_late() -> None:

@@ -10,7 +10,7 @@ from scipy.linalg import solve_discrete_lyapunov
 from noack.core.linear_systems import Matrix
 from noack.guarantee.loss_guarantee import LossGuarantee
 from noack.impairments.constraints import join_guarantee
-from noack.impairments.loss_prediction import loss_process
+from noack.impairments.target_loss import loss_process
 from noack.scenario.resolution import loop_of
 from noack.theory.margins.exact_matrices import exactly
 from noack.theory.margins.scenario_times import loop_times
