@@ -129,7 +129,7 @@ def sampled_runs(loop: SampledLoop) -> None:
         every[:] = first
     while (runs.step < loop.last).any():
         loop.follow(runs, scales, np.full(_SAMPLED_RUNS, loop.last))
-        loop.update(runs, runs.is_event)
+        loop.transmit(runs, runs.is_event)
 
 
 @benchmark("simulation", "Simulation and certificates")

@@ -118,7 +118,7 @@ def recorded_loop(record: RunRecord) -> RecordedLoop:
 
 def _require_ideal(record: RunRecord) -> None:
     """Require settings and processes that stayed the same, and a loop with an exact simulation."""
-    changed, restarted = bool(changes_of(record)), record.restarted()
+    changed, restarted = bool(changes_of(record)), record.restarted_role()
     _require(not changed, "the ideal loop has no changes of settings, as this run has")
     record.scenario.coverage.require_unchanging()
     record.scenario.coverage.require_exact()

@@ -23,7 +23,7 @@ from plant_server.plant import plants_of
 _WARM_UP = 20
 """Wake-ups before the measurement, to warm up the code."""
 _IDLE_S = 10.0
-"""The echo ends after so long without a datagram."""
+"""The echo ends after this time without a datagram."""
 
 
 def wake(period_ns: int, duration_s: float, priority: int, spin_us: float) -> dict[str, object]:

@@ -98,7 +98,7 @@ class Exploration:
     delivered: NDArray[np.bool_]
     """Whether each update was delivered, (k,)."""
     diverged_at_s: float | None
-    cut: str = ""
+    cut_reason: str = ""
     """In words, why the run is drawn until its last event only; empty if it is drawn whole."""
 
     @cached_property
@@ -106,7 +106,7 @@ class Exploration:
         """The key numbers of the run."""
         events, lost = len(self.event_s), self.lost
         share = f" ({100 * lost / events:.0f} %)" if events else ""
-        ended = self.cut or "reached the horizon"
+        ended = self.cut_reason or "reached the horizon"
         if self.diverged_at_s is not None:
             ended = f"diverged at {number(self.diverged_at_s, 4)} s"
         elif self.kind in (LIVE, RECORDED):
@@ -135,7 +135,7 @@ class Exploration:
         return norms
 
     @property
-    def rest_norm(self) -> tuple[str, Vector]:
+    def labelled_norm(self) -> tuple[str, Vector]:
         """‖x‖, (N,), at a set point ‖x − x_r‖; with its name."""
         setpoint = loop_of(self.scenario).setpoint
         if setpoint is None:
@@ -143,7 +143,7 @@ class Exploration:
         return "‖x − x_r‖", np.linalg.norm(self.x - setpoint, axis=1)
 
     @cached_property
-    def controller_knows(self) -> NDArray[np.bool_]:
+    def controller_has_state(self) -> NDArray[np.bool_]:
         """Whether the controller has a state: not before its first update, (N,)."""
         if self.scenario.network.initial_sync == "known_state":
             return np.ones(len(self.t_s), np.bool_)

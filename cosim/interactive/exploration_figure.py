@@ -90,7 +90,7 @@ def _has_points(item: Band | Line | Marks) -> bool:
 def _state(explored: ExploredRun) -> _PanelContent:
     run, i, draws, other = explored.run, explored.state, explored.ensemble, explored.reference
     x, x_s = run.x[:, i], run.x_s[:, i]
-    x_c = np.where(run.controller_knows, run.x_c[:, i], np.nan)
+    x_c = np.where(run.controller_has_state, run.x_c[:, i], np.nan)
     items: list[Band | Line | Marks] = [
         Line(x=run.t_s, y=x, label="plant x", colour=PLANT, width=2.25),
         Line(x=run.t_s, y=x_s, label="sensor x_s", colour=SENSOR),
@@ -172,7 +172,7 @@ def _reference_line(reference: Exploration, values: Vector) -> Line:
 
 def _known_error(run: Exploration, floor: float) -> Vector:
     """Return ‖e_c‖ for a logarithmic axis, NaN before the controller's first update."""
-    return np.where(run.controller_knows, _positive(run.e_c_norm, floor), np.nan)
+    return np.where(run.controller_has_state, _positive(run.e_c_norm, floor), np.nan)
 
 
 def _floor(run: Exploration) -> float:

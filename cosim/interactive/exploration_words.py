@@ -67,7 +67,7 @@ def compare(reference: Reference, run: Exploration) -> Comparison:
 def _measure(run: Exploration, until_s: float) -> dict[str, float]:
     """Return the numbers of a run up to a time."""
     sent, drawn = run.event_s <= until_s, run.t_s <= until_s
-    errors = run.e_c_norm[drawn & run.controller_knows & np.isfinite(run.e_c_norm)]
+    errors = run.e_c_norm[drawn & run.controller_has_state & np.isfinite(run.e_c_norm)]
     return {
         "transmissions": int(sent.sum()),
         "lost": int((sent & ~run.delivered).sum()),
@@ -122,9 +122,9 @@ def verdict_of(run: Exploration, guarantee: Guarantee | None) -> tuple[VerdictLi
     status, reason = ExitStatus.OK, HORIZON
     if run.diverged_at_s is not None:
         status, reason = ExitStatus.FAILED, f"diverged at {number(run.diverged_at_s, 4)} s"
-    elif run.cut:
-        status, reason = ExitStatus.INTERRUPTED, run.cut
-    name, norm = run.rest_norm
+    elif run.cut_reason:
+        status, reason = ExitStatus.INTERRUPTED, run.cut_reason
+    name, norm = run.labelled_norm
     first, largest, last = float(norm[0]), float(np.nanmax(norm)), float(norm[-1])
     state = state_text(first, largest, last, None, name) if run.diverged_at_s is None else ""
     events = len(run.event_s)
@@ -147,7 +147,7 @@ def _guarantee_line(run: Exploration, guarantee: Guarantee | None) -> VerdictLin
         used = [
             values / np.exp(np.interp(run.t_s, guarantee.t_s, np.log(bound)))
             for values, bound in (
-                (np.where(run.controller_knows, run.e_c_norm, 0.0), guarantee.e_c),
+                (np.where(run.controller_has_state, run.e_c_norm, 0.0), guarantee.e_c),
                 (run.x_norm, guarantee.x),
             )
         ]

@@ -158,14 +158,14 @@ def margin_of(scenario: Scenario) -> Margin:
 def warning(run: Exploration, guarantee: Guarantee | None, margin: Margin | None) -> str:
     """Return in words whether a run is unstable, and why nothing is guaranteed; empty if stable."""
     parts = []
-    name, norm = run.rest_norm
+    name, norm = run.labelled_norm
     if run.diverged_at_s is not None:
         parts.append(f"The loop is unstable under these losses: it diverged at {run.diverged_at_s:.3g} s.")
     elif norm[-1] > norm[0]:
         first, last = (number(float(norm[i]), 3) for i in (0, -1))
         parts.append(f"{name} grows from {first} to {last}.")
-    if run.cut:
-        parts.append(f"{run.cut[0].upper()}{run.cut[1:]}.")
+    if run.cut_reason:
+        parts.append(f"{run.cut_reason[0].upper()}{run.cut_reason[1:]}.")
     if parts and guarantee is not None and guarantee.verdict != CERTIFIED:
         parts.append(f"It has no certificate: {guarantee.reason}.")
         if margin is not None and margin.defined:

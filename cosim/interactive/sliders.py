@@ -233,8 +233,8 @@ def _loss_sliders(scenario: Scenario, base: Scenario) -> list[Slider]:
             label = "loss probability" if name == "probability" else label
             slider = Slider(key, label, value, 0.0, 1.0, 0.01, live=True)
         elif value > 0:
-            like = getattr(usual, name, None) if usual.model == loss.model else None
-            slider = _decades(key, label, value, like or value)
+            usual_value = getattr(usual, name, None) if usual.model == loss.model else None
+            slider = _decades(key, label, value, usual_value or value)
         else:
             continue
         sliders.append(_within_field(slider, type(loss), name))
@@ -271,10 +271,10 @@ def _trigger_sliders(scenario: Scenario, base: Scenario) -> list[Slider]:
     for key in trigger_parameters(trigger):
         name = key.removeprefix("trigger.")
         value = getattr(trigger, name)
-        like = getattr(usual, name, None) if usual.policy == trigger.policy else None
+        usual_value = getattr(usual, name, None) if usual.policy == trigger.policy else None
         if isinstance(value, int | float) and value > 0:
             label = _GREEK.get(name, f"trigger: {_words(name)}")
-            slider = _decades(key, label, value, like or value)
+            slider = _decades(key, label, value, usual_value or value)
             if name == "period_s":
                 period_s = scenario.timing.measurement_period_ns / NS_PER_S
                 slider = replace(slider, multiple_of=period_s)

@@ -175,7 +175,7 @@ class _Page:
             parts["compare"] = reference and compare(reference, run)._asdict()
             parts["facts"] = [[heading, [*map(list, rows)]] for heading, rows in facts.items()]
             parts["states"] = {"names": run.state_names, "chosen": explored.state}
-        name = self._live.report if live else self._recorded.chosen * (self._source == RECORDED)
+        name = self._live.report if live else self._recorded.chosen if self._source == RECORDED else ""
         pending = {EXPLORE: self._session.pending, RECORDED: self._recorded.note}
         await self._parts.show(
             pending=pending.get(self._source, ""),
@@ -220,8 +220,10 @@ class _Page:
     def _reference(self) -> Reference | None:
         """Return the run that the shown one is compared with."""
         session = self._session
-        if not self._comparing or self._kept is not None:
-            return self._kept if self._comparing else None
+        if not self._comparing:
+            return None
+        if self._kept is not None:
+            return self._kept
         if self._source == EXPLORE:
             name, run = "the settings before the last change", session.before
         else:

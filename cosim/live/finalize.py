@@ -56,9 +56,9 @@ from noack.theory.certificates.assumptions import Assumption, assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 
 _FEW_LOOPS = 4
-"""The reports of up to so many loops are written at the end of the run."""
+"""A run with at most this number of loops also gets one report per loop."""
 _LOOPS_AT_ONCE, _LEAST_LOOPS, _ROWS_AT_ONCE = 64, 8, 2**18
-"""Loops that are evaluated together, and rows of one of their tables."""
+"""Largest and smallest number of loops that are evaluated together, and rows of one of their tables."""
 
 
 @np.errstate(all="ignore")
@@ -88,7 +88,7 @@ def finalize(ending: RunEnding, *, report: bool = True, view: bool = True, again
         is_recorded = is_recorded and (run_dir / RECORDING_FILE).is_file()
         scenario, _ = scenarios_of(run_dir)
         helpers = stack.enter_context(closing(prepared or FinalizeHelpers(scenario)))
-        helpers.start()
+        helpers.end_preparation()
         run = load_run(run_dir) if is_complete else _complete_record(run_dir, helpers)
         summary, over_time = _evaluate_run(run, ending, helpers)
         _write_summary(run_dir, summary)

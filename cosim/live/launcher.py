@@ -60,7 +60,7 @@ _MOST_SLOWED = 20.0
 """Factor by which a loaded machine extends a limit at most."""
 _OVERLOADED = 1.5
 """From this slow-down on, the message names the load as the likely cause."""
-_UNTIL_THE_END = 3
+_COPIES_AT_END = 3
 """At the end of a run, spool, record and view exist together, each of about the same size."""
 _POLL_S, _STARTING_POLL_S = 0.01, 0.002
 _OVERTIME_S, _OVERTIME_SHARE = 20.0, 0.2
@@ -106,8 +106,8 @@ def launch(
         stack.enter_context(active_run(run_dir))
         ending = stack.enter_context(EndingFile(run_dir))
         _publish_run(stack, descriptor, session)  # first: its file leads to a killed run's socket
-        away = {} if listening is None else listening.hosts
-        coordinator = Coordinator(descriptor, [role for role in spawn if role not in away])
+        remote_hosts = {} if listening is None else listening.hosts
+        coordinator = Coordinator(descriptor, [role for role in spawn if role not in remote_hosts])
         stack.callback(coordinator.close)
         helpers = stack.enter_context(lasting_helpers(resolved))
         watcher = joint_watcher([watcher or Watcher(), Watcher(started=helpers.prepare)])
@@ -116,7 +116,7 @@ def launch(
         remote = None
         if listening is not None and listener is not None:
             descriptor = descriptor.model_copy(update={"host": listening.address[0]})
-            remote = RemoteStart(away, listener.invitation.model_dump_json())
+            remote = RemoteStart(remote_hosts, listener.invitation.model_dump_json())
             watcher.listening(address_text(listener.address), listening)
         children = ChildProcesses(descriptor, run_dir, spawn, server, remote)
         stack.enter_context(children.started(live=live))
@@ -396,7 +396,7 @@ def spool_bytes(resolved: Scenario) -> int:
 
 def needed_bytes(resolved: Scenario) -> int:
     """Bytes on the disk until the run has ended."""
-    return _UNTIL_THE_END * spool_bytes(resolved)
+    return _COPIES_AT_END * spool_bytes(resolved)
 
 
 def require_disk_space(loops: Sequence[Scenario], runs: Path) -> None:
@@ -408,9 +408,9 @@ def require_disk_space(loops: Sequence[Scenario], runs: Path) -> None:
     if folder is None:
         return
     free, spool = shutil.disk_usage(folder).free, sum(map(spool_bytes, loops))
-    if free >= _UNTIL_THE_END * spool or free < LEAST_FREE_BYTES:  # then no run can begin at all
+    if free >= _COPIES_AT_END * spool or free < LEAST_FREE_BYTES:  # then no run can begin at all
         return
-    most = byte_size(_UNTIL_THE_END * spool)
+    most = byte_size(_COPIES_AT_END * spool)
     text = (
         f"{runs}: this run records {byte_size(spool)} and needs {most} until its end; "
         f"{byte_size(free)} are free on the disk"

@@ -1,7 +1,7 @@
 """For which share of a trace's time a scenario's certificate would have been void, by cause.
 
-Each packet of the trace is taken as an update of the scenario, sent when
-it was sent. The conditions are those of the scenario's certificates
+Each packet of the trace is taken as an update that is sent at the packet's time. The conditions are
+those of the scenario's certificates
 (:func:`noack.theory.certificates.conditions.allowed_conditions`). Losses are counted as the claims
 about a run count them: by the rules of the guarantee, and
 :class:`cosim.analysis.claims.observed_conditions.PacketLosses`. A condition is violated
@@ -102,17 +102,15 @@ def certificate_time(trace: PacketTrace, scenario: Scenario) -> CertificateTime:
         conditions.append(_start(trace, delay_ns, end_ns))
     spans = [span for span in conditions if len(span.begin_ns)]
     total_ns = max(end_ns, 1)
-    union = (
-        np.concatenate([[], *times])
-        for times in ([span.begin_ns for span in spans], [span.end_ns for span in spans])
-    )
+    begins_ns = np.concatenate([[], *(span.begin_ns for span in spans)])
+    ends_ns = np.concatenate([[], *(span.end_ns for span in spans)])
     return CertificateTime(
         scenario=resolved.name,
         certificates=certificates or {"any plant": "the scenario cannot have one"},
         allowed_losses=allowed.dropouts,
         allowed_delay_s=delay_ns * 1e-9,
         observed_s=end_ns * 1e-9,
-        share=_covered_ns(*union) / total_ns,
+        share=_covered_ns(begins_ns, ends_ns) / total_ns,
         causes=tuple(
             VoidShare(
                 span.cause,

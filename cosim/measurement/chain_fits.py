@@ -346,7 +346,7 @@ class ChainFits:
 
     @cached_property
     def chosen(self) -> ChainFit:
-        """The model with the smallest Bayesian information criterion, 2 ln n per parameter."""
+        """The model with the smallest BIC, k ln n − 2 ln L for k parameters."""
         models: tuple[tuple[int, float, Callable[[], ChainFit]], ...] = (
             (1, self.bernoulli.log_likelihood, lambda: self.bernoulli),
             (2, self.gilbert.log_likelihood, lambda: self.gilbert),

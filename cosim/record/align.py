@@ -174,16 +174,16 @@ def align_measurements(
     if loop.weight is not None:
         e_c = e_c @ loop.weight.T
     return AlignedRun(
-        t_ns,
-        measurements["x"],
-        x_s,
-        x_c,
-        row_norms(measurements["x"]),
-        measurements["e_s_norm"],
-        _threshold(measurements),
-        row_norms(e_c),
-        received,
-        measurements["input"] // GENERATION,
+        t_ns=t_ns,
+        x=measurements["x"],
+        x_s=x_s,
+        x_c=x_c,
+        x_norm=row_norms(measurements["x"]),
+        e_s_norm=measurements["e_s_norm"],
+        threshold=_threshold(measurements),
+        e_c_norm=row_norms(e_c),
+        received=received,
+        sensor_generation=measurements["input"] // GENERATION,
     )
 
 

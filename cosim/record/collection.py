@@ -139,7 +139,7 @@ def _take(kept: Path, run_dir: Path, source: str) -> list[str]:
         _require_own(table, process, types, name)
         out = SpoolWriter(run_dir / SPOOL, writer)
         try:
-            for first, rows in _check_chunks(path, table, process, types, name):
+            for first, rows in _checked_batches(path, table, process, types, name):
                 out.append(table, first, rows)
         finally:
             out.close()
@@ -158,14 +158,14 @@ def _has_secret(kept: Path, process: _Process, source: str) -> bool:
     """Whether a process kept its secret in a folder, so that it ran there."""
     name = f"{KEPT_KEY}.{process.writer}"
     try:
-        chunks = [*_chunks(kept / name, f"{source}: {SPOOL}/{name}")]
+        chunks = [*_batches(kept / name, f"{source}: {SPOOL}/{name}")]
     except FileNotFoundError:
         return False
     secrets = (chunk.rows.decode(errors="replace") for chunk in chunks)
     return process.writer in map(writer_of, secrets)
 
 
-def _chunks(path: Path, name: str) -> Iterator[SpoolBatch]:
+def _batches(path: Path, name: str) -> Iterator[SpoolBatch]:
     """Yield the batches of a file; raise PeerError if no process can have written it."""
     if not stat.S_ISREG(path.lstat().st_mode):
         raise PeerError(f"{name} is not a regular file")
@@ -184,7 +184,7 @@ def _require_own(table: str, process: _Process, types: Mapping[str, np.dtype[np.
         raise PeerError(f"{name}: the {process.role} has no table of this name")
 
 
-def _check_chunks(
+def _checked_batches(
     path: Path,
     table: str,
     process: _Process,
@@ -192,7 +192,7 @@ def _check_chunks(
     name: str,
 ) -> Iterator[tuple[int, bytes]]:
     """Yield the batches of a file; raise PeerError for one that is not of its process."""
-    for chunk in _chunks(path, name):
+    for chunk in _batches(path, name):
         if table == KEPT_REPORT:
             try:
                 report = parse_message(ProcessReport, chunk.rows).fields()

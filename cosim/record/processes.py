@@ -241,10 +241,10 @@ class _Counts:
             self.gap_ns = int(before)
         self._input, self._now_ns = int(inputs[-1]), int(now_ns[-1])
         first, last = (int(number) // GENERATION for number in (inputs[0], inputs[-1]))
-        for of in [first] if first == last else np.unique(inputs // GENERATION).tolist():
-            own = inputs if first == last else inputs[inputs // GENERATION == of]
-            newest, count = self._numbers.get(of, (-1, 0))
-            self._numbers[of] = max(newest, int(own[-1]) % GENERATION), count + len(own)
+        for number in [first] if first == last else np.unique(inputs // GENERATION).tolist():
+            own = inputs if first == last else inputs[inputs // GENERATION == number]
+            newest, count = self._numbers.get(number, (-1, 0))
+            self._numbers[number] = max(newest, int(own[-1]) % GENERATION), count + len(own)
 
     @property
     def missing_inputs(self) -> int:

@@ -33,10 +33,10 @@ Slice = Mapping[str, Rows]
 """Consecutive rows of several tables, up to the same time."""
 
 BATCH_ROWS = 16_384
-"""A table with at most so many rows is read as a whole; of a longer one, so many at a time."""
+"""A table of at most this many rows is read whole; a longer one in parts of this size."""
 _TIMES = ("t_ns", "now_ns", "since_ns", "release_ns", "copy_ns")
 """Columns with times, which are those of the run or of a loop."""
-_NEVER = ("release_ns", "copy_ns")
+_MAY_BE_NEVER = ("release_ns", "copy_ns")
 """Those in which −1 is no time."""
 
 
@@ -417,7 +417,7 @@ def _shift(rows: Rows, phase_ns: int) -> None:
     """Change times of the run into times of a loop."""
     for name in _TIMES:
         if name in (rows.dtype.names or ()):
-            is_time = rows[name] >= 0 if name in _NEVER else slice(None)
+            is_time = rows[name] >= 0 if name in _MAY_BE_NEVER else slice(None)
             rows[name][is_time] -= phase_ns
             if "since_ns" in (rows.dtype.names or ()) and name != "now_ns":
                 np.maximum(rows[name], 0, out=rows[name])  # a change before the loop begins

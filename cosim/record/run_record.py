@@ -244,8 +244,8 @@ class RunRecord:
     def is_complete(self, role: str) -> bool:
         """Whether the record has all rows that a process reported, of all its generations."""
         return all(
-            table.report is not None and table.report["rows"].items() >= table.rows.items()
-            for table in self.row_counts(role)
+            generation.report is not None and generation.report["rows"].items() >= generation.rows.items()
+            for generation in self.row_counts(role)
         )
 
     def _reports_of(self, role: str) -> Mapping[int, Report]:
@@ -265,7 +265,7 @@ class RunRecord:
         owned = [table for table in self.tables if OWNER[table] == role]
         return [table for table in owned if table not in CLOCK_TABLES]
 
-    def restarted(self) -> str | None:
+    def restarted_role(self) -> str | None:
         """A role whose process was restarted; None if there is none."""
         return next((role for role in LOOP_ROLES if len(self.generation_numbers(role)) > 1), None)
 

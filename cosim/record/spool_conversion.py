@@ -185,7 +185,7 @@ def convert_table(run_dir: Path, table: str) -> None:
 
     scenario, _ = scenarios_of(run_dir)
     dtype = run_tables(scenario)[table]
-    rows = _by_loop(run_dir, table, dtype, len(loop_names(scenario)))
+    rows = _rows_loop_after_loop(run_dir, table, dtype, len(loop_names(scenario)))
     write_table(run_dir / RECORD / f"{table}.parquet", rows, dtype, vector_names(scenario))
 
 
@@ -199,7 +199,7 @@ def _files_of(run_dir: Path, table: str) -> list[Path]:
     return [*spool_files(run_dir / SPOOL, table), *([path] if path.is_file() else [])]
 
 
-def _by_loop(run_dir: Path, table: str, dtype: np.dtype[np.void], loops: int) -> Iterator[Rows]:
+def _rows_loop_after_loop(run_dir: Path, table: str, dtype: np.dtype[np.void], loops: int) -> Iterator[Rows]:
     """Yield the rows of a table from an earlier record and from the spool, loop after loop.
 
     Of many loops, as many are sorted at once as fit into memory; one loop is never in memory as a

@@ -191,7 +191,7 @@ class TableFile:
             names = metadata.schema.names
             places = {name: names.index(name) for name in (LOOP, "input") if name in names}
             _require_types(file, [*places.values()])
-        self.groups = [_group(group, places) for group in groups]
+        self.groups = [_describe_group(group, places) for group in groups]
 
     def batches(self, dtype: RowType | None = None, groups: Iterable[int] | None = None) -> Iterator[Rows]:
         """Yield the rows of each group, or of some, as rows of a type that has fewer columns."""
@@ -216,7 +216,7 @@ class TableFile:
             table = file.read()
             table.validate(full=True)
         for column, _ in _columns(self._dtype):
-            _require_whole(self._path, column, table.column(column))
+            _require_no_nulls(self._path, column, table.column(column))
         in_turn = all(group.last <= after.first for group, after in pairwise(self.groups))
         if in_turn or LOOP not in table.column_names:
             return table
@@ -228,10 +228,10 @@ class TableFile:
         """Yield the groups as segments."""
         for group, rows in enumerate(self.batches(with_columns(self._dtype, ("input",)))):
             if len(rows):
-                read = partial(self._group, group)
+                read = partial(self._read_group, group)
                 yield Segment(int(rows["input"].min()), int(rows["input"].max()), read)
 
-    def _group(self, group: int) -> Rows:
+    def _read_group(self, group: int) -> Rows:
         (rows,) = self.batches(groups=[group])
         return rows
 
@@ -274,7 +274,7 @@ def _require_types(file: pq.ParquetFile, columns: list[int]) -> None:
         next(file.reader.iter_batches(1, row_groups=[group], column_indices=columns, use_threads=False), None)
 
 
-def _group(group: Any, places: Mapping[str, int]) -> _Group:
+def _describe_group(group: Any, places: Mapping[str, int]) -> _Group:
     loops, inputs = (
         group.column(places[name]).statistics if name in places else None for name in (LOOP, "input")
     )
@@ -375,7 +375,7 @@ def _array(values: NDArray[Any]) -> Any:
 
 def _values(path: Path, name: str, column: Any, field: np.dtype[Any]) -> NDArray[Any]:
     """Return the values of a column in one chunk; its ``to_numpy`` would import pandas."""
-    _require_whole(path, name, column)
+    _require_no_nulls(path, name, column)
     if not len(column):
         return np.zeros(0, field)
     chunk = column.chunk(0)
@@ -421,6 +421,6 @@ def _require_columns(path: Path, schema: pa.Schema, dtype: RowType) -> None:
             raise CallerError(f"{path}: column {column} is not one of {kind}")
 
 
-def _require_whole(path: Path, name: str, column: Any) -> None:
+def _require_no_nulls(path: Path, name: str, column: Any) -> None:
     if column.null_count:
         raise CallerError(f"{path}: column {name} has holes")

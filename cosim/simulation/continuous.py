@@ -429,9 +429,9 @@ class ContinuousSummary(NamedTuple):
 
     def to_json(self) -> dict[str, object]:
         """The summary as JSON."""
-        *numbers, _, _ = self._asdict().items()
-        exit_part = {"status": int(self.exit_status), "reason": self.reason}
-        return {"kind": "continuous", **dict(numbers), "exit": exit_part}
+        numbers = self._asdict()
+        exit_part = {"status": int(numbers.pop("exit_status")), "reason": numbers.pop("reason")}
+        return {"kind": "continuous", **numbers, "exit": exit_part}
 
 
 def summary(run: ContinuousRun, resolved: Scenario) -> ContinuousSummary:
@@ -439,7 +439,7 @@ def summary(run: ContinuousRun, resolved: Scenario) -> ContinuousSummary:
     samples = run.at(np.linspace(0.0, run.reached_s, POINTS))
     diverged = run.divergence(samples, resolved)
     arrived = np.flatnonzero(run.delivered)
-    drop_runs = np.diff(arrived, prepend=-1, append=len(run.delivered)) - 1
+    loss_bursts = np.diff(arrived, prepend=-1, append=len(run.delivered)) - 1
     return ContinuousSummary(
         scenario=resolved.name,
         mode=resolved.mode,
@@ -449,7 +449,7 @@ def summary(run: ContinuousRun, resolved: Scenario) -> ContinuousSummary:
         events=len(run.delivered),
         deliveries=int(run.delivered.sum()),
         drops=int((~run.delivered).sum()),
-        longest_loss_burst=int(drop_runs.max()),
+        longest_loss_burst=int(loss_bursts.max()),
         inter_event_min_s=_or_none(np.min, np.diff(run.event_s)),
         inter_event_median_s=_or_none(np.median, np.diff(run.event_s)),
         inter_delivery_median_s=_or_none(np.median, np.diff(run.event_s[run.delivered])),

@@ -151,7 +151,7 @@ class SampledLoop:
         if not known:
             runs.step[0] = 0
             self.measure_at(runs)
-            self.update(runs, np.array([True]))
+            self.transmit(runs, np.array([True]))
         return runs
 
     @property
@@ -193,7 +193,7 @@ class SampledLoop:
             np.zeros(count), np.zeros(count, np.int64), np.zeros(count, np.int64),
         )  # fmt: skip
 
-    def update(self, runs: Runs, delivered: NDArray[np.bool_]) -> None:
+    def transmit(self, runs: Runs, delivered: NDArray[np.bool_]) -> None:
         """Make the events of runs: x_s = y, and send the update of the delivered ones, (N,)."""
         runs.x_s[:] = runs.y
         rows = np.flatnonzero(delivered)

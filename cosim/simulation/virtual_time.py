@@ -128,7 +128,7 @@ class RecordCollector:
         return self._by_loop[table][number]
 
     def notices(self, loop: int | None = None) -> list[dict[str, object]]:
-        """Return the notices of a loop or, of None, those about the whole run, by their times."""
+        """Return the notices about the whole run and, of a number, also those of this loop, by time."""
         return [
             notice._replace(loop=None).line() | {"process": role}
             for notice, role in sorted(self._notices, key=lambda entry: entry[0].t_ns)
@@ -228,6 +228,7 @@ class VirtualRun:
                 "processes": [machines.core for machines in self.machines.values()],
                 "channel": self.channel.core,
                 "wire": {"run_id": RUN_ID},
+                # Numbers of flows begin at 1; place 0 is unused.
                 "directions": [flows.index(flow) if flow in flows else -1 for flow in (0, *Flow)],
                 "steps_left": _INPUTS_PER_PROGRESS,
             },
@@ -390,7 +391,9 @@ def _split(rows: Rows, loops: int) -> list[Rows]:
     numbers = rows[LOOP]
     is_sorted = bool((numbers[1:] >= numbers[:-1]).all())
     order = slice(None) if is_sorted else np.argsort(numbers, kind="stable")
-    data = rows.view(np.uint8).reshape(len(rows), rows.dtype.itemsize)[order, 2:]
+    # The loop's number is the first column.
+    number_bytes = rows.dtype[LOOP].itemsize
+    data = rows.view(np.uint8).reshape(len(rows), rows.dtype.itemsize)[order, number_bytes:]
     own = np.ascontiguousarray(data).view(np.dtype(rows.dtype.descr[1:])).reshape(-1)
     return np.split(own, np.cumsum(np.bincount(numbers, minlength=loops))[:-1])
 

@@ -57,7 +57,7 @@ class Objective(StrEnum):
         return self is Objective.COST
 
     @property
-    def nothing(self) -> float:
+    def initial_value(self) -> float:
         """The value of a run without segments."""
         return 0.0 if self.additive else -np.inf
 
@@ -150,7 +150,7 @@ class PatternFlow(Protocol):
         """Return the states just after events at times (N,); ``delivered`` updates arrive."""
 
     def value_ahead(self, t_s: Vector, z: Matrix, window_s: float) -> Vector:
-        """Return how large the objective may become within a window, (N,), on any scale."""
+        """Return how large the objective may become within a window, (N,); only the order counts."""
 
     def features(self, t_s: Vector, z: Matrix) -> Matrix:
         """Return numbers of size 1 that are nearly equal for runs that nearly coincide, (N, k)."""
@@ -210,7 +210,7 @@ class SegmentFlow:
         """As :meth:`PatternFlow.start`: sensor and controller have x(0)."""
         x0, zero = self.system.loop.x0, np.zeros(1)
         z = np.concatenate([x0, np.zeros(2 * len(x0))])[None]
-        return SegmentEnds(zero, z, zero > 0, zero + self.objective.nothing)
+        return SegmentEnds(zero, z, zero > 0, zero + self.objective.initial_value)
 
     def after_events(self, t_s: Vector, z: Matrix, delivered: Flags) -> Matrix:
         """As :meth:`PatternFlow.after_events`: e_s ← 0, and e_c ← 0 if the update arrives."""
@@ -314,7 +314,7 @@ class SampledFlow:
             self.loop.weight,
             *(
                 bound[0] / np.maximum(bound, _TINY) if bound[0] > 0 else np.ones(len(bound))
-                for bound in (self._bound(True), self._bound(False))
+                for bound in (self._bound(of_error=True), self._bound(of_error=False))
             ),
         )
         object.__setattr__(self, "_scales", scales)
@@ -339,7 +339,7 @@ class SampledFlow:
     def start(self) -> SegmentEnds:
         """As :meth:`PatternFlow.start`."""
         runs = self.loop.start()
-        value = self.objective.nothing
+        value = self.objective.initial_value
         if self.objective is Objective.STATE:
             value = float(np.linalg.norm(runs.x[0]))
         return SegmentEnds(self._time(runs.step), _pack(runs), runs.is_event, np.array([value]))
@@ -347,7 +347,7 @@ class SampledFlow:
     def after_events(self, t_s: Vector, z: Matrix, delivered: Flags) -> Matrix:
         """As :meth:`PatternFlow.after_events`."""
         runs = self._runs(t_s, z)
-        self.loop.update(runs, delivered)
+        self.loop.transmit(runs, delivered)
         return _pack(runs)
 
     def __call__(self, t_s: Vector, z: Matrix) -> SegmentEnds:
@@ -398,7 +398,7 @@ class SampledFlow:
             return runs.state
         return runs.cost if self.objective is Objective.COST else runs.error
 
-    def _bound(self, of_error: bool) -> Vector:
+    def _bound(self, *, of_error: bool) -> Vector:
         """Return the bound of ‖W e_c‖ or of ‖x‖ at each step; 1 without a certificate."""
         t_s = self._time(np.arange(self.loop.last + 1))
         if self.certificate.constants is None:

@@ -278,7 +278,7 @@ class RunClaims:
         """Whether the claims are known already."""
         return "parts" in vars(self)
 
-    @property
+    @cached_property
     def conditions(self) -> dict[str, float | None]:
         """Largest observed value of each condition, over the whole run."""
         first = self.parts[0]

@@ -227,7 +227,7 @@ class ObservedConditions(NamedTuple):
                 violations.append(
                     AssumptionViolation(excess.first_s, rule.name, excess.worst, text, excess.worst_at_s)
                 )
-        every: dict[str, tuple[SampledSeries, float]] = {
+        series_and_limits: dict[str, tuple[SampledSeries, float]] = {
             "sampling": (self.sampling, conditions.sampling_s),
             "delay": (self.delay, conditions.delay_s),
             "hold": (self.hold, conditions.hold_s),
@@ -238,8 +238,8 @@ class ObservedConditions(NamedTuple):
         }
         for cause, series in self.clocks.items():
             lost = cause.endswith("lost")  # every value is a violation
-            every[cause] = (series, -1.0 if lost else self.largest_clock_error_s)
-        for cause, (series, limit) in every.items():
+            series_and_limits[cause] = (series, -1.0 if lost else self.largest_clock_error_s)
+        for cause, (series, limit) in series_and_limits.items():
             if causes is not None and cause not in causes:
                 continue
             if (excess := series.excess(limit)) is not None:

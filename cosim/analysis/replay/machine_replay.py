@@ -287,7 +287,7 @@ def _own_names(dtype: np.dtype[np.void]) -> Sequence[str]:
 
 
 def _prefix_bytes(dtype: np.dtype[np.void]) -> int:
-    return 2 * (LOOP in (dtype.names or ()))
+    return dtype[LOOP].itemsize if LOOP in (dtype.names or ()) else 0
 
 
 def _settings(data: bytes) -> dict[str, object]:

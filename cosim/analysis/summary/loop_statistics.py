@@ -104,7 +104,7 @@ def _quantiles(sketch: QuantileSketch) -> dict[str, float | None]:
 
 
 _ARRIVES_AFTER_END_S = 0.1
-"""Datagrams due until so long after the horizon, in wall time, must have arrived."""
+"""Datagrams due up to this time after the horizon, in wall time, must have arrived."""
 _RECEIVERS = {"measurement": "sensor", "actuation": "plant"}
 """The receivers of hops that are not named by theirs."""
 _VIOLATION = "violation"

@@ -148,7 +148,7 @@ class Coordinator:
             vanished = token.kind == zenoh.SampleKind.DELETE
             self._apply(token.key_expr, Event.DISCONNECT if vanished else Event.RECONNECT)
         for member in self._members.values():
-            if member.state is State.UNREACHABLE and self._away_s(member) < 0:
+            if member.state is State.UNREACHABLE and self._remaining_s(member) < 0:
                 member.apply(Event.TIME_OUT)
         if self._clock is None:
             self._clear_barrier()
@@ -196,7 +196,7 @@ class Coordinator:
         """Whether a process reported its end a moment ago, so that it may not have exited yet."""
         return self.has_ended(role) and self._members[role].age_s() < _EXIT_GRACE_S
 
-    def reported_failure(self, role: str) -> str | None:
+    def await_reported_failure(self, role: str) -> str | None:
         """Why a process ended early, by its own report; None without a report."""
         deadline_s = time.monotonic() + _REPORT_GRACE_S
         while role not in self._reported and time.monotonic() < deadline_s:
@@ -234,7 +234,7 @@ class Coordinator:
         if (member := self._admitted.get(_sender(key_expr))) is not None:
             member.apply(event, reason)
 
-    def _away_s(self, member: _Member) -> float:
+    def _remaining_s(self, member: _Member) -> float:
         """For how long an unreachable process may still come back, in seconds."""
         most_s = LAUNCHED_LOST_S if member.role in self._launched else LOST_AFTER_S
         return most_s - member.age_s()
@@ -302,10 +302,7 @@ class Coordinator:
         """
         request = parse_message(JoinRequest, _payload(query))
         member = self._admitted.get((role, request.instance))
-        current = self._members.get(role)
-        if current is not member:
-            current = self._finished_predecessor(role)
-        other = None if current is member else current
+        other = None if self._members.get(role) is member else self._finished_predecessor(role)
         if member is None or (other is not None and member.generation <= other.generation):
             raise PeerError("it was not admitted")
         if (request.address is None) == (role in LOOP_ROLES):
@@ -328,7 +325,7 @@ class Coordinator:
         """
         before = self._members.get(role)
         if before is not None and before.state is State.UNREACHABLE:
-            left = f"{self._away_s(before):.0f} s"
+            left = f"{self._remaining_s(before):.0f} s"
             raise PeerError(f"the {role} before it may still come back; try again in {left}")
         if before is not None and not before.is_over:
             raise PeerError(f"another {role} is in this run already")

@@ -48,14 +48,14 @@ def progress_line(console: Console, scenario: Scenario, session: str | None = No
     with Progress(*columns, console=console, disable=not live, transient=False) as progress:
         shown = _RunProgress(console, progress, scenario, session)
         yield Watcher(
-            shown.waiting,
-            shown.listening,
-            shown.started,
-            shown.failed,
-            shown.restarted,
-            shown.update,
-            shown.stopping,
-            shown.notice,
+            waiting=shown.waiting,
+            listening=shown.listening,
+            started=shown.started,
+            failed=shown.failed,
+            restarted=shown.restarted,
+            progress=shown.update,
+            stopping=shown.stopping,
+            notice=shown.notice,
         )
 
 

@@ -220,7 +220,7 @@ class RestartPolicy:
 
     def check(self) -> EndReason | None:
         """Restart what may be restarted; return why the run must end, None if it need not."""
-        exited = self._children.failures(self._coordinator.reported_failure)
+        exited = self._children.failures(self._coordinator.await_reported_failure)
         return self._check_restarts(exited) or self._check_failures(exited)
 
     def unfinished(self) -> EndReason | None:

@@ -33,8 +33,8 @@ _MANY_STEPS = 50_000
 start."""
 _GRACE_S = 2.0
 """Wall time for what is being prepared when the run ends."""
-_LOOPS_AT_ONCE = 16
-"""The end of a run waits for the preparation of so many loops at most."""
+_LOOPS_PREPARED_AT_ONCE = 16
+"""The end of a run waits for the preparation of at most this number of loops."""
 _POLL_S = 0.005
 
 
@@ -64,13 +64,13 @@ class FinalizeHelpers:
 
     def prepare(self, run_dir: Path) -> None:
         """Prepare the end of a run of many loops from now on."""
-        if len(self._loops) <= _LOOPS_AT_ONCE:
+        if len(self._loops) <= _LOOPS_PREPARED_AT_ONCE:
             return
-        self.start()
+        self.end_preparation()
         # This process keeps them, too.
         self._due.append(partial(call_by_name, "cosim.record.run_record", "scenarios_of", run_dir))
-        for first in self._loops[::_LOOPS_AT_ONCE]:
-            block = self._loops[first:][:_LOOPS_AT_ONCE]
+        for first in self._loops[::_LOOPS_PREPARED_AT_ONCE]:
+            block = self._loops[first:][:_LOOPS_PREPARED_AT_ONCE]
             self._due.append(partial(self._prepare_loops, run_dir, block))
         self._due.append(lambda: self._call_at_idle_priority("import_libraries"))
         self._due.append(partial(self._write_early, run_dir))
@@ -123,8 +123,8 @@ class FinalizeHelpers:
         expectations = [self._expected[number] for number in loops if number in self._expected]
         return expectations if len(expectations) == len(loops) else None
 
-    def start(self) -> None:
-        """Have processes that are free; prepare no more.
+    def end_preparation(self) -> None:
+        """End the preparation; afterwards there are free processes.
 
         On a busy machine idle priority gets almost no time: what is not prepared soon is given up.
         """

@@ -165,7 +165,8 @@ class _AllLoops:
         self._lag_ns = int(LAG_S * NS_PER_S * scenario.speed)
         self._phases_ns = np.array(phases_ns(scenario))
         numbers = [(name, "<i8") for name in (LOOP, "input", "t_ns")]
-        self._none = self._newest = np.zeros(0, [*numbers, ("x", "<f8", (sizes.max(),))])
+        self._no_rows = np.zeros(0, [*numbers, ("x", "<f8", (sizes.max(),))])
+        self._newest = self._no_rows
         """Of each loop, the newest row of the controller that was used."""
         self._measured: list[Rows] = []
         self._models: list[Rows] = []
@@ -259,7 +260,7 @@ class _AllLoops:
 
     def _take(self, waiting: list[Rows], until_ns: int) -> tuple[Rows, Numbers]:
         """Return the waiting rows up to a time of the run, and their times of the run."""
-        rows = np.concatenate([self._none, *waiting])
+        rows = np.concatenate([self._no_rows, *waiting])
         of_run_ns = rows["t_ns"] + self._phases_ns[rows[LOOP]]
         ready = of_run_ns <= until_ns
         waiting[:] = [rows[~ready]]
@@ -267,7 +268,7 @@ class _AllLoops:
 
     def _needed_columns(self, rows: Rows, time_name: str, vector_name: str) -> Rows:
         """Return the needed columns of rows."""
-        needed = np.empty(len(rows), self._none.dtype)
+        needed = np.empty(len(rows), self._no_rows.dtype)
         needed[LOOP], needed["input"] = rows[LOOP], rows["input"]
         needed["t_ns"] = rows[time_name]
         needed["x"] = np.where(self._entries[rows[LOOP]], rows[vector_name], 0.0)

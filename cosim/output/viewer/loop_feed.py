@@ -189,13 +189,17 @@ class LoopFeed:
         z = true_states(self._steps, aligned.t_ns, "z") if self._has_internal_state else None
         self._steps = self._steps[self._steps["t_ns"] > aligned.t_ns[-1]]
         t_s = np.asarray(aligned.t_ns * 1e-9)
-        bounds = np.column_stack([self._bounds(rows, aligned), self._certified(t_s, "controller_error")])
+        bounds = np.column_stack(
+            [self._identity_bound(rows, aligned), self._certified_bound(t_s, "controller_error")]
+        )
         if not self._scenario.protocol.acknowledges:
             bounds[~shares_update(self._scenario, aligned)] = np.nan
         curves = [aligned.x, aligned.x_s, aligned.x_c, aligned.e_s_norm, aligned.e_c_norm, bounds]
         kept = self._rows_to_show(aligned.t_ns, np.column_stack(curves))
         thin = AlignedRun._make(values[kept] for values in aligned)
-        of_state = np.column_stack([self._certified(t_s, "state"), self._from_event(rows, aligned)])
+        of_state = np.column_stack(
+            [self._certified_bound(t_s, "state"), self._bound_from_event(rows, aligned)]
+        )
         self._view.samples(thin, bounds[kept], of_state[kept])
         frames = Frames(t_s, aligned.x, aligned.x_s, aligned.x_c, z)
         shown = self._frames_to_show(len(t_s))
@@ -209,7 +213,7 @@ class LoopFeed:
         if len(event_ns):
             passed_s = _intervals_s(event_ns, self._last_event_ns)
             keep = self._rows_to_show(event_ns, passed_s)
-            self._view.broadcasts(event_ns[keep], passed_s[keep])
+            self._view.transmissions(event_ns[keep], passed_s[keep])
             self._last_event_ns = int(event_ns[-1])
 
     @cached_property
@@ -222,7 +226,7 @@ class LoopFeed:
             self._view.certified_interval(certificate.inter_event_s, self._scenario.timing.horizon_ns)
         return certificate
 
-    def _certified(self, t_s: Reals, quantity: Literal["controller_error", "state"]) -> Reals:
+    def _certified_bound(self, t_s: Reals, quantity: Literal["controller_error", "state"]) -> Reals:
         if self._certificate is None:
             return np.full(len(t_s), np.nan)
         bound = getattr(self._certificate, quantity)(t_s)
@@ -234,16 +238,16 @@ class LoopFeed:
             return None
         return known_state_bounds(self._scenario, self._certificate)
 
-    def _from_event(self, rows: Rows, aligned: AlignedRun) -> Reals:
+    def _bound_from_event(self, rows: Rows, aligned: AlignedRun) -> Reals:
         """Return the certified bound of ‖x‖ from the newest event on, (k,); NaN for none."""
         if (known := self._known_state) is None:
             return np.full(len(rows), np.nan)
         t_s, since = np.asarray(rows["t_ns"] * 1e-9), self._follower.take(rows, aligned)
         moved = known.state_deviation(t_s, since.age_s, since.missing)
-        bound = np.fmin(row_norms(since.predicted) + moved, self._certified(t_s, "state"))
+        bound = np.fmin(row_norms(since.predicted) + moved, self._certified_bound(t_s, "state"))
         return np.asarray(np.where(t_s < self._claimed_until_s, bound, np.nan))
 
-    def _bounds(self, rows: Rows, aligned: AlignedRun) -> Reals:
+    def _identity_bound(self, rows: Rows, aligned: AlignedRun) -> Reals:
         """Return the bound of ‖e_c‖ from (I1), (k,); NaN if updates are acknowledged."""
         if self._scenario.protocol.acknowledges:
             return np.full(len(rows), np.nan)

@@ -272,7 +272,7 @@ class LoopView:
         """Add the control input u (k, m) at times (k,)."""
         self._send(bp.INPUT, t_ns, u)
 
-    def broadcasts(self, t_ns: Times, interval_s: Reals) -> None:
+    def transmissions(self, t_ns: Times, interval_s: Reals) -> None:
         """Add events: times t_i (k,) and t_i − t_{i−1} in seconds (k,), NaN (drawn 0) for none."""
         interval_s = np.nan_to_num(interval_s)
         self._send_stems(bp.EVENT_STEM, t_ns, interval_s)

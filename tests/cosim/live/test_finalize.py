@@ -262,7 +262,7 @@ def test_a_prepared_end_is_that_of_a_run_without_preparation(
 ) -> None:
     given = (many_loops, 0, ExitStatus.OK, "horizon")
     helpers = FinalizeHelpers(load(many_loops / SCENARIO_FILE))
-    helpers.start()
+    helpers.end_preparation()
     helpers.submit(exec, _NEVER_IDLE).result()
     helpers.prepare(many_loops)
     for thread in helpers._threads:
@@ -327,7 +327,7 @@ def test_the_end_waits_for_who_writes_the_rest_of_the_tables(
     helpers.prepare(many_loops)
     begun.wait()
     with patch.object(helpers, "_abort") as aborted:
-        helpers.start()
+        helpers.end_preparation()
     helpers.close()
     assert not aborted.called
 

@@ -67,7 +67,7 @@ class FakeCoordinator:
     def is_exiting(self, role: str) -> bool:
         return role == self._exiting
 
-    def reported_failure(self, role: str) -> str | None:
+    def await_reported_failure(self, role: str) -> str | None:
         return "the disk is full"
 
     def allow_restart(self, role: str, failure: str, *, dead: bool) -> None:

@@ -99,7 +99,7 @@ def test_the_reason_for_an_end_is_the_reported_one(plane: FakePlane, barrier: Co
     ):
         plane.put("ended", Sample(f"noack/0/ended/{role}/one", text, sent_as=sent_as))
         barrier.poll()
-        assert barrier.reported_failure(role) == reason
+        assert barrier.await_reported_failure(role) == reason
 
 
 def test_a_running_process_is_lost_only_if_its_connection_does_not_come_back(
