@@ -331,7 +331,7 @@ class SampledFlow:
             return None
         if self.objective is Objective.INTER_EVENT:
             return self.certificate.inter_event_s
-        bound = self._bound(self.objective is Objective.ERROR)
+        bound = self._bound(of_error=self.objective is Objective.ERROR)
         if self.objective is Objective.COST:
             return float((bound[1:] ** 2).sum() * self.loop.step_s)
         return float(bound[0])

@@ -140,7 +140,7 @@ def _follow_events(
         parts: list[Any] = [part[:count] for part in runs]
         running = Runs(*parts)
         loop.follow(running, scales, np.full(count, event), tests=False)
-        loop.update(running, np.full(count, arrives))
+        loop.transmit(running, np.full(count, arrives))
     loop.follow(runs, scales, np.full(len(begin), last_step), tests=False)
 
 
