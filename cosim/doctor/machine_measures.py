@@ -22,7 +22,7 @@ from typing import TypedDict, TypeVar
 import numpy as np
 import zenoh
 
-from cosim.live.launcher import needed_bytes
+from cosim.live.disk_space import needed_bytes
 from cosim.output.viewer.rerun_program import has_display, is_installed
 from cosim.record.run_directory import environment
 from noack.core.clock import NS_PER_S

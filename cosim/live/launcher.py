@@ -2,7 +2,7 @@
 
 When a process fails, the launcher names it, stops the run or restarts the process, and leaves a run
 directory with everything that was recorded. Read :func:`launch` first; ``_Run.watch`` follows the
-run. :class:`WaitLimit` limits how long the launcher waits, longer on a loaded machine.
+run.
 """
 
 import contextlib
@@ -12,7 +12,6 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from queue import SimpleQueue
@@ -20,13 +19,14 @@ from threading import Thread
 
 from cosim.lazy_modules import lazy_modules
 from cosim.live.coordination.coordinator import Coordinator
+from cosim.live.disk_space import require_disk_space
 from cosim.live.monitoring.run_watcher import Watcher, joint_watcher
 from cosim.live.processes.child_processes import ChildProcesses, EndReason, RestartPolicy
 from cosim.live.processes.finalize_helpers import RunEndingWithHelpers, lasting_helpers
 from cosim.live.processes.fork_server import ForkServer, fork_server
 from cosim.live.processes.remote_hosts import RemoteStart
+from cosim.live.wait_limit import WaitLimit
 from cosim.record.run_directory import (
-    LEAST_FREE_BYTES,
     PROCESSES_FILE,
     EndingFile,
     active_run,
@@ -37,16 +37,13 @@ from cosim.record.run_directory import (
 )
 from noack.core.errors import ExitStatus, MachineError, NeverStartedError, NoackError
 from noack.core.file_access import write_whole
-from noack.core.number_format import byte_size
-from noack.core.system_processes import cores as usable_cores
-from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_ACTUATION, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.roles import PLANT, RECORDER, ROLES
 from noack.runtime.active_runs import registered_run, run_name
 from noack.runtime.address import address_text
 from noack.runtime.command_line import Signals, stop_reason
 from noack.runtime.life_cycle import HORIZON
 from noack.runtime.run_descriptor import RunDescriptor, descriptor_file, invitation_file, new_descriptor
-from noack.scenario.resolution import resolve_run, resolved_loops, tables_of
+from noack.scenario.resolution import resolve_run, resolved_loops
 from noack.scenario.scenario import Scenario
 
 with lazy_modules():  # asyncio and TLS
@@ -56,12 +53,6 @@ _STOP_TIMEOUT_S = 15.0
 """Wall time that the processes of a stopped run have to end."""
 DEFAULT_START_S = 30.0
 """Wall time within which all processes have to be ready, if the scenario gives none."""
-_MOST_SLOWED = 20.0
-"""Factor by which a loaded machine extends a limit at most."""
-_OVERLOADED = 1.5
-"""From this slow-down on, the message names the load as the likely cause."""
-_COPIES_AT_END = 3
-"""At the end of a run, spool, record and view exist together, each of about the same size."""
 _POLL_S, _STARTING_POLL_S = 0.01, 0.002
 _OVERTIME_S, _OVERTIME_SHARE = 20.0, 0.2
 """After the horizon: the recorder writes the record, and a long run has many rows."""
@@ -323,98 +314,3 @@ def _signalled(signals: Signals) -> EndReason | None:
 def overtime_s(run_s: float) -> float:
     """How long the processes of a run of ``run_s`` of wall time may take to end after it."""
     return run_s * _OVERTIME_SHARE + _OVERTIME_S
-
-
-@dataclass
-class WaitLimit:
-    """The time that the processes of a run have to get ready, or to end.
-
-    When the system load (one-minute average) is k > 1 times the number of cores, a process gets 1/k
-    of a core, and a second of waiting counts as 1/k s, but at least as 1/20 s.
-    """
-
-    within_s: float
-    cores: int = field(default_factory=usable_cores)
-    waited_s: float = 0.0
-    """Waited wall time, in seconds."""
-    counted_s: float = 0.0
-    """The part of it that counts."""
-    load: float = 0.0
-    """The newest load."""
-
-    def wait(self, wall_s: float, load: float) -> None:
-        """Count wall time under a system load."""
-        self.load = load
-        self.waited_s += wall_s
-        self.counted_s += wall_s / min(max(load / self.cores, 1.0), _MOST_SLOWED)
-
-    @property
-    def is_reached(self) -> bool:
-        """Whether the limit is reached."""
-        return self.counted_s > self.within_s
-
-    @property
-    def load_text(self) -> str:
-        """The newest load, for messages."""
-        return f"a load of {self.load:.1f} on {self.cores} cores"
-
-    @property
-    def is_loaded(self) -> bool:
-        """Whether the load extended the limit, so that it is the likely cause."""
-        return self.waited_s > _OVERLOADED * self.counted_s
-
-    def explain_start(self) -> str:
-        """Why processes were not ready within the limit, and what would help."""
-        waited = f"not ready in time: waited {self.waited_s:.0f} s"
-        if self.is_loaded:
-            return (
-                f"{waited}; likely cause: {self.load_text}; start fewer runs at once, or set "
-                f"start_within_s above {self.within_s:g}"
-            )
-        return f"{waited} (start_within_s); {self.load_text} is not the likely cause"
-
-    def explain_end(self) -> str:
-        """Why a run did not end within the limit after its horizon, and what would help."""
-        if self.is_loaded:
-            return f"likely cause: {self.load_text}; start fewer runs at once"
-        return "too slow or stopped; reduce the speed or the rates"
-
-
-def spool_bytes(resolved: Scenario) -> int:
-    """Bytes of the rows on fixed time grids; the number of event rows is not known in advance."""
-    steps = resolved.timing.horizon_ns // resolved.timing.plant_period_ns + 1
-    ticks = resolved.timing.horizon_ns // resolved.timing.controller_period_ns
-    counts = {
-        PLANT_STEP: steps,
-        SENSOR_MEASUREMENT: steps // resolved.plant.measure_every,
-        CONTROLLER_STEP: ticks,
-        PLANT_ACTUATION: ticks,
-    }
-    types = tables_of(resolved)
-    return sum(rows * types[table].itemsize for table, rows in counts.items())
-
-
-def needed_bytes(resolved: Scenario) -> int:
-    """Bytes on the disk until the run has ended."""
-    return _COPIES_AT_END * spool_bytes(resolved)
-
-
-def require_disk_space(loops: Sequence[Scenario], runs: Path) -> None:
-    """Check that a run's record fits on the disk; warn if it may not.
-
-    Raise MachineError if the record needs more than the free space.
-    """
-    folder = next((path for path in (runs, *runs.absolute().parents) if path.is_dir()), None)
-    if folder is None:
-        return
-    free, spool = shutil.disk_usage(folder).free, sum(map(spool_bytes, loops))
-    if free >= _COPIES_AT_END * spool or free < LEAST_FREE_BYTES:  # then no run can begin at all
-        return
-    most = byte_size(_COPIES_AT_END * spool)
-    text = (
-        f"{runs}: this run records {byte_size(spool)} and needs {most} until its end; "
-        f"{byte_size(free)} are free on the disk"
-    )
-    if free < spool:
-        raise MachineError(f"{text}; reduce horizon_s, or choose another disk with --runs")
-    print(f"noack: warning: {text}", file=sys.stderr)

@@ -66,11 +66,11 @@ def test_a_run_with_very_many_events_is_drawn_until_there() -> None:
     even = exploration.explore(noack.load("lane_following", {
         "trigger": {"policy": "periodic", "period_s": 0.002}
     }))  # fmt: skip
-    assert even.cut == "3000 events until 6 s; the rest is not drawn"
+    assert even.cut_reason == "3000 events until 6 s; the rest is not drawn"
     assert even.t_s[-1] == even.event_s[-1] == pytest.approx(5.998)
-    assert dict(even.numbers)["run"] == even.cut
+    assert dict(even.numbers)["run"] == even.cut_reason
     accumulating = exploration.explore(noack.load("lane_following", {"trigger.alpha_per_s": 2.5}))
-    assert accumulating.cut.startswith("Zeno-like behaviour: inter-event times shrink to 0 (")
+    assert accumulating.cut_reason.startswith("Zeno-like behaviour: inter-event times shrink to 0 (")
     assert accumulating.t_s[-1] < 20.0
 
 

@@ -245,7 +245,7 @@ def many_loops(
 ) -> Path:
     """A copy of the run, whose end processes help with."""
     monkeypatch.setattr(finalize_helpers, "_MANY_STEPS", 10)
-    monkeypatch.setattr(finalize_helpers, "_LOOPS_AT_ONCE", LOOPS - 1)
+    monkeypatch.setattr(finalize_helpers, "_LOOPS_PREPARED_AT_ONCE", LOOPS - 1)
     monkeypatch.setattr(cosim.live.finalize, "_LEAST_LOOPS", LOOPS - 1)  # helpers judge loops, too
     monkeypatch.setattr(finalize_helpers, "cores", lambda: 2)
     run_dir, _ = judged_alone

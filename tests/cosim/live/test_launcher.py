@@ -1,18 +1,15 @@
 """Which processes the launcher restarts, when it ends the run, and the reason it reports."""
 
-import shutil
 import time
 from pathlib import Path
 from queue import SimpleQueue
-from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 
-from cosim.live.launcher import WaitLimit, _Run, launch, require_disk_space, spool_bytes
+from cosim.live.launcher import _Run, launch
 from cosim.live.monitoring.run_watcher import Watcher
 from cosim.live.processes.child_processes import ChildProcesses, EndReason
-from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.protocol.roles import RECORDER, ROLES
 from noack.runtime.command_line import Signals
@@ -212,27 +209,6 @@ def test_why_a_run_ends_early_is_shown_before_its_processes_end(case: Case) -> N
     assert (status, reason) == (ExitStatus.FAILED, "plant died: killed by SIGKILL")
 
 
-def reached_after_s(limit: WaitLimit, load: float) -> float:
-    while not limit.is_reached:
-        limit.wait(0.125, load)
-    return limit.waited_s
-
-
-@pytest.mark.parametrize(
-    ("load", "times", "why"),
-    [
-        (0.4, 1, "waited 30 s (start_within_s); a load of 0.4 on 2 cores is not the likely cause"),
-        (2.0, 1, "a load of 2.0 on 2 cores is not the likely cause"),
-        (4.0, 2, "likely cause: a load of 4.0 on 2 cores; start fewer runs at once"),
-        (1e6, 20, "waited 600 s; likely cause: a load of 1000000.0 on 2 cores; start fewer runs"),
-    ],
-)
-def test_the_time_to_start_grows_with_the_load(load: float, times: int, why: str) -> None:
-    limit = WaitLimit(30.0, 2)
-    assert reached_after_s(limit, load) == pytest.approx(30.0 * times, abs=0.25)
-    assert why in limit.explain_start()
-
-
 def test_a_refused_session_leaves_no_run_directory(
     content: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -242,36 +218,3 @@ def test_a_refused_session_leaves_no_run_directory(
     with descriptor_file(descriptor, "lab"), pytest.raises(CallerError, match="another run is open in it"):
         launch(scenario, tmp_path / "runs", spawn=(), session="lab")
     assert list((tmp_path / "runs").iterdir()) == []
-
-
-# --- disk space -----------------------------------------------------------------------------------
-
-
-def with_free(monkeypatch: pytest.MonkeyPatch, free: float) -> None:
-    monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=int(free)))
-
-
-def test_the_estimated_size_is_that_of_all_rows_except_events(content: dict[str, Any]) -> None:
-    resolved = resolve(validate(content, ""))
-    record = simulate(resolved)
-    events = ("controller_delivery", "netem_packet", "netem_release")
-    rows = [record[table].nbytes for table in record.tables if table not in events]
-    assert spool_bytes(resolved) == pytest.approx(sum(rows), rel=0.002)
-
-
-def test_a_run_that_cannot_fit_is_refused_and_one_that_may_not_fit_begins_with_a_warning(
-    content: dict[str, Any],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    scenario = validate(content | {"horizon_s": 1e7}, "")
-    with_free(monkeypatch, spool_bytes(resolve(scenario)) - 1)
-    with pytest.raises(MachineError, match=r"this run records .* are free on the disk"):
-        launch(scenario, tmp_path / "runs")
-    assert not (tmp_path / "runs").exists()
-    resolved = resolve(validate(content | {"horizon_s": 1000.0}, ""))
-    for share, warned in ((1.0, True), (2.9, True), (3.0, False)):
-        with_free(monkeypatch, share * 2 * spool_bytes(resolved))
-        require_disk_space([resolved] * 2, tmp_path / "not" / "yet")
-        assert ("warning: " in capsys.readouterr().err) == warned

@@ -182,3 +182,17 @@ def test_a_refused_change_has_no_effect_on_the_next_one() -> None:
     parameters = requested(requests, {})["runtime_parameters"]
     assert (parameters["network.mansd"], parameters["network.loss"]["probability"]) == (2, 0.2)
     assert [announcement.number for announcement in requests.announced] == [0, 1]
+
+
+def test_a_change_beyond_the_last_one_or_the_end_of_the_run_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    requests, settings = requests_of('{ name = "p" }'), {"network.mansd": 2}
+    monkeypatch.setattr(coordinator, "MOST_CHANGES", 2)
+    for _ in range(2):
+        requested(requests, settings)
+    with pytest.raises(CallerError, match="this run has had 2 changes, the maximum"):
+        requested(requests, settings)
+    assert len(requests.announced) == 2
+    with pytest.raises(CallerError, match=r"the run ends at 0\.1 s, before a change could apply"):
+        requested(requests_of('{ name = "p" }', "horizon_s=0.1"), settings)

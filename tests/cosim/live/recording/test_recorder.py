@@ -280,6 +280,16 @@ def test_the_summary_lists_every_violated_assumption(outage: RunRecord) -> None:
     assert violation.worst_at_s == pytest.approx(0.7)
 
 
+def test_of_many_warnings_the_last_names_the_place_of_the_others() -> None:
+    report = recorder.ProgressReport(
+        t_s=0.0, events=0, deliveries=0, longest_loss_burst=0, x_norm=None, live=None
+    )
+    for number in range(40):
+        report.add_warning(f"warning {number}")
+    assert report.warnings[:-1] == [f"warning {number}" for number in range(30)]
+    assert report.warnings[-1].endswith("are in the logs of the loops")
+
+
 def test_missing_rows_are_reported_as_an_unknown_result(outage: RunRecord, late: Run) -> None:
     late.send_until(outage, 300_000_000)
     late.sent["sensor_measurement"] += 10  # a batch is lost and sent again at the end
