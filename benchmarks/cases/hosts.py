@@ -100,7 +100,7 @@ class ClockCase(NamedTuple):
     """Whether the client reads replies once a period only."""
     rate_ppb: int = ClockOffset().rate_ppb
     answer_every_s: float = 0.0
-    """The reference answers so often; 0: at once."""
+    """Seconds between two answers; 0: at once."""
 
 
 class Clock(NamedTuple):
