@@ -38,7 +38,7 @@ from noack.runtime.address import Address
 from noack.runtime.drivers.realtime_settings import realtime
 from noack.runtime.host_clocks.clock_offset import ClockOffset
 from noack.runtime.host_clocks.time_exchange import TimeClient, TimeReference, answering
-from tests.helpers.live_runs import RunByHand
+from tests.helpers.run_by_hand import RunByHand
 from tests.helpers.two_hosts import DrivenClocks, TwoHosts, enter_namespace, two_hosts
 
 KEY = bytes(range(32))

@@ -30,7 +30,8 @@ from noack.runtime.address import LOOPBACK
 from noack.runtime.udp_sockets import DROPPED_IN_FLOOD
 from noack.scenario.resolution import loop_of
 from tests.attacks.kinds import Plan, Sent, Target, carry_out
-from tests.helpers.live_runs import AWAY, RunByHand, udp_port
+from tests.helpers.live_runs import udp_port
+from tests.helpers.run_by_hand import AWAY, RunByHand
 from tests.helpers.two_hosts import TwoHosts
 from tests.helpers.waiting import wait_for
 

@@ -242,7 +242,7 @@ def is_rerun(process: psutil.Process) -> bool:
 
 
 def disturbed_run(folder: Path) -> Disturbed:
-    with pytest.MonkeyPatch.context() as environment, live.begun(folder) as start:
+    with pytest.MonkeyPatch.context() as environment, live.start_runs(folder) as start:
         for name in [name for name in os.environ if "DISPLAY" in name]:
             environment.delenv(name)  # the viewer opens in a browser
         values = live.settings(speed=4.0, horizon_s=DISTURBED_S)

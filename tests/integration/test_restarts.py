@@ -25,7 +25,7 @@ def is_whole(running: live.Running, table: str) -> bool:
 
 def kill(running: live.Running, role: str) -> None:
     """Kill a process that has rows on disk; wait until its replacement has, too."""
-    table = live.KEEPS[role]
+    table = live.ROWS_OF[role]
     live.wait_for(lambda: len(live.spooled(running, table)) > 0)
     before = live.child_of(running.process, role)
     assert before is not None
@@ -45,7 +45,7 @@ def let_run(running: live.Running, simulated_s: float) -> None:
 def restarted(tmp_path_factory: pytest.TempPathFactory) -> live.Finished:
     """A run in which the processes were killed one after the other."""
     folder = tmp_path_factory.mktemp("restarted")
-    with live.begun(folder) as start:
+    with live.start_runs(folder) as start:
         running = start(
             *live.settings(speed=3.0, horizon_s=4000.0, recovery__rejoin_within_s=60),
             *live.AT_RATE,
