@@ -70,7 +70,7 @@ def record(
     return process
 
 
-def joined(start: Start, *away: str, **more: int) -> list[subprocess.Popen[str]]:
+def start_processes(start: Start, *away: str, **more: int) -> list[subprocess.Popen[str]]:
     """Start all processes of the loop, these on the second host, with the invitation."""
     return [
         start(1, role, "--json", *INVITED, **more) if role in away else start(0, role, "--json")
@@ -116,7 +116,7 @@ def test_several_loops_run_on_hosts_with_different_clocks(
     recording = start(0, "record", "three.toml", "--listen", first_host, "--json", *live.BARE)
     live.wait_for(lambda: (tmp_path / "invitation.json").exists() or recording.poll() is not None)
     assert recording.poll() is None, recording.communicate()
-    processes = joined(start, "netem", "controller", ahead_s=AHEAD_S)
+    processes = start_processes(start, "netem", "controller", ahead_s=AHEAD_S)
     *reports, summary = end_well(*processes, recording)
     addresses = {report["channel"]["local"].rpartition(":")[0].strip("[]") for report in reports}
     assert addresses == {first_host, second_host}
@@ -177,7 +177,7 @@ def test_a_host_that_comes_back_loses_no_row(start: Start, hosts: TwoHosts, tmp_
     """The link is down until the recorder has given the other host's processes up for lost."""
     sets = (*live.settings(horizon_s=20.0), "--set", ROOMY)
     recording = record(start, tmp_path, "10.83.3.1", *sets, impatient=True)
-    processes = joined(start, "netem", "controller", ahead_s=AHEAD_S)
+    processes = start_processes(start, "netem", "controller", ahead_s=AHEAD_S)
     wait_recorded(tmp_path)
     assert recording.stderr is not None
     with _cut_off(hosts):
@@ -202,8 +202,10 @@ def _cut_off(hosts: TwoHosts) -> Iterator[None]:
     """Take the link down meanwhile."""
     command = ["ip", "-n", hosts.names[1], "link", "set", "line"]
     subprocess.run([*command, "down"], check=True)
-    yield
-    subprocess.run([*command, "up"], check=True)
+    try:
+        yield
+    finally:
+        subprocess.run([*command, "up"], check=True)
 
 
 @pytest.fixture
