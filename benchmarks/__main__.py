@@ -21,15 +21,8 @@ from typing import NamedTuple
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 from benchmarks import cases
-from benchmarks.report import (
-    BENCHMARKS,
-    Benchmark,
-    MachineLoad,
-    MeasurementError,
-    Row,
-    print_table,
-    write_json,
-)
+from benchmarks.machine_load import MachineLoad
+from benchmarks.report import BENCHMARKS, Benchmark, MeasurementError, Row, print_table, write_json
 from noack.core.errors import NoackError
 
 GOALS = "goals"
@@ -98,6 +91,8 @@ def run(benchmarks: Mapping[str, Benchmark], arguments: Sequence[str] | None = N
     if options.list:
         print("\n".join(f"{benchmark.name:<20}{benchmark.title}" for benchmark in benchmarks.values()))
         return 0
+    if options.docs is not None and GOALS not in options.names:
+        parser.error(f"--docs writes the rows of all goals: it needs the name {GOALS!r}")
     requested = options.names or [*benchmarks]
     chosen = [name for entry in requested for name in (OF_GOALS if entry == GOALS else (entry,))]
     if unknown := [name for name in chosen if name not in benchmarks]:

@@ -25,7 +25,7 @@ import psutil
 
 from benchmarks.report import MeasurementError
 from noack.protocol.roles import LOOP_ROLES
-from tests.helpers.live_runs import begun, is_over, processes_of
+from tests.helpers.live_runs import is_over, processes_of, start_runs
 from tests.helpers.waiting import PATIENCE_S
 
 PROGRESS = re.compile(r"^([0-9.]+)/[0-9.e+]+ s\b")
@@ -224,7 +224,7 @@ def observed_run(arguments: Sequence[str], folder: Path, length_s: float, pause_
                     with suppress(psutil.Error):
                         samples[role].append(Sample.of(process))
 
-    with begun(folder) as begin:
+    with start_runs(folder) as begin:
         run = begin(command=("run", *arguments), viewer=True)
         run.wait_recording()
         began_s = time.monotonic()

@@ -237,3 +237,29 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
     _, label = connected_components(matrix, connection="strong")
     circular = {name for name, place in number.items() if (label == label[place]).sum() > 1}
     assert {name.rpartition(".")[0] for name in circular} <= CIRCLES
+
+
+WALL_CLOCK = {
+    "noack/runtime/command_line.py": "lines of the log",
+    "noack/plants/systems/code_cache.py": "ages of files",
+    "cosim/record/run_directory.py": "the run's name and its environment",
+    "cosim/live/coordination/coordinator.py": "when a change was requested",
+    "cosim/live/coordination/remote_access.py": "the validity of an invitation",
+    "noack/protocol/ros2_node.py": "the time stamps of messages of ROS 2",
+    "netem/relay/relay.py": "the times of a capture",
+    "netem/control/command_queue.py": "lines of statistics",
+    "native/relay/loop.c": "time stamps of the kernel, compared with the monotonic clock",
+    "noack/runtime/host_clocks/time_exchange.py": "the same",
+}
+"""Files that read the wall clock, and for what."""
+
+
+def test_no_time_of_a_run_is_read_from_the_wall_clock() -> None:
+    reads = re.compile(r"\btime\.time(_ns)?\(|CLOCK_REALTIME\)|datetime\.(now|today)\(|utcnow")
+    readers = {
+        str(path.relative_to(ROOT))
+        for folder in (*PACKAGES, "native")
+        for path in (ROOT / folder).rglob("*.[pc]*")
+        if path.suffix in (".py", ".c") and reads.search(path.read_text())
+    }
+    assert readers == WALL_CLOCK.keys()

@@ -39,7 +39,7 @@ _SPACING_NS = 2_000_000
 
 
 class Decider:
-    """Decides for a flow after the other, with this time between two datagrams."""
+    """Decides one flow after another, datagrams `spacing_ns` apart."""
 
     def __init__(self, words: str, spacing_ns: int = 10_000) -> None:
         self._link, self._flow = LinkState(settings_of(words), 7, "relay", "forward"), 0
@@ -102,9 +102,9 @@ def guarantee(options: argparse.Namespace) -> Iterator[Row]:
     is dropped, or if a later one arrives before it.
     """
     yield from network_rows()
-    for guarantee in COMBINATIONS:
+    for constraint in COMBINATIONS:
         for before in ("loss 50%", f"loss 30% {REORDERING}"):
-            yield from check_rows(before, guarantee, DECISIONS)
+            yield from check_rows(before, constraint, DECISIONS)
 
 
 LOOPS = ("lane_following", "double_integrator", "unstable_pendulum", "f16_lateral")

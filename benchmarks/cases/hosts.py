@@ -38,7 +38,7 @@ from noack.runtime.address import Address
 from noack.runtime.drivers.realtime_settings import realtime
 from noack.runtime.host_clocks.clock_offset import ClockOffset
 from noack.runtime.host_clocks.time_exchange import TimeClient, TimeReference, answering
-from tests.helpers.live_runs import RunByHand
+from tests.helpers.run_by_hand import RunByHand
 from tests.helpers.two_hosts import DrivenClocks, TwoHosts, enter_namespace, two_hosts
 
 KEY = bytes(range(32))
@@ -100,7 +100,7 @@ class ClockCase(NamedTuple):
     """Whether the client reads replies once a period only."""
     rate_ppb: int = ClockOffset().rate_ppb
     answer_every_s: float = 0.0
-    """The reference answers so often; 0: at once."""
+    """Seconds between two answers; 0: at once."""
 
 
 class Clock(NamedTuple):

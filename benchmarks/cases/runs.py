@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import psutil
 
+from benchmarks.machine_load import own_cpu_s
 from benchmarks.programs import (
     NOACK,
     PRIORITY,
@@ -39,7 +40,6 @@ from benchmarks.report import (
     compare,
     median,
     option,
-    own_cpu_s,
 )
 from noack.protocol.roles import LOOP_ROLES, WITH_DEADLINES
 

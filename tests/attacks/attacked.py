@@ -30,7 +30,8 @@ from noack.runtime.address import LOOPBACK
 from noack.runtime.udp_sockets import DROPPED_IN_FLOOD
 from noack.scenario.resolution import loop_of
 from tests.attacks.kinds import Plan, Sent, Target, carry_out
-from tests.helpers.live_runs import AWAY, RunByHand, udp_port
+from tests.helpers.live_runs import udp_port
+from tests.helpers.run_by_hand import AWAY, RunByHand
 from tests.helpers.two_hosts import TwoHosts
 from tests.helpers.waiting import wait_for
 
@@ -137,6 +138,9 @@ def attack(
                 finished = run.finish()
             if all_received:
                 break
+        else:
+            reason = finished.summary["exit"]["reason"]
+            raise AssertionError(f"each run ended before it read the attack: {reason}; {finished.stderr}")
     record = load_record(finished.run_dir)
     return Attacked(finished.status, finished.summary, finished.stderr, record, sent)
 
@@ -175,6 +179,7 @@ _TAKEN = {
     "netem": NETEM_PACKET,
     "controller": CONTROLLER_DELIVERY,
 }
+"""The table with a row for each datagram that a process accepts."""
 
 
 def ends_well(run: Attacked) -> Iterator[str]:
@@ -195,7 +200,7 @@ def nothing_is_accepted(run: Attacked) -> Iterator[str]:
 
 
 def all_are_accounted_for(run: Attacked) -> Iterator[str]:
-    """Each hostile datagram was rejected, for a reason that occurs."""
+    """Each hostile datagram was rejected; the emulator rejects by address only."""
     for role in LOOP_ROLES:
         sent, rejected = run.sent_to(role).total(), run.channel(role)["rejected"]
         if sum(rejected.values()) != sent:

@@ -120,5 +120,16 @@ def test_the_goals_are_selected_in_their_order_and_written_into_the_page(tmp_pat
         write_docs(page, figures)
 
 
+def test_the_page_is_not_written_without_all_goals(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (page := tmp_path / "page.md").write_text(f"{BEGIN}\nold\n{END}\n")
+    row = Row("event → update, no emulator, p50", 30.0, "µs")
+    with pytest.raises(SystemExit):
+        run(by_name(named("latency", row)), ["latency", "--docs", str(page)])
+    assert capsys.readouterr().err.splitlines()[-1].endswith("it needs the name 'goals'")
+    assert "old" in page.read_text()
+
+
 def test_every_goal_is_of_a_benchmark() -> None:
     assert set(OF_GOALS) <= all_benchmarks().keys()

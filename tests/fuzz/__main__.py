@@ -44,14 +44,14 @@ def fuzz(name: str, seconds: int) -> tuple[bool, str]:
             child, environment = sanitized_core.command("tests.fuzz.random_child", name, *flags)
     with log.open("wb") as file:
         done = subprocess.run(child, cwd=ROOT, stdout=file, stderr=file, check=False, env=environment)
-    reports = _STATUS.findall(log.read_bytes())
-    executions, _, features = map(int, reports[-1]) if reports else (0, 0, 0)
+    statuses = _STATUS.findall(log.read_bytes())
+    executions, _, features = map(int, statuses[-1]) if statuses else (0, 0, 0)
     findings = _findings_in(folder)
     is_bad = bool(findings or done.returncode or not executions)
     outcome = f"status {done.returncode}, see {log}" if is_bad else "no finding"
     shown = [f"    python -m tests.fuzz show {name} {path.relative_to(ROOT)}" for path in findings]
-    said = f"  {name}: {executions:,} executions, {features:,} features, {outcome}"
-    return is_bad, "\n".join([said, *shown])
+    report = f"  {name}: {executions:,} executions, {features:,} features, {outcome}"
+    return is_bad, "\n".join([report, *shown])
 
 
 def _findings_in(folder: Path) -> list[Path]:
@@ -86,9 +86,9 @@ def main() -> int:
     print(f"{len(names)} parsers, {seconds} s each, {options.jobs} at a time", flush=True)
     bad = 0
     with ThreadPoolExecutor(options.jobs) as pool:
-        for is_bad, said in pool.map(lambda name: fuzz(name, seconds), names):
+        for is_bad, report in pool.map(lambda name: fuzz(name, seconds), names):
             bad += is_bad
-            print(said, flush=True)
+            print(report, flush=True)
     print(f"{bad} of {len(names)} parsers failed")
     return 1 if bad else 0
 

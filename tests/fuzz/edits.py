@@ -300,17 +300,17 @@ def _one_changed(choices: Choices, column: pa.ChunkedArray) -> Any:
     if not values:
         return column
     at = choices.below(len(values))
-    value: Any = None
+    changed: Any = None
     if choices.below(8):
         if pa.types.is_integer(column.type):
-            value = choices.choose(_IN_64_BITS) if choices.flag() else choices.below(256) - 128
+            changed = choices.choose(_IN_64_BITS) if choices.flag() else choices.below(256) - 128
         elif pa.types.is_floating(column.type):
-            value = choices.real()
+            changed = choices.real()
         elif pa.types.is_dictionary(column.type):
-            value = choices.choose(["forward", "reverse", "up", "", "other"])
+            changed = choices.choose(["forward", "reverse", "up", "", "other"])
         elif isinstance(values[at], bytes):
-            value = bytes(damaged(choices, values[at])).ljust(len(values[at]), b"\0")
-    values[at] = value
+            changed = bytes(damaged(choices, values[at])).ljust(len(values[at]), b"\0")
+    values[at] = changed
     try:
         return pa.array(values, column.type)
     except (pa.ArrowInvalid, OverflowError, TypeError):

@@ -5,7 +5,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,13 +15,11 @@ import psutil
 import pytest
 
 from cosim.record.run_record import Rows
-from noack.protocol.roles import GENERATION, LOOP_ROLES, ROLES
-from noack.runtime.run_descriptor import RunDescriptor, loads
+from noack.protocol.roles import GENERATION, ROLES
 from noack.runtime.spool import read_chunks
 from noack.scenario.resolution import run_tables
 from noack.scenario.scenario_file import load
 from tests.helpers.command_line import invoke
-from tests.helpers.two_hosts import TwoHosts
 from tests.helpers.waiting import PATIENCE_S, wait_for
 
 EPHEMERAL = ("--set", "ports={}")
@@ -40,7 +38,7 @@ Start = Callable[..., "subprocess.Popen[str]"]
 
 
 @contextmanager
-def starting() -> Iterator[Start]:
+def start_commands() -> Iterator[Start]:
     """Start commands of noack; what still runs at the end is killed, with its children."""
     started: list[subprocess.Popen[str]] = []
 
@@ -73,7 +71,7 @@ def starting() -> Iterator[Start]:
             process.communicate()
 
 
-def ended(process: "subprocess.Popen[str]") -> tuple[str, str]:
+def wait_for_end(process: "subprocess.Popen[str]") -> tuple[str, str]:
     """Wait for the end of a process; return what it printed."""
     return process.communicate(timeout=PATIENCE_S)
 
@@ -206,8 +204,8 @@ class Running:
         """Wait until the recorder has stored rows of plant, sensor and controller."""
         self.wait_started()
         for table in ("plant_step", "sensor_measurement", "controller_step"):
-            spooled = self.runs / "latest" / "spool" / f"{table}.recorder"
-            wait_for(lambda spooled=spooled: spooled.exists() and spooled.stat().st_size > 10_000)
+            path = self.runs / "latest" / "spool" / f"{table}.recorder"
+            wait_for(lambda path=path: path.exists() and path.stat().st_size > 10_000)
 
     def child(self, role: str) -> psutil.Process:
         for child in self._children:
@@ -233,9 +231,9 @@ class Running:
 
 
 @contextmanager
-def begun(folder: Path) -> Iterator[Callable[..., Running]]:
+def start_runs(folder: Path) -> Iterator[Callable[..., Running]]:
     """Start ``noack run`` in the background; kill remaining processes at the end."""
-    with starting() as start:
+    with start_commands() as start:
 
         def begin(
             *arguments: str, command: tuple[str, ...] = ("run", "lane_following"), **more: Any
@@ -247,12 +245,13 @@ def begun(folder: Path) -> Iterator[Callable[..., Running]]:
         yield begin
 
 
-KEEPS = {
+ROWS_OF = {
     "sensor": "sensor_measurement",
     "controller": "controller_delivery",
     "netem": "netem_packet",
     "recorder": "plant_step",
 }
+"""A table of each process, by which its rows are counted."""
 
 
 def spooled(running: Running, table: str) -> Rows:
@@ -269,55 +268,4 @@ def goes_on(running: Running, role: str) -> bool:
     if role == "recorder":
         written = (running.runs / "latest" / "spool").glob("plant_step.*")
         return sum(path.stat().st_size > 0 for path in written) > 1
-    return bool((spooled(running, KEEPS[role])["input"] >= GENERATION).any())
-
-
-AWAY = "controller"
-"""The process of a run by hand that is on the second host, if there are two."""
-
-
-class RunByHand:
-    """An active run, started one process at a time; ``stack`` ends what remains."""
-
-    def __init__(self, stack: ExitStack, folder: Path, hosts: TwoHosts | None, *arguments: str) -> None:
-        self._folder, self.hosts = folder, hosts
-        self._begin = stack.enter_context(starting())
-        invitation = str(folder / "invitation.json")
-        network = (
-            EPHEMERAL if hosts is None
-            else ("--listen", hosts.addresses[0][0], "--invitation", invitation)
-        )  # fmt: skip
-        self._recording = self._start(
-            0, "record", "lane_following", "--runs", str(folder / "runs"), "--no-report",
-            *network, *arguments,
-        )  # fmt: skip
-        self.processes = {
-            role: self._start(1, role, "--invitation", invitation)
-            if hosts is not None and role == AWAY
-            else self._start(0, role)
-            for role in LOOP_ROLES
-        }
-
-    def _start(self, host: int, *command: str) -> "subprocess.Popen[str]":
-        before = () if self.hosts is None else self.hosts.inside(host)
-        return self._begin(*command, "--json", before=before, runtime=self._folder)
-
-    def descriptor(self) -> RunDescriptor:
-        """Wait until the run has a descriptor; return it."""
-        path = self._folder / f"noack-{os.getuid()}" / "default.json"
-        self.wait(path.exists)
-        return loads(path.read_text())
-
-    def wait(self, condition: Callable[[], bool]) -> None:
-        """Wait for a condition; fail if the recording ends before."""
-        wait_for(lambda: condition() or self._recording.poll() is not None)
-        assert self._recording.poll() is None, self._recording.communicate()
-
-    def finish(self) -> Finished:
-        """Wait for the end of the run; return its result, with the largest exit status."""
-        stdout, stderr = self._recording.communicate(timeout=PATIENCE_S + 600)
-        for process in self.processes.values():
-            process.communicate(timeout=PATIENCE_S)
-        status = max(process.returncode for process in (self._recording, *self.processes.values()))
-        run_dir = (self._folder / "runs" / "latest").resolve()
-        return Finished(status, json.loads(stdout), stderr, run_dir)
+    return bool((spooled(running, ROWS_OF[role])["input"] >= GENERATION).any())

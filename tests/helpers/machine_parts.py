@@ -15,6 +15,24 @@ from noack.scenario.scenario import Scenario
 from plant_server.plant import Plant, plants_of
 from sensor_node.sensor import Sensor, sensors_of
 
+T = TypeVar("T")
+
+
+class Machine(Protocol[T]):
+    """One process of the loop, without its input and output; T is what it receives and sends."""
+
+    def handle(self, message: T, now_ns: int) -> Sequence[T | Record | Notice]:
+        """Take a message that arrived at simulated time ``now_ns``."""
+        ...
+
+    def on_timer(self, now_ns: int) -> Sequence[T | Record | Notice]:
+        """Do the work due at :meth:`next_deadline_ns`; ``now_ns`` may be later than that."""
+        ...
+
+    def next_deadline_ns(self) -> int | None:
+        """When :meth:`on_timer` is due next; None if no timer is set."""
+        ...
+
 
 class SteppedMachines(LoopMachines):
     """Machines to which a test gives one input at a time, instead of a driver in C."""
@@ -92,22 +110,3 @@ def controller_of(resolved: Scenario, start: Start = BEGINNING) -> OneLoop:
 def machine(part: Plant | Sensor | Controller) -> OneLoop:
     """The machine of one loop."""
     return OneLoop([part])
-
-
-T = TypeVar("T")
-
-
-class Machine(Protocol[T]):
-    """One process of the loop, without its input and output; T is what it receives and sends."""
-
-    def handle(self, message: T, now_ns: int) -> Sequence[T | Record | Notice]:
-        """Take a message that arrived at simulated time ``now_ns``."""
-        ...
-
-    def on_timer(self, now_ns: int) -> Sequence[T | Record | Notice]:
-        """Do the work due at :meth:`next_deadline_ns`; ``now_ns`` may be later than that."""
-        ...
-
-    def next_deadline_ns(self) -> int | None:
-        """When :meth:`on_timer` is due next; None if no timer is set."""
-        ...

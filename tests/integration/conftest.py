@@ -6,18 +6,18 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers.live_runs import Running, begun, starting
+from tests.helpers.live_runs import Running, start_commands, start_runs
 
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Callable[..., Running]]:
     """Start ``noack run`` in the background; kill remaining processes at the end."""
-    with begun(tmp_path) as begin:
+    with start_runs(tmp_path) as begin:
         yield begin
 
 
 @pytest.fixture
 def by_hand(tmp_path: Path) -> Iterator[Callable[[str], subprocess.Popen[str]]]:
     """Start one process by hand; kill remaining processes at the end."""
-    with starting() as start:
+    with start_commands() as start:
         yield lambda role: start(role, "--json", runtime=tmp_path)

@@ -35,13 +35,13 @@ def test_a_wait_for_a_missing_process_can_be_interrupted(
     live.wait_for(lambda: recording.process.stderr.readline() == "waiting for netem\n")  # type: ignore[union-attr]
     children = own.children(recursive=True)
     recording.process.send_signal(signal.SIGINT)
-    stdout, stderr = live.ended(recording.process)
+    stdout, stderr = live.wait_for_end(recording.process)
     assert recording.process.returncode == 130
     (line,) = stderr.splitlines()
     assert line.startswith("noack: stopped by the user (SIGINT) (logs in ")
     assert json.loads(stdout)["exit"]["status"] == 130
     for role, process in processes.items():
-        _, stderr = live.ended(process)
+        _, stderr = live.wait_for_end(process)
         assert process.returncode == 1
         why = stderr.splitlines()[-1].removeprefix(f"noack {role}: ")
         assert why in (
@@ -61,9 +61,9 @@ def test_the_loop_outlives_the_coordinator(start: Start, by_hand: ByHand) -> Non
     recording.wait_recording()
     run_dir = (recording.runs / "latest").resolve()
     recording.process.kill()
-    live.ended(recording.process)
+    live.wait_for_end(recording.process)
     for role, process in processes.items():
-        stdout, stderr = live.ended(process)
+        stdout, stderr = live.wait_for_end(process)
         assert process.returncode == 0, stderr
         assert stderr.splitlines()[-1] == f"noack {role}: ended: horizon"
         assert json.loads(stdout)["ended"] == "horizon"
@@ -118,7 +118,7 @@ class ByHandRun(NamedTuple):
 def run(tmp_path_factory: pytest.TempPathFactory) -> ByHandRun:
     folder = tmp_path_factory.mktemp("by hand")
     private = folder / f"noack-{os.getuid()}"
-    with live.begun(folder) as start, live.starting() as begin:
+    with live.start_runs(folder) as start, live.start_commands() as begin:
 
         def by_hand(role: str) -> subprocess.Popen[str]:
             return begin(role, "--json", runtime=folder)
@@ -153,7 +153,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> ByHandRun:
         assert files(private) == {}
         seen |= files(run_dir) | {"recorder's output": finished.stderr.encode()}
         for role, process in (*processes.items(), ("sensor again", again)):
-            seen[f"{role}'s output"] = "".join(live.ended(process)).encode()
+            seen[f"{role}'s output"] = "".join(live.wait_for_end(process)).encode()
         statuses = {role: process.returncode for role, process in processes.items()}
         return ByHandRun(finished, key, seen, statuses, twice.communicate()[1])
 

@@ -8,23 +8,18 @@ import re
 import shutil
 import signal
 import subprocess
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-import psutil
 import pytest
 
 from cosim.live.finalize import reopen
-from cosim.record.run_record import RunRecord, load_record
+from cosim.record.run_record import load_record
 from noack.core.errors import MachineError
 from noack.protocol.roles import ROLES
-from tests.cosim.output.viewer.recordings import read
 from tests.helpers import live_runs as live
 from tests.helpers.command_line import invoke
-from tests.helpers.waiting import is_left
 
 Start = Callable[..., live.Running]
 LONG = [*live.AT_RATE, *live.settings(speed=4.0, horizon_s=400.0)]
@@ -132,7 +127,7 @@ def test_a_full_and_then_closed_pipe_does_not_disturb_the_run(tmp_path: Path) ->
 
 
 @pytest.fixture
-def small(tmp_path: Path) -> Iterator[Path]:
+def small_disk(tmp_path: Path) -> Iterator[Path]:
     """A disk of 64 MiB that contains the runs of ``start``."""
     path = tmp_path / "runs"
     path.mkdir()
@@ -149,21 +144,21 @@ def small(tmp_path: Path) -> Iterator[Path]:
 
 
 def fill(disk: Path) -> None:
-    room = shutil.disk_usage(disk).free
+    free_bytes = shutil.disk_usage(disk).free
     with (disk / "filler").open("wb", buffering=0) as file:
-        while room > 0:  # other processes may write at the same time
+        while free_bytes > 0:  # other processes may write at the same time
             try:
-                room -= file.write(bytes(min(room, 1 << 16)))
+                free_bytes -= file.write(bytes(min(free_bytes, 1 << 16)))
             except OSError:
                 break
 
 
 @pytest.mark.usefixtures("no_drawing")
-def test_a_run_on_a_disk_that_fills_up_can_be_finalised_later(start: Start, small: Path) -> None:
+def test_a_run_on_a_disk_that_fills_up_can_be_finalised_later(start: Start, small_disk: Path) -> None:
     running = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=240.0))
     running.wait_recording()
     run_dir = (running.runs / "latest").resolve()
-    fill(small)
+    fill(small_disk)
     stdout, stderr = running.process.communicate(timeout=live.PATIENCE_S)
     lines = [line for line in stderr.splitlines() if line.startswith("noack")]
     assert running.process.returncode == 1
@@ -184,7 +179,7 @@ def test_a_run_on_a_disk_that_fills_up_can_be_finalised_later(start: Start, smal
     assert str(refused.value).splitlines() == [line.removeprefix("noack: ") for line in lines]
     assert {path.name: path.stat().st_size for path in (run_dir / "spool").iterdir()} == spooled
 
-    (small / "filler").unlink()
+    (small_disk / "filler").unlink()
     assert invoke("summary", run_dir).exit_code == 0
     record = load_record(run_dir)
     for table in ("plant_step", "sensor_measurement", "controller_step"):
@@ -200,144 +195,3 @@ def test_a_run_on_a_disk_that_fills_up_can_be_finalised_later(start: Start, smal
     assert lines[0] == f"noack: the run failed: {failed}"
     assert failed in (run_dir / "report.html").read_text()
     assert not list(run_dir.rglob("*.partial"))
-
-
-DISTURBED_S = 36.0
-PAUSE_S = 0.7
-"""Well below zenoh's lease, and far above every delay that a certificate allows."""
-SILENT_S = 3.0
-"""Above the lease: all connections break, come back, and rows are sent again."""
-
-
-class Disturbed(NamedTuple):
-    """A finished run, its record, and its live viewer's processes."""
-
-    finished: live.Finished
-    record: RunRecord
-    left_behind: list[psutil.Process]
-    viewers: list[psutil.Process]
-    viewer_group: int
-
-
-def pause(process: psutil.Process, pause_s: float) -> None:
-    process.send_signal(signal.SIGSTOP)
-    time.sleep(pause_s)
-    process.send_signal(signal.SIGCONT)
-
-
-def viewers_of(running: live.Running) -> list[psutil.Process]:
-    """Return the server of the recording and the server of rerun's page."""
-    return [
-        child
-        for child in running.child("recorder").children(recursive=True)
-        if "cosim.output.viewer.recording_viewer" in live.command_of(child) or is_rerun(child)
-    ]
-
-
-def is_rerun(process: psutil.Process) -> bool:
-    try:
-        return "rerun" in Path(process.exe()).name
-    except psutil.Error:  # the process has ended
-        return False
-
-
-def disturbed_run(folder: Path) -> Disturbed:
-    with pytest.MonkeyPatch.context() as environment, live.begun(folder) as start:
-        for name in [name for name in os.environ if "DISPLAY" in name]:
-            environment.delenv(name)  # the viewer opens in a browser
-        values = live.settings(speed=4.0, horizon_s=DISTURBED_S)
-        running = start(*live.AT_RATE, *values, "--live", viewer=True)
-        running.wait_recording()
-        viewers = viewers_of(running)
-        (group,) = {os.getpgid(viewer.pid) for viewer in viewers}
-        os.killpg(group, signal.SIGSTOP)
-        for role in ROLES:
-            pause(running.child(role), PAUSE_S)
-        # The launcher's process routes all telemetry.
-        pause(psutil.Process(running.process.pid), SILENT_S)
-        finished = running.finish()
-        record = load_record(finished.run_dir)
-        return Disturbed(finished, record, running.left_behind(), viewers, group)
-
-
-@pytest.fixture(scope="module")
-def disturbed(tmp_path_factory: pytest.TempPathFactory) -> Disturbed:
-    """A run that the machine has not stalled at its horizon, where no step can be made up for."""
-    for _ in range(3):
-        run = disturbed_run(tmp_path_factory.mktemp("disturbed"))
-        if ": overrun: " not in run.finished.summary["exit"]["reason"]:
-            break
-    assert run.finished.status == 0, run.finished.stderr
-    return run
-
-
-def test_every_step_is_executed_recorded_and_replayed(disturbed: Disturbed) -> None:
-    """The steps due during a pause are executed late and in order."""
-    summary, record = disturbed.finished.summary, disturbed.record
-    assert summary["exit"]["reason"] == "horizon"
-    assert summary["reached_s"] == DISTURBED_S
-    for table in ("plant_step", "sensor_measurement", "controller_step"):
-        rows = record[table]
-        assert np.array_equal(rows["sequence"], np.arange(len(rows)))
-    assert len(record["plant_step"]) == DISTURBED_S * live.RATE_HZ + 1
-    for table in record.tables:
-        assert (np.diff(record[table]["now_ns"]) >= 0).all()
-    loop = disturbed.finished.loop
-    live.assert_complete(loop)
-    assert loop["identity_residual_relative"] < 1e-11
-    assert loop["longest_loss_burst"] <= summary["mansd"]
-    assert disturbed.left_behind == []
-
-
-def test_inputs_too_old_for_a_certificate_make_its_claims_void(disturbed: Disturbed) -> None:
-    record = disturbed.record
-    for role in ("plant", "sensor", "controller"):  # netem may have had no packet
-        assert disturbed.finished.loop["lateness_us"][role]["max"] > 0.9e6 * PAUSE_S
-    certified = [claim for claim in disturbed.finished.loop["claims"] if "certificate" in claim["source"]]
-    assert certified
-    for claim in certified:
-        assert claim["verdict"] == "void"
-        assert 0 <= claim["since_s"] < DISTURBED_S
-    late = [notice["text"] for notice in record.notices if notice["level"] == "late"]
-    assert any(" s old, " in text or "took effect after " in text for text in late), late
-    for text in late:
-        assert disturbed.finished.stderr.count(text) == 1
-    own = [claim for claim in disturbed.finished.loop["claims"] if claim["source"] == "(I1)"]
-    assert {claim["verdict"] for claim in own} == {"held"}
-
-
-def test_the_recording_is_complete_and_the_stalled_viewer_is_ended(disturbed: Disturbed) -> None:
-    assert len(disturbed.viewers) == 2
-    assert "live view: http://127.0.0.1:" in disturbed.finished.stderr
-    chunks = read(disturbed.finished.run_dir / "recording.rrd")
-    assert sum(chunk.num_rows for chunk in chunks["error/log10"]) > DISTURBED_S * live.RATE_HZ
-    live.wait_for(lambda: not is_left(disturbed.viewer_group))
-    assert all(live.is_over(viewer) for viewer in disturbed.viewers)
-
-
-PACKAGES = ("noack", "plant_server", "sensor_node", "controller_node", "netem", "cosim")
-WALL_CLOCK = {
-    "noack/runtime/command_line.py": "lines of the log",
-    "noack/plants/systems/code_cache.py": "ages of files",
-    "cosim/record/run_directory.py": "the run's name and its environment",
-    "cosim/live/coordination/coordinator.py": "when a change was requested",
-    "cosim/live/coordination/remote_access.py": "the validity of an invitation",
-    "noack/protocol/ros2_node.py": "the time stamps of messages of ROS 2",
-    "netem/relay/relay.py": "the times of a capture",
-    "netem/control/command_queue.py": "lines of statistics",
-    "native/relay/loop.c": "time stamps of the kernel, compared with the monotonic clock",
-    "noack/runtime/host_clocks/time_exchange.py": "the same",
-}
-
-
-def test_no_time_of_a_run_is_read_from_the_wall_clock() -> None:
-    root = Path(__file__).parents[2]
-    folders = (*PACKAGES, "native")
-    reads = re.compile(r"\btime\.time(_ns)?\(|CLOCK_REALTIME\)|datetime\.(now|today)\(|utcnow")
-    readers = {
-        str(path.relative_to(root))
-        for folder in folders
-        for path in (root / folder).rglob("*.[pc]*")
-        if path.suffix in (".py", ".c") and reads.search(path.read_text())
-    }
-    assert readers == WALL_CLOCK.keys()

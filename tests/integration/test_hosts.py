@@ -22,7 +22,7 @@ from noack.protocol.roles import LOOP_ROLES
 from noack.scenario.scenario import phases_ns
 from tests.helpers import live_runs as live
 from tests.helpers.command_line import invoke
-from tests.helpers.live_runs import Start, ended
+from tests.helpers.live_runs import Start, wait_for_end
 from tests.helpers.two_hosts import TwoHosts, two_hosts
 
 INVITED = ("--invitation", "invitation.json")
@@ -44,7 +44,7 @@ def hosts() -> Iterator[TwoHosts]:
 @pytest.fixture
 def start(hosts: TwoHosts, tmp_path: Path) -> Iterator[Start]:
     """Start a command of noack on a host, with a runtime directory of the host's own."""
-    with live.starting() as begin:
+    with live.start_commands() as begin:
 
         def on(host: int, *arguments: str, ahead_s: int = 0, **more: Any) -> subprocess.Popen[str]:
             runtime = tmp_path / f"host {host}"
@@ -70,7 +70,7 @@ def record(
     return process
 
 
-def joined(start: Start, *away: str, **more: int) -> list[subprocess.Popen[str]]:
+def start_processes(start: Start, *away: str, **more: int) -> list[subprocess.Popen[str]]:
     """Start all processes of the loop, these on the second host, with the invitation."""
     return [
         start(1, role, "--json", *INVITED, **more) if role in away else start(0, role, "--json")
@@ -82,7 +82,7 @@ def end_well(*processes: subprocess.Popen[str]) -> list[Any]:
     """Wait for the processes' ends, with status 0; return what they printed as JSON."""
     printed = []
     for process in processes:
-        stdout, stderr = ended(process)
+        stdout, stderr = wait_for_end(process)
         assert process.returncode == 0, stderr
         assert "are kept in" not in stderr
         printed.append(json.loads(stdout))
@@ -116,7 +116,7 @@ def test_several_loops_run_on_hosts_with_different_clocks(
     recording = start(0, "record", "three.toml", "--listen", first_host, "--json", *live.BARE)
     live.wait_for(lambda: (tmp_path / "invitation.json").exists() or recording.poll() is not None)
     assert recording.poll() is None, recording.communicate()
-    processes = joined(start, "netem", "controller", ahead_s=AHEAD_S)
+    processes = start_processes(start, "netem", "controller", ahead_s=AHEAD_S)
     *reports, summary = end_well(*processes, recording)
     addresses = {report["channel"]["local"].rpartition(":")[0].strip("[]") for report in reports}
     assert addresses == {first_host, second_host}
@@ -146,8 +146,8 @@ def test_rows_of_a_host_that_was_cut_off_are_collected(start: Start, hosts: TwoH
     away = [start(1, role, *INVITED, *kept, impatient=True) for role in ("netem", "controller")]
     run_dir = wait_recorded(tmp_path)
     with _cut_off(hosts):
-        errors = {process: ended(process)[1] for process in (*away, *at_home)}
-        ended(recording)
+        errors = {process: wait_for_end(process)[1] for process in (*away, *at_home)}
+        wait_for_end(recording)
     assert recording.returncode == 1
     steps = len(load_record(run_dir)["controller_step"])
     assert 0 < steps < 8 * live.RATE_HZ
@@ -177,7 +177,7 @@ def test_a_host_that_comes_back_loses_no_row(start: Start, hosts: TwoHosts, tmp_
     """The link is down until the recorder has given the other host's processes up for lost."""
     sets = (*live.settings(horizon_s=20.0), "--set", ROOMY)
     recording = record(start, tmp_path, "10.83.3.1", *sets, impatient=True)
-    processes = joined(start, "netem", "controller", ahead_s=AHEAD_S)
+    processes = start_processes(start, "netem", "controller", ahead_s=AHEAD_S)
     wait_recorded(tmp_path)
     assert recording.stderr is not None
     with _cut_off(hosts):
@@ -202,8 +202,10 @@ def _cut_off(hosts: TwoHosts) -> Iterator[None]:
     """Take the link down meanwhile."""
     command = ["ip", "-n", hosts.names[1], "link", "set", "line"]
     subprocess.run([*command, "down"], check=True)
-    yield
-    subprocess.run([*command, "up"], check=True)
+    try:
+        yield
+    finally:
+        subprocess.run([*command, "up"], check=True)
 
 
 @pytest.fixture
@@ -247,7 +249,7 @@ def test_a_run_starts_its_processes_on_another_host(
         *live.AT_RATE, *live.settings(horizon_s=3.0, network__encrypted=True),
         environment=on_path(ssh),
     )  # fmt: skip
-    stdout, stderr = ended(run)
+    stdout, stderr = wait_for_end(run)
     assert run.returncode == 0, stderr
     live.assert_complete(json.loads(stdout)["loops"][0])
     run_dir = (tmp_path / "runs" / "latest").resolve()
@@ -268,7 +270,7 @@ def test_a_process_that_does_not_start_on_its_host_ends_the_run(
 ) -> None:
     file = hosts_file(tmp_path, hosts.addresses[0][0], "/missing/noack")
     run = start(0, "run", "lane_following", "--hosts", file, *live.BARE, environment=on_path(ssh))
-    _, stderr = ended(run)
+    _, stderr = wait_for_end(run)
     assert run.returncode == 1
     assert "set `command` in the hosts file to the path of noack" in stderr.splitlines()[-1]
     assert "Traceback" not in stderr

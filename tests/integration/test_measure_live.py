@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from noack.traces.packet_trace import read_trace
-from tests.helpers.live_runs import Start, starting
+from tests.helpers.live_runs import Start, start_commands
 
 LONG_S = 120
 
@@ -18,7 +18,7 @@ LONG_S = 120
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Start]:
     """Start `noack WORDS`; what still runs at the end is killed."""
-    with starting() as begin:
+    with start_commands() as begin:
         yield partial(begin, cwd=tmp_path)
 
 

@@ -25,7 +25,7 @@ def is_whole(running: live.Running, table: str) -> bool:
 
 def kill(running: live.Running, role: str) -> None:
     """Kill a process that has rows on disk; wait until its replacement has, too."""
-    table = live.KEEPS[role]
+    table = live.ROWS_OF[role]
     live.wait_for(lambda: len(live.spooled(running, table)) > 0)
     before = live.child_of(running.process, role)
     assert before is not None
@@ -45,7 +45,7 @@ def let_run(running: live.Running, simulated_s: float) -> None:
 def restarted(tmp_path_factory: pytest.TempPathFactory) -> live.Finished:
     """A run in which the processes were killed one after the other."""
     folder = tmp_path_factory.mktemp("restarted")
-    with live.begun(folder) as start:
+    with live.start_runs(folder) as start:
         running = start(
             *live.settings(speed=3.0, horizon_s=4000.0, recovery__rejoin_within_s=60),
             *live.AT_RATE,
@@ -85,10 +85,10 @@ def record(restarted: live.Finished) -> RunRecord:
     return load_record(restarted.run_dir)
 
 
-def rows_of_life(record: RunRecord, table: str, place: int) -> Rows:
+def rows_of_generation(record: RunRecord, table: str, place: int) -> Rows:
     rows = record[table]
-    numbers: Rows = rows[generation_indices(rows, record.generation_numbers(OWNER[table])) == place]
-    return numbers
+    chosen: Rows = rows[generation_indices(rows, record.generation_numbers(OWNER[table])) == place]
+    return chosen
 
 
 def test_no_recorded_row_is_lost_and_all_rows_are_replayed(
@@ -106,21 +106,21 @@ def test_no_recorded_row_is_lost_and_all_rows_are_replayed(
 def test_a_restarted_sensor_and_network_begin_with_a_delivered_measurement(
     record: RunRecord,
 ) -> None:
-    first = rows_of_life(record, "sensor_measurement", 1)[0]
+    first = rows_of_generation(record, "sensor_measurement", 1)[0]
     assert first["event"] == GENERATION
     assert np.array_equal(first["x"], first["x_s"])
-    packets = rows_of_life(record, "netem_packet", 1)
+    packets = rows_of_generation(record, "netem_packet", 1)
     assert packets["consecutive_losses"][0] == 0
     assert packets["consecutive_losses"].max() <= 1
     # A restarted process has lost the accepted numbers; the generation identifies old messages.
     for table in ("sensor_measurement", "controller_delivery"):
-        last_ns = rows_of_life(record, table, 0)["t_ns"].max()
-        assert rows_of_life(record, table, 1)["t_ns"].min() > last_ns
+        last_ns = rows_of_generation(record, table, 0)["t_ns"].max()
+        assert rows_of_generation(record, table, 1)["t_ns"].min() > last_ns
 
 
 def test_a_restarted_controller_outputs_zero_until_its_first_update(record: RunRecord) -> None:
-    ticks = rows_of_life(record, "controller_step", 1)
-    deliveries = rows_of_life(record, "controller_delivery", 1)
+    ticks = rows_of_generation(record, "controller_step", 1)
+    deliveries = rows_of_generation(record, "controller_delivery", 1)
     waiting = ticks["input"] < deliveries["input"][0]
     assert not ticks["u"][waiting].any()
     assert (ticks["u"][~waiting] != 0).any()

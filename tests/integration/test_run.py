@@ -40,10 +40,10 @@ from tests.helpers.live_runs import (
     Finished,
     Running,
     assert_complete,
-    begun,
     run_scenario,
     settings,
     spooled,
+    start_runs,
     wait_for,
 )
 
@@ -54,7 +54,7 @@ CERTIFIED = "certified for the scenario's plant"
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     """A run on a machine that did not stall: a process that ends misses what others send later."""
     for _ in range(10):
-        with begun(tmp_path_factory.mktemp("finished")) as begin:
+        with start_runs(tmp_path_factory.mktemp("finished")) as begin:
             run = begin(*settings(speed=2.5, horizon_s=10.0), viewer=True).finish()
         if run.status or max(late["max"] for late in run.summary["loops"][0]["lateness_us"].values()) < 1e5:
             break

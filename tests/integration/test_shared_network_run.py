@@ -25,7 +25,7 @@ def different(tmp_path_factory: pytest.TempPathFactory) -> live.Finished:
         *live.settings(horizon_s=3.0, network__encrypted=True),
         "--set", change, "--set", f"network.impairments={queue}",
     )  # fmt: skip
-    with live.begun(tmp_path_factory.mktemp("different")) as start:
+    with live.start_runs(tmp_path_factory.mktemp("different")) as start:
         return start(*settings, command=("run", "different_loops")).finish()
 
 

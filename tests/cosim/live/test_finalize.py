@@ -282,7 +282,7 @@ def test_a_prepared_end_is_that_of_a_run_without_preparation(
 def test_the_end_does_not_wait_for_a_preparation_that_gets_no_time(
     many_loops: Path, monkeypatch: pytest.MonkeyPatch, part: str
 ) -> None:
-    """Nor for who writes tables, if it has not even made the folder in which it would be told."""
+    """A table writer that has not made its folder is not waited for either."""
     begun = Event()
 
     def endless(helpers: FinalizeHelpers, *_: object) -> None:
@@ -302,10 +302,8 @@ def test_the_end_does_not_wait_for_a_preparation_that_gets_no_time(
     assert len(finalize(ending, report=False, view=False).summary.loops) == LOOPS
 
 
-def test_the_end_waits_for_who_writes_the_rest_of_the_tables(
-    many_loops: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It has been told of the end, and is no longer at idle priority."""
+def test_the_end_waits_for_the_table_writer(many_loops: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The writer has seen the end file, and is no longer at idle priority."""
     begun, told = Event(), Event()
 
     def write(helpers: FinalizeHelpers, *_: object) -> None:
@@ -337,7 +335,7 @@ def _killed(*_: object) -> None:
 
 
 @pytest.mark.parametrize("part", [ReplayInHelper.part, _killed])
-def test_the_replay_beside_is_that_of_this_process_and_is_not_lost(
+def test_a_replay_in_a_helper_equals_one_in_this_process(
     run_dir: Path, monkeypatch: pytest.MonkeyPatch, part: Callable[..., Any]
 ) -> None:
     monkeypatch.setattr(finalize_helpers, "_MANY_STEPS", 10)

@@ -67,8 +67,8 @@ def test_the_outage_fit_covers_rate_and_duration() -> None:
         for index, (estimate, truth) in enumerate(((fit.rate_per_s, 1 / 20), (fit.duration_s, 3.0))):
             covered[index] += estimate is not None and estimate.low <= truth <= estimate.high
     assert (covered / 200 > 0.92).all()  # exact intervals cover at least 95 %
-    forty_s = np.full(40, 2.0) + 0.01 * np.arange(40)
-    assert "rejected" in fit_outages(forty_s, np.ones(40, bool), 500.0).text
+    near_equal_s = np.full(40, 2.0) + 0.01 * np.arange(40)
+    assert "rejected" in fit_outages(near_equal_s, np.ones(40, bool), 500.0).text
     assert "not rejected" in fit_outages(rng.exponential(2.0, 40), np.ones(40, bool), 500.0).text
     no_outages = fit_outages(np.zeros(0), np.zeros(0, bool), 100.0)
     assert no_outages.rate_per_s is not None

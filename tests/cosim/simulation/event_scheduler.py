@@ -136,7 +136,7 @@ class EventScheduler:
         self.scenario, self.loops, self.machines = scenario, loops, machines
         self._network = scenario.network.flows
         self._encoder = Encoder(RUN_ID, KEY)
-        self.decoders = {role: self._decoders(RECEIVES[role]) for role in RANKS | {"sensor": 3}}
+        self.decoders = {role: self._decoders(RECEIVES[role]) for role in (*RANKS, "sensor")}
         self.acknowledgements = self._decoders(Flow.ACKNOWLEDGEMENT)
         self._sent: deque[tuple[str, str, bytes]] = deque()
         self._now_ns = 0

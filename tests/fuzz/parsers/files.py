@@ -235,7 +235,7 @@ _IRTT = json.dumps({
         for k in range(5)
     ],
 }).encode()  # fmt: skip
-_FILES = [
+_CAPTURES = [
     pcapng_of(*_SENT, *_ARRIVED),
     pcap_of(*_SENT, link_type=ETHERNET, vlans=1),
     pcap_of(*_PROBES, order=">", nano=False),
@@ -244,7 +244,7 @@ _FILES = [
     _IRTT,
     b"0\n1\n1\n20\n",
 ]
-_FIELDS = [None, "0:4", "2:2:little", "0:8", "9999:1", "x"]
+_SEQUENCE_FIELDS = [None, "0:4", "2:2:little", "0:8", "9999:1", "x"]
 
 
 def captures_input(data: bytes) -> None:
@@ -253,9 +253,9 @@ def captures_input(data: bytes) -> None:
     options = SourceOptions(
         clocks_differ=choices.choose([None, False, True]),
         flow=choices.choose([1, 2, 3]),
-        sequence_at=choices.choose(_FIELDS),
+        sequence_at=choices.choose(_SEQUENCE_FIELDS),
     )
-    path.write_bytes(_damaged(choices, choices.choose(_FILES)))
+    path.write_bytes(_damaged(choices, choices.choose(_CAPTURES)))
     paths = [path]
     if choices.flag():
         other.write_bytes(pcapng_of(*_ARRIVED) if choices.flag() else path.read_bytes())
@@ -284,7 +284,7 @@ def _damaged(choices: Choices, content: bytes) -> bytes:
     return bytes(changed)
 
 
-_NAMES = ("scenario.toml", "record/plant_step.parquet", "../evil", "loops/a/summary.json", "a\\b")
+_ARCHIVED_NAMES = ("scenario.toml", "record/plant_step.parquet", "../evil", "loops/a/summary.json", "a\\b")
 
 
 def _zip(files: dict[str, bytes], *, valid: bool = True, kind: int = zipfile.ZIP_STORED) -> bytes:
@@ -306,7 +306,7 @@ def _zip(files: dict[str, bytes], *, valid: bool = True, kind: int = zipfile.ZIP
 ARCHIVES_SEEDS = [
     _zip({"scenario.toml": b"", "summary.json": b"{}"}),
     _zip({"scenario.toml": b"x" * 50}, valid=False),
-    *(_zip({name: b"content"}) for name in _NAMES),
+    *(_zip({name: b"content"}) for name in _ARCHIVED_NAMES),
     b"PK\x05\x06" + bytes(18),
 ]
 ARCHIVES_WORDS = [b"PK\x01\x02", b"PK\x03\x04", b"PK\x05\x06", MANIFEST.encode(), b"../", b"sha256"]

@@ -121,9 +121,9 @@ def files(acknowledged: bool, live: bool) -> Mapping[str, bytes]:
 def record_input(data: bytes) -> None:
     choices = Choices(data)
     content = dict(files(choices.flag(), choices.flag()))
-    spooled = choices.below(3)  # 0 recorded, 1 interrupted, 2 recorded with rows left in the spool
+    stage = choices.below(3)  # 0 recorded, 1 interrupted, 2 recorded with rows left in the spool
     for name in list(content):
-        if (name.startswith(RECORD) and spooled == 1) or (name.startswith(SPOOL) and spooled == 0):
+        if (name.startswith(RECORD) and stage == 1) or (name.startswith(SPOOL) and stage == 0):
             del content[name]
     whole = list(content)
     for _ in range(choices.below(4)):

@@ -11,7 +11,8 @@ import pytest
 
 from cosim.analysis.claims import claim_catalogue
 from cosim.analysis.claims.claim_catalogue import CertifiedClaim, ClaimDefinition
-from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, RunClaims, definitions
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, RunClaims, definitions, list_violations
+from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.analysis.summary.summary_model import Claim, ClaimVerdict
 from cosim.record.align import aligned_parts
 from cosim.record.run_record import RunRecord
@@ -31,6 +32,7 @@ from noack.scenario.scenario_file import validate
 from tests.cosim.analysis.claims.conftest import MS, Make, event_s, without
 from tests.cosim.record.changed_records import CONTENT as CHANGING
 from tests.cosim.record.changed_records import changed
+from tests.cosim.simulation.outage import with_outage
 from tests.helpers.shipped import resolved
 from tests.oracles.random_scenarios import POLICIES, random_scenario
 
@@ -430,6 +432,17 @@ def test_a_part_is_void_with_the_reason() -> None:
             assert claim.verdict is ClaimVerdict.VOID
             assert claim.since_s == since_s or since_s is None
             assert why in claim.why
+
+
+def test_the_summary_lists_every_violated_assumption() -> None:
+    """The controller stands still from 0.5 s to 0.7 s."""
+    outage = with_outage(resolved("lane_following", "horizon_s=1"), 0.5, 0.7)
+    reported = summarise_loop(outage, 0, "horizon").assumption_violations
+    assert reported == []  # no process detects that an input is old
+    (violation,) = list_violations(reported, RunClaims(outage).violations())
+    assert (violation.cause, violation.t_s, violation.process) == ("hold", pytest.approx(0.506), "recorder")
+    assert violation.what == "an input was 0.203 s old, 0.007 s allowed"
+    assert violation.worst_at_s == pytest.approx(0.7)
 
 
 # --- stopped runs --------------------------------------------------------------------------------

@@ -11,11 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zenoh
-from rich.console import Console
 
-from cosim.analysis.claims.claim_evaluation import RunClaims, list_violations
-from cosim.analysis.summary.loop_summary import summarise_loop
-from cosim.live.monitoring.progress import progress_line
 from cosim.live.recording import recorder
 from cosim.live.recording.recorder import Recorder
 from cosim.output.viewer.loop_recording import ViewError
@@ -271,15 +267,6 @@ def test_a_violation_found_at_the_end_is_reported_unless_the_run_was_stopped(
     assert [notice for notice in late.warnings if notice] == [[notice["text"]] for notice in notices]
 
 
-def test_the_summary_lists_every_violated_assumption(outage: RunRecord) -> None:
-    reported = summarise_loop(outage, 0, "horizon").assumption_violations
-    assert reported == []  # no process detects that an input is old
-    (violation,) = list_violations(reported, RunClaims(outage).violations())
-    assert (violation.cause, violation.t_s, violation.process) == ("hold", pytest.approx(0.506), "recorder")
-    assert violation.what == "an input was 0.203 s old, 0.007 s allowed"
-    assert violation.worst_at_s == pytest.approx(0.7)
-
-
 def test_of_many_warnings_the_last_names_the_place_of_the_others() -> None:
     report = recorder.ProgressReport(
         t_s=0.0, events=0, deliveries=0, longest_loss_burst=0, x_norm=None, live=None
@@ -300,19 +287,3 @@ def test_missing_rows_are_reported_as_an_unknown_result(outage: RunRecord, late:
         "claims are checked after the run only: telemetry is missing or arrived out of order"
     ]
     assert late.finished().notices == []
-
-
-@pytest.mark.parametrize("terminal", [True, False])
-def test_the_terminal_reports_each_cause_once(outage: RunRecord, terminal: bool) -> None:
-    shown = io.StringIO()
-    report: dict[str, Any] = {
-        "t_s": 0.5, "events": 3, "deliveries": 2, "longest_loss_burst": 1, "x_norm": 1.0,
-        "live": None,
-    }  # fmt: skip
-    console = Console(file=shown, force_terminal=terminal, width=200)
-    with progress_line(console, outage.scenario) as watcher:
-        watcher.started(Path())
-        for void in ([], ["one [cause]"], ["one [cause]"], ["one [cause]", "another"]):
-            watcher.progress(RunProgress(**report, warnings=void))
-    assert shown.getvalue().count("one [cause]") == 1
-    assert shown.getvalue().count("another") == 1
