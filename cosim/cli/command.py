@@ -1,7 +1,6 @@
 """Declaration of ``noack``'s commands, what they print, and the program that runs them."""
 
 import inspect
-import io
 import math
 import pkgutil
 import re
@@ -15,13 +14,14 @@ from importlib import import_module
 from itertools import groupby, pairwise
 from json import dumps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Concatenate, ParamSpec, TextIO, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Concatenate, ParamSpec, TypeVar
 
 import typer
 from typer import Option
 from typer.core import TyperGroup, TyperOption
 
 from cosim.cli import commands
+from cosim.cli.pipe_safe_streams import ignore_broken_pipes
 from cosim.lazy_modules import lazy_modules
 from noack.core.errors import ExitStatus, NoackError, plain_mistake, printable, why
 from noack.core.system_processes import exhausted_limit
@@ -36,7 +36,6 @@ with lazy_modules():
     from noack.core import core_library
 
 if TYPE_CHECKING:
-    from _typeshed import ReadableBuffer
     from rich.console import Console
     from rich.status import Status
     from typer._click.core import Command, Context, Parameter
@@ -148,42 +147,6 @@ def examples_of(command: "Command") -> list[str]:
     lines = (command.epilog or "").splitlines()
     commands = (line.strip().partition("   ")[0] for line in lines)
     return [line for line in commands if line.startswith(f"{NAME} ")]
-
-
-def ignore_broken_pipes() -> None:
-    """Discard output to a standard stream after its reader has closed it.
-
-    Hence `noack run ... | head -1` runs to its end, with the run's exit status.
-    """
-    sys.stdout, sys.stderr = pipe_safe_stream(sys.stdout), pipe_safe_stream(sys.stderr)
-
-
-def pipe_safe_stream(stream: TextIO) -> TextIO:
-    """Return a standard stream that discards output after its reader has closed it."""
-    if not isinstance(stream, io.TextIOWrapper):  # the shell closed it by >&-
-        return stream
-    return io.TextIOWrapper(
-        io.BufferedWriter(_PipeSafeFile(stream.fileno(), "w", closefd=False)),
-        encoding=stream.encoding,
-        errors="replace",  # a terminal that cannot show ‖x‖ gets ?x?
-        # PYTHONUNBUFFERED requests more than lines; readers wait for lines.
-        line_buffering=stream.line_buffering or stream.write_through,
-    )
-
-
-class _PipeSafeFile(io.FileIO):
-    """Raises one error if the disk is full; the rest, written at the end, is discarded."""
-
-    _full = False
-
-    def write(self, data: "ReadableBuffer", /) -> int:
-        try:
-            return super().write(data)
-        except OSError as error:
-            if not self._full and not isinstance(error, BrokenPipeError):
-                self._full = True
-                raise
-            return memoryview(data).nbytes
 
 
 _TOUR = (

@@ -51,6 +51,8 @@ EXTRAS = {
 """Extras of noack by name: one module that each installs, and what it is for."""
 _DATAGRAM = bytes(72)
 _ROUND_TRIPS = 1000
+_TOO_MANY_LOST = 3
+"""Lost datagrams after which no more are sent."""
 _FLOOD_DATAGRAMS = 20_000
 _WRITE_BYTES = 32 * 1024 * 1024
 _PROBE_TIMEOUT_S = 20.0
@@ -263,7 +265,7 @@ def lateness(late_ns: Iterable[int], allowance_ns: int) -> Lateness | str:
 
 
 def _round_trips_us(endpoint: socket.socket) -> list[float]:
-    """Return the times of the datagrams that come back; raise MachineError if three do not."""
+    """Return the times of the datagrams that come back; raise MachineError if too many do not."""
     times_us: list[float] = []
     for number in range(_ROUND_TRIPS):
         began_ns = time.perf_counter_ns()
@@ -271,7 +273,7 @@ def _round_trips_us(endpoint: socket.socket) -> list[float]:
             endpoint.send(_DATAGRAM)
             endpoint.recv(len(_DATAGRAM) + 1)
             times_us.append((time.perf_counter_ns() - began_ns) * 1e-3)
-        if number - len(times_us) >= 2:
+        if number + 1 - len(times_us) >= _TOO_MANY_LOST:
             raise MachineError("datagrams on the loopback are lost")
     return times_us
 

@@ -336,7 +336,7 @@ class ChainFits:
         rates = _ordered(best.at)
         return ChainFit("gilbert_elliott", rates, estimates, -best.value, 4)
 
-    def tested(self, fit: ChainFit) -> FitTest:
+    def test(self, fit: ChainFit) -> FitTest:
         """Return the test of the lengths of bursts and deliveries."""
         return length_test(self._bursts, self._left_out, fit.rates, fit.parameters)
 

@@ -226,12 +226,12 @@ class NetworkMeasurement:
     @cached_property
     def models(self) -> dict[str, FittedModel]:
         """The fitted loss models, by name; empty without losses."""
-        return {fit.model: FittedModel(fit, self._fits.tested(fit)) for fit in self._fits.all()}
+        return {fit.model: FittedModel(fit, self._fits.test(fit)) for fit in self._fits.all()}
 
     @cached_property
     def chosen(self) -> FittedModel:
         """The model that the Bayesian information criterion prefers."""
-        return FittedModel(self._fits.chosen, self._fits.tested(self._fits.chosen))
+        return FittedModel(self._fits.chosen, self._fits.test(self._fits.chosen))
 
     @cached_property
     def outage_fit(self) -> OutageFit:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaln
 
 from cosim.lazy_modules import lazy_modules
-from cosim.measurement.chain_fits import ChainFits
+from cosim.measurement.chain_fits import SIGNIFICANCE, ChainFits
 from cosim.measurement.interval_estimates import IntervalEstimate, exponential_estimate, poisson_estimate
 from cosim.measurement.loss_bursts import Flags, LossBursts
 
@@ -116,7 +116,7 @@ class OutageFit:
         """The result of the test in words."""
         if self.p_value is None:
             return f"too few outages for a test of their durations (fewer than {FEWEST_OUTAGES})"
-        verdict = "rejected" if self.p_value < 0.01 else "not rejected"
+        verdict = "rejected" if self.p_value < SIGNIFICANCE else "not rejected"
         return f"exponential durations {verdict}: Anderson–Darling, p = {self.p_value:.2g}"
 
 

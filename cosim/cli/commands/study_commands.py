@@ -22,7 +22,7 @@ from noack.runtime.command_line import print_to_stderr
 with lazy_modules():
     from cosim.output import result_tables
     from cosim.studies.campaign import campaign_file, campaign_grid, campaign_report
-    from cosim.studies.capacity import capacity_page, capacity_plan, capacity_result, study_time
+    from cosim.studies.capacity import capacity_page, capacity_plan, capacity_result, loop_kinds, study_time
     from cosim.studies.paper import paper_page, published_result
     from cosim.studies.paper import results as paper_results
     from noack.scenario import run_sections, scenario_file
@@ -182,12 +182,12 @@ class StudyOptions(opt.ScenarioOptions):
         for option, seconds in (("--update-period", self.update_period), ("--late-after", self.late_after)):
             if seconds is not None and not 0 < seconds < loaded.horizon_s:
                 raise CallerError(f"{option} {seconds:g}: between 0 and the horizon of the scenario")
-        kinds = capacity_plan.kinds_of(loaded, self.update_period)
+        kinds = loop_kinds.kinds_of(loaded, self.update_period)
         shortest_s = min(kind.period_s for kind in kinds)
         deadline_s = self.late_after or loaded.certificate.network_delay_s or shortest_s
         settings["certificate.network_delay_s"] = deadline_s
         capacity_plan.require_in_time(loaded, kinds, deadline_s)
-        least = capacity_plan.smallest_mixture(kinds)
+        least = loop_kinds.smallest_mixture(kinds)
         if self.loops is None:
             carried = capacity_plan.periodic_loops(loaded, kinds)
             counts = capacity_plan.default_counts(carried, least, defaults)
@@ -204,7 +204,7 @@ class StudyOptions(opt.ScenarioOptions):
             settings=settings,
             deadline_s=deadline_s,
             counts=counts,
-            policies=capacity_plan.policies_of(kinds) | self._policies(kinds),
+            policies=loop_kinds.policies_of(kinds) | self._policies(kinds),
             amplitude=defaults.amplitude,
             draws=defaults.draws,
             seed=self.seed,
@@ -220,9 +220,9 @@ class StudyOptions(opt.ScenarioOptions):
             defaults = defaults._replace(amplitude=self.disturbance)
         return defaults
 
-    def _policies(self, kinds: "Sequence[capacity_plan.LoopKind]") -> dict[str, dict[str, Any]]:
+    def _policies(self, kinds: "Sequence[loop_kinds.LoopKind]") -> dict[str, dict[str, Any]]:
         """Return the settings of the policies that are compared, too, by name."""
-        known = {capacity_plan.PERIODIC, capacity_plan.ZOH, capacity_plan.MODEL}
+        known = {loop_kinds.PERIODIC, loop_kinds.ZOH, loop_kinds.MODEL}
         by_name: dict[str, dict[str, Any]] = {}
         for text in self.policy or ():
             name, equals, trigger = text.partition("=")

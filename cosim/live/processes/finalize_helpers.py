@@ -207,6 +207,7 @@ class FinalizeHelpers:
 
     def _abort(self) -> None:
         """End the processes, also those that still compute."""
+        # After an exception `processes` does not wait for them.
         self._stack.__exit__(TimeoutError, TimeoutError(), None)
 
 

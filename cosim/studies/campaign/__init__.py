@@ -4,7 +4,8 @@
    scenario and the work for its draws.
 2. ``random_draws.py``: the draws of a grid point. Ideal loops are followed exactly
    (``cosim/simulation/exact_simulation.py``), others in virtual time (``drawn_runs.py``).
-3. ``campaign_workers.py`` computes chunks of draws, ``chunk_store.py`` stores them.
+3. ``campaign_workers.py`` computes chunks of draws, ``chunk_store.py`` stores them; all processes
+   must have the same code, libraries and arithmetic (``arithmetic.py``).
 4. ``metrics.py``: the metrics and their confidence intervals. ``campaign_summary.py``: every metric
    at every grid point, and the verdicts of the campaign's claims.
 5. ``campaign_figures.py``, ``campaign_report.py``: figures, page, JSON and tables.

@@ -1,98 +1,27 @@
 """Computes the chunks of a campaign: in processes of this machine or on a Dask cluster.
 
-Chunks are independent of each other. Only this process writes results. They depend bit by bit on
-code, libraries and arithmetic, so workers must have the same; this comes first.
+Chunks are independent of each other. Only this process writes results. Workers must have the same
+code, libraries and arithmetic (``arithmetic.py``).
 """
 
 import logging
 import math
-import platform
 import socket
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
-from functools import cache
-from hashlib import blake2b
-from importlib import metadata
-from importlib.util import find_spec
 from itertools import islice
-from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 from urllib.parse import urlsplit
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm
 
 from cosim.live.processes.process_pool import process_starts, processes
-from noack.core.core_library import SOURCES
+from cosim.studies.campaign.arithmetic import arithmetic, difference
 from noack.core.errors import CallerError, PeerError
-
-_PACKAGES = ("noack", "numpy", "scipy", "numba", "llvmlite")
-"""The last two, if they are installed, compile the equations of vehicles with tyres."""
-_CODE = ("noack", "netem", "cosim", "plant_server", "sensor_node", "controller_node")
-_NO_CODE_OF_RUNS = ("cli", "output", "studies")
-
-
-@cache
-def arithmetic() -> Mapping[str, str]:
-    """Return names with values; if all values are equal, the results are equal bit by bit.
-
-    ``rounding`` is a digest of computations on fixed matrices, because libraries select their
-    instructions by the processor.
-    """
-    return {
-        **{name: _version(name) for name in _PACKAGES},
-        "Python": ".".join(platform.python_version_tuple()[:2]),
-        "noack's code": _code(),
-        "noack's core": SOURCES,
-        "machine": platform.machine(),
-        "rounding": _rounding(),
-    }
-
-
-def difference(stored: Mapping[str, str], running: Mapping[str, str]) -> str | None:
-    """Return the first difference as text; None if there is none."""
-    for name in running:
-        if stored.get(name) != running[name]:
-            return f"{name} is {stored.get(name, 'unknown')} there, {running[name]} here"
-    return None
-
-
-def _version(package: str) -> str:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return "not installed"
-
-
-def _code() -> str:
-    digest = blake2b(digest_size=8)
-    for package in _CODE:
-        root = Path(str(find_spec(package).origin)).parent  # type: ignore[union-attr]
-        for path in sorted(root.rglob("*.py")):
-            name = path.relative_to(root)
-            if package != "cosim" or name.parts[0] not in _NO_CODE_OF_RUNS:
-                digest.update(path.read_bytes())
-    for module in ("random_draws.py", "drawn_runs.py"):
-        digest.update(Path(__file__).with_name(module).read_bytes())
-    return digest.hexdigest()
-
-
-def _rounding() -> str:
-    # Exact entries, rank 6; the computed rank depends on the processor.
-    matrix = (np.arange(1, 50) * 7919 % 101 - 50).reshape(7, 7) / 64
-    regular = matrix + 8 * np.eye(7)  # diagonally dominant
-    parts = (
-        expm(matrix),
-        matrix @ matrix,
-        np.linalg.solve(regular, matrix[:, :2]),
-        np.exp(matrix),
-        np.linalg.norm(matrix, axis=1),
-    )
-    return blake2b(b"".join(part.tobytes() for part in parts), digest_size=8).hexdigest()
 
 
 class Work(Protocol):

@@ -18,16 +18,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from cosim.studies.campaign.arithmetic import arithmetic, difference
 from cosim.studies.campaign.campaign_file import Campaign
 from cosim.studies.campaign.campaign_grid import Point, row_type
-from cosim.studies.campaign.campaign_workers import (
-    Chunk,
-    LostWorkersError,
-    OtherArithmeticError,
-    Runner,
-    arithmetic,
-    difference,
-)
+from cosim.studies.campaign.campaign_workers import Chunk, LostWorkersError, OtherArithmeticError, Runner
 from noack.core.errors import CallerError, ExitStatus, MachineError, NoackError, shortened, why
 from noack.core.file_access import PARTIAL, locked, write_whole
 

@@ -19,15 +19,7 @@ from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.studies.campaign.campaign_figures import curve_figure
 from cosim.studies.campaign.campaign_summary import CampaignSummary
 from cosim.studies.campaign.metrics import METRICS
-from cosim.studies.capacity.capacity_plan import (
-    COMMON,
-    DISTURBANCE,
-    LOOPS,
-    OWN,
-    PERIODIC,
-    POLICY,
-    CapacityPlan,
-)
+from cosim.studies.capacity.capacity_plan import COMMON, DISTURBANCE, LOOPS, OWN, POLICY, CapacityPlan
 from cosim.studies.capacity.capacity_result import (
     COST_FACTOR,
     LATE,
@@ -37,6 +29,7 @@ from cosim.studies.capacity.capacity_result import (
     LivePoint,
     PolicyCapacity,
 )
+from cosim.studies.capacity.loop_kinds import PERIODIC
 from noack.core.file_access import write_whole
 from noack.core.number_format import number
 from noack.scenario.link_load import update_delay

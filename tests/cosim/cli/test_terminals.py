@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from cosim.cli.command import pipe_safe_stream
+from cosim.cli.pipe_safe_streams import pipe_safe_stream
 
 NOACK = (sys.executable, "-m", "cosim.cli")
 ROOT = Path(__file__).parents[3]

@@ -13,12 +13,12 @@ import psutil
 import pytest
 
 from cosim.studies.campaign import campaign_workers
+from cosim.studies.campaign.arithmetic import arithmetic
 from cosim.studies.campaign.campaign_workers import (
     Chunk,
     Finished,
     LostWorkersError,
     Work,
-    arithmetic,
     cluster_runner,
     run_in_process,
 )
@@ -47,15 +47,6 @@ def test_large_matrices_are_rounded_as_in_the_processes_of_a_run() -> None:
         environment = os.environ | {"OPENBLAS_NUM_THREADS": threads}
         outputs.add(subprocess.check_output([sys.executable, "-c", script], env=environment))
     assert len(outputs) == 1
-
-
-def test_the_digest_of_the_code_has_every_package_that_a_run_imports() -> None:
-    script = "import sys, cosim.simulation.sampled_loop, cosim.simulation.virtual_time; print(*sys.modules)"
-    imported = subprocess.check_output([sys.executable, "-c", script], text=True).split()
-    packages = {name.partition(".")[0] for name in imported}
-    root = Path(campaign_workers.__file__).parents[3]
-    own = {path.parent.name for path in root.glob("*/__init__.py")} & packages
-    assert {"noack", "plant_server"} <= own == {*campaign_workers._CODE}
 
 
 def contents(folder: Path) -> dict[str, bytes]:

@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from cosim.studies.capacity.capacity_plan import CapacityPlan, kinds_of, policies_of
+from cosim.studies.capacity.capacity_plan import CapacityPlan
+from cosim.studies.capacity.loop_kinds import kinds_of, policies_of
 from noack.scenario.scenario_file import load
 
 FILE = Path(__file__).parents[4] / "scenarios" / "shared_bottleneck.toml"

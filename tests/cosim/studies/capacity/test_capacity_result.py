@@ -13,13 +13,14 @@ from cosim.studies.campaign.campaign_workers import run_in_process
 from cosim.studies.campaign.chunk_store import Store, run_campaign
 from cosim.studies.campaign.metrics import estimate
 from cosim.studies.capacity.capacity_page import CapacityResult
-from cosim.studies.capacity.capacity_plan import CapacityPlan, kinds_of, policies_of
+from cosim.studies.capacity.capacity_plan import CapacityPlan
 from cosim.studies.capacity.capacity_result import (
     PolicyCapacity,
     capacities,
     capacity_of,
     prediction_interval,
 )
+from cosim.studies.capacity.loop_kinds import kinds_of, policies_of
 from noack.scenario.scenario_file import load
 from tests.cosim.studies.capacity.conftest import FILE, LOOP, PERIOD_S, plan_of
 
