@@ -86,17 +86,17 @@ def test_the_preferred_model_is_the_true_one() -> None:
         bursts = loss_bursts(~chain_losses(8000, truth, seed=5))
         fits = ChainFits(bursts)
         assert fits.chosen.model == name
-        assert fits.tested(fits.chosen).verdict == "not rejected"
+        assert fits.test(fits.chosen).verdict == "not rejected"
 
 
 def test_the_test_of_lengths_rejects_at_its_level_and_wrong_models() -> None:
     tests = []
     for seed in range(100):
         fits = ChainFits(loss_bursts(~chain_losses(3000, GILBERT, seed)))
-        tests.append(fits.tested(fits.gilbert).p_value)
+        tests.append(fits.test(fits.gilbert).p_value)
     p_values = np.array(tests, float)
     assert 0.01 < (p_values < 0.05).mean() < 0.12
     fits = ChainFits(loss_bursts(~chain_losses(8000, ELLIOTT, seed=2)))
-    assert fits.tested(fits.gilbert).verdict == "rejected"
+    assert fits.test(fits.gilbert).verdict == "rejected"
     few = ChainFits(loss_bursts(~np.array([0, 1, 0, 0, 1, 1, 0], bool)))
-    assert "too few" in few.tested(few.gilbert).verdict
+    assert "too few" in few.test(few.gilbert).verdict
