@@ -19,7 +19,7 @@ from native.build import HEADER
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("noack", "plant_server", "sensor_node", "controller_node", "netem", "cosim")
 EXEMPT = ("__init__", "__main__")
-MOST_MODULES = 478
+MOST_MODULES = 481
 LINES = {
     "noack/scenario": 4180,
     "noack/controllers": 270,
@@ -39,7 +39,7 @@ LINES = {
     "netem": 6660,
     "cosim/analysis": 8490,
     "cosim/api": 1695,
-    "cosim/cli": 3490,
+    "cosim/cli": 3500,
     "cosim/doctor": 815,
     "cosim/interactive": 1870,
     "cosim/lab": 2005,
@@ -47,14 +47,14 @@ LINES = {
     "cosim/measurement": 2995,
     "cosim/output": 8740,
     "cosim/record": 3695,
-    "cosim/simulation": 2000,
-    "cosim/studies": 9640,
+    "cosim/simulation": 2005,
+    "cosim/studies": 9645,
     "plant_server": 420,
     "sensor_node": 400,
     "controller_node": 410,
     "benchmarks": 3760,
     "native": 11480,
-    "tests": 51585,
+    "tests": 51595,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 

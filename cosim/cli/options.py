@@ -114,15 +114,15 @@ def _usable_folder(folder: Path | None) -> Path | None:
     return folder
 
 
-def _usable_path(path: Path | None) -> Path | None:
+def usable_path(path: Path | None) -> Path | None:
     """Refuse a file or folder that cannot be written, before anything is computed."""
     if path is not None:
         _usable_folder(path if path.is_dir() else path.parent)
     return path
 
 
-OutOption = Annotated[Path | None, Option("--out", callback=_usable_path)]
-OutWithDefault = Annotated[Path, Option("--out", callback=_usable_path)]
+OutOption = Annotated[Path | None, Option("--out", callback=usable_path)]
+OutWithDefault = Annotated[Path, Option("--out", callback=usable_path)]
 
 
 class TriggerMode(StrEnum):

@@ -284,7 +284,7 @@ def fidelity_rows(fidelity: FidelityPart | NoFidelityPart | None) -> Iterator[tu
         yield "difference to the ideal loop", f"not compared: {fidelity.reason}"
         return
     scale = fidelity.rms_x_live
-    of_x = f" ({100 * fidelity.rms_x / scale:.2g} % of x)" if scale else ""
+    of_x = f" ({number(100 * fidelity.rms_x / scale, 3)} % of x)" if scale else ""
     yield "difference to the ideal loop, RMS", f"{fidelity.rms_x:.3g}{of_x}"
     for name, share in fidelity.shares.items():
         if name != "residual":

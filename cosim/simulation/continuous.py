@@ -31,6 +31,7 @@ from cosim.simulation.exact_simulation import (
     TOO_MANY_EVENTS,
     EventLog,
     ExactSimulation,
+    left_out,
     timeless,
     vanished_error,
     vanishes_s,
@@ -424,6 +425,8 @@ class ContinuousSummary(NamedTuple):
     final_state_norm: float
     sup_state_norm: float
     diverged_at_s: float | None
+    left_out: str
+    """The kinds of the network's impairments that do not exist in continuous time; empty if none."""
     exit_status: ExitStatus
     reason: str
 
@@ -457,6 +460,7 @@ def summary(run: ContinuousRun, resolved: Scenario) -> ContinuousSummary:
         final_state_norm=float(np.linalg.norm(samples.x[-1])),
         sup_state_norm=float(np.linalg.norm(samples.x, axis=1).max()),
         diverged_at_s=None if diverged is None else diverged.at_s,
+        left_out=left_out(resolved.network.link),
         exit_status=ExitStatus.OK if diverged is None else ExitStatus.FAILED,
         reason="horizon" if diverged is None else diverged.text,
     )

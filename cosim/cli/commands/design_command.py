@@ -180,7 +180,7 @@ class DesignFiles:
     """
 
     out: opt.OutOption = None
-    page: Path | None = None
+    page: Annotated[Path | None, Option(callback=opt.usable_path)] = None
 
     def page_of(self, name: str) -> Path:
         """Return the file of the page.

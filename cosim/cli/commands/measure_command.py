@@ -132,7 +132,7 @@ class WrittenOptions(opt.FigureOptions):
     )
     settings: opt.SetOption = None
     out: opt.OutOption = None
-    write: Path | None = None
+    write: Annotated[Path | None, Option(callback=opt.usable_path)] = None
     form: Annotated[NetworkForm, Option("--as")] = NetworkForm.TRACE
 
     def request(self) -> "measurement_outputs.OutputRequest":

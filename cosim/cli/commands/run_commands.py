@@ -165,7 +165,7 @@ def simulate(
 
     Examples:
         noack simulate lane_following   the processes of a live run, without sockets
-        noack simulate lane_following --trigger continuous   the paper's loop, exactly
+        noack simulate lane_following --trigger continuous   the paper's loop, exactly, without delays
         noack simulate reactor_petc --no-report --json   print the summary as JSON
     """
     loaded = source.load()
@@ -215,6 +215,7 @@ def _print_run(
         ),
         ("‖x‖ at the start", number(summary.initial_state_norm)),
         ("‖x‖ at the end", number(summary.final_state_norm)),
+        *([("left out of the network", summary.left_out)] if summary.left_out else ()),
     )
     title = run_tables.title_of(summary.scenario, summary.mode, summary.mansd, constraints, "continuous")
     terminal_output.print_numbers(console, title, rows)

@@ -177,7 +177,7 @@ def test_the_report_names_what_is_not_explained_or_not_replayed(record: RunRecor
     text = shown(record, fidelity=fidelity, replay=replay)
     for words in (
         "the residual is 40 % of the difference, which is too large",
-        "Event 7 is the first that differs", "-42.0 %", "12 % of x itself",
+        "Event 7 is the first that differs", "-42.0 %", "12.5 % of x itself",
         "differs from its record", "plant_step row 7, x_1: another x: recorded 1.0",
         "The record has gaps",
     ):  # fmt: skip

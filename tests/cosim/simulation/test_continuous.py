@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -248,6 +249,7 @@ def test_the_command_names_what_it_leaves_out_and_all_that_limits_losses() -> No
     delay = 'network.impairments=[{kind="delay", delay_s=0.5}]'
     result = invoke("simulate", "lane_constrained", "--trigger", "continuous", "--set", delay)
     assert "longest loss burst (at most 3 allowed)" in result.stdout
+    assert re.search("left out of the network +│ +delay ", result.stdout)
     assert result.stderr == (
         "noack: warning: network.impairments: delay: left out, in continuous time the network has no delay\n"
     )
