@@ -140,6 +140,6 @@ def test_the_glossary_has_the_limits_that_decide_the_words() -> None:
 def test_a_run_that_ends_before_its_first_input_is_due_keeps_its_guarantee() -> None:
     """Of 10 ms, it was said that no input came where the first has to come within 34 ms."""
     delay = {"network.impairments": [{"kind": "delay", "delay_s": 0.02}]}
-    for horizon_s in (0.01, 0.2):
+    for horizon_s, held in ((0.01, 8), (0.2, 11)):  # nothing is compared for the other claims
         summary = noack.simulate(noack.load("lane_weighted", {"horizon_s": horizon_s, **delay})).summary
-        assert verdict(summary)[1].text == "guarantee kept: 8 claims held, none violated"
+        assert verdict(summary)[1].text == f"guarantee kept: {held} claims held, none violated"
