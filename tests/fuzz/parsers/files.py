@@ -17,7 +17,7 @@ import tomli_w
 from cosim.measurement.trace_sources import SourceOptions, read_source
 from cosim.studies.campaign import campaign_file
 from cosim.studies.campaign.campaign_grid import grid
-from cosim.studies.run_archive import MANIFEST, unpack
+from cosim.studies.run_archive import MANIFEST, Manifest, unpack
 from noack.core.errors import NoackError
 from noack.impairments.kinds.blackout import Blackout
 from noack.impairments.kinds.delay import Delay
@@ -287,17 +287,17 @@ def _damaged(choices: Choices, content: bytes) -> bytes:
 _ARCHIVED_NAMES = ("scenario.toml", "record/plant_step.parquet", "../evil", "loops/a/summary.json", "a\\b")
 
 
-def _zip(files: dict[str, bytes], *, valid: bool = True, kind: int = zipfile.ZIP_STORED) -> bytes:
+def _zip(files: dict[str, bytes], *, valid: bool = True) -> bytes:
     entries = {
         name: {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
         for name, content in files.items()
     }
     manifest = {
-        "format": "noack run archive 1", "scenario": "a", "kind": "simulated",
+        "format": Manifest.model_fields["format"].default, "scenario": "a", "kind": "simulated",
         "files": entries if valid else {},
     }  # fmt: skip
     buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", kind) as file:
+    with zipfile.ZipFile(buffer, "w") as file:
         for name, content in {MANIFEST: json.dumps(manifest).encode(), **files}.items():
             file.writestr(zipfile.ZipInfo(name), content)
     return buffer.getvalue()
