@@ -108,9 +108,7 @@ def paper(
         return ExitStatus.OK
     if name is not None:
         if out is not None or draws is not None:
-            raise CallerError(
-                "--out, --draws: are for `noack paper` without a name; this has --tables FOLDER"
-            )
+            raise CallerError("--out, --draws: are for `noack paper` without a name; this has --tables")
         with cli.status("computing"):
             result = paper_results.reproduce(name)
         cli.show(json, result.to_json, published_result.print_rows, result)
