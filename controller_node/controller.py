@@ -97,7 +97,7 @@ class LossCheck:
         return [Notice(event_ns, "violation", text) for text in texts]
 
     def _check_burst(self, sequence: int, losses: int, newest_ns: int, now_ns: int) -> str:
-        """Compare with the largest limit in force since the update before."""
+        """Return the violation of the largest limit since the update before; else an empty text."""
         allowed = _longest_burst(self._guarantee)
         if losses > allowed and self._schedule is not None:
             scenarios = self._schedule.between(newest_ns, now_ns)
@@ -109,7 +109,7 @@ class LossCheck:
         )
 
     def _check_further_rules(self, sequence: int, losses: int) -> list[str]:
-        """Return the violations of the other rules, of each rule the largest."""
+        """Return the largest violation of each further rule."""
         if not self._further_rules:
             return []
         worst: dict[LossRule, int] = {}

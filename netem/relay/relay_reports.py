@@ -124,7 +124,7 @@ def coarse_histogram(counts: NDArray[np.int64]) -> list[list[int]]:
 
 
 def quantile_ns(counts: Sequence[int] | NDArray[np.int64], share: float) -> float:
-    """Return the quantile of a level in ns, accurate to 3 %; nan if the histogram is empty."""
+    """Return the quantile at ``share`` in ns, accurate to 3 %; nan if the histogram is empty."""
     reached = np.cumsum(counts)
     if reached[-1] == 0:
         return float("nan")

@@ -27,7 +27,7 @@ Reals = NDArray[np.float64]
 SCRATCH_MATRICES = 10
 """Matrices of a matrix's size that the core needs for scratch, for its exponential."""
 _MOST_PLACES, _MOST_NUMBERS = 1024, 2**20
-"""Matrices that transitions keep, and their numbers."""
+"""Maximum number of matrices that transitions keep, and of their entries."""
 _REMEDY = "run `make setup` in the repository, or install noack again"
 
 try:

@@ -13,7 +13,7 @@ from noack.core.linear_systems import Matrix, Vector
 _SAFE = 1e-140
 """Squares of vectors between this size and its inverse neither underflow nor overflow."""
 _MOST_IN_TURN = 8
-"""Of fewer terms, numpy computes a sum in turn; it takes ten times as long for many short rows."""
+"""numpy, too, adds fewer terms one after the other, but takes ten times as long for many short rows."""
 
 
 def row_norms(rows: Matrix) -> Vector:

@@ -39,7 +39,7 @@ class Part:
     key: str
     """The key of the value; if it has several parts, their keys, with spaces between them."""
     quantity: Quantity[Any] | None = None
-    """Name of the value; None: the word alone implies the settings."""
+    """Kind of the value; None: the word alone implies the settings."""
     symbol: str = ""
     """The value, in ``--help``."""
     word: str = ""

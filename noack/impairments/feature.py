@@ -126,9 +126,9 @@ class Scheduler(QueueDiscipline):
 
     @abstractmethod
     def yields_ns(self, number: int, other_number: int) -> float:
-        """Return how long after a packet of a flow one of another flow may arrive, to go first.
+        """Return how long after a packet of a flow one of the other flow may arrive and still be sent first.
 
-        It is negative if that must arrive before; infinite if it always, or never, goes first.
+        Negative: it must arrive before; ∞: it is always sent first; −∞: never.
         """
 
     def number(self, flow: int) -> int:

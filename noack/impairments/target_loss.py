@@ -59,7 +59,7 @@ class ProbabilityCache:
 
 
 PROBABILITIES = ProbabilityCache(1000)
-"""Those of this process."""
+"""Those of this process: a run descriptor is validated where no cache can be passed."""
 
 
 class _TargetLoss(NamedTuple):

@@ -6,9 +6,9 @@ the folder by his own, or by a link, replaces nothing that is in use.
 
 A lock file describes a running process and how to reach it. The process holds a lock on its file,
 which the system releases when the process ends. A file without a lock is stale, and the next reader
-removes it, and what zenoh left of the process's socket. Readers share their lock. Whoever gives or
-removes a name locks the folder meanwhile: the socket that is removed is not that of a new process
-of this name.
+removes it, and what zenoh left of the process's socket. Readers share their lock. Whoever adds or
+removes a name locks the folder meanwhile, so that the socket of a new process of this name is not
+removed.
 """
 
 import json

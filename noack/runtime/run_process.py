@@ -287,7 +287,7 @@ class RunProcess:
     def _all_done(self, is_done: bool) -> bool:
         """Return whether plant and controller have done their last steps, given whether this process has.
 
-        One that was stopped for a while does them after the horizon. The others must still receive
+        A process that was stopped for a while does them after the horizon. The others must still receive
         what it sends then.
         """
         if is_done and self.role in WITH_DEADLINES:

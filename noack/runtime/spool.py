@@ -134,7 +134,7 @@ def spool_files(folder: Path, table: str) -> list[Path]:
 
 
 def batches_in(data: memoryview) -> tuple[list[tuple[int, memoryview]], int]:
-    """Return the complete batches at the begin of some data, and their length.
+    """Return the complete batches at the beginning of data, and their length.
 
     Of each batch: the number of its first row, and the rows.
     """

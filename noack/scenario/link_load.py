@@ -450,7 +450,7 @@ def require_slots(scenario: Scenario) -> None:
 def require_capacity(scenario: Scenario) -> None:
     """Raise CallerError if a bottleneck cannot carry the datagrams of the loops that must pass.
 
-    So it does if a schedule does not fit the loops.
+    It is raised, too, if a schedule does not fit the loops.
     """
     require_slots(scenario)
     for load in link_loads(scenario):

@@ -1,7 +1,7 @@
 """Accepts connections on a thread, and reads the first bytes of each before it costs more.
 
 A connection whose first bytes are not complete has a descriptor and a few bytes, but no task, no
-TLS and no thread. When too many of them wait, the oldest ones end of the hosts that have the most.
+TLS and no thread. When too many wait, the oldest ones of the hosts that have the most are closed.
 Before one ends, what has arrived of it is read: only a connection without progress ends.
 """
 

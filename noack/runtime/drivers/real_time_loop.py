@@ -22,8 +22,8 @@ _OVERLOAD_SHARE = 0.9  # of CPU time in the time since the last housekeeping
 _TURNS_TO_CATCH_UP = 20
 """Turns of housekeeping (one second) that a machine which is late at its end has to catch up."""
 _TURNS_TO_WAIT = 2 * _TURNS_TO_CATCH_UP
-"""Turns of housekeeping that others have: they may be late, and report a moment later that they are
-done."""
+"""Turns of housekeeping for which a process that is done waits for the others, which may be late and
+report their end a moment later."""
 
 
 class RowSink(Protocol):

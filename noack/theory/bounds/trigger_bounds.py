@@ -65,7 +65,7 @@ def comparison_bound(rule: TriggerRule, weight: Matrix) -> ComparisonBound | Non
         ‖F(e_s + Jx)‖² ≤ f² + ‖C x‖²,   so   ‖W e_s‖ ≤ ‖W F⁻¹‖ (f + ‖C x‖) + ‖W J x‖.
 
     If Q₂₂ is not positive definite, the comparison leaves e_s unbounded in some direction. The same
-    holds with Girard's η, and where the threshold is what the state was at the last event.
+    holds with Girard's dynamic variable, and where the threshold is what the state was at the last event.
 
     ``weight`` is W, (n, n). A rule that integrates compares ∫‖P z‖ instead of ‖P z‖.
     """
