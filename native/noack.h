@@ -826,7 +826,7 @@ typedef struct { /* of a driver that returns to Python for housekeeping */
 
 /* How long to put off housekeeping that has been due for a time; 0: not at all. next_ns: the time
    until the next tick or departure. has_more: datagrams wait. is_busy: no pause is to be expected.
-   All times are those of a clock on the wall. */
+   All times are wall time. */
 int64_t noack_put_off_ns(
     noack_pauses *pauses, int64_t overdue_ns, int64_t next_ns, int64_t has_more, int64_t is_busy);
 

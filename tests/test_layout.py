@@ -54,7 +54,7 @@ LINES = {
     "controller_node": 410,
     "benchmarks": 3760,
     "native": 11480,
-    "tests": 51610,
+    "tests": 51615,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 

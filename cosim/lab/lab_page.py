@@ -175,7 +175,8 @@ class _Page:
             parts["compare"] = reference and compare(reference, run)._asdict()
             parts["facts"] = [[heading, [*map(list, rows)]] for heading, rows in facts.items()]
             parts["states"] = {"names": run.state_names, "chosen": explored.state}
-        name = self._live.report if live else self._recorded.chosen if self._source == RECORDED else ""
+        recorded = self._recorded.chosen if self._source == RECORDED else ""
+        name = self._live.report if live else recorded
         pending = {EXPLORE: self._session.pending, RECORDED: self._recorded.note}
         await self._parts.show(
             pending=pending.get(self._source, ""),

@@ -201,7 +201,7 @@ def listen(address: Address, silence_s: float, save: Path | None, log: Callable[
 
     Args:
         address: where to listen.
-        silence_s: the probe is over after so long without a datagram.
+        silence_s: the probe is over after this time without a datagram.
         save: file for the raw trace; None: no file.
         log: takes a line for the user.
 

@@ -263,7 +263,7 @@ class ProbeReceiver:
     Args:
         host: number of this machine since its last boot; 0 if it is unknown.
         began_ns: when it began to listen.
-        silence_ns: the session is over after so long without a datagram.
+        silence_ns: the session is over after this time without a datagram.
         log: takes a line for the user.
         rows: takes the rows of the raw trace.
     """

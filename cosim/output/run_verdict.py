@@ -23,7 +23,7 @@ SETTLED_SHARE = 0.1
 _MOST_VIOLATIONS = 5
 """Violations that are listed."""
 _MOST_GROWTH, _MOST_LATE = 10.0, 0.01
-"""‖x‖ at the end over that at the start, and share of late steps, from which on a run is warned of."""
+"""Least ratio of ‖x‖ at the end to that at the start, and least share of late steps, for a warning."""
 
 
 class Tone(StrEnum):

@@ -30,7 +30,7 @@ from noack.runtime.connections.zenoh_session import answer_to, cause_of, open_se
 _ANSWER_S = 30.0
 """Longest wait for the answer to a query."""
 _SILENCE_S = 3.0
-"""After so long without statistics it is checked whether the emulator still runs."""
+"""Time without statistics after which it is checked whether the emulator still runs."""
 _POLL_S = 0.02
 
 

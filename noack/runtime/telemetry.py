@@ -49,7 +49,7 @@ Ranges = Sequence[tuple[int, int]]
 """Disjoint, ascending, half-open ranges of row numbers."""
 _REPORT_TIMEOUT_S = 5.0
 _REPORT_ATTEMPTS = 3
-"""Longest wait for the answer to the final report, and how often the recorder gets missing rows again."""
+"""Longest wait for the answer to the final report, and number of times that missing rows are sent again."""
 
 
 def contain(ranges: Ranges, first: int, end: int) -> bool:

@@ -172,8 +172,8 @@ def print_worst(
         speed = (
             f"{worst.runs:,} runs; {worst.nodes:,} segments, {worst.nodes / worst.elapsed_s:,.0f} per second"
         )
-        found = "the loop diverges" if worst.diverges else f"{time_text}{coverage} ({speed})"
-        console.print(f"{worst.objective.value}: {found}")
+        outcome = "the loop diverges" if worst.diverges else f"{time_text}{coverage} ({speed})"
+        console.print(f"{worst.objective.value}: {outcome}")
         console.print(f"  {worst.text}", soft_wrap=True, highlight=False)
     for note in _notes(resolved, trigger):
         console.print(note)
@@ -187,15 +187,15 @@ def print_worst(
 
 
 def _notes(resolved: Scenario, trigger: str) -> Iterator[str]:
-    """Yield what the values are for besides the losses."""
+    """Yield what the values assume besides the losses."""
     if not resolved.network.enforce_mansd:
         yield "[yellow]Nothing enforces this limit of the losses: the network may lose more[/]"
     if trigger != "sampled":
         return
     if not resolved.coverage.is_undisturbed:
-        bounded = disturbance_bounds(resolved) is not None
-        worst = "; of the worst error and state, the worst signs of bounded ones, as far as found" * bounded
-        yield f"[dim]Disturbances and noise: as the seeds draw them{worst}[/]"
+        yield "[dim]Disturbances and noise are drawn from the seeds[/]"
+        if disturbance_bounds(resolved) is not None:
+            yield "[dim]The worst error and state are for the worst signs of bounded ones that were found[/]"
     if delay_ns := network_delay_ns(resolved, 0):
         longest = duration(delay_ns / NS_PER_S)
         yield f"[dim]Every delivered update takes the longest delay that is certified, {longest}[/]"

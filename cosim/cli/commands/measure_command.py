@@ -48,7 +48,7 @@ class ProbeOptions:
         duration: Duration of the probe.
         size: Size of the probe's datagrams, at least 100.
         round_trip: The listener sends each datagram back.
-        silence: Once a probe has begun, a listener ends after so long without a datagram. It waits
+        silence: Once a probe has begun, a listener ends after this time without a datagram. It waits
             for a probe until Ctrl-C.
         save: Write the raw trace to this file while probing (.csv).
     """

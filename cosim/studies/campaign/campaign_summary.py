@@ -30,7 +30,7 @@ from noack.core.linear_systems import Vector
 from noack.core.number_format import number
 
 CONFIRMED_FROM, PARTLY_FROM = 0.95, 0.5
-"""Shares of the runs from which on a claim is confirmed, and partly confirmed."""
+"""Least shares of the runs for which a claim is confirmed, and partly confirmed."""
 _POINTS_AT_ONCE = 4
 """Number of grid points whose runs are in memory."""
 Values = Callable[[Point], Mapping[Metric, Vector]]

@@ -120,7 +120,7 @@ def _read_with_flipped_bits(path: Path, dtype: np.dtype[np.void]) -> None:
     whole = path.read_bytes()
     footer_bytes = int.from_bytes(whole[-8:-4], "little") + 8
     for at in range(len(whole) - footer_bytes, len(whole)):
-        for bit in range(at % 3, 8, 3):
+        for bit in range(8):
             path.write_bytes(flipped(whole, 8 * at + bit))
             with suppress(CallerError):
                 _ = [*TableFile(path, dtype).batches()]

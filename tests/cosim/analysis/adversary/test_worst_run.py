@@ -78,9 +78,13 @@ def test_the_certified_cost_is_the_integral_of_the_squared_bound(floor: float) -
         (
             ('plant.disturbances=[{kind="uniform", at="state", bound=[0.1, 0.1]}]',),
             {},
-            "as the seeds draw them; of the worst error and state, the worst signs of bounded ones",
+            "are drawn from the seeds\nThe worst error and state are for the worst signs of bounded ones",
         ),
-        (("plant.measurement.noise_std=[0.1, 0.1]",), {}, "Disturbances and noise: as the seeds draw them\n"),
+        (
+            ("plant.measurement.noise_std=[0.1, 0.1]",),
+            {},
+            "Disturbances and noise are drawn from the seeds\n",
+        ),
         (
             ('network.impairments=[{kind="delay", delay_s=0.02, jitter_s=0.01}]',),
             {},
