@@ -25,6 +25,7 @@ from cosim.output.figures.figure_description import (
     series_colour,
     time_axis,
 )
+from cosim.output.run_tables import caps_text
 from cosim.record.align import Reals, Times, align_tables
 from cosim.record.run_directory import chosen_run
 from cosim.record.run_record import RunRecord, load_record
@@ -59,7 +60,7 @@ class ComparedRun(NamedTuple):
         """The scenario and its kind of run, as text."""
         mode = "model-based" if self.loop.mode == "model" else "zero-order hold"
         summary = self.summary
-        return f"{summary.scenario}, {mode}, {summary.kind}, M − 1 = {summary.mansd}"
+        return f"{summary.scenario}, {mode}, {summary.kind}, {caps_text(summary)}"
 
     @property
     def loop(self) -> LoopSummary:
