@@ -185,10 +185,10 @@ def explore(scenario: Scenario) -> Exploration:
     except TooManyEventsError as error:
         if error.run is None or error.run.reached_s <= 0:
             raise
-        return _from_exact_run(error.run, resolved, _cut(error.run))
+        return _from_exact_run(error.run, resolved, _cut_reason(error.run))
 
 
-def _cut(run: ContinuousRun) -> str:
+def _cut_reason(run: ContinuousRun) -> str:
     ended = f"{len(run.event_s)} events until {number(run.reached_s, 3)} s"
     first_s = run.event_s[len(run.event_s) // 2]
     second_s = run.reached_s - first_s
@@ -199,7 +199,7 @@ def _cut(run: ContinuousRun) -> str:
 
 
 @np.errstate(all="ignore")  # a run may diverge
-def _from_exact_run(run: ContinuousRun, resolved: Scenario, cut: str) -> Exploration:
+def _from_exact_run(run: ContinuousRun, resolved: Scenario, cut_reason: str) -> Exploration:
     even = run.at(np.linspace(0.0, run.reached_s, POINTS))
     parts = [(even.t_s, even.x, even.e_s, even.e_c)]
     if 0 < len(run.before) <= _MOST_EVENT_POINTS:  # before, after, then the even times
@@ -210,7 +210,7 @@ def _from_exact_run(run: ContinuousRun, resolved: Scenario, cut: str) -> Explora
     diverged = run.divergence(even, resolved)
     return Exploration(
         resolved, EXACT, t_s, x, x + e_s, x + e_c, run.system.norms(e_s), run.system.norms(e_c),
-        threshold_at(resolved, t_s), run.event_s, run.delivered, diverged and diverged.at_s, cut,
+        threshold_at(resolved, t_s), run.event_s, run.delivered, diverged and diverged.at_s, cut_reason,
     )  # fmt: skip
 
 

@@ -243,7 +243,7 @@ class ProbeSender:
             answers = max(self._numbers, default=-1) + 1
         reverse = min(max(answers - len(self._numbers) - counts[_REVERSE], 0), counts[_UNKNOWN])
         return (
-            f"{text}; lost on an unknown way: {counts[_UNKNOWN]}, "
+            f"{text}; lost in an unknown direction: {counts[_UNKNOWN]}, "
             f"of which at least {reverse} in reverse by the numbers of the answers"
         )
 

@@ -236,8 +236,8 @@ def updates_trace(record: RunRecord) -> PacketTrace:
         raise ValueError("no updates reached the network emulator")
     # Numbers of restarted sensors begin anew far above; the order at the emulator has no gaps.
     trace = packet_trace(sent_ns[ended], np.maximum(received_ns, sent_ns)[ended], lost[ended])
-    flying = int((~ended).sum())
-    notes = [f"left out: {flying} updates in flight at the end"] if flying else []
+    in_flight = int((~ended).sum())
+    notes = [f"left out: {in_flight} updates in flight at the end"] if in_flight else []
     return trace.noted("the updates of the run, from emulator to controller", *notes)
 
 

@@ -376,7 +376,7 @@ def _verdicts(loop: LoopSummary) -> Counter[str]:
 
 def network_rows(summary: RunSummary) -> list[tuple[str, str]]:
     """Return the quantities of the network, and their values as text."""
-    network, flying = summary.network, summary.network.in_flight
+    network, in_flight = summary.network, summary.network.in_flight
     sent, reached_s = network.datagrams, summary.reached_s or math.inf
     lost = sum(network.drops_by_cause.values())
     by_cause = network.drops_by_cause.items() if set(network.drops_by_cause) - {"dropped"} else ()
@@ -386,7 +386,7 @@ def network_rows(summary: RunSummary) -> list[tuple[str, str]]:
         ("lost", f"{lost} ({ratio(lost, sent)}){causes}"),
         longest_burst(largest_cap(summary), summary.constraints, network.longest_loss_burst),
         ("forced by the guarantee", str(network.forced_deliveries)),
-        ("datagrams in flight: mean, max", f"{flying.mean:.3g}, {flying.max}"),
+        ("datagrams in flight: mean, max", f"{in_flight.mean:.3g}, {in_flight.max}"),
     ]
     if network.rate_bps is not None and network.utilisation is not None:
         used = f"{100 * network.utilisation:.3g} % of {network.rate_bps:,} bit/s"

@@ -285,7 +285,7 @@ def remarks(summary: RunSummary) -> Iterator[Remark]:
         severe = violation.cause not in CAUSES  # the guarantee, or a change
         yield Remark(f"assumption violated at {where}: {what}", severe=severe)
     if (more := len(violations) - _MOST_VIOLATIONS) > 0:
-        plural = "s" * (more > 1)
+        plural = "s" if more > 1 else ""
         yield Remark(f"{more} more violation{plural} of an assumption", severe=True)
     if loop.replay is not None and loop.replay.bit_exact is False:
         yield Remark("the replay of the run differs from its record", severe=True)

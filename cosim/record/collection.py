@@ -158,10 +158,10 @@ def _has_secret(kept: Path, process: _Process, source: str) -> bool:
     """Whether a process kept its secret in a folder, so that it ran there."""
     name = f"{KEPT_KEY}.{process.writer}"
     try:
-        chunks = [*_batches(kept / name, f"{source}: {SPOOL}/{name}")]
+        batches = [*_batches(kept / name, f"{source}: {SPOOL}/{name}")]
     except FileNotFoundError:
         return False
-    secrets = (chunk.rows.decode(errors="replace") for chunk in chunks)
+    secrets = (batch.rows.decode(errors="replace") for batch in batches)
     return process.writer in map(writer_of, secrets)
 
 
@@ -192,22 +192,22 @@ def _checked_batches(
     name: str,
 ) -> Iterator[tuple[int, bytes]]:
     """Yield the batches of a file; raise PeerError for one that is not of its process."""
-    for chunk in _batches(path, name):
+    for batch in _batches(path, name):
         if table == KEPT_REPORT:
             try:
-                report = parse_message(ProcessReport, chunk.rows).fields()
+                report = parse_message(ProcessReport, batch.rows).fields()
             except PeerError as error:
                 raise PeerError(f"{name}: {error}") from None
             sender = (report.get("process"), report.get("generation", 0), report.get("instance"))
             if sender != (process.role, process.generation, process.writer):
                 raise PeerError(f"{name} is the report of another process")
         elif table in types:
-            if len(chunk.rows) % types[table].itemsize:
+            if len(batch.rows) % types[table].itemsize:
                 raise PeerError(f"{name} is damaged: it has a batch with part of a row")
-            inputs = np.frombuffer(chunk.rows, types[table])["input"]
+            inputs = np.frombuffer(batch.rows, types[table])["input"]
             if (inputs // GENERATION != process.generation).any():
                 raise PeerError(f"{name} has rows of another process")
-        yield chunk.first, chunk.rows
+        yield batch.first, batch.rows
 
 
 def _require_consistent(before_dir: Path, after_dir: Path, source: str) -> None:

@@ -48,12 +48,12 @@ def events(record: RunRecord) -> pa.Table:
     measurements = record[SENSOR_MEASUREMENT]
     sent = measurements[measurements["event"] != NO_SEQUENCE]
     t_s = _seconds(sent["t_ns"])
-    crossed = packet_outcomes(record)
-    fates = np.array([fate.name.lower() for fate in Fate], dtype=object)[crossed.fate]
+    outcomes = packet_outcomes(record)
+    fates = np.array([fate.name.lower() for fate in Fate], dtype=object)[outcomes.fate]
     # The emulator forwarded them, but they were not delivered.
-    fates[effective(crossed.fate) & crossed.lost] = _OUT_OF_ORDER
-    fates[crossed.in_flight] = _IN_FLIGHT
-    known = dict(zip(crossed.sequence.tolist(), fates.tolist(), strict=True))
+    fates[effective(outcomes.fate) & outcomes.lost] = _OUT_OF_ORDER
+    fates[outcomes.in_flight] = _IN_FLIGHT
+    known = dict(zip(outcomes.sequence.tolist(), fates.tolist(), strict=True))
     columns = {
         "event": sent["event"],
         "t_s": t_s,

@@ -126,7 +126,7 @@ def _changes_in(rows: Rows) -> list[tuple[ParameterChange, int]]:
 
 def _add(schedule: ChangeSchedule[None], change: ParameterChange, since_ns: int) -> bool:
     try:
-        schedule.announce("", change, 0, 0, since_ns - 1)
+        schedule.announce(table="", change=change, number=0, now_ns=0, reached_ns=since_ns - 1)
     except CallerError:
         return False
     return True
@@ -180,14 +180,14 @@ def packet_outcomes(record: RunRecord, flow: Flow = Flow.UPDATE) -> PacketOutcom
 def _released(record: RunRecord, flow: Flow) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return the numbers of the delayed datagrams that left, with whether each was stale."""
     direction = direction_of(flow)
-    every = len(record.scenario.network.flows) == 1
+    has_one_flow = len(record.scenario.network.flows) == 1
     releases = record.columns(
         NETEM_RELEASE,
         "sequence",
         "flow",
         "copy",
         "stale",
-        where=lambda rows: np.full(len(rows), every) | (rows["flow"] == direction),
+        where=lambda rows: np.full(len(rows), has_one_flow) | (rows["flow"] == direction),
     )
     return 2 * releases["sequence"] + releases["copy"], releases["stale"] != 0
 

@@ -34,7 +34,7 @@ from noack.protocol.record_tables import LOOP, OWNER, entry_names
 from noack.protocol.wire_format import MAX_LOOPS
 
 _MOST_GROUP_ROWS = 2 * BATCH_ROWS
-"""Largest number of rows of a group that is read; earlier versions wrote so many."""
+"""Largest number of rows of a group that is read: that of earlier versions."""
 _LEAST_GROUP_ROWS = 3 * BATCH_ROWS // 4
 _ROWS_IN_CACHE = 2048
 """Rows that stay in the processor's cache while they are filled column by column."""

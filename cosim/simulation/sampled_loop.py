@@ -2,9 +2,9 @@
 
 The machines of the loop make the steps of all runs (native/driver/segments.c): at step k of the
 plant, in this order, x advances under the input held since step k − 1, and the newest actuation is
-latched. At every ``every``-th step y is measured (with an observer y = x̂), and the trigger tests
-it. After an event x_s = y. Then updates arrive, and the controller ticks, until step k + 1. Nothing
-is late.
+latched. If k is a multiple of ``steps_per_measurement``, y is measured (with an observer y = x̂),
+and the trigger tests it. After an event x_s = y. Then updates arrive, and the controller ticks,
+until step k + 1. Nothing is late.
 """
 
 from copy import copy
@@ -93,13 +93,12 @@ class SampledLoop:
         self.resolved = resolved
         self.last = timing.horizon_ns // timing.plant_period_ns
         self.step_s = timing.plant_period_ns * 1e-9
-        self.every = resolved.plant.measure_every
-        """Steps from one measurement to the next."""
+        self.steps_per_measurement = resolved.plant.measure_every
         self.weight = np.eye(n) if self.matrices.weight is None else self.matrices.weight
         self.delay_ns = network_delay_ns(resolved, 0)
         self._first_auxiliary = rule_of(resolved).initial_dynamic_variable
         self._most_in_flight = self.delay_ns // timing.measurement_period_ns + 2
-        assumed, measurements = assumed_model(resolved), self.last // self.every + 1
+        assumed, measurements = assumed_model(resolved), self.last // self.steps_per_measurement + 1
         self._C, self._gains = assumed.C, np.zeros((0, n, len(assumed.C)))
         if resolved.observer is not None:
             self._gains = _dense(np.array([*islice(resolved.observer.gains(assumed), measurements)]))
@@ -173,8 +172,8 @@ class SampledLoop:
 
     def measure_at(self, runs: Runs) -> None:
         """Measure, where the step of a run is one of a measurement; y is 0 or estimated before."""
-        for i in np.flatnonzero(runs.step % self.every == 0).tolist():
-            number = int(runs.step[i]) // self.every
+        for i in np.flatnonzero(runs.step % self.steps_per_measurement == 0).tolist():
+            number = int(runs.step[i]) // self.steps_per_measurement
             noise = self._noise[number] if len(self._noise) else 0.0
             if len(self._gains):
                 innovation = self._C @ (runs.x[i] - runs.y[i]) + noise

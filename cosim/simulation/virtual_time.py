@@ -113,7 +113,7 @@ class RecordCollector:
         numbers.append(np.array([row[0] for row in self._setting_rows.get(table, [])], np.uint16))
         return np.bincount(np.concatenate(numbers), minlength=self._loops)
 
-    def whole(self, table: str) -> Rows:
+    def take_whole(self, table: str) -> Rows:
         """Return all rows of a table, and keep them no longer."""
         dtype = self._types[table]
         batches = self._batches.pop(table, [])
@@ -124,7 +124,7 @@ class RecordCollector:
     def of_loop(self, table: str, number: int) -> Rows:
         """Return the rows of a loop in a table of the machines, without the loop's number."""
         if table not in self._by_loop:
-            self._by_loop[table] = _split(self.whole(table), self._loops)
+            self._by_loop[table] = _split(self.take_whole(table), self._loops)
         return self._by_loop[table][number]
 
     def notices(self, loop: int | None = None) -> list[dict[str, object]]:
@@ -334,7 +334,7 @@ def _simulate(
     run.announce()
     with np.errstate(all="ignore"):  # a diverging loop overflows and is recorded all the same
         run.run(progress=progress)
-    of_network = {table: run.record.whole(table) for table in network_tables()}
+    of_network = {table: run.record.take_whole(table) for table in network_tables()}
     packets = NetworkRows(RowsInMemory(of_network), run.phases_ns)
     tables = {table for types in run.types.values() for table in types}
     counts = packets.counts() | {

@@ -32,16 +32,16 @@ from noack.core.number_format import number
 Bools = NDArray[np.bool_]
 
 MOST_CURVES = len(palette.SERIES)
-"""Up to so many loops have a curve each, in a colour of its own; more are drawn as bands."""
+"""Largest number of loops with a curve each, in its own colour; more are drawn as bands."""
 _PANEL_IN = 1.7
 _ROW_IN, _LOWEST_IN, _HIGHEST_IN = 0.22, 1.2, 4.5
 """Height of a row of the map, and limits of the height of the map."""
 _DECADES = 5
 """Maximum decades of norms that are shown."""
 _MOST_NAMED_ROWS = 24
-"""Up to so many rows of the map have the names of their loops."""
+"""Largest number of rows of the map that have the names of their loops."""
 _BANDS = ((0, 4, 0.25, "5 to 95 % of the loops"), (1, 3, 0.45, "25 to 75 %"))
-"""Places of two quantiles among QUANTILES, opacity and label of the band between them."""
+"""Indices of two quantiles in QUANTILES, opacity and label of the band between them."""
 _MEDIAN, _LARGEST = 2, 5
 """Their places among QUANTILES."""
 

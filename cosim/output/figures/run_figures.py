@@ -69,7 +69,7 @@ _LONGEST_TITLE = 40  # characters
 _DECADES = 6
 """Maximum decades of an axis of norms."""
 _FAR_RATIO, _FAR_OPACITY = 20.0, 0.45
-"""Bounds that are mostly over so many times the curves are drawn with this opacity."""
+"""A bound that is mostly over this ratio times the curve is drawn with this opacity."""
 _MOST_NUMBERED_BARS = 12
 
 
@@ -241,13 +241,13 @@ def states_figure(
     intervals = [
         Panel(
             title="Broadcasting intervals",
-            items=_broadcasts(sent, between[0]),
+            items=_sent_marks(sent, between[0]),
             x=time_axis(t_s, numbers=False),
             y=y,
         ),
         Panel(
             title="Receiving intervals",
-            items=_receptions(sent, between[1]),
+            items=_received_marks(sent, between[1]),
             x=time_axis(t_s),
             y=y,
         ),
@@ -268,14 +268,14 @@ def states_figure(
     )
 
 
-def _broadcasts(sent: Transmissions, interval_s: Reals) -> list[Item]:
+def _sent_marks(sent: Transmissions, interval_s: Reals) -> list[Item]:
     t_s, lost = sent.sent_s, sent.lost
     arrived = Marks(x=t_s[~lost], y=interval_s[~lost], label="sent", colour=SENSOR, stems=SENSOR)
     crosses = Marks(x=t_s[lost], y=interval_s[lost], label="sent, lost", colour=LOST, stems=SENSOR)
     return [arrived, replace(crosses, marker="x", size=6.5, stroke=1.8)]
 
 
-def _receptions(sent: Transmissions, interval_s: Reals) -> list[Item]:
+def _received_marks(sent: Transmissions, interval_s: Reals) -> list[Item]:
     t_s, forced, lost_s = sent.received_s, sent.forced, sent.sent_s[sent.lost]
     dots = Marks(x=t_s[~forced], y=interval_s[~forced], label="received", colour=CONTROLLER)
     diamonds = Marks(x=t_s[forced], y=interval_s[forced], label="received, forced", colour=FORCED)

@@ -80,7 +80,7 @@ class LoopFeed:
     Args:
         scenario: the resolved scenario.
         view: receives the aligned batches.
-        columns: reduce each batch to the extremes in so many columns; None keeps all rows.
+        columns: number of columns of extremes to which each batch is reduced; None keeps all rows.
         certified: show the certified bounds, which take up to some seconds to compute.
     """
 

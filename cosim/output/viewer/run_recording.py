@@ -59,9 +59,9 @@ from noack.scenario.resolution import loop_of, resolved_loops
 from noack.scenario.scenario import Scenario, loop_names, phases_ns
 
 PICTURED = 12
-"""Up to so many loops are shown one by one, with their pictures."""
+"""Largest number of loops that are shown one by one, with their pictures."""
 _ANIMATED = 4
-"""Up to so many loops have a diagram of their packets, which is most of a recording."""
+"""Largest number of loops with a diagram of their packets, which is most of a recording."""
 QUEUE, SHARE, ALL_ERRORS, ALL_SIZES, MAP = "link/queue", "link/share", "all/error", "all/size", "all/map"
 _DECADES = 5
 """Decades of a norm that the curves show to each side of its usual largest value, and the map below."""
@@ -322,10 +322,10 @@ def _write_network_view(
     numbers = range(count) if count <= PICTURED else [worst.number]
     loops = {number: run.loops[number].scenario for number in numbers}
     with RunRecording(run.scenario, path, _new_id(), loops, run.kind, worst=worst, complete=True) as whole:
-        flying = summary.network.in_flight
-        largest = np.array(flying.max_by_interval, np.float64)
-        queue_ns = (np.arange(len(largest)) + 0.5) * flying.width_s * NS_PER_S
-        whole.queue(queue_ns.astype(np.int64), largest, np.array(flying.mean_by_interval))
+        in_flight = summary.network.in_flight
+        largest = np.array(in_flight.max_by_interval, np.float64)
+        queue_ns = (np.arange(len(largest)) + 0.5) * in_flight.width_s * NS_PER_S
+        whole.queue(queue_ns.astype(np.int64), largest, np.array(in_flight.mean_by_interval))
         middles_ns = (over_time.middles_s * NS_PER_S).astype(np.int64)
         whole.norms(ALL_ERRORS, middles_ns, over_time.errors)
         whole.norms(ALL_SIZES, middles_ns, over_time.states)

@@ -35,21 +35,21 @@ def shown(folder: Path, count: int, *settings: str) -> tuple[RecordedRun, Chunks
     """Simulate loops, and pass their rows on as in a live run; read the recording."""
     given = ["horizon_s=2.0", f'loops=[{{ name = "p", count = {count} }}]', *settings]
     run = simulate_loops(shipped("shared_bottleneck", *given))
-    scenario, said = run.network.scenario, list[str]()
+    scenario, messages = run.network.scenario, list[str]()
     with open_recording(scenario, folder, 9, None) as view:
-        feed = LiveFeed(scenario, view, said.append)
+        feed = LiveFeed(scenario, view, messages.append)
         for table, rows in live_rows(run):
             feed.add(table, rows)
             feed.advance()
         feed.log(Notice(10**9, "diverges", "x is not finite", loop=1).line())
         feed.advance(final=True)
-    return run, read(folder / RECORDING_FILE), said
+    return run, read(folder / RECORDING_FILE), messages
 
 
 @pytest.mark.parametrize("count", [3, 30])
 @pytest.mark.parametrize("phase", ["0.0", "0.3"])
 def test_all_loops_are_shown_as_from_the_record(tmp_path: Path, count: int, phase: str) -> None:
-    run, chunks, said = shown(tmp_path, count, f"controller.phase={phase}")
+    run, chunks, messages = shown(tmp_path, count, f"controller.phase={phase}")
     expected = loops_over_time(run)
     for entity, values in ((ALL_ERRORS, expected.errors), (ALL_SIZES, expected.states)):
         t_ns, drawn = series(chunks, entity)
@@ -69,7 +69,7 @@ def test_all_loops_are_shown_as_from_the_record(tmp_path: Path, count: int, phas
     curves = (shares if count == 3 else quantiles(shares)).T
     np.testing.assert_allclose(series(chunks, SHARE)[1], curves, rtol=1e-6)
     assert (MAP in chunks) == (count == 30)
-    assert not said
+    assert not messages
     assert bp.LOG in chunks
 
 
@@ -80,8 +80,8 @@ def test_loops_in_detail_that_cannot_keep_up_are_given_up_and_named(
     monkeypatch.setattr("cosim.output.viewer.live_feed._WARNED_LAG_S", 0.05)
     monkeypatch.setattr("cosim.output.viewer.live_feed._LONGEST_LAG_S", 0.5)
     monkeypatch.setattr("cosim.output.viewer.live_feed._CORE_SHARE", 1e-4)
-    _, chunks, said = shown(tmp_path, 3)
-    assert "in detail end here" in said[-1]
+    _, chunks, messages = shown(tmp_path, 3)
+    assert "in detail end here" in messages[-1]
     assert len(series(chunks, ALL_ERRORS)[0]) == INTERVALS
     with pytest.raises(ValueError, match="at least one array"):  # nothing but static data
         series(chunks, f"{bp.loop_folder('p-1')}{bp.state_path('angle')}")

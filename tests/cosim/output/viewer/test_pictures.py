@@ -127,7 +127,7 @@ def test_each_packet_is_drawn_with_its_fate() -> None:
     seen = rows_of(sent(NetworkDiagram(), PACKETS), [3 * S])
     steps = [round(t_s * S) for t_s in np.arange(0.013, 3.0, 0.037)]
     assert rows_of(sent(NetworkDiagram(), PACKETS), [*steps, 3 * S]) == seen  # in any batches
-    assert seen.keys() == {"broadcast", "delivered", "forced", "lost"}
+    assert seen.keys() == {"delivered", "forced", "lost", "transmitted"}
     for entity, count in (("delivered", 2), ("forced", 1), ("lost", 2)):
         shown = [bool(shapes) for _, shapes in sorted(seen[entity].items())]
         assert shown.count(False) == count, entity  # each packet is drawn to its end
