@@ -158,7 +158,7 @@ def _loop_result(search: NetworkSearch, loop: CertifiedLoop, *, is_excluded: boo
     requirements, (hold, K), proven = search.requirements, loop.candidate, loop.stability
     requirement = requirements[max(loop.level, 0)]
     sent = search.scenario.timing.measurement_period_ns / requirement.period_ns
-    reach = requirement.name + (", the most examined" * (loop.level == len(requirements) - 1))
+    reach = requirement.name + (", the most examined" if loop.level == len(requirements) - 1 else "")
     if loop.level < 0:
         reach = "nothing proven"
     growth = (
