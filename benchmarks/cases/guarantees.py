@@ -54,7 +54,7 @@ class Decider:
 
 
 def check_rows(before: str, guarantee: str, count: int) -> Iterator[Row]:
-    """Yield the flows with a violation in so many decisions; and the loss rate, if it can be predicted."""
+    """Yield the flows with a violation in ``count`` decisions, and the loss rate if it can be predicted."""
     words, allowed = f"{before} {guarantee}", settings_of(guarantee)
     announce(f"{count:,} decisions, {words}")
     decider = Decider(f"{words} limit 1000000")

@@ -134,7 +134,7 @@ def row_type(points: Sequence[Point]) -> np.dtype[np.void]:
 
 
 def _scaled(entries: object, value: int, source: str) -> list[Table]:
-    """Return the entries of [[loops]] with so many loops in all, in the same proportions."""
+    """Return the entries of [[loops]] with ``value`` loops in all, in the same proportions."""
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise CallerError(f"{source}: loops: expected a list of tables")
     if len(entries) == 1:

@@ -264,7 +264,7 @@ class BurstFrequency(NamedTuple):
     packets: int
     """Largest number of packets of a run."""
     predicted: float
-    """Probability of a longer burst in so many packets: an upper bound for the share."""
+    """Probability of a longer burst in this number of packets: an upper bound for the share."""
 
     @property
     def text(self) -> str:

@@ -177,7 +177,7 @@ class CapacityPlan:
         return CampaignAxis(name=LOOPS, title=title, variants=variants)
 
     def _network(self, loops: int, factor: int) -> Entry:
-        """Return the settings of loops on bottlenecks so many times as fast, with longer queues."""
+        """Return the settings of loops on bottlenecks ``factor`` times as fast, with longer queues."""
         settings: Entry = {"loops": loops}
         for index, impairment in enumerate(self.scenario.network.impairments):
             key = f"network.impairments.{index}"

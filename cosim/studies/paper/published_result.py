@@ -114,7 +114,7 @@ def print_rows(console: "Console", reproduction: Reproduction) -> None:
 def value_row(
     quantity: str, place: str, published: float, computed: float, method: str, *, digits: int
 ) -> ComparedValue:
-    """Return the row of a number that is published with so many digits after the point."""
+    """Return the row of a number that is published with ``digits`` digits after the point."""
     agrees = abs(computed - published) <= 0.5000001 * 10.0**-digits
     texts = f"{published:.{digits}f}", f"{computed:.{digits + 1}f}"
     return ComparedValue(quantity, place, "=", *texts, method, agrees)

@@ -170,7 +170,7 @@ def test_a_missing_recording_is_written_when_it_is_viewed(run_dir: Path, loop: s
 def test_the_report_reads_no_loop_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """How each loop went is known at the end of a run; to find it out takes most of the time."""
     monkeypatch.setattr(loops_over_time, "loop_over_time", None)
-    loops = 'loops=[{ name = "a", count = 6 }]'  # of so many, the map is a bitmap
+    loops = 'loops=[{ name = "a", count = 6 }]'  # enough for a map that is a bitmap
     ending = simulate_run(load(PATH, ["horizon_s=0.5", loops]), tmp_path)
     finalize(ending)
     assert (ending.run_dir / "report.html").is_file()

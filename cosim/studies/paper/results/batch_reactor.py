@@ -30,14 +30,14 @@ def _periods(loop: ContinuousLoop, states: Matrix) -> NDArray[np.int64]:
 
 
 def _held_map(loop: ContinuousLoop, periods: int) -> Matrix:
-    """Return M of x(t) = M x(0), t so many periods after an event."""
+    """Return M of x(t) = M x(0), at the time t that is ``periods`` after an event."""
     A, BK = loop.loop.A, loop.loop.B @ loop.loop.K
     transition = expm(np.block([[A, BK], [np.zeros((4, 8))]]) * _PERIOD_S * periods)
     return np.asarray(transition[:4, :4] + transition[:4, 4:])
 
 
 def _slowest_state(loop: ContinuousLoop, periods: int) -> tuple[float, Matrix]:
-    """Return the smallest eigenvalue of the compared form after so many periods, and its state.
+    """Return the smallest eigenvalue of the compared form after ``periods``, and its state.
 
     If it is positive, every state has transmitted by then.
     """

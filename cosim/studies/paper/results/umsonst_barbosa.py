@@ -168,7 +168,7 @@ class ControllerMessage(NamedTuple):
     """The newest period of which the controller knows the nominal state."""
 
     def input(self, age: int, K: Vector, z: Vector) -> float:
-        """Return the nominal input so many periods later, in the nominal state z."""
+        """Return the nominal input ``age`` periods later, in the nominal state z."""
         return float(self.inputs[age]) if age < N else self.end - float(K @ z)
 
 
