@@ -50,9 +50,9 @@ class Choices:
 
     def take(self, count: int) -> bytes:
         """Return the next ``count`` bytes."""
-        taken = self._data[self._at : self._at + count]
-        self._at += len(taken)
-        return taken.ljust(count, b"\0")
+        part = self._data[self._at : self._at + count]
+        self._at += len(part)
+        return part.ljust(count, b"\0")
 
     def rest(self) -> bytes:
         """Return all unused bytes."""

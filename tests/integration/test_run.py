@@ -62,7 +62,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
 
 
 @pytest.fixture(scope="module")
-def live(finished: Finished) -> RunRecord:
+def record(finished: Finished) -> RunRecord:
     return load_record(finished.run_dir)
 
 
@@ -97,17 +97,17 @@ def test_the_run_directory_holds_everything(finished: Finished) -> None:
     assert "warning" not in finished.stderr
 
 
-def test_the_run_is_replayed_bit_for_bit(live: RunRecord, finished: Finished) -> None:
-    result = replay(live)
+def test_the_run_is_replayed_bit_for_bit(record: RunRecord, finished: Finished) -> None:
+    result = replay(record)
     assert result.first_difference is None, str(result.first_difference)
     assert result.gaps == []
-    assert result.inputs == sum(len(live[table]) for table in tables(1, 1))
+    assert result.inputs == sum(len(record[table]) for table in tables(1, 1))
     assert all(hop.compared == hop.received > 0 for hop in result.messages)
     assert finished.loop["replay"] == result.verdict().model_dump()
-    assert finished.summary["kind"] == live.kind == "live"
+    assert finished.summary["kind"] == record.kind == "live"
 
 
-def test_the_recording_shows_the_record(finished: Finished, live: RunRecord) -> None:
+def test_the_recording_shows_the_record(finished: Finished, record: RunRecord) -> None:
     reader = rerun.chunk.RrdReader(finished.run_dir / "recording.rrd")
     (store,) = reader.recordings()
     rows: Counter[str] = Counter()
@@ -120,14 +120,14 @@ def test_the_recording_shows_the_record(finished: Finished, live: RunRecord) -> 
     assert rows[blueprint.RECEPTION] == summary["deliveries"] - summary["forced_deliveries"]
     assert rows[blueprint.DROP] == summary["drops"]
     assert rows[blueprint.EVENT] == summary["events"]
-    assert rows[blueprint.INPUT] == len(live["controller_step"])
-    for name in live.loop.state_names:
-        assert rows[blueprint.state_path(name)] == len(live["sensor_measurement"])
+    assert rows[blueprint.INPUT] == len(record["controller_step"])
+    for name in record.loop.state_names:
+        assert rows[blueprint.state_path(name)] == len(record["sensor_measurement"])
 
 
-def test_the_recording_shows_the_bounds(finished: Finished, live: RunRecord) -> None:
+def test_the_recording_shows_the_bounds(finished: Finished, record: RunRecord) -> None:
     """The curves drawn during the run equal those that its end evaluates for its schedule."""
-    claims = ClaimEvaluation(live)
+    claims = ClaimEvaluation(record)
     claims.wider = None  # the recording has the bounds of the scenario's schedule
     envelopes = claims.envelopes()
     (identity,) = [e.values for e in envelopes if e.label == "bound from (I1)"]

@@ -148,14 +148,14 @@ def test_a_verdict_says_what_became_of_the_run_and_of_its_guarantee() -> None:
     low = replace(certified, e_c=1e-3 * certified.e_c)
     assert verdict_of(run, low)[1].text.startswith("guarantee broken since ")
     missing = guarantee.certify(noack.load("lane_vehicle"))
-    said = verdict_of(run, missing)[1].text
-    assert said == f"guarantee not checkable: {missing.reason}"
+    verdict = verdict_of(run, missing)[1].text
+    assert verdict == f"guarantee not checkable: {missing.reason}"
 
 
 def test_a_loop_at_its_setpoint_breaks_no_guarantee() -> None:
     """The certificate bounds ‖x − x_r‖, which decays; ‖x‖ stays near ‖x_r‖ = 20.
 
-    Such a loop was called bounded, and was said to grow, where a run's summary calls it stable.
+    Such a loop was called bounded, and was verdict to grow, where a run's summary calls it stable.
     """
     run = exploration.explore_or_simulate(
         noack.load("lane_following", {"controller.setpoint": [0.0, 0.0, 0.0, 20.0]})
@@ -174,9 +174,9 @@ def test_more_losses_than_assumed_break_a_guarantee_that_is_not_enforced() -> No
     scenario = noack.load("lane_following", {"network.enforce_mansd": False, "network.mansd": 3})
     run = exploration.explore(scenario)
     fourth = next(i for i in range(3, len(run.delivered)) if not run.delivered[i - 3 : i + 1].any())
-    said = verdict_of(run, guarantee.certify(scenario))[1].text
+    verdict = verdict_of(run, guarantee.certify(scenario))[1].text
     at_s = run.event_s[fourth]
-    assert said == f"guarantee broken since {at_s:.3f} s: 4 consecutive updates lost, 3 allowed"
+    assert verdict == f"guarantee broken since {at_s:.3f} s: 4 consecutive updates lost, 3 allowed"
 
 
 def test_a_comparison_ends_where_one_of_the_runs_does() -> None:

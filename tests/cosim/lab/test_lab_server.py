@@ -78,10 +78,10 @@ def test_the_address_on_a_command_line_is_for_processes_of_this_user(
     user: int | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every user can read command lines."""
-    asked = []
-    monkeypatch.setattr(lab_server, "socket_user", lambda *of: asked.append(of) or user)
+    connections = []
+    monkeypatch.setattr(lab_server, "socket_user", lambda *of: connections.append(of) or user)
     first, _ = answer("http", f"/{OPENING}/", host="127.0.0.1:8765")
-    assert asked == [(("127.0.0.1", 4711), ("127.0.0.1", 8765))]
+    assert connections == [(("127.0.0.1", 4711), ("127.0.0.1", 8765))]
     if user == os.getuid():
         assert first["status"] == 303
         assert dict(first["headers"])[b"location"] == f"/{SECRET}/?a=1".encode()

@@ -110,9 +110,9 @@ def test_runs_that_cannot_be_compared_give_one_line(runs: list[Path], tmp_path: 
         (*runs, "--out", tmp_path / "a.eps"): f"noack: {tmp_path / 'a.eps'}: a comparison is "
         "written as .html, .svg, .png, .pdf\n",
     }
-    for words, said in mistakes.items():
+    for words, message in mistakes.items():
         done = compare(*words)
-        assert (done.exit_code, done.stderr, done.stdout) == (2, said, "")
+        assert (done.exit_code, done.stderr, done.stdout) == (2, message, "")
 
 
 def test_a_diverged_run_is_overlaid_up_to_its_end(runs: list[Path], tmp_path: Path) -> None:

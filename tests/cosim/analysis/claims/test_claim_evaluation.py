@@ -233,13 +233,13 @@ def test_too_many_dropouts_void_the_papers_theorems(make: Make) -> None:
 
 def test_a_claim_is_not_held_where_the_record_has_no_rows(run: RunRecord) -> None:
     """Measurements continue after the controller's record ends: ‖e_c‖ is unknown from 2 s on."""
-    ticks, taken = run[CONTROLLER_STEP], run[CONTROLLER_DELIVERY]
+    ticks, deliveries = run[CONTROLLER_STEP], run[CONTROLLER_DELIVERY]
     early = {
         CONTROLLER_STEP: ticks[ticks["t_ns"] < 2_000_000_000],
-        CONTROLLER_DELIVERY: taken[taken["now_ns"] < 2_000_000_000],
+        CONTROLLER_DELIVERY: deliveries[deliveries["now_ns"] < 2_000_000_000],
     }
-    cut = changed(run, early)
-    unknown = [c for c in ClaimEvaluation(cut).evaluate() if "e_c" in c.bound or c.source == "(I1)"]
+    shortened = changed(run, early)
+    unknown = [c for c in ClaimEvaluation(shortened).evaluate() if "e_c" in c.bound or c.source == "(I1)"]
     assert unknown
     for claim in unknown:
         assert claim.verdict is not HELD
@@ -462,10 +462,10 @@ def stopped(record: RunRecord, reached_ns: dict[str, int]) -> RunRecord:
 
 @pytest.mark.parametrize("order", [*permutations(LOOP_ROLES)][::5], ids="-".join)
 def test_processes_that_stop_at_different_times_void_no_claim(run: RunRecord, order: tuple[str, ...]) -> None:
-    cut = stopped(run, {role: STOP_NS + i * APART_NS for i, role in enumerate(order)})
+    stopped_record = stopped(run, {role: STOP_NS + i * APART_NS for i, role in enumerate(order)})
     if order[0] == "controller":  # the plant continues with its last input
-        assert ClaimVerdict.VOID in {claim.verdict for claim in ClaimEvaluation(cut).evaluate()}
-    claims = RunClaims(cut)
+        assert ClaimVerdict.VOID in {claim.verdict for claim in ClaimEvaluation(stopped_record).evaluate()}
+    claims = RunClaims(stopped_record)
     verdicts = [(claim.source, claim.verdict) for claim in claims.evaluate()]
     assert len(verdicts) > 5
     assert {verdict for _, verdict in verdicts} == {ClaimVerdict.HELD}, verdicts

@@ -52,16 +52,16 @@ SERIES = ("losses", "sampling", "delay", "hold", "watchdog", "safe_input", "rest
 def batches(record: RunRecord, seed: int) -> Batches:
     """The record as the processes send it: each in its own order, the processes in any order."""
     rng = np.random.default_rng(seed)
-    taken = dict.fromkeys(record.tables, 0)
-    while waiting := [table for table in taken if taken[table] < len(record[table])]:
+    positions = dict.fromkeys(record.tables, 0)
+    while waiting := [table for table in positions if positions[table] < len(record[table])]:
         role = rng.choice([role for role in LOOP_ROLES if any(OWNER[t] == role for t in waiting)])
         own = [table for table in record.tables if OWNER[table] == role]
-        first = min(int(record[t]["input"][taken[t]]) for t in own if t in waiting)
+        first = min(int(record[t]["input"][positions[t]]) for t in own if t in waiting)
         until = first + int(rng.integers(1, 200))
         for table in own:
             end = int(np.searchsorted(record[table]["input"], until))
-            yield table, record[table][taken[table] : end]
-            taken[table] = end
+            yield table, record[table][positions[table] : end]
+            positions[table] = end
             if rng.uniform() < 0.2:
                 yield None
         if rng.uniform() < 0.5:

@@ -255,13 +255,13 @@ def test_an_update_before_the_first_tick_of_a_restarted_controller_is_replayed(
         resolved, "controller", lambda machine: RestartedMachine(machine, successor, at_ns)
     )
     rows = {table: record[table] for table in record.tables}
-    taken, again = rows[CONTROLLER_DELIVERY], rows[CONTROLLER_STEP]["input"] >= GENERATION
-    first = taken[taken["input"] == GENERATION]
+    deliveries, is_restarted = rows[CONTROLLER_DELIVERY], rows[CONTROLLER_STEP]["input"] >= GENERATION
+    first = deliveries[deliveries["input"] == GENERATION]
     assert len(first) == 1
-    assert first["now_ns"][0] < rows[CONTROLLER_STEP]["t_ns"][again][0]
+    assert first["now_ns"][0] < rows[CONTROLLER_STEP]["t_ns"][is_restarted][0]
     if not ticks:  # the process died before it had one
-        rows[CONTROLLER_STEP] = rows[CONTROLLER_STEP][~again]
-        rows[CONTROLLER_DELIVERY] = taken[taken["input"] <= GENERATION]
+        rows[CONTROLLER_STEP] = rows[CONTROLLER_STEP][~is_restarted]
+        rows[CONTROLLER_DELIVERY] = deliveries[deliveries["input"] <= GENERATION]
     notice = {"process": "controller", "level": RESTART, "t_ns": 0, "text": "restarted"}
     result = replay(changed(record, rows, notices=[notice], reports={}, kind="live"))
     assert result.bit_exact, result.verdict()

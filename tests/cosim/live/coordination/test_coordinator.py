@@ -140,10 +140,10 @@ def test_a_join_token_admits_its_roles_until_it_expires(
     reason: str | None,
 ) -> None:  # fmt: skip
     barrier.join_tokens["ab" * 16] = known
-    asked = ask(plane, barrier, "admit", role=role, join_token=join_token)
-    assert asked.error == (None if reason is None else f"cannot join: {reason}")
-    joined = ask(plane, barrier, "join", role=role)
-    assert joined.error == (None if reason is None else "cannot join: it was not admitted")
+    answer = ask(plane, barrier, "admit", role=role, join_token=join_token)
+    assert answer.error == (None if reason is None else f"cannot join: {reason}")
+    answer = ask(plane, barrier, "join", role=role)
+    assert answer.error == (None if reason is None else "cannot join: it was not admitted")
 
 
 # --- requests to change a run ---------------------------------------------------------------------

@@ -81,10 +81,10 @@ def test_a_killed_worker_gives_one_line_and_no_byte_depends_on_the_workers(
     assert psutil.wait_procs(workers, timeout=60)[1] == []
     assert not list(by_two.folder.rglob(".*.partial"))
     run_campaign(reverse, lambda works, chunks: run_in_process(works, reversed(list(chunks))))
-    begun = contents(by_two.folder)
-    assert 5 <= len(begun) < 80
-    assert run_campaign(by_two, run_in_process) == 80 - len(begun)
-    assert begun.items() <= contents(by_two.folder).items()
+    finished_files = contents(by_two.folder)
+    assert 5 <= len(finished_files) < 80
+    assert run_campaign(by_two, run_in_process) == 80 - len(finished_files)
+    assert finished_files.items() <= contents(by_two.folder).items()
     assert contents(by_two.folder) == contents(reverse.folder)
 
 
