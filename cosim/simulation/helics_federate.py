@@ -188,13 +188,13 @@ class _Network:
         helics = self._helics
         for flow, number, bit in departures:
             route, endpoint = self.routes[flow], self._endpoints[flow]
-            kept = route.waiting.pop(number)
-            if kept.copies > 1:
-                route.waiting[number] = kept._replace(copies=kept.copies - 1)
+            queued = route.waiting.pop(number)
+            if queued.copies > 1:
+                route.waiting[number] = queued._replace(copies=queued.copies - 1)
             message = helics.helicsEndpointCreateMessage(endpoint)
-            helics.helicsMessageSetData(message, _with_flipped(kept.data, bit))
+            helics.helicsMessageSetData(message, _with_flipped(queued.data, bit))
             helics.helicsMessageSetDestination(message, route.destination)
-            helics.helicsMessageSetOriginalSource(message, kept.source)
+            helics.helicsMessageSetOriginalSource(message, queued.source)
             helics.helicsMessageSetTime(message, now_s)
             helics.helicsEndpointSendMessage(endpoint, message)
 

@@ -120,11 +120,11 @@ class SampledLoop:
             setattr(plant, name, pointer_to(array, "double *"))
         plant.sources, plant.at_input.width = sources.shape[1], 0
         noises = _dense(noise)
-        for signal, values, given in (
+        for signal, values, count in (
             (plant.at_state, at_state, len(increments)),
             (plant.noise, noises, len(noise)),
         ):
-            signal.width = values.shape[1] if given else 0
+            signal.width = values.shape[1] if count else 0
             signal.first, signal.rows = 0, len(values)
             signal.values = pointer_to(values, "double *")
         self._plant = plant
@@ -137,17 +137,17 @@ class SampledLoop:
 
     def start(self) -> Runs:
         """Return one run at its start: after the delivered first packet, if there is one."""
-        n, known = self.matrices.n, self.known_start
+        n, known_start = self.matrices.n, self.known_start
         runs = self.empty(1)
         x0 = self.matrices.x0
         runs.x[0], runs.auxiliary[0], runs.step[0] = x0, self._first_auxiliary, -1
-        if known:
+        if known_start:
             runs.x_s[0] = runs.x_c[0] = x0
         observer = self.resolved.observer
         if observer is not None:
-            given = observer.initial_estimate
-            runs.y[0] = (x0 if known else np.zeros(n)) if given is None else np.array(given)
-        if not known:
+            estimate = observer.initial_estimate
+            runs.y[0] = (x0 if known_start else np.zeros(n)) if estimate is None else np.array(estimate)
+        if not known_start:
             runs.step[0] = 0
             self.measure_at(runs)
             self.transmit(runs, np.array([True]))
@@ -160,9 +160,9 @@ class SampledLoop:
 
     def with_disturbances(self, increments: Matrix, noise: Matrix) -> "SampledLoop":
         """Return this loop with other disturbances and noise."""
-        changed = copy(self)
-        changed._set_disturbances(increments, noise)
-        return changed
+        loop = copy(self)
+        loop._set_disturbances(increments, noise)
+        return loop
 
     def correction(self, numbers: Numbers) -> Stack:
         """Return the change of y by noise at each of k measurements, (k, n, p)."""
@@ -244,9 +244,9 @@ def state_increments(resolved: Scenario) -> Matrix:
     effect = disturbance_effect(resolved)
     increments = np.zeros((resolved.timing.horizon_ns // resolved.timing.plant_period_ns, n))
     d, w = disturbance.values(range(len(increments)))
-    for part, at in ((d, effect[:, :m]), (w, effect[:, m:])):
+    for part, matrix in ((d, effect[:, :m]), (w, effect[:, m:])):
         if part.shape[1]:
-            increments += part @ at.T
+            increments += part @ matrix.T
     return increments
 
 
