@@ -151,10 +151,10 @@ class LoopFeed:
         self._show_inputs(steps)
         self._undrawn.append(deliveries)
         self._show_deliveries(until_ns)
-        taken = self._take(PLANT_STEP, None)
+        plant_rows = self._take(PLANT_STEP, None)
         if self._has_internal_state or not self._scenario.coverage.knows_state:
-            self._steps = concatenate_rows([self._steps, taken], self._steps.dtype)
-        self._show_lateness("plant", taken)
+            self._steps = concatenate_rows([self._steps, plant_rows], self._steps.dtype)
+        self._show_lateness("plant", plant_rows)
         self._show_measurements(self._take(SENSOR_MEASUREMENT, until_ns), reach_ns)
         for table in self._clock_tables:
             self._show_clock_errors(table, self._take(table, None))

@@ -136,7 +136,7 @@ class RecordingFile:
 def run_text(scenario: Scenario, kind: Kind = "live") -> str:
     """Return the viewer's text about a run, in Markdown."""
     network = scenario.network
-    late = {
+    lateness = {
         "live": "* **Lateness**: wall time between a deadline and the process's action.",
         "simulated": "* The run was **simulated** in virtual time: no deadline was missed.",
     }[kind]
@@ -163,7 +163,7 @@ The network ({network.loss.model.replace("_", "-")} loss) guarantees:
 * **Errors**: e_s = x_s − x with its threshold; e_c = x_c − x with two bounds, one from identity
   (I1) and the certified one. No process of the loop can measure e_c. The certified bound holds
   while no process is later than the certificate allows (see the claims of the summary).
-{late}
+{lateness}
 """
 
 

@@ -68,7 +68,7 @@ class NetworkDiagram:
         self._in_flight = np.zeros(0, _PACKET)
         self._drawn_ns = -1
         self._last_ns = {False: -_SPACING_NS, True: -_SPACING_NS}
-        self._shown: dict[str, int] = {}
+        self._shape_counts: dict[str, int] = {}
 
     @staticmethod
     def panel() -> rrb.Spatial2DView:
@@ -179,8 +179,10 @@ class NetworkDiagram:
         y = np.where(leaves & ~survives, -_HALF_HIGH - 0.2 - 1.3 * fall, 0.0)
         forced = pairs["fate"] == Fate.FORCED
         if self._reverse is Flow.ACTUATION:
-            back = np.where(leaves & survives, _NETWORK * (1 - onward), _CONTROLLER - _BOX_DISTANCE * reached)
-            x, y = np.where(reverse, back, x), np.where(reverse, _INPUT_Y + 0.4 * y, y)
+            x_reverse = np.where(
+                leaves & survives, _NETWORK * (1 - onward), _CONTROLLER - _BOX_DISTANCE * reached
+            )
+            x, y = np.where(reverse, x_reverse, x), np.where(reverse, _INPUT_Y + 0.4 * y, y)
         else:
             x = np.where(reverse, 2 * _NETWORK - x, x)
             y = np.where(reverse & (survives | ~leaves), _REVERSE_Y, y)
@@ -195,8 +197,8 @@ class NetworkDiagram:
         moving: dict[str, Moving] = {}
         for entity, shown in states.items():
             shapes = np.bincount(frame[shown] - first, minlength=last - first + 1)
-            before = np.concatenate([[self._shown.get(entity, 0)], shapes[:-1]])
-            self._shown[entity] = int(shapes[-1])
+            before = np.concatenate([[self._shape_counts.get(entity, 0)], shapes[:-1]])
+            self._shape_counts[entity] = int(shapes[-1])
             rows = (shapes > 0) | (before > 0)  # a row without shapes removes the previous ones
             if rows.any():
                 t_ns = (first + np.flatnonzero(rows)) * _FRAME_NS
@@ -219,6 +221,6 @@ def _shapes(entity: str, places: Reals, counts: NDArray[np.int64]) -> Columns:
 
 
 def _arrow(start: float, end: float, y: float) -> list[list[tuple[float, float]]]:
-    back = -0.2 if end > start else 0.2
-    head = [(end + back, y + 0.14), (end, y), (end + back, y - 0.14)]
+    barb = -0.2 if end > start else 0.2
+    head = [(end + barb, y + 0.14), (end, y), (end + barb, y - 0.14)]
     return [[(start, y), (end, y)], head]
