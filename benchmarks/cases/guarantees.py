@@ -53,16 +53,16 @@ class Decider:
         return self._link.decide_many(*self._columns)
 
 
-def check_rows(before: str, guarantee: str, count: int) -> Iterator[Row]:
+def check_rows(impairments: str, guarantee: str, count: int) -> Iterator[Row]:
     """Yield the flows with a violation in ``count`` decisions, and the loss rate if it can be predicted."""
-    words, allowed = f"{before} {guarantee}", settings_of(guarantee)
+    words, guarantee_settings = f"{impairments} {guarantee}", settings_of(guarantee)
     announce(f"{count:,} decisions, {words}")
     decider = Decider(f"{words} limit 1000000")
     flows = [outcomes_of(decider.decide()) for _ in range(count // _BATCH)]
-    number = sum(not is_allowed(lost, allowed) for lost in flows)
+    number = sum(not is_allowed(lost, guarantee_settings) for lost in flows)
     yield Row(f"{words}: flows with a violation", number, "", goal=ZERO, note=f"{count:,} decisions")
-    if "delay" not in words and (expected := expected_loss(settings_of(words)).rate):
-        yield Row(f"{words}: lost", 100 * float(np.mean(flows)), "%", Peer("predicted", 100 * expected))
+    if "delay" not in words and (predicted_rate := expected_loss(settings_of(words)).rate):
+        yield Row(f"{words}: lost", 100 * float(np.mean(flows)), "%", Peer("predicted", 100 * predicted_rate))
 
 
 def network_rows() -> Iterator[Row]:
@@ -124,8 +124,8 @@ def triggers(paper: dict[str, Any], weight: Matrix) -> dict[str, dict[str, Any]]
     """Return the settings of every policy by name; constant thresholds are a fifth of β."""
     W, delta = {"weight": weight.tolist()}, 0.2 * paper["beta"]
     square = weight.T @ weight
-    nothing = np.zeros_like(square)
-    Q = np.block([[-(_SIGMA**2) * square, nothing], [nothing, square]])
+    zero = np.zeros_like(square)
+    Q = np.block([[-(_SIGMA**2) * square, zero], [zero, square]])
     absolute = {"policy": "absolute", "delta": delta} | W
     deadline = {"policy": "deadline", "interval_s": _DEADLINE_S}
     dynamic = {"policy": "dynamic", "sigma": 0.5, "theta_s": 0.1, "decay_per_s": 1.0}
@@ -182,13 +182,13 @@ def tightness_rows(loop: Scenario, policy: str, trigger: Mapping[str, Any]) -> I
 
 def row_of(name: str, worst: WorstRun) -> Row:
     """Return the share of a bound that the worst run uses; more than 1 refutes the bound."""
-    searched = f"all {worst.runs}" if worst.exact else f"some, {worst.runs} runs"
+    patterns = f"all {worst.runs}" if worst.exact else f"some, {worst.runs} runs"
     return Row(
         f"{name}: {QUANTITIES[worst.objective]}",
         worst.tightness,
         "of the bound",
         goal=Goal("<=", _ROUNDING),
-        note=f"worst {worst.value}, certified {worst.certified}; patterns searched: {searched}",
+        note=f"worst {worst.value}, certified {worst.certified}; patterns searched: {patterns}",
     )
 
 

@@ -136,15 +136,15 @@ def delay(options: argparse.Namespace) -> Iterator[Row]:
     relay's core.
     """
     with relay_load.compiled_code() as tools:
-        added, late = _added(tools), _late(tools)
-    yield added.row(f"{DIRECT}: one way, p50", "µs", "p50", DIRECT)
+        added_rounds, late_rounds = _added(tools), _late(tools)
+    yield added_rounds.row(f"{DIRECT}: one way, p50", "µs", "p50", DIRECT)
     for peer in ("socat", "C relay"):
         for quantile in ("p50", "p99"):
             name, goal = f"{PLAIN}: added one way, {quantile}", ADDED_GOALS.get((peer, quantile))
-            yield added.row(name, "µs", quantile, PLAIN, peer, goal, paired=True)
+            yield added_rounds.row(name, "µs", quantile, PLAIN, peer, goal, paired=True)
     for quantile, goal in (("p50", None), ("p99", Goal("<=", 2))):
         name = f"{PLAIN}: lateness behind {DELAY_MS} ms, {quantile}"
-        yield late.row(name, "µs", quantile, PLAIN, KERNEL, goal, paired=True)
+        yield late_rounds.row(name, "µs", quantile, PLAIN, KERNEL, goal, paired=True)
 
 
 def quantiles_of(name: str, delays_ns: relay_load.Nanoseconds, base_us: float = 0.0) -> Figures:
