@@ -154,12 +154,12 @@ def test_rows_of_a_host_that_was_cut_off_are_collected(start: Start, hosts: TwoH
     folder = tmp_path / "kept" / run_dir.name
     for process in away:
         assert f"are kept in {folder} " in errors[process]
-    done = invoke("collect", run_dir, "nohost.invalid:kept")
-    assert done.exit_code in (1, 2)
-    assert done.stderr.startswith("noack: nohost.invalid:kept: ")
-    done = invoke("collect", run_dir, folder, "--json")
-    assert done.exit_code == 0, done.stderr
-    replay = json.loads(done.stdout)["loops"][0]["replay"]
+    result = invoke("collect", run_dir, "nohost.invalid:kept")
+    assert result.exit_code in (1, 2)
+    assert result.stderr.startswith("noack: nohost.invalid:kept: ")
+    result = invoke("collect", run_dir, folder, "--json")
+    assert result.exit_code == 0, result.stderr
+    replay = json.loads(result.stdout)["loops"][0]["replay"]
     assert replay["bit_exact"]
     assert replay["complete"]
     assert len(load_record(run_dir)["controller_step"]) == 8 * live.RATE_HZ

@@ -45,12 +45,12 @@ EMULATED, TARGET = "arm", "arm-linux-musleabihf"
 def built(folder: Path, **environment: str) -> Path:
     """Build the example for this machine, or by the compiler in CC; skip without a compiler."""
     program = folder / "controller_node"
-    done = subprocess.run(
+    result = subprocess.run(
         [sys.executable, BUILD, "--node", program], check=False, env=os.environ | environment
     )
-    if done.returncode == NO_COMPILER:
+    if result.returncode == NO_COMPILER:
         pytest.skip("there is no C compiler")
-    assert done.returncode == 0
+    assert result.returncode == 0
     return program
 
 
@@ -182,9 +182,9 @@ def test_a_run_with_a_program_that_cannot_be_started_is_refused_in_one_line(tmp_
         (program, "cannot be started: Permission denied; it must be executable"),
     ):
         runs = ("--json", "--runs", tmp_path / "runs", *live.BARE)
-        done = invoke("run", "lane_following", *runs, *options_for(file))
-        assert done.exit_code == 2, done.stderr
-        error = json.loads(done.stdout)["error"]
+        result = invoke("run", "lane_following", *runs, *options_for(file))
+        assert result.exit_code == 2, result.stderr
+        error = json.loads(result.stdout)["error"]
         assert line in error
         assert "\n" not in error
 

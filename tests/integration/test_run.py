@@ -144,9 +144,9 @@ def test_the_recording_shows_the_bounds(finished: Finished, record: RunRecord) -
 
 
 def set_parameters(*words: str) -> dict[str, Any]:
-    done = invoke("set", "--json", *words)
-    answer: dict[str, Any] = json.loads(done.stdout)
-    assert done.exit_code == answer.get("exit", {"status": 0})["status"], done.stderr
+    result = invoke("set", "--json", *words)
+    answer: dict[str, Any] = json.loads(result.stdout)
+    assert result.exit_code == answer.get("exit", {"status": 0})["status"], result.stderr
     return answer
 
 
@@ -156,9 +156,9 @@ def test_a_run_is_changed_twice_and_stopped(
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     running = start(*AT_RATE, *settings(horizon_s=1000.0))
     running.wait_recording()
-    refused = invoke("summary", running.runs / "latest")
-    assert refused.exit_code == 2
-    assert "still under way" in refused.stderr
+    result = invoke("summary", running.runs / "latest")
+    assert result.exit_code == 2
+    assert "still under way" in result.stderr
     first = set_parameters("loss.p", "0.5", "mansd=2")
     second = set_parameters("setpoint", "[0.0, 0.0, 0.0, 1.0]")
     assert second["runtime_parameters"]["network.mansd"] == 2

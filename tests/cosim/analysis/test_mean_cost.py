@@ -145,6 +145,6 @@ def test_costs_that_do_not_depend_on_what_grows_are_those_of_the_loop_without_it
     ],
 )
 def test_noack_cost_prints_the_result_or_the_reason(words: list[str], status: int, message: str) -> None:
-    done = invoke("cost", *words)
-    assert done.exit_code == status, done.output
-    assert message in done.output
+    result = invoke("cost", *words)
+    assert result.exit_code == status, result.output
+    assert message in result.output

@@ -164,9 +164,9 @@ class NoStep(Clock):
     (Clock, HALF, {"seed": np.int64(-1)}, "must be a whole number, 0 or more"),
 ])  # fmt: skip
 def test_a_mistake_is_one_line(env: Any, network: Any, given: Any, why: str) -> None:
-    with pytest.raises(CallerError, match=why) as caught:
+    with pytest.raises(CallerError, match=why) as error:
         noack.LossyChannel(env(), network, **given)
-    assert "\n" not in str(caught.value)
+    assert "\n" not in str(error.value)
 
 
 def test_without_gymnasium_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -243,10 +243,10 @@ def test_a_live_run_ends_with_a_verdict_and_is_the_selected_recorded_run(
     page.call("Page.navigate", url=report)
     page.wait(f"{TEXT}.includes('completed 4 s') && origin === 'null'")
     for wrong, status in ((report.replace("/report/", "x/report/"), 404), (report + "x", 404)):
-        with pytest.raises(HTTPError) as refused:
+        with pytest.raises(HTTPError) as error:
             urlopen(wrong)
-        assert refused.value.code == status
-        refused.value.close()
+        assert error.value.code == status
+        error.value.close()
     # A new page selects the newest run.
     page.go(address)
     page.click("recorded", "button")

@@ -128,10 +128,10 @@ def other_role(host_files: HostFiles, full_record: RunRecord) -> None:
 def other_process(host_files: HostFiles, full_record: RunRecord) -> None:
     """Named after a process of another host, whose secret is not known here."""
     host_files.keep()
-    out = SpoolWriter(host_files.folder / SPOOL, WRITER["plant"])
-    out.append(PLANT_STEP, 0, stored(full_record, PLANT_STEP).tobytes())
-    out.append("key", 0, b"guessed")
-    out.close()
+    spool = SpoolWriter(host_files.folder / SPOOL, WRITER["plant"])
+    spool.append(PLANT_STEP, 0, stored(full_record, PLANT_STEP).tobytes())
+    spool.append("key", 0, b"guessed")
+    spool.close()
 
 
 def unknown_process(host_files: HostFiles, full_record: RunRecord) -> None:
@@ -213,9 +213,9 @@ def test_a_hostile_host_changes_nothing(
 ) -> None:
     attack(host_files, full_record)
     before = contents(run_dir.parent)
-    with pytest.raises(PeerError, match=reason) as caught:
+    with pytest.raises(PeerError, match=reason) as error:
         collect(run_dir, str(host_files.folder), finish_record)
-    assert len(str(caught.value).splitlines()) == 1
+    assert len(str(error.value).splitlines()) == 1
     assert contents(run_dir.parent) == before
 
 

@@ -109,8 +109,8 @@ def test_a_change_received_too_late_is_reported_and_voids_its_claims() -> None:
     assert claims[0].until_s == 0.9
     assert claims[-1].from_s > made.everywhere_ns * 1e-9
     # In between, only one of the two models had the change.
-    joined = align_tables(record)
-    between = (joined.t_ns > 910 * MS) & (joined.t_ns < claims[-1].from_s * 1e9)
+    samples = align_tables(record)
+    between = (samples.t_ns > 910 * MS) & (samples.t_ns < claims[-1].from_s * 1e9)
     assert np.nanmax(identity_residual(record)[between]) > 1e-3
 
 

@@ -39,9 +39,9 @@ def simulated(folder: Path, *settings: str, options: Sequence[str] = ()) -> Resu
 @pytest.fixture(scope="module")
 def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
-    done = simulated(folder, "horizon_s=3", options=["--no-report"])
-    assert done.exit_code == 0, done.output
-    assert json.loads(done.stdout) == json.loads((folder / "latest/summary.json").read_text())
+    result = simulated(folder, "horizon_s=3", options=["--no-report"])
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout) == json.loads((folder / "latest/summary.json").read_text())
     return (folder / "latest").resolve()
 
 
@@ -81,18 +81,18 @@ def test_the_counts_of_the_loops_add_up_to_those_of_the_network(run_dir: Path) -
 
 def test_a_run_and_each_loop_can_be_summarised_and_replayed(run_dir: Path) -> None:
     for options in ((), ("--loop", "periodic")):
-        shown = invoke("summary", run_dir, *options)
-        assert shown.exit_code == 0, shown.output
-        assert ("--loop periodic --verbose" in shown.stdout) == bool(options)
+        output = invoke("summary", run_dir, *options)
+        assert output.exit_code == 0, output.output
+        assert ("--loop periodic --verbose" in output.stdout) == bool(options)
         replayed = invoke("replay", run_dir, *options, "--json")
         assert replayed.exit_code == 0, replayed.output
         assert json.loads(replayed.stdout)["gaps"] == []
-    shown = invoke("summary", run_dir).stdout
-    assert "bottleneck" in shown
-    assert "guarantee not checkable in 11 of 11 loops: pendulum-01: no certificate: " in shown
-    refused = invoke("summary", run_dir, "--loop", "x")
-    assert (refused.exit_code, refused.stderr.count("\n")) == (2, 1)
-    assert "--loop x: the run has no such loop; it has pendulum-01, " in refused.stderr
+    output = invoke("summary", run_dir).stdout
+    assert "bottleneck" in output
+    assert "guarantee not checkable in 11 of 11 loops: pendulum-01: no certificate: " in output
+    result = invoke("summary", run_dir, "--loop", "x")
+    assert (result.exit_code, result.stderr.count("\n")) == (2, 1)
+    assert "--loop x: the run has no such loop; it has pendulum-01, " in result.stderr
 
 
 def test_commands_refuse_a_damaged_table_in_one_line(run_dir: Path, tmp_path: Path) -> None:
@@ -102,10 +102,10 @@ def test_commands_refuse_a_damaged_table_in_one_line(run_dir: Path, tmp_path: Pa
     whole = table.read_bytes()
 
     def refused(*command: str) -> str:
-        done = invoke(command[0], damaged, *command[1:])
-        assert (done.exit_code, done.stderr.count("\n")) == (2, 1), done.output
-        assert done.stderr.startswith(f"noack: {table}: cannot be read: ")
-        return done.stdout
+        result = invoke(command[0], damaged, *command[1:])
+        assert (result.exit_code, result.stderr.count("\n")) == (2, 1), result.output
+        assert result.stderr.startswith(f"noack: {table}: cannot be read: ")
+        return result.stdout
 
     middle = len(whole) // 2
     table.write_bytes(whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :])
@@ -140,9 +140,9 @@ def test_a_report_is_refused_if_the_scenario_has_other_loops_than_the_record(run
     scenario = run_dir / "scenario.toml"
     given = scenario.read_text()
     scenario.write_text(given.replace("count = 10", "count = 9"))
-    refused = invoke("report", run_dir, "--again")
+    result = invoke("report", run_dir, "--again")
     scenario.write_text(given)
-    assert (refused.exit_code, "has other loops than" in refused.stderr) == (2, True)
+    assert (result.exit_code, "has other loops than" in result.stderr) == (2, True)
 
 
 @pytest.mark.usefixtures("no_recording")
@@ -152,17 +152,17 @@ def test_the_verdict_of_all_loops_says_why_claims_are_void(tmp_path: Path) -> No
     late = simulated(tmp_path, *settings, options=["--no-report"])
     claims = [claim for loop in json.loads(late.stdout)["loops"] for claim in loop["claims"]]
     reasons = {claim["why"] for claim in claims if claim["verdict"] == "void"}
-    shown = invoke("summary", tmp_path / "latest").stdout
-    assert any(f"no certificate: {why}" in shown for why in reasons)
-    assert not re.findall("^void: ", shown, re.MULTILINE)
+    output = invoke("summary", tmp_path / "latest").stdout
+    assert any(f"no certificate: {why}" in output for why in reasons)
+    assert not re.findall("^void: ", output, re.MULTILINE)
 
 
 @pytest.mark.parametrize("loop", [None, "periodic"])
 def test_a_missing_recording_is_written_when_it_is_viewed(run_dir: Path, loop: str | None) -> None:
     path = run_dir / ("recording.rrd" if loop is None else f"recording-{loop}.rrd")
     path.unlink(missing_ok=True)
-    done = invoke("view", run_dir, "--json", *(() if loop is None else ("--loop", loop)))
-    assert json.loads(done.stdout) == {"recording": str(path), "exists": True}
+    result = invoke("view", run_dir, "--json", *(() if loop is None else ("--loop", loop)))
+    assert json.loads(result.stdout) == {"recording": str(path), "exists": True}
     assert path.read_bytes().startswith(b"RRF")
 
 
@@ -183,9 +183,9 @@ def test_a_loop_that_diverges_is_named_and_the_others_go_on(tmp_path: Path) -> N
     loops = f'loops=[{{ name = "calm", count = 2 }}, {wild}]'
     change = 'changes=[{ at_s = 1.5, set = { "network.mansd" = 1 } }]'
     settings = ("horizon_s=3", "network.actuation={}", loops, change)
-    done = simulated(tmp_path, *settings, options=["--no-report"])
-    assert done.exit_code == 1
-    summary = json.loads(done.stdout)
+    result = simulated(tmp_path, *settings, options=["--no-report"])
+    assert result.exit_code == 1
+    summary = json.loads(result.stdout)
     diverged_at_s = summary["loops"][2]["diverged_at_s"] + summary["loops"][2]["phase_s"]
     reason = f"1 of 3 loops failed (wild diverged at {diverged_at_s:.2f} s)"
     assert summary["exit"]["reason"] == reason
@@ -213,9 +213,9 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
     settings = [word for setting in SETTINGS for word in ("--set", setting)]
     words = ("simulate", str(ONE_LOOP), "--runs", str(folder), "--json", "--no-report")
-    done = invoke(*words, *settings)
-    assert done.exit_code == 0, done.output
-    assert json.loads(done.stdout) == json.loads((folder / "latest/summary.json").read_text())
+    result = invoke(*words, *settings)
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout) == json.loads((folder / "latest/summary.json").read_text())
     assert not (folder / "latest/report.html").exists()
     assert invoke("report", "--runs", str(folder)).exit_code == 0
     return folder

@@ -46,17 +46,17 @@ def test_theorem_1_bounds_the_error_and_the_sum_over_the_real_intervals(
         plant={"rate_hz": 1000.0}, controller={"rate_hz": 1000.0}, horizon_s=3.0,
     )  # fmt: skip
     record = simulate(fast)
-    joined = align_tables(record)
+    samples = align_tables(record)
     delta = trajectory_delta(record)
     assert delta is not None
-    assert delta >= by_hand(record, joined) * (1 - 1e-6)
+    assert delta >= by_hand(record, samples) * (1 - 1e-6)
     trigger = record.scenario.trigger
-    level = trigger.beta * np.exp(-trigger.alpha_per_s * joined.t_ns * 1e-9)
-    known = joined.received >= 0
+    level = trigger.beta * np.exp(-trigger.alpha_per_s * samples.t_ns * 1e-9)
+    known = samples.received >= 0
     # The theorem assumes a continuous trigger; this one is tested once a millisecond.
-    overshoot = float((joined.e_s_norm / joined.threshold).max())
+    overshoot = float((samples.e_s_norm / samples.threshold).max())
     assert overshoot < 1.2
-    assert (joined.e_c_norm[known] <= overshoot * delta * level[known]).all()
+    assert (samples.e_c_norm[known] <= overshoot * delta * level[known]).all()
 
 
 def test_theorem_1_does_not_apply_without_events_or_with_a_weight(make: Make) -> None:

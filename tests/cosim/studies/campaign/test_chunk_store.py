@@ -81,10 +81,10 @@ def test_a_full_disk_gives_one_line_and_leaves_complete_files_only(
                 raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(file_access, "new_file", fill)
-    with pytest.raises(MachineError) as refused:
+    with pytest.raises(MachineError) as error:
         run_campaign(store, run_in_process)
-    assert str(refused.value).startswith(f"{store.folder}/runs/")
-    assert str(refused.value).endswith(
+    assert str(error.value).startswith(f"{store.folder}/runs/")
+    assert str(error.value).endswith(
         f".parquet: cannot be written: No space left on device; 12 of 28 runs are in "
         f"{store.folder}; the same command continues the campaign"
     )
@@ -120,9 +120,9 @@ def test_another_campaign_is_refused_in_the_same_folder(
     path = write(plan, draws=1)
     use(path, folder)
     assert use(path, folder) == 0
-    with pytest.raises(CallerError) as refused:
+    with pytest.raises(CallerError) as error:
         use(write(plan, **{"compare": None, "figures": [], key: value}), folder)
-    text = str(refused.value)
+    text = str(error.value)
     assert text.startswith(f"{folder}: holds another campaign (")
     assert expected in text
     assert "\n" not in text

@@ -77,9 +77,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def command(*words: str, ok: bool = True) -> Result:
-    done = invoke(*words)
-    assert (done.exit_code == 0) == ok, done.output
-    return done
+    result = invoke(*words)
+    assert (result.exit_code == 0) == ok, result.output
+    return result
 
 
 def test_three_commands_lead_from_a_class_to_a_certified_run() -> None:
@@ -264,11 +264,11 @@ def test_the_lines_about_mistakes_are_those_that_were_approved() -> None:
     pytest.importorskip("fmpy")
 
     def mistake(line: str) -> list[str]:
-        done = invoke(*line.split())
-        assert done.exit_code in (1, 2), done.output
-        assert done.stderr.count("\n") == 1
-        assert done.stdout == ""
-        return [done.stderr.strip()]
+        result = invoke(*line.split())
+        assert result.exit_code in (1, 2), result.output
+        assert result.stderr.count("\n") == 1
+        assert result.stdout == ""
+        return [result.stderr.strip()]
 
     compare_lines(Path(__file__).with_name("mistakes.txt"), mistake)
 

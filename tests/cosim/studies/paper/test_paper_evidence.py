@@ -180,9 +180,9 @@ def test_the_command_runs_the_campaign_and_writes_the_page(
     monkeypatch.setattr("cosim.cli.commands.study_commands.DEFAULT_RUNS", tmp_path / "runs")
     # test_paper_evidence.py computes it
     monkeypatch.setattr(paper_page, "evidence", lambda *_: COMMITTED["evidence"])
-    done = invoke("paper", "--draws", "5", "--out", tmp_path, "--json")
-    assert done.exit_code == 0, done.output
-    report = json.loads(done.stdout)
+    result = invoke("paper", "--draws", "5", "--out", tmp_path, "--json")
+    assert result.exit_code == 0, result.output
+    report = json.loads(result.stdout)
     assert report["draws"] == 5
     assert all(Path(file).is_file() for file in report["files"])
     assert (tmp_path / "runs" / "campaigns" / "paper" / "campaign.html").is_file()
