@@ -80,13 +80,13 @@ def start_processes(start: Start, *away: str, **more: int) -> list[subprocess.Po
 
 def end_well(*processes: subprocess.Popen[str]) -> list[Any]:
     """Wait for the processes' ends, with status 0; return what they printed as JSON."""
-    printed = []
+    outputs = []
     for process in processes:
         stdout, stderr = wait_for_end(process)
         assert process.returncode == 0, stderr
         assert "are kept in" not in stderr
-        printed.append(json.loads(stdout))
-    return printed
+        outputs.append(json.loads(stdout))
+    return outputs
 
 
 SEVERAL = f"""

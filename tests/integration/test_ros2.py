@@ -52,8 +52,8 @@ def node(*words: object) -> Iterator[subprocess.Popen[str]]:
 
 
 def peer(port: int, **more: object) -> dict[str, object]:
-    where = {"router": f"tcp/127.0.0.1:{port}", "listen": True}
-    return {"kind": "ros2", "timeout_s": 20.0, "start_timeout_s": 60.0, **where, **more}
+    ros2_settings = {"router": f"tcp/127.0.0.1:{port}", "listen": True}
+    return {"kind": "ros2", "timeout_s": 20.0, "start_timeout_s": 60.0, **ros2_settings, **more}
 
 
 def in_ros2(port: int) -> dict[str, object]:

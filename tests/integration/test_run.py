@@ -265,20 +265,20 @@ def test_a_live_run_agrees_with_the_simulated_run(tmp_path: Path) -> None:
 
 
 def compare(live: RunRecord, simulated: RunRecord, until_ns: int) -> None:
-    compared = 0
+    compared_rows = 0
     for table, columns in SAME.items():
         # A live row may be later than in the simulation, but the order is the same.
         rows = simulated[table][simulated[table]["now_ns"] < until_ns]
-        others = live[table][: len(rows)]
+        live_rows = live[table][: len(rows)]
         for column in columns:
-            np.testing.assert_array_equal(others[column], rows[column], f"{table}.{column}")
+            np.testing.assert_array_equal(live_rows[column], rows[column], f"{table}.{column}")
         for column in CLOSE.get(table, ()):
             # The same arithmetic in the same order, but BLAS may use another kernel.
             np.testing.assert_allclose(
-                others[column], rows[column], rtol=1e-9, atol=1e-12, err_msg=f"{table}.{column}"
+                live_rows[column], rows[column], rtol=1e-9, atol=1e-12, err_msg=f"{table}.{column}"
             )
-        compared += len(rows)
-    assert until_ns < ENOUGH_S * 1e9 or compared > 60
+        compared_rows += len(rows)
+    assert until_ns < ENOUGH_S * 1e9 or compared_rows > 60
     if until_ns > simulated.scenario.timing.horizon_ns:
         for table in SAME:
             assert len(live[table]) == len(simulated[table]), table

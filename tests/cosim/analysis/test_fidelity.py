@@ -115,7 +115,7 @@ def test_a_plant_that_missed_its_input_once_is_not_explained(record: RunRecord) 
 
 
 @pytest.mark.parametrize(
-    ("table", "column", "row", "value", "why"),
+    ("table", "column", "row", "value", "reason"),
     [
         (PLANT_STEP, "x", slice(300, None), math.nan, "diverged"),
         (SENSOR_MEASUREMENT, "t_ns", None, 2**62, "has times that no run has"),
@@ -132,7 +132,7 @@ def test_a_plant_that_missed_its_input_once_is_not_explained(record: RunRecord) 
     ],
 )
 def test_a_record_that_is_not_that_of_a_whole_run_is_not_compared(
-    record: RunRecord, table: str, column: str | None, row: Any, value: Any, why: str
+    record: RunRecord, table: str, column: str | None, row: Any, value: Any, reason: str
 ) -> None:
     """Without a column, rows are missing; without a row, the one in the middle is meant."""
     rows = record[table].copy()
@@ -141,11 +141,11 @@ def test_a_record_that_is_not_that_of_a_whole_run_is_not_compared(
     else:
         rows[column][len(rows) // 2 if row is None else row] = value
     broken = changed(record, {table: rows})
-    with pytest.raises(IncomparableError, match=why):
+    with pytest.raises(IncomparableError, match=reason):
         compute_fidelity(broken)
     summary = fidelity_for_summary(broken)
     assert isinstance(summary, NoFidelityPart)
-    assert why in summary.reason
+    assert reason in summary.reason
 
 
 def test_an_interrupted_run_is_compared_up_to_its_end(record: RunRecord) -> None:

@@ -191,7 +191,7 @@ def test_an_interrupted_finalisation_is_completed(run_dir: Path) -> None:
     finalize(ended_well(run_dir), report=False)
     notices, write = run_dir / "record/notices.jsonl", json.dumps
     notices.write_text('{"t_ns": 5, "level": "info", "text": "kept", "process": "plant"}\n')
-    before = notices.read_text()
+    old_text = notices.read_text()
     for name in (SPOOL, f"{SPOOL}.done"):
         writer = SpoolWriter(run_dir / name, "plant")
         writer.append(PLANT_STEP, 0, b"")
@@ -204,7 +204,7 @@ def test_an_interrupted_finalisation_is_completed(run_dir: Path) -> None:
 
     with patch("json.dumps", full), pytest.raises(MachineError, match="No space"):
         finish_record(run_dir)
-    assert notices.read_text() == before
+    assert notices.read_text() == old_text
     assert finish_record(run_dir).loop().notices
     assert not [*run_dir.glob(f"{SPOOL}*")]
     (run_dir / SUMMARY_FILE).unlink()
@@ -260,7 +260,7 @@ def test_a_prepared_end_is_that_of_a_run_without_preparation(
     *,
     is_killed: bool,
 ) -> None:
-    given = (many_loops, 0, ExitStatus.OK, "horizon")
+    ending_arguments = (many_loops, 0, ExitStatus.OK, "horizon")
     helpers = FinalizeHelpers(load(many_loops / SCENARIO_FILE))
     helpers.end_preparation()
     helpers.submit(exec, _NEVER_IDLE).result()
@@ -273,7 +273,7 @@ def test_a_prepared_end_is_that_of_a_run_without_preparation(
         assert helpers.submit(os.getpid).result() != os.getpid()
         with pytest.raises(BrokenProcessPool):
             helpers.submit(os._exit, 1).result()
-    ending = RunEndingWithHelpers(*given, helpers=helpers)
+    ending = RunEndingWithHelpers(*ending_arguments, helpers=helpers)
     _, expected = judged_alone
     assert finalize(ending, report=False, view=not is_killed).summary == expected
 

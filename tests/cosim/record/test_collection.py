@@ -51,8 +51,8 @@ def run_dir(full_record: RunRecord, tmp_path: Path) -> Path:
     }
     del reports["controller"]
     (folder / run_directory.REPORTS_FILE).write_text(json.dumps(reports))
-    joined = {WRITER[role]: {"process": role, "generation": 0} for role in SECRETS}
-    (folder / run_directory.PROCESSES_FILE).write_text(json.dumps(joined))
+    processes = {WRITER[role]: {"process": role, "generation": 0} for role in SECRETS}
+    (folder / run_directory.PROCESSES_FILE).write_text(json.dumps(processes))
     tables = {table: full_record[table] for table in full_record.tables}
     tables[CONTROLLER_STEP] = tables[CONTROLLER_STEP][:100]
     write_run(run_of_one_loop(RunRecord(full_record.scenario, tables, [], reports)), folder)
@@ -104,10 +104,10 @@ def test_kept_rows_complete_the_record_also_twice(
     for _ in range(2):
         _, roles = collect(run_dir, str(host_files.folder), finish_record)
         assert roles == ["controller"]
-        again = load_record(run_dir)
-        assert not +missing_rows(again)
+        reloaded = load_record(run_dir)
+        assert not +missing_rows(reloaded)
         for table in full_record.tables:
-            assert again[table].tobytes() == full_record[table].tobytes(), table
+            assert reloaded[table].tobytes() == full_record[table].tobytes(), table
         assert [path.name for path in run_dir.parent.iterdir()] == ["run"]
 
 

@@ -99,7 +99,7 @@ def test_commands_refuse_a_damaged_table_in_one_line(run_dir: Path, tmp_path: Pa
     damaged = tmp_path / "damaged"
     shutil.copytree(run_dir, damaged)
     table = damaged / "record" / "sensor_measurement.parquet"
-    whole = table.read_bytes()
+    table_bytes = table.read_bytes()
 
     def refused(*command: str) -> str:
         result = invoke(command[0], damaged, *command[1:])
@@ -107,13 +107,14 @@ def test_commands_refuse_a_damaged_table_in_one_line(run_dir: Path, tmp_path: Pa
         assert result.stderr.startswith(f"noack: {table}: cannot be read: ")
         return result.stdout
 
-    middle = len(whole) // 2
-    table.write_bytes(whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :])
+    middle = len(table_bytes) // 2
+    changed_byte = bytes([table_bytes[middle] ^ 1])
+    table.write_bytes(table_bytes[:middle] + changed_byte + table_bytes[middle + 1 :])
     for command in (["replay"], ["report"], ["fidelity", "--loop", "periodic"]):
         refused(*command)
     for kind, name in (("csv", "tables"), ("mat", "run.mat"), ("mcap", "run.mcap")):
         refused("export", "--format", kind, "--out", str(tmp_path / name))
-    for content in (whole[:middle], None):
+    for content in (table_bytes[:middle], None):
         table.unlink()
         if content is not None:
             table.write_bytes(content)
@@ -138,10 +139,10 @@ def test_the_summary_and_the_page_of_a_run_name_the_pages_of_its_loops(run_dir: 
 
 def test_a_report_is_refused_if_the_scenario_has_other_loops_than_the_record(run_dir: Path) -> None:
     scenario = run_dir / "scenario.toml"
-    given = scenario.read_text()
-    scenario.write_text(given.replace("count = 10", "count = 9"))
+    text = scenario.read_text()
+    scenario.write_text(text.replace("count = 10", "count = 9"))
     result = invoke("report", run_dir, "--again")
-    scenario.write_text(given)
+    scenario.write_text(text)
     assert (result.exit_code, "has other loops than" in result.stderr) == (2, True)
 
 
@@ -239,12 +240,18 @@ def test_a_simulated_run_has_the_files_of_a_live_run(runs: Path) -> None:
 
 
 def test_the_record_on_disk_equals_the_simulators(runs: Path) -> None:
-    again, loaded = simulate(resolve(load(ONE_LOOP, SETTINGS))), load_record(runs / "latest")
-    assert all(again[table].tobytes() == loaded[table].tobytes() for table in again.tables)
-    assert loaded.scenario == again.scenario
-    assert loaded.kind == again.kind == "simulated"
-    assert loaded.reports == again.reports
-    assert loaded.notices == again.notices
+    simulated_record, loaded_record = (
+        simulate(resolve(load(ONE_LOOP, SETTINGS))),
+        load_record(runs / "latest"),
+    )
+    assert all(
+        simulated_record[table].tobytes() == loaded_record[table].tobytes()
+        for table in simulated_record.tables
+    )
+    assert loaded_record.scenario == simulated_record.scenario
+    assert loaded_record.kind == simulated_record.kind == "simulated"
+    assert loaded_record.reports == simulated_record.reports
+    assert loaded_record.notices == simulated_record.notices
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device")])

@@ -175,10 +175,10 @@ def with_rows(files: Files, path: Path) -> Path:
     """Put five million equal rows, a few kilobytes, in the place of a table."""
     name, rows = "record/plant_step.parquet", io.BytesIO()
     table = pq.read_table(io.BytesIO(files[name]))
-    many = pa.table({
+    large_table = pa.table({
         column.name: pa.repeat(table[column.name][0], 5_000_000) for column in table.schema
     })  # fmt: skip
-    pq.write_table(many.cast(table.schema), rows, compression="zstd")
+    pq.write_table(large_table.cast(table.schema), rows, compression="zstd")
     assert len(rows.getvalue()) < 2_000_000
     return write(path, checked(files | {name: rows.getvalue()}))
 

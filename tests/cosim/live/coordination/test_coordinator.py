@@ -174,10 +174,10 @@ def test_a_refused_change_has_no_effect_on_the_next_one() -> None:
     """It is valid now and with the last settings, but not with the first of those scheduled."""
     change = 'changes=[{ at_s = 8.0, set = { "network.mansd" = 2 } }]'
     requests = requests_of('{ name = "p", count = 2 }', change)
-    kept = {"model": "bernoulli", "probability": 0.8, "keep": True}
+    impossible_loss = {"model": "bernoulli", "probability": 0.8, "keep": True}
     with pytest.raises(CallerError, match=r"network\.loss: loss 80% keep: impossible"):
-        requested(requests, {"network.mansd": 10, "network.loss": kept})
-    loss = kept | {"probability": 0.2}
+        requested(requests, {"network.mansd": 10, "network.loss": impossible_loss})
+    loss = impossible_loss | {"probability": 0.2}
     assert requested(requests, {"network.loss": loss})["from_s"] > 0
     parameters = requested(requests, {})["runtime_parameters"]
     assert (parameters["network.mansd"], parameters["network.loss"]["probability"]) == (2, 0.2)

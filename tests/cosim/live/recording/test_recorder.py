@@ -115,9 +115,9 @@ class Run:
 
 @pytest.fixture
 def run(content: dict[str, Any], tmp_path: Path) -> Iterator[Run]:
-    opened = Run(resolve(validate(content, "")), tmp_path)
-    yield opened
-    opened.recorder.store.writer.close()
+    opened_run = Run(resolve(validate(content, "")), tmp_path)
+    yield opened_run
+    opened_run.recorder.store.writer.close()
 
 
 def test_invalid_telemetry_is_ignored_and_the_rest_is_stored(

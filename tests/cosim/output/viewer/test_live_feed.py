@@ -33,8 +33,8 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def shown(folder: Path, count: int, *settings: str) -> tuple[RecordedRun, Chunks, list[str]]:
     """Simulate loops, and pass their rows on as in a live run; read the recording."""
-    given = ["horizon_s=2.0", f'loops=[{{ name = "p", count = {count} }}]', *settings]
-    run = simulate_loops(shipped("shared_bottleneck", *given))
+    all_settings = ["horizon_s=2.0", f'loops=[{{ name = "p", count = {count} }}]', *settings]
+    run = simulate_loops(shipped("shared_bottleneck", *all_settings))
     scenario, messages = run.network.scenario, list[str]()
     with open_recording(scenario, folder, 9, None) as view:
         feed = LiveFeed(scenario, view, messages.append)
@@ -52,14 +52,14 @@ def test_all_loops_are_shown_as_from_the_record(tmp_path: Path, count: int, phas
     run, chunks, messages = shown(tmp_path, count, f"controller.phase={phase}")
     expected = loops_over_time(run)
     for entity, values in ((ALL_ERRORS, expected.errors), (ALL_SIZES, expected.states)):
-        t_ns, drawn = series(chunks, entity)
+        t_ns, log_values = series(chunks, entity)
         assert (np.diff(t_ns) > 0).all()
         assert len(t_ns) == INTERVALS
         curves = (values if count == 3 else quantiles(values)).T
         known = np.isfinite(curves)
-        difference = np.abs(10**drawn - curves)[known]
-        least = 1e-5 * np.nanmax(curves)  # curves are cut off below
-        close = difference <= 1e-3 * curves[known] + least
+        difference = np.abs(10**log_values - curves)[known]
+        smallest = 1e-5 * np.nanmax(curves)  # curves are cut off below
+        close = difference <= 1e-3 * curves[known] + smallest
         assert close.mean() > 0.99  # at the start, the newest tick may be before x(0)
     horizon_ns = run.network.scenario.timing.horizon_ns
     edges_ns = np.linspace(0, horizon_ns, INTERVALS + 1)

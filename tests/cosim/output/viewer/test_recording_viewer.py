@@ -46,8 +46,8 @@ def get(url: str, host: str | None = None) -> tuple[int, bytes]:
         target = f"{parts.path}?{parts.query}" if parts.query else parts.path
         connection.request("GET", target, headers={"Host": host or parts.netloc})
         answer = connection.getresponse()
-        if (there := answer.getheader("Location")) is not None:
-            return get(urljoin(url, there))
+        if (location := answer.getheader("Location")) is not None:
+            return get(urljoin(url, location))
         return answer.status, answer.read()
 
 
@@ -164,8 +164,8 @@ def test_a_file_that_is_not_a_recording_is_not_served(content: bytes | None, tmp
     path = tmp_path / "recording.rrd"
     if content is not None:
         path.write_bytes(content)
-    wanted = "no such recording" if content is None else "not a rerun recording"
-    with pytest.raises(CallerError, match=rf"recording\.rrd: {wanted}"):
+    message = "no such recording" if content is None else "not a rerun recording"
+    with pytest.raises(CallerError, match=rf"recording\.rrd: {message}"):
         view_recording(path)
 
 

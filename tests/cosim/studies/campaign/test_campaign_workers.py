@@ -16,7 +16,7 @@ from cosim.studies.campaign import campaign_workers
 from cosim.studies.campaign.arithmetic import arithmetic
 from cosim.studies.campaign.campaign_workers import (
     Chunk,
-    Finished,
+    FinishedChunk,
     LostWorkersError,
     Work,
     cluster_runner,
@@ -147,7 +147,7 @@ def test_an_interrupted_and_then_killed_campaign_continues_where_it_stopped(
 def test_a_signal_ends_a_campaign_with_one_line(
     many: Path, tmp_path: Path, run_command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def signalled(works: Sequence[Work], chunks: Iterable[Chunk]) -> Iterator[Finished]:
+    def signalled(works: Sequence[Work], chunks: Iterable[Chunk]) -> Iterator[FinishedChunk]:
         for i, finished in enumerate(run_in_process(works, chunks)):
             if i == 5:
                 signal.raise_signal(signal.SIGTERM)

@@ -273,18 +273,18 @@ def test_the_lines_about_mistakes_are_those_that_were_approved() -> None:
     compare_lines(Path(__file__).with_name("mistakes.txt"), mistake)
 
 
-@pytest.mark.parametrize(("edit", "why"), [
+@pytest.mark.parametrize(("edit", "reason"), [
     ({"plant": 1}, "not written by `noack linearise`"),
     ({"gain": [[1.0]]}, "gain: 1 numbers; the plant has 4 states"),
     ({"gain": [[1.0] * 4] * 2}, "gain: 2 rows; the plant has 1 inputs"),
     ({"gain": [[0.0] * 4]}, "does not stabilise the model"),
     ({"at": [0.0]}, "at: 1 numbers"),
 ])  # fmt: skip
-def test_a_damaged_file_of_a_model_is_refused(edit: dict[str, Any], why: str) -> None:
+def test_a_damaged_file_of_a_model_is_refused(edit: dict[str, Any], reason: str) -> None:
     command("gain", "cart_pole", "--out", "model.json")
     document = json.loads(Path("model.json").read_text())
     Path("model.json").write_text(json.dumps(document | edit))
-    with pytest.raises(CallerError, match=why):
+    with pytest.raises(CallerError, match=reason):
         noack.new("model.json")
 
 
