@@ -23,7 +23,7 @@ from noack.theory.certificates.trigger_weight import choose_weight
 from tests.oracles.loss_language import is_allowed, longest_burst, outcomes_of
 
 DECISIONS = 100_000_000
-_BATCH = 1_000_000
+_FLOW_DECISIONS = 1_000_000
 REORDERING = "delay 5ms 5ms reorder 20% duplicate 5% corrupt 5%"
 COMBINATIONS = (
     "mansd 4",
@@ -43,7 +43,11 @@ class Decider:
 
     def __init__(self, words: str, spacing_ns: int = 10_000) -> None:
         self._link, self._flow = LinkState(settings_of(words), 7, "relay", "forward"), 0
-        self._columns = np.zeros(_BATCH, np.int64), np.full(_BATCH, 72), np.arange(_BATCH) * spacing_ns
+        self._columns = (
+            np.zeros(_FLOW_DECISIONS, np.int64),
+            np.full(_FLOW_DECISIONS, 72),
+            np.arange(_FLOW_DECISIONS) * spacing_ns,
+        )
 
     def decide(self) -> NDArray[Any]:
         """Return the decisions for the datagrams of the next flow."""
@@ -58,7 +62,7 @@ def check_rows(impairments: str, guarantee: str, count: int) -> Iterator[Row]:
     words, guarantee_settings = f"{impairments} {guarantee}", settings_of(guarantee)
     announce(f"{count:,} decisions, {words}")
     decider = Decider(f"{words} limit 1000000")
-    flows = [outcomes_of(decider.decide()) for _ in range(count // _BATCH)]
+    flows = [outcomes_of(decider.decide()) for _ in range(count // _FLOW_DECISIONS)]
     number = sum(not is_allowed(lost, guarantee_settings) for lost in flows)
     yield Row(f"{words}: flows with a violation", number, "", goal=ZERO, note=f"{count:,} decisions")
     if "delay" not in words and (predicted_rate := expected_loss(settings_of(words)).rate):
@@ -84,7 +88,7 @@ def network_rows() -> Iterator[Row]:
         yield Row(f"{name}: longest loss burst", longest_burst(lost), "", goal=goal)
     back_ns = networks[cap]["hold_back_ns"]
     back_ns = back_ns[back_ns > 0]
-    yield Row(f"{cap}: held back", 100 * len(back_ns) / _BATCH, "%")
+    yield Row(f"{cap}: held back", 100 * len(back_ns) / _FLOW_DECISIONS, "%")
     yield Row(f"{cap}: held back by, median", float(np.median(back_ns)) / 1e6, "ms")
 
 
@@ -108,7 +112,7 @@ def guarantee(options: argparse.Namespace) -> Iterator[Row]:
 
 
 LOOPS = ("lane_following", "double_integrator", "unstable_pendulum", "f16_lateral")
-NODES, BEAM = 200_000, 64
+MOST_NODES, BEAM = 200_000, 64
 _SIGMA, _PERIOD_S, _DEADLINE_S = 0.005, 0.01, 0.02
 _ROUNDING = 1 + 1e-9
 LEAST_SHARE = 0.5
@@ -176,7 +180,7 @@ def tightness_rows(loop: Scenario, policy: str, trigger: Mapping[str, Any]) -> I
     if certificate.void is not None:
         yield Row(f"{name}: certificates", 0, "", goal=Goal("==", 1), note=certificate.void)
         return
-    search = partial(find_worst, resolved, most_nodes=NODES, beam=BEAM, certificate=certificate)
+    search = partial(find_worst, resolved, most_nodes=MOST_NODES, beam=BEAM, certificate=certificate)
     yield from (row_of(name, search(objective)) for objective in QUANTITIES)
 
 

@@ -15,8 +15,8 @@ from noack.core.number_format import number, percent
 from noack.guarantee.loss_guarantee import LossHistory
 from noack.runtime.life_cycle import HORIZON
 
-_MOST_SETTINGS, _LONGEST = 4, 28
-"""Settings that are named, and characters of a value that is shown."""
+_MOST_SETTINGS, _LONGEST_VALUE = 4, 28
+"""Largest number of settings that are named, and of characters of a value that is shown."""
 _EQUAL_LENGTH_RATIO = 1.001
 """Runs whose ends differ by a smaller factor are compared as equally long."""
 _END = "‖x‖ at the end"
@@ -84,7 +84,7 @@ def _compare_settings(reference: Exploration, run: Exploration) -> str:
         old, new = (leaf(content, key) for content in (before, after))
         if key.partition(".")[0] in _NOT_COMPARED:
             continue
-        is_long = any(len(_text(value)) > _LONGEST for value in (old, new))
+        is_long = any(len(_text(value)) > _LONGEST_VALUE for value in (old, new))
         texts.append(key if is_long else f"{key} {_text(old)} → {_text(new)}")
     if not texts:
         return "The settings are the same."

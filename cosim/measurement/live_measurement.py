@@ -117,8 +117,8 @@ def _log(line: str) -> None:
 
 
 _LONGEST_WAIT_S = 0.1
-_BATCH = 256
-"""Most datagrams that are read at once."""
+_MOST_AT_ONCE = 256
+"""Largest number of datagrams that are read at once."""
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
 
 
@@ -162,7 +162,7 @@ class ProbeSocket:
         """Number of sends that failed, as the sends or later reads reported."""
         return self._send_errors + self.arrivals.errors
 
-    def receive(self, limit: int = _BATCH) -> list[Arrival]:
+    def receive(self, limit: int = _MOST_AT_ONCE) -> list[Arrival]:
         """Return the datagrams that wait, with the kernel's times of arrival."""
         return self.arrivals.receive(limit)
 

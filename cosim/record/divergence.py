@@ -29,6 +29,7 @@ from noack.scenario.resolution import loop_of, policy_of
 from noack.scenario.scenario import Scenario
 
 GROWTH = 1000.0
+"""Ratio of ‖x‖ to the expected size beyond which a run diverged."""
 _STILL_GROWING = 2.0
 """Factor by which the last tenth must exceed the middle of the run."""
 _LEAST_SAMPLES = 20

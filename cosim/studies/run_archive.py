@@ -421,23 +421,23 @@ def print_repetition(console: Console, result: Repetition) -> None:
     Texts of the archive are printed without control characters.
     """
 
-    def say(text: str, style: str = "") -> None:
+    def print_text(text: str, style: str = "") -> None:
         console.print(Text(printable(text), style), soft_wrap=True)
 
     unit = "inputs replayed" if result.kind == "live" else "rows repeated"
     verdict = ("bit-exact", "green") if result.bit_exact else ("not reproduced", "bold red")
     if not result.compared:
         verdict = "nothing to compare", "bold red"
-    say(f"{result.scenario}, {result.kind}: {verdict[0]}, {result.compared:,} {unit}", verdict[1])
+    print_text(f"{result.scenario}, {result.kind}: {verdict[0]}, {result.compared:,} {unit}", verdict[1])
     for text in result.differences:
-        say(f"first difference: {text}")
+        print_text(f"first difference: {text}")
     for text in result.gaps:
-        say(f"record incomplete: {text}", "yellow")
+        print_text(f"record incomplete: {text}", "yellow")
     if result.numbers:
-        late = ": the simulation has no lateness" if result.kind == "live" else ""
+        no_lateness = ": the simulation has no lateness" if result.kind == "live" else ""
         rows = [[*map(printable, row)] for row in result.numbers]
         heads = ("quantity", "archived", "repeated")
-        table = ResultTable("numbers", f"numbers that differ{late}", heads, rows)
+        table = ResultTable("numbers", f"numbers that differ{no_lateness}", heads, rows)
         console.print(terminal_table(table))
     for change in result.changes:
-        say(f"differs from the archived run's machine: {change}")
+        print_text(f"differs from the archived run's machine: {change}")

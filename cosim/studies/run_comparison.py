@@ -273,7 +273,8 @@ def _flat(settings: Mapping[str, object], prefix: str = "") -> Iterator[tuple[st
 _MOST_STATES = 6
 _STATE_IN, _NORM_IN, _EVENTS_IN = 1.25, 1.8, 0.35
 _DECADES = 5
-_WIDEST, _NARROWER, _NORM_WIDTH = 3.4, 0.75, 1.2
+_WIDEST_LINE, _WIDTH_RATIO, _NORM_LINE = 3.4, 0.75, 1.2
+"""Widths of lines: of the first run's states, the ratio from run to run, and of norms."""
 
 
 def overlay_figure(runs: Sequence[ComparedRun]) -> FigureDescription:
@@ -291,7 +292,7 @@ def overlay_figure(runs: Sequence[ComparedRun]) -> FigureDescription:
         # Each run's line is thinner than the line below it.
         Panel(x=longest, y=Axis(label=label_text(name)), legend=() if i else None, items=[
             Line(x=t_s, y=samples.x[:, i], label=f"{run.label}: {label_text(run.title, 60)}",
-                 colour=series_colour(k), width=max(_WIDEST * _NARROWER**k, 0.8))
+                 colour=series_colour(k), width=max(_WIDEST_LINE * _WIDTH_RATIO**k, 0.8))
             for k, (run, t_s, samples) in numbered_runs
         ])
         for i, name in enumerate(runs[0].record.loop.state_names[:_MOST_STATES])
@@ -306,9 +307,7 @@ def overlay_figure(runs: Sequence[ComparedRun]) -> FigureDescription:
             curves: list[tuple[Reals, Dash]] = [(getattr(samples, name), ())]
             curves += [(samples.threshold, (5, 2))] if name == "e_s_norm" else []
             items += [
-                Line(
-                    x=t_s, y=values, colour=series_colour(k), width=_NORM_WIDTH, order=3 - 0.1 * k, dash=dash
-                )
+                Line(x=t_s, y=values, colour=series_colour(k), width=_NORM_LINE, order=3 - 0.1 * k, dash=dash)
                 for values, dash in curves
             ]
         norms = np.concatenate([getattr(samples, name) for samples in aligned])

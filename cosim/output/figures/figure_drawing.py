@@ -107,7 +107,7 @@ def draw(description: FigureDescription) -> Figure:
             box, title = box._replace(width=width_in), description.heading
         _draw_heading(axes, figure, box, title, legend_items)
     if description.scale is not None:
-        _colour_bar(figure, description.scale, norm, places)
+        _draw_colour_bar(figure, description.scale, norm, places)
     figure.align_ylabels()
     _fit_to_paper(figure)
     if layout().latex:
@@ -202,10 +202,10 @@ def _(item: Line, axes: Axes, norm: Normalize | None) -> Artist | None:
     if item.steps:
         style["drawstyle"] = f"steps-{item.steps}"
     is_log = axes.get_yscale() == "log"
-    return _curve(axes, item.x, (_for_log_axis if is_log else finite)(item.y), **style)
+    return _draw_curve(axes, item.x, (_for_log_axis if is_log else finite)(item.y), **style)
 
 
-def _curve(axes: Axes, x: Reals, y: Reals, **style: Any) -> Artist:
+def _draw_curve(axes: Axes, x: Reals, y: Reals, **style: Any) -> Artist:
     """Draw a curve; its values are finite or NaN; a single point is drawn as a dot."""
     keep = decimate(x, y, _COLUMNS)
     if len(keep) < len(x):
@@ -332,7 +332,9 @@ def _norm(scale: ColourScale | None) -> Normalize | None:
     return (LogNorm if scale.logarithmic else Normalize)(scale.low, scale.high)
 
 
-def _colour_bar(figure: Figure, scale: ColourScale, norm: Normalize | None, places: Sequence[Place]) -> None:
+def _draw_colour_bar(
+    figure: Figure, scale: ColourScale, norm: Normalize | None, places: Sequence[Place]
+) -> None:
     """Draw the bar that explains the colours, at the right of all panels."""
     boxes = [place.box for place in places]
     top_in = min(box.top for box in boxes)

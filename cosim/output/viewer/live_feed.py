@@ -205,11 +205,11 @@ class _AllLoops:
             return
         new, self._intervals_sent = slice(self._intervals_sent, complete), complete
         middles_ns = (self._over_time.middles_s[new] * NS_PER_S).astype(np.int64)
-        self._view.norms(ALL_ERRORS, middles_ns, self._over_time.errors[:, new])
-        self._view.norms(ALL_SIZES, middles_ns, self._over_time.states[:, new])
+        self._view.add_norms(ALL_ERRORS, middles_ns, self._over_time.errors[:, new])
+        self._view.add_norms(ALL_SIZES, middles_ns, self._over_time.states[:, new])
         edges_ns = self._over_time.edges_s[new.start : complete + 1] * NS_PER_S
         means, largest = counts_inside(*self._inside, edges_ns)
-        self._view.queue(middles_ns, largest, means)
+        self._view.add_queue(middles_ns, largest, means)
         stays = self._inside[1] > edges_ns[-1]
         self._inside = self._inside[0][stays], self._inside[1][stays]
         ends_s, shares = self._over_time.shares()
@@ -217,9 +217,9 @@ class _AllLoops:
         if shares_known > self._shares_sent:
             fresh, self._shares_sent = slice(self._shares_sent, shares_known), shares_known
             t_ns = ((ends_s - ends_s[0] / 2) * NS_PER_S).astype(np.int64)
-            self._view.share(t_ns[fresh], shares[:, fresh])
+            self._view.add_shares(t_ns[fresh], shares[:, fresh])
         if not self._view.views and (final or time.monotonic() - self._map_s > _MAP_EVERY_S):
-            self._view.map(self._over_time.errors, int(middles_ns[-1]))
+            self._view.add_map(self._over_time.errors, int(middles_ns[-1]))
             self._map_s = time.monotonic()
 
     def _add_norms(self, until_ns: int) -> None:

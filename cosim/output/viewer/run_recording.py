@@ -157,15 +157,15 @@ to the right.
             },
         )
 
-    def queue(self, t_ns: Times, largest: Reals | NDArray[np.int64], mean: Reals) -> None:
+    def add_queue(self, t_ns: Times, largest: Reals | NDArray[np.int64], mean: Reals) -> None:
         """Add the numbers of datagrams in the network, (k,)."""
         self.send(QUEUE, t_ns, np.column_stack([largest, mean]))
 
-    def share(self, t_ns: Times, shares: Reals) -> None:
+    def add_shares(self, t_ns: Times, shares: Reals) -> None:
         """Add the share of the link of each loop, (L, k)."""
         self.send(SHARE, t_ns, 100 * _curves_or_quantiles(shares).T)
 
-    def norms(self, entity: str, t_ns: Times, values: Reals) -> None:
+    def add_norms(self, entity: str, t_ns: Times, values: Reals) -> None:
         """Add norms of each loop, (L, k), to ``ALL_ERRORS`` or ``ALL_SIZES``.
 
         Their logarithm is cut off some decades from the usual largest value so far: a norm may be
@@ -176,7 +176,7 @@ to the right.
         low, high = self._usual / 10**_DECADES, self._usual * 10**_DECADES
         self.send(entity, t_ns, np.log10(np.clip(curves, low, high)).T)
 
-    def map(self, errors: Reals, t_ns: int | None = None) -> None:
+    def add_map(self, errors: Reals, t_ns: int | None = None) -> None:
         """Show ‖e_c‖ of each loop, (L, k), from a time on; None: at all times."""
         image = BytesIO()
         imsave(image, map_pixels(errors), format="png", pil_kwargs={"compress_level": 1})
@@ -191,7 +191,7 @@ to the right.
         """Write the waiting data and the file's footer; a second call does nothing."""
         try:
             for view in self.views.values():
-                view.draw()
+                view.write_frames()
         finally:
             super().close()
             if self._live is not None:
@@ -321,21 +321,23 @@ def _write_network_view(
     worst, count, path = worst_loop(summary.loops), len(run.loops), run_dir / RECORDING_FILE
     numbers = range(count) if count <= MOST_PICTURED else [worst.number]
     loops = {number: run.loops[number].scenario for number in numbers}
-    with RunRecording(run.scenario, path, _new_id(), loops, run.kind, worst=worst, complete=True) as whole:
+    with RunRecording(
+        run.scenario, path, _new_id(), loops, run.kind, worst=worst, complete=True
+    ) as recording:
         in_flight = summary.network.in_flight
         largest = np.array(in_flight.max_by_interval, np.float64)
         queue_ns = (np.arange(len(largest)) + 0.5) * in_flight.width_s * NS_PER_S
-        whole.queue(queue_ns.astype(np.int64), largest, np.array(in_flight.mean_by_interval))
+        recording.add_queue(queue_ns.astype(np.int64), largest, np.array(in_flight.mean_by_interval))
         middles_ns = (over_time.middles_s * NS_PER_S).astype(np.int64)
-        whole.norms(ALL_ERRORS, middles_ns, over_time.errors)
-        whole.norms(ALL_SIZES, middles_ns, over_time.states)
-        whole.map(over_time.errors)
+        recording.add_norms(ALL_ERRORS, middles_ns, over_time.errors)
+        recording.add_norms(ALL_SIZES, middles_ns, over_time.states)
+        recording.add_map(over_time.errors)
         ends_s, shares = over_time.shares()
-        whole.share(((ends_s - ends_s[0] / 2) * NS_PER_S).astype(np.int64), shares)
+        recording.add_shares(((ends_s - ends_s[0] / 2) * NS_PER_S).astype(np.int64), shares)
         for notice in run.network.notices:
-            whole.log(int(notice["t_ns"]), log_level(notice), str(notice["text"]))
+            recording.log(int(notice["t_ns"]), log_level(notice), str(notice["text"]))
         for number in numbers:
-            _feed_record(run.loops[number], whole, number)
+            _feed_record(run.loops[number], recording, number)
 
 
 def _feed_record(record: RunRecord, recording: RunRecording, number: int = 0) -> None:

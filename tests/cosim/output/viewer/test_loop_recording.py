@@ -30,10 +30,10 @@ def test_the_file_contains_every_sample_exactly(tmp_path: Path, horizon_s: float
     path = tmp_path / "recording.rrd"
     with new_view(path, horizon_s=horizon_s) as view:
         add_samples(view, 5)
-        view.views[0].inputs(times(0), np.stack((np.arange(K), -np.arange(K)), axis=1))
+        view.views[0].add_inputs(times(0), np.stack((np.arange(K), -np.arange(K)), axis=1))
         x = np.zeros((3, 4))
         for _ in range(2):  # the picture has a maximum frame rate
-            view.views[0].move(times(0, 3), Frames(np.zeros(3), x, x, x))
+            view.views[0].add_frames(times(0, 3), Frames(np.zeros(3), x, x, x))
     chunks = read(path)
     assert sum(c.num_rows for c in chunks["picture/plant"] if not c.is_static) == 1
     for i, name in enumerate(STATES):
