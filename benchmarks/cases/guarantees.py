@@ -43,11 +43,8 @@ class Decider:
 
     def __init__(self, words: str, spacing_ns: int = 10_000) -> None:
         self._link, self._flow = LinkState(settings_of(words), 7, "relay", "forward"), 0
-        self._columns = (
-            np.zeros(_FLOW_DECISIONS, np.int64),
-            np.full(_FLOW_DECISIONS, 72),
-            np.arange(_FLOW_DECISIONS) * spacing_ns,
-        )
+        count = _FLOW_DECISIONS
+        self._columns = np.zeros(count, np.int64), np.full(count, 72), np.arange(count) * spacing_ns
 
     def decide(self) -> NDArray[Any]:
         """Return the decisions for the datagrams of the next flow."""

@@ -149,15 +149,12 @@ def quantile_m(bursts: LossBursts, share: float) -> QuantileM:
     """Return M for a share; without bursts it is 1."""
     lengths = np.sort(bursts.length)
     count = len(lengths)
-    rank_in_share = math.ceil(share * count - 1e-9)
+    index = math.ceil(share * count - 1e-9)
     # P(at most rank − 1 of the bursts are in the share) ≥ 95 % (Wilks, 1941)
     rank = int(stats.binom.ppf(LEVEL, count, share)) + 1
     confident = int(lengths[rank - 1]) + 1 if rank <= count else None
     return QuantileM(
-        share,
-        int(lengths[rank_in_share - 1]) + 1 if rank_in_share > 0 else 1,
-        confident,
-        _packet_quantile(bursts, share),
+        share, int(lengths[index - 1]) + 1 if index > 0 else 1, confident, _packet_quantile(bursts, share)
     )
 
 

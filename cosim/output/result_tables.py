@@ -193,18 +193,15 @@ def _aligned(column: Sequence[str]) -> list[str]:
     """Align decimal points by invisible digits; other cells stay at the right."""
     matches = [_NUMBER.fullmatch(cell) for cell in column]
     decimals = [len(match[1] or "") for match in matches if match]
-    most_decimals = max(decimals, default=0)
+    most_digits = max(decimals, default=0)
     cells = []
     for cell, number in zip(column, matches, strict=True):
         if number is None:
             cells.append("--" if cell == NONE else latex_text(cell))
             continue
-        own_decimals = len(number[1] or "")
-        padding = (
-            ("" if own_decimals else ".") + "0" * (most_decimals - own_decimals)
-            if most_decimals > own_decimals
-            else ""
-        )
+        digit_count = len(number[1] or "")
+        zeros = "0" * (most_digits - digit_count)
+        padding = "." + zeros if zeros and not digit_count else zeros
         sign, digits = (r"\ensuremath{-}", cell[1:]) if cell[0] in "-−" else ("", cell)
         cells.append(sign + digits + (rf"\phantom{{{padding}}}" if padding else ""))
     return cells

@@ -324,12 +324,10 @@ def schedule_tables(loop: LoopSummary) -> Iterator[ResultTable]:
     if (allowed := loop.allowed) is None or (observed := loop.conditions) is None:
         return
     exists = any(claim.is_certified and claim.has_bound for claim in loop.claims)
-    certified_conditions = (loop.certified_for or allowed) if exists else None
+    certified = (loop.certified_for or allowed) if exists else None
     rows = []
     for name, words in _SCHEDULE.items():
-        times_s = [
-            getattr(part, name) if part else None for part in (allowed, observed, certified_conditions)
-        ]
+        times_s = [getattr(part, name) if part else None for part in (allowed, observed, certified)]
         # After a change a certificate needs no first input: it is 0 there.
         texts = (duration, duration, duration_at_least)
         cells = [text(time_s) if time_s else NONE for text, time_s in zip(texts, times_s, strict=True)]

@@ -171,10 +171,8 @@ def _if_kept(loop: LoopSummary) -> GuaranteeVerdict | None:
         return GuaranteeVerdict(Tone.GOOD, 0.0, coverage)
     if _without_certificate(loop) or not any(claim.verdict == "held" for claim in certified):
         return None
-    not_checkable = (
-        f"{len(void)} {'claim' if len(void) == 1 else 'claims'} not checkable: {_reason(loop).why}"
-    )
-    return GuaranteeVerdict(Tone.GOOD, 0.0, "; ".join(filter(None, (coverage, not_checkable))))
+    limits = f"{len(void)} {'claim' if len(void) == 1 else 'claims'} not checkable: {_reason(loop).why}"
+    return GuaranteeVerdict(Tone.GOOD, 0.0, "; ".join(filter(None, (coverage, limits))))
 
 
 def _if_not_checkable(loop: LoopSummary) -> GuaranteeVerdict:
@@ -275,12 +273,11 @@ class Remark(NamedTuple):
 def remarks(summary: RunSummary) -> Iterator[Remark]:
     """Yield the remarks on one loop, the severe ones first; none if all went well."""
     (loop,) = summary.loops
-    verdict_reason = guarantee_of(loop).why
+    reason = guarantee_of(loop).why
     violations = [
         violation
         for violation in loop.assumption_violations
-        if violation.what not in verdict_reason
-        and not (violation.cause in SCHEDULE and _covers_lateness(loop))
+        if violation.what not in reason and not (violation.cause in SCHEDULE and _covers_lateness(loop))
     ]
     for violation in violations[:_MOST_VIOLATIONS]:
         where = f"t = {violation.t_s:.3f} s (reported by {violation.process})"

@@ -244,10 +244,8 @@ class _Counts:
         for number in [first] if first == last else np.unique(inputs // GENERATION).tolist():
             of_generation = inputs if first == last else inputs[inputs // GENERATION == number]
             newest, count = self._numbers.get(number, (-1, 0))
-            self._numbers[number] = (
-                max(newest, int(of_generation[-1]) % GENERATION),
-                count + len(of_generation),
-            )
+            newest = max(newest, int(of_generation[-1]) % GENERATION)
+            self._numbers[number] = newest, count + len(of_generation)
 
     @property
     def missing_inputs(self) -> int:

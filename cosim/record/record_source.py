@@ -312,11 +312,9 @@ class NetworkRows:
 
     def of_loops(self, table: str, numbers: Sequence[int]) -> Iterator[list[Rows]]:
         """Yield the next rows of each of some loops, in order; the table is read once."""
-        places_of_loops = [[places[number] for places in self._places.values()] for number in numbers]
-        inputs_of_loops = [
-            np.sort(np.concatenate([*map(np.take, self._inputs.values(), places)]))
-            for places in places_of_loops
-        ]
+        by_number = [[places[number] for places in self._places.values()] for number in numbers]
+        parts = [[*map(np.take, self._inputs.values(), places)] for places in by_number]
+        inputs_of_loops = [np.sort(np.concatenate(inputs)) for inputs in parts]
         first = 0
         for rows in self._source.batches(table):
             by_loop = []

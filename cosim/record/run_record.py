@@ -159,9 +159,8 @@ class RunRecord:
         waits = ~has_left & (packets["release_ns"] > packets["now_ns"])
         packets = packets.copy()
         packets["release_ns"][has_left] = departures["t_ns"][order][row[has_left]]
-        packets["release_ns"][waits] = np.maximum(
-            packets["release_ns"][waits], departures["t_ns"].max(initial=-1)
-        )
+        last_ns = departures["t_ns"].max(initial=-1)
+        packets["release_ns"][waits] = np.maximum(packets["release_ns"][waits], last_ns)
         return packets
 
     def slices(self, *tables: str, columns: Sequence[str] = ()) -> Iterator[Slice]:

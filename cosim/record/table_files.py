@@ -142,12 +142,8 @@ class StoredTables(RecordSource):
     def highest_input(self, table: str) -> int:
         """Return the highest number of an input in a table; −1 without rows."""
         inputs = [group.highest_input for group in self._files[table].groups]
-        known_inputs = [number for number in inputs if number is not None]
-        return (
-            max(known_inputs, default=-1)
-            if len(known_inputs) == len(inputs)
-            else super().highest_input(table)
-        )
+        known = [number for number in inputs if number is not None]
+        return max(known, default=-1) if len(known) == len(inputs) else super().highest_input(table)
 
 
 class _Group(NamedTuple):

@@ -235,9 +235,8 @@ def states_figure(
         for i in range(count)
     ]
     columns = count if count <= 3 else 2 if count == 4 else 3 if count <= 12 else 4
-    between = [
-        np.diff(times_s, prepend=np.nan) for times_s in (transmissions.sent_s, transmissions.received_s)
-    ]
+    times_s = transmissions.sent_s, transmissions.received_s
+    between = [np.diff(times, prepend=np.nan) for times in times_s]
     highest = 1.05 * max(np.nanmax(np.append(finite(gaps), 0.0)) for gaps in between) or None
     y = Axis(label="interval [s]", ends=(0.0, highest))
     intervals = [
@@ -278,11 +277,8 @@ def _sent_marks(transmissions: Transmissions, interval_s: Reals) -> list[Item]:
 
 
 def _received_marks(transmissions: Transmissions, interval_s: Reals) -> list[Item]:
-    t_s, forced, lost_s = (
-        transmissions.received_s,
-        transmissions.forced,
-        transmissions.sent_s[transmissions.lost],
-    )
+    t_s, forced = transmissions.received_s, transmissions.forced
+    lost_s = transmissions.sent_s[transmissions.lost]
     dots = Marks(x=t_s[~forced], y=interval_s[~forced], label="received", colour=CONTROLLER)
     diamonds = Marks(x=t_s[forced], y=interval_s[forced], label="received, forced", colour=FORCED)
     crosses = Marks(x=lost_s, y=np.zeros(len(lost_s)), label="lost", colour=LOST, marker="x")

@@ -179,10 +179,9 @@ class NetworkDiagram:
         y = np.where(leaves & ~survives, -_HALF_HIGH - 0.2 - 1.3 * fall, 0.0)
         forced = pairs["fate"] == Fate.FORCED
         if self._reverse is Flow.ACTUATION:
-            x_reverse = np.where(
-                leaves & survives, _NETWORK * (1 - onward), _CONTROLLER - _BOX_DISTANCE * reached
-            )
-            x, y = np.where(reverse, x_reverse, x), np.where(reverse, _INPUT_Y + 0.4 * y, y)
+            x_ends = _NETWORK * (1 - onward), _CONTROLLER - _BOX_DISTANCE * reached
+            x_back = np.where(leaves & survives, *x_ends)
+            x, y = np.where(reverse, x_back, x), np.where(reverse, _INPUT_Y + 0.4 * y, y)
         else:
             x = np.where(reverse, 2 * _NETWORK - x, x)
             y = np.where(reverse & (survives | ~leaves), _REVERSE_Y, y)

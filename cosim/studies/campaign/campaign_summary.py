@@ -77,23 +77,19 @@ def evaluate_claims(campaign: Campaign, points: Sequence[Point], values: Values)
     """Yield the claims of a campaign with their verdicts."""
     by_number = {point.number: point for point in points}
     values_of_point = lru_cache(_POINTS_AT_ONCE)(lambda number: values(by_number[number]))
-    campaign_labels = {
-        axis: {label_of(value) for value in chosen} for axis, chosen in campaign.claims_at.items()
+    common = {
+        axis: {label_of(value) for value in values_at} for axis, values_at in campaign.claims_at.items()
     }
     for claim in campaign.claims:
-        claim_labels = {axis: {label_of(value)} for axis, value in claim.where.items()}
+        of_claim = {axis: {label_of(value)} for axis, value in claim.where.items()}
         groups: dict[str, list[Point]] = {}
         for point in points:
-            allowed = (
-                campaign_labels
-                | claim_labels
-                | ({} if claim.axis is None else {claim.axis: point.labels.values()})
-            )
+            allowed = common | of_claim | ({} if claim.axis is None else {claim.axis: point.labels.values()})
             if all(point.labels[axis] in labels for axis, labels in allowed.items()):
                 other_labels = (
                     f"{axis} {label}"
                     for axis, label in point.labels.items()
-                    if axis != claim.axis and axis not in claim_labels
+                    if axis != claim.axis and axis not in of_claim
                 )
                 groups.setdefault(", ".join(other_labels), []).append(point)
         yield _evaluate_claim(claim, groups, lambda point: values_of_point(point.number))

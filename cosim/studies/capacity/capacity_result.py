@@ -189,15 +189,13 @@ def chosen_points(text: str | None, plan: CapacityPlan) -> list[tuple[str, int]]
     return [points[part] for part in texts]
 
 
-def live_point(
-    policy_and_count: tuple[str, int], results: Sequence[GridPointResult], folder: Path
-) -> LivePoint:
+def live_point(place: tuple[str, int], results: Sequence[GridPointResult], folder: Path) -> LivePoint:
     """Run a grid point live, without the common disturbance and with the seeds of draw 0.
 
     Raises:
         NoackError: the run could not be started or completed.
     """
-    policy, count = policy_and_count
+    policy, count = place
     labels = {POLICY: policy, LOOPS: str(count), DISTURBANCE: OWN}
     result = next(result for result in results if {DISTURBANCE: OWN, **result.point.labels} == labels)
     point, work = result.point, result.point.work

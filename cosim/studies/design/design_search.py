@@ -117,19 +117,13 @@ def measure(scenario: Scenario, limits: DesignLimits, population: Population) ->
         CallerError: the engine cannot run the scenario.
     """
     rows = run_batch(replace(setting_of(resolve(scenario)), settle=limits.settle), population)
-    transmissions = estimate(rows["transmissions"].astype(np.float64))
+    sends = estimate(rows["transmissions"].astype(np.float64))
     settling_s = np.where(np.isnan(rows["settling_s"]), math.inf, rows["settling_s"])
     quantile_s = float(np.quantile(settling_s, limits.quantile, method="inverted_cdf"))
     low_s, high_s = quantile_interval(settling_s, limits.quantile)
-    settled_share = float(np.mean(settling_s <= limits.settling_s))
+    share = float(np.mean(settling_s <= limits.settling_s))
     return CandidateMeasures(
-        len(rows),
-        transmissions.mean,
-        transmissions.halfwidth,
-        quantile_s,
-        max(low_s, 0.0),
-        high_s,
-        settled_share,
+        len(rows), sends.mean, sends.halfwidth, quantile_s, max(low_s, 0.0), high_s, share
     )
 
 
