@@ -101,7 +101,7 @@ def ticks(first: int, count: int) -> np.ndarray:
 
 
 def received(view: Mock) -> list[tuple[int, bool]]:
-    calls = [call.args for call in view.receptions.call_args_list]
+    calls = [call.args for call in view.add_deliveries.call_args_list]
     return [delivery for t_ns, _, forced in calls for delivery in zip(t_ns, forced, strict=True)]
 
 
