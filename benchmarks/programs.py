@@ -58,9 +58,9 @@ def compile_program(source: str, into: Path, *options: str) -> Path:
     target = into / Path(source).stem
     path = Path(__file__).with_name(source)
     command = [program_path("cc", "gcc"), "-O2", *options, "-o", str(target), str(path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        raise MeasurementError(f"cc {source}: {done.stderr.strip()[:200]}")
+    completed = subprocess.run(command, capture_output=True, text=True, check=False)
+    if completed.returncode != 0:
+        raise MeasurementError(f"cc {source}: {completed.stderr.strip()[:200]}")
     return target
 
 
@@ -253,12 +253,12 @@ RELAY_CORE, LOAD_CORE = _CORES[0], _CORES[-1]
 @contextmanager
 def on_core(core: int) -> Iterator[None]:
     """Pin the calling thread, and processes that it starts within the context, to one core."""
-    before = os.sched_getaffinity(0)
+    previous_cores = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {core})
     try:
         yield
     finally:
-        os.sched_setaffinity(0, before)
+        os.sched_setaffinity(0, previous_cores)
 
 
 @contextmanager

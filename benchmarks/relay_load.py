@@ -81,7 +81,7 @@ class PathEnds:
 
     def __init__(self, load: Any) -> None:
         self._load = load
-        self._sent = 0
+        self._sent_count = 0
         self.sink, self.out = (socket.socket(type=socket.SOCK_DGRAM) for _ in range(2))
         self.sink.bind((LOOPBACK, 0))
         option = partial(self.sink.setsockopt, socket.SOL_SOCKET)
@@ -136,7 +136,7 @@ class PathEnds:
         self._call("soak", self.sink.fileno(), groups, group, DATAGRAM_BYTES, period_ns, state)
 
     def _first(self, count: int) -> int:
-        first, self._sent = self._sent, self._sent + count
+        first, self._sent_count = self._sent_count, self._sent_count + count
         return first
 
     def _call(self, function: str, *arguments: object) -> None:
@@ -222,10 +222,10 @@ class LoadedRelay:
                 raise MeasurementError(f"{self.name} forwards nothing")
         sent, before_s = self._burst, self.cpu_s
         result = self.ends.burst(self.pid, sent, self._slack, addresses)
-        cpu_s, decided = self.cpu_s - before_s, result.last + 1
-        if decided < sent - self._slack or (self._slack == 0 and result.received != sent):
+        cpu_s, decisions = self.cpu_s - before_s, result.last + 1
+        if decisions < sent - self._slack or (self._slack == 0 and result.received != sent):
             raise MeasurementError(f"{self.name}: of a burst of {sent} only {result.received} arrived")
-        return {"per_s": decided / result.wall_ns * 1e9, "cpu_us": cpu_s / sent * 1e6}
+        return {"per_s": decisions / result.wall_ns * 1e9, "cpu_us": cpu_s / sent * 1e6}
 
     def totals(self) -> dict[str, int]:
         """End our relay as Ctrl-C does; return its counts of the datagrams towards the sink."""

@@ -252,7 +252,7 @@ def cpu_ms(call: Callable[[], object]) -> Side:
 
 
 def per_cpu_s(count: float, call: Callable[[], object]) -> Side:
-    """Return a side: so many per second of CPU time."""
+    """Return a side: ``count`` items per second of CPU time of a call."""
     return lambda: count / _cpu_s(call)
 
 

@@ -124,9 +124,11 @@ def memory_trend(at_s: Sequence[float], kib: Sequence[float], length_s: float) -
 
 def lasting_range(at_s: Sequence[float], counts: Sequence[int], length_s: float) -> tuple[int, int]:
     """Return minimum and maximum of a count after the warm-up, ignoring single outliers."""
-    checked = [count for at, count in zip(at_s, counts, strict=True) if warm_up_s(length_s) <= at <= length_s]
-    lasting = [a for a, b in pairwise(checked) if a == b] or checked
-    return (min(lasting), max(lasting)) if lasting else (0, 0)
+    after_warm_up = [
+        count for at, count in zip(at_s, counts, strict=True) if warm_up_s(length_s) <= at <= length_s
+    ]
+    repeated = [a for a, b in pairwise(after_warm_up) if a == b] or after_warm_up
+    return (min(repeated), max(repeated)) if repeated else (0, 0)
 
 
 def process_rows(role: str, samples: Sequence[Sample], began_s: float, length_s: float) -> Iterator[Row]:
@@ -142,10 +144,10 @@ def process_rows(role: str, samples: Sequence[Sample], began_s: float, length_s:
         note = f"{size}; {memory.slope_kib_per_h:+.0f} KiB per hour"
         yield Row(name, memory.growth_kib, "KiB", goal=Goal("<=", memory.allowed_kib), note=note)
     for count, meaning in COUNTS.items():
-        least, most = lasting_range(at_s, [getattr(sample, count) for sample in samples], length_s)
+        low, high = lasting_range(at_s, [getattr(sample, count) for sample in samples], length_s)
         # On an overloaded machine, control-plane sessions reconnect, which adds threads.
         goal = None if count == "threads" and length_s < SHORT_S else ZERO
-        yield Row(f"{role}: variation of {meaning}", most - least, "", goal=goal, note=f"{least} to {most}")
+        yield Row(f"{role}: variation of {meaning}", high - low, "", goal=goal, note=f"{low} to {high}")
 
 
 def end_rows(summary: Mapping[str, Any], delivered_out_of_order: int) -> Iterator[Row]:

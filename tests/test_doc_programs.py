@@ -174,9 +174,9 @@ def test_commands_of_the_tutorial_print_the_shown_output(
     step: Step, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(folder)
-    done = invoke(*shlex.split(step.command)[1:])
-    assert done.exit_code == 0, done.output
-    output = done.output.splitlines()
+    result = invoke(*shlex.split(step.command)[1:])
+    assert result.exit_code == 0, result.output
+    output = result.output.splitlines()
     for line in filter("...".__ne__, step.shown):
         assert any(alike(line, printed) for printed in output), line
 
@@ -192,17 +192,17 @@ def test_the_runtime_parameter_of_the_tutorial_can_be_changed(folder: Path) -> N
             rows = folder / "runs/latest/spool/plant_step.recorder"
             wait_for(lambda: rows.exists() or process.poll() is not None)
             while process.poll() is None:  # the run may not have begun
-                done = subprocess.run(
+                result = subprocess.run(
                     [*noack(change), "--run", "runs/latest"],
                     cwd=folder, capture_output=True, text=True, check=False,
                 )  # fmt: skip
-                if done.returncode == 0:
+                if result.returncode == 0:
                     break
         finally:
             process.send_signal(signal.SIGINT)
             _, stderr = process.communicate(timeout=120)
     assert process.returncode == 130, stderr
-    assert [shape(line) for line in change.shown] == [shape(line) for line in done.stdout.splitlines()]
+    assert [shape(line) for line in change.shown] == [shape(line) for line in result.stdout.splitlines()]
     summary = json.loads((folder / "runs/latest/summary.json").read_text())
     (recorded,) = summary["changes"]
     assert recorded["settings"] == {"network.loss.probability": 0.9}

@@ -250,12 +250,12 @@ def test_the_glossary_of_the_documentation_is_that_of_the_program() -> None:
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site")
-    done = subprocess.run(
+    result = subprocess.run(
         [sys.executable, "-m", "sphinx", "-b", "html", "-W", "--keep-going", "--quiet",
          "--jobs", "auto", "-d", folder / "trees", ROOT / "docs", folder / "html"],
         capture_output=True, text=True, check=False,
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    assert result.returncode == 0, result.stderr
     return folder / "html"
 
 

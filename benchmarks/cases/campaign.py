@@ -28,8 +28,8 @@ def campaign_figures(draws: int, *options: str) -> Figures:
             first = psutil.Process(process.pid)
             while process.poll() is None:
                 with contextlib.suppress(psutil.Error):
-                    every = first, *first.children(recursive=True)
-                    used_bytes = sum(process.memory_full_info().pss for process in every)
+                    processes = first, *first.children(recursive=True)
+                    used_bytes = sum(process.memory_full_info().pss for process in processes)
                     peak_mib = max(peak_mib, used_bytes / 2**20)
                 time.sleep(_POLL_S)
         took_s = time.perf_counter() - began_s
@@ -59,7 +59,7 @@ def campaign(options: argparse.Namespace) -> Iterator[Row]:
     )
     draws = options.campaign_draws
     announce(f"{draws:,} draws")
-    found = campaign_figures(draws)
-    note = f"{found['runs']:,.0f} runs"
-    yield Row(f"noack campaign {CAMPAIGN} --draws {draws}", found["took_s"], "s", note=note)
-    yield Row("the same: peak memory of all its processes", found["peak_mib"], "MiB", goal=Goal("<=", 1024))
+    figures = campaign_figures(draws)
+    note = f"{figures['runs']:,.0f} runs"
+    yield Row(f"noack campaign {CAMPAIGN} --draws {draws}", figures["took_s"], "s", note=note)
+    yield Row("the same: peak memory of all its processes", figures["peak_mib"], "MiB", goal=Goal("<=", 1024))

@@ -172,10 +172,10 @@ def measure_kill(role: str) -> Figures:
 
 def killed_rows(role: str) -> Iterator[Row]:
     """Kill a process several times; yield the rows."""
-    rounds, imported = Rounds(), partial(imported_s, MODULES[role])
+    rounds, import_s = Rounds(), partial(imported_s, MODULES[role])
     sides = {
         role: lambda: measure_kill(role),
-        IMPORT: lambda: dict.fromkeys(("acted_s", "updated_s"), imported()),
+        IMPORT: lambda: dict.fromkeys(("acted_s", "updated_s"), import_s()),
     }
     rounds.measure_in_turn(ROUNDS, sides, f"{role} killed, ")
     row = partial(rounds.row, ours=role)
@@ -279,9 +279,9 @@ def flood_rows(case: FloodCase) -> Iterator[Row]:
         before.append(float(np.quantile(late_us[now_s < run.began_s - MARGIN_S], 0.99)))
         during.append(float(np.quantile(late_us[inside], 0.99)) if inside.any() else np.inf)
     measured = run.record[PLANT_STEP]["sequence"] // run.record.scenario.plant.measure_every
-    missed = np.setdiff1d(measured, run.record[SENSOR_MEASUREMENT]["sequence"]).size
+    missed_measurements = np.setdiff1d(measured, run.record[SENSOR_MEASUREMENT]["sequence"]).size
     yield Row(f"{case.name}: the flood", sent / (run.ended_s - run.began_s), "datagrams/s")
-    yield Row(f"{case.name}: measurements missed", missed, "")
+    yield Row(f"{case.name}: measurements missed", missed_measurements, "")
     yield Row(f"{case.name}: the loop's datagrams lost", run.summary.unintended_losses, "")
     yield Row(f"{case.name}: lateness before, p99", max(before), "µs")
     yield Row(f"{case.name}: lateness during, p99", max(during), "µs")

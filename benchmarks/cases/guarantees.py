@@ -23,7 +23,7 @@ from noack.theory.certificates.trigger_weight import choose_weight
 from tests.oracles.loss_language import is_allowed, longest_burst, outcomes_of
 
 DECISIONS = 100_000_000
-_BATCH = 1_000_000
+_FLOW_DECISIONS = 1_000_000
 REORDERING = "delay 5ms 5ms reorder 20% duplicate 5% corrupt 5%"
 COMBINATIONS = (
     "mansd 4",
@@ -43,7 +43,8 @@ class Decider:
 
     def __init__(self, words: str, spacing_ns: int = 10_000) -> None:
         self._link, self._flow = LinkState(settings_of(words), 7, "relay", "forward"), 0
-        self._columns = np.zeros(_BATCH, np.int64), np.full(_BATCH, 72), np.arange(_BATCH) * spacing_ns
+        count = _FLOW_DECISIONS
+        self._columns = np.zeros(count, np.int64), np.full(count, 72), np.arange(count) * spacing_ns
 
     def decide(self) -> NDArray[Any]:
         """Return the decisions for the datagrams of the next flow."""
@@ -53,16 +54,16 @@ class Decider:
         return self._link.decide_many(*self._columns)
 
 
-def check_rows(before: str, guarantee: str, count: int) -> Iterator[Row]:
-    """Yield the flows with a violation in so many decisions; and the loss rate, if it can be predicted."""
-    words, allowed = f"{before} {guarantee}", settings_of(guarantee)
+def check_rows(impairments: str, guarantee: str, count: int) -> Iterator[Row]:
+    """Yield the flows with a violation in ``count`` decisions, and the loss rate if it can be predicted."""
+    words, guarantee_settings = f"{impairments} {guarantee}", settings_of(guarantee)
     announce(f"{count:,} decisions, {words}")
     decider = Decider(f"{words} limit 1000000")
-    flows = [outcomes_of(decider.decide()) for _ in range(count // _BATCH)]
-    number = sum(not is_allowed(lost, allowed) for lost in flows)
+    flows = [outcomes_of(decider.decide()) for _ in range(count // _FLOW_DECISIONS)]
+    number = sum(not is_allowed(lost, guarantee_settings) for lost in flows)
     yield Row(f"{words}: flows with a violation", number, "", goal=ZERO, note=f"{count:,} decisions")
-    if "delay" not in words and (expected := expected_loss(settings_of(words)).rate):
-        yield Row(f"{words}: lost", 100 * float(np.mean(flows)), "%", Peer("predicted", 100 * expected))
+    if "delay" not in words and (predicted_rate := expected_loss(settings_of(words)).rate):
+        yield Row(f"{words}: lost", 100 * float(np.mean(flows)), "%", Peer("predicted", 100 * predicted_rate))
 
 
 def network_rows() -> Iterator[Row]:
@@ -84,7 +85,7 @@ def network_rows() -> Iterator[Row]:
         yield Row(f"{name}: longest loss burst", longest_burst(lost), "", goal=goal)
     back_ns = networks[cap]["hold_back_ns"]
     back_ns = back_ns[back_ns > 0]
-    yield Row(f"{cap}: held back", 100 * len(back_ns) / _BATCH, "%")
+    yield Row(f"{cap}: held back", 100 * len(back_ns) / _FLOW_DECISIONS, "%")
     yield Row(f"{cap}: held back by, median", float(np.median(back_ns)) / 1e6, "ms")
 
 
@@ -108,7 +109,7 @@ def guarantee(options: argparse.Namespace) -> Iterator[Row]:
 
 
 LOOPS = ("lane_following", "double_integrator", "unstable_pendulum", "f16_lateral")
-NODES, BEAM = 200_000, 64
+MOST_NODES, BEAM = 200_000, 64
 _SIGMA, _PERIOD_S, _DEADLINE_S = 0.005, 0.01, 0.02
 _ROUNDING = 1 + 1e-9
 LEAST_SHARE = 0.5
@@ -124,8 +125,8 @@ def triggers(paper: dict[str, Any], weight: Matrix) -> dict[str, dict[str, Any]]
     """Return the settings of every policy by name; constant thresholds are a fifth of β."""
     W, delta = {"weight": weight.tolist()}, 0.2 * paper["beta"]
     square = weight.T @ weight
-    nothing = np.zeros_like(square)
-    Q = np.block([[-(_SIGMA**2) * square, nothing], [nothing, square]])
+    zero = np.zeros_like(square)
+    Q = np.block([[-(_SIGMA**2) * square, zero], [zero, square]])
     absolute = {"policy": "absolute", "delta": delta} | W
     deadline = {"policy": "deadline", "interval_s": _DEADLINE_S}
     dynamic = {"policy": "dynamic", "sigma": 0.5, "theta_s": 0.1, "decay_per_s": 1.0}
@@ -176,19 +177,19 @@ def tightness_rows(loop: Scenario, policy: str, trigger: Mapping[str, Any]) -> I
     if certificate.void is not None:
         yield Row(f"{name}: certificates", 0, "", goal=Goal("==", 1), note=certificate.void)
         return
-    search = partial(find_worst, resolved, most_nodes=NODES, beam=BEAM, certificate=certificate)
+    search = partial(find_worst, resolved, most_nodes=MOST_NODES, beam=BEAM, certificate=certificate)
     yield from (row_of(name, search(objective)) for objective in QUANTITIES)
 
 
 def row_of(name: str, worst: WorstRun) -> Row:
     """Return the share of a bound that the worst run uses; more than 1 refutes the bound."""
-    searched = f"all {worst.runs}" if worst.exact else f"some, {worst.runs} runs"
+    patterns = f"all {worst.runs}" if worst.exact else f"some, {worst.runs} runs"
     return Row(
         f"{name}: {QUANTITIES[worst.objective]}",
         worst.tightness,
         "of the bound",
         goal=Goal("<=", _ROUNDING),
-        note=f"worst {worst.value}, certified {worst.certified}; patterns searched: {searched}",
+        note=f"worst {worst.value}, certified {worst.certified}; patterns searched: {patterns}",
     )
 
 

@@ -43,7 +43,7 @@ from tests.helpers.two_hosts import DrivenClocks, TwoHosts, enter_namespace, two
 
 KEY = bytes(range(32))
 CHECKS_AT_ONCE = 25
-_PRIORITY = 40
+_FIFO_PRIORITY = 40
 _WAKE_S = 0.001
 _START_NS, _LENGTH_NS = 500_000_000, 6_000_000_000
 """Time of an exchange before it is checked, and while it is."""
@@ -115,7 +115,7 @@ def answer(hosts: TwoHosts, case: ClockCase, bare: bool, parent: Connection) -> 
     enter_namespace(hosts.names[0])
     listen = (hosts.addresses[0][0], 0)
     end = BareReference(listen) if bare else TimeReference(listen, KEY)
-    with closing(end), realtime(True, _PRIORITY):
+    with closing(end), realtime(True, _FIFO_PRIORITY):
         parent.send(end.address[1])
         if isinstance(end, TimeReference) and not case.answer_every_s:
             with answering(end):
@@ -137,7 +137,7 @@ def ask(hosts: TwoHosts, case: ClockCase, plain: bool, port: int, clock: Clock) 
     checks = outside = turns = cpu_ns = due_ns = 0
     steady_ns = time.monotonic_ns() + _START_NS
     end_ns = steady_ns + _LENGTH_NS
-    with closing(client), realtime(True, _PRIORITY):
+    with closing(client), realtime(True, _FIFO_PRIORITY):
         while (now_ns := time.monotonic_ns()) < end_ns:
             is_due = now_ns >= due_ns
             readable, _, _ = select.select([client], (), (), 0 if is_due else _WAKE_S)

@@ -33,12 +33,12 @@ _KEYS = [("ArrowLeft", 37)] * 20 + [("ArrowRight", 39)] * 20
 _SLIDER = "document.getElementById('lab-set-network.loss.probability')"
 _BUSY_PROCESSES = 4
 _STROKES, _STROKE_S = 40, 0.15
-_DRAGGED = "document.getElementById('lab-set-trigger.beta')"
+_DRAGGED_SLIDER = "document.getElementById('lab-set-trigger.beta')"
 _BOX = f"""(slider => {{
   slider.scrollIntoView({{ block: "center" }});
   const r = slider.getBoundingClientRect();
   return [r.x, r.y + r.height / 2, r.width];
-}})({_DRAGGED})"""
+}})({_DRAGGED_SLIDER})"""
 _NOTE_STROKES = Path(__file__).parents[1] / "strokes.js"
 
 

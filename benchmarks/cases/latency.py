@@ -18,8 +18,8 @@ from benchmarks.report import Figures, Goal, MeasurementError, Rounds, Row, benc
 ROUNDS = 3
 OURS, PING = "noack", "ping and relay in C"
 P99_GOAL = Goal("<=", 2)
-_OFTEN = ("--set", "trigger.beta=1e-9")
-_RARELY = ("--set", 'trigger={policy="periodic", period_s=0.5}')
+_FREQUENT_EVENTS = ("--set", "trigger.beta=1e-9")
+_RARE_EVENTS = ("--set", 'trigger={policy="periodic", period_s=0.5}')
 _LOSSLESS = ("--set", 'network.loss={model="lossless"}')
 
 
@@ -36,18 +36,18 @@ class LatencyCase(NamedTuple):
 
 
 CASES = {
-    "every 2 ms, real-time settings": LatencyCase(0.002, 5.0, _OFTEN, True, Goal("<=", 1.4)),
+    "every 2 ms, real-time settings": LatencyCase(0.002, 5.0, _FREQUENT_EVENTS, True, Goal("<=", 1.4)),
     "every 2 ms, no settings": LatencyCase(
-        0.002, 5.0, (*_OFTEN, "--set", "realtime.enabled=false"), False, Goal("<=", 1.3)
+        0.002, 5.0, (*_FREQUENT_EVENTS, "--set", "realtime.enabled=false"), False, Goal("<=", 1.3)
     ),
-    "every 0.5 s, real-time settings": LatencyCase(0.5, 30.0, _RARELY, True, Goal("<=", 1.3)),
+    "every 0.5 s, real-time settings": LatencyCase(0.5, 30.0, _RARE_EVENTS, True, Goal("<=", 1.3)),
 }
 
 
-def ping(program: Callable[[], Path], case: LatencyCase, refused: set[str]) -> Figures:
+def ping(program: Callable[[], Path], case: LatencyCase, refusals: set[str]) -> Figures:
     """Send datagrams through the bare relay; return one-way latencies, µs, and their count.
 
-    Real-time settings that were not permitted are added to ``refused``.
+    Real-time settings that were not permitted are added to ``refusals``.
     """
     count, priority = round(case.round_s / case.period_s), PRIORITY if case.realtime else 0
     command = [str(program()), str(count), str(round(case.period_s * 1e9)), str(priority)]
@@ -57,17 +57,17 @@ def ping(program: Callable[[], Path], case: LatencyCase, refused: set[str]) -> F
         figures = quantiles_us(latencies_ns)
     except (subprocess.SubprocessError, IndexError):
         raise MeasurementError("the ping through the bare relay did not end") from None
-    refused |= {line.partition(":")[0] for line in done.stderr.decode().splitlines()}
+    refusals |= {line.partition(":")[0] for line in done.stderr.decode().splitlines()}
     return {**figures, "count": len(latencies_ns)}
 
 
-def updates(case: LatencyCase, refused: set[str]) -> Figures:
+def updates(case: LatencyCase, refusals: set[str]) -> Figures:
     """Run the loop live; return the latencies of its updates, µs, and their count."""
     horizon = ("--set", f"horizon_s={case.round_s}")
     (loop,) = noack("run", "lane_following", *horizon, *_LOSSLESS, *case.arguments).summary["loops"]
     latency = loop["latency_us"]
     for answers in loop["realtime"].values():
-        refused |= {setting for setting, answer in answers.items() if answer.startswith("not permitted")}
+        refusals |= {setting for setting, answer in answers.items() if answer.startswith("not permitted")}
     return {"p50": latency["p50"], "p99": latency["p99"], "count": latency["updates"]}
 
 
@@ -84,12 +84,12 @@ def latency(options: argparse.Namespace) -> Iterator[Row]:
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
         program = cache(lambda: compile_program("ping.c", Path(folder)))
         for name, case in CASES.items():
-            rounds, refused = Rounds(), set[str]()
-            pinged, run = partial(ping, program, case, refused), partial(updates, case, refused)
+            rounds, refusals = Rounds(), set[str]()
+            pinged, run = partial(ping, program, case, refusals), partial(updates, case, refusals)
             rounds.measure_in_turn(ROUNDS, {PING: pinged, OURS: run}, f"{name}, ")
             counts = (sum(rounds.values(side, "count")) for side in (OURS, PING))
             note = "{:.0f} updates, {:.0f} pings".format(*counts)
-            note += f"; not applied: {', '.join(sorted(refused))}" if refused else ""
+            note += f"; not applied: {', '.join(sorted(refusals))}" if refusals else ""
             row = partial(rounds.row, unit="µs", ours=OURS, peer=PING)
             yield row(f"event → update, {name}, p50", quantity="p50", goal=case.goal, note=note)
             yield row(f"event → update, {name}, p99", quantity="p99", goal=P99_GOAL)

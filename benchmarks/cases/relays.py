@@ -1,4 +1,4 @@
-"""Relays, ours (``python -m netem``) and others, under load; and a shell beside others.
+"""Relays, ours (``python -m netem``) and others, under load.
 
 ``relays`` and ``relay_flows``: a relay is stopped, its receive buffer is filled with thousands of
 datagrams of 72 bytes, and the relay is continued. The rate is the number of datagrams received and
@@ -10,23 +10,16 @@ each relay, and ratios are the median over rounds of the ratio within a round.
 """
 
 import argparse
-import json
 import os
-import re
-import subprocess
-import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from collections.abc import Iterator
 from functools import partial
-from pathlib import Path
 
 import psutil
 
 from benchmarks import relay_load
 from benchmarks.cases.latency import KERNEL, cyclictest
-from benchmarks.programs import LOAD_CORE, RELAY_CORE, compile_program, on_core, program_path, raise_priority
+from benchmarks.programs import LOAD_CORE, RELAY_CORE, on_core, raise_priority
 from benchmarks.report import (
     ZERO,
     Figures,
@@ -41,9 +34,6 @@ from benchmarks.report import (
     option,
     quantiles_us,
 )
-from netem.relay.relay_links import LinkSpec
-from netem.shell.devices import inside, open_devices
-from noack.impairments.link_settings import LinkSettings
 
 ROUNDS = 2
 WORDS = "loss 5% mansd 4 seed 7"
@@ -146,15 +136,15 @@ def delay(options: argparse.Namespace) -> Iterator[Row]:
     relay's core.
     """
     with relay_load.compiled_code() as tools:
-        added, late = _added(tools), _late(tools)
-    yield added.row(f"{DIRECT}: one way, p50", "µs", "p50", DIRECT)
+        added_rounds, late_rounds = _added(tools), _late(tools)
+    yield added_rounds.row(f"{DIRECT}: one way, p50", "µs", "p50", DIRECT)
     for peer in ("socat", "C relay"):
         for quantile in ("p50", "p99"):
             name, goal = f"{PLAIN}: added one way, {quantile}", ADDED_GOALS.get((peer, quantile))
-            yield added.row(name, "µs", quantile, PLAIN, peer, goal, paired=True)
+            yield added_rounds.row(name, "µs", quantile, PLAIN, peer, goal, paired=True)
     for quantile, goal in (("p50", None), ("p99", Goal("<=", 2))):
         name = f"{PLAIN}: lateness behind {DELAY_MS} ms, {quantile}"
-        yield late.row(name, "µs", quantile, PLAIN, KERNEL, goal, paired=True)
+        yield late_rounds.row(name, "µs", quantile, PLAIN, KERNEL, goal, paired=True)
 
 
 def quantiles_of(name: str, delays_ns: relay_load.Nanoseconds, base_us: float = 0.0) -> Figures:
@@ -266,59 +256,3 @@ def _soak_rows(relay: relay_load.LoadedRelay, seconds: int, maximum_per_s: float
     yield Row("longest loss burst", counts.longest_gap, "datagrams", goal=Goal("<=", MANSD))
     note = f"of {resident_kib[-1] / 1024:.0f} MiB"
     yield Row("memory, last quarter beyond second", growth_kib, "KiB", goal=MEMORY_GOAL, note=note)
-
-
-_SHELL_ROUNDS = 5
-_PINGS = 500
-_SECONDS = 3
-_PORT = 5209
-_SHELL, _BARE_FORWARDER = "noack netem shell", "bare forwarder in C"
-
-
-def _bare(forwarder: Path, command: str) -> str:
-    link = open_devices(LinkSpec("bare", ("", 0), ("", 0), LinkSettings(), LinkSettings()))
-    with ExitStack() as stack:
-        stack.callback(link.close)
-        words = [str(forwarder), *map(str, link.devices)]
-        process = stack.enter_context(subprocess.Popen(words, pass_fds=link.devices))
-        stack.callback(process.kill)
-        with inside(link):
-            variables = os.environ | {"TO": link.spec.to[0]}
-            words = ["sh", "-c", command]
-            inner = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=variables)
-        return inner.communicate()[0]
-
-
-def _in_shell(command: str) -> str:
-    words = [sys.executable, "-m", "netem", "shell", "--", "sh", "-c", f"TO=$NOACK_OUTSIDE; {command}"]
-    return subprocess.run(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True).stdout
-
-
-def _shell_figures(run: Callable[[str], str]) -> Figures:
-    """Measure throughput from inside to outside, and the time to there and back.
-
-    ``run`` runs a command line of sh inside, where ``$TO`` is the outside; it returns its output.
-    """
-    try:
-        end = json.loads(run(f"iperf3 -J -c $TO -p {_PORT} -t {_SECONDS}"))["end"]
-        pings = run(f"ping -q -i 0.002 -c {_PINGS} $TO")
-        (trip_ms,) = re.findall(r"= [\d.]+/([\d.]+)/", pings)
-        return {"mbit": end["sum_received"]["bits_per_second"] / 1e6, "us": 1e3 * float(trip_ms)}
-    except (ValueError, KeyError):
-        raise MeasurementError("its programs did not report") from None
-
-
-@benchmark("shell", "A shell: throughput of TCP, and time to the outside and back")
-def shell(_options: argparse.Namespace) -> Iterator[Row]:
-    """Measure a shell without impairments, in turn with the alternative, which needs root."""
-    server = [program_path("iperf3", "iperf3"), "-s", "-p", str(_PORT)]
-    rounds = Rounds()
-    with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder, ExitStack() as stack:
-        process = stack.enter_context(subprocess.Popen(server, stdout=subprocess.DEVNULL))
-        stack.callback(process.kill)
-        bare = partial(_bare, compile_program("tun.c", Path(folder)))
-        runs = {_BARE_FORWARDER: partial(_shell_figures, bare), _SHELL: partial(_shell_figures, _in_shell)}
-        rounds.measure_in_turn(_SHELL_ROUNDS, runs)
-    row = partial(rounds.row, ours=_SHELL, peer=_BARE_FORWARDER, paired=True)
-    yield row("TCP", "Mbit/s", "mbit", goal=Goal(">=", 0.9))
-    yield row("ping, mean", "µs", "us")

@@ -166,7 +166,7 @@ def memory(load: LoopLoad, run: ObservedRun) -> Iterator[Row]:
 
 
 def libraries_mib(count: int) -> float:
-    """Return the private memory of so many Pythons at once that import the libraries."""
+    """Return the private memory of ``count`` simultaneous Pythons that import the libraries."""
     command, pipe = [sys.executable, "-c", _LIBRARIES], subprocess.PIPE
     with ExitStack() as stack:
         pythons = [

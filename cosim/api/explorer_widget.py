@@ -26,7 +26,7 @@ from noack.core.errors import NoackError
 from noack.core.number_format import as_html
 
 _QUIET_S = 0.3
-"""So long after the last change, what takes longer than a redraw is computed."""
+"""Time after the last change at which what takes longer than a redraw is computed."""
 _REST = [CERTIFICATE, ENSEMBLE]
 _DPI = 90
 _QUICK = {"compress_level": 1}

@@ -106,14 +106,14 @@ class Exploration:
         """The key numbers of the run."""
         events, lost = len(self.event_s), self.lost
         share = f" ({100 * lost / events:.0f} %)" if events else ""
-        ended = self.cut_reason or "reached the horizon"
+        ending = self.cut_reason or "reached the horizon"
         if self.diverged_at_s is not None:
-            ended = f"diverged at {number(self.diverged_at_s, 4)} s"
+            ending = f"diverged at {number(self.diverged_at_s, 4)} s"
         elif self.kind in (LIVE, RECORDED):
-            ended = f"until {number(float(self.t_s[-1]), 4)} s"
+            ending = f"until {number(float(self.t_s[-1]), 4)} s"
         shortest_s = number(float(np.diff(self.event_s).min()), 4) + " s" if events > 1 else "–"
         return (
-            Fact("run", ended),
+            Fact("run", ending),
             Fact("transmissions", str(events)),
             Fact("delivered", str(events - lost)),
             Fact("lost", f"{lost}{share}"),
@@ -150,9 +150,9 @@ class Exploration:
         first_s = self.event_s[self.delivered].min(initial=np.inf)
         if not np.isfinite(first_s):
             return np.zeros(len(self.t_s), np.bool_)
-        at = np.flatnonzero(self.t_s == first_s)
+        indices = np.flatnonzero(self.t_s == first_s)
         # If the time of the event occurs twice, it is first the time before the reset.
-        start = int(at[min(1, len(at) - 1)]) if len(at) else int(np.sum(self.t_s < first_s))
+        start = int(indices[min(1, len(indices) - 1)]) if len(indices) else int(np.sum(self.t_s < first_s))
         known: NDArray[np.bool_] = np.arange(len(self.t_s)) >= start
         return known
 
@@ -185,32 +185,32 @@ def explore(scenario: Scenario) -> Exploration:
     except TooManyEventsError as error:
         if error.run is None or error.run.reached_s <= 0:
             raise
-        return _from_exact_run(error.run, resolved, _cut(error.run))
+        return _from_exact_run(error.run, resolved, _cut_reason(error.run))
 
 
-def _cut(run: ContinuousRun) -> str:
-    ended = f"{len(run.event_s)} events until {number(run.reached_s, 3)} s"
+def _cut_reason(run: ContinuousRun) -> str:
+    extent = f"{len(run.event_s)} events until {number(run.reached_s, 3)} s"
     first_s = run.event_s[len(run.event_s) // 2]
     second_s = run.reached_s - first_s
     if second_s > _SHORT * first_s:
-        return f"{ended}; the rest is not drawn"
-    shrink = f"{ended}, half of them in the last {number(second_s, 2)} s"
-    return f"Zeno-like behaviour: inter-event times shrink to 0 ({shrink})"
+        return f"{extent}; the rest is not drawn"
+    accumulation = f"{extent}, half of them in the last {number(second_s, 2)} s"
+    return f"Zeno-like behaviour: inter-event times shrink to 0 ({accumulation})"
 
 
 @np.errstate(all="ignore")  # a run may diverge
-def _from_exact_run(run: ContinuousRun, resolved: Scenario, cut: str) -> Exploration:
-    even = run.at(np.linspace(0.0, run.reached_s, POINTS))
-    parts = [(even.t_s, even.x, even.e_s, even.e_c)]
+def _from_exact_run(run: ContinuousRun, resolved: Scenario, cut_reason: str) -> Exploration:
+    samples = run.at(np.linspace(0.0, run.reached_s, POINTS))
+    parts = [(samples.t_s, samples.x, samples.e_s, samples.e_c)]
     if 0 < len(run.before) <= _MOST_EVENT_POINTS:  # before, after, then the even times
         parts = [_stack(run.before), _stack(run.after), *parts]
     t_s, x, e_s, e_c = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.argsort(t_s, kind="stable")
     t_s, x, e_s, e_c = t_s[order], x[order], e_s[order], e_c[order]
-    diverged = run.divergence(even, resolved)
+    divergence = run.divergence(samples, resolved)
     return Exploration(
         resolved, EXACT, t_s, x, x + e_s, x + e_c, run.system.norms(e_s), run.system.norms(e_c),
-        threshold_at(resolved, t_s), run.event_s, run.delivered, diverged and diverged.at_s, cut,
+        threshold_at(resolved, t_s), run.event_s, run.delivered, divergence and divergence.at_s, cut_reason,
     )  # fmt: skip
 
 
@@ -224,8 +224,8 @@ def threshold_at(resolved: Scenario, t_s: Vector) -> Vector | None:
     trigger = policy_of(resolved)
     if not (isinstance(trigger, TriggerRule) and trigger.is_decaying):
         return None
-    decaying: Vector = trigger.level * np.exp(-trigger.rate_per_s * t_s)
-    return np.maximum(decaying, trigger.floor)
+    level: Vector = trigger.level * np.exp(-trigger.rate_per_s * t_s)
+    return np.maximum(level, trigger.floor)
 
 
 def longest_burst(delivered: NDArray[np.bool_]) -> int:
@@ -270,11 +270,11 @@ def from_record(record: RunRecord, kind: str, diverged_at_s: float | None = None
         parts.append(curves[decimate_all(curves[:, 0], curves[:, 1:], columns)])
     curves, n = np.concatenate(parts), record.loop.n
     t_s, x, x_s, x_c, sizes = np.split(curves, np.cumsum([1, n, n, n]), axis=1)
-    sent, is_decaying = record.events(), threshold_at(resolved, t_s[:1, 0]) is not None
+    events, is_decaying = record.events(), threshold_at(resolved, t_s[:1, 0]) is not None
     return Exploration(
         resolved, kind, t_s[:, 0], x, x_s, x_c, sizes[:, 0], sizes[:, 1],
-        sizes[:, 2] if is_decaying else None, np.asarray(sent["t_ns"] / NS_PER_S),
-        np.isin(sent["event"], record.columns(CONTROLLER_DELIVERY, "sequence")["sequence"]),
+        sizes[:, 2] if is_decaying else None, np.asarray(events["t_ns"] / NS_PER_S),
+        np.isin(events["event"], record.columns(CONTROLLER_DELIVERY, "sequence")["sequence"]),
         diverged_at_s,
     )  # fmt: skip
 
@@ -309,10 +309,10 @@ class Ensemble:
     def numbers(self) -> tuple[Fact, ...]:
         """The key numbers of the draws."""
         low, middle, high = self.transmissions
-        sent = f"{low:.0f} to {high:.0f}, median {middle:.0f}" if math.isfinite(low) else "–"
+        text = f"{low:.0f} to {high:.0f}, median {middle:.0f}" if math.isfinite(low) else "–"
         left_out = Fact("draws with Zeno-like behaviour, not in the bands", f"{self.failed}")
         return (
-            Fact(f"transmissions in 90 % of {self.draws - self.failed} draws", sent),
+            Fact(f"transmissions in 90 % of {self.draws - self.failed} draws", text),
             Fact("draws that diverge", f"{self.diverged} of {self.draws}"),
             *([left_out] if self.failed else []),
         )
@@ -328,20 +328,20 @@ def explore_ensemble(scenario: Scenario, draws: int = DRAWS) -> Ensemble:
     population = box_of(scenario).population(0, range(draws))
     rows, events = run_with_events(setting, population)
     # Draws with too many events, and undecided ones, are left out.
-    used = np.flatnonzero((rows["status"] == OK) | (rows["status"] == DIVERGED))
-    chosen = Population(
-        population.A[used], population.B[used], population.x0[used], population.loss_seeds[used]
+    indices = np.flatnonzero((rows["status"] == OK) | (rows["status"] == DIVERGED))
+    sample = Population(
+        population.A[indices], population.B[indices], population.x0[indices], population.loss_seeds[indices]
     )
     t_s = np.linspace(0.0, setting.horizon_s, _BAND_POINTS)
-    states = trajectories(setting, chosen, [events[i] for i in used], t_s)
+    states = trajectories(setting, sample, [events[i] for i in indices], t_s)
     # Norms, weighted as the trigger weights them, as quantiles over the draws.
     x, e_c = states[:, :, 0], states[:, :, 2]
     weight = setting.trigger.weight
     with np.errstate(all="ignore"):
         weighted = e_c if weight is None else e_c @ weight.T
         x_norm, e_c_norm = (_band(np.linalg.norm(vectors, axis=2)) for vectors in (x, weighted))
-    sent = rows["transmissions"][used]
-    low, middle, high = np.quantile(sent, (LOW, 0.5, HIGH)) if len(sent) else (np.nan,) * 3
+    transmissions = rows["transmissions"][indices]
+    low, middle, high = np.quantile(transmissions, (LOW, 0.5, HIGH)) if len(transmissions) else (np.nan,) * 3
     return Ensemble(
         t_s,
         tuple(_band(x[:, :, i]) for i in range(x.shape[2])),
@@ -349,7 +349,7 @@ def explore_ensemble(scenario: Scenario, draws: int = DRAWS) -> Ensemble:
         e_c_norm,
         draws,
         int((rows["status"] == DIVERGED).sum()),
-        draws - len(used),
+        draws - len(indices),
         (float(low), float(middle), float(high)),
     )
 
@@ -361,12 +361,12 @@ def _ensemble_setting(scenario: Scenario) -> Setting:
 def _band(values: NDArray[np.float64]) -> QuantileBand:
     """Return quantiles over the draws, (k, N) → (N,) each; a diverged draw counts as infinite."""
     if not len(values):
-        nothing = np.full(values.shape[1], np.nan)
-        return QuantileBand(nothing, nothing, nothing)
+        no_values = np.full(values.shape[1], np.nan)
+        return QuantileBand(no_values, no_values, no_values)
     # Nearest ranks: no arithmetic with infinities.
-    ordered = np.sort(np.where(np.isnan(values), np.inf, values), axis=0)
-    places = np.rint(np.array([LOW, 0.5, HIGH]) * (len(values) - 1)).astype(np.intp)
-    low, middle, high = ordered[places]
+    ascending = np.sort(np.where(np.isnan(values), np.inf, values), axis=0)
+    indices = np.rint(np.array([LOW, 0.5, HIGH]) * (len(values) - 1)).astype(np.intp)
+    low, middle, high = ascending[indices]
     return QuantileBand(low, middle, high)
 
 
@@ -386,12 +386,12 @@ def trajectories(
         known_start=setting.known_start,
     )
     samples = []
-    for A, B, x0, own in zip(*population[:3], events, strict=True):
-        rest = np.zeros_like(x0)
-        start = [x0, rest, rest if setting.known_start else -x0]
-        after = own.states.copy()
-        after[:, 1] = 0.0
-        after[own.delivered, 2] = 0.0
-        times_s, states = np.append(0.0, own.event_s), np.concatenate([[start], after])
+    for A, B, x0, run_events in zip(*population[:3], events, strict=True):
+        zero = np.zeros_like(x0)
+        start = [x0, zero, zero if setting.known_start else -x0]
+        resets = run_events.states.copy()
+        resets[:, 1] = 0.0
+        resets[run_events.delivered, 2] = 0.0
+        times_s, states = np.append(0.0, run_events.event_s), np.concatenate([[start], resets])
         samples.append(core.sample(A, B, times_s, states, t_s))
     return np.array(samples).reshape(-1, len(t_s), 3, len(setting.H))

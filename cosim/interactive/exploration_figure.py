@@ -36,7 +36,7 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
 from noack.scenario.scenario import Scenario
 
-BAND, EDGE, KEPT = "90 % of draws", "edge of the 90 % of draws", "for comparison"
+BAND, EDGE, REFERENCE = "90 % of draws", "edge of the 90 % of draws", "for comparison"
 _SMALLEST = 1e-6
 """Smallest value on a logarithmic axis, as a share of the largest; an error is 0 after a reset."""
 _DECADES = 7
@@ -62,16 +62,16 @@ def exploration_figure(explored: ExploredRun) -> FigureDescription:
 
     A name that several panels show is in the legend of the first.
     """
-    known, rows = {"‖x‖"}, list[PanelRow]()
+    names_in_legends, rows = {"‖x‖"}, list[PanelRow]()
     contents = [_state(explored), _errors(explored), _norm(explored), _events(explored)]
     horizon_s = np.array([0.0, explored.run.scenario.horizon_s])
     for content, height_in in zip(contents, _HEIGHTS_IN, strict=True):
-        drawn = [item for item in content.items if _has_points(item)]
-        names = [*dict.fromkeys(item.label for item in drawn)]
-        legend = sorted((name for name in names if name not in known), key=KEPT.__eq__)
-        known |= {*names}
+        items = [item for item in content.items if _has_points(item)]
+        names = [*dict.fromkeys(item.label for item in items)]
+        legend = sorted((name for name in names if name not in names_in_legends), key=REFERENCE.__eq__)
+        names_in_legends |= {*names}
         x = time_axis(horizon_s, numbers=len(rows) == len(contents) - 1)
-        panel = Panel(title=content.title, items=drawn, x=x, y=content.y, legend=legend)
+        panel = Panel(title=content.title, items=items, x=x, y=content.y, legend=legend)
         rows.append(PanelRow(panels=[panel], height_in=height_in))
     description = "; ".join(content.title for content in contents)
     return FigureDescription(name="exploration", rows=rows, description=description)
@@ -88,7 +88,7 @@ def _has_points(item: Band | Line | Marks) -> bool:
 
 
 def _state(explored: ExploredRun) -> _PanelContent:
-    run, i, draws, other = explored.run, explored.state, explored.ensemble, explored.reference
+    run, i, draws, reference = explored.run, explored.state, explored.ensemble, explored.reference
     x, x_s = run.x[:, i], run.x_s[:, i]
     x_c = np.where(run.controller_has_state, run.x_c[:, i], np.nan)
     items: list[Band | Line | Marks] = [
@@ -101,14 +101,14 @@ def _state(explored: ExploredRun) -> _PanelContent:
         low, high = draws.states[i].low, draws.states[i].high
         band = Band(x=draws.t_s, low=low, high=high, label=BAND, colour=PLANT, opacity=0.22)
         items.insert(0, band)
-    if other is not None and i < other.x.shape[1]:
-        items.insert(0, _reference_line(other, other.x[:, i]))
-        about = np.concatenate([about, other.x[:, i]])
+    if reference is not None and i < reference.x.shape[1]:
+        items.insert(0, _reference_line(reference, reference.x[:, i]))
+        about = np.concatenate([about, reference.x[:, i]])
     return _PanelContent(f"{run.state_names[i]}: plant and both models", items, Axis(about=about))
 
 
 def _errors(explored: ExploredRun) -> _PanelContent:
-    run, draws, other = explored.run, explored.ensemble, explored.reference
+    run, draws, reference = explored.run, explored.ensemble, explored.reference
     floor, guarantee = _floor(run), explored.guarantee
     e_s, e_c = _positive(run.e_s_norm, floor), _known_error(run, floor)
     items = [
@@ -124,14 +124,14 @@ def _errors(explored: ExploredRun) -> _PanelContent:
         items.append(_certified_line(guarantee, guarantee.e_c))
     if draws is not None:
         items.append(_edge(draws, _positive(draws.e_c_norm.high, floor)))
-    if other is not None:
-        items.insert(0, _reference_line(other, _known_error(other, floor)))
+    if reference is not None:
+        items.insert(0, _reference_line(reference, _known_error(reference, floor)))
     y = Axis(logarithmic=True, about=about, decades=_DECADES)
     return _PanelContent("errors of the models (logarithmic)", items, y)
 
 
 def _norm(explored: ExploredRun) -> _PanelContent:
-    run, draws, other, guarantee = explored.run, explored.ensemble, explored.reference, explored.guarantee
+    run, draws, reference, guarantee = explored.run, explored.ensemble, explored.reference, explored.guarantee
     norm = _positive(run.x_norm, _SMALLEST * _largest(run.x_norm))
     items = [Line(x=run.t_s, y=norm, label="‖x‖", colour=PLANT, width=2.25)]
     if guarantee is not None:
@@ -139,8 +139,10 @@ def _norm(explored: ExploredRun) -> _PanelContent:
     if draws is not None:
         edges = (draws.x_norm.low, draws.x_norm.high)
         items += [_edge(draws, _positive(edge, 0.0)) for edge in edges]
-    if other is not None:
-        items.insert(0, _reference_line(other, _positive(other.x_norm, _SMALLEST * _largest(other.x_norm))))
+    if reference is not None:
+        items.insert(
+            0, _reference_line(reference, _positive(reference.x_norm, _SMALLEST * _largest(reference.x_norm)))
+        )
     y = Axis(logarithmic=True, about=norm, decades=_DECADES)
     return _PanelContent("‖x‖ (logarithmic)", items, y)
 
@@ -151,10 +153,10 @@ def _events(explored: ExploredRun) -> _PanelContent:
     dots = Marks(x=t_s[delivered], y=since_s[delivered], label="delivered", colour=CONTROLLER)
     crosses = Marks(x=t_s[~delivered], y=since_s[~delivered], label="lost", colour=LOST)
     items = [dots, replace(crosses, marker="x", stroke=1.6)]
-    if (other := explored.reference) is not None:
-        between_s = np.diff(other.event_s, prepend=0.0)
-        before = Marks(x=other.event_s, y=between_s, label=KEPT, colour=FORCED, opacity=0.45)
-        items.insert(0, before)
+    if (reference := explored.reference) is not None:
+        between_s = np.diff(reference.event_s, prepend=0.0)
+        marks = Marks(x=reference.event_s, y=between_s, label=REFERENCE, colour=FORCED, opacity=0.45)
+        items.insert(0, marks)
     return _PanelContent("transmissions: time since the last one [s]", items, Axis(ends=(0.0, None)))
 
 
@@ -167,7 +169,7 @@ def _edge(ensemble: Ensemble, values: Vector) -> Line:
 
 
 def _reference_line(reference: Exploration, values: Vector) -> Line:
-    return Line(x=reference.t_s, y=values, label=KEPT, colour=FORCED, width=0.9, dash=DASHED)
+    return Line(x=reference.t_s, y=values, label=REFERENCE, colour=FORCED, width=0.9, dash=DASHED)
 
 
 def _known_error(run: Exploration, floor: float) -> Vector:
@@ -219,14 +221,14 @@ class DraftResults:
         if draft.scenario.loops:
             raise CallerError("loops: only one loop can be explored; noack.simulate takes several")
         self.draft = draft
-        self._found: dict[str, object] = {}
+        self._results: dict[str, object] = {}
         for listener in self.listeners:
             listener()
 
     @property
     def known(self) -> frozenset[str]:
         """Which results are computed: RUN, CERTIFICATE, ENSEMBLE, MARGIN."""
-        return frozenset(self._found)
+        return frozenset(self._results)
 
     @property
     def run(self) -> Exploration:
@@ -296,9 +298,9 @@ class DraftResults:
 
     def put(self, name: str, result: object) -> None:
         """Take a result that was computed elsewhere: RUN, CERTIFICATE, ENSEMBLE or MARGIN."""
-        self._found[name] = result
+        self._results[name] = result
 
     def _once(self, name: str, compute: Callable[[Scenario], T]) -> T:
-        if name not in self._found:
-            self._found[name] = compute(self.draft.scenario)
-        return cast(T, self._found[name])
+        if name not in self._results:
+            self._results[name] = compute(self.draft.scenario)
+        return cast(T, self._results[name])

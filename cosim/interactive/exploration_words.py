@@ -15,9 +15,9 @@ from noack.core.number_format import number, percent
 from noack.guarantee.loss_guarantee import LossHistory
 from noack.runtime.life_cycle import HORIZON
 
-_MOST_SETTINGS, _LONGEST = 4, 28
-"""Settings that are named, and characters of a value that is shown."""
-_NEARLY = 1.001
+_MOST_SETTINGS, _LONGEST_VALUE = 4, 28
+"""Largest number of settings that are named, and of characters of a value that is shown."""
+_EQUAL_LENGTH_RATIO = 1.001
 """Runs whose ends differ by a smaller factor are compared as equally long."""
 _END = "‖x‖ at the end"
 _NOT_COMPARED = ("name", "ports", "recovery", "realtime")
@@ -53,15 +53,15 @@ class Comparison(NamedTuple):
 
 def compare(reference: Reference, run: Exploration) -> Comparison:
     """Compare a run with a reference."""
-    last_s = [float(shown.t_s[-1]) for shown in (reference.run, run)]
+    last_s = [float(part.t_s[-1]) for part in (reference.run, run)]
     until_s = min(last_s)
-    until = f", until {number(until_s, 3)} s" if max(last_s) > until_s * _NEARLY else ""
-    before, after = (_measure(shown, until_s) for shown in (reference.run, run))
+    until = f", until {number(until_s, 3)} s" if max(last_s) > until_s * _EQUAL_LENGTH_RATIO else ""
+    old, new = (_measure(part, until_s) for part in (reference.run, run))
     rows = (
-        *(_counts(name, before[name], after[name]) for name in ("transmissions", "lost")),
-        *(_sizes(name, before[name], after[name]) for name in (_END, "largest ‖e_c‖")),
+        *(_compare_counts(name, old[name], new[name]) for name in ("transmissions", "lost")),
+        *(_compare_sizes(name, old[name], new[name]) for name in (_END, "largest ‖e_c‖")),
     )
-    return Comparison(f"compared with {reference.name}{until}", _settings(reference.run, run), rows)
+    return Comparison(f"compared with {reference.name}{until}", _compare_settings(reference.run, run), rows)
 
 
 def _measure(run: Exploration, until_s: float) -> dict[str, float]:
@@ -76,39 +76,39 @@ def _measure(run: Exploration, until_s: float) -> dict[str, float]:
     }
 
 
-def _settings(other: Exploration, run: Exploration) -> str:
+def _compare_settings(reference: Exploration, run: Exploration) -> str:
     """Return which settings differ; matrices by their names only."""
-    before, after = (shown.scenario.model_dump(mode="json", exclude_none=True) for shown in (other, run))
-    changed = []
+    before, after = (part.scenario.model_dump(mode="json", exclude_none=True) for part in (reference, run))
+    texts = []
     for key, _ in differences(before, after):
         old, new = (leaf(content, key) for content in (before, after))
         if key.partition(".")[0] in _NOT_COMPARED:
             continue
-        is_long = any(len(_text(value)) > _LONGEST for value in (old, new))
-        changed.append(key if is_long else f"{key} {_text(old)} → {_text(new)}")
-    if not changed:
+        is_long = any(len(_text(value)) > _LONGEST_VALUE for value in (old, new))
+        texts.append(key if is_long else f"{key} {_text(old)} → {_text(new)}")
+    if not texts:
         return "The settings are the same."
-    more = f" and {len(changed) - _MOST_SETTINGS} more" if len(changed) > _MOST_SETTINGS else ""
-    return f"Settings that differ: {', '.join(changed[:_MOST_SETTINGS])}{more}."
+    more = f" and {len(texts) - _MOST_SETTINGS} more" if len(texts) > _MOST_SETTINGS else ""
+    return f"Settings that differ: {', '.join(texts[:_MOST_SETTINGS])}{more}."
 
 
 def _text(value: object) -> str:
     return value_text(value) if isinstance(value, str | int | float | list | dict) else "–"
 
 
-def _counts(name: str, before: float, after: float) -> ComparedNumber:
-    change = after - before
+def _compare_counts(name: str, old: float, new: float) -> ComparedNumber:
+    change = new - old
     words = f"{abs(change):g} {'more' if change > 0 else 'fewer'}" if change else "the same"
-    return ComparedNumber(name, f"{before:g}", f"{after:g}", words)
+    return ComparedNumber(name, f"{old:g}", f"{new:g}", words)
 
 
-def _sizes(name: str, before: float, after: float) -> ComparedNumber:
-    texts = [number(value, 3) if math.isfinite(value) else "–" for value in (before, after)]
+def _compare_sizes(name: str, old: float, new: float) -> ComparedNumber:
+    texts = [number(value, 3) if math.isfinite(value) else "–" for value in (old, new)]
     words = "–"
     if texts[0] == texts[1]:
-        words = "the same" if math.isfinite(before) else "–"
-    elif math.isfinite(before) and math.isfinite(after) and before > 0:
-        ratio = number(after / before, 3)
+        words = "the same" if math.isfinite(old) else "–"
+    elif math.isfinite(old) and math.isfinite(new) and old > 0:
+        ratio = number(new / old, 3)
         words = "nearly the same" if ratio == "1" else f"{ratio} times as large"
     return ComparedNumber(name, texts[0], texts[1], words)
 
@@ -139,22 +139,22 @@ def _guarantee_line(run: Exploration, guarantee: Guarantee | None) -> VerdictLin
     if guarantee is None:
         return VerdictLine("guarantee: being computed", Tone.NEUTRAL)
     if guarantee.verdict != CERTIFIED:
-        why = guarantee.reason if guarantee.verdict != VOID else f"{VOID}: {guarantee.reason}"
-        return VerdictLine(f"guarantee not checkable: {why}", Tone.DOUBTFUL)
-    if not run.scenario.network.enforce_mansd and (broken := _loss_too_many(run)):
-        return VerdictLine(f"guarantee broken since {broken}", Tone.BAD)
+        reason = guarantee.reason if guarantee.verdict != VOID else f"{VOID}: {guarantee.reason}"
+        return VerdictLine(f"guarantee not checkable: {reason}", Tone.DOUBTFUL)
+    if not run.scenario.network.enforce_mansd and (violation := _loss_too_many(run)):
+        return VerdictLine(f"guarantee broken since {violation}", Tone.BAD)
     with np.errstate(all="ignore"):
-        used = [
+        shares = [
             values / np.exp(np.interp(run.t_s, guarantee.t_s, np.log(bound)))
             for values, bound in (
                 (np.where(run.controller_has_state, run.e_c_norm, 0.0), guarantee.e_c),
                 (run.x_norm, guarantee.x),
             )
         ]
-    above = np.nanmax(np.stack([*used, np.zeros_like(run.t_s)]), axis=0) > 1
+    above = np.nanmax(np.stack([*shares, np.zeros_like(run.t_s)]), axis=0) > 1
     if above.any():
         return VerdictLine(f"guarantee broken since {run.t_s[above][0]:.3f} s", Tone.BAD)
-    share = percent(float(np.nanmax(np.append(used[0], 0.0))))
+    share = percent(float(np.nanmax(np.append(shares[0], 0.0))))
     return VerdictLine(f"guarantee kept: ‖e_c‖ was at most {share} of its bound", Tone.GOOD)
 
 

@@ -64,7 +64,7 @@ class Draft:
     folder: Path
     """Relative file names in the text are relative to it."""
     base_text: str
-    before: str
+    unedited_text: str
     """The text before the edits."""
     edits: Mapping[str, Callable[[Table], object]] = field(default_factory=dict)
     """Changes of the content by key, in order."""
@@ -73,13 +73,13 @@ class Draft:
     def text(self) -> str:
         """The text; while a slider is dragged nobody needs it, and it takes milliseconds."""
         if not self.edits:
-            return self.before
+            return self.unedited_text
 
         def change(content: Table) -> None:
             for edit in self.edits.values():
                 edit(content)
 
-        return changed_text(self.before, self.content, change)
+        return changed_text(self.unedited_text, self.content, change)
 
     @cached_property
     def content(self) -> Table:
@@ -118,12 +118,12 @@ class Draft:
         content = copy.deepcopy(self.content)
         change(content)
         if "text" in self.__dict__:
-            made = replace(self, before=self.text, edits={key: change})
+            draft = replace(self, unedited_text=self.text, edits={key: change})
         else:
-            earlier = {edited: edit for edited, edit in self.edits.items() if edited != key}
-            made = replace(self, edits={**earlier, key: change})
-        made.__dict__["content"] = content
-        return made
+            others = {other: edit for other, edit in self.edits.items() if other != key}
+            draft = replace(self, edits={**others, key: change})
+        draft.__dict__["content"] = content
+        return draft
 
     def with_text(self, text: str) -> "Draft":
         """Return the draft with another text."""
@@ -152,14 +152,14 @@ def leaf(content: ReadTable, key: str) -> object:
 def differences(base: object, content: object, key: str = "") -> list[tuple[str, str]]:
     """Return the keys that differ, with their values as TOML; empty for a key that is gone."""
     if isinstance(base, Mapping) and isinstance(content, Mapping):
-        changed = []
+        pairs = []
         for part in [*base, *(part for part in content if part not in base)]:
             inner = f"{key}.{part}" if key else str(part)
             if part not in content:
-                changed.append((inner, ""))
+                pairs.append((inner, ""))
             else:
-                changed += differences(base.get(part, _ABSENT), content[part], inner)
-        return changed
+                pairs += differences(base.get(part, _ABSENT), content[part], inner)
+        return pairs
     return [] if base == content else [(key, value_text(content))]
 
 
@@ -204,13 +204,13 @@ def draft_of_query(query: str, default: str, known: Mapping[str, str]) -> Draft:
     base = dict(pairs).get(_BASE, default)
     if base not in known:
         raise CallerError(f"{base}: an address opens shipped scenarios and files of this folder")
-    draft = opened = open_draft(known[base])
+    draft = base_draft = open_draft(known[base])
     for key, text in pairs:
         if key != _BASE and text:
             draft = draft.with_value(key, value_of(text, key))
         elif key != _BASE:
             draft = draft.without(key)
-    if _code(opened.content) != _code(draft.content):
+    if _code(base_draft.content) != _code(draft.content):
         raise CallerError("the address names files to execute, so its settings were not applied")
     return draft
 
@@ -226,8 +226,8 @@ def _code(content: ReadTable) -> list[object]:
     ]
 
 
-def known_scenarios(folder: Path, given: str) -> dict[str, str]:
-    """Return the scenarios that the page offers: shipped ones, those of a folder, the given one."""
+def known_scenarios(folder: Path, base: str) -> dict[str, str]:
+    """Return the scenarios that the page offers: shipped ones, those of a folder, the draft's base."""
     known = {name: name for name in shipped_names("scenarios")}
     for path in sorted(folder.glob("*.toml")):
         try:
@@ -236,23 +236,23 @@ def known_scenarios(folder: Path, given: str) -> dict[str, str]:
             continue
         if {"model", "plant", "network"} <= content.keys():
             known[path.name] = str(path)
-    return known | {given: given}
+    return known | {base: base}
 
 
-def changed_text(text: str, wanted: ReadTable, change: Callable[[Table], object]) -> str:
+def changed_text(text: str, content: ReadTable, change: Callable[[Table], object]) -> str:
     """Return a changed TOML text with its comments; without them if they cannot be kept.
 
     Args:
         text: the text.
-        wanted: its content after the change.
+        content: its content after the change.
         change: changes a document of tomlkit as it has changed the content.
     """
     with suppress(TOMLKitError, tomllib.TOMLDecodeError, ValueError):
         document = tomlkit.parse(text)
         change(document)
-        if tomllib.loads(new := document.as_string()) == wanted:
+        if tomllib.loads(new := document.as_string()) == content:
             return new
-    return toml_text(wanted)
+    return toml_text(content)
 
 
 def value_text(value: object) -> str:

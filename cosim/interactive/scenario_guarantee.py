@@ -83,11 +83,11 @@ def certify(scenario: Scenario) -> Guarantee:
     """
     resolved = resolve(scenario)
     t_s = np.linspace(0.0, resolved.horizon_s, _POINTS)
-    nothing = np.full(_POINTS, np.nan)
+    no_bound = np.full(_POINTS, np.nan)
     try:
         certificate = _certificate(resolved)
     except CallerError as error:
-        return Guarantee(NOT_COVERED, str(error), (), (), t_s, nothing, nothing, nothing)
+        return Guarantee(NOT_COVERED, str(error), (), (), t_s, no_bound, no_bound, no_bound)
     reason = _reason(certificate)
     assumptions = tuple(
         OpenAssumption(str(assumption.verdict), assumption.what, assumption.why)
@@ -116,8 +116,8 @@ def _certificate(resolved: Scenario) -> ScenarioCertificate:
     if (void := void_at_setpoint(resolved).get(OWN_PLANT)) is not None:
         raise CallerError(f"controller.setpoint: {void}")
     shifted = about_setpoint(resolved)
-    late = resolved.certificate.late_periods
-    return own_plant_scope(shifted).certificate(nominal_conditions(shifted, late))
+    late_periods = resolved.certificate.late_periods
+    return own_plant_scope(shifted).certificate(nominal_conditions(shifted, late_periods))
 
 
 def _reason(certificate: ScenarioCertificate) -> str:

@@ -147,10 +147,10 @@ def _resolve(schema: Schema) -> Schema:
         name = schema["$ref"].rpartition("/")[2]
         return {**_schema()["$defs"][name], **{k: v for k, v in schema.items() if k != "$ref"}}
     if "anyOf" in schema:
-        given = [alternative for alternative in schema["anyOf"] if alternative.get("type") != "null"]
-        if len(given) == 1:
-            rest = {key: value for key, value in schema.items() if key != "anyOf"}
-            return _resolve({**given[0], **rest})
+        alternatives = [alternative for alternative in schema["anyOf"] if alternative.get("type") != "null"]
+        if len(alternatives) == 1:
+            others = {key: value for key, value in schema.items() if key != "anyOf"}
+            return _resolve({**alternatives[0], **others})
     return schema
 
 
@@ -187,8 +187,8 @@ def _kinds(schema: Schema) -> tuple[str, dict[str, Schema]]:
     name = ""
     for reference in schema.get("oneOf", ()):
         kind = _resolve(reference)
-        name, described = next((name, part) for name, part in kind["properties"].items() if "const" in part)
-        kinds[described["const"]] = kind
+        name, part = next((name, part) for name, part in kind["properties"].items() if "const" in part)
+        kinds[part["const"]] = kind
     return name, kinds
 
 

@@ -223,11 +223,11 @@ def _loss_sliders(scenario: Scenario, base: Scenario) -> list[Slider]:
     loss, usual = scenario.network.loss, base.network.loss
     values = loss.model_dump(mode="json", exclude_none=True)
     # The mean loss and burst are those of Gilbert's chain, which loses in the bad state only.
-    fixed = ("loss_in_good", "loss_in_bad") if "mean_loss" in values else ()
+    fixed_names = ("loss_in_good", "loss_in_bad") if "mean_loss" in values else ()
     sliders = []
     for name, value in values.items():
         key, label = f"network.loss.{name}", f"loss: {_words(name)}"
-        if name in fixed or not isinstance(value, float):
+        if name in fixed_names or not isinstance(value, float):
             continue
         if 0 <= value <= 1 and "[" not in label:  # it has no unit
             label = "loss probability" if name == "probability" else label
@@ -340,8 +340,8 @@ def _decades(key: str, label: str, value: float, middle: float, *, live: bool = 
 def _words(name: str) -> str:
     for unit in ("per_s", "s", "hz"):
         if name.endswith(f"_{unit}"):
-            shown = unit.replace("per_s", "1/s").replace("hz", "Hz")
-            return f"{name.removesuffix(f'_{unit}').replace('_', ' ')} [{shown}]"
+            text = unit.replace("per_s", "1/s").replace("hz", "Hz")
+            return f"{name.removesuffix(f'_{unit}').replace('_', ' ')} [{text}]"
     return name.replace("_", " ")
 
 

@@ -208,7 +208,7 @@ def controls_part(controls: Controls, wrong: set[str], *, live: bool) -> Json:
         "sliders": [
             {
                 "key": slider.key,
-                "label": slider.label + " · also live" * (live and slider.live),
+                "label": slider.label + (" · also live" if live and slider.live else ""),
                 "min": slider.ends[0],
                 "max": slider.ends[1],
                 "step": slider.step,

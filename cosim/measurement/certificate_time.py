@@ -74,7 +74,7 @@ class CertificateTime:
     @property
     def first_s(self) -> float | None:
         """When a condition was first violated, None if never: a claim is void from then on."""
-        return min((violated.first_s for violated in self.causes), default=None)
+        return min((cause.first_s for cause in self.causes), default=None)
 
     def to_json(self) -> dict[str, object]:
         """Return all fields for JSON."""
@@ -94,10 +94,10 @@ def certificate_time(trace: PacketTrace, scenario: Scenario) -> CertificateTime:
         certificates["any plant"] = "a loop with acknowledgements cannot have one"
     for certificate in scheduled_certificates(resolved):
         certificates[certificate.scope] = certificate.void if certificate.constants is None else None
-    allowed = allowed_conditions(resolved)
+    limits = allowed_conditions(resolved)
     delay_ns = network_delay_ns(resolved, resolved.certificate.late_periods)
     end_ns = int(max(trace.sent_ns[-1], trace.received_ns.max()))
-    conditions = list(_violations(trace, allowed, delay_ns, end_ns))
+    conditions = list(_violations(trace, limits, delay_ns, end_ns))
     if resolved.network.initial_sync == "first_packet":
         conditions.append(_start(trace, delay_ns, end_ns))
     spans = [span for span in conditions if len(span.begin_ns)]
@@ -107,7 +107,7 @@ def certificate_time(trace: PacketTrace, scenario: Scenario) -> CertificateTime:
     return CertificateTime(
         scenario=resolved.name,
         certificates=certificates or {"any plant": "the scenario cannot have one"},
-        allowed_losses=allowed.dropouts,
+        allowed_losses=limits.dropouts,
         allowed_delay_s=delay_ns * 1e-9,
         observed_s=end_ns * 1e-9,
         share=_covered_ns(begins_ns, ends_ns) / total_ns,
@@ -143,7 +143,7 @@ class _Spans:
 
 
 def _violations(
-    trace: PacketTrace, allowed: NetworkConditions, delay_ns: int, end_ns: int
+    trace: PacketTrace, limits: NetworkConditions, delay_ns: int, end_ns: int
 ) -> Iterator[_Spans]:
     """Yield the intervals of each cause."""
     groups, sent_ns, allowed_s = outcomes(trace), trace.sent_ns, delay_ns * 1e-9
@@ -153,17 +153,17 @@ def _violations(
     # A violation by a lost packet lasts until a newer one is received; else, to the next packet.
     until_ns = np.where(replaced_s > 0, groups.newer_ns, np.append(sent_ns[1:], end_ns))
     until_ns = np.minimum(until_ns, end_ns)
-    for rule in allowed.guarantee.rules:
+    for rule in limits.guarantee.rules:
         losses, drops = (
             PacketLosses(sent_s, times_s).values(rule, allowed_s, rule.start)[0].value
             for times_s in (replaced_s, dropped_s)
         )
         by_drops = drops > rule.limit
-        for suffix, violated in (("", by_drops), (ORDER, (losses > rule.limit) & ~by_drops)):
+        for suffix, is_violated in (("", by_drops), (ORDER, (losses > rule.limit) & ~by_drops)):
             values = losses if suffix else drops
-            worst = float((losses[violated] if violated.any() else values).max(initial=0))
+            worst = float((losses[is_violated] if is_violated.any() else values).max(initial=0))
             yield _Spans(
-                rule.name + suffix, sent_ns[violated], until_ns[violated], worst, rule.violation(worst)
+                rule.name + suffix, sent_ns[is_violated], until_ns[is_violated], worst, rule.violation(worst)
             )
     delays = trace.received_ns - sent_ns
     beyond = ~groups.lost & ~stale & (delays > delay_ns)

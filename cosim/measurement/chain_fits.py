@@ -211,8 +211,8 @@ def _edges(survival: Callable[[Reals], Reals], count: int) -> NDArray[np.int64]:
     tails = count * survival(grid.astype(float))
     edges, share = [1], max(FEWEST_EXPECTED, count / 20)
     for length, tail in zip(grid.tolist()[1:], tails.tolist()[1:], strict=True):
-        begun = count * survival(np.array([edges[-1]]))[0]
-        if begun - tail >= share and tail >= FEWEST_EXPECTED:
+        expected = count * survival(np.array([edges[-1]]))[0]
+        if expected - tail >= share and tail >= FEWEST_EXPECTED:
             edges.append(length)
     return np.array(edges)
 

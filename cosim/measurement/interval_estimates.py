@@ -91,9 +91,9 @@ def minimise(function: Callable[[Reals], Reals], start: Reals, limit: float) -> 
     if not len(start):
         return Minimum(start, float(function(start[None])[0]))
 
-    def with_gradient(at: Reals) -> tuple[float, Reals]:
-        steps = np.where(at + _DIFFERENCE > limit, -_DIFFERENCE, _DIFFERENCE)
-        value, *neighbours = function(np.vstack([at, at + np.diag(steps)]))
+    def with_gradient(point: Reals) -> tuple[float, Reals]:
+        steps = np.where(point + _DIFFERENCE > limit, -_DIFFERENCE, _DIFFERENCE)
+        value, *neighbours = function(np.vstack([point, point + np.diag(steps)]))
         return float(value), (np.array(neighbours) - value) / steps
 
     result = optimize.minimize(

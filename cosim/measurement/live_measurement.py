@@ -117,8 +117,8 @@ def _log(line: str) -> None:
 
 
 _LONGEST_WAIT_S = 0.1
-_BATCH = 256
-"""Most datagrams that are read at once."""
+_MOST_AT_ONCE = 256
+"""Largest number of datagrams that are read at once."""
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
 
 
@@ -162,7 +162,7 @@ class ProbeSocket:
         """Number of sends that failed, as the sends or later reads reported."""
         return self._send_errors + self.arrivals.errors
 
-    def receive(self, limit: int = _BATCH) -> list[Arrival]:
+    def receive(self, limit: int = _MOST_AT_ONCE) -> list[Arrival]:
         """Return the datagrams that wait, with the kernel's times of arrival."""
         return self.arrivals.receive(limit)
 
@@ -243,25 +243,25 @@ def send(address: Address, plan: ProbePlan, save: Path | None, log: Callable[[st
     socket = ProbeSocket(peer=address)
     with socket.endpoint, ProbeRows(save, log) as rows, Signals().handled() as signals:
         sender = ProbeSender(plan, secrets.randbits(64), host_number(), time.monotonic_ns(), rows.add)
-        refused = 0
+        failed_sends = 0
         while not sender.is_over(now_ns := time.monotonic_ns()):
             wait_ns = sender.next_deadline_ns() - now_ns
             if wait_ns <= 0:
                 socket.send(sender.on_timer(time.monotonic_ns()))
                 wait_ns = 0
                 if sender.ends <= 1:  # a send reports the failure of the one before
-                    if socket.send_errors and not refused:
+                    if socket.send_errors and not failed_sends:
                         log(f"{socket.last_send_error}: is a listener running there?")
-                    refused = min(socket.send_errors, sender.sent)
+                    failed_sends = min(socket.send_errors, sender.sent)
             select.select([socket.endpoint], (), (), min(wait_ns * 1e-9, _LONGEST_WAIT_S))
             for arrival in socket.receive():
                 sender.handle(arrival.data, arrival.latest_ns)
             rows.flush()
             if signals.received is not None:
                 sender.stop(time.monotonic_ns())
-        if refused:
-            reason = f"{refused} of {sender.sent} sends failed: {socket.last_send_error}"
-            if refused == sender.sent:
+        if failed_sends:
+            reason = f"{failed_sends} of {sender.sent} sends failed: {socket.last_send_error}"
+            if failed_sends == sender.sent:
                 raise PeerError(f"{address_text(address)}: {reason}; is a listener running there?")
             log(reason)
         result = _finish_probe(sender.finish, socket)

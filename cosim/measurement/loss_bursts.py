@@ -97,9 +97,9 @@ class LossBursts:
         ends = np.append(self.first, self.packets)
         return np.asarray(ends - np.append(0, self.end))
 
-    def only(self, chosen: Flags) -> "LossBursts":
+    def subset(self, selection: Flags) -> "LossBursts":
         """Return some of the bursts."""
-        return LossBursts(self.packets, self.first[chosen], self.length[chosen])
+        return LossBursts(self.packets, self.first[selection], self.length[selection])
 
     def times_s(self, trace: PacketTrace) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return when each burst began, and how long it lasted, (b,) each.
@@ -107,9 +107,9 @@ class LossBursts:
         It lasts from the sending of its first packet to that of the next effective packet, or to
         the last sending.
         """
-        after = np.minimum(self.end, self.packets - 1)
+        next_index = np.minimum(self.end, self.packets - 1)
         begin_ns = trace.sent_ns[self.first]
-        lasts_ns = trace.sent_ns[after] - begin_ns
+        lasts_ns = trace.sent_ns[next_index] - begin_ns
         return np.asarray(begin_ns * 1e-9), np.asarray(lasts_ns * 1e-9)
 
 
@@ -147,23 +147,23 @@ def histogram(bursts: LossBursts) -> dict[int, int]:
 
 def quantile_m(bursts: LossBursts, share: float) -> QuantileM:
     """Return M for a share; without bursts it is 1."""
-    ordered = np.sort(bursts.length)
-    count = len(ordered)
-    covered = math.ceil(share * count - 1e-9)
+    lengths = np.sort(bursts.length)
+    count = len(lengths)
+    index = math.ceil(share * count - 1e-9)
     # P(at most rank − 1 of the bursts are in the share) ≥ 95 % (Wilks, 1941)
     rank = int(stats.binom.ppf(LEVEL, count, share)) + 1
-    confident = int(ordered[rank - 1]) + 1 if rank <= count else None
+    confident = int(lengths[rank - 1]) + 1 if rank <= count else None
     return QuantileM(
-        share, int(ordered[covered - 1]) + 1 if covered > 0 else 1, confident, _packet_quantile(bursts, share)
+        share, int(lengths[index - 1]) + 1 if index > 0 else 1, confident, _packet_quantile(bursts, share)
     )
 
 
 def _packet_quantile(bursts: LossBursts, share: float) -> int:
     """Return the smallest M with Σ max(length − (M − 1), 0) ≤ (1 − share) packets."""
-    allowed = math.floor((1 - share) * bursts.packets + 1e-9)
+    allowed_losses = math.floor((1 - share) * bursts.packets + 1e-9)
 
     def is_enough(allowed_burst: int) -> bool:
-        return int(np.maximum(bursts.length - allowed_burst, 0).sum()) <= allowed
+        return int(np.maximum(bursts.length - allowed_burst, 0).sum()) <= allowed_losses
 
     return bisect_left(range(bursts.longest), True, key=is_enough) + 1
 
@@ -174,14 +174,16 @@ def most_losses(bursts: LossBursts, windows: Sequence[int], left_out: Flags | No
     Windows that touch a burst that is left out do not count; a K without a window has no entry.
     """
     lost = _losses_before(bursts)
-    skipped = None if left_out is None or not left_out.any() else _losses_before(bursts.only(left_out))
+    losses_left_out = (
+        None if left_out is None or not left_out.any() else _losses_before(bursts.subset(left_out))
+    )
     by_window = {}
     for window in windows:
         if window > bursts.packets:
             continue
         losses = lost[window:] - lost[:-window]
-        if skipped is not None:
-            losses = losses[skipped[window:] == skipped[:-window]]
+        if losses_left_out is not None:
+            losses = losses[losses_left_out[window:] == losses_left_out[:-window]]
         if len(losses):
             by_window[window] = int(losses.max())
     return by_window

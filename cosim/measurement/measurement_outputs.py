@@ -160,10 +160,10 @@ def _numbers(measurement: NetworkMeasurement, suffix: str) -> Iterator[tuple[str
     yield "effective losses (all of these)", _share(measurement.bursts.losses, count)
     bursts = measurement.bursts
     if len(bursts.length):
-        listed = [f"{count} × {length}" for length, count in histogram(bursts).items()]
-        if len(listed) > _MOST_LISTED:
-            listed[_MOST_LISTED // 2 : -_MOST_LISTED // 2] = ["…"]
-        yield "loss bursts (number × length)", ", ".join(listed)
+        lengths = [f"{count} × {length}" for length, count in histogram(bursts).items()]
+        if len(lengths) > _MOST_LISTED:
+            lengths[_MOST_LISTED // 2 : -_MOST_LISTED // 2] = ["…"]
+        yield "loss bursts (number × length)", ", ".join(lengths)
         yield "longest loss burst", _burst(measurement, int(np.argmax(bursts.length)))
         outages = np.flatnonzero(measurement.is_outage).tolist()
         yield "outages", str(len(outages)) if outages else f"none: {measurement.outage_rule.reason}"
@@ -194,8 +194,8 @@ def _burst(measurement: NetworkMeasurement, index: int) -> str:
 
 def _model_rows(measurement: NetworkMeasurement) -> Iterator[tuple[str, str, str]]:
     for name, model in measurement.models.items():
-        chosen = " (preferred)" if name == measurement.chosen.fit.model else ""
-        yield f"{_MODELS[name]}{chosen}", "", ""
+        mark = " (preferred)" if name == measurement.chosen.fit.model else ""
+        yield f"{_MODELS[name]}{mark}", "", ""
         for parameter, estimate in model.fit.estimates.items():
             yield f"  {_PARAMETERS[parameter]}", *_estimate(estimate)
         yield "  mean loss rate", number(model.fit.rates.loss_rate), ""
@@ -312,8 +312,8 @@ def _histogram(measurement: NetworkMeasurement) -> Panel:
         edges = np.unique(np.geomspace(1, longest + 1, _WINDOWS).round())
     items = []
     for label, bursts, colour in (
-        ("loss bursts", measurement.bursts.only(~outages), _BURSTS),
-        ("outages", measurement.bursts.only(outages), _OUTAGES),
+        ("loss bursts", measurement.bursts.subset(~outages), _BURSTS),
+        ("outages", measurement.bursts.subset(outages), _OUTAGES),
     ):
         counts = np.histogram(bursts.length, edges)[0].astype(np.float64)
         items.append(Bars(edges=edges - 0.5, heights=counts, label=label, colour=colour, opacity=0.85))
@@ -330,7 +330,7 @@ def _delays(measurement: NetworkMeasurement) -> Panel:
     trace = measurement.trace
     sent_s, lost = np.asarray(trace.sent_ns * 1e-9), trace.lost
     values = np.asarray(np.where(lost, np.nan, np.maximum(trace.delay_ns, 1)) * 1e-9)
-    begin_s, duration_s = measurement.bursts.only(measurement.is_outage).times_s(trace)
+    begin_s, duration_s = measurement.bursts.subset(measurement.is_outage).times_s(trace)
     items: list[Item] = [
         Line(x=sent_s, y=values, colour=_DELAYS, width=0.8, marker=".", size=2.5),
         Spans(begin=begin_s, end=begin_s + duration_s, colour=_OUTAGES),

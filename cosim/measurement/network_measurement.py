@@ -191,12 +191,12 @@ class NetworkMeasurement:
     @cached_property
     def longest_loss_burst(self) -> int:
         """The longest burst that is no outage; with it, the network has M − 1."""
-        return self.bursts.only(~self.is_outage).longest
+        return self.bursts.subset(~self.is_outage).longest
 
     @cached_property
     def quantiles(self) -> list[QuantileM]:
         """M for shares of bursts and packets, without the outages."""
-        usual = self.bursts.only(~self.is_outage)
+        usual = self.bursts.subset(~self.is_outage)
         packets = usual.packets - int(self.bursts.length[self.is_outage].sum())
         usual = LossBursts(packets, usual.first, usual.length)
         return [quantile_m(usual, share) for share in self.options.quantiles]

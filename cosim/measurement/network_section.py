@@ -31,11 +31,11 @@ def write_network(measurement: NetworkMeasurement, path: Path, form: Form) -> li
         MachineError: a file cannot be written.
     """
     require_suffix(path, "--write", ".toml")
-    written = [path]
+    paths = [path]
     if form == "trace":
         trace_path = path.with_suffix(".csv")
         write_whole(trace_path, trace_csv(measurement.trace))
-        section, written = _trace_section(measurement, trace_path.name), [trace_path, path]
+        section, paths = _trace_section(measurement, trace_path.name), [trace_path, path]
     else:
         section = _model_section(measurement)
     cap = {"mansd": measurement.longest_loss_burst, "enforce_mansd": False}
@@ -43,10 +43,10 @@ def write_network(measurement: NetworkMeasurement, path: Path, form: Form) -> li
     source = f"--write {path}"
     content = toml_file.parsed(text, source)["network"]
     assert isinstance(content, dict)
-    loaded = toml_file.validated(NetworkSection, content, source)
-    read_files(loaded.link, path.parent, source)
+    settings = toml_file.validated(NetworkSection, content, source)
+    read_files(settings.link, path.parent, source)
     write_whole(path, text)
-    return written
+    return paths
 
 
 def trace_csv(trace: PacketTrace) -> str:
@@ -61,8 +61,8 @@ def trace_csv(trace: PacketTrace) -> str:
 
 def _comment(measurement: NetworkMeasurement, form: Form) -> str:
     deadline_s = measurement.options.deadline_s
-    late = "" if deadline_s is None else f", deadline {deadline_s:g} s"
-    lines = [f"Measured: {printable(measurement.name)}, {len(measurement.trace)} packets{late}."]
+    deadline = "" if deadline_s is None else f", deadline {deadline_s:g} s"
+    lines = [f"Measured: {printable(measurement.name)}, {len(measurement.trace)} packets{deadline}."]
     if form == "trace":
         lines.append(
             'Each update gets what was recorded at its time. With by = "packet", update k gets record k.'
@@ -72,16 +72,16 @@ def _comment(measurement: NetworkMeasurement, form: Form) -> str:
     lines.append("mansd is not enforced, so that the network behaves as measured.")
     if measurement.is_outage.any():
         lines.append("mansd does not cover the outages; no certificate does.")
-    beside = "; the CSV belongs beside that file" if form == "trace" else ""
-    lines.append(f"To use it, put this section in a scenario file instead of its own [network]{beside}.")
+    hint = "; the CSV belongs beside that file" if form == "trace" else ""
+    lines.append(f"To use it, put this section in a scenario file instead of its own [network]{hint}.")
     return "".join(f"# {line}\n" for line in lines)
 
 
 def _trace_section(measurement: NetworkMeasurement, name: str) -> Mapping[str, object]:
     # The network would deliver the first packet.
-    known = {} if measurement.outcomes.effective[0] else {"initial_sync": "known_state"}
+    start = {} if measurement.outcomes.effective[0] else {"initial_sync": "known_state"}
     replay = {"kind": "replay", "file": name, "by": "time"}
-    return known | {"loss": {"model": "lossless"}, "impairments": [replay]}
+    return start | {"loss": {"model": "lossless"}, "impairments": [replay]}
 
 
 def _model_section(measurement: NetworkMeasurement) -> Mapping[str, object]:

@@ -135,7 +135,7 @@ def fit_outages(
     mean = exponential_estimate(int(complete.sum()), float(durations_s.sum()))
     p_value = None
     if len(durations_s) >= FEWEST_OUTAGES and complete.all():
-        tested = stats.goodness_of_fit(
+        test = stats.goodness_of_fit(
             stats.expon,
             durations_s,
             known_params={"loc": 0.0},
@@ -143,5 +143,5 @@ def fit_outages(
             n_mc_samples=999,
             rng=np.random.default_rng(SEED),
         )
-        p_value = float(tested.pvalue)
+        p_value = float(test.pvalue)
     return OutageFit(len(durations_s), rate, mean, p_value)

@@ -48,7 +48,7 @@ _REASONS = {
 }
 
 
-def counted(ignored: Mapping[str, int]) -> list[str]:
+def ignored_lines(ignored: Mapping[str, int]) -> list[str]:
     """Return a line about the ignored datagrams; none if there are none."""
     parts = [f"{count} {_REASONS[reason]}" for reason, count in ignored.items() if count]
     return [f"ignored datagrams: {', '.join(parts)}"] if parts else []
@@ -105,7 +105,7 @@ class ProbeSender:
         self._content = ProbeDatagram(self._kind, session, host, 0, 0, start_ns, plan.period_ns, plan.planned)
         self._sent_ns, self._received_ns = array("q"), array("q")
         self._to_send = plan.planned
-        self._late = self._longest_late_ns = 0
+        self._late_sends = self._longest_late_ns = 0
         self._late_ns = min(_LATE_NS, plan.period_ns)
         self.ends = 0
         """Number of END datagrams sent so far."""
@@ -141,13 +141,13 @@ class ProbeSender:
                 sequence=self.sent,
                 sent_ns=now_ns,
                 planned=self._to_send,
-                number=self._late,
+                number=self._late_sends,
                 newest=self._longest_late_ns,
             )
             return encode_probe(end, self._plan.size_bytes)
         late_ns = now_ns - self.next_deadline_ns()
         if late_ns > self._late_ns:
-            self._late += 1
+            self._late_sends += 1
             self._longest_late_ns = max(self._longest_late_ns, late_ns)
         probe = self._content._replace(sequence=self.sent, sent_ns=now_ns)
         if not self._plan.is_round_trip:
@@ -197,7 +197,7 @@ class ProbeSender:
 
     def finish(self, kernel_drops: int | None) -> ProbeResult:
         """Return what is known at this end."""
-        notes = [late_sends(self.sent, self._late, self._longest_late_ns)]
+        notes = [late_sends(self.sent, self._late_sends, self._longest_late_ns)]
         if not self._plan.is_round_trip or not self.sent:
             return ProbeResult(None, tuple(notes), kernel_drops)
         sent_ns, received_ns = np.array(self._sent_ns), np.array(self._received_ns)
@@ -206,7 +206,7 @@ class ProbeSender:
         for sequence, direction in directions.items():
             self._rows(sequence, self._sent_ns[sequence], "", direction)
         notes.append(self._losses_by_direction(list(directions.values())))
-        notes += counted(self._ignored)
+        notes += ignored_lines(self._ignored)
         return ProbeResult(packet_trace(sent_ns, received_ns, lost), tuple(notes), kernel_drops)
 
     def lost_directions(self) -> dict[int, str]:
@@ -215,11 +215,11 @@ class ProbeSender:
         Each answer has the newest sequence number that had arrived, and which of the 128 up to it.
         A number that no answer covers was lost in an unknown direction.
         """
-        arrived, covered = self._arrived()
+        arrived, covered = self._arrivals()
         lost = np.flatnonzero(np.array(self._received_ns) == LOST_NS)
         return {int(k): _REVERSE if arrived[k] else _FORWARD if covered[k] else _UNKNOWN for k in lost}
 
-    def _arrived(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    def _arrivals(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return which numbers the answers show as arrived, and which they cover."""
         arrived, covered = np.zeros(self.sent, bool), np.zeros(self.sent, bool)
         seen = np.frombuffer(bytes(self._seen), np.uint8).reshape(-1, SEEN_BITS // 8)
@@ -243,7 +243,7 @@ class ProbeSender:
             answers = max(self._numbers, default=-1) + 1
         reverse = min(max(answers - len(self._numbers) - counts[_REVERSE], 0), counts[_UNKNOWN])
         return (
-            f"{text}; lost on an unknown way: {counts[_UNKNOWN]}, "
+            f"{text}; lost in an unknown direction: {counts[_UNKNOWN]}, "
             f"of which at least {reverse} in reverse by the numbers of the answers"
         )
 
@@ -395,11 +395,11 @@ class ProbeReceiver:
         lost = np.zeros(len(sequence), bool)
         lost[len(lost) - outside :] = True
         trace = packet_trace(sent_ns, received_ns, lost, sequence, clocks_differ=not self.is_same_host)
-        notes = [self._ending()]
+        notes = [self._end_note()]
         if not self.is_same_host:
             trace = relative_delays(trace)
             notes += trace.notes
-        notes += counted(self.ignored)
+        notes += ignored_lines(self.ignored)
         return ProbeResult(trace, tuple(notes), kernel_drops)
 
     def _add_lost(self, first: ProbeDatagram) -> int:
@@ -410,21 +410,21 @@ class ProbeReceiver:
         earliest, latest = min(self._sequence), max(self._sequence)
         # Those before the first are lost if this process listened when they were sent.
         listened = self._first_ns - self._began_ns > first.sent_ns - first.start_ns
-        sent = self._end.sequence if self._end is not None else 0
+        sent_count = self._end.sequence if self._end is not None else 0
         # This number is from outside, too: it cannot be ahead of the schedule.
         longest_ns = self._end_ns - self._first_ns + _AHEAD_NS
-        sent = min(sent, first.sequence + longest_ns // first.period_ns + 1)
-        added = [(0, min(first.start_ns, min(self._sent_ns)))] if earliest and listened else []
-        if sent > latest + 1:
-            added.append((sent - 1, max(first.scheduled_ns(sent - 1), max(self._sent_ns))))
-        for lost, at_ns in added:
+        sent_count = min(sent_count, first.sequence + longest_ns // first.period_ns + 1)
+        lost_ends = [(0, min(first.start_ns, min(self._sent_ns)))] if earliest and listened else []
+        if sent_count > latest + 1:
+            lost_ends.append((sent_count - 1, max(first.scheduled_ns(sent_count - 1), max(self._sent_ns))))
+        for lost, at_ns in lost_ends:
             self._sequence.append(lost)
             self._sent_ns.append(at_ns)
             self._received_ns.append(-1)
             self._rows(lost, at_ns, "")
-        return len(added)
+        return len(lost_ends)
 
-    def _ending(self) -> str:
+    def _end_note(self) -> str:
         if self._end is None:
             return "no end datagram arrived: losses after the last received datagram are not counted"
         return late_sends(self._end.sequence, self._end.number, self._end.newest)

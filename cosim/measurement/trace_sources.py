@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 _HEAD_BYTES = 64
 """Bytes by which a file is recognised."""
-_OTHERS = ("fate files", "run directories", "delivery opportunities")
+_OTHER_SOURCES = ("fate files", "run directories", "delivery opportunities")
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ def read_source(paths: Sequence[Path], options: SourceOptions | None = None) -> 
         refuse_unused(options, FILE_OPTIONS, "delivery opportunities", "period_ns")
         return read_opportunities(first_path, options.period_ns)
     refuse_unused(options, FILE_OPTIONS, "a packet trace", "clocks_differ")
-    return read_trace(first_path, clocks_differ=bool(options.clocks_differ), others=_OTHERS)
+    return read_trace(first_path, clocks_differ=bool(options.clocks_differ), others=_OTHER_SOURCES)
 
 
 def _head(path: Path) -> bytes:
@@ -193,15 +193,15 @@ def _received(path: Path, rows: dict[str, NDArray[np.int64]]) -> tuple[NDArray[n
     times = (rows[name] for name in ("delay_ns", "copy_delay_ns", "arrival_ns"))
     if max(int(np.abs(time_ns).max(initial=0)) for time_ns in times) > _LATEST_NS:
         raise CallerError(f"{path}: has a time that is too large")
-    never = np.iinfo(np.int64).max
+    never_ns = np.iinfo(np.int64).max
     dropped = np.isin(rows["fate"], [Fate.DROPPED, Fate.OVERFLOWED, Fate.BLACKED_OUT])
     delay_ns = np.minimum(
         *(
-            np.where((rows[delay] >= 0) & (rows[bit] < 0) & ~dropped, rows[delay], never)
+            np.where((rows[delay] >= 0) & (rows[bit] < 0) & ~dropped, rows[delay], never_ns)
             for delay, bit in (("delay_ns", "bit"), ("copy_delay_ns", "copy_bit"))
         )
     )
-    lost = delay_ns == never
+    lost = delay_ns == never_ns
     return np.where(lost, LOST_NS, rows["arrival_ns"] + np.where(lost, 0, delay_ns)), lost
 
 
@@ -236,8 +236,8 @@ def updates_trace(record: RunRecord) -> PacketTrace:
         raise ValueError("no updates reached the network emulator")
     # Numbers of restarted sensors begin anew far above; the order at the emulator has no gaps.
     trace = packet_trace(sent_ns[ended], np.maximum(received_ns, sent_ns)[ended], lost[ended])
-    flying = int((~ended).sum())
-    notes = [f"left out: {flying} updates in flight at the end"] if flying else []
+    in_flight = int((~ended).sum())
+    notes = [f"left out: {in_flight} updates in flight at the end"] if in_flight else []
     return trace.noted("the updates of the run, from emulator to controller", *notes)
 
 

@@ -102,12 +102,12 @@ def _print_weight(console: Console, chosen: Certificates, weight: Matrix) -> Non
 
 def _in_words(results: Certificates) -> Iterator[str]:
     """Yield sentences with the certified bounds for the scenario's schedule."""
-    for under, certificate in results:
+    for level, certificate in results:
         constants = certificate.constants
-        if under != SCHEDULE or constants is None:
+        if level != SCHEDULE or constants is None:
             continue
-        own = "the scenario's plant" if results.nonlinear is None else "the model as the plant"
-        plants = {BOX: "every plant of the box", REGION: REGION}.get(certificate.scope, own)
+        other_plants = "the scenario's plant" if results.nonlinear is None else "the model as the plant"
+        plants = {BOX: "every plant of the box", REGION: REGION}.get(certificate.scope, other_plants)
         apart = ""
         spacing_s = certificate.inter_event_s
         if spacing_s is not None and spacing_s < MOST_S:  # else there is no second event
@@ -124,16 +124,16 @@ def _in_words(results: Certificates) -> Iterator[str]:
 
 def _stability_in_words(results: Certificates) -> Iterator[str]:
     """Yield what is known exactly about the stability of a time-triggered loop."""
-    if (known := results.stability) is None:
+    if (stability := results.stability) is None:
         return
     patterns = f"every loss pattern with {results.scenario.network.guarantee.meaning}"
-    growth = f"growth per period {at_least(known.lower)} to {at_most(known.upper)}"
+    growth = f"growth per period {at_least(stability.lower)} to {at_most(stability.upper)}"
     text = {
         "stable": f"Proven stable for {patterns}: {growth}",
-        "destabilised": f"Not stable: the pattern {known.text} (D delivered, L lost), repeated, "
+        "destabilised": f"Not stable: the pattern {stability.text} (D delivered, L lost), repeated, "
         f"destabilises the loop: {growth}",
         "undecided": f"Not decided whether the loop is stable for {patterns}: {growth} under the worst one",
-    }[known.verdict]
+    }[stability.verdict]
     yield f"{text}. This is without lateness; noack margin finds the limits."
 
 
@@ -304,13 +304,13 @@ def mean_cost_tables(costs: MeanCost) -> Iterator[ResultTable]:
     def add(label: str, values: Iterable[float | None], unit: str = "") -> None:
         rows.append((label, *("∞" if value is None else number(value, 6) + unit for value in values)))
 
-    for rms, names, where in (
+    for rms, names, suffix in (
         ("state_rms", costs.state_names, ""),
         ("state_rms_at_transmissions", costs.state_names, " at transmissions"),
         ("input_rms", costs.input_names, ""),
     ):
         for i, name in enumerate(names):
-            add(f"rms of {name}{where}", (getattr(cost.stationary, rms)[i] for cost in known))
+            add(f"rms of {name}{suffix}", (getattr(cost.stationary, rms)[i] for cost in known))
     add("mean cost, stationary", (cost.stationary.cost_per_s for cost in known), " /s")
     costs_until = [cost.horizon_cost for cost in known]
     until = ["not known: too many periods" if cost is None else number(cost, 6) for cost in costs_until]
@@ -333,7 +333,7 @@ def _print_unlimited(console: Console, results: Certificates) -> None:
         return
     likely = [burst for burst in unlimited.bursts if burst.probability < 1 - _RARE]
     if (
-        shown := [burst for burst in likely if burst.probability > _RARE]
+        bursts := [burst for burst in likely if burst.probability > _RARE]
         + [burst for burst in unlimited.bursts if burst not in likely][:1]
     ):
         table = ResultTable(
@@ -349,7 +349,7 @@ def _print_unlimited(console: Console, results: Certificates) -> None:
                     at_most(burst.delta),
                     at_most(burst.state),
                 )
-                for burst in shown
+                for burst in bursts
             ],
         )
         console.print(terminal_table(table, left=()))

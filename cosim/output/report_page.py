@@ -199,8 +199,8 @@ def _worst_loop(report: Report) -> Content | None:
 def _numbers(report: Report) -> Content:
     # Fidelity and replay have their own sections.
     loop = report.loop.model_copy(update={"fidelity": None, "replay": None})
-    rest = report.detail.model_copy(update={"loops": [loop]})
-    return {"numbers": key_numbers(rest), "parameters": [*_parameters(report.scenario)]}
+    detail = report.detail.model_copy(update={"loops": [loop]})
+    return {"numbers": key_numbers(detail), "parameters": [*_parameters(report.scenario)]}
 
 
 @section
@@ -252,7 +252,7 @@ def _words(report: Report) -> Content:
 
 def _parameters(scenario: Scenario) -> Iterator[tuple[str, str]]:
     trigger, network = scenario.trigger, scenario.network
-    every = scenario.plant.measure_every
+    steps = scenario.plant.measure_every
     loss = network.loss.model_dump(exclude={"model"}, exclude_defaults=True)
     model = network.loss.model.replace("_", "-")
     details = _settings(loss)
@@ -268,12 +268,12 @@ def _parameters(scenario: Scenario) -> Iterator[tuple[str, str]]:
         lost = _settings(network.reverse.loss.model_dump())
         yield "acknowledgements", f"loss: {lost}; timeout {timeout_ms:g} ms"
     if (actuation := network.actuation) is not None:
-        most = actuation.link.longest_burst
-        limit = "no guarantee" if most is None else f"at most {most} consecutive losses"
+        longest = actuation.link.longest_burst
+        limit = "no guarantee" if longest is None else f"at most {longest} consecutive losses"
         yield "actuations", f"loss: {_settings(actuation.loss.model_dump())}; {limit}"
     yield "initial synchronisation", network.initial_sync.replace("_", " ")
     yield "plant", f"{scenario.plant.rate_hz:g} steps/s"
-    yield "measurements", "every step" if every == 1 else f"every {every} steps"
+    yield "measurements", "every step" if steps == 1 else f"every {steps} steps"
     controller = scenario.controller
     yield "controller", f"{controller.rate_hz:g} ticks/s, phase {controller.phase:g}"
     yield "horizon", f"{scenario.horizon_s:g} s at speed {scenario.speed:g}"

@@ -23,14 +23,14 @@ from noack.core.number_format import NONE
 
 KEY_VALUE = ("quantity", "value")
 """Headings of a table in which each row has its own unit."""
-_MEASURED = re.compile(r"([-−+]?\d[\d.,]*(?:e[-+]?\d+)?) (s|ms|µs|ns|%|/s|Hz|bytes)")
+_WITH_UNIT = re.compile(r"([-−+]?\d[\d.,]*(?:e[-+]?\d+)?) (s|ms|µs|ns|%|/s|Hz|bytes)")
 _NUMBER = re.compile(r"[-−]?\d+(?:\.(\d+))?")
 _NUMERIC = re.compile(r"[-−+]?\d.*|void|never|\(same\)|[-–]")
 _LINES = r"p{0.4\linewidth}"
 """Kind of a column with lines."""
 _END = r" \tabularnewline"  # \raggedright changes \\
 _BREAK = r" \\ "
-_WIDE = 36
+_WIDE_COLUMN = 36
 """Characters from which on a column breaks its lines."""
 
 _TABLE: dict[str, dict[str, str]] = tomllib.loads(
@@ -75,7 +75,7 @@ def terminal_table(
         styles: styles of texts in the last column, by their first words.
         dense: save width, break no words, and no lines at the right.
     """
-    shown = Table(
+    rich_table = Table(
         title=escape(table.caption) if table.caption else None,
         box=SIMPLE_HEAD if dense else HEAVY_HEAD,
         collapse_padding=dense,
@@ -83,13 +83,13 @@ def terminal_table(
     )
     for i, heading in enumerate(table.headings):
         words = " ".join([heading, *(row[i] for row in table.rows)]).split()
-        least = max(map(len, words)) if dense else None
-        shown.add_column(escape(heading), justify="left" if i in left else "right", min_width=least)
-        shown.columns[-1].no_wrap = dense and i not in left
+        min_width = max(map(len, words)) if dense else None
+        rich_table.add_column(escape(heading), justify="left" if i in left else "right", min_width=min_width)
+        rich_table.columns[-1].no_wrap = dense and i not in left
     for *cells, last in table.rows:
         style = next((style for word, style in (styles or {}).items() if last.startswith(word)), "")
-        shown.add_row(*map(escape, cells), Text(last, style))
-    return shown
+        rich_table.add_row(*map(escape, cells), Text(last, style))
+    return rich_table
 
 
 def save_tables(tables: Iterable[ResultTable], folder: Path) -> list[Path]:
@@ -102,9 +102,9 @@ def save_tables(tables: Iterable[ResultTable], folder: Path) -> list[Path]:
         MachineError: a file cannot be written.
     """
     return [
-        write_whole(folder / f"{table.name}.{ending}", written)
+        write_whole(folder / f"{table.name}.{ending}", content)
         for table in tables
-        for ending, written in (("tex", as_latex(table)), ("csv", as_csv(table)))
+        for ending, content in (("tex", as_latex(table)), ("csv", as_csv(table)))
     ]
 
 
@@ -148,15 +148,15 @@ def _with_units_in_heads(table: ResultTable) -> ResultTable:
     if tuple(table.headings) == KEY_VALUE:
         rows = []
         for label, value in table.rows:
-            match = _MEASURED.fullmatch(value)
+            match = _WITH_UNIT.fullmatch(value)
             rows.append((f"{label} [{match[2]}]", match[1]) if match else (label, value))
         return table._replace(rows=rows)
     columns: list[list[str]] = []
     headings: list[str] = []
     for heading, *column in zip(table.headings, *table.rows, strict=True):
-        measured = [_MEASURED.fullmatch(cell) for cell in column]
-        units = {match[2] for match in measured if match}
-        pairs = list(zip(measured, column, strict=True))
+        matches = [_WITH_UNIT.fullmatch(cell) for cell in column]
+        units = {match[2] for match in matches if match}
+        pairs = list(zip(matches, column, strict=True))
         if len(units) == 1 and all(match or cell in (NONE, "") for match, cell in pairs):
             heading = f"{heading} [{units.pop()}]"
             column = [match[1] if match else cell for match, cell in pairs]
@@ -167,11 +167,11 @@ def _with_units_in_heads(table: ResultTable) -> ResultTable:
 
 def _kind(column: Sequence[str], number: int) -> str:
     """Return the kind of a column: numbers at the right, long texts in lines."""
-    filled = [cell for cell in column if cell]
-    if number and filled and 2 * sum(bool(_NUMERIC.fullmatch(cell)) for cell in filled) > len(filled):
+    texts = [cell for cell in column if cell]
+    if number and texts and 2 * sum(bool(_NUMERIC.fullmatch(cell)) for cell in texts) > len(texts):
         return "r"
     longest = max(map(len, column), default=0)
-    return _LINES if longest > _WIDE and number else "l"
+    return _LINES if longest > _WIDE_COLUMN and number else "l"
 
 
 def _heading(heading: str, kind: str) -> str:
@@ -193,16 +193,17 @@ def _aligned(column: Sequence[str]) -> list[str]:
     """Align decimal points by invisible digits; other cells stay at the right."""
     matches = [_NUMBER.fullmatch(cell) for cell in column]
     decimals = [len(match[1] or "") for match in matches if match]
-    most = max(decimals, default=0)
+    most_digits = max(decimals, default=0)
     cells = []
     for cell, number in zip(column, matches, strict=True):
         if number is None:
             cells.append("--" if cell == NONE else latex_text(cell))
             continue
-        own = len(number[1] or "")
-        missing = ("" if own else ".") + "0" * (most - own) if most > own else ""
+        digit_count = len(number[1] or "")
+        zeros = "0" * (most_digits - digit_count)
+        padding = "." + zeros if zeros and not digit_count else zeros
         sign, digits = (r"\ensuremath{-}", cell[1:]) if cell[0] in "-−" else ("", cell)
-        cells.append(sign + digits + (rf"\phantom{{{missing}}}" if missing else ""))
+        cells.append(sign + digits + (rf"\phantom{{{padding}}}" if padding else ""))
     return cells
 
 
@@ -216,22 +217,22 @@ def latex_text(text: str, depth: int = 0) -> str:
     for match in _TYPESET.finditer(text):
         if match.start() < end:  # inside a superscript
             continue
-        begin, until = match.span("letter")
-        rest = until
+        begin, text_end = match.span("letter")
+        match_end = text_end
         if match["power"]:
             mantissa = match["mantissa"].replace("−", "-")
             power = match["power"].removeprefix("+")
-            typeset, rest = rf"\ensuremath{{{mantissa}\times10^{{{int(power)}}}}}", match.end()
+            typeset, match_end = rf"\ensuremath{{{mantissa}\times10^{{{int(power)}}}}}", match.end()
         else:
             if match["letter"] is None:
                 begin = match.end()
-                if depth == _DEEPEST or (until := _closing(text, begin)) < 0:
+                if depth == _DEEPEST or (text_end := _closing(text, begin)) < 0:
                     continue
-                rest = until + 1
+                match_end = text_end + 1
             command = "superscript" if text[match.start()] == "^" else "subscript"
-            typeset = rf"\text{command}{{{latex_text(text[begin:until], depth + 1)}}}"
+            typeset = rf"\text{command}{{{latex_text(text[begin:text_end], depth + 1)}}}"
         parts += [_plain(text[end : match.start()]), typeset]
-        end = rest
+        end = match_end
     return "".join(parts) + _plain(text[end:])
 
 

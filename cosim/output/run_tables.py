@@ -46,7 +46,7 @@ _SCHEDULE = {
     "hold_s": "age of an input",
     "start_s": "until the first input",
 }
-_FEW = 3
+_MOST_NETWORK_ROWS = 3
 """Rows about the network in a table of a run's loops."""
 _SHORT = (
     "lost in the network", "actuations lost", "longest loss burst (", "deliveries forced",
@@ -90,8 +90,8 @@ def state_norm(loop: LoopSummary) -> str:
 
 def run_facts(summary: RunSummary, directory: Path) -> list[tuple[str, str]]:
     """Return what a run was, how it ended, and its results, in a few lines."""
-    loop, shared = summary.loops[0], shares_network(summary)
-    mode = f"{len(summary.loops)} loops" if shared else mode_words(loop.mode)
+    loop, is_shared = summary.loops[0], shares_network(summary)
+    mode = f"{len(summary.loops)} loops" if is_shared else mode_words(loop.mode)
     verdicts = Counter(str(claim.verdict) for loop in summary.loops for claim in loop.claims)
     norms = (loop.initial_state_norm, loop.final_state_norm)
     of_loop = [
@@ -108,7 +108,7 @@ def run_facts(summary: RunSummary, directory: Path) -> list[tuple[str, str]]:
     return [
         ("run", f"{summary.scenario}, {mode}, {summary.kind}, {caps_text(summary)}"),
         ("ended", f"at {summary.reached_s:g} s of {summary.horizon_s:g} s: {summary.exit.reason}"),
-        *(network_rows(summary)[:_FEW] if shared else of_loop),
+        *(network_rows(summary)[:_MOST_NETWORK_ROWS] if is_shared else of_loop),
         ("claims", ", ".join(f"{n} {verdict}" for verdict, n in verdicts.items()) or "none"),
         ("directory", str(directory)),
     ]
@@ -230,11 +230,11 @@ def _lateness(loop: LoopSummary) -> Iterator[tuple[str, str]]:
     if latency := loop.latency_us:
         quantiles = " / ".join(whole(value) for value in (latency.p50, latency.p99))
         yield "sensor-to-controller latency p50 / p99", f"{quantiles} µs"
-    if late := loop.lateness_us:
-        worst = max(late, key=lambda role: late[role].late_steps)
-        missed, steps = late[worst].late_steps, late[worst].steps
-        if missed:
-            yield "deadlines missed, worst process", f"{worst}: {missed} of {steps} steps"
+    if lateness := loop.lateness_us:
+        worst = max(lateness, key=lambda role: lateness[role].late_steps)
+        late_steps, steps = lateness[worst].late_steps, lateness[worst].steps
+        if late_steps:
+            yield "deadlines missed, worst process", f"{worst}: {late_steps} of {steps} steps"
         else:
             yield "deadlines missed", "none"
 
@@ -255,10 +255,10 @@ def interval_text(claim: Claim) -> str:
 
 def downtime_text(restart: RestartPart) -> str:
     """Return the interval in which a process was down, and the reason."""
-    since, until = seconds(restart.last_s), seconds(restart.first_s)
-    why = (restart.what or "").partition(": ")[2]
-    when = f"at {until}" if restart.last_s is None else f"down from {since} to {until}"
-    return f"{when}: {why}" if why else when
+    begin, end = seconds(restart.last_s), seconds(restart.first_s)
+    reason = (restart.what or "").partition(": ")[2]
+    interval = f"at {end}" if restart.last_s is None else f"down from {begin} to {end}"
+    return f"{interval}: {reason}" if reason else interval
 
 
 def _watchdog(watchdog: WatchdogPart) -> Iterator[tuple[str, str]]:
@@ -329,10 +329,10 @@ def schedule_tables(loop: LoopSummary) -> Iterator[ResultTable]:
     if (allowed := loop.allowed) is None or (observed := loop.conditions) is None:
         return
     exists = any(claim.is_certified and claim.has_bound for claim in loop.claims)
-    covered = (loop.certified_for or allowed) if exists else None
+    certified = (loop.certified_for or allowed) if exists else None
     rows = []
     for name, words in _SCHEDULE.items():
-        times_s = [getattr(part, name) if part else None for part in (allowed, observed, covered)]
+        times_s = [getattr(part, name) if part else None for part in (allowed, observed, certified)]
         # After a change a certificate needs no first input: it is 0 there.
         texts = (duration, duration, duration_at_least)
         cells = [text(time_s) if time_s else NONE for text, time_s in zip(texts, times_s, strict=True)]
@@ -381,7 +381,7 @@ def _verdicts(loop: LoopSummary) -> Counter[str]:
 
 def network_rows(summary: RunSummary) -> list[tuple[str, str]]:
     """Return the quantities of the network, and their values as text."""
-    network, flying = summary.network, summary.network.in_flight
+    network, in_flight = summary.network, summary.network.in_flight
     sent, reached_s = network.datagrams, summary.reached_s or math.inf
     lost = sum(network.drops_by_cause.values())
     by_cause = network.drops_by_cause.items() if set(network.drops_by_cause) - {"dropped"} else ()
@@ -391,11 +391,11 @@ def network_rows(summary: RunSummary) -> list[tuple[str, str]]:
         ("lost", f"{lost} ({ratio(lost, sent)}){causes}"),
         longest_burst(max(caps(summary)), summary.constraints, network.longest_loss_burst),
         ("forced by the guarantee", str(network.forced_deliveries)),
-        ("datagrams in flight: mean, max", f"{flying.mean:.3g}, {flying.max}"),
+        ("datagrams in flight: mean, max", f"{in_flight.mean:.3g}, {in_flight.max}"),
     ]
     if network.rate_bps is not None and network.utilisation is not None:
-        used = f"{100 * network.utilisation:.3g} % of {network.rate_bps:,} bit/s"
-        rows.append(("link used", used.replace(",", " ")))
+        usage = f"{100 * network.utilisation:.3g} % of {network.rate_bps:,} bit/s"
+        rows.append(("link used", usage.replace(",", " ")))
     loops = summary.loops
     if flows := [loop.actuations for loop in loops if loop.actuations is not None]:
         sent, lost = (sum(getattr(flow, key) for flow in flows) for key in ("sent", "lost"))
@@ -422,9 +422,9 @@ def network_rows(summary: RunSummary) -> list[tuple[str, str]]:
 
 
 def _missed_deadlines(deadlines: Mapping[str, DeadlinesPart]) -> str:
-    late = [(role, part.late_steps, part.steps) for role, part in deadlines.items() if part.late_steps]
-    missed = [f"{role} {late_steps} of {steps}" for role, late_steps, steps in late]
-    return ", ".join(missed) or "none"
+    late_roles = [(role, part.late_steps, part.steps) for role, part in deadlines.items() if part.late_steps]
+    texts = [f"{role} {late_steps} of {steps}" for role, late_steps, steps in late_roles]
+    return ", ".join(texts) or "none"
 
 
 def loops_table(loops: Sequence[LoopSummary], title: str) -> ResultTable:
@@ -435,7 +435,7 @@ def loops_table(loops: Sequence[LoopSummary], title: str) -> ResultTable:
 def loop_row(loop: LoopSummary) -> tuple[str, ...]:
     """Return the row of a loop in the table of all loops."""
     claims = _verdicts(loop)
-    held = f"{claims['held']} of {sum(claims.values())}"
+    held_text = f"{claims['held']} of {sum(claims.values())}"
     worse = [f"{claims['violated']} violated"] if claims["violated"] else []
     if loop.exit.status == ExitStatus.FAILED:
         worse = ["failed"]
@@ -448,5 +448,5 @@ def loop_row(loop: LoopSummary) -> tuple[str, ...]:
         number(100 * (loop.link_share or 0.0)),
         number(loop.delay_max_s),
         number(loop.sup_e_c_norm),
-        ", ".join([held, *worse]),
+        ", ".join([held_text, *worse]),
     )

@@ -16,7 +16,7 @@ from noack.core.errors import ExitStatus
 from noack.runtime.life_cycle import HORIZON
 from noack.theory.certificates.assumptions import AssumptionStatus
 
-_NAMED = 3
+_MOST_NAMED = 3
 """Largest number of claims of a verdict that are named."""
 SETTLED_SHARE = 0.1
 """A loop is stable if ‖x‖ falls to this share of its largest value."""
@@ -45,7 +45,7 @@ class VerdictLine(NamedTuple):
 def verdict(summary: RunSummary) -> tuple[VerdictLine, ...]:
     """Return how the run ended and its state, whether its guarantee was kept, its transmissions."""
     loops = summary.loops
-    events, delivered = sum(loop.events for loop in loops), sum(loop.deliveries for loop in loops)
+    events, deliveries = sum(loop.events for loop in loops), sum(loop.deliveries for loop in loops)
     ideal = None
     if isinstance(loops[0].fidelity, FidelityPart) and not shares_network(summary):
         ideal = loops[0].fidelity.events_ideal
@@ -58,21 +58,21 @@ def verdict(summary: RunSummary) -> tuple[VerdictLine, ...]:
             "" if diverged and summary.exit.status == ExitStatus.FAILED else _states(loops),
         ),
         _guarantee_line(loops),
-        transmission_line(events, delivered, ideal),
+        transmission_line(events, deliveries, ideal),
     )
 
 
 def ending_line(end: ExitPart, reached_s: float, horizon_s: float, states: str = "") -> VerdictLine:
     """Return how a run ended, with the words of :func:`state_text` about its loops."""
-    reached = f"{reached_s:g} s"
-    reached_of = f"{reached} of {horizon_s:g} s"
+    length = f"{reached_s:g} s"
+    length_of_horizon = f"{length} of {horizon_s:g} s"
     reason = "" if end.status == ExitStatus.OK and end.reason == HORIZON else end.reason
-    how, tone = {
-        ExitStatus.OK: (f"completed {reached}", Tone.GOOD),
-        ExitStatus.FAILED: (f"failed after {reached_of}", Tone.BAD),
-    }.get(ExitStatus(end.status), (f"stopped after {reached_of}", Tone.DOUBTFUL))
+    outcome, tone = {
+        ExitStatus.OK: (f"completed {length}", Tone.GOOD),
+        ExitStatus.FAILED: (f"failed after {length_of_horizon}", Tone.BAD),
+    }.get(ExitStatus(end.status), (f"stopped after {length_of_horizon}", Tone.DOUBTFUL))
     details = "; ".join(filter(None, (reason.removeprefix("stopped "), states)))
-    return VerdictLine(f"{how}: {details}" if details else how, tone)
+    return VerdictLine(f"{outcome}: {details}" if details else outcome, tone)
 
 
 def state_of(largest: float | None, final: float | None, diverged_at_s: float | None) -> str:
@@ -153,9 +153,9 @@ def _if_broken(loop: LoopSummary) -> GuaranteeVerdict | None:
     violated = [claim for claim in loop.claims if claim.verdict == "violated"]
     if violated:
         named = list(dict.fromkeys(claim.what for claim in violated))
-        more = [f"{len(named) - _NAMED} more"] if len(named) > _NAMED else []
+        more = [f"{len(named) - _MOST_NAMED} more"] if len(named) > _MOST_NAMED else []
         since_s = min(claim.since_s or 0.0 for claim in violated)
-        broken.append((since_s, "violated: " + "; ".join([*named[:_NAMED], *more])))
+        broken.append((since_s, "violated: " + "; ".join([*named[:_MOST_NAMED], *more])))
     return GuaranteeVerdict(Tone.BAD, *min(broken)) if broken else None
 
 
@@ -164,15 +164,15 @@ def _if_kept(loop: LoopSummary) -> GuaranteeVerdict | None:
     certified = [claim for claim in loop.claims if claim.is_certified]
     if not certified:
         return None
-    late, covered = _lateness(loop), ""
+    late, coverage = _lateness(loop), ""
     if late and _covers_lateness(loop):
-        covered = f"certificate recomputed for the lateness of this run: {'; '.join(dict.fromkeys(late))}"
+        coverage = f"certificate recomputed for the lateness of this run: {'; '.join(dict.fromkeys(late))}"
     if not (void := _void_claims(loop)):
-        return GuaranteeVerdict(Tone.GOOD, 0.0, covered)
+        return GuaranteeVerdict(Tone.GOOD, 0.0, coverage)
     if _without_certificate(loop) or not any(claim.verdict == "held" for claim in certified):
         return None
-    unchecked = f"{len(void)} {'claim' if len(void) == 1 else 'claims'} not checkable: {_reason(loop).why}"
-    return GuaranteeVerdict(Tone.GOOD, 0.0, "; ".join(filter(None, (covered, unchecked))))
+    limits = f"{len(void)} {'claim' if len(void) == 1 else 'claims'} not checkable: {_reason(loop).why}"
+    return GuaranteeVerdict(Tone.GOOD, 0.0, "; ".join(filter(None, (coverage, limits))))
 
 
 def _if_not_checkable(loop: LoopSummary) -> GuaranteeVerdict:
@@ -199,16 +199,16 @@ def _without_certificate(loop: LoopSummary) -> list[Claim]:
 
 def _reason(loop: LoopSummary) -> GuaranteeVerdict:
     """Return from when on, and why, the first of the void claims of a loop cannot be checked."""
-    rest = _without_certificate(loop)
+    uncovered = _without_certificate(loop)
     # A certificate that covered a part for some time says more than one that does not exist.
-    concerned = [claim for claim in rest if claim.has_bound] or rest or _void_claims(loop)
-    claim = min(concerned, key=lambda claim: (claim.since_s or 0.0, _why(claim)))
-    why, late = _why(claim), _lateness(loop)
-    if why.endswith(BEYOND_CERTIFICATE):
-        why = f"at worst {why}"
-    elif late and late[0] == why and not loop.missing_samples:
-        why = f"at worst {why}; no certificate covers that"
-    return GuaranteeVerdict(Tone.DOUBTFUL, claim.since_s or 0.0, why, claim.lacks_loop_gain)
+    candidates = [claim for claim in uncovered if claim.has_bound] or uncovered or _void_claims(loop)
+    claim = min(candidates, key=lambda claim: (claim.since_s or 0.0, _why(claim)))
+    reason, late = _why(claim), _lateness(loop)
+    if reason.endswith(BEYOND_CERTIFICATE):
+        reason = f"at worst {reason}"
+    elif late and late[0] == reason and not loop.missing_samples:
+        reason = f"at worst {reason}; no certificate covers that"
+    return GuaranteeVerdict(Tone.DOUBTFUL, claim.since_s or 0.0, reason, claim.lacks_loop_gain)
 
 
 def _why(claim: Claim) -> str:
@@ -273,11 +273,11 @@ class Remark(NamedTuple):
 def remarks(summary: RunSummary) -> Iterator[Remark]:
     """Yield the remarks on one loop, the severe ones first; none if all went well."""
     (loop,) = summary.loops
-    stated = guarantee_of(loop).why  # by the verdict
+    reason = guarantee_of(loop).why
     violations = [
         violation
         for violation in loop.assumption_violations
-        if violation.what not in stated and not (violation.cause in SCHEDULE and _covers_lateness(loop))
+        if violation.what not in reason and not (violation.cause in SCHEDULE and _covers_lateness(loop))
     ]
     for violation in violations[:_MOST_VIOLATIONS]:
         where = f"t = {violation.t_s:.3f} s (reported by {violation.process})"
@@ -285,13 +285,13 @@ def remarks(summary: RunSummary) -> Iterator[Remark]:
         severe = violation.cause not in CAUSES  # the guarantee, or a change
         yield Remark(f"assumption violated at {where}: {what}", severe=severe)
     if (more := len(violations) - _MOST_VIOLATIONS) > 0:
-        plural = "s" * (more > 1)
+        plural = "s" if more > 1 else ""
         yield Remark(f"{more} more violation{plural} of an assumption", severe=True)
     if loop.replay is not None and loop.replay.bit_exact is False:
         yield Remark("the replay of the run differs from its record", severe=True)
     yield from map(Remark, _warnings(summary, loop))
-    for when, change in changes_in(loop.changes):
-        yield Remark(f"{when}: {change}", neutral=True)
+    for interval, change in changes_in(loop.changes):
+        yield Remark(f"{interval}: {change}", neutral=True)
 
 
 def _has_clocks(loop: LoopSummary) -> bool:

@@ -140,8 +140,8 @@ def _void_lines(loops: Sequence[LoopSummary]) -> list[str]:
         lines.append(f"void: {_with_ranges([why for why, _ in alike])} ({where})")
     more = len(lines) - _MOST_REASONS
     if more > 0:
-        rest = f"and {more} more reason{'s' * (more > 1)}: the summaries of the loops have them"
-        lines[_MOST_REASONS:] = [rest]
+        reasons_word = "reason" if more == 1 else "reasons"
+        lines[_MOST_REASONS:] = [f"and {more} more {reasons_word}: the summaries of the loops have them"]
     return lines
 
 
@@ -171,8 +171,8 @@ def _print_claims(console: Console, table: ResultTable, claims: Sequence[Claim])
     for claim in claims:
         if claim.verdict != "held" and claim.why:
             sources.setdefault((claim.verdict, claim.why), []).append(claim.source)
-    for (stated, why), of in sources.items():
-        text = f"{stated}: {'; '.join(dict.fromkeys(of))}: {why}"
+    for (word, reason), claim_sources in sources.items():
+        text = f"{word}: {'; '.join(dict.fromkeys(claim_sources))}: {reason}"
         console.print(text, highlight=False, markup=False)
 
 
@@ -272,9 +272,9 @@ def _where(outcome: Outcome, *, verbose: bool) -> Iterator[str]:
     yield f"run directory  {run_dir}"
     if report.is_file():
         yield f"report         {report}"
-    shown = run_dir / RECORDING_FILE if loop is None else f"{argument}{of_loop}"
+    target = run_dir / RECORDING_FILE if loop is None else f"{argument}{of_loop}"
     if (run_dir / RECORDING_FILE).is_file():
-        yield f"view           {_program()} view {shown}"
+        yield f"view           {_program()} view {target}"
 
 
 def _program() -> str:

@@ -117,8 +117,8 @@ def controller_track(before: ControllerTrack, steps: Rows, deliveries: Rows) -> 
     generations = inputs[order] // GENERATION
     track, begins = before, firsts_of_equal(generations).tolist()
     for begin, end in pairwise([*begins, len(generations)]):
-        own = slice(begin, end)
-        track = _extend(track, int(generations[begin]), model_ns[own], x_c[own], newest[own])
+        rows = slice(begin, end)
+        track = _extend(track, int(generations[begin]), model_ns[rows], x_c[rows], newest[rows])
     return track
 
 
@@ -258,7 +258,7 @@ def _align(record: RunRecord) -> Iterator[AlignedPart]:
         true_x = true_states(steps, rows["t_ns"]) if reads_steps else None
         return AlignedPart(rows, aligned, true_x)
 
-    for taken in record.slices(*tables, *((PLANT_STEP,) if reads_steps else ())):
+    for new_rows in record.slices(*tables, *((PLANT_STEP,) if reads_steps else ())):
         # A later state of the controller proves that all states up to a time are there.
         later = waiting["t_ns"] >= track.model_ns[-1]
         ready = int(np.argmax(later)) if later.any() else len(waiting)
@@ -267,10 +267,10 @@ def _align(record: RunRecord) -> Iterator[AlignedPart]:
             last_ns = waiting["t_ns"][ready - 1]
             keep = max(int(np.searchsorted(track.model_ns, last_ns, "right")) - 1, 0)
             track, steps = track.since(keep), steps.compress(steps["t_ns"] > last_ns)
-        waiting = concatenate_rows([waiting[ready:], taken[SENSOR_MEASUREMENT]], waiting.dtype)
-        track = controller_track(track, taken[CONTROLLER_STEP], taken[CONTROLLER_DELIVERY])
+        waiting = concatenate_rows([waiting[ready:], new_rows[SENSOR_MEASUREMENT]], waiting.dtype)
+        track = controller_track(track, new_rows[CONTROLLER_STEP], new_rows[CONTROLLER_DELIVERY])
         if reads_steps:
-            steps = concatenate_rows([steps, taken[PLANT_STEP]], steps.dtype)
+            steps = concatenate_rows([steps, new_rows[PLANT_STEP]], steps.dtype)
     yield part(waiting, int(track.model_ns[-1]) + scenario.timing.controller_period_ns)
 
 

@@ -118,7 +118,7 @@ def _require_kept_of(run_dir: Path, folder: Path, source: str) -> None:
         raise CallerError(f"{source}: it was kept of another run than {run_dir}")
 
 
-def _take(kept: Path, run_dir: Path, source: str) -> list[str]:
+def _take(folder: Path, run_dir: Path, source: str) -> list[str]:
     """Copy what processes kept into the spool of a run; return their roles.
 
     Raises:
@@ -127,22 +127,22 @@ def _take(kept: Path, run_dir: Path, source: str) -> list[str]:
     processes = {process.writer: process for process in _joined_processes(run_dir)}
     types = run_tables(load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES))
     roles = set()
-    for path in sorted(kept.glob("*.*")):
+    for path in sorted(folder.glob("*.*")):
         table, _, writer = path.name.partition(".")
         process, name = processes.get(writer), f"{source}: {SPOOL}/{path.name}"
         if process is None:
             raise PeerError(f"{name} is of no process that joined this run")
-        if not _has_secret(kept, process, source):
+        if not _has_secret(folder, process, source):
             raise PeerError(f"{source}: the {process.role} of this run did not run there")
         if table == KEPT_KEY:
             continue
         _require_own(table, process, types, name)
-        out = SpoolWriter(run_dir / SPOOL, writer)
+        spool = SpoolWriter(run_dir / SPOOL, writer)
         try:
             for first, rows in _checked_batches(path, table, process, types, name):
-                out.append(table, first, rows)
+                spool.append(table, first, rows)
         finally:
-            out.close()
+            spool.close()
         roles.add(process.role)
     return [role for role in LOOP_ROLES if role in roles]
 
@@ -154,14 +154,14 @@ def _joined_processes(run_dir: Path) -> Iterator[_Process]:
             yield _Process(entry["process"], int(entry.get("generation", 0)), writer)
 
 
-def _has_secret(kept: Path, process: _Process, source: str) -> bool:
+def _has_secret(folder: Path, process: _Process, source: str) -> bool:
     """Whether a process kept its secret in a folder, so that it ran there."""
     name = f"{KEPT_KEY}.{process.writer}"
     try:
-        chunks = [*_batches(kept / name, f"{source}: {SPOOL}/{name}")]
+        batches = [*_batches(folder / name, f"{source}: {SPOOL}/{name}")]
     except FileNotFoundError:
         return False
-    secrets = (chunk.rows.decode(errors="replace") for chunk in chunks)
+    secrets = (batch.rows.decode(errors="replace") for batch in batches)
     return process.writer in map(writer_of, secrets)
 
 
@@ -179,8 +179,8 @@ def _batches(path: Path, name: str) -> Iterator[SpoolBatch]:
 
 
 def _require_own(table: str, process: _Process, types: Mapping[str, np.dtype[np.void]], name: str) -> None:
-    own = [name_of_table for name_of_table in types if OWNER[name_of_table] == process.role]
-    if table not in (*own, notices_of(process.role), KEPT_REPORT):
+    tables = [candidate for candidate in types if OWNER[candidate] == process.role]
+    if table not in (*tables, notices_of(process.role), KEPT_REPORT):
         raise PeerError(f"{name}: the {process.role} has no table of this name")
 
 
@@ -192,22 +192,22 @@ def _checked_batches(
     name: str,
 ) -> Iterator[tuple[int, bytes]]:
     """Yield the batches of a file; raise PeerError for one that is not of its process."""
-    for chunk in _batches(path, name):
+    for batch in _batches(path, name):
         if table == KEPT_REPORT:
             try:
-                report = parse_message(ProcessReport, chunk.rows).fields()
+                report = parse_message(ProcessReport, batch.rows).fields()
             except PeerError as error:
                 raise PeerError(f"{name}: {error}") from None
             sender = (report.get("process"), report.get("generation", 0), report.get("instance"))
             if sender != (process.role, process.generation, process.writer):
                 raise PeerError(f"{name} is the report of another process")
         elif table in types:
-            if len(chunk.rows) % types[table].itemsize:
+            if len(batch.rows) % types[table].itemsize:
                 raise PeerError(f"{name} is damaged: it has a batch with part of a row")
-            inputs = np.frombuffer(chunk.rows, types[table])["input"]
+            inputs = np.frombuffer(batch.rows, types[table])["input"]
             if (inputs // GENERATION != process.generation).any():
                 raise PeerError(f"{name} has rows of another process")
-        yield chunk.first, chunk.rows
+        yield batch.first, batch.rows
 
 
 def _require_consistent(before_dir: Path, after_dir: Path, source: str) -> None:
@@ -222,9 +222,9 @@ def _require_consistent(before_dir: Path, after_dir: Path, source: str) -> None:
                 raise PeerError(f"{source}: it has other rows of {table} than were recorded")
         for role in LOOP_ROLES:
             for generation in after.generations(role):
-                reported = {} if generation.report is None else generation.report["rows"]
-                for table in reported.keys() & generation.rows.keys():
-                    if (surplus := generation.rows[table] - reported[table]) > 0:
+                reported_rows = {} if generation.report is None else generation.report["rows"]
+                for table in reported_rows.keys() & generation.rows.keys():
+                    if (surplus := generation.rows[table] - reported_rows[table]) > 0:
                         raise PeerError(
                             f"{source}: with its rows, {table} has {surplus} more than the {role} reported"
                         )
@@ -243,13 +243,13 @@ def _contains(before: RunRecord, after: RunRecord, table: str) -> bool:
     rows: Rows = np.zeros(0, after.tables[table])
     for old in before.source.batches(table):
         while not len(rows) or rows["input"][-1] < old["input"][-1]:
-            if (more := next(batches, None)) is None:
+            if (batch := next(batches, None)) is None:
                 return False
-            rows = np.concatenate([rows, more])
-        places = np.searchsorted(rows["input"], old["input"])
-        if rows[places].tobytes() != old.tobytes():
+            rows = np.concatenate([rows, batch])
+        indices = np.searchsorted(rows["input"], old["input"])
+        if rows[indices].tobytes() != old.tobytes():
             return False
-        rows = rows[places[-1] :]
+        rows = rows[indices[-1] :]
     return True
 
 

@@ -48,18 +48,18 @@ def events(record: RunRecord) -> pa.Table:
     measurements = record[SENSOR_MEASUREMENT]
     sent = measurements[measurements["event"] != NO_SEQUENCE]
     t_s = _seconds(sent["t_ns"])
-    crossed = packet_outcomes(record)
-    fates = np.array([fate.name.lower() for fate in Fate], dtype=object)[crossed.fate]
+    outcomes = packet_outcomes(record)
+    fates = np.array([fate.name.lower() for fate in Fate], dtype=object)[outcomes.fate]
     # The emulator forwarded them, but they were not delivered.
-    fates[effective(crossed.fate) & crossed.lost] = _OUT_OF_ORDER
-    fates[crossed.in_flight] = _IN_FLIGHT
-    known = dict(zip(crossed.sequence.tolist(), fates.tolist(), strict=True))
+    fates[effective(outcomes.fate) & outcomes.lost] = _OUT_OF_ORDER
+    fates[outcomes.in_flight] = _IN_FLIGHT
+    fate_by_event = dict(zip(outcomes.sequence.tolist(), fates.tolist(), strict=True))
     columns = {
         "event": sent["event"],
         "t_s": t_s,
         "t_ns": sent["t_ns"],
         "interval_s": np.diff(t_s, prepend=np.nan),
-        "fate": np.array([known.get(int(n), _NOT_RECEIVED) for n in sent["event"]], dtype=np.str_),
+        "fate": np.array([fate_by_event.get(int(n), _NOT_RECEIVED) for n in sent["event"]], dtype=np.str_),
         "received": np.isin(sent["event"], record[CONTROLLER_DELIVERY]["sequence"]),
     }
     return _table(columns)

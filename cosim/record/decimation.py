@@ -45,8 +45,8 @@ def decimate_all(t: Reals, values: Reals, columns: int) -> Indices:
     """Select the points that plots of several curves need, values (k, n) over t."""
     if len(t) <= _POINTS_PER_COLUMN * columns:
         return np.arange(len(t))
-    kept = [decimate(t, np.ascontiguousarray(curve), columns) for curve in values.T]
-    return np.unique(np.concatenate(kept))
+    indices = [decimate(t, np.ascontiguousarray(curve), columns) for curve in values.T]
+    return np.unique(np.concatenate(indices))
 
 
 def _where_first(extreme: Reals, y: Reals, column: Indices, first: Indices, last: Indices) -> Indices:

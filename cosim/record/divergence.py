@@ -29,6 +29,7 @@ from noack.scenario.resolution import loop_of, policy_of
 from noack.scenario.scenario import Scenario
 
 GROWTH = 1000.0
+"""Ratio of ‖x‖ to the expected size beyond which a run diverged."""
 _STILL_GROWING = 2.0
 """Factor by which the last tenth must exceed the middle of the run."""
 _LEAST_SAMPLES = 20
@@ -97,7 +98,7 @@ class GrowthMonitor:
     def __init__(self, loops: Sequence[Scenario]) -> None:
         self._early_ns = loops[0].timing.horizon_ns // 10
         self._scales = np.array([_scale(loop) for loop in loops])
-        self._found = np.zeros(len(loops), np.bool_)
+        self._is_reported = np.zeros(len(loops), np.bool_)
         sizes = np.array([loop.model.dimensions[0] for loop in loops])
         self._entries = np.arange(sizes.max()) < sizes[:, None]
         """(loops, n) which entries of a vector each loop has."""
@@ -116,12 +117,12 @@ class GrowthMonitor:
         limits = GROWTH * self._scales[loops]
         beyond = np.flatnonzero(lost | (~early & (limits > 0) & (norms > limits)))
         new = []
-        for row in beyond[~self._found[loops[beyond]]].tolist():
-            if self._found[loop := int(loops[row])]:
+        for row in beyond[~self._is_reported[loops[beyond]]].tolist():
+            if self._is_reported[loop := int(loops[row])]:
                 continue
-            self._found[loop] = True
-            passed = f"‖x‖ passed {limits[row]:.3g} ({GROWTH:g} times its expected size)"
-            text = "x is not finite" if lost[row] else passed
+            self._is_reported[loop] = True
+            growth = f"‖x‖ passed {limits[row]:.3g} ({GROWTH:g} times its expected size)"
+            text = "x is not finite" if lost[row] else growth
             new.append((loop, int(t_ns[row]), text))
         return new
 
@@ -129,7 +130,7 @@ class GrowthMonitor:
 def _scale(scenario: Scenario) -> float:
     """Return the magnitude of ‖x‖ to expect from a scenario's disturbances and set-point."""
     loop = loop_of(scenario)
-    carried = 0.0
+    displacement = 0.0
     for disturbance in scenario.plant.disturbances:
         if isinstance(disturbance, StepDisturbance):
             push = (
@@ -138,9 +139,9 @@ def _scale(scenario: Scenario) -> float:
                 else disturbance.amplitude
             )
             until_s = min(disturbance.until_s or scenario.horizon_s, scenario.horizon_s)
-            carried += float(np.linalg.norm(push)) * max(until_s - disturbance.from_s, 0.0)
+            displacement += float(np.linalg.norm(push)) * max(until_s - disturbance.from_s, 0.0)
     setpoint = 0.0 if loop.setpoint is None else float(np.linalg.norm(loop.setpoint))
     threshold = policy_of(scenario).largest_threshold
     if loop.weight is not None:
         threshold /= float(np.linalg.svd(loop.weight, compute_uv=False)[-1])
-    return max(carried, setpoint, threshold)
+    return max(displacement, setpoint, threshold)

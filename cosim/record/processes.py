@@ -61,17 +61,17 @@ def add_kept_reports(run_dir: Path) -> None:
         MachineError: they cannot be written.
     """
     content = read_object(run_dir / REPORTS_FILE)
-    known = [report for report in content.get(_EARLIER, ()) if isinstance(report, dict)]
-    known += [content[role] for role in LOOP_ROLES if isinstance(content.get(role), dict)]
-    instances = {report.get("instance") for report in known}
-    kept = []
+    reports = [report for report in content.get(_EARLIER, ()) if isinstance(report, dict)]
+    reports += [content[role] for role in LOOP_ROLES if isinstance(content.get(role), dict)]
+    instances = {report.get("instance") for report in reports}
+    new_reports = []
     for _, text in read_chunks(run_dir / SPOOL, KEPT_REPORT):
         with contextlib.suppress(PeerError):  # damaged
             report = parse_message(ProcessReport, text).fields()
             if report.get("process") in LOOP_ROLES and report.get("instance") not in instances:
-                kept.append({"generation": 0} | report)
-    if kept:
-        write_reports(run_dir, [*known, *kept])
+                new_reports.append({"generation": 0} | report)
+    if new_reports:
+        write_reports(run_dir, [*reports, *new_reports])
 
 
 Entries = Sequence[tuple[str, Any]]
@@ -102,33 +102,33 @@ def entries_of_loop(entries: Entries, number: int, rows_of_others: Callable[[int
 
 
 def _of_loop(report: Report, number: int, rows_of_others: Callable[[int, str, int], int]) -> Report:
-    written = dict(report["rows"])
+    row_counts = dict(report["rows"])
     for table, by_loop in report.get("rows_by_loop", {}).items():
-        written[table] = by_loop[number] if number < len(by_loop) else 0
-    for table in written.keys() & network_tables().keys():  # there are rows of notices, too
-        written[table] -= rows_of_others(number, table, report.get("generation", 0))
+        row_counts[table] = by_loop[number] if number < len(by_loop) else 0
+    for table in row_counts.keys() & network_tables().keys():  # there are rows of notices, too
+        row_counts[table] -= rows_of_others(number, table, report.get("generation", 0))
     channel = dict(report["channel"])
     of_loops = channel.pop("loops", [])
-    rejected = Counter[str](channel.get("rejected"))
+    rejected_counts = Counter[str](channel.get("rejected"))
     channel |= of_loops[number] if number < len(of_loops) else {}
     if number == 0 and of_loops:
         for loop in of_loops:
-            rejected.subtract(loop.get("rejected") or {})
-        if of_none := +rejected:  # such as datagrams of others that a socket dropped
+            rejected_counts.subtract(loop.get("rejected") or {})
+        if of_none := +rejected_counts:  # such as datagrams of others that a socket dropped
             channel["rejected"] = channel.get("rejected", {}) | of_none
     answers = channel.get("acknowledgements")
     if answers and "loops" in answers:
         channel["acknowledgements"] = answers["loops"][number]
-    rest = {key: value for key, value in report.items() if key not in ("rows_by_loop", "stored")}
-    return rest | {"rows": written, "channel": channel}
+    fields = {key: value for key, value in report.items() if key not in ("rows_by_loop", "stored")}
+    return fields | {"rows": row_counts, "channel": channel}
 
 
 def joint_reports(network: Mapping[str, Report], loops: Sequence[Mapping[str, Report]]) -> dict[str, Report]:
     """Return the reports of a run from those of its loops; the emulator's are of all loops."""
     reports: dict[str, Report] = {}
     if "netem" in network:
-        own = loops[0].get("netem", network["netem"])["rows"]  # also those of its clock
-        reports["netem"] = network["netem"] | {"rows": own | network["netem"]["rows"]}
+        rows = loops[0].get("netem", network["netem"])["rows"]  # also those of its clock
+        reports["netem"] = network["netem"] | {"rows": rows | network["netem"]["rows"]}
     for role in [loop_role for loop_role in loops[0] if loop_role != "netem"]:
         of_loops = [loop[role] for loop in loops]
         tables = dict.fromkeys(table for report in of_loops for table in report["rows"])
@@ -155,8 +155,8 @@ def valid_reports(
             if role not in LOOP_ROLES:
                 continue
             report = report_of(role, json.dumps(entry), tables)
-            owned = [table for table in tables if OWNER[table] == role]
-            if report.generation < generation_numbers(source, owned)[-1] or role in reports:
+            own_tables = [table for table in tables if OWNER[table] == role]
+            if report.generation < generation_numbers(source, own_tables)[-1] or role in reports:
                 earlier.append(report.fields() | {"process": role})
             else:
                 reports[role] = report.fields()
@@ -184,13 +184,13 @@ class ProcessGeneration(NamedTuple):
     """Number of inputs without a row, before the last recorded input."""
 
 
-def generation_indices(rows: Rows, begun: Sequence[int]) -> NDArray[np.intp]:
-    """Return the place of each row's generation among those that began, ascending, (k,).
+def generation_indices(rows: Rows, generations: Sequence[int]) -> NDArray[np.intp]:
+    """Return the index of each row's generation in ``generations``, ascending, (k,).
 
     A row with an unexpected number belongs to the generation before.
     """
     numbers = rows["input"] // GENERATION
-    return (np.searchsorted(np.array(begun), numbers, side="right") - 1).clip(min=0)
+    return (np.searchsorted(np.array(generations), numbers, side="right") - 1).clip(min=0)
 
 
 def generation_numbers(source: RecordSource, tables: Sequence[str]) -> list[int]:
@@ -204,8 +204,8 @@ def generation_numbers(source: RecordSource, tables: Sequence[str]) -> list[int]
     for table in tables:
         for rows in source.batches(table, ("input",)):
             inputs = rows["input"]
-            begun = inputs[(inputs % GENERATION == 0) & (inputs > 0)] // GENERATION
-            first = max(first, int(begun.max(initial=0)))
+            started = inputs[(inputs % GENERATION == 0) & (inputs > 0)] // GENERATION
+            first = max(first, int(started.max(initial=0)))
             generations = np.union1d(generations, inputs // GENERATION)
     return [0, *generations[(generations > 0) & (generations <= first)].tolist()]
 
@@ -237,14 +237,15 @@ class _Counts:
         inputs, now_ns = inputs[order], now_ns[order]
         gaps = np.flatnonzero(np.diff(inputs, prepend=self._input) > 1)
         if len(gaps) and self.gap_ns is None:
-            before = self._now_ns if gaps[0] == 0 and self._numbers else now_ns[max(gaps[0] - 1, 0)]
-            self.gap_ns = int(before)
+            before_gap_ns = self._now_ns if gaps[0] == 0 and self._numbers else now_ns[max(gaps[0] - 1, 0)]
+            self.gap_ns = int(before_gap_ns)
         self._input, self._now_ns = int(inputs[-1]), int(now_ns[-1])
         first, last = (int(number) // GENERATION for number in (inputs[0], inputs[-1]))
         for number in [first] if first == last else np.unique(inputs // GENERATION).tolist():
-            own = inputs if first == last else inputs[inputs // GENERATION == number]
+            of_generation = inputs if first == last else inputs[inputs // GENERATION == number]
             newest, count = self._numbers.get(number, (-1, 0))
-            self._numbers[number] = max(newest, int(own[-1]) % GENERATION), count + len(own)
+            newest = max(newest, int(of_generation[-1]) % GENERATION)
+            self._numbers[number] = newest, count + len(of_generation)
 
     @property
     def missing_inputs(self) -> int:
@@ -254,17 +255,17 @@ class _Counts:
 def read_generations(
     parts: Iterable[Slice],
     tables: Sequence[str],
-    begun: Sequence[int],
+    generations: Sequence[int],
     reports: Mapping[int, Report],
 ) -> list[ProcessGeneration]:
     """Return the generations of one process from the parts of its tables, with ``GENERATION_COLUMNS``.
 
-    ``begun`` has their numbers, ascending; ``reports`` are by generation.
+    ``generations`` has their numbers, ascending; ``reports`` are by generation.
     """
-    counts = [_Counts(generation, tables) for generation in begun]
+    counts = [_Counts(generation, tables) for generation in generations]
     for part in parts:
-        for count, own in zip(counts, split_by_generation(part, begun), strict=True):
-            count.add(own)
+        for count, rows in zip(counts, split_by_generation(part, generations), strict=True):
+            count.add(rows)
     return [
         ProcessGeneration(
             generation,
@@ -275,15 +276,15 @@ def read_generations(
             count.gap_ns,
             count.missing_inputs,
         )
-        for generation, count in zip(begun, counts, strict=True)
+        for generation, count in zip(generations, counts, strict=True)
     ]
 
 
-def split_by_generation(part: Slice, begun: Sequence[int]) -> Iterator[Slice]:
+def split_by_generation(part: Slice, generations: Sequence[int]) -> Iterator[Slice]:
     """Yield the rows of each generation of a process, from rows of its tables."""
-    if len(begun) == 1:
+    if len(generations) == 1:
         yield part
         return
-    places = {table: generation_indices(rows, begun) for table, rows in part.items()}
-    for i in range(len(begun)):
-        yield {table: rows.compress(places[table] == i) for table, rows in part.items()}
+    indices = {table: generation_indices(rows, generations) for table, rows in part.items()}
+    for i in range(len(generations)):
+        yield {table: rows.compress(indices[table] == i) for table, rows in part.items()}

@@ -263,10 +263,10 @@ def rows_by_loop(
     for number in np.unique(numbers).tolist():
         if number >= len(phases_ns):  # damaged
             continue
-        chosen = rows.take(order[ends[number - 1] if number else 0 : ends[number]])
+        rows_of_loop = rows.take(order[ends[number - 1] if number else 0 : ends[number]])
         if is_of_network(table):
-            chosen = _of_loop(chosen, number, phases_ns)
-        yield number, pack_rows(chosen, types[number][table])
+            rows_of_loop = _of_loop(rows_of_loop, number, phases_ns)
+        yield number, pack_rows(rows_of_loop, types[number][table])
 
 
 class NetworkRows:
@@ -312,17 +312,18 @@ class NetworkRows:
 
     def of_loops(self, table: str, numbers: Sequence[int]) -> Iterator[list[Rows]]:
         """Yield the next rows of each of some loops, in order; the table is read once."""
-        every = [[places[number] for places in self._places.values()] for number in numbers]
-        mine = [np.sort(np.concatenate([*map(np.take, self._inputs.values(), places)])) for places in every]
+        by_number = [[places[number] for places in self._places.values()] for number in numbers]
+        parts = [[*map(np.take, self._inputs.values(), places)] for places in by_number]
+        inputs_of_loops = [np.sort(np.concatenate(inputs)) for inputs in parts]
         first = 0
         for rows in self._source.batches(table):
             by_loop = []
-            for number, inputs in zip(numbers, mine, strict=True):
+            for number, inputs in zip(numbers, inputs_of_loops, strict=True):
                 places = self._places[table][number]
                 begin, end = np.searchsorted(places, (first, first + len(rows)))
-                chosen = rows.take(places[begin:end] - first)
-                chosen["input"] -= self._numbered_before(chosen["input"], inputs)
-                by_loop.append(_of_loop(chosen, number, self._phases_ns))
+                rows_of_loop = rows.take(places[begin:end] - first)
+                rows_of_loop["input"] -= self._numbered_before(rows_of_loop["input"], inputs)
+                by_loop.append(_of_loop(rows_of_loop, number, self._phases_ns))
             yield by_loop
             first += len(rows)
 
@@ -332,11 +333,11 @@ class NetworkRows:
         ``mine`` has all numbers of the loop, ascending. Rows that are missing count as the loop's.
         """
         begin = numbers // GENERATION * GENERATION
-        of_all, own = (
-            np.searchsorted(counted, numbers) - np.searchsorted(counted, begin)
-            for counted in (self._in_order, mine)
+        of_all, of_loop = (
+            np.searchsorted(ascending, numbers) - np.searchsorted(ascending, begin)
+            for ascending in (self._in_order, mine)
         )
-        return np.asarray(of_all - own)
+        return np.asarray(of_all - of_loop)
 
     def count_of_others(self, number: int, table: str, generation: int) -> int:
         """Return how many rows of a generation of the emulator are of other loops than a loop."""

@@ -52,12 +52,12 @@ def write_run(run: RecordedRun, run_dir: Path) -> None:
     write_whole(run_dir / REPORTS_FILE, json.dumps(reports, indent=2), make_folder=False)
     folder, names = run_dir / RECORD, vector_names(run.scenario)
     with record_folder(folder, notices), ThreadPoolExecutor(cores()) as threads:
-        written = [
+        tasks = [
             threads.submit(table_files.write_table, folder / f"{table}.parquet", rows(table), dtype, names)
             for table, dtype in types.items()
         ]
-        for writing in written:
-            writing.result()
+        for task in tasks:
+            task.result()
 
 
 def vector_names(scenario: Scenario) -> dict[str, Sequence[str]]:

@@ -106,13 +106,13 @@ def write_scenario(scenario: "Scenario", run_dir: Path) -> "Scenario":
     """
     common = dict(user_files.file_tables(scenario))
 
-    def copy_files(within: str, within_scenario: "Scenario", folder: str) -> dict[str, "FileSettings"]:
+    def copy_files(prefix: str, within_scenario: "Scenario", folder: str) -> dict[str, "FileSettings"]:
         copies = {}
         for key, table in user_files.file_tables(within_scenario):
-            if within and table == common.get(key):
+            if prefix and table == common.get(key):
                 continue  # the entry does not set it
-            file = user_files.checked_path(table, f"{within}{key}")
-            name = f"{key.split('.')[0]}/{within.replace('.', '_')}{file.name}"
+            file = user_files.checked_path(table, f"{prefix}{key}")
+            name = f"{key.split('.')[0]}/{prefix.replace('.', '_')}{file.name}"
             if not (run_dir / name).is_file():
                 (run_dir / name).parent.mkdir(exist_ok=True)
                 copy_whole(file, run_dir / name)
@@ -120,10 +120,10 @@ def write_scenario(scenario: "Scenario", run_dir: Path) -> "Scenario":
         return copies
 
     def scenario_in(folder: str) -> "Scenario":
-        moved = scenarios.with_loop_tables(
+        relocated = scenarios.with_loop_tables(
             scenario, lambda entry, loop: copy_files(f"{entry}.", loop, folder)
         )
-        return user_files.with_tables(moved, copy_files("", scenario, folder))
+        return user_files.with_tables(relocated, copy_files("", scenario, folder))
 
     write_whole(run_dir / SCENARIO_FILE, scenario_file.dumps(scenario_in("")))
     return scenario_in(f"{run_dir.absolute()}/")
@@ -340,8 +340,8 @@ def write_environment(run_dir: Path, kind: Kind, run_name: str | None = None) ->
 
 def kind_of(run_dir: Path) -> Kind:
     """Return the kind of a run from its environment file; live if the file is missing."""
-    stored = read_object(run_dir / ENVIRONMENT_FILE)
-    return "simulated" if stored.get("kind") == "simulated" else "live"
+    content = read_object(run_dir / ENVIRONMENT_FILE)
+    return "simulated" if content.get("kind") == "simulated" else "live"
 
 
 def changed_since(run_dir: Path) -> list[str]:
@@ -355,12 +355,12 @@ def all_changes_since(run_dir: Path) -> list[str]:
 
 
 def _changes(run_dir: Path, keys: Sequence[str], names: Sequence[str]) -> list[str]:
-    then, now = read_object(run_dir / ENVIRONMENT_FILE), environment("live")
-    packages = then.get("packages")
+    recorded_environment, current_environment = read_object(run_dir / ENVIRONMENT_FILE), environment("live")
+    packages = recorded_environment.get("packages")
     packages = packages if isinstance(packages, dict) else {}
     pairs = [
-        *((key, then.get(key), now[key]) for key in keys),
-        *((name, packages.get(name), now["packages"][name]) for name in names),
+        *((key, recorded_environment.get(key), current_environment[key]) for key in keys),
+        *((name, packages.get(name), current_environment["packages"][name]) for name in names),
     ]
     return [f"{name} was {old}, is {new}" for name, old, new in pairs if old != new]
 

@@ -72,34 +72,34 @@ def changes_of(record: RunRecord) -> list[RecordedChange]:
         for change, since_ns in _changes_in(record[table]):
             changes.setdefault(change.number, change)
             since.setdefault(change.number, {}).setdefault(OWNER[table], since_ns)
-    made: list[RecordedChange] = []
+    recorded_changes: list[RecordedChange] = []
     if not changes:
-        return made
+        return recorded_changes
     scenario = record.scenario
     schedule = ChangeSchedule[None](scenario)
     for number, change in sorted(changes.items(), key=lambda numbered: (numbered[1].t_ns, numbered[0])):
         if _add(schedule, change, change.t_ns):
-            (taken,) = schedule.take(change.t_ns)
-            made.append(RecordedChange(change, since[number], taken.scenario))
-    return made
+            (applied,) = schedule.take(change.t_ns)
+            recorded_changes.append(RecordedChange(change, since[number], applied.scenario))
+    return recorded_changes
 
 
-def model_flow(scenario: Scenario, received: Rows) -> ModelFlow:
+def model_flow(scenario: Scenario, rows: Rows) -> ModelFlow:
     """The flow of the controller's model in a run, with its set-points."""
     loop, schedule = loop_of(scenario), ChangeSchedule[None](scenario)
-    flow, known = ModelFlow(loop.H, loop.setpoint), set()
-    for change, since_ns in _changes_in(received):
-        if change.number not in known:  # a restarted controller receives it again
-            known.add(change.number)
+    flow, numbers = ModelFlow(loop.H, loop.setpoint), set()
+    for change, since_ns in _changes_in(rows):
+        if change.number not in numbers:  # a restarted controller receives it again
+            numbers.add(change.number)
             _add(schedule, change, since_ns)
-    for taken in schedule.take(NEVER_NS):
-        flow.change(taken.since_ns, loop_of(taken.scenario).setpoint)
+    for applied in schedule.take(NEVER_NS):
+        flow.change(applied.since_ns, loop_of(applied.scenario).setpoint)
     return flow
 
 
-def claimed_until_s(received: Rows) -> float:
+def claimed_until_s(rows: Rows) -> float:
     """Return the time of the first change of a table that ends the claims; infinite if none."""
-    ends_ns = [change.t_ns for change, _ in _changes_in(received) if not is_of_loss_alone(change.settings)]
+    ends_ns = [change.t_ns for change, _ in _changes_in(rows) if not is_of_loss_alone(change.settings)]
     return min(ends_ns, default=np.inf) / NS_PER_S
 
 
@@ -126,7 +126,7 @@ def _changes_in(rows: Rows) -> list[tuple[ParameterChange, int]]:
 
 def _add(schedule: ChangeSchedule[None], change: ParameterChange, since_ns: int) -> bool:
     try:
-        schedule.announce("", change, 0, 0, since_ns - 1)
+        schedule.announce(table="", change=change, number=0, now_ns=0, reached_ns=since_ns - 1)
     except CallerError:
         return False
     return True
@@ -171,23 +171,23 @@ class PacketOutcome(NamedTuple):
 @lru_cache(maxsize=4)
 def packet_outcomes(record: RunRecord, flow: Flow = Flow.UPDATE) -> PacketOutcome:
     """Return the outcomes of a flow's datagrams that reached the network emulator."""
-    released = _released(record, flow)
+    departures = _released(record, flow)
     batches = [*record.source.batches(NETEM_PACKET)] or [np.zeros(0, record.tables[NETEM_PACKET])]
-    parts = [_outcomes(record.with_departures(rows), flow, *released) for rows in batches]
+    parts = [_outcomes(record.with_departures(rows), flow, *departures) for rows in batches]
     return PacketOutcome(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def _released(record: RunRecord, flow: Flow) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return the numbers of the delayed datagrams that left, with whether each was stale."""
     direction = direction_of(flow)
-    every = len(record.scenario.network.flows) == 1
+    has_one_flow = len(record.scenario.network.flows) == 1
     releases = record.columns(
         NETEM_RELEASE,
         "sequence",
         "flow",
         "copy",
         "stale",
-        where=lambda rows: np.full(len(rows), every) | (rows["flow"] == direction),
+        where=lambda rows: np.full(len(rows), has_one_flow) | (rows["flow"] == direction),
     )
     return 2 * releases["sequence"] + releases["copy"], releases["stale"] != 0
 

@@ -142,7 +142,7 @@ class RunRecord:
         network = self.scenario.network
         if not any(network.link_of(flow).chooses for flow in network.flows):
             return packets
-        left = self.columns(
+        departures = self.columns(
             NETEM_RELEASE,
             "sequence",
             "flow",
@@ -150,16 +150,16 @@ class RunRecord:
             "t_ns",
             where=lambda rows: rows["copy"] == 0,
         )
-        count = max(left["flow"].max(initial=0), packets["flow"].max(initial=0)) + 1
-        numbers = left["sequence"] * count + left["flow"]
+        count = max(departures["flow"].max(initial=0), packets["flow"].max(initial=0)) + 1
+        numbers = departures["sequence"] * count + departures["flow"]
         order = np.argsort(numbers)
-        wanted, known = packets["sequence"] * count + packets["flow"], numbers[order]
-        row = np.searchsorted(known, wanted)
-        has_left = np.append(known, -1)[row] == wanted
+        arrivals, ascending = packets["sequence"] * count + packets["flow"], numbers[order]
+        row = np.searchsorted(ascending, arrivals)
+        has_left = np.append(ascending, -1)[row] == arrivals
         packets = packets.copy()
         release_ns: NDArray[np.int64] = packets["release_ns"]
         waits = ~has_left & (release_ns > packets["now_ns"])
-        left_ns: NDArray[np.int64] = left["t_ns"]
+        left_ns: NDArray[np.int64] = departures["t_ns"]
         release_ns[has_left] = left_ns[order][row[has_left]]
         release_ns[waits] = np.maximum(release_ns[waits], left_ns.max(initial=-1))
         return packets
@@ -186,9 +186,9 @@ class RunRecord:
         For a long run, only tables of few rows and selections of few rows fit into memory.
         """
         batches = self.source.batches(table, names)
-        chosen = (rows if where is None else rows.compress(where(rows)) for rows in batches)
+        selection = (rows if where is None else rows.compress(where(rows)) for rows in batches)
         dtype = with_columns(self.tables[table], names)
-        return concatenate_rows([pack_rows(rows, dtype) for rows in chosen], dtype)
+        return concatenate_rows([pack_rows(rows, dtype) for rows in selection], dtype)
 
     @cached_method
     def events(self) -> Rows:

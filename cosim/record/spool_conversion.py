@@ -88,8 +88,8 @@ def spool_batches(
                 file.seek(begin)
                 batches, complete = batches_in(memoryview(file.read(length)))
             # Rows of a damaged batch cannot be located.
-            whole = [batch for batch in batches if len(batch[1]) % dtype.itemsize == 0]
-            yield begin, begin + complete, whole
+            whole_batches = [batch for batch in batches if len(batch[1]) % dtype.itemsize == 0]
+            yield begin, begin + complete, whole_batches
             begin += complete
 
 
@@ -102,14 +102,14 @@ def merge_segments(segments: Iterable[Segment], dtype: np.dtype[np.void]) -> Ite
 
     Of several rows with the same input of a loop, the first one is taken.
     """
-    ordered = sorted(segments, key=lambda segment: segment.first)
+    in_turn = sorted(segments, key=lambda segment: segment.first)
     waiting: list[Rows] = []
-    for segment, after in zip(ordered, [*ordered[1:], None], strict=False):
+    for segment, next_segment in zip(in_turn, [*in_turn[1:], None], strict=False):
         waiting.append(segment.read())
-        if after is not None and sum(map(len, waiting)) < BATCH_ROWS:
+        if next_segment is not None and sum(map(len, waiting)) < BATCH_ROWS:
             continue
         rows = in_order(concatenate_rows(waiting, dtype))
-        ready = len(rows) if after is None else int(np.searchsorted(rows["input"], after.first))
+        ready = len(rows) if next_segment is None else int(np.searchsorted(rows["input"], next_segment.first))
         if ready:
             yield rows[:ready]
         waiting = [rows[ready:]]
@@ -128,10 +128,10 @@ def in_order(rows: Rows) -> Rows:
 
 def by_loop(segments: Iterable[Segment], dtype: np.dtype[np.void], loops: range) -> list[Rows]:
     """Return the rows of each of some loops, each in order and without duplicates."""
-    read = (segment.read() for segment in sorted(segments, key=lambda segment: segment.first))
-    own = [rows.compress((rows[LOOP] >= loops.start) & (rows[LOOP] < loops.stop)) for rows in read]
-    rows = concatenate_rows(own, dtype)
-    del own  # as large as the rows
+    row_batches = (segment.read() for segment in sorted(segments, key=lambda segment: segment.first))
+    parts = [rows.compress((rows[LOOP] >= loops.start) & (rows[LOOP] < loops.stop)) for rows in row_batches]
+    rows = concatenate_rows(parts, dtype)
+    del parts  # as large as the rows
     rows = rows.take(np.argsort(rows[LOOP], kind="stable"))
     ends = np.searchsorted(rows[LOOP], np.arange(loops.start, loops.stop), "right")
     return [in_order(rows[first:end]) for first, end in zip([0, *ends[:-1]], ends, strict=True)]
@@ -141,18 +141,20 @@ _BLOCK_BYTES = 32 * 1024 * 1024
 """Rows of several loops that are sorted at once."""
 
 
-Each = Callable[[Callable[[str], None], Sequence[str]], Iterable[None]]
+TableMap = Callable[[Callable[[str], None], Sequence[str]], Iterable[None]]
 
 
-def finish_record(run_dir: Path, each: Each = map, early: Mapping[str, int] | None = None) -> RecordedRun:
+def finish_record(
+    run_dir: Path, map_tables: TableMap = map, early: Mapping[str, int] | None = None
+) -> RecordedRun:
     """Convert a run's spool to its record, and remove the spool.
 
     All spools are merged, without duplicate rows. An interrupted attempt can be repeated.
 
     Args:
         run_dir: the run directory.
-        each: ``each(function, tables)`` calls a function for each table, the largest first; several
-            processes may do so at once.
+        map_tables: ``map_tables(function, tables)`` calls a function for each table, the largest
+            first; several processes may do so at once.
         early: the tables that are in Parquet files of the spool, with the bytes of their spool.
 
     Raises:
@@ -168,7 +170,7 @@ def finish_record(run_dir: Path, each: Each = map, early: Mapping[str, int] | No
         with record_folder(run_dir / RECORD, notices):
             for file in [f"{table}.parquet" for table in ready]:
                 (run_dir / SPOOL / EARLY / file).replace(run_dir / RECORD / file)
-            [*each(partial(convert_table, run_dir), tables)]
+            [*map_tables(partial(convert_table, run_dir), tables)]
     except OSError as error:
         raise _write_error(run_dir, error) from None
     remove_spool(run_dir)
@@ -229,9 +231,9 @@ def remove_spool(run_dir: Path) -> None:
     spool = run_dir / SPOOL
     try:
         if spool.is_dir():  # moved in one step, so that an incomplete spool is never read
-            done = spool.with_name(f"{SPOOL}.done")
-            remove_folder(done)  # of an earlier attempt that was interrupted
-            remove_folder(spool.rename(done))
+            spool_to_remove = spool.with_name(f"{SPOOL}.done")
+            remove_folder(spool_to_remove)  # of an earlier attempt that was interrupted
+            remove_folder(spool.rename(spool_to_remove))
     except OSError as error:
         raise _write_error(run_dir, error) from None
 
@@ -245,7 +247,7 @@ def _write_error(run_dir: Path, error: OSError) -> MachineError:
 
 def _notices(folder: Path, spool: Path, loops: int) -> list[Notice]:
     notices = read_notices(folder)
-    known = {json.dumps(notice, sort_keys=True) for notice in notices}
+    texts = {json.dumps(notice, sort_keys=True) for notice in notices}
     for role in (*LOOP_ROLES, RECORDER):
         for line in stored_lines(spool, role):
             try:
@@ -254,8 +256,8 @@ def _notices(folder: Path, spool: Path, loops: int) -> list[Notice]:
                 continue
             if notice.get(LOOP, 0) not in range(loops):  # damaged
                 continue
-            if (text := json.dumps(notice, sort_keys=True)) not in known:
-                known.add(text)
+            if (text := json.dumps(notice, sort_keys=True)) not in texts:
+                texts.add(text)
                 notices.append(notice)
     return sorted(notices, key=lambda notice: int(notice["t_ns"]))
 
@@ -270,12 +272,12 @@ def write_early(run_dir: Path) -> Mapping[str, int]:
         ValueError: rows are missing or not in order, a batch is incomplete, or a table is long.
         OSError: a file cannot be read or written.
     """
-    ended = run_dir / SPOOL / EARLY / EARLY_ENDED
+    end_file = run_dir / SPOOL / EARLY / EARLY_ENDED
     with ExitStack() as stack:
         with ThreadPoolExecutor(1, initializer=be_idle) as thread:
             tables = thread.submit(_open_tables, run_dir, stack).result()
-            thread.submit(_follow, tables, ended).result()
-        ended.unlink()
+            thread.submit(_follow, tables, end_file).result()
+        end_file.unlink()
         with ThreadPoolExecutor(cores()) as threads:
             [*threads.map(_EarlyTable.finish, tables)]
     return {table.name: table.bytes for table in tables if table.bytes}
@@ -295,8 +297,8 @@ def _open_tables(run_dir: Path, stack: ExitStack) -> "list[_EarlyTable]":
     return tables
 
 
-def _follow(tables: "Sequence[_EarlyTable]", ended: Path) -> None:
-    while not ended.exists():
+def _follow(tables: "Sequence[_EarlyTable]", end_file: Path) -> None:
+    while not end_file.exists():
         # The first that can: a slice is written before the next one is read.
         if not any(table.advance(ended=False) for table in tables):
             time.sleep(_POLL_S)
@@ -368,15 +370,15 @@ class _EarlyTable:
         rows = rows.take(np.argsort(rows[LOOP], kind="stable"))
         loops, inputs = rows[LOOP].astype(np.int64), rows["input"]
         firsts = firsts_of_equal(loops)
-        before = np.append(-1, inputs)[:-1]
-        before[firsts] = self._newest[loops[firsts]]  # IndexError: damaged
-        if not (inputs > before).all():
+        previous_inputs = np.append(-1, inputs)[:-1]
+        previous_inputs[firsts] = self._newest[loops[firsts]]  # IndexError: damaged
+        if not (inputs > previous_inputs).all():
             raise ValueError("rows of a loop are not in order")
         lasts = np.append(firsts[1:], len(rows))[: len(firsts)] - 1
         self._newest[loops[firsts]] = inputs[lasts]
         # Loops in groups of a power of 2: so reading some loops rarely reads many others.
-        most = max(int(np.diff(firsts, append=len(rows)).max(initial=1)), 1)
-        at_once = 2 ** max((BATCH_ROWS // most).bit_length() - 1, 0)
+        longest = max(int(np.diff(firsts, append=len(rows)).max(initial=1)), 1)
+        at_once = 2 ** max((BATCH_ROWS // longest).bit_length() - 1, 0)
         ends = np.searchsorted(loops, np.arange(at_once, len(self._newest) + at_once, at_once))
         for begin, end in zip([0, *ends[:-1]], ends, strict=True):
             for first in range(begin, end, BATCH_ROWS):

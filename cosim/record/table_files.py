@@ -34,7 +34,7 @@ from noack.protocol.record_tables import LOOP, OWNER, entry_names
 from noack.protocol.wire_format import MAX_LOOPS
 
 _MOST_GROUP_ROWS = 2 * BATCH_ROWS
-"""Largest number of rows of a group that is read; earlier versions wrote so many."""
+"""Largest number of rows of a group that is read: that of earlier versions."""
 _LEAST_GROUP_ROWS = 3 * BATCH_ROWS // 4
 _ROWS_IN_CACHE = 2048
 """Rows that stay in the processor's cache while they are filled column by column."""
@@ -84,12 +84,12 @@ class StoredTables(RecordSource):
             return
         groups = self._groups_with(table, number, number)
         alone = [group for group, is_alone in groups.items() if is_alone]
-        own, known = self._files[table].batches(dtype, alone), self._newest.pop(table, {})
+        batches, previous = self._files[table].batches(dtype, alone), self._newest.pop(table, {})
         # The loops are usually read in turn: the next one is in the same groups.
-        newest = self._newest[table] = {group: known[group] for group in groups if group in known}
+        newest = self._newest[table] = {group: previous[group] for group in groups if group in previous}
         for group, is_alone in groups.items():
             if is_alone:
-                yield next(own)
+                yield next(batches)
             else:
                 if group not in newest:
                     (newest[group],) = self._files[table].batches(groups=[group])
@@ -100,12 +100,12 @@ class StoredTables(RecordSource):
         self, table: str, loops: Sequence[int], types: Sequence[RowType]
     ) -> Iterator[tuple[int, Rows]]:
         """Yield place and rows of each of some loops, as rows of its type; a group is read once."""
-        within = [*self._groups_with(table, loops[0], loops[-1])]
+        groups = [*self._groups_with(table, loops[0], loops[-1])]
         for dtype in dict.fromkeys(types):
             parts_of: dict[int, list[Rows]] = {
-                number: [] for number, own in zip(loops, types, strict=True) if own == dtype
+                number: [] for number, row_type in zip(loops, types, strict=True) if row_type == dtype
             }
-            for numbers, rows in self._files[table].batches_by_loop(dtype, within):
+            for numbers, rows in self._files[table].batches_by_loop(dtype, groups):
                 for number, part in parts_by_loop(rows, numbers):
                     if number in parts_of:
                         parts_of[number].append(part)
@@ -124,9 +124,9 @@ class StoredTables(RecordSource):
         counts, groups = np.zeros(MAX_LOOPS + 1, np.int64), self._files[table].groups
         for group in groups:
             counts[group.first] += group.rows * (group.first == group.last)
-        mixed = [number for number, group in enumerate(groups) if group.first != group.last]
+        mixed_groups = [number for number, group in enumerate(groups) if group.first != group.last]
         dtype = with_columns(self.types[table], (LOOP,))
-        for rows in self._files[table].batches(dtype, mixed):
+        for rows in self._files[table].batches(dtype, mixed_groups):
             counts += np.bincount(rows[LOOP], minlength=len(counts))
         return counts
 
@@ -141,9 +141,9 @@ class StoredTables(RecordSource):
     @cached_method
     def highest_input(self, table: str) -> int:
         """Return the highest number of an input in a table; −1 without rows."""
-        highest = [group.highest_input for group in self._files[table].groups]
-        known = [number for number in highest if number is not None]
-        return max(known, default=-1) if len(known) == len(highest) else super().highest_input(table)
+        inputs = [group.highest_input for group in self._files[table].groups]
+        known = [number for number in inputs if number is not None]
+        return max(known, default=-1) if len(known) == len(inputs) else super().highest_input(table)
 
 
 class _Group(NamedTuple):

@@ -153,8 +153,8 @@ class ContinuousLoop:
 
 def reset(state: LoopState, delivered: bool) -> LoopState:
     """Return the state after an event: e_s = 0, and e_c = 0 if the update arrives."""
-    nothing = np.zeros_like(state.e_s)
-    return LoopState(state.t_s, state.x, nothing, nothing if delivered else state.e_c)
+    zero = np.zeros_like(state.e_s)
+    return LoopState(state.t_s, state.x, zero, zero if delivered else state.e_c)
 
 
 def continuous_loop_of(resolved: Scenario) -> ContinuousLoop:
@@ -440,7 +440,7 @@ class ContinuousSummary(NamedTuple):
 def summary(run: ContinuousRun, resolved: Scenario) -> ContinuousSummary:
     """Return the run's numbers."""
     samples = run.at(np.linspace(0.0, run.reached_s, POINTS))
-    diverged = run.divergence(samples, resolved)
+    divergence = run.divergence(samples, resolved)
     arrived = np.flatnonzero(run.delivered)
     loss_bursts = np.diff(arrived, prepend=-1, append=len(run.delivered)) - 1
     return ContinuousSummary(
@@ -459,10 +459,10 @@ def summary(run: ContinuousRun, resolved: Scenario) -> ContinuousSummary:
         initial_state_norm=float(np.linalg.norm(samples.x[0])),
         final_state_norm=float(np.linalg.norm(samples.x[-1])),
         sup_state_norm=float(np.linalg.norm(samples.x, axis=1).max()),
-        diverged_at_s=None if diverged is None else diverged.at_s,
+        diverged_at_s=None if divergence is None else divergence.at_s,
         left_out=left_out(resolved.network.link),
-        exit_status=ExitStatus.OK if diverged is None else ExitStatus.FAILED,
-        reason="horizon" if diverged is None else diverged.text,
+        exit_status=ExitStatus.OK if divergence is None else ExitStatus.FAILED,
+        reason="horizon" if divergence is None else divergence.text,
     )
 
 

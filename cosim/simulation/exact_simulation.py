@@ -219,8 +219,8 @@ class ExactSimulation:
 
 
 def _states(t_s: Vector, states: NDArray[np.float64]) -> CData:
-    given = {"count": len(t_s), "t_s": _pointer(t_s), "states": _pointer(states)}
-    return ffi.new("noack_exact_states *", given)
+    fields = {"count": len(t_s), "t_s": _pointer(t_s), "states": _pointer(states)}
+    return ffi.new("noack_exact_states *", fields)
 
 
 def _pointer(array: NDArray[np.float64] | NDArray[np.int64]) -> CData:
@@ -244,16 +244,16 @@ def vanished_error(from_s: float) -> CallerError:
 
 def timeless(settings: LinkSettings) -> LinkSettings:
     """Return the settings of a link that apply in the paper's loop: losses and corruption."""
-    kept = tuple(
+    impairments = tuple(
         impairment for impairment in settings.impairments if isinstance(impairment, LossOf | Corrupt)
     )
-    return settings.model_copy(update={"impairments": kept})
+    return settings.model_copy(update={"impairments": impairments})
 
 
 def left_out(settings: LinkSettings) -> str:
     """Return the kinds of a link's impairments that do not exist in the paper's loop, as text."""
-    kept = timeless(settings).impairments
-    return ", ".join(stage.kind for stage in settings.impairments if stage not in kept)
+    stages = timeless(settings).impairments
+    return ", ".join(stage.kind for stage in settings.impairments if stage not in stages)
 
 
 class Population(NamedTuple):
@@ -346,7 +346,7 @@ def run_with_events(setting: Setting, population: Population) -> tuple[NDArray[n
     assert log.states is not None
     events = rows["transmissions"].tolist()
     parts = zip(events, log.event_s, log.delivered, log.states, strict=True)
-    return rows, [Events(*(part[:count] for part in own)) for count, *own in parts]
+    return rows, [Events(*(part[:count] for part in arrays)) for count, *arrays in parts]
 
 
 def _run(setting: Setting, population: Population, places: int) -> tuple[NDArray[np.void], EventLog]:
@@ -367,7 +367,7 @@ def _run(setting: Setting, population: Population, places: int) -> tuple[NDArray
 
 def _check(setting: Setting, population: Population) -> None:
     k, n, m = len(population.loss_seeds), len(setting.H), len(setting.K)
-    wanted = {
+    shapes = {
         "H": (setting.H, (n, n)),
         "K": (setting.K, (m, n)),
         "trigger.weight": (setting.trigger.weight, (n, n)),
@@ -378,7 +378,7 @@ def _check(setting: Setting, population: Population) -> None:
         "x0": (population.x0, (k, n)),
         "loss_seeds": (population.loss_seeds, (k,)),
     }
-    for name, (array, shape) in wanted.items():
+    for name, (array, shape) in shapes.items():
         if array is not None and array.shape != shape:
             raise ValueError(f"{name}: expected the shape {shape}, found {array.shape}")
     if population.loss_seeds.dtype != np.uint64:

@@ -157,7 +157,7 @@ class _Network:
                 return
             for time_ns, flow, message in sorted(self._receive(), key=lambda received: received[:2]):
                 self._take(time_ns, flow, message)
-            self._leave(self._channel.release(round(granted_s * NS_PER_S)), granted_s)
+            self._send_departures(self._channel.release(round(granted_s * NS_PER_S)), granted_s)
 
     def _receive(self) -> Iterator[tuple[int, int, _QueuedMessage]]:
         """Yield the messages that have come: time in ns, number of the endpoint, content."""
@@ -172,8 +172,8 @@ class _Network:
     def _take(self, now_ns: int, flow: int, message: _QueuedMessage) -> None:
         """Let the channel decide about a message that was sent now."""
         route, channel = self.routes[flow], self._channel
-        self._leave(channel.release(now_ns), now_ns / NS_PER_S)
-        left, copies = channel.send(flow, route.sent, len(message.data), now_ns)
+        self._send_departures(channel.release(now_ns), now_ns / NS_PER_S)
+        departures, copies = channel.send(flow, route.sent, len(message.data), now_ns)
         if copies:
             route.waiting[route.sent] = message._replace(copies=copies)
         route.sent += 1
@@ -181,20 +181,20 @@ class _Network:
             for row in rows if table == NETEM_PACKET else ():
                 route.lost += row["fate"] in _LOST
                 route.longest_burst = max(route.longest_burst, int(row["consecutive_losses"]))
-        self._leave(left, now_ns / NS_PER_S)
+        self._send_departures(departures, now_ns / NS_PER_S)
 
-    def _leave(self, left: Iterable[Departure], now_s: float) -> None:
+    def _send_departures(self, departures: Iterable[Departure], now_s: float) -> None:
         """Send what leaves the channel now."""
         helics = self._helics
-        for flow, number, bit in left:
+        for flow, number, bit in departures:
             route, endpoint = self.routes[flow], self._endpoints[flow]
-            kept = route.waiting.pop(number)
-            if kept.copies > 1:
-                route.waiting[number] = kept._replace(copies=kept.copies - 1)
+            queued = route.waiting.pop(number)
+            if queued.copies > 1:
+                route.waiting[number] = queued._replace(copies=queued.copies - 1)
             message = helics.helicsEndpointCreateMessage(endpoint)
-            helics.helicsMessageSetData(message, _with_flipped(kept.data, bit))
+            helics.helicsMessageSetData(message, _with_flipped(queued.data, bit))
             helics.helicsMessageSetDestination(message, route.destination)
-            helics.helicsMessageSetOriginalSource(message, kept.source)
+            helics.helicsMessageSetOriginalSource(message, queued.source)
             helics.helicsMessageSetTime(message, now_s)
             helics.helicsEndpointSendMessage(endpoint, message)
 

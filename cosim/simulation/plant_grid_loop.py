@@ -117,25 +117,25 @@ class PlantGridLoop:
     def _advance(self, now: "_Progress", *, hold: bool) -> None:
         """Simulate to the next event, at most to the next update's effect or over a block of steps."""
         x, step, period_ns = now.states[now.step], now.step, self._schedule.period_ns
-        until = min(step + _BLOCK, len(now.states) - 1)
+        last_step = min(step + _BLOCK, len(now.states) - 1)
         if now.in_flight:
-            until = min(until, max(now.in_flight[0].acts_ns // period_ns, step + 1))
-        following = slice(step + 1, until + 1)
+            last_step = min(last_step, max(now.in_flight[0].acts_ns // period_ns, step + 1))
+        steps_ahead = slice(step + 1, last_step + 1)
         if hold:
-            now.states[following] = self._states_under_held_inputs(x, now.newest, step, until)
+            now.states[steps_ahead] = self._states_under_held_inputs(x, now.newest, step, last_step)
         else:
-            within = [update for update in now.in_flight if update.acts_ns < until * period_ns]
-            now.states[following] = self._continuous(x, [now.newest, *within], step, until)
-        x_s = self._follow_model(now.x_s, self._steps_s[1 : until - step + 1])
+            updates = [update for update in now.in_flight if update.acts_ns < last_step * period_ns]
+            now.states[steps_ahead] = self._continuous(x, [now.newest, *updates], step, last_step)
+        x_s = self._follow_model(now.x_s, self._steps_s[1 : last_step - step + 1])
         # What follows the first event is discarded.
-        measured = np.flatnonzero(self._schedule.measured[following])
+        measured = np.flatnonzero(self._schedule.measured[steps_ahead])
         first = 0 if len(measured) else None
         if now.knows_state:
-            block = now.states[following][measured]
+            block = now.states[steps_ahead][measured]
             times_ns = (step + 1 + measured) * period_ns
             first = now.trigger.test(times_ns, block, x_s[measured] - block)
         now.is_event = first is not None
-        steps = until - step if first is None else int(measured[first]) + 1
+        steps = last_step - step if first is None else int(measured[first]) + 1
         now.x_s = x_s[steps - 1]
         now.step += steps
 
@@ -144,16 +144,16 @@ class PlantGridLoop:
             return self._schedule.delay_steps(event) * self._schedule.period_ns
         return self._schedule.delay_ns(event)
 
-    def _continuous(self, x: Vector, updates: list["_Update"], step: int, until: int) -> Matrix:
-        """Return x at the steps after ``step`` up to ``until``, under u = K x_c(t)."""
+    def _continuous(self, x: Vector, updates: list["_Update"], step: int, last_step: int) -> Matrix:
+        """Return x at the steps after ``step`` up to ``last_step``, under u = K x_c(t)."""
         now_ns, newest = step * self._schedule.period_ns, updates[0]
         # With further updates, there is one step; x advances from one update's effect to the next.
         for update in updates[1:]:
             x = self._states_after(x, newest, now_ns, np.array([(update.acts_ns - now_ns) * 1e-9]))[0]
             newest, now_ns = max(newest, update, key=lambda candidate: candidate.number), update.acts_ns
         if len(updates) == 1:
-            return self._states_after(x, newest, now_ns, self._steps_s[1 : until - step + 1])
-        end_ns = until * self._schedule.period_ns
+            return self._states_after(x, newest, now_ns, self._steps_s[1 : last_step - step + 1])
+        end_ns = last_step * self._schedule.period_ns
         return self._states_after(x, newest, now_ns, np.array([(end_ns - now_ns) * 1e-9]))
 
     def _states_after(self, x: Vector, newest: "_Update", now_ns: int, after_s: Vector) -> Matrix:
@@ -167,14 +167,14 @@ class PlantGridLoop:
         start = np.array([x, np.zeros_like(x), np.zeros_like(x)])
         return self._system.follow(np.zeros(1), start[None], age_s).x_c
 
-    def _states_under_held_inputs(self, x: Vector, newest: "_Update", step: int, until: int) -> Matrix:
-        """Return x at the steps after ``step`` up to ``until``, under the inputs applied there."""
-        model_ns = self._schedule.model_ns[step:until]
+    def _states_under_held_inputs(self, x: Vector, newest: "_Update", step: int, last_step: int) -> Matrix:
+        """Return x at the steps after ``step`` up to ``last_step``, under the inputs applied there."""
+        model_ns = self._schedule.model_ns[step:last_step]
         age_ns = np.maximum(model_ns - newest.event_ns, 0)
         inputs = self._follow_model(newest.x, age_ns * 1e-9) @ self._system.loop.K.T
         inputs[model_ns == NO_ACTUATION] = 0.0
         Ad, Bd = self._one_step
-        states = np.empty((until - step, len(x)))
+        states = np.empty((last_step - step, len(x)))
         for i, forced in enumerate(inputs @ Bd.T):
             states[i] = x = Ad @ x + forced
         return states

@@ -2,9 +2,9 @@
 
 The machines of the loop make the steps of all runs (native/driver/segments.c): at step k of the
 plant, in this order, x advances under the input held since step k − 1, and the newest actuation is
-latched. At every ``every``-th step y is measured (with an observer y = x̂), and the trigger tests
-it. After an event x_s = y. Then updates arrive, and the controller ticks, until step k + 1. Nothing
-is late.
+latched. If k is a multiple of ``steps_per_measurement``, y is measured (with an observer y = x̂),
+and the trigger tests it. After an event x_s = y. Then updates arrive, and the controller ticks,
+until step k + 1. Nothing is late.
 """
 
 from copy import copy
@@ -93,13 +93,12 @@ class SampledLoop:
         self.resolved = resolved
         self.last = timing.horizon_ns // timing.plant_period_ns
         self.step_s = timing.plant_period_ns * 1e-9
-        self.every = resolved.plant.measure_every
-        """Steps from one measurement to the next."""
+        self.steps_per_measurement = resolved.plant.measure_every
         self.weight = np.eye(n) if self.matrices.weight is None else self.matrices.weight
         self.delay_ns = network_delay_ns(resolved, 0)
         self._first_auxiliary = rule_of(resolved).initial_dynamic_variable
         self._most_in_flight = self.delay_ns // timing.measurement_period_ns + 2
-        assumed, measurements = assumed_model(resolved), self.last // self.every + 1
+        assumed, measurements = assumed_model(resolved), self.last // self.steps_per_measurement + 1
         self._C, self._gains = assumed.C, np.zeros((0, n, len(assumed.C)))
         if resolved.observer is not None:
             self._gains = _dense(np.array([*islice(resolved.observer.gains(assumed), measurements)]))
@@ -121,11 +120,11 @@ class SampledLoop:
             setattr(plant, name, pointer_to(array, "double *"))
         plant.sources, plant.at_input.width = sources.shape[1], 0
         noises = _dense(noise)
-        for signal, values, given in (
+        for signal, values, count in (
             (plant.at_state, at_state, len(increments)),
             (plant.noise, noises, len(noise)),
         ):
-            signal.width = values.shape[1] if given else 0
+            signal.width = values.shape[1] if count else 0
             signal.first, signal.rows = 0, len(values)
             signal.values = pointer_to(values, "double *")
         self._plant = plant
@@ -138,17 +137,17 @@ class SampledLoop:
 
     def start(self) -> Runs:
         """Return one run at its start: after the delivered first packet, if there is one."""
-        n, known = self.matrices.n, self.known_start
+        n, known_start = self.matrices.n, self.known_start
         runs = self.empty(1)
         x0 = self.matrices.x0
         runs.x[0], runs.auxiliary[0], runs.step[0] = x0, self._first_auxiliary, -1
-        if known:
+        if known_start:
             runs.x_s[0] = runs.x_c[0] = x0
         observer = self.resolved.observer
         if observer is not None:
-            given = observer.initial_estimate
-            runs.y[0] = (x0 if known else np.zeros(n)) if given is None else np.array(given)
-        if not known:
+            estimate = observer.initial_estimate
+            runs.y[0] = (x0 if known_start else np.zeros(n)) if estimate is None else np.array(estimate)
+        if not known_start:
             runs.step[0] = 0
             self.measure_at(runs)
             self.transmit(runs, np.array([True]))
@@ -161,9 +160,9 @@ class SampledLoop:
 
     def with_disturbances(self, increments: Matrix, noise: Matrix) -> "SampledLoop":
         """Return this loop with other disturbances and noise."""
-        changed = copy(self)
-        changed._set_disturbances(increments, noise)
-        return changed
+        loop = copy(self)
+        loop._set_disturbances(increments, noise)
+        return loop
 
     def correction(self, numbers: Numbers) -> Stack:
         """Return the change of y by noise at each of k measurements, (k, n, p)."""
@@ -173,8 +172,8 @@ class SampledLoop:
 
     def measure_at(self, runs: Runs) -> None:
         """Measure, where the step of a run is one of a measurement; y is 0 or estimated before."""
-        for i in np.flatnonzero(runs.step % self.every == 0).tolist():
-            number = int(runs.step[i]) // self.every
+        for i in np.flatnonzero(runs.step % self.steps_per_measurement == 0).tolist():
+            number = int(runs.step[i]) // self.steps_per_measurement
             noise = self._noise[number] if len(self._noise) else 0.0
             if len(self._gains):
                 innovation = self._C @ (runs.x[i] - runs.y[i]) + noise
@@ -245,9 +244,9 @@ def state_increments(resolved: Scenario) -> Matrix:
     effect = disturbance_effect(resolved)
     increments = np.zeros((resolved.timing.horizon_ns // resolved.timing.plant_period_ns, n))
     d, w = disturbance.values(range(len(increments)))
-    for part, at in ((d, effect[:, :m]), (w, effect[:, m:])):
+    for part, matrix in ((d, effect[:, :m]), (w, effect[:, m:])):
         if part.shape[1]:
-            increments += part @ at.T
+            increments += part @ matrix.T
     return increments
 
 

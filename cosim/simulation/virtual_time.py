@@ -69,14 +69,14 @@ class RowMemory:
     """
 
     def __init__(self) -> None:
-        self._rest = np.empty(0, np.uint8)
+        self._free = np.empty(0, np.uint8)
 
     def rows(self, places: int, dtype: np.dtype[np.void]) -> Rows:
         """Return memory for rows of a type."""
         size = places * dtype.itemsize
-        if size > len(self._rest):
-            self._rest = np.empty(max(size, _PIECE_BYTES), np.uint8)
-        rows, self._rest = np.split(self._rest, [size])
+        if size > len(self._free):
+            self._free = np.empty(max(size, _PIECE_BYTES), np.uint8)
+        rows, self._free = np.split(self._free, [size])
         return rows.view(dtype)
 
 
@@ -113,7 +113,7 @@ class RecordCollector:
         numbers.append(np.array([row[0] for row in self._setting_rows.get(table, [])], np.uint16))
         return np.bincount(np.concatenate(numbers), minlength=self._loops)
 
-    def whole(self, table: str) -> Rows:
+    def take_whole(self, table: str) -> Rows:
         """Return all rows of a table, and keep them no longer."""
         dtype = self._types[table]
         batches = self._batches.pop(table, [])
@@ -124,7 +124,7 @@ class RecordCollector:
     def of_loop(self, table: str, number: int) -> Rows:
         """Return the rows of a loop in a table of the machines, without the loop's number."""
         if table not in self._by_loop:
-            self._by_loop[table] = _split(self.whole(table), self._loops)
+            self._by_loop[table] = _split(self.take_whole(table), self._loops)
         return self._by_loop[table][number]
 
     def notices(self, loop: int | None = None) -> list[dict[str, object]]:
@@ -201,9 +201,9 @@ class VirtualRun:
         """
         changes = scheduled(self._scenario)
         for role in CHANGEABLE:
-            announcing = self.channel if role == "netem" else self.machines[role]
+            changeable = self.channel if role == "netem" else self.machines[role]
             for change in changes:
-                for output in announcing.announce(change, 0):
+                for output in changeable.announce(change, 0):
                     self.record.take(role, output)
         for change in changes:
             self.record.take(RECORDER, change_notice(change))
@@ -242,10 +242,10 @@ class VirtualRun:
         """Double the room for datagrams that have been sent."""
         simulation, size = self.core, ffi.sizeof("noack_sent_datagram")
         places, first = simulation.sent_places, simulation.sent_first
-        larger = ffi.new("noack_sent_datagram[]", 2 * places)
-        ffi.memmove(larger, self._sent + first, (places - first) * size)
-        ffi.memmove(larger + (places - first), self._sent, first * size)
-        self._sent = simulation.sent = larger
+        memory = ffi.new("noack_sent_datagram[]", 2 * places)
+        ffi.memmove(memory, self._sent + first, (places - first) * size)
+        ffi.memmove(memory + (places - first), self._sent, first * size)
+        self._sent = simulation.sent = memory
         simulation.sent_places, simulation.sent_first = 2 * places, 0
 
     def _take(self, role: str, *, last: bool = False) -> None:
@@ -312,8 +312,8 @@ def simulate_run(scenario: Scenario, runs: Path, progress: Progress | None = Non
     try:
         with active_run(run_dir), EndingFile(run_dir) as ending:
             write_environment(run_dir, "simulated")
-            simulated = simulate_loops(write_scenario(resolved, run_dir), progress)
-            write_run(simulated, run_dir)
+            run = simulate_loops(write_scenario(resolved, run_dir), progress)
+            write_run(run, run_dir)
             ending.store(ExitStatus.OK, HORIZON)
     except BaseException as error:
         shutil.rmtree(run_dir, ignore_errors=True)
@@ -334,7 +334,7 @@ def _simulate(
     run.announce()
     with np.errstate(all="ignore"):  # a diverging loop overflows and is recorded all the same
         run.run(progress=progress)
-    of_network = {table: run.record.whole(table) for table in network_tables()}
+    of_network = {table: run.record.take_whole(table) for table in network_tables()}
     packets = NetworkRows(RowsInMemory(of_network), run.phases_ns)
     tables = {table for types in run.types.values() for table in types}
     counts = packets.counts() | {
@@ -394,8 +394,8 @@ def _split(rows: Rows, loops: int) -> list[Rows]:
     # The loop's number is the first column.
     number_bytes = rows.dtype[LOOP].itemsize
     data = rows.view(np.uint8).reshape(len(rows), rows.dtype.itemsize)[order, number_bytes:]
-    own = np.ascontiguousarray(data).view(np.dtype(rows.dtype.descr[1:])).reshape(-1)
-    return np.split(own, np.cumsum(np.bincount(numbers, minlength=loops))[:-1])
+    of_loops = np.ascontiguousarray(data).view(np.dtype(rows.dtype.descr[1:])).reshape(-1)
+    return np.split(of_loops, np.cumsum(np.bincount(numbers, minlength=loops))[:-1])
 
 
 def _reports(
@@ -404,11 +404,11 @@ def _reports(
     """Return the final report of each role, as of a loop with these numbers of rows."""
     channels = {role: run.reception(role, loop) for role in _ROLES}
     if scenario.protocol.acknowledges:
-        received = run.reception("sensor", loop, acknowledges=True)
-        channels["sensor"]["acknowledgements"] = received
+        reception = run.reception("sensor", loop, acknowledges=True)
+        channels["sensor"]["acknowledgements"] = reception
     return {role: _report(counts, role, channels.get(role, {"rejected": {}})) for role in LOOP_ROLES}
 
 
 def _report(counts: Mapping[str, int], role: str, channel: ReadTable) -> dict[str, object]:
-    owned = {table: count for table, count in counts.items() if OWNER[table] == role}
-    return {"ended": HORIZON, "channel": channel, "rows": owned}
+    rows = {table: count for table, count in counts.items() if OWNER[table] == role}
+    return {"ended": HORIZON, "channel": channel, "rows": rows}

@@ -286,22 +286,22 @@ def repeat_archive(
         ending = simulate_run(scenario, folder / "repeated")
         finalize(ending, report=False, view=False)
         repeated = load_run(ending.run_dir)
-        compare = _replayed if manifest.kind == "live" else _repeated
+        compare = _compare_replay if manifest.kind == "live" else _compare_repetition
         pairs = zip(_named_loops(recorded), _named_loops(repeated), strict=True)
-        compared = [compare(name, record, repeated_record) for (name, record), (_, repeated_record) in pairs]
+        results = [compare(name, record, repeated_record) for (name, record), (_, repeated_record) in pairs]
         return Repetition(
             scenario=manifest.scenario,
             kind=manifest.kind,
-            compared=sum(result.compared for result in compared),
-            differences=[text for result in compared for text in result.differences],
-            gaps=[text for result in compared for text in result.gaps],
+            compared=sum(result.row_count for result in results),
+            differences=[text for result in results for text in result.differences],
+            gaps=[text for result in results for text in result.gaps],
             changes=all_changes_since(archived),
             numbers=_numbers(archived, ending.run_dir),
         )
 
 
-class _Compared(NamedTuple):
-    compared: int
+class _Comparison(NamedTuple):
+    row_count: int
     differences: Sequence[str]
     gaps: Sequence[str]
 
@@ -322,21 +322,21 @@ def _folder(into: Path | None) -> Iterator[Path]:
 
 
 @contextmanager
-def _naming_archive(path: Path, archived: Path) -> Iterator[None]:
+def _naming_archive(path: Path, folder: Path) -> Iterator[None]:
     """In messages about files of an archive, name the archive and not the folder they are in."""
     try:
         yield
     except CallerError as error:
-        text = str(error).replace(f"{archived}/", f"{path}: ").replace(str(archived), str(path))
+        text = str(error).replace(f"{folder}/", f"{path}: ").replace(str(folder), str(path))
         raise CallerError(text) from None
 
 
-def _scenario(path: Path, archived: Path, *, run_code: bool) -> Scenario:
+def _scenario(path: Path, folder: Path, *, run_code: bool) -> Scenario:
     """Load the scenario of an unpacked archive; refuse code that is not wanted, or elsewhere."""
-    if not (archived / SCENARIO_FILE).is_file():
+    if not (folder / SCENARIO_FILE).is_file():
         raise CallerError(f"{path}: not an archive of a run: has no {SCENARIO_FILE}")
-    scenario = load(archived / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
-    if (outside := outside_files(scenario, archived)) is not None:
+    scenario = load(folder / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
+    if (outside := outside_files(scenario, folder)) is not None:
         raise CallerError(f"{path}: its scenario names {outside}, which is not in the archive")
     for part in (scenario, *loops_of(scenario)):
         for key, table in file_tables(part):
@@ -359,17 +359,17 @@ def _named_loops(run: RecordedRun) -> Iterator[tuple[str, RunRecord]]:
         yield f"loop {name}: ", record
 
 
-def _replayed(name: str, archived: RunRecord, _: RunRecord) -> _Compared:
-    replayed = replay(archived)
-    first = replayed.first_difference
-    gaps = [f"{name}{gap}" for gap in replayed.gaps]
-    return _Compared(replayed.inputs, [] if first is None else [f"{name}{first}"], gaps)
+def _compare_replay(name: str, archived: RunRecord, _: RunRecord) -> _Comparison:
+    verdict = replay(archived)
+    first = verdict.first_difference
+    gaps = [f"{name}{gap}" for gap in verdict.gaps]
+    return _Comparison(verdict.inputs, [] if first is None else [f"{name}{first}"], gaps)
 
 
-def _repeated(name: str, archived: RunRecord, repeated: RunRecord) -> _Compared:
+def _compare_repetition(name: str, archived: RunRecord, repeated: RunRecord) -> _Comparison:
     first = first_difference(archived, repeated)
     count = sum(archived.count(table) for table in archived.tables)
-    return _Compared(count, [] if first is None else [f"{name}{first}"], [])
+    return _Comparison(count, [] if first is None else [f"{name}{first}"], [])
 
 
 def first_difference(archived: RunRecord, repeated: RunRecord) -> ReplayDifference | None:
@@ -421,23 +421,23 @@ def print_repetition(console: Console, result: Repetition) -> None:
     Texts of the archive are printed without control characters.
     """
 
-    def say(text: str, style: str = "") -> None:
+    def print_text(text: str, style: str = "") -> None:
         console.print(Text(printable(text), style), soft_wrap=True)
 
     unit = "inputs replayed" if result.kind == "live" else "rows repeated"
     verdict = ("bit-exact", "green") if result.bit_exact else ("not reproduced", "bold red")
     if not result.compared:
         verdict = "nothing to compare", "bold red"
-    say(f"{result.scenario}, {result.kind}: {verdict[0]}, {result.compared:,} {unit}", verdict[1])
+    print_text(f"{result.scenario}, {result.kind}: {verdict[0]}, {result.compared:,} {unit}", verdict[1])
     for text in result.differences:
-        say(f"first difference: {text}")
+        print_text(f"first difference: {text}")
     for text in result.gaps:
-        say(f"record incomplete: {text}", "yellow")
+        print_text(f"record incomplete: {text}", "yellow")
     if result.numbers:
-        late = ": the simulation has no lateness" if result.kind == "live" else ""
+        no_lateness = ": the simulation has no lateness" if result.kind == "live" else ""
         rows = [[*map(printable, row)] for row in result.numbers]
         heads = ("quantity", "archived", "repeated")
-        table = ResultTable("numbers", f"numbers that differ{late}", heads, rows)
+        table = ResultTable("numbers", f"numbers that differ{no_lateness}", heads, rows)
         console.print(terminal_table(table))
     for change in result.changes:
-        say(f"differs from the archived run's machine: {change}")
+        print_text(f"differs from the archived run's machine: {change}")

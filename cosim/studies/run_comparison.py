@@ -278,7 +278,8 @@ def _flat(settings: Mapping[str, object], prefix: str = "") -> Iterator[tuple[st
 _MOST_STATES = 6
 _STATE_IN, _NORM_IN, _EVENTS_IN = 1.25, 1.8, 0.35
 _DECADES = 5
-_WIDEST, _NARROWER, _NORM_WIDTH = 3.4, 0.75, 1.2
+_WIDEST_LINE, _WIDTH_RATIO, _NORM_LINE = 3.4, 0.75, 1.2
+"""Widths of lines: of the first run's states, the ratio from run to run, and of norms."""
 
 
 def overlay_figure(runs: Sequence[ComparedRun]) -> FigureDescription:
@@ -291,13 +292,13 @@ def overlay_figure(runs: Sequence[ComparedRun]) -> FigureDescription:
         aligned = [align_tables(run.record) for run in runs]
     times = [np.asarray(samples.t_ns / NS_PER_S, dtype=np.float64) for samples in aligned]
     longest = time_axis(max(times, key=lambda t_s: t_s.max(initial=0.0)), numbers=False)
-    numbered = list(enumerate(zip(runs, times, aligned, strict=True)))
+    numbered_runs = list(enumerate(zip(runs, times, aligned, strict=True)))
     panels = [
         # Each run's line is thinner than the line below it.
         Panel(x=longest, y=Axis(label=label_text(name)), legend=() if i else None, items=[
             Line(x=t_s, y=samples.x[:, i], label=f"{run.label}: {label_text(run.title, 60)}",
-                 colour=series_colour(k), width=max(_WIDEST * _NARROWER**k, 0.8))
-            for k, (run, t_s, samples) in numbered
+                 colour=series_colour(k), width=max(_WIDEST_LINE * _WIDTH_RATIO**k, 0.8))
+            for k, (run, t_s, samples) in numbered_runs
         ])
         for i, name in enumerate(runs[0].record.loop.state_names[:_MOST_STATES])
     ]  # fmt: skip
@@ -307,13 +308,11 @@ def overlay_figure(runs: Sequence[ComparedRun]) -> FigureDescription:
         (r"Controller's error $\|e_c\|$", "e_c_norm"),
     ):
         items: list[Item] = []
-        for k, (_, t_s, samples) in numbered:  # the first run is on top
+        for k, (_, t_s, samples) in numbered_runs:  # the first run is on top
             curves: list[tuple[Reals, Dash]] = [(getattr(samples, name), ())]
             curves += [(samples.threshold, (5, 2))] if name == "e_s_norm" else []
             items += [
-                Line(
-                    x=t_s, y=values, colour=series_colour(k), width=_NORM_WIDTH, order=3 - 0.1 * k, dash=dash
-                )
+                Line(x=t_s, y=values, colour=series_colour(k), width=_NORM_LINE, order=3 - 0.1 * k, dash=dash)
                 for values, dash in curves
             ]
         norms = np.concatenate([getattr(samples, name) for samples in aligned])

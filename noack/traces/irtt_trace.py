@@ -23,7 +23,7 @@ _LONGEST_BEGINNING = 2**22
 _KEY = '"round_trips"'
 _MOST = 2**62
 """Upper limit of times in ns."""
-_WAYS = {"true_up": "forward", "true_down": "in reverse", "true": "on an unknown way"}
+_WAYS = {"true_up": "forward", "true_down": "in reverse", "true": "in an unknown direction"}
 
 
 def read_irtt(file: IO[bytes], most_packets: int) -> PacketTrace:

@@ -194,9 +194,9 @@ def nothing_is_accepted(run: Attacked) -> Iterator[str]:
     """Each process accepted exactly as many datagrams as its peer sent."""
     for role in LOOP_ROLES:
         sent = run.channel(sender_to(role, RECEIVES[role]))["sent"]
-        taken = len(run.record[_TAKEN[role]])
-        if not sent == run.accepted(role) == taken:
-            yield f"{role}: {sent} from its peer, {run.accepted(role)} accepted, {taken} acted on"
+        processed = len(run.record[_TAKEN[role]])
+        if not sent == run.accepted(role) == processed:
+            yield f"{role}: {sent} from its peer, {run.accepted(role)} accepted, {processed} acted on"
 
 
 def all_are_accounted_for(run: Attacked) -> Iterator[str]:

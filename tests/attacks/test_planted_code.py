@@ -164,12 +164,12 @@ def test_workers_import_no_planted_module(planted: Path) -> None:
     """The program ``noack`` starts them; its own folder is not the current folder."""
     program = planted.with_name("program.py")
     program.write_text(POOL)
-    done = subprocess.run(
+    result = subprocess.run(
         [sys.executable, program], capture_output=True, text=True, check=False,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     assert not planted.exists(), planted.read_text()
-    assert done.stdout == "32\n", done.stderr
+    assert result.stdout == "32\n", result.stderr
 
 
 def test_only_one_function_starts_the_interpreter() -> None:

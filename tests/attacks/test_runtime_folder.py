@@ -264,11 +264,11 @@ def test_a_command_follows_no_planted_name(
 
     def status_of_command() -> int:
         places = {"out": str(common), "run": str(run), "campaign": str(tmp_path / "campaign.toml")}
-        done = invoke(*(word.format(**places) for word in command.split()))
-        assert not done.exception or isinstance(done.exception, SystemExit), done.exception
-        if done.exit_code:
-            assert done.stderr.count("\n") == 1
-        return done.exit_code
+        result = invoke(*(word.format(**places) for word in command.split()))
+        assert not result.exception or isinstance(result.exception, SystemExit), result.exception
+        if result.exit_code:
+            assert result.stderr.count("\n") == 1
+        return result.exit_code
 
     assert status_of_command() == 0
     names = [path.relative_to(common) for path in common.rglob("*") if path.is_file()]
@@ -330,9 +330,9 @@ def test_a_folder_that_is_another_users_link_is_not_written_to(common: Path, pri
     (common / "tables").symlink_to(private.parent)
     os.chown(common / "tables", NOBODY, NOBODY, follow_symlinks=False)
     words = ["paper", "tabuada", "--tables", str(common / "tables")]
-    done = invoke(*words)
-    assert done.exit_code == 1
-    assert done.stderr.endswith(f"{common / 'tables'} is a symbolic link of another user\n")
+    result = invoke(*words)
+    assert result.exit_code == 1
+    assert result.stderr.endswith(f"{common / 'tables'} is a symbolic link of another user\n")
     assert untouched(private)
     os.chown(common / "tables", os.getuid(), os.getgid(), follow_symlinks=False)
     assert invoke(*words).exit_code == 0
@@ -359,7 +359,7 @@ def test_an_unfinished_run_with_links_is_not_completed(
         shutil.rmtree(run_dir / name)
     (run_dir / name).unlink(missing_ok=True)
     (run_dir / name).symlink_to(tmp_path)
-    done = invoke("summary", run_dir)
-    assert done.exit_code == 2
-    assert f"{run_dir / name}: is a symbolic link; a run directory has none" in done.stderr
+    result = invoke("summary", run_dir)
+    assert result.exit_code == 2
+    assert f"{run_dir / name}: is a symbolic link; a run directory has none" in result.stderr
     assert untouched(private)

@@ -121,13 +121,13 @@ def test_another_user_cannot_bind_reruns_port(server: RecordingServer) -> None:
     code = """
 import socket
 for host in ("127.0.0.1", "0.0.0.0"):
-    with socket.socket() as taken:
-        taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+    with socket.socket() as second:
+        second.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        second.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
         try:
-            taken.bind((host, int(sys.argv[1])))
-            taken.listen()
-            print("taken")
+            second.bind((host, int(sys.argv[1])))
+            second.listen()
+            print("bound")
         except OSError as error:
             print("refused")
 """

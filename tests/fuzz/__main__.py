@@ -43,12 +43,12 @@ def fuzz(name: str, seconds: int) -> tuple[bool, str]:
         with suppress(sanitized_core.NoSanitizersError):
             child, environment = sanitized_core.command("tests.fuzz.random_child", name, *flags)
     with log.open("wb") as file:
-        done = subprocess.run(child, cwd=ROOT, stdout=file, stderr=file, check=False, env=environment)
+        result = subprocess.run(child, cwd=ROOT, stdout=file, stderr=file, check=False, env=environment)
     statuses = _STATUS.findall(log.read_bytes())
     executions, _, features = map(int, statuses[-1]) if statuses else (0, 0, 0)
     findings = _findings_in(folder)
-    is_bad = bool(findings or done.returncode or not executions)
-    outcome = f"status {done.returncode}, see {log}" if is_bad else "no finding"
+    is_bad = bool(findings or result.returncode or not executions)
+    outcome = f"status {result.returncode}, see {log}" if is_bad else "no finding"
     shown = [f"    python -m tests.fuzz show {name} {path.relative_to(ROOT)}" for path in findings]
     report = f"  {name}: {executions:,} executions, {features:,} features, {outcome}"
     return is_bad, "\n".join([report, *shown])

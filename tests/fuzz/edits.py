@@ -50,9 +50,9 @@ class Choices:
 
     def take(self, count: int) -> bytes:
         """Return the next ``count`` bytes."""
-        taken = self._data[self._at : self._at + count]
-        self._at += len(taken)
-        return taken.ljust(count, b"\0")
+        part = self._data[self._at : self._at + count]
+        self._at += len(part)
+        return part.ljust(count, b"\0")
 
     def rest(self) -> bytes:
         """Return all unused bytes."""
@@ -63,9 +63,9 @@ class Choices:
         size = 1 if limit <= 256 else 2
         return int.from_bytes(self.take(size), "little") % limit
 
-    def choose(self, of: Sequence[T]) -> T:
+    def choose(self, options: Sequence[T]) -> T:
         """Return one of these options."""
-        return of[self.below(len(of))]
+        return options[self.below(len(options))]
 
     def flag(self) -> bool:
         """Return True or False."""
@@ -125,10 +125,10 @@ def vocabulary(schema: Mapping[str, Any], *, dates: bool = False) -> Vocabulary:
     return Vocabulary(tuple(keys), tuple(words), dates)
 
 
-def edited(choices: Choices, tree: Any, vocabulary: Vocabulary, most: int = 6) -> Any:
+def edited(choices: Choices, tree: Any, vocabulary: Vocabulary, most_edits: int = 6) -> Any:
     """Return a copy of a tree of dicts and lists with some edits."""
     root = {"": copy.deepcopy(tree)}
-    for _ in range(choices.below(most)):
+    for _ in range(choices.below(most_edits)):
         _edit(choices, root[""], vocabulary)
     return root[""]
 

@@ -48,9 +48,9 @@ def compare_lines(path: Path, lines_of: Callable[[str], Sequence[str]]) -> None:
 
 def lines_of_error(call: Callable[[], object], **places: Path) -> list[str]:
     """The lines of the error that a call raises, with the names of files and folders replaced."""
-    with pytest.raises(NoackError) as caught:
+    with pytest.raises(NoackError) as error:
         call()
-    text = str(caught.value)
+    text = str(error.value)
     for name, path in places.items():
         text = text.replace(str(path), name)
     return text.splitlines()

@@ -183,8 +183,8 @@ def run_scenario(runs: Path, *arguments: str) -> Finished:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", WITHOUT_VIEWER["PYTHONPATH"])
         patch.setattr("cosim.live.finalize._write_recording", lambda *_: None)
-        done = invoke("run", "lane_following", "--json", "--runs", runs, *BARE, *arguments)
-    return Finished(done.exit_code, json.loads(done.stdout), done.stderr, (runs / "latest").resolve())
+        result = invoke("run", "lane_following", "--json", "--runs", runs, *BARE, *arguments)
+    return Finished(result.exit_code, json.loads(result.stdout), result.stderr, (runs / "latest").resolve())
 
 
 class Running:

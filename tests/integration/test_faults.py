@@ -134,9 +134,9 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     if os.geteuid() != 0:
         pytest.skip("only root may mount a disk")
     command = ["mount", "-t", "tmpfs", "-o", "size=64m", "noack-test", str(path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        pytest.skip(f"no disk can be mounted here: {done.stderr.strip()}")
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    if result.returncode != 0:
+        pytest.skip(f"no disk can be mounted here: {result.stderr.strip()}")
     try:
         yield path
     finally:
@@ -174,9 +174,9 @@ def test_a_run_on_a_disk_that_fills_up_can_be_finalised_later(start: Start, smal
     assert running.left_behind() == []
     spooled = {path.name: path.stat().st_size for path in (run_dir / "spool").iterdir()}
 
-    with pytest.raises(MachineError) as refused:
+    with pytest.raises(MachineError) as error:
         reopen(run_dir)
-    assert str(refused.value).splitlines() == [line.removeprefix("noack: ") for line in lines]
+    assert str(error.value).splitlines() == [line.removeprefix("noack: ") for line in lines]
     assert {path.name: path.stat().st_size for path in (run_dir / "spool").iterdir()} == spooled
 
     (small_disk / "filler").unlink()

@@ -80,13 +80,13 @@ def start_processes(start: Start, *away: str, **more: int) -> list[subprocess.Po
 
 def end_well(*processes: subprocess.Popen[str]) -> list[Any]:
     """Wait for the processes' ends, with status 0; return what they printed as JSON."""
-    printed = []
+    outputs = []
     for process in processes:
         stdout, stderr = wait_for_end(process)
         assert process.returncode == 0, stderr
         assert "are kept in" not in stderr
-        printed.append(json.loads(stdout))
-    return printed
+        outputs.append(json.loads(stdout))
+    return outputs
 
 
 SEVERAL = f"""
@@ -154,12 +154,12 @@ def test_rows_of_a_host_that_was_cut_off_are_collected(start: Start, hosts: TwoH
     folder = tmp_path / "kept" / run_dir.name
     for process in away:
         assert f"are kept in {folder} " in errors[process]
-    done = invoke("collect", run_dir, "nohost.invalid:kept")
-    assert done.exit_code in (1, 2)
-    assert done.stderr.startswith("noack: nohost.invalid:kept: ")
-    done = invoke("collect", run_dir, folder, "--json")
-    assert done.exit_code == 0, done.stderr
-    replay = json.loads(done.stdout)["loops"][0]["replay"]
+    result = invoke("collect", run_dir, "nohost.invalid:kept")
+    assert result.exit_code in (1, 2)
+    assert result.stderr.startswith("noack: nohost.invalid:kept: ")
+    result = invoke("collect", run_dir, folder, "--json")
+    assert result.exit_code == 0, result.stderr
+    replay = json.loads(result.stdout)["loops"][0]["replay"]
     assert replay["bit_exact"]
     assert replay["complete"]
     assert len(load_record(run_dir)["controller_step"]) == 8 * live.RATE_HZ

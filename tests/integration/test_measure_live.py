@@ -32,8 +32,8 @@ def line_with(stream: Any, word: str) -> str:
 
 def test_periodic_losses_are_measured_exactly(start: Start, tmp_path: Path) -> None:
     process = start("measure", "--listen", "[::1]:0", "--json", "--save", "received.csv")
-    to = line_with(process.stderr, "listening on").split()[-1]
-    relay = start("netem", "--listen", "[::1]:0", "--to", to, "--json", "loss", "periodic", "1/5")
+    address = line_with(process.stderr, "listening on").split()[-1]
+    relay = start("netem", "--listen", "[::1]:0", "--to", address, "--json", "loss", "periodic", "1/5")
     (link,) = json.loads(line_with(relay.stdout, "ready"))["ready"]
     sender = start("measure", link["listen"], "--rate", "500hz", "--for", "1s", "--save", "sent.csv")
     assert sender.wait(LONG_S) == 0

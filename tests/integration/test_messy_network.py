@@ -90,17 +90,17 @@ def test_each_process_receives_from_its_senders_only(finished: Finished) -> None
 def test_forwarded_updates_reach_the_controller_and_the_cap_holds(
     finished: Finished, record: RunRecord
 ) -> None:
-    packets, taken = record[record_tables.NETEM_PACKET], record[record_tables.CONTROLLER_DELIVERY]
+    packets, deliveries = record[record_tables.NETEM_PACKET], record[record_tables.CONTROLLER_DELIVERY]
     updates = packets[packets["flow"] == record_tables.UPDATES]
     forwarded = int((updates["release_ns"] >= 0).sum() + (updates["copy_ns"] >= 0).sum())
     rejected = finished.loop["rejected_datagrams"]["controller"]
     assert rejected["stale"] > 0
-    assert forwarded == len(taken) + sum(rejected.values())
+    assert forwarded == len(deliveries) + sum(rejected.values())
     sent = [read_header(head.tobytes()).sequence for head in updates["head"]]
     assert sent == list(range(len(sent)))
-    ends = np.concatenate([[-1], taken["sequence"], [len(sent)]])
+    ends = np.concatenate([[-1], deliveries["sequence"], [len(sent)]])
     assert np.diff(ends).max() - 1 <= MANSD
-    assert taken["dropouts"].max() == np.diff(ends[:-1]).max() - 1
+    assert deliveries["dropouts"].max() == np.diff(ends[:-1]).max() - 1
     assert finished.loop["longest_loss_burst"] <= MANSD
     causes = finished.loop["drops_by_cause"]
     assert {"dropped", "corrupted"} <= set(causes)

@@ -12,20 +12,20 @@ from tests.netem.relay.relays import endpoints
 def test_several_links_are_captured_and_counted(tmp_path: Path) -> None:
     links, capture = tmp_path / "links.toml", tmp_path / "all.pcapng"
     lines = tmp_path / "lines.json"
-    with endpoints(*["127.0.0.1"] * 2) as (there, here):
-        there.settimeout(60)
-        to = "{}:{}".format(*there.getsockname())
+    with endpoints(*["127.0.0.1"] * 2) as (server, client):
+        server.settimeout(60)
+        address = "{}:{}".format(*server.getsockname())
         links.write_text(
             f"""
             [[link]]
             name = "first"
             listen = ":0"
-            to = "{to}"
+            to = "{address}"
             words = "loss script 0"
             [[link]]
             name = "second"
             listen = ":0"
-            to = "{to}"
+            to = "{address}"
             """
         )
         arguments = ["--links", str(links), "--capture", str(capture), "--realtime"]
@@ -37,11 +37,11 @@ def test_several_links_are_captured_and_counted(tmp_path: Path) -> None:
             assert process.stdout is not None
             ready = json.loads(process.stdout.readline())["ready"]
             ports = [int(link["listen"].rpartition(":")[2]) for link in ready]
-            here.sendto(b"lost", ("127.0.0.1", ports[0]))
-            here.sendto(b"passes", ("127.0.0.1", ports[1]))
-            assert there.recv(100) == b"passes"
-            here.sendto(b"second of the first", ("127.0.0.1", ports[0]))
-            assert there.recv(100) == b"second of the first"
+            client.sendto(b"lost", ("127.0.0.1", ports[0]))
+            client.sendto(b"passes", ("127.0.0.1", ports[1]))
+            assert server.recv(100) == b"passes"
+            client.sendto(b"second of the first", ("127.0.0.1", ports[0]))
+            assert server.recv(100) == b"second of the first"
             process.send_signal(signal.SIGINT)
             _, stderr = process.communicate(timeout=60)
             assert process.returncode == 0, stderr

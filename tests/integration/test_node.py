@@ -45,12 +45,12 @@ EMULATED, TARGET = "arm", "arm-linux-musleabihf"
 def built(folder: Path, **environment: str) -> Path:
     """Build the example for this machine, or by the compiler in CC; skip without a compiler."""
     program = folder / "controller_node"
-    done = subprocess.run(
+    result = subprocess.run(
         [sys.executable, BUILD, "--node", program], check=False, env=os.environ | environment
     )
-    if done.returncode == NO_COMPILER:
+    if result.returncode == NO_COMPILER:
         pytest.skip("there is no C compiler")
-    assert done.returncode == 0
+    assert result.returncode == 0
     return program
 
 
@@ -67,7 +67,7 @@ def script(folder: Path, commands: str) -> Path:
     return program
 
 
-def by(program: Path, *runner: str, **more: object) -> list[str]:
+def options_for(program: Path, *runner: str, **more: object) -> list[str]:
     """Options with which a program is the controller."""
     return [
         *live.AT_RATE,
@@ -91,16 +91,17 @@ def test_a_program_takes_part_in_a_live_run_and_is_replayed(
 
     What a program has started ends with the run, also while it keeps the program's stream open.
     """
-    number = tmp_path / "number"
+    pid_file = tmp_path / "pid"
     if processor == "own":
-        options = by(script(tmp_path, f"sleep 600 & echo $! >{number}; exec {node}"), horizon_s=3.0)
+        program = script(tmp_path, f"sleep 600 & echo $! >{pid_file}; exec {node}")
+        options = options_for(program, horizon_s=3.0)
     else:
         if shutil.which(f"qemu-{processor}") is None:
             pytest.skip("qemu-user is not installed")
         if find_spec("ziglang") is None:
             pytest.skip("ziglang is not installed")
         compiler = f"{sys.executable} -m ziglang cc -target {TARGET} -static"
-        options = by(built(tmp_path, CC=compiler), f"qemu-{processor}", horizon_s=3.0)
+        options = options_for(built(tmp_path, CC=compiler), f"qemu-{processor}", horizon_s=3.0)
     finished = live.run_scenario(tmp_path / "runs", *options)
     assert finished.status == 0, finished.stderr
     live.assert_complete(finished.loop)
@@ -110,13 +111,13 @@ def test_a_program_takes_part_in_a_live_run_and_is_replayed(
     assert channel["accepted"] == len(record["controller_delivery"]) > 0
     assert channel["rejected"] == channel["send_errors"] == {}
     assert (finished.run_dir / "logs" / "controller.log").read_text() == ""
-    if number.exists():
+    if pid_file.exists():
         with suppress(psutil.NoSuchProcess):
-            live.wait_for(lambda: live.is_over(psutil.Process(int(number.read_text()))))
+            live.wait_for(lambda: live.is_over(psutil.Process(int(pid_file.read_text()))))
 
 
 def test_a_killed_program_ends_the_run_and_its_rows_are_kept(start: Start, node: Path) -> None:
-    running = start(*by(node, speed=4.0, horizon_s=400.0))
+    running = start(*options_for(node, speed=4.0, horizon_s=400.0))
     running.wait_recording()
     program_of(running).kill()
     finished = running.finish()
@@ -133,7 +134,7 @@ def test_a_killed_program_ends_the_run_and_its_rows_are_kept(start: Start, node:
 
 def test_a_stopped_program_ends_with_its_process_and_another_goes_on(start: Start, node: Path) -> None:
     """A program that is stopped does not see the end of its input."""
-    options = by(node, speed=2.0, horizon_s=60.0, recovery__rejoin_within_s=60.0)
+    options = options_for(node, speed=2.0, horizon_s=60.0, recovery__rejoin_within_s=60.0)
     running = start(*options)
     running.wait_recording()
     live.wait_for(lambda: len(live.spooled(running, "controller_delivery")) > 0)
@@ -181,9 +182,9 @@ def test_a_run_with_a_program_that_cannot_be_started_is_refused_in_one_line(tmp_
         (program, "cannot be started: Permission denied; it must be executable"),
     ):
         runs = ("--json", "--runs", tmp_path / "runs", *live.BARE)
-        done = invoke("run", "lane_following", *runs, *by(file))
-        assert done.exit_code == 2, done.stderr
-        error = json.loads(done.stdout)["error"]
+        result = invoke("run", "lane_following", *runs, *options_for(file))
+        assert result.exit_code == 2, result.stderr
+        error = json.loads(result.stdout)["error"]
         assert line in error
         assert "\n" not in error
 
@@ -206,6 +207,6 @@ def test_a_frame_that_no_node_sends_is_named(tmp_path: Path, content: dict[str, 
 
 def test_a_program_that_sends_no_ticks_is_named(tmp_path: Path) -> None:
     program = script(tmp_path, f"echo {GREETING}; exec cat >/dev/null")
-    finished = live.run_scenario(tmp_path / "runs", *by(program, horizon_s=3.0))
+    finished = live.run_scenario(tmp_path / "runs", *options_for(program, horizon_s=3.0))
     assert finished.status == 1
     assert "controller.file (node): has sent 0 ticks, and is" in finished.summary["exit"]["reason"]

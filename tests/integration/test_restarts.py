@@ -85,9 +85,9 @@ def record(restarted: live.Finished) -> RunRecord:
     return load_record(restarted.run_dir)
 
 
-def rows_of_generation(record: RunRecord, table: str, place: int) -> Rows:
+def rows_of_generation(record: RunRecord, table: str, index: int) -> Rows:
     rows = record[table]
-    chosen: Rows = rows[generation_indices(rows, record.generation_numbers(OWNER[table])) == place]
+    chosen: Rows = rows[generation_indices(rows, record.generation_numbers(OWNER[table])) == index]
     return chosen
 
 

@@ -52,8 +52,8 @@ def node(*words: object) -> Iterator[subprocess.Popen[str]]:
 
 
 def peer(port: int, **more: object) -> dict[str, object]:
-    where = {"router": f"tcp/127.0.0.1:{port}", "listen": True}
-    return {"kind": "ros2", "timeout_s": 20.0, "start_timeout_s": 60.0, **where, **more}
+    ros2_settings = {"router": f"tcp/127.0.0.1:{port}", "listen": True}
+    return {"kind": "ros2", "timeout_s": 20.0, "start_timeout_s": 60.0, **ros2_settings, **more}
 
 
 def in_ros2(port: int) -> dict[str, object]:
@@ -99,17 +99,17 @@ def test_a_ros2_node_that_does_not_answer_is_named(port: int) -> None:
     nowhere = peer(port, listen=False)
     with pytest.raises(CallerError, match="cannot reach a router of ROS 2"):
         noack.simulate(noack.load(LOOP | {"controller": nowhere}))
-    done = invoke("bridge", "lane_following", "--router", "nonsense")
-    assert done.exit_code == 2
-    assert "router nonsense: give it as tcp/127.0.0.1:7447" in done.output
+    result = invoke("bridge", "lane_following", "--router", "nonsense")
+    assert result.exit_code == 2
+    assert "router nonsense: give it as tcp/127.0.0.1:7447" in result.output
 
 
 @pytest.mark.usefixtures("no_recording")
 def test_an_independent_client_receives_a_live_run(port: int, tmp_path: Path) -> None:
     with node(LISTENER, port) as listener:
         words = ("--listen", "--router", f"tcp/127.0.0.1:{port}", "--runs", tmp_path, "--no-report")
-        done = invoke("bridge", "lane_following", "--set", "horizon_s=3", *AT_RATE, *words)
-        assert done.exit_code == 0, done.output
+        result = invoke("bridge", "lane_following", "--set", "horizon_s=3", *AT_RATE, *words)
+        assert result.exit_code == 0, result.output
         assert listener.stdout is not None
         received = json.loads(listener.stdout.readline())
     steps = noack.open_run(next(tmp_path.glob("*lane_following"))).table("plant_step")

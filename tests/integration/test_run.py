@@ -62,7 +62,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
 
 
 @pytest.fixture(scope="module")
-def live(finished: Finished) -> RunRecord:
+def record(finished: Finished) -> RunRecord:
     return load_record(finished.run_dir)
 
 
@@ -97,17 +97,17 @@ def test_the_run_directory_holds_everything(finished: Finished) -> None:
     assert "warning" not in finished.stderr
 
 
-def test_the_run_is_replayed_bit_for_bit(live: RunRecord, finished: Finished) -> None:
-    result = replay(live)
+def test_the_run_is_replayed_bit_for_bit(record: RunRecord, finished: Finished) -> None:
+    result = replay(record)
     assert result.first_difference is None, str(result.first_difference)
     assert result.gaps == []
-    assert result.inputs == sum(len(live[table]) for table in tables(1, 1))
+    assert result.inputs == sum(len(record[table]) for table in tables(1, 1))
     assert all(hop.compared == hop.received > 0 for hop in result.messages)
     assert finished.loop["replay"] == result.verdict().model_dump()
-    assert finished.summary["kind"] == live.kind == "live"
+    assert finished.summary["kind"] == record.kind == "live"
 
 
-def test_the_recording_shows_the_record(finished: Finished, live: RunRecord) -> None:
+def test_the_recording_shows_the_record(finished: Finished, record: RunRecord) -> None:
     reader = rerun.chunk.RrdReader(finished.run_dir / "recording.rrd")
     (store,) = reader.recordings()
     rows: Counter[str] = Counter()
@@ -120,14 +120,14 @@ def test_the_recording_shows_the_record(finished: Finished, live: RunRecord) -> 
     assert rows[blueprint.RECEPTION] == summary["deliveries"] - summary["forced_deliveries"]
     assert rows[blueprint.DROP] == summary["drops"]
     assert rows[blueprint.EVENT] == summary["events"]
-    assert rows[blueprint.INPUT] == len(live["controller_step"])
-    for name in live.loop.state_names:
-        assert rows[blueprint.state_path(name)] == len(live["sensor_measurement"])
+    assert rows[blueprint.INPUT] == len(record["controller_step"])
+    for name in record.loop.state_names:
+        assert rows[blueprint.state_path(name)] == len(record["sensor_measurement"])
 
 
-def test_the_recording_shows_the_bounds(finished: Finished, live: RunRecord) -> None:
+def test_the_recording_shows_the_bounds(finished: Finished, record: RunRecord) -> None:
     """The curves drawn during the run equal those that its end evaluates for its schedule."""
-    claims = ClaimEvaluation(live)
+    claims = ClaimEvaluation(record)
     claims.wider = None  # the recording has the bounds of the scenario's schedule
     envelopes = claims.envelopes()
     (identity,) = [e.values for e in envelopes if e.label == "bound from (I1)"]
@@ -144,9 +144,9 @@ def test_the_recording_shows_the_bounds(finished: Finished, live: RunRecord) -> 
 
 
 def set_parameters(*words: str) -> dict[str, Any]:
-    done = invoke("set", "--json", *words)
-    answer: dict[str, Any] = json.loads(done.stdout)
-    assert done.exit_code == answer.get("exit", {"status": 0})["status"], done.stderr
+    result = invoke("set", "--json", *words)
+    answer: dict[str, Any] = json.loads(result.stdout)
+    assert result.exit_code == answer.get("exit", {"status": 0})["status"], result.stderr
     return answer
 
 
@@ -156,9 +156,9 @@ def test_a_run_is_changed_twice_and_stopped(
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     running = start(*AT_RATE, *settings(horizon_s=1000.0))
     running.wait_recording()
-    refused = invoke("summary", running.runs / "latest")
-    assert refused.exit_code == 2
-    assert "still under way" in refused.stderr
+    result = invoke("summary", running.runs / "latest")
+    assert result.exit_code == 2
+    assert "still under way" in result.stderr
     first = set_parameters("loss.p", "0.5", "mansd=2")
     second = set_parameters("setpoint", "[0.0, 0.0, 0.0, 1.0]")
     assert second["runtime_parameters"]["network.mansd"] == 2
@@ -265,20 +265,20 @@ def test_a_live_run_agrees_with_the_simulated_run(tmp_path: Path) -> None:
 
 
 def compare(live: RunRecord, simulated: RunRecord, until_ns: int) -> None:
-    compared = 0
+    compared_rows = 0
     for table, columns in SAME.items():
         # A live row may be later than in the simulation, but the order is the same.
         rows = simulated[table][simulated[table]["now_ns"] < until_ns]
-        others = live[table][: len(rows)]
+        live_rows = live[table][: len(rows)]
         for column in columns:
-            np.testing.assert_array_equal(others[column], rows[column], f"{table}.{column}")
+            np.testing.assert_array_equal(live_rows[column], rows[column], f"{table}.{column}")
         for column in CLOSE.get(table, ()):
             # The same arithmetic in the same order, but BLAS may use another kernel.
             np.testing.assert_allclose(
-                others[column], rows[column], rtol=1e-9, atol=1e-12, err_msg=f"{table}.{column}"
+                live_rows[column], rows[column], rtol=1e-9, atol=1e-12, err_msg=f"{table}.{column}"
             )
-        compared += len(rows)
-    assert until_ns < ENOUGH_S * 1e9 or compared > 60
+        compared_rows += len(rows)
+    assert until_ns < ENOUGH_S * 1e9 or compared_rows > 60
     if until_ns > simulated.scenario.timing.horizon_ns:
         for table in SAME:
             assert len(live[table]) == len(simulated[table]), table

@@ -32,12 +32,12 @@ def command(module: str, *arguments: str) -> tuple[list[str], Mapping[str, str]]
         NoSanitizersError: there is no compiler that has them.
     """
     try:
-        asked = [*compiler(), "-print-file-name=libasan.so"]
+        command = [*compiler(), "-print-file-name=libasan.so"]
     except NoCompilerError as error:
         raise NoSanitizersError(str(error)) from None
-    asan = subprocess.run(asked, capture_output=True, text=True, check=False).stdout.strip()
+    asan = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
     if not Path(asan).is_absolute():
-        raise NoSanitizersError(f"{asked[0]} has no libasan.so")
+        raise NoSanitizersError(f"{command[0]} has no libasan.so")
     build(FOLDER, *SANITIZERS)
     environment = os.environ | {
         "LD_PRELOAD": asan,

@@ -180,19 +180,19 @@ def test_events_that_overflow_the_queue_are_reported_missing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "capture.pcapng"
-    free, begun = threading.Event(), threading.Event()
+    free, writing_started = threading.Event(), threading.Event()
     packets = PcapngSection.packets
 
     def slow(self: PcapngSection, events: Events, data: Bytes) -> memoryview:
         if events.size:
-            begun.set()
+            writing_started.set()
             assert free.wait(PATIENCE_S)
         return packets(self, events, data)
 
     monkeypatch.setattr(PcapngSection, "packets", slow)
     with capturing(path, batches=2) as capture:
         capture.take(*batch({}))
-        assert begun.wait(PATIENCE_S)  # the writer is busy, the queue empty
+        assert writing_started.wait(PATIENCE_S)  # the writer is busy, the queue empty
         capture.take(*batch({}))
         capture.take(*batch({}))
         assert capture.missing_events == 0

@@ -52,19 +52,19 @@ def answers(tmp_path_factory: pytest.TempPathFactory) -> Answers:
     """Run all commands one after another, in one process."""
     folder = tmp_path_factory.mktemp("other_system")
     paths = [str(ROOT), str(Path(__file__).parent)]
-    done = subprocess.run(
+    result = subprocess.run(
         [sys.executable, "-c", PROGRAM, json.dumps([*LIVE, *COMMANDS])],
         cwd=folder, env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)}, capture_output=True,
         text=True, check=False, timeout=500,
     )  # fmt: skip
-    answers, decoder, text = [], json.JSONDecoder(), done.stdout.strip()
+    answers, decoder, text = [], json.JSONDecoder(), result.stdout.strip()
     while text:
         document, end = decoder.raw_decode(text)
         answers.append(document)
         text = text[end:].lstrip()
     documents = [document for document in answers if isinstance(document, dict)]
     ends = [document for document in answers if isinstance(document, list)]
-    return Answers(folder, documents, ends, done.stderr.splitlines())
+    return Answers(folder, documents, ends, result.stderr.splitlines())
 
 
 def test_simulation_theory_measurement_and_campaigns_work(answers: Answers) -> None:

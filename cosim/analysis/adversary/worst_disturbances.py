@@ -65,7 +65,7 @@ def worst_disturbances(
     start = loop.start()
     _follow_events(loop, start, start.step.copy(), run, step, 0 if loop.known_start else 1)
     fixed, drawn = _fixed_disturbances(loop), loop.disturbances
-    n, k, j = loop.matrices.n, step, step // loop.every + 1
+    n, k, j = loop.matrices.n, step, step // loop.steps_per_measurement + 1
     linear = loop.with_disturbances(np.zeros((0, n)), np.zeros((0, drawn[1].shape[1])))
     responses = [_responses_to_disturbance(linear, flow, column, run, step) for column in bounds.columns.T]
     noises = [
@@ -98,10 +98,10 @@ def _responses_to_noise(
     linear: SampledLoop, flow: SampledFlow, entry: int, bound: float, run: SampledRun, step: int
 ) -> Matrix:
     """Return what the noise of each measurement up to ``step`` adds to the vector, (k, n)."""
-    last = step // linear.every
+    last = step // linear.steps_per_measurement
     numbers = _some(np.arange(last + 1))
     runs = linear.empty(len(numbers))
-    runs.step[:] = numbers * linear.every
+    runs.step[:] = numbers * linear.steps_per_measurement
     runs.y[:] = bound * linear.correction(numbers)[:, :, entry]
     _follow_events(linear, runs, runs.step.copy(), run, step, 0)
     return np.repeat(_vectors(flow, runs), np.diff(numbers, append=last + 1), axis=0)

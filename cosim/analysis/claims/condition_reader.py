@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from cosim.analysis.claims.input_origins import (
-    NEVER,
+    NO_INPUT,
     NO_TIMES,
     Batches,
     InputOrigins,
@@ -249,7 +249,7 @@ class ConditionReader:
 
     def _observed(self, end_ns: int | None) -> ObservedConditions:
         ended = end_ns is not None
-        newest = NEVER if ended else self._ticks.newest
+        newest = NO_INPUT if ended else self._ticks.newest
         self._inputs.add_receipts(self._ticks.take_receipts(ended=ended), newest)
         hold, watchdog, safe_input = self._inputs.take_inputs(ended=ended)
         self._updates.add_applied(self._inputs.take_applied(ended=ended))

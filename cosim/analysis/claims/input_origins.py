@@ -25,7 +25,8 @@ from plant_server.plant import too_old
 Times = NDArray[np.int64]
 Batches = list[tuple[NDArray[Any], ...]]
 """Columns of the waiting rows, batch by batch."""
-NEVER = 2**63 - 1
+NO_INPUT = 2**63 - 1
+"""Stands for the number of an input that does not exist; all others are smaller."""
 NO_TIMES: Times = np.zeros(0, np.int64)
 _KEPT_TICKS = 512
 """A process sends its tables one after the other, up to 256 rows of each."""
@@ -79,10 +80,10 @@ class TickMatcher:
         known = len(received) if ended else int((first < len(inputs)).sum())
         self._deliveries = [(received[known:], sequence[known:], model_ns[known:])]
         self._ticks = [(inputs[-_KEPT_TICKS:], ticks[-_KEPT_TICKS:])]
-        tick = np.append(ticks, NEVER)[first[:known]]
+        tick = np.append(ticks, NO_INPUT)[first[:known]]
         # If the controller died before its next tick, the restarted one does not have the update.
         generations = received[:known] // GENERATION
-        same = (tick == NEVER) | (tick // GENERATION == generations)
+        same = (tick == NO_INPUT) | (tick // GENERATION == generations)
         return Receipts(sequence[:known][same], model_ns[:known][same], tick[same])
 
 
@@ -146,8 +147,8 @@ class InputOrigins:
             Ages of inputs; ages of actuations that the watchdog replaced; sizes of safe inputs.
         """
         t_ns, newest, sizes, ahead_ns = columns(self._steps, 4)
-        ready = newest <= (NEVER if ended else self._received)
-        ready &= (newest <= self._ticked) | (self._first_with_state(newest) < NEVER)
+        ready = newest <= (NO_INPUT if ended else self._received)
+        ready &= (newest <= self._ticked) | (self._first_with_state(newest) < NO_INPUT)
         count = int(np.minimum.accumulate(ready).sum())
         self._steps = [(t_ns[count:], newest[count:], sizes[count:], ahead_ns[count:])]
         t_ns, newest, sizes = t_ns[:count], newest[:count], sizes[:count]
@@ -178,7 +179,7 @@ class InputOrigins:
 
     def _first_with_state(self, ticks: Times) -> Times:
         """The first tick with a state, of the same generation of the controller."""
-        first_tick, generations = np.full(len(ticks), NEVER), ticks // GENERATION
+        first_tick, generations = np.full(len(ticks), NO_INPUT), ticks // GENERATION
         for generation, first in self._first_state.items():
             first_tick[generations == generation] = first
         return first_tick

@@ -62,16 +62,16 @@ class LimitOptions:
             self.settling, self.quantile, self.settle, self.bounds(), self.under == "schedule"
         )
 
-    def bounds(self) -> "dict[design_search.Bounded, float]":
+    def bounds(self) -> "dict[design_search.BoundedQuantity, float]":
         """Return the limits of certified bounds; raise CallerError if one is wrong."""
-        by_quantity: dict[design_search.Bounded, float] = {}
+        by_quantity: dict[design_search.BoundedQuantity, float] = {}
         for text in self.bound or ():
             name, _, value = text.partition("=")
             try:
                 limit = float(value)
             except ValueError:
                 limit = math.nan
-            bounded: dict[str, design_search.Bounded] = {"state": "state", "error": "error"}
+            bounded: dict[str, design_search.BoundedQuantity] = {"state": "state", "error": "error"}
             if name not in bounded or not 0 < limit < math.inf:
                 raise CallerError(f"--bound {text}: write it as state=X or error=X, X positive")
             if bounded[name] in by_quantity:

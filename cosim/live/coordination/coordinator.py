@@ -446,7 +446,7 @@ class ChangeRequests:
         for schedule in self._schedules:
             schedule.check(change, -1)
         for schedule in self._schedules:
-            schedule.announce("", change, 0, 0, -1)
+            schedule.announce(table="", change=change, number=0, now_ns=0, reached_ns=-1)
         later = self._schedule.between(change.t_ns, self._scenario.timing.horizon_ns)
         announcement = ChangeAnnouncement(
             number=change.number,

@@ -36,10 +36,10 @@ from noack.runtime.run_descriptor import RemoteAccess, RunDescriptor, new_join_t
 from noack.scenario.run_sections import ClocksSection
 from noack.scenario.scenario import Scenario
 
-_BACKLOG = 4096
+_MOST_PENDING_CONNECTIONS = 4096
 _FLOOD_PER_S = 100
 """Connections without an invitation that are a flood."""
-_VALID = datetime.timedelta(days=3650)
+_VALIDITY = datetime.timedelta(days=3650)
 """A run may be long, and the hosts' dates may differ; an invitation ends with its join token."""
 _CALM_S, _MOST_CALM_S = 3, 60
 """Time without a flood, after which it is over; and the longest such time."""
@@ -110,7 +110,7 @@ def _listen(address: Address) -> socket.socket:
     endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         endpoint.bind(address)
-        endpoint.listen(_BACKLOG)
+        endpoint.listen(_MOST_PENDING_CONNECTIONS)
         own_host(endpoint.getsockname()[:2])  # refuses a broadcast address
     except (OSError, PeerError) as error:
         endpoint.close()
@@ -218,8 +218,8 @@ def _new_key_pair(owner: x509.GeneralName) -> KeyPair:
     now = datetime.datetime.now(datetime.UTC)
     certificate = (
         x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number())
-        .not_valid_before(now - _VALID)
-        .not_valid_after(now + _VALID)
+        .not_valid_before(now - _VALIDITY)
+        .not_valid_after(now + _VALIDITY)
         .add_extension(x509.SubjectAlternativeName([owner]), critical=False)
         .sign(key, hashes.SHA256())
     )

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from cosim.live.coordination.remote_access import ListenSettings
     from noack.scenario.scenario import Scenario
 
-_SOURCE, _EVERY_S = "noack", 1.0
+_SOURCE, _PERIOD_S = "noack", 1.0
 _PREFIX = "noack_run"
 _GAUGES = {
     "simulated_seconds": ("t_s", "simulated time of the newest measurement"),
@@ -89,7 +89,7 @@ class RunLog:
     def _progress(self, report: RunProgress) -> None:
         if time.monotonic() < self._due_s:
             return
-        self._due_s = time.monotonic() + _EVERY_S
+        self._due_s = time.monotonic() + _PERIOD_S
         progress_fields = report.model_dump(exclude={"live", "warnings", "changes"})
         log_event("info", _SOURCE, f"simulated {report.t_s:.1f} s", event="progress", **progress_fields)
 

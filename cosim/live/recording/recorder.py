@@ -112,7 +112,7 @@ class ProcessTokens:
         if self._plane.coordinator_gone():
             self._connected_s = now_s
             return False
-        away_s = 0.0 if stopping else LAUNCHED_LOST_S
+        disconnect_timeout_s = 0.0 if stopping else LAUNCHED_LOST_S
         discovered = self._restarted and now_s - self._began_s > _DISCOVERY_S
 
         def is_done(known: Mapping[str, float]) -> bool:
@@ -121,7 +121,7 @@ class ProcessTokens:
             waiting = [vanished for instance, vanished in known.items() if instance not in reported]
             if len(waiting) < len(known):
                 return math.inf not in waiting
-            return all(now_s - max(vanished, self._connected_s) > away_s for vanished in waiting)
+            return now_s - max(*waiting, self._connected_s) > disconnect_timeout_s
 
         return all(map(is_done, self._vanished_s.values()))
 

@@ -120,8 +120,8 @@ def _exported_run(run_dir: Path, loop: str | None) -> ExportedRun:
     if loop is not None or not run.names[1:]:
         record = run.loop(loop)
         summary = summary_model.read_summary(content)
-        own = summary.of_loop(record.scenario.name).to_json() if summary else content
-        return ExportedRun(run_dir, record, own)
+        loop_summary = summary.of_loop(record.scenario.name).to_json() if summary else content
+        return ExportedRun(run_dir, record, loop_summary)
     parts = dict(zip(run.names, content.get("loops", []), strict=False))
     loops = [
         ExportedRun(run_dir, record, parts.get(name, {}), (), name, phase_ns)

@@ -212,8 +212,8 @@ class _Image:
 
     def add_variable(self, reference: int, numbers: list[int], *, is_real: bool, is_input: bool) -> None:
         """Append the numbers of a variable."""
-        at = self._add(ffi.new("double[]" if is_real else "int64_t[]", numbers))
-        self.head.values[reference] = (len(numbers), is_real, is_input, at)
+        place = self._add(ffi.new("double[]" if is_real else "int64_t[]", numbers))
+        self.head.values[reference] = (len(numbers), is_real, is_input, place)
 
     def add_structure(
         self, structure: CData, rows: Mapping[str, int], places: Mapping[str, int] | None = None
@@ -269,9 +269,9 @@ def _add_controller(image: _Image, resolved: Scenario) -> int:
     """Append the controller, which goes on beyond the horizon."""
     machines = controllers_of([resolved])
     controller = machines.machines + 0  # a pointer to the first one
-    own, model = controller.machine, controller.model
-    own.horizon_ns = own.received.not_after_ns = _NO_HORIZON_NS
-    n, m, places = own.n, own.m, model.transitions.places
+    machine, model = controller.machine, controller.model
+    machine.horizon_ns = machine.received.not_after_ns = _NO_HORIZON_NS
+    n, m, places = machine.n, machine.m, model.transitions.places
     of_transitions = {"H": n * n, "steps_ns": places, "matrices": places * n * n}
     of_transitions |= {"scratch": SCRATCH_MATRICES * n * n + 3 * n}
     transitions_at = image.add_structure(model.transitions, of_transitions)

@@ -139,10 +139,10 @@ def _valid_name(key: str) -> str:
     return (name if name[:1].isalpha() else f"f_{name}")[:_LONGEST_NAME]
 
 
-def _unused_name(name: str, taken: Mapping[str, object]) -> str:
+def _unused_name(name: str, used_names: Mapping[str, object]) -> str:
     """Return the name, with a number if it is taken."""
-    number, unused = 1, name
-    while unused in taken:
+    number, candidate = 1, name
+    while candidate in used_names:
         number += 1
-        unused = f"{name[: _LONGEST_NAME - 4]}_{number}"
-    return unused
+        candidate = f"{name[: _LONGEST_NAME - 4]}_{number}"
+    return candidate

@@ -65,7 +65,7 @@ def write(run: ExportedRun, path: Path, *, certificates: bool = True) -> list[Pa
         raise CallerError(
             "MCAP needs the package mcap, which is not installed; pip install 'noack[mcap]'"
         ) from None
-    written = path
+    file_path = path
     try:
         with new_file(path) as file:
             writer = Writer(file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
@@ -74,11 +74,11 @@ def write(run: ExportedRun, path: Path, *, certificates: bool = True) -> list[Pa
             writer.finish()  # type: ignore[no-untyped-call]
         if not ros2.is_installed():
             return [path]
-        written = path.with_suffix(_ROS_SUFFIX)
-        _write_ros(run, written)
+        file_path = path.with_suffix(_ROS_SUFFIX)
+        _write_ros(run, file_path)
     except (OSError, ValueError) as error:
-        raise MachineError(f"{written}: cannot be written: {why(error)}") from None
-    return [path, written]
+        raise MachineError(f"{file_path}: cannot be written: {why(error)}") from None
+    return [path, file_path]
 
 
 def _write_content(writer: "Writer", run: ExportedRun) -> None:
@@ -202,11 +202,11 @@ def _table_schema(table: str, rows: np.dtype[np.void]) -> dict[str, object]:
         table: name of the table.
         rows: type of its rows in the run.
     """
-    described = {column.name: column for column in (*COMMON, *_TABLES[table].columns)}
+    columns = {column.name: column for column in (*COMMON, *_TABLES[table].columns)}
     properties: dict[str, object] = {}
     for name in rows.names or ():
-        unit = described[name].unit
-        text = described[name].meaning + (f" [{unit}]" if unit else "")
+        unit = columns[name].unit
+        text = columns[name].meaning + (f" [{unit}]" if unit else "")
         properties[name] = {**_json_type(name, rows[name]), "description": text}
     return {
         "$schema": _SCHEMA_DIALECT,
@@ -270,10 +270,10 @@ class _Bag:
                 rows = part[table]
                 for row, topic, entries in ros2.row_entries(table, rows, loop.state_names, loop.input_names):
                     log_ns = max(int(rows["now_ns"][row]) + run.phase_ns, 0)
-                    stamped = entries._replace(stamp_ns=entries.stamp_ns + run.phase_ns)
+                    message_entries = entries._replace(stamp_ns=entries.stamp_ns + run.phase_ns)
                     number = int(rows["sequence"][row]) & _SEQUENCE_MASK
-                    content = ros2.joint_state(stamped, name)
-                    messages.append((log_ns, stamped.stamp_ns, f"{prefix}/{topic}", content, number))
+                    content = ros2.joint_state(message_entries, name)
+                    messages.append((log_ns, message_entries.stamp_ns, f"{prefix}/{topic}", content, number))
             messages.sort(key=lambda message: message[0])
             for log_ns, publish_ns, topic, content, number in messages:
                 channel = self._channel(topic, ros2.JOINT_STATE)

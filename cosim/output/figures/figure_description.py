@@ -321,14 +321,14 @@ def near_ends(ends: tuple[float, float], measured: Reals) -> tuple[float, float]
 
 def histogram(values: Reals, bins: int = 30) -> tuple[Reals, Reals]:
     """Return edges (bins + 1,) of a constant ratio, and the counts of positive values."""
-    drawn = finite(values, positive=True)
-    drawn = drawn[np.isfinite(drawn)]
-    if not len(drawn):
+    positive = finite(values, positive=True)
+    positive = positive[np.isfinite(positive)]
+    if not len(positive):
         return np.ones(1), np.zeros(0)
-    low, high = math.log10(drawn.min()), math.log10(drawn.max())
+    low, high = math.log10(positive.min()), math.log10(positive.max())
     margin = max(0.05 * (high - low), 0.02)
     edges = np.logspace(low - margin, high + margin, bins + 1)
-    return edges, np.histogram(drawn, edges)[0].astype(np.float64)
+    return edges, np.histogram(positive, edges)[0].astype(np.float64)
 
 
 def label_text(name: str, longest: int = 16) -> str:

@@ -89,25 +89,25 @@ _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 class LegendItem(NamedTuple):
     """A drawn object and its label in the legend."""
 
-    drawn: Artist
+    artist: Artist
     label: str
 
 
 @matplotlib_settings()
-def draw(described: FigureDescription) -> Figure:
+def draw(description: FigureDescription) -> Figure:
     """Draw a figure for the width of :func:`cosim.output.figures.figure_layout.use_figure_width`."""
-    places, size_in = place_panels(described)
-    figure, norm = NotebookFigure(figsize=size_in), _norm(described.scale)
+    places, size_in = place_panels(description)
+    figure, norm = NotebookFigure(figsize=size_in), _norm(description.scale)
     for number, place in enumerate(places):
         axes = _axes(figure, place, figure.axes[-1] if place.is_beside else None)
         legend_items = _draw_panel(axes, place, norm)
         box, title = place.box, place.panel.title
-        if described.heading and not number:
+        if description.heading and not number:
             width_in = layout().width_in - layout().right_in - box.left
-            box, title = box._replace(width=width_in), described.heading
+            box, title = box._replace(width=width_in), description.heading
         _draw_heading(axes, figure, box, title, legend_items)
-    if described.scale is not None:
-        _colour_bar(figure, described.scale, norm, places)
+    if description.scale is not None:
+        _draw_colour_bar(figure, description.scale, norm, places)
     figure.align_ylabels()
     _fit_to_paper(figure)
     if layout().latex:
@@ -145,16 +145,16 @@ def _axes(figure: Figure, place: Place, beside: Axes | None = None) -> Axes:
 
 def _draw_panel(axes: Axes, place: Place, norm: Normalize | None) -> list[LegendItem]:
     """Draw a panel; return what its legend shows."""
-    panel, drawn = place.panel, dict[str, Artist]()
+    panel, artists = place.panel, dict[str, Artist]()
     for item in panel.items:
         if (artist := _draw_item(item, axes, norm)) is not None:
-            drawn.setdefault(getattr(item, "label", ""), artist)
+            artists.setdefault(getattr(item, "label", ""), artist)
     _finish_axis(axes, "x", panel.x, has_numbers=place.has_x)
     _finish_axis(axes, "y", panel.y, has_numbers=place.has_y)
     if not np.isfinite(axes.dataLim.bounds).all():
         axes.text(0.5, 0.5, panel.empty, transform=axes.transAxes, ha="center", va="center")
         axes.tick_params(left=False, labelleft=False, which="both")
-    return [LegendItem(drawn[label], label) for label in panel.labels if label in drawn]
+    return [LegendItem(artists[label], label) for label in panel.labels if label in artists]
 
 
 def _draw_heading(
@@ -169,7 +169,7 @@ def _draw_heading(
     for number, entries in enumerate(rows):
         above = len(rows) - 1 - number
         legend = axes.legend(
-            [items[i].drawn for i in entries],
+            [items[i].artist for i in entries],
             [legend_text(items[i].label) for i in entries],
             loc="lower right",
             bbox_to_anchor=(right_in, bottom_in + above * space.legend_row_in),
@@ -202,18 +202,18 @@ def _(item: Line, axes: Axes, norm: Normalize | None) -> Artist | None:
     if item.steps:
         style["drawstyle"] = f"steps-{item.steps}"
     is_log = axes.get_yscale() == "log"
-    return _curve(axes, item.x, (_for_log_axis if is_log else finite)(item.y), **style)
+    return _draw_curve(axes, item.x, (_for_log_axis if is_log else finite)(item.y), **style)
 
 
-def _curve(axes: Axes, x: Reals, y: Reals, **style: Any) -> Artist:
+def _draw_curve(axes: Axes, x: Reals, y: Reals, **style: Any) -> Artist:
     """Draw a curve; its values are finite or NaN; a single point is drawn as a dot."""
     keep = decimate(x, y, _COLUMNS)
     if len(keep) < len(x):
         style.pop("drawstyle", None)  # steps between the remaining points would be wrong
     if np.isfinite(y).sum() == 1:
         style["marker"] = "o"
-    (drawn,) = axes.plot(x[keep], y[keep], **style)
-    return drawn
+    (line,) = axes.plot(x[keep], y[keep], **style)
+    return line
 
 
 @_draw_item.register
@@ -332,7 +332,9 @@ def _norm(scale: ColourScale | None) -> Normalize | None:
     return (LogNorm if scale.logarithmic else Normalize)(scale.low, scale.high)
 
 
-def _colour_bar(figure: Figure, scale: ColourScale, norm: Normalize | None, places: Sequence[Place]) -> None:
+def _draw_colour_bar(
+    figure: Figure, scale: ColourScale, norm: Normalize | None, places: Sequence[Place]
+) -> None:
     """Draw the bar that explains the colours, at the right of all panels."""
     boxes = [place.box for place in places]
     top_in = min(box.top for box in boxes)
@@ -356,34 +358,34 @@ def _for_log_axis(values: Reals) -> Reals:
     A zero (an error after a reset) becomes a value far below every axis, so that the curve falls
     vertically; a NaN would leave a gap. If all values are zero, they become NaN.
     """
-    shown = finite(values, positive=True)
-    if np.isfinite(shown).any():
-        shown[np.asarray(values) == 0] = 1 / LARGEST
-    return shown
+    heights = finite(values, positive=True)
+    if np.isfinite(heights).any():
+        heights[np.asarray(values) == 0] = 1 / LARGEST
+    return heights
 
 
-def _finish_axis(axes: Axes, letter: Literal["x", "y"], described: Axis, *, has_numbers: bool) -> None:
+def _finish_axis(axes: Axes, letter: Literal["x", "y"], description: Axis, *, has_numbers: bool) -> None:
     """Set label, numbers and ends of an axis in which everything is drawn."""
     axis, box = (axes.xaxis, axes.bbox.width) if letter == "x" else (axes.yaxis, axes.bbox.height)
-    axis.set_label_text(described.label if has_numbers else "")
-    if described.whole:
+    axis.set_label_text(description.label if has_numbers else "")
+    if description.whole:
         few = box / axes.figure.dpi < _NARROW_IN
         axis.set_major_locator(MaxNLocator(integer=True, nbins=5 if few else "auto"))
-    if described.ticks is not None:
-        axis.set_ticks([*described.ticks], labels=[*map(_for_font, described.ticks.values())])
-        if letter == "x" and turned_in(described, box / axes.figure.dpi):
+    if description.ticks is not None:
+        axis.set_ticks([*description.ticks], labels=[*map(_for_font, description.ticks.values())])
+        if letter == "x" and turned_in(description, box / axes.figure.dpi):
             for text in axis.get_ticklabels():
                 text.set(rotation=45, horizontalalignment="right", rotation_mode="anchor")
     if not has_numbers:
         axis.set_tick_params(which="both", labelbottom=False, labelleft=False)
-    if described.about is not None and described.logarithmic:
+    if description.about is not None and description.logarithmic:
         values = np.concatenate([np.asarray(line.get_ydata(), np.float64) for line in axes.lines])
-        if (ends := log_ends(values, described.about, described.decades)) is not None:
+        if (ends := log_ends(values, description.about, description.decades)) is not None:
             axes.set_ylim(*ends)
-    elif described.about is not None:
-        axes.set_ylim(*near_ends(axes.get_ylim(), described.about))
-    if described.ends.count(None) == 1:
-        _set_ends(axes, letter, described)
+    elif description.about is not None:
+        axes.set_ylim(*near_ends(axes.get_ylim(), description.about))
+    if description.ends.count(None) == 1:
+        _set_ends(axes, letter, description)
 
 
 def _for_font(text: str) -> str:
@@ -396,8 +398,8 @@ def _for_font(text: str) -> str:
     )
 
 
-def _set_ends(axes: Axes, letter: Literal["x", "y"], described: Axis) -> None:
-    (axes.set_xlim if letter == "x" else axes.set_ylim)(*described.ends)
+def _set_ends(axes: Axes, letter: Literal["x", "y"], description: Axis) -> None:
+    (axes.set_xlim if letter == "x" else axes.set_ylim)(*description.ends)
 
 
 class _PlainFormatter(ScalarFormatter):
@@ -461,8 +463,8 @@ def _fit_to_paper(figure: Figure) -> None:
             axis.set_label_text(_wrapped(axis.get_label_text(), most))
 
 
-def _wrapped(label: str, most: int) -> str:
+def _wrapped(label: str, width: int) -> str:
     """Break a label into lines; a unit in brackets stays in one line."""
-    bound = _UNIT.sub(lambda unit: unit[0].replace(" ", _NO_BREAK), label)
-    lines = textwrap.wrap(bound, most, break_long_words=False)
+    text = _UNIT.sub(lambda unit: unit[0].replace(" ", _NO_BREAK), label)
+    lines = textwrap.wrap(text, width, break_long_words=False)
     return "\n".join(lines).replace(_NO_BREAK, " ")

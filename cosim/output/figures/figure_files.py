@@ -72,13 +72,13 @@ def save_figures(figures: Iterable[FigureDescription], page: Path, files: Figure
 def file_content(figure: FigureDescription, kind: FigureFormat, width_in: float) -> bytes:
     """Return a figure as the content of a file; a PDF has the fonts of LaTeX."""
     with use_figure_width(width_in, latex=kind is FigureFormat.PDF):
-        return _saved(draw(figure), kind)
+        return _file_bytes(draw(figure), kind)
 
 
-def _saved(drawn: Figure, kind: FigureFormat) -> bytes:
+def _file_bytes(figure: Figure, kind: FigureFormat) -> bytes:
     buffer = io.BytesIO()
     with matplotlib_settings():
-        drawn.savefig(buffer, format=kind, metadata=_WITHOUT_DATE[kind])
+        figure.savefig(buffer, format=kind, metadata=_WITHOUT_DATE[kind])
     return buffer.getvalue()
 
 
@@ -87,22 +87,22 @@ def inline(figure: FigureDescription) -> str:
 
     The figure's name, a word, makes its ids unique on the page.
     """
-    drawn, description = draw(figure), figure.description or figure.caption
-    text = _page_svg(_saved(drawn, FigureFormat.SVG), figure.name, description)
+    drawing, description = draw(figure), figure.description or figure.caption
+    text = _page_svg(_file_bytes(drawing, FigureFormat.SVG), figure.name, description)
     if len(text) <= _MOST_SVG_CHARACTERS:
         return text
-    picture = base64.b64encode(_saved(drawn, FigureFormat.PNG)).decode()
+    picture = base64.b64encode(_file_bytes(drawing, FigureFormat.PNG)).decode()
     image = ET.Element("img", {"src": f"data:image/png;base64,{picture}", "alt": description})
     return ET.tostring(image, encoding="unicode")
 
 
-def _page_svg(drawn: bytes, name: str, description: str) -> str:
-    root = ET.fromstring(drawn)
+def _page_svg(svg: bytes, name: str, description: str) -> str:
+    root = ET.fromstring(svg)
     for parent in root.iter():
         for child in list(parent):
             if child.tag.endswith("}style"):  # it would apply to the whole page
                 parent.remove(child)
-    referred = {
+    referred_ids = {
         reference
         for element in root.iter()
         for value in element.attrib.values()
@@ -115,11 +115,11 @@ def _page_svg(drawn: bytes, name: str, description: str) -> str:
         element.attrib.clear()
         for key, value in attributes.items():
             if key == "id":
-                if value in referred:
+                if value in referred_ids:
                     element.set(key, f"{name}-{value}")
             elif key == "style":
-                for ink, own in _PAGE_COLOURS.items():
-                    value = value.replace(ink, own)
+                for ink, colour in _PAGE_COLOURS.items():
+                    value = value.replace(ink, colour)
                 element.set(key, value)
             elif key == "d":
                 element.set(key, _FURTHER_DIGITS.sub(r"\1", value).replace("\n", ""))

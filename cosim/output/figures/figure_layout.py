@@ -203,17 +203,17 @@ class Place(NamedTuple):
     """Whether it has the vertical axis of the place before it."""
 
 
-def place_panels(described: FigureDescription) -> tuple[list[Place], tuple[float, float]]:
+def place_panels(description: FigureDescription) -> tuple[list[Place], tuple[float, float]]:
     """Place the panels; return them, and width and height of the figure in inches."""
     space, places = layout(), list[Place]()
     top_in = 0.0
-    if described.heading:
-        top_in = _head_in(described.rows[0].panels[0].labels, space.width_in)
-    right_in = space.right_in + (4 * BAR_IN if described.scale is not None else 0.0)
-    for row in described.rows:
+    if description.heading:
+        top_in = _head_in(description.rows[0].panels[0].labels, space.width_in)
+    right_in = space.right_in + (4 * BAR_IN if description.scale is not None else 0.0)
+    for row in description.rows:
         columns = _columns(row, space.width_in)
         for first in range(0, len(row.panels), columns):
-            has_heading = bool(described.heading) and not places
+            has_heading = bool(description.heading) and not places
             line = _place_line(row, first, columns, top_in, right_in, has_heading=has_heading)
             places += line
             box = line[0].box

@@ -32,16 +32,16 @@ from noack.core.number_format import number
 Bools = NDArray[np.bool_]
 
 MOST_CURVES = len(palette.SERIES)
-"""Up to so many loops have a curve each, in a colour of its own; more are drawn as bands."""
+"""Largest number of loops with a curve each, in its own colour; more are drawn as bands."""
 _PANEL_IN = 1.7
 _ROW_IN, _LOWEST_IN, _HIGHEST_IN = 0.22, 1.2, 4.5
 """Height of a row of the map, and limits of the height of the map."""
 _DECADES = 5
 """Maximum decades of norms that are shown."""
 _MOST_NAMED_ROWS = 24
-"""Up to so many rows of the map have the names of their loops."""
+"""Largest number of rows of the map that have the names of their loops."""
 _BANDS = ((0, 4, 0.25, "5 to 95 % of the loops"), (1, 3, 0.45, "25 to 75 %"))
-"""Places of two quantiles among QUANTILES, opacity and label of the band between them."""
+"""Indices of two quantiles in QUANTILES, opacity and label of the band between them."""
 _MEDIAN, _LARGEST = 2, 5
 """Their places among QUANTILES."""
 
@@ -78,12 +78,12 @@ def network_figures(
     """
     together = loops_over_time(run, over_time)
     names = [label_text(loop.name) for loop in summary.loops]
-    stayed = np.array([loop.diverged_at_s is None for loop in summary.loops])
+    is_bounded = np.array([loop.diverged_at_s is None for loop in summary.loops])
     in_flight = summary.network.in_flight
     curves = "Each loop has a curve."
     if len(names) > MOST_CURVES:
         curves = "Bands: quantiles over the loops; dashed: the largest value."
-    diverged = "" if stayed.all() else " A loop that diverged leaves the range of the axis."
+    diverged = "" if is_bounded.all() else " A loop that diverged leaves the range of the axis."
     order = "" if len(names) <= _MOST_NAMED_ROWS else " Loops are numbered from 0, as in the scenario."
     largest = together.errors[np.isfinite(together.errors)].max(initial=0.0)
     return [
@@ -96,12 +96,12 @@ def network_figures(
             f"{in_flight.max}. Below, the shares of {len(names)} loops in the bytes that the "
             "network forwarded.",
         ),
-        norms_figure(together, names, stayed).captioned(
+        norms_figure(together, names, is_bounded).captioned(
             "Largest error ‖e_c‖ of the controller's model, and largest norm ‖x‖ of the plant's "
             f"state, in each of {len(together.middles_s)} intervals. {curves}{diverged}",
             f"Norms of {len(names)} loops over time on logarithmic axes; ‖e_c‖ is at most {number(largest)}.",
         ),
-        error_map(together, names, stayed).captioned(
+        error_map(together, names, is_bounded).captioned(
             f"Largest ‖e_c‖ of each loop in each interval; no colour before its first delivery.{order}",
             f"A row of colours for each of {len(names)} loops: ‖e_c‖ over time.",
         ),
@@ -110,11 +110,11 @@ def network_figures(
 
 def _link_rows(over_time: LoopsOverTime, names: Sequence[str], in_flight: InFlightPart) -> list[PanelRow]:
     """Describe the number of datagrams in the network, and the share of each loop of the bytes."""
-    most = np.asarray(in_flight.max_by_interval, np.float64)
+    largest = np.asarray(in_flight.max_by_interval, np.float64)
     mean = np.asarray(in_flight.mean_by_interval, np.float64)
     t_s = np.asarray((np.arange(len(mean)) + 0.5) * in_flight.width_s, np.float64)
     queue: list[Item] = [
-        Band(x=t_s, low=np.zeros(len(t_s)), high=most, label="largest of an interval",
+        Band(x=t_s, low=np.zeros(len(t_s)), high=largest, label="largest of an interval",
              colour=palette.NETWORK, opacity=0.3, steps="mid"),
         Line(x=t_s, y=mean, label="mean", colour=palette.NETWORK),
     ]  # fmt: skip
@@ -131,14 +131,14 @@ def _link_rows(over_time: LoopsOverTime, names: Sequence[str], in_flight: InFlig
     )
 
 
-def norms_figure(over_time: LoopsOverTime, names: Sequence[str], stayed: Bools) -> FigureDescription:
+def norms_figure(over_time: LoopsOverTime, names: Sequence[str], is_bounded: Bools) -> FigureDescription:
     """Describe ‖e_c‖ and ‖x‖ of all loops; the range of the axes is for those that stayed."""
     panels = []
     for title, values in (
         (r"$\|e_c\|$ controller", over_time.errors),
         (r"$\|x\|$ plant", over_time.states),
     ):
-        about = _not_diverged(values, stayed).ravel()
+        about = _not_diverged(values, is_bounded).ravel()
         axis = Axis(label="norm", logarithmic=True, about=about, decades=_DECADES)
         panels.append((title, _curves(over_time.middles_s, values, names), axis))
     return FigureDescription(name="loops", rows=_rows(over_time, *panels))
@@ -180,26 +180,26 @@ def _curves(t_s: Reals, values: Reals, names: Sequence[str], steps: Steps = "") 
     ]
 
 
-def error_map(over_time: LoopsOverTime, names: Sequence[str], stayed: Bools) -> FigureDescription:
+def error_map(over_time: LoopsOverTime, names: Sequence[str], is_bounded: Bools) -> FigureDescription:
     """Describe ‖e_c‖ of each loop, a row, over time, as colours.
 
     Args:
         over_time: the errors.
         names: of the loops.
-        stayed: (L,) the loops that did not diverge, to which the colours are scaled.
+        is_bounded: (L,) the loops that did not diverge, to which the colours are scaled.
     """
     count, values = len(names), np.where(over_time.errors > 0, over_time.errors, np.nan)
     scale = None
     if np.isfinite(values).any():
-        measured = _not_diverged(values, stayed)
-        most = float(np.nanmax(measured))
-        least = max(float(np.nanmin(measured)), most / 10**_DECADES)
-        values[over_time.errors == 0] = least  # just after an update
+        bounded_values = _not_diverged(values, is_bounded)
+        high = float(np.nanmax(bounded_values))
+        low = max(float(np.nanmin(bounded_values)), high / 10**_DECADES)
+        values[over_time.errors == 0] = low  # just after an update
         scale = ColourScale(
-            low=least,
-            high=most if most > least else 2 * least,
+            low=low,
+            high=high if high > low else 2 * low,
             logarithmic=True,
-            exceeded=float(np.nanmax(values)) > most,
+            exceeded=float(np.nanmax(values)) > high,
         )
     heat = Heat(values=values, x_ends=(0.0, float(over_time.edges_s[-1])), downwards=True)
     are_named = count <= _MOST_NAMED_ROWS
@@ -218,7 +218,7 @@ def error_map(over_time: LoopsOverTime, names: Sequence[str], stayed: Bools) -> 
     return FigureDescription(name="map", rows=rows, scale=scale)
 
 
-def _not_diverged(values: Reals, stayed: Bools) -> Reals:
+def _not_diverged(values: Reals, is_bounded: Bools) -> Reals:
     """Return the values of the loops that did not diverge; if none is known, of all."""
-    measured = values[stayed]
-    return measured if np.isfinite(measured).any() else values
+    bounded_values = values[is_bounded]
+    return bounded_values if np.isfinite(bounded_values).any() else values

@@ -10,7 +10,7 @@ Colour = tuple[int, int, int]
 PLANT: Colour = (155, 142, 159)
 """The plant and its state x."""
 SENSOR: Colour = (51, 93, 213)
-"""The sensor: x_s, e_s, broadcasts."""
+"""The sensor: x_s, e_s, transmissions."""
 CONTROLLER: Colour = (255, 86, 10)
 """The controller: x_c, e_c, deliveries."""
 NETWORK: Colour = (165, 75, 75)

@@ -69,7 +69,7 @@ _LONGEST_TITLE = 40  # characters
 _DECADES = 6
 """Maximum decades of an axis of norms."""
 _FAR_RATIO, _FAR_OPACITY = 20.0, 0.45
-"""Bounds that are mostly over so many times the curves are drawn with this opacity."""
+"""A bound that is mostly over this ratio times the curve is drawn with this opacity."""
 _MOST_NUMBERED_BARS = 12
 
 
@@ -93,7 +93,7 @@ def run_figures(
         curves = (curve for curve in certified if curve[1] == quantity)
         return bound_lines((label, t_s, values, kind) for label, _, t_s, values, kind in curves)
 
-    described = {
+    figures = {
         "states": lambda: _states(record, aligned()),
         "errors": lambda: _errors(record.scenario, aligned().run, bounds("e_c")),
         "state-norm": lambda: _state_norm(record, bounds("x")),
@@ -102,13 +102,13 @@ def run_figures(
         "losses": lambda: _losses(record),
     }
     if record.kind == "live" if timed is None else timed:
-        described |= {
+        figures |= {
             "lateness": lambda: lateness_figure(record),
             "latency": lambda: latency_figure(record),
         }
     if errors := clock_errors(record):
-        described["clocks"] = lambda: clocks_figure(record.scenario, errors)
-    return described
+        figures["clocks"] = lambda: clocks_figure(record.scenario, errors)
+    return figures
 
 
 def envelopes(record: RunRecord) -> Sequence[Envelope]:
@@ -213,7 +213,7 @@ class Transmissions(NamedTuple):
 
 
 def states_figure(
-    mode: Literal["model", "zoh"], title: str, states: Trajectory, sent: Transmissions
+    mode: Literal["model", "zoh"], title: str, states: Trajectory, transmissions: Transmissions
 ) -> FigureDescription:
     """States, and broadcasting and receiving intervals: the paper's Fig. 2 and 3.
 
@@ -221,10 +221,10 @@ def states_figure(
         mode: ``model`` is the paper's MB-ET (Fig. 2), ``zoh`` its ZOH-ET (Fig. 3).
         title: shown after "MB-ET" or "ZOH-ET".
         states: the first 16 states are drawn.
-        sent: what was sent and received.
+        transmissions: what was sent and received.
     """
     n, t_s = len(states.names), states.t_s
-    drawn = min(n, _MOST_STATES)
+    count = min(n, _MOST_STATES)
     panels = [
         Panel(
             items=states.items(i),
@@ -232,31 +232,32 @@ def states_figure(
             y=Axis(label=label_text(states.names[i])),
             legend=() if i else None,
         )
-        for i in range(drawn)
+        for i in range(count)
     ]
-    columns = drawn if drawn <= 3 else 2 if drawn == 4 else 3 if drawn <= 12 else 4
-    between = [np.diff(times_s, prepend=np.nan) for times_s in (sent.sent_s, sent.received_s)]
+    columns = count if count <= 3 else 2 if count == 4 else 3 if count <= 12 else 4
+    times_s = transmissions.sent_s, transmissions.received_s
+    between = [np.diff(times, prepend=np.nan) for times in times_s]
     highest = 1.05 * max(np.nanmax(np.append(finite(gaps), 0.0)) for gaps in between) or None
     y = Axis(label="interval [s]", ends=(0.0, highest))
     intervals = [
         Panel(
             title="Broadcasting intervals",
-            items=_broadcasts(sent, between[0]),
+            items=_sent_marks(transmissions, between[0]),
             x=time_axis(t_s, numbers=False),
             y=y,
         ),
         Panel(
             title="Receiving intervals",
-            items=_receptions(sent, between[1]),
+            items=_received_marks(transmissions, between[1]),
             x=time_axis(t_s),
             y=y,
         ),
     ]
     head = "MB-ET" if mode == "model" else "ZOH-ET"
-    note = f" ({drawn} of {n} states)" if drawn < n else ""
+    note = f" ({count} of {n} states)" if count < n else ""
     of_states = PanelRow(
         panels=panels,
-        height_in=1.45 if drawn <= 2 * columns else 1.15,
+        height_in=1.45 if count <= 2 * columns else 1.15,
         columns=columns,
         common="x",
         narrowest_in=_STATES_NARROWEST_IN,
@@ -268,15 +269,16 @@ def states_figure(
     )
 
 
-def _broadcasts(sent: Transmissions, interval_s: Reals) -> list[Item]:
-    t_s, lost = sent.sent_s, sent.lost
+def _sent_marks(transmissions: Transmissions, interval_s: Reals) -> list[Item]:
+    t_s, lost = transmissions.sent_s, transmissions.lost
     arrived = Marks(x=t_s[~lost], y=interval_s[~lost], label="sent", colour=SENSOR, stems=SENSOR)
     crosses = Marks(x=t_s[lost], y=interval_s[lost], label="sent, lost", colour=LOST, stems=SENSOR)
     return [arrived, replace(crosses, marker="x", size=6.5, stroke=1.8)]
 
 
-def _receptions(sent: Transmissions, interval_s: Reals) -> list[Item]:
-    t_s, forced, lost_s = sent.received_s, sent.forced, sent.sent_s[sent.lost]
+def _received_marks(transmissions: Transmissions, interval_s: Reals) -> list[Item]:
+    t_s, forced = transmissions.received_s, transmissions.forced
+    lost_s = transmissions.sent_s[transmissions.lost]
     dots = Marks(x=t_s[~forced], y=interval_s[~forced], label="received", colour=CONTROLLER)
     diamonds = Marks(x=t_s[forced], y=interval_s[forced], label="received, forced", colour=FORCED)
     crosses = Marks(x=lost_s, y=np.zeros(len(lost_s)), label="lost", colour=LOST, marker="x")
@@ -290,7 +292,7 @@ def _receptions(sent: Transmissions, interval_s: Reals) -> list[Item]:
 def _states(record: RunRecord, aligned: _Thinned) -> FigureDescription:
     outcomes, run, events = packet_outcomes(record), aligned.run, record.events()
     deliveries = record.columns(CONTROLLER_DELIVERY, "t_ns", "sequence")
-    sent = Transmissions(
+    transmissions = Transmissions(
         _seconds(events["t_ns"]),
         np.isin(events["event"], outcomes.sequence[outcomes.lost]),
         _seconds(deliveries["t_ns"]),
@@ -300,15 +302,15 @@ def _states(record: RunRecord, aligned: _Thinned) -> FigureDescription:
     x, x_hat = (run.x, None) if aligned.true_x is None else (aligned.true_x, run.x)
     states = Trajectory(names, _seconds(run.t_ns), x, run.x_s, run.x_c, x_hat)
     known = "x" if scenario.coverage.knows_state else "x̂"
-    return states_figure(scenario.mode, scenario.name, states, sent).captioned(
+    return states_figure(scenario.mode, scenario.name, states, transmissions).captioned(
         "States, and the times between transmissions and between deliveries: each stem is the time "
         "since the one before, so the first packet has none. "
         + scenario.protocol.states_caption.format(known=known)
         + _estimate_text(scenario)
         + "Cross: a lost packet. Diamond: a delivery that was forced by the guarantee.",
         f"Above, the states {', '.join(names)} over time, each as x, x_s and x_c. "
-        f"Below, stems for {len(events)} transmissions, of which {int(sent.lost.sum())} were "
-        f"lost, and for {len(deliveries)} deliveries, of which {int(sent.forced.sum())} were "
+        f"Below, stems for {len(events)} transmissions, of which {int(transmissions.lost.sum())} were "
+        f"lost, and for {len(deliveries)} deliveries, of which {int(transmissions.forced.sum())} were "
         "forced.",
     )
 
@@ -320,7 +322,7 @@ def _estimate_text(scenario: Scenario) -> str:
     if scenario.observer is None:
         return "x̂ is the measurement, x with noise. "
     outputs = scenario.message_sizes.outputs
-    return f"x̂ is the estimate of the observer, from {outputs} output{'s' * (outputs != 1)}. "
+    return f"x̂ is the estimate of the observer, from {outputs} {'output' if outputs == 1 else 'outputs'}. "
 
 
 # Norms with their bounds, and inputs
@@ -330,10 +332,10 @@ def _norms(
     name: str, title: str, lines: Sequence[Line], height_in: float, bounds: Sequence[Line] = ()
 ) -> FigureDescription:
     """Describe a figure of norms; its axis is limited: resets fall to rounding errors."""
-    measured = np.concatenate([line.y for line in lines])
-    y = Axis(label="norm", logarithmic=True, about=measured, decades=_DECADES)
-    drawn = [replace(bound, opacity=_FAR_OPACITY) if _is_far(bound, lines) else bound for bound in bounds]
-    panel = Panel(title=title, items=[*lines, *drawn], x=time_axis(lines[0].x), y=y)
+    values = np.concatenate([line.y for line in lines])
+    y = Axis(label="norm", logarithmic=True, about=values, decades=_DECADES)
+    items = [replace(bound, opacity=_FAR_OPACITY) if _is_far(bound, lines) else bound for bound in bounds]
+    panel = Panel(title=title, items=[*lines, *items], x=time_axis(lines[0].x), y=y)
     return one_panel(name, panel, height_in)
 
 
@@ -344,8 +346,8 @@ def _is_far(bound: Line, curves: Sequence[Line]) -> bool:
         return False
     at_bound = [np.interp(bound.x, curve.x, curve.y) for curve in curves]
     ratios = bound.y / np.fmax.reduce(at_bound)
-    known = ratios[np.isfinite(ratios)]
-    return len(known) > 0 and bool(np.median(known) > _FAR_RATIO)
+    finite_ratios = ratios[np.isfinite(ratios)]
+    return len(finite_ratios) > 0 and bool(np.median(finite_ratios) > _FAR_RATIO)
 
 
 def _errors(scenario: Scenario, run: AlignedRun, bounds: list[Line]) -> FigureDescription:
@@ -430,9 +432,9 @@ def _seconds(t_ns: NDArray[np.int64]) -> Reals:
 def _losses(record: RunRecord) -> FigureDescription:
     """Describe the losses that occurred, beside what the guarantee allows."""
     outcomes, network = packet_outcomes(record), record.scenario.network
-    bursts, most = outcomes.loss_bursts(), network.longest_burst
-    title, consecutive, both = "Consecutive losses", "consecutive losses", ""
-    panels = [_loss_panel(title, consecutive, "bursts", bursts, most)]
+    bursts, longest = outcomes.loss_bursts(), network.longest_burst
+    title, consecutive, actuation_text = "Consecutive losses", "consecutive losses", ""
+    panels = [_loss_panel(title, consecutive, "bursts", bursts, longest)]
     for rule in network.guarantee.rules[:3]:
         if isinstance(rule, LossesInWindow):
             title = f"Losses in {rule.window} updates"
@@ -443,15 +445,15 @@ def _losses(record: RunRecord) -> FigureDescription:
         lost = packet_outcomes(record, Flow.ACTUATION).loss_bursts()
         limit, label = actuation.link.longest_burst, "consecutive lost actuations"
         panels.append(_loss_panel("Of actuations", label, "bursts", lost, limit))
-        both = " Last panel: the same of actuations."
+        actuation_text = " Last panel: the same of actuations."
     narrowest_in, widest_in = _LOSSES_NARROWEST_IN, _LOSSES_WIDEST_IN
     row = PanelRow(panels=panels, height_in=1.9, narrowest_in=narrowest_in, widest_in=widest_in)
-    kept = "the guarantee" if network.enforce_mansd else "the assumption (not enforced)"
+    limit_name = "the guarantee" if network.enforce_mansd else "the assumption (not enforced)"
     return FigureDescription(name="losses", rows=[row]).captioned(
         "Effective losses of updates: dropped, corrupted, or delivered out of order. "
-        f"Dashed: the largest number that {kept} allows: {network.guarantee.meaning}.{both}",
+        f"Dashed: the largest number that {limit_name} allows: {network.guarantee.meaning}.{actuation_text}",
         f"{len(bursts)} bursts of losses, the longest of {int(bursts.max(initial=0))}; at most "
-        f"{most} consecutive losses are allowed.",
+        f"{longest} consecutive losses are allowed.",
     )
 
 

@@ -144,8 +144,8 @@ class ClockErrors(NamedTuple):
     @property
     def largest_us(self) -> float | None:
         """The largest known bound; None without one."""
-        known = self.error_us[~self.lost]
-        return float(known.max()) if len(known) else None
+        errors_us = self.error_us[~self.lost]
+        return float(errors_us.max()) if len(errors_us) else None
 
 
 def clock_errors(record: RunRecord) -> dict[str, ClockErrors]:
@@ -167,8 +167,8 @@ def clocks_figure(scenario: Scenario, errors: Mapping[str, ClockErrors]) -> Figu
     allowed_us, last_s = scenario.clocks.largest_error_us, scenario.horizon_s
     lines, crosses, texts = list[Item](), list[Item](), list[str]()
     for i, (process, error) in enumerate(errors.items()):
-        most, colour, order = error.largest_us, palette.PROCESSES[process], 2 + 0.1 * i
-        texts.append(f"{process} " + ("never known" if most is None else f"{most:.3g} µs"))
+        largest_us, colour, order = error.largest_us, palette.PROCESSES[process], 2 + 0.1 * i
+        texts.append(f"{process} " + ("never known" if largest_us is None else f"{largest_us:.3g} µs"))
         keep = error.t_s <= last_s
         t_s, error_us, lost = error.t_s[keep], error.error_us[keep], error.lost[keep]
         # The curves often coincide: the first ones are wider, and stay visible under the last.
@@ -176,8 +176,8 @@ def clocks_figure(scenario: Scenario, errors: Mapping[str, ClockErrors]) -> Figu
         curve = Line(x=t_s, y=error_us, label=process, colour=colour, width=width)
         lines.append(replace(curve, order=order))
         began_s = t_s[lost & ~np.append(False, lost[:-1])]
-        at = np.full(len(began_s), allowed_us)
-        cross = Marks(x=began_s, y=at, colour=colour, marker="x", size=9.0, stroke=2.0)
+        heights = np.full(len(began_s), allowed_us)
+        cross = Marks(x=began_s, y=heights, colour=colour, marker="x", size=9.0, stroke=2.0)
         crosses.append(replace(cross, order=order))
     limit = Rule(at=allowed_us, colour=THRESHOLD, label="allowed", width=1.2, dash=(4, 3))
     unknown = all(error.largest_us is None for error in errors.values())
@@ -188,11 +188,11 @@ def clocks_figure(scenario: Scenario, errors: Mapping[str, ClockErrors]) -> Figu
         x=time_axis(np.array([0.0, last_s])),
         y=Axis(label="bound of error [wall µs]", logarithmic=True, ends=ends),
     )
-    largest, gone = ", ".join(texts), [name for name, error in errors.items() if error.lost.any()]
+    largest, lost_clocks = ", ".join(texts), [name for name, error in errors.items() if error.lost.any()]
     return one_panel("clocks", panel, 1.9).captioned(
         "Bound of the difference between a process's time and the recorder's, for the "
         f"processes on hosts with other clocks. Largest: {largest}. Dashed: the largest bound with "
         "which claims hold."
-        + (f" Cross: from here on, the bound was lost ({', '.join(gone)})." if gone else ""),
+        + (f" Cross: from here on, the bound was lost ({', '.join(lost_clocks)})." if lost_clocks else ""),
         f"Bounds of the clocks' errors over time on a logarithmic axis; largest: {largest}.",
     )

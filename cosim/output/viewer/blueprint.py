@@ -64,9 +64,9 @@ EVENT, EVENT_STEM, EVENT_CERTIFIED = "event/interval", "event/stem", "event/cert
 RECEPTION, RECEPTION_FORCED, RECEPTION_STEM = "reception/interval", "reception/forced", "reception/stem"
 DROP = "drop"
 
-_PAGE_OF_FEW, _PAGE_OF_MANY, _MANY = 4, 9, 16
-"""States on a page, of up to :data:`_MANY` states and of more."""
-_BEFORE, _AFTER = 0.02, 0.06
+_FEW_PER_PAGE, _MANY_PER_PAGE, _MOST_FEW_STATES = 4, 9, 16
+"""States on a page, of up to :data:`_MOST_FEW_STATES` states and of more."""
+_MARGIN_BEFORE, _MARGIN_AFTER = 0.02, 0.06
 """Margins of the time axis, as shares of the run's length."""
 _GLOBAL_VIEW = UUID("5c0dca6a-e63f-9cf7-f657-2602590474cc")
 """Id of rerun's view that stores the shared settings of linked views."""
@@ -238,8 +238,8 @@ def move_below(part: rrb.Container | rrb.View, folder: str) -> None:
     """Let panels show the entities below a folder instead of those at the root."""
     if isinstance(part, rrb.View):
         part.origin = f"{folder}{part.origin}"
-        given = part.contents
-        paths = [given] if isinstance(given, str) else [*cast(Sequence[str], given)]
+        contents = part.contents
+        paths = [contents] if isinstance(contents, str) else [*cast(Sequence[str], contents)]
         part.contents = [p if p.startswith("$") else f"/{folder}{p.lstrip('/')}" for p in paths]
         overrides = part.visualizer_overrides
         part.visualizer_overrides = {f"{folder}{path}": override for path, override in overrides.items()}
@@ -250,11 +250,11 @@ def move_below(part: rrb.Container | rrb.View, folder: str) -> None:
 
 
 def _intervals() -> rrb.Container:
-    sent = [EVENT_STEM, EVENT, DROP, EVENT_CERTIFIED]
-    received = [RECEPTION_STEM, RECEPTION, RECEPTION_FORCED, DROP]
+    event_entities = [EVENT_STEM, EVENT, DROP, EVENT_CERTIFIED]
+    reception_entities = [RECEPTION_STEM, RECEPTION, RECEPTION_FORCED, DROP]
     return rrb.Horizontal(
-        plot("Broadcasting intervals [s]", "event", sent),
-        plot("Receiving intervals [s]", "reception", received),
+        plot("Broadcasting intervals [s]", "event", event_entities),
+        plot("Receiving intervals [s]", "reception", reception_entities),
     )
 
 
@@ -292,17 +292,17 @@ def log_view() -> rrb.View:
 
 def _states(names: Sequence[str]) -> rrb.Container:
     """Return one panel per coordinate: up to four together, more in tabs of equal size."""
-    most = _PAGE_OF_FEW if len(names) <= _MANY else _PAGE_OF_MANY
-    size = math.ceil(len(names) / math.ceil(len(names) / most))
+    per_page = _FEW_PER_PAGE if len(names) <= _MOST_FEW_STATES else _MANY_PER_PAGE
+    size = math.ceil(len(names) / math.ceil(len(names) / per_page))
     pages = [names[i : i + size] for i in range(0, len(names), size)]
     return _page(pages[0]) if len(pages) == 1 else rrb.Tabs(*map(_page, pages))
 
 
 def _page(names: Sequence[str]) -> rrb.Container:
     title = names[0] if len(names) == 1 else f"{names[0]} … {names[-1]}"
-    crowded = len(names) > _PAGE_OF_FEW
+    crowded = len(names) > _FEW_PER_PAGE
     panels = [plot(f"State {name}", state_path(name)) for name in names]
-    if len(panels) < _PAGE_OF_FEW:
+    if len(panels) < _FEW_PER_PAGE:
         return rrb.Vertical(*panels, name=title)
     return rrb.Grid(*panels, grid_columns=3 if crowded else 2, name=title)
 
@@ -313,7 +313,8 @@ def _common_time_axis(horizon_s: float) -> rrb.View:
     The viewer stores the common range in a hidden view of its own, identified by its id.
     """
     start, end = (
-        rr.TimeRangeBoundary.absolute(seconds=share * horizon_s) for share in (-_BEFORE, 1 + _AFTER)
+        rr.TimeRangeBoundary.absolute(seconds=share * horizon_s)
+        for share in (-_MARGIN_BEFORE, 1 + _MARGIN_AFTER)
     )
     whole_run = rr.TimeRange(start=start, end=end)
     view = rrb.TimeSeriesView(visible=False, axis_x=rrb.TimeAxis(view_range=whole_run))
@@ -390,7 +391,7 @@ def colour_key(input_names: Sequence[str]) -> Mapping[str, Shape]:
     for i, row in enumerate(_key_rows(input_names)):
         for j, (name, colour, sample) in enumerate(row):
             x, y = (j + 0.5) * _KEY_WIDTH / len(row), -i * _ROW_HEIGHT
-            moved = [(x + dx, y + dy) for dx, dy in sample]
-            shapes[f"{i}/{j}/sample"] = lines([moved], colour, _STROKE_WIDTH)
+            points = [(x + dx, y + dy) for dx, dy in sample]
+            shapes[f"{i}/{j}/sample"] = lines([points], colour, _STROKE_WIDTH)
             shapes[f"{i}/{j}/name"] = label(name, (x, y - 0.2), colour)
     return shapes

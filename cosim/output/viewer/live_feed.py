@@ -157,10 +157,10 @@ class _AllLoops:
         sizes = np.array([loop.n for loop in self._loops])
         self._entries = np.arange(sizes.max()) < sizes[:, None]
         """(loops, n) which entries of a vector each loop has; the others are 0 here."""
-        self._rest = np.zeros(self._entries.shape)
-        for rest, loop in zip(self._rest, self._loops, strict=True):
+        self._setpoints = np.zeros(self._entries.shape)
+        for setpoint, loop in zip(self._setpoints, self._loops, strict=True):
             if loop.setpoint is not None:
-                rest[: loop.n] = loop.setpoint
+                setpoint[: loop.n] = loop.setpoint
         self._transitions: dict[int, Reals] = {}
         self._lag_ns = int(LAG_S * NS_PER_S * scenario.speed)
         self._phases_ns = np.array(phases_ns(scenario))
@@ -168,14 +168,14 @@ class _AllLoops:
         self._no_rows = np.zeros(0, [*numbers, ("x", "<f8", (sizes.max(),))])
         self._newest = self._no_rows
         """Of each loop, the newest row of the controller that was used."""
-        self._measured: list[Rows] = []
+        self._measurements: list[Rows] = []
         self._models: list[Rows] = []
         knows_state = loops[0].network.initial_sync == "known_state"
         self._first_ns = np.full(len(loops), -1 if knows_state else NEVER_NS)
         """When each loop's controller received its first state."""
         self._over_time = empty_over_time(scenario)
         self._inside = np.zeros(0, np.int64), np.zeros(0, np.int64)
-        self._sent = self._shares_sent = 0
+        self._intervals_sent = self._shares_sent = 0
         self._map_s = 0.0
         self.newest_ns = 0
 
@@ -186,7 +186,7 @@ class _AllLoops:
             begin_ns, end_ns = map(np.concatenate, zip(self._inside, times_inside(rows), strict=True))
             self._inside = begin_ns, end_ns
         elif table == SENSOR_MEASUREMENT:
-            self._measured.append(self._needed_columns(rows, "t_ns", "x"))
+            self._measurements.append(self._needed_columns(rows, "t_ns", "x"))
             of_run_ns = rows["t_ns"] + self._phases_ns[rows[LOOP]]
             self.newest_ns = max(self.newest_ns, int(of_run_ns.max()))
         elif table in (CONTROLLER_STEP, CONTROLLER_DELIVERY):
@@ -200,48 +200,48 @@ class _AllLoops:
         """Show the intervals that are complete."""
         until_ns = self._horizon_ns if final else self.newest_ns - self._lag_ns
         self._add_norms(until_ns)
-        done = min(max(until_ns, 0) * INTERVALS // self._horizon_ns, INTERVALS)
-        if done == self._sent:
+        complete = min(max(until_ns, 0) * INTERVALS // self._horizon_ns, INTERVALS)
+        if complete == self._intervals_sent:
             return
-        new, self._sent = slice(self._sent, done), done
+        new, self._intervals_sent = slice(self._intervals_sent, complete), complete
         middles_ns = (self._over_time.middles_s[new] * NS_PER_S).astype(np.int64)
-        self._view.norms(ALL_ERRORS, middles_ns, self._over_time.errors[:, new])
-        self._view.norms(ALL_SIZES, middles_ns, self._over_time.states[:, new])
-        edges_ns = self._over_time.edges_s[new.start : done + 1] * NS_PER_S
+        self._view.add_norms(ALL_ERRORS, middles_ns, self._over_time.errors[:, new])
+        self._view.add_norms(ALL_SIZES, middles_ns, self._over_time.states[:, new])
+        edges_ns = self._over_time.edges_s[new.start : complete + 1] * NS_PER_S
         means, largest = counts_inside(*self._inside, edges_ns)
-        self._view.queue(middles_ns, largest, means)
+        self._view.add_queue(middles_ns, largest, means)
         stays = self._inside[1] > edges_ns[-1]
         self._inside = self._inside[0][stays], self._inside[1][stays]
         ends_s, shares = self._over_time.shares()
-        known = int((ends_s <= self._over_time.edges_s[done]).sum())
-        if known > self._shares_sent:
-            fresh, self._shares_sent = slice(self._shares_sent, known), known
+        shares_known = int((ends_s <= self._over_time.edges_s[complete]).sum())
+        if shares_known > self._shares_sent:
+            fresh, self._shares_sent = slice(self._shares_sent, shares_known), shares_known
             t_ns = ((ends_s - ends_s[0] / 2) * NS_PER_S).astype(np.int64)
-            self._view.share(t_ns[fresh], shares[:, fresh])
+            self._view.add_shares(t_ns[fresh], shares[:, fresh])
         if not self._view.views and (final or time.monotonic() - self._map_s > _MAP_EVERY_S):
-            self._view.map(self._over_time.errors, int(middles_ns[-1]))
+            self._view.add_map(self._over_time.errors, int(middles_ns[-1]))
             self._map_s = time.monotonic()
 
     def _add_norms(self, until_ns: int) -> None:
         """Add the norms of the measurements up to a time of the run."""
-        measured, at_ns = self._take(self._measured, until_ns)
-        self._raise_largest(self._over_time.states, measured[LOOP], at_ns, row_norms(measured["x"]))
+        measurements, at_ns = self._take(self._measurements, until_ns)
+        self._raise_largest(self._over_time.states, measurements[LOOP], at_ns, row_norms(measurements["x"]))
         # x_c at each measurement follows from the newest row of the controller before it.
         models = np.append(self._newest, self._take(self._models, until_ns)[0])
         models = models[np.lexsort((models["input"], models["t_ns"], models[LOOP]))]
         _, from_end = np.unique(models[LOOP][::-1], return_index=True)
         self._newest = models[len(models) - 1 - from_end]
-        keys, wanted = _keys(models), _keys(measured)
-        row = np.searchsorted(keys, wanted, "right") - 1
-        age_ns = wanted - keys[row] if len(keys) else wanted
-        known = (row >= 0) & (age_ns >= 0) & (age_ns <= self._periods_ns[measured[LOOP]])
-        known &= at_ns >= self._first_ns[measured[LOOP]]
-        measured, age_ns, x_c = measured[known], age_ns[known], models["x"][row[known]]
+        keys, measurement_keys = _keys(models), _keys(measurements)
+        row = np.searchsorted(keys, measurement_keys, "right") - 1
+        age_ns = measurement_keys - keys[row] if len(keys) else measurement_keys
+        known = (row >= 0) & (age_ns >= 0) & (age_ns <= self._periods_ns[measurements[LOOP]])
+        known &= at_ns >= self._first_ns[measurements[LOOP]]
+        measurements, age_ns, x_c = measurements[known], age_ns[known], models["x"][row[known]]
         for dt_ns in np.unique(age_ns).tolist():
-            aged = age_ns == dt_ns
-            x_c[aged] = self._propagate(dt_ns, measured[LOOP][aged], x_c[aged])
-        errors = row_norms(x_c - measured["x"])
-        self._raise_largest(self._over_time.errors, measured[LOOP], at_ns[known], errors)
+            has_age = age_ns == dt_ns
+            x_c[has_age] = self._propagate(dt_ns, measurements[LOOP][has_age], x_c[has_age])
+        errors = row_norms(x_c - measurements["x"])
+        self._raise_largest(self._over_time.errors, measurements[LOOP], at_ns[known], errors)
 
     def _propagate(self, dt_ns: int, loops: Numbers, x_c: Reals) -> Reals:
         """Return models of controllers, (k, n), a time later, with the set-points of the start."""
@@ -250,9 +250,9 @@ class _AllLoops:
             for matrix, loop in zip(transitions, self._loops, strict=True):
                 matrix[: loop.n, : loop.n] = Propagator(loop.H).transition(dt_ns)
             self._transitions[dt_ns] = transitions
-        rest = self._rest[loops]
-        moved: Reals = np.einsum("kij,kj->ki", self._transitions[dt_ns][loops], x_c - rest)
-        return rest + moved
+        setpoints = self._setpoints[loops]
+        deviations: Reals = np.einsum("kij,kj->ki", self._transitions[dt_ns][loops], x_c - setpoints)
+        return setpoints + deviations
 
     def _raise_largest(self, values: Reals, loops: Numbers, t_ns: Numbers, norms: Reals) -> None:
         """Enter norms into the largest values of their loops and intervals."""
@@ -268,12 +268,12 @@ class _AllLoops:
 
     def _needed_columns(self, rows: Rows, time_name: str, vector_name: str) -> Rows:
         """Return the needed columns of rows."""
-        needed = np.empty(len(rows), self._no_rows.dtype)
+        columns = np.empty(len(rows), self._no_rows.dtype)
         loops: Numbers = rows[LOOP]
         vectors: Reals = rows[vector_name]
-        needed[LOOP], needed["input"], needed["t_ns"] = loops, rows["input"], rows[time_name]
-        needed["x"] = np.where(self._entries[loops], vectors, 0.0)
-        return needed
+        columns[LOOP], columns["input"], columns["t_ns"] = loops, rows["input"], rows[time_name]
+        columns["x"] = np.where(self._entries[loops], vectors, 0.0)
+        return columns
 
 
 def _keys(rows: Rows) -> Numbers:

@@ -80,7 +80,7 @@ class LoopFeed:
     Args:
         scenario: the resolved scenario.
         view: receives the aligned batches.
-        columns: reduce each batch to the extremes in so many columns; None keeps all rows.
+        columns: number of columns of extremes to which each batch is reduced; None keeps all rows.
         certified: show the certified bounds, which take up to some seconds to compute.
     """
 
@@ -147,14 +147,14 @@ class LoopFeed:
             until_ns = max(reach_ns, newest_ns - int(_PATIENCE_S * wall_ns))
             until_ns -= int(LAG_S * wall_ns)
         self._show_packets(self._take(NETEM_PACKET, None))
-        self._view.travel(self._scenario.timing.horizon_ns if until_ns is None else until_ns)
+        self._view.animate_packets(self._scenario.timing.horizon_ns if until_ns is None else until_ns)
         self._show_inputs(steps)
         self._undrawn.append(deliveries)
         self._show_deliveries(until_ns)
-        taken = self._take(PLANT_STEP, None)
+        plant_rows = self._take(PLANT_STEP, None)
         if self._has_internal_state or not self._scenario.coverage.knows_state:
-            self._steps = concatenate_rows([self._steps, taken], self._steps.dtype)
-        self._show_lateness("plant", taken)
+            self._steps = concatenate_rows([self._steps, plant_rows], self._steps.dtype)
+        self._show_lateness("plant", plant_rows)
         self._show_measurements(self._take(SENSOR_MEASUREMENT, until_ns), reach_ns)
         for table in self._clock_tables:
             self._show_clock_errors(table, self._take(table, None))
@@ -163,7 +163,7 @@ class LoopFeed:
         if len(rows):
             error_us = np.where(rows["error_ns"] == LOST_NS, np.nan, rows["error_ns"] * 1e-3)
             keep = self._rows_to_show(rows["now_ns"], error_us)
-            self._view.clock_errors(OWNER[table], rows["now_ns"][keep], error_us[keep])
+            self._view.add_clock_errors(OWNER[table], rows["now_ns"][keep], error_us[keep])
 
     def _take(self, table: str, until_ns: int | None) -> Rows:
         """Return the waiting rows of a table up to a time; they wait no longer."""
@@ -200,10 +200,10 @@ class LoopFeed:
         of_state = np.column_stack(
             [self._certified_bound(t_s, "state"), self._bound_from_event(rows, aligned)]
         )
-        self._view.samples(thin, bounds[kept], of_state[kept])
+        self._view.add_samples(thin, bounds[kept], of_state[kept])
         frames = Frames(t_s, aligned.x, aligned.x_s, aligned.x_c, z)
         shown = self._frames_to_show(len(t_s))
-        self._view.move(aligned.t_ns[shown], frames.at(shown))
+        self._view.add_frames(aligned.t_ns[shown], frames.at(shown))
         keep = max(int(np.searchsorted(self._track.model_ns, rows["t_ns"][-1], "right")) - 1, 0)
         self._track = self._track.since(keep)
         self._show_events(rows["t_ns"][rows["event"] != NO_SEQUENCE])
@@ -213,7 +213,7 @@ class LoopFeed:
         if len(event_ns):
             passed_s = _intervals_s(event_ns, self._last_event_ns)
             keep = self._rows_to_show(event_ns, passed_s)
-            self._view.transmissions(event_ns[keep], passed_s[keep])
+            self._view.add_transmissions(event_ns[keep], passed_s[keep])
             self._last_event_ns = int(event_ns[-1])
 
     @cached_property
@@ -223,7 +223,7 @@ class LoopFeed:
             return None  # with a set-point, it bounds the deviations from it
         certificate = certify(self._scenario, allowed_conditions(self._scenario))
         if certificate.inter_event_s is not None:
-            self._view.certified_interval(certificate.inter_event_s, self._scenario.timing.horizon_ns)
+            self._view.add_certified_interval(certificate.inter_event_s, self._scenario.timing.horizon_ns)
         return certificate
 
     def _certified_bound(self, t_s: Reals, quantity: Literal["controller_error", "state"]) -> Reals:
@@ -282,7 +282,7 @@ class LoopFeed:
         event_ns = rows["t_ns"]
         passed_s = _intervals_s(event_ns, self._last_delivery_ns)
         keep = self._rows_to_show(event_ns, passed_s)
-        self._view.receptions(event_ns[keep], passed_s[keep], forced[keep])
+        self._view.add_deliveries(event_ns[keep], passed_s[keep], forced[keep])
         self._last_delivery_ns = int(event_ns[-1])
 
     def _show_packets(self, rows: Rows) -> None:
@@ -290,20 +290,20 @@ class LoopFeed:
             return
         for flow in self._scenario.network.flows[1:]:
             reverse = messages_in(rows, flow)[0]
-            self._view.packets(reverse["t_ns"], reverse["release_ns"], reverse["fate"], reverse=True)
+            self._view.add_packets(reverse["t_ns"], reverse["release_ns"], reverse["fate"], reverse=True)
         rows, sequence, event_ns = messages_in(rows)
-        self._view.packets(event_ns, rows["release_ns"], rows["fate"])
+        self._view.add_packets(event_ns, rows["release_ns"], rows["fate"])
         self._forced.update(sequence[rows["fate"] == Fate.FORCED].tolist())
         dropped = ~effective(rows["fate"])
         if dropped.any():
             lost_ns = event_ns[dropped]
-            self._view.drops(lost_ns[self._rows_to_show(lost_ns, np.zeros(len(lost_ns)))])
+            self._view.add_losses(lost_ns[self._rows_to_show(lost_ns, np.zeros(len(lost_ns)))])
         self._show_lateness("netem", rows)
 
     def _show_inputs(self, steps: Rows) -> None:
         if len(steps):
             keep = self._rows_to_show(steps["t_ns"], steps["u"])
-            self._view.inputs(steps["t_ns"][keep], steps["u"][keep])
+            self._view.add_inputs(steps["t_ns"][keep], steps["u"][keep])
             self._show_lateness("controller", steps)
 
     def _show_lateness(self, process: str, rows: Rows) -> None:
@@ -311,7 +311,7 @@ class LoopFeed:
             t_ns, late_ns = rows["t_ns"], rows["now_ns"] - rows["t_ns"]
             late_us = np.asarray(late_ns / (1e3 * self._scenario.speed), dtype=np.float64)
             keep = self._rows_to_show(t_ns, late_us)
-            self._view.lateness(process, t_ns[keep], late_us[keep])
+            self._view.add_lateness(process, t_ns[keep], late_us[keep])
 
 
 def _intervals_s(t_ns: Times, before_ns: int | None) -> Reals:

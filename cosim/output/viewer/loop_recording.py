@@ -136,7 +136,7 @@ class RecordingFile:
 def run_text(scenario: Scenario, kind: Kind = "live") -> str:
     """Return the viewer's text about a run, in Markdown."""
     network = scenario.network
-    late = {
+    lateness = {
         "live": "* **Lateness**: wall time between a deadline and the process's action.",
         "simulated": "* The run was **simulated** in virtual time: no deadline was missed.",
     }[kind]
@@ -163,7 +163,7 @@ The network ({network.loss.model.replace("_", "-")} loss) guarantees:
 * **Errors**: e_s = x_s − x with its threshold; e_c = x_c − x with two bounds, one from identity
   (I1) and the certified one. No process of the loop can measure e_c. The certified bound holds
   while no process is later than the certificate allows (see the claims of the summary).
-{late}
+{lateness}
 """
 
 
@@ -201,7 +201,7 @@ class LoopView:
         """Add one line to the loop's log; ``level`` is one of rerun's, such as INFO or WARN."""
         self._file.log(t_ns + self._layout.phase_ns, level, text, self._layout.folder)
 
-    def samples(self, aligned: AlignedRun, e_c_bounds: Reals, x_bounds: Reals) -> None:
+    def add_samples(self, aligned: AlignedRun, e_c_bounds: Reals, x_bounds: Reals) -> None:
         """Add k samples.
 
         Args:
@@ -222,7 +222,7 @@ class LoopView:
         sizes = np.column_stack([x_bounds, np.linalg.norm(aligned.x, axis=1)])
         self._send(bp.SIZE_LOG10, t_ns, _log10(sizes, aligned.threshold))
 
-    def move(self, t_ns: Times, frames: Frames) -> None:
+    def add_frames(self, t_ns: Times, frames: Frames) -> None:
         """Add states at times (k,) to the plant's picture, at its frame rate."""
         if self._layout.picture is None:
             return
@@ -233,9 +233,9 @@ class LoopView:
         self._frame = int(frame[-1])
         self._waiting.append((t_ns[new], frames.at(new)))
         if sum(len(times) for times, _ in self._waiting) >= _FRAMES_AT_ONCE:
-            self.draw()
+            self.write_frames()
 
-    def draw(self) -> None:
+    def write_frames(self) -> None:
         """Write the waiting frames of the picture."""
         if self._layout.picture is None or not self._waiting:
             return
@@ -245,7 +245,7 @@ class LoopView:
         for entity, columns in self._layout.picture.frames(frames).items():
             self._send_columns(f"{PICTURE}/{entity}", t_ns, columns)
 
-    def packets(
+    def add_packets(
         self,
         t_ns: Times,
         release_ns: Times,
@@ -257,28 +257,28 @@ class LoopView:
         if self._layout.diagram is not None:
             self._layout.diagram.add(t_ns, release_ns, fate, reverse=reverse)
 
-    def travel(self, until_ns: int) -> None:
+    def animate_packets(self, until_ns: int) -> None:
         """Animate the packets up to a time by which all of them were added."""
         if self._layout.diagram is None:
             return
         for entity, moving in self._layout.diagram.advance(until_ns).items():
             self._send_columns(f"{DIAGRAM}/{entity}", moving.t_ns, moving.columns)
 
-    def certified_interval(self, interval_s: float, until_ns: int) -> None:
+    def add_certified_interval(self, interval_s: float, until_ns: int) -> None:
         """Draw the certified minimum inter-event time, from 0 to ``until_ns``."""
         self._send(bp.EVENT_CERTIFIED, np.array([0, until_ns]), np.full(2, interval_s))
 
-    def inputs(self, t_ns: Times, u: Reals) -> None:
+    def add_inputs(self, t_ns: Times, u: Reals) -> None:
         """Add the control input u (k, m) at times (k,)."""
         self._send(bp.INPUT, t_ns, u)
 
-    def transmissions(self, t_ns: Times, interval_s: Reals) -> None:
+    def add_transmissions(self, t_ns: Times, interval_s: Reals) -> None:
         """Add events: times t_i (k,) and t_i − t_{i−1} in seconds (k,), NaN (drawn 0) for none."""
         interval_s = np.nan_to_num(interval_s)
         self._send_stems(bp.EVENT_STEM, t_ns, interval_s)
         self._send(bp.EVENT, t_ns, interval_s)
 
-    def receptions(self, t_ns: Times, interval_s: Reals, forced: npt.NDArray[np.bool_]) -> None:
+    def add_deliveries(self, t_ns: Times, interval_s: Reals, forced: npt.NDArray[np.bool_]) -> None:
         """Add deliveries: times (k,), seconds since the previous one (k,), forced (k,).
 
         A delivery is forced if M − 1 consecutive updates were lost before it. An interval that is
@@ -290,16 +290,16 @@ class LoopView:
         self._send(bp.RECEPTION, t_ns[~forced], interval_s[~forced])
         self._send(bp.RECEPTION_FORCED, t_ns[forced], interval_s[forced])
 
-    def drops(self, t_ns: Times) -> None:
+    def add_losses(self, t_ns: Times) -> None:
         """Add the times (k,) at which an update was lost."""
         self._send(bp.DROP, t_ns, np.zeros(len(t_ns)))
 
-    def lateness(self, process: str, t_ns: Times, lateness_us: Reals) -> None:
+    def add_lateness(self, process: str, t_ns: Times, lateness_us: Reals) -> None:
         """Add a process's lateness in µs (k,) at times (k,), if it is shown."""
         if process in self._layout.processes:
             self._send(bp.lateness_path(process), t_ns, lateness_us)
 
-    def clock_errors(self, process: str, t_ns: Times, error_us: Reals) -> None:
+    def add_clock_errors(self, process: str, t_ns: Times, error_us: Reals) -> None:
         """Add bounds of the error of a process's clock in µs (k,) at times (k,); NaN: lost."""
         if process in self._layout.processes:
             self._send(bp.clock_path(process), t_ns, error_us)

@@ -1,8 +1,8 @@
 """The loop as a diagram that animates every update until it arrives or is lost.
 
 A real transmission takes microseconds. Each leg is drawn with a duration of ``LEG_S`` of simulated
-time, so that it is visible at the speed of the run: a dot leaves the sensor at the broadcast, and
-the effect of the delivery on the states appears before the dot arrives.
+time, so that it is visible at the speed of the run: a dot leaves the sensor at the transmission,
+and the effect of the delivery on the states appears before the dot arrives.
 """
 
 from collections.abc import Mapping
@@ -27,7 +27,7 @@ LEG_S = 0.15
 _FALL_S = 0.45
 """Drawn duration of the fall of a lost packet."""
 _SPACING_S = 0.025
-"""Least time between the broadcasts of two packets that are drawn."""
+"""Least time between the transmissions of two packets that are drawn."""
 _LEG_NS, _FALL_NS, _SPACING_NS = (round(s * NS_PER_S) for s in (LEG_S, _FALL_S, _SPACING_S))
 _FRAME_NS = round(NS_PER_S / 60)
 
@@ -51,8 +51,8 @@ class Moving(NamedTuple):
 
 
 _PACKET = np.dtype([("t_ns", "i8"), ("out_ns", "i8"), ("fate", "i8"), ("reverse", "?")])
-"""A packet in the drawing: time of its broadcast; time at which it leaves the network, or, if it is
-lost, starts to fall; its fate; whether it is sent from the controller to the sensor."""
+"""A packet in the drawing: time of its transmission; time at which it leaves the network, or, if it
+is lost, starts to fall; its fate; whether it is sent from the controller to the sensor."""
 
 
 class NetworkDiagram:
@@ -68,7 +68,7 @@ class NetworkDiagram:
         self._in_flight = np.zeros(0, _PACKET)
         self._drawn_ns = -1
         self._last_ns = {False: -_SPACING_NS, True: -_SPACING_NS}
-        self._shown: dict[str, int] = {}
+        self._shape_counts: dict[str, int] = {}
 
     @staticmethod
     def panel() -> rrb.Spatial2DView:
@@ -108,7 +108,7 @@ class NetworkDiagram:
         shapes["lost/word"] = label("lost", (_NETWORK + 1.1, -1.0), LOST)
         shapes["forced/word"] = label("forced", (_NETWORK + _BOX_DISTANCE / 2, 1.55), FORCED)
         for entity, colour in (
-            ("broadcast", SENSOR),
+            ("transmitted", SENSOR),
             ("delivered", CONTROLLER),
             ("reverse", NETWORK),
         ):
@@ -125,7 +125,7 @@ class NetworkDiagram:
         """Add packets (p,) that follow the previously added ones.
 
         Args:
-            t_ns: times of their broadcasts; in reverse, times of arrival at the network.
+            t_ns: times of their transmissions; in reverse, times of arrival at the network.
             release_ns: times at which they leave the network.
             fate: their fates in the network.
             reverse: whether they are from the controller.
@@ -150,17 +150,17 @@ class NetworkDiagram:
         if last < first:
             return {}
         self._drawn_ns = last * _FRAME_NS
-        flying = self._in_flight
-        shown_ns = np.where(effective(flying["fate"]), _LEG_NS, _FALL_NS)
-        end_ns = flying["out_ns"] + shown_ns
-        begin = np.maximum(-(-flying["t_ns"] // _FRAME_NS), first)
+        in_flight = self._in_flight
+        shown_ns = np.where(effective(in_flight["fate"]), _LEG_NS, _FALL_NS)
+        end_ns = in_flight["out_ns"] + shown_ns
+        begin = np.maximum(-(-in_flight["t_ns"] // _FRAME_NS), first)
         end = np.minimum(-(-end_ns // _FRAME_NS), last + 1)
         counts = np.maximum(end - begin, 0)
         packet = np.repeat(np.arange(len(counts)), counts)
         frame = begin[packet] + np.arange(len(packet)) - np.repeat(np.cumsum(counts) - counts, counts)
         order = np.argsort(frame, kind="stable")
-        pairs, frame = flying[packet[order]], frame[order]
-        self._in_flight = flying[end_ns > self._drawn_ns]
+        pairs, frame = in_flight[packet[order]], frame[order]
+        self._in_flight = in_flight[end_ns > self._drawn_ns]
         return self._moving(pairs, frame, first, last)
 
     def _moving(self, pairs: NDArray[np.void], frame: Times, first: int, last: int) -> Mapping[str, Moving]:
@@ -179,14 +179,15 @@ class NetworkDiagram:
         y = np.where(leaves & ~survives, -_HALF_HIGH - 0.2 - 1.3 * fall, 0.0)
         forced = pairs["fate"] == Fate.FORCED
         if self._reverse is Flow.ACTUATION:
-            back = np.where(leaves & survives, _NETWORK * (1 - onward), _CONTROLLER - _BOX_DISTANCE * reached)
-            x, y = np.where(reverse, back, x), np.where(reverse, _INPUT_Y + 0.4 * y, y)
+            x_ends = _NETWORK * (1 - onward), _CONTROLLER - _BOX_DISTANCE * reached
+            x_back = np.where(leaves & survives, *x_ends)
+            x, y = np.where(reverse, x_back, x), np.where(reverse, _INPUT_Y + 0.4 * y, y)
         else:
             x = np.where(reverse, 2 * _NETWORK - x, x)
             y = np.where(reverse & (survives | ~leaves), _REVERSE_Y, y)
         places = upright(np.column_stack([x, y]))
         states = {
-            "broadcast": ~leaves & ~reverse,
+            "transmitted": ~leaves & ~reverse,
             "delivered": leaves & survives & ~forced & ~reverse,
             "reverse": (survives | ~leaves) & reverse,
             "forced": leaves & forced & ~reverse,
@@ -195,8 +196,8 @@ class NetworkDiagram:
         moving: dict[str, Moving] = {}
         for entity, shown in states.items():
             shapes = np.bincount(frame[shown] - first, minlength=last - first + 1)
-            before = np.concatenate([[self._shown.get(entity, 0)], shapes[:-1]])
-            self._shown[entity] = int(shapes[-1])
+            before = np.concatenate([[self._shape_counts.get(entity, 0)], shapes[:-1]])
+            self._shape_counts[entity] = int(shapes[-1])
             rows = (shapes > 0) | (before > 0)  # a row without shapes removes the previous ones
             if rows.any():
                 t_ns = (first + np.flatnonzero(rows)) * _FRAME_NS
@@ -219,6 +220,6 @@ def _shapes(entity: str, places: Reals, counts: NDArray[np.int64]) -> Columns:
 
 
 def _arrow(start: float, end: float, y: float) -> list[list[tuple[float, float]]]:
-    back = -0.2 if end > start else 0.2
-    head = [(end + back, y + 0.14), (end, y), (end + back, y - 0.14)]
+    barb = -0.2 if end > start else 0.2
+    head = [(end + barb, y + 0.14), (end, y), (end + barb, y - 0.14)]
     return [[(start, y), (end, y)], head]

@@ -181,9 +181,9 @@ class RecordingServer:
                 self._downloads -= 1
 
 
-def _are_equal(secret: str, wanted: str) -> bool:
+def _are_equal(secret: str, expected: str) -> bool:
     """Whether two secrets are equal, compared in constant time."""
-    return secrets.compare_digest(secret.encode(), wanted.encode())
+    return secrets.compare_digest(secret.encode(), expected.encode())
 
 
 class _PageServer(socketserver.ThreadingTCPServer):
@@ -376,8 +376,8 @@ def view_recording(path: Path, *, native: bool | None = None) -> None:
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, _exit)
     with contextlib.suppress(KeyboardInterrupt), RecordingServer(path, follow=False) as server:
-        wanted = has_display() if native is None else native
-        window = server.open_window() if wanted else None
+        has_window = has_display() if native is None else native
+        window = server.open_window() if has_window else None
         if window is not None:
             window.wait()
             return

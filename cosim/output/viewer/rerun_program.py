@@ -152,8 +152,8 @@ def _prctl() -> Callable[[int, int], int]:
 
 def _program_path() -> str:
     """Return the path of rerun's own program; the ``rerun`` script is a wrapper and orphans it."""
-    if chosen := os.environ.get("RERUN_CLI_PATH"):
-        return chosen
+    if path := os.environ.get("RERUN_CLI_PATH"):
+        return path
     spec = importlib.util.find_spec("rerun_cli")
     if spec is not None and spec.origin is not None:
         folder = Path(spec.origin).parent
@@ -227,12 +227,12 @@ def socket_user(own: tuple[str, int], peer: tuple[str, int]) -> int | None:
     Linux's list of sockets has the user of each.
     """
     try:
-        wanted = [_listed_address(own), _listed_address(peer)]
+        addresses = [_listed_address(own), _listed_address(peer)]
         for _ in range(_TRIES):
             for line in _SOCKET_LIST.read_text().splitlines()[1:]:
                 fields = line.split()
                 user, inode = fields[7], fields[9]
-                if fields[1:3] == wanted and inode != "0":
+                if fields[1:3] == addresses and inode != "0":
                     return int(user)
     except OSError:  # this is not Linux
         pass

@@ -13,7 +13,7 @@ root. What is shown of several loops together:
 ``all/map``        ‖e_c‖ of each loop, a row, over time, as colours
 =================  ==========================================================================
 
-Up to ``PICTURED`` loops are all shown; of more, the worst one only, in the recording of a run that
+Up to ``MOST_PICTURED`` loops are all shown; of more, the worst one only, in the recording of a run that
 has ended.
 """
 
@@ -58,10 +58,10 @@ from noack.protocol.roles import LOOP_ROLES
 from noack.scenario.resolution import loop_of, resolved_loops
 from noack.scenario.scenario import Scenario, loop_names, phases_ns
 
-PICTURED = 12
-"""Up to so many loops are shown one by one, with their pictures."""
-_ANIMATED = 4
-"""Up to so many loops have a diagram of their packets, which is most of a recording."""
+MOST_PICTURED = 12
+"""Largest number of loops that are shown one by one, with their pictures."""
+_MOST_ANIMATED = 4
+"""Largest number of loops with a diagram of their packets, which is most of a recording."""
 QUEUE, SHARE, ALL_ERRORS, ALL_SIZES, MAP = "link/queue", "link/share", "all/error", "all/size", "all/map"
 _DECADES = 5
 """Decades of a norm that the curves show to each side of its usual largest value, and the map below."""
@@ -106,7 +106,7 @@ class RunRecording(RecordingFile):
     ) -> None:
         self.names, phases = loop_names(run), phases_ns(run)
         self.is_shared = len(self.names) > 1
-        animated = len(shown) <= _ANIMATED and not (complete and is_long(run))
+        animated = len(shown) <= _MOST_ANIMATED and not (complete and is_long(run))
         loops = {
             number: _loop_layout(
                 loop,
@@ -134,12 +134,12 @@ class RunRecording(RecordingFile):
 
     def _describe(self, run: Scenario, worst: WorstLoop | None) -> None:
         """Write the static data of what all loops share."""
-        named = "" if worst is None else f"Worst loop: **{self.names[worst.number]}** ({worst.why})."
+        worst_text = "" if worst is None else f"Worst loop: **{self.names[worst.number]}** ({worst.why})."
         text = f"""# {run.name}
 
 {run.description}
 
-{len(self.names)} loops on one network. {named}
+{len(self.names)} loops on one network. {worst_text}
 
 Curves of more than {len(SERIES)} loops are quantiles over the loops:
 {", ".join(f"{100 * q:g} %" for q in QUANTILES)}.
@@ -157,15 +157,15 @@ to the right.
             },
         )
 
-    def queue(self, t_ns: Times, largest: Reals | NDArray[np.int64], mean: Reals) -> None:
+    def add_queue(self, t_ns: Times, largest: Reals | NDArray[np.int64], mean: Reals) -> None:
         """Add the numbers of datagrams in the network, (k,)."""
         self.send(QUEUE, t_ns, np.column_stack([largest, mean]))
 
-    def share(self, t_ns: Times, shares: Reals) -> None:
+    def add_shares(self, t_ns: Times, shares: Reals) -> None:
         """Add the share of the link of each loop, (L, k)."""
         self.send(SHARE, t_ns, 100 * _curves_or_quantiles(shares).T)
 
-    def norms(self, entity: str, t_ns: Times, values: Reals) -> None:
+    def add_norms(self, entity: str, t_ns: Times, values: Reals) -> None:
         """Add norms of each loop, (L, k), to ``ALL_ERRORS`` or ``ALL_SIZES``.
 
         Their logarithm is cut off some decades from the usual largest value so far: a norm may be
@@ -173,10 +173,10 @@ to the right.
         """
         curves = _curves_or_quantiles(values)
         self._usual = max(self._usual, usual_largest(curves))
-        least, most = self._usual / 10**_DECADES, self._usual * 10**_DECADES
-        self.send(entity, t_ns, np.log10(np.clip(curves, least, most)).T)
+        low, high = self._usual / 10**_DECADES, self._usual * 10**_DECADES
+        self.send(entity, t_ns, np.log10(np.clip(curves, low, high)).T)
 
-    def map(self, errors: Reals, t_ns: int | None = None) -> None:
+    def add_map(self, errors: Reals, t_ns: int | None = None) -> None:
         """Show ‖e_c‖ of each loop, (L, k), from a time on; None: at all times."""
         image = BytesIO()
         imsave(image, map_pixels(errors), format="png", pil_kwargs={"compress_level": 1})
@@ -191,7 +191,7 @@ to the right.
         """Write the waiting data and the file's footer; a second call does nothing."""
         try:
             for view in self.views.values():
-                view.draw()
+                view.write_frames()
         finally:
             super().close()
             if self._live is not None:
@@ -225,19 +225,19 @@ def _tabs(loops: Mapping[str, bp.LoopLayout], count: int, worst: WorstLoop | Non
         bp.plot("Datagrams in the network", QUEUE),
         bp.plot(f"Share of the link [%]{kind}", SHARE),
     ]
-    pages, left = list[rrb.Container](), list[rrb.View]()
+    pages, pictures_of_loops = list[rrb.Container](), list[rrb.View]()
     for name, loop in loops.items():
         pages.append(loop.panels())
         pages[-1].name = f"worst loop: {name}" if len(loops) == 1 and worst is not None else name
-        left.append(loop.small_picture())
-        left[-1].name = name
+        pictures_of_loops.append(loop.small_picture())
+        pictures_of_loops[-1].name = name
     columns = math.ceil(math.sqrt(count))
-    pictures: rrb.Container = rrb.Grid(*left, grid_columns=columns)
-    if count > PICTURED:
+    pictures: rrb.Container = rrb.Grid(*pictures_of_loops, grid_columns=columns)
+    if count > MOST_PICTURED:
         of_map = rrb.Spatial2DView(origin=MAP, name="log10 ‖e_c‖ of each loop, a row, over time")
         pictures = rrb.Vertical(of_map, bp.plot(f"log10 ‖x‖{kind}", ALL_SIZES), row_shares=[2, 1])
-    everything = rrb.Horizontal(pictures, rrb.Vertical(*plots), name="all loops")
-    return rrb.Tabs(everything, *pages, bp.log_view(), bp.about_view(), active_tab=0)
+    overview = rrb.Horizontal(pictures, rrb.Vertical(*plots), name="all loops")
+    return rrb.Tabs(overview, *pages, bp.log_view(), bp.about_view(), active_tab=0)
 
 
 def _series(names: Sequence[str]) -> rr.SeriesLines:
@@ -264,19 +264,19 @@ def map_pixels(errors: Reals) -> NDArray[np.uint8]:
     """Return the colours of norms (L, k), with rows as high as needed; black where unknown."""
     known = np.isfinite(errors)
     levels = np.log10(np.where(known, np.maximum(errors, np.finfo(float).tiny), 1.0))
-    most = min(levels[known].max(initial=-np.inf), np.log10(_RANGE * usual_largest(errors)))
-    share = np.clip(1 + (levels - most) / _DECADES, 0, 1) if known.any() else levels
+    highest = min(levels[known].max(initial=-np.inf), np.log10(_RANGE * usual_largest(errors)))
+    share = np.clip(1 + (levels - highest) / _DECADES, 0, 1) if known.any() else levels
     pixels = colormaps["viridis"](share, bytes=True)[..., :3]
     pixels[~known] = 0
-    high = max(_ROW_PIXELS // len(errors), 1)
-    wide = max(2 * _ROW_PIXELS // errors.shape[1], 1)
-    return np.asarray(pixels.repeat(high, axis=0).repeat(wide, axis=1), np.uint8)
+    height = max(_ROW_PIXELS // len(errors), 1)
+    width = max(2 * _ROW_PIXELS // errors.shape[1], 1)
+    return np.asarray(pixels.repeat(height, axis=0).repeat(width, axis=1), np.uint8)
 
 
 def open_recording(scenario: Scenario, run_dir: Path, run_id: int, live: LiveView | None) -> RunRecording:
     """Create the recording of a run, which is written while the run goes on."""
     loops = dict(enumerate(resolved_loops(scenario)))
-    shown = loops if len(loops) <= PICTURED else {}
+    shown = loops if len(loops) <= MOST_PICTURED else {}
     run = scenario if len(loops) > 1 else loops[0]
     return RunRecording(run, run_dir / RECORDING_FILE, run_id, shown, live=live)
 
@@ -319,23 +319,25 @@ def _write_network_view(
 ) -> None:
     require_space(run_dir)
     worst, count, path = worst_loop(summary.loops), len(run.loops), run_dir / RECORDING_FILE
-    numbers = range(count) if count <= PICTURED else [worst.number]
+    numbers = range(count) if count <= MOST_PICTURED else [worst.number]
     loops = {number: run.loops[number].scenario for number in numbers}
-    with RunRecording(run.scenario, path, _new_id(), loops, run.kind, worst=worst, complete=True) as whole:
-        flying = summary.network.in_flight
-        largest = np.array(flying.max_by_interval, np.float64)
-        queue_ns = (np.arange(len(largest)) + 0.5) * flying.width_s * NS_PER_S
-        whole.queue(queue_ns.astype(np.int64), largest, np.array(flying.mean_by_interval))
+    with RunRecording(
+        run.scenario, path, _new_id(), loops, run.kind, worst=worst, complete=True
+    ) as recording:
+        in_flight = summary.network.in_flight
+        largest = np.array(in_flight.max_by_interval, np.float64)
+        queue_ns = (np.arange(len(largest)) + 0.5) * in_flight.width_s * NS_PER_S
+        recording.add_queue(queue_ns.astype(np.int64), largest, np.array(in_flight.mean_by_interval))
         middles_ns = (over_time.middles_s * NS_PER_S).astype(np.int64)
-        whole.norms(ALL_ERRORS, middles_ns, over_time.errors)
-        whole.norms(ALL_SIZES, middles_ns, over_time.states)
-        whole.map(over_time.errors)
+        recording.add_norms(ALL_ERRORS, middles_ns, over_time.errors)
+        recording.add_norms(ALL_SIZES, middles_ns, over_time.states)
+        recording.add_map(over_time.errors)
         ends_s, shares = over_time.shares()
-        whole.share(((ends_s - ends_s[0] / 2) * NS_PER_S).astype(np.int64), shares)
+        recording.add_shares(((ends_s - ends_s[0] / 2) * NS_PER_S).astype(np.int64), shares)
         for notice in run.network.notices:
-            whole.log(int(notice["t_ns"]), log_level(notice), str(notice["text"]))
+            recording.log(int(notice["t_ns"]), log_level(notice), str(notice["text"]))
         for number in numbers:
-            _feed_record(run.loops[number], whole, number)
+            _feed_record(run.loops[number], recording, number)
 
 
 def _feed_record(record: RunRecord, recording: RunRecording, number: int = 0) -> None:

@@ -241,7 +241,7 @@ def _distribution(
         if spec.metric in result.estimates
     }
     return distribution_figure(series, spec.metric), (
-        f"{_title(spec.metric)}: the share of runs in which it is at most so much"
+        f"{_title(spec.metric)}: cumulative distribution over the runs"
     )
 
 

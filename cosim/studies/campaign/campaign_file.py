@@ -305,7 +305,7 @@ class CampaignClaim(ScenarioSection):
         return self
 
 
-_CHUNK, _SAMPLED_CHUNK = 2000, 20
+_CHUNK_DRAWS, _SAMPLED_DRAWS = 2000, 20
 """Draws per file: each file takes some seconds."""
 
 
@@ -330,7 +330,7 @@ class Campaign(ScenarioSection):
     seed: Seed = 0
     """Seed of the draws. Draw i has the same plant, x(0) and losses at every grid point."""
     chunk: Annotated[int, Field(ge=1, le=1_000_000)] = Field(
-        default_factory=lambda values: _SAMPLED_CHUNK if values.get("time") == "sampled" else _CHUNK
+        default_factory=lambda values: _SAMPLED_DRAWS if values.get("time") == "sampled" else _CHUNK_DRAWS
     )
     """Draws per file of the results; by default 2000, or 20 with sampled time. A worker computes one
     file at a time."""

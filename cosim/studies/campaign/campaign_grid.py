@@ -134,7 +134,7 @@ def row_type(points: Sequence[Point]) -> np.dtype[np.void]:
 
 
 def _scaled(entries: object, value: int, source: str) -> list[Table]:
-    """Return the entries of [[loops]] with so many loops in all, in the same proportions."""
+    """Return the entries of [[loops]] with ``value`` loops in all, in the same proportions."""
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise CallerError(f"{source}: loops: expected a list of tables")
     if len(entries) == 1:
@@ -142,12 +142,12 @@ def _scaled(entries: object, value: int, source: str) -> list[Table]:
     counts = [entry.get("count", 1) for entry in entries]
     if not all(isinstance(count, int) and count > 0 for count in counts):
         return entries  # the scenario's validation says what is wrong
-    least = sum(counts) // math.gcd(*counts)
-    if value < 1 or value % least:
+    smallest = sum(counts) // math.gcd(*counts)
+    if value < 1 or value % smallest:
         pairs = zip(entries, counts, strict=True)
         names = ", ".join(f"{count} {entry.get('name')}" for entry, count in pairs)
         raise CallerError(
-            f"{source}: loops = {value}: expected a multiple of {least}, to keep the proportions "
+            f"{source}: loops = {value}: expected a multiple of {smallest}, to keep the proportions "
             f"of [[loops]]: {names}"
         )
     total = sum(counts)

@@ -245,9 +245,9 @@ def estimate_text(estimate: Estimate | None) -> str:
 def _unfinished(summary: CampaignSummary) -> Iterator[str]:
     """Return a note for each grid point at which a run did not reach the horizon."""
     for result in summary.results:
-        unfinished = {ending: count for ending, count in result.ended.items() if ending != "finished"}
-        if unfinished:
-            counts = ", ".join(f"{n:,} {ending.replace('_', ' ')}" for ending, n in unfinished.items())
+        other_endings = {ending: count for ending, count in result.ended.items() if ending != "finished"}
+        if other_endings:
+            counts = ", ".join(f"{n:,} {ending.replace('_', ' ')}" for ending, n in other_endings.items())
             yield f"{_place_text(result.point.labels)} not all runs reached the horizon: {counts}"
 
 

@@ -76,21 +76,23 @@ def share_text(share: float) -> str:
 def evaluate_claims(campaign: Campaign, points: Sequence[Point], values: Values) -> Iterator[EvaluatedClaim]:
     """Yield the claims of a campaign with their verdicts."""
     by_number = {point.number: point for point in points}
-    cached = lru_cache(_POINTS_AT_ONCE)(lambda number: values(by_number[number]))
-    common = {axis: {label_of(value) for value in chosen} for axis, chosen in campaign.claims_at.items()}
+    values_of_point = lru_cache(_POINTS_AT_ONCE)(lambda number: values(by_number[number]))
+    common = {
+        axis: {label_of(value) for value in values_at} for axis, values_at in campaign.claims_at.items()
+    }
     for claim in campaign.claims:
-        fixed = {axis: {label_of(value)} for axis, value in claim.where.items()}
+        of_claim = {axis: {label_of(value)} for axis, value in claim.where.items()}
         groups: dict[str, list[Point]] = {}
         for point in points:
-            allowed = common | fixed | ({} if claim.axis is None else {claim.axis: point.labels.values()})
+            allowed = common | of_claim | ({} if claim.axis is None else {claim.axis: point.labels.values()})
             if all(point.labels[axis] in labels for axis, labels in allowed.items()):
                 other_labels = (
                     f"{axis} {label}"
                     for axis, label in point.labels.items()
-                    if axis != claim.axis and axis not in fixed
+                    if axis != claim.axis and axis not in of_claim
                 )
                 groups.setdefault(", ".join(other_labels), []).append(point)
-        yield _evaluate_claim(claim, groups, lambda point: cached(point.number))
+        yield _evaluate_claim(claim, groups, lambda point: values_of_point(point.number))
 
 
 def _evaluate_claim(claim: CampaignClaim, groups: dict[str, list[Point]], values: Values) -> EvaluatedClaim:
@@ -125,7 +127,7 @@ def _side(term: Term, claim: CampaignClaim, group: Sequence[Point], values: Valu
 
 _ROUNDING = 1e-9
 """A bound is exceeded only by a larger share of it than this."""
-_ENDED = {
+_ENDING_NAMES = {
     OK: "finished",
     DIVERGED: "diverged",
     TOO_MANY_EVENTS: "too_many_events",
@@ -225,7 +227,7 @@ def _point_result(point: Point, store: Store) -> GridPointResult:
     bound_shares = metrics.get("certificate_used", np.zeros(0))
     return GridPointResult(
         point,
-        {ending: int((status == code).sum()) for code, ending in _ENDED.items() if code in status},
+        {ending: int((status == code).sum()) for code, ending in _ENDING_NAMES.items() if code in status},
         {name: estimate(values) for name, values in metrics.items()},
         int((bound_shares[np.isfinite(bound_shares)] > 1 + _ROUNDING).sum()),
         burst_frequency(point.scenario, metrics),

@@ -45,11 +45,11 @@ class Chunk(NamedTuple):
         return range(self.start, self.stop)
 
 
-Finished = tuple[Chunk, NDArray[np.void]]
-Runner = Callable[[Sequence[Work], Iterable[Chunk]], Iterator[Finished]]
+FinishedChunk = tuple[Chunk, NDArray[np.void]]
+Runner = Callable[[Sequence[Work], Iterable[Chunk]], Iterator[FinishedChunk]]
 """Computes chunks, given the work of each grid point; yields results in any order."""
 
-_AHEAD = 2
+_CHUNKS_AHEAD = 2
 """Chunks in flight per worker: one is computed and one waits."""
 _LOOK_EVERY_S, _PATIENCE_S = 1.0, 30.0
 """Time between two looks at the cluster, and time that it may be without a worker."""
@@ -64,7 +64,7 @@ class LostWorkersError(PeerError):
     """Workers have died or cannot be reached."""
 
 
-def run_in_process(works: Sequence[Work], chunks: Iterable[Chunk]) -> Iterator[Finished]:
+def run_in_process(works: Sequence[Work], chunks: Iterable[Chunk]) -> Iterator[FinishedChunk]:
     """Compute chunks in this process."""
     for chunk in chunks:
         yield chunk, works[chunk.point].run(chunk.draws)
@@ -78,9 +78,9 @@ def local_runner(workers: int) -> Iterator[Runner]:
         return
     with processes(workers) as pool:
 
-        def run(works: Sequence[Work], chunks: Iterable[Chunk]) -> Iterator[Finished]:
+        def run(works: Sequence[Work], chunks: Iterable[Chunk]) -> Iterator[FinishedChunk]:
             try:
-                yield from _limit_in_flight(pool, works, chunks, lambda: _AHEAD * workers)
+                yield from _limit_in_flight(pool, works, chunks, lambda: _CHUNKS_AHEAD * workers)
             except BrokenProcessPool:
                 raise LostWorkersError("a worker process was killed (out of memory?)") from None
 
@@ -142,7 +142,7 @@ def cluster_runner(address: str, report: Callable[[str], None] = lambda line: No
     except (OSError, TimeoutError):
         raise PeerError(f"--scheduler {address}: no Dask scheduler answers there") from None
 
-    def run(works: Sequence[Work], chunks: Iterable[Chunk]) -> Iterator[Finished]:
+    def run(works: Sequence[Work], chunks: Iterable[Chunk]) -> Iterator[FinishedChunk]:
         size = _ClusterSize(client, address, report)
         executor: Executor = client.get_executor(pure=False)
         try:
@@ -197,21 +197,21 @@ class _ClusterSize:
                     f"{self._address}: the cluster has had no worker for {_PATIENCE_S:g} s "
                     "(workers with an older noack end at once)"
                 )
-        return max(_AHEAD * self._cores, 1)
+        return max(_CHUNKS_AHEAD * self._cores, 1)
 
 
 def _limit_in_flight(
     executor: Executor,
     works: Sequence[Work],
     chunks: Iterable[Chunk],
-    most: Callable[[], int],
+    most_chunks: Callable[[], int],
     expected: Mapping[str, str] | None = None,
-) -> Iterator[Finished]:
+) -> Iterator[FinishedChunk]:
     """Keep a limited number of chunks in flight, so that memory use stays bounded."""
     waiting = iter(chunks)
     in_flight: dict[Future[NDArray[np.void]], Chunk] = {}
     while True:
-        for chunk in islice(waiting, max(most() - len(in_flight), 0)):
+        for chunk in islice(waiting, max(most_chunks() - len(in_flight), 0)):
             with process_starts():
                 future = executor.submit(run_alike, works[chunk.point], chunk.draws, expected)
             in_flight[future] = chunk

@@ -167,18 +167,18 @@ def _claim(folder: Path, manifest: Mapping[str, object]) -> Mapping[str, str]:
     """Write or check the folder's manifest; return the code and libraries of its runs."""
     path = folder / MANIFEST
     try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
+        stored_manifest = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         if (folder / RUNS).exists():
             raise CallerError(f"{folder}: holds runs, but no {MANIFEST}; give another --out") from None
         write_whole(path, json.dumps(manifest, indent=1))
-        stored = dict(manifest)
+        stored_manifest = dict(manifest)
     except ValueError:
-        stored = None
-    if not isinstance(stored, dict) or not isinstance(stored.get("arithmetic"), dict):
+        stored_manifest = None
+    if not isinstance(stored_manifest, dict) or not isinstance(stored_manifest.get("arithmetic"), dict):
         raise CallerError(f"{path}: not a manifest of a campaign; give another --out")
-    made_by: dict[str, str] = stored.pop("arithmetic")
-    mismatch = _difference(stored, {k: v for k, v in manifest.items() if k != "arithmetic"})
+    made_by: dict[str, str] = stored_manifest.pop("arithmetic")
+    mismatch = _difference(stored_manifest, {k: v for k, v in manifest.items() if k != "arithmetic"})
     if mismatch is not None:
         raise CallerError(
             f"{folder}: holds another campaign ({mismatch}); give another --out, or remove the folder"

@@ -112,16 +112,16 @@ class SampledWork:
         if points.any():
             own_points = points[np.searchsorted(since_ns, steps["t_ns"], "right")]
             from_setpoint = np.linalg.norm(steps["x"] - own_points, axis=1)
-        settled = self.settle * from_setpoint[0]
-        if from_setpoint[-1] <= settled:
-            row["settling_s"] = t_s[from_setpoint > settled].max(initial=0.0)
+        settled_norm = self.settle * from_setpoint[0]
+        if from_setpoint[-1] <= settled_norm:
+            row["settling_s"] = t_s[from_setpoint > settled_norm].max(initial=0.0)
         row["final_norm"] = norms[-1]
         row["cost"] = self._cost(record)
         # The controller's error, where it shares an update with the sensor.
         aligned = align_tables(record)
         decay_per_s = policy_of(record.scenario).fading_per_s
-        scaled = aligned.e_c_norm * np.exp(decay_per_s * aligned.t_ns / NS_PER_S)
-        row["sup_e_c_scaled"] = scaled[shares_update(record.scenario, aligned)].max(initial=0.0)
+        scaled_errors = aligned.e_c_norm * np.exp(decay_per_s * aligned.t_ns / NS_PER_S)
+        row["sup_e_c_scaled"] = scaled_errors[shares_update(record.scenario, aligned)].max(initial=0.0)
 
     def _cost(self, record: RunRecord) -> float:
         """Return ∫ xᵀQx + uᵀRu dt, exactly, as inputs are held (Van Loan 1978)."""
@@ -257,11 +257,11 @@ class SharedNetworkWork(SampledWork):
 
     def _measure_network(self, records: Sequence[RunRecord], row: np.void) -> None:
         scenario = records[0].scenario
-        counted = [_updates(record, self.count_from_s) for record in records]
+        updates = [_updates(record, self.count_from_s) for record in records]
         burst = scenario.network.longest_burst
-        row["loops_guarantee_used"] = np.mean([used_up(packets["fate"], burst) for packets in counted])
+        row["loops_guarantee_used"] = np.mean([used_up(packets["fate"], burst) for packets in updates])
         delays_ns = np.concatenate(
-            [(packets["release_ns"] - packets["now_ns"])[effective(packets["fate"])] for packets in counted]
+            [(packets["release_ns"] - packets["now_ns"])[effective(packets["fate"])] for packets in updates]
         )
         due_s = scenario.certificate.network_delay_s
         due_ns = scenario.timing.measurement_period_ns if due_s is None else due_s * NS_PER_S
@@ -276,8 +276,8 @@ def cost_of(entry: str) -> str:
 
 def _updates(record: RunRecord, from_s: float) -> Rows:
     packets = record.with_departures(record[NETEM_PACKET])
-    counted: Rows = packets[(packets["flow"] == 0) & (packets["now_ns"] >= from_s * NS_PER_S)]
-    return counted
+    updates: Rows = packets[(packets["flow"] == 0) & (packets["now_ns"] >= from_s * NS_PER_S)]
+    return updates
 
 
 def used_up(fates: NDArray[np.int64], burst: int) -> bool:

@@ -90,7 +90,7 @@ METRICS: Mapping[Metric, Description] = {
 
 
 def compute_metrics(
-    columns: Mapping[str, NDArray[np.generic]], certified: float | None
+    columns: Mapping[str, NDArray[np.generic]], certified_bound: float | None
 ) -> dict[Metric, Vector]:
     """Return all metrics of k runs.
 
@@ -105,10 +105,10 @@ def compute_metrics(
             if name == "loops_claims_held" and np.isnan(values).all():  # no claims were evaluated
                 continue
             values_of[name] = np.where(np.isnan(values) | failed, np.inf, values)
-    arrived = columns["deliveries"] / np.maximum(columns["transmissions"], 1)
-    values_of["lost_share"] = np.where(failed, np.inf, 1.0 - arrived)
-    if certified is not None:
-        values_of["certificate_used"] = values_of["sup_e_c_scaled"] / certified
+    delivered_share = columns["deliveries"] / np.maximum(columns["transmissions"], 1)
+    values_of["lost_share"] = np.where(failed, np.inf, 1.0 - delivered_share)
+    if certified_bound is not None:
+        values_of["certificate_used"] = values_of["sup_e_c_scaled"] / certified_bound
     return values_of
 
 
@@ -128,10 +128,10 @@ def certified_error(resolved: Scenario) -> float | None:
         return None
     models = error_gains(loop_of(resolved), trigger.alpha_per_s)
     try:
-        missing = float(models.missing(Output.WEIGHTED, network.longest_burst, 0.0))
+        missing_gain = float(models.missing(Output.WEIGHTED, network.longest_burst, 0.0))
     except NotDecayingError:
         return None
-    return (models.now(Output.WEIGHTED) + missing) * trigger.beta
+    return (models.now(Output.WEIGHTED) + missing_gain) * trigger.beta
 
 
 CONFIDENCE = 0.95
@@ -232,9 +232,9 @@ def _quantiles(values: Vector, shares: Sequence[float]) -> list[float]:
 
 def quantile_interval(values: Vector, share: float) -> tuple[float, float]:
     """Return the ends of a quantile's 95 % confidence interval; ±inf if no draw bounds it."""
-    ordered = np.append(np.sort(values), math.inf)
+    ascending = np.append(np.sort(values), math.inf)
     low, high = interval_ranks(len(values), share)
-    return float(ordered[low]) if low >= 0 else -math.inf, float(ordered[high])
+    return float(ascending[low]) if low >= 0 else -math.inf, float(ascending[high])
 
 
 @cache
@@ -245,8 +245,8 @@ def interval_ranks(count: int, share: float) -> tuple[int, int]:
     """
     # The j-th smallest draw, from 1, exceeds the quantile if fewer than j draws lie below it.
     tail = (1.0 - CONFIDENCE) / 2
-    fewer = bdtr(np.arange(count + 1), count, share)
-    low, high = np.searchsorted(fewer, (tail, 1.0 - tail)).tolist()
+    below_probability = bdtr(np.arange(count + 1), count, share)
+    low, high = np.searchsorted(below_probability, (tail, 1.0 - tail)).tolist()
     return low - 1, min(high, count)
 
 
@@ -264,7 +264,7 @@ class BurstFrequency(NamedTuple):
     packets: int
     """Largest number of packets of a run."""
     predicted: float
-    """Probability of a longer burst in so many packets: an upper bound for the share."""
+    """Probability of a longer burst in this number of packets: an upper bound for the share."""
 
     @property
     def text(self) -> str:

@@ -22,8 +22,8 @@ from cosim.studies.campaign.metrics import METRICS
 from cosim.studies.capacity.capacity_plan import COMMON, DISTURBANCE, LOOPS, OWN, POLICY, CapacityPlan
 from cosim.studies.capacity.capacity_result import (
     COST_FACTOR,
-    LATE,
     LIMITS,
+    MOST_LATE_SHARE,
     Capacity,
     Limit,
     LivePoint,
@@ -37,7 +37,7 @@ from noack.scenario.link_load import update_delay
 PAGE, RESULTS = "capacity.html", "capacity.json"
 _SENTENCES = {
     "guarantee": "a loop used up its guarantee: M − 1 consecutive losses, one in the full queue",
-    "deadline": f"more than {100 * LATE:g} % of the updates were late",
+    "deadline": f"more than {100 * MOST_LATE_SHARE:g} % of the updates were late",
     "cost": f"the mean cost of the loops, or of one kind of them, was at least {COST_FACTOR:g} "
     "times that of loops that have the link for themselves",
 }
@@ -83,12 +83,12 @@ def write(result: CapacityResult, folder: Path, figure_files: FigureFiles | None
         MachineError: they cannot be written.
     """
     document = to_json(result.to_json(), indent=1, inf_nan_mode="null")
-    written = [write_whole(folder / PAGE, page(result)), write_whole(folder / RESULTS, document + b"\n")]
+    paths = [write_whole(folder / PAGE, page(result)), write_whole(folder / RESULTS, document + b"\n")]
     files = figure_files or FigureFiles(FigureFormat.SVG, SCREEN_IN)
     for figure in figures(result):
-        written.append(folder / f"{figure.name}.{files.kind}")
-        save_figure(figure, written[-1], files.width_in)
-    return written
+        paths.append(folder / f"{figure.name}.{files.kind}")
+        save_figure(figure, paths[-1], files.width_in)
+    return paths
 
 
 def page(result: CapacityResult) -> str:
@@ -127,8 +127,8 @@ def rows(result: CapacityResult) -> Iterator[tuple[str, ...]]:
     last = result.plan.counts[-1]
     for case in result.capacities:
         limits = [_limit_text(case.limits[limit], last) for limit in LIMITS]
-        carried = _limit_text(case.any_limit, last)
-        yield case.policy, case.disturbance, carried, case.limited_by or "–", *limits
+        any_limit = _limit_text(case.any_limit, last)
+        yield case.policy, case.disturbance, any_limit, case.limited_by or "–", *limits
 
 
 def rate_sentence(plan: CapacityPlan) -> str:
@@ -146,10 +146,10 @@ def mixture_sentences(result: CapacityResult) -> Iterator[str]:
     """Yield the median capacities as multiples of the mixture that the scenario has."""
     plan = result.plan
     for capacity in () if plan.is_one_kind else result.capacities:
-        median, least = capacity.any_limit.median, ""
+        median, prefix = capacity.any_limit.median, ""
         if math.isinf(median):
-            median, least = plan.counts[-1], "at least "
-        text = f"{least}{plan.factor(median):g} × the given mixture"
+            median, prefix = plan.counts[-1], "at least "
+        text = f"{prefix}{plan.factor(median):g} × the given mixture"
         if median:
             text += f" ({_listed(plan.composition(median))})"
         else:

@@ -177,7 +177,7 @@ class CapacityPlan:
         return CampaignAxis(name=LOOPS, title=title, variants=variants)
 
     def _network(self, loops: int, factor: int) -> Entry:
-        """Return the settings of loops on bottlenecks so many times as fast, with longer queues."""
+        """Return the settings of loops on bottlenecks ``factor`` times as fast, with longer queues."""
         settings: Entry = {"loops": loops}
         for index, impairment in enumerate(self.scenario.network.impairments):
             key = f"network.impairments.{index}"
@@ -254,19 +254,19 @@ def with_rate(scenario: Scenario, rate_bps: int) -> Scenario:
     return scenario.model_copy(update={"network": network})
 
 
-def default_counts(periodic: float, least: int, defaults: StudyDefaults) -> tuple[int, ...]:
+def default_counts(periodic: float, smallest: int, defaults: StudyDefaults) -> tuple[int, ...]:
     """Return numbers of loops around that of the periodic loops that the link carries.
 
     Args:
         periodic: number of periodic loops that the link carries.
-        least: number of loops of the smallest mixture.
+        smallest: number of loops of the smallest mixture.
         defaults: those of the study.
     """
-    multiples = {max(round(share * periodic / least), 1) for share in defaults.shares}
-    return require_counts([least * multiple for multiple in multiples], least)
+    multiples = {max(round(share * periodic / smallest), 1) for share in defaults.shares}
+    return require_counts([smallest * multiple for multiple in multiples], smallest)
 
 
-def require_counts(counts: Sequence[int], least: int) -> tuple[int, ...]:
+def require_counts(counts: Sequence[int], smallest: int) -> tuple[int, ...]:
     """Return sorted numbers of loops; of one kind with 1, the reference of the cost.
 
     Raises:
@@ -275,9 +275,9 @@ def require_counts(counts: Sequence[int], least: int) -> tuple[int, ...]:
     for count in counts:
         if count < 1:
             raise CallerError(f"--loops {count}: numbers of loops are at least 1")
-        if count % least:
+        if count % smallest:
             raise CallerError(
-                f"--loops {count}: expected a multiple of {least}, to keep the proportions of "
+                f"--loops {count}: expected a multiple of {smallest}, to keep the proportions of "
                 "[[loops]]; or study one kind, e.g. --set 'loops=[{ name = \"p\" }]'"
             )
-    return tuple(sorted({*counts, *([1] if least == 1 else [])}))
+    return tuple(sorted({*counts, *([1] if smallest == 1 else [])}))

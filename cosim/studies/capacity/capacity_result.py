@@ -3,7 +3,7 @@
 A run reaches a limit if
 
 * guarantee: a loop has used up its guarantee, because of the full queue;
-* deadline: more than :data:`LATE` of the delivered updates are late;
+* deadline: more than :data:`MOST_LATE_SHARE` of the delivered updates are late;
 * cost: the mean cost of the loops is at least :data:`COST_FACTOR` times the mean over all draws of
   the cost of one loop. A run of one loop reaches it only by diverging. With several kinds of loops:
   the mean cost of a kind is at least :data:`COST_FACTOR` times that of the same loops, in the same
@@ -38,7 +38,7 @@ from cosim.studies.capacity.capacity_plan import DISTURBANCE, LOOPS, OWN, POLICY
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 
-LATE = 0.01
+MOST_LATE_SHARE = 0.01
 """Largest share of the delivered updates that may be late."""
 COST_FACTOR = 2.0
 Limit = Literal["guarantee", "deadline", "cost"]
@@ -119,7 +119,7 @@ def capacity_of(
 
     reached: dict[Limit, NDArray[np.bool_]] = {
         "guarantee": values(LIMITS["guarantee"]) > 0,
-        "deadline": values(LIMITS["deadline"]) > LATE,
+        "deadline": values(LIMITS["deadline"]) > MOST_LATE_SHARE,
     }
     if plan.is_one_kind:
         cost = values("cost")
@@ -189,16 +189,16 @@ def chosen_points(text: str | None, plan: CapacityPlan) -> list[tuple[str, int]]
     return [points[part] for part in texts]
 
 
-def live_point(chosen: tuple[str, int], results: Sequence[GridPointResult], folder: Path) -> LivePoint:
+def live_point(place: tuple[str, int], results: Sequence[GridPointResult], folder: Path) -> LivePoint:
     """Run a grid point live, without the common disturbance and with the seeds of draw 0.
 
     Raises:
         NoackError: the run could not be started or completed.
     """
-    policy, count = chosen
+    policy, count = place
     labels = {POLICY: policy, LOOPS: str(count), DISTURBANCE: OWN}
-    simulated = next(result for result in results if {DISTURBANCE: OWN, **result.point.labels} == labels)
-    point, work = simulated.point, simulated.point.work
+    result = next(result for result in results if {DISTURBANCE: OWN, **result.point.labels} == labels)
+    point, work = result.point, result.point.work
     assert isinstance(work, SharedNetworkWork)
     changes = {"seeds": seeds_of(work.seed, 0), "name": f"{policy}-{count}"}
     outcome = finalize(launch(point.scenario.model_copy(update=changes), folder), report=False, view=False)
@@ -215,7 +215,7 @@ def live_point(chosen: tuple[str, int], results: Sequence[GridPointResult], fold
         outcome.reason,
         sum(loop.unintended_losses for loop in outcome.summary.loops),
         {metric: values[metric] for metric in [*compared, "delay_max_s"]},
-        {metric: prediction_interval(simulated.estimates[metric]) for metric in compared},
+        {metric: prediction_interval(result.estimates[metric]) for metric in compared},
     )
 
 

@@ -46,8 +46,8 @@ class LoopKind(NamedTuple):
         """Return its entry with other keys; those that are None are left out."""
         if self.is_periodic:
             return self.entry | {"mode": self.scenario.mode}
-        changed = {**self.entry, **change}
-        return {key: value for key, value in changed.items() if value is not None}
+        entry = {**self.entry, **change}
+        return {key: value for key, value in entry.items() if value is not None}
 
     def disturbed(self, pulse: Entry, amplitude: float) -> list[Entry]:
         """Return its disturbances, and with an amplitude a pulse on all its inputs."""

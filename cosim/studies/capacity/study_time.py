@@ -49,7 +49,7 @@ def cpu_per_loop_s(points: Sequence[Point]) -> float:
 
 
 def estimated_s(loops: int, cpu_s: float, workers: int) -> float:
-    """Return the time of runs with so many loops in all, if the workers' cores are idle."""
+    """Return the time of runs with ``loops`` loops in all, if the workers' cores are idle."""
     return _START_S + _OVERLOADED * loops * cpu_s / workers
 
 

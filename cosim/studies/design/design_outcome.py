@@ -157,8 +157,8 @@ def periodic_outcome(search: NetworkSearch, original: CertifiedLoop, best: Certi
 def _loop_result(search: NetworkSearch, loop: CertifiedLoop, *, is_excluded: bool = False) -> LoopResult:
     requirements, (hold, K), proven = search.requirements, loop.candidate, loop.stability
     requirement = requirements[max(loop.level, 0)]
-    sent = search.scenario.timing.measurement_period_ns / requirement.period_ns
-    reach = requirement.name + (", the most examined" * (loop.level == len(requirements) - 1))
+    share = search.scenario.timing.measurement_period_ns / requirement.period_ns
+    reach = requirement.name + (", the most examined" if loop.level == len(requirements) - 1 else "")
     if loop.level < 0:
         reach = "nothing proven"
     growth = (
@@ -169,12 +169,12 @@ def _loop_result(search: NetworkSearch, loop: CertifiedLoop, *, is_excluded: boo
         "growth per period there": growth,
         "the next one": _next_requirement_text(requirements, loop),
         "cost without losses": f"{loop.cost:.4g}",
-        "share of measurements sent": f"{100 * sent:.3g} %",
+        "share of measurements sent": f"{100 * share:.3g} %",
         "between updates": hold.text + " (not in --holds)" * is_excluded,
         "K": gain_text(K),
     }
-    certified = None if loop.level < 0 else requirement.number
-    document: dict[str, object] = {"certified": certified, "cost": loop.cost, "transmitted": sent}
+    number = None if loop.level < 0 else requirement.number
+    document: dict[str, object] = {"certified": number, "cost": loop.cost, "transmitted": share}
     document |= {"mode": hold.mode, "hold": hold.text, "K": K}
     for name, stability in (("stability", proven), ("beyond", loop.beyond)):
         document[name] = stability and stability_document(stability)

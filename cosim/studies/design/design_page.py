@@ -133,7 +133,7 @@ def rows(result: DesignResult) -> list[tuple[str, ...]]:
             f"{trial.candidate.beta:.4g}",
             result.space.families[trial.candidate.family].weight,
             result.space.families[trial.candidate.family].gain
-            + " ← chosen" * (result.feasible and trial is result.best),
+            + (" ← chosen" if result.feasible and trial is result.best else ""),
         )
         for trial in result.front
     ]

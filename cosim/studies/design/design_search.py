@@ -26,19 +26,19 @@ from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import ideal_conditions, nominal_conditions
 from noack.theory.certificates.scenario_certificates import certify, certify_box, outside_box
 
-Bounded = Literal["state", "error"]
-Bounds = Mapping[Bounded, float]
+BoundedQuantity = Literal["state", "error"]
+Bounds = Mapping[BoundedQuantity, float]
 """Certified sup‖x‖ and sup‖e_c‖, Euclidean; infinite if there is no bound."""
-WORDS: dict[Bounded, str] = {"state": "sup‖x‖", "error": "sup‖e_c‖"}
+WORDS: dict[BoundedQuantity, str] = {"state": "sup‖x‖", "error": "sup‖e_c‖"}
 Progress = Callable[[float], None]
 """Called with the approximate share of the work that is done."""
 _SMALLEST_STEP = 0.04
 """Smallest step of the refinement, as a share of the grid's steps."""
 _MOST_ROUNDS = 24
 """Most rounds of the refinement."""
-_SCREENING = 4
+_SCREENING_DIVISOR = 4
 """Screening uses the number of draws divided by this."""
-_DESIGNED = "_designed"
+_NAME_SUFFIX = "_designed"
 
 
 @dataclass(frozen=True)
@@ -117,13 +117,13 @@ def measure(scenario: Scenario, limits: DesignLimits, population: Population) ->
         CallerError: the engine cannot run the scenario.
     """
     rows = run_batch(replace(setting_of(resolve(scenario)), settle=limits.settle), population)
-    sent = estimate(rows["transmissions"].astype(np.float64))
+    sends = estimate(rows["transmissions"].astype(np.float64))
     settling_s = np.where(np.isnan(rows["settling_s"]), math.inf, rows["settling_s"])
     quantile_s = float(np.quantile(settling_s, limits.quantile, method="inverted_cdf"))
     low_s, high_s = quantile_interval(settling_s, limits.quantile)
-    settled = float(np.mean(settling_s <= limits.settling_s))
+    share = float(np.mean(settling_s <= limits.settling_s))
     return CandidateMeasures(
-        len(rows), sent.mean, sent.halfwidth, quantile_s, max(low_s, 0.0), high_s, settled
+        len(rows), sends.mean, sends.halfwidth, quantile_s, max(low_s, 0.0), high_s, share
     )
 
 
@@ -151,8 +151,8 @@ def _require_certifiable(scenario: Scenario) -> None:
 def certified_bounds(scenario: Scenario, limits: DesignLimits) -> Bounds:
     """Return the bounds for all plants in the box, or for the plant if there is no box."""
     resolved = resolve(scenario)
-    late = resolved.certificate.late_periods
-    conditions = nominal_conditions(resolved, late) if limits.schedule else ideal_conditions(resolved)
+    late_periods = resolved.certificate.late_periods
+    conditions = nominal_conditions(resolved, late_periods) if limits.schedule else ideal_conditions(resolved)
     return bounds_of(certify_box(resolved, conditions) or certify(resolved, conditions), scenario)
 
 
@@ -174,9 +174,9 @@ class TriggerSearch:
 
     def __init__(self, space: DesignSpace, limits: DesignLimits, box: Box, seed: int, draws: int) -> None:
         self.space, self.limits = space, limits
-        self._few = box.population(seed, range(max(draws // _SCREENING, 1)))
-        self._all = box.population(seed, range(draws))
-        self._fresh = box.population(seed, range(draws, 2 * draws))
+        self._screening_draws = box.population(seed, range(max(draws // _SCREENING_DIVISOR, 1)))
+        self._draws = box.population(seed, range(draws))
+        self._fresh_draws = box.population(seed, range(draws, 2 * draws))
         self._trials: dict[TriggerCandidate, Trial] = {}
 
     @property
@@ -214,9 +214,9 @@ class TriggerSearch:
                 for trial in self.trials
                 if all(trial.bounds.get(name, 0.0) <= limit for name, limit in limits)
             ]
-            sent = np.array([t.measured.transmissions for t in within_bounds])
+            transmissions = np.array([t.measured.transmissions for t in within_bounds])
             settling_s = np.array([t.measured.settling_s for t in within_bounds])
-            front = [within_bounds[i] for i in undominated(sent, settling_s)]
+            front = [within_bounds[i] for i in undominated(transmissions, settling_s)]
             front = [t for t in front if np.isfinite(t.measured.settling_s)]
             rough = [t for t in front if not self._is_exact(t)]
             if not rough:
@@ -226,7 +226,7 @@ class TriggerSearch:
 
     def confirm(self, trial: Trial) -> CandidateMeasures:
         """Measure a trial on new draws, which the search did not use."""
-        return measure(self.scenario(trial), self.limits, self._fresh)
+        return measure(self.scenario(trial), self.limits, self._fresh_draws)
 
     def _refine(self, family: int) -> None:
         """Try the neighbours of a family's best trial, in steps that become smaller."""
@@ -246,7 +246,7 @@ class TriggerSearch:
         for candidate in candidates:
             if candidate not in self._trials:
                 scenario = self.space.families[candidate.family].with_trigger(candidate)
-                measured = measure(scenario, self.limits, self._few)
+                measured = measure(scenario, self.limits, self._screening_draws)
                 self._trials[candidate] = Trial(candidate, measured)
 
     def _best(self, trials: list[Trial]) -> Trial:
@@ -265,7 +265,7 @@ class TriggerSearch:
     def _measure_more(self, trial: Trial) -> None:
         """Measure a trial with all draws; if this is already done, certify its bounds."""
         if not trial.full:
-            trial.measured = measure(self.scenario(trial), self.limits, self._all)
+            trial.measured = measure(self.scenario(trial), self.limits, self._draws)
             trial.full = True
         elif not trial.bounds:
             trial.bounds = certified_bounds(self.scenario(trial), self.limits)
@@ -374,10 +374,10 @@ class DesignResult:
 
 def designed_name(name: str) -> str:
     """Return the name of a scenario that is designed from one of another name."""
-    return f"{name.removesuffix(_DESIGNED)[: 64 - len(_DESIGNED)]}{_DESIGNED}"
+    return f"{name.removesuffix(_NAME_SUFFIX)[: 64 - len(_NAME_SUFFIX)]}{_NAME_SUFFIX}"
 
 
-def certified(name: Bounded, value: float) -> str:
+def certified(name: BoundedQuantity, value: float) -> str:
     """Return a certified bound as text."""
     if not math.isfinite(value):
         return f"no certified bound of {WORDS[name]}"

@@ -29,7 +29,7 @@ RATE_STEP, RATE_STEPS, MOST_RATE = 1.5, 6, 0.95
 LEVELS = np.geomspace(0.01, 3.0, 8)
 """β of the grid, as shares of ‖x(0)‖."""
 LEVEL_STEP = float(LEVELS[1] / LEVELS[0])
-_WIDEST = 3.0
+_WIDEST_RATIO = 3.0
 """Factor by which the search may exceed the grid's range of β."""
 _MOST_DIGITS_APART = 12
 """Of the largest weights of Q and R; further apart, a Riccati equation without a solution is theirs."""
@@ -98,8 +98,8 @@ class DesignSpace:
 
     def contains(self, candidate: TriggerCandidate) -> bool:
         """Whether a candidate is within the ranges."""
-        low = max(LEVELS[0] * self.initial_norm / _WIDEST, self.floor)
-        high = LEVELS[-1] * self.initial_norm * _WIDEST
+        low = max(LEVELS[0] * self.initial_norm / _WIDEST_RATIO, self.floor)
+        high = LEVELS[-1] * self.initial_norm * _WIDEST_RATIO
         slow = candidate.alpha_per_s < self.decay_per_s[candidate.family]
         return slow and low < candidate.beta < high
 

@@ -110,7 +110,7 @@ class EventSearch:
         self.most = examined_m(scenario, request.most or _MOST_M)
         box = box_of(scenario)
         self._draws = box.population(seed, range(draws))
-        self._fresh = box.population(seed, range(draws, 2 * draws))
+        self._fresh_draws = box.population(seed, range(draws, 2 * draws))
         self.of_box = False
         certificate = self.certificate(self.original, 1, of_box=True)
         is_certified = certificate is not None and certificate.exists
@@ -225,23 +225,23 @@ class EventSearch:
         best, value = starts[order[0]], values[order[0]]
         for number, index in enumerate(order):
 
-            def improving(share: float, number: int = number) -> None:
+            def report_share(share: float, number: int = number) -> None:
                 progress(0.3 + 0.6 * (number + share) / len(order))
 
-            most = self.request.effort // (10 * _STARTS)
-            improved, reached = self._improve(starts[index], most, improving)
-            if reached < value:
-                best, value = improved, reached
-            improving(1.0)
+            tries = self.request.effort // (10 * _STARTS)
+            candidate, candidate_value = self._improve(starts[index], tries, report_share)
+            if candidate_value < value:
+                best, value = candidate, candidate_value
+            report_share(1.0)
         if value >= min(values[0], 0.0):  # no better than the given loop, or beyond a limit
             best = self.original
-        original, chosen = (
-            CertifiedEventLoop(loop, self.largest_m(loop), self.measure(loop, self._fresh))
+        original, designed = (
+            CertifiedEventLoop(loop, self.largest_m(loop), self.measure(loop, self._fresh_draws))
             for loop in (self.original, best)
         )
-        return original, chosen
+        return original, designed
 
-    def _improve(self, start: EventLoop, most: int, progress: Progress) -> tuple[EventLoop, float]:
+    def _improve(self, start: EventLoop, most_tries: int, progress: Progress) -> tuple[EventLoop, float]:
         centre = np.array([*np.ravel(start.K), start.alpha_per_s, start.beta])
         scale = np.append(step_sizes(np.array(start.K)), centre[-2:])
         best, value, tries = start, math.inf, 0
@@ -249,17 +249,17 @@ class EventSearch:
         def objective(steps: Vector) -> float:
             nonlocal best, value, tries
             tries += 1
-            progress(min(tries / most, 1.0))
-            moved = centre + scale * steps
-            moved[-2:] = centre[-2:] * np.exp(steps[-2:])
-            loop = _rounded(moved[:-2], start, *moved[-2:].tolist())
+            progress(min(tries / most_tries, 1.0))
+            parameters = centre + scale * steps
+            parameters[-2:] = centre[-2:] * np.exp(steps[-2:])
+            loop = _rounded(parameters[:-2], start, *parameters[-2:].tolist())
             excess = self.excess(loop)
             if excess < value:
                 best, value = loop, excess
             return excess
 
-        if most > 0:
-            nelder_mead(objective, centre.size, 0.2, most)
+        if most_tries > 0:
+            nelder_mead(objective, centre.size, 0.2, most_tries)
         return best, value
 
 
@@ -301,17 +301,18 @@ def event_outcome(
 
 def _notes(search: EventSearch, original: CertifiedEventLoop, best: CertifiedEventLoop) -> Iterator[str]:
     """Yield what the reader should know of a search."""
-    limits, before, after = search.limits, original.loop.alpha_per_s, best.loop.alpha_per_s
+    limits, alpha_per_s, best_alpha_per_s = search.limits, original.loop.alpha_per_s, best.loop.alpha_per_s
     limit = f"a mean cost of at most {limits.cost:.4g}"
     if search.request.goal == "network":
         limit += f", at most {limits.transmissions:.4g} transmissions"
-    for name, most in search.request.bounds.items():
-        limit += f", {WORDS[name]} ≤ {most:g} certified"
+    for name, bound in search.request.bounds.items():
+        limit += f", {WORDS[name]} ≤ {bound:g} certified"
     proven = "its certificate is proven, that it is the best is not" if best.m else "it has no certificate"
     yield f"the best of {search.tried:,} loops tried with {limit}; {proven}"
     yield "costs and transmissions are means over fresh draws with the scenario's own network"
-    if after < before:
-        yield f"the threshold and the certified bounds decay at {after:.4g} /s instead of {before:.4g} /s"
+    if best_alpha_per_s < alpha_per_s:
+        rates = f"{best_alpha_per_s:.4g} /s instead of {alpha_per_s:.4g} /s"
+        yield f"the threshold and the certified bounds decay at {rates}"
 
 
 def _loop_result(search: EventSearch, certified: CertifiedEventLoop) -> LoopResult:

@@ -330,13 +330,13 @@ class NetworkSearch:
         stability = None
         while level >= 0 and (stability := self.stability(candidate, level)).verdict != "stable":
             level, stability = level - 1, None
-        following, limit = None, math.inf if candidate == self.original else self.cost_limit
+        next_stability, limit = None, math.inf if candidate == self.original else self.cost_limit
         while level + 1 < len(self.requirements) and self.cost(candidate, level + 1) <= limit:
-            following = self.stability(candidate, level + 1)
-            if following.verdict != "stable":
+            next_stability = self.stability(candidate, level + 1)
+            if next_stability.verdict != "stable":
                 break
-            level, stability, following = level + 1, following, None
-        return CertifiedLoop(candidate, level, stability, following, self.cost(candidate, level))
+            level, stability, next_stability = level + 1, next_stability, None
+        return CertifiedLoop(candidate, level, stability, next_stability, self.cost(candidate, level))
 
     def regulators(self) -> list[GainCandidate]:
         """Return LQR gains of the model with all hold strategies."""
@@ -391,11 +391,11 @@ class NetworkSearch:
             tries_left = share
             while tries_left > 0 and level + 1 < len(self.requirements):
                 tried_before = self.tried
-                improved = self._improve(candidate, level + 1, tries_left)
+                better = self._improve(candidate, level + 1, tries_left)
                 tries_left -= max(self.tried - tried_before, 1)
-                if improved is None:
+                if better is None:
                     break
-                candidate = improved
+                candidate = better
                 top, _ = self.highest_possible(candidate, level + 1)
                 new_level, stability = self.highest_certified(candidate, max(top, level + 1), level)
                 if stability is None:
@@ -410,16 +410,16 @@ class NetworkSearch:
             level = self.highest_level.get(hold, -1)
             yield hold.text, self.requirements[level].name if level >= 0 else "nothing"
 
-    def _improve(self, start: GainCandidate, level: int, most: int) -> GainCandidate | None:
+    def _improve(self, start: GainCandidate, level: int, most_tries: int) -> GainCandidate | None:
         """Return a loop near ``start`` whose lower bound at a level is below 1; None: none found."""
         K = np.array(start.K)
         scale = step_sizes(K)
 
-        def moved(steps: Vector) -> GainCandidate:
+        def candidate_at(steps: Vector) -> GainCandidate:
             return GainCandidate(start.hold, round_gain((K.ravel() + scale * steps).reshape(K.shape)))
 
         def objective(steps: Vector) -> float:
-            return self.excess(moved(steps), level)
+            return self.excess(candidate_at(steps), level)
 
-        steps = nelder_mead(objective, K.size, 0.3, most, tolerance=1e-5, enough=-_SLACK)
-        return None if steps is None else moved(steps)
+        steps = nelder_mead(objective, K.size, 0.3, most_tries, tolerance=1e-5, enough=-_SLACK)
+        return None if steps is None else candidate_at(steps)

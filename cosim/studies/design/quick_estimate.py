@@ -88,9 +88,9 @@ class QuickLoop:
         until_ns, arrival_ns = from_ns + self.times.period_ns, from_ns + self.times.delay_ns
         first = self._between(from_ns, arrival_ns, from_ns + usable_ns)
         second = self._between(arrival_ns, until_ns, from_ns + self.times.timeout_ns)
-        arrived = first.M.copy()
-        arrived[self._x_c] = self._arrived
-        return _Map(arrived, first.C).then(second)
+        M = first.M.copy()
+        M[self._x_c] = self._arrived
+        return _Map(M, first.C).then(second)
 
     def cost(self, x0: Vector) -> float:
         """Return ∫ xᵀQx + uᵀRu dt from x(0) with every update delivered; infinite if unstable.
@@ -126,7 +126,7 @@ class PatternGraph:
         ends = (np.array(part) for part in zip(*((b.source, b.target, b.steps) for b in bursts), strict=True))
         self._graph = Graph(*ends)
         self._most_edges = min(_FURTHER_EDGES + self._graph.nodes, _MOST_EDGES)
-        self._known: dict[tuple[int, ...], None] = {}
+        self._cycles: dict[tuple[int, ...], None] = {}
 
     def growth(self, maps: Stack) -> float:
         """Return a lower bound of log growth per period, up to rounding.
@@ -135,14 +135,14 @@ class PatternGraph:
         """
         if not np.isfinite(maps).all() or np.abs(maps).max() > 1e150:
             return math.inf
-        nowhere = np.zeros_like(self._graph.sources)
-        (T,) = replace(self._graph, sources=nowhere, targets=nowhere).balancing(maps, _BALANCING_STEPS)
-        turned, best = T @ maps @ np.linalg.inv(T), -math.inf
-        for cycle in self._known:
-            product = reduce(lambda before, edge: turned[edge] @ before, cycle, np.eye(len(T)))
+        zeros = np.zeros_like(self._graph.sources)
+        (T,) = replace(self._graph, sources=zeros, targets=zeros).balancing(maps, _BALANCING_STEPS)
+        balanced, best = T @ maps @ np.linalg.inv(T), -math.inf
+        for cycle in self._cycles:
+            product = reduce(lambda before, edge: balanced[edge] @ before, cycle, np.eye(len(T)))
             duration = self._graph.durations[list(cycle)].sum()
             best = max(best, float(np.log(spectral_radii(product) + _TINY) / duration))
-        best, faster = self._graph.fastest_cycle(turned, self._most_edges, _BEAM, best)
+        best, faster = self._graph.fastest_cycle(balanced, self._most_edges, _BEAM, best)
         if faster:
-            self._known[faster] = None
+            self._cycles[faster] = None
         return best

@@ -12,7 +12,7 @@ def nelder_mead(
     objective: Callable[[Vector], float],
     size: int,
     first_step: float,
-    most: int,
+    evaluations: int,
     tolerance: float = 1e-4,
     enough: float = -math.inf,
 ) -> Vector | None:
@@ -22,7 +22,7 @@ def nelder_mead(
         objective: to be minimised.
         size: number of unknowns.
         first_step: size of the first simplex.
-        most: largest number of evaluations.
+        evaluations: largest number of evaluations.
         tolerance: difference of values at which the search ends.
         enough: the search ends at once at a value below this one.
     """
@@ -43,7 +43,7 @@ def nelder_mead(
             evaluate,
             np.zeros(size),
             method="Nelder-Mead",
-            options={"maxfev": most, "adaptive": True, "initial_simplex": simplex, "fatol": tolerance},
+            options={"maxfev": evaluations, "adaptive": True, "initial_simplex": simplex, "fatol": tolerance},
         )
     except StopIteration:
         return good_points[0]

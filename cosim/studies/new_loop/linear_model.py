@@ -239,7 +239,7 @@ def linearise(
         )
     if not (np.isfinite(within) and within > 0):
         raise CallerError(f"within: {within:g}; give a positive number")
-    at, input = ([given] if isinstance(given, float | int) else given for given in (at, input))  # noqa: A001
+    at, input = ([values] if isinstance(values, float | int) else values for values in (at, input))  # noqa: A001
     sizes = (None if at is None else len(at), None if input is None else len(input))
     reference = plant_reference(plant, settings or {}, sizes)
     x, u = parse_vector("at", at, reference.n, "states"), parse_vector("input", input, reference.m, "inputs")
@@ -324,18 +324,18 @@ def _place_poles(model: LinearModel, poles: Complex) -> Matrix:
     if len(poles) != model.rank:
         raise CallerError(f"poles: {len(poles)} given; the controllable part has {model.rank} eigenvalues")
     try:
-        placed = place_poles(basis.T @ model.A @ basis, basis.T @ model.B, poles)
+        placement = place_poles(basis.T @ model.A @ basis, basis.T @ model.B, poles)
     except ValueError:
         raise CallerError(
             "poles: complex ones must be in conjugate pairs, and none may occur more often than there "
             f"are independent inputs ({np.linalg.matrix_rank(model.B)})"
         ) from None
-    return np.asarray(-placed.gain_matrix @ basis.T, dtype=np.float64)
+    return np.asarray(-placement.gain_matrix @ basis.T, dtype=np.float64)
 
 
-def _weight_matrix(key: str, weights: ArrayLike | None, shaped: Matrix) -> Matrix:
-    """Return a diagonal weight with an entry for each row of ``shaped``."""
-    size, values = len(shaped), np.atleast_1d(np.array(1.0 if weights is None else weights, np.float64))
+def _weight_matrix(key: str, weights: ArrayLike | None, matrix: Matrix) -> Matrix:
+    """Return a diagonal weight with an entry for each row of ``matrix``."""
+    size, values = len(matrix), np.atleast_1d(np.array(1.0 if weights is None else weights, np.float64))
     if values.shape not in ((1,), (size,)):
         raise CallerError(f"{key}: {values.size} numbers; give 1 or {size}")
     if not (np.isfinite(values).all() and (values >= 0).all() and (key == "q" or values.all())):

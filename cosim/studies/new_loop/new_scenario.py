@@ -208,8 +208,8 @@ def _list_trials(model: LinearModel | LoopGain, x0: Vector) -> Iterator[_Trial]:
 class _TrialScenarios:
     """Builds, certifies and simulates the scenarios of trials."""
 
-    def __init__(self, model: LinearModel, path: Path, fixed: ReadTable) -> None:
-        self._model, self._path, self._fixed = model, path, fixed
+    def __init__(self, model: LinearModel, path: Path, fixed_settings: ReadTable) -> None:
+        self._model, self._path, self._fixed_settings = model, path, fixed_settings
         self.is_linear = isinstance(model.plant.system, LinearSettings)
 
     def content(self, trial: _Trial) -> Table:
@@ -253,13 +253,13 @@ class _TrialScenarios:
             },
             "seeds": {"loss": 1},
         }
-        for key, value in self._fixed.items():
+        for key, value in self._fixed_settings.items():
             put(content, key, value, f"--set {key}")
         return content
 
     @property
     def _losses(self) -> str:
-        is_given = any(key.startswith("network") for key in self._fixed)
+        is_given = any(key.startswith("network") for key in self._fixed_settings)
         return "" if is_given else " that loses half of the updates"
 
     def _system(self) -> Table:
@@ -292,7 +292,7 @@ class _TrialScenarios:
 
     def search(self, trials: Sequence[_Trial], report: Callable[[str], None]) -> _Trial:
         """Return the trial that is used."""
-        certified: list[tuple[float, _Trial]] = []
+        candidates: list[tuple[float, _Trial]] = []
         closest, contents = (math.inf, trials[0]), set[str]()
         for number, trial in enumerate(trials):
             report(f"certifying: {number + 1} of {len(trials)}")
@@ -303,14 +303,14 @@ class _TrialScenarios:
             if certificate.constants is None:
                 closest = min(closest, (loop_gain, trial), key=lambda entry: entry[0])
                 continue
-            certified.append((certificate.constants.state / (norm(trial.x0) or 1.0), trial))
-            if certified[-1][0] <= _LOOSE_BOUND_RATIO:
+            candidates.append((certificate.constants.state / (norm(trial.x0) or 1.0), trial))
+            if candidates[-1][0] <= _LOOSE_BOUND_RATIO:
                 return trial
-        if certified:
-            return min(certified, key=lambda entry: entry[0])[1]
+        if candidates:
+            return min(candidates, key=lambda entry: entry[0])[1]
         report("choosing a norm")
-        weighted = self._weighted(closest[1]) if math.isfinite(closest[0]) else None
-        return trials[0] if weighted is None else weighted
+        with_norm = self._weighted(closest[1]) if math.isfinite(closest[0]) else None
+        return trials[0] if with_norm is None else with_norm
 
     def _weighted(self, trial: _Trial) -> _Trial | None:
         """Return a trial in a norm that certifies it; None if there is none."""
@@ -384,14 +384,14 @@ _REASONS = {
 """How values are chosen that are not given."""
 
 
-def _file_text(content: ReadTable, notes: Sequence[str], trial: _Trial, fixed: ReadTable) -> str:
+def _file_text(content: ReadTable, notes: Sequence[str], trial: _Trial, fixed_settings: ReadTable) -> str:
     """Return the file: the content with comments."""
     poles, decay = eigenvalue_text(trial.gain.eigenvalues), trial.gain.decay_per_s
     comments = _COMMENTS | {
         "model.gain": f"u = gain x_c. {trial.gain.method}; eigenvalues of A + B gain: {poles} /s.",
         "trigger.alpha_per_s": f"Must be below the decay rate of A + B gain, {decay:.4g} /s.",
     }
-    comments |= {key: comments[key] + reason for key, reason in _REASONS.items() if key not in fixed}
+    comments |= {key: comments[key] + reason for key, reason in _REASONS.items() if key not in fixed_settings}
     lines = [f"# A scenario for {trial.gain.model.plant.label}, written by `noack new`."]
     lines += [line for note in notes for line in _comment_lines(note)]
     return "\n".join([*lines, *_section_lines("", content, comments), ""])

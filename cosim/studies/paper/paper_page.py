@@ -37,7 +37,7 @@ POLICIES = ("MB-ET", "ZOH-ET")
 """The paper's names of the loops."""
 _OTHER_EXAMPLES = ("nothing lost", "box × 5", "box × 0: exact model")
 """Variations that change the paper's example. The others vary only unspecified settings."""
-_REPRESENTED: tuple[Metric, ...] = (
+_EXAMPLE_METRICS: tuple[Metric, ...] = (
     "transmissions",
     "deliveries",
     "settling_s",
@@ -48,7 +48,7 @@ _DIGITS = 5
 """Number of significant digits in the file."""
 _SMALL, _LARGE = 1e-3, 1e6
 """Numbers outside these limits are written with a power of ten."""
-_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _SHOWN_S, _STEP_S = 20.0, 0.01
 """A draw is shown up to this time; later values are too small to be visible."""
 _COLUMNS, _GLUE = 100, "\N{NO-BREAK SPACE}"
@@ -119,7 +119,7 @@ def _representative(campaign: FinishedCampaign) -> int:
     distance = np.zeros(campaign.summary.draws)
     for point in (drawn for drawn in campaign.store.points if drawn.labels["variation"] == BASE):
         metrics, _ = runs_at(point, campaign.store)
-        for name in _REPRESENTED:
+        for name in _EXAMPLE_METRICS:
             low, middle, high = quartiles(metrics[name])
             if math.isfinite(high) and high > low:
                 distance += ((metrics[name] - middle) / (high - low)) ** 2
@@ -222,7 +222,7 @@ def number(value: float | None, digits: int = 3) -> str:
         text = f"{short:,.0f}" if abs(short) >= 10**digits else f"{short:g}"
     else:
         mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
-        power = f"10{str(int(exponent)).translate(_RAISED)}"
+        power = f"10{str(int(exponent)).translate(_SUPERSCRIPTS)}"
         text = power if float(mantissa) == 1 else f"{float(mantissa):g} · {power}"
     return text.replace("-", "−")
 

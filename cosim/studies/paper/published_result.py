@@ -89,9 +89,9 @@ class Reproduction(NamedTuple):
 
     def remarks(self) -> list[str]:
         """Return how the rows are computed, known deviations, and what is not given."""
-        hows = dict.fromkeys(f"computed: {row.how}" for row in self.rows)
+        methods = dict.fromkeys(f"computed: {row.how}" for row in self.rows)
         deviations = (f"{row.quantity}: {row.deviation}" for row in self.rows if row.deviation)
-        return [*hows, *deviations, *self.result.notes]
+        return [*methods, *deviations, *self.result.notes]
 
     def to_json(self) -> Mapping[str, object]:
         """Return the document of ``--json``."""
@@ -112,12 +112,12 @@ def print_rows(console: "Console", reproduction: Reproduction) -> None:
 
 
 def value_row(
-    quantity: str, place: str, published: float, computed: float, method: str, *, digits: int
+    quantity: str, where: str, published: float, computed: float, method: str, *, digits: int
 ) -> ComparedValue:
-    """Return the row of a number that is published with so many digits after the point."""
+    """Return the row of a number that is published with ``digits`` digits after the point."""
     agrees = abs(computed - published) <= 0.5000001 * 10.0**-digits
     texts = f"{published:.{digits}f}", f"{computed:.{digits + 1}f}"
-    return ComparedValue(quantity, place, "=", *texts, method, agrees)
+    return ComparedValue(quantity, where, "=", *texts, method, agrees)
 
 
 def stored_matrices(name: str) -> dict[str, dict[str, Matrix]]:

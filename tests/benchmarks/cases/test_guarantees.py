@@ -17,7 +17,7 @@ from tests.oracles.loss_language import is_allowed, outcomes_of
 def test_no_combination_is_violated_and_each_would_be_without_it(
     words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bench, "_BATCH", 200_000)
+    monkeypatch.setattr(bench, "_FLOW_DECISIONS", 200_000)
     for before in ("loss 50%", f"loss 30% {bench.REORDERING}"):
         violations, *rates = bench.check_rows(before, words, 200_000)
         assert violations.value == 0

@@ -115,7 +115,7 @@ def test_a_plant_that_missed_its_input_once_is_not_explained(record: RunRecord) 
 
 
 @pytest.mark.parametrize(
-    ("table", "column", "row", "value", "why"),
+    ("table", "column", "row", "value", "reason"),
     [
         (PLANT_STEP, "x", slice(300, None), math.nan, "diverged"),
         (SENSOR_MEASUREMENT, "t_ns", None, 2**62, "has times that no run has"),
@@ -132,7 +132,7 @@ def test_a_plant_that_missed_its_input_once_is_not_explained(record: RunRecord) 
     ],
 )
 def test_a_record_that_is_not_that_of_a_whole_run_is_not_compared(
-    record: RunRecord, table: str, column: str | None, row: Any, value: Any, why: str
+    record: RunRecord, table: str, column: str | None, row: Any, value: Any, reason: str
 ) -> None:
     """Without a column, rows are missing; without a row, the one in the middle is meant."""
     rows = record[table].copy()
@@ -141,11 +141,11 @@ def test_a_record_that_is_not_that_of_a_whole_run_is_not_compared(
     else:
         rows[column][len(rows) // 2 if row is None else row] = value
     broken = changed(record, {table: rows})
-    with pytest.raises(IncomparableError, match=why):
+    with pytest.raises(IncomparableError, match=reason):
         compute_fidelity(broken)
     summary = fidelity_for_summary(broken)
     assert isinstance(summary, NoFidelityPart)
-    assert why in summary.reason
+    assert reason in summary.reason
 
 
 def test_an_interrupted_run_is_compared_up_to_its_end(record: RunRecord) -> None:
@@ -232,9 +232,9 @@ def alter(runs: Path, table: str, column: str, by: float) -> None:
 
 def test_the_commands_replay_and_fidelity_take_the_last_run(simulated: Path) -> None:
     for command, text in (("replay", "bit-exact: "), ("fidelity", "held actuation")):
-        done = invoke(command, "--runs", simulated)
-        assert (done.exit_code, done.stderr) == (0, "")
-        assert text in done.stdout
+        result = invoke(command, "--runs", simulated)
+        assert (result.exit_code, result.stderr) == (0, "")
+        assert text in result.stdout
     document = json.loads(invoke("replay", "--runs", simulated, "--json").stdout)
     assert (document["bit_exact"], document["complete"]) == (True, True)
     assert document["first_difference"] is None
@@ -252,24 +252,24 @@ def test_a_difference_is_reported_and_fails(runs: Path) -> None:
     environment = json.loads(path.read_text())
     environment["packages"]["numpy"] = "1.0"
     path.write_text(json.dumps(environment))
-    done = invoke("replay", "--runs", runs)
-    assert done.exit_code == 1
-    assert "controller_step row 1, x_c_3" in done.stdout
-    assert "0x1." in done.stdout
-    assert "numpy was 1.0, is " in done.stdout
-    done = invoke("replay", "--runs", runs, "--json")
-    document = json.loads(done.stdout)
-    assert (done.exit_code, document["first_difference"]["column"]) == (1, "x_c_3")
+    result = invoke("replay", "--runs", runs)
+    assert result.exit_code == 1
+    assert "controller_step row 1, x_c_3" in result.stdout
+    assert "0x1." in result.stdout
+    assert "numpy was 1.0, is " in result.stdout
+    result = invoke("replay", "--runs", runs, "--json")
+    document = json.loads(result.stdout)
+    assert (result.exit_code, document["first_difference"]["column"]) == (1, "x_c_3")
     assert len(document["changed_since"]) == 1
 
 
 def test_an_empty_record_and_an_unexplained_difference_fail(runs: Path) -> None:
     alter(runs, "plant_step", "x_4", 1.0)
-    done = invoke("fidelity", runs / "latest")
-    assert done.exit_code == invoke("fidelity", runs / "latest", "--json").exit_code == 1
-    assert "too large" in done.stdout
+    result = invoke("fidelity", runs / "latest")
+    assert result.exit_code == invoke("fidelity", runs / "latest", "--json").exit_code == 1
+    assert "too large" in result.stdout
     for path in (runs / "latest/record").glob("*.parquet"):
         rewrite(runs, path.stem, lambda rows: rows.slice(0, 0))
-    done = invoke("replay", "--runs", runs)
-    assert done.exit_code == 1
-    assert "nothing to compare" in done.stdout
+    result = invoke("replay", "--runs", runs)
+    assert result.exit_code == 1
+    assert "nothing to compare" in result.stdout

@@ -121,8 +121,8 @@ def test_a_loop_with_events_has_a_margin_for_all_times_between_them() -> None:
     last = document["caps"][-1]
     assert last["verdict"] == "destabilised"
     assert len(last["intervals_s"]) == len(last["pattern"].replace("L", "D").split("D")) - 1
-    printed = invoke("margin", "double_integrator", *DEADLINE, "--no-period")
-    assert "with updates 0.2 to 0.8 s apart" in " ".join(printed.output.split())
+    result = invoke("margin", "double_integrator", *DEADLINE, "--no-period")
+    assert "with updates 0.2 to 0.8 s apart" in " ".join(result.output.split())
     words = ["margin", "lane_periodic", "--no-period", "--most", "2"]
     assert "proven stable for every loss pattern with M ≤ 2" in invoke(*words).output
 

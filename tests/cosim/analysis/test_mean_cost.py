@@ -76,10 +76,10 @@ def test_the_mean_cost_is_that_of_all_patterns_of_simulated_runs(mode: str, sync
 
 def test_the_mean_cost_of_noisy_runs_is_that_of_a_campaign() -> None:
     """A campaign of 100 draws; by chance 5.5 standard errors are exceeded once in 10⁷."""
-    given = scenario(**NOISE, network={"mansd": 2, "loss": BURSTS})
+    lossy_scenario = scenario(**NOISE, network={"mansd": 2, "loss": BURSTS})
     Q, R = np.array([[2.0, 0.5], [0.5, 1.0]]), np.array([[0.3]])
-    cost = find_mean_cost(given, Q, R).with_guarantee
-    costs = SampledWork(given, 3, Q, R, 0.1, 10**6).run(range(100))["cost"]
+    cost = find_mean_cost(lossy_scenario, Q, R).with_guarantee
+    costs = SampledWork(lossy_scenario, 3, Q, R, 0.1, 10**6).run(range(100))["cost"]
     assert isinstance(cost, CostUnder)
     assert abs(costs.mean() - cost.horizon_cost) < 5.5 * costs.std() / np.sqrt(len(costs))
     assert costs.std() / np.sqrt(len(costs)) < 0.05 * cost.horizon_cost
@@ -145,6 +145,6 @@ def test_costs_that_do_not_depend_on_what_grows_are_those_of_the_loop_without_it
     ],
 )
 def test_noack_cost_prints_the_result_or_the_reason(words: list[str], status: int, message: str) -> None:
-    done = invoke("cost", *words)
-    assert done.exit_code == status, done.output
-    assert message in done.output
+    result = invoke("cost", *words)
+    assert result.exit_code == status, result.output
+    assert message in result.output

@@ -214,8 +214,8 @@ def test_a_disturbance_or_set_point_sets_the_scale_of_the_state(content: dict[st
     assert diverged(late, [plain]) is not None
     step = {"kind": "step", "amplitude": [1.0], "from_s": 0.0}
     assert diverged(late, [loop(content, disturbances=[step])]) is None
-    moved = plain.controller.model_copy(update={"setpoint": (1.0, 0.0)})
-    assert diverged(late, [plain, plain.model_copy(update={"controller": moved})]) is None
+    controller = plain.controller.model_copy(update={"setpoint": (1.0, 0.0)})
+    assert diverged(late, [plain, plain.model_copy(update={"controller": controller})]) is None
 
 
 def unstable(content: dict[str, Any], horizon_s: float) -> Scenario:

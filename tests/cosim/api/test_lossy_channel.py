@@ -118,13 +118,13 @@ def test_a_seed_gives_the_same_bits_and_each_episode_has_other_losses() -> None:
     lossy = {**HALF, "impairments": [{"kind": "delay", "delay_s": 0.03, "jitter_s": 0.03}]}
     env, second_env = (noack.LossyChannel(Clock(), {**lossy, "actuation": HALF}) for _ in range(2))
     first, infos = episode(env, 300, seed=4)
-    second, more = episode(env, 300, seed=None)
-    again, same = episode(second_env, 300, seed=4)
-    assert first.tobytes() == again.tobytes()
-    assert infos == same
+    second, more_infos = episode(env, 300, seed=None)
+    second_observations, second_infos = episode(second_env, 300, seed=4)
+    assert first.tobytes() == second_observations.tobytes()
+    assert infos == second_infos
     assert first.tobytes() != second.tobytes()
     assert episode(second_env, 300, seed=None)[0].tobytes() == second.tobytes()
-    assert losses(infos, "observation") != losses(more, "observation")
+    assert losses(infos, "observation") != losses(more_infos, "observation")
     assert losses(infos, "observation") != losses(infos, "action")
 
 
@@ -148,7 +148,7 @@ class NoStep(Clock):
     dt = None  # type: ignore[assignment]
 
 
-@pytest.mark.parametrize(("env", "network", "given", "why"), [
+@pytest.mark.parametrize(("env", "network", "given", "reason"), [
     (Clock, {"mansd": 3}, {}, r"^LossyChannel: network.loss: missing"),
     (Clock, {**HALF, "mansd": -1}, {}, r"^LossyChannel: network.mansd"),
     (Clock, {}, {}, r"^LossyChannel: network.loss: missing .*; network.mansd: missing"),
@@ -163,10 +163,10 @@ class NoStep(Clock):
     (Clock, HALF, {"seed": 1.5}, "seed = 1.5: must be a whole number"),
     (Clock, HALF, {"seed": np.int64(-1)}, "must be a whole number, 0 or more"),
 ])  # fmt: skip
-def test_a_mistake_is_one_line(env: Any, network: Any, given: Any, why: str) -> None:
-    with pytest.raises(CallerError, match=why) as caught:
+def test_a_mistake_is_one_line(env: Any, network: Any, given: Any, reason: str) -> None:
+    with pytest.raises(CallerError, match=reason) as error:
         noack.LossyChannel(env(), network, **given)
-    assert "\n" not in str(caught.value)
+    assert "\n" not in str(error.value)
 
 
 def test_without_gymnasium_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -38,19 +38,19 @@ def test_the_estimates_are_those_of_the_draws(result: noack.CampaignResult) -> N
     assert (row["draws"], row["finite"]) == (30, 30)
     assert row["mean"] == pytest.approx(values.mean())
     assert row["largest"] == values.max()
-    others = result.draws(mode="model", loss=0.8)["transmissions"].to_numpy()
+    transmissions = result.draws(mode="model", loss=0.8)["transmissions"].to_numpy()
     (compared,) = (
         row for row in result.differences().to_pylist()
         if (row["mode"], row["loss"], row["metric"]) == ("model", "0.8", "transmissions")
     )  # fmt: skip
-    assert compared["mean"] == pytest.approx(np.mean(others - values))
+    assert compared["mean"] == pytest.approx(np.mean(transmissions - values))
     assert result.breaches == 0
 
 
 def test_the_page_the_summary_and_the_figures_are_there(result: noack.CampaignResult) -> None:
     assert result.report().is_file()
-    written = json.loads((result.folder / "summary.json").read_text())
-    assert [row["axes"] for row in written["points"]] == [row["axes"] for row in result.summary["points"]]
+    document = json.loads((result.folder / "summary.json").read_text())
+    assert [row["axes"] for row in document["points"]] == [row["axes"] for row in result.summary["points"]]
     assert result.plot().axes
     assert "0.8" in repr(result)
     assert "<table>" in result._repr_html_()
@@ -59,9 +59,9 @@ def test_the_page_the_summary_and_the_figures_are_there(result: noack.CampaignRe
 def test_numbers_may_be_those_of_numpy(result: noack.CampaignResult) -> None:
     axes = [PLAN["axes"][0], PLAN["axes"][1] | {"values": np.array([0.2, 0.8])}]
     plan = PLAN | {"axes": axes, "settings": {"horizon_s": np.float32(5)}, "draws": np.int64(30)}
-    again = noack.campaign(plan, draws=np.int64(30), workers=np.int64(1))
-    assert again.summary == result.summary
-    assert again.draws(mode="hold", loss=np.float64(0.8)).num_rows == 30
+    repetition = noack.campaign(plan, draws=np.int64(30), workers=np.int64(1))
+    assert repetition.summary == result.summary
+    assert repetition.draws(mode="hold", loss=np.float64(0.8)).num_rows == 30
     first, same = (
         noack.margin("lane_periodic", most_m=m, accuracy=accuracy, period=False).caps[-1].stability.lower
         for m, accuracy in ((np.int64(2), np.float64(1e-3)), (2, 1e-3))

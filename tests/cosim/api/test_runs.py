@@ -24,8 +24,8 @@ from tests.helpers.live_runs import WITHOUT_VIEWER
 def test_a_run_gives_its_results(simulated: noack.Run) -> None:
     assert simulated.ok
     assert simulated.reason == "horizon"
-    written = json.loads((simulated.directory / "summary.json").read_text())
-    assert simulated.summary.to_json() == written
+    document = json.loads((simulated.directory / "summary.json").read_text())
+    assert simulated.summary.to_json() == document
     (loop,) = simulated.summary.loops
     assert simulated.claims == loop.claims != []
     assert simulated.scenario.plant.draw == "given"
@@ -88,10 +88,10 @@ def test_a_run_of_the_api_has_an_ordinary_run_directory(
     run = noack.simulate(short, runs=tmp_path / "runs")
     assert (run.directory / "recording.rrd").is_file()
     monkeypatch.chdir(tmp_path)
-    opened = noack.open_run()
-    assert opened.directory.samefile(run.directory)
-    assert opened.summary == run.summary
-    assert opened.report() == opened.directory / "report.html"
+    newest = noack.open_run()
+    assert newest.directory.samefile(run.directory)
+    assert newest.summary == run.summary
+    assert newest.report() == newest.directory / "report.html"
 
 
 def test_an_interrupted_live_run_is_returned() -> None:

@@ -34,10 +34,10 @@ def test_files_are_found_relative_to_the_scenario(
     ],
 )
 def test_a_wrong_setting_gives_one_line(settings: Any, message: str) -> None:
-    with pytest.raises(noack.NoackError) as caught:
+    with pytest.raises(noack.NoackError) as error:
         noack.with_settings(noack.load("lane_following"), settings)
-    assert message in str(caught.value)
-    assert "\n" not in str(caught.value)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
 
 
 def test_a_system_becomes_a_scenario_with_the_documented_choices() -> None:
@@ -73,7 +73,7 @@ def test_a_python_control_system_keeps_its_names_and_may_have_another_plant() ->
     ],
 )
 def test_an_invalid_system_gives_one_line(gain: Any, initial_state: Any, message: str) -> None:
-    with pytest.raises(noack.NoackError) as caught:
+    with pytest.raises(noack.NoackError) as error:
         noack.from_system(SYSTEM, gain, initial_state)
-    assert message in str(caught.value)
-    assert "\n" not in str(caught.value)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)

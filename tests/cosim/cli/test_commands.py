@@ -64,14 +64,14 @@ SHORT = ("double_integrator", "--no-report", "--set", "horizon_s=0.1")
 
 @pytest.mark.usefixtures("usual_signals", "no_report", "no_recording")
 @pytest.mark.parametrize(
-    ("number", "status", "why"),
+    ("number", "status", "reason"),
     [
         (signal.SIGINT, 130, "stopped by the user (SIGINT)"),
         (signal.SIGHUP, 143, "stopped because the terminal was closed (SIGHUP)"),
     ],
 )
 def test_a_signal_while_a_run_is_finalised_names_the_command_that_completes_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals, status: int, why: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals, status: int, reason: str
 ) -> None:
     def signalled(*_: Any) -> None:
         signal.raise_signal(number)
@@ -81,7 +81,9 @@ def test_a_signal_while_a_run_is_finalised_names_the_command_that_completes_it(
         result = invoke("simulate", *SHORT, "--runs", tmp_path)
     assert result.exit_code == status
     (run_dir,) = (path for path in tmp_path.iterdir() if not path.is_symlink())
-    assert result.stderr.splitlines()[-1] == (f"noack: {why}; `noack summary {run_dir}` completes its record")
+    assert result.stderr.splitlines()[-1] == (
+        f"noack: {reason}; `noack summary {run_dir}` completes its record"
+    )
     assert not (run_dir / SUMMARY_FILE).exists()
     assert invoke("summary", run_dir).exit_code == 0
     assert (run_dir / SUMMARY_FILE).is_file()

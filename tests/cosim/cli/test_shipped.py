@@ -79,11 +79,11 @@ def test_all_shipped_scenarios_are_listed_with_their_description() -> None:
     assert [entry["name"] for entry in document["campaigns"]] == CAMPAIGNS
     result = invoke("scenarios")
     assert result.exit_code == 0
-    listed = [" ".join(line.split()) for line in result.stdout.splitlines()]  # one line each
+    lines = [" ".join(line.split()) for line in result.stdout.splitlines()]  # one line each
     for folder, names in (("scenarios", SCENARIOS), ("campaigns", CAMPAIGNS)):
         for name in names:
             content = tomllib.loads((ROOT / folder / f"{name}.toml").read_text("utf-8"))
-            assert f"{name} {content['description']}" in listed
+            assert f"{name} {content['description']}" in lines
 
 
 @pytest.mark.parametrize("name", SCENARIOS)

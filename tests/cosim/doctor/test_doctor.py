@@ -93,8 +93,8 @@ def test_lateness_is_compared_with_the_allowance_of_the_certificates() -> None:
     not_realtime = replace(WANTED, realtime=False)  # what is not used does not matter
     assert about("wake-ups", plain=late).verdict is MachineVerdict.GOOD
     assert about("wake-ups", not_realtime, plain=late).verdict is MachineVerdict.LIMITED
-    refused = {"sched_fifo": "not permitted: Operation not permitted"}
-    assert about("real-time", not_realtime, settings=refused).verdict is MachineVerdict.GOOD
+    settings = {"sched_fifo": "not permitted: Operation not permitted"}
+    assert about("real-time", not_realtime, settings=settings).verdict is MachineVerdict.GOOD
     # 4 of 1000 at 500 Hz: one every 250 steps of 2 ms
     assert "4 of them (0.4 %) beyond the 4 ms that loop's certificates allow" in finding.means
     assert "one every 0.5 s of a run of 20 s" in finding.means
@@ -104,10 +104,10 @@ def test_lateness_is_compared_with_the_allowance_of_the_certificates() -> None:
 def test_every_finding_is_documented() -> None:
     text = (Path(__file__).parents[3] / "docs/command-line.md").read_text()
     rows = re.findall(r"^\| `([^`]+)` \|", text.partition("| finding |")[2], re.MULTILINE)
-    named = [row.removesuffix(" ...").removesuffix(" of").removesuffix(":") for row in rows]
+    names = [row.removesuffix(" ...").removesuffix(" of").removesuffix(":") for row in rows]
     titles = {finding.what for finding in find_all(IDEAL, WANTED)}
-    assert all(any(title.startswith(name) for name in named) for title in titles)
-    assert all(any(title.startswith(name) for title in titles) for name in named)
+    assert all(any(title.startswith(name) for name in names) for title in titles)
+    assert all(any(title.startswith(name) for title in titles) for name in names)
 
 
 def test_lateness_statistics_are_those_of_the_sample() -> None:

@@ -34,9 +34,11 @@ def test_a_run_is_drawn_as_simulated_with_both_sides_of_each_event() -> None:
         assert explored.e_s_norm[first] == pytest.approx(np.linalg.norm(before.e_s))
         assert explored.e_c_norm[first + 1] == pytest.approx(np.linalg.norm(after.e_c))
         assert explored.e_s_norm[first + 1] == 0.0
-    known = noack.load("lane_following", {"network.initial_sync": "known_state"})
-    shown = ExploredRun(exploration.explore(known), 0)._replace(guarantee=guarantee.certify(known))
-    figure = exploration_figure(shown)
+    known_scenario = noack.load("lane_following", {"network.initial_sync": "known_state"})
+    explored_run = ExploredRun(exploration.explore(known_scenario), 0)._replace(
+        guarantee=guarantee.certify(known_scenario)
+    )
+    figure = exploration_figure(explored_run)
     errors = figure.rows[1].panels[0].legend or ()
     assert "certified bound" in errors
     part = figure_part(figure)
@@ -45,7 +47,7 @@ def test_a_run_is_drawn_as_simulated_with_both_sides_of_each_event() -> None:
     ends = np.cumsum(part["lengths"])
     item = next(item for item in part["panels"][2]["items"] if item["label"] == "‖x‖")
     sent = np.split(numbers, ends[:-1])[item["y"]]
-    np.testing.assert_allclose(sent, shown.run.x_norm, rtol=1e-6)
+    np.testing.assert_allclose(sent, explored_run.run.x_norm, rtol=1e-6)
 
 
 def test_a_run_that_diverges_is_drawn_up_to_that_time_and_widens_the_band() -> None:
@@ -117,8 +119,8 @@ def test_trajectories_of_an_ensemble_are_those_of_the_exact_simulator(name: str)
     states = exploration.trajectories(setting, population, events, t_s)
     for draw in range(draws):
         exact = run_continuous(drawn_scenario(scenario, 7, draw)).at(t_s)
-        wanted = np.stack(exact[1:], axis=1)
-        np.testing.assert_allclose(states[draw], wanted, rtol=1e-6, atol=1e-8)
+        expected = np.stack(exact[1:], axis=1)
+        np.testing.assert_allclose(states[draw], expected, rtol=1e-6, atol=1e-8)
 
 
 def test_a_certificate_has_bounds_over_time_or_a_reason() -> None:
@@ -130,10 +132,10 @@ def test_a_certificate_has_bounds_over_time_or_a_reason() -> None:
     bound = np.interp(run.t_s, certified.t_s, certified.e_c)
     assert (run.e_c_norm <= bound * 1.01).all()
     assert "loop gain" in guarantee.certify(noack.load("reactor_petc")).reason
-    missing = guarantee.certify(noack.load("lane_vehicle"))
-    assert missing.verdict == guarantee.NOT_COVERED
-    assert "not linear" in missing.reason
-    assert np.isnan(missing.e_c).all()
+    no_guarantee = guarantee.certify(noack.load("lane_vehicle"))
+    assert no_guarantee.verdict == guarantee.NOT_COVERED
+    assert "not linear" in no_guarantee.reason
+    assert np.isnan(no_guarantee.e_c).all()
 
 
 def test_a_verdict_says_what_became_of_the_run_and_of_its_guarantee() -> None:
@@ -148,14 +150,14 @@ def test_a_verdict_says_what_became_of_the_run_and_of_its_guarantee() -> None:
     low = replace(certified, e_c=1e-3 * certified.e_c)
     assert verdict_of(run, low)[1].text.startswith("guarantee broken since ")
     missing = guarantee.certify(noack.load("lane_vehicle"))
-    said = verdict_of(run, missing)[1].text
-    assert said == f"guarantee not checkable: {missing.reason}"
+    verdict = verdict_of(run, missing)[1].text
+    assert verdict == f"guarantee not checkable: {missing.reason}"
 
 
 def test_a_loop_at_its_setpoint_breaks_no_guarantee() -> None:
     """The certificate bounds ‖x − x_r‖, which decays; ‖x‖ stays near ‖x_r‖ = 20.
 
-    Such a loop was called bounded, and was said to grow, where a run's summary calls it stable.
+    Such a loop was called bounded, and was verdict to grow, where a run's summary calls it stable.
     """
     run = exploration.explore_or_simulate(
         noack.load("lane_following", {"controller.setpoint": [0.0, 0.0, 0.0, 20.0]})
@@ -174,9 +176,9 @@ def test_more_losses_than_assumed_break_a_guarantee_that_is_not_enforced() -> No
     scenario = noack.load("lane_following", {"network.enforce_mansd": False, "network.mansd": 3})
     run = exploration.explore(scenario)
     fourth = next(i for i in range(3, len(run.delivered)) if not run.delivered[i - 3 : i + 1].any())
-    said = verdict_of(run, guarantee.certify(scenario))[1].text
+    verdict = verdict_of(run, guarantee.certify(scenario))[1].text
     at_s = run.event_s[fourth]
-    assert said == f"guarantee broken since {at_s:.3f} s: 4 consecutive updates lost, 3 allowed"
+    assert verdict == f"guarantee broken since {at_s:.3f} s: 4 consecutive updates lost, 3 allowed"
 
 
 def test_a_comparison_ends_where_one_of_the_runs_does() -> None:

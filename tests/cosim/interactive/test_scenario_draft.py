@@ -22,12 +22,12 @@ def test_the_model_error_multiplies_both_boxes() -> None:
     draft = open_draft("lane_following")
     (slider,) = [part for part in controls_of(draft).sliders if part.scaled]
     assert slider.value == 1.0
-    wide = drag(drag(draft, slider, 3.0), slider, 12.0)
-    assert "# M - 1: at most four consecutive losses" in wide.text
-    assert wide.value("plant.uncertainty_A")[0] == [1.2, 1.2, 0.0, 0.0]
-    assert wide.value("plant.uncertainty_B")[1] == [0.0, 0.6]
-    assert [part.value for part in controls_of(wide).sliders if part.scaled] == [12.0]
-    assert drag(wide, slider, 1.0).text.count("0.1, 0.1") == 2
+    dragged = drag(drag(draft, slider, 3.0), slider, 12.0)
+    assert "# M - 1: at most four consecutive losses" in dragged.text
+    assert dragged.value("plant.uncertainty_A")[0] == [1.2, 1.2, 0.0, 0.0]
+    assert dragged.value("plant.uncertainty_B")[1] == [0.0, 0.6]
+    assert [part.value for part in controls_of(dragged).sliders if part.scaled] == [12.0]
+    assert drag(dragged, slider, 1.0).text.count("0.1, 0.1") == 2
     nominal = draft.with_value("plant.draw", "nominal")
     assert not any(part.scaled for part in controls_of(nominal).sliders)
 
@@ -39,10 +39,10 @@ def test_any_value_at_any_place_is_read_back(key: str, value: object) -> None:
     draft = Draft("a", Path(), text, text)
     content = toml_file.parsed(text, "")
     put(content, key, value, key)
-    changed = draft.with_value(key, value)
-    assert toml_file.parsed(changed.text, "") == changed.content == content
-    assert (changed.text.count("#") >= 2) or "new" in key
-    assert toml_file.parsed(changed.without(key).text, "") == changed.without(key).content
+    other_draft = draft.with_value(key, value)
+    assert toml_file.parsed(other_draft.text, "") == other_draft.content == content
+    assert (other_draft.text.count("#") >= 2) or "new" in key
+    assert toml_file.parsed(other_draft.without(key).text, "") == other_draft.without(key).content
 
 
 def test_mistakes_are_shown_at_their_keys() -> None:
@@ -66,10 +66,10 @@ def test_every_scenario_has_controls_and_an_address(name: str) -> None:
         low, high = slider.ends
         assert low <= slider.position <= high
         for share in (0.0, 0.77, 1.0):
-            moved = drag(draft, slider, slider.value_at(low + share * (high - low)))
-            again = draft_of_query(moved.query(), name, {name: name})
-            assert again.content == moved.content
-            assert moved.scenario  # it is valid
+            dragged = drag(draft, slider, slider.value_at(low + share * (high - low)))
+            reopened = draft_of_query(dragged.query(), name, {name: name})
+            assert reopened.content == dragged.content
+            assert dragged.scenario  # it is valid
 
 
 def test_an_address_cannot_name_code_or_foreign_files(tmp_path: Path) -> None:

@@ -58,9 +58,9 @@ def test_a_wrong_text_stays_as_it_is_typed_and_is_named_at_its_field() -> None:
     assert field("trigger.beta").text(draft) == "about 1: or 2"
     draft = fill_in(draft, field("plant.initial_state"), '[1.0, "a", 0, 0]')
     draft = fill_in(draft, field("network.mansd"), "-3")
-    with pytest.raises(DraftError) as caught:
+    with pytest.raises(DraftError) as error:
         _ = draft.scenario
-    assert by_field(form_of(draft), caught.value.mistakes) == {
+    assert by_field(form_of(draft), error.value.mistakes) == {
         "trigger.beta": "expected a number",
         "plant.initial_state": "expected a number",
         "network.mansd": "expected at least 0",
@@ -88,9 +88,9 @@ def test_another_kind_keeps_what_both_kinds_have() -> None:
     draft, choice = open_draft("lane_following"), field("controller.kind")
     python = fill_in(draft, choice, "python")
     assert python.value("controller") == {"rate_hz": 500.0, "kind": "python"}
-    with pytest.raises(DraftError) as caught:
+    with pytest.raises(DraftError) as error:
         _ = python.scenario
-    assert by_field(form_of(python), caught.value.mistakes)["controller.name"]
+    assert by_field(form_of(python), error.value.mistakes)["controller.name"]
     assert fill_in(python, choice, "").value("controller") is None
     policy = field("trigger.policy")
     for kind in policy.options:

@@ -66,6 +66,6 @@ def test_a_range_stays_put_while_its_slider_is_dragged(draft: Draft) -> None:
             value = slider.value_at(low + share * (high - low))
             with suppress(DraftError):  # the value may contradict another one
                 moved = drag(dragged, slider, value)
-                after = {control.key: control for control in controls_of(moved).sliders}
-                assert after[slider.key].ends == pytest.approx(slider.ends), slider.key
+                controls_after = {control.key: control for control in controls_of(moved).sliders}
+                assert controls_after[slider.key].ends == pytest.approx(slider.ends), slider.key
                 dragged = moved

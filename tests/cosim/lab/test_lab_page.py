@@ -61,19 +61,19 @@ def test_a_kept_run_is_drawn_beside_the_next_one_and_the_difference_is_said(
     page.wait(f"{COMPARED}.includes('trigger.beta') && {COMPARED}.includes('→ 5.0')")
     page.press_button("keep for comparison")
     page.wait(f"{COMPARED}.includes('the kept run') && {COMPARED}.includes('are the same')")
-    before = page.js(PIXELS)
+    empty_pixels = page.js(PIXELS)
     page.drag("β, threshold at the start", 0.0)
     page.wait(f"{COMPARED}.includes('trigger.beta 5.0 → 0.05')")
-    assert page.js(PIXELS) != before
+    assert page.js(PIXELS) != empty_pixels
     rows = [row.split("\t") for row in page.js(COMPARED).split("\n") if "\t" in row]
     kept, now = (counts("lane_following", **{"horizon_s": 4.0, "trigger.beta": beta}) for beta in (5.0, 0.05))
     assert [row[1:3] for row in rows[1:3]] == [list(pair) for pair in zip(kept, now, strict=True)]
     assert rows[1][3] == f"{int(now[0]) - int(kept[0])} more"
     assert rows[3][0] == "‖x‖ at the end"
     assert rows[4][0] == "largest ‖e_c‖"
-    drawn = page.js(PIXELS)
+    pixels = page.js(PIXELS)
     page.js("document.querySelector('.lab-bar [role=checkbox]').click()")
-    page.wait(f"document.getElementById('lab-compare').hidden && {PIXELS} !== {json.dumps(drawn)}")
+    page.wait(f"document.getElementById('lab-compare').hidden && {PIXELS} !== {json.dumps(pixels)}")
 
 
 def test_the_form_shows_mistakes_at_their_fields_and_keeps_what_is_typed(
@@ -243,10 +243,10 @@ def test_a_live_run_ends_with_a_verdict_and_is_the_selected_recorded_run(
     page.call("Page.navigate", url=report)
     page.wait(f"{TEXT}.includes('completed 4 s') && origin === 'null'")
     for wrong, status in ((report.replace("/report/", "x/report/"), 404), (report + "x", 404)):
-        with pytest.raises(HTTPError) as refused:
+        with pytest.raises(HTTPError) as error:
             urlopen(wrong)
-        assert refused.value.code == status
-        refused.value.close()
+        assert error.value.code == status
+        error.value.close()
     # A new page selects the newest run.
     page.go(address)
     page.click("recorded", "button")

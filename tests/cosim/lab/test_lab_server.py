@@ -32,9 +32,9 @@ def answer(kind: str, path: str, **headers: str) -> list[MutableMapping[str, Any
     async def send(message: MutableMapping[str, Any]) -> None:
         sent.append(message)
 
-    given = [(name.encode(), value.encode()) for name, value in headers.items()]
+    encoded_headers = [(name.encode(), value.encode()) for name, value in headers.items()]
     scope = {
-        "type": kind, "path": path, "headers": given, "query_string": b"a=1",
+        "type": kind, "path": path, "headers": encoded_headers, "query_string": b"a=1",
         "client": ("127.0.0.1", 4711), "server": ("127.0.0.1", 8765),
     }  # fmt: skip
     asyncio.run(AddressGuard(inner, SECRET, OPENING)(scope, receive, send))
@@ -78,10 +78,10 @@ def test_the_address_on_a_command_line_is_for_processes_of_this_user(
     user: int | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every user can read command lines."""
-    asked = []
-    monkeypatch.setattr(lab_server, "socket_user", lambda *of: asked.append(of) or user)
+    connections = []
+    monkeypatch.setattr(lab_server, "socket_user", lambda *of: connections.append(of) or user)
     first, _ = answer("http", f"/{OPENING}/", host="127.0.0.1:8765")
-    assert asked == [(("127.0.0.1", 4711), ("127.0.0.1", 8765))]
+    assert connections == [(("127.0.0.1", 4711), ("127.0.0.1", 8765))]
     if user == os.getuid():
         assert first["status"] == 303
         assert dict(first["headers"])[b"location"] == f"/{SECRET}/?a=1".encode()
@@ -93,16 +93,16 @@ def test_the_address_on_a_command_line_is_for_processes_of_this_user(
 def test_the_browser_is_started_with_the_address_for_command_lines(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    opened, announced = list[str](), list[str]()
+    opened_urls, announced_urls = list[str](), list[str]()
 
     def open_page(address: str) -> None:
-        opened.append(address)
+        opened_urls.append(address)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(lab_server.webbrowser, "open", open_page)
     options = LabOptions("lane_following", "", tmp_path, tmp_path / "runs", 0, open_browser=True)
-    lab_server.serve(options, announced.append)
+    lab_server.serve(options, announced_urls.append)
     faulthandler.cancel_dump_traceback_later()
-    (page,), (line) = announced, opened[0]
+    (page,), (line) = announced_urls, opened_urls[0]
     assert urlsplit(page).netloc == urlsplit(line).netloc
     assert urlsplit(page).path != urlsplit(line).path

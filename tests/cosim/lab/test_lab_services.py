@@ -36,8 +36,8 @@ def test_the_services_end_whatever_the_worker_does(tmp_path: Path) -> None:
     """In a program of its own: the interpreter's exit must not wait either."""
     functions = "".join(
         f"""
-def unanswered_{number}(begun):
-    Path(begun).touch()
+def unanswered_{number}(begin_file):
+    Path(begin_file).touch()
     {what}
 """
         for number, what in enumerate(UNANSWERED.values())
@@ -49,9 +49,9 @@ from pathlib import Path
 from cosim.lab.lab_services import LabServices
 {functions}
 async def main(services, unanswered):
-    begun = Path(unanswered.__name__)
-    call = asyncio.create_task(services.compute(unanswered, str(begun)))
-    while not begun.exists():
+    begin_file = Path(unanswered.__name__)
+    call = asyncio.create_task(services.compute(unanswered, str(begin_file)))
+    while not begin_file.exists():
         await asyncio.sleep(0.01)
     await asyncio.sleep(0.1)  # so that the pool's thread reads what there is
     call.cancel()
@@ -111,13 +111,13 @@ class Watched(Inline):
 
     def __init__(self) -> None:
         self.session: Session | None = None
-        self.begun: list[tuple[str, bool]] = []
+        self.shown: list[tuple[str, bool]] = []
 
     async def compute(self, function: Callable[..., Any], *arguments: Any) -> Any:
         assert self.session is not None
         while not self.session.pending.endswith("waiting for the processor"):
             await asyncio.sleep(0)
-        self.begun.append((self.session.pending, known(self.session, CERTIFICATE)))
+        self.shown.append((self.session.pending, known(self.session, CERTIFICATE)))
         return await super().compute(function, *arguments)
 
 
@@ -128,7 +128,7 @@ def test_the_certificate_is_shown_before_the_bands_and_waiting_is_said(
     calls = Watched()
     lab_session = calls.session = session_of("lane_following", drawn, calls, horizon_s=2.0)
     asyncio.run(settled(lab_session))
-    assert calls.begun == [
+    assert calls.shown == [
         ("certificate: waiting for the processor", False),
         ("bands: waiting for the processor", True),
         ("margin: waiting for the processor", True),
@@ -166,13 +166,13 @@ def with_services(use: Callable[[LabServices], Awaitable[Any]], folder: Path) ->
 
 def test_a_closed_page_gives_up_its_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lab_services, "_GIVE_UP_S", 0.0)
-    begun = tmp_path / "begun"
+    marker = tmp_path / "marker"
 
     async def use(services: LabServices) -> int:
         closed, other = PageCalls(services), PageCalls(services)
         given_up = [
             asyncio.create_task(closed.compute(time.sleep, 1e6)),
-            asyncio.create_task(closed.compute(begun.touch)),
+            asyncio.create_task(closed.compute(marker.touch)),
         ]
         wanted = asyncio.create_task(other.compute(int, "7"))
         while not services._turn.locked():  # the first of them is begun
@@ -183,7 +183,7 @@ def test_a_closed_page_gives_up_its_work(tmp_path: Path, monkeypatch: pytest.Mon
         return await wanted
 
     assert with_services(use, tmp_path) == 7
-    assert not begun.exists()
+    assert not marker.exists()
 
 
 def test_the_newest_run_that_has_ended_is_known(tmp_path: Path) -> None:

@@ -83,7 +83,7 @@ def test_a_run_writes_nothing_beside_the_scenario_and_reads_the_files_there(
     shutil.copy(draft.folder / "saturated_lqr.py", folder)
     (folder / f".lab-{os.getpid()}.toml").symlink_to(private)
     monkeypatch.setenv("PYTHONPATH", WITHOUT_VIEWER["PYTHONPATH"])
-    before = folder.stat().st_mtime_ns  # changes if a file is made, renamed or removed
+    changed_ns = folder.stat().st_mtime_ns  # changes if a file is made, renamed or removed
 
     async def run() -> LiveRun:
         live = LiveRun(0.5)
@@ -93,7 +93,7 @@ def test_a_run_writes_nothing_beside_the_scenario_and_reads_the_files_there(
 
     live = asyncio.run(run())
     assert live.state == "ended", live.lines
-    assert folder.stat().st_mtime_ns == before
+    assert folder.stat().st_mtime_ns == changed_ns
     assert private.read_text() == "precious"
 
 

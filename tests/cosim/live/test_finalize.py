@@ -191,7 +191,7 @@ def test_an_interrupted_finalisation_is_completed(run_dir: Path) -> None:
     finalize(ended_well(run_dir), report=False)
     notices, write = run_dir / "record/notices.jsonl", json.dumps
     notices.write_text('{"t_ns": 5, "level": "info", "text": "kept", "process": "plant"}\n')
-    before = notices.read_text()
+    old_text = notices.read_text()
     for name in (SPOOL, f"{SPOOL}.done"):
         writer = SpoolWriter(run_dir / name, "plant")
         writer.append(PLANT_STEP, 0, b"")
@@ -204,7 +204,7 @@ def test_an_interrupted_finalisation_is_completed(run_dir: Path) -> None:
 
     with patch("json.dumps", full), pytest.raises(MachineError, match="No space"):
         finish_record(run_dir)
-    assert notices.read_text() == before
+    assert notices.read_text() == old_text
     assert finish_record(run_dir).loop().notices
     assert not [*run_dir.glob(f"{SPOOL}*")]
     (run_dir / SUMMARY_FILE).unlink()
@@ -260,7 +260,7 @@ def test_a_prepared_end_is_that_of_a_run_without_preparation(
     *,
     is_killed: bool,
 ) -> None:
-    given = (many_loops, 0, ExitStatus.OK, "horizon")
+    ending_arguments = (many_loops, 0, ExitStatus.OK, "horizon")
     helpers = FinalizeHelpers(load(many_loops / SCENARIO_FILE))
     helpers.end_preparation()
     helpers.submit(exec, _NEVER_IDLE).result()
@@ -273,7 +273,7 @@ def test_a_prepared_end_is_that_of_a_run_without_preparation(
         assert helpers.submit(os.getpid).result() != os.getpid()
         with pytest.raises(BrokenProcessPool):
             helpers.submit(os._exit, 1).result()
-    ending = RunEndingWithHelpers(*given, helpers=helpers)
+    ending = RunEndingWithHelpers(*ending_arguments, helpers=helpers)
     _, expected = judged_alone
     assert finalize(ending, report=False, view=not is_killed).summary == expected
 
@@ -283,13 +283,13 @@ def test_the_end_does_not_wait_for_a_preparation_that_gets_no_time(
     many_loops: Path, monkeypatch: pytest.MonkeyPatch, part: str
 ) -> None:
     """A table writer that has not made its folder is not waited for either."""
-    begun = Event()
+    preparation_started = Event()
 
     def endless(helpers: FinalizeHelpers, *_: object) -> None:
         if part == "_write_early":
             helpers._end_file, helpers._writer = many_loops / "none" / "ended", current_thread()
         waiting = helpers.submit(time.sleep, 1e6)
-        begun.set()
+        preparation_started.set()
         waiting.result()
 
     for method in ("_prepare_loops", "_write_early", "_call_at_idle_priority"):
@@ -297,33 +297,33 @@ def test_the_end_does_not_wait_for_a_preparation_that_gets_no_time(
     monkeypatch.setattr(finalize_helpers, "_GRACE_S", 0.0)
     helpers = FinalizeHelpers(load(many_loops / SCENARIO_FILE))
     helpers.prepare(many_loops)
-    begun.wait()
+    preparation_started.wait()
     ending = RunEndingWithHelpers(many_loops, 0, ExitStatus.OK, "horizon", helpers=helpers)
     assert len(finalize(ending, report=False, view=False).summary.loops) == LOOPS
 
 
 def test_the_end_waits_for_the_table_writer(many_loops: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The writer has seen the end file, and is no longer at idle priority."""
-    begun, told = Event(), Event()
+    writing_started, end_file_made = Event(), Event()
 
     def write(helpers: FinalizeHelpers, *_: object) -> None:
         helpers._end_file, helpers._writer = many_loops / "ended", current_thread()
-        begun.set()
-        told.wait()
+        writing_started.set()
+        end_file_made.wait()
         time.sleep(20 * finalize_helpers._POLL_S)
 
-    def tell(_: FinalizeHelpers) -> bool:
-        told.set()
+    def make_end_file(_: FinalizeHelpers) -> bool:
+        end_file_made.set()
         return True
 
-    for method, replacement in (("_write_early", write), ("_make_end_file", tell)):
+    for method, replacement in (("_write_early", write), ("_make_end_file", make_end_file)):
         monkeypatch.setattr(FinalizeHelpers, method, replacement)
     for method in ("_prepare_loops", "_call_at_idle_priority"):
         monkeypatch.setattr(FinalizeHelpers, method, lambda *_: None)
     monkeypatch.setattr(finalize_helpers, "_GRACE_S", 0.0)
     helpers = FinalizeHelpers(load(many_loops / SCENARIO_FILE))
     helpers.prepare(many_loops)
-    begun.wait()
+    writing_started.wait()
     with patch.object(helpers, "_abort") as aborted:
         helpers.end_preparation()
     helpers.close()
@@ -340,15 +340,15 @@ def test_a_replay_in_a_helper_equals_one_in_this_process(
 ) -> None:
     monkeypatch.setattr(finalize_helpers, "_MANY_STEPS", 10)
     monkeypatch.setattr(finalize_helpers, "cores", lambda: 2)
-    asked = []
+    replays = []
 
-    def told(self: ReplayInHelper) -> Any:
-        asked.append(self)
+    def recorded_part(self: ReplayInHelper) -> Any:
+        replays.append(self)
         with suppress(MemoryError):
             return part(self)
 
-    monkeypatch.setattr(ReplayInHelper, "part", told)
+    monkeypatch.setattr(ReplayInHelper, "part", recorded_part)
     finalize(ended_well(run_dir), report=False, view=False)
     stored = summary_of(run_dir)["loops"][0]["replay"]
     assert stored == replay(load_record(run_dir)).verdict().model_dump()
-    assert len(asked) == 1
+    assert len(replays) == 1

@@ -193,19 +193,19 @@ class Ending(FakeCoordinator):
 
 def test_why_a_run_ends_early_is_shown_before_its_processes_end(case: Case) -> None:
     """The completion of the record of many loops takes minutes."""
-    shown: list[Any] = []
+    calls: list[Any] = []
 
-    def stopping(why: str) -> None:
+    def stopping(reason: str) -> None:
         assert children.running()
-        shown.append(why)
+        calls.append(reason)
         for role in ROLES:
             children.exit(role, 0)
 
     children, coordinator = case.children(None), Ending(0.5)
     coordinator.children = children
-    run = case.run(children, coordinator, stopping=stopping, progress=shown.append)
+    run = case.run(children, coordinator, stopping=stopping, progress=calls.append)
     status, reason = run.watch(Signals(), lambda *_: None)
-    assert shown == [reason, {"warnings": ["late"]}]
+    assert calls == [reason, {"warnings": ["late"]}]
     assert (status, reason) == (ExitStatus.FAILED, "plant died: killed by SIGKILL")
 
 

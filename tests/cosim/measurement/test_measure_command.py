@@ -43,11 +43,11 @@ def test_json_tables_and_page_have_the_same_numbers(tmp_path: Path) -> None:
     assert document["written"] == [str(page)]
     html = page.read_text()
     assert html.count("<svg") + html.count("<img") == 4
-    printed = measure(RURAL, "--deadline", "100ms")
-    assert printed.exit_code == 0
+    result = measure(RURAL, "--deadline", "100ms")
+    assert result.exit_code == 0
     for text in ("616 (28.3 %)", "175 packets, 10.9 s, from 81.312 s"):
         assert text in html
-        assert text in " ".join(printed.output.split())
+        assert text in " ".join(result.output.split())
 
 
 def test_the_written_model_is_a_network_with_the_fitted_parameters(chain_csv: Path, tmp_path: Path) -> None:

@@ -95,10 +95,14 @@ def test_a_round_trip_tells_on_which_way_each_datagram_was_lost(forward: set[int
     assert set(np.flatnonzero(result.trace.lost)) == truth.keys()
     # Fewer than 128 are lost in a row, so that each answer covers what was lost before it.
     answered = [k for k in arrived if k not in lost_in_reverse]
-    known = {k: direction for k, direction in truth.items() if answered and k < answered[-1]}
-    assert {k: direction for k, direction in probe.sender.lost_directions().items() if k in known} == known
-    after = {direction for k, direction in probe.sender.lost_directions().items() if k not in known}
-    assert after <= {"unknown"}
+    known_directions = {k: direction for k, direction in truth.items() if answered and k < answered[-1]}
+    assert {
+        k: direction for k, direction in probe.sender.lost_directions().items() if k in known_directions
+    } == known_directions
+    later_directions = {
+        direction for k, direction in probe.sender.lost_directions().items() if k not in known_directions
+    }
+    assert later_directions <= {"unknown"}
 
 
 def test_a_probe_without_an_end_and_late_sends_are_named() -> None:

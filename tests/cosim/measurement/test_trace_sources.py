@@ -72,6 +72,6 @@ def test_files_that_cannot_be_measured_are_refused_in_one_line(tmp_path: Path) -
         ([csv, csv], SourceOptions(), "expected one file, or two captures"),
         ([csv], SourceOptions(sequence_at="0:4"), "--sequence-at: has no effect on a packet trace"),
     ):
-        with pytest.raises(CallerError, match=message) as refused:
+        with pytest.raises(CallerError, match=message) as error:
             read_source(paths, options)
-        assert "\n" not in str(refused.value)
+        assert "\n" not in str(error.value)

@@ -52,18 +52,18 @@ def test_the_documentation_quotes_computed_figures(lane: Certificates, weighted:
         key: [cell.strip() for cell in cells.strip(" |").split("|")]
         for key, cells in re.findall(r"^\| (Δ|X|δ) \|(.*)$", text, re.MULTILINE)
     }
-    own, chosen = (constants(s.paper) for s in (lane, weighted))
+    scenario_norm, other_norm = (constants(s.paper) for s in (lane, weighted))
     theorem = lane.theorem_2
-    assert rows["Δ"] == ["(same)", f"{own.delta:.3g}", f"{chosen.delta:.3g}"]
-    assert own.inter_event_s >= 100 * theorem.inter_event_s
-    assert 3.06 < chosen.delta < 1.5 * 3.06  # 3.06: the worst run of 30 s
+    assert rows["Δ"] == ["(same)", f"{scenario_norm.delta:.3g}", f"{other_norm.delta:.3g}"]
+    assert scenario_norm.inter_event_s >= 100 * theorem.inter_event_s
+    assert 3.06 < other_norm.delta < 1.5 * 3.06  # 3.06: the worst run of 30 s
     assert constants(weighted.paper_box).delta == pytest.approx(5.0, abs=1e-9)  # Δ ≤ M
-    printed = theorem.state_start + theorem.state_forced
-    assert rows["X"] == [f"{printed:.3g}", f"{own.state:.3g}", f"{chosen.state:.3g}"]
+    paper_bound = theorem.state_start + theorem.state_forced
+    assert rows["X"] == [f"{paper_bound:.3g}", f"{scenario_norm.state:.3g}", f"{other_norm.state:.3g}"]
     assert rows["δ"] == [
         f"{1e6 * theorem.inter_event_s:.3g} µs",
-        f"{1e3 * own.inter_event_s:.3g} ms",
-        f"{1e3 * chosen.inter_event_s:.3g} ms",
+        f"{1e3 * scenario_norm.inter_event_s:.3g} ms",
+        f"{1e3 * other_norm.inter_event_s:.3g} ms",
     ]
     live = constants(lane.schedule)
     least_ms = 1e3 * live.inter_event_s
@@ -156,8 +156,8 @@ def test_no_weight_improves_a_hold_and_identity_removes_the_weight() -> None:
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_numbers_that_overflow_give_no_certificate(settings: list[str]) -> None:
     """No certificate has a constant that is not finite."""
-    loaded = shipped("unstable_pendulum", *settings)
-    for _, certificate in certificates_of(loaded):
+    scenario = shipped("unstable_pendulum", *settings)
+    for _, certificate in certificates_of(scenario):
         if certificate.constants is None:
             assert certificate.void
         else:
@@ -266,10 +266,10 @@ def test_a_run_of_the_largest_number_of_events_keeps_the_assumption_as_often_as_
     lost = np.random.default_rng(1).uniform(size=(4000, packets)) < P
     lost[:, 0] = False
     bursts = np.lib.stride_tricks.sliding_window_view(lost, MANSD + 1, axis=1)
-    kept = int((~bursts.all(axis=2).any(axis=1)).sum())
+    allowed_count = int((~bursts.all(axis=2).any(axis=1)).sum())
     (why,) = (assumption.why for assumption in scheduled.assumptions if "not enforced" in assumption.why)
     stated = float(why.split("probability ")[1].split()[0])
-    assert abs(kept / 4000 - stated) < 5 * (stated * (1 - stated) / 4000) ** 0.5
+    assert abs(allowed_count / 4000 - stated) < 5 * (stated * (1 - stated) / 4000) ** 0.5
 
 
 def test_there_is_no_statement_where_losses_depend_on_times_and_the_reason_is_named(
@@ -310,10 +310,10 @@ def test_a_norm_with_certificates_is_found_and_can_be_pasted(
     monkeypatch.setattr("cosim.cli.command.show", lambda *given: shows.append(given))
     invoke("certify", "lane_following", *(f"--set={setting}" for setting in SLOW))
     ((_, to_json, print_text, *arguments),) = shows
-    print_text(Console(file=(out := StringIO()), width=100), *arguments)
-    shown, document = out.getvalue(), to_json()
-    pasted = shown[shown.index("\nweight = [") :].splitlines()[1:]
-    rows = "".join(line.strip() for line in pasted)
+    print_text(Console(file=(output := StringIO()), width=100), *arguments)
+    text, document = output.getvalue(), to_json()
+    pasted_lines = text[text.index("\nweight = [") :].splitlines()[1:]
+    rows = "".join(line.strip() for line in pasted_lines)
     weighted = certificates_of(shipped("lane_following", *SLOW, f"trigger.{rows}"))
     assert weighted.schedule.constants is not None
     assert document["certificates"][1]["constants"] is None

@@ -94,19 +94,19 @@ def test_the_report_of_a_live_run_is_complete(record: RunRecord, tmp_path: Path)
     (tmp_path / "environment.json").write_text(
         json.dumps({"started": "2020-01-02", "command": ["noack", "run"], "packages": {"a": "1.2"}})
     )
-    parsed, summary = written(record, tmp_path, claims=CLAIMS)
-    assert figure_names(parsed) == FIGURES + TIMED
+    page, summary = written(record, tmp_path, claims=CLAIMS)
+    assert figure_names(page) == FIGURES + TIMED
     for claim in CLAIMS:
         for key in ("what", "source", "bound", "verdict", "why"):
-            assert str(claim[key]) in parsed.text
+            assert str(claim[key]) in page.text
     for number in ("2.5", "0.4371", "17.5 %", "t = 3.25 s", "0.011"):
-        assert number in parsed.text
+        assert number in page.text
     for assumption in summary.loops[0].assumptions:
-        assert assumption.what in parsed.text
-        assert assumption.why in parsed.text
-    assert scenario_toml(record.scenario) in parsed.text
-    assert "guarantee broken since 0.000 s: violated: controller error" in parsed.text
-    assert "started 2020-01-02" in parsed.text
+        assert assumption.what in page.text
+        assert assumption.why in page.text
+    assert scenario_toml(record.scenario) in page.text
+    assert "guarantee broken since 0.000 s: violated: controller error" in page.text
+    assert "started 2020-01-02" in page.text
 
 
 OUTSIDE = """(() => {

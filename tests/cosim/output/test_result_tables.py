@@ -73,8 +73,8 @@ def test_the_library_writes_the_tables_of_the_command_line(tmp_path: Path) -> No
     ):  # fmt: skip
         files = noack.save_tables(result, tmp_path / name)
         assert [file.name for file in files[:2]] == [f"{name}.tex", f"{name}.csv"]
-    done = invoke("margin", "lane_periodic", "--most", "2", "--no-period", "--tables", tmp_path)
-    assert done.exit_code == 0, done.output
+    result = invoke("margin", "lane_periodic", "--most", "2", "--no-period", "--tables", tmp_path)
+    assert result.exit_code == 0, result.output
     for ending in ("tex", "csv"):
         own = tmp_path / "margin" / f"margin.{ending}"
         assert own.read_bytes() == (tmp_path / f"margin.{ending}").read_bytes()

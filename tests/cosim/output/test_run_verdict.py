@@ -34,9 +34,9 @@ def test_the_second_line_states_whether_the_guarantee_was_kept(outcome: Outcome)
     """A line of the file has the summary's claims, each with what it has of its own, and other parts."""
 
     def stated(line: str) -> list[str]:
-        changed = json.loads(line)
-        changed["claims"] = [claim(**changes) for changes in changed["claims"]]
-        text, tone = verdict(with_values(outcome.summary, **changed))[1]
+        content = json.loads(line)
+        content["claims"] = [claim(**changes) for changes in content["claims"]]
+        text, tone = verdict(with_values(outcome.summary, **content))[1]
         return [f"{tone}: {text}"]
 
     compare_lines(Path(__file__).with_name("approved") / "verdicts.txt", stated)

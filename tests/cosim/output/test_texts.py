@@ -41,9 +41,9 @@ def test_the_terminal_shows_what_was_approved(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.setattr("sys.argv", ["noack"])
-    done = invoke(*(run if word == "RUN" else word for word in words))
-    assert done.exit_code == 0, done.output
-    compare_output(f"{name}.txt", done.stdout.replace(str(run), "RUN"))
+    result = invoke(*(run if word == "RUN" else word for word in words))
+    assert result.exit_code == 0, result.output
+    compare_output(f"{name}.txt", result.stdout.replace(str(run), "RUN"))
 
 
 @pytest.mark.usefixtures("no_drawing")

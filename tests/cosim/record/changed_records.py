@@ -33,10 +33,10 @@ def copied(record: RunRecord) -> dict[str, Rows]:
 
 def changed(record: RunRecord, rows: Mapping[str, Rows] = NO_CHANGE, **others: Any) -> RunRecord:
     """The record with other rows of some tables, or another scenario, notices, reports or kind."""
-    every = {table: rows.get(table, record[table]) for table in record.tables}
+    all_rows = {table: rows.get(table, record[table]) for table in record.tables}
     names = ("scenario", "notices", "reports", "kind", "number", "roles")
-    kept = {name: getattr(record, name) for name in names}
-    return RunRecord(rows=every, **(kept | others))
+    attributes = {name: getattr(record, name) for name in names}
+    return RunRecord(rows=all_rows, **(attributes | others))
 
 
 def flipped(record: RunRecord, table: str, row: int, column: str, bit: int) -> RunRecord:

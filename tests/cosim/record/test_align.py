@@ -117,11 +117,11 @@ def test_a_track_in_parts_is_the_whole_track(split: int) -> None:
     early, delivered = TICKS["input"] <= last, UPDATES["input"] <= last
     track = controller_track(START, TICKS[early], UPDATES[delivered])
     track = controller_track(track, TICKS[~early], UPDATES[~delivered])
-    whole = controller_track(START, TICKS, UPDATES)
-    for values, expected in zip(track, whole, strict=True):
+    full_track = controller_track(START, TICKS, UPDATES)
+    for values, expected in zip(track, full_track, strict=True):
         np.testing.assert_array_equal(values, expected)
-    rest = whole.since(int(np.searchsorted(whole.model_ns, 20 * MS, "right")) - 1)
-    np.testing.assert_array_equal(align(rest, [20, 30, 55]).x_c, align(whole, [20, 30, 55]).x_c)
+    later_track = full_track.since(int(np.searchsorted(full_track.model_ns, 20 * MS, "right")) - 1)
+    np.testing.assert_array_equal(align(later_track, [20, 30, 55]).x_c, align(full_track, [20, 30, 55]).x_c)
 
 
 def test_the_model_follows_its_set_point_from_the_change_on() -> None:

@@ -51,8 +51,8 @@ def run_dir(full_record: RunRecord, tmp_path: Path) -> Path:
     }
     del reports["controller"]
     (folder / run_directory.REPORTS_FILE).write_text(json.dumps(reports))
-    joined = {WRITER[role]: {"process": role, "generation": 0} for role in SECRETS}
-    (folder / run_directory.PROCESSES_FILE).write_text(json.dumps(joined))
+    processes = {WRITER[role]: {"process": role, "generation": 0} for role in SECRETS}
+    (folder / run_directory.PROCESSES_FILE).write_text(json.dumps(processes))
     tables = {table: full_record[table] for table in full_record.tables}
     tables[CONTROLLER_STEP] = tables[CONTROLLER_STEP][:100]
     write_run(run_of_one_loop(RunRecord(full_record.scenario, tables, [], reports)), folder)
@@ -104,10 +104,10 @@ def test_kept_rows_complete_the_record_also_twice(
     for _ in range(2):
         _, roles = collect(run_dir, str(host_files.folder), finish_record)
         assert roles == ["controller"]
-        again = load_record(run_dir)
-        assert not +missing_rows(again)
+        reloaded = load_record(run_dir)
+        assert not +missing_rows(reloaded)
         for table in full_record.tables:
-            assert again[table].tobytes() == full_record[table].tobytes(), table
+            assert reloaded[table].tobytes() == full_record[table].tobytes(), table
         assert [path.name for path in run_dir.parent.iterdir()] == ["run"]
 
 
@@ -128,10 +128,10 @@ def other_role(host_files: HostFiles, full_record: RunRecord) -> None:
 def other_process(host_files: HostFiles, full_record: RunRecord) -> None:
     """Named after a process of another host, whose secret is not known here."""
     host_files.keep()
-    out = SpoolWriter(host_files.folder / SPOOL, WRITER["plant"])
-    out.append(PLANT_STEP, 0, stored(full_record, PLANT_STEP).tobytes())
-    out.append("key", 0, b"guessed")
-    out.close()
+    spool = SpoolWriter(host_files.folder / SPOOL, WRITER["plant"])
+    spool.append(PLANT_STEP, 0, stored(full_record, PLANT_STEP).tobytes())
+    spool.append("key", 0, b"guessed")
+    spool.close()
 
 
 def unknown_process(host_files: HostFiles, full_record: RunRecord) -> None:
@@ -213,9 +213,9 @@ def test_a_hostile_host_changes_nothing(
 ) -> None:
     attack(host_files, full_record)
     before = contents(run_dir.parent)
-    with pytest.raises(PeerError, match=reason) as caught:
+    with pytest.raises(PeerError, match=reason) as error:
         collect(run_dir, str(host_files.folder), finish_record)
-    assert len(str(caught.value).splitlines()) == 1
+    assert len(str(error.value).splitlines()) == 1
     assert contents(run_dir.parent) == before
 
 

@@ -30,9 +30,9 @@ def test_each_column_keeps_its_extremes_and_its_ends(y: np.ndarray, columns: int
     for c in np.unique(column):
         inside = (column == c) & ~edge
         kept = np.isin(np.arange(len(y)), keep) & (column == c)
-        seen = y[inside & np.isfinite(y)]
-        if len(seen):
-            assert np.nanmin(y[kept]) <= seen.min()
-            assert np.nanmax(y[kept]) >= seen.max()
+        values = y[inside & np.isfinite(y)]
+        if len(values):
+            assert np.nanmin(y[kept]) <= values.min()
+            assert np.nanmax(y[kept]) >= values.max()
     assert keep[0] == 0
     assert keep[-1] == len(y) - 1

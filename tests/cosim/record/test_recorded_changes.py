@@ -28,8 +28,8 @@ MS = 1_000_000
 
 
 def run_with(changes: list[tuple[int, dict[str, Any]]], **more: Any) -> RunRecord:
-    listed = [{"at_s": t_ns / 1e9, "set": settings} for t_ns, settings in changes]
-    return simulate(resolve(validate(CONTENT | {"changes": listed} | more, "here")))
+    changes_table = [{"at_s": t_ns / 1e9, "set": settings} for t_ns, settings in changes]
+    return simulate(resolve(validate(CONTENT | {"changes": changes_table} | more, "here")))
 
 
 def test_the_cap_in_force_holds_for_losses_that_change() -> None:
@@ -98,25 +98,25 @@ def test_a_change_received_too_late_is_reported_and_voids_its_claims() -> None:
             del announced_ns[role]
     record = scheduler.record()
     assert replay(record).bit_exact
-    (made,) = changes_of(record)
-    assert list(made.late) == ["controller"]
-    assert made.everywhere_ns == made.late["controller"] > 990 * MS
+    (recorded_change,) = changes_of(record)
+    assert list(recorded_change.late) == ["controller"]
+    assert recorded_change.everywhere_ns == recorded_change.late["controller"] > 990 * MS
     (violation,) = summarise_loop(record, 0, "horizon").to_json()["assumption_violations"]
     assert "change received too late" in violation["what"]
     assert violation["process"] == "controller"
     claims = [claim for claim in RunClaims(record).evaluate() if claim.source == "(I1)"]
     assert [claim.verdict for claim in claims] == [ClaimVerdict.HELD] * 4
     assert claims[0].until_s == 0.9
-    assert claims[-1].from_s > made.everywhere_ns * 1e-9
+    assert claims[-1].from_s > recorded_change.everywhere_ns * 1e-9
     # In between, only one of the two models had the change.
-    joined = align_tables(record)
-    between = (joined.t_ns > 910 * MS) & (joined.t_ns < claims[-1].from_s * 1e9)
+    samples = align_tables(record)
+    between = (samples.t_ns > 910 * MS) & (samples.t_ns < claims[-1].from_s * 1e9)
     assert np.nanmax(identity_residual(record)[between]) > 1e-3
 
 
 def test_a_network_that_knows_of_no_change_or_of_another_is_reported() -> None:
-    listed = [{"at_s": 1.0, "set": {"network.mansd": 1}}]
-    resolved = resolve(validate(CONTENT | {"changes": listed}, "here"))
+    changes_table = [{"at_s": 1.0, "set": {"network.mansd": 1}}]
+    resolved = resolve(validate(CONTENT | {"changes": changes_table}, "here"))
     with pytest.raises(CallerError, match="settings that stay the same"):
         simulate(resolved, lambda data, now_ns: 0)
     record = simulate(resolved)

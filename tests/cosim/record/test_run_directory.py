@@ -55,23 +55,23 @@ COLUMNS: list[tuple[Callable[[int], Any], str]] = [
 
 def test_a_damaged_column_or_report_is_refused_or_ignored(run_dir: Path) -> None:
     path, reports = run_dir / RECORD / f"{PLANT_STEP}.parquet", run_dir / REPORTS_FILE
-    whole, given = pq.read_table(path), json.loads(reports.read_text())
+    table, old_reports = pq.read_table(path), json.loads(reports.read_text())
     text = {"ended": "horizon", "channel": {}, "rows": {"plant_step": "1", "plant_actuation": 1}}
     for report in (None, [], text, text | {"rows": {"plant_step": 1}}):
-        reports.write_text(json.dumps(given | {"plant": report}))
+        reports.write_text(json.dumps(old_reports | {"plant": report}))
         record = load_record(run_dir)
         assert record.reports.keys() == {"sensor", "netem", "controller"}
         assert summarise_loop(record, 0, "").to_json()["missing_samples"] == 0
-    number = whole.column_names.index("t_ns")
+    number = table.column_names.index("t_ns")
     for values, expected in COLUMNS:
-        pq.write_table(whole.set_column(number, "t_ns", values(len(whole))), path)
+        pq.write_table(table.set_column(number, "t_ns", values(len(table))), path)
         with pytest.raises(CallerError, match=expected):
             _ = load_record(run_dir)[PLANT_STEP]
-    pq.write_table(whole, path)
+    pq.write_table(table, path)
     (run_dir / RECORD / "notices.jsonl").write_bytes(b"\xae\xff")
     with pytest.raises(CallerError, match=r"notices\.jsonl: cannot be read"):
         load_record(run_dir)
-    pq.write_table(whole.append_column("t_ns", whole["t_ns"]), path)
+    pq.write_table(table.append_column("t_ns", table["t_ns"]), path)
     with pytest.raises(CallerError, match=r"plant_step\.parquet: .*t_ns"):
         load_record(run_dir)
 
@@ -88,8 +88,8 @@ def test_the_readable_part_of_a_damaged_spool_is_read(run_dir: Path) -> None:
         writer.append(notices_of("netem"), number, line.encode())
     writer.close()
     finished = finish_record(run_dir).loop()
-    kept = [*rows["input"][:2].tolist(), *rows["input"][4:].tolist()]
-    assert finished[PLANT_STEP]["input"].tolist() == kept
+    inputs = [*rows["input"][:2].tolist(), *rows["input"][4:].tolist()]
+    assert finished[PLANT_STEP]["input"].tolist() == inputs
     assert [notice["text"] for notice in finished.notices] == ["MANSD violated", "last"]
     assert summarise_loop(finished, 0, "").to_json()["missing_by_table"] == {PLANT_STEP: 2}
     assert steps == len(finished[PLANT_STEP]) + 2
@@ -117,11 +117,11 @@ def test_a_flipped_bit_in_a_footer_does_not_end_the_process(tmp_path: Path) -> N
 
 
 def _read_with_flipped_bits(path: Path, dtype: np.dtype[np.void]) -> None:
-    whole = path.read_bytes()
-    footer_bytes = int.from_bytes(whole[-8:-4], "little") + 8
-    for at in range(len(whole) - footer_bytes, len(whole)):
+    content = path.read_bytes()
+    footer_bytes = int.from_bytes(content[-8:-4], "little") + 8
+    for position in range(len(content) - footer_bytes, len(content)):
         for bit in range(8):
-            path.write_bytes(flipped(whole, 8 * at + bit))
+            path.write_bytes(flipped(content, 8 * position + bit))
             with suppress(CallerError):
                 _ = [*TableFile(path, dtype).batches()]
 

@@ -39,24 +39,24 @@ def shared(content: dict[str, Any]) -> RecordedRun:
 
 def spool(run_dir: Path, table: str, rows: Rows, *, writer: str = "recorder") -> None:
     """Spool rows in batches of which every third comes late, and every fifth comes twice."""
-    out = SpoolWriter(run_dir / SPOOL, writer)
-    late = []
+    spool_writer = SpoolWriter(run_dir / SPOOL, writer)
+    late_batches = []
     for number, first in enumerate(range(0, len(rows), 7)):
         batch = rows[first : first + 7].tobytes()
-        late += [(first, batch)] * (number % 3 == 0) + [(first, batch)] * (number % 5 == 0)
+        late_batches += [(first, batch)] * (number % 3 == 0) + [(first, batch)] * (number % 5 == 0)
         if number % 3:
-            out.append(table, first, batch)
-    for first, batch in late:
-        out.append(table, first, batch)
-    out.close()
+            spool_writer.append(table, first, batch)
+    for first, batch in late_batches:
+        spool_writer.append(table, first, batch)
+    spool_writer.close()
 
 
 def same_rows(run_dir: Path, shared: RecordedRun, early: Mapping[str, int] | None = None) -> list[str]:
     """Finish a record and compare its rows; return the tables that were still to be written."""
-    written: list[str] = []
+    written_tables: list[str] = []
 
     def each(function: Callable[[str], None], tables: Sequence[str]) -> Iterable[None]:
-        written.extend(tables)
+        written_tables.extend(tables)
         return map(function, tables)
 
     finished = finish_record(run_dir, each, early)
@@ -65,7 +65,7 @@ def same_rows(run_dir: Path, shared: RecordedRun, early: Mapping[str, int] | Non
     ):
         for table in expected.tables:
             assert record[table].tobytes() == expected[table].tobytes(), table
-    return written
+    return written_tables
 
 
 def opened(shared: RecordedRun, run_dir: Path) -> Path:
@@ -125,8 +125,8 @@ def test_tables_written_during_the_run_have_the_same_rows(
 ) -> None:
     run_dir, rows = opened(shared, tmp_path / "run"), mixed_rows(shared)
     # Sent again: one comes late, another one twice.
-    again, less = [0, 50, 150, 150, 200, 100, 250, 300], [0, 50, 150, 200, 250, 300]
-    order = {"sent again": again, "a batch less": less}.get(kind, range(0, 350, 50))
+    repeated_firsts, fewer_firsts = [0, 50, 150, 150, 200, 100, 250, 300], [0, 50, 150, 200, 250, 300]
+    order = {"sent again": repeated_firsts, "a batch less": fewer_firsts}.get(kind, range(0, 350, 50))
     out, batches = SpoolWriter(run_dir / SPOOL, "recorder"), iter(order)
     out.prepare(rows)
 

@@ -83,9 +83,9 @@ class Loops:
         return min(self._due(), default=(None, 0))[0]
 
     def handle(self, message: Any, now_ns: int) -> Sequence[Any]:
-        own = self._machines[message.loop]
+        machine = self._machines[message.loop]
         single = message._replace(loop=0)
-        outputs = own.handle(single, now_ns - self._phases_ns[message.loop])
+        outputs = machine.handle(single, now_ns - self._phases_ns[message.loop])
         return [self._numbered(message.loop, output) for output in outputs]
 
     def on_timer(self, now_ns: int) -> Sequence[Any]:
@@ -96,9 +96,9 @@ class Loops:
     def announce(self, change: Any, now_ns: int) -> Sequence[Any]:
         outputs: list[Any] = []
         for loop, phase_ns in enumerate(self._phases_ns):
-            own = change._replace(t_ns=max(change.t_ns - phase_ns, 0))
-            announced = self._machines[loop].announce(own, now_ns - phase_ns)  # type: ignore[attr-defined]
-            outputs += [self._numbered(loop, output) for output in announced]
+            change_of_loop = change._replace(t_ns=max(change.t_ns - phase_ns, 0))
+            outputs_of_loop = self._machines[loop].announce(change_of_loop, now_ns - phase_ns)  # type: ignore[attr-defined]
+            outputs += [self._numbered(loop, output) for output in outputs_of_loop]
         return outputs
 
     def _due(self) -> list[tuple[int, int]]:

@@ -140,8 +140,8 @@ def check_events(run: ContinuousRun, setting: Setting) -> int:
             right = max(level * math.exp(-rule.rate_per_s * (t_s - since_s)), rule.floor)
             if rule.integrates:
                 return float(y[-1]) - right
-            used = 0.0 if dynamic is None else float(y[-1])
-            return value_of(rule.form, y[: 2 * n]) - used - right * right
+            eta_now = 0.0 if dynamic is None else float(y[-1])
+            return value_of(rule.form, y[: 2 * n]) - eta_now - right * right
 
         start = np.concatenate([*state[1:], [0.0 if rule.integrates else eta]])
         solved = solve_ivp(flow, (begin_s, end_s), start, "DOP853", rtol=1e-11, atol=1e-14, dense_output=True)

@@ -92,16 +92,18 @@ def test_the_threshold_is_reached_at_events_only_and_i1_holds_between_them(case:
     levels = np.array([run.system.threshold(t) for t in t_s])
     assert (run.e_s_norm(samples) <= levels * (1 + 1e-12)).all()
     for state in run.before[0 if case.known else 1 :]:
-        reached = run.system.norms(state.e_s[None])[0]
-        assert reached == pytest.approx(run.system.threshold(state.t_s), rel=1e-12)
+        norm = run.system.norms(state.e_s[None])[0]
+        assert norm == pytest.approx(run.system.threshold(state.t_s), rel=1e-12)
     received = -1
     for i, t in enumerate(t_s):
         happened = int(np.searchsorted(run.event_s, t, side="right"))
         received = max([received, *np.flatnonzero(run.delivered[:happened])])
-        missed = [expm(H * (t - event.t_s)) @ event.e_s for event in run.before[received + 1 : happened]]
+        missed_errors = [
+            expm(H * (t - event.t_s)) @ event.e_s for event in run.before[received + 1 : happened]
+        ]
         if received < 0 and not case.known:
             continue
-        expected = np.sum([np.zeros(case.loop.n), *missed], axis=0)
+        expected = np.sum([np.zeros(case.loop.n), *missed_errors], axis=0)
         scale = max(np.abs(samples.x[: i + 1]).max(), 1.0)
         difference = samples.x_c[i] - samples.x_s[i]
         np.testing.assert_allclose(difference, expected, rtol=0, atol=1e-12 * scale)
@@ -176,8 +178,8 @@ def test_samples_at_the_time_of_an_event_are_those_after_it() -> None:
     samples = run.at(run.event_s)
     assert not samples.e_s.any()
     np.testing.assert_allclose(samples.x, [state.x for state in run.after], rtol=1e-14)
-    before = run.at(np.nextafter(run.event_s, 0))
-    np.testing.assert_allclose(before.e_s, [state.e_s for state in run.before], atol=1e-12)
+    just_before = run.at(np.nextafter(run.event_s, 0))
+    np.testing.assert_allclose(just_before.e_s, [state.e_s for state in run.before], atol=1e-12)
     assert run.at([]).x.shape == (0, 2)
     for outside_s in (-1e-9, run.reached_s + 1e-9):
         with pytest.raises(ValueError, match="lie in"):

@@ -36,7 +36,7 @@ MOST_EVENTS = 500
 
 def settings(name: str, seeds: range) -> list[tuple[Setting, Population]]:
     """Random settings under a policy, with two draws each."""
-    made = []
+    simulations = []
     for seed in seeds:
         rng = np.random.default_rng([seed, *name.encode()])
         n, m = SIZES[seed % 2]
@@ -45,8 +45,8 @@ def settings(name: str, seeds: range) -> list[tuple[Setting, Population]]:
         if name == "lyapunov":  # After a lost update, the next event follows at once.
             setting = replace(setting, link=LinkSettings(), H=0.3 * setting.H - 0.7 * np.eye(n))
         population = random_population(rng, setting, 2)
-        made.append((replace(setting, trigger=policy, most_events=MOST_EVENTS), population))
-    return made
+        simulations.append((replace(setting, trigger=policy, most_events=MOST_EVENTS), population))
+    return simulations
 
 
 @pytest.mark.parametrize("name", TABLES)
@@ -139,9 +139,9 @@ def test_invalid_settings_are_refused() -> None:
         run_batch(setting, population._replace(x0=population.x0[:, :1]))
     with pytest.raises(ValueError, match="loss_seeds: expected uint64"):
         run_batch(setting, population._replace(loss_seeds=np.zeros(3, np.int64)))  # type: ignore[arg-type]
-    late = setting.link.model_copy(update={"impairments": (Delay(delay_s=1.0),)})
+    delayed_link = setting.link.model_copy(update={"impairments": (Delay(delay_s=1.0),)})
     with pytest.raises(CallerError, match="losses and corruption only"):
-        run_batch(Setting(**{**vars(setting), "link": late}), population)
+        run_batch(Setting(**{**vars(setting), "link": delayed_link}), population)
     with pytest.raises(CallerError, match=r"trigger\.floor"):
         run_batch(
             Setting(**{**vars(setting), "trigger": decaying_rule(1.0, 1.0), "horizon_s": 1e3}),

@@ -123,7 +123,7 @@ def test_copies_damage_and_overtaking_are_those_of_the_link(start: Start) -> Non
     settings = json.dumps(IMPAIRMENTS).replace('": ', '" = ')
     options = ("--endpoint", "a", "--endpoint", "b", "--set", f"network.impairments={settings}")
     address, _ = federation(start, 2, *options)
-    seen, errors = start("-c", SENDER, address).communicate(timeout=TIMEOUT_S)
+    received_lines, errors = start("-c", SENDER, address).communicate(timeout=TIMEOUT_S)
     scenario = noack.load("double_integrator", {"network.impairments": IMPAIRMENTS})
     link = LinkState(scenario.network.link, scenario.seeds.loss, UPDATE_LINK, rows=2)
     for row in range(2):
@@ -136,7 +136,7 @@ def test_copies_damage_and_overtaking_are_those_of_the_link(start: Start) -> Non
                 data = int.from_bytes(b"%08d" % k, "little") ^ (1 << bit if bit >= 0 else 0)
                 if time_ns >= 0:
                     expected.append(f"{name} {time_ns} {data.to_bytes(8, 'little').hex()} s")
-    assert sorted(seen.splitlines()) == sorted(expected), errors
+    assert sorted(received_lines.splitlines()) == sorted(expected), errors
     assert len(expected) > MESSAGES / 4
 
 

@@ -88,9 +88,11 @@ def step_by_step(record: RunRecord, schedule: StepSchedule, *, delay: bool) -> t
 def test_the_plant_grid_loop_is_what_one_exponential_after_another_gives(delay: bool) -> None:
     for number in range(POLICIES.index("decaying"), 120, len(POLICIES)):
         record = simulated(number)
-        whole = recorded_loop(record).schedule
-        late = replace(whole, measured=whole.measured & (np.arange(len(whole.measured)) > 3))
-        for schedule in (whole, late):
+        full_schedule = recorded_loop(record).schedule
+        late_schedule = replace(
+            full_schedule, measured=full_schedule.measured & (np.arange(len(full_schedule.measured)) > 3)
+        )
+        for schedule in (full_schedule, late_schedule):
             grid_run = on_the_grid(record, schedule, delay=delay, hold=False)
             expected, events = step_by_step(record, schedule, delay=delay)
             assert grid_run.event_steps.tolist() == events

@@ -156,7 +156,7 @@ def test_updates_report_their_errors_to_a_queue_that_chooses_by_them(crowded: Co
     shared = run(crowded, *loops)
     assert replay(shared.network).bit_exact
     assert all(set(error_levels(record)) == {0} for record in tail_drop.loops)
-    seen: set[int] = set()
+    flows: set[int] = set()
     for record in shared.loops:
         assert replay(record).bit_exact
         first_level, *levels = error_levels(record)
@@ -167,6 +167,6 @@ def test_updates_report_their_errors_to_a_queue_that_chooses_by_them(crowded: Co
             share = event["compared"] / event["threshold"] if event["threshold"] else event["e_s_norm"]
             least, following = shares_of(level)
             assert least <= share < following
-        seen.update(levels)
-    assert min(seen) < 120
-    assert max(seen) > 136
+        flows.update(levels)
+    assert min(flows) < 120
+    assert max(flows) > 136

@@ -39,9 +39,9 @@ def simulated(folder: Path, *settings: str, options: Sequence[str] = ()) -> Resu
 @pytest.fixture(scope="module")
 def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
-    done = simulated(folder, "horizon_s=3", options=["--no-report"])
-    assert done.exit_code == 0, done.output
-    assert json.loads(done.stdout) == json.loads((folder / "latest/summary.json").read_text())
+    result = simulated(folder, "horizon_s=3", options=["--no-report"])
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout) == json.loads((folder / "latest/summary.json").read_text())
     return (folder / "latest").resolve()
 
 
@@ -81,39 +81,40 @@ def test_the_counts_of_the_loops_add_up_to_those_of_the_network(run_dir: Path) -
 
 def test_a_run_and_each_loop_can_be_summarised_and_replayed(run_dir: Path) -> None:
     for options in ((), ("--loop", "periodic")):
-        shown = invoke("summary", run_dir, *options)
-        assert shown.exit_code == 0, shown.output
-        assert ("--loop periodic --verbose" in shown.stdout) == bool(options)
+        output = invoke("summary", run_dir, *options)
+        assert output.exit_code == 0, output.output
+        assert ("--loop periodic --verbose" in output.stdout) == bool(options)
         replayed = invoke("replay", run_dir, *options, "--json")
         assert replayed.exit_code == 0, replayed.output
         assert json.loads(replayed.stdout)["gaps"] == []
-    shown = invoke("summary", run_dir).stdout
-    assert "bottleneck" in shown
-    assert "guarantee not checkable in 11 of 11 loops: pendulum-01: no certificate: " in shown
-    refused = invoke("summary", run_dir, "--loop", "x")
-    assert (refused.exit_code, refused.stderr.count("\n")) == (2, 1)
-    assert "--loop x: the run has no such loop; it has pendulum-01, " in refused.stderr
+    output = invoke("summary", run_dir).stdout
+    assert "bottleneck" in output
+    assert "guarantee not checkable in 11 of 11 loops: pendulum-01: no certificate: " in output
+    result = invoke("summary", run_dir, "--loop", "x")
+    assert (result.exit_code, result.stderr.count("\n")) == (2, 1)
+    assert "--loop x: the run has no such loop; it has pendulum-01, " in result.stderr
 
 
 def test_commands_refuse_a_damaged_table_in_one_line(run_dir: Path, tmp_path: Path) -> None:
     damaged = tmp_path / "damaged"
     shutil.copytree(run_dir, damaged)
     table = damaged / "record" / "sensor_measurement.parquet"
-    whole = table.read_bytes()
+    table_bytes = table.read_bytes()
 
     def refused(*command: str) -> str:
-        done = invoke(command[0], damaged, *command[1:])
-        assert (done.exit_code, done.stderr.count("\n")) == (2, 1), done.output
-        assert done.stderr.startswith(f"noack: {table}: cannot be read: ")
-        return done.stdout
+        result = invoke(command[0], damaged, *command[1:])
+        assert (result.exit_code, result.stderr.count("\n")) == (2, 1), result.output
+        assert result.stderr.startswith(f"noack: {table}: cannot be read: ")
+        return result.stdout
 
-    middle = len(whole) // 2
-    table.write_bytes(whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :])
+    middle = len(table_bytes) // 2
+    changed_byte = bytes([table_bytes[middle] ^ 1])
+    table.write_bytes(table_bytes[:middle] + changed_byte + table_bytes[middle + 1 :])
     for command in (["replay"], ["report"], ["fidelity", "--loop", "periodic"]):
         refused(*command)
     for kind, name in (("csv", "tables"), ("mat", "run.mat"), ("mcap", "run.mcap")):
         refused("export", "--format", kind, "--out", str(tmp_path / name))
-    for content in (whole[:middle], None):
+    for content in (table_bytes[:middle], None):
         table.unlink()
         if content is not None:
             table.write_bytes(content)
@@ -138,11 +139,11 @@ def test_the_summary_and_the_page_of_a_run_name_the_pages_of_its_loops(run_dir: 
 
 def test_a_report_is_refused_if_the_scenario_has_other_loops_than_the_record(run_dir: Path) -> None:
     scenario = run_dir / "scenario.toml"
-    given = scenario.read_text()
-    scenario.write_text(given.replace("count = 10", "count = 9"))
-    refused = invoke("report", run_dir, "--again")
-    scenario.write_text(given)
-    assert (refused.exit_code, "has other loops than" in refused.stderr) == (2, True)
+    text = scenario.read_text()
+    scenario.write_text(text.replace("count = 10", "count = 9"))
+    result = invoke("report", run_dir, "--again")
+    scenario.write_text(text)
+    assert (result.exit_code, "has other loops than" in result.stderr) == (2, True)
 
 
 @pytest.mark.usefixtures("no_recording")
@@ -152,17 +153,17 @@ def test_the_verdict_of_all_loops_says_why_claims_are_void(tmp_path: Path) -> No
     late = simulated(tmp_path, *settings, options=["--no-report"])
     claims = [claim for loop in json.loads(late.stdout)["loops"] for claim in loop["claims"]]
     reasons = {claim["why"] for claim in claims if claim["verdict"] == "void"}
-    shown = invoke("summary", tmp_path / "latest").stdout
-    assert any(f"no certificate: {why}" in shown for why in reasons)
-    assert not re.findall("^void: ", shown, re.MULTILINE)
+    output = invoke("summary", tmp_path / "latest").stdout
+    assert any(f"no certificate: {why}" in output for why in reasons)
+    assert not re.findall("^void: ", output, re.MULTILINE)
 
 
 @pytest.mark.parametrize("loop", [None, "periodic"])
 def test_a_missing_recording_is_written_when_it_is_viewed(run_dir: Path, loop: str | None) -> None:
     path = run_dir / ("recording.rrd" if loop is None else f"recording-{loop}.rrd")
     path.unlink(missing_ok=True)
-    done = invoke("view", run_dir, "--json", *(() if loop is None else ("--loop", loop)))
-    assert json.loads(done.stdout) == {"recording": str(path), "exists": True}
+    result = invoke("view", run_dir, "--json", *(() if loop is None else ("--loop", loop)))
+    assert json.loads(result.stdout) == {"recording": str(path), "exists": True}
     assert path.read_bytes().startswith(b"RRF")
 
 
@@ -170,7 +171,7 @@ def test_a_missing_recording_is_written_when_it_is_viewed(run_dir: Path, loop: s
 def test_the_report_reads_no_loop_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """How each loop went is known at the end of a run; to find it out takes most of the time."""
     monkeypatch.setattr(loops_over_time, "loop_over_time", None)
-    loops = 'loops=[{ name = "a", count = 6 }]'  # of so many, the map is a bitmap
+    loops = 'loops=[{ name = "a", count = 6 }]'  # enough for a map that is a bitmap
     ending = simulate_run(load(PATH, ["horizon_s=0.5", loops]), tmp_path)
     finalize(ending)
     assert (ending.run_dir / "report.html").is_file()
@@ -183,9 +184,9 @@ def test_a_loop_that_diverges_is_named_and_the_others_go_on(tmp_path: Path) -> N
     loops = f'loops=[{{ name = "calm", count = 2 }}, {wild}]'
     change = 'changes=[{ at_s = 1.5, set = { "network.mansd" = 1 } }]'
     settings = ("horizon_s=3", "network.actuation={}", loops, change)
-    done = simulated(tmp_path, *settings, options=["--no-report"])
-    assert done.exit_code == 1
-    summary = json.loads(done.stdout)
+    result = simulated(tmp_path, *settings, options=["--no-report"])
+    assert result.exit_code == 1
+    summary = json.loads(result.stdout)
     diverged_at_s = summary["loops"][2]["diverged_at_s"] + summary["loops"][2]["phase_s"]
     reason = f"1 of 3 loops failed (wild diverged at {diverged_at_s:.2f} s)"
     assert summary["exit"]["reason"] == reason
@@ -213,9 +214,9 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
     settings = [word for setting in SETTINGS for word in ("--set", setting)]
     words = ("simulate", str(ONE_LOOP), "--runs", str(folder), "--json", "--no-report")
-    done = invoke(*words, *settings)
-    assert done.exit_code == 0, done.output
-    assert json.loads(done.stdout) == json.loads((folder / "latest/summary.json").read_text())
+    result = invoke(*words, *settings)
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout) == json.loads((folder / "latest/summary.json").read_text())
     assert not (folder / "latest/report.html").exists()
     assert invoke("report", "--runs", str(folder)).exit_code == 0
     return folder
@@ -239,12 +240,18 @@ def test_a_simulated_run_has_the_files_of_a_live_run(runs: Path) -> None:
 
 
 def test_the_record_on_disk_equals_the_simulators(runs: Path) -> None:
-    again, loaded = simulate(resolve(load(ONE_LOOP, SETTINGS))), load_record(runs / "latest")
-    assert all(again[table].tobytes() == loaded[table].tobytes() for table in again.tables)
-    assert loaded.scenario == again.scenario
-    assert loaded.kind == again.kind == "simulated"
-    assert loaded.reports == again.reports
-    assert loaded.notices == again.notices
+    simulated_record, loaded_record = (
+        simulate(resolve(load(ONE_LOOP, SETTINGS))),
+        load_record(runs / "latest"),
+    )
+    assert all(
+        simulated_record[table].tobytes() == loaded_record[table].tobytes()
+        for table in simulated_record.tables
+    )
+    assert loaded_record.scenario == simulated_record.scenario
+    assert loaded_record.kind == simulated_record.kind == "simulated"
+    assert loaded_record.reports == simulated_record.reports
+    assert loaded_record.notices == simulated_record.notices
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device")])

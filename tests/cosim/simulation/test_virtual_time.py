@@ -64,12 +64,12 @@ def test_a_scripted_network_decides_as_in_the_plain_driver() -> None:
 
 @pytest.mark.sanitized
 def test_loops_of_different_sizes_run_as_by_the_plain_driver() -> None:
-    given = shipped("unstable_pendulum", "horizon_s=1.0").model_dump(mode="json", exclude_none=True)
+    content = shipped("unstable_pendulum", "horizon_s=1.0").model_dump(mode="json", exclude_none=True)
     rate = {"kind": "rate", "rate_bps": 50_000, "queue": 6}
-    network = given["network"] | {
+    network = content["network"] | {
         "impairments": [rate, IMPAIRMENTS[1]], "actuation": {"impairments": IMPAIRMENTS},
     }  # fmt: skip
-    scenario = validate(given | {"network": network, "loops": LOOPS}, "")
+    scenario = validate(content | {"network": network, "loops": LOOPS}, "")
     scheduler = EventScheduler(scenario, [resolve(loop) for loop in loops_of(scenario)], numbered=True)
     scheduler.run()
     simulated = simulate_loops(scenario)
@@ -79,8 +79,8 @@ def test_loops_of_different_sizes_run_as_by_the_plain_driver() -> None:
     for number, record in enumerate(simulated.loops):
         for table, dtype in tables_of(record.scenario).items():
             if OWNER[table] != "netem":
-                own = [row[1:] for row in scheduler.rows.get(table, []) if row[0] == number]
-                assert np.array(own, dtype).tobytes() == record[table].tobytes(), table
+                rows_of_loop = [row[1:] for row in scheduler.rows.get(table, []) if row[0] == number]
+                assert np.array(rows_of_loop, dtype).tobytes() == record[table].tobytes(), table
         received = record.reports["controller"]["channel"]
         assert received == scheduler.decoders["controller"][number].report()
     assert simulated.loops[4]["plant_step"]["x"].shape[1] == 3
@@ -90,17 +90,17 @@ def test_loops_of_different_sizes_run_as_by_the_plain_driver() -> None:
 def test_numbers_of_no_simulation_are_refused() -> None:
     scenario = resolved("unstable_pendulum", "horizon_s=1.0")
     run = VirtualRun(scenario, (scenario,))
-    own = run.core
+    simulation = run.core
     for name, value in (("loops", 2), ("sent_places", 3), ("sent_count", -1)):
-        before = getattr(own, name)
-        setattr(own, name, value)
-        assert core.noack_simulation_check(own) != ffi.NULL
-        setattr(own, name, before)
-    own.directions[2] = 1
-    assert core.noack_simulation_check(own) != ffi.NULL
-    own.directions[2] = 0
-    own.processes[1] = own.processes[0]
-    assert core.noack_simulation_check(own) != ffi.NULL
+        old_value = getattr(simulation, name)
+        setattr(simulation, name, value)
+        assert core.noack_simulation_check(simulation) != ffi.NULL
+        setattr(simulation, name, old_value)
+    simulation.directions[2] = 1
+    assert core.noack_simulation_check(simulation) != ffi.NULL
+    simulation.directions[2] = 0
+    simulation.processes[1] = simulation.processes[0]
+    assert core.noack_simulation_check(simulation) != ffi.NULL
 
 
 @pytest.fixture

@@ -193,8 +193,8 @@ def check_identity(record: RunRecord) -> int:
 
 def test_only_the_plant_sends_to_the_sensor_and_nobody_accepts_acknowledgements() -> None:
     """Each decoder accepts one flow, even under the run's key."""
-    to = {role: receiver_of(role, flow) for role, flow in SENDS.items()}
-    assert [role for role, receiver in to.items() if receiver == "sensor"] == ["plant"]
+    receivers = {role: receiver_of(role, flow) for role, flow in SENDS.items()}
+    assert [role for role, receiver in receivers.items() if receiver == "sensor"] == ["plant"]
     assert Flow.ACKNOWLEDGEMENT not in {*RECEIVES.values(), *SENDS.values()}
     key = bytes(32)
     for role in ("plant", "sensor", "controller"):

@@ -109,18 +109,18 @@ def test_a_repetition_names_what_differs(archive: Path, tmp_path: Path) -> None:
     changed = {"scenario.toml": scenario, "environment.json": json.dumps(environment).encode()}
     path = write(tmp_path / "b.zip", checked(files | changed))
     words = ["reproduce", str(path), "--into", str(tmp_path / "i")]
-    done = invoke(*words, "--json")
-    assert done.exit_code == 1, done.output
-    repetition = json.loads(done.stdout)
+    result = invoke(*words, "--json")
+    assert result.exit_code == 1, result.output
+    repetition = json.loads(result.stdout)
     assert not repetition["bit_exact"]
     assert "sensor_measurement row 0, threshold: the row differs" in repetition["differences"][0]
     assert repetition["changes"][0].startswith("numpy was 1.0, is ")
     assert "transmissions" in [row[0] for row in repetition["numbers"]]
     assert (tmp_path / "i/archived/summary.json").is_file()
-    done = invoke(*words)
-    assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
-    done = invoke("reproduce", path)
-    assert "not reproduced" in done.stdout
+    result = invoke(*words)
+    assert (result.exit_code, result.stderr.count("\n")) == (2, 1)
+    result = invoke("reproduce", path)
+    assert "not reproduced" in result.stdout
 
 
 def compressed(files: Files, path: Path) -> Path:
@@ -175,10 +175,10 @@ def with_rows(files: Files, path: Path) -> Path:
     """Put five million equal rows, a few kilobytes, in the place of a table."""
     name, rows = "record/plant_step.parquet", io.BytesIO()
     table = pq.read_table(io.BytesIO(files[name]))
-    many = pa.table({
+    large_table = pa.table({
         column.name: pa.repeat(table[column.name][0], 5_000_000) for column in table.schema
     })  # fmt: skip
-    pq.write_table(many.cast(table.schema), rows, compression="zstd")
+    pq.write_table(large_table.cast(table.schema), rows, compression="zstd")
     assert len(rows.getvalue()) < 2_000_000
     return write(path, checked(files | {name: rows.getvalue()}))
 
@@ -239,12 +239,12 @@ HOSTILE: dict[str, tuple[Callable[[Files, Path], Path], str]] = {
 def test_a_hostile_archive_gives_one_line(case: str, archive: Path, tmp_path: Path) -> None:
     make, message = HOSTILE[case]
     path = make(files_of(archive), tmp_path / "b.zip")
-    done = invoke("reproduce", path, "--into", tmp_path / "into")
-    assert done.exit_code == 2, done.output
-    assert done.stderr.startswith(f"noack: {path}: ")
-    assert message in done.stderr
-    assert str(tmp_path / "into") not in done.stderr
-    assert done.stderr.count("\n") == 1
+    result = invoke("reproduce", path, "--into", tmp_path / "into")
+    assert result.exit_code == 2, result.output
+    assert result.stderr.startswith(f"noack: {path}: ")
+    assert message in result.stderr
+    assert str(tmp_path / "into") not in result.stderr
+    assert result.stderr.count("\n") == 1
     assert not list(tmp_path.rglob("evil"))
 
 

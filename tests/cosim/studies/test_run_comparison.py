@@ -77,19 +77,19 @@ def test_the_distance_is_over_the_common_times(comparison: RunComparison) -> Non
 
 def test_the_command_prints_the_table_and_writes_an_escaped_page(runs: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "new" / "overlay.html"
-    done = compare(*runs, "--out", out)
-    assert done.exit_code == 0, done.output
-    assert "transmissions" in done.stdout
-    assert "network.mansd" in done.stdout
-    assert done.stdout.splitlines()[-1] == f"overlay: {out}"
+    result = compare(*runs, "--out", out)
+    assert result.exit_code == 0, result.output
+    assert "transmissions" in result.stdout
+    assert "network.mansd" in result.stdout
+    assert result.stdout.splitlines()[-1] == f"overlay: {out}"
     assert list(out.parent.iterdir()) == [out]
     html = out.read_text()
     assert html.startswith("<!DOCTYPE html>")
     assert html.count("<svg") == 1
     assert "<script" not in html
     assert "zero-order hold" in html
-    done = compare(*runs[:2], "--out", tmp_path / "a.svg", "--json")
-    document = json.loads(done.stdout)
+    result = compare(*runs[:2], "--out", tmp_path / "a.svg", "--json")
+    document = json.loads(result.stdout)
     first, second = document["numbers"]["deliveries"]
     assert document["differences"]["deliveries"] == [0, second - first]
     assert document["settings"]["mode"] == ["model", "zoh"]
@@ -110,9 +110,9 @@ def test_runs_that_cannot_be_compared_give_one_line(runs: list[Path], tmp_path: 
         (*runs, "--out", tmp_path / "a.eps"): f"noack: {tmp_path / 'a.eps'}: a comparison is "
         "written as .html, .svg, .png, .pdf\n",
     }
-    for words, said in mistakes.items():
-        done = compare(*words)
-        assert (done.exit_code, done.stderr, done.stdout) == (2, said, "")
+    for words, message in mistakes.items():
+        result = compare(*words)
+        assert (result.exit_code, result.stderr, result.stdout) == (2, message, "")
 
 
 def test_a_diverged_run_is_overlaid_up_to_its_end(runs: list[Path], tmp_path: Path) -> None:

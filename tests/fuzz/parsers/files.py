@@ -318,8 +318,8 @@ def archives_input(data: bytes) -> None:
         path.write_bytes(data)
         with refusal((f"{path}: ", f"{folder}: ")):
             manifest = unpack(path, folder)
-            written = {path for path in folder.rglob("*") if path.is_file()}
-            assert written == {folder / name for name in manifest.files}
+            files = {path for path in folder.rglob("*") if path.is_file()}
+            assert files == {folder / name for name in manifest.files}
         inside = {path, folder.parent, *folder.parent.rglob("*")}
         assert set(Path(place).rglob("*")) <= inside, "a file outside the folder"
 

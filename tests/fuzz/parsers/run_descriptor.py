@@ -76,17 +76,17 @@ def barrier_input(data: bytes) -> None:
                 queries.setdefault(role, []).append(query)
                 plane.put("join", query)
         barrier.poll()
-    for role, asked in queries.items():
+    for role, role_queries in queries.items():
         if barrier.epoch_ns is not None or role not in ROLES:
             # A new join request replaces the sender's previous one.
-            assert _is_over(asked[-1]), "a join request has no answer"
+            assert _is_over(role_queries[-1]), "a join request has no answer"
     assert all(query.answered == 1 for query in admissions), "an admission request has no answer"
     for answer in plane.answers:
         for host, port in answer.fields().get("addresses", {}).values():
             assert isinstance(host, str)
             assert 0 < port <= 65_535
     barrier.stop("the end")
-    assert all(_is_over(asked[-1]) for asked in queries.values())
+    assert all(_is_over(role_queries[-1]) for role_queries in queries.values())
 
 
 def _is_over(query: Query) -> bool:

@@ -108,7 +108,7 @@ def test_a_one_way_link_sends_from_one_port_and_discards_answers(here: int, ther
 
 
 def test_seven_hundred_clients_keep_their_flows_and_answers_apart() -> None:
-    """For so many, the relay loads the clients' data before the decisions."""
+    """For 700 clients, the relay loads their data before the decisions."""
     with endpoints(V4) as (server,), endpoints(*[V4] * 700) as clients:
         ports = [name_of(client)[1] for client in clients]
         with running([link(name_of(server), THIRD_LOST)]) as emulator:

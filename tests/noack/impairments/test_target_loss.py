@@ -18,7 +18,7 @@ from noack.impairments.target_loss import (
 
 
 @pytest.mark.parametrize(
-    ("words", "asked"),
+    ("words", "rate"),
     [
         ("loss 30% keep mansd 2", 0.3),
         ("loss 80% keep mansd 4", 0.8),
@@ -27,10 +27,10 @@ from noack.impairments.target_loss import (
         ("loss 40% keep loss burst 10% 3 mansd 4 atmost 6 in 9", 0.4),
     ],
 )
-def test_a_kept_loss_is_predicted_as_it_was_asked(words: str, asked: float) -> None:
+def test_a_target_loss_is_predicted(words: str, rate: float) -> None:
     asking = settings_of(words)
-    assert predict(with_target_loss(asking)).rate == pytest.approx(asked, abs=1e-9)
-    assert expected_loss(asking).rate == pytest.approx(asked, abs=1e-9)
+    assert predict(with_target_loss(asking)).rate == pytest.approx(rate, abs=1e-9)
+    assert expected_loss(asking).rate == pytest.approx(rate, abs=1e-9)
 
 
 def probability(settings: LinkSettings, known: ProbabilityCache) -> float:

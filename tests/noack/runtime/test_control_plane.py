@@ -110,8 +110,8 @@ def test_another_user_can_neither_connect_nor_listen(
         coordinator = Coordinator(descriptor)
         path = private_folder() / RUNS / f"{run_name(descriptor.run_id)}.sock"
         assert path.is_socket()
-        said = output_of_another_user(REACH, str(path))
-        assert said.splitlines() == ["connect refused", "bind refused", "unlink refused"]
+        output = output_of_another_user(REACH, str(path))
+        assert output.splitlines() == ["connect refused", "bind refused", "unlink refused"]
         with ControlPlane(descriptor, "plant"):  # its user can
             pass
         coordinator.close()

@@ -79,9 +79,9 @@ def test_changes_announced_out_of_order_are_applied_in_order_of_time(scenario: S
     schedule.announce("t", ParameterChange(1, 100, {"network.mansd": 5}), 1, 0, -1)
     assert schedule.next_ns == 100
     assert schedule.take(99) == []
-    taken = schedule.take(250)
-    assert [change.since_ns for change in taken] == [100, 200]
-    scenarios = [change.scenario for change in taken]
+    changes = schedule.take(250)
+    assert [change.since_ns for change in changes] == [100, 200]
+    scenarios = [change.scenario for change in changes]
     assert [(scenario.network.mansd, scenario.decaying.beta) for scenario in scenarios] == [
         (5, 0.5),
         (5, 0.1),

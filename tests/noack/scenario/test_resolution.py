@@ -137,14 +137,14 @@ def test_the_lane_model_is_the_papers() -> None:
 def test_results_that_are_kept_with_a_scenario_are_no_part_of_it() -> None:
     """Copies with other keys, comparisons and pickles do not see what was computed before."""
     path = SCENARIOS / "lane_following.toml"
-    asked, other = resolve(load(path)), resolve(load(path))
-    for scenario in (asked, other):  # arrays, which == does not compare
+    resolved, other = resolve(load(path)), resolve(load(path))
+    for scenario in (resolved, other):  # arrays, which == does not compare
         loop_of(scenario)
         assert scenario.network.link.mansd == 4
-    assert loop_of(asked) is loop_of(asked)
-    assert asked == other == pickle.loads(pickle.dumps(asked))
-    plant = asked.plant.model_copy(update={"initial_state": (1.0, 2.0, 3.0, 4.0)})
-    moved = asked.model_copy(update={"plant": plant})
+    assert loop_of(resolved) is loop_of(resolved)
+    assert resolved == other == pickle.loads(pickle.dumps(resolved))
+    plant = resolved.plant.model_copy(update={"initial_state": (1.0, 2.0, 3.0, 4.0)})
+    moved = resolved.model_copy(update={"plant": plant})
     assert loop_of(moved).x0.tolist() == [1.0, 2.0, 3.0, 4.0]
-    assert moved != asked
-    assert asked.network.model_copy(update={"mansd": 7}).link.mansd == 7
+    assert moved != resolved
+    assert resolved.network.model_copy(update={"mansd": 7}).link.mansd == 7

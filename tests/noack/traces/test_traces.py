@@ -182,7 +182,7 @@ def test_irtt_gives_losses_and_delays_of_round_trips(
     assert trace.sent_ns.tolist() == [k * 20_000_000 for k in range(COUNT)]
     kept = [k for k in range(COUNT) if k not in (3, 5, 6, 7)]
     assert trace.delay_ns[kept].tolist() == [30_000_000 + k for k in kept]
-    assert trace.notes[1:] == ("lost forward: 1", "lost in reverse: 2", "lost on an unknown way: 1")
+    assert trace.notes[1:] == ("lost forward: 1", "lost in reverse: 2", "lost in an unknown direction: 1")
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,8 @@ from cosim.output.viewer.pictures import picture as draw
 from cosim.record.align import Reals
 from noack.plants.cart_pole import CartPoleSettings
 
-_CART, _CART_HIGH = 0.5, 0.22
+_CART_LENGTH, _CART_HEIGHT = 0.5, 0.22
+"""As shares of the scale of the picture."""
 _WIDTHS: Mapping[str, float] = {"plant": 0.075, "sensor": 0.022, "controller": 0.03}
 
 
@@ -71,7 +72,7 @@ class PendulumPicture(draw.Picture):
             shapes["pivot"] = draw.lines([foot], draw.STILL, 0.04 * scale)
             shapes["upright"] = draw.lines([[(0.0, 0.0), (0.0, 1.15 * scale)]], draw.STILL, 0.008 * scale)
         else:
-            ground = -(_CART_HIGH / 2 + 0.03) * scale
+            ground = -(_CART_HEIGHT / 2 + 0.03) * scale
             ends = (-2 * self._wide, 2 * self._wide)
             step = 10.0 ** np.floor(np.log10(self._wide))
             ticks = (step * np.arange(-10, 11)).tolist()
@@ -104,7 +105,7 @@ class PendulumPicture(draw.Picture):
         return columns
 
     def _cart(self, who: str) -> draw.Shape:
-        x, y = _CART / 2 * self._scale, _CART_HIGH / 2 * self._scale
+        x, y = _CART_LENGTH / 2 * self._scale, _CART_HEIGHT / 2 * self._scale
         if who == "plant":
             inner = y * 0.5
             rows = [[(-x + inner, at), (x - inner, at)] for at in (-inner, 0.0, inner)]

@@ -11,7 +11,7 @@ import numpy as np
 from cosim.output.viewer.pictures import picture as draw
 from cosim.record.align import Reals
 
-_RING = 0.035
+_RING_RADIUS = 0.035
 _WIDTHS: Mapping[str, float] = {"plant": 0.022, "sensor": 0.009, "controller": 0.014}
 
 
@@ -56,7 +56,7 @@ class PhasePicture(draw.Picture):
             if who == "plant":  # filled by its line width
                 shapes[f"{who}/point"] = draw.body(who, [[(-1e-3, 0), (1e-3, 0)]], 0.06)
             else:
-                radius, dash = (_RING, None) if who == "sensor" else (1.6 * _RING, 0.01)
+                radius, dash = (_RING_RADIUS, None) if who == "sensor" else (1.6 * _RING_RADIUS, 0.01)
                 ring = draw.outline(draw.circle(radius, 16), dash)
                 shapes[f"{who}/point"] = draw.body(who, ring, 1.4 * width)
             if self.trails:

@@ -17,8 +17,8 @@ from noack.core.linear_systems import Matrix
 
 _PERIOD_S = 0.01
 """Between two tests of the trigger."""
-_WHERE = "ETCetera's README.md"
-_HOW = "exact runs from random states, and from the four states that wait longest"
+_SOURCE = "ETCetera's README.md"
+_METHOD = "exact runs from random states, and from the four states that wait longest"
 _INTERVALS, _AFTER_ONE = {1, 2, 3, 4, 5}, {1, 2, 3}
 """Published times between two events, in periods: all of them, and those that may follow one of 1 period."""
 
@@ -30,14 +30,14 @@ def _periods(loop: ContinuousLoop, states: Matrix) -> NDArray[np.int64]:
 
 
 def _held_map(loop: ContinuousLoop, periods: int) -> Matrix:
-    """Return M of x(t) = M x(0), t so many periods after an event."""
+    """Return M of x(t) = M x(0), at the time t that is ``periods`` after an event."""
     A, BK = loop.loop.A, loop.loop.B @ loop.loop.K
     transition = expm(np.block([[A, BK], [np.zeros((4, 8))]]) * _PERIOD_S * periods)
     return np.asarray(transition[:4, :4] + transition[:4, 4:])
 
 
 def _slowest_state(loop: ContinuousLoop, periods: int) -> tuple[float, Matrix]:
-    """Return the smallest eigenvalue of the compared form after so many periods, and its state.
+    """Return the smallest eigenvalue of the compared form after ``periods``, and its state.
 
     If it is positive, every state has transmitted by then.
     """
@@ -61,10 +61,10 @@ def _rows() -> list[ComparedValue]:
     are_listed, after_one = following <= _AFTER_ONE, (_listed(_AFTER_ONE), _listed(following))
     return [
         ComparedValue(
-            "intervals, periods", _WHERE, "=", _listed(_INTERVALS), _listed(occurring), _HOW, complete
+            "intervals, periods", _SOURCE, "=", _listed(_INTERVALS), _listed(occurring), _METHOD, complete
         ),
-        ComparedValue("intervals after one of 1 period", _WHERE, "among", *after_one, _HOW, are_listed),
-        ComparedValue("states whose interval is 2 periods", _WHERE, "=", *counts, _HOW, agree),
+        ComparedValue("intervals after one of 1 period", _SOURCE, "among", *after_one, _METHOD, are_listed),
+        ComparedValue("states whose interval is 2 periods", _SOURCE, "=", *counts, _METHOD, agree),
     ]
 
 

@@ -9,8 +9,8 @@ from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 from cosim.studies.paper.published_result import ComparedValue, PublishedResult, stored_matrices, value_row
 from noack.core.linear_systems import Matrix
 
-_WHERE = "authors' README.md"
-_HOW = (
+_SOURCE = "authors' README.md"
+_METHOD = (
     "stationary second moments of plant, filter and controller together over a period (a discrete "
     "Lyapunov equation), not the formula of the authors' program"
 )
@@ -89,7 +89,7 @@ def _rows() -> list[ComparedValue]:
     for schedule, published in stored_matrices("demirel")["losses"].items():
         turns = schedule.split(",")
         total = sum(loop.mean_cost([turn == name for turn in turns]) for name, loop in drawn)
-        row = value_row(f"loss of {', '.join(turns)}", _WHERE, float(published), total, _HOW, digits=4)
+        row = value_row(f"loss of {', '.join(turns)}", _SOURCE, float(published), total, _METHOD, digits=4)
         rows.append(row._replace(deviation=_DEVIATION if len(turns) == 7 else ""))
     return rows
 

@@ -12,11 +12,11 @@ _WORKS = {1: [1, 1], 2: [0, 1], 3: [1, 0], 4: [0, 0]}
 """Which of the two gains work, by mode."""
 _EDGES = (123, 212, 131, 312, 231, 323, 331, 344, 431)
 """From node, to node, mode."""
-_WHERE, _RADIUS = "library's test", 0.9748171979372
+_SOURCE, _RADIUS = "library's test", 0.9748171979372
 """Published growth per step, and where it stands."""
 _CYCLE = (2, 1, 2, 3, 1, 1, 1, 1)
 """The modes of the published cycle that grows most."""
-_HOW = "by noack margin's enclosures: a cycle from below, invariant polytopes from above"
+_METHOD = "by noack margin's enclosures: a cycle from below, invariant polytopes from above"
 
 
 def edges() -> list[Edge]:
@@ -36,9 +36,9 @@ def _rows() -> list[ComparedValue]:
     computed_cycle = _CYCLE if _CYCLE in rotated else rotated[0]
     published, computed = (",".join(map(str, cycle)) for cycle in (_CYCLE, computed_cycle))
     return [
-        value_row("growth, lower bound", _WHERE, _RADIUS, radius.lower, _HOW, digits=12),
-        value_row("growth, upper bound", _WHERE, _RADIUS, radius.upper, _HOW, digits=10),
-        ComparedValue("its modes", _WHERE, "=", published, computed, _HOW, _CYCLE in rotated),
+        value_row("growth, lower bound", _SOURCE, _RADIUS, radius.lower, _METHOD, digits=12),
+        value_row("growth, upper bound", _SOURCE, _RADIUS, radius.upper, _METHOD, digits=10),
+        ComparedValue("its modes", _SOURCE, "=", published, computed, _METHOD, _CYCLE in rotated),
     ]
 
 

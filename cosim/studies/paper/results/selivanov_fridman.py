@@ -27,7 +27,7 @@ Solution = Mapping[str, Matrix]
 
 _MARGIN = 1e-9
 """Smallest eigenvalue, after scaling, that counts as positive."""
-_WHERE = "authors' test.m"
+_SOURCE = "authors' test.m"
 _LMI = (
     "the publication says that the LMIs are feasible; the smallest scaled eigenvalue of all "
     "matrices of a stored solution shows it. Theorem 1, Remark 1: δ = 0.24. Theorem 2, Remark 3: "
@@ -37,7 +37,7 @@ _RUN = (
     "exact runs in continuous time from states on a circle: the largest V(t_k)e^(2δt_k)/V(0) of "
     "all transmissions, V = xᵀPx"
 )
-_SENT = "of the same runs, the mean number of transmissions in 20 s: {:.2f}, {:.2f}"
+_TRANSMISSIONS_METHOD = "of the same runs, the mean number of transmissions in 20 s: {:.2f}, {:.2f}"
 DELTA, GAMMA, DELAY_S = 0.24, 100.0, 0.1
 """Decay rate of Example 1; gain and largest delay of Example 2."""
 _SWITCHING, _PERIODIC = (0.899, 0.554), (1.115, 0.0046)
@@ -123,21 +123,21 @@ INEQUALITIES = {
 
 
 def _rows() -> list[ComparedValue]:
-    rows, solved = [], stored_matrices("selivanov_fridman")
+    rows, solutions = [], stored_matrices("selivanov_fridman")
     for statement, (inequalities, h, epsilon, waits) in INEQUALITIES.items():
-        parts = inequalities(solved[statement], h, epsilon, waits=waits)
+        parts = inequalities(solutions[statement], h, epsilon, waits=waits)
         margin = min(map(smallest_eigenvalue, parts))
         quantity = f"{statement}, h = {h}, ε = {epsilon}"
-        rows.append(ComparedValue(quantity, _WHERE, ">", "0", f"{margin:.1e}", _LMI, margin > _MARGIN))
+        rows.append(ComparedValue(quantity, _SOURCE, ">", "0", f"{margin:.1e}", _LMI, margin > _MARGIN))
     loops = (("switching", "Theorem 1", _switching()), ("periodic", "Remark 1", _periodic()))
     means = []
     for name, statement, loop in loops:
-        grown, mean = _growth_and_transmissions(loop, solved[statement]["P"], unit_states(100, 2))
+        growth, mean = _growth_and_transmissions(loop, solutions[statement]["P"], unit_states(100, 2))
         means.append(mean)
         quantity, place = f"growth of V, {name}", f"follows from {statement}"
-        rows.append(ComparedValue(quantity, place, "≤", "1", f"{grown:.3f}", _RUN, grown <= 1))
+        rows.append(ComparedValue(quantity, place, "≤", "1", f"{growth:.3f}", _RUN, growth <= 1))
     share = means[0] / means[1]
-    quantity, method = "transmissions, switching / periodic", _SENT.format(*means)
+    quantity, method = "transmissions, switching / periodic", _TRANSMISSIONS_METHOD.format(*means)
     return [*rows, ComparedValue(quantity, "abstract", "<", "1", f"{share:.3f}", method, share < 1)]
 
 
@@ -162,12 +162,12 @@ def _growth_and_transmissions(loop: ContinuousLoop, P: Matrix, x0: Matrix) -> tu
     """
     log = run_from_each(loop, x0, 20.0, most_events=100)
     assert log.states is not None
-    happened = ~np.isnan(log.event_s)
-    x, t_s = log.states[:, :, 0][happened], log.event_s[happened]
-    starts = np.repeat(x0, happened.sum(axis=1), axis=0)
+    has_event = ~np.isnan(log.event_s)
+    x, t_s = log.states[:, :, 0][has_event], log.event_s[has_event]
+    starts = np.repeat(x0, has_event.sum(axis=1), axis=0)
     energies, at_start = (np.einsum("ki,ij,kj->k", states, P, states) for states in (x, starts))
-    grown = energies * np.exp(2 * DELTA * t_s) / at_start
-    return float(grown.max()), 1 + len(t_s) / len(x0)
+    growth = energies * np.exp(2 * DELTA * t_s) / at_start
+    return float(growth.max()), 1 + len(t_s) / len(x0)
 
 
 RESULT = PublishedResult(

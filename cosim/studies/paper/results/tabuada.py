@@ -12,8 +12,8 @@ from cosim.studies.paper.published_result import (
     unit_states,
 )
 
-_WHERE = "Corollary IV.1"
-_HOW = "shortest inter-event time of exact runs of 2 s; τ is the corollary's integral"
+_SOURCE = "Corollary IV.1"
+_METHOD = "shortest inter-event time of exact runs of 2 s; τ is the corollary's integral"
 _SIGMAS = (0.02, 0.05, 0.1, 0.2)
 """σ of the triggers ‖e‖ > σ‖x‖ that are simulated."""
 _CLOSE = 1.2
@@ -38,7 +38,7 @@ def _rows() -> list[ComparedValue]:
         least_s = bound_s(loop, sigma)
         agrees = least_s <= shortest_s <= _CLOSE * least_s
         texts = f"{1e3 * least_s:.3f} ms", f"{1e3 * shortest_s:.3f} ms"
-        rows.append(ComparedValue(f"shortest interval, σ = {sigma:g}", _WHERE, "≥", *texts, _HOW, agrees))
+        rows.append(ComparedValue(f"shortest interval, σ = {sigma:g}", _SOURCE, "≥", *texts, _METHOD, agrees))
     return rows
 
 

@@ -26,13 +26,13 @@ _ANGLE = 2
 _NEAR_M = 0.01
 """Distance from the target that counts as arrived after 5 s; nothing is published."""
 _ABSTRACT, _README = "abstract", "authors' Results/README.md"
-_HOW = (
+_METHOD = (
     "the largest of 20 runs of the linear plant for 5 s, with losses of 0, 10, … 90 % in each "
     "direction; for each one with random disturbances, one with those that turn the pole most"
 )
 _SHRINK = 0.99999
 """Share of the tightened limits within which the steady position is."""
-_SOLVED = 1e-9
+_SOLUTION_ROUNDING = 1e-9
 """Rounding of a solution: a smaller residual is 0, and limits may be exceeded by this."""
 
 
@@ -55,11 +55,11 @@ class ConstrainedPlant(NamedTuple):
 
     def tube(self, K: Matrix, direction: Vector) -> float:
         """Return how far the tube of a gain reaches in a direction."""
-        closed, reached, added = (self.A - self.B @ K).T, 0.0, math.inf
-        while added > 1e-15 * reached:
-            added = float(self.most_w @ np.abs(direction))
-            reached, direction = reached + added, closed @ direction
-        return reached
+        closed_loop, extent, step = (self.A - self.B @ K).T, 0.0, math.inf
+        while step > 1e-15 * extent:
+            step = float(self.most_w @ np.abs(direction))
+            extent, direction = extent + step, closed_loop @ direction
+        return extent
 
 
 def cart_pole() -> ConstrainedPlant:
@@ -107,17 +107,19 @@ class Optimisation:
     def _terminal_set(self, plant: ConstrainedPlant, most_u: float) -> tuple[Matrix, Vector]:
         """Return rows and limits of the largest set of (z, s) in which the feedback to s stays."""
         n = len(plant.A)
-        closed, unit = plant.A - plant.B @ self.K, np.eye(n)[:, :1]
-        step = np.block([[closed, (np.eye(n) - closed) @ unit], [np.zeros((1, n)), np.ones((1, 1))]])
+        closed_loop, unit = plant.A - plant.B @ self.K, np.eye(n)[:, :1]
+        step = np.block(
+            [[closed_loop, (np.eye(n) - closed_loop) @ unit], [np.zeros((1, n)), np.ones((1, 1))]]
+        )
         rows = np.vstack([np.eye(n, n + 1), np.hstack([-self.K, self.K @ unit])])
-        most = np.append(self._limits, most_u)
-        kept = np.vstack([rows, np.eye(n + 1)[n:]])
-        limits = np.append(most, _SHRINK * self._limits[0])
+        step_limits = np.append(self._limits, most_u)
+        set_rows = np.vstack([rows, np.eye(n + 1)[n:]])
+        limits = np.append(step_limits, _SHRINK * self._limits[0])
         rows = rows @ step
-        while any(_reaches(row, kept, limits) > end for row, end in zip(rows, most, strict=True)):
-            kept, limits = np.vstack([kept, rows]), np.append(limits, most)
+        while any(_reaches(row, set_rows, limits) > end for row, end in zip(rows, step_limits, strict=True)):
+            set_rows, limits = np.vstack([set_rows, rows]), np.append(limits, step_limits)
             rows = rows @ step
-        return kept, limits
+        return set_rows, limits
 
     def inputs(self, start: Vector) -> tuple[Vector, float] | None:
         """Return N inputs and s for the nominal state ``start``; None if none is within the limits.
@@ -134,7 +136,7 @@ class Optimisation:
         if room.min() < 0:
             columns = np.vstack([np.vstack([-self._scaled, self._scaled]).T, -room])
             residual = columns @ nnls(columns, np.eye(N + 2)[N + 1])[0] - np.eye(N + 2)[N + 1]
-            if abs(residual[-1]) < _SOLVED:
+            if abs(residual[-1]) < _SOLUTION_ROUNDING:
                 return None
             shortest = -residual[:-1] / residual[-1]
         best = solve_triangular(self._root, shortest - offset, lower=True, trans=1)
@@ -153,8 +155,8 @@ def _predictions(plant: ConstrainedPlant) -> tuple[Matrix, Matrix]:
 
 def _reaches(row: Vector, rows: Matrix, limits: Vector) -> float:
     """Return the largest value of a row in the set |rows · v| ≤ limits."""
-    both, ends = np.vstack([rows, -rows]), np.tile(limits, 2)
-    farthest: Vector = linprog(-row, A_ub=both, b_ub=ends, bounds=(None, None))["x"]
+    both_signs, ends = np.vstack([rows, -rows]), np.tile(limits, 2)
+    farthest: Vector = linprog(-row, A_ub=both_signs, b_ub=ends, bounds=(None, None))["x"]
     return float(row @ farthest)
 
 
@@ -168,7 +170,7 @@ class ControllerMessage(NamedTuple):
     """The newest period of which the controller knows the nominal state."""
 
     def input(self, age: int, K: Vector, z: Vector) -> float:
-        """Return the nominal input so many periods later, in the nominal state z."""
+        """Return the nominal input ``age`` periods later, in the nominal state z."""
         return float(self.inputs[age]) if age < N else self.end - float(K @ z)
 
 
@@ -215,8 +217,8 @@ class RunOutcome(NamedTuple):
     """Of the plant's position from the target, after 5 s."""
 
 
-def run(optimisation: Optimisation, lost: float, disturbances: Matrix, own: Vector) -> RunOutcome:
-    """Run the loop from rest; ``own`` is the gain of the plant's side.
+def run(optimisation: Optimisation, lost: float, disturbances: Matrix, own_gain: Vector) -> RunOutcome:
+    """Run the loop from rest; ``own_gain`` is the gain of the plant's side.
 
     The plant's side uses a message if it has received all since the period ``acknowledged`` in it: then
     the controller knew the nominal state. Its answer says which message it uses. Without an answer
@@ -225,20 +227,20 @@ def run(optimisation: Optimisation, lost: float, disturbances: Matrix, own: Vect
     plant, K = optimisation.plant, optimisation.K[0]
     A, b, n = plant.A, plant.B[:, 0], len(plant.A)
     reach = np.array([plant.tube(optimisation.K, unit) for unit in np.eye(n)])
-    arriving = np.random.default_rng(round(100 * lost)).random((STEPS, 2)) >= lost
-    arriving[0] = True
+    arrivals = np.random.default_rng(round(100 * lost)).random((STEPS, 2)) >= lost
+    arrivals[0] = True
     controller, x, z = _Controller(optimisation), np.zeros(n), np.zeros(n)
-    used = received_in_sequence = unsolved = 0
+    used_message = received_in_sequence = unsolved = 0
     shares = np.zeros(3)
-    for k, ((arrives, is_answered), w) in enumerate(zip(arriving, disturbances, strict=True)):
+    for k, ((arrives, is_answered), w) in enumerate(zip(arrivals, disturbances, strict=True)):
         is_solved = controller.send()
         unsolved += not is_solved
         is_received = arrives and is_solved
         received_in_sequence = received_in_sequence + 1 if is_received else 0
         if is_received and received_in_sequence >= k - controller.sent[k].acknowledged:
-            used = k
-        v = controller.sent[used].input(k - used, K, z)
-        u = v - float(own @ (x - z))
+            used_message = k
+        v = controller.sent[used_message].input(k - used_message, K, z)
+        u = v - float(own_gain @ (x - z))
         now = (np.abs(x - z) / reach).max(), (np.abs(x) / plant.most_x).max(), abs(u) / plant.most_u
         shares = np.maximum(shares, now)
         z, x = A @ z + b * v, A @ x + b * u + w
@@ -254,11 +256,11 @@ def make_disturbances(optimisation: Optimisation) -> tuple[Matrix, Matrix]:
     The latter make the angle's difference x − z reach the tube's end in the last period.
     """
     plant = optimisation.plant
-    drawn = np.random.default_rng(1).uniform(-1.0, 1.0, (STEPS, len(plant.A))) * plant.most_w
-    closed, turned = (plant.A - plant.B @ optimisation.K).T, [np.eye(len(plant.A))[_ANGLE]]
+    random_ones = np.random.default_rng(1).uniform(-1.0, 1.0, (STEPS, len(plant.A))) * plant.most_w
+    closed_loop, directions = (plant.A - plant.B @ optimisation.K).T, [np.eye(len(plant.A))[_ANGLE]]
     for _ in range(STEPS - 1):
-        turned.append(closed @ turned[-1])
-    return drawn, np.roll(np.sign(turned)[::-1], -1, axis=0) * plant.most_w
+        directions.append(closed_loop @ directions[-1])
+    return random_ones, np.roll(np.sign(directions)[::-1], -1, axis=0) * plant.most_w
 
 
 @cache
@@ -282,15 +284,15 @@ def _rows() -> list[ComparedValue]:
     )
     return [
         ComparedValue(
-            "optimisations without a solution", _ABSTRACT, "=", "0", f"{unsolved}", _HOW, unsolved == 0
+            "optimisations without a solution", _ABSTRACT, "=", "0", f"{unsolved}", _METHOD, unsolved == 0
         ),
         *(
-            ComparedValue(quantity, where, "≤", "1", f"{share:.3f}", _HOW, share <= 1 + _SOLVED)
+            ComparedValue(quantity, where, "≤", "1", f"{share:.3f}", _METHOD, share <= 1 + _SOLUTION_ROUNDING)
             for quantity, where, share in largest
         ),
         ComparedValue(
             "distance of the nominal position from the target after 5 s", _ABSTRACT, "<",
-            f"{1000 * _NEAR_M:.0f} mm, then 0", f"{1000 * distance_m:.1f} mm", _HOW,
+            f"{1000 * _NEAR_M:.0f} mm, then 0", f"{1000 * distance_m:.1f} mm", _METHOD,
             distance_m < _NEAR_M,
         ),
     ]  # fmt: skip

@@ -34,8 +34,8 @@ def network_of(decide: Callable[[int], int | None]) -> Network:
 
 def without(record: RunRecord, *processes: str) -> RunRecord:
     """The record without the rows of some processes."""
-    gone = {table: record[table][:0] for table in record.tables if OWNER[table] in processes}
-    return changed(record, gone)
+    without_rows = {table: record[table][:0] for table in record.tables if OWNER[table] in processes}
+    return changed(record, without_rows)
 
 
 def event_s(record: RunRecord, number: int) -> float:

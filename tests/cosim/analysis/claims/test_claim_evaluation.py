@@ -63,8 +63,8 @@ def test_the_docs_list_every_claim_of_the_catalogue() -> None:
     assert len(rows) == defined
     text = DOCS.read_text(encoding="utf-8")
     section = text[text.index("\n## Claims") : text.index("\n## The summary")]
-    listed = [line.strip("| ").split(" | ") for line in section.splitlines() if " | " in line]
-    assert {tuple(cells) for cells in listed[1:]} == rows
+    table_rows = [line.strip("| ").split(" | ") for line in section.splitlines() if " | " in line]
+    assert {tuple(cells) for cells in table_rows[1:]} == rows
 
 
 # --- held -----------------------------------------------------------------------------------------
@@ -233,13 +233,13 @@ def test_too_many_dropouts_void_the_papers_theorems(make: Make) -> None:
 
 def test_a_claim_is_not_held_where_the_record_has_no_rows(run: RunRecord) -> None:
     """Measurements continue after the controller's record ends: ‖e_c‖ is unknown from 2 s on."""
-    ticks, taken = run[CONTROLLER_STEP], run[CONTROLLER_DELIVERY]
+    ticks, deliveries = run[CONTROLLER_STEP], run[CONTROLLER_DELIVERY]
     early = {
         CONTROLLER_STEP: ticks[ticks["t_ns"] < 2_000_000_000],
-        CONTROLLER_DELIVERY: taken[taken["now_ns"] < 2_000_000_000],
+        CONTROLLER_DELIVERY: deliveries[deliveries["now_ns"] < 2_000_000_000],
     }
-    cut = changed(run, early)
-    unknown = [c for c in ClaimEvaluation(cut).evaluate() if "e_c" in c.bound or c.source == "(I1)"]
+    shortened = changed(run, early)
+    unknown = [c for c in ClaimEvaluation(shortened).evaluate() if "e_c" in c.bound or c.source == "(I1)"]
     assert unknown
     for claim in unknown:
         assert claim.verdict is not HELD
@@ -295,8 +295,8 @@ APART_NS = 47 * MS
 
 
 def run_with(*changes: tuple[float, dict[str, Any]], **more: Any) -> RunRecord:
-    listed = [{"at_s": at_s, "set": settings} for at_s, settings in changes]
-    return simulate(resolve(validate(CONTENT | {"changes": listed} | more, "here")))
+    changes_table = [{"at_s": at_s, "set": settings} for at_s, settings in changes]
+    return simulate(resolve(validate(CONTENT | {"changes": changes_table} | more, "here")))
 
 
 def test_a_change_of_the_loss_alone_affects_no_claim() -> None:
@@ -359,13 +359,13 @@ def test_events_that_are_due_after_a_change_may_lie_beside_the_new_grid() -> Non
 def test_a_plant_that_does_not_rest_at_the_set_point_has_a_constant_disturbance() -> None:
     plant = CONTENT["plant"] | {"uncertainty_A": [[0.0, 0.0], [0.3, 0.0]]}
     record = run_with((2.005, {"controller.setpoint": [3.0, 0.0]}), plant=plant)
-    after = [claim for claim in RunClaims(record).evaluate() if claim.from_s > 0]
-    own = [claim for claim in after if claim.source == "certificate"]
-    assert own
-    assert {claim.verdict for claim in own} == {ClaimVerdict.HELD}
-    void = [claim for claim in after if claim.verdict is ClaimVerdict.VOID]
+    later_claims = [claim for claim in RunClaims(record).evaluate() if claim.from_s > 0]
+    certificate_claims = [claim for claim in later_claims if claim.source == "certificate"]
+    assert certificate_claims
+    assert {claim.verdict for claim in certificate_claims} == {ClaimVerdict.HELD}
+    void = [claim for claim in later_claims if claim.verdict is ClaimVerdict.VOID]
     assert {claim.source for claim in void} == {"box certificate"}
-    identity = next(claim for claim in after if claim.source == "(I1)")
+    identity = next(claim for claim in later_claims if claim.source == "(I1)")
     assert identity.verdict is ClaimVerdict.HELD
 
 
@@ -462,10 +462,10 @@ def stopped(record: RunRecord, reached_ns: dict[str, int]) -> RunRecord:
 
 @pytest.mark.parametrize("order", [*permutations(LOOP_ROLES)][::5], ids="-".join)
 def test_processes_that_stop_at_different_times_void_no_claim(run: RunRecord, order: tuple[str, ...]) -> None:
-    cut = stopped(run, {role: STOP_NS + i * APART_NS for i, role in enumerate(order)})
+    stopped_record = stopped(run, {role: STOP_NS + i * APART_NS for i, role in enumerate(order)})
     if order[0] == "controller":  # the plant continues with its last input
-        assert ClaimVerdict.VOID in {claim.verdict for claim in ClaimEvaluation(cut).evaluate()}
-    claims = RunClaims(cut)
+        assert ClaimVerdict.VOID in {claim.verdict for claim in ClaimEvaluation(stopped_record).evaluate()}
+    claims = RunClaims(stopped_record)
     verdicts = [(claim.source, claim.verdict) for claim in claims.evaluate()]
     assert len(verdicts) > 5
     assert {verdict for _, verdict in verdicts} == {ClaimVerdict.HELD}, verdicts

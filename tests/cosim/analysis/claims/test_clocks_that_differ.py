@@ -58,7 +58,10 @@ class OtherClock:
 
 def simulated(scenario: Scenario, clocks: dict[str, tuple[int, int]]) -> RunRecord:
     """Simulate with the offset in ns and the drift in ppb of the clock of each role."""
-    wraps = {role: partial(OtherClock, offset_ns=at, drift_ppb=by) for role, (at, by) in clocks.items()}
+    wraps = {
+        role: partial(OtherClock, offset_ns=offset_ns, drift_ppb=drift_ppb)
+        for role, (offset_ns, drift_ppb) in clocks.items()
+    }
     return record_of_run(scenario, wraps=wraps)
 
 
@@ -134,7 +137,7 @@ LOST = "the bound of the error of sensor's clock was lost"
 
 
 @pytest.mark.parametrize(
-    ("errors", "t_ns", "since_s", "why"),
+    ("errors", "t_ns", "since_s", "reason"),
     [
         (
             {("netem_clock", 40): WIDE_NS}, {}, 1.95,
@@ -148,17 +151,17 @@ LOST = "the bound of the error of sensor's clock was lost"
     ],
 )  # fmt: skip
 def test_all_claims_are_void_from_then_on_for_that_reason(
-    clocked: RunRecord, errors: Errors, t_ns: dict[str, int], since_s: float, why: str
+    clocked: RunRecord, errors: Errors, t_ns: dict[str, int], since_s: float, reason: str
 ) -> None:
     record = with_errors(clocked, errors, **t_ns)
     for claim in judged(record):
         assert claim.verdict is not ClaimVerdict.HELD
         if claim.verdict is ClaimVerdict.VOID and claim.since_s != 0:
             assert claim.since_s == pytest.approx(since_s)
-            assert why in claim.why
+            assert reason in claim.why
     assert ClaimVerdict.VOID in {claim.verdict for claim in judged(record)}
     first = min(RunClaims(record).violations())
-    assert (first.t_s, first.text) == (pytest.approx(since_s), why)
+    assert (first.t_s, first.text) == (pytest.approx(since_s), reason)
 
 
 @pytest.mark.parametrize("seed", range(6))

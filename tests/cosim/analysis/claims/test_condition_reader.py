@@ -52,16 +52,16 @@ SERIES = ("losses", "sampling", "delay", "hold", "watchdog", "safe_input", "rest
 def batches(record: RunRecord, seed: int) -> Batches:
     """The record as the processes send it: each in its own order, the processes in any order."""
     rng = np.random.default_rng(seed)
-    taken = dict.fromkeys(record.tables, 0)
-    while waiting := [table for table in taken if taken[table] < len(record[table])]:
+    positions = dict.fromkeys(record.tables, 0)
+    while waiting := [table for table in positions if positions[table] < len(record[table])]:
         role = rng.choice([role for role in LOOP_ROLES if any(OWNER[t] == role for t in waiting)])
-        own = [table for table in record.tables if OWNER[table] == role]
-        first = min(int(record[t]["input"][taken[t]]) for t in own if t in waiting)
-        until = first + int(rng.integers(1, 200))
-        for table in own:
-            end = int(np.searchsorted(record[table]["input"], until))
-            yield table, record[table][taken[table] : end]
-            taken[table] = end
+        own_tables = [table for table in record.tables if OWNER[table] == role]
+        first = min(int(record[t]["input"][positions[t]]) for t in own_tables if t in waiting)
+        end_input = first + int(rng.integers(1, 200))
+        for table in own_tables:
+            end = int(np.searchsorted(record[table]["input"], end_input))
+            yield table, record[table][positions[table] : end]
+            positions[table] = end
             if rng.uniform() < 0.2:
                 yield None
         if rng.uniform() < 0.5:
@@ -207,7 +207,7 @@ def restarted_sensor(make: Make) -> RunRecord:
 
 
 @pytest.mark.parametrize(
-    ("violate", "at", "why"),
+    ("violate", "at", "reason"),
     [
         (deaf("controller", 10, 14), 12, "4 consecutive updates lost, 2 allowed"),
         (deaf("netem", 10, 14), 12, "4 consecutive updates lost, 2 allowed"),
@@ -222,7 +222,7 @@ def restarted_sensor(make: Make) -> RunRecord:
     ],
 )  # fmt: skip
 def test_claims_are_void_from_the_time_and_for_the_reason_that_the_monitor_reports(
-    violate: Callable[[Make], RunRecord], at: float, why: str, make: Make
+    violate: Callable[[Make], RunRecord], at: float, reason: str, make: Make
 ) -> None:
     """``at`` is a time, or the number of an event."""
     record = violate(make)
@@ -234,10 +234,10 @@ def test_claims_are_void_from_the_time_and_for_the_reason_that_the_monitor_repor
     assert claims
     for claim in claims:
         assert claim.since_s == pytest.approx(when_s)
-        assert claim.why.startswith(why)
+        assert claim.why.startswith(reason)
     first = min(reported(record))
     assert first.t_s == pytest.approx(when_s)
-    assert first.text[:20] == why[:20]
+    assert first.text[:20] == reason[:20]
 
 
 @pytest.mark.parametrize(
@@ -374,9 +374,9 @@ def test_the_worst_case_of_a_schedule_occurs(
 ) -> None:
     """The assumed delays and ages occur exactly, to the nanosecond."""
     resolved = busy(make, step_ns, tick_ns, every, phase, "first_packet")
-    seen, assumed = read_conditions(simulate(resolved)).summary(), nominal_conditions(resolved, 0)
+    observed, nominal = read_conditions(simulate(resolved)).summary(), nominal_conditions(resolved, 0)
     for name in ("sampling_s", "delay_s", "hold_s", "start_s"):
-        assert seen[name] == pytest.approx(getattr(assumed, name), abs=1e-12), name
+        assert observed[name] == pytest.approx(getattr(nominal, name), abs=1e-12), name
 
 
 def test_every_table_may_be_empty(run: RunRecord) -> None:

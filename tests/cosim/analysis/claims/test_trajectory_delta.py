@@ -14,7 +14,7 @@ from tests.cosim.analysis.claims.conftest import MS, Make
 from tests.cosim.record.changed_records import changed
 
 
-def by_hand(record: RunRecord, joined: AlignedRun, horizon: int = 10**9) -> float:
+def by_hand(record: RunRecord, samples: AlignedRun, horizon: int = 10**9) -> float:
     """1 + Σ_k e^{αδ̃_k} sup‖e^{Hτ}‖ over the missing events after each event.
 
     Computed from the real intervals; the theorem's δ̄_j bound them from above.
@@ -22,13 +22,13 @@ def by_hand(record: RunRecord, joined: AlignedRun, horizon: int = 10**9) -> floa
     from scipy.linalg import expm
 
     rows, alpha = record[SENSOR_MEASUREMENT], record.scenario.trigger.alpha_per_s
-    at = np.flatnonzero(rows["event"] != NO_SEQUENCE)
-    ends_s = [*(rows["t_ns"][at[1:]] * 1e-9), rows["t_ns"][-1] * 1e-9]
+    indices = np.flatnonzero(rows["event"] != NO_SEQUENCE)
+    ends_s = [*(rows["t_ns"][indices[1:]] * 1e-9), rows["t_ns"][-1] * 1e-9]
     largest = 1.0
-    for k, start in enumerate(at):
-        missing = [i for i in at[: k + 1] if rows["event"][i] > joined.received[start]]
+    for k, start in enumerate(indices):
+        missing_indices = [i for i in indices[: k + 1] if rows["event"][i] > samples.received[start]]
         delta = 1.0
-        for i in missing[-horizon:]:
+        for i in missing_indices[-horizon:]:
             reach_s = ends_s[k] - rows["t_ns"][i] * 1e-9
             grown = expm(record.loop.H * np.linspace(0, reach_s, 200)[:, None, None])
             delta += math.exp(alpha * reach_s) * np.linalg.norm(grown, 2, (1, 2)).max()
@@ -46,17 +46,17 @@ def test_theorem_1_bounds_the_error_and_the_sum_over_the_real_intervals(
         plant={"rate_hz": 1000.0}, controller={"rate_hz": 1000.0}, horizon_s=3.0,
     )  # fmt: skip
     record = simulate(fast)
-    joined = align_tables(record)
+    samples = align_tables(record)
     delta = trajectory_delta(record)
     assert delta is not None
-    assert delta >= by_hand(record, joined) * (1 - 1e-6)
+    assert delta >= by_hand(record, samples) * (1 - 1e-6)
     trigger = record.scenario.trigger
-    level = trigger.beta * np.exp(-trigger.alpha_per_s * joined.t_ns * 1e-9)
-    known = joined.received >= 0
+    level = trigger.beta * np.exp(-trigger.alpha_per_s * samples.t_ns * 1e-9)
+    known = samples.received >= 0
     # The theorem assumes a continuous trigger; this one is tested once a millisecond.
-    overshoot = float((joined.e_s_norm / joined.threshold).max())
+    overshoot = float((samples.e_s_norm / samples.threshold).max())
     assert overshoot < 1.2
-    assert (joined.e_c_norm[known] <= overshoot * delta * level[known]).all()
+    assert (samples.e_c_norm[known] <= overshoot * delta * level[known]).all()
 
 
 def test_theorem_1_does_not_apply_without_events_or_with_a_weight(make: Make) -> None:

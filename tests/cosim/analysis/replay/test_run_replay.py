@@ -151,9 +151,9 @@ def test_a_time_that_decreases_is_reported(table: str) -> None:
 @pytest.mark.parametrize("table", FILLED)
 def test_missing_rows_are_reported(table: str) -> None:
     rows = RECORD[table]
-    cut = len(rows) // 2
-    result = replay(changed(RECORD, {table: np.delete(rows, [cut])}))
-    number = int(rows["input"][cut])
+    removed_row = len(rows) // 2
+    result = replay(changed(RECORD, {table: np.delete(rows, [removed_row])}))
+    number = int(rows["input"][removed_row])
     process = OWNER[table]
     assert result.bit_exact  # up to the gap
     assert result.gaps == [f"{process}: rows are missing from input {number} on"]
@@ -167,10 +167,10 @@ def test_missing_rows_are_reported(table: str) -> None:
 def test_rows_missing_at_the_end_are_reported(role: str) -> None:
     owned = {table: RECORD[table] for table in RECORD.tables if OWNER[table] == role}
     last = max(int(rows["input"][-1]) for rows in owned.values() if len(rows))
-    cut = {table: rows[rows["input"] < last] for table, rows in owned.items()}
-    others = {other: report for other, report in RECORD.reports.items() if other != role}
+    shorter_rows = {table: rows[rows["input"] < last] for table, rows in owned.items()}
+    others = {other_role: report for other_role, report in RECORD.reports.items() if other_role != role}
     for record, gap in (
-        (changed(RECORD, cut), f"{role}: rows are missing from input {last} on"),
+        (changed(RECORD, shorter_rows), f"{role}: rows are missing from input {last} on"),
         (
             changed(RECORD, reports=others),
             f"{role}: left no report; whether its last rows are missing is not known",
@@ -218,11 +218,11 @@ def test_a_delivery_of_a_dropped_update_is_reported() -> None:
 def test_ticks_after_the_runs_end_are_not_made(table: str) -> None:
     """Of a period of 10¹⁸ ns, the times of ten more steps would not fit 64 bits."""
     rows = RECORD[table]
-    more = np.repeat(rows[-1:], 10)
+    copies = np.repeat(rows[-1:], 10)
     owned = (RECORD[name]["input"] for name in RECORD.tables if OWNER[name] == OWNER[table])
     last = max(inputs.max(initial=0) for inputs in owned)
-    more["input"], more["now_ns"] = np.arange(1, 11) + last, 2**62
-    result = replay(changed(RECORD, {table: np.concatenate([rows, more])}))
+    copies["input"], copies["now_ns"] = np.arange(1, 11) + last, 2**62
+    result = replay(changed(RECORD, {table: np.concatenate([rows, copies])}))
     account = next(process for process in result.processes if process.process == OWNER[table])
     assert account.difference is not None
     assert account.difference.row == len(rows)
@@ -255,13 +255,13 @@ def test_an_update_before_the_first_tick_of_a_restarted_controller_is_replayed(
         resolved, "controller", lambda machine: RestartedMachine(machine, successor, at_ns)
     )
     rows = {table: record[table] for table in record.tables}
-    taken, again = rows[CONTROLLER_DELIVERY], rows[CONTROLLER_STEP]["input"] >= GENERATION
-    first = taken[taken["input"] == GENERATION]
+    deliveries, is_restarted = rows[CONTROLLER_DELIVERY], rows[CONTROLLER_STEP]["input"] >= GENERATION
+    first = deliveries[deliveries["input"] == GENERATION]
     assert len(first) == 1
-    assert first["now_ns"][0] < rows[CONTROLLER_STEP]["t_ns"][again][0]
+    assert first["now_ns"][0] < rows[CONTROLLER_STEP]["t_ns"][is_restarted][0]
     if not ticks:  # the process died before it had one
-        rows[CONTROLLER_STEP] = rows[CONTROLLER_STEP][~again]
-        rows[CONTROLLER_DELIVERY] = taken[taken["input"] <= GENERATION]
+        rows[CONTROLLER_STEP] = rows[CONTROLLER_STEP][~is_restarted]
+        rows[CONTROLLER_DELIVERY] = deliveries[deliveries["input"] <= GENERATION]
     notice = {"process": "controller", "level": RESTART, "t_ns": 0, "text": "restarted"}
     result = replay(changed(record, rows, notices=[notice], reports={}, kind="live"))
     assert result.bit_exact, result.verdict()
@@ -283,8 +283,8 @@ def test_a_record_with_any_numbers_is_replayed(number: int, data: st.DataObject)
         place = data.draw(st.integers(0, len(words) - 1)), data.draw(st.integers(1, 3))
         if data.draw(st.booleans()):
             place = place[0], data.draw(st.integers(4, words.shape[1] - 1))
-        before, words[place] = words[place], data.draw(st.sampled_from(WORDS))
-        equal &= bool(before == words[place])
+        old_word, words[place] = words[place], data.draw(st.sampled_from(WORDS))
+        equal &= bool(old_word == words[place])
     result = replay(changed(record, rows))
     assert json.dumps(result.to_json(), allow_nan=False)
     if equal:

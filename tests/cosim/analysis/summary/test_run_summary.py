@@ -62,7 +62,7 @@ FAILED = {"exit": {"status": 1, "reason": "diverged"}}
 
 
 @pytest.mark.parametrize(
-    ("loops", "number", "why"),
+    ("loops", "number", "reason"),
     [
         ([{}, FAILED, {"claims": [bound("‖x‖ ≤ 1", 0.9)]}], 1, "diverged"),
         ([{"claims": [bound("‖x‖ ≤ 1", 0.5)]}, {"claims": [bound("‖W e_c‖ ≤ 1", 0.6)]}], 1, ": 60 %"),
@@ -74,10 +74,12 @@ FAILED = {"exit": {"status": 1, "reason": "diverged"}}
     ],
 )  # fmt: skip
 def test_the_worst_loop_failed_or_came_nearest_to_a_bound(
-    loop: LoopSummary, loops: list[dict[str, Any]], number: int, why: str
+    loop: LoopSummary, loops: list[dict[str, Any]], number: int, reason: str
 ) -> None:
     content = loop.model_dump(mode="json") | {"claims": []}
-    given = [LoopSummary.model_validate(content | {"number": i} | own) for i, own in enumerate(loops)]
-    worst = worst_loop(given)
+    summaries = [
+        LoopSummary.model_validate(content | {"number": i} | changes) for i, changes in enumerate(loops)
+    ]
+    worst = worst_loop(summaries)
     assert worst.number == number
-    assert why in worst.why
+    assert reason in worst.why

@@ -87,16 +87,16 @@ def test_a_damaged_summary_is_shown_or_detected(record: RunRecord, summary: dict
     assert shown > 100  # numbers that may be missing, keys that are not shown
 
 
-def places(value: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    if at:
-        yield at
+def places(value: Any, prefix: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    if prefix:
+        yield prefix
     inner: Any = ()
     if isinstance(value, dict):
         inner = value.items()
     elif isinstance(value, list):
         inner = enumerate(value[:1])
     for key, part in inner:
-        yield from places(part, (*at, key))
+        yield from places(part, (*prefix, key))
 
 
 def changed(summary: dict[str, Any], place: tuple[Any, ...], value: Any) -> dict[str, Any]:
@@ -105,9 +105,9 @@ def changed(summary: dict[str, Any], place: tuple[Any, ...], value: Any) -> dict
     table: Any = copied
     for key in place[:-1]:
         table = table[key]
-    before = table.pop(place[-1])
+    old_value = table.pop(place[-1])
     if value is RENAMED and isinstance(table, dict):
-        table["[/b]"] = before
+        table["[/b]"] = old_value
     elif value is not DELETED and isinstance(table, dict):
         table[place[-1]] = value
     elif value is not DELETED:
@@ -142,14 +142,14 @@ def simulated(content: dict[str, Any]) -> RunRecord:
 
 def test_the_expected_loss_rate_is_shown_beside_the_measured_one(content: dict[str, Any]) -> None:
     """With loss probability p and cap N, Σ_{k=1…N} p^k drops are expected for each delivery."""
-    shown = summary_of(simulated(content))
+    summary = summary_of(simulated(content))
     drops = 0.5 + 0.5**2
-    assert shown.loops[0].loss_expected == pytest.approx(drops / (1 + drops))
-    assert ("  expected loss rate", "42.9 %") in key_numbers(shown)
+    assert summary.loops[0].loss_expected == pytest.approx(drops / (1 + drops))
+    assert ("  expected loss rate", "42.9 %") in key_numbers(summary)
     change = {"at_s": 0.5, "set": {"network.loss.probability": 0.2}}
-    shown = summary_of(simulated(content | {"changes": [change]}))
-    assert shown.loops[0].loss_expected is None
-    assert not any("expected loss" in quantity for quantity, _ in key_numbers(shown))
+    summary = summary_of(simulated(content | {"changes": [change]}))
+    assert summary.loops[0].loss_expected is None
+    assert not any("expected loss" in quantity for quantity, _ in key_numbers(summary))
 
 
 def test_no_loss_rate_is_expected_where_some_losses_are_not_predicted(content: dict[str, Any]) -> None:

@@ -140,10 +140,10 @@ def test_a_join_token_admits_its_roles_until_it_expires(
     reason: str | None,
 ) -> None:  # fmt: skip
     barrier.join_tokens["ab" * 16] = known
-    asked = ask(plane, barrier, "admit", role=role, join_token=join_token)
-    assert asked.error == (None if reason is None else f"cannot join: {reason}")
-    joined = ask(plane, barrier, "join", role=role)
-    assert joined.error == (None if reason is None else "cannot join: it was not admitted")
+    answer = ask(plane, barrier, "admit", role=role, join_token=join_token)
+    assert answer.error == (None if reason is None else f"cannot join: {reason}")
+    answer = ask(plane, barrier, "join", role=role)
+    assert answer.error == (None if reason is None else "cannot join: it was not admitted")
 
 
 # --- requests to change a run ---------------------------------------------------------------------
@@ -174,10 +174,10 @@ def test_a_refused_change_has_no_effect_on_the_next_one() -> None:
     """It is valid now and with the last settings, but not with the first of those scheduled."""
     change = 'changes=[{ at_s = 8.0, set = { "network.mansd" = 2 } }]'
     requests = requests_of('{ name = "p", count = 2 }', change)
-    kept = {"model": "bernoulli", "probability": 0.8, "keep": True}
+    impossible_loss = {"model": "bernoulli", "probability": 0.8, "keep": True}
     with pytest.raises(CallerError, match=r"network\.loss: loss 80% keep: impossible"):
-        requested(requests, {"network.mansd": 10, "network.loss": kept})
-    loss = kept | {"probability": 0.2}
+        requested(requests, {"network.mansd": 10, "network.loss": impossible_loss})
+    loss = impossible_loss | {"probability": 0.2}
     assert requested(requests, {"network.loss": loss})["from_s"] > 0
     parameters = requested(requests, {})["runtime_parameters"]
     assert (parameters["network.mansd"], parameters["network.loss"]["probability"]) == (2, 0.2)

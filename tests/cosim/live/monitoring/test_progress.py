@@ -14,15 +14,15 @@ from tests.helpers.shipped import resolved
 
 @pytest.mark.parametrize("terminal", [True, False])
 def test_the_terminal_reports_each_cause_once(terminal: bool) -> None:
-    shown = io.StringIO()
+    output = io.StringIO()
     report: dict[str, Any] = {
         "t_s": 0.5, "events": 3, "deliveries": 2, "longest_loss_burst": 1, "x_norm": 1.0,
         "live": None,
     }  # fmt: skip
-    console = Console(file=shown, force_terminal=terminal, width=200)
+    console = Console(file=output, force_terminal=terminal, width=200)
     with progress_line(console, resolved("lane_following")) as watcher:
         watcher.started(Path())
         for void in ([], ["one [cause]"], ["one [cause]"], ["one [cause]", "another"]):
             watcher.progress(RunProgress(**report, warnings=void))
-    assert shown.getvalue().count("one [cause]") == 1
-    assert shown.getvalue().count("another") == 1
+    assert output.getvalue().count("one [cause]") == 1
+    assert output.getvalue().count("another") == 1

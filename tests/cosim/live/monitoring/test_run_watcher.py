@@ -39,18 +39,18 @@ def test_metrics_follow_the_launchers_reports() -> None:
 
 
 def test_a_watcher_whose_output_is_closed_does_not_stop_the_others() -> None:
-    seen: list[float] = []
+    times_s: list[float] = []
 
     def closed(report: RunProgress) -> None:
-        seen.append(-1)
+        times_s.append(-1)
         raise BrokenPipeError
 
     joint = joint_watcher([
-        Watcher(progress=closed), Watcher(progress=lambda report: seen.append(report.t_s))
+        Watcher(progress=closed), Watcher(progress=lambda report: times_s.append(report.t_s))
     ])  # fmt: skip
     joint.progress(RunProgress(**PROGRESS | {"t_s": 1.0}))
     joint.progress(RunProgress(**PROGRESS | {"t_s": 2.0}))
-    assert seen == [-1, 1.0, 2.0]
+    assert times_s == [-1, 1.0, 2.0]
 
 
 @pytest.mark.usefixtures("without_viewer")
@@ -106,5 +106,5 @@ def test_long_work_prints_its_share_and_the_remaining_time_as_lines_without_a_te
             for share in (0.1, 0.2, 0.25, 1.0):
                 now_s[0] += 3
                 show(share)
-        printed = capsys.readouterr().err
-        assert printed == lines * "noack: trying gains: 20 % after 6 s, about 24 s left\n"
+        text = capsys.readouterr().err
+        assert text == lines * "noack: trying gains: 20 % after 6 s, about 24 s left\n"

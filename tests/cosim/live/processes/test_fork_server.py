@@ -70,8 +70,8 @@ with closing(ForkServer(of_itself=True)) as server, open(sys.argv[1], "a") as lo
 
 def test_a_command_forks_the_server_of_itself(tmp_path: Path) -> None:
     command = [sys.executable, "-c", _OF_ITSELF, str(tmp_path / "log")]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=150)
-    assert done.stdout.splitlines() == ["False", f"{ExitStatus.CALLER} ForkedProcess False"]
+    result = subprocess.run(command, capture_output=True, text=True, check=True, timeout=150)
+    assert result.stdout.splitlines() == ["False", f"{ExitStatus.CALLER} ForkedProcess False"]
     assert "not a valid run descriptor" in (tmp_path / "log").read_text()
 
 
@@ -84,13 +84,13 @@ def test_a_command_with_threads_or_another_encoding_starts_the_server_as_a_progr
     tmp_path: Path, before: str, environment: dict[str, str]
 ) -> None:
     command = [sys.executable, "-c", f"{before}\n{_OF_ITSELF}", str(tmp_path / "log")]
-    done = subprocess.run(
+    result = subprocess.run(
         command, capture_output=True, text=True, check=True, timeout=150,
         env=os.environ | environment,
     )  # fmt: skip
-    if environment and "ForkedProcess" in done.stdout:
+    if environment and "ForkedProcess" in result.stdout:
         pytest.skip("the system has no such locale")
-    assert f"{ExitStatus.CALLER} Popen" in done.stdout
+    assert f"{ExitStatus.CALLER} Popen" in result.stdout
 
 
 def test_an_ignored_sigchld_hides_the_exit_status_only(tmp_path: Path) -> None:

@@ -19,6 +19,6 @@ def test_a_program_without_a_main_guard_is_not_run_again(tmp_path: Path) -> None
     program = tmp_path / "program.py"
     program.write_text(_PROGRAM)
     command = [sys.executable, str(program)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert done.stdout == "once\n[1, 2, 3]\n"
-    assert done.stderr == ""
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert result.stdout == "once\n[1, 2, 3]\n"
+    assert result.stderr == ""

@@ -86,6 +86,6 @@ def test_a_diverging_loop_is_named_once_also_among_many(content: Content) -> Non
         assert only.text.startswith("wild: diverges from ")
         assert only.notice.loop == len(run.loops) - 1
         x = run.loops[-1]["plant_step"]
-        at = np.searchsorted(x["t_ns"], only.notice.t_ns)
+        index = np.searchsorted(x["t_ns"], only.notice.t_ns)
         early = np.linalg.norm(x["x"][x["t_ns"] < run.network.scenario.timing.horizon_ns / 10], axis=1)
-        assert np.linalg.norm(x["x"][at]) > 1000 * early.max() >= np.linalg.norm(x["x"][at - 1])
+        assert np.linalg.norm(x["x"][index]) > 1000 * early.max() >= np.linalg.norm(x["x"][index - 1])

@@ -115,9 +115,9 @@ class Run:
 
 @pytest.fixture
 def run(content: dict[str, Any], tmp_path: Path) -> Iterator[Run]:
-    opened = Run(resolve(validate(content, "")), tmp_path)
-    yield opened
-    opened.recorder.store.writer.close()
+    opened_run = Run(resolve(validate(content, "")), tmp_path)
+    yield opened_run
+    opened_run.recorder.store.writer.close()
 
 
 def test_invalid_telemetry_is_ignored_and_the_rest_is_stored(
@@ -191,9 +191,9 @@ def test_a_restarted_recorder_does_not_wait_for_ended_processes(
 
 
 def test_a_process_is_gone_once_the_one_that_replaced_it_has_reported(run: Run) -> None:
-    gone = Sample("noack/0/alive/plant/plant")
-    gone.kind = zenoh.SampleKind.DELETE  # type: ignore[assignment]
-    run.plane.put("alive", gone)
+    vanished = Sample("noack/0/alive/plant/plant")
+    vanished.kind = zenoh.SampleKind.DELETE  # type: ignore[assignment]
+    run.plane.put("alive", vanished)
     for role in set(LOOP_ROLES) - {"plant"}:
         assert run.report(role) == {}
     assert not run.recorder.finished  # it may come back

@@ -29,9 +29,9 @@ def scenario(content: dict[str, Any]) -> Scenario:
 
 @pytest.fixture
 def store(scenario: Scenario, tmp_path: Path) -> Iterator[TelemetryStore]:
-    opened = TelemetryStore(scenario, tmp_path, "first", BEGINNING)
-    yield opened
-    opened.writer.close()
+    telemetry_store = TelemetryStore(scenario, tmp_path, "first", BEGINNING)
+    yield telemetry_store
+    telemetry_store.writer.close()
 
 
 def batch(store: TelemetryStore, first: int, generation: int = 0, count: int = BATCH) -> bytes:
@@ -63,15 +63,15 @@ def acknowledged(store: TelemetryStore) -> dict[str, Any]:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_batches_may_arrive_in_any_order_and_twice(store: TelemetryStore, seed: int) -> None:
-    batches, stored, end = 12, set[int](), 0
+    batches, stored_batches, end = 12, set[int](), 0
     rng = np.random.default_rng(seed)
     for number in [*rng.permutation(batches), *rng.integers(batches, size=3)]:
         first = BATCH * int(number)
         assert add(store, first) is (first == end)
-        stored |= set(range(first, first + BATCH))
+        stored_batches |= set(range(first, first + BATCH))
         end = max(end, first + BATCH)
         absent = {row for begin, until in missing(store, BATCH * batches) for row in range(begin, until)}
-        assert absent == set(range(BATCH * batches)) - stored
+        assert absent == set(range(BATCH * batches)) - stored_batches
     assert acknowledged(store)["plant"] == {"generation": 0, "rows": {PLANT_STEP: [(0, BATCH * batches)]}}
 
 

@@ -158,9 +158,9 @@ def test_channels_of_several_loops_have_the_loops_names(loops: noack.Run, tmp_pa
 
 def test_csv_files_have_the_tables(run: noack.Run, tmp_path: Path) -> None:
     words = ["export", str(run.directory), "--format", "csv", "--out", str(tmp_path / "csv")]
-    done = invoke(*words, "--json")
-    assert done.exit_code == 0, done.output
-    names = {Path(file).stem for file in json.loads(done.stdout)["files"]}
+    result = invoke(*words, "--json")
+    assert result.exit_code == 0, result.output
+    names = {Path(file).stem for file in json.loads(result.stdout)["files"]}
     assert names == {*run.tables, "samples", "events"}
     steps = csv.read_csv(tmp_path / "csv/plant_step.csv")
     assert steps.equals(run.loops[run.scenario.name].table("plant_step"))

@@ -194,16 +194,16 @@ def test_instances_are_separate_and_can_begin_or_go_on_again(folders: Folders) -
     whole = sent(first, range(60))
     assert len({tuple(row) for row in whole}) > 20
     assert sent(second, range(30)) == whole[:30]  # while the other one exists
-    kept = second.state()
+    state = second.state()
     assert sent(second, range(30, 60)) == whole[30:]
     for instance in (first, second):
-        instance.set_state(kept)
-        assert instance.state() == kept
+        instance.set_state(state)
+        assert instance.state() == state
         assert sent(instance, range(30, 60)) == whole[30:]
     first.slave.reset()
     assert sent(first.start(), range(60)) == whole
     controller = Fmu(other).start()
-    for content in (controller.state(), kept[:-1], kept[:-1] + b"?"):
+    for content in (controller.state(), state[:-1], state[:-1] + b"?"):
         assert "the state is not one of this FMU" in second.refuses(second.set_state, content)
     for instance in (first, second, controller):
         instance.slave.freeInstance()
@@ -227,11 +227,11 @@ def test_what_is_called_at_the_wrong_time_is_an_error(folders: Folders) -> None:
     no_state = (slave.fmi3SetFMUState, slave.component, None)
     assert "there is no state" in channel.refuses(*no_state)
     channel.step(0.0, H_S)
-    kept = channel.state()
+    state = channel.state()
     for from_s, step_s in ((0.0, H_S), (H_S, -H_S), (math.nan, H_S), (H_S, math.inf), (0.5, H_S)):
         assert "a step" in channel.refuses(slave.doStep, from_s, step_s)
         assert now in channel.refuses(slave.doStep, H_S, H_S)
-        channel.set_state(kept)
+        channel.set_state(state)
     channel.set("send", 2)
     assert "`send` must be" in channel.refuses(slave.doStep, H_S, H_S)
     slave.reset()
@@ -263,8 +263,8 @@ def test_packets_that_no_run_has_are_not_used(folders: Folders) -> None:
     )
     for k, packet in enumerate([*wrong, (5, 0.0, 1.0), (5, 0.0, 2.0), (4, 0.0, 2.0)]):
         number, sent_s, x = ([value, *[0] * 7] for value in packet)
-        given = {"packet_number": number, "packet_sent_s": sent_s}
-        controller.step(k * H_S, H_S, arrivals=k + 1, packet_x=np.repeat(x, 2), **given)
+        inputs = {"packet_number": number, "packet_sent_s": sent_s}
+        controller.step(k * H_S, H_S, arrivals=k + 1, packet_x=np.repeat(x, 2), **inputs)
         assert controller.get("updates") == (k >= len(wrong))
     assert np.isfinite(controller.get("x_c")).all()
 
@@ -309,9 +309,9 @@ def test_the_command_takes_scenarios_and_runs(tmp_path: Path, monkeypatch: pytes
     with pytest.raises(CallerError, match="the scenario has loops"):
         next(iter(loops.loops.values())).export("d.fmu")
     for option, kind in ("--set=network.mansd=2", "csv"), ("--no-certificates", "fmu"):
-        refused = invoke("export", str(run.directory), "--format", kind, option)
-        assert refused.exit_code == 2
-        assert f"{option.split('=')[0]}: " in refused.stderr
+        result = invoke("export", str(run.directory), "--format", kind, option)
+        assert result.exit_code == 2
+        assert f"{option.split('=')[0]}: " in result.stderr
     Path("v1.2").mkdir()
     invoke("export", "double_integrator", "--format", "fmu", "--out", "v1.2")
     invoke("export", "double_integrator", "--format", "fmu", "--out", "v1.2/v1.2")

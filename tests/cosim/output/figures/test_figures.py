@@ -81,10 +81,10 @@ def legends(axes: Axes) -> list[Legend]:
 def test_every_figure_is_drawn_with_its_curves_in_the_legend(case: str, tmp_path: Path) -> None:
     """Warnings are errors here: no log of zero, no limits that coincide."""
     for name, figure in described(case).items():
-        shown = {label for axes in draw(figure).axes for label in labels(axes)}
+        shown_labels = {label for axes in draw(figure).axes for label in labels(axes)}
         for row in figure.rows:
             lines = [item for item in row.panels[0].items if isinstance(item, Line)]
-            assert {line.label for line in lines if line.label} <= shown, name
+            assert {line.label for line in lines if line.label} <= shown_labels, name
         if case == "diverged":
             save_figure(figure, tmp_path / f"{name}.png")
             assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
@@ -135,9 +135,9 @@ def test_signal_names_are_drawn_literally() -> None:
 
 
 def test_a_curve_of_zeros_is_not_drawn_on_a_logarithmic_axis() -> None:
-    drawn, zeros = draw(norms(line(T_S, T_S), line(T_S, 0 * T_S))).axes[0].lines
+    curve, zeros = draw(norms(line(T_S, T_S), line(T_S, 0 * T_S))).axes[0].lines
     assert np.isnan(zeros.get_ydata()).all()
-    np.testing.assert_array_equal(drawn.get_ydata(), T_S)
+    np.testing.assert_array_equal(curve.get_ydata(), T_S)
 
 
 def test_the_distribution_of_lateness_is_exact_at_its_ends() -> None:
@@ -152,8 +152,8 @@ def test_the_distribution_of_lateness_is_exact_at_its_ends() -> None:
 @pytest.mark.parametrize("ending", ["svg", "png", "pdf"])
 def test_the_same_figure_gives_the_same_bytes(tmp_path: Path, ending: str) -> None:
     path, contents = tmp_path / f"figure.{ending}", set()
-    for own in ({}, {"lines.linewidth": 9, "axes.titlepad": 40, "svg.hashsalt": "other"}):
-        with mpl.rc_context(own):
+    for user_settings in ({}, {"lines.linewidth": 9, "axes.titlepad": 40, "svg.hashsalt": "other"}):
+        with mpl.rc_context(user_settings):
             save_figure(norms(line(T_S, T_S)), path)
         contents.add(path.read_bytes())
     (content,) = contents

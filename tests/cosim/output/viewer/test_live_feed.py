@@ -33,33 +33,33 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def shown(folder: Path, count: int, *settings: str) -> tuple[RecordedRun, Chunks, list[str]]:
     """Simulate loops, and pass their rows on as in a live run; read the recording."""
-    given = ["horizon_s=2.0", f'loops=[{{ name = "p", count = {count} }}]', *settings]
-    run = simulate_loops(shipped("shared_bottleneck", *given))
-    scenario, said = run.network.scenario, list[str]()
+    all_settings = ["horizon_s=2.0", f'loops=[{{ name = "p", count = {count} }}]', *settings]
+    run = simulate_loops(shipped("shared_bottleneck", *all_settings))
+    scenario, messages = run.network.scenario, list[str]()
     with open_recording(scenario, folder, 9, None) as view:
-        feed = LiveFeed(scenario, view, said.append)
+        feed = LiveFeed(scenario, view, messages.append)
         for table, rows in live_rows(run):
             feed.add(table, rows)
             feed.advance()
         feed.log(Notice(10**9, "diverges", "x is not finite", loop=1).line())
         feed.advance(final=True)
-    return run, read(folder / RECORDING_FILE), said
+    return run, read(folder / RECORDING_FILE), messages
 
 
 @pytest.mark.parametrize("count", [3, 30])
 @pytest.mark.parametrize("phase", ["0.0", "0.3"])
 def test_all_loops_are_shown_as_from_the_record(tmp_path: Path, count: int, phase: str) -> None:
-    run, chunks, said = shown(tmp_path, count, f"controller.phase={phase}")
+    run, chunks, messages = shown(tmp_path, count, f"controller.phase={phase}")
     expected = loops_over_time(run)
     for entity, values in ((ALL_ERRORS, expected.errors), (ALL_SIZES, expected.states)):
-        t_ns, drawn = series(chunks, entity)
+        t_ns, log_values = series(chunks, entity)
         assert (np.diff(t_ns) > 0).all()
         assert len(t_ns) == INTERVALS
         curves = (values if count == 3 else quantiles(values)).T
         known = np.isfinite(curves)
-        difference = np.abs(10**drawn - curves)[known]
-        least = 1e-5 * np.nanmax(curves)  # curves are cut off below
-        close = difference <= 1e-3 * curves[known] + least
+        difference = np.abs(10**log_values - curves)[known]
+        smallest = 1e-5 * np.nanmax(curves)  # curves are cut off below
+        close = difference <= 1e-3 * curves[known] + smallest
         assert close.mean() > 0.99  # at the start, the newest tick may be before x(0)
     horizon_ns = run.network.scenario.timing.horizon_ns
     edges_ns = np.linspace(0, horizon_ns, INTERVALS + 1)
@@ -69,7 +69,7 @@ def test_all_loops_are_shown_as_from_the_record(tmp_path: Path, count: int, phas
     curves = (shares if count == 3 else quantiles(shares)).T
     np.testing.assert_allclose(series(chunks, SHARE)[1], curves, rtol=1e-6)
     assert (MAP in chunks) == (count == 30)
-    assert not said
+    assert not messages
     assert bp.LOG in chunks
 
 
@@ -80,8 +80,8 @@ def test_loops_in_detail_that_cannot_keep_up_are_given_up_and_named(
     monkeypatch.setattr("cosim.output.viewer.live_feed._WARNED_LAG_S", 0.05)
     monkeypatch.setattr("cosim.output.viewer.live_feed._LONGEST_LAG_S", 0.5)
     monkeypatch.setattr("cosim.output.viewer.live_feed._CORE_SHARE", 1e-4)
-    _, chunks, said = shown(tmp_path, 3)
-    assert "in detail end here" in said[-1]
+    _, chunks, messages = shown(tmp_path, 3)
+    assert "in detail end here" in messages[-1]
     assert len(series(chunks, ALL_ERRORS)[0]) == INTERVALS
     with pytest.raises(ValueError, match="at least one array"):  # nothing but static data
         series(chunks, f"{bp.loop_folder('p-1')}{bp.state_path('angle')}")
@@ -101,7 +101,7 @@ def ticks(first: int, count: int) -> np.ndarray:
 
 
 def received(view: Mock) -> list[tuple[int, bool]]:
-    calls = [call.args for call in view.receptions.call_args_list]
+    calls = [call.args for call in view.add_deliveries.call_args_list]
     return [delivery for t_ns, _, forced in calls for delivery in zip(t_ns, forced, strict=True)]
 
 

@@ -30,10 +30,10 @@ def test_the_file_contains_every_sample_exactly(tmp_path: Path, horizon_s: float
     path = tmp_path / "recording.rrd"
     with new_view(path, horizon_s=horizon_s) as view:
         add_samples(view, 5)
-        view.views[0].inputs(times(0), np.stack((np.arange(K), -np.arange(K)), axis=1))
+        view.views[0].add_inputs(times(0), np.stack((np.arange(K), -np.arange(K)), axis=1))
         x = np.zeros((3, 4))
         for _ in range(2):  # the picture has a maximum frame rate
-            view.views[0].move(times(0, 3), Frames(np.zeros(3), x, x, x))
+            view.views[0].add_frames(times(0, 3), Frames(np.zeros(3), x, x, x))
     chunks = read(path)
     assert sum(c.num_rows for c in chunks["picture/plant"] if not c.is_static) == 1
     for i, name in enumerate(STATES):
@@ -60,7 +60,7 @@ def test_the_recording_shows_what_was_approved(tmp_path: Path) -> None:
     reader = rerun.chunk.RrdReader(path)
     (recording,), (layout,) = reader.recordings(), reader.blueprints()
     assert recording.application_id == layout.application_id == APPLICATION_ID
-    shown = [
+    shown_rows = [
         f"{entity} {name}: {value}"
         for entity, chunks in sorted(read(path).items())
         for batch in (chunk.to_record_batch() for chunk in chunks if chunk.is_static)
@@ -68,8 +68,8 @@ def test_the_recording_shows_what_was_approved(tmp_path: Path) -> None:
         if name.endswith((":names", ":labels", ":colors", ":text"))
         for value in batch.column(name).to_pylist()
     ]
-    shown += sorted(of_views(read(path, "blueprint"), "ViewBlueprint:display_name"))
-    compare_output("recording.txt", "\n".join(shown))
+    shown_rows += sorted(of_views(read(path, "blueprint"), "ViewBlueprint:display_name"))
+    compare_output("recording.txt", "\n".join(shown_rows))
 
 
 def test_a_file_that_cannot_be_created_is_named(tmp_path: Path) -> None:
@@ -95,9 +95,9 @@ def test_a_disk_that_fills_during_the_run_is_reported_by_the_closing(tmp_path: P
 
 def test_a_loop_without_a_picture_has_a_panel_for_every_coordinate(tmp_path: Path) -> None:
     """Names with special characters give different entities, too."""
-    path, shown = tmp_path / "recording.rrd", LoopLayout("", ["a/b", "a b", "ψ"], ["u"])
-    with RecordingFile(path, "1", over_time(shown.panels(), 1.0), indexed=True) as file:
-        LoopView(file, shown)
+    path, layout = tmp_path / "recording.rrd", LoopLayout("", ["a/b", "a b", "ψ"], ["u"])
+    with RecordingFile(path, "1", over_time(layout.panels(), 1.0), indexed=True) as file:
+        LoopView(file, layout)
     entities = {entity for entity in read(path) if entity.startswith("state/")}
     origins = of_views(read(path, "blueprint"), "ViewBlueprint:space_origin")
     assert len(entities) == 3

@@ -63,16 +63,16 @@ def test_every_moving_shape_has_a_position_in_every_frame(name: str) -> None:
     frames = frames_of(n, internal)
     frames.x_c[3:] = np.nan  # no controller
     frames.x[5] = 1e300  # a diverging run
-    moved = picture.frames(frames)
-    assert moved.keys() >= {entity for entity in shapes if entity in WHO}
-    for entity, columns in moved.items():
+    moving_shapes = picture.frames(frames)
+    assert moving_shapes.keys() >= {entity for entity in shapes if entity in WHO}
+    for entity, columns in moving_shapes.items():
         assert any(shape == entity or shape.startswith(f"{entity}/") for shape in shapes), entity
         for values in arrays(columns).values():
             assert len(values) == len(frames.t_s)
             assert np.isfinite(np.array(values, dtype=float)).all()
     # Plant and both models move, by their position or by their parts.
     for who in WHO:
-        assert any(who in entity.split("/") for entity in moved), who
+        assert any(who in entity.split("/") for entity in moving_shapes), who
     assert picture.rate_hz <= 60
 
 
@@ -86,13 +86,13 @@ def test_the_car_is_drawn_in_its_direction_of_travel() -> None:
     while len(x) < len(t_s):
         x.append(advance @ x[-1])
     states = np.array(x)
-    moved = picture.frames(Frames(t_s, states, states, states))
-    place, angle = pose(moved["plant"])
+    moving_shapes = picture.frames(Frames(t_s, states, states, states))
+    place, angle = pose(moving_shapes["plant"])
     # The markings are fixed to the ground, up to whole periods.
-    passed = -np.unwrap(pose(moved["road/passing"])[0][:, 0], period=18.0)
+    passed_m = -np.unwrap(pose(moving_shapes["road/passing"])[0][:, 0], period=18.0)
     speed = 12.0
-    np.testing.assert_allclose(np.diff(passed) * 60, speed, rtol=1e-3)
-    slope = np.gradient(place[:, 1], passed)
+    np.testing.assert_allclose(np.diff(passed_m) * 60, speed, rtol=1e-3)
+    slope = np.gradient(place[:, 1], passed_m)
     sideslip = states[:, 0] / speed
     np.testing.assert_allclose(slope[1:-1], (angle + sideslip)[1:-1], atol=2e-3)
 
@@ -124,15 +124,15 @@ PACKETS = [
 
 
 def test_each_packet_is_drawn_with_its_fate() -> None:
-    seen = rows_of(sent(NetworkDiagram(), PACKETS), [3 * S])
+    rows = rows_of(sent(NetworkDiagram(), PACKETS), [3 * S])
     steps = [round(t_s * S) for t_s in np.arange(0.013, 3.0, 0.037)]
-    assert rows_of(sent(NetworkDiagram(), PACKETS), [*steps, 3 * S]) == seen  # in any batches
-    assert seen.keys() == {"broadcast", "delivered", "forced", "lost"}
+    assert rows_of(sent(NetworkDiagram(), PACKETS), [*steps, 3 * S]) == rows  # in any batches
+    assert rows.keys() == {"delivered", "forced", "lost", "transmitted"}
     for entity, count in (("delivered", 2), ("forced", 1), ("lost", 2)):
-        shown = [bool(shapes) for _, shapes in sorted(seen[entity].items())]
-        assert shown.count(False) == count, entity  # each packet is drawn to its end
-    lost_ns = [t_ns for t_ns, shapes in seen["lost"].items() if shapes]
+        is_shown = [bool(shapes) for _, shapes in sorted(rows[entity].items())]
+        assert is_shown.count(False) == count, entity  # each packet is drawn to its end
+    lost_ns = [t_ns for t_ns, shapes in rows["lost"].items() if shapes]
     assert min(lost_ns) >= (0.6 + LEG_S) * S
     # The network is at 8.8, between sensor and controller at 4.4 and 13.2.
-    assert max(x for shapes in seen["delivered"].values() for x, _ in shapes) > 11
-    assert max(x for shapes in seen["lost"].values() for line in shapes for x, _ in line) < 9.3
+    assert max(x for shapes in rows["delivered"].values() for x, _ in shapes) > 11
+    assert max(x for shapes in rows["lost"].values() for line in shapes for x, _ in line) < 9.3

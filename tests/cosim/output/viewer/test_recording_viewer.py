@@ -46,8 +46,8 @@ def get(url: str, host: str | None = None) -> tuple[int, bytes]:
         target = f"{parts.path}?{parts.query}" if parts.query else parts.path
         connection.request("GET", target, headers={"Host": host or parts.netloc})
         answer = connection.getresponse()
-        if (there := answer.getheader("Location")) is not None:
-            return get(urljoin(url, there))
+        if (location := answer.getheader("Location")) is not None:
+            return get(urljoin(url, location))
         return answer.status, answer.read()
 
 
@@ -164,8 +164,8 @@ def test_a_file_that_is_not_a_recording_is_not_served(content: bytes | None, tmp
     path = tmp_path / "recording.rrd"
     if content is not None:
         path.write_bytes(content)
-    wanted = "no such recording" if content is None else "not a rerun recording"
-    with pytest.raises(CallerError, match=rf"recording\.rrd: {wanted}"):
+    message = "no such recording" if content is None else "not a rerun recording"
+    with pytest.raises(CallerError, match=rf"recording\.rrd: {message}"):
         view_recording(path)
 
 
@@ -227,19 +227,19 @@ def summary_at(at_s: float | None) -> str:
 def test_the_time_is_sent_until_the_window_has_the_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[tuple[str, Any]] = []
+    requests: list[tuple[str, Any]] = []
 
     class Client:
         @classmethod
         def connect(cls, url: str) -> "Client":
-            asked.append(("connect", url))
-            if len(asked) == 1:
+            requests.append(("connect", url))
+            if len(requests) == 1:
                 raise ConnectionError("transport error")
             return cls()
 
         def set_time(self, timeline: str, **more: Any) -> None:
-            asked.append((timeline, more))
-            if len(asked) == 3:
+            requests.append((timeline, more))
+            if len(requests) == 3:
                 raise ConnectionError("no active recording to set the time for")
 
     monkeypatch.setattr(rerun.experimental, "ViewerClient", Client)
@@ -250,9 +250,9 @@ def test_the_time_is_sent_until_the_window_has_the_recording(
         window.kill()
     wanted = ("t", {"duration": 4.244, "play_state": "paused"})
     connected = ("connect", address)
-    assert asked == [connected, connected, wanted, connected, wanted]
+    assert requests == [connected, connected, wanted, connected, wanted]
     move_window_to(TIMELINE, T_NS, window, log.open("rb"))  # closed: no further request
-    assert len(asked) == 5
+    assert len(requests) == 5
 
 
 def test_only_the_page_of_a_finished_run_moves_the_cursor(tmp_path: Path) -> None:

@@ -70,13 +70,13 @@ def test_each_envelope_holds_all_samples_of_its_bin(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(run_record, "BATCH_ROWS", PART_STEPS)
     monkeypatch.setattr(RunRecord, "slice_columns", COLUMNS)
     finalize(RunEnding(tmp_path, 7, ExitStatus.OK, "horizon"), report=False)
-    shown = read(tmp_path / RECORDING_FILE)
+    chunks = read(tmp_path / RECORDING_FILE)
     inputs = record[CONTROLLER_STEP]
-    require_envelope(inputs["t_ns"], inputs["u"], *series(shown, bp.INPUT))
+    require_envelope(inputs["t_ns"], inputs["u"], *series(chunks, bp.INPUT))
     measured = record[SENSOR_MEASUREMENT]
     after_reset = np.where(measured["event"][:, None] >= 0, measured["x"], measured["x_s"])
     for i, name in enumerate(record.loop.state_names):
-        kept_ns, kept = series(shown, bp.state_path(name))
+        kept_ns, kept = series(chunks, bp.state_path(name))
         require_envelope(measured["t_ns"], measured["x"][:, i : i + 1], kept_ns, kept[:, :1])
         require_envelope(measured["t_ns"], after_reset[:, i : i + 1], kept_ns, kept[:, 1:2])
 

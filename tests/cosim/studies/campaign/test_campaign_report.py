@@ -21,9 +21,9 @@ def test_an_exceeded_certificate_is_reported_in_every_output(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     monkeypatch.setattr(campaign_grid, "certified_error", lambda resolved: 1e-3)
-    done = run_command(write(plan, figures=[]))
-    assert done.exit_code == 1
-    assert "28 of 28 runs exceed a certified bound." in done.output
+    result = run_command(write(plan, figures=[]))
+    assert result.exit_code == 1
+    assert "28 of 28 runs exceed a certified bound." in result.output
     assert 'class="verdict bad"' in (tmp_path / "out" / "campaign.html").read_text()
 
 
@@ -31,14 +31,14 @@ def test_the_command_writes_the_reported_files_and_keeps_complete_chunks(
     write: Write, plan: dict[str, Any], tmp_path: Path, run_command: Command
 ) -> None:
     path = write(plan, figures=[])
-    done = run_command(path, "--json", "--draws", "4")
-    assert done.exit_code == 0, done.output
-    report = json.loads(done.stdout)
+    result = run_command(path, "--json", "--draws", "4")
+    assert result.exit_code == 0, result.output
+    report = json.loads(result.stdout)
     assert report.pop("made") == 16
     assert all(Path(file).exists() for file in report.pop("files"))
     assert json.loads((tmp_path / "out" / "summary.json").read_text()) == report
-    done = run_command(path, "--json", "--tables", str(tmp_path / "tables"))
-    assert json.loads(done.stdout)["made"] == 4 * (7 - 3)
+    result = run_command(path, "--json", "--tables", str(tmp_path / "tables"))
+    assert json.loads(result.stdout)["made"] == 4 * (7 - 3)
     names = {file.name for file in (tmp_path / "tables").iterdir()}
     assert names == {"campaign.csv", "campaign.tex", "differences.csv", "differences.tex"}
     rows = (tmp_path / "tables/campaign.csv").read_text().splitlines()

@@ -16,7 +16,7 @@ from cosim.studies.campaign import campaign_workers
 from cosim.studies.campaign.arithmetic import arithmetic
 from cosim.studies.campaign.campaign_workers import (
     Chunk,
-    Finished,
+    FinishedChunk,
     LostWorkersError,
     Work,
     cluster_runner,
@@ -72,19 +72,19 @@ def test_a_killed_worker_gives_one_line_and_no_byte_depends_on_the_workers(
             workers.extend(child for child in children if "spawn_main" in " ".join(command_of(child)))
             workers[0].kill()
 
-    with pytest.raises(LostWorkersError) as lost, campaign_workers.local_runner(2) as runner:
+    with pytest.raises(LostWorkersError) as error, campaign_workers.local_runner(2) as runner:
         run_campaign(by_two, runner, progress)
-    text = str(lost.value)
+    text = str(error.value)
     assert text.startswith("a worker process was killed (out of memory?); ")
     assert text.endswith("the same command continues the campaign")
     assert len(workers) == 2
     assert psutil.wait_procs(workers, timeout=60)[1] == []
     assert not list(by_two.folder.rglob(".*.partial"))
     run_campaign(reverse, lambda works, chunks: run_in_process(works, reversed(list(chunks))))
-    begun = contents(by_two.folder)
-    assert 5 <= len(begun) < 80
-    assert run_campaign(by_two, run_in_process) == 80 - len(begun)
-    assert begun.items() <= contents(by_two.folder).items()
+    finished_files = contents(by_two.folder)
+    assert 5 <= len(finished_files) < 80
+    assert run_campaign(by_two, run_in_process) == 80 - len(finished_files)
+    assert finished_files.items() <= contents(by_two.folder).items()
     assert contents(by_two.folder) == contents(reverse.folder)
 
 
@@ -137,9 +137,9 @@ def test_an_interrupted_and_then_killed_campaign_continues_where_it_stopped(
     assert psutil.wait_procs(children, timeout=60)[1] == []
     before = files(folder)
     assert 10 <= len(before) < RUNS
-    ended = run_command(many, "--json")
-    assert ended.exit_code == 0, ended.output
-    assert f'"made": {RUNS - len(before)}' in ended.stdout
+    result = run_command(many, "--json")
+    assert result.exit_code == 0, result.output
+    assert f'"made": {RUNS - len(before)}' in result.stdout
     assert files(folder).items() >= before.items()
 
 
@@ -147,16 +147,16 @@ def test_an_interrupted_and_then_killed_campaign_continues_where_it_stopped(
 def test_a_signal_ends_a_campaign_with_one_line(
     many: Path, tmp_path: Path, run_command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def signalled(works: Sequence[Work], chunks: Iterable[Chunk]) -> Iterator[Finished]:
+    def signalled(works: Sequence[Work], chunks: Iterable[Chunk]) -> Iterator[FinishedChunk]:
         for i, finished in enumerate(run_in_process(works, chunks)):
             if i == 5:
                 signal.raise_signal(signal.SIGTERM)
             yield finished
 
     monkeypatch.setattr(campaign_workers, "run_in_process", signalled)
-    ended = run_command(many)
-    assert ended.exit_code == 143
-    assert ended.stderr.splitlines()[-1] == (
+    result = run_command(many)
+    assert result.exit_code == 143
+    assert result.stderr.splitlines()[-1] == (
         f"noack: stopped on request (SIGTERM); 5 of {RUNS} runs are in {tmp_path / 'out'}; "
         "the same command continues the campaign"
     )
@@ -241,9 +241,9 @@ def test_a_cluster_from_its_first_worker_to_its_end(
     other = {**arithmetic(), "numpy": "1.0"}
     with monkeypatch.context() as patched:
         patched.setattr(campaign_workers, "arithmetic", lambda: other)
-        with pytest.raises(PeerError) as refused, cluster_runner(dask.address) as runner:
+        with pytest.raises(PeerError) as error, cluster_runner(dask.address) as runner:
             run_campaign(there, runner)
-    text = str(refused.value)
+    text = str(error.value)
     assert text.startswith(f"{dask.address}: a worker on ")
     assert f"would compute other results: numpy is {np.__version__} there, 1.0 here; 0 of" in text
     assert files(there.folder) == {}
@@ -284,7 +284,7 @@ def test_only_a_campaign_with_a_scheduler_imports_dask(
 ) -> None:
     for module in ("distributed", "dask"):
         monkeypatch.setitem(sys.modules, module, None)
-    done = run_command(write(plan, draws=1, figures=[]))
-    assert done.exit_code == 0, done.output
+    result = run_command(write(plan, draws=1, figures=[]))
+    assert result.exit_code == 0, result.output
     with pytest.raises(CallerError, match=r"pip install 'noack\[cluster\]'"), cluster_runner("x:1"):
         pass

@@ -50,16 +50,16 @@ def test_only_a_damaged_file_is_computed_again(full: Store) -> None:
     assert list(full.missing()) == [Chunk(1, 3, 6)]
     assert run_campaign(full, run_in_process) == 3
     assert path.read_bytes() == whole
-    changed = {name for name, when in files(full.folder).items() if before[name] != when}
-    assert changed == {"runs/point-00001/draws-000000003.parquet"}
+    changed_files = {name for name, time in files(full.folder).items() if before[name] != time}
+    assert changed_files == {"runs/point-00001/draws-000000003.parquet"}
 
 
 def test_more_draws_keep_full_chunks_and_fewer_draws_keep_all(full: Store, campaign: Few) -> None:
-    more = Store(full.folder, campaign[1], 10, 3)
-    assert {(chunk.start, chunk.stop) for chunk in more.missing()} == {(6, 9), (9, 10)}
-    run_campaign(more, run_in_process)
+    larger_store = Store(full.folder, campaign[1], 10, 3)
+    assert {(chunk.start, chunk.stop) for chunk in larger_store.missing()} == {(6, 9), (9, 10)}
+    run_campaign(larger_store, run_in_process)
     expected = campaign[1][2].work.run(range(10))["cost"]
-    np.testing.assert_array_equal(more.columns(2, ["cost"])["cost"], expected)
+    np.testing.assert_array_equal(larger_store.columns(2, ["cost"])["cost"], expected)
     fewer = Store(full.folder, campaign[1], 4, 3)
     assert list(fewer.missing()) == []
     np.testing.assert_array_equal(fewer.columns(2, ["cost"])["cost"], expected[:4])
@@ -81,10 +81,10 @@ def test_a_full_disk_gives_one_line_and_leaves_complete_files_only(
                 raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(file_access, "new_file", fill)
-    with pytest.raises(MachineError) as refused:
+    with pytest.raises(MachineError) as error:
         run_campaign(store, run_in_process)
-    assert str(refused.value).startswith(f"{store.folder}/runs/")
-    assert str(refused.value).endswith(
+    assert str(error.value).startswith(f"{store.folder}/runs/")
+    assert str(error.value).endswith(
         f".parquet: cannot be written: No space left on device; 12 of 28 runs are in "
         f"{store.folder}; the same command continues the campaign"
     )
@@ -120,9 +120,9 @@ def test_another_campaign_is_refused_in_the_same_folder(
     path = write(plan, draws=1)
     use(path, folder)
     assert use(path, folder) == 0
-    with pytest.raises(CallerError) as refused:
+    with pytest.raises(CallerError) as error:
         use(write(plan, **{"compare": None, "figures": [], key: value}), folder)
-    text = str(refused.value)
+    text = str(error.value)
     assert text.startswith(f"{folder}: holds another campaign (")
     assert expected in text
     assert "\n" not in text
@@ -136,16 +136,16 @@ def test_a_changed_scenario_makes_another_campaign_and_changed_figures_do_not(
     plan["settings"]["network.loss"] = {"model": "trace", "file": "lost.txt"}
     use(write(plan, draws=1), folder)
     plan["axes"][1]["title"] = "threshold"
-    shown = {"figures": [], "compare": None, "draws": 2, "description": "new"}
-    shown |= {"claims": [{"says": "It settles.", "holds": ["settling_s < 9"]}]}
-    assert use(write(plan, **shown, metrics={"shown": ["cost"]}), folder) == 8
+    presentation = {"figures": [], "compare": None, "draws": 2, "description": "new"}
+    presentation |= {"claims": [{"says": "It settles.", "holds": ["settling_s < 9"]}]}
+    assert use(write(plan, **presentation, metrics={"shown": ["cost"]}), folder) == 8
     scenario = tmp_path / "small.toml"
-    before = scenario.read_text()
+    text = scenario.read_text()
     path = write(plan)
-    scenario.write_text(before.replace("mansd = 2", "mansd = 3"))
+    scenario.write_text(text.replace("mansd = 2", "mansd = 3"))
     with pytest.raises(CallerError, match=r"scenario\.network\.mansd is 2 there, 3 here"):
         use(path, folder)
-    scenario.write_text(before)
+    scenario.write_text(text)
     losses.write_text("0 1 0\n")
     with pytest.raises(CallerError, match="holds another campaign"):
         use(path, folder)
@@ -194,9 +194,9 @@ def test_runs_of_another_version_are_shown_but_not_extended(
     manifest = json.loads((folder / "campaign.json").read_text())
     manifest["arithmetic"]["numpy"] = "1.0"
     (folder / "campaign.json").write_text(json.dumps(manifest))
-    left = folder / "runs" / "point-00000" / ".draws-000000000.parquet.partial"
-    left.write_bytes(b"PAR1")  # of a killed run
+    partial_file = folder / "runs" / "point-00000" / ".draws-000000000.parquet.partial"
+    partial_file.write_bytes(b"PAR1")  # of a killed run
     assert use(path, folder) == 0
-    assert not left.exists()
+    assert not partial_file.exists()
     with pytest.raises(CallerError, match=r"differ from the existing ones \(numpy is 1\.0 there"):
         use(path, folder, draws=10)

@@ -120,8 +120,8 @@ def test_the_cost_is_the_integral_under_the_held_inputs(overrides: tuple[str, ..
 
 
 def test_a_nonlinear_plant_is_drawn_and_its_cost_is_a_sum() -> None:
-    given = load(SHIPPED / "cart_pole.toml", ["horizon_s=1.0", "plant.rate_hz=200.0"])
-    sampled = SampledWork(in_virtual_time(given), 7, None, None, 0.5, 1000)
+    scenario = load(SHIPPED / "cart_pole.toml", ["horizon_s=1.0", "plant.rate_hz=200.0"])
+    sampled = SampledWork(in_virtual_time(scenario), 7, None, None, 0.5, 1000)
     (row,) = sampled.run(range(1))
     record = record_of(sampled, 0)
     steps = record["plant_step"]
@@ -237,18 +237,18 @@ def test_draws_depend_neither_on_the_chunk_nor_on_the_grid_point(campaign: Few) 
 
 def test_plants_are_drawn_uniformly_in_the_box(campaign: Few) -> None:
     point = campaign[1][0]
-    drawn = point.work.box.population(11, range(20_000))
+    population = point.work.box.population(11, range(20_000))
     centre, half = loop_of(drawn_scenario(with_plant(point.scenario, draw="nominal"), 0, 0)), 0.2
-    off = drawn.A[:, 1, 0] - centre.A[1, 0]
+    off = population.A[:, 1, 0] - centre.A[1, 0]
     assert np.abs(off).max() <= half
     # The standard deviation of a mean of 20,000 is below 0.001, that of a variance below 0.0001.
     assert abs(off.mean()) < 0.005
     assert off.var() == pytest.approx(half**2 / 3, abs=0.0005)
-    np.testing.assert_array_equal(drawn.A[:, 0], np.broadcast_to(centre.A[0], (20_000, 2)))
-    pairs = np.column_stack([off, drawn.A[:, 1, 1], drawn.x0, drawn.loss_seeds.astype(float)])
+    np.testing.assert_array_equal(population.A[:, 0], np.broadcast_to(centre.A[0], (20_000, 2)))
+    pairs = np.column_stack([off, population.A[:, 1, 1], population.x0, population.loss_seeds.astype(float)])
     correlation = np.corrcoef(pairs.T) - np.eye(5)
     assert np.abs(correlation).max() < 0.04  # 5.6 standard deviations
-    assert len(set(drawn.loss_seeds.tolist())) == 20_000
+    assert len(set(population.loss_seeds.tolist())) == 20_000
 
 
 def test_vertex_draws_are_corners_and_nominal_and_given_plants_are_constant(campaign: Few) -> None:
@@ -258,9 +258,9 @@ def test_vertex_draws_are_corners_and_nominal_and_given_plants_are_constant(camp
     nominal = box_of(with_plant(scenario, draw="nominal")).population(0, range(5)).A
     assert (nominal == nominal[0]).all()
     A, B = ((5.0, 1.0), (0.0, 2.0)), ((3.0,), (1.0,))
-    given = box_of(with_plant(scenario, draw="given", A=A, B=B)).population(0, range(5))
-    assert (np.array(A) == given.A).all()
-    assert (np.array(B) == given.B).all()
+    population = box_of(with_plant(scenario, draw="given", A=A, B=B)).population(0, range(5))
+    assert (np.array(A) == population.A).all()
+    assert (np.array(B) == population.B).all()
 
 
 def test_a_draw_of_a_campaign_can_be_run_as_a_scenario(campaign: Few) -> None:

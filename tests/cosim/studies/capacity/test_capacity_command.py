@@ -30,8 +30,8 @@ def test_the_default_answers_for_the_shipped_mixture_and_says_how_long_it_takes(
 ) -> None:
     assert plans.QUICK.draws == 6
     monkeypatch.setattr(plans, "QUICK", plans.QUICK._replace(draws=1))
-    out = "--out", str(tmp_path), "--workers", "1", "--json", "--set", "horizon_s=0.2"
-    result = capacity("shared_bottleneck", *out, *SHORT[2:])
+    options = "--out", str(tmp_path), "--workers", "1", "--json", "--set", "horizon_s=0.2"
+    result = capacity("shared_bottleneck", *options, *SHORT[2:])
     assert result.exit_code == 0, result.output
     assert re.search(
         r"18 runs of 0.2 s with 11 to 33 loops; the simulation takes about \d+ s on an idle core; "
@@ -43,10 +43,10 @@ def test_the_default_answers_for_the_shipped_mixture_and_says_how_long_it_takes(
     for row in document["capacities"]:
         if row["median"] is not None:
             assert row["loops_by_kind"]["pendulum"] == 10 * row["factor"] == row["median"] / 1.1
-    again = capacity("shared_bottleneck", *out, *SHORT[2:])
-    assert again.exit_code == 0
-    assert json.loads(again.stdout)["made"] == 0
-    assert "takes about" not in again.stderr
+    repetition = capacity("shared_bottleneck", *options, *SHORT[2:])
+    assert repetition.exit_code == 0
+    assert json.loads(repetition.stdout)["made"] == 0
+    assert "takes about" not in repetition.stderr
 
 
 @pytest.mark.usefixtures("without_viewer", "no_drawing")

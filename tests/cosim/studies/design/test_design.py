@@ -265,9 +265,9 @@ def test_of_equal_transmissions_the_earlier_settling_is_chosen(result: DesignRes
 
 
 def test_too_few_draws_for_a_quantile_are_refused_with_the_required_number() -> None:
-    with pytest.raises(CallerError, match="--draws: 50 are too few") as caught:
+    with pytest.raises(CallerError, match="--draws: 50 are too few") as error:
         require_draws(50, 0.95)
-    enough = int(str(caught.value).split()[-3])
+    enough = int(str(error.value).split()[-3])
     require_draws(enough, 0.95)
     assert 1 - 0.95**enough >= 0.975  # P(the largest value exceeds the quantile)
 

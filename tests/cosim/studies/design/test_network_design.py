@@ -179,15 +179,18 @@ def test_each_hold_strategy_is_written_decided_and_run_as_claimed(
     """Repeated patterns of the M that is proven vanish in a run, one of the next M grows."""
     scenario = shipped("unstable_pendulum", "mode=zoh", "controller.safe_input=[0.1]")
     outcome = searched(scenario, DesignRequest(period_s=PERIOD_S, effort=0, holds=read_holds(word), cost=50))
-    best, written = outcome.best, validate(tomllib.loads(outcome.shown.scenario_toml()), "written")
+    best, written_scenario = outcome.best, validate(tomllib.loads(outcome.shown.scenario_toml()), "written")
     assert best.candidate.hold in read_holds(word)
-    assert (written.mode, written.controller.update_timeout_s) == (mode, timeout_s)
-    assert (written.controller.timeout_input, written.controller.safe_input) == (timeout_input, None)
-    assert LossMargin(resolve(written)).coarse_bounds().verdict == "stable"
+    assert (written_scenario.mode, written_scenario.controller.update_timeout_s) == (mode, timeout_s)
+    assert (written_scenario.controller.timeout_input, written_scenario.controller.safe_input) == (
+        timeout_input,
+        None,
+    )
+    assert LossMargin(resolve(written_scenario)).coarse_bounds().verdict == "stable"
     assert best.stability is not None
     assert best.beyond is not None
-    assert final_size(written, best.stability.pattern) < 0.3
-    assert final_size(written, best.beyond.pattern) > 1e2
+    assert final_size(written_scenario, best.stability.pattern) < 0.3
+    assert final_size(written_scenario, best.beyond.pattern) > 1e2
 
 
 def test_the_holds_that_are_named_decide_also_about_the_given_timeout() -> None:
@@ -198,9 +201,9 @@ def test_the_holds_that_are_named_decide_also_about_the_given_timeout() -> None:
     assert outcome.best.level < outcome.given.level
     assert any("--holds excludes its strategy" in note for note in outcome.shown.notes)
     assert outcome.shown.given.cells["between updates"].endswith(" (not in --holds)")
-    same = searched(shipped("unstable_pendulum", *ZERO), request)
-    assert same.search.keeps_given_hold
-    assert same.best.level >= same.given.level
+    repetition = searched(shipped("unstable_pendulum", *ZERO), request)
+    assert repetition.search.keeps_given_hold
+    assert repetition.best.level >= repetition.given.level
 
 
 def test_a_period_between_two_measurements_is_said_to_be_longer() -> None:

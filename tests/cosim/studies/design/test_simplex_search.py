@@ -16,7 +16,7 @@ def test_the_first_point_below_the_limit_is_returned() -> None:
         values.append(float(np.sum((point - MINIMUM) ** 2 * [1.0, 10.0])))
         return values[-1]
 
-    point = nelder_mead(objective, 2, 0.1, most=500, enough=1e-3)
+    point = nelder_mead(objective, 2, 0.1, evaluations=500, enough=1e-3)
     assert point is not None
     np.testing.assert_allclose(point, MINIMUM, atol=0.04)
     assert values[-1] < 1e-3 <= min(values[:-1])
@@ -29,7 +29,7 @@ def test_without_a_point_below_the_limit_the_evaluations_are_limited() -> None:
         points.append(point.copy())
         return float(np.sum((point - MINIMUM) ** 2))
 
-    assert nelder_mead(objective, 2, 0.1, most=60, tolerance=0.0, enough=-1.0) is None
+    assert nelder_mead(objective, 2, 0.1, evaluations=60, tolerance=0.0, enough=-1.0) is None
     assert len(points) <= 60
     np.testing.assert_allclose(
         min(points, key=lambda point: np.sum((point - MINIMUM) ** 2)), MINIMUM, atol=0.01

@@ -77,9 +77,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def command(*words: str, ok: bool = True) -> Result:
-    done = invoke(*words)
-    assert (done.exit_code == 0) == ok, done.output
-    return done
+    result = invoke(*words)
+    assert (result.exit_code == 0) == ok, result.output
+    return result
 
 
 def test_three_commands_lead_from_a_class_to_a_certified_run() -> None:
@@ -264,27 +264,27 @@ def test_the_lines_about_mistakes_are_those_that_were_approved() -> None:
     pytest.importorskip("fmpy")
 
     def mistake(line: str) -> list[str]:
-        done = invoke(*line.split())
-        assert done.exit_code in (1, 2), done.output
-        assert done.stderr.count("\n") == 1
-        assert done.stdout == ""
-        return [done.stderr.strip()]
+        result = invoke(*line.split())
+        assert result.exit_code in (1, 2), result.output
+        assert result.stderr.count("\n") == 1
+        assert result.stdout == ""
+        return [result.stderr.strip()]
 
     compare_lines(Path(__file__).with_name("mistakes.txt"), mistake)
 
 
-@pytest.mark.parametrize(("edit", "why"), [
+@pytest.mark.parametrize(("edit", "reason"), [
     ({"plant": 1}, "not written by `noack linearise`"),
     ({"gain": [[1.0]]}, "gain: 1 numbers; the plant has 4 states"),
     ({"gain": [[1.0] * 4] * 2}, "gain: 2 rows; the plant has 1 inputs"),
     ({"gain": [[0.0] * 4]}, "does not stabilise the model"),
     ({"at": [0.0]}, "at: 1 numbers"),
 ])  # fmt: skip
-def test_a_damaged_file_of_a_model_is_refused(edit: dict[str, Any], why: str) -> None:
+def test_a_damaged_file_of_a_model_is_refused(edit: dict[str, Any], reason: str) -> None:
     command("gain", "cart_pole", "--out", "model.json")
     document = json.loads(Path("model.json").read_text())
     Path("model.json").write_text(json.dumps(document | edit))
-    with pytest.raises(CallerError, match=why):
+    with pytest.raises(CallerError, match=reason):
         noack.new("model.json")
 
 

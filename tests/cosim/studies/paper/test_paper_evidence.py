@@ -180,15 +180,15 @@ def test_the_command_runs_the_campaign_and_writes_the_page(
     monkeypatch.setattr("cosim.cli.commands.study_commands.DEFAULT_RUNS", tmp_path / "runs")
     # test_paper_evidence.py computes it
     monkeypatch.setattr(paper_page, "evidence", lambda *_: COMMITTED["evidence"])
-    done = invoke("paper", "--draws", "5", "--out", tmp_path, "--json")
-    assert done.exit_code == 0, done.output
-    report = json.loads(done.stdout)
+    result = invoke("paper", "--draws", "5", "--out", tmp_path, "--json")
+    assert result.exit_code == 0, result.output
+    report = json.loads(result.stdout)
     assert report["draws"] == 5
     assert all(Path(file).is_file() for file in report["files"])
     assert (tmp_path / "runs" / "campaigns" / "paper" / "campaign.html").is_file()
-    written = json.loads((tmp_path / "figures" / "paper.json").read_bytes())
-    assert (tmp_path / "paper.md").read_text(encoding="utf-8") == render(written)
-    assert 0 <= written["representative"] < 5
+    document = json.loads((tmp_path / "figures" / "paper.json").read_bytes())
+    assert (tmp_path / "paper.md").read_text(encoding="utf-8") == render(document)
+    assert 0 <= document["representative"] < 5
 
 
 def test_a_folder_that_cannot_be_written_gives_one_line_before_any_simulation(

@@ -34,9 +34,9 @@ def test_rows_are_as_published_and_as_documented(name: str) -> None:
         assert f"| {' | '.join(cells)} |" in PAGE
         assert row.verdict == ("reproduced" if row.relation == "=" else "agrees") or row.deviation
     assert reproduction.result.about in PAGE
-    printed = StringIO()
-    print_rows(Console(file=printed, width=80), reproduction)
-    lines = printed.getvalue().splitlines()
+    output = StringIO()
+    print_rows(Console(file=output, width=80), reproduction)
+    lines = output.getvalue().splitlines()
     verdicts = sum(line.endswith(("reproduced ", "agrees ", "differs ")) for line in lines)
     assert verdicts == len(reproduction.rows)
 
