@@ -1156,8 +1156,8 @@ void noack_relay_open(noack_relay *relay);
 /* Receive the kernel's timestamps of arrivals, too: delays count from the arrival. */
 void noack_relay_read_stamps(noack_relay *relay);
 
-/* Wait for a socket's datagrams, too; return 0 or errno. number is its place in sockets. */
-int64_t noack_relay_watch(noack_relay *relay, int64_t fd, int64_t number);
+/* Wait for a socket's datagrams, too; return 0 or errno. socket is its place in sockets. */
+int64_t noack_relay_watch(noack_relay *relay, int64_t fd, int64_t socket);
 
 /* Relay until Python is needed, or until a time; return a noack_reason. INT64_MIN: do what is due,
    and do not wait. */

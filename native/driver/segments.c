@@ -139,11 +139,11 @@ static void control(noack_segments *segments, int64_t run, int64_t step, noack_o
 static int64_t measure(
     noack_segments *segments, int64_t run, int64_t step, int64_t tests, noack_output *output) {
     noack_sensor *sensor = segments->sensor;
-    int64_t n = sensor->machine.n, number = step / segments->plant->measure_every;
+    int64_t n = sensor->machine.n, measurement = step / segments->plant->measure_every;
     double *error = segments->scratch, *image = error + n;
     if (segments->gains != NULL)
         sensor->observer.gain =
-            (double *)segments->gains + number * n * sensor->observer.p; /* not written */
+            (double *)segments->gains + measurement * n * sensor->observer.p; /* not written */
     noack_message message;
     copy_message(&message, &output->message);
     sensor->is_user = sensor->machine.answered = !tests;

@@ -50,11 +50,11 @@ static void advance(noack_plant *plant) {
         append_recent_input(plant);
     if (plant->system != NOACK_LINEAR)
         return;
-    double *free = plant->scratch, *forced = free + n;
-    noack_product(n, n, plant->Ad, plant->x, free);
-    noack_product(n, plant->sources, plant->Bd, plant->applied, forced);
+    double *free_part = plant->scratch, *forced_part = free_part + n;
+    noack_product(n, n, plant->Ad, plant->x, free_part);
+    noack_product(n, plant->sources, plant->Bd, plant->applied, forced_part);
     for (int64_t k = 0; k < n; k++)
-        plant->x[k] = free[k] + forced[k];
+        plant->x[k] = free_part[k] + forced_part[k];
 }
 
 /* A predictive actuator: u + K(e^(H(t - t_j)) x_c - x_c), the controller's input if no update has

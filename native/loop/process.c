@@ -57,8 +57,8 @@ static void append_row(noack_process *process, int64_t loop) {
     uint8_t *row = table->rows + table->count++ * table->row_bytes;
     int64_t bytes = table->row_bytes - NOACK_LOOP_BYTES;
     const int64_t *layout = table->layouts == NULL ? NULL : table->layouts[loop];
-    uint16_t number = (uint16_t)loop;
-    memcpy(row, &number, NOACK_LOOP_BYTES);
+    uint16_t loop_number = (uint16_t)loop;
+    memcpy(row, &loop_number, NOACK_LOOP_BYTES);
     if (layout == NULL)
         memcpy(row + NOACK_LOOP_BYTES, process->output.row, (size_t)bytes);
     else

@@ -164,14 +164,14 @@ static int64_t handle_acknowledgement(
     noack_machine *machine = &sensor->machine;
     int64_t n = machine->n, t_ns = message->t_ns, place = find_sent(sensor, message->sequence);
     double *before = sensor->scratch;
-    int found = place < sensor->sent_count;
-    if (found && sensor->is_user && !machine->answered) {
+    int is_unacknowledged = place < sensor->sent_count;
+    if (is_unacknowledged && sensor->is_user && !machine->answered) {
         sensor->trigger.event_ns = t_ns;
         copy(n, sensor->sent_x + place * n, sensor->event_x);
         return NOACK_ASK_RESTART;
     }
     copy(n, sensor->x_s, before);
-    if (found) {
+    if (is_unacknowledged) {
         const double *x = sensor->sent_x + place * n;
         noack_model_advance(&sensor->model, x, t_ns, sensor->model_ns, sensor->x_s);
         sensor->trigger.event_ns = t_ns;

@@ -45,8 +45,8 @@ void noack_relay_read_stamps(noack_relay *relay) {
         renew_header(relay, k);
 }
 
-int64_t noack_relay_watch(noack_relay *relay, int64_t fd, int64_t number) {
-    struct epoll_event event = {.events = EPOLLIN, .data.u64 = (uint64_t)number};
+int64_t noack_relay_watch(noack_relay *relay, int64_t fd, int64_t socket) {
+    struct epoll_event event = {.events = EPOLLIN, .data.u64 = (uint64_t)socket};
     return epoll_ctl((int)relay->epoll, EPOLL_CTL_ADD, (int)fd, &event) == 0 ? 0 : errno;
 }
 
@@ -75,8 +75,8 @@ int64_t noack_relay_receiver(const noack_relay *relay) { return scratch_of(relay
    record its departure. */
 static void enqueue_departure(noack_relay *relay) {
     relay_scratch *scratch = scratch_of(relay);
-    int32_t number = (int32_t)scratch->leaving_count++;
-    departure *leaving = &scratch->leaving[number];
+    int32_t row = (int32_t)scratch->leaving_count++;
+    departure *leaving = &scratch->leaving[row];
     noack_direction *direction = &relay->directions[leaving->datagram.direction];
     leaving->stale = (uint8_t)noack_link_leave(
         direction->link, relay->clients[leaving->datagram.client].flow_row,
@@ -93,13 +93,13 @@ static void enqueue_departure(noack_relay *relay) {
         leaving->socket = (int32_t)(relay->links + link);
     noack_socket *socket = &relay->sockets[leaving->socket];
     if (socket->is_queued) {
-        scratch->leaving[socket->tail].next = number;
+        scratch->leaving[socket->tail].next = row;
     } else {
         socket->is_queued = 1;
-        socket->head = (uint16_t)number;
+        socket->head = (uint16_t)row;
         scratch->order[scratch->order_count++] = leaving->socket;
     }
-    socket->tail = (uint16_t)number;
+    socket->tail = (uint16_t)row;
     leaving->next = -1;
 }
 
