@@ -809,7 +809,7 @@ typedef struct {
     int64_t epoch_ns; /* reading of the coordinator's monotonic clock at simulated time 0 */
     double speed;     /* simulated time per time of that clock */
     int64_t slew_ppb; /* 0: this host has that clock; else the slew of SlewedClock */
-    int64_t since_ns, begun_ns, target_ns; /* as of SlewedClock */
+    int64_t since_ns, first_offset_ns, target_offset_ns; /* as of SlewedClock */
 } noack_clock;
 
 /* The simulated time at a reading of this host's monotonic clock. */

@@ -65,8 +65,8 @@ class LossyUdp:
             raise CallerError(f"seed {seed}: must be a whole number, 0 or more, below 2^64")
         listen_at = parse_address(_text(listen, "listen"), "listen")
         server = parse_destination(_text(to, "to"), "to", listen_at)
-        forward, backward = _settings(words, "words"), _settings(reverse, "reverse")
-        self._spec = LinkSpec(name, listen_at, server, forward, backward, seed)
+        forward_settings, reverse_settings = _settings(words, "words"), _settings(reverse, "reverse")
+        self._spec = LinkSpec(name, listen_at, server, forward_settings, reverse_settings, seed)
         self._opened: Future[tuple[CommandQueue, Address]] = Future()
         self._ended: Snapshot | None = None
         self._stop = Event()

@@ -36,7 +36,7 @@ from noack.runtime.spool import (
     SPOOL,
     SpoolBatch,
     SpoolWriter,
-    chunks_of,
+    batches_of_file,
     kept_run_name,
     notices_of,
     writer_of,
@@ -44,7 +44,7 @@ from noack.runtime.spool import (
 from noack.scenario.resolution import run_tables
 from noack.scenario.scenario_file import MOST_RECORDED_BYTES, load
 
-_MOST_CHUNK_BYTES = 64 * 2**20
+_MOST_BATCH_BYTES = 64 * 2**20
 """A process keeps no more in memory before it writes a batch."""
 
 T = TypeVar("T")
@@ -158,10 +158,10 @@ def _has_secret(kept: Path, process: _Process, source: str) -> bool:
     """Whether a process kept its secret in a folder, so that it ran there."""
     name = f"{KEPT_KEY}.{process.writer}"
     try:
-        chunks = [*_batches(kept / name, f"{source}: {SPOOL}/{name}")]
+        batches = [*_batches(kept / name, f"{source}: {SPOOL}/{name}")]
     except FileNotFoundError:
         return False
-    secrets = (chunk.rows.decode(errors="replace") for chunk in chunks)
+    secrets = (batch.rows.decode(errors="replace") for batch in batches)
     return process.writer in map(writer_of, secrets)
 
 
@@ -173,7 +173,7 @@ def _batches(path: Path, name: str) -> Iterator[SpoolBatch]:
     descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     with os.fdopen(descriptor, "rb") as file:
         try:
-            yield from chunks_of(file, most_bytes=_MOST_CHUNK_BYTES)
+            yield from batches_of_file(file, most_bytes=_MOST_BATCH_BYTES)
         except ValueError as error:
             raise PeerError(f"{name} has {error}") from None
 
@@ -192,22 +192,22 @@ def _checked_batches(
     name: str,
 ) -> Iterator[tuple[int, bytes]]:
     """Yield the batches of a file; raise PeerError for one that is not of its process."""
-    for chunk in _batches(path, name):
+    for batch in _batches(path, name):
         if table == KEPT_REPORT:
             try:
-                report = parse_message(ProcessReport, chunk.rows).fields()
+                report = parse_message(ProcessReport, batch.rows).fields()
             except PeerError as error:
                 raise PeerError(f"{name}: {error}") from None
             sender = (report.get("process"), report.get("generation", 0), report.get("instance"))
             if sender != (process.role, process.generation, process.writer):
                 raise PeerError(f"{name} is the report of another process")
         elif table in types:
-            if len(chunk.rows) % types[table].itemsize:
+            if len(batch.rows) % types[table].itemsize:
                 raise PeerError(f"{name} is damaged: it has a batch with part of a row")
-            inputs = np.frombuffer(chunk.rows, types[table])["input"]
+            inputs = np.frombuffer(batch.rows, types[table])["input"]
             if (inputs // GENERATION != process.generation).any():
                 raise PeerError(f"{name} has rows of another process")
-        yield chunk.first, chunk.rows
+        yield batch.first, batch.rows
 
 
 def _require_consistent(before_dir: Path, after_dir: Path, source: str) -> None:

@@ -200,10 +200,10 @@ def loss_process(settings: LinkSettings) -> LossProcess:
     if order.reordered:
         raise NotPredictableError("packets may arrive out of order, which counts as a loss")
     try:
-        start, moves, lost = joint_chain(with_target_loss(settings))
+        start, transitions, lost = joint_chain(with_target_loss(settings))
     except ValueError as error:  # the loss rate cannot be kept
         raise NotPredictableError(str(error)) from None
-    return LossProcess(start, moves, lost, settings.first_delivered)
+    return LossProcess(start, transitions, lost, settings.first_delivered)
 
 
 def expected_loss(settings: LinkSettings) -> LossPrediction:

@@ -85,7 +85,7 @@ def test_a_change_does_not_reset_the_guarantee(ends: Ends) -> None:
         assert ends.received(10) == list(range(3, 40, 4))
 
 
-@pytest.mark.parametrize(("arguments", "told"), [
+@pytest.mark.parametrize(("arguments", "message_part"), [
     (("127.0.0.1:9", "los 3%"), "los"),
     (("127.0.0.1:9", "loss 3% seed 4"), "seed 4"),
     (("127.0.0.1:9", 5), "words: 5; give words such as"),
@@ -94,10 +94,10 @@ def test_a_change_does_not_reset_the_guarantee(ends: Ends) -> None:
     (("127.0.0.1:0",), "to: expected a port from 1 to 65535"),
     (((1, 2),), "to: (1, 2); give host and port, or 'host:port'"),
 ])  # fmt: skip
-def test_a_mistake_is_one_line(arguments: tuple[str, ...], told: str) -> None:
+def test_a_mistake_is_one_line(arguments: tuple[str, ...], message_part: str) -> None:
     with pytest.raises(NoackError) as error:
         noack.LossyUdp(*arguments)
-    assert told in str(error.value)
+    assert message_part in str(error.value)
     assert "\n" not in str(error.value)
 
 

@@ -149,8 +149,8 @@ class GilbertElliottLoss(LossModel):
         if self.step_s is not None:
             raise NotPredictableError("losses in a common state depend on when packets arrive")
         p, r = self.transitions
-        moves = np.array([[1 - p, p], [r, 1 - r]])
-        return (Chain(np.array([1.0, 0.0]), moves, np.array([self.loss_in_good, self.loss_in_bad])),)
+        transitions = np.array([[1 - p, p], [r, 1 - r]])
+        return (Chain(np.array([1.0, 0.0]), transitions, np.array([self.loss_in_good, self.loss_in_bad])),)
 
     def tc_lacks(self, earlier: Sequence[Impairment]) -> str:
         return "" if self.step_s is None else "a state that all flows share"
