@@ -159,11 +159,11 @@ void decide_or_repeat(
     if (recorded != NULL) {
         repeat(recorded, decision);
     } else {
-        packet own = {link, flow, decision, 0};
+        packet arriving = {link, flow, decision, 0};
         noack_stage_memory *memory = link->memory + row * link->stage_count;
-        for (; own.stage < link->stage_count; own.stage++) {
-            const noack_stage *stage = &link->stages[own.stage];
-            APPLY[stage->kind](&own, stage, &memory[own.stage]);
+        for (; arriving.stage < link->stage_count; arriving.stage++) {
+            const noack_stage *stage = &link->stages[arriving.stage];
+            APPLY[stage->kind](&arriving, stage, &memory[arriving.stage]);
         }
         if (decision->waits)
             complete_waiting_decision(decision);

@@ -50,17 +50,17 @@ static void load(noack_segments *segments, int64_t run) {
     noack_sensor *sensor = segments->sensor;
     noack_controller *controller = segments->controller;
     int64_t n = plant->machine.n, m = plant->machine.m, step = segments->step[run];
-    int64_t every = plant->measure_every, begun = max_of(step, 0);
-    int64_t t_ns = begun * plant->machine.period_ns;
+    int64_t measure_every = plant->measure_every, first_step = max_of(step, 0);
+    int64_t t_ns = first_step * plant->machine.period_ns;
     copy(n, segments->x + run * n, plant->x);
     copy(m, segments->u + run * m, plant->u);
     copy(m, segments->u_next + run * m, plant->inputs);
     if (plant->reports_inputs)
-        memset(plant->recent_inputs, 0, (size_t)(every * m) * sizeof *plant->recent_inputs);
+        memset(plant->recent_inputs, 0, (size_t)(measure_every * m) * sizeof *plant->recent_inputs);
     plant->newest_ns = t_ns;
     plant->machine.step = step + 1;
-    plant->measurements = step < 0 ? 0 : step / every + 1;
-    noack_disturb(plant, begun);
+    plant->measurements = step < 0 ? 0 : step / measure_every + 1;
+    noack_disturb(plant, first_step);
     copy(n, segments->x_s + run * n, sensor->x_s);
     copy(n, segments->y + run * n, sensor->x);
     sensor->model_ns = t_ns;
@@ -69,7 +69,8 @@ static void load(noack_segments *segments, int64_t run) {
     noack_trigger_start(&sensor->rule, &sensor->trigger, n, t_ns, sensor->x_s, sensor->scratch + n);
     if (segments->gains != NULL) {
         copy(n, segments->y + run * n, sensor->observer.x);
-        sensor->observer.t_ns = step < 0 ? -1 : t_ns - step % every * plant->machine.period_ns;
+        sensor->observer.t_ns =
+            step < 0 ? -1 : t_ns - step % measure_every * plant->machine.period_ns;
     }
     copy(n, segments->x_c + run * n, controller->x_c);
     controller->model_ns = t_ns;

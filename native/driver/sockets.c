@@ -207,10 +207,10 @@ void receive_datagrams(noack_driver *driver, int64_t ready) {
         int64_t most = min_of(scratch->batch, MESSAGES - 1 - scratch->message_end);
         if (!(ready >> k & 1) || most == 0)
             continue;
-        int64_t taken =
+        int64_t received =
             call_receive(scratch, (int)driver->receivers[k], scratch->message_end, most);
-        scratch->message_end += max_of(taken, 0);
-        scratch->has_more |= taken == most;
+        scratch->message_end += max_of(received, 0);
+        scratch->has_more |= received == most;
     }
     scratch->first ^= 1;
     take_datagrams(driver);

@@ -56,15 +56,16 @@ static int64_t icmp_error(struct msghdr *message) {
 int64_t take_errors(noack_relay *relay, int64_t socket) {
     relay_scratch *scratch = scratch_of(relay);
     int64_t icmp_errors = 0, client = client_of_socket(relay, socket);
-    int taken = relay->devices ? 0 : ERRORS, fd = relay->sockets[socket].fd;
-    while (taken == ERRORS) {
+    int message_count = relay->devices ? 0 : ERRORS, fd = relay->sockets[socket].fd;
+    while (message_count == ERRORS) {
         for (int k = 0; k < ERRORS; k++) {
             struct msghdr *message = &scratch->error_headers[k].msg_hdr;
             *message = (struct msghdr){
                 .msg_control = &scratch->error_controls[k], .msg_controllen = ERROR_CONTROL_BYTES};
         }
-        taken = recvmmsg(fd, scratch->error_headers, ERRORS, MSG_DONTWAIT | MSG_ERRQUEUE, NULL);
-        for (int k = 0; k < taken; k++) {
+        message_count =
+            recvmmsg(fd, scratch->error_headers, ERRORS, MSG_DONTWAIT | MSG_ERRQUEUE, NULL);
+        for (int k = 0; k < message_count; k++) {
             int64_t error = icmp_error(&scratch->error_headers[k].msg_hdr), link = -1;
             icmp_errors += error != 0;
             if (client >= 0)

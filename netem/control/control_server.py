@@ -165,7 +165,7 @@ class ControlServer:
             self._queryables = [
                 (self._session.declare_queryable(self._key(query), RingChannel(_QUERIES)), answer)
                 for query, answer in (
-                    ("report", lambda _: self._thread.now()),
+                    ("report", lambda _: self._thread.current()),
                     ("settings", self._settings),
                     ("change", self._change),
                 )
