@@ -94,7 +94,7 @@ def with_target_loss(settings: LinkSettings, *, known: ProbabilityCache = PROBAB
     return _with_probability(settings, target_loss, known[key])
 
 
-def found_probabilities(*links: LinkSettings, known: ProbabilityCache = PROBABILITIES) -> dict[str, float]:
+def find_probabilities(*links: LinkSettings, known: ProbabilityCache = PROBABILITIES) -> dict[str, float]:
     """Return the probabilities of valid settings, for :func:`store_probabilities`.
 
     There is none where no loss rate is kept.

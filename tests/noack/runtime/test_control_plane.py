@@ -60,7 +60,7 @@ def test_a_message_that_arrives_under_another_key_is_ignored(
 
         def arrives() -> bool:
             listener.acknowledge_rows("plant", {"rows": {}})
-            return plant.persisted() is not None
+            return plant.next_persisted_ack() is not None
 
         wait_for(arrives)  # the listener knows the subscriptions
         for key in ("stop", "change"):
