@@ -9,7 +9,7 @@
 
 #include "../loop/loop.h"
 
-static const double LARGEST = 1e100; /* a state above this norm counts as diverged */
+static const double DIVERGED_NORM = 1e100; /* a state above this norm counts as diverged */
 enum { LAST_STEP = 1 << 30 };
 
 static int covers(const noack_signal *signal, int64_t last) {
@@ -180,7 +180,7 @@ static void follow_one(
         step++;
         noack_plant_tick(plant, step * plant->machine.period_ns, output, &note);
         double size = noack_norm(n, plant->x);
-        if (!(size < LARGEST)) {
+        if (!(size < DIVERGED_NORM)) {
             segments->error[run] = segments->state[run] = segments->cost[run] = INFINITY;
             break;
         }

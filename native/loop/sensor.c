@@ -24,12 +24,12 @@ static double *rule_scratch(const noack_sensor *sensor) {
 static const double *from_setpoint(const noack_sensor *sensor, int64_t t_ns, const double *x) {
     const double *point = noack_model_point(&sensor->model, t_ns);
     int64_t n = sensor->machine.n;
-    double *moved = sensor->scratch + n;
+    double *difference = sensor->scratch + n;
     if (point == NULL)
         return x;
     for (int64_t k = 0; k < n; k++)
-        moved[k] = x[k] - point[k];
-    return moved;
+        difference[k] = x[k] - point[k];
+    return difference;
 }
 
 /* Whether a measurement is an event, by the rule or by the answer of the user's trigger. */
