@@ -30,7 +30,7 @@ from netem.relay_watch import add_watching_options, check_watching_options, watc
 from noack.core.errors import CallerError, ExitStatus, MachineError, NoackError, why
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import address_text
-from noack.runtime.command_line import Signals, failed, log_event, log_format
+from noack.runtime.command_line import Signals, log_event, log_format, report_failure
 from noack.runtime.drivers.realtime_settings import realtime
 
 _FIFO_PRIORITY = 50
@@ -103,7 +103,7 @@ def run_stand_alone(arguments: Sequence[str]) -> ExitStatus:
         try:
             totals = relay(specs, options)
         except NoackError as error:  # reported in the format of the log
-            return failed(str(error), error.exit_status, source="noack netem", as_json=options.json)
+            return report_failure(str(error), error.exit_status, source="noack netem", as_json=options.json)
         report_totals(totals, options)
     return ExitStatus.UNINTENDED_LOSSES if unintended_losses(totals) else ExitStatus.OK
 

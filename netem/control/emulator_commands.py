@@ -24,7 +24,7 @@ from netem.tc_words import guarantee_words, require_no_dashes, settings_of
 from noack.core.errors import CallerError, ExitStatus, NoackError, PeerError
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.target_loss import read_files
-from noack.runtime.command_line import Parser, Signals, discard_output, failed
+from noack.runtime.command_line import Parser, Signals, discard_output, report_failure
 from noack.runtime.connections.zenoh_session import answer_to, cause_of, open_session
 
 _ANSWER_S = 30.0
@@ -99,7 +99,7 @@ def main(arguments: Sequence[str]) -> ExitStatus:
         return COMMANDS[command](options)
     except NoackError as error:
         source, as_json = f"noack netem {command}", "--json" in options
-        return failed(str(error), error.exit_status, source=source, as_json=as_json)
+        return report_failure(str(error), error.exit_status, source=source, as_json=as_json)
     except BrokenPipeError:  # the reader has closed the pipe
         discard_output(sys.stdout.fileno())
         return ExitStatus.OK

@@ -105,9 +105,11 @@ def find_probabilities(*links: LinkSettings, known: ProbabilityCache = PROBABILI
     }
 
 
-def store_probabilities(probabilities: Mapping[str, float]) -> Mapping[str, float]:
+def store_probabilities(
+    probabilities: Mapping[str, float], *, known: ProbabilityCache = PROBABILITIES
+) -> Mapping[str, float]:
     """Use these probabilities, which another process found, instead of computing them."""
-    PROBABILITIES.add(probabilities)
+    known.add(probabilities)
     return probabilities
 
 

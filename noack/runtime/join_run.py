@@ -20,7 +20,7 @@ from setproctitle import setproctitle
 from noack.core.errors import ExitStatus, NoackError, NoAnswerError, PeerError
 from noack.core.system_processes import exhausted_limit, require_limits
 from noack.runtime.address import address_text
-from noack.runtime.command_line import DESCRIPTOR_ON_STDIN, Parser, Signals, failed
+from noack.runtime.command_line import DESCRIPTOR_ON_STDIN, Parser, Signals, report_failure
 from noack.runtime.control_plane import ControlPlane
 from noack.runtime.life_cycle import HORIZON, Event
 from noack.runtime.run_descriptor import (
@@ -113,10 +113,10 @@ def _exit_status(role: str, signals: Signals, *, as_json: bool) -> Iterator[None
         yield
     except NoackError as error:
         if signals.received is None:
-            sys.exit(failed(str(error), error.exit_status, source=source, as_json=as_json))
+            sys.exit(report_failure(str(error), error.exit_status, source=source, as_json=as_json))
     except Exception as error:
         if (line := exhausted_limit(error)) is not None:
-            sys.exit(failed(line, ExitStatus.FAILED, source=source, as_json=as_json))
+            sys.exit(report_failure(line, ExitStatus.FAILED, source=source, as_json=as_json))
         traceback.print_exc()
         print(f"{source}: internal error, see above", file=sys.stderr)
         sys.exit(ExitStatus.FAILED)
