@@ -219,6 +219,6 @@ $(VENV)/.installed-lab: requirements-lab.lock $(VENV)/.installed
 
 $(VENV)/.installed-dev: requirements-dev.lock $(VENV)/.installed
 	@echo "installing development tools ..."
+	@# A tool's modules are compiled when it first runs: most never are.
 	@$(PIP) --no-compile -r requirements-dev.lock
-	@$(BIN)/python -m compileall -q -q -j 0 $(VENV)/lib || true
 	@touch $@

@@ -102,8 +102,9 @@ class Certificates:
             raise CallerError(f"controller.setpoint: {void[OWN_PLANT]}")
         scenario = about_setpoint(scenario)
         self.scenario, self.weight, self.late_periods = scenario, weight, late_periods
-        self._scheduled = nominal_conditions(scenario, late_periods)
-        conditions = {IDEAL: ideal_conditions(scenario), SCHEDULE: self._scheduled}
+        self.scheduled = nominal_conditions(scenario, late_periods)
+        """The times of the schedule, with its permitted lateness."""
+        conditions = {IDEAL: ideal_conditions(scenario), SCHEDULE: self.scheduled}
         scopes = (own_plant_scope(scenario), None if BOX in void else box_scope(scenario))
         self._scopes = [scope for scope in scopes if scope is not None]
         if nonlinear is not None:
@@ -179,7 +180,7 @@ class Certificates:
 
         They are computed at the first access, from dozens of certificates.
         """
-        return {scope.name: network_limits(scope, self._scheduled) for scope in self._scopes}
+        return {scope.name: network_limits(scope, self.scheduled) for scope in self._scopes}
 
     @cached_property
     def stability(self) -> Stability | None:
@@ -208,6 +209,9 @@ class Certificates:
             "certificates": [{"under": under, **certificate.to_json()} for under, certificate in self],
             "stability": None if self.stability is None else self.stability._asdict(),
             "unlimited_losses": None if self.unlimited is None else self.unlimited.to_json(),
+            "schedule": {
+                f"{name}_s": getattr(self.scheduled, f"{name}_s") for name in ("sampling", "delay", "hold")
+            },
             "limits": {scope: limits._asdict() for scope, limits in self.limits_by_scope.items()},
         }
 
@@ -215,7 +219,7 @@ class Certificates:
         if self.scenario.network.enforce_mansd:
             return None, None
         try:
-            return unlimited_losses(self.scenario, self._scopes[0], self._scheduled), None
+            return unlimited_losses(self.scenario, self._scopes[0], self.scheduled), None
         except NotPredictableError as error:
             return None, str(error)
 

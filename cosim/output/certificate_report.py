@@ -17,7 +17,7 @@ from cosim.analysis.mean_cost import CostUnder, MeanCost
 from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.output.terminal_output import print_assumptions
 from noack.core.linear_systems import Matrix
-from noack.core.number_format import NONE, at_least, at_most, duration_at_least, number
+from noack.core.number_format import NONE, at_least, at_most, duration, duration_at_least, number
 from noack.scenario.resolution import loop_of, policy_of
 from noack.theory.certificates.assumptions import assumptions
 from noack.theory.certificates.certified_bounds import envelope_formula
@@ -175,7 +175,10 @@ def certificate_tables(results: Certificates) -> Iterator[ResultTable]:
         (scope, *map(_limit, limits)) for scope, limits in results.limits_by_scope.items() if any(limits)
     ]
     if limits:
-        yield ResultTable("limits", caption, LIMIT_HEADINGS, limits)
+        scheduled = results.scheduled
+        times_s = (scheduled.sampling_s, scheduled.delay_s, scheduled.hold_s)
+        present = (f"the {SCHEDULE} has", *map(duration, times_s))
+        yield ResultTable("limits", caption, LIMIT_HEADINGS, [present, *limits])
 
 
 def _print_notes(console: Console, results: Certificates) -> None:

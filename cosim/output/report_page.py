@@ -23,6 +23,7 @@ from cosim.output.page_kit import TERMS, templates, value_text, words
 from cosim.output.run_tables import (
     LOOPS_CAPTION,
     badness,
+    caps_text,
     key_numbers,
     loops_table,
     mode_words,
@@ -94,7 +95,7 @@ class Report:
             mode = f" of {len(self.summary.loops)} loops on one network"
         started = self.environment.get("started")
         when = f", started {started}" if started else ""
-        return f"{self.summary.kind} run{mode}, M − 1 = {self.summary.mansd}{when}"
+        return f"{self.summary.kind} run{mode}, {caps_text(self.summary)}{when}"
 
 
 @np.errstate(all="ignore")  # a run may diverge

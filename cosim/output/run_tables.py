@@ -106,7 +106,7 @@ def run_facts(summary: RunSummary, directory: Path) -> list[tuple[str, str]]:
         ),
     ]
     return [
-        ("run", f"{summary.scenario}, {mode}, {summary.kind}, M − 1 = {summary.mansd}"),
+        ("run", f"{summary.scenario}, {mode}, {summary.kind}, {caps_text(summary)}"),
         ("ended", f"at {summary.reached_s:g} s of {summary.horizon_s:g} s: {summary.exit.reason}"),
         *(network_rows(summary)[:_FEW] if shared else of_loop),
         ("claims", ", ".join(f"{n} {verdict}" for verdict, n in verdicts.items()) or "none"),
@@ -121,12 +121,12 @@ def run_title(summary: RunSummary) -> str:
     """Return the title of the tables of a run: scenario, mode of a single loop, and cap."""
     mode = "" if shares_network(summary) else summary.loops[0].mode
     kind = "" if summary.kind == "live" else summary.kind
-    return title_of(summary.scenario, mode, summary.mansd, summary.constraints, kind)
+    return title_of(summary.scenario, mode, caps_text(summary), summary.constraints, kind)
 
 
-def title_of(scenario: str, mode: str, mansd: int, constraints: Sequence[str] = (), kind: str = "") -> str:
+def title_of(scenario: str, mode: str, cap: str, constraints: Sequence[str] = (), kind: str = "") -> str:
     """Return the title of the tables of a run; ``kind`` is empty for a live run."""
-    words = (scenario, mode and mode_words(mode), f"M − 1 = {mansd}", *constraints, kind)
+    words = (scenario, mode and mode_words(mode), cap, *constraints, kind)
     return ", ".join(filter(None, words))
 
 
@@ -171,7 +171,7 @@ def _losses(summary: RunSummary, loop: LoopSummary) -> Iterator[tuple[str, str]]
             yield name, str(sent.sent)
             yield f"{name} lost", f"{sent.lost} ({ratio(sent.lost, sent.sent)})"
             yield f"longest loss burst of {name}", str(sent.longest_loss_burst)
-    yield longest_burst(largest_cap(summary), summary.constraints, loop.longest_loss_burst)
+    yield longest_burst(max(caps(summary)), summary.constraints, loop.longest_loss_burst)
     violated = [violation.cause for violation in loop.assumption_violations]
     yield "loss bursts beyond M − 1", str(violated.count("dropouts"))
     for constraint in summary.constraints:
@@ -183,10 +183,15 @@ def lost_row(lost: int, delivered: int) -> tuple[str, str]:
     return "lost in the network", f"{lost} ({ratio(lost, lost + delivered)})"
 
 
-def largest_cap(summary: RunSummary) -> int:
-    """Return the largest M − 1 of a run, which may have changed it."""
+def caps(summary: RunSummary) -> list[int]:
+    """Return the values of M − 1 of a run, which may have changed it, in their order."""
     changed = (change.settings.get(MANSD) for change in summary.changes)
-    return max([summary.mansd, *(cap for cap in changed if isinstance(cap, int))])
+    return [summary.mansd, *(cap for cap in changed if isinstance(cap, int))]
+
+
+def caps_text(summary: RunSummary) -> str:
+    """Write the values of M − 1 of a run, as in ``M − 1 = 3 → 1``."""
+    return f"M − 1 = {' → '.join(map(str, caps(summary)))}"
 
 
 def longest_burst(cap: int, constraints: Sequence[str], longest: int) -> tuple[str, str]:
@@ -384,7 +389,7 @@ def network_rows(summary: RunSummary) -> list[tuple[str, str]]:
     rows = [
         ("updates of all loops", f"{sent} ({sent / reached_s:.4g} /s)"),
         ("lost", f"{lost} ({ratio(lost, sent)}){causes}"),
-        longest_burst(largest_cap(summary), summary.constraints, network.longest_loss_burst),
+        longest_burst(max(caps(summary)), summary.constraints, network.longest_loss_burst),
         ("forced by the guarantee", str(network.forced_deliveries)),
         ("datagrams in flight: mean, max", f"{flying.mean:.3g}, {flying.max}"),
     ]

@@ -156,10 +156,12 @@ class RunRecord:
         wanted, known = packets["sequence"] * count + packets["flow"], numbers[order]
         row = np.searchsorted(known, wanted)
         has_left = np.append(known, -1)[row] == wanted
-        waits = ~has_left & (packets["release_ns"] > packets["now_ns"])
         packets = packets.copy()
-        packets["release_ns"][has_left] = left["t_ns"][order][row[has_left]]
-        packets["release_ns"][waits] = np.maximum(packets["release_ns"][waits], left["t_ns"].max(initial=-1))
+        release_ns: NDArray[np.int64] = packets["release_ns"]
+        waits = ~has_left & (release_ns > packets["now_ns"])
+        left_ns: NDArray[np.int64] = left["t_ns"]
+        release_ns[has_left] = left_ns[order][row[has_left]]
+        release_ns[waits] = np.maximum(release_ns[waits], left_ns.max(initial=-1))
         return packets
 
     def slices(self, *tables: str, columns: Sequence[str] = ()) -> Iterator[Slice]:

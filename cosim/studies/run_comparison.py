@@ -25,13 +25,15 @@ from cosim.output.figures.figure_description import (
     series_colour,
     time_axis,
 )
-from cosim.record.align import Reals, align_tables
+from cosim.output.run_tables import caps_text
+from cosim.record.align import Reals, Times, align_tables
 from cosim.record.run_directory import chosen_run
 from cosim.record.run_record import RunRecord, load_record
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, shortened
 from noack.core.file_access import write_whole
 from noack.core.number_format import as_text
+from noack.core.row_operations import row_norms
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, NO_SEQUENCE, PLANT_STEP, SENSOR_MEASUREMENT
 
 if TYPE_CHECKING:
@@ -58,7 +60,7 @@ class ComparedRun(NamedTuple):
         """The scenario and its kind of run, as text."""
         mode = "model-based" if self.loop.mode == "model" else "zero-order hold"
         summary = self.summary
-        return f"{summary.scenario}, {mode}, {summary.kind}, M − 1 = {summary.mansd}"
+        return f"{summary.scenario}, {mode}, {summary.kind}, {caps_text(summary)}"
 
     @property
     def loop(self) -> LoopSummary:
@@ -253,10 +255,13 @@ _NUMBERS: dict[str, Callable[[LoopSummary], float | None]] = {
 def _distance(first: RunRecord, second: RunRecord) -> tuple[float | None, float | None]:
     """RMS and maximum of ‖x − x'‖ over the common times of two records; None if not finite."""
     a, b = first[PLANT_STEP], second[PLANT_STEP]
-    _, at_a, at_b = np.intersect1d(a["t_ns"], b["t_ns"], return_indices=True)
+    a_ns: Times = a["t_ns"]
+    b_ns: Times = b["t_ns"]
+    _, at_a, at_b = np.intersect1d(a_ns, b_ns, return_indices=True)
     if first is second or not len(at_a):
         return None, None
-    distances = np.linalg.norm(b["x"][at_b] - a["x"][at_a], axis=1)
+    difference: Reals = b["x"][at_b] - a["x"][at_a]
+    distances = row_norms(difference)
     if not np.isfinite(distances).all():
         return None, None
     return float(np.sqrt(np.mean(distances**2))), float(distances.max())

@@ -180,10 +180,12 @@ def in_flight(packets: Rows, horizon_ns: int, reached_ns: int) -> InFlightPart:
 def times_inside(packets: Rows) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return when each delayed datagram, or its copy, came into the network, and when it left."""
     begins, ends = [], []
+    in_ns: NDArray[np.int64] = packets["now_ns"]
     for column in ("release_ns", "copy_ns"):
-        delayed = packets[packets[column] > packets["now_ns"]]
-        begins.append(delayed["now_ns"])
-        ends.append(delayed[column])
+        out_ns: NDArray[np.int64] = packets[column]
+        is_delayed = out_ns > in_ns
+        begins.append(in_ns[is_delayed])
+        ends.append(out_ns[is_delayed])
     return np.concatenate(begins), np.concatenate(ends)
 
 

@@ -217,7 +217,8 @@ def _print_run(
         ("‖x‖ at the end", number(summary.final_state_norm)),
         *([("left out of the network", summary.left_out)] if summary.left_out else ()),
     )
-    title = run_tables.title_of(summary.scenario, summary.mode, summary.mansd, constraints, "continuous")
+    cap = f"M − 1 = {summary.mansd}"
+    title = run_tables.title_of(summary.scenario, summary.mode, cap, constraints, "continuous")
     terminal_output.print_numbers(console, title, rows)
     table = _event_table(run)
     console.print(result_tables.terminal_table(table, left=(), styles={"lost": "red"}))

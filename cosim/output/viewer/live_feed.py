@@ -269,9 +269,10 @@ class _AllLoops:
     def _needed_columns(self, rows: Rows, time_name: str, vector_name: str) -> Rows:
         """Return the needed columns of rows."""
         needed = np.empty(len(rows), self._no_rows.dtype)
-        needed[LOOP], needed["input"] = rows[LOOP], rows["input"]
-        needed["t_ns"] = rows[time_name]
-        needed["x"] = np.where(self._entries[rows[LOOP]], rows[vector_name], 0.0)
+        loops: Numbers = rows[LOOP]
+        vectors: Reals = rows[vector_name]
+        needed[LOOP], needed["input"], needed["t_ns"] = loops, rows["input"], rows[time_name]
+        needed["x"] = np.where(self._entries[loops], vectors, 0.0)
         return needed
 
 

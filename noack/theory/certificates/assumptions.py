@@ -13,7 +13,7 @@ import numpy as np
 
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, spectral_abscissa
-from noack.core.number_format import at_least
+from noack.core.number_format import apart_from, at_least
 from noack.scenario.estimation import SteadyState, steady_state
 from noack.scenario.resolution import LoopMatrices, loop_of, policy_of
 from noack.scenario.scenario import Scenario
@@ -280,7 +280,7 @@ def certificate_assumptions(
         status = AssumptionStatus.NOT_CHECKED if is_unchecked else AssumptionStatus.VIOLATED
         checked.append(Assumption("there is a certificate", "certificate", status, str(void)))
     else:
-        why = f"the loop gain of the errors is {loop_gain:.3g}, below 1"
+        why = f"the loop gain of the errors is {apart_from(1, loop_gain)}, below 1"
         checked.append(_checked("small-gain condition", "certificate", True, why))
     why = "the bounds rest on (I1), which holds for every plant"
     assumed, source = "A is unstable with distinct eigenvalues", "Proposition 1"

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from noack.core.cached_method import cached_function
 from noack.core.linear_systems import Vector
+from noack.core.number_format import apart_from
 from noack.theory.bounds.certificate_terms import (
     CertificatePart,
     Constants,
@@ -264,7 +265,7 @@ class _SmallestConstants(NamedTuple):
             return NoCertificateError("events may be arbitrarily close, so that any number may be in flight")
         if gain < 1:
             return NoCertificateError("its bounds are too large for floating point")
-        return NoCertificateError(f"the loop gain of the errors is {gain:.3g}, not below 1", gain)
+        return NoCertificateError(f"the loop gain of the errors is {apart_from(1, gain)}, not below 1", gain)
 
 
 def _smallest_constants(

@@ -32,6 +32,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from noack.core.linear_systems import Vector, exponential
+from noack.core.number_format import apart_from
 from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertificateError
 from noack.theory.bounds.enclosure import NotDecayingError, response, response_until
 from noack.theory.bounds.gains import ErrorGains, Output, PlantGains
@@ -111,7 +112,9 @@ def root_mean_squares(
     except (np.linalg.LinAlgError, OverflowError):
         raise NoCertificateError("numbers overflow: an input is too old for the fastest mode") from None
     if bounds is None:
-        raise NoCertificateError(f"the loop gain of the mean squares is {loop_gain:.3g}, not below 1")
+        raise NoCertificateError(
+            f"the loop gain of the mean squares is {apart_from(1, loop_gain)}, not below 1"
+        )
     if refined:
         bounds = inequalities.refine(bounds)
     e_c, x = bounds.errors[Output.WEIGHTED], bounds.states[Output.STATE]

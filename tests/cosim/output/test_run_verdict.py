@@ -12,7 +12,7 @@ from cosim.analysis.summary.run_summary import Outcome
 from cosim.analysis.summary.summary_model import Claim
 from cosim.live.finalize import finalize
 from cosim.output.page_kit import TERMS
-from cosim.output.run_tables import short_numbers
+from cosim.output.run_tables import run_title, short_numbers
 from cosim.output.run_verdict import SETTLED_SHARE, Tone, remarks, state_text, verdict
 from cosim.record.divergence import GROWTH
 from cosim.simulation.virtual_time import simulate_run
@@ -116,6 +116,7 @@ def test_the_longest_burst_is_shown_with_the_limit_of_all_rules(outcome: Outcome
     change = {"number": 1, "t_s": 1.0, "settings": {"network.mansd": 9}, "what": ""}
     raised = with_values(outcome.summary, changes=[change | {"in_force_from_s": {}}])
     assert "longest loss burst (cap M − 1 = 9)" in dict(short_numbers(raised))
+    assert run_title(raised) == "lane_following, model-based, M − 1 = 4 → 9, simulated"
     limited = with_values(outcome.summary, constraints=["atmost 3 in 8"])
     assert "longest loss burst (at most 3 allowed)" in dict(short_numbers(limited))
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from noack.core.core_library import CoreMemory, reals_at
-from noack.core.number_format import at_least, at_most, duration_at_least, plus_minus
+from noack.core.number_format import apart_from, at_least, at_most, duration_at_least, plus_minus
 from noack.core.random_streams import stream, stream_key, stream_keys, uniforms, words
 
 
@@ -116,3 +116,11 @@ def test_a_bound_with_decimals_and_a_time() -> None:
     assert [duration_at_least(time_s) for time_s in (0.0499999, 0.05, 1.0096, 2.5e-6)] == [
         "49.9 ms", "50 ms", "1 s", "2.5 µs",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(2.63123, "2.63"), (1.0, "1"), (1.0000003, "1.0000003"), (0.9999, "0.9999"), (math.inf, "inf")],
+)
+def test_a_number_is_told_from_its_limit(value: float, text: str) -> None:
+    assert apart_from(1.0, value) == text

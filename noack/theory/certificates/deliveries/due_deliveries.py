@@ -23,6 +23,7 @@ from functools import cached_property
 import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector, exponential, spectral_abscissa
+from noack.core.number_format import apart_from
 from noack.theory.bounds.certificate_terms import (
     Constants,
     NetworkConditions,
@@ -446,7 +447,8 @@ def _contracting_gains(loop: GapLoop) -> GapGains:
             return gains
         smallest = min(smallest, gains.largest)
     raise NoCertificateError(
-        f"in a norm the loop grows from delivery to delivery: {smallest:.3g}, not below 1", smallest
+        f"in a norm the loop grows from delivery to delivery: {apart_from(1, smallest)}, not below 1",
+        smallest,
     )
 
 
