@@ -67,8 +67,8 @@ class LossCheck:
     def reach(self, t_ns: int) -> None:
         """Use the guarantee that is in force at a time of the controller's model."""
         if self._schedule is not None:
-            now = self._schedule.at(t_ns)
-            self._change(now.scenario.network.guarantee, now.since_ns)
+            applied = self._schedule.at(t_ns)
+            self._change(applied.scenario.network.guarantee, applied.since_ns)
 
     @property
     def counts_every_update(self) -> bool:
@@ -183,8 +183,7 @@ class Controller(MachinePart):
     role = CONTROLLER
 
     def __post_init__(self) -> None:
-        known = self.x0 is not None
-        self._losses = LossCheck(self.guarantee, self.schedule, known_start=known)
+        self._losses = LossCheck(self.guarantee, self.schedule, known_start=self.x0 is not None)
         self._points: list[Vector | None] = [self.setpoint and self.setpoint[0]]
         self._since_ns: list[int] = []
         self._failed = False
@@ -298,9 +297,11 @@ class Controller(MachinePart):
         """Use another set point; x_c follows it from ``since_ns`` on."""
         self.setpoint = setpoint
         point = setpoint and setpoint[0]
-        before = self._points[-1]
-        same = point is before if point is None or before is None else np.array_equal(point, before)
-        if not same:
+        last_point = self._points[-1]
+        is_same = (
+            point is last_point if point is None or last_point is None else np.array_equal(point, last_point)
+        )
+        if not is_same:
             self._points.append(point)
             self._since_ns.append(since_ns)
             self._memory.set_model(
@@ -344,7 +345,7 @@ def _with_draws_of(controller: Controller, resolved: Scenario) -> Controller:
 
 def _part(start: Start, resolved: Scenario) -> Controller:
     loop = loop_of(resolved)
-    known = resolved.network.initial_sync == "known_state" and not start.is_restart
+    starts_from_x0 = resolved.network.initial_sync == "known_state" and not start.is_restart
     safe_input, acknowledges = resolved.controller.safe_input, resolved.protocol.acknowledges
     changes = not (acknowledges or resolved.controller.is_program)
     return Controller(
@@ -355,7 +356,7 @@ def _part(start: Start, resolved: Scenario) -> Controller:
         first_ns=resolved.timing.controller_phase_ns,
         horizon_ns=resolved.timing.horizon_ns,
         guarantee=resolved.network.guarantee,
-        x0=loop.x0 if known else None,
+        x0=loop.x0 if starts_from_x0 else None,
         acknowledges=acknowledges,
         start=start,
         safe_input=None if safe_input is None else np.array(safe_input),

@@ -58,23 +58,23 @@ static void release(
     int64_t release_ns = copy ? decision->copy_ns : decision->release_ns;
     int64_t bit = copy ? decision->copy_bit : decision->bit;
     int64_t direction = datagram->flow / channel->loops;
-    noack_delayed *kept = &channel->delayed[channel->free_place];
-    kept->packet = decision->packet;
-    kept->copy = copy;
-    kept->counts = is_first_intact(decision, copy);
-    kept->delayed = release_ns > decision->arrival_ns;
-    copy_datagram(&kept->datagram, datagram);
-    kept->datagram.bit = bit;
+    noack_delayed *delayed = &channel->delayed[channel->free_place];
+    delayed->packet = decision->packet;
+    delayed->copy = copy;
+    delayed->counts = is_first_intact(decision, copy);
+    delayed->delayed = release_ns > decision->arrival_ns;
+    copy_datagram(&delayed->datagram, datagram);
+    delayed->datagram.bit = bit;
     if (bit >= 0 && bit < 8 * NOACK_HEAD_BYTES)
-        kept->datagram.head[bit / 8] ^= (uint8_t)(1 << (bit % 8));
+        delayed->datagram.head[bit / 8] ^= (uint8_t)(1 << (bit % 8));
     channel->delayed_count++;
-    if (!decision->waits && !kept->delayed && !is_behind(channel, direction, release_ns)) {
-        leave(channel, kept);
-        copy_datagram(&channel->leaving[channel->leaving_count++], &kept->datagram);
+    if (!decision->waits && !delayed->delayed && !is_behind(channel, direction, release_ns)) {
+        leave(channel, delayed);
+        copy_datagram(&channel->leaving[channel->leaving_count++], &delayed->datagram);
         return;
     }
     int64_t place = channel->free_place, order = departure_order(direction, channel->delayed_count);
-    channel->free_place = kept->next;
+    channel->free_place = delayed->next;
     if (decision->waits)
         wait_for_link(
             channel->links[direction], datagram->flow % channel->loops, channel->waiting, place,

@@ -11,8 +11,8 @@ static int64_t applied_offset_ns(const noack_clock *clock, int64_t own_ns) {
     /* The product of both numbers may exceed 64 bits. */
     int64_t most_ns = clock->slew_ppb * floor_div(since_ns, PPB)
                       + floor_div(clock->slew_ppb * floor_mod(since_ns, PPB), PPB);
-    int64_t change_ns = clock->target_ns - clock->begun_ns;
-    return clock->begun_ns + min_of(max_of(change_ns, -most_ns), most_ns);
+    int64_t change_ns = clock->target_offset_ns - clock->first_offset_ns;
+    return clock->first_offset_ns + min_of(max_of(change_ns, -most_ns), most_ns);
 }
 
 int64_t noack_clock_at_ns(const noack_clock *clock, int64_t own_ns) {

@@ -48,8 +48,8 @@ double noack_exp_at_limits(double x) {
         return rounded;
     /* Round once, to a multiple of the smallest double. */
     double to_multiple = ldexp(1.0, 52 - 1074 - exponent), shifted = to_multiple + parts.high;
-    double lost = parts.high - (shifted - to_multiple);
-    return ldexp((shifted + (lost + parts.low)) - to_multiple, exponent);
+    double rounding = parts.high - (shifted - to_multiple);
+    return ldexp((shifted + (rounding + parts.low)) - to_multiple, exponent);
 }
 
 double noack_exp(double x) { return fixed_exp(x); }
@@ -65,8 +65,8 @@ double noack_expm1(double x) {
     power_parts parts = exp_parts(x);
     double power = power_of_2(parts.exponent);
     double high = parts.high * power, low = parts.low * power, less = high - 1.0;
-    double lost = high > 1.0 ? (high - less) - 1.0 : high - (less + 1.0);
-    return less + (lost + low);
+    double rounding = high > 1.0 ? (high - less) - 1.0 : high - (less + 1.0);
+    return less + (rounding + low);
 }
 
 /* With x = 2^(k/32) (1 + r): ln x = k ln 2/32 + r - r^2/2 + r^3/3 - ..., where |r| < 0.012. The

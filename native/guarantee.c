@@ -32,20 +32,22 @@ int64_t noack_must_pass(const noack_link *link, int64_t row) {
     if (!counts_losses(link))
         return 0;
     const int64_t *losses = link->losses + row * link->loss_width;
-    int64_t packet = flow->packets, mask = link->loss_width - 1, so_far = losses[packet & mask];
+    int64_t packet = flow->packets, loss_mask = link->loss_width - 1,
+            so_far = losses[packet & loss_mask];
     for (int64_t i = 0; i < link->window_count; i++) {
         const noack_window *window = &link->windows[i];
-        if (so_far - losses[(packet + 1 - window->packets) & mask] >= window->losses)
+        if (so_far - losses[(packet + 1 - window->packets) & loss_mask] >= window->losses)
             return 1;
     }
     int begins_burst = flow->consecutive_losses == 0;
-    return begins_burst && so_far != losses[(packet - link->recovery) & mask];
+    return begins_burst && so_far != losses[(packet - link->recovery) & loss_mask];
 }
 
 /* The newest effectively delivered packet below end; below oldest: none. */
-static int64_t newest_below(const int64_t *recent_ns, int64_t mask, int64_t oldest, int64_t end) {
+static int64_t newest_below(
+    const int64_t *recent_ns, int64_t recent_mask, int64_t oldest, int64_t end) {
     int64_t number = end - 1;
-    while (number >= oldest && recent_ns[number & mask] < 0)
+    while (number >= oldest && recent_ns[number & recent_mask] < 0)
         number--;
     return number;
 }
@@ -59,14 +61,14 @@ static int64_t needed_after(
     int64_t needed = burst > link->mansd ? 1 : 0;
     if (!counts_losses(link))
         return needed;
-    int64_t mask = link->loss_width - 1, before = losses[(delivered + 1) & mask];
+    int64_t loss_mask = link->loss_width - 1, before = losses[(delivered + 1) & loss_mask];
     for (int64_t i = 0; i < link->window_count; i++) {
         const noack_window *window = &link->windows[i];
         int64_t beyond =
-            before + burst - losses[(packet - window->packets) & mask] - window->losses;
+            before + burst - losses[(packet - window->packets) & loss_mask] - window->losses;
         needed = max_of(needed, beyond);
     }
-    if (needed == 0 && before != losses[(delivered + 1 - link->recovery) & mask])
+    if (needed == 0 && before != losses[(delivered + 1 - link->recovery) & loss_mask])
         needed = 1;
     return needed;
 }
@@ -80,18 +82,18 @@ int64_t noack_hold_back_until(
     const noack_link *link, int64_t row, int64_t packet, int64_t desired_ns) {
     const int64_t *recent_ns = link->recent_ns + row * link->recent_width;
     const int64_t *losses = link->losses + row * link->loss_width;
-    int64_t mask = link->recent_width - 1, oldest = max_of(packet - link->mansd - 1, 0);
+    int64_t recent_mask = link->recent_width - 1, oldest = max_of(packet - link->mansd - 1, 0);
     int64_t release_ns = max_of(desired_ns, link->flows[row].first_release_ns);
     if (link->scheduler >= 0) /* each flow leaves in its order; see waiting.c */
         return release_ns;
-    int64_t delivered = newest_below(recent_ns, mask, oldest, packet);
-    while (delivered >= oldest && recent_ns[delivered & mask] > release_ns)
-        delivered = newest_below(recent_ns, mask, oldest, delivered);
+    int64_t delivered = newest_below(recent_ns, recent_mask, oldest, packet);
+    while (delivered >= oldest && recent_ns[delivered & recent_mask] > release_ns)
+        delivered = newest_below(recent_ns, recent_mask, oldest, delivered);
     int64_t first = delivered + 1, needed = 0;
     if (delivered < oldest)
         delivered = -1;
     for (int64_t number = first; number < packet; number++) {
-        int64_t time_ns = recent_ns[number & mask];
+        int64_t time_ns = recent_ns[number & recent_mask];
         if (time_ns > release_ns) {
             if (needed == 0)
                 needed = needed_after(link, losses, delivered, packet);
@@ -131,6 +133,6 @@ int64_t make_stale(const noack_link *link, int64_t row, int64_t packet, int64_t 
 void note_outcome(const noack_link *link, int64_t row, int64_t packet, int lost) {
     if (!counts_losses(link))
         return;
-    int64_t *losses = link->losses + row * link->loss_width, mask = link->loss_width - 1;
-    losses[(packet + 1) & mask] = losses[packet & mask] + (lost ? 1 : 0);
+    int64_t *losses = link->losses + row * link->loss_width, loss_mask = link->loss_width - 1;
+    losses[(packet + 1) & loss_mask] = losses[packet & loss_mask] + (lost ? 1 : 0);
 }

@@ -112,9 +112,9 @@ static void order_copies(noack_decision *decision) {
 
 /* Drop a delayed packet or its copy if it needs more than the free places in flight. A packet that
    is lost, by this or before, has neither times nor flipped bits. */
-static void keep_limit(int64_t free, noack_decision *decision) {
+static void keep_limit(int64_t free_places, noack_decision *decision) {
     int64_t now_ns = decision->arrival_ns;
-    if (decision->release_ns > now_ns && free <= 0)
+    if (decision->release_ns > now_ns && free_places <= 0)
         refuse(decision, NOACK_OVERFLOWED);
     if (decision->fate != NOACK_DELIVERED) {
         decision->release_ns = decision->copy_ns = NOACK_NEVER_NS;
@@ -122,7 +122,7 @@ static void keep_limit(int64_t free, noack_decision *decision) {
         return;
     }
     order_copies(decision);
-    if (decision->copy_ns > now_ns && free < (decision->release_ns > now_ns ? 2 : 1)) {
+    if (decision->copy_ns > now_ns && free_places < (decision->release_ns > now_ns ? 2 : 1)) {
         decision->copy_ns = NOACK_NEVER_NS;
         decision->copy_bit = -1;
     }
@@ -159,11 +159,11 @@ void decide_or_repeat(
     if (recorded != NULL) {
         repeat(recorded, decision);
     } else {
-        packet own = {link, flow, decision, 0};
+        packet arriving = {link, flow, decision, 0};
         noack_stage_memory *memory = link->memory + row * link->stage_count;
-        for (; own.stage < link->stage_count; own.stage++) {
-            const noack_stage *stage = &link->stages[own.stage];
-            APPLY[stage->kind](&own, stage, &memory[own.stage]);
+        for (; arriving.stage < link->stage_count; arriving.stage++) {
+            const noack_stage *stage = &link->stages[arriving.stage];
+            APPLY[stage->kind](&arriving, stage, &memory[arriving.stage]);
         }
         if (decision->waits)
             complete_waiting_decision(decision);

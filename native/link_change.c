@@ -30,10 +30,10 @@ static int64_t rate_of(const noack_stage *stage) {
 
 /* Transfer a queue; a shorter one drops the earliest departure times, and is full then. */
 static void change_queue(
-    const noack_link *before, int64_t was, const noack_link *after, int64_t place) {
-    const noack_stage *old = &before->stages[was], *new = &after->stages[place];
-    const noack_queue *queue = &before->queues[was];
-    noack_queue *new_queue = &after->queues[place];
+    const noack_link *before, int64_t old_place, const noack_link *after, int64_t new_place) {
+    const noack_stage *old = &before->stages[old_place], *new = &after->stages[new_place];
+    const noack_queue *queue = &before->queues[old_place];
+    noack_queue *new_queue = &after->queues[new_place];
     int64_t count = min_of(queue->count, new->queue_places);
     int64_t first = queue->head + queue->count - count;
     for (int64_t k = 0; k < count; k++)
@@ -46,34 +46,34 @@ static void change_queue(
     new_queue->carry = rate_of(new) == rate_of(old) ? queue->carry : 0;
 }
 
-static void change_stage(const noack_link *before, const noack_link *after, int64_t place) {
-    const noack_stage *stage = &after->stages[place];
-    int64_t was = find_stage(before, stage);
-    if (was < 0)
+static void change_stage(const noack_link *before, const noack_link *after, int64_t new_place) {
+    const noack_stage *stage = &after->stages[new_place];
+    int64_t old_place = find_stage(before, stage);
+    if (old_place < 0)
         return;
-    int same = stage->kind == before->stages[was].kind;
-    if (same)
-        after->queues[place] = before->queues[was];
+    int is_same_kind = stage->kind == before->stages[old_place].kind;
+    if (is_same_kind)
+        after->queues[new_place] = before->queues[old_place];
     if (stage->queue_places > 0)
-        change_queue(before, was, after, place);
-    if (same)
+        change_queue(before, old_place, after, new_place);
+    if (is_same_kind)
         for (int64_t row = 0; row < before->rows; row++)
-            after->memory[row * after->stage_count + place] =
-                before->memory[row * before->stage_count + was];
+            after->memory[row * after->stage_count + new_place] =
+                before->memory[row * before->stage_count + old_place];
 }
 
 /* Transfer the outcomes of the last packets; an unknown outcome counts as a delivery. */
 static void change_losses(const noack_link *before, const noack_link *after, int64_t row) {
     const noack_flow *flow = &before->flows[row];
-    const int64_t *known = before->losses + row * before->loss_width;
+    const int64_t *old_losses = before->losses + row * before->loss_width;
     const int64_t *times_ns = before->recent_ns + row * before->recent_width;
     int64_t *losses = after->losses + row * after->loss_width;
-    int64_t packets = flow->packets, mask = after->loss_width - 1, count;
+    int64_t packets = flow->packets, new_mask = after->loss_width - 1, count;
     int counted = counts_losses(before), listed = before->tracks && before->mansd >= 0;
     if (counted) {
         count = before->loss_width - 1;
-        if (count == mask) {
-            memcpy(losses, known, (size_t)after->loss_width * sizeof *losses);
+        if (count == new_mask) {
+            memcpy(losses, old_losses, (size_t)after->loss_width * sizeof *losses);
             return;
         }
     } else if (listed) {
@@ -81,15 +81,15 @@ static void change_losses(const noack_link *before, const noack_link *after, int
     } else {
         count = flow->consecutive_losses;
     }
-    int64_t so_far = 0, known_mask = count;
-    for (int64_t number = packets - min_of(count, mask); number < packets; number++) {
+    int64_t so_far = 0, old_mask = count;
+    for (int64_t number = packets - min_of(count, new_mask); number < packets; number++) {
         int lost = 1;
         if (counted)
-            lost = known[(number + 1) & known_mask] > known[number & known_mask];
+            lost = old_losses[(number + 1) & old_mask] > old_losses[number & old_mask];
         else if (listed)
             lost = times_ns[number & (before->recent_width - 1)] < 0;
         so_far += lost;
-        losses[(number + 1) & mask] = so_far;
+        losses[(number + 1) & new_mask] = so_far;
     }
 }
 
@@ -111,17 +111,18 @@ static void change_releases(
     const noack_link *before, const noack_link *after, int64_t row, int64_t latest_ns) {
     noack_flow *flow = &after->flows[row];
     int64_t *times_ns = after->recent_ns + row * after->recent_width;
-    const int64_t *older_ns = before->recent_ns + row * before->recent_width;
-    int64_t mask = after->recent_width - 1, kept = 0;
+    const int64_t *old_times_ns = before->recent_ns + row * before->recent_width;
+    int64_t recent_mask = after->recent_width - 1, kept_times = 0;
     if (before->tracks && before->mansd >= 0)
-        kept = min_of(after->mansd, before->mansd) + 1;
-    int64_t known = flow->packets - kept, lost = flow->packets - flow->consecutive_losses;
+        kept_times = min_of(after->mansd, before->mansd) + 1;
+    int64_t first_known = flow->packets - kept_times,
+            first_lost = flow->packets - flow->consecutive_losses;
     for (int64_t number = max_of(flow->packets - after->mansd - 1, 0); number < flow->packets;
          number++) {
-        if (number >= known)
-            times_ns[number & mask] = older_ns[number & (before->recent_width - 1)];
-        else if (number < lost)
-            times_ns[number & mask] = 0;
+        if (number >= first_known)
+            times_ns[number & recent_mask] = old_times_ns[number & (before->recent_width - 1)];
+        else if (number < first_lost)
+            times_ns[number & recent_mask] = 0;
     }
     if (before->tracks
         && (!is_same_guarantee(before, after) || before->scheduler >= 0 || after->scheduler >= 0))

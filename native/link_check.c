@@ -28,60 +28,63 @@ static int ascends(
 }
 
 static const char *check_bottleneck(const noack_stage *stage) {
-    const noack_bottleneck *own = &stage->bottleneck;
-    if (!is_between(1, own->rate_bps, FAR_NS))
+    const noack_bottleneck *settings = &stage->bottleneck;
+    if (!is_between(1, settings->rate_bps, FAR_NS))
         return "a bottleneck has no rate";
-    if (!is_between(-MOST_BYTES, own->overhead_bytes, MOST_BYTES)
-        || !is_between(0, own->cell_bytes, MOST_BYTES)
-        || !is_between(0, own->cell_overhead_bytes, MOST_CELL_HEADER))
+    if (!is_between(-MOST_BYTES, settings->overhead_bytes, MOST_BYTES)
+        || !is_between(0, settings->cell_bytes, MOST_BYTES)
+        || !is_between(0, settings->cell_overhead_bytes, MOST_CELL_HEADER))
         return "a bottleneck has an overhead or cells of more than 65,536 bytes, or below 0";
     if (stage->kind == NOACK_CODEL
-        && (own->target_ns < 0 || !is_between(1, own->interval_ns, FAR_NS / 16)))
+        && (settings->target_ns < 0 || !is_between(1, settings->interval_ns, FAR_NS / 16)))
         return "CoDel has no target or interval";
     return stage->queue_places < 1 ? "a bottleneck has no queue" : NULL;
 }
 
 static const char *check_scheduler(const noack_link *link, const noack_stage *stage) {
-    const noack_bottleneck *own = &stage->bottleneck;
+    const noack_bottleneck *settings = &stage->bottleneck;
     if (link->scheduler != stage - link->stages)
         return "a stage is a scheduler, but not that of the link";
-    if (!is_between(1, own->flows, link->integer_count)
-        || !is_between(0, own->begin, link->integer_count - own->flows))
+    if (!is_between(1, settings->flows, link->integer_count)
+        || !is_between(0, settings->begin, link->integer_count - settings->flows))
         return "the numbers of flows are outside the table of integers";
-    for (int64_t i = 0; i < own->flows; i++)
-        if (!is_between(0, link->integers[own->begin + i], LONGEST_DELAY_NS))
+    for (int64_t i = 0; i < settings->flows; i++)
+        if (!is_between(0, link->integers[settings->begin + i], LONGEST_DELAY_NS))
             return "the number of a flow is below 0, or a deadline of more than 11.6 days";
     return check_bottleneck(stage);
 }
 
 static const char *check_opportunities(const noack_link *link, const noack_stage *stage) {
-    const noack_opportunities *own = &stage->opportunities;
-    if (!in_range(own->begin, own->end, link->integer_count) || own->begin == own->end)
+    const noack_opportunities *settings = &stage->opportunities;
+    if (!in_range(settings->begin, settings->end, link->integer_count)
+        || settings->begin == settings->end)
         return "delivery opportunities are outside the table of integers";
-    int64_t last_ms = link->integers[own->end - 1], count = own->end - own->begin;
-    if (last_ms < 1 || !ascends(link->integers, own->begin, own->end, 0, FAR_NS / NS_PER_MS))
+    int64_t last_ms = link->integers[settings->end - 1], count = settings->end - settings->begin;
+    if (last_ms < 1
+        || !ascends(link->integers, settings->begin, settings->end, 0, FAR_NS / NS_PER_MS))
         return "delivery opportunities do not ascend from 0, or end at 0 or after 73 years";
     if (count / MOST_OPPORTUNITIES_PER_MS >= last_ms)
         return "there are more than a million delivery opportunities in a millisecond";
-    if (!is_between(0, own->offset_ns, FAR_NS) || !is_between(0, own->queue_bytes, FAR_NS)
-        || !is_between(-MOST_BYTES, own->overhead_bytes, MOST_BYTES))
+    if (!is_between(0, settings->offset_ns, FAR_NS) || !is_between(0, settings->queue_bytes, FAR_NS)
+        || !is_between(-MOST_BYTES, settings->overhead_bytes, MOST_BYTES))
         return "delivery opportunities have an offset, overhead or queue out of range";
     if (stage->queue_places < 2 || stage->queue_places % 2 != 0)
         return "a queue of delivery opportunities needs two numbers for a packet";
     return NULL;
 }
 
-static const char *check_replay(const noack_link *link, const noack_replay *own) {
-    if (!in_range(own->begin, own->end, link->integer_count) || own->begin == own->end)
+static const char *check_replay(const noack_link *link, const noack_replay *settings) {
+    if (!in_range(settings->begin, settings->end, link->integer_count)
+        || settings->begin == settings->end)
         return "a trace is outside the table of integers";
-    for (int64_t i = own->begin; i < own->end; i++)
+    for (int64_t i = settings->begin; i < settings->end; i++)
         if (!is_between(-1 - LONGEST_DELAY_NS, link->integers[i], LONGEST_DELAY_NS))
             return "a recorded delay is longer than 11.6 days";
-    if (!is_between(0, own->offset, FAR_NS) || !is_between(0, own->period_ns, FAR_NS))
+    if (!is_between(0, settings->offset, FAR_NS) || !is_between(0, settings->period_ns, FAR_NS))
         return "a trace has an offset or length below 0, or of more than 73 years";
-    if (own->period_ns == 0)
+    if (settings->period_ns == 0)
         return NULL;
-    int64_t count = own->end - own->begin, first = own->times_begin;
+    int64_t count = settings->end - settings->begin, first = settings->times_begin;
     if (first < 0 || first > link->integer_count - count)
         return "sending times are outside the table of integers";
     if (link->integers[first] != 0 || !ascends(link->integers, first, first + count, 0, FAR_NS))
@@ -89,20 +92,22 @@ static const char *check_replay(const noack_link *link, const noack_replay *own)
     return NULL;
 }
 
-static const char *check_schedule(const noack_link *link, const noack_schedule *own) {
-    int64_t flows = own->flows, count = link->integer_count;
-    if (!is_between(1, own->slots, MOST_EVER) || !is_between(1, flows, MOST_EVER)
-        || !is_between(1, own->slot_ns, FAR_NS / 4 / own->slots)
-        || !is_between(1, own->queue, MOST_EVER))
+static const char *check_schedule(const noack_link *link, const noack_schedule *settings) {
+    int64_t flows = settings->flows, count = link->integer_count;
+    if (!is_between(1, settings->slots, MOST_EVER) || !is_between(1, flows, MOST_EVER)
+        || !is_between(1, settings->slot_ns, FAR_NS / 4 / settings->slots)
+        || !is_between(1, settings->queue, MOST_EVER))
         return "a schedule has no slots, flows or queue, or a round of more than 18 years";
-    if (!is_between(0, own->begin, count - flows - 1)
-        || !ascends(link->integers, own->begin, own->begin + flows + 1, 0, own->slots)
-        || link->integers[own->begin] != 0
-        || link->integers[own->begin + flows] > count - own->begin - flows - 1)
+    if (!is_between(0, settings->begin, count - flows - 1)
+        || !ascends(
+            link->integers, settings->begin, settings->begin + flows + 1, 0, settings->slots)
+        || link->integers[settings->begin] != 0
+        || link->integers[settings->begin + flows] > count - settings->begin - flows - 1)
         return "the slots of a schedule are outside the table of integers";
-    const int64_t *firsts = link->integers + own->begin;
-    for (int64_t i = 0, begin = own->begin + flows + 1; i < flows; i++)
-        if (!ascends(link->integers, begin + firsts[i], begin + firsts[i + 1], 0, own->slots - 1))
+    const int64_t *firsts = link->integers + settings->begin;
+    for (int64_t i = 0, begin = settings->begin + flows + 1; i < flows; i++)
+        if (!ascends(
+                link->integers, begin + firsts[i], begin + firsts[i + 1], 0, settings->slots - 1))
             return "the slots of a flow do not ascend, or exceed the round";
     return NULL;
 }

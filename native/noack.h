@@ -175,7 +175,7 @@ typedef struct {
     int64_t times_begin; /* sending times in ns, which do not descend */
     int64_t offset;      /* first record; by time, the first time in ns */
     int64_t period_ns;   /* length of the trace; 0: by packet */
-    int64_t once;
+    int64_t once;        /* 1: it does not repeat */
 } noack_replay;
 
 /* Slots for flows. The table of integers has from begin on: flows + 1 places, then the numbers of
@@ -615,7 +615,7 @@ typedef struct {
     double *x_s;           /* (n,) */
     double *event_x;       /* (n,) x - x_r at the last event */
     int64_t model_ns;
-    int64_t has_state;   /* 0: the first measurement is an event */
+    int64_t has_state;     /* 0: the first measurement is an event */
     int64_t events;        /* number of the next one */
     int64_t wait_ns;       /* time until which it waits for an acknowledgement; -1: it does not */
     int64_t sent_count, sent_places;
@@ -708,7 +708,8 @@ typedef struct {
     int64_t **layouts;
 } noack_table;
 
-/* An entry of a heap, by (due_ns, number): a delayed datagram, or the next tick of a loop. */
+/* An entry of a heap, by (due_ns, number): a delayed datagram, or the next tick of the loop of this
+   number. */
 typedef struct {
     int64_t due_ns, number;
     int64_t slot; /* of the datagram */
@@ -809,7 +810,8 @@ typedef struct {
     int64_t epoch_ns; /* reading of the coordinator's monotonic clock at simulated time 0 */
     double speed;     /* simulated time per time of that clock */
     int64_t slew_ppb; /* 0: this host has that clock; else the slew of SlewedClock */
-    int64_t since_ns, begun_ns, target_ns; /* as of SlewedClock */
+    /* as of SlewedClock */
+    int64_t since_ns, first_offset_ns, target_offset_ns;
 } noack_clock;
 
 /* The simulated time at a reading of this host's monotonic clock. */
@@ -859,7 +861,7 @@ enum noack_examination {
 typedef struct {
     int64_t run_id;    /* the bits of the unsigned number */
     int64_t encrypted; /* 1: Python encrypts and decrypts the vectors, and makes the tags */
-    uint64_t keyed[8]; /* BLAKE2b's state after the key */
+    uint64_t keyed_state[8]; /* BLAKE2b's state after the key */
 } noack_wire;
 
 /* Set the key. */
@@ -934,7 +936,7 @@ typedef struct {
     int64_t timer;                /* a timerfd */
     int64_t epoll;                /* waits for the sockets and the timer */
     noack_peer sources[2];
-    int64_t unknown_source;              /* datagrams from other addresses */
+    int64_t unknown_source;       /* datagrams from other addresses */
     int64_t sent;
     int64_t errors[NOACK_ERRNOS]; /* datagrams that could not be sent, by errno */
     int64_t question;             /* a noack_question */
@@ -1156,8 +1158,8 @@ void noack_relay_open(noack_relay *relay);
 /* Receive the kernel's timestamps of arrivals, too: delays count from the arrival. */
 void noack_relay_read_stamps(noack_relay *relay);
 
-/* Wait for a socket's datagrams, too; return 0 or errno. number is its place in sockets. */
-int64_t noack_relay_watch(noack_relay *relay, int64_t fd, int64_t number);
+/* Wait for a socket's datagrams, too; return 0 or errno. socket is its place in sockets. */
+int64_t noack_relay_watch(noack_relay *relay, int64_t fd, int64_t socket);
 
 /* Relay until Python is needed, or until a time; return a noack_reason. INT64_MIN: do what is due,
    and do not wait. */
@@ -1510,8 +1512,8 @@ typedef struct {
     noack_fmu_values values[NOACK_FMU_VARIABLES];
     int64_t mode, now_ns;
     /* packets that have been sent, or of those that have arrived */
-    int64_t taken;
-    int64_t before;                     /* arrivals before this step */
+    int64_t packets_taken;
+    int64_t arrivals_before;            /* this step */
 } noack_fmu_image;
 
 /* ---- Exact simulation in continuous time: native/exact/ -------------------------------------- */

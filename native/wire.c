@@ -85,16 +85,16 @@ static void compress(uint64_t chain[8], const uint64_t m[16], uint64_t count, in
 void noack_wire_key(noack_wire *wire, const uint8_t key[NOACK_KEY_BYTES]) {
     uint64_t block[16] = {0};
     memcpy(block, key, NOACK_KEY_BYTES);
-    memcpy(wire->keyed, initial, sizeof initial);
-    wire->keyed[0] ^= 0x01010000 ^ NOACK_KEY_BYTES << 8 ^ NOACK_TAG_BYTES;
-    compress(wire->keyed, block, BLOCK_BYTES, 0);
+    memcpy(wire->keyed_state, initial, sizeof initial);
+    wire->keyed_state[0] ^= 0x01010000 ^ NOACK_KEY_BYTES << 8 ^ NOACK_TAG_BYTES;
+    compress(wire->keyed_state, block, BLOCK_BYTES, 0);
 }
 
 void noack_wire_tag(
     const noack_wire *wire, int64_t size_bytes, const uint8_t *content,
     uint8_t tag[NOACK_TAG_BYTES]) {
     uint64_t chain[8], block[16];
-    memcpy(chain, wire->keyed, sizeof chain);
+    memcpy(chain, wire->keyed_state, sizeof chain);
     uint64_t count = BLOCK_BYTES;
     while (size_bytes > BLOCK_BYTES) {
         memcpy(block, content, BLOCK_BYTES);

@@ -15,7 +15,7 @@ with stoppable_imports():
     from netem.run_network import NetworkChannel, RunNetwork
     from noack.core.errors import ExitStatus, NoackError
     from noack.protocol.roles import ENDS
-    from noack.runtime.command_line import Parser, failed
+    from noack.runtime.command_line import Parser, report_failure
     from noack.runtime.join_run import add_options, join_run
     from noack.runtime.run_process import RunProcess
 
@@ -45,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         return run_stand_alone(words)
     except NoackError as error:
-        return failed(str(error), error.exit_status, source="noack netem", as_json=as_json)
+        return report_failure(str(error), error.exit_status, source="noack netem", as_json=as_json)
 
 
 def run_network(run: RunProcess) -> None:

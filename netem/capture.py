@@ -70,7 +70,7 @@ class PcapngSection:
         self._interfaces = tuple(interfaces)
         self._missing = np.zeros(len(interfaces), np.int64)
         self._all_missing = np.zeros(len(interfaces), np.int64)
-        self._written = np.zeros(len(interfaces), np.int64)
+        self._written_packets = np.zeros(len(interfaces), np.int64)
         self._start_ns = 0
         self._end_ns = 0
         self._out = np.empty(0, np.uint8)
@@ -123,7 +123,7 @@ class PcapngSection:
             events.size,
             pointer_to(data, "uint8_t *"),
             pointer_to(self._missing, "int64_t *"),
-            pointer_to(self._written, "int64_t *"),
+            pointer_to(self._written_packets, "int64_t *"),
             pointer_to(self._out, "uint8_t *"),
         )
         return self._out.data[:size]
@@ -144,7 +144,9 @@ class PcapngSection:
                 (_RECEIVED, struct.pack("<q", written + missing)),
                 (_DROPPED, struct.pack("<q", missing)),
             )
-            for index, (written, missing) in enumerate(zip(self._written, self._all_missing, strict=True))
+            for index, (written, missing) in enumerate(
+                zip(self._written_packets, self._all_missing, strict=True)
+            )
         )
 
 
@@ -204,7 +206,7 @@ class CaptureWriter:
         self._unreported = np.zeros(2 * len(specs), np.int64)
         self._received_events = 0
         self._missing_events = 0
-        self._written = 0
+        self._written_events = 0
         self._bytes = 0
         self._closed = False
         self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
@@ -214,13 +216,13 @@ class CaptureWriter:
     def missing_events(self) -> int:
         """Number of events that will not be in the file."""
         if self.error is not None:
-            return self._received_events - self._written
+            return self._received_events - self._written_events
         return self._missing_events
 
     @property
-    def written(self) -> int:
+    def written_events(self) -> int:
         """Number of events in the file."""
-        return self._written
+        return self._written_events
 
     def take(self, events: Events, data: Bytes) -> None:
         """Queue a copy of a batch; never waits."""
@@ -257,7 +259,7 @@ class CaptureWriter:
             while self.error is None and (batch := self._queue.get()) is not None:
                 self._section.miss(batch.missing)
                 self._write(self._section.packets(batch.events, batch.data))
-                self._written += batch.events.size
+                self._written_events += batch.events.size
             if self.error is None:
                 self._section.miss(self._unreported)
                 self._write(self._section.statistics())
@@ -268,19 +270,19 @@ class CaptureWriter:
 
     def _write(self, blocks: bytes | memoryview) -> None:
         view = memoryview(blocks)
-        written = 0
+        written_bytes = 0
         try:
-            while written < len(view):
-                size = os.write(self._file, view[written:])
-                written += size
+            while written_bytes < len(view):
+                size = os.write(self._file, view[written_bytes:])
+                written_bytes += size
                 self._bytes += size
         except OSError:
             with suppress(OSError):  # remove an incomplete block; a pipe cannot be truncated
-                os.ftruncate(self._file, os.lseek(self._file, 0, os.SEEK_CUR) - written)
+                os.ftruncate(self._file, os.lseek(self._file, 0, os.SEEK_CUR) - written_bytes)
             raise
 
     def _fail(self, reason: str) -> None:
-        self.error = f"{self._path}: the capture ends after {self._written} events: {reason}"
+        self.error = f"{self._path}: the capture ends after {self._written_events} events: {reason}"
 
 
 def _open(path: str | Path) -> int:

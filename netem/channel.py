@@ -108,7 +108,7 @@ class Channel:
         self._heap: Rows = np.zeros(0, dtype_of("noack_heap_entry"))
         self._delayed: CData = ffi.new("noack_delayed[]", 0)
         self._waiting: Rows = np.zeros(0, dtype_of("noack_waiting"))
-        self._taken: list[tuple[str, Rows]] = []
+        self._earlier_rows: list[tuple[str, Rows]] = []
         self._add_places(_PLACES)
         if (wrong := core.noack_channel_check(self.core)) != ffi.NULL:
             raise ValueError(f"network: {ffi.string(wrong).decode()}")
@@ -128,7 +128,7 @@ class Channel:
             self.decide(encode_message(self.core.asked.message))
         else:
             assert question == core.NOACK_ROWS_FULL
-            self._taken = self.take_rows()
+            self._earlier_rows = self.take_rows()
 
     def send(self, flow: int, number: int, size_bytes: int, now_ns: int) -> tuple[list[Departure], int]:
         """Take a packet of a flow; return what leaves at once, and the number of its copies.
@@ -162,11 +162,11 @@ class Channel:
 
     def take_rows(self) -> list[tuple[str, Rows]]:
         """Return all rows since the last call, in batches of a table in their order."""
-        channel, batches = self.core, self._taken
+        channel, batches = self.core, self._earlier_rows
         packets = self._packets[: channel.packet_count].view(PACKET_ROW).copy()
         releases = self._releases[: channel.release_count].copy()
         channel.packet_count = channel.release_count = 0
-        self._taken = []
+        self._earlier_rows = []
         return [*batches, (NETEM_PACKET, packets), (NETEM_RELEASE, releases)]
 
     def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:

@@ -25,7 +25,7 @@ _COMMANDS = ("show", "set", "watch", "shell")
 _EXAMPLE_LISTEN, _EXAMPLE_TO = ":9000", ":9001"
 """Addresses for --explain."""
 
-_NOWHERE = ("0.0.0.0", 0)
+_NO_ADDRESS = ("0.0.0.0", 0)
 _SHELL_EPILOG = """
 The command reaches the outside at the addresses in NOACK_OUTSIDE and NOACK_OUTSIDE6. As root, and
 in another shell, the outside is the present network namespace. Otherwise it is a new one, without
@@ -116,18 +116,18 @@ def command_line_parser() -> Parser:
     )
     add_options(parser)
     # An emulator on its own.
-    alone = parser.add_argument_group("links")
-    _add_words(alone, "clients", "server")
-    alone.add_argument(
+    links = parser.add_argument_group("links")
+    _add_words(links, "clients", "server")
+    links.add_argument(
         "--listen",
         metavar="HOST:PORT",
         help="address for the clients; "
         ":9000 is 127.0.0.1:9000, and 0.0.0.0:9000 or [::]:9000 is any address of this machine",
     )
-    alone.add_argument("--to", metavar="HOST:PORT", help="address of the server")
-    alone.add_argument("--links", metavar="FILE", type=Path, help="several links, from a TOML file")
-    alone.add_argument("--one-way", action="store_true", help="do not relay the server's answers")
-    alone.add_argument(
+    links.add_argument("--to", metavar="HOST:PORT", help="address of the server")
+    links.add_argument("--links", metavar="FILE", type=Path, help="several links, from a TOML file")
+    links.add_argument("--one-way", action="store_true", help="do not relay the server's answers")
+    links.add_argument(
         "--explain", action="store_true", help="explain the words, or the links of a file, and exit"
     )
     return parser
@@ -171,7 +171,7 @@ def shell_spec(options: argparse.Namespace) -> LinkSpec:
     """
     forward, reverse, seed = _directions(options)
     forward, reverse = (read_files(settings, Path()) for settings in (forward, reverse))
-    return LinkSpec(LINK_NAME, _NOWHERE, _NOWHERE, forward, reverse, seed, idle_s=_idle_s(options.idle))
+    return LinkSpec(LINK_NAME, _NO_ADDRESS, _NO_ADDRESS, forward, reverse, seed, idle_s=_idle_s(options.idle))
 
 
 def parse_options(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argparse.Namespace:

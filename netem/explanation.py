@@ -26,12 +26,14 @@ _NARROW_WIDTH, _WIDE_WIDTH = 20, 44
 """Minimum and maximum columns for words."""
 
 
-def explain(specs: Sequence[LinkSpec], written: Sequence[LinkSpec], *, as_json: bool, as_file: bool) -> None:
+def explain(
+    specs: Sequence[LinkSpec], as_written: Sequence[LinkSpec], *, as_json: bool, as_file: bool
+) -> None:
     """Print the effect of links' settings on standard output, as tables or as JSON.
 
     Args:
         specs: the links.
-        written: the same links, with the names of files instead of their content: what tables show.
+        as_written: the same links, with the names of files instead of their content: what tables show.
         as_json: JSON, with the content.
         as_file: tables have the links as a file of links instead of their names.
     """
@@ -50,7 +52,7 @@ def explain(specs: Sequence[LinkSpec], written: Sequence[LinkSpec], *, as_json: 
         print(json.dumps({"links": links}, indent=2))
         return
     console = Console(highlight=False)
-    for number, (spec, written_spec) in enumerate(zip(specs, written, strict=True)):
+    for number, (spec, written_spec) in enumerate(zip(specs, as_written, strict=True)):
         if number:
             console.print()
         if not as_file:

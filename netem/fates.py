@@ -134,10 +134,10 @@ class FateRecorder:
         self._pending_rows = 0
         self._max_waiting = max_waiting
         self._queue: SimpleQueue[StructRows | str | None] = SimpleQueue()
-        self._taken = 0
-        self._done = 0
-        self._missed = 0
-        self._unwritten = 0
+        self._queued_rows = 0
+        self._processed_rows = 0
+        self._missing_rows = 0
+        self._unwritten_rows = 0
         self._failed = False
         with suppress(OSError, ValueError), open_regular(path) as file:
             if file.read(len(_MAGIC)) not in (b"", _MAGIC):
@@ -165,12 +165,12 @@ class FateRecorder:
     @property
     def rows(self) -> int:
         """Number of rows in the file; valid after the context."""
-        return self._done - self._unwritten
+        return self._processed_rows - self._unwritten_rows
 
     @property
     def missing_events(self) -> int:
         """Number of events that are not in the trace."""
-        return self._missed + self._unwritten
+        return self._missing_rows + self._unwritten_rows
 
     def take(self, events: StructRows, data: Bytes) -> None:
         """Queue the arrivals; called in the relay's thread."""
@@ -179,17 +179,17 @@ class FateRecorder:
         except MemoryError:
             self.missing(len(events))
             return
-        if self._taken - self._done + len(rows) > self._max_waiting:
+        if self._queued_rows - self._processed_rows + len(rows) > self._max_waiting:
             self.missing(len(rows))
         elif len(rows):
-            self._taken += len(rows)
+            self._queued_rows += len(rows)
             self._queue.put(rows)
 
     def missing(self, events: int) -> None:
         """Count events for which the relay had no room; called in its thread."""
-        if self._missed == 0 and events:
+        if self._missing_rows == 0 and events:
             self._queue.put("events are missing: they arrive faster than they can be written")
-        self._missed += events
+        self._missing_rows += events
 
     def _run(self) -> None:
         while (item := self._queue.get()) is not None:
@@ -225,8 +225,8 @@ class FateRecorder:
             except OSError as error:
                 self._fail(error)
         if self._failed:
-            self._unwritten += rows
-        self._done += rows
+            self._unwritten_rows += rows
+        self._processed_rows += rows
 
     def _end(self) -> None:
         try:
@@ -234,7 +234,7 @@ class FateRecorder:
             self._writer.close()
         except OSError as error:
             self._fail(error)
-            self._unwritten = self._done
+            self._unwritten_rows = self._processed_rows
 
     def _fail(self, error: OSError) -> None:
         if not self._failed:

@@ -153,8 +153,8 @@ class LinkState:
         tables = StageTables(
             scored=any(getattr(impairment, "loss_correlation", 0) != 0 for impairment in settings.impairments)
         )
-        keyed = list(_stages(settings, tables, self._seed, self._name))
-        stage_array, stages = _stage_array(keyed), [stage for stage, *_ in keyed]
+        keyed_stages = list(_stages(settings, tables, self._seed, self._name))
+        stage_array, stages = _stage_array(keyed_stages), [stage for stage, *_ in keyed_stages]
         limits, windows = _loss_limits(settings)
         tracks = tracks or any(impairment.delays for impairment in settings.impairments)
         mansd = limits["mansd"]
@@ -162,7 +162,7 @@ class LinkState:
             "noack_link *",
             {
                 "stages": stage_array,
-                "stage_count": len(keyed),
+                "stage_count": len(keyed_stages),
                 "recorded_flows": len(self._decisions_begin) - 1,
                 "limit": settings.limit,
                 "tracks": tracks,
@@ -214,7 +214,7 @@ class _KeyedStage(NamedTuple):
 
 def stream_names(settings: LinkSettings, *name: str) -> list[tuple[str, ...]]:
     """Return the names of the random streams of a link's stages, in their order."""
-    return [keyed.stream for keyed in _stages(settings, StageTables(), 0, name)]
+    return [keyed_stage.stream for keyed_stage in _stages(settings, StageTables(), 0, name)]
 
 
 def _link_memory(link: CData) -> dict[str, AnyArray]:

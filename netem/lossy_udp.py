@@ -65,10 +65,10 @@ class LossyUdp:
             raise CallerError(f"seed {seed}: must be a whole number, 0 or more, below 2^64")
         listen_at = parse_address(_text(listen, "listen"), "listen")
         server = parse_destination(_text(to, "to"), "to", listen_at)
-        forward, backward = _settings(words, "words"), _settings(reverse, "reverse")
-        self._spec = LinkSpec(name, listen_at, server, forward, backward, seed)
-        self._opened: Future[tuple[CommandQueue, Address]] = Future()
-        self._ended: Snapshot | None = None
+        forward_settings, reverse_settings = _settings(words, "words"), _settings(reverse, "reverse")
+        self._spec = LinkSpec(name, listen_at, server, forward_settings, reverse_settings, seed)
+        self._opening: Future[tuple[CommandQueue, Address]] = Future()
+        self._last_snapshot: Snapshot | None = None
         self._stop = Event()
         self._thread = Thread(target=self._run, name=f"noack {name}", daemon=True)
 
@@ -78,7 +78,7 @@ class LossyUdp:
             raise CallerError(f"{self._spec.name}: it has ended; make a new one")
         if self._thread.ident is None:
             self._thread.start()
-        self._opened.result()
+        self._opening.result()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -146,29 +146,29 @@ class LossyUdp:
 
     def _statistics(self) -> LinkStatistics:
         commands, _ = self._running()
-        snapshot = commands.snapshot() if self._ended is None else self._ended
+        snapshot = commands.snapshot() if self._last_snapshot is None else self._last_snapshot
         return statistics(snapshot)["links"][0]
 
     def _running(self) -> tuple[CommandQueue, Address]:
         if self._thread.ident is None:
             raise CallerError(f"{self._spec.name}: not entered; with noack.LossyUdp(...) as link:")
-        return self._opened.result()
+        return self._opening.result()
 
     def _run(self) -> None:
         """Relay until the context ends; all of the relay is used in this thread."""
         try:
             relay = Relay([self._spec])
         except OSError as error:  # e.g. too many open files
-            self._opened.set_exception(CallerError(f"{self._spec.name}: {why(error)}"))
+            self._opening.set_exception(CallerError(f"{self._spec.name}: {why(error)}"))
             return
         except BaseException as error:  # raised where the context is entered
-            self._opened.set_exception(error)
+            self._opening.set_exception(error)
             return
         commands = CommandQueue(relay)
         try:
-            self._opened.set_result((commands, relay.addresses()[self._spec.name]))
+            self._opening.set_result((commands, relay.addresses()[self._spec.name]))
             relay.run(self._stop.is_set, commands.run_pending)
-            self._ended = commands.snapshot_here()
+            self._last_snapshot = commands.snapshot_here()
         finally:
             commands.close()
             relay.close()

@@ -90,12 +90,12 @@ class RunNetwork:
         relay.spin_ns = spin_ns
         self.set_clock(clock)
         self._memory.sockets["fd"][1] = sender.fileno()
-        for number, endpoint in zip((0, self._memory.first_path), receivers.values(), strict=False):
+        for place, endpoint in zip((0, self._memory.first_path), receivers.values(), strict=False):
             stamp_arrivals(endpoint)
             if len(receivers) == 1:
-                self._memory.wait_for_only(endpoint.fileno(), number, set_receive_timeout(endpoint))
+                self._memory.wait_for_only(endpoint.fileno(), place, set_receive_timeout(endpoint))
             else:
-                self._memory.watch(endpoint.fileno(), number)
+                self._memory.watch(endpoint.fileno(), place)
         core.noack_relay_read_stamps(relay)
         self._sensor, name_bytes = packed_name(next(iter(receivers)))
         clients["name_bytes"][: self._loops] = name_bytes
@@ -130,8 +130,8 @@ class RunNetwork:
 
     def handle(self, message: Datagram, now_ns: int) -> Sequence[Record]:
         """Process a datagram as if it had been received now; return its rows."""
-        number = self._memory.first_path if message.flow >= self._loops else 0
-        core.noack_relay_add_datagram(self._relay, number, self._sensor, message.data, len(message.data))
+        place = self._memory.first_path if message.flow >= self._loops else 0
+        core.noack_relay_add_datagram(self._relay, place, self._sensor, message.data, len(message.data))
         return self.on_timer(now_ns)
 
     def on_timer(self, now_ns: int) -> Sequence[Record]:
@@ -235,7 +235,7 @@ class NetworkChannel(CountingSockets):
         destinations = [destination for _, destination in routes]
         super().__init__(endpoint, destinations, list(self._directions))
         self._loops = loops
-        self._foreign = self._of_no_loop = 0
+        self._unknown_sources = self._of_no_loop = 0
         self._network, self._passed_on = network, [0, 0]
         receivers = dict(zip(self._directions, self.peer_sockets, strict=True))
         network.open(clock, self.senders[0], receivers, destinations, spin_ns)
@@ -245,7 +245,7 @@ class NetworkChannel(CountingSockets):
         direction = self._directions.get(source[:2])
         loop = loop_number(data)
         if direction is None:
-            self._foreign += 1
+            self._unknown_sources += 1
         elif loop is None or loop >= self._loops:
             self._of_no_loop += 1
         else:
@@ -260,7 +260,10 @@ class NetworkChannel(CountingSockets):
         for source, direction in self._directions.items():
             received = network.received[direction] - self._passed_on[direction]
             self.count_received(source, received)
-        rejected = {"source": self._foreign + network.refused, "loop": self._of_no_loop + network.of_no_loop}
+        rejected = {
+            "source": self._unknown_sources + network.refused,
+            "loop": self._of_no_loop + network.of_no_loop,
+        }
         return super().report() | {
             "sent": network.sent,
             "send_errors": errors_by_text(network.send_errors),

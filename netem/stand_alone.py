@@ -30,7 +30,7 @@ from netem.relay_watch import add_watching_options, check_watching_options, watc
 from noack.core.errors import CallerError, ExitStatus, MachineError, NoackError, why
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import address_text
-from noack.runtime.command_line import Signals, failed, log_event, log_format
+from noack.runtime.command_line import Signals, log_event, log_format, report_failure
 from noack.runtime.drivers.realtime_settings import realtime
 
 _FIFO_PRIORITY = 50
@@ -96,14 +96,14 @@ def run_stand_alone(arguments: Sequence[str]) -> ExitStatus:
     options = parse_options(parser, arguments)
     specs = specs_of(options)
     if options.explain:
-        written = specs_of(options, read=False)
-        explain(specs, written, as_json=options.json, as_file=options.links is None)
+        specs_as_written = specs_of(options, read=False)
+        explain(specs, specs_as_written, as_json=options.json, as_file=options.links is None)
         return ExitStatus.OK
     with log_format(options.log_format):
         try:
             totals = relay(specs, options)
         except NoackError as error:  # reported in the format of the log
-            return failed(str(error), error.exit_status, source="noack netem", as_json=options.json)
+            return report_failure(str(error), error.exit_status, source="noack netem", as_json=options.json)
         report_totals(totals, options)
     return ExitStatus.UNINTENDED_LOSSES if unintended_losses(totals) else ExitStatus.OK
 
@@ -150,13 +150,15 @@ def relay(
             devices = None if program is None else program.devices
             raise_file_limit()
             try:
-                opened = Relay(specs, segment=options.segment, taps=taps, spin_ns=spin_ns, devices=devices)
+                open_relay = Relay(
+                    specs, segment=options.segment, taps=taps, spin_ns=spin_ns, devices=devices
+                )
             except OSError as error:  # no IPv6, or too many open files
                 raise MachineError(f"the sockets of the links cannot be opened: {why(error)}") from None
-            stack.callback(opened.close)
+            stack.callback(open_relay.close)
             # Signals stay handled until all files are complete.
             signals = last.enter_context(Signals().handled())
-            side = stack.enter_context(watch_relay(opened, options))
+            side = stack.enter_context(watch_relay(open_relay, options))
             running = nullcontext(lambda: False) if program is None else program.running(signals)
             has_ended = stack.enter_context(running)
         for setting, answer in stack.enter_context(realtime(options.realtime, _FIFO_PRIORITY)).items():
@@ -165,8 +167,8 @@ def relay(
         takes_output = options.view or (options.stats is not None and options.stats_file is None)
         if program is None:
             is_free = options.capture != "-" and not takes_output
-            _report_ready(opened, print_it=is_free, as_json=options.json)
-        opened.run(
+            _report_ready(open_relay, print_it=is_free, as_json=options.json)
+        open_relay.run(
             lambda: side.quit_requested or signals.received is not None or has_ended(),
             side.commands.run_pending,
         )
@@ -227,20 +229,20 @@ def _capture(path: str, specs: Sequence[LinkSpec]) -> Iterator[Tap]:
             report_line(f"the capture lacks {writer.missing_events} events")
 
 
-def _report_ready(opened: Relay, *, print_it: bool, as_json: bool) -> None:
+def _report_ready(open_relay: Relay, *, print_it: bool, as_json: bool) -> None:
     """Report on standard error that the relay runs, when Ctrl-C is handled already.
 
     ``print_it``: also print a line on standard output that other programs can wait for.
     """
-    listen = {name: address_text(address) for name, address in opened.addresses().items()}
-    for spec in opened.specs:
-        name = f" ({spec.name})" if len(opened.specs) > 1 else ""
+    listen = {name: address_text(address) for name, address in open_relay.addresses().items()}
+    for spec in open_relay.specs:
+        name = f" ({spec.name})" if len(open_relay.specs) > 1 else ""
         report_line(f"{listen[spec.name]} → {address_text(spec.to)}{name}, Ctrl-C ends")
     line = f"ready: listening on {', '.join(listen.values())}"
     if as_json:
         links = [
             {"name": spec.name, "listen": listen[spec.name], "to": address_text(spec.to)}
-            for spec in opened.specs
+            for spec in open_relay.specs
         ]
         line = json.dumps({"ready": links})
     if print_it and sys.stdout is not None:

@@ -36,7 +36,7 @@ _CLAUSES = {
 _SETTINGS = {"mansd": "mansd", "first": "first_delivered", "limit": "limit"}
 KEYWORDS = (*_CLAUSES, *_SETTINGS, "seed")
 """Words that begin a clause."""
-_WORDS = [word for kind in _KINDS for clause in kind.clauses for word in clause.described()]
+_WORDS = [word for kind in _KINDS for clause in kind.clauses for word in clause.list_words()]
 _AFTER = {
     word.name: ", or after ".join(same_word.preceding for same_word in _WORDS if same_word.name == word.name)
     for word in _WORDS
@@ -54,7 +54,7 @@ GRAMMAR = [
     word.grammar
     for kind in IMPAIRMENTS
     for clause in kind.clauses
-    for word in clause.described()
+    for word in clause.list_words()
     if word.grammar
 ]
 """The words of each impairment, for ``--help``."""

@@ -141,8 +141,8 @@ def watchdog_notice(watchdog: Watchdog, note: CData) -> Notice:
         text = f"actuations arrive again; there was none in time for {lasted_s:.4g} s"
         return Notice(t_ns, "watchdog", text)
     age_s, timeout_s = ((ns / NS_PER_S) for ns in (t_ns - newest_ns, watchdog.timeout_ns))
-    none = note["newest_sequence"] == NO_SEQUENCE
-    what = "no actuation for" if none else "the newest actuation is too old:"
+    has_none = note["newest_sequence"] == NO_SEQUENCE
+    what = "no actuation for" if has_none else "the newest actuation is too old:"
     name = INPUT_NAMES[watchdog.policy]
     text = f"{what} {age_s:.4g} s, {timeout_s:.4g} s allowed; the input is {name}"
     return Notice(t_ns, "watchdog", text)

@@ -148,25 +148,27 @@ class Sensor(MachinePart):
     @property
     def shape(self) -> RecordShape:
         """The sizes of the rows."""
-        observed = (0, 0) if self.observer is None else (self.observer.p, self.observer.reported)
+        outputs, inputs_reported = (
+            (0, 0) if self.observer is None else (self.observer.p, self.observer.reported)
+        )
         return RecordShape(
             len(self.H),
             self.inputs,
             acknowledged=self.timeout_ns is not None,
-            outputs=observed[0],
-            inputs_reported=observed[1],
+            outputs=outputs,
+            inputs_reported=inputs_reported,
         )
 
     def fill(self, sensor: CData, memory: CoreMemory) -> None:
         """Fill a ``noack_sensor`` at its start."""
-        n, own, steps_ns = len(self.H), self.observer, (self.period_ns or 0,)
+        n, observer, steps_ns = len(self.H), self.observer, (self.period_ns or 0,)
         self._memory = memory
         set_machine(
             sensor.machine,
             n=n,
             m=self.inputs,
             flow=Flow.MEASUREMENT,
-            entries=n if own is None else own.p + own.reported,
+            entries=n if observer is None else observer.p + observer.reported,
             first_number=self.first_number,
             horizon_ns=self.horizon_ns,
         )
@@ -183,8 +185,8 @@ class Sensor(MachinePart):
         sensor.trigger.auxiliary = sensor.rule.initial
         if self.timeout_ns is not None:
             self._make_room(sensor, _SENT_PLACES)
-        if own is not None:
-            own.fill(sensor, memory)
+        if observer is not None:
+            observer.fill(sensor, memory)
         if self.x0 is not None:
             self._start(sensor, 0, self.x0)
 
@@ -314,11 +316,11 @@ def sensors_of(
 
 def _part(start: Start, resolved: Scenario) -> Sensor:
     loop, acknowledges = loop_of(resolved), resolved.protocol.acknowledges
-    known = resolved.network.initial_sync == "known_state" and not start.is_restart
+    starts_from_x0 = resolved.network.initial_sync == "known_state" and not start.is_restart
     return Sensor(
         loop.H,
         policy_of(resolved),
-        loop.x0 if known else None,
+        loop.x0 if starts_from_x0 else None,
         inputs=loop.m,
         period_ns=resolved.timing.measurement_period_ns,
         first_number=start.first_number,

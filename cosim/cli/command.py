@@ -25,7 +25,7 @@ from cosim.cli.pipe_safe_streams import ignore_broken_pipes
 from cosim.lazy_modules import lazy_modules
 from noack.core.errors import ExitStatus, NoackError, plain_mistake, printable, why
 from noack.core.system_processes import exhausted_limit
-from noack.runtime.command_line import StopRequestError, failed, stop_requests_raised
+from noack.runtime.command_line import StopRequestError, report_failure, stop_requests_raised
 
 with lazy_modules():
     from importlib import metadata
@@ -93,10 +93,10 @@ class Program(TyperGroup):
         except typer.TyperException as error:
             status = ExitStatus.CALLER
             if message := self._line(error, words):
-                failed(message, status, source=NAME, as_json="--json" in words)
+                report_failure(message, status, source=NAME, as_json="--json" in words)
         except OSError as error:  # help is written to a full disk
             text, as_json = f"cannot write: {why(error)}", "--json" in words
-            status = failed(text, ExitStatus.FAILED, source=NAME, as_json=as_json)
+            status = report_failure(text, ExitStatus.FAILED, source=NAME, as_json=as_json)
         if standalone_mode:
             sys.exit(int(status or 0))
         return status
@@ -306,7 +306,7 @@ def _status_of(call: Callable[[], int | None], *, as_json: bool) -> int:
         if reason is None:
             raise
         line, status = reason, ExitStatus.FAILED
-    return int(failed(line, status, source=NAME, as_json=as_json))
+    return int(report_failure(line, status, source=NAME, as_json=as_json))
 
 
 def _describe_options(described: Any) -> tuple[str, list[tuple[str, str]]]:

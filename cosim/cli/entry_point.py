@@ -8,7 +8,7 @@ from contextlib import ExitStack, closing, suppress
 from cosim.lazy_modules import lazy_modules
 from noack.core.errors import NoackError
 from noack.core.system_processes import exhausted_limit
-from noack.runtime.command_line import failed, stoppable_imports
+from noack.runtime.command_line import report_failure, stoppable_imports
 
 with lazy_modules():
     from cosim.cli import command
@@ -31,11 +31,11 @@ def run() -> None:
             command.register_commands(*(words or _completed_words())[:1])
             command.run_program(server)  # a command handles signals itself
         except NoackError as error:
-            sys.exit(failed(str(error), error.exit_status, source="noack", as_json=as_json))
+            sys.exit(report_failure(str(error), error.exit_status, source="noack", as_json=as_json))
         except Exception as error:
             if (line := exhausted_limit(error)) is None:
                 raise
-            sys.exit(failed(line, NoackError.exit_status, source="noack", as_json=as_json))
+            sys.exit(report_failure(line, NoackError.exit_status, source="noack", as_json=as_json))
 
 
 def _completed_words() -> list[str]:

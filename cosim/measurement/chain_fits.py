@@ -60,10 +60,10 @@ class ChainRates(NamedTuple):
     def matrices(self) -> tuple[Reals, Reals, Reals]:
         """Return π, (2,), D₀ and D₁, (2, 2)."""
         p, r = self.good_to_bad, self.bad_to_good
-        moves = np.array([[1 - p, p], [r, 1 - r]])
+        transitions = np.array([[1 - p, p], [r, 1 - r]])
         lost = np.array([self.loss_in_good, self.loss_in_bad])
         start = np.array([1 - self.share_bad, self.share_bad])
-        return start, moves * (1 - lost), moves * lost
+        return start, transitions * (1 - lost), transitions * lost
 
     def survival(self, *, lost: bool) -> Callable[[Reals], Reals]:
         """Return ℓ → P(length ≥ ℓ) of loss bursts, or of the deliveries between them."""
@@ -115,11 +115,11 @@ class LossLikelihood:
         """Return those of several chains, (j,), whose probabilities are the rows of (j, 4)."""
         to_bad, to_good, *losses = rates.T
         lost = np.array(losses)
-        moves = np.array([[1 - to_bad, to_bad], [to_good, 1 - to_good]])
+        transitions = np.array([[1 - to_bad, to_bad], [to_good, 1 - to_good]])
         start = np.array([to_good, to_bad]) / (to_bad + to_good)
         # A factor for each stretch of deliveries and the burst after it, apart from its scale.
-        log_delivering, delivering = _powers(moves * (1 - lost), self._deliveries.astype(float))
-        log_losing, losing = _powers(moves * lost, self._losses.astype(float))
+        log_delivering, delivering = _powers(transitions * (1 - lost), self._deliveries.astype(float))
+        log_losing, losing = _powers(transitions * lost, self._losses.astype(float))
         log_loss, loss = log_losing[:, self._loss_of], losing[..., self._loss_of]
         if self._left_out is not None:
             log_loss = np.where(self._left_out, 0.0, log_loss)

@@ -36,7 +36,7 @@ from noack.runtime.spool import (
     SPOOL,
     SpoolBatch,
     SpoolWriter,
-    chunks_of,
+    batches_of_file,
     kept_run_name,
     notices_of,
     writer_of,
@@ -44,7 +44,7 @@ from noack.runtime.spool import (
 from noack.scenario.resolution import run_tables
 from noack.scenario.scenario_file import MOST_RECORDED_BYTES, load
 
-_MOST_CHUNK_BYTES = 64 * 2**20
+_MOST_BATCH_BYTES = 64 * 2**20
 """A process keeps no more in memory before it writes a batch."""
 
 T = TypeVar("T")
@@ -173,7 +173,7 @@ def _batches(path: Path, name: str) -> Iterator[SpoolBatch]:
     descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     with os.fdopen(descriptor, "rb") as file:
         try:
-            yield from chunks_of(file, most_bytes=_MOST_CHUNK_BYTES)
+            yield from batches_of_file(file, most_bytes=_MOST_BATCH_BYTES)
         except ValueError as error:
             raise PeerError(f"{name} has {error}") from None
 

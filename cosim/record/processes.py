@@ -21,7 +21,7 @@ from noack.core.file_access import write_whole
 from noack.protocol.record_tables import OWNER, network_tables
 from noack.protocol.roles import GENERATION, LOOP_ROLES
 from noack.runtime.control_messages import ProcessReport, parse_message
-from noack.runtime.spool import KEPT_REPORT, SPOOL, read_chunks
+from noack.runtime.spool import KEPT_REPORT, SPOOL, read_batches
 
 _EARLIER = "earlier"
 Report = dict[str, Any]
@@ -65,7 +65,7 @@ def add_kept_reports(run_dir: Path) -> None:
     reports += [content[role] for role in LOOP_ROLES if isinstance(content.get(role), dict)]
     instances = {report.get("instance") for report in reports}
     new_reports = []
-    for _, text in read_chunks(run_dir / SPOOL, KEPT_REPORT):
+    for _, text in read_batches(run_dir / SPOOL, KEPT_REPORT):
         with contextlib.suppress(PeerError):  # damaged
             report = parse_message(ProcessReport, text).fields()
             if report.get("process") in LOOP_ROLES and report.get("instance") not in instances:

@@ -15,27 +15,28 @@ static const noack_reception *reception_of(const noack_input_replay *replay, int
     return kind == NOACK_ACKNOWLEDGEMENTS ? &machine->acknowledgements : &machine->received;
 }
 
-static const char *check_table(const noack_input_replay *replay, const noack_recorded_table *own) {
-    if (!is_between(NOACK_TICKS, own->kind, NOACK_SETTINGS) || own->count < 0)
+static const char *check_table(
+    const noack_input_replay *replay, const noack_recorded_table *table) {
+    if (!is_between(NOACK_TICKS, table->kind, NOACK_SETTINGS) || table->count < 0)
         return "a recorded table has an unknown kind, or a negative length";
-    if (own->kind == NOACK_SETTINGS || own->count == 0)
+    if (table->kind == NOACK_SETTINGS || table->count == 0)
         return NULL;
-    if (!is_between(NOW + 8, own->row_bytes, (int64_t)sizeof replay->replayed))
+    if (!is_between(NOW + 8, table->row_bytes, (int64_t)sizeof replay->replayed))
         return "the rows of a recorded table are too short or too long";
     int is_network = replay->role == NOACK_NETWORK;
-    if (is_network && own->kind == NOACK_MESSAGES && own->row_bytes != sizeof(noack_packet_row))
+    if (is_network && table->kind == NOACK_MESSAGES && table->row_bytes != sizeof(noack_packet_row))
         return "a row of a packet has another size";
-    if (is_network || own->kind == NOACK_TICKS)
+    if (is_network || table->kind == NOACK_TICKS)
         return NULL;
     int64_t entries = 0;
     for (int i = 0; i < 3; i++) {
-        const noack_columns *columns = &own->vector[i];
+        const noack_columns *columns = &table->vector[i];
         if (!is_between(0, columns->entries, NOACK_MAX_ENTRIES)
-            || !is_between(0, columns->begin, own->row_bytes - 8 * columns->entries))
+            || !is_between(0, columns->begin, table->row_bytes - 8 * columns->entries))
             return "the vector of a message is not in its row";
         entries += columns->entries;
     }
-    if (entries != reception_of(replay, own->kind)->entries)
+    if (entries != reception_of(replay, table->kind)->entries)
         return "a recorded message has another size than the machine receives";
     return NULL;
 }

@@ -9,7 +9,7 @@
 
 #include "../loop/loop.h"
 
-static const double LARGEST = 1e100; /* a state above this norm counts as diverged */
+static const double DIVERGED_NORM = 1e100; /* a state above this norm counts as diverged */
 enum { LAST_STEP = 1 << 30 };
 
 static int covers(const noack_signal *signal, int64_t last) {
@@ -50,17 +50,17 @@ static void load(noack_segments *segments, int64_t run) {
     noack_sensor *sensor = segments->sensor;
     noack_controller *controller = segments->controller;
     int64_t n = plant->machine.n, m = plant->machine.m, step = segments->step[run];
-    int64_t every = plant->measure_every, begun = max_of(step, 0);
-    int64_t t_ns = begun * plant->machine.period_ns;
+    int64_t measure_every = plant->measure_every, first_step = max_of(step, 0);
+    int64_t t_ns = first_step * plant->machine.period_ns;
     copy(n, segments->x + run * n, plant->x);
     copy(m, segments->u + run * m, plant->u);
     copy(m, segments->u_next + run * m, plant->inputs);
     if (plant->reports_inputs)
-        memset(plant->recent_inputs, 0, (size_t)(every * m) * sizeof *plant->recent_inputs);
+        memset(plant->recent_inputs, 0, (size_t)(measure_every * m) * sizeof *plant->recent_inputs);
     plant->newest_ns = t_ns;
     plant->machine.step = step + 1;
-    plant->measurements = step < 0 ? 0 : step / every + 1;
-    noack_disturb(plant, begun);
+    plant->measurements = step < 0 ? 0 : step / measure_every + 1;
+    noack_disturb(plant, first_step);
     copy(n, segments->x_s + run * n, sensor->x_s);
     copy(n, segments->y + run * n, sensor->x);
     sensor->model_ns = t_ns;
@@ -69,7 +69,8 @@ static void load(noack_segments *segments, int64_t run) {
     noack_trigger_start(&sensor->rule, &sensor->trigger, n, t_ns, sensor->x_s, sensor->scratch + n);
     if (segments->gains != NULL) {
         copy(n, segments->y + run * n, sensor->observer.x);
-        sensor->observer.t_ns = step < 0 ? -1 : t_ns - step % every * plant->machine.period_ns;
+        sensor->observer.t_ns =
+            step < 0 ? -1 : t_ns - step % measure_every * plant->machine.period_ns;
     }
     copy(n, segments->x_c + run * n, controller->x_c);
     controller->model_ns = t_ns;
@@ -139,11 +140,11 @@ static void control(noack_segments *segments, int64_t run, int64_t step, noack_o
 static int64_t measure(
     noack_segments *segments, int64_t run, int64_t step, int64_t tests, noack_output *output) {
     noack_sensor *sensor = segments->sensor;
-    int64_t n = sensor->machine.n, number = step / segments->plant->measure_every;
+    int64_t n = sensor->machine.n, measurement = step / segments->plant->measure_every;
     double *error = segments->scratch, *image = error + n;
     if (segments->gains != NULL)
         sensor->observer.gain =
-            (double *)segments->gains + number * n * sensor->observer.p; /* not written */
+            (double *)segments->gains + measurement * n * sensor->observer.p; /* not written */
     noack_message message;
     copy_message(&message, &output->message);
     sensor->is_user = sensor->machine.answered = !tests;
@@ -179,7 +180,7 @@ static void follow_one(
         step++;
         noack_plant_tick(plant, step * plant->machine.period_ns, output, &note);
         double size = noack_norm(n, plant->x);
-        if (!(size < LARGEST)) {
+        if (!(size < DIVERGED_NORM)) {
             segments->error[run] = segments->state[run] = segments->cost[run] = INFINITY;
             break;
         }

@@ -177,12 +177,12 @@ void take_datagrams(noack_driver *driver) {
     scratch->in_next = scratch->in_end = 0;
     /* One place is left for a datagram that Python adds. */
     while (scratch->message_next < scratch->message_end && scratch->in_end < BUFFERS - 1) {
-        int64_t number = scratch->message_next, all_bytes = scratch->in_headers[number].msg_len;
+        int64_t message = scratch->message_next, all_bytes = scratch->in_headers[message].msg_len;
         int64_t size_bytes =
-            min_of(segment_bytes(&scratch->in_headers[number]), all_bytes - scratch->taken_bytes);
-        const uint8_t *name = scratch->in_names[number];
+            min_of(segment_bytes(&scratch->in_headers[message]), all_bytes - scratch->taken_bytes);
+        const uint8_t *name = scratch->in_names[message];
         scratch->arrivals[scratch->in_end++] =
-            (arrival){scratch->in_data[number] + scratch->taken_bytes, size_bytes, name};
+            (arrival){scratch->in_data[message] + scratch->taken_bytes, size_bytes, name};
         scratch->taken_bytes += size_bytes;
         int64_t source = 0;
         while (source < 2 && !is_peer(name, &driver->sources[source]))
@@ -192,7 +192,7 @@ void take_datagrams(noack_driver *driver) {
         else
             driver->unknown_source++;
         if (scratch->taken_bytes == all_bytes) {
-            renew_header(scratch, number);
+            renew_header(scratch, message);
             scratch->taken_bytes = 0;
             scratch->message_next++;
         }
@@ -207,10 +207,10 @@ void receive_datagrams(noack_driver *driver, int64_t ready) {
         int64_t most = min_of(scratch->batch, MESSAGES - 1 - scratch->message_end);
         if (!(ready >> k & 1) || most == 0)
             continue;
-        int64_t taken =
+        int64_t received =
             call_receive(scratch, (int)driver->receivers[k], scratch->message_end, most);
-        scratch->message_end += max_of(taken, 0);
-        scratch->has_more |= taken == most;
+        scratch->message_end += max_of(received, 0);
+        scratch->has_more |= received == most;
     }
     scratch->first ^= 1;
     take_datagrams(driver);

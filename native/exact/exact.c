@@ -147,9 +147,9 @@ typedef struct { /* the free part of the scratch, which is 0 */
 } free_scratch;
 
 static double *take(free_scratch *scratch, int64_t count) {
-    double *taken = scratch->next;
+    double *numbers = scratch->next;
     scratch->next += count;
-    return taken;
+    return numbers;
 }
 
 /* Take a matrix, or NULL for NULL. */
@@ -157,9 +157,9 @@ static double *take_square(free_scratch *scratch, int64_t n, const double *matri
     if (matrix == NULL)
         return NULL;
     int64_t stride = scratch->code->stride;
-    double *taken = take(scratch, scratch->code->n * stride);
-    pad(n, n, matrix, stride, taken);
-    return taken;
+    double *padded = take(scratch, scratch->code->n * stride);
+    pad(n, n, matrix, stride, padded);
+    return padded;
 }
 
 typedef struct { /* P and N of a rule's form, (rows, 2n) */

@@ -47,8 +47,8 @@ static inline curve_point evaluate(
 /* |y|^2 - (c e^(-rs))^2 and its derivatives: for Halley's method, in place of h, which has a square
    root and the same sign. */
 static inline search_point look_at_square(const void *curve, const level_search *search, double s) {
-    const vector_curve *own = curve;
-    curve_point at = evaluate(own->c, own->p, search, s);
+    const vector_curve *vector = curve;
+    curve_point at = evaluate(vector->c, vector->p, search, s);
     double level = level_at(search, s), square = level * level, rate = search->rate;
     return (search_point){
         s, dot(at.y, at.y) - square, 2.0 * (dot(at.y, at.dy) + rate * square),
@@ -77,7 +77,7 @@ typedef enum { UNKNOWN, LIKELY, ENDS_BELOW } forecast; /* of a crossing; or that
 static double first_exit(
     const double *curve, int p, const level_search *search, forecast crossing, int most_steps) {
     const double ahead = 3.0, nearer = 0.6;
-    vector_curve own = {curve, p};
+    vector_curve vector = {curve, p};
     double rate = search->rate, end_s = search->end_s, s = 0.0, ahead_s = end_s;
     if (crossing != LIKELY) {
         double lowest = level_at(search, end_s);
@@ -101,7 +101,7 @@ static double first_exit(
                 size > 0.0 ? speed - radial * radial + dot(at.y, at.ddy) : dot(at.dy, at.ddy);
             double curvature = turned / (size > 0.0 ? size : radial) - rate * rate * level;
             search_point start = {s, size - level, slope, curvature};
-            s = ascend(look_at_square, &own, search, start, ahead_s);
+            s = ascend(look_at_square, &vector, search, start, ahead_s);
             if (s != NONE || ahead_s == end_s)
                 return s;
             s = ahead_s;

@@ -9,9 +9,9 @@
 #include "piece_measures.h"
 #include "quadratic_crossing.h"
 
-enum { MOST_PIECES = 1000000 };      /* of a run */
-static const double LARGEST = 1e100; /* a state above this norm counts as diverged */
-static const double SLOWEST = 2.0;   /* largest l s on a piece, l the decay rate of eta */
+enum { MOST_PIECES = 1000000 };            /* of a run */
+static const double DIVERGED_NORM = 1e100; /* a state above this norm counts as diverged */
+static const double SLOWEST = 2.0;         /* largest l s on a piece, l the decay rate of eta */
 /* Length of the first search after an event, in units of the time that the error would need by its
    first coefficients. */
 static const double LOOK_AHEAD = 1.05;
@@ -36,7 +36,7 @@ typedef struct { /* whether r, d and q move; whether d and q differ from 0 */
 
 /* Write the coefficients. kinds is a constant, and each has code of its own. */
 static inline __attribute__((always_inline)) void expand_kinds(
-    exact_memory *memory, loop_state state, expansion wanted, curve_kinds kinds) {
+    exact_memory *memory, loop_state state, expansion range, curve_kinds kinds) {
     const int moves = kinds.moves, has_d = kinds.has_d, has_q = kinds.has_q;
     const double *H_k = memory->H_k, *A_k = memory->A_k, *X_k = memory->X_k, *D_k = memory->D_k;
     const double *KH_k = memory->KH_k, *weight = memory->weight;
@@ -44,7 +44,7 @@ static inline __attribute__((always_inline)) void expand_kinds(
     double *us = memory->u, *errors = memory->own_error, *weighted = memory->own_weighted;
     lanes x_c = has_q ? subtract(state.r, state.q) : state.r;
     int quadratic = memory->quadratic;
-    for (int k = wanted.begin; k <= wanted.end; k++) {
+    for (int k = range.begin; k <= range.end; k++) {
         int table = k * N * STRIDE, at = k * STRIDE;
         lanes r = filled(0.0), d = r, q = r, e = times(X_k + table, state.r);
         e = add(times(A_k + table, state.e), e);
@@ -70,30 +70,30 @@ static inline __attribute__((always_inline)) void expand_kinds(
             store(errors + at, weigh(weight, e_s));
         if (quadratic) {
             int64_t place = at * memory->blocks;
-            put_rows(memory->form.rows, memory->blocks, x, e_s, wanted.factor, memory->y + place);
+            put_rows(memory->form.rows, memory->blocks, x, e_s, range.factor, memory->y + place);
             if (memory->dynamic)
                 put_rows(
-                    memory->gain.rows, memory->blocks, x, e_s, wanted.factor, memory->w + place);
+                    memory->gain.rows, memory->blocks, x, e_s, range.factor, memory->w + place);
         }
     }
 }
 
-static void expand(exact_memory *memory, const loop_state *state, expansion wanted) {
-    int own = memory->weight != NULL || memory->has_q;
-    memory->weighted = own ? memory->own_weighted : memory->e;
+static void expand(exact_memory *memory, const loop_state *state, expansion range) {
+    int is_weighted = memory->weight != NULL || memory->has_q;
+    memory->weighted = is_weighted ? memory->own_weighted : memory->e;
     memory->error = memory->has_d ? memory->own_error : memory->weighted;
     if (memory->has_q && !memory->has_D_k) {
         driven(memory->A, memory->minus_BK, memory->H_k, memory->D_k);
         memory->has_D_k = 1;
     }
     if (memory->has_q)
-        expand_kinds(memory, *state, wanted, (curve_kinds){1, 1, 1});
+        expand_kinds(memory, *state, range, (curve_kinds){1, 1, 1});
     else if (memory->is_static)
-        expand_kinds(memory, *state, wanted, (curve_kinds){0, 1, 0});
+        expand_kinds(memory, *state, range, (curve_kinds){0, 1, 0});
     else if (memory->has_d)
-        expand_kinds(memory, *state, wanted, (curve_kinds){1, 1, 0});
+        expand_kinds(memory, *state, range, (curve_kinds){1, 1, 0});
     else
-        expand_kinds(memory, *state, wanted, (curve_kinds){1, 0, 0});
+        expand_kinds(memory, *state, range, (curve_kinds){1, 0, 0});
 }
 
 /* The same state with the plant's own as the reference, if that is small beside the present one:
@@ -194,17 +194,19 @@ static int measure_supremum(exact_memory *memory, exact_run *run, const piece *d
         .growth = run->growth,
     };
     run->growth = fades ? growth_at(exact, end_s) : norm.growth;
-    double grown = end_s <= exact->fading_until_s ? run->growth
-                                                  : norm.growth * fixed_exp(norm.rate * norm.end_s);
-    double before = run->row->sup_e_c_scaled, at_s = norm.end_s, ceiling = INFINITY;
+    double end_growth = end_s <= exact->fading_until_s
+                            ? run->growth
+                            : norm.growth * fixed_exp(norm.rate * norm.end_s);
+    double earlier_sup = run->row->sup_e_c_scaled, at_s = norm.end_s, ceiling = INFINITY;
     if (done->bound != NULL)
-        ceiling = done->bound->threshold * (done->bound->rate_per_s > 0.0 ? norm.growth : grown);
-    double best = largest_of(before, size_of(last) * grown);
+        ceiling =
+            done->bound->threshold * (done->bound->rate_per_s > 0.0 ? norm.growth : end_growth);
+    double best = largest_of(earlier_sup, size_of(last) * end_growth);
     if (!(ceiling <= best * (1.0 + CERTAINTY)))
         best = raise_supremum(memory, &norm, best, &at_s);
     if (best == UNRESOLVED)
         return 0;
-    run->at_s = best > before ? done->t_s + at_s : run->at_s;
+    run->at_s = best > earlier_sup ? done->t_s + at_s : run->at_s;
     run->row->sup_e_c_scaled = best;
     return 1;
 }
@@ -381,7 +383,7 @@ static double auxiliary_at(
 static int has_diverged(const rule_phase *phase, loop_state state, double s) {
     int is_usual = phase->threshold > 1e-10 && phase->rate_per_s * s < 1.0;
     return !(is_usual && is_within(state, 1e30, 1.0))
-           && !is_within(state, LARGEST, threshold_after(phase, s));
+           && !is_within(state, DIVERGED_NORM, threshold_after(phase, s));
 }
 
 /* Follow a run over a piece: to its next event, or as far as its polynomials and the phase of its
@@ -396,7 +398,7 @@ follow_piece(exact_memory *memory, exact_run *run, progress *now) {
     double end_s = least(phase.until_s, exact->horizon_s), left_s = end_s - now->t_s;
     comparison compared = comparison_at(memory, phase, now->state, now->auxiliary);
     memory->has_d = !now->agree || memory->has_q;
-    if (phase.compares && !now->looked && !is_within(now->state, LARGEST, phase.threshold))
+    if (phase.compares && !now->looked && !is_within(now->state, DIVERGED_NORM, phase.threshold))
         return NOACK_EXACT_DIVERGED;
     int p;
     double window_s = left_s;
@@ -408,7 +410,7 @@ follow_piece(exact_memory *memory, exact_run *run, progress *now) {
     now->auxiliary = auxiliary_at(memory, &compared, p, spent_s);
     now->state = state_at(memory, degree_for(memory->reach_s, spent_s), spent_s);
     if (has_diverged(&phase, now->state, spent_s)) {
-        now->t_s += passed_at(memory, spent_s, LARGEST, &phase);
+        now->t_s += passed_at(memory, spent_s, DIVERGED_NORM, &phase);
         return NOACK_EXACT_DIVERGED;
     }
     int is_bounded = now->agree && !memory->quadratic && phase.compares && !memory->integrates

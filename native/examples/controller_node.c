@@ -37,7 +37,7 @@ static int sockets[3]; /* connected: it receives updates; sends actuations; ackn
 static struct sockaddr_storage peer;
 
 static double numbers[STATES * STATES * (PLACES + 12) + STATES * (INPUTS + 16) + 8 * INPUTS];
-static int64_t used, steps_ns[PLACES], no_change;
+static int64_t numbers_used, steps_ns[PLACES], no_change;
 static uint8_t pending[PENDING_BYTES]; /* for noack, which may be slow */
 static size_t pending_bytes;
 
@@ -101,8 +101,8 @@ static void read_exactly(void *content, int64_t bytes) {
 /* ---- The settings ---- */
 
 static double *allocate(int64_t count) {
-    double *place = numbers + used;
-    used += count;
+    double *place = numbers + numbers_used;
+    numbers_used += count;
     return place;
 }
 

@@ -19,7 +19,7 @@ static const char *arrive(noack_fmu_image *image, const noack_message *message, 
     int64_t *arrivals = values_of(image, NOACK_FMU_ARRIVALS);
     int64_t *received = values_of(image, NOACK_FMU_RECEIVED);
     double sent_s = (double)message->t_ns / NS, now_s = (double)now_ns / NS;
-    if (++*arrivals - image->before > image->packets)
+    if (++*arrivals - image->arrivals_before > image->packets)
         return "more packets arrive in this step than `packets` has room for: make shorter steps";
     put_first(image, NOACK_FMU_NUMBERS, 1, &message->sequence);
     put_first(image, NOACK_FMU_SENT_S, 1, &sent_s);
@@ -61,7 +61,7 @@ static const char *send(fmu *instance) {
         .arrival_ns = image->now_ns,
         .bit = -1,
         .message.flow = NOACK_UPDATE,
-        .message.sequence = image->taken++,
+        .message.sequence = image->packets_taken++,
         .message.t_ns = image->now_ns,
         .message.entries = image->n,
     };
@@ -75,11 +75,11 @@ static const char *step_channel(fmu *instance, int64_t to_ns) {
     noack_fmu_image *image = instance->image;
     int64_t sent = *(int64_t *)values_of(image, NOACK_FMU_SEND);
     const char *wrong;
-    image->before = *(int64_t *)values_of(image, NOACK_FMU_ARRIVALS);
-    if (!is_between(image->taken, sent, image->taken + 1))
+    image->arrivals_before = *(int64_t *)values_of(image, NOACK_FMU_ARRIVALS);
+    if (!is_between(image->packets_taken, sent, image->packets_taken + 1))
         return "`send` must be as in the step before, or greater by 1: a packet in a step at most";
     if ((wrong = release_before(instance, image->now_ns + 1)) != NULL
-        || (sent > image->taken && (wrong = send(instance)) != NULL)
+        || (sent > image->packets_taken && (wrong = send(instance)) != NULL)
         || (wrong = release_before(instance, to_ns)) != NULL)
         return wrong;
     const noack_link *link = instance->channel->links[0];
@@ -115,18 +115,18 @@ static const char *step_controller(fmu *instance, int64_t to_ns) {
     const noack_machine *machine = &controller->machine;
     int64_t arrivals = *(int64_t *)values_of(image, NOACK_FMU_ARRIVALS);
     const double *arrival_s = values_of(image, NOACK_FMU_ARRIVAL_S);
-    if (arrivals < image->taken)
+    if (arrivals < image->packets_taken)
         return "`arrivals` counts all packets that have arrived: it must not decrease";
-    if (!is_between(image->taken, arrivals, image->taken + image->packets))
+    if (!is_between(image->packets_taken, arrivals, image->packets_taken + image->packets))
         return "more packets have arrived than `packets` has room for: make shorter steps";
     for (;;) {
-        int64_t place = arrivals - image->taken - 1, due_ns = tick_ns(machine);
+        int64_t place = arrivals - image->packets_taken - 1, due_ns = tick_ns(machine);
         int64_t arrival_ns = place >= 0 ? ns_of(arrival_s[place]) : INT64_MAX;
         if (arrival_ns < 0)
             return "`packet_arrival_s` of an arrival is not a time from 0 to 4,000,000 s";
         if (arrival_ns <= due_ns && arrival_ns < to_ns) {
             receive(instance, place);
-            image->taken++;
+            image->packets_taken++;
         } else if (due_ns < to_ns) {
             noack_controller_tick(controller, due_ns, &instance->output);
             copy(machine->m, instance->output.message.vector, values_of(image, NOACK_FMU_U));

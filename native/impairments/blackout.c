@@ -3,13 +3,13 @@
 
 void apply_blackout(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {
     (void)memory;
-    const noack_blackout *own = &stage->blackout;
+    const noack_blackout *settings = &stage->blackout;
     const int64_t *times_ns = packet->link->integers;
     int64_t now_ns = packet->decision->arrival_ns;
-    if (own->period_ns > 0 && now_ns >= 0)
-        now_ns %= own->period_ns;
-    int64_t count = (own->end - own->begin) / 2;
-    int64_t place = first_above(times_ns, own->begin + count, own->end, now_ns);
-    if (place < own->end && times_ns[place - count] <= now_ns)
+    if (settings->period_ns > 0 && now_ns >= 0)
+        now_ns %= settings->period_ns;
+    int64_t count = (settings->end - settings->begin) / 2;
+    int64_t place = first_above(times_ns, settings->begin + count, settings->end, now_ns);
+    if (place < settings->end && times_ns[place - count] <= now_ns)
         refuse(packet->decision, NOACK_BLACKED_OUT);
 }

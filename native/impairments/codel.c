@@ -24,26 +24,26 @@ static int64_t service_ns(const noack_queue *queue) {
 }
 
 /* t + interval/sqrt(count) */
-static int64_t control_law(const noack_bottleneck *own, int64_t t_ns, int64_t drops) {
-    return t_ns + (int64_t)((double)own->interval_ns / sqrt((double)drops));
+static int64_t control_law(const noack_bottleneck *settings, int64_t t_ns, int64_t drops) {
+    return t_ns + (int64_t)((double)settings->interval_ns / sqrt((double)drops));
 }
 
 /* Whether the law drops the newly arrived packet. */
 int codel_is_due(const noack_link *link, int64_t stage) {
-    const noack_bottleneck *own = &link->stages[stage].bottleneck;
+    const noack_bottleneck *settings = &link->stages[stage].bottleneck;
     noack_queue *queue = &link->queues[stage];
     int64_t now_ns = service_ns(queue), sojourn_ns = now_ns - queue->entry_ns;
     int above_long_enough = 0;
-    if (sojourn_ns < own->target_ns || sojourn_ns <= own->mtu_ns)
+    if (sojourn_ns < settings->target_ns || sojourn_ns <= settings->mtu_ns)
         queue->first_above_ns = 0;
     else if (queue->first_above_ns == 0)
-        queue->first_above_ns = now_ns + own->interval_ns;
+        queue->first_above_ns = now_ns + settings->interval_ns;
     else
         above_long_enough = now_ns >= queue->first_above_ns;
     if (queue->dropped_before) {
         queue->dropped_before = 0;
         if (above_long_enough)
-            queue->drop_next_ns = control_law(own, queue->drop_next_ns, queue->drops);
+            queue->drop_next_ns = control_law(settings, queue->drop_next_ns, queue->drops);
     }
     if (!above_long_enough) {
         queue->dropping = 0;
@@ -54,7 +54,7 @@ int codel_is_due(const noack_link *link, int64_t stage) {
 
 /* Drop the newly arrived packet: it keeps its place, and the law's state advances. */
 void codel_drop(noack_link *link, int64_t stage) {
-    const noack_bottleneck *own = &link->stages[stage].bottleneck;
+    const noack_bottleneck *settings = &link->stages[stage].bottleneck;
     noack_queue *queue = &link->queues[stage];
     int64_t now_ns = service_ns(queue);
     queue_occupy(link, stage, now_ns);
@@ -63,10 +63,10 @@ void codel_drop(noack_link *link, int64_t stage) {
         queue->dropped_before = 1;
         return;
     }
-    int recent = now_ns - queue->drop_next_ns < 16 * own->interval_ns;
+    int recent = now_ns - queue->drop_next_ns < 16 * settings->interval_ns;
     int64_t delta = queue->drops - queue->last_drops;
     queue->dropping = 1;
     queue->drops = delta > 1 && recent ? delta : 1;
     queue->last_drops = queue->drops;
-    queue->drop_next_ns = control_law(own, now_ns, queue->drops);
+    queue->drop_next_ns = control_law(settings, now_ns, queue->drops);
 }

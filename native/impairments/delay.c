@@ -46,16 +46,17 @@ double noack_delay_quantile_ns(const noack_delay *delay, const double *reals, do
    A correlated delay is drawn from normal scores, which keeps its distribution: with rho the
    correlation with the loss model's score s, z = rho s + sqrt(1 - rho^2) z', and the delay is the
    quantile at Phi(z). */
-static int64_t drawn_ns(
-    const noack_delay *own, const packet *packet, noack_stage_memory *memory, double u) {
-    if (own->correlation != 0.0 || own->loss_correlation != 0.0) {
-        double z = latent(own->correlation, own->innovation, memory, u);
-        if (own->loss_correlation != 0.0)
-            z = own->loss_correlation * packet->flow->score + own->loss_innovation * z;
+static int64_t draw_delay_ns(
+    const noack_delay *settings, const packet *packet, noack_stage_memory *memory, double u) {
+    if (settings->correlation != 0.0 || settings->loss_correlation != 0.0) {
+        double z = latent(settings->correlation, settings->innovation, memory, u);
+        if (settings->loss_correlation != 0.0)
+            z = settings->loss_correlation * packet->flow->score + settings->loss_innovation * z;
         u = fmin(noack_normal_cdf(z), 0.9999999999999999);
     }
-    double drawn = own->constant_ns + noack_delay_quantile_ns(own, packet->link->reals, u);
-    return (int64_t)fmin(fmax(drawn, 0.0), LONGEST_NS);
+    double delay_ns =
+        settings->constant_ns + noack_delay_quantile_ns(settings, packet->link->reals, u);
+    return (int64_t)fmin(fmax(delay_ns, 0.0), LONGEST_NS);
 }
 
 /* Delay the packet and its copy; the copy's delay is drawn as if it were the next packet. */
@@ -63,10 +64,10 @@ void apply_delay(packet *packet, const noack_stage *stage, noack_stage_memory *m
     noack_decision *decision = packet->decision;
     double uniform[2];
     draw(packet, stage, 0, uniform);
-    decision->release_ns += drawn_ns(&stage->delay, packet, memory, uniform[0]);
+    decision->release_ns += draw_delay_ns(&stage->delay, packet, memory, uniform[0]);
     if (decision->copy_ns != NOACK_NEVER_NS) {
         noack_stage_memory latest = *memory; /* the next packet's must not depend on a copy */
-        decision->copy_ns += drawn_ns(&stage->delay, packet, memory, uniform[1]);
+        decision->copy_ns += draw_delay_ns(&stage->delay, packet, memory, uniform[1]);
         *memory = latest;
     }
 }

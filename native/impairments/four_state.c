@@ -5,23 +5,23 @@
 #include "../core.h"
 
 void apply_four_state(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {
-    const noack_four_state *own = &stage->four_state;
+    const noack_four_state *settings = &stage->four_state;
     double uniform[2];
     draw(packet, stage, 0, uniform);
     double u = uniform[0];
     int64_t state = memory->state + 1;
     if (state == 1) {
-        if (u < own->p13)
+        if (u < settings->p13)
             state = 3;
-        else if (u < own->p13 + own->p14)
+        else if (u < settings->p13 + settings->p14)
             state = 4;
     } else if (state == 2) {
-        if (u < own->p23)
+        if (u < settings->p23)
             state = 3;
     } else if (state == 3) {
-        if (u < own->p31)
+        if (u < settings->p31)
             state = 1;
-        else if (u < own->p31 + own->p32)
+        else if (u < settings->p31 + settings->p32)
             state = 2;
     } else {
         state = 1;

@@ -15,21 +15,22 @@ enum { OPPORTUNITY_BYTES = NOACK_OPPORTUNITY_BYTES, NS_PER_MS = 1000000 };
 
 /* The number of the first opportunity after a time, counted over all repetitions. */
 static int64_t opportunity_after(
-    const noack_opportunities *own, const int64_t *times_ms, int64_t now_ns) {
-    int64_t period_ns = times_ms[own->end - 1] * NS_PER_MS;
-    int64_t elapsed_ns = now_ns + own->offset_ns, cycle = floor_div(elapsed_ns, period_ns);
+    const noack_opportunities *settings, const int64_t *times_ms, int64_t now_ns) {
+    int64_t period_ns = times_ms[settings->end - 1] * NS_PER_MS;
+    int64_t elapsed_ns = now_ns + settings->offset_ns, cycle = floor_div(elapsed_ns, period_ns);
     elapsed_ns -= cycle * period_ns;
-    int64_t place = first_above(times_ms, own->begin, own->end - 1, elapsed_ns / NS_PER_MS);
-    return cycle * (own->end - own->begin) + place - own->begin;
+    int64_t place =
+        first_above(times_ms, settings->begin, settings->end - 1, elapsed_ns / NS_PER_MS);
+    return cycle * (settings->end - settings->begin) + place - settings->begin;
 }
 
 /* The time of an opportunity. */
 static int64_t opportunity_ns(
-    const noack_opportunities *own, const int64_t *times_ms, int64_t number) {
-    int64_t count = own->end - own->begin, period_ms = times_ms[own->end - 1];
+    const noack_opportunities *settings, const int64_t *times_ms, int64_t number) {
+    int64_t count = settings->end - settings->begin, period_ms = times_ms[settings->end - 1];
     int64_t cycle = min_of(floor_div(number, count), LATEST_NS / NS_PER_MS / period_ms + 1);
-    int64_t elapsed_ms = cycle * period_ms + times_ms[own->begin + floor_mod(number, count)];
-    return min_of(elapsed_ms, LATEST_NS / NS_PER_MS) * NS_PER_MS - own->offset_ns;
+    int64_t elapsed_ms = cycle * period_ms + times_ms[settings->begin + floor_mod(number, count)];
+    return min_of(elapsed_ms, LATEST_NS / NS_PER_MS) * NS_PER_MS - settings->offset_ns;
 }
 
 /* Whether a packet may enter at now_ns; removes packets that are carried until then. */
@@ -52,25 +53,25 @@ static int has_room(
 static int64_t carry_packet(
     const noack_stage *stage, const int64_t *times_ms, noack_queue *queue, int64_t *ring,
     int64_t line_bytes) {
-    const noack_opportunities *own = &stage->opportunities;
+    const noack_opportunities *settings = &stage->opportunities;
     int64_t number;
     if (queue->busy_until_ns <= queue->entry_ns) { /* it is empty, and that opportunity is over */
-        number = opportunity_after(own, times_ms, queue->entry_ns);
+        number = opportunity_after(settings, times_ms, queue->entry_ns);
         queue->left_bytes = OPPORTUNITY_BYTES;
     } else {
-        number = opportunity_after(own, times_ms, queue->busy_until_ns - 1) + queue->used - 1;
+        number = opportunity_after(settings, times_ms, queue->busy_until_ns - 1) + queue->used - 1;
         if (queue->left_bytes == 0) {
             number++;
             queue->left_bytes = OPPORTUNITY_BYTES;
         }
     }
-    int64_t begin_ns = opportunity_ns(own, times_ms, number);
+    int64_t begin_ns = opportunity_ns(settings, times_ms, number);
     int64_t more =
         max_of(line_bytes - queue->left_bytes + OPPORTUNITY_BYTES - 1, 0) / OPPORTUNITY_BYTES;
     number += more;
     queue->left_bytes += more * OPPORTUNITY_BYTES - line_bytes;
-    queue->busy_until_ns = opportunity_ns(own, times_ms, number);
-    queue->used = number - opportunity_after(own, times_ms, queue->busy_until_ns - 1) + 1;
+    queue->busy_until_ns = opportunity_ns(settings, times_ms, number);
+    queue->used = number - opportunity_after(settings, times_ms, queue->busy_until_ns - 1) + 1;
     if (queue->count < stage->queue_places)
         queue->count += 2;
     else /* a packet that must pass; as in queue_occupy, what is older does not matter */

@@ -3,8 +3,8 @@
 
 void apply_periodic(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {
     (void)memory;
-    const noack_periodic *own = &stage->periodic;
-    int64_t number = packet->decision->packet - own->first;
-    if (number >= 0 && number % own->period < own->burst)
+    const noack_periodic *settings = &stage->periodic;
+    int64_t number = packet->decision->packet - settings->first;
+    if (number >= 0 && number % settings->period < settings->burst)
         refuse(packet->decision, NOACK_DROPPED);
 }

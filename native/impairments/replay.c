@@ -20,34 +20,37 @@ static int64_t part_of(int64_t change_ns, int64_t elapsed_ns, int64_t gap_ns) {
 }
 
 /* The delay of a packet by its time in the trace, or -1 - d for a lost packet. */
-static int64_t delay_at(const noack_replay *own, const int64_t *table, int64_t elapsed_ns) {
-    int64_t count = own->end - own->begin;
-    int64_t high = first_above(table, own->times_begin, own->times_begin + count, elapsed_ns)
-                   - own->times_begin;
+static int64_t delay_at(const noack_replay *settings, const int64_t *table, int64_t elapsed_ns) {
+    int64_t count = settings->end - settings->begin;
+    int64_t high =
+        first_above(table, settings->times_begin, settings->times_begin + count, elapsed_ns)
+        - settings->times_begin;
     int64_t low = max_of(high - 1, 0); /* the last record that is not later */
-    int64_t delay_ns = table[own->begin + low];
-    if (delay_ns < 0 || high == count || table[own->begin + high] < 0)
+    int64_t delay_ns = table[settings->begin + low];
+    if (delay_ns < 0 || high == count || table[settings->begin + high] < 0)
         return delay_ns;
-    int64_t sent_ns = table[own->times_begin + low];
-    int64_t gap_ns = table[own->times_begin + high] - sent_ns;
-    return delay_ns + part_of(table[own->begin + high] - delay_ns, elapsed_ns - sent_ns, gap_ns);
+    int64_t sent_ns = table[settings->times_begin + low];
+    int64_t gap_ns = table[settings->times_begin + high] - sent_ns;
+    return delay_ns
+           + part_of(table[settings->begin + high] - delay_ns, elapsed_ns - sent_ns, gap_ns);
 }
 
 /* Lose or delay the packet, and its copy, as recorded. */
 void apply_replay(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {
     (void)memory;
-    const noack_replay *own = &stage->replay;
+    const noack_replay *settings = &stage->replay;
     const int64_t *table = packet->link->integers;
     noack_decision *decision = packet->decision;
     int64_t delay_ns = 0;
-    if (own->period_ns > 0) {
-        int64_t elapsed_ns = decision->arrival_ns + own->offset;
-        if (!own->once || (0 <= elapsed_ns && elapsed_ns < own->period_ns))
-            delay_ns = delay_at(own, table, floor_mod(elapsed_ns, own->period_ns));
+    if (settings->period_ns > 0) {
+        int64_t elapsed_ns = decision->arrival_ns + settings->offset;
+        if (!settings->once || (0 <= elapsed_ns && elapsed_ns < settings->period_ns))
+            delay_ns = delay_at(settings, table, floor_mod(elapsed_ns, settings->period_ns));
     } else {
-        int64_t record = decision->packet + own->offset, count = own->end - own->begin;
-        if (!own->once || record < count)
-            delay_ns = table[own->begin + record % count];
+        int64_t record = decision->packet + settings->offset,
+                count = settings->end - settings->begin;
+        if (!settings->once || record < count)
+            delay_ns = table[settings->begin + record % count];
     }
     if (delay_ns < 0) {
         refuse(decision, NOACK_DROPPED);

@@ -13,7 +13,7 @@
 
 /* The own slots of a flow: their numbers in a round, ascending. */
 typedef struct {
-    const noack_schedule *own;
+    const noack_schedule *settings;
     const int64_t *slots;
     int64_t count;
 } turns;
@@ -21,23 +21,24 @@ typedef struct {
 /* The number of the first own slot that begins at a time, or later. */
 static int64_t turn_from(const turns *turns, int64_t now_ns) {
     int64_t before =
-        floor_div(now_ns - 1, turns->own->slot_ns); /* the last slot that is too early */
-    int64_t round = floor_div(before, turns->own->slots);
-    int64_t place = first_above(turns->slots, 0, turns->count, before - round * turns->own->slots);
+        floor_div(now_ns - 1, turns->settings->slot_ns); /* the last slot that is too early */
+    int64_t round = floor_div(before, turns->settings->slots);
+    int64_t place =
+        first_above(turns->slots, 0, turns->count, before - round * turns->settings->slots);
     return round * turns->count + place;
 }
 
 /* The begin of an own slot. */
 static int64_t turn_ns(const turns *turns, int64_t number) {
     int64_t round = floor_div(number, turns->count);
-    int64_t slot = round * turns->own->slots + turns->slots[floor_mod(number, turns->count)];
-    return min_of(slot * turns->own->slot_ns, LATEST_NS);
+    int64_t slot = round * turns->settings->slots + turns->slots[floor_mod(number, turns->count)];
+    return min_of(slot * turns->settings->slot_ns, LATEST_NS);
 }
 
 /* Whether a packet that arrives at now_ns finds few enough slots taken. */
 static int has_room(const turns *turns, const noack_stage_memory *memory, int64_t now_ns) {
     int64_t number = turn_from(turns, max_of(now_ns, memory->taken_until_ns));
-    return number - turn_from(turns, now_ns + 1) < turns->own->queue;
+    return number - turn_from(turns, now_ns + 1) < turns->settings->queue;
 }
 
 /* Take a slot for a packet that arrives at now_ns; return its begin. */

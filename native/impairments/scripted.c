@@ -3,12 +3,12 @@
 
 void apply_scripted(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {
     (void)memory;
-    const noack_scripted *own = &stage->scripted;
+    const noack_scripted *settings = &stage->scripted;
     const int64_t *numbers = packet->link->integers;
-    int64_t wanted = packet->decision->packet;
-    if (own->period > 0)
-        wanted %= own->period;
-    int64_t place = first_above(numbers, own->begin, own->end, wanted - 1);
-    if (place < own->end && numbers[place] == wanted)
+    int64_t number = packet->decision->packet;
+    if (settings->period > 0)
+        number %= settings->period;
+    int64_t place = first_above(numbers, settings->begin, settings->end, number - 1);
+    if (place < settings->end && numbers[place] == number)
         refuse(packet->decision, NOACK_DROPPED);
 }

@@ -7,47 +7,47 @@
 
 /* Whether the queue has a free place at now_ns; removes packets that have left until then. */
 int64_t noack_queue_enters(noack_link *link, int64_t stage, int64_t now_ns) {
-    const noack_stage *own = &link->stages[stage];
-    const int64_t *ring_ns = link->departures_ns + own->queue_begin;
+    const noack_stage *settings = &link->stages[stage];
+    const int64_t *ring_ns = link->departures_ns + settings->queue_begin;
     noack_queue *queue = &link->queues[stage];
     queue->entry_ns = max_of(queue->entry_ns, now_ns);
     while (queue->count > 0 && ring_ns[queue->head] <= queue->entry_ns) {
-        queue->head = (queue->head + 1) % own->queue_places;
+        queue->head = (queue->head + 1) % settings->queue_places;
         queue->count--;
     }
-    return queue->count < own->queue_places;
+    return queue->count < settings->queue_places;
 }
 
 /* Occupy a place in the queue until a time; a packet that must pass may exceed the size. The ring
    has the departures of the newest packets. So, if it is full, what is older does not matter: while
    the oldest one of the ring has not left, at least as many packets wait as there are places. */
 void queue_occupy(noack_link *link, int64_t stage, int64_t until_ns) {
-    const noack_stage *own = &link->stages[stage];
+    const noack_stage *settings = &link->stages[stage];
     noack_queue *queue = &link->queues[stage];
-    if (queue->count < own->queue_places)
+    if (queue->count < settings->queue_places)
         queue->count++;
     else
-        queue->head = (queue->head + 1) % own->queue_places;
-    int64_t last = (queue->head + queue->count - 1) % own->queue_places;
-    link->departures_ns[own->queue_begin + last] = until_ns;
+        queue->head = (queue->head + 1) % settings->queue_places;
+    int64_t last = (queue->head + queue->count - 1) % settings->queue_places;
+    link->departures_ns[settings->queue_begin + last] = until_ns;
 }
 
 /* Put a packet into the queue, after noack_queue_enters; return its departure time. */
 int64_t noack_queue_serve(noack_link *link, int64_t stage, int64_t size_bytes) {
-    const noack_bottleneck *own = &link->stages[stage].bottleneck;
+    const noack_bottleneck *settings = &link->stages[stage].bottleneck;
     noack_queue *queue = &link->queues[stage];
-    int64_t line_bytes = max_of(size_bytes + own->overhead_bytes, 0);
-    if (own->cell_bytes > 0) {
-        int64_t cells = (line_bytes + own->cell_bytes - 1) / own->cell_bytes;
-        line_bytes = cells * (own->cell_bytes + own->cell_overhead_bytes);
+    int64_t line_bytes = max_of(size_bytes + settings->overhead_bytes, 0);
+    if (settings->cell_bytes > 0) {
+        int64_t cells = (line_bytes + settings->cell_bytes - 1) / settings->cell_bytes;
+        line_bytes = cells * (settings->cell_bytes + settings->cell_overhead_bytes);
     }
     if (queue->busy_until_ns < queue->entry_ns) {
         queue->busy_until_ns = queue->entry_ns;
         queue->carry = 0;
     }
     int64_t work = line_bytes * 8 * NS_PER_S + queue->carry;
-    queue->busy_until_ns = min_of(queue->busy_until_ns + work / own->rate_bps, LATEST_NS);
-    queue->carry = work % own->rate_bps;
+    queue->busy_until_ns = min_of(queue->busy_until_ns + work / settings->rate_bps, LATEST_NS);
+    queue->carry = work % settings->rate_bps;
     queue_occupy(link, stage, queue->busy_until_ns);
     return queue->busy_until_ns;
 }

@@ -30,9 +30,9 @@ int64_t noack_controller_handle(
         return NOACK_ASK_UPDATE;
     }
     machine->answered = 0;
-    double *before = controller->scratch;
+    double *x_c_before = controller->scratch;
     noack_model_advance(
-        &controller->model, controller->x_c, controller->model_ns, model_ns, before);
+        &controller->model, controller->x_c, controller->model_ns, model_ns, x_c_before);
     noack_model_advance(&controller->model, message->vector, event_ns, model_ns, controller->x_c);
     controller->model_ns = machine->reached_ns = model_ns;
     controller->update_ns = event_ns;
@@ -40,7 +40,7 @@ int64_t noack_controller_handle(
     begin_row(output, NOACK_MESSAGES, machine, message->sequence, event_ns, now_ns);
     put(output, model_ns);
     put_reals(output, n, message->vector);
-    put_reals(output, n, before);
+    put_reals(output, n, x_c_before);
     put_reals(output, n, controller->x_c);
     put(output, lost_between(controller->newest, message->sequence));
     controller->newest = message->sequence;
@@ -113,9 +113,9 @@ int64_t noack_controller_tick(noack_controller *controller, int64_t now_ns, noac
     machine->answered = 0;
     copy(n, x_c, controller->x_c);
     controller->model_ns = machine->reached_ns = model_ns;
-    int64_t number = machine->first_number + machine->step++;
-    begin_row(output, NOACK_TICKS, machine, number, t_ns, now_ns);
-    begin_message(output, NOACK_ACTUATION, number, model_ns);
+    int64_t sequence = machine->first_number + machine->step++;
+    begin_row(output, NOACK_TICKS, machine, sequence, t_ns, now_ns);
+    begin_message(output, NOACK_ACTUATION, sequence, model_ns);
     double *u = output->message.vector;
     output->message.entries = m;
     copy(m, controller->u, u);

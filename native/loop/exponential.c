@@ -13,7 +13,7 @@ enum { DEGREE = 16 };
 
 /* Up to this alpha the polynomial is the exponential of a matrix that differs by less than 2^-53 of
    its norm (Al-Mohy and Higham, SIAM J. Sci. Comput. 33(2), 2011, table 3.1). */
-static const double LARGEST = 0.78;
+static const double LARGEST_ALPHA = 0.78;
 
 /* The 1-norm (largest absolute column sum); NaN if an entry is NaN. */
 static double one_norm(int64_t n, const double *matrix) {
@@ -79,20 +79,20 @@ void noack_exponential(int64_t n, const double *matrix, double *result, double *
     double *powers[4] = {scratch, scratch + size, scratch + 2 * size, scratch + 3 * size};
     double *other = scratch + 4 * size;
     /* Scaled to a norm of at most 1 first: its powers do not overflow. */
-    int halved = halvings(one_norm(n, matrix), 1.0);
+    int norm_halvings = halvings(one_norm(n, matrix), 1.0);
     for (int64_t k = 0; k < size; k++)
-        powers[0][k] = ldexp(matrix[k], -halved);
+        powers[0][k] = ldexp(matrix[k], -norm_halvings);
     noack_multiply(n, n, n, powers[0], powers[0], 0, powers[1]);
     noack_multiply(n, n, n, powers[1], powers[0], 0, powers[2]);
     noack_multiply(n, n, n, powers[1], powers[1], 0, powers[3]);
     double cube = noack_cube_root(one_norm(n, powers[2]));
     double fourth = sqrt(sqrt(one_norm(n, powers[3])));
     double alpha = fourth > cube ? fourth : cube;
-    int more = halvings(ldexp(alpha, halved), LARGEST) - halved;
+    int further_halvings = halvings(ldexp(alpha, norm_halvings), LARGEST_ALPHA) - norm_halvings;
     for (int k = 0; k < 4; k++)
-        scale(size, powers[k], -more * (k + 1));
+        scale(size, powers[k], -further_halvings * (k + 1));
     polynomial(n, powers, result, other);
-    for (int k = 0; k < halved + more; k++) {
+    for (int k = 0; k < norm_halvings + further_halvings; k++) {
         noack_multiply(n, n, n, result, result, 0, other);
         memcpy(result, other, (size_t)size * sizeof *result);
     }

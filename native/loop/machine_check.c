@@ -35,11 +35,13 @@ static const char *check_machine(const noack_machine *machine) {
 }
 
 static const char *check_model(const noack_model *model, int64_t n) {
-    const noack_transitions *own = model->transitions;
-    if (own == NULL || own->n != n || own->H == NULL || own->steps_ns == NULL
-        || own->matrices == NULL || own->scratch == NULL)
+    const noack_transitions *transitions = model->transitions;
+    if (transitions == NULL || transitions->n != n || transitions->H == NULL
+        || transitions->steps_ns == NULL || transitions->matrices == NULL
+        || transitions->scratch == NULL)
         return "a model has no matrices of its size";
-    if (!is_between(4, own->places, MOST_PLACES) || (own->places & (own->places - 1)) != 0)
+    if (!is_between(4, transitions->places, MOST_PLACES)
+        || (transitions->places & (transitions->places - 1)) != 0)
         return "a model's number of kept matrices is not a power of 2, from 4 on";
     if (!is_between(0, model->changes, MOST_LENGTH) || model->has_point == NULL
         || model->points == NULL || (model->changes > 0 && model->since_ns == NULL))

@@ -39,7 +39,7 @@ static void propagate(
 static void advance_about(
     const noack_model *model, int64_t place, const double *x, int64_t dt_ns, double *result) {
     int64_t n = model->transitions->n;
-    double *moved = model->transitions->scratch + 10 * n * n, *advanced = moved + n;
+    double *from_point = model->transitions->scratch + 10 * n * n, *advanced = from_point + n;
     if (!model->has_point[place] || dt_ns == 0) {
         propagate(model->transitions, x, dt_ns, advanced);
         copy(n, advanced, result);
@@ -47,8 +47,8 @@ static void advance_about(
     }
     const double *point = model->points + place * n;
     for (int64_t k = 0; k < n; k++)
-        moved[k] = x[k] - point[k];
-    propagate(model->transitions, moved, dt_ns, advanced);
+        from_point[k] = x[k] - point[k];
+    propagate(model->transitions, from_point, dt_ns, advanced);
     for (int64_t k = 0; k < n; k++)
         result[k] = point[k] + advanced[k];
 }

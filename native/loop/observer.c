@@ -44,11 +44,11 @@ static void solve(int64_t p, int64_t n, double *S, double *B) {
 }
 
 void noack_observer_predict(noack_observer *observer, int64_t n, int64_t m, const double *u) {
-    double *free = observer->scratch, *forced = free + n;
-    noack_product(n, n, observer->Ad, observer->x, free);
-    noack_product(n, m, observer->Bd, u, forced);
+    double *free_part = observer->scratch, *forced_part = free_part + n;
+    noack_product(n, n, observer->Ad, observer->x, free_part);
+    noack_product(n, m, observer->Bd, u, forced_part);
     for (int64_t k = 0; k < n; k++)
-        observer->x[k] = free[k] + forced[k];
+        observer->x[k] = free_part[k] + forced_part[k];
     if (observer->kind != NOACK_KALMAN)
         return;
     double *half = observer->scratch;

@@ -50,11 +50,11 @@ static void advance(noack_plant *plant) {
         append_recent_input(plant);
     if (plant->system != NOACK_LINEAR)
         return;
-    double *free = plant->scratch, *forced = free + n;
-    noack_product(n, n, plant->Ad, plant->x, free);
-    noack_product(n, plant->sources, plant->Bd, plant->applied, forced);
+    double *free_part = plant->scratch, *forced_part = free_part + n;
+    noack_product(n, n, plant->Ad, plant->x, free_part);
+    noack_product(n, plant->sources, plant->Bd, plant->applied, forced_part);
     for (int64_t k = 0; k < n; k++)
-        plant->x[k] = free[k] + forced[k];
+        plant->x[k] = free_part[k] + forced_part[k];
 }
 
 /* A predictive actuator: u + K(e^(H(t - t_j)) x_c - x_c), the controller's input if no update has
@@ -73,11 +73,11 @@ static void predict(noack_plant *plant, int64_t t_ns) {
     noack_model_advance(
         &plant->fallback, plant->x_fallback, plant->fallback_ns, t_ns, plant->x_fallback);
     plant->fallback_ns = t_ns;
-    double *now = plant->scratch, *then = now + m;
-    noack_product(m, n, plant->K, plant->x_fallback, now);
-    noack_product(m, n, plant->K, plant->x_c, then);
+    double *input_now = plant->scratch, *input_then = input_now + m;
+    noack_product(m, n, plant->K, plant->x_fallback, input_now);
+    noack_product(m, n, plant->K, plant->x_c, input_then);
     for (int64_t k = 0; k < m; k++)
-        plant->u[k] = plant->inputs[k] + (now[k] - then[k]);
+        plant->u[k] = plant->inputs[k] + (input_now[k] - input_then[k]);
 }
 
 /* Choose the input from t_ns on; return its number in the newest actuation, -1: the watchdog's. */
@@ -125,8 +125,8 @@ void noack_disturb(noack_plant *plant, int64_t step) {
 
 /* y = C x + v, and the inputs since the last measurement if they are reported. */
 static void measure(noack_plant *plant, int64_t t_ns, noack_output *output) {
-    int64_t number = plant->measurements++;
-    begin_message(output, NOACK_MEASUREMENT, number, t_ns);
+    int64_t sequence = plant->measurements++;
+    begin_message(output, NOACK_MEASUREMENT, sequence, t_ns);
     double *y = output->message.vector;
     if (plant->C == NULL)
         copy(plant->p, plant->x, y);
@@ -134,7 +134,7 @@ static void measure(noack_plant *plant, int64_t t_ns, noack_output *output) {
         noack_product(plant->p, plant->machine.n, plant->C, plant->x, y);
     output->message.entries = plant->p;
     if (plant->noise.width > 0) {
-        const double *v = value(&plant->noise, number);
+        const double *v = value(&plant->noise, sequence);
         for (int64_t k = 0; k < plant->p; k++)
             y[k] += v[k];
     }

@@ -39,15 +39,16 @@ static int is_full(const noack_process *process, int64_t table) {
 }
 
 /* Write a loop's own row where the columns of a table with longer vectors have it. */
-static void spread_row(const int64_t *layout, int64_t words, const int64_t *own, uint8_t *row) {
+static void spread_row(
+    const int64_t *layout, int64_t words, const int64_t *loop_row, uint8_t *row) {
     static const double missing = NAN;
-    for (int64_t k = 0; k < words; k++, row += sizeof *own) {
+    for (int64_t k = 0; k < words; k++, row += sizeof *loop_row) {
         if (layout[k] >= 0)
-            memcpy(row, &own[layout[k]], sizeof *own);
+            memcpy(row, &loop_row[layout[k]], sizeof *loop_row);
         else if (layout[k] == NOACK_MISSING_NAN)
             memcpy(row, &missing, sizeof missing);
         else
-            memset(row, 0, sizeof *own);
+            memset(row, 0, sizeof *loop_row);
     }
 }
 
@@ -57,8 +58,8 @@ static void append_row(noack_process *process, int64_t loop) {
     uint8_t *row = table->rows + table->count++ * table->row_bytes;
     int64_t bytes = table->row_bytes - NOACK_LOOP_BYTES;
     const int64_t *layout = table->layouts == NULL ? NULL : table->layouts[loop];
-    uint16_t number = (uint16_t)loop;
-    memcpy(row, &number, NOACK_LOOP_BYTES);
+    uint16_t loop_number = (uint16_t)loop;
+    memcpy(row, &loop_number, NOACK_LOOP_BYTES);
     if (layout == NULL)
         memcpy(row + NOACK_LOOP_BYTES, process->output.row, (size_t)bytes);
     else

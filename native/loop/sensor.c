@@ -24,12 +24,12 @@ static double *rule_scratch(const noack_sensor *sensor) {
 static const double *from_setpoint(const noack_sensor *sensor, int64_t t_ns, const double *x) {
     const double *point = noack_model_point(&sensor->model, t_ns);
     int64_t n = sensor->machine.n;
-    double *moved = sensor->scratch + n;
+    double *difference = sensor->scratch + n;
     if (point == NULL)
         return x;
     for (int64_t k = 0; k < n; k++)
-        moved[k] = x[k] - point[k];
-    return moved;
+        difference[k] = x[k] - point[k];
+    return difference;
 }
 
 /* Whether a measurement is an event, by the rule or by the answer of the user's trigger. */
@@ -163,15 +163,15 @@ static int64_t handle_acknowledgement(
     noack_sensor *sensor, const noack_message *message, int64_t now_ns, noack_output *output) {
     noack_machine *machine = &sensor->machine;
     int64_t n = machine->n, t_ns = message->t_ns, place = find_sent(sensor, message->sequence);
-    double *before = sensor->scratch;
-    int found = place < sensor->sent_count;
-    if (found && sensor->is_user && !machine->answered) {
+    double *x_s_before = sensor->scratch;
+    int is_unacknowledged = place < sensor->sent_count;
+    if (is_unacknowledged && sensor->is_user && !machine->answered) {
         sensor->trigger.event_ns = t_ns;
         copy(n, sensor->sent_x + place * n, sensor->event_x);
         return NOACK_ASK_RESTART;
     }
-    copy(n, sensor->x_s, before);
-    if (found) {
+    copy(n, sensor->x_s, x_s_before);
+    if (is_unacknowledged) {
         const double *x = sensor->sent_x + place * n;
         noack_model_advance(&sensor->model, x, t_ns, sensor->model_ns, sensor->x_s);
         sensor->trigger.event_ns = t_ns;
@@ -183,7 +183,7 @@ static int64_t handle_acknowledgement(
     }
     begin_row(output, NOACK_ACKNOWLEDGEMENTS, machine, message->sequence, t_ns, now_ns);
     put(output, sensor->model_ns);
-    put_reals(output, n, before);
+    put_reals(output, n, x_s_before);
     put_reals(output, n, sensor->x_s);
     return NOACK_DONE;
 }

@@ -23,11 +23,12 @@ static int is_reached(const noack_trigger_rule *rule, double norm, double t_s, d
     if (LARGEST_EXPONENT < exponent)
         exponent = LARGEST_EXPONENT;
     /* The first two terms of the series where the third is below rounding. */
-    double grown = tau_s * (1 + exponent / 2);
+    double growth_s = tau_s * (1 + exponent / 2);
     if (exponent > 1e-8)
-        grown = noack_expm1(exponent) / rule->growth_per_s;
-    double faded = rule->beta * fixed_exp(-rule->alpha_per_s * (t_s + tau_s));
-    return speed * grown >= (rule->forecast_floor > faded ? rule->forecast_floor : faded);
+        growth_s = noack_expm1(exponent) / rule->growth_per_s;
+    double threshold = rule->beta * fixed_exp(-rule->alpha_per_s * (t_s + tau_s));
+    return speed * growth_s
+           >= (rule->forecast_floor > threshold ? rule->forecast_floor : threshold);
 }
 
 double noack_forecast_ns(const noack_trigger_rule *rule, double norm, double t_s) {

@@ -112,20 +112,20 @@ static int is_multicast(const uint8_t *packet, int64_t size_bytes) {
 int read_packets(noack_relay *relay, int64_t socket, int most) {
     relay_scratch *scratch = scratch_of(relay);
     int64_t begin = scratch->batch_end;
-    int taken = 0, fd = relay->sockets[socket].fd;
-    while (taken < most) {
-        int64_t k = begin + taken;
+    int packet_count = 0, fd = relay->sockets[socket].fd;
+    while (packet_count < most) {
+        int64_t k = begin + packet_count;
         ssize_t size_bytes = read(fd, scratch->buffers[k], MOST_BYTES);
         if (size_bytes < 0)
             break;
         if (is_multicast(scratch->buffers[k], size_bytes))
             continue;
-        taken++;
+        packet_count++;
         scratch->in_headers[k].msg_len = (unsigned)size_bytes;
         scratch->in_headers[k].msg_hdr.msg_controllen = 0;
         read_flow(scratch->buffers[k], size_bytes, socket != 0, scratch->in_names[k]);
     }
-    return taken > 0 ? taken : -1;
+    return packet_count > 0 ? packet_count : -1;
 }
 
 /* Write packets; return the number of those written before the first that failed, or -1. */

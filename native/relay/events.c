@@ -45,13 +45,13 @@ static uint16_t put_host(const uint8_t *name, uint8_t host[16], uint8_t *family)
 /* The next event of a direction and a client, on one side of the link, with its addresses. */
 static noack_event *next_event(
     noack_relay *relay, int64_t direction, int64_t client, int server_side) {
-    const noack_client *here = &relay->clients[client];
+    const noack_client *entry = &relay->clients[client];
     const noack_direction *forward = &relay->directions[direction & ~INT64_C(1)];
-    const uint8_t *near = server_side ? here->local : here->name;
+    const uint8_t *near = server_side ? entry->local : entry->name;
     const uint8_t *far = server_side ? forward->name : forward->listen;
     noack_event *event = &relay->events[relay->event_length++];
     *event = (noack_event){
-        .flow = here->number,
+        .flow = entry->number,
         .mansd = relay->directions[direction].link->mansd,
         .copy_delay_ns = -1,
         .copy_bit = -1,
@@ -68,7 +68,7 @@ static noack_event *next_event(
     return event;
 }
 
-static int64_t after(int64_t t_ns, int64_t now_ns) {
+static int64_t delay_until(int64_t t_ns, int64_t now_ns) {
     return t_ns == NOACK_NEVER_NS ? -1 : t_ns - now_ns;
 }
 
@@ -81,8 +81,8 @@ void report_arrival(
     event->fate = (uint8_t)decision->fate;
     event->size_bytes = (uint32_t)size_bytes;
     event->consecutive_losses = decision->consecutive_losses;
-    event->delay_ns = after(decision->release_ns, relay->now_ns);
-    event->copy_delay_ns = after(decision->copy_ns, relay->now_ns);
+    event->delay_ns = delay_until(decision->release_ns, relay->now_ns);
+    event->copy_delay_ns = delay_until(decision->copy_ns, relay->now_ns);
     event->hold_back_ns = decision->hold_back_ns;
     event->bit = decision->bit;
     event->copy_bit = decision->copy_bit;

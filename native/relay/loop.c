@@ -45,8 +45,8 @@ void noack_relay_read_stamps(noack_relay *relay) {
         renew_header(relay, k);
 }
 
-int64_t noack_relay_watch(noack_relay *relay, int64_t fd, int64_t number) {
-    struct epoll_event event = {.events = EPOLLIN, .data.u64 = (uint64_t)number};
+int64_t noack_relay_watch(noack_relay *relay, int64_t fd, int64_t socket) {
+    struct epoll_event event = {.events = EPOLLIN, .data.u64 = (uint64_t)socket};
     return epoll_ctl((int)relay->epoll, EPOLL_CTL_ADD, (int)fd, &event) == 0 ? 0 : errno;
 }
 
@@ -75,8 +75,8 @@ int64_t noack_relay_receiver(const noack_relay *relay) { return scratch_of(relay
    record its departure. */
 static void enqueue_departure(noack_relay *relay) {
     relay_scratch *scratch = scratch_of(relay);
-    int32_t number = (int32_t)scratch->leaving_count++;
-    departure *leaving = &scratch->leaving[number];
+    int32_t row = (int32_t)scratch->leaving_count++;
+    departure *leaving = &scratch->leaving[row];
     noack_direction *direction = &relay->directions[leaving->datagram.direction];
     leaving->stale = (uint8_t)noack_link_leave(
         direction->link, relay->clients[leaving->datagram.client].flow_row,
@@ -93,13 +93,13 @@ static void enqueue_departure(noack_relay *relay) {
         leaving->socket = (int32_t)(relay->links + link);
     noack_socket *socket = &relay->sockets[leaving->socket];
     if (socket->is_queued) {
-        scratch->leaving[socket->tail].next = number;
+        scratch->leaving[socket->tail].next = row;
     } else {
         socket->is_queued = 1;
-        socket->head = (uint16_t)number;
+        socket->head = (uint16_t)row;
         scratch->order[scratch->order_count++] = leaving->socket;
     }
-    socket->tail = (uint16_t)number;
+    socket->tail = (uint16_t)row;
     leaving->next = -1;
 }
 
@@ -357,26 +357,27 @@ static int wait_for_datagrams(noack_relay *relay, int64_t until_ns) {
 static int receive(noack_relay *relay, int64_t socket, int flags) {
     relay_scratch *scratch = scratch_of(relay);
     int64_t begin = scratch->batch_end, before_ns = relay->read_ns;
-    int fd = relay->sockets[socket].fd, most = scratch->is_busy ? (int)(BUFFERS - begin) : 1, taken;
+    int fd = relay->sockets[socket].fd, most = scratch->is_busy ? (int)(BUFFERS - begin) : 1,
+        received;
     if (relay->devices) {
-        taken = read_packets(relay, socket, most);
+        received = read_packets(relay, socket, most);
     } else if (scratch->is_busy) {
-        taken = recvmmsg(fd, &scratch->in_headers[begin], (unsigned)most, flags, NULL);
+        received = recvmmsg(fd, &scratch->in_headers[begin], (unsigned)most, flags, NULL);
     } else {
         ssize_t size_bytes = recvmsg(fd, &scratch->in_headers[begin].msg_hdr, flags & MSG_DONTWAIT);
         scratch->in_headers[begin].msg_len = (unsigned)max_of(size_bytes, 0);
-        taken = size_bytes < 0 ? -1 : 1;
+        received = size_bytes < 0 ? -1 : 1;
     }
-    int error = taken > 0 ? 0 : errno;
+    int error = received > 0 ? 0 : errno;
     relay->read_ns = run_time_ns(&relay->clock);
     if (scratch->stamps)
         scratch->real_ns = clock_ns(CLOCK_REALTIME);
-    scratch->is_busy = taken > 1 || relay->read_ns - before_ns < BUSY_NS;
-    scratch->has_more = scratch->is_busy && taken == most;
-    if (taken > 0) {
+    scratch->is_busy = received > 1 || relay->read_ns - before_ns < BUSY_NS;
+    scratch->has_more = scratch->is_busy && received == most;
+    if (received > 0) {
         scratch->batch_socket = socket;
         scratch->batch_next = begin;
-        scratch->batch_end = begin + taken;
+        scratch->batch_end = begin + received;
         touch_clients(relay);
     }
     return error;
@@ -415,8 +416,8 @@ int64_t noack_relay_run(noack_relay *relay, int64_t until_ns) {
             reason = decide_batch(relay);
         if (reason == NOACK_CARRY_ON)
             reason = release_due(relay, relay->read_ns);
-        int all_taken = scratch->ready_next >= scratch->ready_count;
-        if (reason != NOACK_CARRY_ON || all_taken || BUFFERS - scratch->batch_end < FEW_BUFFERS) {
+        int all_read = scratch->ready_next >= scratch->ready_count;
+        if (reason != NOACK_CARRY_ON || all_read || BUFFERS - scratch->batch_end < FEW_BUFFERS) {
             if (scratch->leaving_count > 0)
                 sent_ns = send_all(relay);
             scratch->pauses.worked_since_wait |= sent_ns >= 0;
@@ -426,7 +427,7 @@ int64_t noack_relay_run(noack_relay *relay, int64_t until_ns) {
                 return reason;
             scratch->batch_next = scratch->batch_end = 0;
         }
-        if (all_taken) {
+        if (all_read) {
             relay->read_ns = sent_ns >= 0 ? sent_ns : run_time_ns(&relay->clock);
             int64_t wait_until_ns = waiting_ends_ns(relay, until_ns);
             if (wait_until_ns == INT64_MIN)

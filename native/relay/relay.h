@@ -86,7 +86,7 @@ int64_t blocks_for(int64_t size_bytes);
 uint8_t *block_address(const noack_relay *relay, int64_t block);
 int64_t store_payload(noack_relay *relay, const uint8_t *data, noack_slot *datagram);
 void copy_payload(const noack_relay *relay, int64_t slot, uint8_t *into);
-void free_payload(noack_relay *relay, int64_t slot);
+void free_payload(noack_relay *relay, int64_t slot_number);
 
 /* device.c */
 int64_t headers_bytes(const noack_relay *relay);

@@ -52,21 +52,22 @@ static int64_t icmp_error(struct msghdr *message) {
 
    With IP_RECVERR, a send to a full device queue fails (ENOBUFS). However, each ICMP error also
    makes the socket's next call fail once. Therefore the error queue is emptied after a failed call,
-   to find out whether an ICMP error caused the failure. */
+   to see whether an ICMP error caused the failure. */
 int64_t take_errors(noack_relay *relay, int64_t socket) {
     relay_scratch *scratch = scratch_of(relay);
-    int64_t found = 0, client = client_of_socket(relay, socket);
-    int taken = relay->devices ? 0 : ERRORS, fd = relay->sockets[socket].fd;
-    while (taken == ERRORS) {
+    int64_t icmp_errors = 0, client = client_of_socket(relay, socket);
+    int message_count = relay->devices ? 0 : ERRORS, fd = relay->sockets[socket].fd;
+    while (message_count == ERRORS) {
         for (int k = 0; k < ERRORS; k++) {
             struct msghdr *message = &scratch->error_headers[k].msg_hdr;
             *message = (struct msghdr){
                 .msg_control = &scratch->error_controls[k], .msg_controllen = ERROR_CONTROL_BYTES};
         }
-        taken = recvmmsg(fd, scratch->error_headers, ERRORS, MSG_DONTWAIT | MSG_ERRQUEUE, NULL);
-        for (int k = 0; k < taken; k++) {
+        message_count =
+            recvmmsg(fd, scratch->error_headers, ERRORS, MSG_DONTWAIT | MSG_ERRQUEUE, NULL);
+        for (int k = 0; k < message_count; k++) {
             int64_t error = icmp_error(&scratch->error_headers[k].msg_hdr), link = -1;
-            found += error != 0;
+            icmp_errors += error != 0;
             if (client >= 0)
                 link = relay->clients[client].link;
             else if (socket >= relay->links)
@@ -75,7 +76,7 @@ int64_t take_errors(noack_relay *relay, int64_t socket) {
                 relay->directions[2 * link].port_unreachable++;
         }
     }
-    return found;
+    return icmp_errors;
 }
 
 static int64_t vectors_of(const departure *leaving) {
@@ -150,44 +151,43 @@ static void write_destination(
 
 /* Fill a message with a datagram and the following ones that the kernel can segment; return the
    datagram after them, and add to the number of vectors in use. */
-static int64_t fill_message(noack_relay *relay, int header, int64_t number, int64_t *vectors) {
+static int64_t fill_message(noack_relay *relay, int header, int64_t row, int64_t *vectors) {
     relay_scratch *scratch = scratch_of(relay);
-    const departure *first = &scratch->leaving[number];
+    const departure *first = &scratch->leaving[row];
     struct msghdr *message = &scratch->out_headers[header].msg_hdr;
     int64_t begin = *vectors, size_bytes = first->datagram.size_bytes, all_bytes = size_bytes;
     int64_t end = add_vectors(relay, begin, begin, first), last_bytes = size_bytes, segments = 1;
     *message = (struct msghdr){.msg_iov = scratch->out_vectors + begin};
-    scratch->out_first[header] = (int32_t)number;
-    number = first->next;
+    scratch->out_first[header] = (int32_t)row;
+    row = first->next;
     int can_segment = relay->segment && 0 < size_bytes && size_bytes < relay->segment_below;
-    while (can_segment && number >= 0 && segments < MOST_SEGMENTS && last_bytes == size_bytes) {
-        const departure *other = &scratch->leaving[number];
+    while (can_segment && row >= 0 && segments < MOST_SEGMENTS && last_bytes == size_bytes) {
+        const departure *other = &scratch->leaving[row];
         if (!may_join(relay, first, other, all_bytes) || end + vectors_of(other) > VECTORS)
             break;
         last_bytes = other->datagram.size_bytes;
         end = add_vectors(relay, begin, end, other);
         all_bytes += last_bytes;
         segments++;
-        number = other->next;
+        row = other->next;
     }
     if (segments > 1)
         write_segment_size(message, &scratch->out_controls[header], size_bytes);
     message->msg_iovlen = (size_t)(end - begin);
     write_destination(relay, message, first);
     *vectors = end;
-    return number;
+    return row;
 }
 
 /* Fill messages from a datagram on; return their number, and the datagram after them. */
-static int fill_messages(noack_relay *relay, int64_t number, int64_t *following) {
+static int fill_messages(noack_relay *relay, int64_t row, int64_t *following) {
     relay_scratch *scratch = scratch_of(relay);
     int64_t vectors = 0;
     int headers = 0;
     scratch->joined_bytes = 0;
-    while (number >= 0 && headers < LEAVING
-           && vectors + vectors_of(&scratch->leaving[number]) <= VECTORS)
-        number = fill_message(relay, headers++, number, &vectors);
-    *following = number;
+    while (row >= 0 && headers < LEAVING && vectors + vectors_of(&scratch->leaving[row]) <= VECTORS)
+        row = fill_message(relay, headers++, row, &vectors);
+    *following = row;
     return headers;
 }
 
@@ -214,9 +214,9 @@ static int call_send(const noack_relay *relay, int fd, struct mmsghdr *headers, 
     return sendmmsg(fd, headers, (unsigned)count, MSG_DONTWAIT);
 }
 
-static void mark_failed(relay_scratch *scratch, int64_t number, int64_t end, int error) {
-    for (; number != end; number = scratch->leaving[number].next)
-        scratch->leaving[number].error = error;
+static void mark_failed(relay_scratch *scratch, int64_t row, int64_t end, int error) {
+    for (; row != end; row = scratch->leaving[row].next)
+        scratch->leaving[row].error = error;
 }
 
 /* Send a number of messages; return the number of messages that were sent or failed.
@@ -242,7 +242,7 @@ static int transmit(noack_relay *relay, int64_t socket, int headers, int64_t fol
             waited_ns += wait_for_room(fd);
             continue;
         }
-        int64_t number = scratch->out_first[done];
+        int64_t row = scratch->out_first[done];
         if (error != EAGAIN && error != ENOBUFS) {
             tries++;
             if (tries < (take_errors(relay, socket) > 0 ? MOST_TRIES : TRIES))
@@ -250,13 +250,13 @@ static int transmit(noack_relay *relay, int64_t socket, int headers, int64_t fol
             const struct msghdr *message = &scratch->out_headers[done].msg_hdr;
             if (message->msg_controllen > 0) {
                 relay->segment_below =
-                    min_of(relay->segment_below, scratch->leaving[number].datagram.size_bytes);
+                    min_of(relay->segment_below, scratch->leaving[row].datagram.size_bytes);
                 return done;
             }
         }
         done++;
         tries = 0;
-        mark_failed(scratch, number, done < headers ? scratch->out_first[done] : following, error);
+        mark_failed(scratch, row, done < headers ? scratch->out_first[done] : following, error);
     }
     return done;
 }
@@ -281,13 +281,13 @@ static void account(noack_relay *relay, const departure *leaving, int64_t now_ns
 static int64_t send_queued(noack_relay *relay, int32_t place) {
     relay_scratch *scratch = scratch_of(relay);
     const noack_socket *socket = &relay->sockets[place];
-    int64_t number = socket->head, following, calls = 0;
-    for (; number >= 0; number = following) {
-        int headers = fill_messages(relay, number, &following), done = headers;
+    int64_t row = socket->head, following, calls = 0;
+    for (; row >= 0; row = following) {
+        int headers = fill_messages(relay, row, &following), done = headers;
         if (socket->fd >= 0)
             done = transmit(relay, place, headers, following);
         else
-            mark_failed(scratch, number, following, socket->error);
+            mark_failed(scratch, row, following, socket->error);
         if (done < headers)
             following = scratch->out_first[done];
         calls++;
@@ -310,8 +310,8 @@ int64_t send_all(noack_relay *relay) {
         for (; accounted <= place; accounted++) {
             noack_socket *socket = &relay->sockets[scratch->order[accounted]];
             socket->is_queued = 0;
-            for (int32_t number = socket->head; number >= 0; number = scratch->leaving[number].next)
-                account(relay, &scratch->leaving[number], now_ns);
+            for (int32_t row = socket->head; row >= 0; row = scratch->leaving[row].next)
+                account(relay, &scratch->leaving[row], now_ns);
         }
     }
     scratch->order_count = 0;

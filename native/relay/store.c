@@ -15,8 +15,8 @@ uint8_t *block_address(const noack_relay *relay, int64_t block) {
 /* Store a datagram with its payload, of which the bit that it names is flipped (-1: none); set its
    first block, and return the number of its slot. There must be room. */
 int64_t store_payload(noack_relay *relay, const uint8_t *data, noack_slot *datagram) {
-    int64_t number = relay->free_slot, size_bytes = datagram->size_bytes, bit = datagram->bit;
-    noack_slot *slot = &relay->slots[number];
+    int64_t slot_number = relay->free_slot, size_bytes = datagram->size_bytes, bit = datagram->bit;
+    noack_slot *slot = &relay->slots[slot_number];
     relay->free_slot = slot->next;
     relay->free_slots--;
     if (bit >= 0)
@@ -36,7 +36,7 @@ int64_t store_payload(noack_relay *relay, const uint8_t *data, noack_slot *datag
     relay->free_block = block;
     relay->block_next[last] = -1;
     relay->free_blocks -= blocks_for(size_bytes);
-    return number;
+    return slot_number;
 }
 
 void copy_payload(const noack_relay *relay, int64_t slot, uint8_t *into) {
@@ -51,8 +51,8 @@ void copy_payload(const noack_relay *relay, int64_t slot, uint8_t *into) {
 }
 
 /* Free a slot and its blocks. */
-void free_payload(noack_relay *relay, int64_t number) {
-    noack_slot *slot = &relay->slots[number];
+void free_payload(noack_relay *relay, int64_t slot_number) {
+    noack_slot *slot = &relay->slots[slot_number];
     int64_t count = blocks_for(slot->size_bytes), last = slot->block;
     for (int64_t k = 1; k < count; k++)
         last = relay->block_next[last];
@@ -60,7 +60,7 @@ void free_payload(noack_relay *relay, int64_t number) {
     relay->free_block = slot->block;
     relay->free_blocks += count;
     slot->next = (int32_t)relay->free_slot;
-    relay->free_slot = number;
+    relay->free_slot = slot_number;
     relay->free_slots++;
 }
 

@@ -68,12 +68,12 @@ def starting(name: str | None) -> Iterator[None]:
         yield
         return
     with registered_emulator(name, _STARTING):
-        if name in running():
+        if name in running_emulators():
             raise _in_use(name)
         yield
 
 
-def running() -> list[str]:
+def running_emulators() -> list[str]:
     """Return the names of this user's emulators that accept commands.
 
     Raises:
@@ -82,7 +82,7 @@ def running() -> list[str]:
     return list(_files())
 
 
-def find(name: str | None) -> str:
+def find_emulator(name: str | None) -> str:
     """Return the name of a running emulator; if ``name`` is None, of the only one.
 
     Raises:
@@ -165,7 +165,7 @@ class ControlServer:
             self._queryables = [
                 (self._session.declare_queryable(self._key(query), RingChannel(_QUERIES)), answer)
                 for query, answer in (
-                    ("report", lambda _: self._thread.now()),
+                    ("report", lambda _: self._thread.current()),
                     ("settings", self._settings),
                     ("change", self._change),
                 )

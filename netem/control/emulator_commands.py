@@ -16,7 +16,7 @@ import zenoh
 from rich.console import Console
 from zenoh.handlers import RingChannel
 
-from netem.control.control_server import EMULATORS, find, running
+from netem.control.control_server import EMULATORS, find_emulator, running_emulators
 from netem.control.emulator_statistics import Statistics
 from netem.control.statistics_view import Screen, picture_of
 from netem.relay.relay_reports import DIRECTIONS
@@ -24,7 +24,7 @@ from netem.tc_words import guarantee_words, require_no_dashes, settings_of
 from noack.core.errors import CallerError, ExitStatus, NoackError, PeerError
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.target_loss import read_files
-from noack.runtime.command_line import Parser, Signals, discard_output, failed
+from noack.runtime.command_line import Parser, Signals, discard_output, report_failure
 from noack.runtime.connections.zenoh_session import answer_to, cause_of, open_session
 
 _ANSWER_S = 30.0
@@ -83,7 +83,7 @@ class Client:
                     yield cast(Statistics, json.loads(sample.payload.to_string()))
                 elif time.monotonic() < received_s + _SILENCE_S:
                     time.sleep(_POLL_S)
-                elif self._name not in running():
+                elif self._name not in running_emulators():
                     raise PeerError(f"emulator {self._name!r} has ended")
                 else:
                     received_s = time.monotonic()
@@ -99,7 +99,7 @@ def main(arguments: Sequence[str]) -> ExitStatus:
         return COMMANDS[command](options)
     except NoackError as error:
         source, as_json = f"noack netem {command}", "--json" in options
-        return failed(str(error), error.exit_status, source=source, as_json=as_json)
+        return report_failure(str(error), error.exit_status, source=source, as_json=as_json)
     except BrokenPipeError:  # the reader has closed the pipe
         discard_output(sys.stdout.fileno())
         return ExitStatus.OK
@@ -120,11 +120,11 @@ def _parser(
     return parser
 
 
-def _find_emulator(options: argparse.Namespace) -> str:
+def _named_emulator(options: argparse.Namespace) -> str:
     """Return the emulator that NAME or --control NAME selects."""
     if options.control is not None and options.name not in (None, options.control):
         raise CallerError(f"--control {options.control}: NAME is {options.name} already")
-    return find(options.control or options.name)
+    return find_emulator(options.control or options.name)
 
 
 def _show(arguments: Sequence[str]) -> ExitStatus:
@@ -136,7 +136,7 @@ def _show(arguments: Sequence[str]) -> ExitStatus:
     )
     parser.add_argument("name", nargs="?", help=_NAME_HELP)
     options = parser.parse_args(arguments)
-    name = _find_emulator(options)
+    name = _named_emulator(options)
     with Client(name) as client:
         statistics = client.ask("report")
     if options.json:
@@ -166,7 +166,7 @@ def _set(arguments: Sequence[str]) -> ExitStatus:
     options.name, settings = _name_and_settings(options.words)
     settings = read_files(settings, Path())
     # Change the emulator, and show all settings afterwards.
-    with Client(_find_emulator(options)) as client:
+    with Client(_named_emulator(options)) as client:
         earlier = client.ask("settings")
         answer = client.ask(
             "change",
@@ -205,7 +205,7 @@ def _warn_of_removed_caps(earlier: Sequence[Mapping[str, Any]], later: Sequence[
 def _name_and_settings(words: Sequence[str]) -> tuple[str | None, LinkSettings]:
     """Separate the emulator's name, if the words begin with one, from the settings."""
     name, setting_words = None, words
-    if words and words[0] in running():
+    if words and words[0] in running_emulators():
         name, setting_words = words[0], words[1:]
     if not setting_words:
         raise CallerError("words are missing, for example: loss 5% mansd 4; or: loss none")
@@ -229,7 +229,7 @@ def _watch(arguments: Sequence[str]) -> ExitStatus:
     )
     parser.add_argument("name", nargs="?", help=_NAME_HELP)
     options = parser.parse_args(arguments)
-    name = _find_emulator(options)
+    name = _named_emulator(options)
     with (
         Signals().handled() as signals,
         Client(name) as client,

@@ -301,7 +301,7 @@ class StatisticsThread:
         self._stopping.set()
         self._thread.join(_JOIN_S)
 
-    def now(self) -> Statistics:
+    def current(self) -> Statistics:
         """Return the present statistics, with rates over the last one or two periods.
 
         Raises:

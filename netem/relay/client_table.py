@@ -37,9 +37,9 @@ class ClientTable:
         self._free_rows = list(reversed(range(len(memory.clients))))
         self._free_flow_rows: list[list[int]] = [[] for _ in links]
         self._used_flow_rows = [0] * len(links)
-        self.ever = [0] * len(links)
+        self.total_counts = [0] * len(links)
         """(links,) Clients so far."""
-        self.present = [0] * len(links)
+        self.present_counts = [0] * len(links)
         """(links,) Clients that are in the table."""
         self._paths: dict[int, Endpoint] = {}
         self._drops: dict[int, int] = {}
@@ -51,7 +51,7 @@ class ClientTable:
 
     def add(self, link: int, name: bytes) -> None:
         """Add a client by its packed name; if that is impossible, refuse clients until one leaves."""
-        present = self.present[link]
+        present = self.present_counts[link]
         if present >= self._links[link].spec.most_clients:
             self._warnings[link].report_full()
             self._set_full(link, True)
@@ -78,7 +78,7 @@ class ClientTable:
             path = self._paths.get(row)
             if path is None or not has_data(path):
                 self._forget(row)
-        for link, present in enumerate(self.present):
+        for link, present in enumerate(self.present_counts):
             if present == 0:  # full for lack of a file descriptor; no client can make room
                 self._set_full(link, False)
 
@@ -138,9 +138,9 @@ class ClientTable:
         else:
             flow_row = self._used_flow_rows[link]
             self._used_flow_rows[link] += 1
-        number = self.ever[link]
-        self.ever[link] += 1
-        self.present[link] += 1
+        number = self.total_counts[link]
+        self.total_counts[link] += 1
+        self.present_counts[link] += 1
         for direction in self._directions[2 * link : 2 * link + 2]:
             direction.start_flow(flow_row, number)
         memory = self._memory
@@ -181,7 +181,7 @@ class ClientTable:
         memory.sockets["error"][self._memory.first_path + row] = 0
         self._free_rows.append(row)
         self._free_flow_rows[link].append(int(memory.clients["flow_row"][row]))
-        self.present[link] -= 1
+        self.present_counts[link] -= 1
         self._set_full(link, False)
 
     def _set_full(self, link: int, full: bool) -> None:

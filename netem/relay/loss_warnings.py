@@ -37,7 +37,7 @@ class LinkWarnings:
             f"no file descriptors are left for more than {clients} clients; raise the limit (ulimit -n)"
         )
 
-    def port_unreachable(self, answers: int) -> None:
+    def set_port_unreachable(self, answers: int) -> None:
         """Set the total number of ICMP port-unreachable messages from the server's host."""
         if answers:
             self._report(
@@ -62,11 +62,11 @@ class UnintendedLosses:
         self._counts: Counter[str] = Counter({KERNEL: 0})
         self._reported: Counter[str] = Counter()
 
-    def lost_in_kernel(self, datagrams: int) -> None:
+    def set_lost_in_kernel(self, datagrams: int) -> None:
         """Set the total number of datagrams that the kernel has dropped."""
         self._set(KERNEL, datagrams)
 
-    def not_sent(self, error: int, datagrams: int) -> None:
+    def set_not_sent(self, error: int, datagrams: int) -> None:
         """Set the total number of datagrams that could not be sent or stored, for one errno."""
         self._set(os.strerror(error), datagrams)
 

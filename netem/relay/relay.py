@@ -130,8 +130,8 @@ class Relay:
         if link not in names:
             raise CallerError(f"link {link}: there is none of this name, but {', '.join(names)}")
         number = 2 * names.index(link) + DIRECTIONS.index(direction)
-        relayed = self._directions[number]
-        relayed.change(settings, self._memory.latest_ns(number, relayed.rows))
+        changed = self._directions[number]
+        changed.change(settings, self._memory.latest_ns(number, changed.rows))
         self._stamp_arrivals(number)
 
     def report(self) -> Sequence[LinkReport]:
@@ -168,12 +168,12 @@ class Relay:
     def _update_losses(self) -> None:
         for number, link in enumerate(self._open_links):
             *_, port_unreachable = self._link_counts(number)
-            self._warnings[number].port_unreachable(port_unreachable)
-            self._losses[2 * number].lost_in_kernel(link.drops("forward"))
-            lost = self._clients.drops[number] + link.drops("reverse")
-            self._losses[2 * number + 1].lost_in_kernel(lost)
+            self._warnings[number].set_port_unreachable(port_unreachable)
+            self._losses[2 * number].set_lost_in_kernel(link.drops("forward"))
+            drops = self._clients.drops[number] + link.drops("reverse")
+            self._losses[2 * number + 1].set_lost_in_kernel(drops)
         for direction, error, datagrams in self._send_errors():
-            self._losses[direction].not_sent(error, datagrams)
+            self._losses[direction].set_not_sent(error, datagrams)
 
     def _relay_until(self, until_ns: int) -> None:
         """Relay datagrams, and pass their events to the taps."""
@@ -208,8 +208,8 @@ class Relay:
     def _link_counts(self, link: int) -> tuple[int, int, int, int]:
         """Return present clients, all clients, refused datagrams, ICMP port-unreachable errors."""
         row = self._directions[2 * link].row
-        present, ever = self._clients.present[link], self._clients.ever[link]
-        return present, ever, row.refused, row.port_unreachable
+        present, total = self._clients.present_counts[link], self._clients.total_counts[link]
+        return present, total, row.refused, row.port_unreachable
 
     def _send_errors(self) -> Iterator[tuple[int, int, int]]:
         """Yield direction, errno and number of datagrams that could not be sent or stored."""

@@ -203,13 +203,13 @@ def _refuse_loops(links: Sequence[OpenLink]) -> None:
         if leads_to(link.server, name)
     }
     for link in links:
-        passed = [link.spec.name]
-        while (following_link := following.get(passed[-1])) is not None:
+        passed_names = [link.spec.name]
+        while (following_link := following.get(passed_names[-1])) is not None:
             if following_link is link:
-                over = f" over {', '.join(passed[1:])}" if len(passed) > 1 else ""
+                over = f" over {', '.join(passed_names[1:])}" if len(passed_names) > 1 else ""
                 raise CallerError(
                     f"link {link.spec.name}: {address_text(link.spec.to)} leads back to itself{over}"
                 )
-            if following_link.spec.name in passed:
+            if following_link.spec.name in passed_names:
                 break
-            passed.append(following_link.spec.name)
+            passed_names.append(following_link.spec.name)

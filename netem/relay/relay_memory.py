@@ -82,30 +82,30 @@ class RelayMemory:
             setattr(self.core, name, pointer_to(getattr(self, name), kind))
         core.noack_relay_open(self.core)
 
-    def watch(self, fd: int, number: int) -> None:
+    def watch(self, fd: int, place: int) -> None:
         """Wait for the datagrams of a socket, too; closing it ends this.
 
         Args:
             fd: its descriptor.
-            number: its place among the sockets.
+            place: its place among the sockets.
 
         Raises:
             OSError: the system refuses.
         """
-        self.sockets["fd"][number] = fd
-        if error := core.noack_relay_watch(self.core, fd, number):
+        self.sockets["fd"][place] = fd
+        if error := core.noack_relay_watch(self.core, fd, place):
             raise OSError(error, "epoll_ctl")
 
-    def wait_for_only(self, fd: int, number: int, wait_ns: int) -> None:
+    def wait_for_only(self, fd: int, place: int, wait_ns: int) -> None:
         """Wait for the datagrams of no socket but this one, by receiving from it.
 
         Args:
             fd: its descriptor.
-            number: its place among the sockets.
+            place: its place among the sockets.
             wait_ns: how long receiving from it waits.
         """
-        self.sockets["fd"][number] = fd
-        self.core.only_socket, self.core.receive_wait_ns = number, wait_ns
+        self.sockets["fd"][place] = fd
+        self.core.only_socket, self.core.receive_wait_ns = place, wait_ns
 
     def add_room(self) -> None:
         """Make room for one more delayed datagram and its copy, if there is memory."""

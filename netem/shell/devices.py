@@ -144,11 +144,11 @@ def _open_tun(name: str) -> int:
 
 def _configure(name: str, address: IPv4Address, prefix_bits: int) -> None:
     """Give a device its addresses, and let packets pass."""
-    six_bits = _RANGE6_BITS + prefix_bits - _RANGE.prefixlen
+    prefix6_bits = _RANGE6_BITS + prefix_bits - _RANGE.prefixlen
     _ip(
         "link set lo up",
         f"link set {name} mtu {MTU_BYTES} txqueuelen {_QUEUE_PACKETS} up",
-        f"address add {_ipv6_address(address)}/{six_bits} dev {name} nodad",
+        f"address add {_ipv6_address(address)}/{prefix6_bits} dev {name} nodad",
         f"address add {address}/{prefix_bits} dev {name}",
     )
 

@@ -83,11 +83,11 @@ def children(parent: int) -> set[int]:
     return ids
 
 
-def end_children(kept: Collection[int] = ()) -> None:
-    """End all children and adopted descendants but those kept: by SIGTERM, then by SIGKILL."""
+def end_children(kept_processes: Collection[int] = ()) -> None:
+    """End all children and adopted descendants but ``kept_processes``: by SIGTERM, then by SIGKILL."""
     deadline_s = time.monotonic() + _GRACE_S
     terminated: set[int] = set()
-    while remaining := children(os.getpid()).difference(kept):
+    while remaining := children(os.getpid()).difference(kept_processes):
         is_overdue = time.monotonic() > deadline_s
         for child in remaining if is_overdue else remaining - terminated:
             os.kill(child, signal.SIGKILL if is_overdue else signal.SIGTERM)

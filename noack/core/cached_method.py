@@ -24,11 +24,11 @@ def cached_method(
 
     @wraps(method)
     def wrapper(self: Owner, /, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        known: dict[Hashable, Result] = self.__dict__.setdefault(results, {})
+        by_key: dict[Hashable, Result] = self.__dict__.setdefault(results, {})
         key = _bits(*args, **kwargs)
-        if key not in known:
-            known[key] = method(self, *args, **kwargs)
-        return known[key]
+        if key not in by_key:
+            by_key[key] = method(self, *args, **kwargs)
+        return by_key[key]
 
     return wrapper
 

@@ -126,13 +126,13 @@ class CoreMemory:
     """
 
     def __init__(self) -> None:
-        self._kept: list[object] = []
+        self._owners: list[object] = []
         self._transitions: dict[bytes, CData] = {}
         self._shared: list[AnyArray] = []
 
     def keep(self, owner: T) -> T:
         """Keep an object alive as long as this memory; return it."""
-        self._kept.append(owner)
+        self._owners.append(owner)
         return owner
 
     def reals(self, values: ArrayLike) -> CData:
@@ -170,12 +170,12 @@ class CoreMemory:
         points: Iterable[Reals | None] = (None,),
     ) -> None:
         """Fill a ``noack_model``: its set points x_r, and the times at which they change."""
-        since, known = list(since_ns), list(points)
+        times_ns, all_points = list(since_ns), list(points)
         n = transitions.n
-        model.transitions, model.changes = transitions, len(since)
-        model.since_ns = self.integers(since or [0])
-        model.has_point = self.integers([point is not None for point in known])
-        model.points = self.reals([np.zeros(n) if point is None else point for point in known])
+        model.transitions, model.changes = transitions, len(times_ns)
+        model.since_ns = self.integers(times_ns or [0])
+        model.has_point = self.integers([point is not None for point in all_points])
+        model.points = self.reals([np.zeros(n) if point is None else point for point in all_points])
 
     def fill(self, structure: CData, numbers: Mapping[str, object]) -> None:
         """Set fields of a structure; an array becomes a pointer to a copy of it."""
@@ -186,7 +186,7 @@ class CoreMemory:
     @property
     def mark(self) -> int:
         """How much this memory keeps now; :meth:`copy` copies what was added since."""
-        return len(self._kept)
+        return len(self._owners)
 
     def copy(self, structures: CData, first: int, others: Sequence[int], mark: int) -> None:
         """Make structures of an array copies of one of them, each with arrays of its own.
@@ -197,33 +197,35 @@ class CoreMemory:
             others: numbers of those that become like it; they share its transition matrices.
             mark: that of this memory before it was filled.
         """
-        arrays = [kept.reshape(-1) for kept in self._kept[mark:] if isinstance(kept, np.ndarray)]
+        arrays = [owner.reshape(-1) for owner in self._owners[mark:] if isinstance(owner, np.ndarray)]
         ends = [*accumulate(map(len, arrays), initial=0)]
-        own = np.empty((len(others), ends[-1] + 1), np.uint64)
-        own[:, : ends[-1]] = np.concatenate([array.view(np.uint64) for array in arrays])
-        self._kept.append(own)
+        copied = np.empty((len(others), ends[-1] + 1), np.uint64)
+        copied[:, : ends[-1]] = np.concatenate([array.view(np.uint64) for array in arrays])
+        self._owners.append(copied)
         words = np.frombuffer(ffi.buffer(structures), np.uint64).reshape(len(structures), -1)
         copies = np.repeat(words[None, first], len(others), axis=0)
         starts = {array.ctypes.data: end for array, end in zip(arrays, ends[:-1], strict=True)}
         for word in _pointer_words(ffi.typeof(structures).item):
             if (start := starts.get(int(words[first, word]))) is not None:
-                copies[:, word] = own.ctypes.data + start * 8 + own.strides[0] * np.arange(len(own))
+                copies[:, word] = copied.ctypes.data + start * 8 + copied.strides[0] * np.arange(len(copied))
         words[others] = copies
 
     def _new_transitions(self, H: Reals) -> CData:
         n = len(H)
-        fits = max(_MOST_NUMBERS // (n * n), 4)
-        places = min(_MOST_PLACES, 1 << fits.bit_length() - 1)
-        made = ffi.new("noack_transitions *", {"n": n, "is_static": not H.any(), "places": places})
+        most_places = max(_MOST_NUMBERS // (n * n), 4)
+        places = min(_MOST_PLACES, 1 << most_places.bit_length() - 1)
+        transitions = ffi.new("noack_transitions *", {"n": n, "is_static": not H.any(), "places": places})
         steps_ns, matrices = np.zeros(places, np.int64), np.zeros(places * n * n)
         scratch = np.zeros(SCRATCH_MATRICES * n * n + 3 * n)
-        made.H, made.steps_ns = pointer_to(H, "double *"), pointer_to(steps_ns, "int64_t *")
-        made.matrices, made.scratch = (pointer_to(array, "double *") for array in (matrices, scratch))
+        transitions.H, transitions.steps_ns = pointer_to(H, "double *"), pointer_to(steps_ns, "int64_t *")
+        transitions.matrices, transitions.scratch = (
+            pointer_to(array, "double *") for array in (matrices, scratch)
+        )
         self._shared += [H, steps_ns, matrices, scratch]
-        return made
+        return transitions
 
     def _pointer(self, array: AnyArray, kind: str) -> CData:
-        self._kept.append(array)
+        self._owners.append(array)
         return ffi.cast(kind, ffi.from_buffer(array))  # faster than numpy's address
 
 

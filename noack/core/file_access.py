@@ -20,8 +20,8 @@ _NOT_REGULAR = "not a regular file"
 _HAS_LINKS = os.open in os.supports_dir_fd
 """Whether other users can put links into a folder (POSIX). On Windows links need their privilege,
 and a folder has no descriptor, nor can an open file be replaced."""
-_UNBLOCKED = os.O_NONBLOCK if _HAS_LINKS else os.O_BINARY  # type: ignore[attr-defined]
-_SAFE = _UNBLOCKED | (os.O_NOFOLLOW | os.O_CLOEXEC if _HAS_LINKS else 0)
+_UNBLOCKED_FLAGS = os.O_NONBLOCK if _HAS_LINKS else os.O_BINARY  # type: ignore[attr-defined]
+_SAFE_FLAGS = _UNBLOCKED_FLAGS | (os.O_NOFOLLOW | os.O_CLOEXEC if _HAS_LINKS else 0)
 """Follow no link, and do not wait for the reader of a FIFO."""
 
 
@@ -151,7 +151,7 @@ def _open_regular(path: Path, flags: int) -> int:
     """Open a regular file; follow no link, and do not wait for the reader of a FIFO."""
     try:
         with _folder(path.parent) as folder:
-            descriptor = folder.open(path.name, flags | _SAFE, 0o666)
+            descriptor = folder.open(path.name, flags | _SAFE_FLAGS, 0o666)
     except OSError as error:
         if error.errno in (errno.ELOOP, errno.ENXIO):
             raise OSError(_NOT_REGULAR) from None
@@ -180,7 +180,7 @@ class _Folder(NamedTuple):
 def _scratch_file(folder: _Folder, mode: int) -> tuple[str, int]:
     """Create a file with a random name in an open folder; return its name and descriptor."""
     name = f".{os.urandom(8).hex()}{PARTIAL}"
-    return name, folder.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _SAFE, mode)
+    return name, folder.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _SAFE_FLAGS, mode)
 
 
 @contextmanager
@@ -213,7 +213,7 @@ def _is_trusted(status: os.stat_result) -> bool:
 @contextmanager
 def open_regular(path: Path) -> Iterator[IO[bytes]]:
     """Open a regular file; raise ValueError if it is a device, a FIFO or a directory."""
-    descriptor = os.open(path, os.O_RDONLY | _UNBLOCKED)  # so that a FIFO does not block
+    descriptor = os.open(path, os.O_RDONLY | _UNBLOCKED_FLAGS)  # so that a FIFO does not block
     try:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             raise ValueError(_NOT_REGULAR)

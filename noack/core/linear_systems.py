@@ -29,7 +29,7 @@ _CACHED_STEPS = 4096
 """Transition matrices that are kept."""
 _NEGLIGIBLE = 1e-140
 """Smaller entries have no influence when a matrix is balanced."""
-_BALANCINGS, _FARTHEST = 20, 200
+_MOST_ROUNDS, _LARGEST_EXPONENT = 20, 200
 """Most rounds of balancing, and the largest exponent."""
 _MOST_STATES = 12
 """The linear equations of a Lyapunov equation grow with the fourth power of the states."""
@@ -37,11 +37,11 @@ _MOST_STATES = 12
 
 def exponential(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return e^M, (n, n). An entry that overflows is infinite or not a number."""
-    given = np.ascontiguousarray(matrix, np.float64)
-    result, scratch = np.empty_like(given), np.empty((SCRATCH_MATRICES, *given.shape))
-    if len(given):
-        pointers = (pointer_to(array, "double *") for array in (given, result, scratch))
-        core.noack_exponential(len(given), *pointers)
+    contiguous = np.ascontiguousarray(matrix, np.float64)
+    result, scratch = np.empty_like(contiguous), np.empty((SCRATCH_MATRICES, *contiguous.shape))
+    if len(contiguous):
+        pointers = (pointer_to(array, "double *") for array in (contiguous, result, scratch))
+        core.noack_exponential(len(contiguous), *pointers)
     return result
 
 
@@ -166,17 +166,17 @@ def balancing_exponents(sizes: Matrix) -> NDArray[np.int64]:
     radius = float(np.abs(np.linalg.eigvals(sizes)).max())  # the same in all units
     radius = radius if radius > _NEGLIGIBLE else 1.0
     others = np.where(np.eye(len(sizes)) + (sizes < _NEGLIGIBLE), 0.0, sizes)
-    for _ in range(_BALANCINGS):
-        before = exponents.copy()
+    for _ in range(_MOST_ROUNDS):
+        earlier = exponents.copy()
         for i in range(len(sizes)):
             scaled = np.ldexp(others, exponents[:, None] - exponents)
             row, column = float(scaled[i].max()), float(scaled[:, i].max())
             # What has no influence, or is not influenced, has its other size near the radius.
             ratio = math.log2(column or radius) - math.log2(row or radius)
             exponents[i] += round(ratio / 2 if row and column else ratio)
-        if (exponents == before).all():
+        if (exponents == earlier).all():
             break
-    return np.clip(exponents - int(np.median(exponents)), -_FARTHEST, _FARTHEST)
+    return np.clip(exponents - int(np.median(exponents)), -_LARGEST_EXPONENT, _LARGEST_EXPONENT)
 
 
 def _reals(values: Matrix | Vector) -> CData:
@@ -217,8 +217,8 @@ class ModelFlow:
     def _propagate_about(self, setpoint: Vector | None, x: Vector, dt_ns: int) -> Vector:
         if setpoint is None or dt_ns == 0:
             return self.propagate(x, dt_ns)
-        moved: Vector = setpoint + self.propagate(x - setpoint, dt_ns)
-        return moved
+        propagated: Vector = setpoint + self.propagate(x - setpoint, dt_ns)
+        return propagated
 
 
 def _same(a: Vector | None, b: Vector | None) -> bool:

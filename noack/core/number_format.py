@@ -11,16 +11,16 @@ from decimal import MAX_EMAX, MIN_EMIN, ROUND_CEILING, ROUND_FLOOR, Context, Dec
 
 NONE = "-"
 """Text for a missing number."""
-_DIGITS = 2  # significant digits of the half-width
-_ALONE = 4
+_HALFWIDTH_DIGITS = 2  # significant digits of the half-width
+_MEAN_DIGITS = 4
 """Significant digits of a mean without an interval, or with an interval in exponent notation."""
-_NOISE = 12
+_BOUND_DIGITS = 12
 """Significant digits of a bound that are used; later ones are rounding errors."""
-_WIDE = Context(prec=400, Emin=MIN_EMIN, Emax=MAX_EMAX)
-_FIXED = range(-5, 7)  # powers of ten that are written without exponent notation
+_WIDE_CONTEXT = Context(prec=400, Emin=MIN_EMIN, Emax=MAX_EMAX)
+_FIXED_POWERS = range(-5, 7)  # powers of ten that are written without exponent notation
 _TIME_DIGITS = 3
 """Significant digits of a duration."""
-_SIZES = (1e9, 1e6, 1e3)
+_UNIT_SIZES = (1e9, 1e6, 1e3)
 TextRows = Sequence[Sequence[str]]
 """The first entry of a row is its name."""
 _CELL = 'style="text-align: left; vertical-align: top; line-height: 1.4"'
@@ -50,9 +50,9 @@ def at_least(value: float | None, digits: int = 4, decimals: int | None = None) 
 def _bound(value: float | None, digits: int, decimals: int | None, rounding: str) -> str:
     if value is None or value == 0 or not math.isfinite(value):
         return number(value, digits)
-    exact = Decimal(f"{value:.{_NOISE}g}") if decimals is None else Decimal(value)
+    exact = Decimal(f"{value:.{_BOUND_DIGITS}g}") if decimals is None else Decimal(value)
     last = exact.adjusted() - digits + 1 if decimals is None else -decimals
-    rounded = exact.quantize(Decimal(1).scaleb(last), rounding, _WIDE)
+    rounded = exact.quantize(Decimal(1).scaleb(last), rounding, _WIDE_CONTEXT)
     return f"{float(rounded):.{digits}g}" if decimals is None else f"{rounded:.{decimals}f}"
 
 
@@ -103,7 +103,7 @@ def percent(share: float) -> str:
 
 def with_unit(value: float, units: tuple[str, str, str, str]) -> str:
     """Write a value with three digits in units of 10⁹, 10⁶, 10³ or 1."""
-    for unit, size in zip(units, _SIZES, strict=False):
+    for unit, size in zip(units, _UNIT_SIZES, strict=False):
         if abs(value) >= 0.9995 * size:
             part = abs(value) / size
             digits = 0 if part >= 99.95 else 1 if part >= 9.995 else 2
@@ -122,11 +122,11 @@ def plus_minus(mean: float, halfwidth: float) -> str:
     The half-width has two significant digits. The mean has as many decimals as the half-width:
     ``0.1594 ± 0.016`` is ``0.159 ± 0.016``.
     """
-    if not (math.isfinite(mean) and math.isfinite(halfwidth) and halfwidth > 10**-_NOISE * abs(mean)):
-        return f"{mean:.{_ALONE}g}".replace("-", "−")
-    last = _power(float(f"{halfwidth:.{_DIGITS - 1}e}")) - _DIGITS + 1
-    if last + _DIGITS - 1 not in _FIXED or _power(mean) not in _FIXED:
-        return f"{mean:.{_ALONE}g} ± {halfwidth:.{_DIGITS}g}".replace("-", "−")
+    if not (math.isfinite(mean) and math.isfinite(halfwidth) and halfwidth > 10**-_BOUND_DIGITS * abs(mean)):
+        return f"{mean:.{_MEAN_DIGITS}g}".replace("-", "−")
+    last = _power(float(f"{halfwidth:.{_HALFWIDTH_DIGITS - 1}e}")) - _HALFWIDTH_DIGITS + 1
+    if last + _HALFWIDTH_DIGITS - 1 not in _FIXED_POWERS or _power(mean) not in _FIXED_POWERS:
+        return f"{mean:.{_MEAN_DIGITS}g} ± {halfwidth:.{_HALFWIDTH_DIGITS}g}".replace("-", "−")
     return f"{_rounded(mean, last)} ± {_rounded(halfwidth, last)}".replace("-", "−")
 
 

@@ -31,8 +31,8 @@ def words(seed: int, *name: str, rows: range, width: int) -> NDArray[np.uint64]:
     blocks = -(-width // 4)
     low, high = stream_key(seed, *name)
     table = np.random.Philox(key=low | high << 32, counter=rows.start * blocks)
-    drawn = table.random_raw(len(rows) * blocks * 4)
-    return np.asarray(drawn).reshape(len(rows), blocks * 4)[:, :width]
+    values = table.random_raw(len(rows) * blocks * 4)
+    return np.asarray(values).reshape(len(rows), blocks * 4)[:, :width]
 
 
 def uniforms(seed: int, *name: str, rows: range, width: int) -> NDArray[np.float64]:
@@ -77,21 +77,21 @@ def named_stream_keys(seeds: Sequence[int], names: Sequence[tuple[str, ...]]) ->
 
 def _keys(seeds: NDArray[np.uint64], names: NDArray[np.uint32]) -> NDArray[np.int64]:
     # numpy's SeedSequence for many seeds at once. A seed below 2¹²⁸ is four words of entropy.
-    words = np.zeros((8, len(seeds)), np.uint32)
-    words[0] = seeds & np.uint64(0xFFFFFFFF)
-    words[1] = seeds >> np.uint64(32)
-    words[4:] = names
-    hashed = _Hash(0x43B0D7E5, 0x931E8875)
-    pool = [hashed(word) for word in words[:4]]
+    entropy = np.zeros((8, len(seeds)), np.uint32)
+    entropy[0] = seeds & np.uint64(0xFFFFFFFF)
+    entropy[1] = seeds >> np.uint64(32)
+    entropy[4:] = names
+    entropy_hash = _Hash(0x43B0D7E5, 0x931E8875)
+    pool = [entropy_hash(word) for word in entropy[:4]]
     for source in range(4):
         for into in range(4):
             if source != into:
-                pool[into] = _mixed(pool[into], hashed(pool[source]))
-    for word in words[4:]:
+                pool[into] = _mixed(pool[into], entropy_hash(pool[source]))
+    for word in entropy[4:]:
         for into in range(4):
-            pool[into] = _mixed(pool[into], hashed(word))
-    drawn = _Hash(0x8B51F9DD, 0x58F38DED)
-    return np.stack([drawn(pool[0]), drawn(pool[1])], axis=1).astype(np.int64)
+            pool[into] = _mixed(pool[into], entropy_hash(word))
+    output_hash = _Hash(0x8B51F9DD, 0x58F38DED)
+    return np.stack([output_hash(pool[0]), output_hash(pool[1])], axis=1).astype(np.int64)
 
 
 class _Hash:
@@ -100,18 +100,18 @@ class _Hash:
     def __init__(self, constant: int, factor: int) -> None:
         self._constant, self._factor = constant, factor
 
-    def __call__(self, words: NDArray[np.uint32]) -> NDArray[np.uint32]:
-        words = words ^ np.uint32(self._constant)
+    def __call__(self, values: NDArray[np.uint32]) -> NDArray[np.uint32]:
+        values = values ^ np.uint32(self._constant)
         self._constant = self._constant * self._factor & 0xFFFFFFFF
-        words *= np.uint32(self._constant)
-        words ^= words >> np.uint32(16)
-        return words
+        values *= np.uint32(self._constant)
+        values ^= values >> np.uint32(16)
+        return values
 
 
 def _mixed(a: NDArray[np.uint32], b: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    words = a * np.uint32(0xCA01F9DD) - b * np.uint32(0x4973F715)
-    words ^= words >> np.uint32(16)
-    return words
+    values = a * np.uint32(0xCA01F9DD) - b * np.uint32(0x4973F715)
+    values ^= values >> np.uint32(16)
+    return values
 
 
 def _sequence(seed: int, name: tuple[str, ...]) -> "np.random.SeedSequence":

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, Vector
 
-_SAFE = 1e-140
+_SMALLEST_SAFE = 1e-140
 """Squares of vectors between this size and its inverse neither underflow nor overflow."""
 _MOST_IN_TURN = 8
 """numpy, too, adds fewer terms one after the other, but takes ten times as long for many short rows."""
@@ -26,7 +26,7 @@ def row_norms(rows: Matrix) -> Vector:
             norms = np.asarray(np.sqrt(reduce(np.add, (entries * entries for entries in rows.T))))
         else:
             norms = np.asarray(np.linalg.norm(rows, axis=1))
-    doubtful = (norms < _SAFE) | ~(norms < 1 / _SAFE)
+    doubtful = (norms < _SMALLEST_SAFE) | ~(norms < 1 / _SMALLEST_SAFE)
     if doubtful.any():
         sizes = np.abs(rows[doubtful]).max(axis=1, initial=0.0)
         scales = np.where((sizes > 0) & np.isfinite(sizes), sizes, 1.0)

@@ -14,7 +14,7 @@ from noack.core.errors import MachineError, one_line
 with suppress(ImportError):  # Windows has no limits
     import resource
 
-_FILES = 64
+_LEAST_OPEN_FILES = 64
 """Open files of a process of a run, up to 40, and some more."""
 _ADDRESS_SPACE_BYTES = 3_000_000_000
 """Address space of a launcher, 2.8 GB, most of it never used; it has 0.3 GB in memory."""
@@ -28,13 +28,14 @@ def require_limits() -> None:
     if a limit is too low.
     """
     soft, hard = _limits("RLIMIT_NOFILE")
-    if soft < _FILES:
-        if hard < _FILES:
+    if soft < _LEAST_OPEN_FILES:
+        if hard < _LEAST_OPEN_FILES:
             raise MachineError(
-                f"at most {hard} open files are permitted; a process of a run needs {_FILES}: ulimit -n 1024"
+                f"at most {hard} open files are permitted; a process of a run needs "
+                f"{_LEAST_OPEN_FILES}: ulimit -n 1024"
             )
         _, hard_limit = resource.getrlimit(resource.RLIMIT_NOFILE)
-        resource.setrlimit(resource.RLIMIT_NOFILE, (_FILES, hard_limit))
+        resource.setrlimit(resource.RLIMIT_NOFILE, (_LEAST_OPEN_FILES, hard_limit))
     soft, _ = _limits("RLIMIT_AS")
     if soft < _ADDRESS_SPACE_BYTES:
         raise MachineError(
@@ -50,9 +51,9 @@ def exhausted_limit(error: BaseException) -> str | None:
         soft, _ = _limits("RLIMIT_NOFILE")
         return f"too many open files: at most {soft} are permitted; see `ulimit -n`"
     text = one_line(error)
-    known = isinstance(error, ImportError | RuntimeError)
-    known = known and any(phrase in text.lower() for phrase in _OUT_OF_MEMORY)
-    if not (known or isinstance(error, MemoryError) or number == errno.ENOMEM):
+    is_known = isinstance(error, ImportError | RuntimeError)
+    is_known = is_known and any(phrase in text.lower() for phrase in _OUT_OF_MEMORY)
+    if not (is_known or isinstance(error, MemoryError) or number == errno.ENOMEM):
         return None
     soft, _ = _limits("RLIMIT_AS")
     if soft == math.inf:

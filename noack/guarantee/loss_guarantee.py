@@ -246,8 +246,8 @@ class LossAutomaton:
             self._numbers[key] = len(self._states)
             self._states.append(key)
             if len(self._states) > len(self._next):
-                room = np.full((len(self._next), 2), _UNKNOWN)
-                self._next = np.concatenate([self._next, room])
+                added_rows = np.full((len(self._next), 2), _UNKNOWN)
+                self._next = np.concatenate([self._next, added_rows])
         return self._numbers[key]
 
 
@@ -294,22 +294,22 @@ def find_counterexample(guarantee: LossGuarantee, implied: LossGuarantee) -> Out
     Raises:
         CallerError: the guarantee has too many states.
     """
-    states = _States(guarantee)
-    patterns = [states.pattern_against(rule) for rule in implied.rules]
+    shortest = _ShortestPatterns(guarantee)
+    patterns = [shortest.pattern_against(rule) for rule in implied.rules]
     return min((pattern for pattern in patterns if pattern is not None), key=len, default=None)
 
 
-class _States:
+class _ShortestPatterns:
     """The states of a guarantee in the order of the shortest patterns that reach them."""
 
     def __init__(self, guarantee: LossGuarantee) -> None:
         self._meaning = guarantee.meaning
-        moves = transition_table(guarantee, _MOST_STATES)
-        if moves is None:
+        table = transition_table(guarantee, _MOST_STATES)
+        if table is None:
             raise self._too_many()
-        self._after_loss, self._after_delivery = moves
-        reached, places = np.unique(np.column_stack(moves), return_index=True)
-        self._origins = np.zeros((len(moves.after_loss), 2), int)
+        self._after_loss, self._after_delivery = table
+        reached, places = np.unique(np.column_stack(table), return_index=True)
+        self._origins = np.zeros((len(table.after_loss), 2), int)
         """The state before each state, and 1 if the update between was delivered, else 0."""
         self._origins[reached[reached > 0]] = np.column_stack(np.divmod(places[reached > 0], 2))
         self._depths = np.zeros(len(self._origins), int)

@@ -75,10 +75,10 @@ class Part:
         if self.quantity is None:
             return self.word
         value = tuple(getattr(settings, key) for key in self.keys)
-        written = self.quantity.text(value[0] if len(value) == 1 else value)
-        return f"{self.word} {written}".strip()
+        value_text = self.quantity.text(value[0] if len(value) == 1 else value)
+        return f"{self.word} {value_text}".strip()
 
-    def described(self, preceding: str) -> Iterator[Word]:
+    def list_words(self, preceding: str) -> Iterator[Word]:
         """Yield the part's words, given those before it."""
         if self.word:
             yield Word(self.word, self.example, preceding)
@@ -115,7 +115,7 @@ class FileOr(Part):
             return super().text(settings)
         return shlex.quote(f"./{name}" if name == self.word else name)
 
-    def described(self, preceding: str) -> Iterator[Word]:
+    def list_words(self, preceding: str) -> Iterator[Word]:
         if self.word:
             first = preceding.removesuffix(" FILE")
             yield Word(self.word, self.example, first, f"{first} {self.word} {self.symbol}")
@@ -212,7 +212,7 @@ class Clause:
         first = "" if self.is_bare else self.word
         return " ".join(filter(None, [first, *required, nested, *options]))
 
-    def described(self, preceding: str = "") -> Iterator[Word]:
+    def list_words(self, preceding: str = "") -> Iterator[Word]:
         """Yield the clause's words, given those before it; the first word comes first."""
         required = [part.grammar for part in self._values[: self.least]]
         clause_words = " ".join(filter(None, [preceding, "" if self.is_bare else self.word, *required]))
@@ -220,4 +220,4 @@ class Clause:
         for synonym in self.synonyms:
             yield Word(synonym, self.example, preceding)
         for part in self.parts:
-            yield from part.described(clause_words)
+            yield from part.list_words(clause_words)

@@ -228,7 +228,7 @@ class LossModel(StageFeature):
 
 
 class PacketOrder(NamedTuple):
-    """What may have happened to packets: whether some were delayed, and whether some overtook others."""
+    """What may have happened to packets: whether some were delayed, and whether some leave out of order."""
 
     delayed: bool = False
     reordered: bool = False

@@ -41,10 +41,10 @@ from noack.impairments.markov_chain import (
     NotPredictableError,
     PeriodicLosses,
     constrained_rate,
-    moves_by_outcome,
     pattern_rate,
-    reachable_moves,
+    reachable_transitions,
     stochastic,
+    transitions_by_outcome,
 )
 
 _MOST_SQUARED = 600
@@ -121,12 +121,12 @@ def _capped_rate(parts: Sequence[Chain | PeriodicLosses], mansd: int | None) -> 
     patterns = [part for part in parts if isinstance(part, PeriodicLosses)]
     if len(patterns) == len(parts):
         return _pattern_rate([part.lost for part in patterns], mansd)
-    start, moves, ineffective = _joint_chain(parts)
+    start, transitions, ineffective = _joint_chain(parts)
     if mansd is None:
-        return float(_stationary(start, moves) @ ineffective)
-    lost, passed = moves * ineffective, moves * (1 - ineffective)
+        return float(_stationary(start, transitions) @ ineffective)
+    lost, passed = transitions * ineffective, transitions * (1 - ineffective)
     total, power = _geometric(lost, mansd)
-    at_delivery = _stationary(start, stochastic(total @ passed + power @ moves))
+    at_delivery = _stationary(start, stochastic(total @ passed + power @ transitions))
     burst = float((at_delivery @ lost @ total).sum())
     return burst / (burst + 1)
 
@@ -160,16 +160,16 @@ def _joint_chain(parts: Sequence[Chain | PeriodicLosses]) -> tuple[Array, Array,
     if states > MOST_STATES:
         raise NotPredictableError(f"together the impairments have {states} states, too many to compute with")
     start: Array = np.ones(1)
-    moves: Array = np.ones((1, 1))
+    transitions: Array = np.ones((1, 1))
     chains = [part.chain if isinstance(part, PeriodicLosses) else part for part in parts]
     joined: list[Chain] = []
     for chain in chains:
         n, size_so_far = len(chain.start), len(start)
         start = np.kron(start, chain.start).astype(np.float64)
-        moves = np.kron(moves, chain.moves).astype(np.float64)
+        transitions = np.kron(transitions, chain.transitions).astype(np.float64)
         joined = [chain_before._replace(acts=np.repeat(chain_before.acts, n)) for chain_before in joined]
         joined.append(chain._replace(acts=np.tile(chain.acts, size_so_far)))
-    return start, moves, _ineffective(joined, states)
+    return start, transitions, _ineffective(joined, states)
 
 
 def _ineffective(chains: Sequence[Chain], states: int) -> Array:
@@ -206,12 +206,12 @@ def _geometric(matrix: Array, terms: int) -> tuple[Array, Array]:
     return total, power
 
 
-def _stationary(start: Array, moves: Array) -> Array:
+def _stationary(start: Array, transitions: Array) -> Array:
     """Return the mean distribution over the states, by doubling over 2⁶⁴ steps.
 
     The mean exists for periodic chains, too.
     """
-    mean, power = np.eye(len(start)), moves
+    mean, power = np.eye(len(start)), transitions
     for _ in range(64):
         mean, power = (mean + power @ mean) / 2, stochastic(power @ power)
     distribution: Array = start @ mean
@@ -223,7 +223,7 @@ class LossProcess:
     """The random losses of a link's packets."""
 
     start: Array  # (n,) distribution before the first packet
-    moves: Array  # (n, n) transition matrix
+    transitions: Array  # (n, n) transition matrix
     lost: Array  # (n,) probability of a loss in each state
     first_delivered: bool = True  # Whether the first packet is delivered in any case
 
@@ -245,9 +245,9 @@ class LossProcess:
             The bounds, (count,), for j = 1, 2, …; exact if the chain is stationary. And the largest
             probability, given any past, that the next ``count`` packets are all lost.
         """
-        lost, weights, tails = self.moves * self.lost, np.ones(len(self.start)), []
+        lost, weights, tails = self.transitions * self.lost, np.ones(len(self.start)), []
         # One step would not show that a slow chain is far from its mean distribution.
-        stationary = np.abs(_stationary(self.start, self.moves) - self.start).max() <= _ROUNDING
+        stationary = np.abs(_stationary(self.start, self.transitions) - self.start).max() <= _ROUNDING
         for _ in range(count):
             weights = lost @ weights
             tails.append(self.start @ weights if stationary else weights.max())
@@ -260,15 +260,15 @@ class LossProcess:
             NotPredictableError: there are too many states.
         """
         n, most = len(self.start), _MOST_SQUARED // len(self.start)
-        after_delivery = reachable_moves(guarantee, most).after_delivery
-        losing, delivering = moves_by_outcome(self.moves, self.lost, guarantee)
+        after_delivery = reachable_transitions(guarantee, most).after_delivery
+        losing, delivering = transitions_by_outcome(self.transitions, self.lost, guarantee)
         count = len(after_delivery) * n
         # The last state is that before the first packet.
         lost, delivered = np.zeros((count + 1, count + 1)), np.zeros((count + 1, count + 1))
         lost[:count, :count], delivered[:count, :count] = losing.toarray(), delivering.toarray()
         if self.first_delivered:
             first = after_delivery[0] * n
-            delivered[count, first : first + n] = self.start @ self.moves
+            delivered[count, first : first + n] = self.start @ self.transitions
         else:
             lost[count], delivered[count] = self.start @ lost[:n], self.start @ delivered[:n]
         reached = np.arange(count + 1) == count
@@ -287,12 +287,12 @@ class LossProcess:
             NotPredictableError: there are too many states or packets.
         """
         n = len(self.start)
-        after_loss, after_delivery = reachable_moves(guarantee, _MOST_STEPS // n)
+        after_loss, after_delivery = reachable_transitions(guarantee, _MOST_STEPS // n)
         allowed = after_loss >= 0
-        lost, passed = self.moves * self.lost, self.moves * (1 - self.lost)
+        lost, passed = self.transitions * self.lost, self.transitions * (1 - self.lost)
         weights = np.zeros((len(after_loss), n))
         if self.first_delivered and packets > 0:
-            weights[after_delivery[0]] = self.start @ self.moves
+            weights[after_delivery[0]] = self.start @ self.transitions
             packets -= 1
         else:
             weights[0] = self.start
@@ -317,8 +317,8 @@ class LossProcess:
         """The probability of a loss, given each state before it that can be reached; (k,)."""
         reached, count = self.start > 0, -1
         while count != (count := int(np.count_nonzero(reached))):
-            reached = reached | (reached @ self.moves > 0)
-        loss_given_state: Array = (self.moves @ self.lost)[reached]
+            reached = reached | (reached @ self.transitions > 0)
+        loss_given_state: Array = (self.transitions @ self.lost)[reached]
         return loss_given_state
 
 
@@ -345,9 +345,9 @@ class OutcomeChain(NamedTuple):
         """
         from scipy.sparse.csgraph import connected_components  # slow to import
 
-        moves = self.lost + self.delivered > 0
-        _, labels = connected_components(moves, connection="strong")
-        transient_labels = labels[(moves & (labels[:, None] != labels)).any(axis=1)]
+        transitions = self.lost + self.delivered > 0
+        _, labels = connected_components(transitions, connection="strong")
+        transient_labels = labels[(transitions & (labels[:, None] != labels)).any(axis=1)]
         lasting = ~np.isin(labels, transient_labels)
         if len(set(labels[lasting])) > 1:
             raise NotPredictableError("the losses depend on what happens at the beginning")
@@ -355,5 +355,5 @@ class OutcomeChain(NamedTuple):
 
     def distribution(self, spacing: int = 1) -> Array:
         """Return the mean distribution before the packets 0, ``spacing``, 2 ``spacing``, …, (n,)."""
-        moves = np.linalg.matrix_power(self.lost + self.delivered, spacing)
-        return _stationary(np.eye(len(moves))[-1], moves)
+        transitions = np.linalg.matrix_power(self.lost + self.delivered, spacing)
+        return _stationary(np.eye(len(transitions))[-1], transitions)

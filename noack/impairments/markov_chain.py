@@ -41,7 +41,7 @@ class Chain(NamedTuple):
     """A Markov chain with n states: for each packet it advances, then may act on the packet."""
 
     start: Array  # (n,) Distribution before the first packet
-    moves: Array  # (n, n) Transition matrix
+    transitions: Array  # (n, n) Transition matrix
     acts: Array  # (n,) Probability in each state that it acts on the packet
     action: str = "lose"  # The action: ``lose``, ``corrupt`` or ``duplicate``
     probability: float = 0.0  # Probability that it acts on a copy
@@ -70,10 +70,10 @@ class PeriodicLosses(NamedTuple):
         period = len(self.lost)
         if not self.begin:
             return Chain(np.eye(period)[-1], np.roll(np.eye(period), 1, axis=1), self.lost.astype(float))
-        moves = np.eye(self.states, k=1)
-        moves[-1, -period] = 1.0
+        transitions = np.eye(self.states, k=1)
+        transitions[-1, -period] = 1.0
         acts = np.concatenate([np.zeros(self.begin + 1), np.roll(self.lost, -(self.begin % period))])
-        return Chain(np.eye(self.states)[0], moves, acts)
+        return Chain(np.eye(self.states)[0], transitions, acts)
 
 
 def pattern(period: int, lost: Iterable[int], begin: int = 0) -> PeriodicLosses:
@@ -101,9 +101,9 @@ def chance_chain(probability: float, correlation: float, action: str) -> Chain:
     nodes, weights, acts = _nodes(probability, correlation)
     innovation = math.sqrt(1 - correlation**2)
     steps = (nodes - correlation * nodes[:, None]) / innovation
-    moves = stochastic(np.exp(-(steps**2) / 2) * weights)
+    transitions = stochastic(np.exp(-(steps**2) / 2) * weights)
     start = np.exp(-(nodes**2) / 2) * weights
-    return Chain(start / start.sum(), moves, acts, action, probability)
+    return Chain(start / start.sum(), transitions, acts, action, probability)
 
 
 def _nodes(probability: float, correlation: float) -> tuple[Array, Array, Array]:
@@ -131,18 +131,18 @@ def stochastic(matrix: Array) -> Array:
     return rows
 
 
-def reachable_moves(guarantee: LossGuarantee, most: int) -> TransitionTable:
-    """Return the moves between all states of a guarantee.
+def reachable_transitions(guarantee: LossGuarantee, most: int) -> TransitionTable:
+    """Return the transitions between all states of a guarantee.
 
     Raises:
         NotPredictableError: there are more than ``most``.
     """
-    if (moves := transition_table(guarantee, most)) is None:
+    if (transitions := transition_table(guarantee, most)) is None:
         raise NotPredictableError(
             f"impairments and guarantee together have more than {MOST_JOINT_STATES} states, "
             "too many to compute with"
         )
-    return moves
+    return transitions
 
 
 def pattern_rate(lost: NDArray[np.bool_], guarantee: LossGuarantee) -> float:
@@ -167,15 +167,15 @@ def pattern_rate(lost: NDArray[np.bool_], guarantee: LossGuarantee) -> float:
     raise NotPredictableError("the losses repeat only after too many packets to compute with")
 
 
-def moves_by_outcome(
-    moves: Array, lost: Array, guarantee: LossGuarantee
+def transitions_by_outcome(
+    transitions: Array, lost: Array, guarantee: LossGuarantee
 ) -> "tuple[csr_array[np.float64], csr_array[np.float64]]":
-    """Return the joint chain's moves with a loss, and those with a delivery, under a guarantee.
+    """Return the joint chain's transitions with a loss, and those with a delivery, under a guarantee.
 
     The first n states have the state before the first packet of the guarantee's automaton.
 
     Args:
-        moves: (n, n) transition matrix.
+        transitions: (n, n) transition matrix.
         lost: (n,) probability in each state that the packet is lost, if it may be.
         guarantee: the guarantee.
 
@@ -184,7 +184,7 @@ def moves_by_outcome(
     """
     from scipy import sparse  # slow to import
 
-    after_loss, after_delivery = reachable_moves(guarantee, MOST_JOINT_STATES // len(moves))
+    after_loss, after_delivery = reachable_transitions(guarantee, MOST_JOINT_STATES // len(transitions))
     count = len(after_loss)
     allowed = after_loss >= 0
 
@@ -193,25 +193,25 @@ def moves_by_outcome(
         shape = (count, count)
         return sparse.csr_array((np.ones(len(places)), (places, targets[places])), shape)
 
-    losing = sparse.kron(to(after_loss, allowed), moves * lost)
-    delivering = sparse.kron(to(after_delivery, allowed), moves * (1 - lost))
-    forced = sparse.kron(to(after_delivery, ~allowed), moves)
+    losing = sparse.kron(to(after_loss, allowed), transitions * lost)
+    delivering = sparse.kron(to(after_delivery, allowed), transitions * (1 - lost))
+    forced = sparse.kron(to(after_delivery, ~allowed), transitions)
     return losing.tocsr(), (delivering + forced).tocsr()
 
 
-def constrained_rate(start: Array, moves: Array, lost: Array, guarantee: LossGuarantee) -> float:
+def constrained_rate(start: Array, transitions: Array, lost: Array, guarantee: LossGuarantee) -> float:
     """Return the loss rate of a joint chain of n states.
 
     Args:
         start: (n,) distribution before the first packet.
-        moves: (n, n) transition matrix.
+        transitions: (n, n) transition matrix.
         lost: (n,) probability in each state that the packet is lost, if it may be.
         guarantee: the guarantee.
 
     Raises:
         NotPredictableError: there are too many states, or the rate depends on chance.
     """
-    losing, delivering = moves_by_outcome(moves, lost, guarantee)
+    losing, delivering = transitions_by_outcome(transitions, lost, guarantee)
     at_start = np.zeros(losing.shape[0])
     at_start[: len(start)] = start
     distribution = _stationary((losing + delivering).tocsr(), at_start)
@@ -237,7 +237,7 @@ def _stationary(joint: "csr_array[np.float64]", start: Array) -> Array:
     return distribution
 
 
-def _balance(moves: "csr_array[np.float64]") -> Array:
+def _balance(transitions: "csr_array[np.float64]") -> Array:
     """Return the stationary distribution π = πP of an irreducible chain.
 
     With π = 1 for a likely state, the other equations are a regular, well-conditioned system. It is
@@ -245,15 +245,15 @@ def _balance(moves: "csr_array[np.float64]") -> Array:
     """
     from scipy.sparse import eye_array, linalg  # slow to import
 
-    count = moves.shape[0]
+    count = transitions.shape[0]
     distribution: Array = np.ones(count)
     if count == 1:
         return distribution
     for _ in range(_WARM_UP):
-        distribution = (distribution + moves.T @ distribution) / 2
+        distribution = (distribution + transitions.T @ distribution) / 2
     unlikely = np.delete(np.arange(count), likely := int(np.argmax(distribution)))
-    system = (eye_array(count) - moves.T).tocsc()
-    flow = moves[[likely]].toarray()[0, unlikely]
+    system = (eye_array(count) - transitions.T).tocsc()
+    flow = transitions[[likely]].toarray()[0, unlikely]
     distribution[likely] = 1.0
     distribution[unlikely] = np.maximum(linalg.splu(system[unlikely][:, unlikely].tocsc()).solve(flow), 0.0)
     distribution /= distribution.sum()

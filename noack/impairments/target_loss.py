@@ -94,7 +94,7 @@ def with_target_loss(settings: LinkSettings, *, known: ProbabilityCache = PROBAB
     return _with_probability(settings, target_loss, known[key])
 
 
-def found_probabilities(*links: LinkSettings, known: ProbabilityCache = PROBABILITIES) -> dict[str, float]:
+def find_probabilities(*links: LinkSettings, known: ProbabilityCache = PROBABILITIES) -> dict[str, float]:
     """Return the probabilities of valid settings, for :func:`store_probabilities`.
 
     There is none where no loss rate is kept.
@@ -105,9 +105,11 @@ def found_probabilities(*links: LinkSettings, known: ProbabilityCache = PROBABIL
     }
 
 
-def store_probabilities(probabilities: Mapping[str, float]) -> Mapping[str, float]:
+def store_probabilities(
+    probabilities: Mapping[str, float], *, known: ProbabilityCache = PROBABILITIES
+) -> Mapping[str, float]:
     """Use these probabilities, which another process found, instead of computing them."""
-    PROBABILITIES.add(probabilities)
+    known.add(probabilities)
     return probabilities
 
 
@@ -200,10 +202,10 @@ def loss_process(settings: LinkSettings) -> LossProcess:
     if order.reordered:
         raise NotPredictableError("packets may arrive out of order, which counts as a loss")
     try:
-        start, moves, lost = joint_chain(with_target_loss(settings))
+        start, transitions, lost = joint_chain(with_target_loss(settings))
     except ValueError as error:  # the loss rate cannot be kept
         raise NotPredictableError(str(error)) from None
-    return LossProcess(start, moves, lost, settings.first_delivered)
+    return LossProcess(start, transitions, lost, settings.first_delivered)
 
 
 def expected_loss(settings: LinkSettings) -> LossPrediction:

@@ -228,13 +228,13 @@ class LoopMachines:
             if len(set(shapes)) > 1:
                 table.layouts = self._layouts(name, types[name], shapes)
 
-    def _layouts(self, name: str, whole: np.dtype[np.void], shapes: Sequence[RecordShape]) -> CData:
+    def _layouts(self, name: str, table_type: np.dtype[np.void], shapes: Sequence[RecordShape]) -> CData:
         """Return the layout of each loop's rows in a table; loops of a shape share it."""
 
         @cache
         def layout(shape: RecordShape) -> CData:
-            own = tables(**asdict(shape)).get(name)
-            return ffi.NULL if own is None else self.memory.integers(row_layout(own, whole))
+            loop_type = tables(**asdict(shape)).get(name)
+            return ffi.NULL if loop_type is None else self.memory.integers(row_layout(loop_type, table_type))
 
         return self.memory.keep(ffi.new("int64_t *[]", [layout(shape) for shape in shapes]))
 
@@ -263,7 +263,7 @@ class LoopMachines:
                 part.external.connect()
 
     @property
-    def asked(self) -> External | None:
+    def asking_part(self) -> External | None:
         """The part outside of noack of the machine whose step has stopped at a question."""
         return self.parts[int(self.core.asking)].external
 
@@ -279,7 +279,7 @@ class LoopMachines:
         ``last``: the machines make no step before the caller has used the rows, which the next step
         overwrites.
         """
-        taken: list[tuple[str, StructRows]] = []
+        batches: list[tuple[str, StructRows]] = []
         for number, rows in self._tables.items():
             table = self.core.tables[number]
             if table.count:
@@ -290,19 +290,19 @@ class LoopMachines:
                     self._renew_table(number, self._new_rows(len(rows), rows.dtype))
                 name = self.role.tables[number]
                 assert name is not None
-                taken.append((name, new))
+                batches.append((name, new))
                 if number == core.NOACK_MESSAGES:
                     self._inspect(new)
         for note in self._notes[: self.core.note_count]:
             loop = int(note["loop"])
             self._keep_notices(loop, (self.parts[loop].note(note),))
         self.core.note_count = 0
-        return taken
+        return batches
 
     def take_notices(self) -> list[Notice]:
         """Return the lines for the log since the last call; call :meth:`take_rows` before."""
-        taken, self._notices = self._notices, []
-        return taken
+        notices, self._notices = self._notices, []
+        return notices
 
     def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
         """Announce a change of settings to every machine; its time is that of the run.
@@ -311,18 +311,18 @@ class LoopMachines:
         loop's scenario would be invalid.
         """
         table, schedules = self.role.changes, [part.schedule for part in self.parts]
-        own = [change._replace(t_ns=max(change.t_ns - ns, 0)) for ns in self.phases_ns]
-        for schedule, of_loop, structure in zip(schedules, own, self.machines, strict=True):
+        loop_changes = [change._replace(t_ns=max(change.t_ns - ns, 0)) for ns in self.phases_ns]
+        for schedule, loop_change, structure in zip(schedules, loop_changes, self.machines, strict=True):
             if table is None or schedule is None:
                 raise CallerError(f"the settings of this {self.role.name} cannot be changed")
-            schedule.check(of_loop, structure.machine.reached_ns)
+            schedule.check(loop_change, structure.machine.reached_ns)
         outputs: list[Record | Notice] = []
         for loop, schedule in enumerate(schedules):
             assert table is not None
             assert schedule is not None
             machine = self.machines[loop].machine
             announced = schedule.announce(
-                table, own[loop], machine.inputs, now_ns - self.phases_ns[loop], machine.reached_ns
+                table, loop_changes[loop], machine.inputs, now_ns - self.phases_ns[loop], machine.reached_ns
             )
             machine.inputs += 1
             machine.change_ns = schedule.next_ns
@@ -334,9 +334,9 @@ class LoopMachines:
         notable = self._notable(rows)
         if not len(notable):
             return
-        for own in np.split(notable, np.flatnonzero(np.diff(notable[LOOP])) + 1):
-            loop = int(own[LOOP][0])
-            self._keep_notices(loop, self.parts[loop].inspect(own))
+        for loop_rows in np.split(notable, np.flatnonzero(np.diff(notable[LOOP])) + 1):
+            loop = int(loop_rows[LOOP][0])
+            self._keep_notices(loop, self.parts[loop].inspect(loop_rows))
             self._update_counting(loop)
 
     def _update_counting(self, loop: int) -> None:
@@ -376,22 +376,22 @@ def _row_types(shape: RecordShape) -> Mapping[str, np.dtype[np.void]]:
     return {name: np.dtype([(LOOP, "<u2"), *kind.descr]) for name, kind in types.items()}
 
 
-def row_layout(own: np.dtype[np.void], whole: np.dtype[np.void]) -> NDArray[np.int64]:
+def row_layout(loop_type: np.dtype[np.void], table_type: np.dtype[np.void]) -> NDArray[np.int64]:
     """Return which word of a loop's own row each word of a table's row is.
 
     A vector of the loop is the beginning of the table's; the rest of it is NaN. A column that the
     loop does not have is 0.
 
     Args:
-        own: the row type of the loop, without its number.
-        whole: the row type of the table, with the number of the loop.
+        loop_type: the row type of the loop, without its number.
+        table_type: the row type of the table, with the number of the loop.
     """
-    layout = np.full((whole.itemsize - core.NOACK_LOOP_BYTES) // 8, core.NOACK_MISSING_ZERO)
-    for name in own.names or ():
-        assert own.fields is not None
-        assert whole.fields is not None
-        (kind, begin), (room, at) = own.fields[name][:2], whole.fields[name][:2]
-        first, words = (at - core.NOACK_LOOP_BYTES) // 8, kind.itemsize // 8
-        layout[first : first + room.itemsize // 8] = core.NOACK_MISSING_NAN
+    layout = np.full((table_type.itemsize - core.NOACK_LOOP_BYTES) // 8, core.NOACK_MISSING_ZERO)
+    for name in loop_type.names or ():
+        assert loop_type.fields is not None
+        assert table_type.fields is not None
+        (kind, begin), (table_kind, table_begin) = loop_type.fields[name][:2], table_type.fields[name][:2]
+        first, words = (table_begin - core.NOACK_LOOP_BYTES) // 8, kind.itemsize // 8
+        layout[first : first + table_kind.itemsize // 8] = core.NOACK_MISSING_NAN
         layout[first : first + words] = begin // 8 + np.arange(words)
     return layout

@@ -46,7 +46,7 @@ _VALUES: Mapping[str, tuple[tuple[type, ...], str]] = {
     "String": ((str,), "a text"),
 }
 """Python types of a variable's value, by its FMI type; all others are whole numbers."""
-_ALIKE = 1e-6
+_TOLERANCE = 1e-6
 """Largest relative difference between x(0) of the scenario and x(0) of the FMU."""
 _LONGEST = 300
 """Largest length of a quoted text, in characters."""
@@ -213,7 +213,7 @@ class FmuSystem:
     def _require_start(self, x0: Vector) -> None:
         """Raise CallerError if the FMU begins at another state."""
         scale = np.abs(x0) + np.abs(self._operating_state) + 1.0
-        if not np.all(np.abs(self.x - x0) <= _ALIKE * scale):
+        if not np.all(np.abs(self.x - x0) <= _TOLERANCE * scale):
             raise CallerError(
                 f"plant.initial_state: it is {x0.tolist()}, but the FMU begins at "
                 f"{self.x.tolist()}; name in plant.system.initial_variables the variables to set"

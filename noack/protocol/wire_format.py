@@ -68,11 +68,11 @@ class Tagger:
 
     def __init__(self, key: bytes) -> None:
         require_key(key)
-        self._keyed = hashlib.blake2b(key=key, digest_size=TAG_BYTES)
+        self._keyed_hash = hashlib.blake2b(key=key, digest_size=TAG_BYTES)
 
     def __call__(self, content: bytes) -> bytes:
         """Return the tag."""
-        state = self._keyed.copy()
+        state = self._keyed_hash.copy()
         state.update(content)
         return state.digest()
 

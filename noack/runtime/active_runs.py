@@ -61,19 +61,19 @@ def find_run(session: str | None = None, run_dir: Path | None = None) -> OpenRun
     Raise CallerError if no such run is active, or several are.
     """
     runs = active_runs()
-    fitting = [
+    matching = [
         run
         for run in runs
         if (session is None or run.session == session)
         and (run_dir is None or Path(run.run_dir) == run_dir.resolve())
     ]
-    if len(fitting) == 1:
-        return fitting[0]
+    if len(matching) == 1:
+        return matching[0]
     if not runs:
         ended = "" if run_dir is None else f"the run {run_dir} is not active, and "
         raise CallerError(f"{ended}no run is active; start one, e.g. `noack demo`")
-    active = "active: " + ", ".join(run.run_dir for run in fitting or runs)
-    if fitting:
+    active = "active: " + ", ".join(run.run_dir for run in matching or runs)
+    if matching:
         raise CallerError(f"several runs are {active}; choose one by --run DIRECTORY")
     criterion = f"in session {session!r}" if run_dir is None else f"in {run_dir}"
     raise CallerError(f"no run is active {criterion}; {active}")

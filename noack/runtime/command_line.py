@@ -139,7 +139,7 @@ class Parser(argparse.ArgumentParser):
         raise CallerError(f"{mistake}; see `{self.prog} --help`")
 
 
-def failed(message: str, status: ExitStatus, *, source: str, as_json: bool) -> ExitStatus:
+def report_failure(message: str, status: ExitStatus, *, source: str, as_json: bool) -> ExitStatus:
     """Print why a command failed, one line per mistake, and return its exit status.
 
     Each line begins with ``source``, such as ``noack netem``. With ``as_json`` a JSON document is

@@ -74,7 +74,7 @@ class ControlPlane:
         # Room for all possible changes: none is ever pushed out.
         self._changes = session.declare_subscriber(key("change"), RingChannel(MOST_CHANGES))
         self._dones = session.declare_subscriber(key("done", "*"), RingChannel(8))
-        self._done: set[str] = set()
+        self._roles_done: set[str] = set()
         self._persisted = session.declare_subscriber(key("persisted", role), RingChannel(1))
 
     def __enter__(self) -> Self:
@@ -105,8 +105,8 @@ class ControlPlane:
         On a busy machine a connection may break because one end got no CPU time; it comes back.
         """
         while (life := self._coordinator.try_recv()) is not None:
-            gone = life.kind == zenoh.SampleKind.DELETE
-            self._coordinator_gone_s = time.monotonic() if gone else None
+            has_vanished = life.kind == zenoh.SampleKind.DELETE
+            self._coordinator_gone_s = time.monotonic() if has_vanished else None
         since_s = self._coordinator_gone_s
         return since_s is not None and time.monotonic() - since_s >= for_s
 
@@ -132,7 +132,7 @@ class ControlPlane:
         drop = CongestionControl.DROP
         self.publish("persisted", role, content=message_json(content), congestion=drop)
 
-    def persisted(self) -> bytes | None:
+    def next_persisted_ack(self) -> bytes | None:
         """The recorder's newest confirmation of rows of this process; None without a new one."""
         return next_payload(self._persisted)
 
@@ -146,14 +146,14 @@ class ControlPlane:
 
     def announce_done(self) -> None:
         """Tell the other processes that this one has done its last step."""
-        self._done.add(self.role)
+        self._roles_done.add(self.role)
         self.publish("done", self.role, content=self.role, priority=Priority.REAL_TIME)
 
-    def done(self) -> set[str]:
+    def roles_done(self) -> set[str]:
         """The roles whose process has announced that it is done."""
         while (role := next_payload(self._dones)) is not None:
-            self._done.add(role.decode(errors="replace"))
-        return self._done
+            self._roles_done.add(role.decode(errors="replace"))
+        return self._roles_done
 
     def report_end(self, reason: str) -> None:
         """Report to the coordinator why this process ends; without a report it counts as dead."""

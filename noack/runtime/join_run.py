@@ -20,7 +20,7 @@ from setproctitle import setproctitle
 from noack.core.errors import ExitStatus, NoackError, NoAnswerError, PeerError
 from noack.core.system_processes import exhausted_limit, require_limits
 from noack.runtime.address import address_text
-from noack.runtime.command_line import DESCRIPTOR_ON_STDIN, Parser, Signals, failed
+from noack.runtime.command_line import DESCRIPTOR_ON_STDIN, Parser, Signals, report_failure
 from noack.runtime.control_plane import ControlPlane
 from noack.runtime.life_cycle import HORIZON, Event
 from noack.runtime.run_descriptor import (
@@ -82,12 +82,12 @@ def join_run(role: str, arguments: Sequence[str] | None = None) -> Iterator[RunP
         with signals.handled():
             require_limits()
             if options.invitation is None:
-                descriptor = _descriptor(role, options.session, signals)
+                descriptor = _find_descriptor(role, options.session, signals)
             else:
-                descriptor = _invited(role, options.invitation, options.runs, signals)
+                descriptor = _wait_for_invitation(role, options.invitation, options.runs, signals)
             if descriptor.launched:
                 setproctitle(f"noack {role}")  # in lists of processes
-            process = _admitted(role, descriptor, signals)
+            process = _request_admission(role, descriptor, signals)
             with process.plane:
                 try:
                     yield process
@@ -113,10 +113,10 @@ def _exit_status(role: str, signals: Signals, *, as_json: bool) -> Iterator[None
         yield
     except NoackError as error:
         if signals.received is None:
-            sys.exit(failed(str(error), error.exit_status, source=source, as_json=as_json))
+            sys.exit(report_failure(str(error), error.exit_status, source=source, as_json=as_json))
     except Exception as error:
         if (line := exhausted_limit(error)) is not None:
-            sys.exit(failed(line, ExitStatus.FAILED, source=source, as_json=as_json))
+            sys.exit(report_failure(line, ExitStatus.FAILED, source=source, as_json=as_json))
         traceback.print_exc()
         print(f"{source}: internal error, see above", file=sys.stderr)
         sys.exit(ExitStatus.FAILED)
@@ -124,7 +124,7 @@ def _exit_status(role: str, signals: Signals, *, as_json: bool) -> Iterator[None
         sys.exit(signals.status)
 
 
-def _descriptor(role: str, session: str, signals: Signals) -> RunDescriptor:
+def _find_descriptor(role: str, session: str, signals: Signals) -> RunDescriptor:
     if os.environ.pop(DESCRIPTOR_ON_STDIN, None):
         return loads(sys.stdin.buffer.readline().decode())
     descriptor = _wait_for(
@@ -139,7 +139,7 @@ def _descriptor(role: str, session: str, signals: Signals) -> RunDescriptor:
     return descriptor
 
 
-def _invited(role: str, invitation: Path, runs: Path, signals: Signals) -> RunDescriptor:
+def _wait_for_invitation(role: str, invitation: Path, runs: Path, signals: Signals) -> RunDescriptor:
     """Wait for an invitation and return its run descriptor.
 
     Raise CallerError or PeerError without one.
@@ -165,7 +165,7 @@ def _wait_for(find: Callable[[], T], signals: Signals, waiting: str) -> T:
     return result
 
 
-def _admitted(role: str, descriptor: RunDescriptor, signals: Signals) -> RunProcess:
+def _request_admission(role: str, descriptor: RunDescriptor, signals: Signals) -> RunProcess:
     """Connect to a run and request admission; raise PeerError without an admission.
 
     A launched process tries again while its launcher lives. On a busy machine a connection may

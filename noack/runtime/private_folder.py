@@ -89,8 +89,8 @@ class PrivateFolder:
     def remove_same(self, name: str, status: os.stat_result) -> bool:
         """Remove a file unless it was replaced; return whether it was removed."""
         with suppress(FileNotFoundError):
-            now = os.stat(name, dir_fd=self.descriptor, follow_symlinks=False)
-            if os.path.samestat(now, status):
+            current = os.stat(name, dir_fd=self.descriptor, follow_symlinks=False)
+            if os.path.samestat(current, status):
                 self.remove(name)
                 return True
         return False
@@ -181,7 +181,7 @@ def live_lock_files(kind: str, only_name: str = "") -> list[LockFile]:
         with open_private(*_inside(kind)) as folder:
             candidates = [only_name + _SUFFIX] if only_name else sorted(folder.names())
             names = [name for name in candidates if name.endswith(_SUFFIX)]
-            return [file for name in names if (file := _alive(folder, name)) is not None]
+            return [file for name in names if (file := _live_file(folder, name)) is not None]
     except FileNotFoundError:
         return []
 
@@ -197,11 +197,11 @@ def _replace_file(folder: PrivateFolder, scratch: str, name: str) -> None:
                 folder.link(scratch, name)
             return
         except FileExistsError:
-            if attempt or _alive(folder, name) is not None:
+            if attempt or _live_file(folder, name) is not None:
                 raise
 
 
-def _alive(folder: PrivateFolder, name: str) -> LockFile | None:
+def _live_file(folder: PrivateFolder, name: str) -> LockFile | None:
     """Return a file if its process runs; remove it otherwise."""
     try:
         descriptor = folder.open(name)

@@ -21,7 +21,7 @@ from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat, ValidationE
 from noack.core.clock import clock_identity
 from noack.core.errors import CallerError, PeerError, why
 from noack.core.file_access import new_file, open_regular, read_regular
-from noack.impairments.target_loss import found_probabilities, store_probabilities
+from noack.impairments.target_loss import find_probabilities, store_probabilities
 from noack.protocol.wire_format import KEY_BYTES
 from noack.runtime.address import LOOPBACK, Address, address_text, family_of
 from noack.runtime.control_messages import NumericHost, SocketAddress
@@ -80,7 +80,7 @@ def new_descriptor(scenario: Scenario, run_dir: Path, *, launched: bool) -> RunD
         launched=launched,
         join_token=new_join_token(),
         clock=clock_identity(),
-        target_losses=found_probabilities(*map(scenario.network.link_of, scenario.network.flows)),
+        target_losses=find_probabilities(*map(scenario.network.link_of, scenario.network.flows)),
         scenario=scenario,
     )
 

@@ -102,7 +102,7 @@ class RunProcess:
         self.replaces: str | None = None
         """Of a restarted process: how the one before it ended."""
         self.report: dict[str, object] = {}
-        self._applied: dict[str, str] = {}
+        self._realtime: dict[str, str] = {}
         self._clock_record: ClockRecord | None = None
 
     def request_admission(self) -> None:
@@ -193,7 +193,7 @@ class RunProcess:
         with (
             closing(bind(port, f"ports.{self.role}", self.descriptor.host)) as endpoint,
             # Before the barrier: locking memory may take a tenth of a second.
-            realtime(settings.enabled, settings.fifo_priority, place) as self._applied,
+            realtime(settings.enabled, settings.fifo_priority, place) as self._realtime,
         ):
             size_bytes = len(self.phases_ns) * _BUFFER_BYTES  # it may be late to the start
             enlarge_buffer(endpoint, min(size_bytes, _LARGEST_BUFFER_BYTES))
@@ -223,7 +223,7 @@ class RunProcess:
             self.report = {
                 "pid": os.getpid(),
                 "ended": self.ended,
-                "realtime": self._applied,
+                "realtime": self._realtime,
                 "channel": channel.report(),
                 "rows": telemetry.totals(),
                 "stored": telemetry.stored(),
@@ -292,7 +292,7 @@ class RunProcess:
         """
         if is_done and self.role in WITH_DEADLINES:
             self.plane.announce_done()
-        return is_done and self.plane.done().issuperset(WITH_DEADLINES)
+        return is_done and self.plane.roles_done().issuperset(WITH_DEADLINES)
 
     @property
     def _end_ns(self) -> int:

@@ -1,7 +1,7 @@
 """The spool: batches of the record on disk as they arrive, readable up to the last complete one.
 
-One file per table and writer: a sequence of chunks ``first row (u64), bytes (u64), rows``, little
-endian. A killed writer leaves at most one incomplete chunk at the end, which readers ignore. Two
+One file per table and writer: a sequence of batches ``first row (u64), bytes (u64), rows``, little
+endian. A killed writer leaves at most one incomplete batch at the end, which readers ignore. Two
 writers may write the same rows; the row numbers identify them. A table of a run's log has lines of
 text, each a JSON object, in place of rows.
 """
@@ -29,7 +29,8 @@ KEPT_KEY = "key"
 """Name of a process's secret in the spool that it keeps on another host; see `writer_of`."""
 RUN_NAME_FILE = "run_name.txt"
 """In the folder of what a process on another host keeps: of which run it is."""
-_CHUNK = struct.Struct("<QQ")
+_BATCH_HEAD = struct.Struct("<QQ")
+"""Number of a batch's first row, and bytes of its rows."""
 _READ_BYTES = 256 * 1024
 _MOST_NAME_BYTES = 1024
 """Longest name of a run's directory in its file."""
@@ -59,7 +60,7 @@ class SpoolWriter:
     def append(self, table: str, first: int, payload: bytes) -> None:
         """Write one batch through to the operating system."""
         with self._errors_with_path():
-            _write_complete(self._open(table), _CHUNK.pack(first, len(payload)) + payload)
+            _write_complete(self._open(table), _BATCH_HEAD.pack(first, len(payload)) + payload)
 
     def prepare(self, tables: Iterable[str]) -> None:
         """Open the files of tables before the first rows."""
@@ -102,12 +103,12 @@ class SpoolWriter:
         self._files.clear()
 
 
-def _write_complete(file: BinaryIO, chunk: bytes) -> None:
-    """Write a complete chunk or nothing: a partial chunk would be read as rows later."""
+def _write_complete(file: BinaryIO, batch: bytes) -> None:
+    """Write a complete batch or nothing: a partial batch would be read as rows later."""
     written = 0
     try:
-        while written < len(chunk):
-            written += file.write(chunk[written:])
+        while written < len(batch):
+            written += file.write(batch[written:])
     except OSError:
         file.truncate(file.tell() - written)
         raise
@@ -138,31 +139,31 @@ def batches_in(data: memoryview) -> tuple[list[tuple[int, memoryview]], int]:
 
     Of each batch: the number of its first row, and the rows.
     """
-    batches, begin, rows = [], 0, _CHUNK.size
+    batches, begin, rows = [], 0, _BATCH_HEAD.size
     while rows <= len(data):
-        first, length = _CHUNK.unpack_from(data, begin)
+        first, length = _BATCH_HEAD.unpack_from(data, begin)
         if (end := rows + length) > len(data):
             break
         batches.append((first, data[rows:end]))
-        begin, rows = end, end + _CHUNK.size
+        begin, rows = end, end + _BATCH_HEAD.size
     return batches, begin
 
 
 def batch_bytes(data: memoryview) -> int | None:
     """Return the length of the batch that begins with some data; None if they are too short."""
-    return None if len(data) < _CHUNK.size else _CHUNK.size + int(_CHUNK.unpack_from(data)[1])
+    return None if len(data) < _BATCH_HEAD.size else _BATCH_HEAD.size + int(_BATCH_HEAD.unpack_from(data)[1])
 
 
-def chunks_of(file: IO[bytes], most_bytes: int | None = None) -> Iterator[SpoolBatch]:
+def batches_of_file(file: IO[bytes], most_bytes: int | None = None) -> Iterator[SpoolBatch]:
     """Yield the complete batches of an open file, from its beginning.
 
     Raise ValueError for a batch of more than ``most_bytes``.
     """
     size, end = os.fstat(file.fileno()).st_size, 0
     file.seek(0)
-    while len(head := file.read(_CHUNK.size)) == _CHUNK.size:
-        first, length = _CHUNK.unpack(head)
-        end += _CHUNK.size + length
+    while len(head := file.read(_BATCH_HEAD.size)) == _BATCH_HEAD.size:
+        first, length = _BATCH_HEAD.unpack(head)
+        end += _BATCH_HEAD.size + length
         if end > size:  # incomplete, or damaged: a read could be endless
             break
         if most_bytes is not None and length > most_bytes:
@@ -170,11 +171,11 @@ def chunks_of(file: IO[bytes], most_bytes: int | None = None) -> Iterator[SpoolB
         yield SpoolBatch(first, file.read(length))
 
 
-def read_chunks(folder: Path, table: str) -> Iterator[SpoolBatch]:
+def read_batches(folder: Path, table: str) -> Iterator[SpoolBatch]:
     """Yield each complete batch of a table, from all writers."""
     for path in spool_files(folder, table):
         with path.open("rb", buffering=_READ_BYTES) as file:
-            yield from chunks_of(file)
+            yield from batches_of_file(file)
 
 
 def notices_of(role: str) -> str:
@@ -199,5 +200,5 @@ def lines_in(batch: bytes) -> list[bytes]:
 
 def stored_lines(spool: Path, role: str) -> Iterator[bytes]:
     """Yield the log lines of a process in a spool; a line may come twice."""
-    for _, batch in read_chunks(spool, notices_of(role)):
+    for _, batch in read_batches(spool, notices_of(role)):
         yield from lines_in(batch)

@@ -120,20 +120,20 @@ class TelemetryBuffer:
         store: Publish = lambda table, header, rows: None,
     ) -> None:
         self._publish, self._store = publish, store
-        self._stored: dict[str, ReceivedRows] = {}
+        self._stored_rows: dict[str, ReceivedRows] = {}
         self._generation = generation
         self._persisted = persisted
         self._rows = {table: np.zeros(_BATCH_ROWS, dtype) for table, dtype in tables.items()}
-        self._filled = dict.fromkeys(tables, 0)
+        self._row_counts = dict.fromkeys(tables, 0)
         self._lines: list[bytes] = []
-        self._published = dict.fromkeys([*tables, NOTICES], 0)
-        of_loops = [table for table, dtype in tables.items() if LOOP in (dtype.names or ())]
-        self._by_loop = {table: np.zeros(0, np.int64) for table in of_loops}
-        self._kept: deque[_RowBatch] = deque()
+        self._row_totals = dict.fromkeys([*tables, NOTICES], 0)
+        loop_tables = [table for table, dtype in tables.items() if LOOP in (dtype.names or ())]
+        self._by_loop = {table: np.zeros(0, np.int64) for table in loop_tables}
+        self._kept_batches: deque[_RowBatch] = deque()
         """The batches that are not known to be on disk, the oldest first."""
         self._to_resend: deque[_RowBatch] = deque()
-        self._old = 0
-        """Number of batches at the front of `_kept` that were there at the last confirmation, too."""
+        self._old_count = 0
+        """Number of batches at the front of `_kept_batches` that were there at the last confirmation, too."""
         self._kept_bytes = 0
 
     def append(self, record: Record) -> None:
@@ -146,11 +146,11 @@ class TelemetryBuffer:
             self.flush()
             self._publish_rows(table, rows)
             return
-        if self._filled[table] + len(rows) > _BATCH_ROWS:
+        if self._row_counts[table] + len(rows) > _BATCH_ROWS:
             self.flush()
-        begin = self._filled[table]
+        begin = self._row_counts[table]
         self._rows[table][begin : begin + len(rows)] = rows
-        self._filled[table] = begin + len(rows)
+        self._row_counts[table] = begin + len(rows)
         if begin + len(rows) == _BATCH_ROWS:
             self.flush()  # all tables: a reader merges them in the order of publication
 
@@ -162,10 +162,10 @@ class TelemetryBuffer:
 
     def flush(self) -> None:
         """Publish all collected rows and lines; send again what was lost."""
-        for table, filled in self._filled.items():
-            if filled:
-                self._filled[table] = 0
-                self._publish_rows(table, self._rows[table][:filled])
+        for table, count in self._row_counts.items():
+            if count:
+                self._row_counts[table] = 0
+                self._publish_rows(table, self._rows[table][:count])
         if self._lines:
             lines, self._lines = self._lines, []
             self._send(NOTICES, len(lines), batch_of(lines))
@@ -177,7 +177,7 @@ class TelemetryBuffer:
 
     def totals(self) -> dict[str, int]:
         """Rows published so far, by table."""
-        return dict(self._published)
+        return dict(self._row_totals)
 
     def totals_by_loop(self) -> dict[str, list[int]]:
         """Rows published so far of each loop, up to the last with rows."""
@@ -185,17 +185,17 @@ class TelemetryBuffer:
 
     def store_all(self) -> None:
         """Store all batches that are not known to be on disk."""
-        while self._kept:
+        while self._kept_batches:
             self._store_oldest()
 
     def stored(self) -> dict[str, Ranges]:
         """Ranges of the rows that were stored, by table."""
-        return {table: received.ranges for table, received in self._stored.items()}
+        return {table: received.ranges for table, received in self._stored_rows.items()}
 
     def resend(self, missing: Mapping[str, Ranges], publish: Publish) -> int:
         """Publish the kept batches again that overlap missing row ranges; return their number."""
         sent = 0
-        for batch in self._kept:
+        for batch in self._kept_batches:
             if overlap(missing.get(batch.table, ()), batch.first, batch.first + batch.rows):
                 publish(batch.table, self._header(batch), batch.payload)
                 sent += 1
@@ -209,33 +209,33 @@ class TelemetryBuffer:
         self._send(table, len(rows), rows.tobytes())
 
     def _send(self, table: str, rows: int, payload: bytes) -> None:
-        batch = _RowBatch(table, self._published[table], rows, payload)
-        self._published[table] += rows
-        self._kept.append(batch)
+        batch = _RowBatch(table, self._row_totals[table], rows, payload)
+        self._row_totals[table] += rows
+        self._kept_batches.append(batch)
         self._kept_bytes += len(payload)
         while self._kept_bytes > _MOST_KEPT_BYTES:
             self._store_oldest()
         self._publish(table, self._header(batch), payload)
 
     def _store_oldest(self) -> None:
-        batch = self._kept.popleft()
+        batch = self._kept_batches.popleft()
         self._kept_bytes -= len(batch.payload)
-        self._old = max(self._old - 1, 0)
+        self._old_count = max(self._old_count - 1, 0)
         self._store(batch.table, self._header(batch), batch.payload)
-        stored = self._stored.setdefault(batch.table, ReceivedRows())
+        stored = self._stored_rows.setdefault(batch.table, ReceivedRows())
         stored.add(batch.first, batch.first + batch.rows)
 
     def _forget(self, rows: Mapping[str, Ranges]) -> None:
         """Drop batches that are on disk; plan to send older ones again that are not."""
         remaining: deque[_RowBatch] = deque()
         old = 0
-        for i, batch in enumerate(self._kept):
+        for i, batch in enumerate(self._kept_batches):
             if not contain(rows.get(batch.table, ()), batch.first, batch.first + batch.rows):
                 remaining.append(batch)
-                old += i < self._old
+                old += i < self._old_count
         # Newer batches may have been in flight when the recorder sent its confirmation.
         self._to_resend = deque(islice(remaining, old))
-        self._kept, self._old = remaining, len(remaining)
+        self._kept_batches, self._old_count = remaining, len(remaining)
         self._kept_bytes = sum(len(batch.payload) for batch in remaining)
 
     def _header(self, batch: _RowBatch) -> bytes:
@@ -252,7 +252,7 @@ def first_row(header: bytes) -> tuple[int, int]:
 def persisted_rows(plane: ControlPlane, generation: int) -> Mapping[str, Sequence[tuple[int, int]]]:
     """Ranges of this process's rows that are on disk, by table; empty without a new message."""
     with suppress(PeerError):  # not from the recorder
-        if (message := plane.persisted()) is not None:
+        if (message := plane.next_persisted_ack()) is not None:
             acknowledged = parse_message(PersistedAck, message)
             return acknowledged.rows if acknowledged.generation == generation else {}
     return {}

@@ -130,19 +130,19 @@ class CountingSockets(ABC):
     ) -> None:
         self._destination, self._peers = destinations[0], frozenset(peers)
         other_destinations = [address for address in dict.fromkeys(destinations) if address not in peers]
-        opened = open_beside(endpoint, [*peers, *other_destinations])
-        if not opened:
+        sockets = open_beside(endpoint, [*peers, *other_destinations])
+        if not sockets:
             raise PeerError("the system refused to open a socket for each peer")
-        self._opened = dict(zip([*dict.fromkeys(peers), *other_destinations], opened, strict=True))
-        self.peer_sockets = [self._opened[address] for address in dict.fromkeys(peers)]
-        self.senders = [self._opened[address] for address in destinations]
+        self._sockets = dict(zip([*dict.fromkeys(peers), *other_destinations], sockets, strict=True))
+        self.peer_sockets = [self._sockets[address] for address in dict.fromkeys(peers)]
+        self.senders = [self._sockets[address] for address in destinations]
         """Sockets connected to the destinations."""
-        self._unexpected = [endpoint, *(self._opened[address] for address in other_destinations)]
+        self._unexpected = [endpoint, *(self._sockets[address] for address in other_destinations)]
         for unexpected in self._unexpected:
             unexpected.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _UNKNOWN_BYTES)
         self._flood, self._sources = FloodWatch(), SourceCount(peers)
-        self._counted: Counter[Address] = Counter()
-        self._begins = True
+        self._core_totals: Counter[Address] = Counter()
+        self._is_first_turn = True
 
     @abstractmethod
     def take(self, data: bytes, source: SocketName, now_ns: int, sink: RecordSink) -> None:
@@ -150,15 +150,15 @@ class CountingSockets(ABC):
 
     def do_housekeeping(self, now_ns: int, sink: RecordSink) -> None:
         """Begin the next interval of housekeeping; read the datagrams of other sources."""
-        line = self._flood.next_interval(self._shed())
+        line = self._flood.next_interval(self._flood_drops())
         if line is not None:
             sink.notice(Notice(now_ns, "info", line))
         reads_left = _READ_AT_ONCE
-        while (reads_left or self._begins) and self._flood.left > 0:
+        while (reads_left or self._is_first_turn) and self._flood.reads_left > 0:
             if not self._read(now_ns, sink):
                 break
             reads_left = max(reads_left - 1, 0)
-        self._begins = False
+        self._is_first_turn = False
 
     def _read(self, now_ns: int, sink: RecordSink) -> bool:
         """Read a datagram from a source that is no peer; return whether there was one."""
@@ -177,13 +177,13 @@ class CountingSockets(ABC):
         address = source[:2]
         self._sources.add(address)
         if address not in self._peers:
-            self._flood.left -= 1
+            self._flood.reads_left -= 1
         self.take(data, source, now_ns, sink)
 
     def count_received(self, source: Address, total: int) -> None:
         """Note how many datagrams the core has received from a peer so far."""
-        self._sources.add(source, total - self._counted[source])
-        self._counted[source] = total
+        self._sources.add(source, total - self._core_totals[source])
+        self._core_totals[source] = total
 
     def report(self) -> dict[str, object]:
         """Counters, for the run's summary.
@@ -201,7 +201,7 @@ class CountingSockets(ABC):
 
     def rejected(self, by_reason: Mapping[str, int]) -> dict[str, int]:
         """Add the datagrams from unknown sources that the kernel dropped in a flood."""
-        return {reason: n for reason, n in (*by_reason.items(), (DROPPED_IN_FLOOD, self._shed())) if n}
+        return {reason: n for reason, n in (*by_reason.items(), (DROPPED_IN_FLOOD, self._flood_drops())) if n}
 
     def finish(self, now_ns: int, sink: RecordSink) -> None:
         """Read the datagrams that still wait, so that the counters are complete."""
@@ -211,10 +211,10 @@ class CountingSockets(ABC):
 
     def close(self) -> None:
         """Close the sockets that it opened itself."""
-        for opened in self._opened.values():
-            opened.close()
+        for endpoint in self._sockets.values():
+            endpoint.close()
 
-    def _shed(self) -> int:
+    def _flood_drops(self) -> int:
         return sum(drops_of(endpoint) or 0 for endpoint in self._unexpected)
 
 
@@ -277,14 +277,14 @@ class FloodWatch:
     """
 
     def __init__(self) -> None:
-        self.left = READ_PER_INTERVAL
+        self.reads_left = READ_PER_INTERVAL
         """Number of those that may still be read in this interval; the reader decrements it."""
         self.is_flood = False
         self._allowed = READ_PER_INTERVAL
         self._dropped = 0
-        self._begun_with = 0
-        self._calm = 0
-        self._needed = _CALM_INTERVALS
+        self._drops_at_start = 0
+        self._calm_intervals = 0
+        self._needed_calm_intervals = _CALM_INTERVALS
 
     def next_interval(self, dropped: int) -> str | None:
         """Begin the next interval; return a log line about the last one, if there is any.
@@ -292,21 +292,21 @@ class FloodWatch:
         ``dropped`` is the number of datagrams that the kernel has dropped so far.
         """
         earlier, self._dropped = self._dropped, dropped
-        arrived = self._allowed - self.left + dropped - earlier
-        too_many = arrived > READ_PER_INTERVAL if self.is_flood else dropped > earlier or self.left == 0
+        arrived = self._allowed - self.reads_left + dropped - earlier
+        too_many = arrived > READ_PER_INTERVAL if self.is_flood else dropped > earlier or self.reads_left == 0
         line = None
         if self.is_flood:
-            self._calm = 0 if too_many else self._calm + 1
-            if self._calm >= self._needed:
+            self._calm_intervals = 0 if too_many else self._calm_intervals + 1
+            if self._calm_intervals >= self._needed_calm_intervals:
                 line = self._end()
         elif too_many:
             line = self._begin(earlier)
-        self.left = self._allowed = READ_PER_INTERVAL_IN_FLOOD if self.is_flood else READ_PER_INTERVAL
+        self.reads_left = self._allowed = READ_PER_INTERVAL_IN_FLOOD if self.is_flood else READ_PER_INTERVAL
         return line
 
     def _begin(self, dropped_before: int) -> str:
-        self.is_flood, self._calm = True, 0
-        self._begun_with = dropped_before
+        self.is_flood, self._calm_intervals = True, 0
+        self._drops_at_start = dropped_before
         return (
             "flood: too many datagrams from unknown sources; "
             "the kernel drops them and keeps the peers' datagrams"
@@ -314,9 +314,9 @@ class FloodWatch:
 
     def _end(self) -> str:
         self.is_flood = False
-        self._needed = min(2 * self._needed, _MOST_CALM_INTERVALS)
-        shed = self._dropped - self._begun_with
-        return f"the flood is over: the kernel dropped {shed} datagrams from unknown sources"
+        self._needed_calm_intervals = min(2 * self._needed_calm_intervals, _MOST_CALM_INTERVALS)
+        drops = self._dropped - self._drops_at_start
+        return f"the flood is over: the kernel dropped {drops} datagrams from unknown sources"
 
 
 class SourceCount:

@@ -13,12 +13,15 @@ import numpy as np
 
 from noack.core.system_processes import python_command
 
-_OF_NUMBERS = {
+_NUMERIC_CLASSES = {
     "double", "single", "sparse", "logical",
     "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64",
 }  # fmt: skip
-_MODERN = 3  # exit status for a file of v7.3
+"""MATLAB's classes of arrays of numbers."""
+_STATUS_OF_V7_3 = 3
+"""Exit status of the separate process for a file of v7.3."""
 _PATIENCE_S = 60.0
+"""Longest time for reading a file."""
 
 
 def matrices_as_npz(content: bytes, most_entries: int) -> bytes:
@@ -32,7 +35,7 @@ def matrices_as_npz(content: bytes, most_entries: int) -> bytes:
         reader = subprocess.run(command, input=content, capture_output=True, timeout=_PATIENCE_S, check=False)
     except subprocess.TimeoutExpired:
         raise ValueError("it cannot be read in time") from None
-    if reader.returncode == _MODERN:
+    if reader.returncode == _STATUS_OF_V7_3:
         raise NotImplementedError
     if reader.returncode != 0:
         raise ValueError("it cannot be read")
@@ -48,12 +51,12 @@ def _main() -> int:
         names = [
             name
             for name, shape, kind in whosmat(file)  # type: ignore[arg-type] # accepts files, too
-            if np.prod(shape, dtype=float) <= most_entries and kind in _OF_NUMBERS
+            if np.prod(shape, dtype=float) <= most_entries and kind in _NUMERIC_CLASSES
         ]
         file.seek(0)
         variables = loadmat(file, variable_names=names)  # type: ignore[arg-type]
     except NotImplementedError:
-        return _MODERN
+        return _STATUS_OF_V7_3
     arrays = {
         name: variables[name].toarray() if hasattr(variables[name], "toarray") else variables[name]
         for name in names

@@ -82,7 +82,7 @@ USES: dict[str, Use] = {
     "publish a run": lambda descriptor: active_runs.registered_run(descriptor, None).__enter__(),
     "find a run": lambda _: active_runs.find_run(),
     "publish an emulator": lambda _: emulator_session.registered_emulator(EMULATOR).__enter__(),
-    "list emulators": lambda _: emulator_session.running(),
+    "list emulators": lambda _: emulator_session.running_emulators(),
 }
 
 
@@ -181,7 +181,7 @@ def test_a_run_without_a_usable_folder_is_refused(shared: Path) -> None:
     assert find_descriptor("default") is None
     with pytest.raises(CallerError, match="no run is active"):
         active_runs.find_run()
-    assert emulator_session.running() == []
+    assert emulator_session.running_emulators() == []
     assert not (shared / OWN).exists()
 
 

@@ -16,7 +16,7 @@ import pytest
 
 from cosim.record.run_record import Rows
 from noack.protocol.roles import GENERATION, ROLES
-from noack.runtime.spool import read_chunks
+from noack.runtime.spool import read_batches
 from noack.scenario.resolution import run_tables
 from noack.scenario.scenario_file import load
 from tests.helpers.command_line import invoke
@@ -258,8 +258,8 @@ def spooled(running: Running, table: str) -> Rows:
     """Return the rows of a table that are on disk."""
     spool = running.runs / "latest" / "spool"
     dtype = run_tables(load(running.runs / "latest" / "scenario.toml"))[table]
-    chunks = [np.frombuffer(data, dtype) for _, data in read_chunks(spool, table)]
-    return np.concatenate([np.zeros(0, dtype), *chunks])
+    batches = [np.frombuffer(data, dtype) for _, data in read_batches(spool, table)]
+    return np.concatenate([np.zeros(0, dtype), *batches])
 
 
 def goes_on(running: Running, role: str) -> bool:

@@ -170,7 +170,7 @@ def test_a_new_capture_replaces_an_older_file(tmp_path: Path) -> None:
             capture.take(events, data)
             events["packet"], data[:] = 9, 0  # the relay reuses these arrays
     assert path.read_bytes() == file_of(*FOUR)
-    assert (capture.error, capture.missing_events, capture.written) == (None, 0, 4)
+    assert (capture.error, capture.missing_events, capture.written_events) == (None, 0, 4)
     capture.take(*batch({}))
     capture.close()
     assert capture.missing_events == 1
@@ -200,9 +200,9 @@ def test_events_that_overflow_the_queue_are_reported_missing(
         capture.take(*batch({"interface": 1}))
         assert capture.missing_events == 3
         free.set()
-        wait_for(lambda: capture.written == 3)
+        wait_for(lambda: capture.written_events == 3)
         capture.take(*batch({"interface": 1}, {"interface": 1}, {}))
-    assert (capture.missing_events, capture.written, capture.error) == (3, 6, None)
+    assert (capture.missing_events, capture.written_events, capture.error) == (3, 6, None)
     drop_counts = [packet.options.get(4, [b""])[0] for packet in read(path.read_bytes()).packets]
     assert [int.from_bytes(count, "little") for count in drop_counts] == [0, 0, 0, 1, 0, 2]
 
@@ -219,7 +219,7 @@ def test_a_capture_that_a_full_disk_ends_can_be_read(tmp_path: Path) -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert capture.error is not None
     assert capture.error.endswith(f"ends after 17 events: {os.strerror(errno.EFBIG)}")
-    assert (capture.written, capture.missing_events) == (17, 23)
+    assert (capture.written_events, capture.missing_events) == (17, 23)
     assert len(read(path.read_bytes()).packets) == 17
 
 
@@ -240,7 +240,7 @@ def test_a_reader_that_reads_nothing_does_not_delay_the_end(fifo: tuple[Path, in
     capture.close(patience_s=0.05)
     assert capture.error is not None
     assert capture.error.endswith(": nothing could be written for 0.05 s")
-    assert capture.missing_events == 3 - capture.written > 0
+    assert capture.missing_events == 3 - capture.written_events > 0
     while os.read(descriptor, 1 << 16):
         pass
     capture._thread.join(PATIENCE_S)

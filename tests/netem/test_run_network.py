@@ -209,7 +209,7 @@ def test_early_and_later_datagrams_are_relayed_and_foreign_ones_counted() -> Non
         received: Received = []
         waiting = iter(sent[early:])
 
-        def news(now_ns: int) -> list[Notice]:
+        def send_batch(now_ns: int) -> list[Notice]:
             for data in islice(waiting, 100):
                 sensor.sendto(data, here)
             return []
@@ -221,7 +221,7 @@ def test_early_and_later_datagrams_are_relayed_and_foreign_ones_counted() -> Non
 
         channel = NetworkChannel(endpoint, ends, network=network, clock=clock, loops=1)
         with closing(channel) as shell:
-            run_loop(network, shell, clock, telemetry, end_ns=None, stop=stop, external_inputs=news)
+            run_loop(network, shell, clock, telemetry, end_ns=None, stop=stop, external_inputs=send_batch)
             shell.finish(clock.now_ns(), telemetry)
             telemetry.flush()
             report = shell.report()

@@ -147,7 +147,7 @@ class InputReplay:
 
     def _recall(self, locate: "_InputRows") -> None:
         """Let a part that is outside of noack answer as recorded."""
-        if not isinstance(self._machine, Channel) and (asked := self._machine.asked) is not None:
+        if not isinstance(self._machine, Channel) and (asked := self._machine.asking_part) is not None:
             table, row, rows = locate(self._core.next)
             if table in _ANSWERS:
                 asked.recorded = rows[_ANSWERS[table]][row].copy()

@@ -18,7 +18,7 @@ from zenoh.handlers import FifoChannel, RingChannel
 from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import CallerError, PeerError
 from noack.core.system_processes import cores
-from noack.impairments.target_loss import found_probabilities
+from noack.impairments.target_loss import find_probabilities
 from noack.protocol.roles import COORDINATOR, LOOP_ROLES, ROLES
 from noack.runtime.connections.zenoh_session import header_of, next_payload
 from noack.runtime.control_messages import (
@@ -454,7 +454,7 @@ class ChangeRequests:
             settings=dict(change.settings),
             requested_ns=requested_ns,
             requested_at=requested_at,
-            target_losses=found_probabilities(*(changed_scenario.network.link for changed_scenario in later)),
+            target_losses=find_probabilities(*(changed_scenario.network.link for changed_scenario in later)),
         )
         self.announced += (announcement,)
         return announcement

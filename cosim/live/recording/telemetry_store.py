@@ -13,7 +13,7 @@ from noack.core.errors import PeerError
 from noack.protocol.record_tables import OWNER
 from noack.protocol.roles import GENERATION, LOOP_ROLES, RECORDER, Notice, Start
 from noack.runtime.control_messages import LogLine, ProcessReport, parse_message
-from noack.runtime.spool import NOTICES, SPOOL, SpoolWriter, lines_in, notice_number, notices_of, read_chunks
+from noack.runtime.spool import NOTICES, SPOOL, SpoolWriter, lines_in, notice_number, notices_of, read_batches
 from noack.runtime.telemetry import ReceivedRows
 from noack.scenario.resolution import run_tables
 from noack.scenario.scenario import Scenario
@@ -93,14 +93,14 @@ class TelemetryStore:
     def load(self, on_rows: Callable[[str, Rows], None]) -> None:
         """Read what an earlier recorder of this run has stored."""
         for table, dtype in self.types.items():
-            for first, data in read_chunks(self._folder, table):
+            for first, data in read_batches(self._folder, table):
                 if len(data) and len(data) % dtype.itemsize == 0:
                     rows: Rows = np.frombuffer(data, dtype)
                     generation = int(rows["input"][0]) // GENERATION
                     self._received[OWNER[table], table, generation].add(first, first + len(rows))
                     on_rows(table, rows)
         for role in LOOP_ROLES:
-            for number, payload in read_chunks(self._folder, notices_of(role)):
+            for number, payload in read_batches(self._folder, notices_of(role)):
                 generation, first = divmod(number, GENERATION)
                 end = first + len(lines_in(payload))
                 self._received[role, NOTICES, generation].add(first, end)

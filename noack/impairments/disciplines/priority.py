@@ -36,8 +36,8 @@ class Priority(Scheduler):
         return self.levels
 
     def yields_ns(self, number: int, other_number: int) -> float:
-        below = number - other_number
-        return math.copysign(math.inf, below) if below else 0.0
+        difference = number - other_number
+        return math.copysign(math.inf, difference) if difference else 0.0
 
     def meaning(self) -> str:
         levels = numbers_text(self.levels)

@@ -15,8 +15,9 @@ from noack.impairments.words import OWN_TIME_S, Quantity, time_text
 from noack.settings.user_files import NamedFile
 
 MOST_INTERVALS = 1_000_000
-MOST_S = 1e9
-_TimeS = Annotated[FiniteFloat, Field(ge=0, le=MOST_S)]
+LATEST_S = 1e9
+"""Latest time of an interval: 32 years."""
+_TimeS = Annotated[FiniteFloat, Field(ge=0, le=LATEST_S)]
 
 
 def _read_intervals(word: str) -> list[tuple[float, float]]:
@@ -114,7 +115,7 @@ def _require_order(intervals_s: Sequence[tuple[float, float]], every_s: float | 
     ends = [t_s for interval in intervals_s for t_s in interval]
     if any(a >= b for a, b in pairwise(ends)):
         raise ValueError("intervals_s: each must end after it begins, and before the next")
-    if not 0 <= ends[0] <= ends[-1] <= MOST_S:
-        raise ValueError(f"intervals_s: must lie between 0 and {MOST_S:g} s")
+    if not 0 <= ends[0] <= ends[-1] <= LATEST_S:
+        raise ValueError(f"intervals_s: must lie between 0 and {LATEST_S:g} s")
     if every_s is not None and ends[-1] > every_s:
         raise ValueError(f"every_s: the intervals last longer, until {ends[-1]:g} s")

@@ -64,7 +64,7 @@ class _JitterPart(Part):
         assert isinstance(settings, Delay)
         return super().is_default(settings) and settings.distribution in ("uniform", "empirical")
 
-    def described(self, preceding: str) -> Iterator[Word]:
+    def list_words(self, preceding: str) -> Iterator[Word]:
         yield Word("jitter", "delay 10ms 2ms", preceding)
 
 
@@ -196,9 +196,9 @@ class Delay(FileFeature, Impairment):
             text += f" ± {time_text(self.jitter_s)}, uniformly distributed"
         elif self.jitter_s:
             text += f", with a standard deviation of {time_text(self.jitter_s)} ({self.distribution})"
-        below = self._share_below_zero()
-        if below >= _NOTEWORTHY:
-            share = percent_text(float(f"{below:.2g}"))
+        share_below = self._share_below_zero()
+        if share_below >= _NOTEWORTHY:
+            share = percent_text(float(f"{share_below:.2g}"))
             text += f"; negative delays become 0 ({share} of the draws)"
         if self.correlation:
             text += f"; correlation {brief_percent(self.correlation)}"
@@ -267,14 +267,14 @@ def _read_samples(file: NamedFile, jitter_s: float) -> tuple[float, ...]:
     if file.path.suffix == TABLE_SUFFIX:
         if jitter_s == 0:
             file.wrong("a distribution table is scaled by the jitter, which is 0; give a jitter")
-        samples_s = [jitter_s * entry / _TABLE_SCALE for entry in _table(file)]
+        samples_s = [jitter_s * entry / _TABLE_SCALE for entry in _read_table(file)]
     else:
         if jitter_s != 0:
             file.wrong(
                 "observed delays are taken as they are, and have no jitter beside them; "
                 f"a distribution table of tc is named *{TABLE_SUFFIX}"
             )
-        samples_s = list(_observed_s(file))
+        samples_s = list(_read_delays_s(file))
     if not 2 <= len(samples_s) <= MAX_SAMPLES:
         file.wrong(f"has {len(samples_s)} delays; expected 2 to {MAX_SAMPLES}")
     if max(map(abs, samples_s)) > MOST_DELAY_S:
@@ -282,7 +282,7 @@ def _read_samples(file: NamedFile, jitter_s: float) -> tuple[float, ...]:
     return tuple(samples_s)
 
 
-def _table(file: NamedFile) -> Iterator[int]:
+def _read_table(file: NamedFile) -> Iterator[int]:
     for number, line in file.lines():
         for word in line.split():
             if not re.fullmatch("-?[0-9]{1,5}", word):
@@ -290,7 +290,7 @@ def _table(file: NamedFile) -> Iterator[int]:
             yield int(word)
 
 
-def _observed_s(file: NamedFile) -> Iterator[float]:
+def _read_delays_s(file: NamedFile) -> Iterator[float]:
     for number, line in file.lines():
         match = _DELAY.fullmatch(line)
         scale = _UNITS_S.get(match[2]) if match else None

@@ -36,10 +36,10 @@ class _LossClause(Clause):
             reader.wrong("this emulator cannot mark packets: it sees payloads, not IP headers")
         return {"loss": loss}
 
-    def described(self, preceding: str = "") -> Iterator[Word]:
+    def list_words(self, preceding: str = "") -> Iterator[Word]:
         yield from (Word(name, self.example, preceding) for name in (self.word, *self.synonyms))
         for _, clause in _MODELS.values():
-            yield from clause.described(self.word)
+            yield from clause.list_words(self.word)
 
 
 class LossOf(Impairment):

@@ -151,9 +151,9 @@ class Opportunities(FileFeature, Impairment):
         return Stage(self.kind, numbers, queue_places=2 * self.queue)
 
     def read_file(self, file: NamedFile) -> Self:
-        read = self.model_copy(update={"times_ms": _times_ms(file), "file": None})
-        require_inside(self.offset_s, read.length_ns, file)
-        return read
+        opportunities = self.model_copy(update={"times_ms": _times_ms(file), "file": None})
+        require_inside(self.offset_s, opportunities.length_ns, file)
+        return opportunities
 
 
 def _times_ms(file: NamedFile) -> tuple[int, ...]:

@@ -42,8 +42,8 @@ class _DisciplinePart(Part):
         assert isinstance(settings, Rate)
         return settings.discipline.text()
 
-    def described(self, preceding: str) -> Iterator[Word]:
-        yield from (word._replace(grammar="") for word in self._clause.described(preceding))
+    def list_words(self, preceding: str) -> Iterator[Word]:
+        yield from (word._replace(grammar="") for word in self._clause.list_words(preceding))
 
 
 class Rate(Impairment):

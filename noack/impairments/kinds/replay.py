@@ -160,7 +160,7 @@ class Replay(FileFeature, Impairment):
     def stage(self, tables: StageTables) -> Stage:
         self.require_content()
         times_begin, _ = add_numbers(tables.integers, self.sent_ns or ())
-        begin, end = add_numbers(tables.integers, self._applied_ns())
+        begin, end = add_numbers(tables.integers, self._stage_delays_ns())
         first_ns = offset_ns(self.offset_s, self.length_ns, tables)
         by_time = self.by == "time"
         numbers = {
@@ -173,15 +173,15 @@ class Replay(FileFeature, Impairment):
         }
         return Stage(self.kind, numbers)
 
-    def _applied_ns(self) -> Sequence[int]:
+    def _stage_delays_ns(self) -> Sequence[int]:
         """Return the delays as a stage has them: a lost packet has that of its predecessor."""
-        applied_ns: list[int] = []
+        stage_delays_ns: list[int] = []
         latest_ns = 0
         for delay_ns in self.delays_ns or ():
             if delay_ns >= 0:
                 latest_ns = delay_ns if self.delay_share == 1 else round(delay_ns * self.delay_share)
-            applied_ns.append(latest_ns if delay_ns >= 0 else -1 - latest_ns)
-        return applied_ns
+            stage_delays_ns.append(latest_ns if delay_ns >= 0 else -1 - latest_ns)
+        return stage_delays_ns
 
     def chains(self) -> Sequence[PeriodicLosses]:
         self.require_content(NotPredictableError)
@@ -214,6 +214,6 @@ class Replay(FileFeature, Impairment):
             "file": None,
             "clocks_differ": False,
         }
-        read = self.model_copy(update=update)
-        require_inside(self.offset_s, read.length_ns, file)
-        return read
+        replay = self.model_copy(update=update)
+        require_inside(self.offset_s, replay.length_ns, file)
+        return replay

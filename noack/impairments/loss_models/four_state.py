@@ -66,7 +66,7 @@ class FourStateLoss(LossModel):
         return Stage(self.model, self.model_dump(include=set(_NAMES)))
 
     def chains(self) -> Sequence[Chain]:
-        moves = np.array(
+        transitions = np.array(
             [
                 [1 - self.p13 - self.p14, 0.0, self.p13, self.p14],
                 [0.0, 1 - self.p23, self.p23, 0.0],
@@ -74,7 +74,7 @@ class FourStateLoss(LossModel):
                 [1.0, 0.0, 0.0, 0.0],
             ]
         )
-        return (Chain(np.eye(4)[0], np.maximum(moves, 0.0), np.array([0.0, 0.0, 1.0, 1.0])),)
+        return (Chain(np.eye(4)[0], np.maximum(transitions, 0.0), np.array([0.0, 0.0, 1.0, 1.0])),)
 
     def tc_text(self) -> str:
         return f"state {' '.join(percent_text(getattr(self, name)) for name in _NAMES)}"

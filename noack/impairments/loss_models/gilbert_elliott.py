@@ -119,12 +119,12 @@ class GilbertElliottLoss(LossModel):
 
     def meaning(self) -> str:
         p, r = self.transitions
-        per, lasts = "per packet", "packets"
+        per, unit = "per packet", "packets"
         if self.step_s is not None:
             per = f"per step of {time_text(self.step_s)}, for all flows at once,"
-            lasts = "steps"
+            unit = "steps"
         bad = f"the bad state begins with probability {brief_percent(p)} {per}"
-        length = f" and lasts {brief_number(1 / r)} {lasts} on average" if r else " and never ends"
+        length = f" and lasts {brief_number(1 / r)} {unit} on average" if r else " and never ends"
         if (self.loss_in_good, self.loss_in_bad) == (0.0, 1.0):
             return f"loses all packets in the bad state; {bad}{length}"
         return (
@@ -149,8 +149,8 @@ class GilbertElliottLoss(LossModel):
         if self.step_s is not None:
             raise NotPredictableError("losses in a common state depend on when packets arrive")
         p, r = self.transitions
-        moves = np.array([[1 - p, p], [r, 1 - r]])
-        return (Chain(np.array([1.0, 0.0]), moves, np.array([self.loss_in_good, self.loss_in_bad])),)
+        transitions = np.array([[1 - p, p], [r, 1 - r]])
+        return (Chain(np.array([1.0, 0.0]), transitions, np.array([self.loss_in_good, self.loss_in_bad])),)
 
     def tc_lacks(self, earlier: Sequence[Impairment]) -> str:
         return "" if self.step_s is None else "a state that all flows share"

@@ -39,11 +39,11 @@ class FirstBytes:
     most: int
     """More bytes are not read, and not waited for."""
     within_s: float
-    refused: bytes = b""
+    refusal: bytes = b""
     """Sent before a connection ends whose bytes are wrong."""
     no_room: bytes = b""
     """Sent before a connection ends to make room."""
-    unserved: Callable[[Counter[str]], None] = lambda count: None
+    report_unserved: Callable[[Counter[str]], None] = lambda counts: None
     """Called every second: how many connections ended since without being served, by host."""
 
 
@@ -93,7 +93,7 @@ class TaskLimit:
         """Oldest first."""
 
     @contextmanager
-    def counted(self, host: str) -> Iterator[None]:
+    def count(self, host: str) -> Iterator[None]:
         """Count the current task within the context."""
         task = asyncio.current_task()
         assert task is not None
@@ -210,7 +210,7 @@ class _Gate:
             self._forget(waiting)
             self._serve(waiting.connection, waiting.data, waiting.host)
         else:
-            self._end(waiting, first.refused)
+            self._end(waiting, first.refusal)
         return True
 
     def _make_room(self) -> None:
@@ -233,8 +233,8 @@ class _Gate:
             if waiting.until_s > now_s:
                 break
             self._end(waiting)
-        count, self._unserved = self._unserved, Counter()
-        self._first.unserved(count)
+        counts, self._unserved = self._unserved, Counter()
+        self._first.report_unserved(counts)
         self._loop.call_later(_CHECK_S, self._check)
 
     def _end(self, waiting: _PartialConnection, answer: bytes = b"") -> None:

@@ -73,11 +73,11 @@ _PAUSE_S = 0.2
 _READY = b"ready\n"
 _BACKLOG = 16
 """Connections that the kernel keeps until they are accepted."""
-_FOREIGN = (
+_REFUSED_TEXT = (
     "a program listens there, but does not accept this invitation; each run has a new one: copy "
     "that of the open run"
 )
-_FLOODED = (
+_NO_ROOM_TEXT = (
     "it had no room for this connection: other connections flood its port; start this process "
     "again, and see what `noack record` says about the flood"
 )
@@ -178,9 +178,9 @@ def forwarding(
             accept=lambda data, peer: proof.check(data, peer, own_address),
             most=PROOF_BYTES,
             within_s=_PROOF_S,
-            refused=Answer.REFUSED.value,
+            refusal=Answer.REFUSED.value,
             no_room=Answer.NO_ROOM.value,
-            unserved=protection.unserved,
+            report_unserved=protection.unserved,
         )
     return accepting(listening, forwarder.serve, first, name="forwarder", linger_s=linger_s)
 
@@ -198,10 +198,10 @@ class _Forwarder:
         if self._protection is not None:
             accepted.send(Answer.ADMITTED.value)
         connection = socket.socket(fileno=accepted.detach())
-        with self._handshakes.counted(host):
+        with self._handshakes.count(host):
             reader, writer = await self._streams(connection)
         try:
-            with self._connections.counted(host):
+            with self._connections.count(host):
                 await self._forward(reader, writer)
         finally:
             writer.transport.abort()
@@ -345,7 +345,7 @@ async def connect(destination: Destination) -> Streams:
             "other connections flood its port?"
         ) from None
     except ssl.SSLError:
-        raise PeerError(_FOREIGN) from None
+        raise PeerError(_REFUSED_TEXT) from None
     except OSError as error:
         raise PeerError(why(error)) from None
 
@@ -358,11 +358,11 @@ async def _connect(destination: Destination) -> Streams:
         writer.write(proof.make(*addresses))
         answer = await reader.read(1)
         if answer == Answer.NO_ROOM:
-            raise NoAnswerError(_FLOODED)
+            raise NoAnswerError(_NO_ROOM_TEXT)
         if answer == b"":
             raise ConnectionResetError
         if answer != Answer.ADMITTED:
-            raise PeerError(_FOREIGN)
+            raise PeerError(_REFUSED_TEXT)
         context = tls_context(
             destination.coordinator, destination.certificate, destination.private_key, server=False
         )
@@ -377,10 +377,10 @@ def _main() -> None:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # it ends after the process that it serves
     destination = Destination(*json.loads(sys.stdin.buffer.readline()))
-    prepared: list[Streams] = []
+    prepared_streams: list[Streams] = []
 
     async def target() -> Streams:
-        return prepared.pop() if prepared else await connect(destination)
+        return prepared_streams.pop() if prepared_streams else await connect(destination)
 
     with (
         socket.socket(fileno=int(sys.argv[1])) as listening,
@@ -389,7 +389,7 @@ def _main() -> None:
     ):
         opening = asyncio.run_coroutine_threadsafe(_connect_patiently(destination), loop)
         try:
-            prepared.append(opening.result())
+            prepared_streams.append(opening.result())
         except PeerError as error:
             os.write(sys.stdout.fileno(), f"{error}\n".encode())
             return

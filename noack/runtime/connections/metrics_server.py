@@ -70,7 +70,7 @@ def metrics_server(host_port: str, collect: "Callable[[], Iterable[Metric]]") ->
     limit = TaskLimit(_MOST_ANSWERS)
 
     async def answer(connection: socket.socket, request: bytes, host: str) -> None:
-        with limit.counted(host):
+        with limit.count(host):
             content = _answer(app, request)
             async with asyncio.timeout(_ANSWER_S):
                 await asyncio.get_running_loop().sock_sendall(connection, content)

@@ -48,10 +48,12 @@ _READS = 16
 _LOOK_S = 0.05
 """Longest time between two looks at the reasons to stop."""
 _ROWS = (core.NOACK_TICKS, core.NOACK_MESSAGES)
-_COPIED = (
+"""The kinds of frames with a row of the record."""
+_COPIED_FIELDS = (
     *("has_point", "acknowledges", "predictions", "carries_model", "timeout_ns", "holds_input"),
     *("model_ns", "has_state", "newest"),
 )
+"""Fields of a ``noack_controller`` that the settings of a node have, too."""
 _HEAD = struct.Struct("<qq")
 _GREETING = f"noack node {core.NOACK_NODE_VERSION} {ffi.sizeof('noack_node_settings')}"
 
@@ -87,7 +89,7 @@ class NodeDriver(LiveDriver):
         rows = {kind: tables[kind].row_bytes - core.NOACK_LOOP_BYTES for kind in _ROWS}
         counts = ffi.sizeof("noack_node_counts")
         self._sizes = rows | {core.NOACK_NODE_COUNTS: counts, core.NOACK_NODE_UNSENT: 8}
-        self._own, peer = socket.socketpair()
+        self._stream, peer = socket.socketpair()
         peer.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _READ_BYTES)  # this process may stall
         with peer:
             self._program = self._start(checked_path(settings, "controller"), settings.runner, peer)
@@ -104,7 +106,7 @@ class NodeDriver(LiveDriver):
                 preexec_fn=partial(prctl, _PR_SET_PDEATHSIG, signal.SIGKILL),
             )
         except OSError as error:
-            self._own.close()
+            self._stream.close()
             if runner:
                 raise CallerError(
                     f'controller.runner = "{runner[0]}": cannot be started: {error.strerror}'
@@ -124,15 +126,15 @@ class NodeDriver(LiveDriver):
                 f"{self._label}: {answer}; a node of this version says {_GREETING!r}: build it by "
                 "native/build.py --node"
             )
-        self._own.setblocking(False)
+        self._stream.setblocking(False)
         return self
 
     def _first_line(self) -> bytes:
         line, until_s = b"", time.monotonic() + _LONGEST_WAIT_S
         with suppress(TimeoutError):
             while not line.endswith(b"\n") and len(line) < _GREETING_BYTES:
-                self._own.settimeout(max(until_s - time.monotonic(), 1e-6))
-                if not (byte := self._own.recv(1)):
+                self._stream.settimeout(max(until_s - time.monotonic(), 1e-6))
+                if not (byte := self._stream.recv(1)):
                     self._is_closed = True
                     break
                 line += byte
@@ -142,7 +144,7 @@ class NodeDriver(LiveDriver):
         with suppress(ProcessLookupError):
             os.killpg(self._program.pid, signal.SIGKILL)
         self._program.wait()
-        self._own.close()
+        self._stream.close()
 
     def open(
         self,
@@ -157,21 +159,21 @@ class NodeDriver(LiveDriver):
     def set_clock(self, clock: RunClock) -> None:
         """Let the program read the time as this clock does; the first time, it begins."""
         super().set_clock(clock)
-        self._clock, now = clock, bytes(ffi.buffer(ffi.addressof(self.core, "clock")))
+        self._clock, clock_bytes = clock, bytes(ffi.buffer(ffi.addressof(self.core, "clock")))
         if not self._sent_clock:
             data = self._settings()
             first = _HEAD.pack(core.NOACK_NODE_SETTINGS, len(data))
             with suppress(BrokenPipeError):  # drive() finds that it has ended
-                socket.send_fds(self._own, [first[:1]], [endpoint.fileno() for endpoint in self._sockets])
+                socket.send_fds(self._stream, [first[:1]], [endpoint.fileno() for endpoint in self._sockets])
             self._to_send += first[1:] + data
-        elif now != self._sent_clock:
-            self._queue_message(core.NOACK_NODE_CLOCK, now)
-        self._sent_clock = now
+        elif clock_bytes != self._sent_clock:
+            self._queue_message(core.NOACK_NODE_CLOCK, clock_bytes)
+        self._sent_clock = clock_bytes
 
     def _settings(self) -> bytes:
         controller = self.machines.machines[0]
         n, m, model = controller.machine.n, controller.machine.m, controller.model
-        numbers = {name: getattr(controller, name) for name in _COPIED} | {
+        numbers = {name: getattr(controller, name) for name in _COPIED_FIELDS} | {
             "run_id": self.core.wire.run_id,
             "key": self._key,
             "clock": self.core.clock,
@@ -219,7 +221,7 @@ class NodeDriver(LiveDriver):
         while goes_on and (wait_s := until_s - time.monotonic()) > 0:
             if not self._to_send:
                 with suppress(OSError):  # it has ended
-                    self._own.shutdown(socket.SHUT_WR)
+                    self._stream.shutdown(socket.SHUT_WR)
             goes_on = self._exchange(min(wait_s, _LOOK_S), select.POLLIN)
             self._take_frames(sink)
         self._pass_rows(sink)
@@ -245,15 +247,15 @@ class NodeDriver(LiveDriver):
         The program may have ended while another one, which it has started, keeps its stream.
         """
         poll = select.poll()
-        poll.register(self._own, wake | (select.POLLOUT if self._to_send else 0))
+        poll.register(self._stream, wake | (select.POLLOUT if self._to_send else 0))
         poll.poll(1000 * wait_s)
         goes_on = self._program.poll() is None
         with suppress(BlockingIOError, BrokenPipeError, ConnectionResetError):
             while self._to_send:
-                del self._to_send[: self._own.send(self._to_send)]
+                del self._to_send[: self._stream.send(self._to_send)]
         try:
             for _ in range(_READS):
-                if not (data := self._own.recv(_READ_BYTES)):
+                if not (data := self._stream.recv(_READ_BYTES)):
                     self._is_closed = True
                     break
                 self._received += data

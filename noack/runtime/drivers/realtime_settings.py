@@ -65,10 +65,10 @@ def realtime(enabled: bool, fifo_priority: int, place: int | None = None) -> Ite
             # Locking memory takes 0.1 s: at real-time priority it would block this core.
             applied["memory_lock"] = _attempt(lock_memory)
             applied["timer_slack"] = _attempt(_call_system, "prctl", _PR_SET_TIMERSLACK, 1, 0, 0, 0)
-            applied["sched_fifo"] = _attempt(_fifo, fifo_priority, place, undo)
+            applied["sched_fifo"] = _attempt(_set_fifo_priority, fifo_priority, place, undo)
             if place is not None and applied["sched_fifo"] == "applied":
-                applied["affinity"] = _attempt(_affinity, place, undo)
-            applied["cpu_dma_latency"] = _attempt(_cpu_dma_latency, undo)
+                applied["affinity"] = _attempt(_set_affinity, place, undo)
+            applied["cpu_dma_latency"] = _attempt(_set_cpu_dma_latency, undo)
         yield applied
 
 
@@ -81,7 +81,7 @@ def _attempt(apply: Callable[[*Arguments], None], *arguments: *Arguments) -> str
     return "applied"
 
 
-def _fifo(priority: int, place: int | None, undo: ExitStack) -> None:
+def _set_fifo_priority(priority: int, place: int | None, undo: ExitStack) -> None:
     if sys.platform != "linux":
         raise OSError(0, "not available on this system")
     loop = threading.get_native_id()
@@ -96,7 +96,7 @@ def _fifo(priority: int, place: int | None, undo: ExitStack) -> None:
             os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(max(rank, 1)))
 
 
-def _affinity(place: int, undo: ExitStack) -> None:
+def _set_affinity(place: int, undo: ExitStack) -> None:
     cores = sorted(os.sched_getaffinity(0))
     if len(cores) < 2:
         raise OSError(0, "there is only one core")
@@ -112,7 +112,7 @@ def _call_system(function: str, *arguments: int) -> None:
         raise OSError(number, os.strerror(number))
 
 
-def _cpu_dma_latency(undo: ExitStack) -> None:
+def _set_cpu_dma_latency(undo: ExitStack) -> None:
     # The kernel keeps the request for as long as the file stays open.
     descriptor = os.open(_CPU_DMA_LATENCY, os.O_WRONLY)
     undo.callback(os.close, descriptor)

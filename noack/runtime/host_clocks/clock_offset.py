@@ -178,9 +178,9 @@ class Slew(NamedTuple):
     """Largest change of the offset, in parts per 10⁹ of the own time."""
     since_ns: int
     """Reading of the own clock."""
-    begun_ns: int
-    """The offset then."""
-    target_ns: int
+    first_offset_ns: int
+    """The offset then, from which it moves."""
+    target_offset_ns: int
     """The offset towards which it moves."""
 
 
@@ -204,19 +204,19 @@ class SlewedClock:
         self._offset = offset
         self.slew_ppb = slew_ppb
         self._since_ns = own_ns
-        self._begun_at_ns = self._target_ns = interval.midpoint_ns
+        self._first_offset_ns = self._target_offset_ns = interval.midpoint_ns
 
     def follow(self, own_ns: int) -> None:
         """Move towards the estimate at ``own_ns`` from now on; without one the offset stays."""
         applied_ns = self._applied_ns(own_ns)
         interval = self._offset.interval(own_ns)
-        self._since_ns, self._begun_at_ns = own_ns, applied_ns
-        self._target_ns = applied_ns if interval is None else interval.midpoint_ns
+        self._since_ns, self._first_offset_ns = own_ns, applied_ns
+        self._target_offset_ns = applied_ns if interval is None else interval.midpoint_ns
 
     @property
     def slew(self) -> Slew:
         """The motion of the offset until the next call of :meth:`follow`."""
-        return Slew(self.slew_ppb, self._since_ns, self._begun_at_ns, self._target_ns)
+        return Slew(self.slew_ppb, self._since_ns, self._first_offset_ns, self._target_offset_ns)
 
     def now_ns(self, own_ns: int) -> int:
         """Return the time of this clock at a reading of the own clock."""
@@ -237,8 +237,8 @@ class SlewedClock:
     def _applied_ns(self, own_ns: int) -> int:
         """In one nanosecond of the own time it changes by at most one."""
         most_ns = self.slew_ppb * (own_ns - self._since_ns) // _PPB
-        change_ns = self._target_ns - self._begun_at_ns
-        return self._begun_at_ns + min(max(change_ns, -most_ns), most_ns)
+        change_ns = self._target_offset_ns - self._first_offset_ns
+        return self._first_offset_ns + min(max(change_ns, -most_ns), most_ns)
 
 
 class SlewedRunClock(RunClock):
@@ -266,4 +266,4 @@ class SlewedRunClock(RunClock):
         super().set_core(clock)
         slew = self._slewed.slew
         clock.slew_ppb, clock.since_ns = slew.slew_ppb, slew.since_ns
-        clock.begun_ns, clock.target_ns = slew.begun_ns, slew.target_ns
+        clock.first_offset_ns, clock.target_offset_ns = slew.first_offset_ns, slew.target_offset_ns

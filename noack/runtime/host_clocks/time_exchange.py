@@ -199,7 +199,7 @@ class ArrivalSocket:
         self._endpoint = endpoint
         self._most_bytes = most_bytes
         self._clocks = clocks
-        self._known: ClockDifference | None = None
+        self._difference: ClockDifference | None = None
         """Read since before the last call that left the socket empty: before any later arrival."""
         self.clock_sets = 0
         """Calls with datagrams for which the real-time clock was found to have been set."""
@@ -212,14 +212,14 @@ class ArrivalSocket:
 
     def receive(self, most: int) -> list[Arrival]:
         """Return the datagrams that wait, at most ``most``."""
-        earlier, previous = read_difference(self._clocks), self._known
-        self._known = previous and previous.joined(earlier)
+        earlier, previous = read_difference(self._clocks), self._difference
+        self._difference = previous and previous.joined(earlier)
         waiting: list[tuple[bytes, Address, int | None, int]] = []
         for _ in range(most):
             try:
                 data, ancillary, _, source = self._endpoint.recvmsg(self._most_bytes + 1, _ANCILLARY_BYTES)
             except BlockingIOError:
-                self._known = earlier
+                self._difference = earlier
                 break
             except OSError:
                 self.errors += 1
@@ -229,7 +229,7 @@ class ArrivalSocket:
         if not waiting:
             return []
         later = read_difference(self._clocks)
-        self._known = self._known and self._known.joined(later)
+        self._difference = self._difference and self._difference.joined(later)
         if previous is None:  # nothing was read before these arrivals
             return [Arrival(data, source, read_ns) for data, source, _, read_ns in waiting]
         difference = previous.joined(earlier).joined(later)
@@ -277,7 +277,7 @@ class TimeReference:
         self.address: Address = self._endpoint.getsockname()[:2]
         self._arrivals = ArrivalSocket(self._endpoint, TIME_BYTES, _HOST_CLOCKS)
         self._clock = secrets.randbits(64)
-        self.answered = 0
+        self.answers_sent = 0
         self.rejected: Counter[Rejection] = Counter()
         self.send_errors: Counter[str] = Counter()
 
@@ -297,7 +297,7 @@ class TimeReference:
             reply = TimeDatagram(TimeKind.REPLY, request.nonce, self._clock, received_ns, sent_ns)
             try:
                 self._endpoint.sendto(self._format.encode(reply), source)
-                self.answered += 1
+                self.answers_sent += 1
             except OSError as error:
                 self.send_errors[why(error)] += 1
         return len(arrivals)

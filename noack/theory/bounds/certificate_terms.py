@@ -43,7 +43,7 @@ class Constants(NamedTuple):
     delta: float
     """Δ: ‖e_c‖_W ≤ Δβe^{−αt}."""
     overshoot: float
-    """β̃/β: ‖e_s‖_W ≤ β̃e^{−αt}."""
+    """(β̃ + η)/β: ‖x_s − x̂‖_W ≤ (β̃ + η)e^{−αt}. With x̂ = x: ‖e_s‖_W ≤ β̃e^{−αt}."""
     input_error: float
     """π: ‖u − Kx‖ ≤ πe^{−αt}, from the first applied input of the controller on."""
     start_error: float
@@ -59,7 +59,7 @@ class Constants(NamedTuple):
     loop_gain: float
     """Loop gain of the errors (small-gain condition); below 1, and 0 where the bounds need none."""
     estimation_error: float = 0.0
-    """‖x̂ − x‖_W at the measurements. Where it is not 0, e_s and e_c are x_s − x̂ and x_c − x̂."""
+    """η: ‖x̂ − x‖_W ≤ ηe^{−αt} at the measurements. Where it is not 0, Δ is of x_c − x̂."""
     received_input_error: float = 0.0
     """The same as π while the controller has every update: ‖KW^{−1}‖β̃ + q."""
     present_input_error: float = 0.0

@@ -313,7 +313,7 @@ class _Bends:
     decaying_remainder: Stack
     """(…, groups, k), factor of ‖C L^{−1}‖ in a bound of the remainder from the decay; infinite
     without one."""
-    least: Stack
+    decaying_value: Stack
     """(…, groups, k), factor of ‖C L^{−1}‖ in a bound of the whole value; infinite without one."""
 
     def over(self, outputs: Outputs[Name]) -> Stack:
@@ -331,7 +331,7 @@ class _Bends:
             return np.asarray(bound + remainder)
         factor = outputs.norms_with(self.decay.inverse)[..., None, None]
         bound += np.minimum(remainder, factor * self.decaying_remainder[..., None, :, :])
-        return np.asarray(np.minimum(factor * self.least[..., None, :, :], bound))
+        return np.asarray(np.minimum(factor * self.decaying_value[..., None, :, :], bound))
 
 
 def _bound_bends(
@@ -350,11 +350,11 @@ def _bound_bends(
         return np.stack([frobenius_norms_along_last(values[..., group, :]) for group in columns], axis=-2)
 
     last = scales[-1][..., None, :]
-    decaying_remainder = least = np.zeros(0)
+    decaying_remainder = decaying_value = np.zeros(0)
     if decay is not None:
         exists = (decay.rate_per_s > 0)[..., None, None]
         decaying_remainder = np.where(exists, last * norms(decay.factor @ powers[..., -1, :, :]), math.inf)
-        least = np.where(exists, norms(decay.factor @ powers[..., 0, :, :]), math.inf)
+        decaying_value = np.where(exists, norms(decay.factor @ powers[..., 0, :, :]), math.inf)
     return _Bends(
         columns,
         powers[..., :-1, :, :],
@@ -363,7 +363,7 @@ def _bound_bends(
         growth[..., None, :] * last * norms(powers[..., -1, :, :]),
         decay,
         decaying_remainder,
-        least,
+        decaying_value,
     )
 
 

@@ -5,8 +5,9 @@
 From (I1) to a certificate (docs/theory.md, "Certificates"; docs/derivations.md, "Closing the
 loop"):
 
-1. ``inequalities.py``. (I1) bounds ‖C e_c‖ by D_C β̃: the present e_s, plus at most N missing
-   events, each propagated by e^{(H+αI)τ}. N is the longest loss burst plus ⌈d/δ⌉ updates in flight.
+1. ``inequalities.py``. (I1) bounds ‖C e_c‖ by D_C β̃ (``error_rows.py``): the present e_s, plus at
+   most N missing events, each propagated by e^{(H+αI)τ}. N is the longest loss burst plus ⌈d/δ⌉
+   updates in flight.
    The plant bounds ‖C x‖ by free + gain · sup‖p‖; between two tests β̃ grows from β; a held
    input is of age ≤ σ. All these inequalities are linear in non-negative numbers. If the loop gain
    is below 1, their solution bounds the run at all times, by induction over time: Δ (of the size of
@@ -18,7 +19,8 @@ loop"):
 3. ``persistent_bounds.py``. With persistent disturbances, noise, an observer or a constant threshold, each
    bound has a decaying part and a persistent part. All inequalities are linear in functions of
    time, so the bounds of the two parts are added.
-4. ``scenario_certificates.py``. Which of these a scenario gets, for its own plant and for the box.
+4. ``scenario_certificates.py``. Which of these a scenario gets, for its own plant and for the box;
+   ``constants_search.py``: at which rate of decay.
    ``network_limits.py``: the largest sampling period, delay and age of inputs that are certified.
 5. ``region.py``. A nonlinear plant is one of the plants of a box, as long as x and u stay in the
    region over which its equations are enclosed; they do if the box's bounds are inside it.

@@ -43,12 +43,8 @@ from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.certificates.assumptions import Assumption, AssumptionStatus
 from noack.theory.certificates.certified_bounds import Region, ScenarioCertificate
 from noack.theory.certificates.conditions import REGION, void_by_safe_input
-from noack.theory.certificates.scenario_certificates import (
-    CertificateScope,
-    Phases,
-    box_scope,
-    own_plant_scope,
-)
+from noack.theory.certificates.constants_search import Phases
+from noack.theory.certificates.scenario_certificates import CertificateScope, box_scope, own_plant_scope
 from noack.theory.certificates.solution import Search, completed_alone
 
 _WIDER = 1.02
@@ -97,35 +93,16 @@ class _Box(CertificateScope):
             NoCertificateError, NotDecayingError: there are none.
         """
         try:
-            phases = yield from self.without_decay(conditions)
+            phases = yield from self._constants.without_decay(conditions)
         except (NoCertificateError, NotDecayingError, OverflowError, np.linalg.LinAlgError):
             phases = yield from self.all_phases(conditions)
         return phases, self._coordinate_bounds(phases, conditions)
 
-    def without_decay(self, conditions: NetworkConditions) -> Search[list[Phases]]:
-        """Search for constants of bounds without decay.
-
-        Raises: as :meth:`bounded`.
-        """
-        if not self.is_simple:
-            pairs = yield from self._disturbed.constants(conditions, decays=False, longest=False)
-            return [self._checked(Phases(main, persistent=added)) for main, added in pairs]
-        trigger = self._trigger
-        level = 0.0 if trigger.is_homogeneous else max(trigger.beta, trigger.floor)
-        tested, least_level = trigger.conditions_of_tests(conditions), trigger.floor or None
-        constants = yield from self._solve(tested, 0.0, level, least_level, longest=False)
-        return [self._checked(Phases(constants))]
-
     def _coordinate_bounds(self, phases: list[Phases], conditions: NetworkConditions) -> Vector:
         bounds = list[Vector]()
         for phase in phases:
-            parts = (
-                [(self._plants[phase.main.rate_per_s], phase.main)]
-                if self.is_simple
-                else self._disturbed.with_plants(phase.main, phase.persistent)
-            )
             total = np.zeros(self._loop.n + self._loop.m)
-            for plant, constants in parts:
+            for plant, constants in self._constants.with_plants(phase):
                 assert isinstance(plant, BoxGains)
                 total += plant.coordinate_bounds(constants.input_error, conditions.start_s)
             bounds.append(total)

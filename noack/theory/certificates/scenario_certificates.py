@@ -7,8 +7,6 @@ import contextlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
@@ -17,43 +15,24 @@ from noack.scenario.resolution import loop_of, rule_of
 from noack.scenario.scenario import Scenario
 from noack.settings.section import MatrixRows
 from noack.theory.bounds.box import BoxGains
-from noack.theory.bounds.certificate_terms import (
-    CertificatePart,
-    Constants,
-    NetworkConditions,
-    NoCertificateError,
-)
+from noack.theory.bounds.certificate_terms import Constants, NetworkConditions, NoCertificateError
 from noack.theory.bounds.enclosure import NotDecayingError
-from noack.theory.bounds.gains import ErrorGains, PlantGains, error_gains, first_equal
+from noack.theory.bounds.gains import ErrorGains, PlantGains, error_gains
 from noack.theory.bounds.trigger_bounds import TriggerBounds
-from noack.theory.certificates.assumptions import certificate_assumptions, is_below_decay_rate
+from noack.theory.certificates.assumptions import certificate_assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import BOX, OWN_PLANT, kept_probability, void_by_safe_input
+from noack.theory.certificates.constants_search import ConstantsSearch, Phases, is_within
 from noack.theory.certificates.deliveries.due_deliveries import Deliveries
-from noack.theory.certificates.persistent_bounds import DisturbedCertificate, PlantAt, choose_rate
-from noack.theory.certificates.solution import Problem, Search, completed_alone, sharpened
+from noack.theory.certificates.persistent_bounds import PlantAt
+from noack.theory.certificates.solution import Search, completed_alone
 
-_SLOWER = 0.9
-"""Rate that is certified if α is too large, as a share of the decay rate of the loop."""
 _TIMED_RATES = (0.7, 0.4, 0.1)
 """Rates that are tried where events are due, as shares of the decay rate of A + BK: the first that
 has a certificate is used."""
-_SHARES_OF_ALPHA = (0.8, 0.6, 0.4, 0.2)
-"""Rates that are tried for a box, as shares of α."""
-_TOO_LARGE = "intermediate results are too large or too small for floating point"
 _OUTSIDE_RANGE = "at its start the input was not known, or not in the range of K, where the bounds have it"
 _LARGEST_START = 1e150
 """The squares of larger entries of x(0) may overflow."""
-
-
-class Phases(NamedTuple):
-    """The constants of one bound of a run."""
-
-    main: Constants
-    floor: Constants | None = None
-    """Those from when the threshold has reached its floor."""
-    persistent: Constants | None = None
-    """Those to be added under persistent disturbances."""
 
 
 def trigger_bounds(resolved: Scenario, *, starts_on_grid: bool = True) -> TriggerBounds:
@@ -154,20 +133,20 @@ class CertificateScope:
         self._loop = loop_of(resolved)
         self._start = self._loop.x0[:, None] if start is None else start
         self._trigger = trigger_bounds(resolved, starts_on_grid=start_error is None)
-        # Where events have a due time, a missed update is missed for a limited time.
-        due = self._trigger.has_due_time
-        self._models_are_constant = not self._loop.H.any() and not due
-        decays = math.inf if self._models_are_constant or due else -spectral_abscissa(self._loop.H)
+        is_limited = not self._loop.H.any() or self._trigger.has_due_time
+        decays = math.inf if is_limited else -spectral_abscissa(self._loop.H)
         self.decay_per_s = {"the models": decays, "A + BK": -spectral_abscissa(closed_loop)}
         """Decay rates; that of the models is infinite if they are constant."""
-        assert start is None or self.is_simple  # other starts are those of the scenario
         self._plant_at = plant_at
-        self._plants: dict[float, PlantGains] = {}
-
-    @property
-    def is_simple(self) -> bool:
-        """Whether nothing persists whose bounds are added to those from the start."""
-        return self._resolved.coverage.is_undisturbed and not self._trigger.is_constant
+        self._constants = ConstantsSearch(
+            resolved,
+            plant_at,
+            self._trigger,
+            self._start,
+            self._start_error,
+            min(self.decay_per_s.values()),
+        )
+        assert start is None or self._constants.is_simple  # other starts are those of the scenario
 
     def certificate(self, conditions: NetworkConditions) -> ScenarioCertificate:
         """Return the certificate under some conditions; a void certificate has the reason."""
@@ -248,7 +227,7 @@ class CertificateScope:
             return math.inf
         # Whether inputs of an earlier run are covered depends on the constants.
         try:
-            search = self._solve_inequalities(conditions, longest=self._start_error > 0)
+            search = self._constants.phases(conditions, longest=self._start_error > 0)
             constants = completed_alone(search)
         except NoCertificateError as error:
             gain = max(error.loop_gain, 1.0)
@@ -271,7 +250,7 @@ class CertificateScope:
             NotDecayingError: a mode of the loop decays too slowly.
         """
         try:
-            solved = yield from self._solve_inequalities(conditions, longest=True)
+            solved = yield from self._constants.phases(conditions, longest=True)
         except (NoCertificateError, NotDecayingError) as error:
             solved, void = [], error
         inter_event_s = max((main.inter_event_s or 0.0 for main, *_ in solved), default=0.0)
@@ -281,20 +260,8 @@ class CertificateScope:
                 raise void
             return solved
         inter_event_s = max(inter_event_s, timed.inter_event_s or 0.0)
-        useful = [phases for phases in solved if not _is_within(timed, phases.main)]
+        useful = [phases for phases in solved if not is_within(timed, phases.main)]
         return [Phases(timed._replace(inter_event_s=inter_event_s)), *useful]
-
-    def _solve_inequalities(self, conditions: NetworkConditions, *, longest: bool) -> Search[list[Phases]]:
-        """Search for the constants that solve the inequalities.
-
-        ``longest``: search for the tightest bounds and the longest δ; otherwise any suffice.
-        """
-        try:
-            if self.is_simple:
-                return [(yield from self._phases(conditions, longest=longest))]
-            return (yield from self._disturbed_phases(conditions, longest=longest))
-        except (OverflowError, np.linalg.LinAlgError):
-            raise NoCertificateError(_TOO_LARGE) from None
 
     def _constants_from_due_times(
         self, conditions: NetworkConditions, inter_event_s: float
@@ -325,149 +292,3 @@ class CertificateScope:
                     least_s = max(bound.times.shortest_s, inter_event_s)
                     bound = bound._replace(times=bound.times._replace(shortest_s=least_s))
                     yield Deliveries(plant, tested, bound)
-
-    def _phases(self, conditions: NetworkConditions, *, longest: bool) -> Search[Phases]:
-        """Search for the constants, and those after the threshold has reached its floor, if any."""
-        trigger, floor = self._trigger, None
-        conditions = trigger.conditions_of_tests(conditions)
-        main = yield from self._first_phase(conditions, longest=longest)
-        if 0 < trigger.floor < trigger.beta and main.rate_per_s == trigger.alpha_per_s:
-            floor = _at_floor(main, trigger.floor / trigger.beta)
-        return self._checked(Phases(main, floor))
-
-    def _disturbed_phases(self, conditions: NetworkConditions, *, longest: bool) -> Search[list[Phases]]:
-        """Search for the constants, and those to be added under persistent disturbances."""
-        alpha = self._trigger.alpha_per_s
-        decays = not self._models_are_constant and is_below_decay_rate(alpha, min(self.decay_per_s.values()))
-        search = self._disturbed.constants(conditions, decays=decays, longest=longest)
-        pairs = yield from search
-        return [self._checked(Phases(main, persistent=added)) for main, added in pairs]
-
-    @cached_property
-    def _disturbed(self) -> DisturbedCertificate:
-        return DisturbedCertificate(
-            self._resolved, self._plant_at, self._trigger, self._start_error, min(self.decay_per_s.values())
-        )
-
-    def _checked(self, phases: Phases) -> Phases:
-        """Return the constants.
-
-        Raises:
-            NoCertificateError: they do not cover the inputs at the start, or are not finite.
-        """
-        if phases.main.input_error < self._start_error:
-            raise NoCertificateError(
-                f"at its start the input was {self._start_error:.3g} from Kx; a certificate "
-                f"covers at most {phases.main.input_error:.3g}"
-            )
-        for constants in phases:
-            if constants is not None and not _is_finite(constants):
-                raise NoCertificateError(_TOO_LARGE)
-        return phases
-
-    def _first_phase(self, conditions: NetworkConditions, *, longest: bool) -> Search[Constants]:
-        trigger, decay = self._trigger, min(self.decay_per_s.values())
-        beta, alpha, floor = trigger.beta, trigger.alpha_per_s, trigger.floor
-        if trigger.is_homogeneous:
-            if not longest:
-                with contextlib.suppress(NoCertificateError):
-                    return (yield from self._solve(conditions, 0.0, 0.0, None, longest=False))
-            return (yield from self._fastest(conditions, decay))
-        if not self._models_are_constant and is_below_decay_rate(alpha, decay) and floor < beta:
-            try:
-                return (yield from self._solve(conditions, alpha, beta, beta, longest=longest))
-            except NotDecayingError:
-                if floor > 0:
-                    raise
-                return (yield from self._slower(conditions, alpha))
-        # Certify a slower decay or none; the smallest event level is then the floor, if any.
-        slower = 0.0 if self._models_are_constant or floor > 0 else max(_SLOWER * decay, 0.0)
-        level = max(beta, floor)
-        return (yield from self._solve(conditions, slower, level, floor or None, longest=longest))
-
-    def _fastest(self, conditions: NetworkConditions, decay: float) -> Search[Constants]:
-        """Search for bounds for a threshold that is a share of the state, at any rate.
-
-        Raises:
-            NoCertificateError: there are no bounds, not even without decay.
-        """
-
-        def at_rate(rate_per_s: float) -> Search[tuple[Constants]]:
-            return ((yield from self._solve(conditions, rate_per_s, 0.0, None)),)
-
-        # Inputs of an earlier run are bounded without a rate.
-        if not self._models_are_constant and 0 < decay < math.inf and self._start_error == 0.0:
-            with contextlib.suppress(NotDecayingError, NoCertificateError):
-                (constants,) = yield from choose_rate(at_rate, decay, self._loop.x0, self._start)
-                return constants
-        return (yield from self._solve(conditions, 0.0, 0.0, None))
-
-    def _slower(self, conditions: NetworkConditions, alpha_per_s: float) -> Search[Constants]:
-        """Search for bounds that decay more slowly than the threshold, for a box too large for α.
-
-        Raises:
-            NotDecayingError: there are no such bounds.
-        """
-        for share in _SHARES_OF_ALPHA:
-            rate = share * alpha_per_s
-            with contextlib.suppress(NotDecayingError):
-                return (yield from self._solve(conditions, rate, self._trigger.beta, None))
-        raise NotDecayingError("the uncertainty box is too large for the loop's gains")
-
-    def _solve(
-        self,
-        conditions: NetworkConditions,
-        alpha_per_s: float,
-        level: float,
-        least_level: float | None,
-        *,
-        longest: bool = True,
-    ) -> Search[Constants]:
-        if alpha_per_s not in self._plants:
-            error = error_gains(self._loop, alpha_per_s)
-            plant = self._plant_at(error, self._start, alpha_per_s)
-            plant = replace(plant, further_outputs=self._trigger.outputs)
-            self._plants[alpha_per_s] = first_equal(plant)
-        plant = self._plants[alpha_per_s]
-        # Inputs of an earlier run are covered by their norm only.
-        earlier = self._start_error
-        part = CertificatePart(plant.error, plant, self._trigger.bound(conditions, level, least_level))
-        return (
-            yield from sharpened(
-                Problem((part,), conditions, earlier, structured=earlier == 0.0, longest=longest)
-            )
-        )
-
-
-_BOUNDS = (
-    "input_error",
-    "state",
-    "state_weighted",
-    "mismatch",
-    "received_input_error",
-    "present_input_error",
-)
-"""Constants that bound a signal themselves, not in units of the threshold."""
-
-
-def _at_floor(constants: Constants, share: float) -> Constants:
-    """Return the constants from the floor on, ``share`` = ε/β.
-
-    With θ(t) = max(βe^{−αt}, ε) in place of βe^{−αt}, all bounds of the first phase hold at all
-    times: for s ≤ t, θ(s) ≤ θ(t) e^{α(t−s)}, which is all that their proof uses of βe^{−αt}.
-    """
-    names = ("start_error", *_BOUNDS)
-    return constants._replace(rate_per_s=0.0, **{name: share * getattr(constants, name) for name in names})
-
-
-def _is_within(inner: Constants, outer: Constants) -> bool:
-    """Return whether no bound of ``outer`` is below that of ``inner`` at any time."""
-    return inner.rate_per_s >= outer.rate_per_s and all(
-        getattr(inner, name) <= getattr(outer, name) for name in ("delta", "overshoot", *_BOUNDS)
-    )
-
-
-def _is_finite(constants: Constants) -> bool:
-    """Return whether every constant is finite; only the inter-event time may be infinite."""
-    numbers = [v for v in constants._replace(inter_event_s=None) if v is not None]
-    return all(map(math.isfinite, numbers)) and not math.isnan(constants.inter_event_s or 0.0)

@@ -30,7 +30,8 @@ from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.error_growth import LONGEST_S
 from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.certificates.deliveries.sharpened_constants import can_be_sharpened, sharpened_constants
-from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities, LoopConstants
+from noack.theory.certificates.error_rows import BoundMethod
+from noack.theory.certificates.inequalities import ErrorInequalities, LoopConstants
 
 _INTER_EVENT_SETTLED = 1e-3
 """Relative change of δ at which the search for it ends."""

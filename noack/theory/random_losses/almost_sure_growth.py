@@ -168,13 +168,13 @@ class _TiltedBound:
         chances = self._chances[self._steps]
         by_state = np.bincount(self._steps[1], chances * s, len(self._chain.lost))
         sizes = np.bincount(self._steps[1], chances * np.abs(s), len(self._chain.lost))
-        moves = self._chain.lost + self._chain.delivered - np.eye(len(by_state))
-        moves[:, -1] = 1.0
-        if (inverse_moves := inverse(moves)) is None:
+        equations = self._chain.lost + self._chain.delivered - np.eye(len(by_state))
+        equations[:, -1] = 1.0
+        if (inverse_equations := inverse(equations)) is None:
             raise NotPredictableError("the frequencies of the losses could not be enclosed")
         shares, radii = (
-            inverse_moves.middle[-1],
-            inverse_moves.radius[-1] + EPSILON * inverse_moves.magnitude.sum(axis=0),
+            inverse_equations.middle[-1],
+            inverse_equations.radius[-1] + EPSILON * inverse_equations.magnitude.sum(axis=0),
         )
         error = (radii + (len(s) + 4) * EPSILON * np.abs(shares)) @ sizes
         return float(shares @ by_state + error * (1 + 1e-9))

@@ -318,8 +318,11 @@ class LoopMoments:
         """Return the moments after a period, and its mean costs."""
         moments, shares = np.zeros_like(current.moments), np.zeros_like(current.shares)
         costs = np.zeros_like(slot[0].constants)
-        for step, moves in zip(slot, (self._outcomes.delivered, self._outcomes.lost), strict=True):
-            before, weights = np.einsum("ij,iab->jab", moves, current.moments), current.shares @ moves
+        for step, transitions in zip(slot, (self._outcomes.delivered, self._outcomes.lost), strict=True):
+            before, weights = (
+                np.einsum("ij,iab->jab", transitions, current.moments),
+                current.shares @ transitions,
+            )
             moments += step.matrix @ before @ step.matrix.T + weights[:, None, None] * step.noise
             shares += weights
             costs += np.einsum("kab,jab->k", step.costs, before) + weights.sum() * step.constants

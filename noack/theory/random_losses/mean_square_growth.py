@@ -160,12 +160,12 @@ class PeriodMaps(NamedTuple):
         largest = max(float(part.magnitude.max()) for slot in self.enclosed for part in slot)
         X = np.tile(_OTHERS / (1 + (size * largest) ** 2) * np.eye(size), (modes, 1, 1))
         X[:, :rank, :rank] = forms
-        moves = exactly(np.vstack([outcomes.delivered, outcomes.lost]).T)
+        transitions = exactly(np.vstack([outcomes.delivered, outcomes.lost]).T)
         image = exactly(X)
         for slot in self.enclosed:
             parts = [M @ image @ M.transposed for M in slot]
             flat = [np.concatenate(part).reshape(2 * modes, -1) for part in zip(*parts, strict=True)]
-            mixed = moves @ IntervalMatrix(*flat)
+            mixed = transitions @ IntervalMatrix(*flat)
             image = IntervalMatrix(*(part.reshape(X.shape) for part in mixed))
         scaled = exactly(bound * np.eye(size)) @ exactly(X)
         return _is_positive(exactly(X)) and _is_positive(scaled - image)

@@ -43,8 +43,8 @@ def test_the_likelihood_is_that_of_the_forward_algorithm(
 def test_the_fitted_chain_has_the_matrices_of_the_emulators() -> None:
     chain = GilbertElliottLoss(**ELLIOTT._asdict()).chains()[0]
     _, delivers, loses = ELLIOTT.matrices()
-    np.testing.assert_allclose(delivers + loses, chain.moves)
-    np.testing.assert_allclose(loses, chain.moves * chain.acts)
+    np.testing.assert_allclose(delivers + loses, chain.transitions)
+    np.testing.assert_allclose(loses, chain.transitions * chain.acts)
 
 
 def test_the_fit_of_gilberts_chain_is_the_share_of_its_moves() -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from netem import relay_watch
 from netem.control.command_queue import CommandQueue
-from netem.control.control_server import running
+from netem.control.control_server import running_emulators
 from netem.control.emulator_metrics import EmulatorMetrics, metrics
 from netem.control.emulator_statistics import statistics
 from netem.relay_watch import watch_relay
@@ -94,13 +94,13 @@ def test_attachments_end_with_the_relay(relay: FakeRelay, tmp_path: Path) -> Non
     with watch_relay(
         relay, options("--control", "lab", "--stats", "0.01", "--stats-file", str(file))
     ) as side:
-        assert running() == ["lab"]
+        assert running_emulators() == ["lab"]
         assert sys.getswitchinterval() < interval
         for _ in range(3):
             side.commands.run_pending()
         relay.counters["up", "forward"].received = 5
         assert side.commands.snapshot_here().links[0].forward.counters.received == 5
-    assert running() == []
+    assert running_emulators() == []
     assert threading.active_count() == threads
     assert sys.getswitchinterval() == interval
     last = file.read_text().splitlines()[-1]

@@ -16,7 +16,13 @@ from zenoh.handlers import FifoChannel
 from netem import stand_alone
 from netem.control import control_server, emulator_commands
 from netem.control.command_queue import CommandQueue
-from netem.control.control_server import EMULATORS, ControlServer, find, registered_emulator, running
+from netem.control.control_server import (
+    EMULATORS,
+    ControlServer,
+    find_emulator,
+    registered_emulator,
+    running_emulators,
+)
 from netem.control.emulator_commands import Client
 from netem.control.statistics_view import Screen
 from netem.fates import FateRecorder
@@ -33,31 +39,31 @@ from tests.netem.relay.relays import endpoints
 
 @pytest.fixture
 def client(server: ControlServer) -> Any:
-    with Client(find("lab")) as client:
+    with Client(find_emulator("lab")) as client:
         yield client
 
 
 def test_a_session_is_found_while_it_lasts() -> None:
     """Its file is private, and is not removed if another emulator has replaced it."""
     with pytest.raises(CallerError, match="no emulator accepts commands; start one"):
-        find(None)
+        find_emulator(None)
     with registered_emulator("lab") as path:
-        assert running() == ["lab"]
-        assert find("lab") == find(None) == "lab"
+        assert running_emulators() == ["lab"]
+        assert find_emulator("lab") == find_emulator(None) == "lab"
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
         assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
         with registered_emulator("b"):
             with pytest.raises(CallerError, match=r"which emulator\? Running: b, lab"):
-                find(None)
+                find_emulator(None)
             with pytest.raises(CallerError, match="no emulator 'lba'; running: b, lab"):
-                find("lba")
+                find_emulator("lba")
         other = path.with_name("other")
         other.write_text("mine")
         other.replace(path)
     assert path.read_text() == "mine"
     with pytest.raises(FileExistsError, match="capture"), registered_emulator("d"):
         raise FileExistsError("capture.pcapng")  # an error of the emulator itself
-    assert running() == []
+    assert running_emulators() == []
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "../up", ".hidden", "x" * 65])
@@ -71,7 +77,7 @@ def test_statistics_are_published(
 ) -> None:
     monkeypatch.setattr(control_server, "_PUBLISH_S", 0.2)
     relay.counters["up", "forward"].received = 1
-    with ControlServer("lab", commands), Client(find("lab")) as client:
+    with ControlServer("lab", commands), Client(find_emulator("lab")) as client:
         statistics = (document["links"][0]["forward"] for document in client.follow(lambda: False))
         first = next(statistics)["received"]
         relay.counters["up", "forward"].received = 1001
@@ -103,7 +109,7 @@ def test_a_mistake_gets_the_approved_line_and_changes_nothing(
 def test_a_second_server_of_the_name_is_refused(server: ControlServer) -> None:
     with pytest.raises(CallerError, match=r"^--control lab: an emulator of this name runs"):
         ControlServer("lab", CommandQueue(FakeRelay("up"))).__enter__()
-    assert running() == ["lab"]
+    assert running_emulators() == ["lab"]
 
 
 def test_a_client_that_blocks_the_server_does_not_block_the_relay(
@@ -224,7 +230,7 @@ def test_a_cap_set_at_runtime_is_kept(emulate: Emulate, capsys: pytest.CaptureFi
             endpoint.settimeout(60)
         emulator = emulate("{}:{}".format(*server.getsockname()), "--control", "lab")
         client.connect((emulator.host, emulator.port))
-        assert running() == ["lab"]
+        assert running_emulators() == ["lab"]
         for payload in sent[:20]:
             client.send(payload)
         assert [server.recv(10) for _ in range(20)] == sent[:20]
@@ -251,7 +257,7 @@ def test_a_cap_set_at_runtime_is_kept(emulate: Emulate, capsys: pytest.CaptureFi
             "noack netem set: relay forward no longer has mansd 2; the words replaced all settings\n"
         )
         emulator.finish()
-    assert running() == []
+    assert running_emulators() == []
 
 
 def test_a_replay_uses_the_cap_of_its_trace_by_default(tmp_path: Path) -> None:

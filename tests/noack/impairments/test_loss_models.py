@@ -37,9 +37,9 @@ def correlated(p: float, correlation: float = 0.0) -> Joint:
     return joint
 
 
-def chain(moves: Any, losses: Sequence[float]) -> Joint:
+def chain(transitions: Any, losses: Sequence[float]) -> Joint:
     """For a Markov chain: π Λ Pᵏ Λ 1, with its stationary distribution π."""
-    P, lost = np.array(moves), np.array(losses)
+    P, lost = np.array(transitions), np.array(losses)
     values, vectors = np.linalg.eig(P.T)
     stationary = np.real(vectors[:, np.argmax(np.real(values))])
     stationary /= stationary.sum()
@@ -85,7 +85,7 @@ def test_losses_have_the_rate_and_the_joint_probabilities(
 
 
 @pytest.mark.parametrize(
-    ("words", "start", "moves", "losses"),
+    ("words", "start", "transitions", "losses"),
     [
         ("loss 20% 95%", [1.0], [[1.0]], [0.2]),  # the latent process is stationary from the start
         ("loss gemodel 20% 1%", [1.0, 0.0], [[0.8, 0.2], [0.01, 0.99]], [0.0, 1.0]),
@@ -94,14 +94,14 @@ def test_losses_have_the_rate_and_the_joint_probabilities(
     ],
 )  # fmt: skip
 def test_the_chain_begins_in_its_first_state_and_moves_before_each_packet(
-    decide: Any, words: str, start: list[float], moves: Any, losses: list[float]
+    decide: Any, words: str, start: list[float], transitions: Any, losses: list[float]
 ) -> None:
     """The distribution of the k-th packet's state is e₁ Pᵏ⁺¹ (average over many flows)."""
     flows, steps = 20_000, 3
     fates = decide(words, steps * flows, flows=np.tile(np.arange(flows), steps)).fates
     state = np.array(start)
     for of_step in fates.reshape(steps, flows) == 1:
-        state = state @ np.array(moves)
+        state = state @ np.array(transitions)
         p = float(state @ losses)
         assert abs(of_step.mean() - p) <= 5 * np.sqrt(p * (1 - p) / flows)
 
@@ -170,10 +170,10 @@ def test_common_states_at_a_distance_follow_the_powers_of_the_matrix(every: int)
     """Also if most steps are without a packet."""
     link, count = common_state(), 20_000
     bad = np.array([link.decide(i % 3, 1, i * every * STEP_NS).fate == 1 for i in range(count)])
-    moves = np.linalg.matrix_power(np.array([[1 - P, P], [R, 1 - R]]), every)
+    transitions = np.linalg.matrix_power(np.array([[1 - P, P], [R, 1 - R]]), every)
     for state in (0, 1):
         after = bad[1:][bad[:-1] == state]
-        expected = moves[state, 1]
+        expected = transitions[state, 1]
         spread = np.sqrt(expected * (1 - expected) / len(after))
         assert abs(after.mean() - expected) < 5 * spread
 

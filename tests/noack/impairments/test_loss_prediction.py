@@ -168,7 +168,7 @@ def probability(losses: LossProcess, outcomes: tuple[bool, ...]) -> float:
     """The probability of these outcomes (True: lost), following every state of the chain."""
     weights = losses.start
     for number, lost in enumerate(outcomes):
-        weights = weights @ losses.moves
+        weights = weights @ losses.transitions
         forced = number == 0 and losses.first_delivered
         weights = weights * (float(not lost) if forced else losses.lost if lost else 1 - losses.lost)
     return float(weights.sum())

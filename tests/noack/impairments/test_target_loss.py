@@ -12,7 +12,8 @@ from noack.impairments.loss_prediction import predict
 from noack.impairments.target_loss import (
     ProbabilityCache,
     expected_loss,
-    found_probabilities,
+    find_probabilities,
+    store_probabilities,
     with_target_loss,
 )
 
@@ -44,10 +45,10 @@ def test_a_probability_that_another_process_found_is_not_computed_again() -> Non
     """Not even by the loops of a run; but other settings have another probability."""
     settings = settings_of("loss 10% keep loss 5% mansd 1 delay 1ms")
     there, here = ProbabilityCache(10), ProbabilityCache(10)
-    found = found_probabilities(settings, settings_of("delay 1ms"), known=there)
+    found = find_probabilities(settings, settings_of("delay 1ms"), known=there)
     assert list(found.values()) == [probability(settings, there)]
     received = 0.123  # no computation gives this
-    here.add(json.loads(json.dumps(dict.fromkeys(found, received))))
+    store_probabilities(json.loads(json.dumps(dict.fromkeys(found, received))), known=here)
     assert probability(settings, here) == received
     assert probability(settings_of("loss 10% keep loss 5% delay 9ms mansd 1"), here) == received
     for other in ("loss 10% keep loss 5% mansd 2", "loss 10% keep mansd 1"):

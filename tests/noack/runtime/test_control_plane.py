@@ -25,7 +25,7 @@ from noack.runtime.command_line import Signals
 from noack.runtime.connections.zenoh_session import cause_of, label
 from noack.runtime.control_messages import RunStart, parse_message
 from noack.runtime.control_plane import ControlPlane
-from noack.runtime.join_run import _admitted
+from noack.runtime.join_run import _request_admission
 from noack.runtime.private_folder import private_folder
 from noack.runtime.run_descriptor import RunDescriptor, new_descriptor
 from noack.scenario.resolution import resolve
@@ -60,7 +60,7 @@ def test_a_message_that_arrives_under_another_key_is_ignored(
 
         def arrives() -> bool:
             listener.acknowledge_rows("plant", {"rows": {}})
-            return plant.persisted() is not None
+            return plant.next_persisted_ack() is not None
 
         wait_for(arrives)  # the listener knows the subscriptions
         for key in ("stop", "change"):
@@ -175,7 +175,7 @@ def test_a_launched_process_connects_again_until_it_is_admitted(
 
     monkeypatch.setattr(noack.runtime.join_run, "ControlPlane", Silent)
     monkeypatch.setattr(noack.runtime.join_run, "launcher_has_ended", lambda: False)
-    asking = partial(_admitted, "plant", changed(descriptor, launched=launched), Signals())
+    asking = partial(_request_admission, "plant", changed(descriptor, launched=launched), Signals())
     if launched:
         assert asking().plane is cast(Any, tries[2])
         assert [attempt.is_closed for attempt in tries] == [False, True, False]

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from noack.core.errors import ExitStatus
-from noack.runtime.command_line import LogFormat, failed, log_event, log_format, print_to_stderr
+from noack.runtime.command_line import LogFormat, log_event, log_format, print_to_stderr, report_failure
 from tests.helpers.command_line import invoke
 from tests.helpers.json_log import objects
 
@@ -25,7 +25,7 @@ def test_each_line_of_the_log_becomes_a_json_object(monkeypatch: pytest.MonkeyPa
         print_to_stderr("noack: warning: no disk")
         print_to_stderr("noack netem: ready")
         print("a plain", "\x1b[31mline\x1b[0m\n\nand one\tmore", file=sys.stderr)
-        failed("wrong\ntwice", ExitStatus.CALLER, source="noack netem", as_json=False)
+        report_failure("wrong\ntwice", ExitStatus.CALLER, source="noack netem", as_json=False)
     print_to_stderr("text again")
     *lines, last = error.getvalue().splitlines()
     assert last == "text again"

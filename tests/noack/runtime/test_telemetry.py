@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from noack.core.errors import MachineError, NoAnswerError
 from noack.protocol.roles import Notice, Record
 from noack.runtime import telemetry
-from noack.runtime.spool import NOTICES, SpoolWriter, kept_run_name, read_chunks
+from noack.runtime.spool import NOTICES, SpoolWriter, kept_run_name, read_batches
 from noack.runtime.telemetry import OwnSpool, ReceivedRows, TelemetryBuffer, deliver_report, first_row
 
 ROW = np.dtype([("number", "<i8"), ("x", "<f8", (2,))])
@@ -202,21 +202,21 @@ def spool(folder: Path, writer: str, table: str, *batches: tuple[int, bytes]) ->
     return folder / f"{table}.{writer}"
 
 
-def test_the_file_is_the_documented_sequence_of_chunks(tmp_path: Path) -> None:
+def test_the_file_is_the_documented_sequence_of_batches(tmp_path: Path) -> None:
     path = spool(tmp_path, "recorder", "plant_step", (7, b"abc"), (8, b"de"))
     expected = struct.pack("<QQ", 7, 3) + b"abc" + struct.pack("<QQ", 8, 2) + b"de"
     assert path.read_bytes() == expected
 
 
-def test_an_incomplete_chunk_is_ignored(tmp_path: Path) -> None:
+def test_an_incomplete_batch_is_ignored(tmp_path: Path) -> None:
     batches = [(0, b"first"), (5, b"second")]
     path = spool(tmp_path, "recorder", "plant_step", *batches)
     whole = path.read_bytes()
     for size in range(len(whole)):
         path.write_bytes(whole[:size])
-        assert list(read_chunks(tmp_path, "plant_step")) == batches[: int(size >= 16 + 5)]
+        assert list(read_batches(tmp_path, "plant_step")) == batches[: int(size >= 16 + 5)]
     path.write_bytes(whole + struct.pack("<QQ", 11, 2**62))  # a damaged length takes no memory
-    assert list(read_chunks(tmp_path, "plant_step")) == batches
+    assert list(read_batches(tmp_path, "plant_step")) == batches
 
 
 @pytest.mark.parametrize("what", ["deleted", "moved", "replaced", "folder"])

@@ -21,7 +21,8 @@ from noack.theory.bounds.enclosure import response_until
 from noack.theory.bounds.error_growth import COARSE_CELLS, ErrorGrowth
 from noack.theory.bounds.gains import Growth, Output, PlantGains
 from noack.theory.bounds.stacked_norms import Stack
-from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities, Signal
+from noack.theory.certificates.error_rows import BoundMethod, Signal
+from noack.theory.certificates.inequalities import ErrorInequalities
 
 Growths = Sequence[Sequence[ErrorGrowth]]
 """Growths of e_s that are possible under each bound of it. All bounds hold; of each, one growth applies."""

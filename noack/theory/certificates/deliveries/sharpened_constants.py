@@ -29,7 +29,7 @@ from noack.theory.certificates.deliveries.delivery_reach import DeliveryEllipsoi
 from noack.theory.certificates.deliveries.inserted_bounds import InsertedInequalities
 from noack.theory.certificates.deliveries.invariant_ellipsoids import InvariantEllipsoids
 from noack.theory.certificates.deliveries.lost_events import SensorErrors, bend_of_error, errors_after_losses
-from noack.theory.certificates.inequalities import Signal
+from noack.theory.certificates.error_rows import Signal
 
 _MOST_ROUNDS, _SETTLED = 20, 0.99
 """Limit of the rounds; they end when no bound of x or e_c falls below this share of the last one."""

@@ -23,7 +23,7 @@ from noack.core.errors import MachineError
 from noack.protocol.record_tables import OWNER, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.roles import BEGINNING, GENERATION, LOOP_ROLES, RECORDER, Start
 from noack.runtime.control_messages import RunProgress, parse_message
-from noack.runtime.spool import NOTICES, SPOOL, batch_of, read_chunks
+from noack.runtime.spool import NOTICES, SPOOL, batch_of, read_batches
 from noack.scenario.resolution import resolve, run_tables
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import dumps, validate
@@ -156,7 +156,7 @@ def test_rows_that_a_process_has_stored_are_not_requested_and_are_logged(run: Ru
     run.rows(PLANT_STEP, 5)
     stored = {PLANT_STEP: [[3, 7], [8, 10]]}
     assert run.report("plant", stored=stored, **{PLANT_STEP: 10}) == {PLANT_STEP: [[7, 8]]}
-    ((_, line),) = read_chunks(run.run_dir / SPOOL, f"{NOTICES}_{RECORDER}")
+    ((_, line),) = read_batches(run.run_dir / SPOOL, f"{NOTICES}_{RECORDER}")
     assert "plant: 4 rows were written to disk by itself" in line.decode()
 
 
@@ -226,7 +226,7 @@ def test_a_log_on_a_full_disk_does_not_stop_the_record(run: Run, monkeypatch: py
         run.recorder.give_up_view(ViewError("no space left"))
         run.send("junk", 0, b"", "plant")
     run.rows(PLANT_STEP, 3)
-    assert len(list(read_chunks(run.run_dir / SPOOL, PLANT_STEP))) == 1
+    assert len(list(read_batches(run.run_dir / SPOOL, PLANT_STEP))) == 1
 
 
 # --- claims ---------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from noack.core.errors import MachineError, PeerError
 from noack.protocol.record_tables import PLANT_STEP
 from noack.protocol.roles import BEGINNING, GENERATION, Start
 from noack.runtime.control_messages import ChannelCounters, ProcessReport
-from noack.runtime.spool import NOTICES, SPOOL, batch_of, read_chunks
+from noack.runtime.spool import NOTICES, SPOOL, batch_of, read_batches
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
@@ -91,7 +91,7 @@ def test_a_batch_of_another_process_is_refused_and_not_stored(store: TelemetrySt
     with pytest.raises(PeerError):
         store.add_notices("plant", 0, 0, b"no JSON")
     assert acknowledged(store) == {}
-    assert list(read_chunks(tmp_path / SPOOL, PLANT_STEP)) == []
+    assert list(read_batches(tmp_path / SPOOL, PLANT_STEP)) == []
 
 
 def test_rows_are_acknowledged_for_the_newest_process_of_a_role(store: TelemetryStore) -> None:

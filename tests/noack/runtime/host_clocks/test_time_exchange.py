@@ -96,7 +96,7 @@ def test_a_reply_is_accepted_once_and_a_repeated_request_does_no_harm(
     for _ in range(3):
         wire.sendto(request, pair.reference.address)
         time.sleep(1e-3)
-    while pair.reference.answered < 3:
+    while pair.reference.answers_sent < 3:
         select.select([pair.reference], (), (), 60)
         pair.reference.answer_all()
     replies = [received(wire, TimeKind.REPLY)[0] for _ in range(3)]

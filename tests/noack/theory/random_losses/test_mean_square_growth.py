@@ -25,7 +25,7 @@ def test_the_second_moment_of_all_patterns_grows_like_the_spectral_radius(
     """With two slots; the sum over all patterns of 14 periods, divided by that of 12."""
     rng = np.random.default_rng(3)
     slots = [(rng.normal(size=(2, 2)), rng.normal(size=(2, 2))) for _ in range(2)]
-    fates = process.moves * (1 - process.lost), process.moves * process.lost
+    fates = process.transitions * (1 - process.lost), process.transitions * process.lost
 
     def second_moment(periods: int) -> float:
         total = 0.0

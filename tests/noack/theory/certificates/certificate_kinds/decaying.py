@@ -17,7 +17,7 @@ import numpy as np
 from noack.theory.bounds.certificate_terms import Constants, NoCertificateError
 from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError, constant_kernel
 from noack.theory.bounds.gains import Coefficients, ErrorGains, Output, PlantGains
-from noack.theory.certificates.inequalities import ErrorInequalities
+from noack.theory.certificates.error_rows import ErrorRows
 from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificates.certified_loops import certify_loop, conditions_of, gains_of
 from tests.oracles.lossy_loops import (
@@ -75,13 +75,13 @@ class NoGrowthOfMissing(PlantGains):
 
 def inputs_of_no_missing_event(system: System) -> Constants:
     """Bounds what enters before every missing event as while no event is missing."""
-    true = ErrorInequalities._stages
+    true = ErrorRows._stages
 
     def wrong(*args: Any) -> Any:
         stages = true(*args)
         return stages and stages._replace(inputs=np.broadcast_to(stages.inputs[:1], stages.inputs.shape))
 
-    with patch.object(ErrorInequalities, "_stages", wrong):
+    with patch.object(ErrorRows, "_stages", wrong):
         return certify_loop(system)
 
 

@@ -175,7 +175,7 @@ REGIONS = Kind(
         ),
         "the first region": _broken(
             _Box, "bounded",
-            _reaching(lambda box, reached: reached * (not box._plants[0.0].halfwidth_A.any())),
+            _reaching(lambda box, reached: reached * (not box._constants._plants[0.0].halfwidth_A.any())),
             _steep_loop,
         ),
     },
