@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from noack.runtime.drivers import realtime_settings
-from noack.runtime.drivers.realtime_settings import _fifo, _mappings
+from noack.runtime.drivers.realtime_settings import _mappings, _set_fifo_priority
 
 READ, WRITE = 22, 23
 """MADV_POPULATE_READ and MADV_POPULATE_WRITE of Linux."""
@@ -28,7 +28,7 @@ def test_a_receiver_interrupts_its_sender_and_the_loop_the_other_threads(
     for place, own in enumerate(expected):
         given.clear()
         with ExitStack() as undo:
-            _fifo(priority, place, undo)
+            _set_fifo_priority(priority, place, undo)
         first, *others, last = given
         assert (first, last) == ((threading.get_native_id(), own), (0, 0))
         assert {rank for _, rank in others} <= {max(priority - 4, 1)}
