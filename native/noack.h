@@ -1051,7 +1051,7 @@ typedef struct {
     uint8_t unused;
 } noack_slot;
 
-/* A stored datagram that waits until the link is free; see native/waiting.c. */
+/* A stored datagram that waits until the link is free; see native/network/waiting.c. */
 typedef struct {
     int64_t key, order, row, size_bytes, after_ns, earliest_ns;
     int64_t left, right, parent; /* the heap: places + 1; 0: none */

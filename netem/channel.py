@@ -1,4 +1,4 @@
-"""The network of a run as a machine without sockets: native/channel.c decides, this configures it.
+"""The network of a run as a machine without sockets: native/network/channel.c decides, this configures it.
 
 Simulation and replay drive it. The relay of a live run (:mod:`netem.run_network`) decides
 alike. The flows 0 to N − 1 of a run with N loops come from the sensors, the next N from the
@@ -188,7 +188,7 @@ class Channel:
         self.core.change_ns = self._schedule.next_ns
 
     def change(self, settings: LinkSettings) -> None:
-        """Apply other settings to the first direction; see native/link_change.c."""
+        """Apply other settings to the first direction; see native/network/link_change.c."""
         latest_ns = np.full(self.links[0].rows, core.NOACK_NEVER_NS, np.int64)
         core.noack_channel_latest(self.core, 0, pointer_to(latest_ns, "int64_t *"))
         self.links[0].change(settings, latest_ns)

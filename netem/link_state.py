@@ -24,7 +24,7 @@ _COUNTED = dtype_of("noack_counters").names or ()
 
 
 class LinkState:
-    """Settings and state of one direction of a link; see native/link.c.
+    """Settings and state of one direction of a link; see native/network/link.c.
 
     Args:
         settings: the settings; they must not name files.
@@ -130,7 +130,7 @@ class LinkState:
         return bool(core.noack_link_leave(self.core, row, packet, size_bytes, delayed, counts))
 
     def change(self, settings: LinkSettings, latest_ns: Integers) -> None:
-        """Apply other settings; see native/link_change.c.
+        """Apply other settings; see native/network/link_change.c.
 
         Args:
             settings: the new settings.

@@ -1,7 +1,7 @@
 """The network of a run, which itself waits for, receives and sends datagrams.
 
 It decides as :mod:`netem.channel` does, which replays its record: both call the core
-(native/link.c), and both number these calls.
+(native/network/link.c), and both number these calls.
 """
 
 import socket

@@ -1,5 +1,6 @@
 """The guarantee of a network (MANSD, and the other constraints on losses), as rules.
 
-``native/guarantee.c`` enforces it in the emulator. The settings that name a rule are in
+``native/network/guarantee.c`` enforces it in the emulator. M − 1 is the setting ``mansd`` of a link
+(``noack/impairments/link_settings.py``); the settings of the other rules are in
 ``noack/impairments/constraints/``.
 """

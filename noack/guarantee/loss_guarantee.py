@@ -3,7 +3,7 @@
 A rule is a counter: from its state and the next outcome follow its next state and a value. The
 outcome keeps the rule if the value is at most the rule's limit; a delivery always does. These
 counters are the one definition of the guarantee for the checks of records, for the controller and
-for the adversary; ``native/guarantee.c`` enforces them in the emulator. At the end, from
+for the adversary; ``native/network/guarantee.c`` enforces them in the emulator. At the end, from
 :func:`transition_table` on: whether one guarantee implies another.
 """
 

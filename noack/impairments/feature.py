@@ -48,7 +48,7 @@ class Stage(NamedTuple):
     queue_places: int = 0
     """Maximum number of packets in its queue; 0: no queue."""
     schedules: bool = False
-    """Its queue chooses when the link is free (native/waiting.c)."""
+    """Its queue chooses when the link is free (native/network/waiting.c)."""
 
 
 class StageTables:

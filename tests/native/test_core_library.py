@@ -144,7 +144,7 @@ def test_a_build_compiles_only_what_has_changed_and_says_so_in_one_line(copy: Pa
 def test_a_mistake_leaves_the_earlier_core_as_it_was(copy: Path) -> None:
     build(copy)
     made = files(copy)
-    with (copy / "link.c").open("a") as file:
+    with (copy / "network" / "link.c").open("a") as file:
         file.write("int mistake(\n")
     done = build(copy)
     assert done.returncode == 1

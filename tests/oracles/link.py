@@ -1,8 +1,8 @@
 """The network of a run in plain Python: datagrams in, surviving datagrams out, maybe later.
 
-The core decides for each packet (native/link.c): this is no independent statement of the decisions.
+The core decides for each packet (native/network/link.c): this is no independent statement of the decisions.
 :mod:`tests.oracles.loss_decisions` has one of losses, :mod:`tests.oracles.loss_language` one of the
-guarantee. Independent of native/channel.c is here what follows from the decisions: rows, copies,
+guarantee. Independent of native/network/channel.c is here what follows from the decisions: rows, copies,
 flipped bits, the queue of a rate that chooses, and the order of departures.
 """
 
@@ -115,7 +115,7 @@ class Link:
         return None if row is None else self._state.flow(row)
 
     def change(self, settings: LinkSettings) -> None:
-        """Apply other settings; see native/link_change.c."""
+        """Apply other settings; see native/network/link_change.c."""
         self._serve(math.inf)
         latest_ns = np.full(self._state.rows, core.NOACK_NEVER_NS, np.int64)
         for leaving in self._in_flight:

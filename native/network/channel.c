@@ -3,7 +3,7 @@
 
    Datagrams come in; those that survive go out, at once or later. Each input has one row of the
    record, numbered over both directions. */
-#include "core.h"
+#include "../core.h"
 
 const char *noack_channel_check(const noack_channel *channel) {
     if (!is_between(1, channel->loops, MOST_LOOPS) || !is_between(1, channel->directions, 2))

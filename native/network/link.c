@@ -1,7 +1,7 @@
 /* One direction of a link: decisions for arriving packets, and accounting of departures. */
 #include <string.h>
 
-#include "core.h"
+#include "../core.h"
 
 static stage_function *const APPLY[NOACK_STAGE_KINDS] = {
     [NOACK_BERNOULLI] = apply_bernoulli,

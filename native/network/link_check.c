@@ -1,7 +1,7 @@
 /* Checks the numbers of a link once, where they enter the core: all that the other files assume. */
 #include <stddef.h>
 
-#include "core.h"
+#include "../core.h"
 
 /* With these limits no sum and no product of the other files overflows, for packets of at most
    65,535 bytes that arrive at times from 0 to FAR_NS. */
