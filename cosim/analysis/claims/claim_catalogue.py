@@ -120,10 +120,14 @@ def controller_error_bound(
     values: Reals,
     constant: float | None = None,
     void: VoidFrom | None = None,
-    since_s: float = 0.0,
+    *,
+    by_certificate: bool = False,
 ) -> Bound:
-    """Return a bound of ‖e_c‖_W at the measurements from a time on; void from a record's first gap."""
-    here = samples.is_bounded & (samples.t_s >= since_s - 1e-9)
+    """Return a bound of ‖e_c‖_W at the measurements, by a certificate or without one.
+
+    It is void from a record's first gap.
+    """
+    here = samples.is_bounded & (run.bounds_controller_error(samples.t_s) if by_certificate else True)
     # Allow for the rounding of x, which matters for a bound of that size.
     slack = run.rounding(samples.aligned.x_norm[here])
     shares = upper_shares(samples.aligned.e_c_norm[here], values[here] + slack)
@@ -261,11 +265,11 @@ def theorem_2_state(run: RunEvidence, samples: Samples) -> ClaimBound:
 def controller_error(
     run: RunEvidence, samples: Samples, certificate: ScenarioCertificate, constants: Constants
 ) -> ClaimBound:
-    """‖e_c‖_W from when the plant applies the controller's input on."""
+    """‖e_c‖_W from when the plant applies the controller's input on, with the x_c of this input."""
     formula = envelope_formula(norm_text(run, "e_c"), certificate, "delta")
     values, void = certificate.controller_error(samples.t_s), run.violation_of(certificate)
     return ClaimBound(
-        controller_error_bound(run, samples, formula, values, constants.delta, void, run.started_s),
+        controller_error_bound(run, samples, formula, values, constants.delta, void, by_certificate=True),
         Envelope(f"certified for {certificate.scope}", "e_c", samples.t_s, values),
     )
 
@@ -285,7 +289,7 @@ def controller_error_from_events(
     void = run.violation_of(certificate)
     label = "bound, given the updates missing now"
     return ClaimBound(
-        controller_error_bound(run, samples, formula, values, void=void, since_s=run.started_s),
+        controller_error_bound(run, samples, formula, values, void=void, by_certificate=True),
         Envelope(label, "e_c", samples.t_s, np.where(samples.is_bounded, values, np.nan)),
     )
 

@@ -118,6 +118,7 @@ class _Updates:
     def __init__(self) -> None:
         self._events: deque[tuple[int, int]] = deque()
         self._applied: deque[tuple[int, int, int | None]] = deque()
+        self._early: list[tuple[int, int]] = []
         self._passed: dict[int, bool] = {}
         self._newest_packet = NO_SEQUENCE
         self._resolved = NO_SEQUENCE
@@ -135,6 +136,8 @@ class _Updates:
 
     def add_applied(self, applied: list[tuple[int, int, int | None]]) -> None:
         self._applied.extend(applied)
+        times = [(applied_ns, model_ns) for _, model_ns, applied_ns in applied if applied_ns is not None]
+        self._early += [(applied_ns, model_ns) for applied_ns, model_ns in times if applied_ns < model_ns]
 
     @property
     def waiting(self) -> int:
@@ -161,6 +164,12 @@ class _Updates:
             PacketLosses(lost[:, 0] * 1e-9, lost[:, 1]),
             SampledSeries(late[:, 0] * 1e-9, late[:, 1] * 1e-9),
         )
+
+    def take_early(self) -> SampledSeries:
+        """Return the updates that acted before the model time of their reset, since the last call."""
+        early = np.array(self._early).reshape(-1, 2) * 1e-9
+        self._early = []
+        return SampledSeries(early[:, 0], early[:, 1])
 
     def _fate(self, sequence: int, event_ns: int, end_ns: int | None) -> tuple[float, int | None] | None:
         """Return when a newer update replaced a lost one, in s, and when the update acted, in ns.
@@ -270,6 +279,7 @@ class ConditionReader:
             {} if self._clocks is None else self._clocks.take(),
             np.inf if self._clocks is None else self._clocks.largest_s,
             np.inf if end_ns is None else end_ns * 1e-9,
+            self._updates.take_early(),
         )
 
 

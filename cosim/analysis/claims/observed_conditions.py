@@ -198,6 +198,9 @@ class ObservedConditions(NamedTuple):
     largest_clock_error_s: float = np.inf
     reached_s: float = np.inf
     """The end of the run, once it is known."""
+    early: SampledSeries = SampledSeries(np.zeros(0), np.zeros(0))
+    """Model time at which an update reset x_c, in seconds, by the earlier time at which the plant
+    first applied an input computed with it: its step was late, or the controller's clock ahead."""
 
     def _first_input(self, limit_s: float) -> SampledSeries:
         """The time of the first input, at t = 0; 0 if the run ended before that had to come."""
@@ -314,6 +317,7 @@ def combine(parts: Sequence[ObservedConditions]) -> ObservedConditions:
             cause: SampledSeries(*join(part.clocks[cause] for part in parts)).in_order().peaks()
             for cause in last.clocks
         },
+        early=SampledSeries(*join(part.early for part in parts)),
     )
 
 

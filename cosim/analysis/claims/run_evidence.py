@@ -234,6 +234,15 @@ class RunEvidence:
         """When the plant applied the first input of the controller; infinite if never."""
         return self._as_read.start_s
 
+    def bounds_controller_error(self, t_s: Reals) -> NDArray[np.bool_]:
+        """Return where the certificates bound e_c, (k,).
+
+        The plant applies the controller's input, and x_c has every update with which it was computed.
+        """
+        acts_s, reset_s = map(np.sort, self._as_read.early)
+        is_behind = np.searchsorted(acts_s, t_s, "right") > np.searchsorted(reset_s, t_s, "right")
+        return np.asarray((t_s >= self.started_s - 1e-9) & ~is_behind)
+
     def violations(self) -> list[AssumptionViolation]:
         """The assumptions that the run violated, the guarantee included, each at the first time."""
         scenario = self.record.scenario

@@ -163,11 +163,14 @@ def _input_error(part_record: RunRecord, steps: Rows, alpha_per_s: float) -> flo
         return math.inf
     ends = np.maximum(row_norms(u - x[:-1] @ loop.K.T), row_norms(u - x[1:] @ loop.K.T))
     speed = x[:-1] @ loop.A.T + u @ loop.B.T
-    grown = math.exp(min(float(np.linalg.norm(loop.A, 2)) * dt_s, 700.0))
+    # ‖KA e^{As} ẋ‖ is at most ‖KA ẋ‖ + ‖KA‖ ‖e^{As} − I‖ ‖ẋ‖.
+    gain = loop.K @ loop.A
+    turned = float(np.linalg.norm(gain, 2)) * math.expm1(min(float(np.linalg.norm(loop.A, 2)) * dt_s, 700.0))
     forced, forcing = 0.0, bound_forcing(part_record.scenario, loop.B)
     if forcing is not None:
-        forced = float(np.linalg.norm(loop.K @ loop.A @ forcing.limited, axis=0).sum())
-    bend = dt_s**2 / 8 * grown * (row_norms(speed @ (loop.K @ loop.A).T) + forced)
+        sizes = np.linalg.norm(gain @ forcing.limited, axis=0)
+        forced = float((sizes + turned * np.linalg.norm(forcing.limited, axis=0)).sum())
+    bend = dt_s**2 / 8 * (row_norms(speed @ gain.T) + turned * row_norms(speed) + forced)
     largest = float(((ends + bend) * np.exp(alpha_per_s * steps["t_ns"][1:] * 1e-9)).max())
     return math.inf if math.isnan(largest) else largest
 
