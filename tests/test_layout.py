@@ -37,7 +37,7 @@ LINES = {
     "noack/traces": 1350,
     "noack/trigger_policies": 1075,
     "netem": 6670,
-    "cosim/analysis": 8495,
+    "cosim/analysis": 8525,
     "cosim/api": 1695,
     "cosim/cli": 3500,
     "cosim/doctor": 815,
@@ -54,7 +54,7 @@ LINES = {
     "controller_node": 415,
     "benchmarks": 3775,
     "native": 11505,
-    "tests": 51660,
+    "tests": 51715,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 
