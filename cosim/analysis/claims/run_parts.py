@@ -11,10 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cosim.record.align import Reals
 from cosim.record.run_record import Rows, RunRecord
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Vector
 from noack.core.row_operations import row_norms
+from noack.plants.plant_settings import SystemFailedError
+from noack.plants.systems.jacobian_enclosure import NotEnclosedError
 from noack.protocol.record_tables import (
     CLOCK_TABLES,
     CONTROLLER_DELIVERY,
@@ -34,6 +37,7 @@ from noack.theory.bounds.disturbances import bound_forcing
 from noack.theory.bounds.enclosure import factors
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import about_setpoint
+from noack.theory.certificates.region import enclosed_motion
 
 
 class RunPart(NamedTuple):
@@ -130,7 +134,8 @@ def start_error(part_record: RunRecord, started_s: float) -> float:
     """sup‖u − Kx‖ e^{αt} over the steps until the plant applied the first input of the part.
 
     u is constant within a step. So ‖u − Kx‖ is at most the larger of its values at both ends, plus
-    a term for the curvature of x: Δt²/8 sup‖K A ẋ‖, with ẋ = e^{As}(Ax + Bu + Dw), w constant.
+    a term for the curvature of x: Δt²/8 sup‖K ẍ‖, of a linear plant with ẍ = A e^{As}(Ax + Bu + Dw),
+    w constant.
     Infinite: u is not in the range of K, in which the bounds have it. It may be outside if K has
     fewer independent rows than there are inputs, and u was that of a set-point with another u_r; or
     u is not finite, or not recorded at each of these steps.
@@ -162,7 +167,16 @@ def _input_error(part_record: RunRecord, steps: Rows, alpha_per_s: float) -> flo
     if (outside > _ROUNDED * (row_norms(u) + row_norms(x[:-1] @ loop.K.T))).any():
         return math.inf
     ends = np.maximum(row_norms(u - x[:-1] @ loop.K.T), row_norms(u - x[1:] @ loop.K.T))
-    speed = x[:-1] @ loop.A.T + u @ loop.B.T
+    is_linear = part_record.scenario.coverage.linear_certificates_apply
+    bend = (_bend if is_linear else _nonlinear_bend)(part_record, x[:-1], u, dt_s)
+    largest = float(((ends + bend) * np.exp(alpha_per_s * steps["t_ns"][1:] * 1e-9)).max())
+    return math.inf if math.isnan(largest) else largest
+
+
+def _bend(part_record: RunRecord, x: Reals, u: Reals, dt_s: float) -> Reals:
+    """Return Δt²/8 sup‖KAẋ‖ within each step of a linear plant."""
+    loop = part_record.loop
+    speed = x @ loop.A.T + u @ loop.B.T
     # ‖KA e^{As} ẋ‖ is at most ‖KA ẋ‖ + ‖KA‖ ‖e^{As} − I‖ ‖ẋ‖.
     gain = loop.K @ loop.A
     turned = float(np.linalg.norm(gain, 2)) * math.expm1(min(float(np.linalg.norm(loop.A, 2)) * dt_s, 700.0))
@@ -170,9 +184,20 @@ def _input_error(part_record: RunRecord, steps: Rows, alpha_per_s: float) -> flo
     if forcing is not None:
         sizes = np.linalg.norm(gain @ forcing.limited, axis=0)
         forced = float((sizes + turned * np.linalg.norm(forcing.limited, axis=0)).sum())
-    bend = dt_s**2 / 8 * (row_norms(speed @ gain.T) + turned * row_norms(speed) + forced)
-    largest = float(((ends + bend) * np.exp(alpha_per_s * steps["t_ns"][1:] * 1e-9)).max())
-    return math.inf if math.isnan(largest) else largest
+    return dt_s**2 / 8 * (row_norms(speed @ gain.T) + turned * row_norms(speed) + forced)
+
+
+def _nonlinear_bend(part_record: RunRecord, x: Reals, u: Reals, dt_s: float) -> Reals:
+    """Return Δt²/8 sup‖Kẍ‖ over the steps of a nonlinear plant; infinite if it is not known."""
+    loop, scenario = part_record.loop, part_record.scenario
+    forced, at_input = np.zeros(loop.n), np.zeros(loop.m)
+    if (forcing := bound_forcing(scenario, loop.B)) is not None:
+        forced, at_input = np.abs(forcing.limited).sum(axis=1), forcing.at_input
+    reach = np.concatenate([np.abs(x).max(axis=0), np.abs(u).max(axis=0) + at_input])
+    try:
+        return np.full(len(x), enclosed_motion(scenario).bound_bend(loop.K, reach, forced, dt_s))
+    except (NotEnclosedError, SystemFailedError):
+        return np.full(len(x), math.inf)
 
 
 def common_end_ns(record: RunRecord) -> int | None:

@@ -41,6 +41,8 @@ _LONGEST_S = 1e9
 """The equations are enclosed for all times from 0 to this."""
 _AT_REST = 1e-9
 """The plant rests if |f(0, 0)| is at most this share of the largest entry of A and B in its row."""
+_WIDENINGS = 8
+"""Regions that are tried for the steps that begin in another."""
 _UNDECIDED = "its equations distinguish cases, and the region contains more than one of them"
 _NOT_INSTALLED = "its equations cannot be enclosed without python-flint: pip install 'noack[regions]'"
 
@@ -273,6 +275,32 @@ class EnclosedMotion:
             )
         return Inclusion(centre[:, :n], centre[:, n:], halves[:, :n], halves[:, n:])
 
+    def bound_bend(self, C: Matrix, reach: Vector, forcing: Vector, period_s: float) -> float:
+        """Return a bound of T² sup‖C ẍ‖/8 over steps of length T that begin in a region.
+
+        By that much C x differs at most from its chord over a step; u is constant within it.
+
+        Args:
+            C: (k, n).
+            reach: largest |(x, u)_j| at the beginnings, (n + m,).
+            forcing: bounds of what is added to ẋ, constant within a step, (n,).
+            period_s: T.
+
+        Raises:
+            NotEnclosedError: there is no enclosure over the region that the steps reach.
+        """
+        n, halfwidths = self.n, reach
+        for _ in range(_WIDENINGS):
+            rates = self._values(halfwidths, range(n + self.m + 1))
+            slopes = np.array([[_size(slope) for slope in rate.slopes] for rate in rates])
+            speed = np.array([_size(rate.value) for rate in rates]) + forcing
+            moved = np.concatenate([period_s * speed, np.zeros(self.m)])
+            if (reach + moved <= halfwidths).all():  # so x stays in the region: ẍ = f_x ẋ + f_t
+                bend = np.abs(C) @ (slopes[:, :n] @ speed + slopes[:, -1])
+                return period_s**2 / 8 * float(np.linalg.norm(bend))
+            halfwidths = reach + 2 * moved
+        raise NotEnclosedError("x moves too far within a step")
+
     @cached_property
     def at_rest(self) -> Vector:
         """Bounds of the entries of |f(0, 0)|, (n,): 0, or what rounding leaves.
@@ -293,14 +321,15 @@ class EnclosedMotion:
         return [entry / _SLICES for entry in total]
 
     def _values(self, halfwidths: Vector, coordinates: Sequence[int]) -> list[Enclosed]:
-        """Return f over a region, with its derivatives by some coordinates."""
+        """Return f over a region, with its derivatives by some coordinates; that after (x, u) is time."""
         constant = [_ball(0.0)] * len(coordinates)
         enclosed = [
             Enclosed(_ball(0.0, width), [_ball(float(index == j)) for j in coordinates])
             for index, width in enumerate(halfwidths.tolist())
         ]
         x, u = np.split(np.array(enclosed, dtype=object), [self.n])
-        time = Enclosed(_ball(_LONGEST_S / 2, _LONGEST_S / 2), constant)
+        of_time = [_ball(float(j == len(enclosed))) for j in coordinates]
+        time = Enclosed(_ball(_LONGEST_S / 2, _LONGEST_S / 2), of_time)
         expressions = self.system.expressions(time, x, u)  # type: ignore[attr-defined]
         if expressions is None:
             raise NotEnclosedError("x is neither its state nor its state minus a constant")

@@ -226,13 +226,21 @@ class RegionScope(_Box):
 
     @cached_property
     def _motion(self) -> EnclosedMotion:
-        loop, timing = self._loop, self._resolved.timing
-        plant = self._resolved.plant.system
-        if not plant.has_equations:
-            raise NotEnclosedError(f'a plant of kind "{plant.kind}" has no equations to enclose')
-        start = PlantStart(np.zeros(loop.n), loop.A_model, loop.B_model, timing.plant_period_ns)
-        try:
-            system = plant.system(start)
-        except NoackError as error:  # a user's class that does not accept x = 0, for example
-            raise NotEnclosedError(str(error)) from None
-        return EnclosedMotion(system, loop.n, loop.m)
+        return enclosed_motion(self._resolved)
+
+
+def enclosed_motion(resolved: Scenario) -> EnclosedMotion:
+    """Return the equations of a resolved scenario's plant, to be enclosed.
+
+    Raises:
+        NotEnclosedError: it has no equations that can be enclosed, or does not accept x = 0.
+    """
+    loop, plant = loop_of(resolved), resolved.plant.system
+    if not plant.has_equations:
+        raise NotEnclosedError(f'a plant of kind "{plant.kind}" has no equations to enclose')
+    start = PlantStart(np.zeros(loop.n), loop.A_model, loop.B_model, resolved.timing.plant_period_ns)
+    try:
+        system = plant.system(start)
+    except NoackError as error:  # a user's class that does not accept x = 0, for example
+        raise NotEnclosedError(str(error)) from None
+    return EnclosedMotion(system, loop.n, loop.m)

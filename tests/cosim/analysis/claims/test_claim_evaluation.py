@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from cosim.analysis.claims import claim_catalogue
 from cosim.analysis.claims.claim_catalogue import CertifiedClaim, ClaimDefinition
@@ -431,6 +432,30 @@ def test_the_start_error_of_a_part_bounds_it_between_two_steps() -> None:
     steps["t_ns"], steps["u"], steps["x"] = [0, 10 * MS], u, [state(0.0), state(dt_s)]
     largest = max(abs(float(u - (K @ state(s))[0])) for s in np.linspace(0.0, dt_s, 101))
     assert largest > 6e-8
+    assert start_error(changed(record, {PLANT_STEP: steps}), dt_s) >= largest
+
+
+def test_the_start_error_of_a_nonlinear_plant_bounds_it_between_two_steps() -> None:
+    """K ẋ = 0 in the middle of the step, and KAẋ = 0 of the linearisation: only the sine bends Kx."""
+    pytest.importorskip("flint")
+    sets, dt_s = ("horizon_s=0.1", "plant.rate_hz=1000", "trigger.alpha_per_s=1e-9"), 1e-3
+    record = simulate(resolved("sine_pendulum", *sets))
+    gain = np.array([-15.0, -5.0])
+    angle, added = 1.0, 9.81 * (np.sin(1.0) - 1.0)  # what the sine adds to the linearisation
+    slope = -gain[1] * 9.81 / (gain[0] + 0.1 * -gain[1])
+    rate = added / (-gain[0] / gain[1] - slope)
+    u = slope * rate - 9.81 * angle + 0.1 * rate
+
+    def motion(_: float, x: Any) -> Any:
+        return [x[1], 9.81 * np.sin(x[0]) - 0.1 * x[1] + u]
+
+    times_s = np.linspace(0.0, dt_s, 101)
+    back = solve_ivp(motion, (0.0, -dt_s / 2), [angle, rate], rtol=1e-12, atol=1e-14).y[:, -1]
+    states = solve_ivp(motion, (0.0, dt_s), back, t_eval=times_s, rtol=1e-12, atol=1e-14).y.T
+    steps = record[PLANT_STEP][:2].copy()
+    steps["t_ns"], steps["u"], steps["x"] = [0, MS], u, states[[0, -1]]
+    largest, ends = np.abs(u - states @ gain).max(), np.abs(u - states[[0, -1]] @ gain).max()
+    assert largest > ends + 1e-6
     assert start_error(changed(record, {PLANT_STEP: steps}), dt_s) >= largest
 
 
