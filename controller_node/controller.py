@@ -222,13 +222,13 @@ class Controller(MachinePart):
         steps_ns = (period_ns, self.first_ns, period_ns - self.first_ns)
         transitions = memory.transitions(self.H, steps_ns)
         memory.set_model(controller.model, transitions, (), self._points)
-        linear = isinstance(self.law, LinearFeedback)
+        K = self.law.K if isinstance(self.law, LinearFeedback) else None
         memory.fill(
             controller,
             {
-                "K": self.law.K if isinstance(self.law, LinearFeedback) else np.zeros((m, n)),
+                "K": np.zeros((m, n)) if K is None else K,
                 "safe_input": np.zeros(m) if self.safe_input is None else self.safe_input,
-                "is_user": not linear,
+                "is_user": K is None,
                 "acknowledges": self.acknowledges,
                 "predictions": self.predictions,
                 "timeout_ns": self.timeout_ns,

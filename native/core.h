@@ -1,4 +1,7 @@
-/* What the files of the core share. */
+/* What the files of the core share.
+
+   Names of what a node on a board links (MACHINES in build.py) begin with noack_, since a firmware
+   has names of its own; others need not, since the library hides all but those of noack.h. */
 #ifndef NOACK_CORE_H
 #define NOACK_CORE_H
 
@@ -22,8 +25,8 @@
 #pragma GCC poison sin cos tan asin acos atan atan2 sinh cosh tanh
 
 #define NS_PER_S INT64_C(1000000000)
-#define LATEST_NS                                                                                  \
-    (INT64_C(1) << 61) /* 73 years: packets that must pass may exceed a queue's size */
+/* 73 years: packets that must pass may exceed a queue's size. */
+#define LATEST_NS (INT64_C(1) << 61)
 
 enum { MOST_LOOPS = 65535 }; /* of a run: datagrams have the number of the loop in 16 bits */
 

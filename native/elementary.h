@@ -64,8 +64,8 @@ static inline double power_of_2(int64_t exponent) {
     return power;
 }
 
-double noack_exp_at_limits(
-    double x); /* where e^x is close to the limits of doubles, or x is no number */
+/* e^x where it is close to the limits of doubles, or x is no number. */
+double noack_exp_at_limits(double x);
 
 static inline double fixed_exp(double x) {
     if (!(fabs(x) < 708.0))

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from noack.runtime.command_line import stoppable_imports
 
 with stoppable_imports():
-    from netem.run_network import NetworkChannel, RunNetwork
+    from netem.run_network import NetworkSockets, RunNetwork
     from noack.core.errors import ExitStatus, NoackError
     from noack.protocol.roles import ENDS
     from noack.runtime.command_line import Parser, report_failure
@@ -57,7 +57,7 @@ def run_network(run: RunProcess) -> None:
             (addresses[ENDS[flow].sender], addresses[ENDS[flow].receiver])
             for flow in run.scenario.network.flows
         ]
-        channel = NetworkChannel(
+        sockets = NetworkSockets(
             endpoint,
             routes,
             network=network,
@@ -65,7 +65,7 @@ def run_network(run: RunProcess) -> None:
             spin_ns=run.spin_ns,
             loops=len(run.phases_ns),
         )
-        run.run(network, channel, network)
+        run.run(network, sockets, network)
 
 
 if __name__ == "__main__":

@@ -128,7 +128,7 @@ class PcapngSection:
         )
         return self._out.data[:size]
 
-    def miss(self, events: NDArray[np.int64]) -> None:
+    def add_missing(self, events: NDArray[np.int64]) -> None:
         """Note (interfaces,) numbers of events that are missing at this place of the file."""
         self._missing += events
         self._all_missing += events
@@ -257,11 +257,11 @@ class CaptureWriter:
         try:
             self._write(self._section.header())
             while self.error is None and (batch := self._queue.get()) is not None:
-                self._section.miss(batch.missing)
+                self._section.add_missing(batch.missing)
                 self._write(self._section.packets(batch.events, batch.data))
                 self._written_events += batch.events.size
             if self.error is None:
-                self._section.miss(self._unreported)
+                self._section.add_missing(self._unreported)
                 self._write(self._section.statistics())
         except (OSError, ValueError) as error:
             self._fail(getattr(error, "strerror", None) or str(error))

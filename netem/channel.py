@@ -26,7 +26,7 @@ from noack.scenario.scenario import Scenario
 
 Rows = NDArray[np.void]
 
-Network = Callable[[bytes, int], int | None]
+UserNetwork = Callable[[bytes, int], int | None]
 """Maps an update's datagram and the current time, ns, to its delay, ns, or to None for a loss."""
 
 PACKET_ROW = np.dtype(
@@ -87,7 +87,7 @@ class Channel:
         loops: int = 1,
         first_number: int = 0,
         schedule: ChangeSchedule[LinkSettings] | None = None,
-        network: Network | None = None,
+        network: UserNetwork | None = None,
     ) -> None:
         self._links, self._loops = tuple(links), loops
         self._schedule, self._network = schedule, network
@@ -219,7 +219,7 @@ class Channel:
 
 
 def channel_of(
-    resolved: Scenario, start: Start = BEGINNING, *, loops: int = 1, network: Network | None = None
+    resolved: Scenario, start: Start = BEGINNING, *, loops: int = 1, network: UserNetwork | None = None
 ) -> Channel:
     """Return the network of a resolved scenario; ``network`` replaces the link of the updates."""
     links: list[LinkState] = []
@@ -241,23 +241,23 @@ def channel_of(
     return Channel(links, loops=loops, first_number=start.first_number, schedule=schedule, network=network)
 
 
-def require_stand_alone(network: Scenario) -> Scenario:
+def require_stand_alone(scenario: Scenario) -> Scenario:
     """Return a scenario whose network is used outside a run of noack.
 
     Raises:
         CallerError: the network changes, has several loops, acknowledges, or chooses by errors.
     """
-    for name, setting in (("changes", network.changes), ("loops", network.loops)):
+    for name, setting in (("changes", scenario.changes), ("loops", scenario.loops)):
         if setting:
             raise CallerError(
                 f"network: the scenario has {name}; outside a run of noack a network serves one "
                 f"loop and does not change: remove {name}"
             )
-    if network.network.protocol != "none":
+    if scenario.network.protocol != "none":
         raise CallerError('network: nothing is acknowledged here; set protocol = "none"')
-    if network.network.link.reads_errors:
+    if scenario.network.link.reads_errors:
         raise CallerError("network: maximum_error is for noack's own sensors; take another discipline")
-    return network
+    return scenario
 
 
 def settings_at_start(settings: LinkSettings, name: str, start: Start) -> tuple[LinkSettings, list[str]]:
@@ -274,16 +274,16 @@ def settings_at_start(settings: LinkSettings, name: str, start: Start) -> tuple[
 
 
 def announce_change(
-    network: CData,
+    core_network: CData,
     schedule: ChangeSchedule[LinkSettings],
     change: ParameterChange,
     now_ns: int,
     reached_ns: int,
 ) -> Sequence[Record | Notice]:
     """Accept a change for a ``noack_channel`` or ``noack_relay``; it is an input with a number."""
-    outputs = schedule.announce(NETEM_SETTING, change, network.inputs, now_ns, reached_ns)
-    network.inputs += 1
-    network.change_ns = schedule.next_ns
+    outputs = schedule.announce(NETEM_SETTING, change, core_network.inputs, now_ns, reached_ns)
+    core_network.inputs += 1
+    core_network.change_ns = schedule.next_ns
     return outputs
 
 

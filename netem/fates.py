@@ -177,15 +177,15 @@ class FateRecorder:
         try:
             rows = events.view(_RAW)[events["departure"] == 0]
         except MemoryError:
-            self.missing(len(events))
+            self.add_missing(len(events))
             return
         if self._queued_rows - self._processed_rows + len(rows) > self._max_waiting:
-            self.missing(len(rows))
+            self.add_missing(len(rows))
         elif len(rows):
             self._queued_rows += len(rows)
             self._queue.put(rows)
 
-    def missing(self, events: int) -> None:
+    def add_missing(self, events: int) -> None:
         """Count events for which the relay had no room; called in its thread."""
         if self._missing_rows == 0 and events:
             self._queue.put("events are missing: they arrive faster than they can be written")

@@ -25,7 +25,7 @@ from noack.runtime.address import Address, address_text, parse_address, parse_de
 
 
 class LossyUdp:
-    """A UDP relay to a server, which delays and loses datagrams, but never too many in a row.
+    """A UDP relay to a server, which delays and loses datagrams, within the limits that its words set.
 
     Clients send to ``address`` instead of to the server. A datagram's fate depends on ``seed``,
     ``name``, the direction, the number of the client (in the order in which clients appear) and the
@@ -43,9 +43,9 @@ class LossyUdp:
         to: the server: host and port, or ``"host:port"``.
         words: what happens to datagrams of clients, in the words of ``noack netem``.
         reverse: what happens to the server's answers; nothing by default.
-        seed: of the random streams.
+        seed: seed of the random streams.
         listen: where clients send to; port 0 selects a free port.
-        name: of the link; part of the names of its random streams.
+        name: name of the link, and part of the names of its random streams.
 
     Raises:
         CallerError: an address or a word is wrong; the listening address is in use (on entering).

@@ -204,7 +204,7 @@ class _RowList(list[Record]):
         self.extend(Record(table, row) for row in rows.tolist())
 
 
-class NetworkChannel(CountingSockets):
+class NetworkSockets(CountingSockets):
     """The sockets of a network in the core, which receives the peers' datagrams and sends itself.
 
     Args:

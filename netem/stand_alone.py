@@ -1,6 +1,6 @@
 """A stand-alone emulator: runs a relay, with what watches, changes and records it; prints totals.
 
-:func:`run_stand_alone` reads the command line, :func:`relay` relays until Ctrl-C.
+:func:`run_stand_alone` reads the command line, :func:`run_relay` relays until Ctrl-C.
 """
 
 import argparse
@@ -101,7 +101,7 @@ def run_stand_alone(arguments: Sequence[str]) -> ExitStatus:
         return ExitStatus.OK
     with log_format(options.log_format):
         try:
-            totals = relay(specs, options)
+            totals = run_relay(specs, options)
         except NoackError as error:  # reported in the format of the log
             return report_failure(str(error), error.exit_status, source="noack netem", as_json=options.json)
         report_totals(totals, options)
@@ -125,7 +125,7 @@ def report_totals(totals: Statistics, options: argparse.Namespace) -> None:
             console.print(f"unintended losses: {text}", style="bold red", soft_wrap=True)
 
 
-def relay(
+def run_relay(
     specs: Sequence[LinkSpec], options: argparse.Namespace, program: RelayedProgram | None = None
 ) -> Statistics:
     """Relay until Ctrl-C, or the program's end; return the totals.
@@ -139,40 +139,48 @@ def relay(
     check_options(options)
     if options.replay_fates is not None:
         specs = _replaying(specs, options.replay_fates)
-    with ExitStack() as last, ExitStack() as stack:
+    # Signals stay handled until all files are complete.
+    with ExitStack() as signal_stack, ExitStack() as stack:
+        # Open what records the relay, the relay, and what watches it.
         with starting(options.control):
             taps: list[Tap] = []
             if options.capture is not None:
                 taps.append(stack.enter_context(_capture(options.capture, specs)))
             if options.record_fates is not None:
                 taps.append(stack.enter_context(FateRecorder(options.record_fates, specs)))
-            spin_ns = _SPIN_NS if options.realtime else 0
-            devices = None if program is None else program.devices
-            raise_file_limit()
-            try:
-                open_relay = Relay(
-                    specs, segment=options.segment, taps=taps, spin_ns=spin_ns, devices=devices
-                )
-            except OSError as error:  # no IPv6, or too many open files
-                raise MachineError(f"the sockets of the links cannot be opened: {why(error)}") from None
-            stack.callback(open_relay.close)
-            # Signals stay handled until all files are complete.
-            signals = last.enter_context(Signals().handled())
-            side = stack.enter_context(watch_relay(open_relay, options))
+            relay = _open_relay(specs, options, taps, None if program is None else program.devices)
+            stack.callback(relay.close)
+            signals = signal_stack.enter_context(Signals().handled())
+            watch = stack.enter_context(watch_relay(relay, options))
             running = nullcontext(lambda: False) if program is None else program.running(signals)
             has_ended = stack.enter_context(running)
+        # Relay.
         for setting, answer in stack.enter_context(realtime(options.realtime, _FIFO_PRIORITY)).items():
             if answer.startswith("not permitted"):
                 report_line(f"{setting} {answer}")
         takes_output = options.view or (options.stats is not None and options.stats_file is None)
         if program is None:
             is_free = options.capture != "-" and not takes_output
-            _report_ready(open_relay, print_it=is_free, as_json=options.json)
-        open_relay.run(
-            lambda: side.quit_requested or signals.received is not None or has_ended(),
-            side.commands.run_pending,
+            _report_ready(relay, print_it=is_free, as_json=options.json)
+        relay.run(
+            lambda: watch.quit_requested or signals.received is not None or has_ended(),
+            watch.commands.run_pending,
         )
-        return statistics(side.commands.snapshot_here())
+        return statistics(watch.commands.snapshot_here())
+
+
+def _open_relay(
+    specs: Sequence[LinkSpec],
+    options: argparse.Namespace,
+    taps: Sequence[Tap],
+    devices: DeviceLink | None,
+) -> Relay:
+    raise_file_limit()
+    spin_ns = _SPIN_NS if options.realtime else 0
+    try:
+        return Relay(specs, segment=options.segment, taps=taps, spin_ns=spin_ns, devices=devices)
+    except OSError as error:  # no IPv6, or too many open files
+        raise MachineError(f"the sockets of the links cannot be opened: {why(error)}") from None
 
 
 def _replaying(specs: Sequence[LinkSpec], path: Path) -> Sequence[LinkSpec]:
@@ -229,20 +237,20 @@ def _capture(path: str, specs: Sequence[LinkSpec]) -> Iterator[Tap]:
             report_line(f"the capture lacks {writer.missing_events} events")
 
 
-def _report_ready(open_relay: Relay, *, print_it: bool, as_json: bool) -> None:
+def _report_ready(relay: Relay, *, print_it: bool, as_json: bool) -> None:
     """Report on standard error that the relay runs, when Ctrl-C is handled already.
 
     ``print_it``: also print a line on standard output that other programs can wait for.
     """
-    listen = {name: address_text(address) for name, address in open_relay.addresses().items()}
-    for spec in open_relay.specs:
-        name = f" ({spec.name})" if len(open_relay.specs) > 1 else ""
+    listen = {name: address_text(address) for name, address in relay.addresses().items()}
+    for spec in relay.specs:
+        name = f" ({spec.name})" if len(relay.specs) > 1 else ""
         report_line(f"{listen[spec.name]} → {address_text(spec.to)}{name}, Ctrl-C ends")
     line = f"ready: listening on {', '.join(listen.values())}"
     if as_json:
         links = [
             {"name": spec.name, "listen": listen[spec.name], "to": address_text(spec.to)}
-            for spec in open_relay.specs
+            for spec in relay.specs
         ]
         line = json.dumps({"ready": links})
     if print_it and sys.stdout is not None:

@@ -214,6 +214,7 @@ class Plant(MachinePart):
             period_ns=self.period_ns,
             horizon_ns=self.horizon_ns,
         )
+        # Its settings and its memory.
         sources, reported = m + n * shape.disturbed_state, self.measure_every * self.reports_inputs
         C = None if self.measurement is None else self.measurement.C
         memory.fill(plant, {
@@ -228,16 +229,11 @@ class Plant(MachinePart):
             "x_fallback": np.zeros(n), "scratch": np.zeros(2 * n + 2 * m),
         })  # fmt: skip
         if isinstance(self.system, LinearSystem):
-            memory.fill(
-                plant,
-                {
-                    "system": core.NOACK_LINEAR,
-                    "Ad": np.zeros((n, n)),
-                    "Bd": np.zeros((n, sources)),
-                },
-            )
+            matrices = {"Ad": np.zeros((n, n)), "Bd": np.zeros((n, sources))}
+            memory.fill(plant, {"system": core.NOACK_LINEAR, **matrices})
         self.set_drawn_values(plant, memory)
         self.watchdog.fill(plant, memory, self.period_ns)
+        # Disturbances and noise, of which no block has been drawn yet.
         widths = (0, 0) if self.disturbance is None else self.disturbance.widths
         noisy = self.measurement is not None and self.measurement.is_noisy
         for name, width in (

@@ -27,7 +27,7 @@ from cosim.record.run_directory import (
     write_scenario,
 )
 from cosim.record.run_record import NETWORK_ROLES, RecordedRun, Rows, RunRecord, loop_roles
-from netem.channel import RUN_ID, Network, channel_of
+from netem.channel import RUN_ID, UserNetwork, channel_of
 from noack.core.clock import NEVER_NS
 from noack.core.core_library import CData, core, ffi
 from noack.core.errors import ExitStatus, MachineError, why
@@ -150,7 +150,7 @@ class VirtualRun:
         scenario: Scenario,
         loops: Sequence[Scenario],
         *,
-        network: Network | None = None,
+        network: UserNetwork | None = None,
     ) -> None:
         self._scenario = scenario
         self.phases_ns = phases_ns(scenario)
@@ -263,7 +263,7 @@ class VirtualRun:
 
 
 def simulate(
-    resolved: Scenario, network: Network | None = None, progress: Progress | None = None
+    resolved: Scenario, network: UserNetwork | None = None, progress: Progress | None = None
 ) -> RunRecord:
     """Run a resolved scenario of one loop in virtual time; see :func:`simulate_loops`.
 
@@ -327,7 +327,7 @@ def simulate_run(scenario: Scenario, runs: Path, progress: Progress | None = Non
 def _simulate(
     scenario: Scenario,
     loops: Sequence[Scenario],
-    network: Network | None,
+    network: UserNetwork | None,
     progress: Progress | None,
 ) -> RecordedRun:
     run = VirtualRun(scenario, loops, network=network)

@@ -96,8 +96,7 @@ static void check_deadline(noack_input_replay *replay, int64_t due_ns, int64_t n
         differ(replay, NOACK_BEFORE_DEADLINE, due_ns);
 }
 
-/* The network. -----------------------------------------------------------------------------------
- */
+/* The network. --------------------------------------------------------------------------------- */
 
 static int64_t replay_packet(noack_input_replay *replay, const uint8_t *recorded, int64_t now_ns) {
     noack_channel *channel = replay->channel;
@@ -144,8 +143,7 @@ static int64_t replay_network(
     return NOACK_DONE;
 }
 
-/* The machines. ----------------------------------------------------------------------------------
- */
+/* The machines. -------------------------------------------------------------------------------- */
 
 static int64_t tick(noack_input_replay *replay, int64_t now_ns) {
     noack_process *process = replay->process;

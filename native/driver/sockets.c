@@ -105,8 +105,7 @@ static int send_segmented(driver_scratch *scratch, int fd, int64_t place, int64_
     return -1;
 }
 
-/* Send datagrams of one socket, from a place on; return the number of those that were sent, or -1.
- */
+/* Send datagrams of one socket, from a place on; return how many were sent, or -1. */
 static int call_send(driver_scratch *scratch, int fd, int64_t place, int64_t count) {
     const struct iovec *vectors = &scratch->out_vectors[place];
     int64_t equal = 1;

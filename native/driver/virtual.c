@@ -43,8 +43,7 @@ const char *noack_simulation_check(const noack_simulation *simulation) {
     return NULL;
 }
 
-/* Datagrams that have been sent. -----------------------------------------------------------------
- */
+/* Datagrams that have been sent. --------------------------------------------------------------- */
 
 static noack_sent_datagram *next_place(noack_simulation *simulation) {
     int64_t place = simulation->sent_first + simulation->sent_count++;
@@ -86,8 +85,7 @@ static void forward(noack_simulation *simulation) {
     }
 }
 
-/* Inputs of the machines. ------------------------------------------------------------------------
- */
+/* Inputs of the machines. ---------------------------------------------------------------------- */
 
 static int64_t ask(noack_simulation *simulation, int64_t who, int64_t question) {
     simulation->asking = who;
@@ -166,8 +164,7 @@ static int64_t receive(noack_simulation *simulation, int64_t role, noack_datagra
     return NOACK_DONE;
 }
 
-/* The order of time. -----------------------------------------------------------------------------
- */
+/* The order of time. --------------------------------------------------------------------------- */
 
 int64_t noack_simulate(noack_simulation *simulation, int64_t until_ns) {
     for (;;) {

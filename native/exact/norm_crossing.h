@@ -55,13 +55,12 @@ static inline search_point look_at_square(const void *curve, const level_search 
         2.0 * (dot(at.dy, at.dy) + dot(at.y, at.ddy) - 2.0 * rate * rate * square)};
 }
 
-/* The length of a step that skips no crossing, at most span. speed is |y'|^2, curvature_bound is b.
- */
+/* The length of a step that skips no crossing, at most span. speed: |y'|^2; curvature_bound: b. */
 static inline double safe_length(
     double size, double radial, double speed, double level, double rate, double curvature_bound,
     double span) {
-    const double small =
-        0.125; /* share of the level below which |y| + |y'| q is the better bound */
+    /* The share of the level below which |y| + |y'| q is the better bound. */
+    const double small = 0.125;
     if (size < small * level)
         return safe_step(size - level, rate * level + sqrt(speed), curvature_bound, span);
     double turned = radial > 0.0 ? speed - radial * radial : speed;

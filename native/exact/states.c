@@ -174,12 +174,11 @@ static double growth_at(const noack_exact *exact, double t_s) {
 typedef struct { /* a piece of a run, which has been followed */
     double t_s, length_s;
     loop_state end;
-    const rule_phase
-        *bound; /* the norm of the error is at most its threshold; NULL: it may exceed it */
+    /* The norm of the error is at most its threshold; NULL: it may exceed it. */
+    const rule_phase *bound;
 } piece;
 
-/* Raise a row's supremum by that of a piece with curves of degree q; return 0 if it is UNRESOLVED.
- */
+/* Raise a row's supremum by that of a piece with curves of degree q; return 0 if UNRESOLVED. */
 static int measure_supremum(exact_memory *memory, exact_run *run, const piece *done, int q) {
     const noack_exact *exact = memory->exact;
     double end_s = done->t_s + done->length_s;

@@ -6,8 +6,7 @@
 enum { MOST_PLACES = 1 << 20, MOST_EVERY = 1 << 20, MOST_ROWS = 1 << 16 };
 static const int64_t MOST_LENGTH = INT64_C(1) << 32;
 
-/* Times and numbers of which a few sums, with the time of a message, are in the range of int64_t.
- */
+/* Times and numbers of which a few sums, with the time of a message, fit into an int64_t. */
 static const int64_t MOST_NS = INT64_C(1) << 60, MOST_NUMBER = INT64_MAX / 2;
 
 /* A time up to which a machine has come: that of a message at most. */

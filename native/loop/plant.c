@@ -58,8 +58,7 @@ static void advance(noack_plant *plant) {
 }
 
 /* A predictive actuator: u + K(e^(H(t - t_j)) x_c - x_c), the controller's input if no update has
-   arrived since the actuation of time t_j. The state is advanced over the plant's step each time.
- */
+   arrived since the actuation of time t_j. Each call advances the state over one step. */
 static void predict(noack_plant *plant, int64_t t_ns) {
     int64_t n = plant->machine.n, m = plant->machine.m;
     copy(m, plant->inputs, plant->u);

@@ -12,8 +12,7 @@ static int is_bottleneck(const noack_stage *stage) {
     return stage->kind == NOACK_CODEL || stage->kind == NOACK_TAIL_DROP || is_scheduler(stage);
 }
 
-/* The place of the stage with this random stream and the same kind, or also a bottleneck; -1: none.
- */
+/* The place of the stage with this stream and the same kind, or also a bottleneck; -1: none. */
 static int64_t find_stage(const noack_link *link, const noack_stage *stage) {
     for (int64_t i = 0; i < link->stage_count; i++) {
         const noack_stage *other = &link->stages[i];

@@ -27,8 +27,7 @@ enum {
 /* The bytes of a packet before what a UDP payload would be; 0 for datagrams of sockets. */
 int64_t headers_bytes(const noack_relay *relay) { return relay->devices ? NOACK_HEADERS_BYTES : 0; }
 
-/* Skip the extension headers of IPv6 from next_header on; return where the transport's header is.
- */
+/* Skip the extension headers of IPv6, from next_header on; return where the transport's begins. */
 static int64_t skip_extensions(const uint8_t *packet, int64_t size_bytes, uint8_t *name) {
     int64_t at = IPV6_BYTES;
     uint8_t next = packet[6];
@@ -99,8 +98,7 @@ static void read_flow(const uint8_t *packet, int64_t size_bytes, int reverse, ui
         read_ports(packet + at, size_bytes - at, reverse, name);
 }
 
-/* Whether a packet is for several receivers. The kernel sends some by itself, which would be flows.
- */
+/* Whether a packet is for several receivers. The kernel itself sends some, which would be flows. */
 static int is_multicast(const uint8_t *packet, int64_t size_bytes) {
     if (size_bytes >= IPV4_BYTES && packet[0] >> 4 == 4)
         return packet[16] >> 4 == 0xE;

@@ -225,18 +225,18 @@ def _cells(
     return [
         ("", Text(_ARROWS[direction], "bold cyan")),
         ("", _wrap(side["words"] or "no impairment", width)),
-        ("received", Text(_flow(side, "received"))),
+        ("received", Text(_traffic_text(side, "received"))),
         ("", Text(sparkline(arrivals, top), "green")),
-        ("forwarded", Text(_flow(side, "forwarded"))),
+        ("forwarded", Text(_traffic_text(side, "forwarded"))),
         ("", Text(sparkline(departures, top), "green")),
-        ("loss", Text(_loss(side))),
+        ("loss", Text(_loss_text(side))),
         ("", Text(sparkline(losses, _top([*losses, side["loss"]["predicted"]])), "yellow")),
         ("drawn", Text(_drawn_text(side))),
         ("lost", _wrap(_lost_text(side), width)),
         ("", _wrap(_further_counts(side), width)),
         ("burst", _burst(side, width)),
-        ("delay", Text(_times(delay, width))),
-        ("lateness", Text(_times(late, width))),
+        ("delay", Text(_times_text(delay, width))),
+        ("lateness", Text(_times_text(late, width))),
         ("in flight", Text(f"{side['in_flight']:,}, max {side['most_in_flight']:,}")),
     ]
 
@@ -249,14 +249,14 @@ def _rate(side: DirectionStatistics, key: str) -> str:
     return rate_text(recent[f"{key}_per_s"])  # type: ignore[literal-required]
 
 
-def _flow(side: DirectionStatistics, key: str) -> str:
+def _traffic_text(side: DirectionStatistics, key: str) -> str:
     """Return :func:`_rate`, and the rate in bits per second."""
     recent = side["recent"]
     bits = "" if recent is None else with_unit(recent[f"{key}_bits_per_s"], _BIT_RATES)  # type: ignore[literal-required]
     return f"{_rate(side, key)}  {bits}".strip()
 
 
-def _times(times: DelayQuantiles, width: int) -> str:
+def _times_text(times: DelayQuantiles, width: int) -> str:
     if times["p50"] is None:
         return _NONE
     text = f"p50 {time_text(times['p50']):<9} p99 {time_text(times['p99'])}"
@@ -267,7 +267,7 @@ def _top(values: Sequence[float | None]) -> float:
     return max((value for value in values if value is not None), default=0.0)
 
 
-def _loss(side: DirectionStatistics) -> str:
+def _loss_text(side: DirectionStatistics) -> str:
     lost, realised = side["loss"]["lost"], side["loss"]["realised"]
     stale = f", with stale {percent_text(realised)}" if realised != lost else ""
     return percent_text(lost) + stale
@@ -385,9 +385,9 @@ def _plain_line(elapsed_s: float, link: LinkStatistics, name: Direction) -> str:
     parts = [
         f"{elapsed_s:.1f} s",
         f"{link['name']} {name}",
-        f"received {_flow(side, 'received')}",
-        f"forwarded {_flow(side, 'forwarded')}",
-        f"loss {_loss(side)}",
+        f"received {_traffic_text(side, 'received')}",
+        f"forwarded {_traffic_text(side, 'forwarded')}",
+        f"loss {_loss_text(side)}",
         f"drawn {_drawn_text(side)}",
         f"longest loss burst {burst_text(side)}",
         f"forced {side['fates']['forced']:,}",

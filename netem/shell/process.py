@@ -101,6 +101,7 @@ def end_children(kept_processes: Collection[int] = ()) -> None:
 
 def guard(parent: int, command: list[str]) -> int:
     """Run a command; return its exit status when all processes that it started have ended."""
+    # Signals that end the command wait until they are asked for; those of the terminal are its own.
     ending = {signal.SIGTERM, signal.SIGHUP}
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {*ending, signal.SIGCHLD})
     handlers = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGQUIT)}
@@ -108,6 +109,7 @@ def guard(parent: int, command: list[str]) -> int:
     group = os.getpgrp()
     os.setpgid(0, 0)  # what kills the whole group does not kill this process
     call("prctl", _DEATH_SIGNAL, signal.SIGTERM, 0, 0, 0)
+    # The command, in the terminal's group and with the signals as they were.
     child = os.fork()
     if child == 0:
         with suppress(OSError):  # the group has ended
@@ -122,6 +124,7 @@ def guard(parent: int, command: list[str]) -> int:
         except OSError as error:
             os.write(2, f"noack netem: {command[0]}: {error.strerror}\n".encode())
             os._exit(NOT_FOUND)
+    # Wait for the command's end, a signal, or the parent's end.
     status = None
     while status is None and os.getppid() == parent:
         if signal.sigwait({*ending, signal.SIGCHLD}) in ending:

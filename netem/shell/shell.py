@@ -17,7 +17,7 @@ from netem.relay.relay_links import DeviceLink
 from netem.relay.relay_reports import report_line
 from netem.shell import process
 from netem.shell.devices import inside, open_devices
-from netem.stand_alone import add_recording_options, check_options, relay, report_totals
+from netem.stand_alone import add_recording_options, check_options, report_totals, run_relay
 from noack.core.errors import CallerError, ExitStatus
 from noack.core.system_processes import python_command
 from noack.runtime.command_line import Signals, log_format
@@ -50,7 +50,7 @@ def run_in_shell(arguments: Sequence[str]) -> int:
             raise CallerError(f"{argv[0]}: there is no such program")
     with log_format(options.log_format):
         program = _Program(open_devices(spec), command, outside)
-        totals = relay([program.devices.spec], options, program)
+        totals = run_relay([program.devices.spec], options, program)
         report_totals(totals, options)
     return program.status
 

@@ -226,7 +226,7 @@ class CoreMemory:
 
     def _pointer(self, array: AnyArray, kind: str) -> CData:
         self._owners.append(array)
-        return ffi.cast(kind, ffi.from_buffer(array))  # faster than numpy's address
+        return pointer_to(array, kind)
 
 
 @cache

@@ -349,7 +349,7 @@ class _ShortestPatterns:
         if best is None:
             return None
         _, state, packets = best
-        pattern = [*self._to(state)]
+        pattern = [*self._path_to(state)]
         for losses in is_loss[packets - 1 :: -1]:
             pattern.append(not losses[state])
             state = int((self._after_loss if losses[state] else self._after_delivery)[state])
@@ -363,12 +363,12 @@ class _ShortestPatterns:
         for between in range(1, deliveries):
             reached = self._after_delivery[reached]
             patterns += [
-                (*self._to(state), False, *[True] * between, False)
+                (*self._path_to(state), False, *[True] * between, False)
                 for state in states[self._after_loss[reached] >= 0][:1].tolist()
             ]
         return min(patterns, key=len, default=None)
 
-    def _to(self, state: int) -> OutcomePattern:
+    def _path_to(self, state: int) -> OutcomePattern:
         """Return a shortest pattern that reaches a state."""
         pattern: list[bool] = []
         while state:

@@ -139,14 +139,8 @@ class Environment:
         is_mujoco = not hasattr(self._environment, "state") and hasattr(self._environment, "init_qpos")
         self._names = settings.state or (_MUJOCO if is_mujoco else ("state",))
         if self._names == _MUJOCO:
-            mujoco = import_module("mujoco")
-            # Otherwise MuJoCo starts again from its initial state when a motion diverges.
-            disabled = int(getattr(mujoco.mjtDisableBit, "mjDSBL_AUTORESET", 0))
-            self._environment.model.opt.disableflags |= disabled
-            # It would print a line for each such step, and write MUJOCO_LOG.TXT into the current
-            # folder. That a motion has diverged is reported anyway.
-            mujoco.set_mju_user_warning(lambda text: None)
-            self._environment.set_state(self._environment.init_qpos, self._environment.init_qvel)
+            self._prepare_mujoco()
+        # The maps between its state and x, and between its action and u.
         size, actions = len(self._state()), int(np.prod(space.shape))
         self._entries = np.arange(size) if settings.entries is None else np.array(settings.entries)
         if (last := int(self._entries.max())) >= size:
@@ -162,6 +156,17 @@ class Environment:
             )
         self.n, self.m = len(self._entries), self._actuation.shape[1]
         self._offset = np.array(settings.operating_state or np.zeros(self.n))
+
+    def _prepare_mujoco(self) -> None:
+        """Set MuJoCo's initial state; let a motion that diverges go on without a warning."""
+        mujoco = import_module("mujoco")
+        # Otherwise MuJoCo starts again from its initial state when a motion diverges.
+        disabled = int(getattr(mujoco.mjtDisableBit, "mjDSBL_AUTORESET", 0))
+        self._environment.model.opt.disableflags |= disabled
+        # It would print a line for each such step, and write MUJOCO_LOG.TXT into the current
+        # folder. That a motion has diverged is reported anyway.
+        mujoco.set_mju_user_warning(lambda text: None)
+        self._environment.set_state(self._environment.init_qpos, self._environment.init_qvel)
 
     def wrong(self, message: str) -> NoReturn:
         """Refuse the environment by a CallerError."""

@@ -154,7 +154,7 @@ def row_entries(
 
     Args:
         table: a key of :data:`TOPICS`.
-        rows: of one loop.
+        rows: rows of one loop.
         states: names of the states.
         inputs: names of the inputs.
     """

@@ -98,8 +98,8 @@ class Node:
     """A node; close it at the end.
 
     Args:
-        name: of the node.
-        endpoint: of the router, as zenoh writes it.
+        name: name of the node.
+        endpoint: address of the router, as zenoh writes it.
         domain: the ``ROS_DOMAIN_ID``.
         listen: whether the node is itself the router, to which the other nodes connect.
 

@@ -62,7 +62,7 @@ def join_run(role: str, arguments: Sequence[str] | None = None) -> Iterator[RunP
     keeps below ``--runs`` what it cannot send to the recorder.
 
     Args:
-        role: of the process.
+        role: role of the process.
         arguments: the options of :func:`add_options`; None: those of the command line.
 
     Raises:

@@ -52,13 +52,13 @@ _REPORT_ATTEMPTS = 3
 """Longest wait for the answer to the final report, and number of times that missing rows are sent again."""
 
 
-def contain(ranges: Ranges, first: int, end: int) -> bool:
+def contains(ranges: Ranges, first: int, end: int) -> bool:
     """Return whether one of the ranges has all numbers from ``first`` to before ``end``."""
     index = bisect_right(ranges, first, key=lambda entry: entry[0])
     return index > 0 and end <= ranges[index - 1][1]
 
 
-def overlap(ranges: Ranges, first: int, end: int) -> bool:
+def overlaps(ranges: Ranges, first: int, end: int) -> bool:
     """Return whether the ranges have one of the numbers from ``first`` to before ``end``."""
     index = bisect_right(ranges, first, key=lambda entry: entry[1])
     return index < len(ranges) and ranges[index][0] < end
@@ -196,7 +196,7 @@ class TelemetryBuffer:
         """Publish the kept batches again that overlap missing row ranges; return their number."""
         sent = 0
         for batch in self._kept_batches:
-            if overlap(missing.get(batch.table, ()), batch.first, batch.first + batch.rows):
+            if overlaps(missing.get(batch.table, ()), batch.first, batch.first + batch.rows):
                 publish(batch.table, self._header(batch), batch.payload)
                 sent += 1
         return sent
@@ -230,7 +230,7 @@ class TelemetryBuffer:
         remaining: deque[_RowBatch] = deque()
         old = 0
         for i, batch in enumerate(self._kept_batches):
-            if not contain(rows.get(batch.table, ()), batch.first, batch.first + batch.rows):
+            if not contains(rows.get(batch.table, ()), batch.first, batch.first + batch.rows):
                 remaining.append(batch)
                 old += i < self._old_count
         # Newer batches may have been in flight when the recorder sent its confirmation.

@@ -110,7 +110,7 @@ class CountingSockets(ABC):
 
     The core reads the socket of each peer, and sends by sockets that are connected to the
     destinations. Python reads, at every turn of housekeeping, what other sources send to the
-    process's port (:mod:`noack.runtime.udp_sockets`). At the first turn it passes on what the
+    process's port, as far as :class:`FloodWatch` allows. At the first turn it passes on what the
     peers sent before their sockets were open.
 
     Args:

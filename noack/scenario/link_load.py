@@ -297,6 +297,12 @@ def _slots(schedule: Schedule, run_parts: Sequence[_RunPart]) -> list[list[int]]
     return [*schedule.slots, *([] for _ in range(loops))][:loops]
 
 
+def _least_times_s(run_parts: Sequence[_RunPart]) -> list[float]:
+    """Return the shortest time between two transmissions of a loop in the run, by its demand."""
+    by_demand = zip(*(part.loops for part in run_parts), strict=True)
+    return [min(demand.least_s for demand in demands) for demands in by_demand]
+
+
 def _window(direction: DirectionSection) -> WindowBound:
     link = direction.link
     windows = join_guarantee(link.mansd, link.constraints).windows
@@ -348,29 +354,46 @@ def _slot_delays_s(
     schedule: Schedule, run_parts: Sequence[_RunPart], spread_s: float, *, copied: bool
 ) -> list[float]:
     """Return the bounds for the slots of each loop; see :func:`_queue_delay_s`."""
-    least_s = [
-        min(part.loops[entry].least_s for part in run_parts)
-        for entry, demand in enumerate(run_parts[0].loops)
+    least_ns = [
+        round(least_s * NS_PER_S)
+        for least_s, demand in zip(_least_times_s(run_parts), run_parts[0].loops, strict=True)
         for _ in range(demand.loops)
     ]
     share = max(_share(_window(part.direction)) for part in run_parts)
     if any(part.direction.constraints for part in run_parts):
         share = math.inf
-    delays_s = []
-    for slots, loop_least_s in zip(_slots(schedule, run_parts), least_s, strict=True):
-        least_ns, count = round(loop_least_s * NS_PER_S), len(slots)
-        round_ns, copies = len(schedule.order) * schedule.slot_ns, 2 if copied else 1
-        bounds = [math.inf]
-        if copies * round_ns <= count * least_ns:
-            waits_ns = (schedule.wait_ns(slots, n + 1) for n in range(copies * count))
-            bounds.append(max(t_ns - n // copies * least_ns for n, t_ns in enumerate(waits_ns)))
-        if slots and share == 0:
-            bounds.append(schedule.wait_ns(slots, schedule.queue))
-        elif slots and round_ns * share <= count * least_ns:
-            waits_ns = (schedule.wait_ns(slots, schedule.queue + n + 1) for n in range(count))
-            bounds.append(max(t_ns - n * least_ns / share for n, t_ns in enumerate(waits_ns)))
-        delays_s.append(min(bounds) / NS_PER_S + spread_s)
-    return delays_s
+    copies = 2 if copied else 1
+    return [
+        _slot_delay_ns(schedule, slots, loop_least_ns, share, copies) / NS_PER_S + spread_s
+        for slots, loop_least_ns in zip(_slots(schedule, run_parts), least_ns, strict=True)
+    ]
+
+
+def _slot_delay_ns(
+    schedule: Schedule, slots: Sequence[int], least_ns: int, share: float, copies: int
+) -> float:
+    """Return the smaller of both bounds for the slots of a loop, without J; infinite: there is none.
+
+    Args:
+        schedule: the schedule.
+        slots: the numbers of the loop's slots.
+        least_ns: d, the shortest time between two transmissions.
+        share: s, the share of the datagrams that must pass; infinite: that is not known.
+        copies: how many times each datagram may arrive.
+    """
+    round_ns, count = len(schedule.order) * schedule.slot_ns, len(slots)
+    bounds_ns = [math.inf]
+    # W(n) − (n − 1) d, if every datagram passes.
+    if copies * round_ns <= count * least_ns:
+        waits_ns = (schedule.wait_ns(slots, n + 1) for n in range(copies * count))
+        bounds_ns.append(max(t_ns - n // copies * least_ns for n, t_ns in enumerate(waits_ns)))
+    # W(Q + n) − (n − 1) d/s, if the others find the queue full; W(Q) if nothing must pass.
+    if slots and share == 0:
+        bounds_ns.append(schedule.wait_ns(slots, schedule.queue))
+    elif slots and round_ns * share <= count * least_ns:
+        waits_ns = (schedule.wait_ns(slots, schedule.queue + n + 1) for n in range(count))
+        bounds_ns.append(max(t_ns - n * least_ns / share for n, t_ns in enumerate(waits_ns)))
+    return min(bounds_ns)
 
 
 def _chosen_delays_s(rate: Rate, scheduler: Scheduler, run_parts: Sequence[_RunPart]) -> list[float]:
@@ -380,16 +403,18 @@ def _chosen_delays_s(rate: Rate, scheduler: Scheduler, run_parts: Sequence[_RunP
     """
     demands = run_parts[0].loops
     changes = any(part.direction.link != run_parts[0].direction.link for part in run_parts)
+    # d and c of the loops of each demand.
     senders_ns = [
         (
-            round(min(part.loops[entry].least_s for part in run_parts) * NS_PER_S),
+            round(least_s * NS_PER_S),
             max(-(-int(rate.line_bits(demand.payload_bytes)) * NS_PER_S // rate.rate_bps), 1),
         )
-        for entry, demand in enumerate(demands)
+        for least_s, demand in zip(_least_times_s(run_parts), demands, strict=True)
     ]
     entries = (entry for entry, demand in enumerate(demands) for _ in range(demand.loops))
     kinds = [(entry, scheduler.number(loop)) for loop, entry in enumerate(entries)]
     counts = Counter(kinds)
+    # The bound of each kind: the other loops by their d and c, and by when they yield.
     bounds_s = {}
     for kind in counts:
         entry, number = kind
@@ -417,8 +442,7 @@ def _queue_delay_s(rate: Rate, run_parts: Sequence[_RunPart], spread_s: float, *
         return math.inf
     bits = [int(rate.line_bits(loop.payload_bytes)) for loop in run_parts[0].loops]
     counts = [loop.loops for loop in run_parts[0].loops]
-    demands_by_entry = zip(*(part.loops for part in run_parts), strict=True)
-    least_s: list[float] = [min(demand.least_s for demand in demands) for demands in demands_by_entry]
+    least_s = _least_times_s(run_parts)
     every_bps: float = sum(
         bit_count * count / least for bit_count, count, least in zip(bits, counts, least_s, strict=True)
     )

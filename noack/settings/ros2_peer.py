@@ -47,9 +47,9 @@ class Ros2Peer(External):
     """The node, which is asked; connected with the first question, or before.
 
     Args:
-        settings: of the plant or controller.
+        settings: settings of the plant or controller.
         place: the table of the scenario.
-        topics: of the questions and of the answers.
+        topics: topics of the questions and of the answers.
         first: content of the first question.
         count: number of values of an answer.
     """

@@ -327,10 +327,8 @@ def trace_of_numbers(
     numbered = _first_of_each(
         numbered._replace(number=number, received_ns=numbered.received_ns[order]), capture.notes
     )
-    k, received_ns = (
-        numbered.number - numbered.number[0],
-        numbered.received_ns - numbered.received_ns.min(),
-    )
+    k = numbered.number - numbered.number[0]
+    received_ns = numbered.received_ns - numbered.received_ns.min()
     if k[-1] >= most_packets:
         raise ValueError(
             f"the sequence numbers span {k[-1] + 1} packets; at most {most_packets} can "

@@ -26,7 +26,7 @@ from noack.core.clock import RunClock
 from noack.core.errors import PeerError
 from noack.protocol.roles import SENDS
 from noack.protocol.wire_format import Wire
-from noack.runtime.drivers.live_driver import LoopChannel
+from noack.runtime.drivers.live_driver import LoopSockets
 from noack.runtime.drivers.node_driver import NodeDriver
 from noack.runtime.udp_sockets import bind
 from noack.settings.user_files import with_absolute_path
@@ -195,13 +195,13 @@ def test_a_frame_that_no_node_sends_is_named(tmp_path: Path, content: dict[str, 
     with bind(0, "test") as endpoint, driver_of(program, content) as driver:
         driver.set_clock(clock)
         own = endpoint.getsockname()
-        channel = LoopChannel(endpoint, driver, SENDS["controller"], source=own, destination=own)
+        sockets = LoopSockets(endpoint, driver, SENDS["controller"], source=own, destination=own)
 
         def drive() -> None:
             while True:
                 driver.drive(clock.now_ns() + 10_000_000, Rows())
 
-        with closing(channel), pytest.raises(PeerError, match=r"\(node\): has sent a frame of kind 0 and 0"):
+        with closing(sockets), pytest.raises(PeerError, match=r"\(node\): has sent a frame of kind 0 and 0"):
             drive()
 
 

@@ -119,9 +119,9 @@ def test_missing_events_are_reported_at_their_place_and_at_the_end() -> None:
     section = PcapngSection((INTERFACES[0], Interface("link0 server", "")))
     data = section.header()
     data += bytes(section.packets(*batch({}, {"interface": 1})))
-    section.miss(np.array([0, 2**33 + 5]))
+    section.add_missing(np.array([0, 2**33 + 5]))
     data += bytes(section.packets(*batch({}, {"interface": 1}, {"interface": 1, "t_ns": T_NS + 7})))
-    section.miss(np.array([4, 0]))
+    section.add_missing(np.array([4, 0]))
     file = read(data + section.statistics())
     counts = [packet.options.get(4) for packet in file.packets]
     assert counts == [None, None, None, [struct.pack("<Q", 2**33 + 5)], None]

@@ -119,7 +119,7 @@ def test_events_beyond_the_queue_limit_are_reported_missing_at_once(
         recorder.take(arrived(100_000), NOTHING)
         recorder.take(arrived(7), NOTHING)  # returns at once, although the write is blocked
         assert recorder.missing_events == 7
-        recorder.missing(2)  # events that the relay lost
+        recorder.add_missing(2)  # events that the relay lost
         free.set()
     error = capsys.readouterr().err
     assert error.count("\n") == 1

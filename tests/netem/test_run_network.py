@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from cosim.shipped_files import find_shipped
 from netem.relay.relay_links import LinkSpec
-from netem.run_network import NetworkChannel, RunNetwork
+from netem.run_network import NetworkSockets, RunNetwork
 from noack.core.clock import RunClock
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, OWNER
@@ -219,12 +219,12 @@ def test_early_and_later_datagrams_are_relayed_and_foreign_ones_counted() -> Non
             late = clock.now_ns() > PATIENCE_S * 1e9 * scenario.speed
             return late or len(received) == len(sent)
 
-        channel = NetworkChannel(endpoint, ends, network=network, clock=clock, loops=1)
-        with closing(channel) as shell:
-            run_loop(network, shell, clock, telemetry, end_ns=None, stop=stop, external_inputs=send_batch)
-            shell.finish(clock.now_ns(), telemetry)
+        sockets = NetworkSockets(endpoint, ends, network=network, clock=clock, loops=1)
+        with closing(sockets):
+            run_loop(network, sockets, clock, telemetry, end_ns=None, stop=stop, external_inputs=send_batch)
+            sockets.finish(clock.now_ns(), telemetry)
             telemetry.flush()
-            report = shell.report()
+            report = sockets.report()
         senders = {address_text(name_of(source)) for source in (sensor, other)}
     assert [data for data, _ in received] == sent
     assert {address_text(source) for _, source in received} == {report["local"]}

@@ -10,7 +10,7 @@ from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import allowed_conditions
 from noack.theory.certificates.region import scopes
-from noack.theory.certificates.solution import Search, completed
+from noack.theory.certificates.solution import Search, run_searches
 
 LateSchedules = Generator[
     NetworkConditions, Sequence[ScenarioCertificate], Sequence[ScenarioCertificate] | None
@@ -83,6 +83,6 @@ def certificates_together(
             searches.append(scope.search(limits))
             numbers.append(number)
     by_scenario: list[list[ScenarioCertificate]] = [[] for _ in scenarios]
-    for number, certificate in zip(numbers, completed(searches), strict=True):
+    for number, certificate in zip(numbers, run_searches(searches), strict=True):
         by_scenario[number].append(certificate)
     return by_scenario

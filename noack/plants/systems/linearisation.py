@@ -216,7 +216,7 @@ def largest_errors(
     Args:
         system_at: makes the system.
         motion: its linear model.
-        halfwidths: of the box, (n + m,).
+        halfwidths: half-widths of the box, (n + m,).
         settling_s: as for :func:`linearise`.
         x0: the point x₀, (n,).
         u0: u₀, (m,).

@@ -57,13 +57,15 @@ def accepting(
     linger_s: float = 0.0,
     longest_wait_s: float | None = None,
 ) -> Iterator[asyncio.AbstractEventLoop]:
-    """Accept connections on a thread meanwhile, and yield its event loop; at the end, end all.
+    """Accept connections on a thread within the context, and yield the thread's event loop.
+
+    All connections end with the context.
 
     Args:
         listening: a socket that listens; the caller closes it.
         begin: serves a connection in a task of the thread's event loop.
         first: what a connection must send before; None: it is served at once.
-        name: of the thread.
+        name: name of the thread.
         linger_s: at the end, how long connections that are served may go on.
         longest_wait_s: longest wait at the end for a task that computes; None: no limit.
     """

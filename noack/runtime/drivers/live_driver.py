@@ -53,12 +53,12 @@ def run_machines(process: RunProcess, machines: LoopMachines) -> None:
     )
     with process.open_socket() as endpoint:
         addresses = process.join(endpoint.getsockname()[:2])
-        channel = LoopChannel(endpoint, driver, SENDS[process.role], **ends_of(process, addresses))
-        process.run(driver, channel, machines)
+        sockets = LoopSockets(endpoint, driver, SENDS[process.role], **ends_of(process, addresses))
+        process.run(driver, sockets, machines)
 
 
 class FlowAddresses(TypedDict):
-    """The other ends of a process's flows; see :class:`LoopChannel`."""
+    """The other ends of a process's flows; see :class:`LoopSockets`."""
 
     source: Address
     destination: Address
@@ -244,7 +244,7 @@ class LiveDriver:
         memory[:] = seal.encrypt(bytes(memory[:HEADER_BYTES]), bytes(memory[HEADER_BYTES:-TAG_BYTES]))
 
 
-class LoopChannel(CountingSockets):
+class LoopSockets(CountingSockets):
     """The sockets of a process in the loop.
 
     Args:

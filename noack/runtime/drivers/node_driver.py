@@ -30,7 +30,7 @@ from noack.core.errors import CallerError, PeerError, shortened
 from noack.machines.loop_machines import LoopMachines
 from noack.protocol.roles import SENDS
 from noack.runtime.address import Address, SocketName
-from noack.runtime.drivers.live_driver import LiveDriver, LoopChannel, ends_of
+from noack.runtime.drivers.live_driver import LiveDriver, LoopSockets, ends_of
 from noack.runtime.drivers.real_time_loop import RecordSink
 from noack.runtime.run_process import RunProcess
 from noack.settings.user_files import checked_path
@@ -67,8 +67,8 @@ def run_program(process: RunProcess, machines: LoopMachines, settings: ProgramCo
     """
     with process.open_socket() as endpoint, NodeDriver(process, machines, settings) as driver:
         addresses = process.join(endpoint.getsockname()[:2])
-        channel = LoopChannel(endpoint, driver, SENDS[process.role], **ends_of(process, addresses))
-        process.run(driver, channel, machines)
+        sockets = LoopSockets(endpoint, driver, SENDS[process.role], **ends_of(process, addresses))
+        process.run(driver, sockets, machines)
 
 
 class NodeDriver(LiveDriver):

@@ -176,7 +176,7 @@ def latest_arrival_ns(stamp_ns: int, read_ns: int, difference: ClockDifference) 
     Args:
         stamp_ns: the kernel's stamp, real-time clock.
         read_ns: when the datagram was read, monotonic clock.
-        difference: of the two clocks, read before and after the arrival.
+        difference: difference of the two clocks, read before and after the arrival.
     """
     return read_ns if difference.was_set else min(read_ns, stamp_ns + 1 - difference.least_ns)
 

@@ -37,11 +37,11 @@ class BoxGains(PlantGains):
     is_one_plant: ClassVar = False
 
     @property
-    def likeness(self) -> Hashable:
-        """See :attr:`PlantGains.likeness`: only x(0) may differ."""
+    def batch_key(self) -> Hashable:
+        """See :attr:`PlantGains.batch_key`: only x(0) may differ."""
         matrices = self.A, self.B, self.halfwidth_A, self.halfwidth_B
-        like = super().likeness
-        return None if like is None else (like, *map(matrix_key, matrices))
+        key = super().batch_key
+        return None if key is None else (key, *map(matrix_key, matrices))
 
     @cached_property
     def states(self) -> Mapping[str, Coefficients]:

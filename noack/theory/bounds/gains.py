@@ -337,7 +337,7 @@ class PlantGains:
     """Whether A and B are the plant's, and not the centre of a box."""
 
     @property
-    def likeness(self) -> Hashable:
+    def batch_key(self) -> Hashable:
         """The common properties of plants that allow for computing their gains together.
 
         None: those of this plant are computed alone.
@@ -351,14 +351,14 @@ class PlantGains:
         return type(self), id(self.error), self.alpha_per_s, rank, *shapes, *outputs
 
     @property
-    def identity(self) -> Hashable:
+    def cache_key(self) -> Hashable:
         """The common properties of equal plants without disturbances."""
         values = [getattr(self, value.name) for value in fields(self)]
-        return self.likeness, *(matrix_key(value) for value in values if isinstance(value, np.ndarray))
+        return self.batch_key, *(matrix_key(value) for value in values if isinstance(value, np.ndarray))
 
     @classmethod
     def together(cls, plants: Sequence[Self]) -> Self:
-        """Return several plants of equal likeness as one object; a single one is returned as is."""
+        """Return several plants of one :attr:`batch_key` as one object; a single one as it is."""
         first, *others = plants
         if not others:
             return first
@@ -537,7 +537,7 @@ class PlantGains:
         return self.error.growths(self.columns, until_s, cells, self.error.stacked)
 
 
-@cached_function(16, key=lambda plant: plant.identity)
+@cached_function(16, key=lambda plant: plant.cache_key)
 def first_equal(plant: PlantGains) -> PlantGains:
     """Return the first of several equal plants, which have no disturbances; the others use its gains."""
     return plant

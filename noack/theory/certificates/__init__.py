@@ -28,7 +28,7 @@ loop"):
    event on, at which the sensor knows x (docs/theory.md, "From the newest event").
 
 Certificates of several loops are computed together: a search (``solution.py``, ``Search``) yields
-the inequalities to be solved as a ``Problem``, and ``completed`` solves like problems of several
+the inequalities to be solved as a ``Problem``, and ``run_searches`` solves like problems of several
 loops as arrays with a leading axis. One loop is one such search. Its numbers may differ from those
 of the same loop among others in their last bits.
 

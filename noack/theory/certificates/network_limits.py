@@ -65,7 +65,7 @@ def largest_stable_time_s(loop_gain: Callable[[float], float], usual_s: float) -
     The gain grows with the time; it is infinite where it is not known.
 
     Args:
-        loop_gain: of a time in s.
+        loop_gain: returns the loop gain at a time in s.
         usual_s: a time in s for which the gain is probably below 1.
     """
     low_s, high_s, known = 0.0, math.inf, list[tuple[float, float]]()

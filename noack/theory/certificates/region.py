@@ -45,7 +45,7 @@ from noack.theory.certificates.certified_bounds import Region, ScenarioCertifica
 from noack.theory.certificates.conditions import REGION, void_by_safe_input
 from noack.theory.certificates.constants_search import Phases
 from noack.theory.certificates.scenario_certificates import CertificateScope, box_scope, own_plant_scope
-from noack.theory.certificates.solution import Search, completed_alone
+from noack.theory.certificates.solution import Search, run_search
 
 _WIDER = 1.02
 """The next region is larger than the bounds by this factor."""
@@ -159,7 +159,7 @@ class RegionScope(_Box):
         if void_by_safe_input(self._resolved, conditions) is not None:
             return math.inf
         try:
-            phases = completed_alone(self.all_phases(conditions, longest=False, near=True))
+            phases = run_search(self.all_phases(conditions, longest=False, near=True))
         except NoCertificateError as error:
             return max(error.loop_gain, 1.0)
         except NotDecayingError:

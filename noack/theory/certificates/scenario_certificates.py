@@ -25,7 +25,7 @@ from noack.theory.certificates.conditions import BOX, OWN_PLANT, kept_probabilit
 from noack.theory.certificates.constants_search import ConstantsSearch, Phases, is_within
 from noack.theory.certificates.deliveries.due_deliveries import Deliveries
 from noack.theory.certificates.persistent_bounds import PlantAt
-from noack.theory.certificates.solution import Search, completed_alone
+from noack.theory.certificates.solution import Search, run_search
 
 _TIMED_RATES = (0.7, 0.4, 0.1)
 """Rates that are tried where events are due, as shares of the decay rate of A + BK: the first that
@@ -150,7 +150,7 @@ class CertificateScope:
 
     def certificate(self, conditions: NetworkConditions) -> ScenarioCertificate:
         """Return the certificate under some conditions; a void certificate has the reason."""
-        return completed_alone(self.search(conditions, beforehand=True))
+        return run_search(self.search(conditions, beforehand=True))
 
     def search(
         self, conditions: NetworkConditions, *, beforehand: bool = False
@@ -159,7 +159,6 @@ class CertificateScope:
 
         ``beforehand``: no run shows whether its input was 0 at the start.
         """
-        trigger = self._trigger
         # The constants, or the reason for having none.
         void: NotDecayingError | NoCertificateError | None = None
         phases: Sequence[tuple[Constants | None, ...]] = [(None, None, None)]
@@ -171,29 +170,8 @@ class CertificateScope:
             phases = yield from self.all_phases(conditions)
         except (NotDecayingError, NoCertificateError) as error:
             void = self._overflow() or error
-        reason = None if void is None else str(void)
-
-        def certificate(
-            phase: tuple[Constants | None, ...], *other_phases: tuple[Constants | None, ...]
-        ) -> ScenarioCertificate:
-            main, floor, persistent = phase
-            return ScenarioCertificate(
-                scope=self.name,
-                beta=trigger.beta,
-                alpha_per_s=trigger.alpha_per_s,
-                floor=trigger.floor,
-                weighted=self._loop.weight is not None,
-                conditions=conditions,
-                assumptions=(),
-                constants=main,
-                floor_constants=floor,
-                void=reason,
-                persistent_constants=persistent,
-                other=certificate(*other_phases) if other_phases else None,
-            )
-
+        unchecked = self._with_constants(phases, conditions, None if void is None else str(void))
         # The assumptions under which they hold.
-        unchecked = certificate(*phases)
         main, persistent = unchecked.constants, unchecked.persistent_constants
         probability = None
         if not self._resolved.network.enforce_mansd:
@@ -206,10 +184,33 @@ class CertificateScope:
             constants=main,
             void=void,
             loop_gain=max(gains, default=0.0),
-            trigger_bound=trigger.text(),
+            trigger_bound=self._trigger.text(),
             probability=probability,
         )
         return replace(unchecked, assumptions=tuple(assumptions))
+
+    def _with_constants(
+        self,
+        phases: Sequence[tuple[Constants | None, ...]],
+        conditions: NetworkConditions,
+        void: str | None,
+    ) -> ScenarioCertificate:
+        """Return the certificate of the first phase, with those of the others; no assumptions yet."""
+        (main, floor, persistent), *others = phases
+        return ScenarioCertificate(
+            scope=self.name,
+            beta=self._trigger.beta,
+            alpha_per_s=self._trigger.alpha_per_s,
+            floor=self._trigger.floor,
+            weighted=self._loop.weight is not None,
+            conditions=conditions,
+            assumptions=(),
+            constants=main,
+            floor_constants=floor,
+            void=void,
+            persistent_constants=persistent,
+            other=self._with_constants(others, conditions, void) if others else None,
+        )
 
     def _overflow(self) -> NoCertificateError | None:
         """Return the reason for having no certificate if x(0) is too large."""
@@ -228,7 +229,7 @@ class CertificateScope:
         # Whether inputs of an earlier run are covered depends on the constants.
         try:
             search = self._constants.phases(conditions, longest=self._start_error > 0)
-            constants = completed_alone(search)
+            constants = run_search(search)
         except NoCertificateError as error:
             gain = max(error.loop_gain, 1.0)
         except NotDecayingError:

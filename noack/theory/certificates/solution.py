@@ -59,9 +59,9 @@ class Problem(NamedTuple):
     """Whether the longest δ is sought; otherwise only if there is no certificate without it."""
 
     @property
-    def likeness(self) -> Hashable:
+    def batch_key(self) -> Hashable:
         """The common properties of problems that are solved together; None if this one is alone."""
-        plants = [part.plant.likeness for part in self.parts]
+        plants = [part.plant.batch_key for part in self.parts]
         if None in plants:
             return None
         terms = [(part.bound, part.estimation) for part in self.parts]
@@ -79,7 +79,7 @@ _MOST_TOGETHER = 256
 _UNSOLVED_ERRORS = (NotDecayingError, np.linalg.LinAlgError, OverflowError)
 
 
-def completed(searches: Sequence[Search[Result]]) -> list[Result]:
+def run_searches(searches: Sequence[Search[Result]]) -> list[Result]:
     """Return the results of searches; their like problems are solved together.
 
     Raises:
@@ -103,9 +103,9 @@ def completed(searches: Sequence[Search[Result]]) -> list[Result]:
     return [results[number] for number in range(len(searches))]
 
 
-def completed_alone(search: Search[Result]) -> Result:
-    """Return the result of one search; see :func:`completed`."""
-    (answer,) = completed([search])
+def run_search(search: Search[Result]) -> Result:
+    """Return the result of one search; see :func:`run_searches`."""
+    (answer,) = run_searches([search])
     return answer
 
 
@@ -113,8 +113,8 @@ def _answers(problems: Sequence[Problem]) -> list[list[Constants] | Exception]:
     """Return the constants of each problem, or its error."""
     alike = defaultdict[Hashable, list[int]](list)
     for index, problem in enumerate(problems):
-        likeness = problem.likeness if len(problems) > 1 else None
-        alike[("alone", index) if likeness is None else likeness].append(index)
+        key = problem.batch_key if len(problems) > 1 else None
+        alike[("alone", index) if key is None else key].append(index)
     groups: list[list[int]] = []
     for indices in alike.values():
         states = len(problems[indices[0]].parts[0].error.H)
@@ -148,7 +148,7 @@ def solve(
         NotDecayingError: a mode of the loop decays more slowly than the threshold.
     """
     problem = Problem((CertificatePart(error, plant, bound),), conditions, structured=structured)
-    return completed_alone(sharpened(problem))
+    return run_search(sharpened(problem))
 
 
 def sharpened(problem: Problem) -> Search[Constants]:

@@ -13,7 +13,7 @@ edges (:func:`with_history`), or products of several steps are shorter than γ^d
 
 import math
 from dataclasses import replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -21,6 +21,9 @@ from noack.core.linear_systems import Matrix, Vector
 from noack.theory.bounds.stacked_norms import Stack
 from noack.theory.margins.exact_matrices import ENLARGED, IntervalMatrix, exactly
 from noack.theory.margins.switched_system import Graph, Numbers, SwitchedSystem
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_array  # slow to import
 
 FEW_ENTRIES, MOST_ENTRIES = 1200, 2500
 """Numbers of entries of all P_v with which the search takes some seconds, and up to a minute."""
@@ -196,13 +199,12 @@ class _EdgeInequalities(NamedTuple):
         With G = F^{−1}, the curvature is tr(G dF G dF) with dF = dP_v − NᵀdP_wN + S dlog γ,
         S = 2d NᵀP_wN, and 2d tr(G S) for log γ; the rest would make it indefinite.
         """
-        from scipy.sparse import coo_array  # slow to import
-        from scipy.sparse.linalg import splu
+        from scipy.sparse.linalg import splu  # slow to import
 
         sources, targets, durations = self.graph.sources, self.graph.targets, self.graph.durations
         (count, n), steps = P.shape[:2], self._steps(log_growth)
         basis = _symmetric_basis(n)
-        size, carried = basis.shape[1], self._carried(P, steps)
+        carried = self._carried(P, steps)
         G = np.asarray(np.linalg.inv(P[sources] - carried), dtype=np.float64)
         S = 2 * durations[:, None, None] * carried
         mixed, transformed = G @ steps.swapaxes(1, 2), G @ S
@@ -214,20 +216,7 @@ class _EdgeInequalities(NamedTuple):
             np.add.at(total, targets, -steps @ edges @ steps.swapaxes(1, 2))
             return np.asarray((total.reshape(count, n * n) @ basis).ravel())
 
-        def products(factors: Stack) -> Stack:
-            squares = np.einsum("eij,ekl->eikjl", factors, factors)
-            return np.asarray(basis.T @ squares.reshape(-1, n * n, n * n) @ basis)
-
-        # The curvature: a block for each pair of P_v and P_w of an edge.
-        crossed = -products(mixed)
-        blocks = np.concatenate([products(G), products(steps @ mixed), crossed, crossed.swapaxes(1, 2)])
-        rows = np.concatenate([sources, targets, sources, targets]) * size
-        columns = np.concatenate([sources, targets, targets, sources]) * size
-        inner = np.arange(size)
-        i = np.broadcast_to(rows[:, None, None] + inner[:, None], blocks.shape)
-        j = np.broadcast_to(columns[:, None, None] + inner, blocks.shape)
-        shape = (count * size, count * size)
-        curvature = coo_array((blocks.ravel(), (i.ravel(), j.ravel())), shape=shape).tocsc()
+        curvature = self._curvature(basis, G, mixed, steps @ mixed, count)
         solver = splu(curvature, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
         # Newton's equations, bordered by that of log γ.
         slope, border = of_nodes(-G, np.eye(n)), of_nodes(transformed @ G, np.zeros((n, n)))
@@ -241,7 +230,38 @@ class _EdgeInequalities(NamedTuple):
         log_growth_change = -(own_slope - float(border @ along)) / corner
         change = -along - log_growth_change * across
         decrement = -float(slope @ change) - own_slope * log_growth_change
-        return (change.reshape(count, size) @ basis.T).reshape(P.shape), log_growth_change, decrement
+        return (change.reshape(count, -1) @ basis.T).reshape(P.shape), log_growth_change, decrement
+
+    def _curvature(
+        self, basis: Matrix, G: Stack, mixed: Stack, carried: Stack, count: int
+    ) -> "csc_array[np.float64]":
+        """Return the curvature in the entries of all P: a block for each pair of an edge's nodes.
+
+        Args:
+            basis: the map from the entries of a P to the P.
+            G: F^{−1} of each edge.
+            mixed: G Nᵀ of each edge.
+            carried: N G Nᵀ of each edge.
+            count: number of nodes.
+        """
+        from scipy.sparse import coo_array  # slow to import
+
+        n, size = G.shape[1], basis.shape[1]
+        sources, targets = self.graph.sources, self.graph.targets
+
+        def products(factors: Stack) -> Stack:
+            squares = np.einsum("eij,ekl->eikjl", factors, factors)
+            return np.asarray(basis.T @ squares.reshape(-1, n * n, n * n) @ basis)
+
+        crossed = -products(mixed)
+        blocks = np.concatenate([products(G), products(carried), crossed, crossed.swapaxes(1, 2)])
+        rows = np.concatenate([sources, targets, sources, targets]) * size
+        columns = np.concatenate([sources, targets, targets, sources]) * size
+        inner = np.arange(size)
+        i = np.broadcast_to(rows[:, None, None] + inner[:, None], blocks.shape)
+        j = np.broadcast_to(columns[:, None, None] + inner, blocks.shape)
+        shape = (count * size, count * size)
+        return coo_array((blocks.ravel(), (i.ravel(), j.ravel())), shape=shape).tocsc()
 
 
 def _symmetric_basis(n: int) -> Matrix:

@@ -134,7 +134,7 @@ class Graph:
         Of all paths of each length, those with the largest products are continued.
 
         Args:
-            matrices: of the edges, (k, n, n), best in balanced coordinates.
+            matrices: matrices of the edges, (k, n, n), best in balanced coordinates.
             most_edges: largest length.
             beam: number of paths that are continued.
             at_least: logarithm of a known growth; without a faster cycle there are no edges.

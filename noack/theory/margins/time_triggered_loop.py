@@ -95,11 +95,11 @@ class Timeline(Generic[_Map]):
     """The maps of (x, x_c, u, w) while no update arrives, in any arithmetic.
 
     Args:
-        times: of the loop.
+        times: times of the loop.
         flow: the map over some nanoseconds between steps and ticks.
-        latch: a step of the plant.
-        tick: of the controller.
-        late_tick: a tick when no update is new enough.
+        latch: the map of a step of the plant.
+        tick: the map of a tick of the controller.
+        late_tick: the map of a tick when no update is new enough.
     """
 
     def __init__(

@@ -101,7 +101,7 @@ def almost_sure_growth(delivered: IntervalMatrix, lost: IntervalMatrix, outcomes
     Args:
         delivered: M₀, (N, N).
         lost: M₁, (N, N).
-        outcomes: of the updates.
+        outcomes: outcomes of the updates.
 
     Raises:
         NotPredictableError: there are too many states, or what happens in the long run is decided

@@ -97,7 +97,7 @@ def root_mean_squares(
     Args:
         error: the gains of the models.
         plant: the gains of the plant.
-        conditions: of the schedule.
+        conditions: conditions of the schedule.
         beta: β: after a test, ‖e_s‖_W ≤ βe^{−αt}.
         largest_probability: p̄, the largest probability of a loss, given the past.
         refined: whether to make the bounds smaller by quadratic functions, which takes longer.

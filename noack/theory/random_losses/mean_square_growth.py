@@ -62,7 +62,7 @@ def mean_square_growth(
     Args:
         maps: M₀ (delivered) and M₁ (lost), (N, N) each, for every slot: period k uses the pair
             k modulo their number.
-        outcomes: of the updates.
+        outcomes: outcomes of the updates.
 
     Raises:
         NotPredictableError: there are too many states.
@@ -153,7 +153,7 @@ class PeriodMaps(NamedTuple):
             bound: γ
             forms: X_j in the first coordinates, (modes, rank, rank); in the others X_j is a small
                 multiple of the identity.
-            outcomes: of the updates.
+            outcomes: outcomes of the updates.
         """
         modes, rank = len(forms), forms.shape[-1]
         size = self.enclosed[0][0].middle.shape[0]

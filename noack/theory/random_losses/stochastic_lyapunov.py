@@ -108,7 +108,7 @@ class LossyFlow:
     Args:
         error: the gains of the models.
         plant: the gains of the plant; α of both is the same.
-        conditions: of the schedule; ``dropouts`` has no effect.
+        conditions: conditions of the schedule; ``dropouts`` has no effect.
         probability: p̄.
         counts_age: whether the input's age is followed by itself, as v_h.
     """

@@ -25,7 +25,7 @@ from cosim.analysis.fidelity import (
 from cosim.analysis.summary.summary_model import NoFidelityPart
 from cosim.live.finalize import finalize
 from cosim.record.run_record import RecordedRun, RunRecord, load_run
-from cosim.simulation.virtual_time import Network, simulate, simulate_run
+from cosim.simulation.virtual_time import UserNetwork, simulate, simulate_run
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
@@ -35,7 +35,7 @@ from tests.helpers.command_line import invoke
 LANE = Path(__file__).parents[3] / "scenarios" / "lane_following.toml"
 
 
-def lane(network: Network | None = None, *settings: str) -> RunRecord:
+def lane(network: UserNetwork | None = None, *settings: str) -> RunRecord:
     scenario = load(LANE, ["horizon_s=4", "plant.rate_hz=100", "controller.rate_hz=100", *settings])
     return simulate(resolve(scenario), network)
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from cosim.record.run_record import RunRecord
-from netem.channel import RUN_ID, Datagram, Network, channel_of
+from netem.channel import RUN_ID, Datagram, UserNetwork, channel_of
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, OWNER, Fate
 from noack.protocol.roles import CHANGEABLE, ENDS, LOOP_ROLES, RECEIVES, RECORDER, Notice, Record, receiver_of
 from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, loop_number
@@ -36,7 +36,7 @@ Wrap = Callable[[Machine[Any]], Machine[Any]]
 class ScriptedNetwork:
     """A network of one loop whose losses and delays a function decides."""
 
-    def __init__(self, decide: Network) -> None:
+    def __init__(self, decide: UserNetwork) -> None:
         self._decide = decide
         self._inputs = self._packets = self._losses = 0
         self._newest = -1
@@ -120,7 +120,7 @@ class EventScheduler:
         loops: Sequence[Scenario],
         *,
         numbered: bool = False,
-        network: Network | None = None,
+        network: UserNetwork | None = None,
         wraps: Mapping[str, Wrap] | None = None,
     ) -> None:
         phases = phases_ns(scenario)
@@ -227,7 +227,7 @@ class EventScheduler:
 
 
 def record_of_run(
-    resolved: Scenario, network: Network | None = None, wraps: Mapping[str, Wrap] | None = None
+    resolved: Scenario, network: UserNetwork | None = None, wraps: Mapping[str, Wrap] | None = None
 ) -> RunRecord:
     """Return the record of a run of one loop."""
     scheduler = EventScheduler(resolved, (resolved,), network=network, wraps=wraps)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cosim.record.run_record import RunRecord
-from netem.channel import Network
+from netem.channel import UserNetwork
 from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
@@ -109,7 +109,7 @@ def simulate_with(
     resolved: Scenario,
     role: str,
     wrap: Callable[[Machine[Any]], Machine[Any]],
-    network: Network | None = None,
+    network: UserNetwork | None = None,
 ) -> RunRecord:
     """Simulate a scenario with the machine of one role replaced."""
     return record_of_run(resolved, network, {role: wrap})

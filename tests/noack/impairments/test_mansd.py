@@ -1,4 +1,4 @@
-"""The guarantee, checked by an observer at the receiver without access to the link's decisions.
+"""The guarantee, checked at the receiver without access to the link's decisions.
 
 At the end: all that the guarantee allows can occur.
 """
@@ -54,13 +54,13 @@ def payload(flow: int, number: int) -> bytes:
     return struct.pack("<HI", flow, number) * 3
 
 
-class Observer:
+class Receiver:
     """Records the numbers of the delivered datagrams of each flow."""
 
     def __init__(self) -> None:
         self.counted: dict[int, list[int]] = {}
 
-    def see(self, outputs: Sequence[Any]) -> None:
+    def take(self, outputs: Sequence[Any]) -> None:
         for output in outputs:
             if not isinstance(output, Datagram):
                 continue
@@ -84,37 +84,37 @@ def send_all(
     steps: Sequence[tuple[int, int]],
     late: Callable[[], bool] = lambda: False,
     before_each: Callable[[], None] = lambda: None,
-) -> tuple[Observer, dict[int, int]]:
+) -> tuple[Receiver, dict[int, int]]:
     """Send datagrams at their times; before each, serve the due timers unless ``late()``."""
-    observer, sent = Observer(), dict[int, int]()
+    receiver, sent = Receiver(), dict[int, int]()
     now_ns = 0
     for flow, gap_ns in steps:
         now_ns += gap_ns
         while (due := link.next_deadline_ns()) is not None and due <= now_ns and not late():
-            observer.see(link.on_timer(now_ns))
+            receiver.take(link.on_timer(now_ns))
         before_each()
         number = sent.get(flow, 0)
         sent[flow] = number + 1
-        observer.see(link.handle(Datagram(flow, payload(flow, number)), now_ns))
+        receiver.take(link.handle(Datagram(flow, payload(flow, number)), now_ns))
     while (due := link.next_deadline_ns()) is not None:
         now_ns = max(now_ns, due)
-        observer.see(link.on_timer(now_ns))
-    return observer, sent
+        receiver.take(link.on_timer(now_ns))
+    return receiver, sent
 
 
-def assert_kept(settings: LinkSettings, link: Link, observer: Observer, sent: Any) -> None:
+def assert_kept(settings: LinkSettings, link: Link, receiver: Receiver, sent: Any) -> None:
     """The guarantee holds since the last change; the link counts the bursts that are observed."""
     assert settings.longest_burst is not None
     longest = 0
     for flow, count in sent.items():
-        of_flow = link.flow(flow)
-        assert of_flow is not None
-        lost = observer.lost(flow, count, of_flow.since)
-        assert of_flow.longest_loss_burst == longest_burst(np.array(lost, bool))
-        longest = max(longest, of_flow.longest_loss_burst)
+        flow_state = link.flow(flow)
+        assert flow_state is not None
+        lost = receiver.lost(flow, count, flow_state.since)
+        assert flow_state.longest_loss_burst == longest_burst(np.array(lost, bool))
+        longest = max(longest, flow_state.longest_loss_burst)
         assert is_allowed(lost, settings)
-        if settings.first_delivered and of_flow.since == 0:
-            assert observer.counted[flow][0] == 0
+        if settings.first_delivered and flow_state.since == 0:
+            assert receiver.counted[flow][0] == 0
     assert link.counters.longest_loss_burst == longest <= settings.longest_burst
 
 
@@ -144,10 +144,10 @@ def test_the_guarantee_holds_with_late_timers_and_changes(
             in_force = in_force.model_copy(update=own) if same else in_force
             link.change(in_force)
 
-    observer, sent = send_all(link, steps, lambda: rng.random() < late, change_sometimes)
-    assert_kept(in_force, link, observer, sent)
+    receiver, sent = send_all(link, steps, lambda: rng.random() < late, change_sometimes)
+    assert_kept(in_force, link, receiver, sent)
     if same:  # the same guarantee holds across the changes, too
-        assert all(is_allowed(observer.lost(*of_flow), in_force) for of_flow in sent.items())
+        assert all(is_allowed(receiver.lost(*of_flow), in_force) for of_flow in sent.items())
 
 
 @settings(max_examples=30)
@@ -156,18 +156,18 @@ def test_the_guarantee_needs_no_clock(settings: LinkSettings, seed: int, count: 
     """Arrival times in any order, timers served too early."""
     link = Link(settings, 1, "a")
     rng = np.random.default_rng(seed)
-    observer, sent = Observer(), [0, 0]
+    receiver, sent = Receiver(), [0, 0]
     for flow, now_ns in zip(
         rng.integers(0, 2, count).tolist(), rng.integers(0, 10 * MS, count).tolist(), strict=True
     ):
-        observer.see(link.handle(Datagram(flow, payload(flow, sent[flow])), now_ns))
+        receiver.take(link.handle(Datagram(flow, payload(flow, sent[flow])), now_ns))
         sent[flow] += 1
         if link.next_deadline_ns() is not None and rng.random() < 0.5:
-            observer.see(link.on_timer(0))
+            receiver.take(link.on_timer(0))
     while link.next_deadline_ns() is not None:
-        observer.see(link.on_timer(0))
-    for flow, of_flow in enumerate(sent):
-        assert is_allowed(observer.lost(flow, of_flow), settings)
+        receiver.take(link.on_timer(0))
+    for flow, sent_count in enumerate(sent):
+        assert is_allowed(receiver.lost(flow, sent_count), settings)
 
 
 decisions = st.builds(
@@ -191,8 +191,8 @@ def test_the_guarantee_holds_in_any_replay(
     update = {"mansd": mansd, "constraints": constraints}
     settings = settings_of(f"loss worst {'first' * first}").model_copy(update=update)
     link = Link(settings, 1, "a", decisions=[recorded])
-    observer, sent = send_all(link, [(0, gap) for gap in gaps])
-    assert_kept(settings, link, observer, sent)
+    receiver, sent = send_all(link, [(0, gap) for gap in gaps])
+    assert_kept(settings, link, receiver, sent)
 
 
 HISTORIES = list(itertools.product([False, True], repeat=9))

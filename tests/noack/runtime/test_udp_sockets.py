@@ -14,7 +14,7 @@ from noack.protocol.record_tables import SENSOR_MEASUREMENT
 from noack.protocol.wire_format import Flow
 from noack.runtime import udp_sockets
 from noack.runtime.address import LOOPBACK, Address, address_text, family_of, parse_address, parse_destination
-from noack.runtime.drivers.live_driver import LoopChannel
+from noack.runtime.drivers.live_driver import LoopSockets
 from noack.runtime.udp_sockets import DROPPED_IN_FLOOD, SourceCount, bind, enlarge_buffer, open_beside
 from tests.noack.runtime.drivers.live_loops import Live, measurement, scenario
 
@@ -62,11 +62,11 @@ def test_a_flood_displaces_no_peer_datagram_and_all_are_counted(content: dict[st
             sent += 1000
             live.send(measurement(round_, [1.0, 0.0]))
             live.drive_until_accepted(round_ + 1)
-            live.channel.do_housekeeping(0, live.rows)
+            live.sockets.do_housekeeping(0, live.rows)
         while len(live.rows.notices) < 2:
-            live.channel.do_housekeeping(0, live.rows)
-        live.channel.finish(0, live.rows)
-        report = live.channel.report()
+            live.sockets.do_housekeeping(0, live.rows)
+        live.sockets.finish(0, live.rows)
+        report = live.sockets.report()
     rejected: Any = report["rejected"]
     assert rejected[DROPPED_IN_FLOOD] > 5000
     assert sum(rejected.values()) == sent
@@ -86,7 +86,7 @@ def test_datagrams_before_the_peer_sockets_are_read_first(content: dict[str, Any
 
     with closing(Live("sensor", [scenario(content, horizon_s=10.0)], early=before)) as live:
         live.send(measurement(early, [1.0, 0.0]))
-        live.channel.do_housekeeping(0, live.rows)
+        live.sockets.do_housekeeping(0, live.rows)
         assert live.driver.accepted == early
         live.drive_until_accepted(early + 1)
         assert not any(live.driver.rejected.values())
@@ -102,7 +102,7 @@ def test_a_process_needs_a_socket_for_each_peer(
     with closing(Live("sensor", [scenario(content)])) as live, closing(bind(0, "port")) as endpoint:
         monkeypatch.setattr(udp_sockets, "open_beside", lambda endpoint, peers: ())
         with pytest.raises(PeerError, match="refused to open a socket for each peer"):
-            LoopChannel(endpoint, live.driver, Flow.UPDATE, source=own, destination=own)
+            LoopSockets(endpoint, live.driver, Flow.UPDATE, source=own, destination=own)
 
 
 @pytest.mark.sanitized

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cosim.record.run_record import RunRecord
-from cosim.simulation.virtual_time import Network, simulate
+from cosim.simulation.virtual_time import UserNetwork, simulate
 from noack.protocol.record_tables import OWNER, SENSOR_MEASUREMENT
 from noack.protocol.wire_format import read_header
 from noack.scenario.resolution import resolve
@@ -20,7 +20,7 @@ MS = 1_000_000
 Make = Callable[..., Scenario]
 
 
-def network_of(decide: Callable[[int], int | None]) -> Network:
+def network_of(decide: Callable[[int], int | None]) -> UserNetwork:
     """A network that maps an update's number to a delay in ms, or to None for a loss."""
 
     def network(data: bytes, now_ns: int) -> int | None:

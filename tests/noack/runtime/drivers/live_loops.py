@@ -13,7 +13,7 @@ from noack.core.clock import RunClock
 from noack.machines.loop_machines import LoopMachines
 from noack.protocol.roles import SENDS, Notice, Record
 from noack.protocol.wire_format import Encoder, Flow, Message, Wire
-from noack.runtime.drivers.live_driver import LiveDriver, LoopChannel
+from noack.runtime.drivers.live_driver import LiveDriver, LoopSockets
 from noack.runtime.udp_sockets import bind
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
@@ -66,13 +66,13 @@ def scenario(content: dict[str, Any], **changes: Any) -> Scenario:
 
 
 class Live:
-    """The machines of a role with their driver and channel; ``peer`` sends what they receive.
+    """The machines of a role with their driver and sockets; ``peer`` sends what they receive.
 
     Args:
         role: the process.
         loops: the resolved scenario of each loop.
         phases_ns: when they begin.
-        early: called before the channel exists.
+        early: called before the sockets exist.
         since_ns: how long ago the run began, in wall time.
     """
 
@@ -102,7 +102,7 @@ class Live:
         self.address = self.endpoint.getsockname()
         early(self)
         own = self.peer.getsockname()
-        self.channel = LoopChannel(
+        self.sockets = LoopSockets(
             self.endpoint, self.driver, SENDS[role], source=own, destination=own,
             acknowledged_by=self.answers.getsockname() if acknowledged else None,
             acknowledges_to=self.answers.getsockname() if role == "controller" else None,
@@ -130,7 +130,7 @@ class Live:
         self.drive(lambda: self.driver.accepted >= count)
 
     def close(self) -> None:
-        self.channel.close()
+        self.sockets.close()
         self._stack.close()
 
 

@@ -92,8 +92,8 @@ def test_they_are_sent_singly_if_the_kernel_refuses_to_segment(content: dict[str
         live.drive(lambda: live.driver.core.sent + sum(live.driver.core.errors) >= 500)
         sizes = [len(datagram) for datagram in received(live.peer, 65_536)]
         assert sizes == [DATAGRAM_BYTES] * live.driver.core.sent
-        live.channel.finish(0, live.rows)
-        assert live.channel.report()["send_errors"] == {}
+        live.sockets.finish(0, live.rows)
+        assert live.sockets.report()["send_errors"] == {}
 
 
 @pytest.mark.sanitized
@@ -116,8 +116,8 @@ def test_messages_are_handled_in_order_and_answered(
         assert repr(live.rows.tables) == repr({SENSOR_MEASUREMENT: rows})  # with NaN
         assert received(live.peer) == sent
         assert len(sent) > 0
-        live.channel.finish(0, live.rows)
-        report = live.channel.report()
+        live.sockets.finish(0, live.rows)
+        report = live.sockets.report()
         assert (report["accepted"], report["rejected"]) == (len(given), {})
         assert (report["sent"], report["send_errors"]) == (len(sent), {})
         own = "{}:{}".format(*live.peer.getsockname())
@@ -169,7 +169,7 @@ def test_acknowledgements_have_a_socket_and_counters_of_their_own(content: dict[
         live.send(answer, by=live.answers)
         machine = live.machines.machines[0].machine
         live.drive(lambda: machine.acknowledgements.rejected[core.NOACK_STALE] == 1)
-        report = live.channel.report()
+        report = live.sockets.report()
         counters = {"accepted": 1, "rejected": {"source": 1, "stale": 1}}
         assert report["acknowledgements"] == counters | {"loops": [counters]}
         assert (report["accepted"], report["rejected"]) == (5, {})
@@ -182,7 +182,7 @@ def test_what_cannot_be_sent_is_counted(content: dict[str, Any]) -> None:
         live.driver.core.senders[0] = -1
         live.send(*measurements(1))
         live.drive_until_accepted(1)
-        report = live.channel.report()
+        report = live.sockets.report()
         text = str(OSError(errno.EBADF, os.strerror(errno.EBADF)))
         assert (report["sent"], report["send_errors"]) == (0, {text: 1})
 

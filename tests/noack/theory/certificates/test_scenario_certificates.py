@@ -22,7 +22,7 @@ from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import allowed_conditions, ideal_conditions, nominal_conditions
 from noack.theory.certificates.scenario_certificates import box_scope, certify, certify_box, own_plant_scope
-from noack.theory.certificates.solution import completed
+from noack.theory.certificates.solution import run_searches
 from tests.noack.theory.certificates.certificate_kinds.policies import exceeded_by, scenario_with
 from tests.noack.theory.certificates.certified_loops import conditions_of
 from tests.oracles.lossy_loops import SEARCH, STEPS, System, Trace, networks, seeds, simulate, systems
@@ -140,7 +140,7 @@ def test_certificates_that_are_computed_together_are_those_of_each_loop() -> Non
         for scope in (own_plant_scope(loop), box_scope(loop))
         if scope is not None
     ]
-    certificates = completed([scope.search(conditions) for scope, conditions in scopes])
+    certificates = run_searches([scope.search(conditions) for scope, conditions in scopes])
     assert any(certificate.constants is not None for certificate in certificates)
     for together, (scope, conditions) in zip(certificates, scopes, strict=True):
         # Sums over grids that end at different times are rounded differently.
