@@ -14,8 +14,9 @@ from typing import NamedTuple
 from nicegui import ui
 from nicegui.events import GenericEventArguments, ValueChangeEventArguments
 
+from cosim.interactive.draft_results import CERTIFICATE
 from cosim.interactive.exploration import EXACT, Fact
-from cosim.interactive.exploration_figure import CERTIFICATE, ExploredRun, exploration_figure
+from cosim.interactive.exploration_figure import ExploredRun, exploration_figure
 from cosim.interactive.exploration_words import Reference, compare, verdict_of
 from cosim.interactive.scenario_draft import Draft, DraftError, draft_of_query, open_draft
 from cosim.interactive.settings_form import by_field, fill_in, form_of

@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self, TypeVar, TypeVarTuple
 
+from cosim.interactive.draft_results import CERTIFICATE, ENSEMBLE, MARGIN, RUN, DraftResults
 from cosim.interactive.exploration import Exploration, explore_ensemble, explore_or_simulate, why_not_exact
-from cosim.interactive.exploration_figure import CERTIFICATE, ENSEMBLE, MARGIN, RUN, DraftResults
 from cosim.interactive.scenario_draft import Draft, DraftError, Mistake, known_scenarios
 from cosim.interactive.scenario_guarantee import certify, margin_of
 from cosim.lab.live_run import LiveRun
