@@ -57,6 +57,14 @@ class DraftResults:
         """The run."""
         return self._once(RUN, explore_or_simulate)
 
+    def compute_run(self) -> None:
+        """Compute the run, unless it is known.
+
+        Raises:
+            NoackError: the scenario is wrong.
+        """
+        self._once(RUN, explore_or_simulate)
+
     @property
     def certificate(self) -> Guarantee:
         """What is guaranteed."""

@@ -75,7 +75,7 @@ class _Page:
         self._moved = _MovedSlider("", "")
         self._last = _LastChange("", 0.0)
         self._unsettled = {""}
-        """Keys that have changed since the settings rested."""
+        """Keys that have changed since the settings rested; an empty one for all keys."""
         self._client.on_disconnect(self._session.end)  # a page that connects again is a new one
         ui.on("lab", self._respond)
 
@@ -210,8 +210,8 @@ class _Page:
         explored = None
         if self._source == EXPLORE and self._session.results is not None:
             explored = self._session.results.explored_run(0)
-        elif self._source == LIVE and self._live.run is not None:
-            explored = ExploredRun(self._live.run, 0)
+        elif self._source == LIVE and (run := self._live.watch()) is not None:
+            explored = ExploredRun(run, 0)
         elif self._source == RECORDED and view is not None:
             explored = ExploredRun(view.run, 0, guarantee=view.bounds)
         if explored is None:
@@ -247,7 +247,7 @@ class _Page:
     # What the visitor does
 
     async def _respond(self, event: GenericEventArguments) -> None:
-        """Respond to an element that is not the framework's; see labSay in lab.js."""
+        """Respond to an element that is not the framework's; see labSend in lab.js."""
         message = event.args
         match message["what"]:
             case "slide":

@@ -270,7 +270,7 @@ class Session:
             if (why := why_not_exact(scenario)) is not None:
                 self.note = f"in virtual time, which takes longer: {why}"
                 results.put(RUN, await self._compute("run", explore_or_simulate, scenario))
-            _ = results.run  # an exact one takes some milliseconds
+            results.compute_run()  # an exact one takes some milliseconds
             self.results, self.pending = results, "computing: certificate"
         except DraftError as error:
             self.mistakes = error.mistakes

@@ -102,11 +102,12 @@ def launch(
         stack.callback(coordinator.close)
         helpers = stack.enter_context(lasting_helpers(resolved))
         watcher = joint_watcher([watcher or Watcher(), Watcher(started=helpers.prepare)])
+        if listening is not None:
+            descriptor = descriptor.model_copy(update={"host": listening.address[0]})
         with _no_directory_if_refused(run_dir):
             listener = _open_to_others(stack, descriptor, session, listening, coordinator)
         remote = None
         if listening is not None and listener is not None:
-            descriptor = descriptor.model_copy(update={"host": listening.address[0]})
             remote = RemoteStart(remote_hosts, listener.invitation.model_dump_json())
             watcher.listening(address_text(listener.address), listening)
         children = ChildProcesses(descriptor, run_dir, spawn, server, remote)
@@ -141,7 +142,6 @@ def _open_to_others(
     """Let processes join that are started by hand; return how those of other hosts join."""
     listener = None
     if listening is not None:
-        descriptor = descriptor.model_copy(update={"host": listening.address[0]})
         listener = stack.enter_context(remote_access.open_to_hosts(listening, descriptor, coordinator))
     if session is not None:
         by_hand = descriptor.model_copy(update={"launched": False})
