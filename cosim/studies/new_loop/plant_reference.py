@@ -41,16 +41,22 @@ _FORMS = (
 class PlantReference:
     """A plant, its numbers of states and inputs, and what is known about its runs."""
 
-    label: str  # as the user named it
-    settings: ReadTable  # values by the keys of a scenario
+    label: str
+    """As the user named it."""
+    settings: ReadTable
+    """Values by the keys of a scenario."""
     system: PlantSettings
     n: int
     m: int
-    names: tuple[tuple[str, ...] | None, tuple[str, ...] | None]  # of states and inputs
-    rates: Mapping[str, float]  # rate_hz and measure_every of its plant, if they are given
+    names: tuple[tuple[str, ...] | None, tuple[str, ...] | None]
+    """Of states and inputs."""
+    rates: Mapping[str, float]
+    """``rate_hz`` and ``measure_every`` of its plant, if they are given."""
     initial_state: tuple[float, ...] | None = None
-    matrices: tuple[Matrix, Matrix] | None = None  # A and B of a linear plant
-    model_matrices: tuple[Matrix, Matrix] | None = None  # Â and B̂, which sensor and controller know of it
+    matrices: tuple[Matrix, Matrix] | None = None
+    """A and B of a linear plant."""
+    model_matrices: tuple[Matrix, Matrix] | None = None
+    """Â and B̂ of its model, which sensor and controller use."""
 
     @property
     def state_names(self) -> tuple[str, ...]:
