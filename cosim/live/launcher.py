@@ -86,10 +86,9 @@ def launch(
         NeverStartedError: the run ended before all processes were ready.
     """
     began_ns = time.monotonic_ns()
-    scenario = scenario if listening is None else remote_access.with_clocks(scenario)
     with contextlib.ExitStack() as stack:
         server = server or stack.enter_context(fork_server())
-        resolved = _prepare(scenario, runs, spawn)
+        resolved = _prepare(scenario, runs, spawn, across_hosts=listening is not None)
         signals = stack.enter_context(Signals().handled())
         run_dir = new_run_dir(runs, resolved.name)
         resolved = write_scenario(resolved, run_dir)
@@ -121,8 +120,10 @@ def launch(
     return RunEndingWithHelpers(run_dir, descriptor.run_id, status, reason, startup_s, helpers)
 
 
-def _prepare(scenario: Scenario, runs: Path, spawn: Sequence[str]) -> Scenario:
+def _prepare(scenario: Scenario, runs: Path, spawn: Sequence[str], *, across_hosts: bool) -> Scenario:
     """Return the resolved scenario, for whose record there is space on the disk."""
+    if across_hosts:
+        scenario = remote_access.with_clocks(scenario)
     loops, resolved = resolved_loops(scenario), resolve_run(scenario)
     require_disk_space(loops, runs)
     if PLANT in spawn:
