@@ -81,7 +81,7 @@ class Explorer:
     @property
     def warning(self) -> str:
         """In words: whether the loop is unstable, and why nothing is guaranteed; else empty."""
-        _ = self.certificate
+        self._results.compute_certificate()
         return self._results.warning
 
     def set(self, settings: Mapping[str, object]) -> None:
@@ -109,7 +109,7 @@ class Explorer:
         Raises:
             NoackError: there is no such state.
         """
-        _ = self.certificate
+        self._results.compute_certificate()
         content = self._results.explored_run(self._state(state))
         return figure_drawing.draw(exploration_figure.exploration_figure(content))
 

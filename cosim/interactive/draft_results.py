@@ -65,6 +65,14 @@ class DraftResults:
         """
         self._once(RUN, explore_or_simulate)
 
+    def compute_certificate(self) -> None:
+        """Compute the certificate, unless it is known; a figure then shows it.
+
+        Raises:
+            NoackError: the scenario is wrong.
+        """
+        self._once(CERTIFICATE, certify)
+
     @property
     def certificate(self) -> Guarantee:
         """What is guaranteed."""

@@ -47,7 +47,7 @@ async def show_page(services: LabServices) -> None:
     problem = ""
     try:
         draft = draft_of_query(query, services.scenario, services.known)
-        _ = draft.scenario  # a page without a valid scenario would have no sliders
+        draft.require_valid()  # a page without a valid scenario would have no sliders
     except NoackError as error:
         problem, draft = str(error), open_draft(services.scenario)
     page = _Page(services, draft)
