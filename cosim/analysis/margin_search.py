@@ -332,6 +332,7 @@ def find_margin(
         progress(name or guarantee.meaning)
         return margin.stability(guarantee, accuracy, effort=effort)
 
+    # M = 1, 2, … up to the first one that is destabilised, or that the other rules imply.
     caps: list[LossCap] = []
     every_m = False
     for m in range(1, most_m + 1):

@@ -225,6 +225,7 @@ def states_figure(
     """
     n, t_s = len(states.names), states.t_s
     count = min(n, _MOST_STATES)
+    # A panel for each state; below, both kinds of intervals with a common vertical axis.
     panels = [
         Panel(
             items=states.items(i),

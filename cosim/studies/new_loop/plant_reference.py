@@ -190,15 +190,16 @@ def _of_scenario(label: str, settings: ReadTable) -> PlantReference:
     resolved = resolve(scenario_file.completed(content, path))
     loop, plant = loop_of(resolved), resolved.plant
     return PlantReference(
-        label,
-        settings,
-        plant.system,
-        loop.n,
-        loop.m,
-        (loop.state_names, loop.input_names),
-        {"rate_hz": plant.rate_hz, "measure_every": plant.measure_every},
-        plant.initial_state,
-        *(((loop.A, loop.B), (loop.A_model, loop.B_model)) if resolved.coverage.is_linear else ()),
+        label=label,
+        settings=settings,
+        system=plant.system,
+        n=loop.n,
+        m=loop.m,
+        names=(loop.state_names, loop.input_names),
+        rates={"rate_hz": plant.rate_hz, "measure_every": plant.measure_every},
+        initial_state=plant.initial_state,
+        matrices=(loop.A, loop.B) if resolved.coverage.is_linear else None,
+        model_matrices=(loop.A_model, loop.B_model) if resolved.coverage.is_linear else None,
     )
 
 
