@@ -238,7 +238,7 @@ def compare(
     The alternative may also be a known figure.
     """
     announce(name)
-    if not isinstance(peer, tuple) or isinstance(peer, Peer):
+    if peer is None or isinstance(peer, Peer):
         return Row(name, median(ours() for _ in range(rounds)), unit, peer, goal, note, unchecked_because)
     pairs = [(ours(), peer[1]()) for _ in range(rounds)]
     value, other = (median(side) for side in zip(*pairs, strict=True))

@@ -45,7 +45,7 @@ _QUIET_S = 0.25
 FAULT_S = 2.5
 """Time in the run when a fault begins."""
 
-Act = Callable[[Mapping[str, psutil.Process]], object]
+Fault = Callable[[Mapping[str, psutil.Process]], object]
 """Makes a fault, with the processes of a run by role."""
 
 
@@ -60,28 +60,28 @@ class FaultedRun(NamedTuple):
     """The fault's end."""
 
 
-def faulted_run(name: str, settings: Sequence[str], act: Act) -> FaultedRun:
+def faulted_run(name: str, settings: Sequence[str], fault: Fault) -> FaultedRun:
     """Run the lane example at speed 1, with a fault.
 
     Args:
         name: for messages.
         settings: changes to the scenario.
-        act: called in a thread.
+        fault: makes the fault; called in a thread.
     """
     announce(name)
     scenario = load(find_scenario("lane_following"), ["ports={}", *settings])
     threads, fault_s = list[threading.Thread](), list[float]()
 
-    def fault(processes: Mapping[str, psutil.Process]) -> None:
+    def timed_fault(processes: Mapping[str, psutil.Process]) -> None:
         fault_s.append(time.monotonic())
-        act(processes)
+        fault(processes)
         fault_s.append(time.monotonic())
 
     def progress(report: RunProgress) -> None:
         if report.t_s >= FAULT_S and not threads:
             processes = processes_of(psutil.Process())
             if processes.keys() == set(ROLES):  # else at the next report: a title cannot be read now
-                threads.append(threading.Thread(target=fault, args=(processes,)))
+                threads.append(threading.Thread(target=timed_fault, args=(processes,)))
                 threads[0].start()
 
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as runs:
@@ -93,8 +93,8 @@ def faulted_run(name: str, settings: Sequence[str], act: Act) -> FaultedRun:
             raise MeasurementError(f"{name}: the run ended: {ending.reason}")
         (summary,) = finalize(ending, report=False, view=False).summary.loops
         record = load_record(ending.run_dir)
-        for table in (*STEPS.values(), CONTROLLER_DELIVERY):  # they are kept in memory
-            record[table]
+        for table in (*STEPS.values(), CONTROLLER_DELIVERY):
+            record.source.whole(table)  # kept in memory: the folder is removed
     return FaultedRun(record, summary, *(at_s - launched_s - ending.startup_s for at_s in fault_s))
 
 
@@ -137,12 +137,12 @@ def kill(role: str) -> FaultedRun:
 def stop(role: str) -> FaultedRun:
     """Stop a process of a run, and continue it after 0.7 s."""
 
-    def act(processes: Mapping[str, psutil.Process]) -> None:
+    def fault(processes: Mapping[str, psutil.Process]) -> None:
         processes[role].send_signal(signal.SIGSTOP)
         time.sleep(STOPPED_S)
         processes[role].send_signal(signal.SIGCONT)
 
-    return faulted_run(f"{role} stopped", _RESTARTS, act)
+    return faulted_run(f"{role} stopped", _RESTARTS, fault)
 
 
 def measure_kill(role: str) -> Figures:
@@ -266,12 +266,12 @@ def flood_rows(case: FloodCase) -> Iterator[Row]:
     """
     sent = 0
 
-    def act(processes: Mapping[str, psutil.Process]) -> None:
+    def fault(processes: Mapping[str, psutil.Process]) -> None:
         nonlocal sent
         sent = flood([udp_port(processes[role]) for role in case.roles], case.rate_hz)
 
     settings = ["horizon_s=8", f"realtime.enabled={str(case.realtime).lower()}"]
-    run = faulted_run(case.name, settings, act)
+    run = faulted_run(case.name, settings, fault)
     before, during = [], []
     for role, table in STEPS.items():
         late_us, now_s = lateness_us(run.record, role), run.record[table]["now_ns"] * 1e-9

@@ -126,19 +126,20 @@ def answer(hosts: TwoHosts, case: ClockCase, bare: bool, parent: Connection) -> 
                 end.answer_all()
 
 
-def ask(hosts: TwoHosts, case: ClockCase, plain: bool, port: int, clock: Clock) -> Figures:
+def ask(hosts: TwoHosts, case: ClockCase, bare: bool, port: int, clock: Clock) -> Figures:
     """Check the bound against the true offset for a time; return the figures."""
     enter_namespace(hosts.names[1])
     clocks, address = DrivenClocks(*clock), (hosts.addresses[0][0], port)
     offset, period_ns = ClockOffset(case.rate_ppb), round(case.period_s * 1e9)
-    bare = BareClient(address, clocks) if plain else None
-    client = bare or TimeClient(address, KEY, offset, period_ns=period_ns, clocks=clocks)
+    bare_client = BareClient(address, clocks) if bare else None
+    client = bare_client or TimeClient(address, KEY, offset, period_ns=period_ns, clocks=clocks)
     errors_ns, estimates_ns = list[int](), list[int]()
     checks = outside = turns = cpu_ns = due_ns = 0
     steady_ns = time.monotonic_ns() + _START_NS
     end_ns = steady_ns + _LENGTH_NS
     with closing(client), realtime(True, _FIFO_PRIORITY):
         while (now_ns := time.monotonic_ns()) < end_ns:
+            # Ask once a period; read the answer at once, or a period later.
             is_due = now_ns >= due_ns
             readable, _, _ = select.select([client], (), (), 0 if is_due else _WAKE_S)
             if is_due or (readable and not case.late):
@@ -147,6 +148,7 @@ def ask(hosts: TwoHosts, case: ClockCase, plain: bool, port: int, clock: Clock) 
                 cpu_ns += time.thread_time_ns() - begin_ns
             if is_due:
                 due_ns, turns = max(due_ns, now_ns - period_ns) + period_ns, turns + 1
+            # Compare the bound and the estimate with the true offset, which is −added_ns.
             for _ in range(CHECKS_AT_ONCE):
                 true_ns = time.monotonic_ns()
                 added_ns = clocks.added_ns(true_ns)
@@ -156,7 +158,9 @@ def ask(hosts: TwoHosts, case: ClockCase, plain: bool, port: int, clock: Clock) 
                     outside += not bounds.lower_ns <= -added_ns <= bounds.upper_ns
                     if true_ns > steady_ns:
                         errors_ns.append(bounds.error_ns)
-                estimate_ns = bare.midpoint_ns if bare else bounds and bounds.midpoint_ns
+                estimate_ns = bounds and bounds.midpoint_ns
+                if bare_client is not None:
+                    estimate_ns = bare_client.midpoint_ns
                 if estimate_ns is not None and true_ns > steady_ns:
                     estimates_ns.append(abs(estimate_ns + added_ns))
     figures = {"checks": checks, "outside": outside, "cpu_us": cpu_ns / 1e3 / max(turns, 1)}

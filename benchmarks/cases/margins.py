@@ -56,6 +56,7 @@ def random_loop(seed: int) -> RandomLoop:
     above 1, or below for three of four.
     """
     rng = np.random.default_rng([seed, 43])
+    # The plant, its regulator, and how it is sampled.
     if rng.random() < 1 / 6:
         both = zip(_matrices(rng, 2), _matrices(rng, 2), strict=True)
         A, B, K = (block_diag(nominal, other) for nominal, other in both)
@@ -74,6 +75,7 @@ def random_loop(seed: int) -> RandomLoop:
     }
     content["network"]["impairments"] = [{"kind": "delay", "delay_s": delay_s}] * (delay_s > 0)
     margin = LossMargin(resolve(validate(content, f"loop {seed}")))
+    # The guarantee: M, with a limit in a window, and with deliveries between bursts, in turn.
     number = seed // 2 % len(GUARANTEES)
     burst = int(rng.integers(1, 8))
     rules: list[LossRule] = [LongestBurst(burst)]
@@ -82,6 +84,7 @@ def random_loop(seed: int) -> RandomLoop:
     if number >= 2:
         rules.append(DeliveriesBetweenBursts(int(rng.integers(2, 4))))
     guarantee = LossGuarantee(tuple(rules))
+    # The growth of the worst pattern, scaled to a distance from 1.
     distance = 10 ** rng.uniform(-3, -1)
     wanted = 1 + distance if rng.random() < 0.25 else 1 - distance
     scale = wanted / _fastest(margin, guarantee)

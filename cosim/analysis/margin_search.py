@@ -332,6 +332,7 @@ def find_margin(
         progress(name or guarantee.meaning)
         return margin.stability(guarantee, accuracy, effort=effort)
 
+    # M = 1, 2, … up to the first one that is destabilised, or that the other rules imply.
     caps: list[LossCap] = []
     every_m = False
     for m in range(1, most_m + 1):
@@ -366,12 +367,12 @@ def _with_implied_bounds(caps: Sequence[LossCap]) -> tuple[LossCap, ...]:
     A larger M allows all patterns of a smaller one: it has its lower bound, and this one the upper
     bound of the larger one.
     """
-    of_each = [cap.stability for cap in caps]
-    for place in range(1, len(caps)):
-        of_each[place] = of_each[place].with_lower_of(of_each[place - 1])
-    for place in reversed(range(1, len(caps))):
-        of_each[place - 1] = of_each[place - 1].with_upper_of(of_each[place])
-    return tuple(cap._replace(stability=of_it) for cap, of_it in zip(caps, of_each, strict=True))
+    bounds = [cap.stability for cap in caps]
+    for i in range(1, len(caps)):
+        bounds[i] = bounds[i].with_lower_of(bounds[i - 1])
+    for i in reversed(range(1, len(caps))):
+        bounds[i - 1] = bounds[i - 1].with_upper_of(bounds[i])
+    return tuple(cap._replace(stability=stability) for cap, stability in zip(caps, bounds, strict=True))
 
 
 def _require_in_range(most_m: int, accuracy: float, effort: float) -> None:

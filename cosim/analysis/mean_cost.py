@@ -139,14 +139,14 @@ def find_mean_cost(resolved: Scenario, Q: Matrix | None = None, R: Matrix | None
             return f"not known: {error}"
 
     return MeanCost(
-        resolved.name,
-        resolved.mode,
-        periods.times.period_ns / NS_PER_S,
-        resolved.timing.horizon_ns / NS_PER_S,
-        loop.state_names or tuple(f"x_{i + 1}" for i in range(n)),
-        loop.input_names or tuple(f"u_{j + 1}" for j in range(loop.m)),
-        attempt(join_guarantee(link.mansd, link.constraints)),
-        attempt(LossGuarantee()),
+        scenario=resolved.name,
+        mode=resolved.mode,
+        period_s=periods.times.period_ns / NS_PER_S,
+        horizon_s=resolved.timing.horizon_ns / NS_PER_S,
+        state_names=loop.state_names or tuple(f"x_{i + 1}" for i in range(n)),
+        input_names=loop.input_names or tuple(f"u_{j + 1}" for j in range(loop.m)),
+        with_guarantee=attempt(join_guarantee(link.mansd, link.constraints)),
+        without_guarantee=attempt(LossGuarantee()),
     )
 
 
@@ -165,8 +165,8 @@ def _cost_under(resolved: Scenario, periods: LoopPeriods, guarantee: LossGuarant
 
     def at_transmissions(state: int) -> float | None:
         part = moments.of_cost(state)
-        fixed_point, place = part.stationary(), part.states.index(state)
-        return None if fixed_point is None else float(fixed_point[0].moments[:, place, place].sum())
+        fixed_point, index = part.stationary(), part.states.index(state)
+        return None if fixed_point is None else float(fixed_point[0].moments[:, index, index].sum())
 
     rms = _roots(map(over_time, range(n + m)))
     horizon_cost: float | None = None

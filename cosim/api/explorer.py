@@ -12,7 +12,7 @@ from noack.core.file_access import write_whole
 from noack.core.number_format import as_text
 
 with lazy_modules():
-    from cosim.interactive import exploration_figure as explored
+    from cosim.interactive import draft_results, exploration_figure
     from cosim.interactive import scenario_draft as drafts
     from cosim.output.figures import figure_drawing
 
@@ -32,7 +32,7 @@ class Explorer:
     the explorer as sliders beside the figure.
     """
 
-    def __init__(self, results: "explored.DraftResults") -> None:
+    def __init__(self, results: "draft_results.DraftResults") -> None:
         self._results = results
         self._widget: Widget | None = None
 
@@ -81,7 +81,7 @@ class Explorer:
     @property
     def warning(self) -> str:
         """In words: whether the loop is unstable, and why nothing is guaranteed; else empty."""
-        _ = self.certificate
+        self._results.compute_certificate()
         return self._results.warning
 
     def set(self, settings: Mapping[str, object]) -> None:
@@ -109,9 +109,9 @@ class Explorer:
         Raises:
             NoackError: there is no such state.
         """
-        _ = self.certificate
+        self._results.compute_certificate()
         content = self._results.explored_run(self._state(state))
-        return figure_drawing.draw(explored.exploration_figure(content))
+        return figure_drawing.draw(exploration_figure.exploration_figure(content))
 
     def save(self, path: str | PathLike[str]) -> Path:
         """Write the scenario as TOML, with the comments of the file that it came from.
@@ -194,7 +194,7 @@ def explore(source: Source, settings: Mapping[str, object] | None = None) -> Exp
     scenario = load(source)  # its messages name the source
     is_name = isinstance(source, str | PathLike)
     draft = drafts.open_draft(str(source)) if is_name else drafts.draft_of(scenario)
-    explorer = Explorer(explored.DraftResults(draft))
+    explorer = Explorer(draft_results.DraftResults(draft))
     if settings:
         explorer.set(settings)
     return explorer

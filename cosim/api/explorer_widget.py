@@ -11,13 +11,8 @@ from collections.abc import Callable, Mapping
 
 import ipywidgets as widgets
 
-from cosim.interactive.exploration_figure import (
-    CERTIFICATE,
-    ENSEMBLE,
-    MARGIN,
-    DraftResults,
-    exploration_figure,
-)
+from cosim.interactive.draft_results import CERTIFICATE, ENSEMBLE, MARGIN, DraftResults
+from cosim.interactive.exploration_figure import exploration_figure
 from cosim.interactive.scenario_draft import Draft
 from cosim.interactive.sliders import Choice, Slider, choose, controls_of, drag
 from cosim.output.figures.figure_drawing import draw

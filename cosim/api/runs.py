@@ -243,7 +243,7 @@ class Run:
         Raises:
             NoackError: the path has another ending, or a file cannot be written.
         """
-        self.summary  # noqa: B018  # of a temporary run, it is computed now
+        self._ensure_summary()
         return export_formats.export_run(
             self.directory, Path(path), loop=self._loop, certificates=certificates
         )
@@ -254,7 +254,7 @@ class Run:
         Raises:
             NoackError: the file cannot be written.
         """
-        self.summary  # noqa: B018  # of a temporary run, it is computed now
+        self._ensure_summary()
         run_archive.write_archive(self.directory, Path(path))
         return Path(path)
 
@@ -280,6 +280,10 @@ class Run:
     def _figures(self, *, bounded: bool) -> "Mapping[str, Callable[[], FigureDescription]]":
         """Return functions that describe the figures, by name; ``bounded`` with their bounds."""
         return network_figures.page_figures(self._run, lambda: self.summary, self._loop, bounded=bounded)
+
+    def _ensure_summary(self) -> None:
+        """Write the summary into the run directory: a temporary run computes it when it is used."""
+        _ = self._outcome
 
     @cached_property
     def _outcome(self) -> "run_summary.Outcome":
@@ -326,7 +330,7 @@ def simulate(scenario: Source, *, runs: PathLike | None = None) -> Run:
         ending, view = virtual_time.simulate_run(loaded, folder), temporary is None
         simulated = Run(ending.run_dir, lambda: run_end.finalize(ending, report=False, view=view), temporary)
     if temporary is None:
-        simulated.summary  # noqa: B018  # writes it into the run directory
+        simulated._ensure_summary()
     return simulated
 
 
@@ -410,7 +414,7 @@ def compare(*runs: Run | PathLike) -> "run_comparison.RunComparison":
     """
     for source in runs:
         if isinstance(source, Run):
-            source.summary  # noqa: B018  # a temporary run computes it at the first access
+            source._ensure_summary()
     directories = [source.directory if isinstance(source, Run) else Path(source) for source in runs]
     return run_comparison.compare_runs(directories)
 

@@ -50,7 +50,7 @@ _MOST_EVENT_POINTS = 600
 """With more events, only the evenly spaced times are drawn."""
 _MOST_EVENTS = 3000
 """A run with more events is drawn up to there, so that dragging stays quick."""
-_SHORT = 0.5
+_ACCUMULATION_SHARE = 0.5
 """Inter-event times shrink to 0 if the second half of the events takes less than this share of the
 time of the first."""
 EXACT, SAMPLED, LIVE, RECORDED = "exact", "sampled", "live", "recorded"
@@ -192,7 +192,7 @@ def _cut_reason(run: ContinuousRun) -> str:
     extent = f"{len(run.event_s)} events until {number(run.reached_s, 3)} s"
     first_s = run.event_s[len(run.event_s) // 2]
     second_s = run.reached_s - first_s
-    if second_s > _SHORT * first_s:
+    if second_s > _ACCUMULATION_SHARE * first_s:
         return f"{extent}; the rest is not drawn"
     accumulation = f"{extent}, half of them in the last {number(second_s, 2)} s"
     return f"Zeno-like behaviour: inter-event times shrink to 0 ({accumulation})"
@@ -209,9 +209,20 @@ def _from_exact_run(run: ContinuousRun, resolved: Scenario, cut_reason: str) -> 
     t_s, x, e_s, e_c = t_s[order], x[order], e_s[order], e_c[order]
     divergence = run.divergence(samples, resolved)
     return Exploration(
-        resolved, EXACT, t_s, x, x + e_s, x + e_c, run.system.norms(e_s), run.system.norms(e_c),
-        threshold_at(resolved, t_s), run.event_s, run.delivered, divergence and divergence.at_s, cut_reason,
-    )  # fmt: skip
+        scenario=resolved,
+        kind=EXACT,
+        t_s=t_s,
+        x=x,
+        x_s=x + e_s,
+        x_c=x + e_c,
+        e_s_norm=run.system.norms(e_s),
+        e_c_norm=run.system.norms(e_c),
+        threshold=threshold_at(resolved, t_s),
+        event_s=run.event_s,
+        delivered=run.delivered,
+        diverged_at_s=divergence and divergence.at_s,
+        cut_reason=cut_reason,
+    )
 
 
 def _stack(states: tuple[LoopState, ...]) -> tuple[Vector, Matrix, Matrix, Matrix]:
@@ -272,11 +283,19 @@ def from_record(record: RunRecord, kind: str, diverged_at_s: float | None = None
     t_s, x, x_s, x_c, sizes = np.split(curves, np.cumsum([1, n, n, n]), axis=1)
     events, is_decaying = record.events(), threshold_at(resolved, t_s[:1, 0]) is not None
     return Exploration(
-        resolved, kind, t_s[:, 0], x, x_s, x_c, sizes[:, 0], sizes[:, 1],
-        sizes[:, 2] if is_decaying else None, np.asarray(events["t_ns"] / NS_PER_S),
-        np.isin(events["event"], record.columns(CONTROLLER_DELIVERY, "sequence")["sequence"]),
-        diverged_at_s,
-    )  # fmt: skip
+        scenario=resolved,
+        kind=kind,
+        t_s=t_s[:, 0],
+        x=x,
+        x_s=x_s,
+        x_c=x_c,
+        e_s_norm=sizes[:, 0],
+        e_c_norm=sizes[:, 1],
+        threshold=sizes[:, 2] if is_decaying else None,
+        event_s=np.asarray(events["t_ns"] / NS_PER_S),
+        delivered=np.isin(events["event"], record.columns(CONTROLLER_DELIVERY, "sequence")["sequence"]),
+        diverged_at_s=diverged_at_s,
+    )
 
 
 @dataclass(frozen=True)
@@ -343,14 +362,14 @@ def explore_ensemble(scenario: Scenario, draws: int = DRAWS) -> Ensemble:
     transmissions = rows["transmissions"][indices]
     low, middle, high = np.quantile(transmissions, (LOW, 0.5, HIGH)) if len(transmissions) else (np.nan,) * 3
     return Ensemble(
-        t_s,
-        tuple(_band(x[:, :, i]) for i in range(x.shape[2])),
-        x_norm,
-        e_c_norm,
-        draws,
-        int((rows["status"] == DIVERGED).sum()),
-        draws - len(indices),
-        (float(low), float(middle), float(high)),
+        t_s=t_s,
+        states=tuple(_band(x[:, :, i]) for i in range(x.shape[2])),
+        x_norm=x_norm,
+        e_c_norm=e_c_norm,
+        draws=draws,
+        diverged=int((rows["status"] == DIVERGED).sum()),
+        failed=draws - len(indices),
+        transmissions=(float(low), float(middle), float(high)),
     )
 
 

@@ -1,24 +1,13 @@
-"""The figure of an explored run: a state with its two models, errors, ‖x‖, and transmissions.
+"""The figure of an explored run: a state with its two models, errors, ‖x‖, and transmissions."""
 
-:class:`DraftResults` computes what the figure shows, when it is first asked for.
-"""
-
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple, TypeVar, cast
+from typing import NamedTuple
 
 import numpy as np
 
-from cosim.interactive.exploration import (
-    Ensemble,
-    Exploration,
-    Fact,
-    explore_ensemble,
-    explore_or_simulate,
-    why_not_exact,
-)
-from cosim.interactive.scenario_draft import Draft
-from cosim.interactive.scenario_guarantee import Guarantee, Margin, certify, margin_of, warning
+from cosim.interactive.exploration import Ensemble, Exploration
+from cosim.interactive.scenario_guarantee import Guarantee
 from cosim.output.figures.figure_description import (
     DASHED,
     DOTTED,
@@ -32,9 +21,7 @@ from cosim.output.figures.figure_description import (
     time_axis,
 )
 from cosim.output.figures.palette import CERTIFIED, CONTROLLER, FORCED, LOST, PLANT, SENSOR, THRESHOLD
-from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
-from noack.scenario.scenario import Scenario
 
 BAND, EDGE, REFERENCE = "90 % of draws", "edge of the 90 % of draws", "for comparison"
 _SMALLEST = 1e-6
@@ -193,114 +180,3 @@ def _positive(values: Vector, floor: float) -> Vector:
     """Return values for a logarithmic axis: not below a floor; NaN if that is 0."""
     with np.errstate(all="ignore"):
         return np.where(values > floor, values, floor if floor > 0 else np.nan)
-
-
-T = TypeVar("T")
-
-RUN, CERTIFICATE, ENSEMBLE, MARGIN = "run", "certificate", "ensemble", "margin"
-
-
-class DraftResults:
-    """The draft and its results; each change of the draft begins anew.
-
-    Raises:
-        NoackError: the scenario is wrong, or has several loops.
-    """
-
-    def __init__(self, draft: Draft) -> None:
-        self.listeners: list[Callable[[], None]] = []
-        """Called after each change of the draft."""
-        self.take(draft)
-
-    def take(self, draft: Draft) -> None:
-        """Take another draft; if it is wrong, the old one stays.
-
-        Raises:
-            NoackError: the scenario is wrong, or has several loops.
-        """
-        if draft.scenario.loops:
-            raise CallerError("loops: only one loop can be explored; noack.simulate takes several")
-        self.draft = draft
-        self._results: dict[str, object] = {}
-        for listener in self.listeners:
-            listener()
-
-    @property
-    def known(self) -> frozenset[str]:
-        """Which results are computed: RUN, CERTIFICATE, ENSEMBLE, MARGIN."""
-        return frozenset(self._results)
-
-    @property
-    def run(self) -> Exploration:
-        """The run."""
-        return self._once(RUN, explore_or_simulate)
-
-    @property
-    def certificate(self) -> Guarantee:
-        """What is guaranteed."""
-        return self._once(CERTIFICATE, certify)
-
-    @property
-    def ensemble(self) -> Ensemble | None:
-        """Bands over many draws; None without exact simulation."""
-        if why_not_exact(self.draft.scenario) is not None:
-            return None
-        return self._once(ENSEMBLE, explore_ensemble)
-
-    @property
-    def margin(self) -> Margin:
-        """For which M the loop is stable; this may take seconds."""
-        return self._once(MARGIN, margin_of)
-
-    @property
-    def warning(self) -> str:
-        """In words, by what is computed: whether the loop is unstable, and why."""
-        certificate = self.certificate if CERTIFICATE in self.known else None
-        return warning(self.run, certificate, self.margin if MARGIN in self.known else None)
-
-    @property
-    def facts(self) -> dict[str, list[Fact]]:
-        """What is computed, in groups."""
-        bands = self.ensemble if ENSEMBLE in self.known else None
-        run = [*self.run.numbers, *(() if bands is None else bands.numbers)]
-        groups = {f"this run ({self.run.kind})": run}
-        if CERTIFICATE in self.known:
-            certificate = self.certificate
-            groups["certificate"] = [
-                Fact("certificate", f"{certificate.verdict}: {certificate.reason}"),
-                *certificate.rows,
-                *(
-                    Fact(assumption.what, f"{assumption.verdict} ({assumption.why})")
-                    for assumption in certificate.assumptions
-                ),
-            ]
-        if MARGIN in self.known:
-            groups["margin"] = [
-                Fact("margin", self.margin.verdict),
-                *(
-                    Fact(
-                        f"M = {row.m}: growth of the worst pattern (D delivered, L lost) per event",
-                        f"{row.growth}, {row.verdict}",
-                    )
-                    for row in self.margin.rows
-                ),
-            ]
-        return groups
-
-    def explored_run(self, state: int) -> ExploredRun:
-        """Return what a figure shows of the results that are computed."""
-        return ExploredRun(
-            self.run,
-            state,
-            self.ensemble if ENSEMBLE in self.known else None,
-            self.certificate if CERTIFICATE in self.known else None,
-        )
-
-    def put(self, name: str, result: object) -> None:
-        """Take a result that was computed elsewhere: RUN, CERTIFICATE, ENSEMBLE or MARGIN."""
-        self._results[name] = result
-
-    def _once(self, name: str, compute: Callable[[Scenario], T]) -> T:
-        if name not in self._results:
-            self._results[name] = compute(self.draft.scenario)
-        return cast(T, self._results[name])

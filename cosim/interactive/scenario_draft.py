@@ -99,6 +99,10 @@ class Draft:
         except NoackError as error:
             raise DraftError(str(error)) from None
 
+    def require_valid(self) -> None:
+        """Raise DraftError with all mistakes, unless the text is a valid scenario."""
+        _ = self.scenario
+
     def value(self, key: str) -> object:
         """Return the value of a key in the text; None if it is not given."""
         value = leaf(self.content, key)

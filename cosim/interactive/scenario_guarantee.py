@@ -44,15 +44,15 @@ class Guarantee:
     """CERTIFIED, VOID or NOT_COVERED."""
     reason: str
     """One sentence: what is guaranteed, or why nothing is."""
-    rows: tuple[Fact, ...]
-    """The constants."""
-    assumptions: tuple[OpenAssumption, ...]
     t_s: Vector
     e_s: Vector
     """Bound of ‖e_s‖; NaN without a certificate."""
     e_c: Vector
     x: Vector
     """Bound of ‖x‖; at a set-point that of ‖x − x_r‖ plus ‖x_r‖."""
+    rows: tuple[Fact, ...] = ()
+    """The constants."""
+    assumptions: tuple[OpenAssumption, ...] = ()
 
 
 class MarginRow(NamedTuple):
@@ -87,7 +87,7 @@ def certify(scenario: Scenario) -> Guarantee:
     try:
         certificate = _certificate(resolved)
     except CallerError as error:
-        return Guarantee(NOT_COVERED, str(error), (), (), t_s, no_bound, no_bound, no_bound)
+        return Guarantee(NOT_COVERED, str(error), t_s=t_s, e_s=no_bound, e_c=no_bound, x=no_bound)
     reason = _reason(certificate)
     assumptions = tuple(
         OpenAssumption(str(assumption.verdict), assumption.what, assumption.why)
@@ -101,12 +101,12 @@ def certify(scenario: Scenario) -> Guarantee:
         return Guarantee(
             VOID if certificate.constants is None else CERTIFIED,
             reason,
-            tuple(Fact(label, values[0]) for label, values, _ in rows),
-            assumptions,
-            t_s,
-            certificate.sensor_error(t_s),
-            certificate.controller_error(t_s),
-            certificate.state(t_s) + distance,
+            t_s=t_s,
+            e_s=certificate.sensor_error(t_s),
+            e_c=certificate.controller_error(t_s),
+            x=certificate.state(t_s) + distance,
+            rows=tuple(Fact(label, values[0]) for label, values, _ in rows),
+            assumptions=assumptions,
         )
 
 

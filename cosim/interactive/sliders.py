@@ -116,7 +116,7 @@ class Controls:
         )
 
 
-_GREEK = {
+_TRIGGER_LABELS = {
     "alpha_per_s": "α, decay of the threshold [1/s]",
     "beta": "β, threshold at the start",
     "floor": "ε, smallest threshold",
@@ -149,14 +149,16 @@ def _choices(scenario: Scenario) -> tuple[Choice, ...]:
     policies = {name: name.replace("_", " ") for name in POLICIES if name != "python"}
     policy, loss = scenario.trigger.policy, scenario.network.loss.model
     constraints = scenario.network.constraints
-    kind = "" if not constraints else _WINDOW["kind"] if _is_window(scenario) else "own"
+    kind = ""
+    if constraints:
+        kind = str(_WINDOW["kind"]) if _is_window(scenario) else "own"
     limits = {"": "M − 1 consecutive", str(_WINDOW["kind"]): "also m in any K packets"}
     return (
         Choice("mode", "mode: input between updates", scenario.mode, modes),
         Choice("trigger", "trigger policy: when the sensor transmits", policy,
                {policy: policy.replace("_", " ")} | policies),
         Choice("network.loss", "loss model", loss, {loss: loss.replace("_", " ")} | _LOSS_NAMES),
-        Choice("network.constraints", "guarantee: most losses", str(kind),
+        Choice("network.constraints", "guarantee: most losses", kind,
                limits | ({"own": "as given"} if kind == "own" else {})),
     )  # fmt: skip
 
@@ -273,7 +275,7 @@ def _trigger_sliders(scenario: Scenario, base: Scenario) -> list[Slider]:
         value = getattr(trigger, name)
         usual_value = getattr(usual, name, None) if usual.policy == trigger.policy else None
         if isinstance(value, int | float) and value > 0:
-            label = _GREEK.get(name, f"trigger: {_words(name)}")
+            label = _TRIGGER_LABELS.get(name, f"trigger: {_words(name)}")
             slider = _decades(key, label, value, usual_value or value)
             if name == "period_s":
                 period_s = scenario.timing.measurement_period_ns / NS_PER_S

@@ -10,10 +10,10 @@ const LEFT = 62, RIGHT = 10, TOP = 6, BOTTOM = 8, NUMBERS = 42;
 
 function labNode(tag, attributes, ...children) {
   const svg = ['svg', 'g', 'path', 'line', 'text', 'circle'].includes(tag);
-  const made = svg ? document.createElementNS(SVG, tag) : document.createElement(tag);
-  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
-  made.append(...children);
-  return made;
+  const node = svg ? document.createElementNS(SVG, tag) : document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
+  node.append(...children);
+  return node;
 }
 
 class LabPanel {
@@ -89,15 +89,15 @@ class LabPanel {
   /* Trace a curve, forward or backward; a gap in the values is a gap in a curve. */
   trace(x, y, step) {
     const t = this.columns[x], values = this.columns[y], {pen} = this;
-    let on = step < 0;
+    let drawing = step < 0;
     for (let k = 0; k < t.length; k++) {
       const i = step > 0 ? k : t.length - 1 - k;
-      const at = Math.min(Math.max(this.y(values[i]), -999), 9999);
-      if (at !== at) on = false;
-      else if (on) pen.lineTo(this.x(t[i]), at);
+      const height = Math.min(Math.max(this.y(values[i]), -999), 9999);
+      if (Number.isNaN(height)) drawing = false;
+      else if (drawing) pen.lineTo(this.x(t[i]), height);
       else {
-        pen.moveTo(this.x(t[i]), at);
-        on = true;
+        pen.moveTo(this.x(t[i]), height);
+        drawing = true;
       }
     }
   }
@@ -148,7 +148,7 @@ class LabPanel {
     this.pointer.setAttribute('d', out ? '' :
       `M${(LEFT + this.x(t)).toFixed(1)} ${TOP}v${this.inner.height}`);
     this.panel.legend.forEach((entry, i) => {
-      const item = this.panel.items.find(one => one.kind === 'line' && one.label === entry.label);
+      const item = this.panel.items.find(other => other.kind === 'line' && other.label === entry.label);
       const value = out || !item ? NaN
         : this.columns[item.y][labIndex(this.columns[item.x], t)];
       this.values[i].textContent = Number.isFinite(value) ? ` ${+value.toPrecision(3)}` : '';
@@ -180,20 +180,20 @@ function labSwatch(item) {
 
 /* Return round numbers between two ends: at most about ``most``. */
 function labTicks(low, high, log, most) {
-  const found = [];
+  const ticks = [];
   if (log && high / low > 20) {
     const first = Math.ceil(Math.log10(low)), last = Math.floor(Math.log10(high));
     const step = Math.max(1, Math.ceil((last - first + 1) / Math.max(most, 2)));
-    for (let i = Math.ceil(first / step) * step; i <= last; i += step) found.push(10 ** i);
-    return found;
+    for (let i = Math.ceil(first / step) * step; i <= last; i += step) ticks.push(10 ** i);
+    return ticks;
   }
   const rough = (high - low) / Math.max(Math.min(most, 10), 2);
   const decade = 10 ** Math.floor(Math.log10(rough));
   const step = decade * [1, 2, 5, 10].find(factor => factor * decade >= rough * 0.999);
   for (let i = Math.ceil(low / step - 1e-9); i * step <= high * (1 + 1e-9); i++) {
-    found.push(+(i * step).toPrecision(9));
+    ticks.push(+(i * step).toPrecision(9));
   }
-  return found;
+  return ticks;
 }
 
 function labNumber(value) {
@@ -201,11 +201,11 @@ function labNumber(value) {
     return String(+value.toPrecision(6)).replace('-', '−');
   }
   const [digits, power] = value.toExponential().split('e');
-  const raised = [...String(+power)].map(one => '⁻⁰¹²³⁴⁵⁶⁷⁸⁹'['-0123456789'.indexOf(one)]).join('');
+  const raised = [...String(+power)].map(digit => '⁻⁰¹²³⁴⁵⁶⁷⁸⁹'['-0123456789'.indexOf(digit)]).join('');
   return (digits === '1' ? '' : `${+(+digits).toPrecision(3)}·`) + `10${raised}`;
 }
 
-/* Return the place of the last time that is not later. */
+/* Return the index of the last time that is not later. */
 function labIndex(times, t) {
   let low = 0, high = times.length;
   while (low < high) {
@@ -221,14 +221,14 @@ class LabFigure {
     this.panels = [];
     this.sizes = new ResizeObserver(entries => {
       for (const entry of entries) {
-        const panel = this.panels.find(one => one.box === entry.target);
+        const panel = this.panels.find(shown => shown.box === entry.target);
         if (!panel) continue;
         ({width: panel.width, height: panel.height} = entry.contentRect);
         requestAnimationFrame(() => panel.draw());
       }
     });
     place.addEventListener('pointermove', event => this.point(event));
-    place.addEventListener('pointerleave', () => this.panels.forEach(one => one.point(null)));
+    place.addEventListener('pointerleave', () => this.panels.forEach(panel => panel.point(null)));
   }
 
   show({panels, lengths, numbers, description}) {
@@ -249,10 +249,10 @@ class LabFigure {
   }
 
   point(event) {
-    const panel = this.panels.find(one => one.width);
-    if (!panel) return;
-    const x = event.clientX - panel.box.getBoundingClientRect().left - LEFT;
-    const {start, end} = panel.panel, width = panel.width - LEFT - RIGHT;
-    this.panels.forEach(one => one.point(start + (end - start) * x / width));
+    const first = this.panels.find(panel => panel.width);
+    if (!first) return;
+    const x = event.clientX - first.box.getBoundingClientRect().left - LEFT;
+    const {start, end} = first.panel, width = first.width - LEFT - RIGHT;
+    this.panels.forEach(panel => panel.point(start + (end - start) * x / width));
   }
 }

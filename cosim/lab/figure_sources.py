@@ -80,9 +80,8 @@ class LiveSource:
         )
         self._frame = ui.element("div").classes("w-full")
 
-    @property
-    def run(self) -> Exploration | None:
-        """What is drawn of it."""
+    def watch(self) -> Exploration | None:
+        """Return the recorded part of the run, and ask for a newer one; None without a run."""
         if (live := self._services.live) is None:
             return None
         live.watched = True
@@ -90,12 +89,12 @@ class LiveSource:
 
     @property
     def is_running(self) -> bool:
-        """Whether a loop runs, which settings can change."""
+        """Whether a loop is running, whose settings can then be changed."""
         return self._services.live is not None and self._services.live.state == "running"
 
     @property
     def progress(self) -> float | None:
-        """Which share of the run is over; None without one that goes on."""
+        """The simulated share of the horizon; None if no run is active."""
         live = self._services.live
         if live is None or live.is_over:
             return None
@@ -103,7 +102,7 @@ class LiveSource:
 
     @property
     def verdict(self) -> list[VerdictLine]:
-        """How it is: the verdict at its end; before, what is known so far."""
+        """The verdict of a run that has ended; the state and the counts of an active one."""
         if (live := self._services.live) is None:
             return [VerdictLine(_ABOUT, Tone.NEUTRAL)]
         if live.verdict:

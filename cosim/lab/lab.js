@@ -1,10 +1,10 @@
 /* What the page does in the browser itself: it shows the parts that the server sends (labShow), and
-   reports what a visitor does (labSay). Drawer, sliders and tutorial are plain elements, so that a
+   reports what a visitor does (labSend). Drawer, sliders and tutorial are plain elements, so that a
    dragged slider changes nothing else. */
 
 const LAB = {narrow: matchMedia('(max-width: 800px)')};
 
-function labSay(what, fields) {
+function labSend(what, fields) {
   emitEvent('lab', {what, ...fields});
 }
 
@@ -139,7 +139,7 @@ function labShowControls({choices, sliders}) {
 
 function labChoice(choice) {
   const select = labNode('select', {id: `lab-set-${choice.key}`});
-  select.addEventListener('change', () => labSay('choose', {key: choice.key, value: select.value}));
+  select.addEventListener('change', () => labSend('choose', {key: choice.key, value: select.value}));
   return labNode('div', {class: 'lab-choice'},
     labNode('label', {for: select.id}, choice.label), select);
 }
@@ -148,7 +148,7 @@ function labSlider(slider) {
   const input = labNode('input', {type: 'range', id: `lab-set-${slider.key}`});
   input.addEventListener('input', () => {
     input.labMoved = performance.now();
-    labSay('slide', {key: slider.key, position: input.valueAsNumber});
+    labSend('slide', {key: slider.key, position: input.valueAsNumber});
   });
   return labNode('div', {class: 'lab-slider'},
     labNode('label', {for: input.id}), labNode('output', {for: input.id}), input);
@@ -192,16 +192,16 @@ function labField(field) {
   const input = labNode(field.options ? 'select' : 'input', {
     id: name, title: field.help, placeholder: field.default, autocomplete: 'off',
     'aria-describedby': `${name}-error`});
-  const say = () => {
-    clearTimeout(input.labUnsaid);
-    input.labUnsaid = null;
-    labSay('fill', {key: field.key, text: input.value});
+  const send = () => {
+    clearTimeout(input.labUnsent);
+    input.labUnsent = null;
+    labSend('fill', {key: field.key, text: input.value});
   };
   input.addEventListener(field.options ? 'change' : 'input', () => {
-    clearTimeout(input.labUnsaid);
-    input.labUnsaid = setTimeout(say, field.options ? 0 : 400);
+    clearTimeout(input.labUnsent);
+    input.labUnsent = setTimeout(send, field.options ? 0 : 400);
   });
-  input.addEventListener('blur', () => input.labUnsaid ? say() : labFillForm(LAB.form));
+  input.addEventListener('blur', () => input.labUnsent ? send() : labFillForm(LAB.form));
   LAB.fields.set(field.key, input);
   return labNode('div', {class: 'lab-choice'}, labNode('label', {for: name}, field.label), input,
     labNode('p', {id: `${name}-error`, class: 'lab-bad', role: 'status'}));
@@ -219,7 +219,7 @@ function labFillForm(group) {
       const known = field.options.some(([value]) => value === field.text);
       labFill(input, known ? field.options : [...field.options, [field.text, field.text]],
         field.text);
-    } else if (input !== document.activeElement && !input.labUnsaid && input.value !== field.text) {
+    } else if (input !== document.activeElement && !input.labUnsent && input.value !== field.text) {
       input.value = field.text;
     }
     input.ariaInvalid = String(Boolean(field.error));
@@ -259,10 +259,10 @@ function labToggleGuide() {
 
 function labGoTo(step, begin) {
   const button = (text, to) => {
-    const made = labNode('button', {type: 'button'}, text);
-    made.disabled = !LAB.steps[to];
-    made.addEventListener('click', () => labGoTo(to, true));
-    return made;
+    const node = labNode('button', {type: 'button'}, text);
+    node.disabled = !LAB.steps[to];
+    node.addEventListener('click', () => labGoTo(to, true));
+    return node;
   };
   const {title, text, drag} = LAB.steps[LAB.step = step];
   const next = button('next', step + 1), back = button('back', step - 1);
@@ -271,8 +271,8 @@ function labGoTo(step, begin) {
   labById('guide').replaceChildren(
     labNode('h2', {}, `${step + 1} of ${LAB.steps.length}: ${title}`), labNode('p', {}, text),
     labNode('p', {class: 'lab-drag'}, drag), labNode('div', {}, next, back, again));
-  [next, back, again].find(made => made.textContent === focused && !made.disabled)?.focus();
-  if (begin) labSay('step', {number: step});
+  [next, back, again].find(node => node.textContent === focused && !node.disabled)?.focus();
+  if (begin) labSend('step', {number: step});
 }
 
 /* Name the editor, which cannot be named from the server. */
@@ -291,7 +291,7 @@ function labBegin() {
   const remembered = localStorage.getItem('lab-drawer');
   labDrawer(remembered ? remembered === 'open' : !LAB.narrow.matches, false);
   labById('state').addEventListener('change', event =>
-    labSay('state', {number: Number(event.target.value)}));
+    labSend('state', {number: Number(event.target.value)}));
   document.addEventListener('keydown', event => {
     const inside = labById('drawer').contains(document.activeElement);
     if (event.key !== 'Escape' || !inside) return;

@@ -14,8 +14,9 @@ from typing import NamedTuple
 from nicegui import ui
 from nicegui.events import GenericEventArguments, ValueChangeEventArguments
 
+from cosim.interactive.draft_results import CERTIFICATE
 from cosim.interactive.exploration import EXACT, Fact
-from cosim.interactive.exploration_figure import CERTIFICATE, ExploredRun, exploration_figure
+from cosim.interactive.exploration_figure import ExploredRun, exploration_figure
 from cosim.interactive.exploration_words import Reference, compare, verdict_of
 from cosim.interactive.scenario_draft import Draft, DraftError, draft_of_query, open_draft
 from cosim.interactive.settings_form import by_field, fill_in, form_of
@@ -46,7 +47,7 @@ async def show_page(services: LabServices) -> None:
     problem = ""
     try:
         draft = draft_of_query(query, services.scenario, services.known)
-        _ = draft.scenario  # a page without a valid scenario would have no sliders
+        draft.require_valid()  # a page without a valid scenario would have no sliders
     except NoackError as error:
         problem, draft = str(error), open_draft(services.scenario)
     page = _Page(services, draft)
@@ -74,7 +75,7 @@ class _Page:
         self._moved = _MovedSlider("", "")
         self._last = _LastChange("", 0.0)
         self._unsettled = {""}
-        """Keys that have changed since the settings rested."""
+        """Keys that have changed since the settings rested; an empty one for all keys."""
         self._client.on_disconnect(self._session.end)  # a page that connects again is a new one
         ui.on("lab", self._respond)
 
@@ -209,8 +210,8 @@ class _Page:
         explored = None
         if self._source == EXPLORE and self._session.results is not None:
             explored = self._session.results.explored_run(0)
-        elif self._source == LIVE and self._live.run is not None:
-            explored = ExploredRun(self._live.run, 0)
+        elif self._source == LIVE and (run := self._live.watch()) is not None:
+            explored = ExploredRun(run, 0)
         elif self._source == RECORDED and view is not None:
             explored = ExploredRun(view.run, 0, guarantee=view.bounds)
         if explored is None:
@@ -246,7 +247,7 @@ class _Page:
     # What the visitor does
 
     async def _respond(self, event: GenericEventArguments) -> None:
-        """Respond to an element that is not the framework's; see labSay in lab.js."""
+        """Respond to an element that is not the framework's; see labSend in lab.js."""
         message = event.args
         match message["what"]:
             case "slide":

@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self, TypeVar, TypeVarTuple
 
+from cosim.interactive.draft_results import CERTIFICATE, ENSEMBLE, MARGIN, RUN, DraftResults
 from cosim.interactive.exploration import Exploration, explore_ensemble, explore_or_simulate, why_not_exact
-from cosim.interactive.exploration_figure import CERTIFICATE, ENSEMBLE, MARGIN, RUN, DraftResults
 from cosim.interactive.scenario_draft import Draft, DraftError, Mistake, known_scenarios
 from cosim.interactive.scenario_guarantee import certify, margin_of
 from cosim.lab.live_run import LiveRun
@@ -270,7 +270,7 @@ class Session:
             if (why := why_not_exact(scenario)) is not None:
                 self.note = f"in virtual time, which takes longer: {why}"
                 results.put(RUN, await self._compute("run", explore_or_simulate, scenario))
-            _ = results.run  # an exact one takes some milliseconds
+            results.compute_run()  # an exact one takes some milliseconds
             self.results, self.pending = results, "computing: certificate"
         except DraftError as error:
             self.mistakes = error.mistakes

@@ -57,7 +57,7 @@ class LiveRun:
     """The verdict at the end; empty before."""
     ok: bool | None = None
     exploration: "Exploration | None" = None
-    """What is drawn of it: what was recorded when a page last asked for it."""
+    """What was recorded when a page last asked for it."""
     watched: bool = False
     """Whether a page has shown the run since then."""
     version: int = 0

@@ -90,7 +90,7 @@ def _bounds(record: RunRecord) -> Guarantee | None:
     t_s, e_c = bounds["e_c"]
     unknown = np.full(len(t_s), np.nan)
     x = np.asarray(np.interp(t_s, *bounds["x"])) if "x" in bounds else unknown
-    return Guarantee(CERTIFIED, "", (), (), t_s, unknown, e_c, x)
+    return Guarantee(CERTIFIED, "", t_s=t_s, e_s=unknown, e_c=e_c, x=x)
 
 
 def replay_run(directory: Path) -> str:

@@ -86,10 +86,9 @@ def launch(
         NeverStartedError: the run ended before all processes were ready.
     """
     began_ns = time.monotonic_ns()
-    scenario = scenario if listening is None else remote_access.with_clocks(scenario)
     with contextlib.ExitStack() as stack:
         server = server or stack.enter_context(fork_server())
-        resolved = _prepare(scenario, runs, spawn)
+        resolved = _prepare(scenario, runs, spawn, across_hosts=listening is not None)
         signals = stack.enter_context(Signals().handled())
         run_dir = new_run_dir(runs, resolved.name)
         resolved = write_scenario(resolved, run_dir)
@@ -102,11 +101,12 @@ def launch(
         stack.callback(coordinator.close)
         helpers = stack.enter_context(lasting_helpers(resolved))
         watcher = joint_watcher([watcher or Watcher(), Watcher(started=helpers.prepare)])
+        if listening is not None:
+            descriptor = descriptor.model_copy(update={"host": listening.address[0]})
         with _no_directory_if_refused(run_dir):
             listener = _open_to_others(stack, descriptor, session, listening, coordinator)
         remote = None
         if listening is not None and listener is not None:
-            descriptor = descriptor.model_copy(update={"host": listening.address[0]})
             remote = RemoteStart(remote_hosts, listener.invitation.model_dump_json())
             watcher.listening(address_text(listener.address), listening)
         children = ChildProcesses(descriptor, run_dir, spawn, server, remote)
@@ -120,8 +120,10 @@ def launch(
     return RunEndingWithHelpers(run_dir, descriptor.run_id, status, reason, startup_s, helpers)
 
 
-def _prepare(scenario: Scenario, runs: Path, spawn: Sequence[str]) -> Scenario:
+def _prepare(scenario: Scenario, runs: Path, spawn: Sequence[str], *, across_hosts: bool) -> Scenario:
     """Return the resolved scenario, for whose record there is space on the disk."""
+    if across_hosts:
+        scenario = remote_access.with_clocks(scenario)
     loops, resolved = resolved_loops(scenario), resolve_run(scenario)
     require_disk_space(loops, runs)
     if PLANT in spawn:
@@ -141,7 +143,6 @@ def _open_to_others(
     """Let processes join that are started by hand; return how those of other hosts join."""
     listener = None
     if listening is not None:
-        descriptor = descriptor.model_copy(update={"host": listening.address[0]})
         listener = stack.enter_context(remote_access.open_to_hosts(listening, descriptor, coordinator))
     if session is not None:
         by_hand = descriptor.model_copy(update={"launched": False})

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from cosim.analysis.claims.observed_conditions import PacketLosses, causes_of
 from cosim.analysis.claims.run_certificates import scheduled_certificates
-from cosim.measurement.loss_bursts import outcomes
+from cosim.measurement.loss_bursts import Outcomes, outcomes
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import NetworkConditions
@@ -89,11 +89,13 @@ def certificate_time(trace: PacketTrace, scenario: Scenario) -> CertificateTime:
     """
     resolved = resolve(scenario)
     resolved.coverage.require_constant()
+    # The certificates, and why there are none for some plants.
     certificates: dict[str, str | None] = {}
     if not causes_of(resolved):
         certificates["any plant"] = "a loop with acknowledgements cannot have one"
     for certificate in scheduled_certificates(resolved):
         certificates[certificate.scope] = certificate.void if certificate.constants is None else None
+    # The intervals in which each of their conditions was violated.
     limits = allowed_conditions(resolved)
     delay_ns = network_delay_ns(resolved, resolved.certificate.late_periods)
     end_ns = int(max(trace.sent_ns[-1], trace.received_ns.max()))
@@ -145,9 +147,28 @@ class _Spans:
 def _violations(
     trace: PacketTrace, limits: NetworkConditions, delay_ns: int, end_ns: int
 ) -> Iterator[_Spans]:
-    """Yield the intervals of each cause."""
-    groups, sent_ns, allowed_s = outcomes(trace), trace.sent_ns, delay_ns * 1e-9
-    sent_s, dropped_s = np.asarray(sent_ns * 1e-9), np.where(groups.lost, np.inf, 0.0)
+    """Yield the intervals of each cause: those of each rule of the guarantee, then the delay."""
+    groups = outcomes(trace)
+    yield from _loss_violations(trace, groups, limits, delay_ns, end_ns)
+    in_order = ~groups.lost & ~groups.out_of_order
+    delays_ns = trace.received_ns - trace.sent_ns
+    late = in_order & (delays_ns > delay_ns)
+    worst_s = float(delays_ns[in_order].max(initial=0)) * 1e-9
+    yield _Spans(
+        DELAY,
+        trace.sent_ns[late] + delay_ns,
+        trace.received_ns[late],
+        worst_s,
+        f"an update was in the network for {worst_s:.4g} s, {delay_ns * 1e-9:.4g} s allowed",
+    )
+
+
+def _loss_violations(
+    trace: PacketTrace, groups: Outcomes, limits: NetworkConditions, delay_ns: int, end_ns: int
+) -> Iterator[_Spans]:
+    """Yield, for each rule, the intervals with too many drops, and those with too many losses."""
+    sent_ns, sent_s = trace.sent_ns, np.asarray(trace.sent_ns * 1e-9)
+    dropped_s = np.where(groups.lost, np.inf, 0.0)
     stale, replaced_s = groups.out_of_order, dropped_s.copy()
     replaced_s[stale] = (groups.newer_ns - sent_ns)[stale] * 1e-9
     # A violation by a lost packet lasts until a newer one is received; else, to the next packet.
@@ -155,7 +176,7 @@ def _violations(
     until_ns = np.minimum(until_ns, end_ns)
     for rule in limits.guarantee.rules:
         losses, drops = (
-            PacketLosses(sent_s, times_s).values(rule, allowed_s, rule.start)[0].value
+            PacketLosses(sent_s, times_s).values(rule, delay_ns * 1e-9, rule.start)[0].value
             for times_s in (replaced_s, dropped_s)
         )
         by_drops = drops > rule.limit
@@ -165,16 +186,6 @@ def _violations(
             yield _Spans(
                 rule.name + suffix, sent_ns[is_violated], until_ns[is_violated], worst, rule.violation(worst)
             )
-    delays = trace.received_ns - sent_ns
-    beyond = ~groups.lost & ~stale & (delays > delay_ns)
-    worst = float(delays[~groups.lost & ~stale].max(initial=0)) * 1e-9
-    yield _Spans(
-        DELAY,
-        sent_ns[beyond] + delay_ns,
-        trace.received_ns[beyond],
-        worst,
-        f"an update was in the network for {worst:.4g} s, {allowed_s:.4g} s allowed",
-    )
 
 
 def _start(trace: PacketTrace, delay_ns: int, end_ns: int) -> _Spans:

@@ -167,7 +167,7 @@ class FitTest:
         return "rejected" if self.p_value < SIGNIFICANCE else "not rejected"
 
     @property
-    def figures(self) -> str:
+    def numbers_text(self) -> str:
         """Statistic, degrees of freedom, and p."""
         if self.p_value is None:
             return ""

@@ -68,13 +68,13 @@ class LossBursts:
     packets: int
     """k"""
     first: Int64s
-    """(b,) Place of the first lost packet."""
+    """(b,) Index of the first lost packet."""
     length: Int64s
     """(b,)"""
 
     @property
     def end(self) -> Int64s:
-        """(b,) Place of the packet after the last lost one."""
+        """(b,) Index of the packet after the last lost one."""
         return self.first + self.length
 
     @property
@@ -109,8 +109,8 @@ class LossBursts:
         """
         next_index = np.minimum(self.end, self.packets - 1)
         begin_ns = trace.sent_ns[self.first]
-        lasts_ns = trace.sent_ns[next_index] - begin_ns
-        return np.asarray(begin_ns * 1e-9), np.asarray(lasts_ns * 1e-9)
+        durations_ns = trace.sent_ns[next_index] - begin_ns
+        return np.asarray(begin_ns * 1e-9), np.asarray(durations_ns * 1e-9)
 
 
 def loss_bursts(effective: Flags) -> LossBursts:

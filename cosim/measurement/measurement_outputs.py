@@ -199,7 +199,7 @@ def _model_rows(measurement: NetworkMeasurement) -> Iterator[tuple[str, str, str
         for parameter, estimate in model.fit.estimates.items():
             yield f"  {_PARAMETERS[parameter]}", *_estimate(estimate)
         yield "  mean loss rate", number(model.fit.rates.loss_rate), ""
-        yield "  fit", model.test.verdict, model.test.figures
+        yield "  fit", model.test.verdict, model.test.numbers_text
 
 
 def _estimate(estimate: IntervalEstimate | None) -> tuple[str, str]:

@@ -217,7 +217,9 @@ class ProbeSender:
         """
         arrived, covered = self._arrivals()
         lost = np.flatnonzero(np.array(self._received_ns) == LOST_NS)
-        return {int(k): _REVERSE if arrived[k] else _FORWARD if covered[k] else _UNKNOWN for k in lost}
+        directions = np.where(covered, _FORWARD, _UNKNOWN)
+        directions[arrived] = _REVERSE
+        return {int(k): str(directions[k]) for k in lost}
 
     def _arrivals(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return which numbers the answers show as arrived, and which they cover."""

@@ -31,16 +31,7 @@ from noack.theory.random_losses.unlimited_losses import UnlimitedLosses
 def print_certificates(console: Console, results: Certificates, chosen: Certificates | None = None) -> None:
     """Print the tables, and what is certified in a norm that noack chose instead."""
     if results.nonlinear is not None:
-        region = results.schedule_region
-        if region is None or region.constants is None:
-            why = "" if region is None else f": {region.void}"
-            own = f". The plant itself has no certificate from its x(0){why}"
-        else:
-            own = ", except under “region”: that is certified for the plant itself"
-        console.print(
-            f"[yellow]the plant is not linear[/] ({escape(results.nonlinear)}): what follows is "
-            f"certified for the linear plant ẋ = Âx + B̂u in its place{escape(own)}"
-        )
+        _print_nonlinear(console, results, results.nonlinear)
     tables = list(certificate_tables(results))
     if tables:
         console.print(terminal_table(tables[0]))
@@ -67,21 +58,40 @@ def print_certificates(console: Console, results: Certificates, chosen: Certific
     if results.weight is not None and exists:
         _print_weight(console, results, results.weight)
     if not exists and chosen is None:
-        share = "trigger.sigma, " if hasattr(results.scenario.trigger, "sigma") else ""
-        advice = ""
-        if (results.schedule.void or "").startswith("the loop gain"):
-            advice = (
-                f": raise plant.rate_hz and controller.rate_hz, or lower {share}network.mansd, the network's "
-                "delay or certificate.late_periods"
-            )
-        console.print(
-            f"[yellow]no certificate for the schedule[/], so no bound of ‖x‖{advice}; noack adversary "
-            "shows what losses can do to it"
-        )
+        _print_advice(console, results)
     if chosen is not None and chosen.weight is not None:
         console.print("[bold]With another norm, also in the trigger, there are certificates:[/]")
         console.print(terminal_table(next(certificate_tables(chosen))))
         _print_weight(console, chosen, chosen.weight)
+
+
+def _print_nonlinear(console: Console, results: Certificates, why_nonlinear: str) -> None:
+    """Print for which plant the certificates of a nonlinear one are."""
+    region = results.schedule_region
+    if region is None or region.constants is None:
+        why = "" if region is None else f": {region.void}"
+        own = f". The plant itself has no certificate from its x(0){why}"
+    else:
+        own = ", except under “region”: that is certified for the plant itself"
+    console.print(
+        f"[yellow]the plant is not linear[/] ({escape(why_nonlinear)}): what follows is "
+        f"certified for the linear plant ẋ = Âx + B̂u in its place{escape(own)}"
+    )
+
+
+def _print_advice(console: Console, results: Certificates) -> None:
+    """Print that there is no certificate, and which settings could give one."""
+    share = "trigger.sigma, " if hasattr(results.scenario.trigger, "sigma") else ""
+    advice = ""
+    if (results.schedule.void or "").startswith("the loop gain"):
+        advice = (
+            f": raise plant.rate_hz and controller.rate_hz, or lower {share}network.mansd, the network's "
+            "delay or certificate.late_periods"
+        )
+    console.print(
+        f"[yellow]no certificate for the schedule[/], so no bound of ‖x‖{advice}; noack adversary "
+        "shows what losses can do to it"
+    )
 
 
 def _print_weight(console: Console, chosen: Certificates, weight: Matrix) -> None:

@@ -157,9 +157,10 @@ def _verdict(report: Report) -> Content:
     notes = [remark.text for remark in remarks(report.detail)]
     tones = {line.tone for line in lines} - {Tone.NEUTRAL}
     is_good = tones == {Tone.GOOD} and (report.shares_network or not notes)
+    tone = Tone.GOOD if is_good else Tone.DOUBTFUL
     return {
         "lines": [line.text for line in lines],
-        "tone": Tone.BAD if Tone.BAD in tones else Tone.GOOD if is_good else Tone.DOUBTFUL,
+        "tone": Tone.BAD if Tone.BAD in tones else tone,
         "remarks": [] if report.shares_network else notes,
     }
 

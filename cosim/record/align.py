@@ -73,11 +73,14 @@ class AlignedRun(NamedTuple):
 
 
 class ControllerTrack(NamedTuple):
-    """The controller's states in order."""
+    """The controller's states in order; k states, n entries."""
 
     model_ns: Times
+    """(k,) model times, ascending."""
     x_c: Reals
+    """(k, n)"""
     received: NDArray[np.int64]
+    """(k,) sequence number of the newest update in each state, −1 for none."""
     generation: int = 0
     """Generation of the controller in the last state."""
 

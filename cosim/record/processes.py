@@ -114,8 +114,8 @@ def _of_loop(report: Report, number: int, rows_of_others: Callable[[int, str, in
     if number == 0 and of_loops:
         for loop in of_loops:
             rejected_counts.subtract(loop.get("rejected") or {})
-        if of_none := +rejected_counts:  # such as datagrams of others that a socket dropped
-            channel["rejected"] = channel.get("rejected", {}) | of_none
+        if of_no_loop := +rejected_counts:  # such as datagrams of others that a socket dropped
+            channel["rejected"] = channel.get("rejected", {}) | of_no_loop
     answers = channel.get("acknowledgements")
     if answers and "loops" in answers:
         channel["acknowledgements"] = answers["loops"][number]
@@ -218,7 +218,10 @@ class _Counts:
         self.first_ns: int | None = None
         self.last_ns: int | None = None
         self.gap_ns: int | None = None
-        self._input, self._now_ns = generation * GENERATION - 1, 0
+        self._input = generation * GENERATION - 1
+        """The last input of the parts before."""
+        self._now_ns = 0
+        """Its time."""
         self._numbers: dict[int, tuple[int, int]] = {}
         """By generation in the input numbers: the largest number, and the number of rows."""
 
@@ -234,12 +237,19 @@ class _Counts:
         self.first_ns = low_ns if self.first_ns is None else min(self.first_ns, low_ns)
         self.last_ns = high_ns if self.last_ns is None else max(self.last_ns, high_ns)
         order = np.argsort(inputs, kind="stable")
-        inputs, now_ns = inputs[order], now_ns[order]
+        self._find_gap(inputs[order], now_ns[order])
+        self._count_inputs(inputs[order])
+
+    def _find_gap(self, inputs: NDArray[np.int64], now_ns: NDArray[np.int64]) -> None:
+        """Find the first gap before or between inputs, which are ascending, with their times."""
         gaps = np.flatnonzero(np.diff(inputs, prepend=self._input) > 1)
         if len(gaps) and self.gap_ns is None:
-            before_gap_ns = self._now_ns if gaps[0] == 0 and self._numbers else now_ns[max(gaps[0] - 1, 0)]
-            self.gap_ns = int(before_gap_ns)
+            is_between_parts = gaps[0] == 0 and bool(self._numbers)
+            self.gap_ns = self._now_ns if is_between_parts else int(now_ns[max(gaps[0] - 1, 0)])
         self._input, self._now_ns = int(inputs[-1]), int(now_ns[-1])
+
+    def _count_inputs(self, inputs: NDArray[np.int64]) -> None:
+        """Count inputs, which are ascending, by the generation in their numbers."""
         first, last = (int(number) // GENERATION for number in (inputs[0], inputs[-1]))
         for number in [first] if first == last else np.unique(inputs // GENERATION).tolist():
             of_generation = inputs if first == last else inputs[inputs // GENERATION == number]

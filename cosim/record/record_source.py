@@ -280,31 +280,31 @@ class NetworkRows:
     def __init__(self, source: RecordSource, phases_ns: Sequence[int]) -> None:
         self._source, self._phases_ns = source, phases_ns
         self._inputs: dict[str, NDArray[np.int64]] = {}
-        self._places: dict[str, list[NDArray[np.int32]]] = {}
-        """The places of the rows of each loop in a table."""
+        self._indices: dict[str, list[NDArray[np.int32]]] = {}
+        """The indices of the rows of each loop in a table."""
         for table in network_tables():
             batches = [*source.batches(table, ("input", "flow"))]
             inputs = [rows["input"] for rows in batches]
             self._inputs[table] = np.concatenate([np.zeros(0, np.int64), *inputs])
             if table == NETEM_SETTING:  # a change of settings concerns every loop
                 everywhere = np.arange(len(self._inputs[table]), dtype=np.int32)
-                self._places[table] = [everywhere] * len(phases_ns)
+                self._indices[table] = [everywhere] * len(phases_ns)
                 continue
             flows = [rows["flow"] for rows in batches]
             loops = np.concatenate([np.zeros(0, np.int64), *flows]) % len(phases_ns)
             ends = np.cumsum(np.bincount(loops, minlength=len(phases_ns)))
             order = np.argsort(loops, kind="stable").astype(np.int32)
-            self._places[table] = np.split(order, ends[:-1])
+            self._indices[table] = np.split(order, ends[:-1])
         self._in_order = np.sort(np.concatenate([*self._inputs.values()]))
         self._counts: dict[tuple[str, int], int] = {}
 
     def counts(self) -> dict[str, NDArray[np.int64]]:
         """Return the number of rows of each loop by table, shape (loops,)."""
-        return {table: np.array(list(map(len, places))) for table, places in self._places.items()}
+        return {table: np.array(list(map(len, indices))) for table, indices in self._indices.items()}
 
     def count(self, table: str, number: int) -> int:
         """Return the number of rows of a loop in a table."""
-        return len(self._places[table][number])
+        return len(self._indices[table][number])
 
     def of_loop(self, table: str, number: int) -> Iterator[Rows]:
         """Yield the rows of a loop in order."""
@@ -312,30 +312,32 @@ class NetworkRows:
 
     def of_loops(self, table: str, numbers: Sequence[int]) -> Iterator[list[Rows]]:
         """Yield the next rows of each of some loops, in order; the table is read once."""
-        by_number = [[places[number] for places in self._places.values()] for number in numbers]
-        parts = [[*map(np.take, self._inputs.values(), places)] for places in by_number]
+        by_number = [[indices[number] for indices in self._indices.values()] for number in numbers]
+        parts = [[*map(np.take, self._inputs.values(), indices)] for indices in by_number]
         inputs_of_loops = [np.sort(np.concatenate(inputs)) for inputs in parts]
         first = 0
         for rows in self._source.batches(table):
             by_loop = []
             for number, inputs in zip(numbers, inputs_of_loops, strict=True):
-                places = self._places[table][number]
-                begin, end = np.searchsorted(places, (first, first + len(rows)))
-                rows_of_loop = rows.take(places[begin:end] - first)
+                indices = self._indices[table][number]
+                begin, end = np.searchsorted(indices, (first, first + len(rows)))
+                rows_of_loop = rows.take(indices[begin:end] - first)
                 rows_of_loop["input"] -= self._numbered_before(rows_of_loop["input"], inputs)
                 by_loop.append(_of_loop(rows_of_loop, number, self._phases_ns))
             yield by_loop
             first += len(rows)
 
-    def _numbered_before(self, numbers: NDArray[np.int64], mine: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _numbered_before(
+        self, numbers: NDArray[np.int64], own_inputs: NDArray[np.int64]
+    ) -> NDArray[np.int64]:
         """Return how many inputs of other loops precede those of a loop, in their generation.
 
-        ``mine`` has all numbers of the loop, ascending. Rows that are missing count as the loop's.
+        ``own_inputs`` has all numbers of the loop, ascending. Rows that are missing count as the loop's.
         """
         begin = numbers // GENERATION * GENERATION
         of_all, of_loop = (
             np.searchsorted(ascending, numbers) - np.searchsorted(ascending, begin)
-            for ascending in (self._in_order, mine)
+            for ascending in (self._in_order, own_inputs)
         )
         return np.asarray(of_all - of_loop)
 
@@ -344,7 +346,7 @@ class NetworkRows:
         inputs, key = self._inputs[table], (table, generation)
         if key not in self._counts:
             self._counts[key] = _count_of(inputs, generation)
-        return self._counts[key] - _count_of(inputs[self._places[table][number]], generation)
+        return self._counts[key] - _count_of(inputs[self._indices[table][number]], generation)
 
 
 def _count_of(inputs: NDArray[np.int64], generation: int) -> int:

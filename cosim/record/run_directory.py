@@ -164,8 +164,8 @@ def latest_run(runs: Path) -> Path:
             run may execute the code of its plant.
     """
     if not _HAS_LINKS:  # the names begin with the time
-        if made := sorted(path.parent for path in runs.glob(f"*/{SCENARIO_FILE}")):
-            return made[-1]
+        if run_dirs := sorted(path.parent for path in runs.glob(f"*/{SCENARIO_FILE}")):
+            return run_dirs[-1]
         raise CallerError(f"{runs}: no run yet; `noack simulate SCENARIO` makes one")
     link = runs / LATEST
     if not link.is_symlink() or not link.is_dir():

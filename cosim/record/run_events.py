@@ -217,13 +217,13 @@ def messages_in(packets: Rows, flow: Flow = Flow.UPDATE) -> tuple[Rows, NDArray[
         Their rows of ``netem_packet``, sequence numbers and event times.
     """
     headers = np.ascontiguousarray(packets["head"]).view(HEADER_ROW)
-    mine = np.logical_or.reduce([headers["version"] == version for version in VERSIONS])
-    mine &= (headers["magic"] == MAGIC) & (headers["flow"] == flow) & (headers["t_ns"] >= 0)
-    mine &= headers["sequence"] < 2**63  # others do not fit the record's columns
+    is_of_flow = np.logical_or.reduce([headers["version"] == version for version in VERSIONS])
+    is_of_flow &= (headers["magic"] == MAGIC) & (headers["flow"] == flow) & (headers["t_ns"] >= 0)
+    is_of_flow &= headers["sequence"] < 2**63  # others do not fit the record's columns
     return (
-        packets.compress(mine),
-        headers["sequence"].compress(mine).astype(np.int64),
-        headers["t_ns"].compress(mine),
+        packets.compress(is_of_flow),
+        headers["sequence"].compress(is_of_flow).astype(np.int64),
+        headers["t_ns"].compress(is_of_flow),
     )
 
 

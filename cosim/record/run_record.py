@@ -467,16 +467,13 @@ def steps_of(scenario: Scenario) -> int:
     A step is the shortest period of a loop's processes; a table of a record has at most a few rows
     for each.
     """
-    exchange_ns = round(scenario.speed * _CLOCK_EXCHANGE_NS)
-    return sum(
-        section.count
-        * (
-            timing.horizon_ns // min(timing.plant_period_ns, timing.controller_period_ns, max(exchange_ns, 1))
-            + 1
-        )
-        for section in loop_sections(scenario)
-        for timing in [loop_scenario(scenario, section).timing]
-    )
+    exchange_ns = max(round(scenario.speed * _CLOCK_EXCHANGE_NS), 1)
+    steps = 0
+    for section in loop_sections(scenario):
+        timing = loop_scenario(scenario, section).timing
+        shortest_ns = min(timing.plant_period_ns, timing.controller_period_ns, exchange_ns)
+        steps += section.count * (timing.horizon_ns // shortest_ns + 1)
+    return steps
 
 
 def read_notices(folder: Path) -> list[Notice]:

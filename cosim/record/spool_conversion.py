@@ -170,7 +170,8 @@ def finish_record(
         with record_folder(run_dir / RECORD, notices):
             for file in [f"{table}.parquet" for table in ready]:
                 (run_dir / SPOOL / EARLY / file).replace(run_dir / RECORD / file)
-            [*map_tables(partial(convert_table, run_dir), tables)]
+            for _ in map_tables(partial(convert_table, run_dir), tables):
+                pass  # each table is written as the iteration reaches it
     except OSError as error:
         raise _write_error(run_dir, error) from None
     remove_spool(run_dir)
@@ -246,6 +247,7 @@ def _write_error(run_dir: Path, error: OSError) -> MachineError:
 
 
 def _notices(folder: Path, spool: Path, loops: int) -> list[Notice]:
+    """Return the lines of the run's log from an earlier record and from the spool, by time."""
     notices = read_notices(folder)
     texts = {json.dumps(notice, sort_keys=True) for notice in notices}
     for role in (*LOOP_ROLES, RECORDER):
@@ -266,7 +268,8 @@ def write_early(run_dir: Path) -> Mapping[str, int]:
     """Write the tables of the loops of a run: at idle priority until it has ended, then the rest.
 
     Returns:
-        By table: the bytes of its spool whose rows the file has. Without a whole slice, it has none.
+        By table: the bytes of its spool whose rows are in the file. A table without a whole slice is
+        left out.
 
     Raises:
         ValueError: rows are missing or not in order, a batch is incomplete, or a table is long.
@@ -279,7 +282,8 @@ def write_early(run_dir: Path) -> Mapping[str, int]:
             thread.submit(_follow, tables, end_file).result()
         end_file.unlink()
         with ThreadPoolExecutor(cores()) as threads:
-            [*threads.map(_EarlyTable.finish, tables)]
+            for _ in threads.map(_EarlyTable.finish, tables):
+                pass  # an error of a thread is raised here
     return {table.name: table.bytes for table in tables if table.bytes}
 
 

@@ -68,7 +68,7 @@ class StoredTables(RecordSource):
             table: TableFile(folder / f"{table}.parquet", dtype, most_rows) for table, dtype in types.items()
         }
         self._newest: dict[str, dict[int, Rows]] = {}
-        """The groups of several loops that were read last, by table and place."""
+        """The groups of several loops that were read last, by table and index."""
 
     def count(self, table: str) -> int:
         """Return the number of rows of a table."""
@@ -99,7 +99,7 @@ class StoredTables(RecordSource):
     def of_loops(
         self, table: str, loops: Sequence[int], types: Sequence[RowType]
     ) -> Iterator[tuple[int, Rows]]:
-        """Yield place and rows of each of some loops, as rows of its type; a group is read once."""
+        """Yield index and rows of each of some loops, as rows of its type; a group is read once."""
         groups = [*self._groups_with(table, loops[0], loops[-1])]
         for dtype in dict.fromkeys(types):
             parts_of: dict[int, list[Rows]] = {
@@ -189,9 +189,9 @@ class TableFile:
                     f"{path}: has {largest:,} rows in one part; at most {_MOST_GROUP_ROWS:,} are read"
                 )
             names = metadata.schema.names
-            places = {name: names.index(name) for name in (LOOP, "input") if name in names}
-            _require_types(file, [*places.values()])
-        self.groups = [_describe_group(group, places) for group in groups]
+            column_indices = {name: names.index(name) for name in (LOOP, "input") if name in names}
+            _require_types(file, [*column_indices.values()])
+        self.groups = [_describe_group(group, column_indices) for group in groups]
 
     def batches(self, dtype: RowType | None = None, groups: Iterable[int] | None = None) -> Iterator[Rows]:
         """Yield the rows of each group, or of some, as rows of a type that has fewer columns."""
@@ -274,9 +274,10 @@ def _require_types(file: pq.ParquetFile, columns: list[int]) -> None:
         next(file.reader.iter_batches(1, row_groups=[group], column_indices=columns, use_threads=False), None)
 
 
-def _describe_group(group: Any, places: Mapping[str, int]) -> _Group:
+def _describe_group(group: Any, column_indices: Mapping[str, int]) -> _Group:
     loops, inputs = (
-        group.column(places[name]).statistics if name in places else None for name in (LOOP, "input")
+        group.column(column_indices[name]).statistics if name in column_indices else None
+        for name in (LOOP, "input")
     )
     highest = int(inputs.max) if inputs is not None and inputs.has_min_max else None
     if loops is None or not loops.has_min_max:

@@ -106,10 +106,11 @@ class ContinuousLoop:
     @property
     def generator(self) -> Matrix:
         """G of dz/dt = G z, per second, shape (3n, 3n)."""
-        loop, none = self.loop, np.zeros_like(self.loop.H)
+        loop = self.loop
+        zero = np.zeros_like(loop.H)
         BK = loop.B @ loop.K
         E = loop.A + BK - loop.H
-        return np.block([[loop.A + BK, none, BK], [-E, loop.H, -BK], [-E, none, loop.H - BK]])
+        return np.block([[loop.A + BK, zero, BK], [-E, loop.H, -BK], [-E, zero, loop.H - BK]])
 
     @property
     def decaying(self) -> TriggerRule:
@@ -171,8 +172,8 @@ def continuous_loop_of(resolved: Scenario) -> ContinuousLoop:
     return ContinuousLoop(loop_of(resolved), rule_of(resolved))
 
 
-_PLACES = 64
-"""Room for events in the first attempt; each further one has four times as much."""
+_FIRST_LOG_EVENTS = 64
+"""Events that the log of the first attempt can hold; that of each further one holds four times as many."""
 
 
 class TooManyEventsError(CallerError):
@@ -270,7 +271,7 @@ def simulate_continuous(
     """
     until_s = min(horizon_s, vanishes_s(system.trigger))
     x0 = np.array(system.loop.x0 if x0 is None else x0, np.float64)
-    row, log = _with_room(system, until_s, x0, delivered, known_start, max_events)
+    row, log = _simulate_with_log(system, until_s, x0, delivered, known_start, max_events)
     if row["status"] == OK and until_s < horizon_s:
         raise vanished_error(until_s)
     if row["status"] not in (OK, DIVERGED, TOO_MANY_EVENTS):
@@ -291,7 +292,7 @@ def simulate_continuous(
     return run
 
 
-def _with_room(
+def _simulate_with_log(
     system: ContinuousLoop,
     until_s: float,
     x0: Vector,
@@ -299,25 +300,25 @@ def _with_room(
     known_start: bool,
     max_events: int,
 ) -> tuple[np.void, EventLog]:
-    """Return row and events of a run, for which more room is made until its events fit."""
+    """Return the row and the events of a run; it is repeated with a larger log until its events fit."""
     loop, fates = system.loop, [] if callable(delivered) else list(delivered)
-    places = min(_PLACES, max_events)
+    log_events = min(_FIRST_LOG_EVENTS, max_events)
     while True:
         if callable(delivered):
-            fates += [bool(delivered(event)) for event in range(len(fates), places)]
+            fates += [bool(delivered(event)) for event in range(len(fates), log_events)]
         simulation = system.simulation(
             until_s,
             known_start=known_start,
-            most_events=places,
+            most_events=log_events,
             delivered=np.array(fates, bool),
             measure=core.NOACK_EXACT_TIMES,
         )
-        rows, log = simulation.runs(loop.A[None], loop.B[None], x0[None], places=places, states=True)
+        rows, log = simulation.runs(loop.A[None], loop.B[None], x0[None], places=log_events, states=True)
         row: np.void = rows[0]
-        full = row["status"] == TOO_MANY_EVENTS and row["transmissions"] == places
-        if not full or places == max_events:
+        full = row["status"] == TOO_MANY_EVENTS and row["transmissions"] == log_events
+        if not full or log_events == max_events:
             return row, log
-        places = min(4 * places, max_events)
+        log_events = min(4 * log_events, max_events)
 
 
 def _read_run(

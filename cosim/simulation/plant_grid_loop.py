@@ -75,14 +75,14 @@ class PlantGridLoop:
     @np.errstate(all="ignore")
     def run(self, *, delay: bool, hold: bool) -> PlantGridRun:
         """Simulate; once the state is not finite, it stays non-finite."""
-        now = self._begin()
+        run = self._begin()
         while True:
-            if now.is_event:
-                self._take_event(now, delay=delay, hold=hold)
-            self._apply_updates(now)
-            if now.step == len(now.states) - 1:
-                return PlantGridRun(now.states, np.array(now.event_steps, dtype=np.int64))
-            self._advance(now, hold=hold)
+            if run.is_event:
+                self._take_event(run, delay=delay, hold=hold)
+            self._apply_updates(run)
+            if run.step == len(run.states) - 1:
+                return PlantGridRun(run.states, np.array(run.event_steps, dtype=np.int64))
+            self._advance(run, hold=hold)
 
     def _begin(self) -> "_Progress":
         """Return step 0, which is an event unless the start is known and passes the trigger."""
@@ -97,47 +97,48 @@ class PlantGridLoop:
         start = _Update(-1, 0, 0, x0 if known_start else np.zeros_like(x0))
         return _Progress(states, trigger, x0, start, known_start, is_event)
 
-    def _take_event(self, now: "_Progress", *, delay: bool, hold: bool) -> None:
+    def _take_event(self, run: "_Progress", *, delay: bool, hold: bool) -> None:
         """Reset the sensor's model; the update of a delivered event is on its way from now on."""
-        x, now_ns, number = now.states[now.step], now.step * self._schedule.period_ns, len(now.event_steps)
-        now.x_s, now.knows_state = x, True
-        now.trigger.start(now_ns, x)
-        now.event_steps.append(now.step)
+        x, number = run.states[run.step], len(run.event_steps)
+        now_ns = run.step * self._schedule.period_ns
+        run.x_s, run.knows_state = x, True
+        run.trigger.start(now_ns, x)
+        run.event_steps.append(run.step)
         if self._schedule.delivered(number):
             wait_ns = self._wait_ns(number, hold=hold) if delay else 0
-            now.in_flight.append(_Update(number, now_ns, now_ns + wait_ns, x))
-            now.in_flight.sort(key=lambda update: update.acts_ns)
+            run.in_flight.append(_Update(number, now_ns, now_ns + wait_ns, x))
+            run.in_flight.sort(key=lambda update: update.acts_ns)
 
-    def _apply_updates(self, now: "_Progress") -> None:
+    def _apply_updates(self, run: "_Progress") -> None:
         """Apply the updates that act by now: the newest counts."""
-        now_ns = now.step * self._schedule.period_ns
-        while now.in_flight and now.in_flight[0].acts_ns <= now_ns:
-            now.newest = max(now.newest, now.in_flight.pop(0), key=lambda update: update.number)
+        now_ns = run.step * self._schedule.period_ns
+        while run.in_flight and run.in_flight[0].acts_ns <= now_ns:
+            run.newest = max(run.newest, run.in_flight.pop(0), key=lambda update: update.number)
 
-    def _advance(self, now: "_Progress", *, hold: bool) -> None:
+    def _advance(self, run: "_Progress", *, hold: bool) -> None:
         """Simulate to the next event, at most to the next update's effect or over a block of steps."""
-        x, step, period_ns = now.states[now.step], now.step, self._schedule.period_ns
-        last_step = min(step + _BLOCK, len(now.states) - 1)
-        if now.in_flight:
-            last_step = min(last_step, max(now.in_flight[0].acts_ns // period_ns, step + 1))
+        x, step, period_ns = run.states[run.step], run.step, self._schedule.period_ns
+        last_step = min(step + _BLOCK, len(run.states) - 1)
+        if run.in_flight:
+            last_step = min(last_step, max(run.in_flight[0].acts_ns // period_ns, step + 1))
         steps_ahead = slice(step + 1, last_step + 1)
         if hold:
-            now.states[steps_ahead] = self._states_under_held_inputs(x, now.newest, step, last_step)
+            run.states[steps_ahead] = self._states_under_held_inputs(x, run.newest, step, last_step)
         else:
-            updates = [update for update in now.in_flight if update.acts_ns < last_step * period_ns]
-            now.states[steps_ahead] = self._continuous(x, [now.newest, *updates], step, last_step)
-        x_s = self._follow_model(now.x_s, self._steps_s[1 : last_step - step + 1])
+            updates = [update for update in run.in_flight if update.acts_ns < last_step * period_ns]
+            run.states[steps_ahead] = self._continuous(x, [run.newest, *updates], step, last_step)
+        x_s = self._follow_model(run.x_s, self._steps_s[1 : last_step - step + 1])
         # What follows the first event is discarded.
         measured = np.flatnonzero(self._schedule.measured[steps_ahead])
         first = 0 if len(measured) else None
-        if now.knows_state:
-            block = now.states[steps_ahead][measured]
+        if run.knows_state:
+            block = run.states[steps_ahead][measured]
             times_ns = (step + 1 + measured) * period_ns
-            first = now.trigger.test(times_ns, block, x_s[measured] - block)
-        now.is_event = first is not None
+            first = run.trigger.test(times_ns, block, x_s[measured] - block)
+        run.is_event = first is not None
         steps = last_step - step if first is None else int(measured[first]) + 1
-        now.x_s = x_s[steps - 1]
-        now.step += steps
+        run.x_s = x_s[steps - 1]
+        run.step += steps
 
     def _wait_ns(self, event: int, *, hold: bool) -> int:
         if hold:

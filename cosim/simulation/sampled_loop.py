@@ -137,16 +137,17 @@ class SampledLoop:
 
     def start(self) -> Runs:
         """Return one run at its start: after the delivered first packet, if there is one."""
-        n, known_start = self.matrices.n, self.known_start
+        known_start = self.known_start
         runs = self.empty(1)
         x0 = self.matrices.x0
         runs.x[0], runs.auxiliary[0], runs.step[0] = x0, self._first_auxiliary, -1
         if known_start:
             runs.x_s[0] = runs.x_c[0] = x0
         observer = self.resolved.observer
-        if observer is not None:
-            estimate = observer.initial_estimate
-            runs.y[0] = (x0 if known_start else np.zeros(n)) if estimate is None else np.array(estimate)
+        if observer is not None and observer.initial_estimate is not None:
+            runs.y[0] = observer.initial_estimate
+        elif observer is not None and known_start:
+            runs.y[0] = x0
         if not known_start:
             runs.step[0] = 0
             self.measure_at(runs)
@@ -185,11 +186,14 @@ class SampledLoop:
         """Return runs at 0."""
         n, m, r = self.matrices.n, self.matrices.m, self._most_in_flight
         return Runs(
-            np.zeros(count, np.int64), np.zeros((count, n)), np.zeros((count, n)),
-            np.zeros((count, n)), np.zeros((count, n)), np.zeros((count, m)),
-            np.zeros((count, m)), np.full((count, r), -1.0), np.zeros((count, r, n)),
-            np.zeros(count), np.zeros(count, np.bool_), np.zeros(count), np.zeros(count),
-            np.zeros(count), np.zeros(count, np.int64), np.zeros(count, np.int64),
+            step=np.zeros(count, np.int64),
+            x=np.zeros((count, n)), y=np.zeros((count, n)),
+            x_s=np.zeros((count, n)), x_c=np.zeros((count, n)),
+            u=np.zeros((count, m)), u_next=np.zeros((count, m)),
+            sent=np.full((count, r), -1.0), updates=np.zeros((count, r, n)),
+            auxiliary=np.zeros(count), is_event=np.zeros(count, np.bool_),
+            error=np.zeros(count), state=np.zeros(count), cost=np.zeros(count),
+            error_at=np.zeros(count, np.int64), state_at=np.zeros(count, np.int64),
         )  # fmt: skip
 
     def transmit(self, runs: Runs, delivered: NDArray[np.bool_]) -> None:

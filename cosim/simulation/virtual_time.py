@@ -71,9 +71,9 @@ class RowMemory:
     def __init__(self) -> None:
         self._free = np.empty(0, np.uint8)
 
-    def rows(self, places: int, dtype: np.dtype[np.void]) -> Rows:
+    def rows(self, count: int, dtype: np.dtype[np.void]) -> Rows:
         """Return memory for rows of a type."""
-        size = places * dtype.itemsize
+        size = count * dtype.itemsize
         if size > len(self._free):
             self._free = np.empty(max(size, _PIECE_BYTES), np.uint8)
         rows, self._free = np.split(self._free, [size])

@@ -53,7 +53,7 @@ from noack.settings.user_files import FILE_TABLES, Sha256, file_tables
 MANIFEST = "archive.json"
 SUFFIX = ".noack.zip"
 _FILES = {SCENARIO_FILE, ENVIRONMENT_FILE, REPORTS_FILE, ENDING_FILE, SUMMARY_FILE}
-_FOLDERS = {RECORD, "logs", *(place.split(".")[0] for place in FILE_TABLES)}
+_FOLDERS = {RECORD, "logs", *(table.split(".")[0] for table in FILE_TABLES)}
 _MOST_ENTRIES = 1_000_000
 _MOST_MANIFEST_BYTES = 256 * 2**20
 _CHUNK_BYTES = 2**20

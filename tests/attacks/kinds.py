@@ -42,79 +42,79 @@ Make = Callable[[Target, random.Random], bytes]
 
 
 def _authentic(
-    target: Target, draw: random.Random, *, sequence: int | None = None, flow: Flow | None = None,
+    target: Target, rng: random.Random, *, sequence: int | None = None, flow: Flow | None = None,
     run_id: int | None = None, key: bytes | None = None,
 ) -> bytes:  # fmt: skip
     message = Message(
         target.flow if flow is None else flow,
-        FUTURE + draw.getrandbits(20) if sequence is None else sequence,
-        draw.getrandbits(32),  # within the run
-        np.array([draw.gauss(0, 1e6) for _ in range(target.dimension)]),
+        FUTURE + rng.getrandbits(20) if sequence is None else sequence,
+        rng.getrandbits(32),  # within the run
+        np.array([rng.gauss(0, 1e6) for _ in range(target.dimension)]),
     )
     encoder = Encoder(target.run_id if run_id is None else run_id, target.key if key is None else key)
     return encoder.encode(message)
 
 
-def empty(target: Target, draw: random.Random) -> bytes:
+def empty(target: Target, rng: random.Random) -> bytes:
     """An empty datagram."""
     return b""
 
 
-def noise(target: Target, draw: random.Random) -> bytes:
+def noise(target: Target, rng: random.Random) -> bytes:
     """Random bytes, often of the right length."""
     right = HEADER_BYTES + 8 * target.dimension + TAG_BYTES
-    return draw.randbytes(draw.choice((right, draw.randrange(1, 1400))))
+    return rng.randbytes(rng.choice((right, rng.randrange(1, 1400))))
 
 
-def forged(target: Target, draw: random.Random) -> bytes:
+def forged(target: Target, rng: random.Random) -> bytes:
     """A correct header, random values, a guessed tag."""
-    return _authentic(target, draw)[:-TAG_BYTES] + draw.randbytes(TAG_BYTES)
+    return _authentic(target, rng)[:-TAG_BYTES] + rng.randbytes(TAG_BYTES)
 
 
-def flipped(target: Target, draw: random.Random) -> bytes:
+def flipped(target: Target, rng: random.Random) -> bytes:
     """An authentic datagram with one bit flipped."""
-    data = bytearray(_authentic(target, draw))
-    bit = draw.randrange(8 * len(data))
+    data = bytearray(_authentic(target, rng))
+    bit = rng.randrange(8 * len(data))
     data[bit // 8] ^= 1 << bit % 8
     return bytes(data)
 
 
-def truncated(target: Target, draw: random.Random) -> bytes:
+def truncated(target: Target, rng: random.Random) -> bytes:
     """The beginning of an authentic datagram."""
-    data = _authentic(target, draw)
-    return data[: draw.randrange(len(data))]
+    data = _authentic(target, rng)
+    return data[: rng.randrange(len(data))]
 
 
-def oversized(target: Target, draw: random.Random) -> bytes:
+def oversized(target: Target, rng: random.Random) -> bytes:
     """An authentic datagram with additional bytes."""
-    return _authentic(target, draw) + bytes(draw.choice((1, 8, 1000, 60_000)))
+    return _authentic(target, rng) + bytes(rng.choice((1, 8, 1000, 60_000)))
 
 
-def replayed(target: Target, draw: random.Random) -> bytes:
+def replayed(target: Target, rng: random.Random) -> bytes:
     """An authentic datagram that was accepted before."""
-    return _authentic(target, draw, sequence=REPLAYED)
+    return _authentic(target, rng, sequence=REPLAYED)
 
 
-def cross_run(target: Target, draw: random.Random) -> bytes:
+def cross_run(target: Target, rng: random.Random) -> bytes:
     """A datagram of another run: another id, another key, or both."""
-    other_id, other_key = draw.getrandbits(64), draw.randbytes(KEY_BYTES)
-    which = draw.randrange(3)
+    other_id, other_key = rng.getrandbits(64), rng.randbytes(KEY_BYTES)
+    which = rng.randrange(3)
     return _authentic(
-        target, draw,
+        target, rng,
         run_id=other_id if which != 1 else None,
         key=other_key if which != 0 else None,
     )  # fmt: skip
 
 
-def cross_flow(target: Target, draw: random.Random) -> bytes:
+def cross_flow(target: Target, rng: random.Random) -> bytes:
     """An authentic datagram of a flow to another process."""
     flows = [flow for flow in Flow if flow not in (target.flow, Flow.ACKNOWLEDGEMENT)]
-    return _authentic(target, draw, flow=draw.choice(flows))
+    return _authentic(target, rng, flow=rng.choice(flows))
 
 
-def elsewhere(target: Target, draw: random.Random) -> bytes:
+def elsewhere(target: Target, rng: random.Random) -> bytes:
     """An authentic datagram, newer than all others, not from the peer's address."""
-    return _authentic(target, draw)
+    return _authentic(target, rng)
 
 
 FROM_ANYWHERE: Mapping[str, Make] = {
@@ -173,13 +173,13 @@ class _Sender:
         self._raw.sendto(header + data, (target.host, target.port))
 
 
-def _datagrams(make: Make, target: Target, draw: random.Random) -> Iterator[bytes]:
+def _datagrams(make: Make, target: Target, rng: random.Random) -> Iterator[bytes]:
     """Yield datagrams of a kind; some repeat, because making them takes time."""
     made: list[bytes] = []
     while True:
         if len(made) < _DISTINCT:
-            made.append(make(target, draw))
-        yield made[-1] if len(made) < _DISTINCT else draw.choice(made)
+            made.append(make(target, rng))
+        yield made[-1] if len(made) < _DISTINCT else rng.choice(made)
 
 
 def _paced(count: int, rate_hz: float, until_s: float) -> Iterator[int]:
@@ -200,14 +200,14 @@ def carry_out(plan: Plan) -> Sent:
     """Attack; return the numbers of datagrams."""
     if plan.namespace is not None:
         enter_namespace(plan.namespace)
-    draw, sender, sent = random.Random(1), _Sender(plan.forge_addresses), Sent()
+    rng, sender, sent = random.Random(1), _Sender(plan.forge_addresses), Sent()
     arms: list[list[tuple[str, str, Iterator[bytes]]]] = []
     for target in plan.targets:
         kinds = [(STRANGER, kind) for kind in FROM_ANYWHERE]
         # The emulator accepts the sensor's address.
         if plan.forge_addresses and target.is_forgeable and target.role != "netem":
             kinds += [(PEER, kind) for kind in FROM_THE_PEER]
-        arms.append([(by, kind, _datagrams(FROM_ANYWHERE[kind], target, draw)) for by, kind in kinds])
+        arms.append([(by, kind, _datagrams(FROM_ANYWHERE[kind], target, rng)) for by, kind in kinds])
     for number in _paced(plan.per_port, plan.rate_hz, plan.until_s):
         for target, of_target in zip(plan.targets, arms, strict=True):
             by, kind, datagrams = of_target[number % len(of_target)]

@@ -92,21 +92,21 @@ INSIDE = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("place", "use"), [*INSIDE, *(("", use) for use in USES)])
+@pytest.mark.parametrize(("subfolder", "use"), [*INSIDE, *(("", use) for use in USES)])
 def test_a_symbolic_link_instead_of_a_folder_is_refused(
-    place: str, use: str, shared: Path, descriptor: RunDescriptor
+    subfolder: str, use: str, shared: Path, descriptor: RunDescriptor
 ) -> None:
     """Even a link to this user's own folder: its owner can change the target at any time."""
     own = shared / "own"
     for folder in (own, own / "runs", own / "netem", shared / OWN):
         folder.mkdir(mode=0o700)
-    if not place:
+    if not subfolder:
         (shared / OWN).rmdir()
     (own / "default.json").write_text(descriptor.model_dump_json())
-    (shared / OWN / place).symlink_to(own)
+    (shared / OWN / subfolder).symlink_to(own)
     with pytest.raises(CallerError, match="closed to others"):
         USES[use](descriptor)
-    if not place:
+    if not subfolder:
         assert "closed to others" in str(_runtime_folder_problem())  # the doctor reports it
     assert [file.name for file in own.rglob("*") if file.is_file()] == ["default.json"]
 

@@ -168,10 +168,10 @@ def key(choices: Choices, vocabulary: Vocabulary) -> str:
 
 
 def _edit(choices: Choices, tree: Any, vocabulary: Vocabulary) -> None:
-    places = list(_containers(tree))
-    if not places:
+    containers = list(_containers(tree))
+    if not containers:
         return
-    container = choices.choose(places)
+    container = choices.choose(containers)
     at: Any
     if isinstance(container, dict):
         at = choices.choose(list(container)) if container and choices.below(3) else key(choices, vocabulary)
@@ -184,7 +184,7 @@ def _edit(choices: Choices, tree: Any, vocabulary: Vocabulary) -> None:
         case 0 | 1:
             container[at] = value(choices, vocabulary)
         case 2:
-            container[at] = copy.deepcopy(choices.choose(places))
+            container[at] = copy.deepcopy(choices.choose(containers))
         case 3 if isinstance(container, list):
             container.insert(at, copy.deepcopy(container[at]))
         case _ if isinstance(container, dict):

@@ -46,11 +46,11 @@ def compare_lines(path: Path, lines_of: Callable[[str], Sequence[str]]) -> None:
     compare_text(path, "\n".join(lines) + "\n")
 
 
-def lines_of_error(call: Callable[[], object], **places: Path) -> list[str]:
+def lines_of_error(call: Callable[[], object], **paths: Path) -> list[str]:
     """The lines of the error that a call raises, with the names of files and folders replaced."""
     with pytest.raises(NoackError) as error:
         call()
     text = str(error.value)
-    for name, path in places.items():
+    for name, path in paths.items():
         text = text.replace(str(path), name)
     return text.splitlines()

@@ -39,10 +39,12 @@ SELF_TRIGGERED = {
 
 
 def dwell(rule: Table, interval_s: float) -> Table:
+    """A rule that is not tested for a time after an event."""
     return {"policy": "dwell", "interval_s": interval_s, "rule": rule}
 
 
 def deadline(rule: Table, interval_s: float) -> Table:
+    """A rule with an event at the latest after a time."""
     return {"policy": "deadline", "interval_s": interval_s, "rule": rule}
 
 
@@ -100,20 +102,24 @@ def random_rule(name: str, rng: np.random.Generator, n: int, weight: Matrix | No
 def decaying_rule(
     beta: float, alpha_per_s: float, floor: float = 0.0, weight: Matrix | None = None, n: int = 2
 ) -> TriggerRule:
+    """‖e_s‖_W exceeds max(βe^(−αt), floor), the paper's rule."""
     n = n if weight is None else len(weight)
     return TriggerRule(error_form(n, weight), beta, alpha_per_s, floor, weight=weight)
 
 
 def absolute_rule(delta: float, weight: Matrix | None = None, n: int = 2) -> TriggerRule:
+    """‖e_s‖_W exceeds δ."""
     n = n if weight is None else len(weight)
     return TriggerRule(error_form(n, weight), floor=delta, weight=weight)
 
 
 def area_rule(delta_s: float, weight: Matrix | None = None, n: int = 2) -> TriggerRule:
+    """The integral of ‖e_s‖_W since the last event exceeds δ."""
     return absolute_rule(delta_s, weight, n)._replace(integrates=True)
 
 
 def mixed_rule(sigma: float, epsilon: float = 0.0, weight: Matrix | None = None, n: int = 2) -> TriggerRule:
+    """‖e_s‖_W² exceeds σ²‖x‖_W² + ε²."""
     return given_mixed_rule(n if weight is None else len(weight), sigma, epsilon, weight)
 
 
@@ -121,6 +127,7 @@ def quadratic_rule(
     Q: Matrix, period_ns: int, epsilon: float = 0.0, heartbeat: int = 0,
     weight: Matrix | None = None,
 ) -> TriggerRule:  # fmt: skip
+    """A quadratic form of (x, e_s) exceeds ε; tested once a period, with an event every ``heartbeat``."""
     longest_ns = heartbeat * period_ns if heartbeat else np.inf
     return TriggerRule(
         quadratic_form(Q), floor=float(np.sqrt(epsilon)), grid_ns=period_ns, longest_ns=longest_ns,

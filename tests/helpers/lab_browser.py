@@ -94,16 +94,19 @@ class Page:
             )  # fmt: skip
 
     def js(self, expression: str) -> Any:
+        """Return the value of a JavaScript expression; a promise is awaited."""
         answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
         return answer["result"].get("value")
 
     def wait(self, condition: str) -> None:
+        """Wait until a JavaScript expression is true."""
         deadline_s = time.monotonic() + PATIENCE_S
         while not self.js(condition):
             assert time.monotonic() < deadline_s, (condition, self.js(TEXT))
             time.sleep(0.05)
 
     def click(self, text: str, kind: str) -> None:
+        """Click on the last element of a kind whose text ends so."""
         element = (
             f"[...document.querySelectorAll('{kind}')].filter(e => e.offsetParent && "
             f"e.innerText.trim().toLowerCase().endsWith({json.dumps(text)}))"
@@ -162,13 +165,13 @@ class Page:
 
     def drag(self, label: str, to: float) -> None:
         """Drag the slider with a label to a share of its length."""
-        place = (
+        box = (
             f"(() => {{ const s = [...document.querySelectorAll('.lab-slider')].find(e => "
             f"e.innerText.startsWith({json.dumps(label)})).querySelector('input'); "
             "s.scrollIntoView({ block: 'center' }); const r = s.getBoundingClientRect(); "
             "return [r.x, r.y + r.height / 2, r.width]; })()"
         )
-        x, y, width = self.js(place)
+        x, y, width = self.js(box)
         for kind, share in (("mousePressed", 0.4), ("mouseMoved", 0.45), ("mouseMoved", to),
                             ("mouseReleased", to)):  # fmt: skip
             self.call(
@@ -180,6 +183,7 @@ class Page:
 
 @contextmanager
 def started(profile: Path, *card: str) -> Iterator[Browser]:
+    """Start a headless browser within the context; skip the test if there is none."""
     program = shutil.which("chromium") or shutil.which("google-chrome")
     if program is None or sys.platform != "linux" or not hasattr(os, "fork"):
         pytest.skip("no chromium here")

@@ -30,6 +30,7 @@ WITHOUT_VIEWER = {"PYTHONPATH": str(Path(__file__).parents[1] / "integration" / 
 
 
 def noack_command(*arguments: str, impatient: bool = False) -> list[str]:
+    """Return a command of noack; an impatient one waits less for processes that do not respond."""
     module = "tests.integration.impatient" if impatient else "cosim.cli"
     return [sys.executable, "-m", module, *arguments]
 
@@ -85,6 +86,8 @@ def assert_complete(loop: Mapping[str, Any]) -> None:
 
 @dataclass(frozen=True)
 class Finished:
+    """A run that has ended."""
+
     status: int
     summary: dict[str, Any]
     stderr: str
@@ -196,6 +199,7 @@ class Running:
         self._children: list[psutil.Process] = []
 
     def wait_started(self) -> None:
+        """Wait until the loop has started; fail if the run ends before."""
         wait_for(lambda: (self.runs / "latest").exists() or self.process.poll() is not None)
         assert self.process.poll() is None, self.process.communicate()
         self._children = psutil.Process(self.process.pid).children(recursive=True)
@@ -208,12 +212,14 @@ class Running:
             wait_for(lambda path=path: path.exists() and path.stat().st_size > 10_000)
 
     def child(self, role: str) -> psutil.Process:
+        """Return the process of a role, as of the start."""
         for child in self._children:
             if is_of(role, child):
                 return child
         raise AssertionError(f"no process of {role}")
 
     def finish(self, patience_s: float = PATIENCE_S) -> Finished:
+        """Wait for the end of the run."""
         stdout, stderr = self.process.communicate(timeout=patience_s)
         assert stdout, (self.process.returncode, stderr)
         summary = json.loads(stdout)
@@ -226,6 +232,7 @@ class Running:
         return str(json.loads(stdout)["error"])
 
     def left_behind(self) -> list[psutil.Process]:
+        """Return the processes of the run that do not end."""
         _, alive = psutil.wait_procs(self._children, timeout=PATIENCE_S)
         return [child for child in alive if not is_over(child)]
 

@@ -27,6 +27,7 @@ def values_of(text: str) -> Values:
 
 
 def exposed(collector: object) -> str:
+    """Return the metrics of a collector as text."""
     registry = CollectorRegistry()
     registry.register(collector)  # type: ignore[arg-type]
     return str(generate_latest(registry).decode())
@@ -54,6 +55,7 @@ def slow_reader(address: Address) -> Iterator[threading.Thread]:
 
 
 def read(address: Address, accept: str = OPENMETRICS, method: str = "GET") -> str:
+    """Return the metrics that are served at an address."""
     request = urllib.request.Request(
         f"http://{address[0]}:{address[1]}/metrics", headers={"Accept": accept}, method=method
     )

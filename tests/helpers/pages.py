@@ -25,7 +25,8 @@ def fences(page: str) -> list[tuple[str, str]]:
 
 
 def blocks(page: str, language: str) -> list[str]:
-    return [content for of, content in fences(page) if of == language]
+    """Return the fenced blocks of a language."""
+    return [content for block_language, content in fences(page) if block_language == language]
 
 
 def target_exists(command: str) -> bool:

@@ -12,10 +12,12 @@ from noack.scenario.scenario_file import load
 
 
 def shipped(name: str, *settings: str) -> Scenario:
+    """Return a shipped scenario with settings."""
     return load(find_shipped(name, "scenarios"), settings)
 
 
 def resolved(name: str, *settings: str) -> Scenario:
+    """Return the same, resolved."""
     return resolve(shipped(name, *settings))
 
 

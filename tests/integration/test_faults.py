@@ -158,6 +158,7 @@ def test_a_run_on_a_disk_that_fills_up_can_be_finalised_later(start: Start, smal
     running = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=240.0))
     running.wait_recording()
     run_dir = (running.runs / "latest").resolve()
+    # The disk is full: the run fails with the reason, and keeps what was recorded.
     fill(small_disk)
     stdout, stderr = running.process.communicate(timeout=live.PATIENCE_S)
     lines = [line for line in stderr.splitlines() if line.startswith("noack")]
@@ -173,12 +174,12 @@ def test_a_run_on_a_disk_that_fills_up_can_be_finalised_later(start: Start, smal
     assert "No space left on device" in stdout  # as JSON
     assert running.left_behind() == []
     spooled = {path.name: path.stat().st_size for path in (run_dir / "spool").iterdir()}
-
+    # It is still full: the same reason again, and nothing is lost.
     with pytest.raises(MachineError) as error:
         reopen(run_dir)
     assert str(error.value).splitlines() == [line.removeprefix("noack: ") for line in lines]
     assert {path.name: path.stat().st_size for path in (run_dir / "spool").iterdir()} == spooled
-
+    # There is space again: the record has all rows that were on disk.
     (small_disk / "filler").unlink()
     assert invoke("summary", run_dir).exit_code == 0
     record = load_record(run_dir)

@@ -156,6 +156,7 @@ def test_a_run_is_changed_twice_and_stopped(
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     running = start(*AT_RATE, *settings(horizon_s=1000.0))
     running.wait_recording()
+    # While it runs: no summary yet, two changes, and one that is refused.
     result = invoke("summary", running.runs / "latest")
     assert result.exit_code == 2
     assert "still under way" in result.stderr
@@ -169,7 +170,7 @@ def test_a_run_is_changed_twice_and_stopped(
     wait_for(lambda: spooled(running, PLANT_STEP)["t_ns"][-1] > until_ns)
     running.process.send_signal(signal.SIGTERM)
     finished = running.finish()
-
+    # It was stopped, and its record is complete up to then.
     summary, record = finished.summary, load_record(finished.run_dir)
     assert finished.status == 143, finished.stderr
     assert summary["exit"]["reason"] == "stopped on request (SIGTERM)"
@@ -181,7 +182,7 @@ def test_a_run_is_changed_twice_and_stopped(
     assert finished.loop["identity_residual_relative"] < 1e-9
     assert set(finished.loop["realtime"]) == set(LOOP_ROLES)
     assert running.left_behind() == []
-
+    # Both changes are recorded, and are no violation.
     assert [change["t_s"] for change in summary["changes"]] == [first["from_s"], second["from_s"]]
     assert summary["changes"][1]["settings"] == {"controller.setpoint": [0.0, 0.0, 0.0, 1.0]}
     assert record.scenario.network.mansd == 4  # as it was at the start

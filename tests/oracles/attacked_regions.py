@@ -203,11 +203,11 @@ class _AttackedLoops:
         random_delay = self.rng.integers(0, self.longest + 1, self.runs)
         delay = np.where(self.always_longest, self.longest, random_delay)
         first_delay = np.minimum(delay, int(self.conditions.start_s / self.h + 1e-9))
-        place = (number + (delay if number else first_delay)) % (self.longest + 1)
+        arrival = (number + (delay if number else first_delay)) % (self.longest + 1)
         delivered = np.flatnonzero(event & ~lost)
         updates = np.einsum("rij,jr->ri", self.late[delay[delivered]], self.x[:, delivered])
-        self.arriving[place[delivered], :, delivered] = updates
-        self.arrives[place[delivered], delivered] = self.sent[delivered]
+        self.arriving[arrival[delivered], :, delivered] = updates
+        self.arrives[arrival[delivered], delivered] = self.sent[delivered]
 
     def receive(self, number: int) -> None:
         """Reset x_c where an update arrives that is newer than the last one."""

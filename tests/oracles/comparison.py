@@ -92,9 +92,9 @@ class Comparison:
         largest = np.abs(recorded).reshape(len(recorded), -1).max(axis=1, initial=0.0)
         size = np.maximum(np.maximum.accumulate(largest), self._size(t_ns))
         error = np.abs(recorded - own).reshape(len(own), -1).max(axis=1, initial=0.0) / size
-        place = int(error.argmax())
-        self.error = max(self.error, float(error[place]))
-        assert error[place] <= TOLERANCE, f"{name} at {t_ns[place]} ns: {recorded[place]}, {own[place]}"
+        worst = int(error.argmax())
+        self.error = max(self.error, float(error[worst]))
+        assert error[worst] <= TOLERANCE, f"{name} at {t_ns[worst]} ns: {recorded[worst]}, {own[worst]}"
 
 
 NOT_COMPUTED = {table: {"loop", "input", "now_ns"} for table in TIMES} | {

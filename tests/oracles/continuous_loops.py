@@ -37,17 +37,17 @@ def simulate_continuous_time(system: System, delivered: Flags, _: Steps) -> Cont
     """Simulate the outcomes (runs, events) of the updates; a run ends when it has no more."""
     # z = (x, x_s, x_c) with dz/dt = F z between events, and what is measured of it.
     n, A, H = len(system.A), system.A, system.H
-    BK, none = system.B @ system.K, np.zeros((n, n))
-    F = np.block([[A, none, BK], [none, H, none], [none, none, H]])
+    BK, zero = system.B @ system.K, np.zeros((n, n))
+    F = np.block([[A, zero, BK], [zero, H, zero], [zero, zero, H]])
     W, eye = system.weight, np.eye(n)
     E = A + BK - H
     signals = [
-        W @ np.hstack([-eye, eye, none]),
-        W @ np.hstack([-eye, none, eye]),
-        np.hstack([eye, none, none]),
-        W @ np.hstack([eye, none, none]),
-        system.K @ np.hstack([-eye, none, eye]),
-        W @ E @ np.hstack([eye, none, none]),
+        W @ np.hstack([-eye, eye, zero]),
+        W @ np.hstack([-eye, zero, eye]),
+        np.hstack([eye, zero, zero]),
+        W @ np.hstack([eye, zero, zero]),
+        system.K @ np.hstack([-eye, zero, eye]),
+        W @ E @ np.hstack([eye, zero, zero]),
     ]
     e_s = signals[0].T
     rows, begins = np.vstack(signals).T, np.cumsum([0, *(len(signal) for signal in signals[:-1])])

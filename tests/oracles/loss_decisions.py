@@ -50,7 +50,8 @@ def fates_of_flow(settings: LinkSettings, seed: int, name: str, flow: int, count
         lost = is_lost(*uniform_pair(key, flow, packet))
         may_be_lost = is_allowed([*outcomes, True], settings) and (packet or not settings.first_delivered)
         outcomes.append(lost and bool(may_be_lost))
-        fates.append(Fate.DELIVERED if not lost else Fate.DROPPED if may_be_lost else Fate.FORCED)
+        fate_of_loss = Fate.DROPPED if may_be_lost else Fate.FORCED
+        fates.append(fate_of_loss if lost else Fate.DELIVERED)
     return fates
 
 

@@ -130,11 +130,13 @@ def _find_sampled(
     flow = SampledFlow(SampledLoop(resolved), objective, certificate)
     own_run = run_sampled(flow, network_fates(resolved))
     first_event = 0 if flow.loop.known_start else 1
+    # The worst pattern with the disturbances that are drawn.
     search = PatternSearch(flow, resolved.network.guarantee, report)
     exact = _search(search, own_run.delivered[first_event:], beam, most_nodes)
     worst, lossless = _run(flow, search.pattern), run_sampled(flow, lambda event: True)
     bounds = disturbance_bounds(resolved) if objective in (Objective.ERROR, Objective.STATE) else None
     if bounds is not None:
+        # The worst disturbances for it, the worst pattern for these, and once more the disturbances.
         exact = False
         disturbed_flow, worst = _worsen_disturbances(flow, bounds, worst)
         second_search = PatternSearch(disturbed_flow, resolved.network.guarantee, report)

@@ -204,7 +204,9 @@ def _notes(resolved: Scenario, trigger: str) -> Iterator[str]:
 def _quantity(objective: Objective, certificate: ScenarioCertificate, trigger: str) -> str:
     constants, sampled = certificate.constants, trigger == "sampled"
     alpha = certificate.alpha_per_s
-    rate = (0.0 if sampled else alpha) if constants is None else constants.rate_per_s
+    rate = 0.0 if sampled else alpha
+    if constants is not None:
+        rate = constants.rate_per_s
     symbol = "α" if rate == alpha and not sampled else f"{rate:.3g}"
     growth = f" e^({symbol}t)" if rate else ""
     if sampled and _is_shaped(certificate):

@@ -90,6 +90,7 @@ class _Measurements:
         self.newest_ns = 0
 
     def add(self, rows: Rows) -> None:
+        """Add measurements, in their order."""
         t_ns, generations = rows["t_ns"], rows["input"] // GENERATION
         self._times.append(np.append(self.newest_ns, t_ns))
         self.newest_ns = int(t_ns[-1])
@@ -98,6 +99,7 @@ class _Measurements:
         self._restarts.append((t_ns[first], generations[first]))
 
     def gaps(self, end_ns: int | None) -> SampledSeries:
+        """Return the times between measurements since the last call, with the end of the run if given."""
         times, self._times = self._times, []
         if end_ns is not None:
             times.append(np.array([self.newest_ns, end_ns]))
@@ -107,6 +109,7 @@ class _Measurements:
         return SampledSeries(since_ns[longer] * 1e-9, gaps_ns[longer] * 1e-9)
 
     def restarts(self) -> SampledSeries:
+        """Return the generations of restarted sensors since the last call."""
         t_ns, generations = columns(self._restarts, 2)
         self._restarts = []
         return SampledSeries(t_ns * 1e-9, generations * 1.0)
@@ -124,10 +127,12 @@ class _Updates:
         self._resolved = NO_SEQUENCE
 
     def add_measurements(self, rows: Rows) -> None:
+        """Add measurements, of which the events have updates."""
         events = rows.compress(rows["event"] != NO_SEQUENCE)
         self._events.extend(zip(events["event"].tolist(), events["t_ns"].tolist(), strict=True))
 
     def add_packets(self, rows: Rows) -> None:
+        """Add packets at the emulator, of which the updates show whether they passed."""
         rows, sequences, _ = messages_in(rows)
         forwarded = effective(rows["fate"]).tolist()
         for sequence, passed in zip(sequences.tolist(), forwarded, strict=True):
@@ -135,12 +140,14 @@ class _Updates:
             self._newest_packet = max(self._newest_packet, sequence)
 
     def add_applied(self, applied: list[tuple[int, int, int | None]]) -> None:
+        """Add updates: number, model time of the reset, time at which the plant applied it, or None."""
         self._applied.extend(applied)
         times = [(applied_ns, model_ns) for _, model_ns, applied_ns in applied if applied_ns is not None]
         self._early += [(applied_ns, model_ns) for applied_ns, model_ns in times if applied_ns < model_ns]
 
     @property
     def waiting(self) -> int:
+        """Number of entries that wait for others."""
         return len(self._events) + len(self._applied) + len(self._passed)
 
     def take_resolved(self, start_s: float, end_ns: int | None) -> tuple[PacketLosses, SampledSeries]:
@@ -267,19 +274,19 @@ class ConditionReader:
         if not self._inputs.started and not ended:
             start_s = self._inputs.classified_ns * 1e-9
         return ObservedConditions(
-            losses,
-            self._measurements.gaps(end_ns),
-            delay,
-            hold,
-            start_s,
-            watchdog,
-            safe_input,
-            self._measurements.restarts(),
-            self._timeout_s,
-            {} if self._clocks is None else self._clocks.take(),
-            np.inf if self._clocks is None else self._clocks.largest_s,
-            np.inf if end_ns is None else end_ns * 1e-9,
-            self._updates.take_early(),
+            losses=losses,
+            sampling=self._measurements.gaps(end_ns),
+            delay=delay,
+            hold=hold,
+            start_s=start_s,
+            watchdog=watchdog,
+            safe_input=safe_input,
+            restarts=self._measurements.restarts(),
+            timeout_s=self._timeout_s,
+            clocks={} if self._clocks is None else self._clocks.take(),
+            largest_clock_error_s=np.inf if self._clocks is None else self._clocks.largest_s,
+            reached_s=np.inf if end_ns is None else end_ns * 1e-9,
+            early=self._updates.take_early(),
         )
 
 

@@ -63,7 +63,7 @@ class InputReplay:
         role: whose it is.
         machine: new machines, or a new network.
         sizes: entries of the vectors that the machine sends, by flow.
-        loop: the place of its loop among those of the machines.
+        loop: the index of its loop among those of the machines.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class InputReplay:
 
         Args:
             owned: the next rows by table.
-            order: places of the inputs among the rows of all tables, in order.
+            order: indices of the inputs among the rows of all tables, in order.
             before: numbers of rows before them, by table.
 
         Returns:
@@ -135,8 +135,8 @@ class InputReplay:
         error level.
         """
         sent = self._sent[: self._core.sent_count]
-        mine = sent[:, 0] == flow
-        words = sent if mine.all() else sent[mine]
+        is_of_flow = sent[:, 0] == flow
+        words = sent if is_of_flow.all() else sent[is_of_flow]
         return words[:, 1 : _HEADER_WORDS + self._sizes.get(flow, 0) + 1]
 
     def forwarded(self) -> tuple[Numbers, NDArray[np.void]]:
@@ -225,7 +225,7 @@ class _InputRows:
 
 
 def table_and_row(owned: Slice, row: int) -> tuple[str, int]:
-    """Return table and row of a place among the rows of all tables."""
+    """Return table and row of an index among the rows of all tables."""
     for table, rows in owned.items():
         if row < len(rows):
             return table, row
@@ -315,11 +315,11 @@ class SharedMachines:
     def __init__(self, records: Sequence[RunRecord]) -> None:
         shared = [record for record in records if record.is_short and not any(map(record.count, SETTINGS))]
         self._loops = [record.scenario for record in shared]
-        self._places = {record.number: place for place, record in enumerate(shared)}
+        self._indices = {record.number: index for index, record in enumerate(shared)}
 
-    def place(self, record: RunRecord) -> int | None:
-        """Return the place of a loop among the machines; None if they do not have it."""
-        return self._places.get(record.number)
+    def index(self, record: RunRecord) -> int | None:
+        """Return the index of a loop among the machines; None if they do not have it."""
+        return self._indices.get(record.number)
 
     @cached_method
     def of(self, role: str) -> LoopMachines:
@@ -383,9 +383,9 @@ class _GenerationReplay:
         order = self._in_order(owned)
         if self._run is None:
             self._run = self._begin(owned)
-        taken = self._run.replay(owned, order, self._before)
-        self._stopped |= taken < len(order)
-        self._compared += taken
+        compared = self._run.replay(owned, order, self._before)
+        self._stopped |= compared < len(order)
+        self._compared += compared
         for table, rows in owned.items():
             self._before[table] += len(rows)
         return [self._run]
@@ -397,9 +397,9 @@ class _GenerationReplay:
         if role == "netem":
             channel = channel_of(scenario, start, loops=len(loops_of(scenario)))
             return InputReplay(role, channel, sizes)
-        position = None if generation else self._shared.place(self._record)
-        if position is not None:
-            return InputReplay(role, self._shared.of(role), sizes, position)
+        index = None if generation else self._shared.index(self._record)
+        if index is not None:
+            return InputReplay(role, self._shared.of(role), sizes, index)
         return InputReplay(role, _MACHINES[role]((scenario,), start=start), sizes)
 
     def result(self) -> ProcessReplay:
@@ -416,7 +416,7 @@ class _GenerationReplay:
         )
 
     def _in_order(self, owned: Slice) -> Numbers:
-        """Return the places of the inputs in order, among the rows of all tables, up to a gap."""
+        """Return the indices of the inputs in order, among the rows of all tables, up to a gap."""
         numbers = np.concatenate([rows["input"] for rows in owned.values()])
         numbers = numbers - self._own.number * GENERATION
         order = np.argsort(numbers, kind="stable")

@@ -188,7 +188,7 @@ def _why_failed(record: RunRecord, missing: Mapping[str, int], diverged: Diverge
 
 
 def _divergence(record: RunRecord) -> Divergence | None:
-    scenarios = [record.scenario, *(made.scenario for made in changes_of(record))]
+    scenarios = [record.scenario, *(change.scenario for change in changes_of(record))]
     batches = record.source.batches(PLANT_STEP, ("t_ns", "x"))
     parts = ((steps["t_ns"] * 1e-9, steps["x"]) for steps in batches)
     diverged = divergence(parts, record.count(PLANT_STEP), scenarios)
@@ -203,13 +203,13 @@ def change_parts(record: RunRecord) -> list[ChangePart]:
     """Return the changes of settings during the run."""
     return [
         ChangePart(
-            number=made.change.number,
-            t_s=made.change.t_ns / NS_PER_S,
-            settings=dict(made.change.settings),
-            what=text_of(made.change.settings),
-            in_force_from_s={role: ns / NS_PER_S for role, ns in made.since_ns.items()},
+            number=change.change.number,
+            t_s=change.change.t_ns / NS_PER_S,
+            settings=dict(change.change.settings),
+            what=text_of(change.change.settings),
+            in_force_from_s={role: ns / NS_PER_S for role, ns in change.since_ns.items()},
         )
-        for made in changes_of(record)
+        for change in changes_of(record)
     ]
 
 

@@ -69,7 +69,7 @@ def lab(
     edited = scenario_draft.open_draft(source.scenario)
     for key, value in map(scenario_file.setting_of, source.settings or ()):
         edited = edited.with_value(key, value)
-    _ = edited.scenario  # report mistakes here
+    edited.require_valid()  # report mistakes here
     query = edited.query() if source.settings else ""
     options = lab_server.LabOptions(source.scenario, query, Path.cwd(), runs, port, browser)
 

@@ -102,18 +102,12 @@ def paper(
         noack paper selivanov_fridman   one of them
     """
     if list_names:
-        names = paper_results.NAMES if name is None else [name]
-        known = {result_name: paper_results.find_result(result_name).about for result_name in names}
-        cli.print_lines(json, known, *(f"{result_name:<18} {about}" for result_name, about in known.items()))
+        _list_results(paper_results.NAMES if name is None else [name], json=json)
         return ExitStatus.OK
     if name is not None:
         if out is not None or draws is not None:
             raise CallerError("--out, --draws: are for `noack paper` without a name; this has --tables")
-        with cli.status("computing"):
-            result = paper_results.reproduce(name)
-        cli.show(json, result.to_json, published_result.print_rows, result)
-        cli.write_tables([result.table], tables, json=json)
-        return ExitStatus.OK if result.as_expected else ExitStatus.FAILED
+        return _reproduce(name, tables, json=json)
     out = out or DEFAULT_RUNS / "paper"
     paper_page.make_folder(out)
     path, folder = find_shipped("paper", "campaigns"), DEFAULT_RUNS / "campaigns" / "paper"
@@ -133,6 +127,21 @@ def paper(
     cli.print_lines(json, document, *files)
     cli.write_tables([table], tables, json=json)
     return ExitStatus.OK
+
+
+def _list_results(names: Sequence[str], *, json: bool) -> None:
+    """Print published results, each with what it is about."""
+    known = {name: paper_results.find_result(name).about for name in names}
+    cli.print_lines(json, known, *(f"{name:<18} {about}" for name, about in known.items()))
+
+
+def _reproduce(name: str, tables: Path | None, *, json: bool) -> int:
+    """Compute a published result, and print it beside the published values; return the exit status."""
+    with cli.status("computing"):
+        result = paper_results.reproduce(name)
+    cli.show(json, result.to_json, published_result.print_rows, result)
+    cli.write_tables([result.table], tables, json=json)
+    return ExitStatus.OK if result.as_expected else ExitStatus.FAILED
 
 
 @opt.option_group

@@ -75,18 +75,18 @@ class _RunProgress:
         if roles:
             self._print(f"waiting for {', '.join(roles)}")
 
-    def listening(self, address: str, how: "ListenSettings") -> None:
+    def listening(self, address: str, settings: "ListenSettings") -> None:
         """Say how processes on other hosts join."""
-        if how.invitation is None:
-            places = (f"{role} on {host.ssh}" for role, host in how.hosts.items())
-            self._print(f"listening on {escape(address)} (TCP); by ssh: {escape(', '.join(places))}")
+        if settings.invitation is None:
+            remote = (f"{role} on {host.ssh}" for role, host in settings.hosts.items())
+            self._print(f"listening on {escape(address)} (TCP); by ssh: {escape(', '.join(remote))}")
             return
-        role = how.role or "plant|sensor|netem|controller"
+        role = settings.role or "plant|sensor|netem|controller"
         self._print(
             f"listening on {escape(address)}; copy the invitation to the other hosts, and start "
-            f"processes there within {how.valid_s / 60:g} min; it has secret keys:\n"
-            f"  scp {escape(str(how.invitation))} HOST:\n"
-            f"  noack {role} --invitation {escape(how.invitation.name)}"
+            f"processes there within {settings.valid_s / 60:g} min; it has secret keys:\n"
+            f"  scp {escape(str(settings.invitation))} HOST:\n"
+            f"  noack {role} --invitation {escape(settings.invitation.name)}"
         )
 
     @property
@@ -154,27 +154,45 @@ def _bar(
         yield lambda **fields: progress.update(task, **fields)
 
 
+class _SparseLines:
+    """Lines about some work where there is no terminal: at most one every ``_LINE_EVERY_S``."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._began_s = self._printed_s = time.monotonic()
+
+    @property
+    def spent_s(self) -> float:
+        """Time since the work began."""
+        return time.monotonic() - self._began_s
+
+    def print(self, line: str) -> None:
+        """Print a line, unless there is a terminal, or the last line is recent."""
+        now_s = time.monotonic()
+        if not self._console.is_terminal and now_s - self._printed_s >= _LINE_EVERY_S:
+            self._printed_s = now_s
+            self._console.print(f"noack: {line}", highlight=False, markup=False, soft_wrap=True)
+
+
 @contextmanager
 def work_bar(description: str, *, lines: bool = False) -> Iterator[Callable[[float], None]]:
     """Show the completed share of some work, and an estimate of the remaining time.
 
     Where there is no terminal, print them as a line at intervals if ``lines``.
     """
-    console, began_s = error_console(), time.monotonic()
-    line_s = began_s
+    console = error_console()
+    sparse_lines = _SparseLines(console)
     columns = TextColumn("{task.percentage:.0f} %"), TimeRemainingColumn()
     with _bar(console, 1.0, *columns, description=description) as update:
 
         def show(share: float) -> None:
-            nonlocal line_s
             update(completed=share)
-            now_s = time.monotonic()
-            if lines and not console.is_terminal and 0 < share < 1 and now_s - line_s >= _LINE_EVERY_S:
-                line_s, spent_s = now_s, now_s - began_s
-                line = f"noack: {description}: {100 * share:.0f} % after {spent_s:.0f} s"
+            if lines and 0 < share < 1:
+                spent_s = sparse_lines.spent_s
+                line = f"{description}: {100 * share:.0f} % after {spent_s:.0f} s"
                 if share >= _LEAST_SHARE:
                     line += f", about {spent_s / share - spent_s:.0f} s left"
-                console.print(line, highlight=False, markup=False, soft_wrap=True)
+                sparse_lines.print(line)
 
         yield show
 
@@ -198,20 +216,18 @@ def runs_bar(console: Console) -> Iterator[Callable[[int, int], None]]:
         TextColumn("{task.fields[rate]}"),
         TimeRemainingColumn(),
     )
-    began_s, before = time.monotonic(), -1
-    line_s = began_s
+    sparse_lines = _SparseLines(console)
+    before: int | None = None
     with _bar(console, 1, *columns) as show:
 
         def update(done: int, total: int) -> None:
-            nonlocal before, line_s
-            before, now_s = done if before < 0 else before, time.monotonic()
-            rate = (done - before) / max(now_s - began_s, 1e-3)
+            nonlocal before
+            before = done if before is None else before
+            spent_s = sparse_lines.spent_s
+            rate = (done - before) / max(spent_s, 1e-3)
             text = f"{rate:,.0f}/s" if done > before else "starting"
             show(completed=done, total=total, rate=text)
-            if not console.is_terminal and now_s - line_s >= _LINE_EVERY_S:
-                line_s = now_s
-                line = f"{done:,} of {total:,} runs after {now_s - began_s:.0f} s"
-                console.print(f"noack: {line}", highlight=False, markup=False, soft_wrap=True)
+            sparse_lines.print(f"{done:,} of {total:,} runs after {spent_s:.0f} s")
 
         yield update
 
@@ -220,19 +236,14 @@ def runs_bar(console: Console) -> Iterator[Callable[[int, int], None]]:
 def search_status() -> Iterator[Callable[[str], Callable[[str, int, float], None]]]:
     """Show the state of an adversary's search; where there is no terminal, a line at intervals."""
     console = error_console()
-    began_s = line_s = time.monotonic()
+    sparse_lines = _SparseLines(console)
     with console.status("searching") as status:
 
         def named(aim: str) -> Callable[[str, int, float], None]:
             def report(search: str, nodes: int, value: float) -> None:
-                nonlocal line_s
-                now_s = time.monotonic()
-                spent = f"{nodes} segments, worst {abs(value):.6g}, {now_s - began_s:.0f} s"
-                status.update(f"{aim}, {search}: {spent}")
-                if not console.is_terminal and now_s - line_s >= _LINE_EVERY_S:
-                    line_s = now_s
-                    line = f"noack: {aim}, {search}: {spent}"
-                    console.print(line, highlight=False, markup=False, soft_wrap=True)
+                state = f"{nodes} segments, worst {abs(value):.6g}, {sparse_lines.spent_s:.0f} s"
+                status.update(f"{aim}, {search}: {state}")
+                sparse_lines.print(f"{aim}, {search}: {state}")
 
             return report
 

@@ -37,26 +37,34 @@ class Watcher:
     """Callbacks of a launched run; each must return at once."""
 
     waiting: Callable[[Sequence[str]], None] = lambda roles: None
-    listening: "Callable[[str, ListenSettings], None]" = lambda address, how: None
+    """The start barrier waits for these roles, which are started by hand."""
+    listening: "Callable[[str, ListenSettings], None]" = lambda address, settings: None
+    """Processes on other hosts can join at this address."""
     started: Callable[[Path], None] = lambda run_dir: None
+    """The loop has started; its run directory exists."""
     failed: Callable[[str, float, str | None], None] = lambda why, t_s, by_hand: None
+    """A process failed; the role is given if it must be restarted by hand."""
     restarted: Callable[[str, float], None] = lambda role, t_s: None
+    """A process that failed runs again."""
     progress: Callable[[RunProgress], None] = lambda progress: None
+    """The recorder has sent a progress report."""
     stopping: Callable[[str], None] = lambda why: None
+    """The run ends early."""
     notice: Callable[[str], None] = lambda line: None
+    """A line for the person who watches the run."""
 
 
 def joint_watcher(watchers: Sequence[Watcher]) -> Watcher:
     """Return a watcher that calls others in order; after an OSError, no more of that one."""
-    left = list(watchers)
+    active = list(watchers)
 
     def call(name: str) -> Callable[..., None]:
         def each(*arguments: object) -> None:
-            for watcher in [*left]:
+            for watcher in [*active]:
                 try:
                     getattr(watcher, name)(*arguments)
                 except OSError:  # nobody reads its output any more
-                    left.remove(watcher)
+                    active.remove(watcher)
 
         return each
 

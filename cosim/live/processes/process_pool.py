@@ -37,18 +37,18 @@ def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
     """
     # A fork would inherit threads of the libraries.
     context = multiprocessing.get_context("spawn")
-    theirs, ours = context.Pipe(duplex=False)
+    child_end, own_end = context.Pipe(duplex=False)
     before = {name: os.environ.get(name) for name in _ENVIRONMENT}
     os.environ.update(_ENVIRONMENT)  # inherited by the children
     with process_starts():  # it starts a process for semaphores
-        pool = ProcessPoolExecutor(workers, context, _depend_on, (theirs, gc.get_threshold()))
+        pool = ProcessPoolExecutor(workers, context, _depend_on, (child_end, gc.get_threshold()))
     try:
         yield pool
         pool.shutdown()
     finally:
-        ours.close()  # ends processes that still compute
+        own_end.close()  # ends processes that still compute
         pool.shutdown(cancel_futures=True)
-        theirs.close()
+        child_end.close()
         for name, value in before.items():
             if value is None:
                 del os.environ[name]

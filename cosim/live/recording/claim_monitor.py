@@ -55,7 +55,7 @@ class ClaimMonitor:
         if not checked:
             self.stop(f"the run has {len(loops)} loops; up to {MOST_CHECKED} are checked during it")
         self._growth = GrowthMonitor(loops)
-        self._found: list[Finding] = []
+        self._findings: list[Finding] = []
         self._waiting: dict[str, list[Rows]] = {}
         self._due: list[int] = []
         """The loops that are still to be checked in this round."""
@@ -147,11 +147,11 @@ class ClaimMonitor:
         of_run = f"{event} from {self._of_run_s(loop, t_ns):.3f} s on: {why}"
         if len(self._names) > 1:
             of_run = f"{self._names[loop]}: {of_run}"
-        self._found.append(Finding(Notice(t_ns, level, own, loop), of_run))
+        self._findings.append(Finding(Notice(t_ns, level, own, loop), of_run))
 
     def _of_run_s(self, loop: int, t_ns: int) -> float:
         return (t_ns + self._phases_ns[loop]) / NS_PER_S
 
     def _take_findings(self) -> list[Finding]:
-        findings, self._found = self._found, []
+        findings, self._findings = self._findings, []
         return sorted(findings, key=lambda finding: finding.notice.t_ns)

@@ -46,7 +46,7 @@ _INDEPENDENT, _INPUT, _OUTPUT = "independent", "input", "output"
 
 
 class _Variable(NamedTuple):
-    """A variable; its place in the table is its value reference (``noack_fmu_variable``)."""
+    """A variable; its index in the table is its value reference (``noack_fmu_variable``)."""
 
     name: str
     channel: str
@@ -129,7 +129,8 @@ def write_scenario(scenario: Scenario, path: Path) -> list[Path]:
 
 def _archive(resolved: Scenario, role: str) -> bytes:
     """Return the file of an FMU."""
-    loop, image, variables = loop_of(resolved), _Image(), dict[int, tuple[_Variable, list[int]]]()
+    loop, image = loop_of(resolved), _Image()
+    variables: dict[int, tuple[_Variable, list[int]]] = {}
     sizes = {"n": len(loop.H), "m": loop.m, "p": _PACKETS_PER_STEP}
     for reference, variable in enumerate(_VARIABLES):
         if getattr(variable, role):
@@ -145,7 +146,30 @@ def _archive(resolved: Scenario, role: str) -> bytes:
         image.add_variable(reference, numbers, is_real=variable.is_real, is_input=is_input)
     content = image.content()
     identifier = re.sub(r"\W|^(?=\d)", "_", f"{resolved.name}_{role}", flags=re.ASCII)
-    description = _DESCRIPTION.format(
+    description = _model_description(resolved, role, identifier, content, variables)
+    system, ending = _SYSTEMS[sys.platform]
+    processor = _PROCESSORS.get(machine().lower(), machine().lower())
+    files = {
+        "modelDescription.xml": description.encode(),
+        "resources/noack.bin": content,
+        f"binaries/{processor}-{system}/{identifier}{ending}": LIBRARY.read_bytes(),
+    }
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in files.items():
+            archive.writestr(zipfile.ZipInfo(name, _FILE_DATE), data, zipfile.ZIP_DEFLATED)
+    return buffer.getvalue()
+
+
+def _model_description(
+    resolved: Scenario,
+    role: str,
+    identifier: str,
+    content: bytes,
+    variables: Mapping[int, tuple[_Variable, list[int]]],
+) -> str:
+    """Return the description of the model, with its variables by their value references."""
+    return _DESCRIPTION.format(
         scenario=resolved.name,
         role=role,
         token=content[: core.NOACK_TAG_BYTES].hex(),
@@ -161,18 +185,6 @@ def _archive(resolved: Scenario, role: str) -> bytes:
             if getattr(variable, role) == _OUTPUT
         ),
     )
-    system, ending = _SYSTEMS[sys.platform]
-    processor = _PROCESSORS.get(machine().lower(), machine().lower())
-    files = {
-        "modelDescription.xml": description.encode(),
-        "resources/noack.bin": content,
-        f"binaries/{processor}-{system}/{identifier}{ending}": LIBRARY.read_bytes(),
-    }
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, data in files.items():
-            archive.writestr(zipfile.ZipInfo(name, _FILE_DATE), data, zipfile.ZIP_DEFLATED)
-    return buffer.getvalue()
 
 
 def _variable_xml(role: str, reference: int, variable: _Variable, shape: list[int]) -> str:
@@ -212,21 +224,22 @@ class _Image:
 
     def add_variable(self, reference: int, numbers: list[int], *, is_real: bool, is_input: bool) -> None:
         """Append the numbers of a variable."""
-        place = self._add(ffi.new("double[]" if is_real else "int64_t[]", numbers))
-        self.head.values[reference] = (len(numbers), is_real, is_input, place)
+        offset = self._add(ffi.new("double[]" if is_real else "int64_t[]", numbers))
+        self.head.values[reference] = (len(numbers), is_real, is_input, offset)
 
     def add_structure(
-        self, structure: CData, rows: Mapping[str, int], places: Mapping[str, int] | None = None
+        self, structure: CData, rows: Mapping[str, int], targets: Mapping[str, int] | None = None
     ) -> int:
-        """Append a copy of a structure and of its arrays; return its place.
+        """Append a copy of a structure and of its arrays; return its offset.
 
         Args:
             structure: a pointer to it.
             rows: the number of rows of each array, by the name of the pointer; a dot separates the
                 names of inner structures.
-            places: where the targets of other pointers are.
+            targets: the offsets of what other pointers point to.
         """
-        kind, offset, targets = ffi.typeof(structure).item, self._add(structure), dict(places or {})
+        kind, offset = ffi.typeof(structure).item, self._add(structure)
+        targets = dict(targets or {})
         for name, count in rows.items():
             array = structure
             for part in name.split("."):
@@ -253,14 +266,14 @@ def _add_channel(image: _Image, resolved: Scenario) -> int:
     for _ in range(_MEMORY_DOUBLINGS):
         channel.answer(core.NOACK_ASK_PLACES)
     channel.core.row_places = 1  # there is no record
-    stages, places = link.stage_count, channel.core.places
+    stages, capacity = link.stage_count, channel.core.places
     of_link = {"stages": stages, "memory": stages, "queues": stages, "flows": 1}
     of_link |= {"integers": link.integer_count, "reals": link.real_count}
     of_link |= {"windows": link.window_count, "decisions": 0, "decisions_begin": 1}
     of_link |= {"recent_ns": link.recent_width, "losses": link.loss_width}
     of_link |= {"departures_ns": link.departure_places}
     link_at = image.add_structure(link, of_link)
-    of_channel = {"heap": places, "delayed": places, "waiting": places}
+    of_channel = {"heap": capacity, "delayed": capacity, "waiting": capacity}
     of_channel |= {"packets": 1, "releases": 1}
     return image.add_structure(channel.core, of_channel, {"links.0": link_at})
 
@@ -271,8 +284,8 @@ def _add_controller(image: _Image, resolved: Scenario) -> int:
     controller = machines.machines + 0  # a pointer to the first one
     machine, model = controller.machine, controller.model
     machine.horizon_ns = machine.received.not_after_ns = _NO_HORIZON_NS
-    n, m, places = machine.n, machine.m, model.transitions.places
-    of_transitions = {"H": n * n, "steps_ns": places, "matrices": places * n * n}
+    n, m, capacity = machine.n, machine.m, model.transitions.places
+    of_transitions = {"H": n * n, "steps_ns": capacity, "matrices": capacity * n * n}
     of_transitions |= {"scratch": SCRATCH_MATRICES * n * n + 3 * n}
     transitions_at = image.add_structure(model.transitions, of_transitions)
     rows = {"model.since_ns": 1, "model.has_point": 1, "model.points": n, "K": m * n}

@@ -225,6 +225,7 @@ def states_figure(
     """
     n, t_s = len(states.names), states.t_s
     count = min(n, _MOST_STATES)
+    # A panel for each state; below, both kinds of intervals with a common vertical axis.
     panels = [
         Panel(
             items=states.items(i),
@@ -234,7 +235,7 @@ def states_figure(
         )
         for i in range(count)
     ]
-    columns = count if count <= 3 else 2 if count == 4 else 3 if count <= 12 else 4
+    columns = _state_columns(count)
     times_s = transmissions.sent_s, transmissions.received_s
     between = [np.diff(times, prepend=np.nan) for times in times_s]
     highest = 1.05 * max(np.nanmax(np.append(finite(gaps), 0.0)) for gaps in between) or None
@@ -267,6 +268,15 @@ def states_figure(
         heading=": ".join(filter(None, (head, label_text(title, _LONGEST_TITLE)))) + note,
         rows=[of_states, *(PanelRow(panels=[panel], height_in=1.2) for panel in intervals)],
     )
+
+
+def _state_columns(count: int) -> int:
+    """Return the number of panels side by side, for the curves of ``count`` states."""
+    if count <= 3:
+        return count
+    if count == 4:
+        return 2
+    return 3 if count <= 12 else 4
 
 
 def _sent_marks(transmissions: Transmissions, interval_s: Reals) -> list[Item]:

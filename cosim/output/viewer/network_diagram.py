@@ -185,7 +185,7 @@ class NetworkDiagram:
         else:
             x = np.where(reverse, 2 * _NETWORK - x, x)
             y = np.where(reverse & (survives | ~leaves), _REVERSE_Y, y)
-        places = upright(np.column_stack([x, y]))
+        positions = upright(np.column_stack([x, y]))
         states = {
             "transmitted": ~leaves & ~reverse,
             "delivered": leaves & survives & ~forced & ~reverse,
@@ -201,7 +201,7 @@ class NetworkDiagram:
             rows = (shapes > 0) | (before > 0)  # a row without shapes removes the previous ones
             if rows.any():
                 t_ns = (first + np.flatnonzero(rows)) * _FRAME_NS
-                moving[entity] = Moving(t_ns, _shapes(entity, places[shown], shapes[rows]))
+                moving[entity] = Moving(t_ns, _shapes(entity, positions[shown], shapes[rows]))
         return moving
 
 
@@ -210,13 +210,13 @@ _CROSS = _DOT_RADIUS * np.array([[-1, -1], [1, 1], [0, 0], [-1, 1], [1, -1]])
 """One line that passes its middle twice."""
 
 
-def _shapes(entity: str, places: Reals, counts: NDArray[np.int64]) -> Columns:
-    """Return shapes at places (q, 2); ``counts`` is the number of shapes in each row."""
+def _shapes(entity: str, positions: Reals, counts: NDArray[np.int64]) -> Columns:
+    """Return shapes at positions (q, 2); ``counts`` is the number of shapes in each row."""
     if entity in ("forced", "lost"):
         shape = _DIAMOND if entity == "forced" else _CROSS
-        points = (places[:, None, :] + shape).astype(np.float32)
+        points = (positions[:, None, :] + shape).astype(np.float32)
         return rr.LineStrips2D.columns(strips=list(points)).partition(counts)
-    return rr.Points2D.columns(positions=places.astype(np.float32)).partition(counts)
+    return rr.Points2D.columns(positions=positions.astype(np.float32)).partition(counts)
 
 
 def _arrow(start: float, end: float, y: float) -> list[list[tuple[float, float]]]:

@@ -44,8 +44,8 @@ _LONGEST_LABEL = 28
 def figures(summary: CampaignSummary, store: Store) -> Iterator[FigureDescription]:
     """Describe the figures that the campaign asks for."""
     for i, spec in enumerate(summary.campaign.figures):
-        places = set(summary.campaign.selected(spec.where))
-        results = [result for result in summary.results if result.point.indices in places]
+        selected = set(summary.campaign.selected(spec.where))
+        results = [result for result in summary.results if result.point.indices in selected]
         match spec:
             case campaign_file.Pareto():
                 figure, caption = _pareto(summary, results, spec)
@@ -202,10 +202,10 @@ def _curve(
         name: {result.point.labels[axis.name]: result.estimates.get(spec.metric) for result in group}
         for name, group in _series(summary, results, (spec.x, *spec.where)).items()
     }
-    places = [i for i, x in enumerate(axis.labels) if any(curve.get(x) for curve in curves.values())]
-    labels = [axis.labels[i] for i in places]
+    measured = [i for i, x in enumerate(axis.labels) if any(curve.get(x) for curve in curves.values())]
+    labels = [axis.labels[i] for i in measured]
     series = {name: [curve.get(x) for x in labels] for name, curve in curves.items() if any(curve.values())}
-    numbers = None if axis.numbers is None else np.array(axis.numbers)[places]
+    numbers = None if axis.numbers is None else np.array(axis.numbers)[measured]
     return curve_figure(numbers, labels, series, axis.heading, spec.metric), (
         f"{_title(spec.metric)} over {axis.name_in_figures}: means and 95 % confidence intervals"
         + _left_out(estimate for curve in series.values() for estimate in curve if estimate)

@@ -69,10 +69,10 @@ def scales_loops(key: str, value: object) -> bool:
     return key == LOOPS and isinstance(value, int)
 
 
-def _require_kept(place: str, settings: Mapping[str, JsonValue]) -> None:
+def _require_kept(table: str, settings: Mapping[str, JsonValue]) -> None:
     for old, new in itertools.combinations(settings, 2):
         if find_replaced_key([old], [new]):
-            raise ValueError(f"{place}: {new} replaces {old}, which is given before it")
+            raise ValueError(f"{table}: {new} replaces {old}, which is given before it")
 
 
 _UNITS = {"_per_s": "1/s", "_s": "s", "_ms": "ms", "_us": "µs", "_ns": "ns", "_hz": "Hz", "_bps": "bit/s"}
@@ -389,13 +389,13 @@ class Campaign(ScenarioSection):
             self._require_values("claims_at", ((name, value) for value in values))
         return self
 
-    def _check_figure(self, place: str, figure: AnyFigure) -> None:
+    def _check_figure(self, path: str, figure: AnyFigure) -> None:
         axis_names = [getattr(figure, key) for key in figure.spanned]
         for key, name in zip(figure.spanned, axis_names, strict=True):
-            self._require_axis(f"{place}.{key}", name)
-        self._require_values(f"{place}.where", figure.where.items())
+            self._require_axis(f"{path}.{key}", name)
+        self._require_values(f"{path}.where", figure.where.items())
         if len(set(axis_names)) < len(axis_names):
-            raise ValueError(f"{place}.y: a map needs two different axes")
+            raise ValueError(f"{path}.y: a map needs two different axes")
         if isinstance(figure, Pareto):
             series = [self.by_name[figure.series]]
         else:
@@ -403,26 +403,26 @@ class Campaign(ScenarioSection):
         count = math.prod(len(axis.labels) for axis in series)
         if count > MOST_SERIES:
             raise ValueError(
-                f"{place}: {count} series are too many, at most {MOST_SERIES}; "
+                f"{path}: {count} series are too many, at most {MOST_SERIES}; "
                 "select values of other axes with where = { axis = value }"
             )
 
-    def _require_axis(self, place: str, name: str) -> None:
+    def _require_axis(self, path: str, name: str) -> None:
         if name not in self.by_name:
-            raise ValueError(f"{place}: no such axis; the axes are {', '.join(self.by_name)}")
+            raise ValueError(f"{path}: no such axis; the axes are {', '.join(self.by_name)}")
 
-    def _require_values(self, place: str, values: Iterable[tuple[str, Value]]) -> None:
+    def _require_values(self, path: str, values: Iterable[tuple[str, Value]]) -> None:
         for axis, value in values:
-            self._require_axis(f"{place}.{axis}", axis)
-            self._require_value(f"{place}.{axis}", axis, value)
+            self._require_axis(f"{path}.{axis}", axis)
+            self._require_value(f"{path}.{axis}", axis, value)
 
-    def _require_value(self, place: str, axis: str, value: Value) -> None:
+    def _require_value(self, path: str, axis: str, value: Value) -> None:
         labels = self.by_name[axis].labels
         if label_of(value) not in labels:
-            raise ValueError(f"{place}: no such value; {axis} has {', '.join(labels)}")
+            raise ValueError(f"{path}: no such value; {axis} has {', '.join(labels)}")
 
     def selected(self, conditions: Mapping[str, Value]) -> Iterator[tuple[int, ...]]:
-        """Return the places in the grid, one index per axis, of the points with these values."""
+        """Return the indices, one per axis, of the points of the grid with these values."""
         ranges = [
             [
                 i

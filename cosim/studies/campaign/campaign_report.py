@@ -104,6 +104,7 @@ def page(summary: CampaignSummary, store: Store, base: Mapping[str, object]) -> 
     content = campaign.model_dump(mode="json", exclude_none=True)
     remarks = list(_unfinished(summary))
     tables = {table.name: table for table in campaign_tables(summary, shares=True)}
+    tone = "doubt" if remarks else "good"
     return (
         templates(Path(__file__).parent)
         .get_template("campaign.html.jinja")
@@ -113,7 +114,7 @@ def page(summary: CampaignSummary, store: Store, base: Mapping[str, object]) -> 
             subtitle=f"{len(summary.results):,} grid points, {summary.draws:,} draws at each, "
             f"seed {campaign.seed}",
             verdict=_verdict(summary),
-            tone="bad" if summary.breaches else "doubt" if remarks else "good",
+            tone="bad" if summary.breaches else tone,
             remarks=[*remarks, *_bursts(summary)],
             figures=list(figures(summary, store)),
             tables=tables,
@@ -193,9 +194,9 @@ def split_table(table: ResultTable, names: int, width: int) -> Iterator[Table]:
             pad_edge=False,
             collapse_padding=True,
         )
-        places = [*range(names), *range(begin, end)]
-        unbroken = sum(max(len(table.headings[i]) + _APART, widths[i]) for i in places)
-        for i in places:
+        shown = [*range(names), *range(begin, end)]
+        unbroken = sum(max(len(table.headings[i]) + _APART, widths[i]) for i in shown)
+        for i in shown:
             part.add_column(
                 escape(table.headings[i]),
                 justify="left" if i < names else "right",
@@ -204,7 +205,7 @@ def split_table(table: ResultTable, names: int, width: int) -> Iterator[Table]:
                 max_width=widths[i] - _APART if unbroken > width else None,
             )
         for row in table.rows:
-            part.add_row(*(escape(row[i]) for i in places))
+            part.add_row(*(escape(row[i]) for i in shown))
         yield part
         begin = end
 
@@ -248,17 +249,17 @@ def _unfinished(summary: CampaignSummary) -> Iterator[str]:
         other_endings = {ending: count for ending, count in result.ended.items() if ending != "finished"}
         if other_endings:
             counts = ", ".join(f"{n:,} {ending.replace('_', ' ')}" for ending, n in other_endings.items())
-            yield f"{_place_text(result.point.labels)} not all runs reached the horizon: {counts}"
+            yield f"{_point_text(result.point.labels)} not all runs reached the horizon: {counts}"
 
 
 def _bursts(summary: CampaignSummary) -> Iterator[str]:
     """Return, for each grid point without an enforced guarantee, how often it was exceeded."""
     for result in summary.results:
         if result.bursts is not None:
-            yield f"{_place_text(result.point.labels)} {result.bursts.text}"
+            yield f"{_point_text(result.point.labels)} {result.bursts.text}"
 
 
-def _place_text(labels: Mapping[str, str]) -> str:
+def _point_text(labels: Mapping[str, str]) -> str:
     return "At " + ", ".join(f"{axis} {label}" for axis, label in labels.items())
 
 

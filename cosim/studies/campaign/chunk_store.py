@@ -210,8 +210,8 @@ def _difference(stored: object, running: object, key: str = "") -> str | None:
     else:
         texts = [shortened(json.dumps(value, ensure_ascii=False), 60) for value in (stored, running)]
         return None if stored == running else f"{key} is {texts[0]} there, {texts[1]} here"
-    places = (f"{key}.{name}".removeprefix(".") for name in names)
-    differences = (_difference(*pair, inner_key) for pair, inner_key in zip(pairs, places, strict=True))
+    keys = (f"{key}.{name}".removeprefix(".") for name in names)
+    differences = (_difference(*pair, inner_key) for pair, inner_key in zip(pairs, keys, strict=True))
     return next(filter(None, differences), None)
 
 

@@ -174,7 +174,20 @@ def estimate(values: Vector, finite: Vector | None = None) -> Estimate:
     q05, q25, median, q75, q95 = _quantiles(values, QUANTILES)
     low, high = quantile_interval(values, 0.5)
     largest = float(values.max())
-    return Estimate(len(values), len(finite), mean, halfwidth, q05, q25, median, q75, q95, low, high, largest)
+    return Estimate(
+        draws=len(values),
+        finite=len(finite),
+        mean=mean,
+        halfwidth=halfwidth,
+        q05=q05,
+        q25=q25,
+        median=median,
+        q75=q75,
+        q95=q95,
+        median_low=low,
+        median_high=high,
+        largest=largest,
+    )
 
 
 class Quartiles(NamedTuple):

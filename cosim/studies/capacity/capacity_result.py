@@ -189,13 +189,13 @@ def chosen_points(text: str | None, plan: CapacityPlan) -> list[tuple[str, int]]
     return [points[part] for part in texts]
 
 
-def live_point(place: tuple[str, int], results: Sequence[GridPointResult], folder: Path) -> LivePoint:
+def live_point(grid_point: tuple[str, int], results: Sequence[GridPointResult], folder: Path) -> LivePoint:
     """Run a grid point live, without the common disturbance and with the seeds of draw 0.
 
     Raises:
         NoackError: the run could not be started or completed.
     """
-    policy, count = place
+    policy, count = grid_point
     labels = {POLICY: policy, LOOPS: str(count), DISTURBANCE: OWN}
     result = next(result for result in results if {DISTURBANCE: OWN, **result.point.labels} == labels)
     point, work = result.point, result.point.work
@@ -208,14 +208,14 @@ def live_point(place: tuple[str, int], results: Sequence[GridPointResult], folde
     values = {key: float(value[0]) for key, value in compute_metrics(columns, None).items()}
     compared: list[Metric] = ["transmissions", *LIMITS.values()]
     return LivePoint(
-        policy,
-        count,
-        outcome.run_dir,
-        int(outcome.status),
-        outcome.reason,
-        sum(loop.unintended_losses for loop in outcome.summary.loops),
-        {metric: values[metric] for metric in [*compared, "delay_max_s"]},
-        {metric: prediction_interval(result.estimates[metric]) for metric in compared},
+        policy=policy,
+        loops=count,
+        run_dir=outcome.run_dir,
+        status=int(outcome.status),
+        reason=outcome.reason,
+        unintended_losses=sum(loop.unintended_losses for loop in outcome.summary.loops),
+        values={metric: values[metric] for metric in [*compared, "delay_max_s"]},
+        simulated={metric: prediction_interval(result.estimates[metric]) for metric in compared},
     )
 
 

@@ -133,15 +133,15 @@ def figure_of(name: str, panel: Panel, caption: str) -> FigureDescription:
 def periodic_outcome(search: NetworkSearch, original: CertifiedLoop, best: CertifiedLoop) -> DesignOutcome:
     """Return what is shown of a search."""
     return DesignOutcome(
-        search.scenario.name,
-        "proven stable for every loss pattern",
-        _loop_result(search, original, is_excluded=not search.keeps_given_hold),
-        _loop_result(search, best),
-        list(_network_notes(search, original, best)),
-        search.scenario_of(best.candidate, best.level),
-        best.level >= 0,
-        best.candidate != original.candidate,
-        {
+        name=search.scenario.name,
+        claim="proven stable for every loss pattern",
+        given=_loop_result(search, original, is_excluded=not search.keeps_given_hold),
+        best=_loop_result(search, best),
+        notes=list(_network_notes(search, original, best)),
+        scenario=search.scenario_of(best.candidate, best.level),
+        is_certified=best.level >= 0,
+        is_better=best.candidate != original.candidate,
+        document={
             "goal": search.request.goal,
             "window": search.request.window,
             "cost_limit": search.cost_limit,
@@ -149,8 +149,8 @@ def periodic_outcome(search: NetworkSearch, original: CertifiedLoop, best: Certi
             "examined": search.examined,
             "highest_by_hold": dict(search.by_hold()),
         },
-        _growth_figure(search, original, best),
-        tuple(search.by_hold()),
+        figure=_growth_figure(search, original, best),
+        by_hold=tuple(search.by_hold()),
     )
 
 

@@ -61,6 +61,7 @@ def write_page(result: DesignResult, path: Path, figure_files: FigureFiles | Non
         MachineError: they cannot be written.
     """
     limits, bounds = result.limits, result.bounds or {}
+    tone = "doubt" if result.feasible else "bad"
     return _write(
         path,
         trade_off(result),
@@ -69,7 +70,7 @@ def write_page(result: DesignResult, path: Path, figure_files: FigureFiles | Non
         kind="design",
         subtitle=f"{len(result.trials):,} candidates, {result.fresh.draws:,} draws, seed {result.seed}",
         verdict=result.verdict(),
-        tone="good" if result.confirmed else "doubt" if result.feasible else "bad",
+        tone="good" if result.confirmed else tone,
         notes=[
             f"required: {100 * limits.quantile:g} % of draws settle to {limits.settle:g} ‖x(0)‖ "
             f"within {limits.settling_s:g} s",

@@ -280,22 +280,22 @@ def event_outcome(
     """Return what is shown of a search."""
     of_network = search.request.goal == "network"
     return DesignOutcome(
-        search.scenario.name,
-        "certified " + ("for the whole box" if search.of_box else "for the scenario's own plant"),
-        _loop_result(search, original),
-        _loop_result(search, best),
-        list(_notes(search, original, best)),
-        search.scenario_of(best.loop, best.m if of_network and best.m else None),
-        best.m > 0,
-        best.loop != original.loop,
-        {
+        name=search.scenario.name,
+        claim="certified " + ("for the whole box" if search.of_box else "for the scenario's own plant"),
+        given=_loop_result(search, original),
+        best=_loop_result(search, best),
+        notes=list(_notes(search, original, best)),
+        scenario=search.scenario_of(best.loop, best.m if of_network and best.m else None),
+        is_certified=best.m > 0,
+        is_better=best.loop != original.loop,
+        document={
             "goal": search.request.goal,
             "of_box": search.of_box,
             "limits": search.limits._asdict(),
             "tried": search.tried,
             "examined": search.examined,
         },
-        _figure(search, original, best),
+        figure=_figure(search, original, best),
     )
 
 

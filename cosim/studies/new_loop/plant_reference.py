@@ -41,16 +41,22 @@ _FORMS = (
 class PlantReference:
     """A plant, its numbers of states and inputs, and what is known about its runs."""
 
-    label: str  # as the user named it
-    settings: ReadTable  # values by the keys of a scenario
+    label: str
+    """As the user named it."""
+    settings: ReadTable
+    """Values by the keys of a scenario."""
     system: PlantSettings
     n: int
     m: int
-    names: tuple[tuple[str, ...] | None, tuple[str, ...] | None]  # of states and inputs
-    rates: Mapping[str, float]  # rate_hz and measure_every of its plant, if they are given
+    names: tuple[tuple[str, ...] | None, tuple[str, ...] | None]
+    """Of states and inputs."""
+    rates: Mapping[str, float]
+    """``rate_hz`` and ``measure_every`` of its plant, if they are given."""
     initial_state: tuple[float, ...] | None = None
-    matrices: tuple[Matrix, Matrix] | None = None  # A and B of a linear plant
-    model_matrices: tuple[Matrix, Matrix] | None = None  # Â and B̂, which sensor and controller know of it
+    matrices: tuple[Matrix, Matrix] | None = None
+    """A and B of a linear plant."""
+    model_matrices: tuple[Matrix, Matrix] | None = None
+    """Â and B̂ of its model, which sensor and controller use."""
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -184,15 +190,16 @@ def _of_scenario(label: str, settings: ReadTable) -> PlantReference:
     resolved = resolve(scenario_file.completed(content, path))
     loop, plant = loop_of(resolved), resolved.plant
     return PlantReference(
-        label,
-        settings,
-        plant.system,
-        loop.n,
-        loop.m,
-        (loop.state_names, loop.input_names),
-        {"rate_hz": plant.rate_hz, "measure_every": plant.measure_every},
-        plant.initial_state,
-        *(((loop.A, loop.B), (loop.A_model, loop.B_model)) if resolved.coverage.is_linear else ()),
+        label=label,
+        settings=settings,
+        system=plant.system,
+        n=loop.n,
+        m=loop.m,
+        names=(loop.state_names, loop.input_names),
+        rates={"rate_hz": plant.rate_hz, "measure_every": plant.measure_every},
+        initial_state=plant.initial_state,
+        matrices=(loop.A, loop.B) if resolved.coverage.is_linear else None,
+        model_matrices=(loop.A_model, loop.B_model) if resolved.coverage.is_linear else None,
     )
 
 

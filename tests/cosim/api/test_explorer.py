@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import noack
-from cosim.interactive import exploration_figure
+from cosim.interactive import draft_results
 
 
 def test_results_are_those_of_the_library() -> None:
@@ -60,8 +60,8 @@ def test_a_saved_scenario_has_the_settings_and_the_comments(tmp_path: Path) -> N
 
 @pytest.fixture
 def few_draws(monkeypatch: pytest.MonkeyPatch) -> None:
-    few = partial(exploration_figure.explore_ensemble, draws=20)
-    monkeypatch.setattr(exploration_figure, "explore_ensemble", few)
+    few = partial(draft_results.explore_ensemble, draws=20)
+    monkeypatch.setattr(draft_results, "explore_ensemble", few)
 
 
 @pytest.mark.usefixtures("few_draws")

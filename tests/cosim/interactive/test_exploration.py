@@ -34,6 +34,9 @@ def test_a_run_is_drawn_as_simulated_with_both_sides_of_each_event() -> None:
         assert explored.e_s_norm[first] == pytest.approx(np.linalg.norm(before.e_s))
         assert explored.e_c_norm[first + 1] == pytest.approx(np.linalg.norm(after.e_c))
         assert explored.e_s_norm[first + 1] == 0.0
+
+
+def test_the_browser_is_sent_the_curves_and_legends_of_the_figure() -> None:
     known_scenario = noack.load("lane_following", {"network.initial_sync": "known_state"})
     explored_run = ExploredRun(exploration.explore(known_scenario), 0)._replace(
         guarantee=guarantee.certify(known_scenario)
@@ -157,7 +160,7 @@ def test_a_verdict_says_what_became_of_the_run_and_of_its_guarantee() -> None:
 def test_a_loop_at_its_setpoint_breaks_no_guarantee() -> None:
     """The certificate bounds ‖x − x_r‖, which decays; ‖x‖ stays near ‖x_r‖ = 20.
 
-    Such a loop was called bounded, and was verdict to grow, where a run's summary calls it stable.
+    The verdict is that of the run's summary: stable.
     """
     run = exploration.explore_or_simulate(
         noack.load("lane_following", {"controller.setpoint": [0.0, 0.0, 0.0, 20.0]})

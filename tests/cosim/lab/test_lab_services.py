@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip("nicegui", reason="the extra `lab` is not installed")
 
-from cosim.interactive.exploration_figure import CERTIFICATE
+from cosim.interactive.draft_results import CERTIFICATE
 from cosim.interactive.scenario_draft import open_draft
 from cosim.interactive.scenario_guarantee import Margin
 from cosim.lab import lab_services

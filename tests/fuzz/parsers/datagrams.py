@@ -19,6 +19,7 @@ WIRE_WORDS = (b"NA\x01", struct.pack("<Q", RUN))
 
 
 def wire_input(data: bytes) -> None:
+    """Both receivers agree; what they accept is encoded to the same bytes again."""
     _junk(data)
     choices = Choices(data)
     dimension = 1 + choices.below(4)
@@ -93,6 +94,7 @@ _CONTENT = "<2sBBI16sQqq"
 
 
 def times_input(data: bytes) -> None:
+    """A datagram of an exchange of timestamps is accepted only if it is authentic and sound."""
     form, choices = TimeFormat(TIMES_KEY), Choices(data)
     for kind in TimeKind:
         assert isinstance(form.decode(data, kind), Rejection)
@@ -127,6 +129,7 @@ _SIGNED = ("sent_ns", "start_ns")
 
 
 def probes_input(data: bytes) -> None:
+    """Both ends of a probe take any datagram; an answer is as long as the request."""
     choices = Choices(data)
     receiver = ProbeReceiver(5, 0, 10**9)
     sender = ProbeSender(ProbePlan(_PERIOD_NS, 20, is_round_trip=True), 1, 5, 0)
@@ -151,10 +154,10 @@ def probes_input(data: bytes) -> None:
             assert report is None or report.trace is None or len(report.trace) < 10**7
 
 
-def _datagram(choices: Choices, place: int) -> bytes:
+def _datagram(choices: Choices, sequence: int) -> bytes:
     kind = choices.choose([ProbeKind.PROBE, *ProbeKind])
     content = ProbeDatagram(
-        kind, 1, 5, place % 4, max(place, 4) * _PERIOD_NS, 0, _PERIOD_NS, 20, place, place
+        kind, 1, 5, sequence % 4, max(sequence, 4) * _PERIOD_NS, 0, _PERIOD_NS, 20, sequence, sequence
     )
     for _ in range(choices.below(3)):
         name = choices.choose(_FIELDS)

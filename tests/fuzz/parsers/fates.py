@@ -45,6 +45,7 @@ TABLE = _rows()
 
 
 def fates_input(data: bytes) -> None:
+    """A trace of fates is refused, or can be replayed."""
     choices = Choices(data)
     document: Any = edited(choices, DOCUMENT, KNOWN) if choices.flag() else DOCUMENT
     text = json.dumps(document)
@@ -61,8 +62,8 @@ def fates_input(data: bytes) -> None:
 def _replay(path: Path, links: list[str] | None) -> None:
     """Replay the decisions of a trace; every accepted trace must be replayable."""
     fates = read_fates(path, links)
-    for place, flows in fates.decisions.items():
-        link = Link(LinkSettings(**fates.guarantees[place]), 0, *place, decisions=flows)
+    for direction, flows in fates.decisions.items():
+        link = Link(LinkSettings(**fates.guarantees[direction]), 0, *direction, decisions=flows)
         for flow, decisions in enumerate(flows):
             for _, delay_ns, copy_delay_ns, *_ in decisions:
                 # The compiled relay adds in signed 64 bits.

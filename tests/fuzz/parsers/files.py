@@ -81,6 +81,7 @@ SCENARIO_BASES = bases(
 
 
 def scenario_input(data: bytes) -> None:
+    """A scenario is refused with all mistakes, or reads back the same, also when resolved."""
     overrides: list[str] = []
     if data[:1] == b"\0":
         choices = Choices(data[1:])
@@ -130,6 +131,7 @@ _MOST_POINTS = 8
 
 
 def campaign_input(data: bytes) -> None:
+    """A campaign is refused, or its grid can be made."""
     if data[:1] == b"\0":
         choices = Choices(data[1:])
         data = tomli_w.dumps(edited(choices, choices.choose(CAMPAIGN_BASES), CAMPAIGN_KNOWN)).encode()
@@ -177,6 +179,7 @@ MATRICES_WORDS = [
 
 
 def matrices_input(data: bytes) -> None:
+    """Matrices that are read are finite and two-dimensional."""
     (workspace() / "any.npz").write_bytes(data)
     with refusal('run.toml: model.file = "any.npz"'):
         matrices = read_matrices(NamedFile("any.npz", workspace(), "run.toml: model"))
@@ -197,6 +200,7 @@ TRACES_WORDS = [
 
 
 def traces_input(data: bytes) -> None:
+    """A trace that is read satisfies the validation of settings."""
     kind, content = data[:1], data[1:]
     name = "any.dist" if kind == b"\2" else "any.txt"
     (workspace() / name).write_bytes(content)
@@ -248,6 +252,7 @@ _SEQUENCE_FIELDS = [None, "0:4", "2:2:little", "0:8", "9999:1", "x"]
 
 
 def captures_input(data: bytes) -> None:
+    """In a trace from captures, no packet is received before it was sent."""
     choices = Choices(data)
     path, other = workspace() / "one.pcap", workspace() / "other.pcap"
     options = SourceOptions(
@@ -313,15 +318,16 @@ ARCHIVES_WORDS = [b"PK\x01\x02", b"PK\x03\x04", b"PK\x05\x06", MANIFEST.encode()
 
 
 def archives_input(data: bytes) -> None:
-    with tempfile.TemporaryDirectory(dir=workspace()) as place:
-        path, folder = Path(place, "a.zip"), Path(place, "inner", "out")
+    """An archive is refused, or unpacks exactly its files, inside the folder."""
+    with tempfile.TemporaryDirectory(dir=workspace()) as parent:
+        path, folder = Path(parent, "a.zip"), Path(parent, "inner", "out")
         path.write_bytes(data)
         with refusal((f"{path}: ", f"{folder}: ")):
             manifest = unpack(path, folder)
             files = {path for path in folder.rglob("*") if path.is_file()}
             assert files == {folder / name for name in manifest.files}
         inside = {path, folder.parent, *folder.parent.rglob("*")}
-        assert set(Path(place).rglob("*")) <= inside, "a file outside the folder"
+        assert set(Path(parent).rglob("*")) <= inside, "a file outside the folder"
 
 
 PARSERS = {

@@ -95,9 +95,9 @@ def _link(choices: Choices) -> tuple[Any, dict[str, Any]] | None:
     keys[:] = choices.below(2)  # a change of settings transfers states between equal keys
     for _ in range(choices.below(6)):
         number = _integer(choices)
-        place = choices.below(len(tables) + 2)
-        if place < len(tables):
-            words = [*tables.values()][place]
+        index = choices.below(len(tables) + 2)
+        if index < len(tables):
+            words = [*tables.values()][index]
             if len(words):
                 words[choices.below(1 << 16) % len(words)] = number
         else:

@@ -69,6 +69,7 @@ def sentence(choices: Choices) -> str:
 
 
 def words_input(data: bytes) -> None:
+    """Words are refused, or mean the same when they are written again."""
     structured = data[:1] == b"\0"
     text = sentence(Choices(data[1:])) if structured else data.decode("utf-8", "replace")
     for words in (text, text.split(" ")):
@@ -128,6 +129,7 @@ def numeric(host: str, port: int, family: int, kind: int) -> Any:
 
 
 def links_input(data: bytes) -> None:
+    """A file of links is refused, or its settings survive JSON and words."""
     if data[:1] == b"\0":
         choices = Choices(data[1:])
         content: dict[str, Any] = json.loads(json.dumps(BASE))
@@ -184,6 +186,7 @@ class _AtOnce:
 
 
 def control_input(data: bytes) -> None:
+    """A request is answered once; a refused one changes no settings."""
     if data[:1] == b"\0":
         choices = Choices(data[1:])
         base = json.loads(json.dumps(choices.choose(BASES)))

@@ -119,6 +119,7 @@ def files(acknowledged: bool, live: bool) -> Mapping[str, bytes]:
 
 
 def record_input(data: bytes) -> None:
+    """A damaged run directory is refused, or every command can show it."""
     choices = Choices(data)
     content = dict(files(choices.flag(), choices.flag()))
     stage = choices.below(3)  # 0 recorded, 1 interrupted, 2 recorded with rows left in the spool
@@ -224,6 +225,7 @@ TELEMETRY_KNOWN = Vocabulary(
 
 
 def telemetry_input(data: bytes) -> None:
+    """The recorder takes any messages; the valid part of them is the record."""
     choices = Choices(data)
     run_dir = workspace() / "telemetry"
     shutil.rmtree(run_dir, ignore_errors=True)

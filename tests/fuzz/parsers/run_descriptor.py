@@ -30,6 +30,7 @@ WORDS = [json.dumps(word).encode() for word in DESCRIPTOR]
 
 
 def descriptor_input(data: bytes) -> None:
+    """A run descriptor is refused, or is valid and survives JSON."""
     if data[:1] == b"\0":
         choices = Choices(data[1:])
         content = edited(choices, DESCRIPTOR, DESCRIPTOR_KNOWN)
@@ -52,6 +53,7 @@ BARRIER_KNOWN = Vocabulary((*HELLO, *PROGRESS), ("127.0.0.1", "", *ROLES))
 
 
 def barrier_input(data: bytes) -> None:
+    """The coordinator takes any messages before the start; each request has one answer."""
     choices = Choices(data)
     plane = FakePlane()
     with patch.object(coordinator, "ControlPlane", lambda *_, **__: plane):
@@ -126,6 +128,7 @@ CHANGES_KNOWN = Vocabulary(
 
 
 def changes_input(data: bytes) -> None:
+    """Requests, announcements and answers about changes are refused, or can be applied."""
     choices = Choices(data)
     match choices.below(4):
         case 0:

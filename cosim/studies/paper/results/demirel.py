@@ -48,9 +48,10 @@ class ScheduledLoop(NamedTuple):
         step without transmission x_c follows the model; else it is x_f.
         """
         A, L, K, n = self.A, self.gain, self.filter_gain, len(self.A)
-        BL, KC, none, empty = self.B @ L, K @ self.C, np.zeros((n, n)), np.zeros_like(K)
-        free = np.block([[A, none, -BL], [KC @ A, A - KC @ A, -BL], [none, none, A - BL]])
-        plant, sensor = np.vstack([np.eye(n), KC, none]), np.vstack([empty, K, empty])
+        BL, KC = self.B @ L, K @ self.C
+        zero, no_gain = np.zeros((n, n)), np.zeros_like(K)
+        free = np.block([[A, zero, -BL], [KC @ A, A - KC @ A, -BL], [zero, zero, A - BL]])
+        plant, sensor = np.vstack([np.eye(n), KC, zero]), np.vstack([no_gain, K, no_gain])
         noise = plant @ self.W @ plant.T + sensor @ self.V @ sensor.T
         copy = np.eye(3 * n)
         copy[2 * n :] = copy[n : 2 * n]

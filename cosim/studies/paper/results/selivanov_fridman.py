@@ -134,8 +134,8 @@ def _rows() -> list[ComparedValue]:
     for name, statement, loop in loops:
         growth, mean = _growth_and_transmissions(loop, solutions[statement]["P"], unit_states(100, 2))
         means.append(mean)
-        quantity, place = f"growth of V, {name}", f"follows from {statement}"
-        rows.append(ComparedValue(quantity, place, "≤", "1", f"{growth:.3f}", _RUN, growth <= 1))
+        quantity, source = f"growth of V, {name}", f"follows from {statement}"
+        rows.append(ComparedValue(quantity, source, "≤", "1", f"{growth:.3f}", _RUN, growth <= 1))
     share = means[0] / means[1]
     quantity, method = "transmissions, switching / periodic", _TRANSMISSIONS_METHOD.format(*means)
     return [*rows, ComparedValue(quantity, "abstract", "<", "1", f"{share:.3f}", method, share < 1)]
