@@ -266,7 +266,7 @@ class RunClaims:
                 error = start_error(part_record, ClaimEvaluation(part_record).started_s)
         offset = _offset(record.scenario)
         until_s = _until_s(first_ns, 0)
-        part = RunPart(record, 0.0, until_s, error, void, certificates, offset)
+        part = RunPart(self.record, 0.0, until_s, error, void, certificates, offset)
         parts: list[ClaimEvaluation | Claim] = [ClaimEvaluation(part_record, part)]
         for change, after in zip(changes, [*changes[1:], None], strict=False):
             until_ns = NEVER_NS if after is None else after.first_ns
@@ -351,7 +351,7 @@ class RunClaims:
         origin_ns, sequence = int(after["t_ns"][0]), int(after["sequence"][0])
         part_record = cut_part(record, change.scenario, origin_ns, sequence)
         part = RunPart(
-            record,
+            self.record,
             origin_ns / NS_PER_S,
             _until_s(until_ns, origin_ns),
             start_error(part_record, ClaimEvaluation(part_record).started_s),
