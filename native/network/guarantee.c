@@ -52,9 +52,8 @@ static int64_t newest_below(
     return number;
 }
 
-/* 0 if all packets between `delivered` and `packet` may be lost; -1: all before it. Else at least
-   so many of the effectively delivered ones between them must remain so: each takes one loss from
-   every window. */
+/* 0 if all packets between `delivered` and `packet` may be lost. Else at least so many of the
+   effectively delivered ones between them must remain so: each takes one loss from every window. */
 static int64_t needed_after(
     const noack_link *link, const int64_t *losses, int64_t delivered, int64_t packet) {
     int64_t burst = packet - 1 - delivered;
@@ -90,8 +89,6 @@ int64_t noack_hold_back_until(
     while (delivered >= oldest && recent_ns[delivered & recent_mask] > release_ns)
         delivered = newest_below(recent_ns, recent_mask, oldest, delivered);
     int64_t first = delivered + 1, needed = 0;
-    if (delivered < oldest)
-        delivered = -1;
     for (int64_t number = first; number < packet; number++) {
         int64_t time_ns = recent_ns[number & recent_mask];
         if (time_ns > release_ns) {
@@ -99,11 +96,12 @@ int64_t noack_hold_back_until(
                 needed = needed_after(link, losses, delivered, packet);
             if (needed == 0)
                 break;
-            needed--;
             release_ns = time_ns;
         }
-        if (time_ns >= 0)
+        if (time_ns >= 0) {
             delivered = number;
+            needed = max_of(needed - 1, 0);
+        }
     }
     return release_ns;
 }

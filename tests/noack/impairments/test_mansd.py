@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from netem.link_state import LinkState
 from netem.tc_words import settings_of
 from noack.core.core_library import core, ffi
+from noack.impairments.constraints.at_most import AtMost
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings, RecordedDecision
 from noack.impairments.loss_models.scripted import ScriptedLoss
@@ -254,6 +255,8 @@ def settle(link: LinkState, packet: int, release_ns: int | None) -> Any:
     st.lists(st.none() | st.integers(0, 12), max_size=24), st.integers(0, 4),
     any_settings.constraints,
 )  # fmt: skip
+@example([2, 2, 3, 0], 3, (AtMost(losses=1, window=3),))  # as far back as the cap, but not the window
+@example([None, 1, 1, 3, 0], 2, (AtMost(losses=2, window=4),))  # two leave at the same time
 def test_a_datagram_is_held_back_no_longer_than_necessary(
     wishes: list[int | None], mansd: int, constraints: Any
 ) -> None:
