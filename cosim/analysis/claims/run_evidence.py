@@ -24,7 +24,7 @@ from cosim.analysis.claims.observed_conditions import (
     guarantee_causes,
 )
 from cosim.analysis.claims.run_certificates import LateSchedules, late_certificates, scheduled_certificates
-from cosim.analysis.claims.run_parts import RunPart
+from cosim.analysis.claims.run_parts import RunPart, common_end_ns
 from cosim.analysis.claims.trajectory_delta import trajectory_delta
 from cosim.analysis.summary.signal_statistics import SampleFacts, SampleFactsReader, signal_statistics
 from cosim.record.align import NOT_SHARED, AlignedRun, EventFollower, SinceEvent, aligned_parts, bounded_parts
@@ -261,13 +261,15 @@ class RunEvidence:
         limit = _ANY._replace(sampling_s=self._schedule.sampling_s)
         gaps = [self.observed.first_violation(limit, ("sampling", *CLOCK_CAUSES))]
         whole_record = self.part.whole_record or self.record
+        end_ns = common_end_ns(whole_record)
+        end_s = math.inf if end_ns is None else end_ns * 1e-9 - self.part.from_s
         for role in LOOP_ROLES:
             if whole_record.is_complete(role):
                 continue
             gaps_ns = filter(None, (generation.gap_ns for generation in whole_record.generations(role)))
             times_s = [ns * 1e-9 - self.part.from_s for ns in gaps_ns]
             why = f"rows of {role} are missing from the record"
-            gaps += [VoidFrom(t_s, why) for t_s in times_s if t_s >= 0]
+            gaps += [VoidFrom(t_s, why) for t_s in times_s if 0 <= t_s <= end_s]
         if (gap_s := self.facts.gap_s) is not None:
             why = "the controller's error is not on record, or not finite"
             gaps.append(VoidFrom(gap_s, why))

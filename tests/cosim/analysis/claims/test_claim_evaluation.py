@@ -507,7 +507,12 @@ def stopped(record: RunRecord, reached_ns: dict[str, int]) -> RunRecord:
         table: record[table][record[table]["now_ns"] <= reached_ns[OWNER[table]]] for table in record.tables
     }
     reports = {
-        role: record.reports[role] | {"ended": "stopped by the user (SIGINT)", "reached_ns": reached_ns[role]}
+        role: record.reports[role]
+        | {
+            "ended": "stopped by the user (SIGINT)",
+            "reached_ns": reached_ns[role],
+            "rows": {table: len(rows[table]) for table in record.reports[role]["rows"]},
+        }
         for role in LOOP_ROLES
     }
     return changed(record, rows, reports=reports, kind="live")
@@ -524,3 +529,11 @@ def test_processes_that_stop_at_different_times_void_no_claim(run: RunRecord, or
     assert {verdict for _, verdict in verdicts} == {ClaimVerdict.HELD}, verdicts
     assert claims.judged_until_s is not None
     assert 3.0 <= claims.judged_until_s <= STOP_NS * 1e-9
+
+
+def test_a_stopped_run_has_the_certificate_of_its_lateness(make: Make) -> None:
+    late = with_outage(make(), 2.0, 2.05)
+    record = stopped(late, {role: STOP_NS + i * APART_NS for i, role in enumerate(LOOP_ROLES)})
+    claims = RunClaims(record).evaluate()
+    verdicts = {claim.verdict for claim in claims if claim.source == "certificate"}
+    assert verdicts == {ClaimVerdict.HELD}, [claim.why for claim in claims]
