@@ -17,6 +17,10 @@ from noack.protocol.record_tables import NO_SEQUENCE
 from noack.theory.paper import InterEventTrajectory, longest_interval_s, theorem_1
 
 
+_MOST_MISSED = 200
+"""Largest number of missed events for which Δ is computed; it takes seconds, beyond it minutes."""
+
+
 class _Start(NamedTuple):
     """An event from which an interval starts."""
 
@@ -28,7 +32,8 @@ class _Start(NamedTuple):
 def trajectory_delta(record: RunRecord, until_s: float = math.inf) -> float | None:
     """Return Theorem 1's Δ from a recorded trajectory; None if there is none, or if W ≠ I.
 
-    The theorem's assumptions hold until ``until_s``.
+    It is not computed either where many updates are in flight, as under a long delay. The theorem's
+    assumptions hold until ``until_s``.
     """
     loop, trigger = record.loop, record.scenario.decaying
     if loop.weight is not None:
@@ -48,6 +53,8 @@ def trajectory_delta(record: RunRecord, until_s: float = math.inf) -> float | No
             first += 1
         if first <= index and start.received != NO_SEQUENCE:
             stretches[first] = index + 1
+    if max((end - first for first, end in stretches.items()), default=0) > _MOST_MISSED:
+        return None
     deltas = [
         theorem_1(loop.H, trigger.alpha_per_s, missed_s)
         for missed_s in undominated([longest_s[first:end] for first, end in stretches.items()])

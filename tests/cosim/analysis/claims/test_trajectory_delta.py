@@ -67,3 +67,11 @@ def test_theorem_1_does_not_apply_without_events_or_with_a_weight(make: Make) ->
     assert trajectory_delta(changed(record, scenario=weighted)) is None
     assert trajectory_delta(record) is not None
     assert record[SENSOR_MEASUREMENT]["t_ns"][1] == 10 * MS
+
+
+def test_theorem_1_is_not_computed_for_long_delays(make: Make) -> None:
+    """Its terms, two for each of these updates, take a minute."""
+    delay = {"impairments": [{"kind": "delay", "delay_s": 2.5}]}
+    record = simulate(make(network=delay, trigger={"beta": 1e-9}))
+    assert trajectory_delta(record, 2.0) is not None
+    assert trajectory_delta(record) is None
