@@ -85,6 +85,34 @@ class _LazyFinder(MetaPathFinder):
         return None
 
 
+class _LoadedFinder(MetaPathFinder):
+    """Finds a module that its own package has loaded since the import of it began.
+
+    An import that is not lazy looks for the module, then reads ``__path__`` of its package. If that
+    loads the package, which imports the module, the module must not be loaded a second time.
+    """
+
+    def find_spec(
+        self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        module = sys.modules.get(name)
+        return None if target is not None or module is None else ModuleSpec(name, _LoadedLoader(module))
+
+
+class _LoadedLoader(Loader):
+    def __init__(self, module: ModuleType) -> None:
+        self._module, self._spec = module, module.__spec__
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        return self._module
+
+    def exec_module(self, module: ModuleType) -> None:
+        module.__spec__ = self._spec
+
+
+sys.meta_path.insert(0, _LoadedFinder())
+
+
 def load_module(name: str) -> ModuleType:
     """Import a module, and load it if it has been imported lazily."""
     module = import_module(name)

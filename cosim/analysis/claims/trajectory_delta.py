@@ -16,7 +16,6 @@ from noack.core.linear_systems import Matrix, Propagator, spectral_abscissa
 from noack.protocol.record_tables import NO_SEQUENCE
 from noack.theory.paper import InterEventTrajectory, longest_interval_s, theorem_1
 
-
 _MOST_MISSED = 200
 """Largest number of missed events for which Δ is computed; it takes seconds, beyond it minutes."""
 

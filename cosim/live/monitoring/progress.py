@@ -241,9 +241,9 @@ def search_status() -> Iterator[Callable[[str], Callable[[str, int, float], None
 
         def named(aim: str) -> Callable[[str, int, float], None]:
             def report(search: str, nodes: int, value: float) -> None:
-                state = f"{nodes} segments, worst {abs(value):.6g}, {sparse_lines.spent_s:.0f} s"
-                status.update(f"{aim}, {search}: {state}")
-                sparse_lines.print(f"{aim}, {search}: {state}")
+                state = f"{nodes:,} segments, {abs(value):.6g} so far, {sparse_lines.spent_s:.0f} s"
+                status.update(f"worst {aim}: {search}, {state}")
+                sparse_lines.print(f"worst {aim}: {search}, {state}")
 
             return report
 

@@ -149,8 +149,10 @@ def test_a_package_is_loaded_before_its_modules(package: str) -> None:
 
 def test_a_package_is_loaded_before_a_module_that_is_not_imported_lazily(package: str) -> None:
     lazily_imported(package, "inner")
-    importlib.import_module(f"{package}.inner.two")
-    assert sys.argv[:3] == [f"{package}{name}" for name in ("", ".inner", ".inner.one")]
+    module = importlib.import_module(f"{package}.inner.two")  # the package imports it, too
+    assert sys.argv == [f"{package}{name}" for name in ("", ".inner", ".inner.one", ".inner.two")]
+    assert module.__spec__ is not None
+    assert module.__spec__.origin == module.__file__
 
 
 def test_another_thread_waits_until_it_is_loaded(package: str) -> None:
