@@ -54,7 +54,7 @@ LINES = {
     "controller_node": 415,
     "benchmarks": 3780,
     "native": 11490,
-    "tests": 51820,
+    "tests": 51825,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 
