@@ -268,7 +268,7 @@ typedef struct {
     int64_t most_in_flight;
 } noack_counters;
 
-/* At most so many losses among any so many consecutive packets of a flow. */
+/* At most `losses` losses among any `packets` consecutive packets of a flow. */
 typedef struct {
     int64_t losses, packets;
 } noack_window;

@@ -232,8 +232,8 @@ static int64_t wait_for_ns(
     return noack_put_off_ns(&scratch_of(driver)->pauses, overdue_ns, tick_ns, 0, 0);
 }
 
-/* Whether a table has so many rows that Python should take them before the next steps: few at a
-   time keep it for a short time only. */
+/* Whether Python should take a table's rows before the next steps: taking few at a time keeps it
+   for a short time only. */
 static int has_many_rows(const noack_process *process) {
     for (int k = 0; k < NOACK_TABLES; k++)
         if (process->tables[k].count * process->tables[k].row_bytes >= MANY_BYTES)

@@ -52,8 +52,8 @@ static int64_t newest_below(
     return number;
 }
 
-/* 0 if all packets between `delivered` and `packet` may be lost. Else at least so many of the
-   effectively delivered ones between them must remain so: each takes one loss from every window. */
+/* The number of effectively delivered packets between `delivered` and `packet` that must at least
+   remain so: each takes one loss from every window. 0: all packets between them may be lost. */
 static int64_t needed_after(
     const noack_link *link, const int64_t *losses, int64_t delivered, int64_t packet) {
     int64_t burst = packet - 1 - delivered;

@@ -17,7 +17,7 @@ from noack.protocol.record_tables import NO_SEQUENCE
 from noack.theory.paper import InterEventTrajectory, longest_interval_s, theorem_1
 
 _MOST_MISSED = 200
-"""Largest number of missed events for which Δ is computed; it takes seconds, beyond it minutes."""
+"""Largest number of missing events for which Δ is computed: this takes seconds, more take minutes."""
 
 
 class _Start(NamedTuple):

@@ -73,7 +73,7 @@ class Schedule(Impairment):
         return round(self.slot_s * NS_PER_S)
 
     def wait_ns(self, slots: Sequence[int], count: int) -> int:
-        """Return the longest time until so many of these slots have begun."""
+        """Return the longest time until ``count`` of these slots have begun."""
         rounds, remainder = divmod(count, len(slots))
         begins = np.array(slots)
         ends = np.concatenate((begins, begins + len(self.order)))[remainder:][: len(slots)]

@@ -193,6 +193,7 @@ def test_a_set_point_is_certified_in_its_own_coordinates() -> None:
     zero = resolved("double_integrator", "plant.initial_state=[-2.0, 0.0]")
     assert constants(moved.schedule) == constants(Certificates(zero, 2).schedule)
     assert moved.to_json()["setpoint"] == (3.0, 0.0)
+    assert moved.to_json()["schedule"]["delay_s"] == moved.scheduled.delay_s > 0
     settings = (
         "controller.setpoint=[0.1, 0.0]",
         "plant.A=[[0.0, 1.0], [0.2, 0.1]]",

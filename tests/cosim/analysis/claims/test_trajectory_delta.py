@@ -70,7 +70,7 @@ def test_theorem_1_does_not_apply_without_events_or_with_a_weight(make: Make) ->
 
 
 def test_theorem_1_is_not_computed_for_long_delays(make: Make) -> None:
-    """Its terms, two for each of these updates, take a minute."""
+    """Δ has a term for each update in flight: over 200 at the end, fewer up to 2 s."""
     delay = {"impairments": [{"kind": "delay", "delay_s": 2.5}]}
     record = simulate(make(network=delay, trigger={"beta": 1e-9}))
     assert trajectory_delta(record, 2.0) is not None
