@@ -102,7 +102,7 @@ netem: setup ## The network: loses at most M - 1 consecutive packets
 	@$(BIN)/noack netem --session $(SESSION) $(ARGS)
 
 ##@ Work on noack
-.PHONY: setup setup-dev test test-builds pytest fuzz attack soak check format bench screenshots schema docs docs-serve lock dist clean
+.PHONY: setup setup-dev test test-system pytest fuzz attack soak check format bench screenshots schema docs docs-serve lock dist clean
 setup: $(VENV)/.installed ## Create the environment in .venv (the other targets do this if needed)
 
 setup-dev: $(VENV)/.installed-dev
@@ -110,14 +110,18 @@ setup-dev: $(VENV)/.installed-dev
 ifneq (,$(filter test,$(MAKECMDGOALS)))
 MAKEFLAGS += --jobs=2 # what is checked does not wait for what is tested
 endif
-test: check pytest ## Lint, types, import rules, and tests (ARGS are pytest's, e.g. ARGS="-k mansd")
+# The checks run beside the tests, which leave the processors idle at times; their lines come last.
+test: setup-dev ## Lint, types, import rules, and tests (ARGS are pytest's, e.g. ARGS="-k mansd")
+	@$(MAKE) --no-print-directory check >$(VENV)/.checks.txt 2>&1 & checks=$$!; \
+	$(MAKE) --no-print-directory pytest; tested=$$?; \
+	wait $$checks; checked=$$?; cat $(VENV)/.checks.txt; exit $$((tested || checked))
 
-test-builds: setup-dev ## Test sanitizers, another compiler, qemu, another system, wheel, site
-	$(BIN)/python -m pytest -m builds --numprocesses=2 --dist=loadfile $(ARGS)
+test-system: setup-dev ## Test what needs a browser, root or a system package, and other builds
+	$(BIN)/python -m pytest -m system --numprocesses=2 --dist=loadfile $(ARGS)
 
 pytest: setup-dev
 	$(BIN)/python -m pytest \
-		$(or $(ARGS),-m "not builds" --numprocesses=3 --dist=loadfile --no-loadscope-reorder)
+		$(or $(ARGS),-m "not system" --numprocesses=3 --dist=loadfile --no-loadscope-reorder)
 
 fuzz: setup-dev ## Fuzz every parser for MINUTES=10 in total; exit status 1 if an input fails
 	$(BIN)/python -m tests.fuzz run --minutes $(MINUTES) $(ARGS)

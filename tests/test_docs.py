@@ -259,7 +259,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "html"
 
 
-@pytest.mark.builds
+@pytest.mark.system
 def test_every_page_command_and_public_name_is_there(site: Path) -> None:
     pages = {path.stem for path in (ROOT / "docs").glob("*.md")}
     assert pages <= {path.stem for path in site.glob("*.html")}
@@ -271,7 +271,7 @@ def test_every_page_command_and_public_name_is_there(site: Path) -> None:
         assert f'id="noack.{name}"' in text
 
 
-@pytest.mark.builds
+@pytest.mark.system
 def test_the_site_serves_its_own_mathjax(site: Path) -> None:
     for name in ("theory", "derivations", "mansd"):
         page = (site / f"{name}.html").read_text()
@@ -282,7 +282,7 @@ def test_the_site_serves_its_own_mathjax(site: Path) -> None:
         assert not re.search(r"\$|\\(?:lVert|beta|frac)", left)
 
 
-@pytest.mark.builds
+@pytest.mark.system
 def test_a_page_loads_no_external_resources(site: Path) -> None:
     for page in site.glob("*.html"):
         loaded = re.findall(r"<(?:script|link|img|iframe)\b[^>]*>", page.read_text())

@@ -25,6 +25,8 @@ from tests.helpers.command_line import invoke
 from tests.helpers.live_runs import Start, wait_for_end
 from tests.helpers.two_hosts import TwoHosts, two_hosts
 
+pytestmark = pytest.mark.system
+
 INVITED = ("--invitation", "invitation.json")
 ROOMY = "clocks.largest_error_us=1000000"
 """A busy machine gives wide bounds."""

@@ -83,7 +83,7 @@ def program_of(running: live.Running) -> psutil.Process:
     return program
 
 
-@pytest.mark.parametrize("processor", ["own", pytest.param(EMULATED, marks=pytest.mark.builds)])
+@pytest.mark.parametrize("processor", ["own", pytest.param(EMULATED, marks=pytest.mark.system)])
 def test_a_program_takes_part_in_a_live_run_and_is_replayed(
     processor: str, node: Path, tmp_path: Path
 ) -> None:

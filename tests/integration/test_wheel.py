@@ -20,7 +20,7 @@ from cosim.doctor.machine_measures import EXTRAS
 from native.build import HEADER, INTO, LIBRARY
 from tests.helpers.live_runs import EPHEMERAL, PATIENCE_S
 
-pytestmark = pytest.mark.builds
+pytestmark = pytest.mark.system
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = {
     name: value

@@ -10,7 +10,7 @@ import pytest
 
 from native.build import HERE, NO_COMPILER
 
-pytestmark = pytest.mark.builds
+pytestmark = pytest.mark.system
 BARE = {"memcpy", "memmove", "memset", "memcmp"}
 """What compilers expect of every system."""
 LIBM = {"fabs", "floor", "fmax", "fmin", "frexp", "ldexp", "sqrt"}

@@ -9,7 +9,7 @@ import pytest
 
 from native.build import FLAGS, LIBRARY, build, compiler, sources
 
-pytestmark = pytest.mark.builds
+pytestmark = pytest.mark.system
 FORMATS = {  # the first bytes: the format, and the processor at its place
     "manylinux_2_17_aarch64": (b"\x7fELF", 18, b"\xb7\x00"),
     "macosx_11_0_arm64": (b"\xcf\xfa\xed\xfe", 4, b"\x0c\x00\x00\x01"),

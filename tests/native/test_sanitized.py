@@ -8,7 +8,7 @@ import pytest
 
 from tests.native import sanitized_core
 
-pytestmark = pytest.mark.builds
+pytestmark = pytest.mark.system
 ROOT = sanitized_core.ROOT
 PYTEST = ("pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "-s", "--hypothesis-profile=few")
 

@@ -11,7 +11,7 @@ import pytest
 
 from tests.helpers.command_line import invoke
 
-pytestmark = pytest.mark.builds
+pytestmark = pytest.mark.system
 ROOT = Path(__file__).parents[2]
 CERTIFIED = (
     ["certify", "lane_following", "--json"],

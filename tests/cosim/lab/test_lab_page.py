@@ -15,6 +15,8 @@ from tests.helpers import live_runs as live
 from tests.helpers.lab_browser import TEXT, Page, Served
 from tools.screenshot_recording import Browser
 
+pytestmark = pytest.mark.system
+
 pytest.importorskip("nicegui", reason="the extra `lab` is not installed")
 
 

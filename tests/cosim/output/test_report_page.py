@@ -130,6 +130,7 @@ OUTSIDE = """(() => {
 texts below 10 pixels, of their glyphs that are cut, and what is wider than the page."""
 
 
+@pytest.mark.system
 def test_nothing_is_cut_or_too_small_to_read_on_any_screen(record: RunRecord, tmp_path: Path) -> None:
     written(record, tmp_path, claims=CLAIMS)
     with started(tmp_path / "profile") as browser:

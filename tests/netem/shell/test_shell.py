@@ -24,6 +24,8 @@ from noack.protocol.record_tables import Fate
 from noack.runtime.command_line import Signals
 from tests.netem.capture_reader import read
 
+pytestmark = pytest.mark.system
+
 ENDS = str(Path(__file__).with_name("ends.py"))
 SHELL = [sys.executable, "-m", "netem", "shell"]
 PATIENCE_S = 120
