@@ -29,15 +29,17 @@ _Points = Sequence[tuple[float, float]]
 class NetworkLimits(NamedTuple):
     """Largest certified value of each quantity; the others are those of the schedule."""
 
-    sampling_s: float
+    sampling_s: float | None
+    """None with an observer: its gain belongs to the period of its measurements."""
     delay_s: float
     hold_s: float
 
 
 def network_limits(scope: CertificateScope, scheduled: NetworkConditions) -> NetworkLimits:
     """Return the limits for some plants; 0 means that there is no certificate at any time."""
+    sampling_s = None if scope.has_observer else network_limit(scope, scheduled, "sampling")
     return NetworkLimits(
-        *(network_limit(scope, scheduled, quantity) for quantity in ("sampling", "delay", "hold"))
+        sampling_s, network_limit(scope, scheduled, "delay"), network_limit(scope, scheduled, "hold")
     )
 
 
@@ -52,7 +54,8 @@ _CHANGES: dict[str, Callable[[NetworkConditions, float], NetworkConditions]] = {
 def network_limit(scope: CertificateScope, scheduled: NetworkConditions, quantity: str) -> float:
     """Return the limit of one of the times ``sampling``, ``delay``, ``hold`` and ``start``, in s.
 
-    0 means that there is no certificate at any time.
+    0 means that there is no certificate at any time. With an observer, a sampling period other than
+    its own needs another gain, about which this says nothing.
     """
     change = _CHANGES[quantity]
     usual_s: float = getattr(scheduled, f"{quantity}_s")

@@ -129,6 +129,7 @@ class CertificateScope:
     ) -> None:
         self._start_error = start_error or 0.0
         self.name = name
+        self.has_observer = resolved.observer is not None
         self._resolved = resolved
         self._loop = loop_of(resolved)
         self._start = self._loop.x0[:, None] if start is None else start
