@@ -235,7 +235,9 @@ def _print_notes(console: Console, results: Certificates) -> None:
 LIMIT_HEADINGS = ("", "sampling period", "delay of updates", "age of inputs")
 
 
-def _limit(value_s: float) -> str:
+def _limit(value_s: float | None) -> str:
+    if value_s is None:
+        return NONE
     if value_s <= 0:
         return "none"
     return "any" if value_s >= MOST_S else duration_at_least(value_s)

@@ -99,6 +99,8 @@ def measure_of(system: ContinuousLoop, objective: Objective, rate_per_s: float |
     if objective is Objective.COST:
         return Measure(objective, output, trigger.level)
     rate_per_s = trigger.rate_per_s if rate_per_s is None else rate_per_s
+    if trigger.floor >= trigger.level:  # the threshold is constant
+        return Measure(objective, output, trigger.level)
     floor = trigger.floor if rate_per_s == trigger.rate_per_s else 0.0
     return Measure(objective, output, trigger.level, rate_per_s, floor)
 

@@ -267,15 +267,15 @@ def cost_ceiling(system: ContinuousLoop, longest_burst: int | None, horizon_s: f
     ones, at any distance. The bound is cheap and prunes the late part of the search tree. There is
     no comparable bound for suprema: they may occur at any time.
 
-    None if A + BK is not stable, or bursts may be of any length.
+    None if A + BK or the models are not stable, or bursts may be of any length.
     """
     if longest_burst is None:
         return None
     loop, trigger = system.loop, system.decaying
     closed = loop.A + loop.B @ loop.K
     models = _models(system)
-    missing = models.now(Output.GAIN) + models.missing(Output.GAIN, longest_burst, 0.0)
     try:
+        missing = models.now(Output.GAIN) + models.missing(Output.GAIN, longest_burst, 0.0)
         pushed = response(closed, loop.B @ models.split_K[0])
     except NotDecayingError:
         return None

@@ -204,7 +204,7 @@ def _notes(resolved: Scenario, trigger: str) -> Iterator[str]:
 def _quantity(objective: Objective, certificate: ScenarioCertificate, trigger: str) -> str:
     constants, sampled = certificate.constants, trigger == "sampled"
     alpha = certificate.alpha_per_s
-    rate = 0.0 if sampled else alpha
+    rate = 0.0 if sampled or certificate.floor >= certificate.beta else alpha
     if constants is not None:
         rate = constants.rate_per_s
     symbol = "α" if rate == alpha and not sampled else f"{rate:.3g}"

@@ -1,10 +1,13 @@
 """The largest sampling period, delay and age of inputs for which a certificate exists.
 
 Each is increased alone. The loop gain grows with it, so its largest value is where the gain is 1.
+A rule with times of its own, such as a deadline, has its next test at the first measurement after
+them, and this is late for some short sampling periods; such periods count for all longer ones.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache
 from typing import NamedTuple
 
 from noack.theory.bounds.certificate_terms import NetworkConditions
@@ -22,6 +25,8 @@ _WIDER, _NEXT = 4.0, 1.2
 """Factors from a time to the next one until the limit is enclosed: without a guess, and at least."""
 _BISECTION_EVERY = 6
 """Every sixth step tries the middle, in case interpolation does not find the limit."""
+_JUST_BELOW = 1 - 1e-6
+"""Factor from a period to one at which a test is just too early."""
 _Points = Sequence[tuple[float, float]]
 """Logarithms of loop gains, and of their times."""
 
@@ -29,15 +34,17 @@ _Points = Sequence[tuple[float, float]]
 class NetworkLimits(NamedTuple):
     """Largest certified value of each quantity; the others are those of the schedule."""
 
-    sampling_s: float
+    sampling_s: float | None
+    """None with an observer: its gain belongs to the period of its measurements."""
     delay_s: float
     hold_s: float
 
 
 def network_limits(scope: CertificateScope, scheduled: NetworkConditions) -> NetworkLimits:
     """Return the limits for some plants; 0 means that there is no certificate at any time."""
+    sampling_s = None if scope.has_observer else network_limit(scope, scheduled, "sampling")
     return NetworkLimits(
-        *(network_limit(scope, scheduled, quantity) for quantity in ("sampling", "delay", "hold"))
+        sampling_s, network_limit(scope, scheduled, "delay"), network_limit(scope, scheduled, "hold")
     )
 
 
@@ -52,11 +59,32 @@ _CHANGES: dict[str, Callable[[NetworkConditions, float], NetworkConditions]] = {
 def network_limit(scope: CertificateScope, scheduled: NetworkConditions, quantity: str) -> float:
     """Return the limit of one of the times ``sampling``, ``delay``, ``hold`` and ``start``, in s.
 
-    0 means that there is no certificate at any time.
+    0 means that there is no certificate at any time. With an observer, a sampling period other than
+    its own needs another gain, about which this says nothing.
     """
     change = _CHANGES[quantity]
     usual_s: float = getattr(scheduled, f"{quantity}_s")
-    return largest_stable_time_s(lambda value_s: scope.loop_gain(change(scheduled, value_s)), usual_s)
+
+    @cache
+    def gain_at(value_s: float) -> float:
+        return scope.loop_gain(change(scheduled, value_s))
+
+    def gain_up_to(value_s: float) -> float:
+        if quantity != "sampling":
+            return gain_at(value_s)
+        shorter_s = _with_late_tests_s(value_s, scope.test_times_s)
+        return max(map(gain_at, (value_s, *(t_s for t_s in shorter_s if t_s > usual_s))))
+
+    return largest_stable_time_s(gain_up_to, usual_s)
+
+
+def _with_late_tests_s(period_s: float, times_s: Sequence[float]) -> Iterator[float]:
+    """Yield for each time T the period up to ``period_s`` with the latest test after T.
+
+    It is just below T/k: k tests come before T, and the next one nearly T/k after it.
+    """
+    for time_s in times_s:
+        yield time_s / math.ceil(time_s / period_s) * _JUST_BELOW
 
 
 def largest_stable_time_s(loop_gain: Callable[[float], float], usual_s: float) -> float:

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.scenario.resolution import loop_of, rule_of
 from noack.scenario.scenario import Scenario
@@ -129,6 +130,7 @@ class CertificateScope:
     ) -> None:
         self._start_error = start_error or 0.0
         self.name = name
+        self.has_observer = resolved.observer is not None
         self._resolved = resolved
         self._loop = loop_of(resolved)
         self._start = self._loop.x0[:, None] if start is None else start
@@ -147,6 +149,13 @@ class CertificateScope:
             min(self.decay_per_s.values()),
         )
         assert start is None or self._constants.is_simple  # other starts are those of the scenario
+
+    @property
+    def test_times_s(self) -> list[float]:
+        """Times of the trigger's rule after which the first measurement has a test."""
+        rule = self._trigger.rule
+        times_ns = (rule.grid_ns, rule.idle_ns, rule.longest_ns)
+        return [t_ns / NS_PER_S for t_ns in times_ns if 0 < t_ns < math.inf]
 
     def certificate(self, conditions: NetworkConditions) -> ScenarioCertificate:
         """Return the certificate under some conditions; a void certificate has the reason."""

@@ -69,8 +69,19 @@ def test_the_documentation_quotes_computed_figures(lane: Certificates, weighted:
     least_ms = 1e3 * live.inter_event_s
     message = f"Δ = {live.delta:.3g}, X = {live.state:.3g} and δ = {least_ms:.0f} ms"
     assert message in " ".join(text.split())
-    limits = weighted.limits
-    assert f"sampling periods up to {1e3 * limits.sampling_s:.3g} ms" in text
+    sampling_s = weighted.limits.sampling_s
+    assert sampling_s is not None
+    assert f"sampling periods up to {1e3 * sampling_s:.3g} ms" in text
+
+
+def test_an_observer_has_no_limit_of_the_sampling_period() -> None:
+    gain = 'observer={kind="luenberger", gain=[[1.0], [100.0]]}'
+    limits = Certificates(resolved("pendulum_observed", gain), 2).limits
+    assert limits.sampling_s is None
+    assert limits.delay_s > 0.1
+    # At 32 ms the observer is unstable, although e_s grows by less than with 65 ms between two tests.
+    rarely = Certificates(resolved("pendulum_observed", gain, "plant.measure_every=16"), 2)
+    assert rarely.schedule.constants is None
 
 
 RATE_HZ = 1 / 0.048

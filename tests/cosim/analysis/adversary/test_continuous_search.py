@@ -19,6 +19,7 @@ from noack.scenario.scenario_file import validate
 from noack.theory.certificates.conditions import ideal_conditions
 from noack.theory.certificates.scenario_certificates import certify
 from tests.cosim.analysis.adversary.scenarios import every_run, flow_of, scenarios, simulate
+from tests.helpers.shipped import resolved as resolved_shipped
 
 MANY = settings(suppress_health_check=list(HealthCheck), phases=[Phase.generate])
 
@@ -96,3 +97,17 @@ def test_a_diverging_loop_has_an_infinite_objective(content: dict[str, Any]) -> 
     assert worst.diverges
     assert worst.exact
     assert worst.to_json()["value"] is None
+
+
+@pytest.mark.parametrize("floor", [0.0, 0.03])
+def test_unstable_models_and_a_constant_threshold_are_searched(floor: float) -> None:
+    """The floor is above β = 0.02; there is neither a certificate nor a bound of the cost to come."""
+    unstable = ("model.gain=[[-1.0, -1.0]]", "model.allow_unstable=true", "horizon_s=1.2")
+    pendulum = resolved_shipped("unstable_pendulum", *unstable, f"trigger.floor={floor}")
+    runs = list(every_run(pendulum))
+    for objective in Objective:
+        worst = find_worst(pendulum, objective, beam=0)
+        measure = flow_of(pendulum, objective, None).measure
+        assert worst.exact
+        assert worst.certified is None
+        assert signed(worst) == pytest.approx(max(evaluate(run, measure).value for run in runs))

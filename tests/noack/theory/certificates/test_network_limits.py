@@ -5,7 +5,10 @@ from collections.abc import Callable
 
 import pytest
 
-from noack.theory.certificates.network_limits import MOST_S, largest_stable_time_s
+from noack.theory.certificates.conditions import nominal_conditions
+from noack.theory.certificates.network_limits import MOST_S, largest_stable_time_s, network_limit
+from noack.theory.certificates.scenario_certificates import own_plant_scope
+from tests.helpers.shipped import resolved
 
 GAINS: dict[str, Callable[[float], float]] = {
     "proportional": lambda share: share,
@@ -34,3 +37,17 @@ def test_the_limit_is_found_to_its_resolution(name: str, limit_s: float, usual_s
 def test_all_times_or_none_may_have_a_certificate() -> None:
     assert largest_stable_time_s(lambda value_s: 0.5, 0.01) == MOST_S
     assert largest_stable_time_s(lambda value_s: math.inf, 0.01) == 0.0
+
+
+def test_no_shorter_sampling_period_makes_an_update_too_late() -> None:
+    """With updates 0.72 s apart there is a certificate; of a period of 0.5 s, they are 3 · 0.25 s apart."""
+    scenario = resolved("double_integrator", 'trigger={policy="periodic", period_s=0.5}')
+    scope, scheduled = own_plant_scope(scenario), nominal_conditions(scenario)
+
+    def gain(t_s: float) -> float:
+        return scope.loop_gain(scheduled._replace(sampling_s=t_s, spacing_s=t_s))
+
+    limit_s = network_limit(scope, scheduled, "sampling")
+    assert gain(0.24) < 1 < gain(0.375)
+    assert gain(0.72) < 1
+    assert 0.24 < limit_s < 0.25
