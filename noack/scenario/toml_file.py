@@ -457,8 +457,12 @@ def _purpose(section: type[ScenarioSection] | None, key: str) -> str:
 SYMBOLS = {
     "M": "M is network.mansd + 1; set network.mansd",
     "K": "K is model.gain",
+    "α": "α is trigger.alpha_per_s",
+    "β": "β is trigger.beta",
+    "h": "the sampling period is plant.measure_every / plant.rate_hz",
+    "delay": "a delay is an entry of network.impairments",
     "x0": "x(0) is plant.initial_state",
-    "seed": "seeds has one for each random part",
+    "seed": "each random part has a seed, e.g. seeds.loss",
 }
 """What is said of unknown keys that people write, such as the paper's symbols."""
 
