@@ -1,7 +1,7 @@
 """All certificates of a scenario: as one object, as JSON, and as rows of a table."""
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -181,6 +181,16 @@ class Certificates:
         They are computed at the first access, from dozens of certificates.
         """
         return {scope.name: network_limits(scope, self.scheduled) for scope in self._scopes}
+
+    def is_certified_with(self, changes: Mapping[str, float]) -> bool:
+        """Whether the plant has a certificate for the schedule with settings such as network.mansd."""
+        scenario = self.scenario
+        for name, value in changes.items():
+            section, _, key = name.partition(".")
+            changed = getattr(scenario, section).model_copy(update={key: value})
+            scenario = scenario.model_copy(update={section: changed})
+        conditions = nominal_conditions(scenario, self.late_periods)
+        return own_plant_scope(scenario).loop_gain(conditions) < 1
 
     @cached_property
     def stability(self) -> Stability | None:
