@@ -182,16 +182,6 @@ class Certificates:
         """
         return {scope.name: network_limits(scope, self.scheduled) for scope in self._scopes}
 
-    def is_certified_with(self, changes: Mapping[str, float]) -> bool:
-        """Whether the plant has a certificate for the schedule with settings such as network.mansd."""
-        scenario = self.scenario
-        for name, value in changes.items():
-            section, _, key = name.partition(".")
-            changed = getattr(scenario, section).model_copy(update={key: value})
-            scenario = scenario.model_copy(update={section: changed})
-        conditions = nominal_conditions(scenario, self.late_periods)
-        return own_plant_scope(scenario).loop_gain(conditions) < 1
-
     @cached_property
     def stability(self) -> Stability | None:
         """What is known about the stability of all loss patterns, if the loop is time-triggered.
@@ -251,6 +241,17 @@ class Certificates:
 
     def _repr_html_(self) -> str:
         return as_html(self._rows())
+
+
+def is_certified_with(results: Certificates, changes: Mapping[str, float]) -> bool:
+    """Whether the plant has a certificate for the schedule with settings such as network.mansd."""
+    scenario = results.scenario
+    for name, value in changes.items():
+        section, _, key = name.partition(".")
+        changed = getattr(scenario, section).model_copy(update={key: value})
+        scenario = scenario.model_copy(update={section: changed})
+    conditions = nominal_conditions(scenario, results.late_periods)
+    return own_plant_scope(scenario).loop_gain(conditions) < 1
 
 
 def _theorem_2(scenario: Scenario, certificate: ScenarioCertificate) -> Theorem2 | None:

@@ -7,11 +7,18 @@ time-triggered loop, :func:`print_mean_cost` its mean cost under random losses.
 
 import math
 from collections.abc import Iterable, Iterator
+from functools import partial
 
 from rich.console import Console
 from rich.markup import escape
 
-from cosim.analysis.certificates import SCHEDULE, Certificates, constant_rows, covered_plants
+from cosim.analysis.certificates import (
+    SCHEDULE,
+    Certificates,
+    constant_rows,
+    covered_plants,
+    is_certified_with,
+)
 from cosim.analysis.margin_search import MarginResult
 from cosim.analysis.mean_cost import CostUnder, MeanCost
 from cosim.output.result_tables import ResultTable, terminal_table
@@ -113,7 +120,7 @@ def _helpful_changes(results: Certificates) -> Iterator[str]:
         [{"trigger.sigma": sigma / 2**k} for k in range(1, 10) if sigma],
     )
     for changes in candidates:
-        if (helpful := next(filter(results.is_certified_with, changes), None)) is not None:
+        if (helpful := next(filter(partial(is_certified_with, results), changes), None)) is not None:
             yield " and ".join(f"{name} = {value:g}" for name, value in helpful.items())
 
 
