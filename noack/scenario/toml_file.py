@@ -206,8 +206,8 @@ def _unfit(value: object) -> None:
         written = json.dumps({"kind": "python", "file": "my_plant.py", "name": value.__name__})
         raise TypeError(f"{value.__name__}: a class is given by its file and its name: {written}")
     if isinstance(value, date | time):
-        raise TypeError(f"{value}: a date or time is no value of a setting; write text in quotes")
-    raise TypeError(f"a value of type {type(value).__name__} is no value of a setting")
+        raise TypeError(f"{value}: a date or time cannot be the value of a setting; write text in quotes")
+    raise TypeError(f"a value of type {type(value).__name__} cannot be the value of a setting")
 
 
 _PATTERNS = {
