@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import rerun.chunk
-from click.testing import Result
 
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.replay import replay
@@ -159,7 +158,7 @@ def set_parameters(*words: str) -> dict[str, Any]:
 class ChangedRun(NamedTuple):
     """A run that was changed twice and then stopped, and what was answered while it ran."""
 
-    early_summary: Result
+    early_summary: Any
     first: dict[str, Any]
     second: dict[str, Any]
     invalid: dict[str, Any]
