@@ -103,7 +103,11 @@ def load_links(path: Path, *, read: bool = True) -> tuple[LinkSpec, ...]:
     Raises:
         CallerError: one line per mistake, each with file, key, value and remedy.
     """
-    links = toml_file.validated(LinksFile, toml_file.read(path, LinksFile), str(path)).link
+    content = toml_file.read(path, LinksFile)
+    if "link" not in content and not content.keys().isdisjoint(("model", "axes")):
+        kind = "scenario" if "model" in content else "campaign"
+        raise CallerError(f"{path}: a {kind}, not a file of links; it has no [[link]]")
+    links = toml_file.validated(LinksFile, content, str(path)).link
     specs = tuple(
         link.spec(path.parent, f"{path}: link.{number}", read=read) for number, link in enumerate(links)
     )

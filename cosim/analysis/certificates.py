@@ -1,7 +1,7 @@
 """All certificates of a scenario: as one object, as JSON, and as rows of a table."""
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -241,6 +241,17 @@ class Certificates:
 
     def _repr_html_(self) -> str:
         return as_html(self._rows())
+
+
+def is_certified_with(results: Certificates, changes: Mapping[str, float]) -> bool:
+    """Whether the plant has a certificate for the schedule with settings such as network.mansd."""
+    scenario = results.scenario
+    for name, value in changes.items():
+        section, _, key = name.partition(".")
+        changed = getattr(scenario, section).model_copy(update={key: value})
+        scenario = scenario.model_copy(update={section: changed})
+    conditions = nominal_conditions(scenario, results.late_periods)
+    return own_plant_scope(scenario).loop_gain(conditions) < 1
 
 
 def _theorem_2(scenario: Scenario, certificate: ScenarioCertificate) -> Theorem2 | None:

@@ -41,7 +41,7 @@ from cosim.simulation.continuous import (
 )
 from cosim.simulation.exact_simulation import MAX_EVENTS
 from cosim.simulation.plant_grid_loop import NO_ACTUATION, PlantGridLoop, StepSchedule
-from noack.core.errors import CallerError, NoackError
+from noack.core.errors import NoackError
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.number_format import percent
 from noack.protocol.record_tables import (
@@ -58,7 +58,7 @@ _AFTER_ANY_TIME_NS = 2**62
 """Later than any time of a run; differences of times still fit 64 bits."""
 
 
-class IncomparableError(CallerError):
+class IncomparableError(NoackError):
     """The run's record does not allow the comparison; the message has the reason."""
 
 
@@ -433,7 +433,9 @@ def _ideal(
         )
     except TooManyEventsError:
         raise IncomparableError(
-            f"the ideal loop has more than {max_events} events, which accumulate"
+            f"in continuous time the events accumulate (more than {max_events:,}), so there is no ideal "
+            "loop; a stable loop, a larger threshold or a floor would keep them apart; `noack compare` "
+            "compares runs with each other"
         ) from None
     if ideal.diverged_at_s is not None:
         raise IncomparableError(f"the ideal loop diverges at {ideal.diverged_at_s:g} s")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from cosim.api.scenarios import Source, load
 from cosim.lazy_modules import lazy_modules
-from cosim.record.run_directory import RECORD, REPORT_FILE, SCENARIO_FILE, chosen_run, file_of_loop
+from cosim.record.run_directory import RECORD, REPORT_FILE, chosen_run, file_of_loop, require_run_directory
 from noack.core.errors import CallerError, ExitStatus
 from noack.core.number_format import as_html, as_text
 from noack.scenario import link_load, resolution
@@ -372,8 +372,7 @@ def open_run(directory: PathLike = "runs/latest") -> Run:
             damaged, or the run is still active.
     """
     path = chosen_run(Path(directory), Path(directory).parent)
-    if not (path / SCENARIO_FILE).is_file():
-        raise CallerError(f"{path}: not a run directory (no {SCENARIO_FILE})")
+    require_run_directory(path)
     outcome = run_end.reopen(path.resolve())
     return Run(outcome.run_dir, lambda: outcome)
 

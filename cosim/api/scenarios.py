@@ -143,7 +143,8 @@ def _complete(content: Table, settings: ReadTable | None, path: Path) -> Scenari
     """Apply settings, validate, and read the named files, relative to ``path``."""
     if not isinstance(settings, Mapping | None):
         raise CallerError(
-            f'settings: {settings!r} is no table; give values by key, {{"network.loss.probability": 0.8}}'
+            f"settings: {settings!r} is not a table; give values by key, "
+            'e.g. {"network.loss.probability": 0.8}'
         )
     for key, value in (settings or {}).items():
         if not isinstance(key, str):

@@ -34,6 +34,7 @@ with lazy_modules():
     from cosim.live.processes import fork_server
     from cosim.output import result_tables
     from noack.core import core_library
+    from noack.scenario import runtime_parameters, scenario, toml_file
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -110,13 +111,27 @@ class Program(TyperGroup):
         message = _with_value(message.removeprefix("invalid value: "), words)
         name = next((word for word in words if word in self.commands), None)
         where, command = (f"{name}: ", f"{NAME} {name}") if name else ("", NAME)
-        if near := getattr(error, "possibilities", None):
-            return f"{where}no such option: {error.option_name}; did you mean {near[0]}?"  # type: ignore[attr-defined]
+        if option := getattr(error, "option_name", None):
+            hint = _setting_hint(option, self.commands.get(name or ""))
+            if near := getattr(error, "possibilities", None):
+                hint = hint or f"did you mean {near[0]}?"
+            if hint:
+                return f"{where}no such option: {option}; {hint}"
         if message.endswith("?"):
             return f"{where}{message}"
         if name and message.startswith("missing "):
             return f"{where}{message}, e.g. `{examples_of(self.commands[name])[0]}`"
         return f"{where}{message}; see `{command} --help`"
+
+
+def _setting_hint(option: str, command: "Command | None") -> str:
+    """Return what to set instead if the name of an unknown option is that of a scenario's key."""
+    if command is None or not any("--set" in parameter.opts for parameter in command.params):
+        return ""
+    name = option.lstrip("-").replace("-", "_")
+    known = {*runtime_parameters.SHORT, *toml_file.keys(scenario.Scenario)}
+    keys = [key for key in (name, f"{name}_s") if key in known]
+    return f"did you mean --set {keys[0]}=...?" if keys else toml_file.SYMBOLS.get(name, "")
 
 
 def _with_value(message: str, words: Sequence[str]) -> str:

@@ -19,7 +19,6 @@ from tomlkit.exceptions import TOMLKitError
 
 from cosim.shipped_files import find_shipped, shipped_names, text_of
 from noack.core.errors import CallerError, NoackError
-from noack.core.file_access import read_regular
 from noack.scenario import toml_file
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import completed, put, remove, toml_text, value_of
@@ -178,9 +177,9 @@ def open_draft(name: str) -> Draft:
         text = text_of(name)
     else:
         try:
-            text = read_regular(path, toml_file.MOST_BYTES).decode("utf-8")
-        except (OSError, ValueError) as error:
-            raise CallerError(f"{name}: cannot be read: {error}") from None
+            text = toml_file.read_text(path)
+        except FileNotFoundError:
+            raise CallerError(f"{name}: no such file") from None
     return Draft(name, path.absolute().parent, text, text)
 
 

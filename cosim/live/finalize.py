@@ -43,6 +43,7 @@ from cosim.record.run_directory import (
     finished_run,
     read_object,
     refuse_links,
+    require_run_directory,
 )
 from cosim.record.run_record import RecordedRun, RunRecord, load_run, scenarios_of
 from cosim.record.spool_conversion import finish_record
@@ -389,8 +390,7 @@ def reopen(run_dir: Path, *, view: bool = True) -> Outcome:
     Raises:
         CallerError: it is not a run directory, or the run is still under way.
     """
-    if not (run_dir / SCENARIO_FILE).is_file():
-        raise CallerError(f"{run_dir}: not a run directory (no {SCENARIO_FILE})")
+    require_run_directory(run_dir)
     summary = read_summary(read_object(run_dir / SUMMARY_FILE))
     # A process that was frozen may have spooled rows after the end.
     if summary is not None and not (run_dir / SPOOL).is_dir():

@@ -7,11 +7,18 @@ time-triggered loop, :func:`print_mean_cost` its mean cost under random losses.
 
 import math
 from collections.abc import Iterable, Iterator
+from functools import partial
 
 from rich.console import Console
 from rich.markup import escape
 
-from cosim.analysis.certificates import SCHEDULE, Certificates, constant_rows, covered_plants
+from cosim.analysis.certificates import (
+    SCHEDULE,
+    Certificates,
+    constant_rows,
+    covered_plants,
+    is_certified_with,
+)
 from cosim.analysis.margin_search import MarginResult
 from cosim.analysis.mean_cost import CostUnder, MeanCost
 from cosim.output.result_tables import ResultTable, terminal_table
@@ -80,18 +87,41 @@ def _print_nonlinear(console: Console, results: Certificates, why_nonlinear: str
 
 
 def _print_advice(console: Console, results: Certificates) -> None:
-    """Print that there is no certificate, and which settings could give one."""
-    share = "trigger.sigma, " if hasattr(results.scenario.trigger, "sigma") else ""
+    """Print that there is no certificate, and which changes give one; each was computed."""
     advice = ""
     if (results.schedule.void or "").startswith("the loop gain"):
-        advice = (
-            f": raise plant.rate_hz and controller.rate_hz, or lower {share}network.mansd, the network's "
-            "delay or certificate.late_periods"
-        )
+        changes = list(_helpful_changes(results))
+        advice = "; neither shorter times nor a smaller network.mansd alone give one"
+        if changes:
+            advice = f"; there is one with {', or with '.join(changes)}"
     console.print(
         f"[yellow]no certificate for the schedule[/], so no bound of ‖x‖{advice}; noack adversary "
         "shows what losses can do to it"
     )
+
+
+def _helpful_changes(results: Certificates) -> Iterator[str]:
+    """Yield, in words, changes of which each gives a certificate for the plant."""
+    times = {
+        "sampling": "a sampling period of at most {} (plant.measure_every, plant.rate_hz)",
+        "delay": "a delay of updates of at most {} (the network's, and certificate.late_periods)",
+        "hold": "an age of inputs of at most {} (controller.rate_hz, certificate.late_periods)",
+    }
+    for name, text in times.items():
+        limit_s = getattr(results.limits, f"{name}_s")
+        if 0 < limit_s < getattr(results.scheduled, f"{name}_s"):
+            yield text.format(_limit(limit_s))
+    scenario = results.scenario
+    rates = {"plant.rate_hz": scenario.plant.rate_hz, "controller.rate_hz": scenario.controller.rate_hz}
+    sigma = getattr(scenario.trigger, "sigma", 0.0)
+    candidates: tuple[list[dict[str, float]], ...] = (
+        [{name: factor * rate for name, rate in rates.items()} for factor in (2, 5, 10)],
+        [{"network.mansd": most} for most in range(scenario.network.mansd - 1, -1, -1)],
+        [{"trigger.sigma": sigma / 2**k} for k in range(1, 10) if sigma],
+    )
+    for changes in candidates:
+        if (helpful := next(filter(partial(is_certified_with, results), changes), None)) is not None:
+            yield " and ".join(f"{name} = {value:g}" for name, value in helpful.items())
 
 
 def _print_weight(console: Console, chosen: Certificates, weight: Matrix) -> None:

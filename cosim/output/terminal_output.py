@@ -238,9 +238,10 @@ def print_fidelity(console: Console, fidelity: Fidelity) -> None:
         console.print(terminal_table(table))
     console.print(
         "Each row adds one effect to the rows above. RMS, max: of the norm, in model units. Δt: "
-        "largest change of an event's time. split at event: number of the first event that moves "
-        "by more than ten measurement periods, or that one of the two lacks; from there on, the "
-        "recorded losses fall on other events. A negative share partly cancels the other effects.",
+        "largest change of an event's time. All rows lose the packets of the same event numbers. "
+        "split at event: number of the first event that moves by more than ten measurement periods, "
+        "or that one of the two lacks; from there on, an event of the same number happens at another "
+        "time. A negative share partly cancels the other effects.",
         highlight=False,
     )
     colour = "green" if fidelity.explained else "bold red"

@@ -115,7 +115,7 @@ def _require_kept_of(run_dir: Path, folder: Path, source: str) -> None:
     if not any((folder / SPOOL).glob("*.*")):
         raise CallerError(f"{source}: nothing was kept there (no files in {SPOOL}/)")
     if kept_run_name(folder) != read_object(run_dir / ENVIRONMENT_FILE).get("run_name"):
-        raise CallerError(f"{source}: it was kept of another run than {run_dir}")
+        raise CallerError(f"{source}: it belongs to another run than {run_dir}")
 
 
 def _take(folder: Path, run_dir: Path, source: str) -> list[str]:
@@ -131,7 +131,7 @@ def _take(folder: Path, run_dir: Path, source: str) -> list[str]:
         table, _, writer = path.name.partition(".")
         process, name = processes.get(writer), f"{source}: {SPOOL}/{path.name}"
         if process is None:
-            raise PeerError(f"{name} is of no process that joined this run")
+            raise PeerError(f"{name} belongs to no process that joined this run")
         if not _has_secret(folder, process, source):
             raise PeerError(f"{source}: the {process.role} of this run did not run there")
         if table == KEPT_KEY:

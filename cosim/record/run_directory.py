@@ -194,6 +194,23 @@ def chosen_run(run_dir: Path | None, runs: Path) -> Path:
     return run_dir
 
 
+def require_run_directory(path: Path) -> None:
+    """Raise CallerError, which says what the path is instead, if it is no run directory."""
+    if (path / SCENARIO_FILE).is_file():
+        return
+    if not path.exists():
+        raise CallerError(f"{path}: no such run directory")
+    if path.is_dir():
+        raise CallerError(f"{path}: not a run directory (no {SCENARIO_FILE})")
+    hint = ""
+    for folder in path.parents:
+        if not hint and (folder / SCENARIO_FILE).is_file() and (folder / RECORD).is_dir():
+            hint = f"; did you mean {folder}?"
+    if not hint and path.suffix == ".toml":
+        hint = "; `noack simulate` makes one from a scenario"
+    raise CallerError(f"{path}: a file, not a run directory{hint}")
+
+
 def file_of_loop(file: str, loop: str | None) -> str:
     """Return the name of a loop's own report or recording, such as ``report-NAME.html``."""
     base, dot, ending = file.rpartition(".")

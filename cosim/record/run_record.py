@@ -36,7 +36,14 @@ from cosim.record.record_source import (
     with_columns,
 )
 from cosim.record.record_source import Rows as Rows
-from cosim.record.run_directory import RECORD, SCENARIO_FILE, SUMMARY_FILE, Kind, kind_of
+from cosim.record.run_directory import (
+    RECORD,
+    SCENARIO_FILE,
+    SUMMARY_FILE,
+    Kind,
+    kind_of,
+    require_run_directory,
+)
 from noack.core.cached_method import cached_method
 from noack.core.errors import CallerError, PeerError
 from noack.protocol.record_tables import (
@@ -436,8 +443,7 @@ def load_run(run_dir: Path) -> RecordedRun:
             earlier version of noack.
     """
     folder = run_dir / RECORD
-    if not (run_dir / SCENARIO_FILE).is_file():
-        raise CallerError(f"{run_dir}: not a run directory (no {SCENARIO_FILE})")
+    require_run_directory(run_dir)
     if not folder.is_dir():
         ended = (run_dir / SUMMARY_FILE).is_file()
         hint = "" if ended else "; `noack summary` finalises an interrupted run"

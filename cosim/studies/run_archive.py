@@ -115,6 +115,8 @@ def unpack(path: Path, folder: Path) -> Manifest:
         CallerError: the file is not such an archive, is damaged, or names files elsewhere.
         MachineError: the folder cannot be written.
     """
+    if path.is_dir():
+        raise CallerError(f"{path}: a folder, not an archive; `noack archive` makes one of a run")
     try:
         with open_regular(path) as file, zipfile.ZipFile(file) as archive:
             infos = _checked_entries(path, archive, os.fstat(file.fileno()).st_size)

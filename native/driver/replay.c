@@ -25,7 +25,7 @@ static const char *check_table(
         return "the rows of a recorded table are too short or too long";
     int is_network = replay->role == NOACK_NETWORK;
     if (is_network && table->kind == NOACK_MESSAGES && table->row_bytes != sizeof(noack_packet_row))
-        return "a row of a packet has another size";
+        return "a row of a packet has the wrong size";
     if (is_network || table->kind == NOACK_TICKS)
         return NULL;
     int64_t entries = 0;
@@ -33,11 +33,11 @@ static const char *check_table(
         const noack_columns *columns = &table->vector[i];
         if (!is_between(0, columns->entries, NOACK_MAX_ENTRIES)
             || !is_between(0, columns->begin, table->row_bytes - 8 * columns->entries))
-            return "the vector of a message is not in its row";
+            return "the vector of a message lies outside its row";
         entries += columns->entries;
     }
     if (entries != reception_of(replay, table->kind)->entries)
-        return "a recorded message has another size than the machine receives";
+        return "a recorded message does not have the size that the machine receives";
     return NULL;
 }
 
@@ -48,9 +48,9 @@ const char *noack_replay_check(const noack_input_replay *replay) {
                          || !is_between(0, replay->loop, replay->process->loops - 1))
         return "a replay has no machine";
     if (!is_between(0, replay->next, replay->count))
-        return "a replay has more inputs than it has";
+        return "a replay has used more inputs than it has";
     if (is_network ? replay->sent_width != SENT_DATAGRAM : replay->sent_width <= SENT_HEADER)
-        return "there is no room for what is sent";
+        return "there is no room for the messages that are sent";
     const char *wrong = NULL;
     int64_t rows = 0;
     for (int i = 0; wrong == NULL && i < TABLES; i++) {

@@ -31,7 +31,7 @@ const char *noack_segments_check(const noack_segments *segments) {
         return "the last step, the delay or the number of updates in flight is out of range";
     if (!covers(&plant->at_state, segments->last) || plant->at_input.width > 0
         || !covers(&plant->noise, segments->last / plant->measure_every))
-        return "disturbances or noise do not reach to the last step";
+        return "disturbances or noise end before the last step";
     if ((segments->sensor->observer.kind != NOACK_NO_OBSERVER) != (segments->gains != NULL)
         || segments->sensor->observer.kind == NOACK_KALMAN)
         return "an observer needs its gain at each measurement";

@@ -26,7 +26,7 @@ const char *noack_simulation_check(const noack_simulation *simulation) {
     if (wrong != NULL)
         return wrong;
     if (!is_between(1, simulation->loops, MOST_LOOPS) || channel->loops != simulation->loops)
-        return "the network has another number of loops, or there are no loops";
+        return "the network has a different number of loops, or there are no loops";
     for (int64_t role = NOACK_PLANT; role <= NOACK_CONTROLLER; role++) {
         const noack_process *process = simulation->processes[role];
         if (process == NULL || process->role != role || process->loops != simulation->loops)
@@ -34,7 +34,7 @@ const char *noack_simulation_check(const noack_simulation *simulation) {
     }
     for (int64_t flow = NOACK_MEASUREMENT; flow <= NOACK_ACKNOWLEDGEMENT; flow++)
         if (!is_between(-1, simulation->directions[flow], channel->directions - 1))
-            return "a flow crosses the network in no direction of it";
+            return "a flow has no direction of the network";
     int64_t places = simulation->sent_places;
     if (!is_between(MOST_OUTPUTS, places, MOST_PLACES) || (places & (places - 1)) != 0
         || !is_between(0, simulation->sent_count, places)

@@ -113,14 +113,14 @@ static const char *check_exact_rule(const noack_exact *exact) {
     if (rule->longest_ns < rule->shortest_ns)
         return "a trigger rule has times out of range";
     if (rule->integrates && (is_quadratic(exact) || rule->is_dynamic))
-        return "a trigger rule integrates another norm than that of W e_s, or on a grid";
+        return "a trigger rule may integrate the norm of W e_s only, and not on a grid";
     return NULL;
 }
 
 const char *noack_exact_check(const noack_exact *exact) {
     if (!is_between(1, exact->n, NOACK_EXACT_ENTRIES)
         || !is_between(1, exact->m, NOACK_EXACT_ENTRIES))
-        return "a loop has no state or input, or more than 64";
+        return "a loop needs 1 to 64 states and 1 to 64 inputs";
     if (exact->H == NULL || exact->K == NULL || exact->scratch == NULL)
         return "a simulation has no matrix or no memory";
     if (!is_finite_nonnegative(exact->horizon_s) || !is_finite_nonnegative(exact->settle)
@@ -128,14 +128,14 @@ const char *noack_exact_check(const noack_exact *exact) {
         return "a simulation has a time, a share or a rate below 0";
     if (!is_between(0, exact->most_events, INT64_MAX)
         || !is_between(NOACK_EXACT_ROW, exact->measure, NOACK_EXACT_TIMES))
-        return "a simulation has an unknown measure, or less than 0 events";
+        return "a simulation has an unknown measure, or a negative number of events";
     if (!is_between(0, exact->event_places, MOST_FATES)
         || (exact->event_places > 0 && (exact->event_s == NULL || exact->delivered == NULL)))
         return "a simulation has no room for its events";
     if (exact->link == NULL) {
         if (!is_between(0, exact->fate_count, MOST_FATES)
             || (exact->fate_count > 0 && exact->fates == NULL))
-            return "a simulation has no fates";
+            return "a simulation has no packet fates";
     } else if (noack_link_check(exact->link) != NULL || exact->link->rows < 1)
         return "a simulation has no link";
     return check_exact_rule(exact);

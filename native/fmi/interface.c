@@ -54,7 +54,7 @@ fmu *fmi3InstantiateCoSimulation(
     for (int k = 0; wrong == NULL && k < NOACK_TAG_BYTES; k++)
         snprintf(own + 2 * k, 3, "%02x", instance->image->tag[k]);
     if (wrong == NULL && (token == NULL || strcmp(token, own) != 0))
-        wrong = "noack.bin does not belong to modelDescription.xml: its token is another one";
+        wrong = "noack.bin does not belong to modelDescription.xml: their tokens differ";
     if (wrong == NULL)
         return instance;
     fail(instance, wrong);
@@ -91,9 +91,9 @@ status fmi3DoStep(
     int64_t from_ns = ns_of(from_s), to_ns = ns_of(from_s + step_s);
     const char *wrong;
     if (from_ns < 0 || to_ns <= image->now_ns)
-        wrong = "a step goes forward, at times below 4,000,000 s";
+        wrong = "a step must go forward, at times below 4,000,000 s";
     else if (!is_between(image->now_ns - DRIFT_NS, from_ns, image->now_ns + DRIFT_NS))
-        wrong = "a step begins where the last one has ended";
+        wrong = "a step must begin where the last one ended";
     else
         wrong = step(instance, to_ns);
     *needs_event = *ends = *returns_early = 0;
@@ -189,7 +189,7 @@ static void tag_state(const fmu *instance, const noack_fmu_image *state, uint8_t
 
 status fmi3SerializeFMUState(fmu *instance, const void *state, uint8_t *bytes, size_t count) {
     if (instance == NULL || state == NULL || count != (size_t)instance->initial->bytes)
-        return fail(instance, "there is no state, or its place has another size");
+        return fail(instance, "there is no state, or the memory for it has the wrong size");
     memcpy(bytes, state, count);
     tag_state(instance, state, bytes);
     return FMI_OK;

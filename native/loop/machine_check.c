@@ -15,7 +15,7 @@ static int is_model_time(int64_t t_ns) { return is_between(0, t_ns, MESSAGE_TIME
 static const char *check_machine(const noack_machine *machine) {
     if (!is_between(1, machine->n, NOACK_MAX_ENTRIES)
         || !is_between(1, machine->m, NOACK_MAX_ENTRIES))
-        return "a machine has not 1 to 64 states and inputs";
+        return "a machine needs 1 to 64 states and 1 to 64 inputs";
     if (!is_between(0, machine->phase_ns, MOST_NS) || !is_between(0, machine->horizon_ns, MOST_NS)
         || !is_between(0, machine->first_ns, MOST_NS)
         || !is_between(0, machine->period_ns, MOST_NS))
@@ -23,7 +23,7 @@ static const char *check_machine(const noack_machine *machine) {
     if (!is_between(0, machine->step, MOST_NUMBER) || !is_between(0, machine->inputs, MOST_NUMBER)
         || !is_between(0, machine->first_number, MOST_NUMBER)
         || (machine->period_ns > 0 && machine->step > MOST_NS / machine->period_ns))
-        return "a machine has numbers out of range";
+        return "a machine's step, count of inputs or first number is out of range";
     if (!is_between(0, machine->received.entries, NOACK_MAX_ENTRIES)
         || machine->acknowledgements.entries != 0)
         return "a machine receives vectors of more than 64 entries";
@@ -41,7 +41,7 @@ static const char *check_model(const noack_model *model, int64_t n) {
         return "a model has no matrices of its size";
     if (!is_between(4, transitions->places, MOST_PLACES)
         || (transitions->places & (transitions->places - 1)) != 0)
-        return "a model's number of kept matrices is not a power of 2, from 4 on";
+        return "the number of matrices that a model keeps must be a power of 2, at least 4";
     if (!is_between(0, model->changes, MOST_LENGTH) || model->has_point == NULL
         || model->points == NULL || (model->changes > 0 && model->since_ns == NULL))
         return "a model has no set points";
@@ -57,7 +57,7 @@ static const char *check_signal(const noack_signal *signal, int64_t width) {
         return NULL;
     if (signal->width != width || !is_between(1, signal->rows, MOST_ROWS)
         || !is_between(-MOST_NUMBER, signal->first, MOST_NUMBER) || signal->values == NULL)
-        return "a disturbance or a noise has another width than what it is added to";
+        return "a disturbance or noise does not have the width of the vector that it is added to";
     return NULL;
 }
 
@@ -87,7 +87,7 @@ static const char *check_plant(const noack_plant *plant) {
         return "a plant's input matrix has another number of columns than it has sources";
     if (!is_between(1, plant->predictions, NOACK_MAX_ENTRIES)
         || machine->received.entries != plant->predictions * m + (plant->carries_model ? n : 0))
-        return "a plant receives actuations of another size";
+        return "a plant must receive actuations of its number of inputs";
     if (plant->p + (plant->reports_inputs ? plant->measure_every * m : 0) > NOACK_MAX_ENTRIES)
         return "a measurement has more than 64 entries";
     if (plant->timeout_ns < 0 || plant->notice_ns < 0 || !is_model_time(plant->newest_ns)
@@ -146,10 +146,10 @@ static const char *check_sensor(const noack_sensor *sensor) {
         || (wrong = check_observer(&sensor->observer, machine)) != NULL)
         return wrong;
     if (machine->period_ns != 0)
-        return "a sensor has ticks";
+        return "a sensor must not have ticks";
     if (sensor->observer.kind == NOACK_NO_OBSERVER ? machine->received.entries != machine->n
                                                    : sensor->plant_period_ns < 1)
-        return "a sensor receives measurements of another size";
+        return "a sensor receives measurements of the wrong size";
     if (sensor->x_s == NULL || sensor->event_x == NULL || sensor->x == NULL || sensor->e_s == NULL
         || sensor->scratch == NULL)
         return "a sensor has no state";
@@ -170,7 +170,7 @@ static const char *check_controller(const noack_controller *controller) {
     const noack_machine *machine = &controller->machine;
     int64_t n = machine->n, m = machine->m;
     if (machine->period_ns < 1 || machine->received.entries != n)
-        return "a controller has no period, or receives updates of another size";
+        return "a controller has no period, or receives updates of the wrong size";
     if (!is_between(1, controller->predictions, NOACK_MAX_ENTRIES)
         || controller->predictions * m + (controller->carries_model ? n : 0) > NOACK_MAX_ENTRIES)
         return "an actuation has more than 64 entries";
@@ -229,7 +229,7 @@ static const char *check_tables(const noack_process *process, int64_t loop) {
         if (words == 0)
             continue;
         if (words > NOACK_MAX_ROW_WORDS || !has_layout(table, loop, words))
-            return "the rows of a table have another size than the machines write";
+            return "the rows of a table do not have the size that the machines write";
         if (table->rows == NULL || !is_between(1, table->places, MOST_LENGTH)
             || !is_between(0, table->count, table->places))
             return "a table has no rows";

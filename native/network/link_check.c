@@ -34,7 +34,7 @@ static const char *check_bottleneck(const noack_stage *stage) {
     if (!is_between(-MOST_BYTES, settings->overhead_bytes, MOST_BYTES)
         || !is_between(0, settings->cell_bytes, MOST_BYTES)
         || !is_between(0, settings->cell_overhead_bytes, MOST_CELL_HEADER))
-        return "a bottleneck has an overhead or cells of more than 65,536 bytes, or below 0";
+        return "the overhead and cells of a bottleneck must be from 0 to 65,536 bytes";
     if (stage->kind == NOACK_CODEL
         && (settings->target_ns < 0 || !is_between(1, settings->interval_ns, FAR_NS / 16)))
         return "CoDel has no target or interval";
@@ -147,7 +147,7 @@ static const char *check_stage(const noack_link *link, const noack_stage *stage)
         if (stage->delay.shape == NOACK_EMPIRICAL
             && (!in_range(stage->delay.begin, stage->delay.end, link->real_count)
                 || stage->delay.end - stage->delay.begin < 2))
-            return "quantiles of a delay are outside the table of reals, or less than two";
+            return "quantiles of a delay are outside the table of reals, or fewer than two";
         return NULL;
     case NOACK_CODEL:
     case NOACK_TAIL_DROP:
@@ -193,7 +193,7 @@ static const char *check_guarantee(const noack_link *link) {
         longest = max_of(longest, window->packets);
     }
     if (!is_power_of_2(link->recent_width) || !is_power_of_2(link->loss_width))
-        return "the width of a ring is no power of 2";
+        return "the width of a ring must be a power of 2";
     if (link->tracks && link->mansd >= 0 && link->recent_width <= link->mansd)
         return "the ring of release times is shorter than M packets";
     if (counts_losses(link)

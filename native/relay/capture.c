@@ -31,7 +31,7 @@ const char *noack_capture_check(
         if (event->t_ns < 0)
             return "an event is before 1970";
         if (event->family != 0 && event->family != 4 && event->family != 6)
-            return "an event is neither of IPv4 nor of IPv6";
+            return "an event must be of IPv4 or IPv6";
         if (udp_bytes > MOST_PACKET_BYTES - (event->family == 4 ? IPV4_BYTES : 0))
             return "an event has a payload that is too large for a datagram";
         if (event->offset > (uint64_t)data_bytes

@@ -128,7 +128,7 @@ class Relay:
         """
         names = [spec.name for spec in self.specs]
         if link not in names:
-            raise CallerError(f"link {link}: there is none of this name, but {', '.join(names)}")
+            raise CallerError(f"link {link}: no such link; links: {', '.join(names)}")
         number = 2 * names.index(link) + DIRECTIONS.index(direction)
         changed = self._directions[number]
         changed.change(settings, self._memory.latest_ns(number, changed.rows))

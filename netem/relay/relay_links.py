@@ -172,7 +172,7 @@ def open_links(specs: Sequence[LinkSpec]) -> Sequence[OpenLink]:
     names = [spec.name for spec in specs]
     for name in names:
         if names.count(name) > 1:
-            raise CallerError(f"link {name}: there are two of this name")
+            raise CallerError(f"link {name}: two links have this name")
     with ExitStack() as undo:
         links = []
         for spec in specs:
@@ -180,7 +180,8 @@ def open_links(specs: Sequence[LinkSpec]) -> Sequence[OpenLink]:
             server = socket_name(spec.to, f"link {spec.name}: to")
             if spec.to[1] == 0:
                 raise CallerError(
-                    f"link {spec.name}: to {address_text(spec.to)}: port 0 is no destination; give its port"
+                    f"link {spec.name}: to {address_text(spec.to)}: port 0 is not a destination; "
+                    "give its port"
                 )
             title = f"link {spec.name}: UDP port {address_text(spec.listen)}"
             endpoint = undo.enter_context(listen(title, own_name))

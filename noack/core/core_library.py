@@ -49,7 +49,7 @@ def load_core(path: Path) -> CData:
         reason = str(error).rpartition("': ")[2]  # begins with the path
         raise CallerError(f"noack's core in C cannot be loaded: {reason}; {_REMEDY}") from None
     if built_from != SOURCES:
-        raise CallerError(f"{path}: is not of the same sources as its declarations; {_REMEDY}")
+        raise CallerError(f"{path}: was built from other sources than its declarations; {_REMEDY}")
     return library
 
 

@@ -274,7 +274,7 @@ def _described(path: Path) -> "ModelDescription":
         with path.open("rb") as content:  # FMPy does not close a file that it cannot read
             description = fmpy.read_model_description(content, validate=False)
     except Exception as error:  # a file that is not an FMU can raise any error
-        file.wrong(f"is no FMU of FMI 2 or 3, or a damaged one: {_short_line(error)}")
+        file.wrong(f"is not an FMU of FMI 2 or 3, or is damaged: {_short_line(error)}")
     if description.fmiVersion.startswith("1."):
         file.wrong(f"is of FMI {description.fmiVersion}; FMI 2 and 3 are supported")
     if description.coSimulation is None:

@@ -198,7 +198,7 @@ def _text(path: Path) -> str:
     try:
         return content.decode()
     except UnicodeDecodeError:
-        raise CallerError(f"{path}: not an invitation: it is no text") from None
+        raise CallerError(f"{path}: not an invitation: it is not text") from None
 
 
 def _require_writable(folder: Path) -> None:
@@ -207,7 +207,7 @@ def _require_writable(folder: Path) -> None:
     while not os.access(nearest, os.F_OK) and nearest != nearest.parent:
         nearest = nearest.parent
     if not nearest.is_dir():
-        raise CallerError(f"{folder}: rows could not be kept there: {nearest} is no folder")
+        raise CallerError(f"{folder}: rows could not be kept there: {nearest} is not a folder")
     if not os.access(nearest, os.W_OK | os.X_OK):
         raise CallerError(f"{folder}: rows could not be kept there: {nearest} is not writable")
 

@@ -166,7 +166,7 @@ def _arrays(file: NamedFile) -> Arrays:
     except NotImplementedError:
         file.wrong("is of MATLAB's v7.3, which is HDF5; save it as v7: save(name, '-v7')")
     except Exception:  # an invalid file can raise any error
-        file.wrong(f"is no {file.path.suffix} file, or a damaged one")
+        file.wrong(f"is not a {file.path.suffix} file, or is damaged")
 
 
 def _npz_arrays(content: bytes) -> Arrays:
@@ -191,7 +191,7 @@ _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.r
 
 def _matrix(file: NamedFile, name: str, value: NDArray[np.generic]) -> Matrix:
     if value.dtype.kind not in _NUMBERS:
-        file.wrong(f"{name} is not of real numbers")
+        file.wrong(f"{name} must have real numbers only")
     if value.ndim != 2 or not value.size:
         shape = " x ".join(map(str, value.shape)) or "no"
         file.wrong(f"{name} has {shape} entries; a matrix is needed, with rows and columns")

@@ -11,7 +11,7 @@ from types import NoneType
 from typing import get_args
 
 from noack.core.errors import CallerError
-from noack.scenario.toml_file import nearest_key
+from noack.scenario.toml_file import SYMBOLS, nearest_key
 from noack.settings.section import ReadTable, Table
 from noack.trigger_policies.policy_settings import PolicySettings
 
@@ -56,6 +56,8 @@ def require_runtime_parameters(settings: ReadTable, trigger: PolicySettings) -> 
     """Raise ValueError unless all keys are runtime parameters; the message lists these."""
     allowed = (LOSS, MANSD, CONSTRAINTS, *trigger_parameters(trigger), SETPOINT)
     for key, value in settings.items():
+        if key in SYMBOLS:
+            raise ValueError(f"{key}: unknown name; {SYMBOLS[key]}")
         if key not in allowed and not key.startswith(f"{LOSS}."):
             short = [name for name, full in SHORT.items() if full in (*allowed, _PROBABILITY)]
             nearest = nearest_key(key, (*short, *allowed, _PROBABILITY))

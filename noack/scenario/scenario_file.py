@@ -67,6 +67,10 @@ def completed(content: ReadTable, path: Path, source: str | None = None) -> Scen
     source = source or str(path)
     if "axes" in content and "model" not in content:
         raise CallerError(f"{source}: a campaign, not a scenario; `noack campaign` runs it")
+    if "link" in content and "model" not in content:
+        raise CallerError(f"{source}: a file of links, not a scenario; `noack netem --links` takes it")
+    if content.keys().isdisjoint(("loops", *LOOP_NEEDS)):
+        raise CallerError(f"{source}: not a scenario: {', '.join(LOOP_NEEDS)} are missing")
     content = with_matrices(content, path.parent, source)
     content = with_named_scenarios(content, path.parent, source)
     return _with_files(validate(content, source), path, source)

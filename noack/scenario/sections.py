@@ -186,7 +186,7 @@ def require_no_file(file: str | None, names: object | None) -> None:
     if file is not None:
         raise ValueError("file: it is read where a scenario file is loaded; give matrices here")
     if names is not None:
-        raise ValueError("names: they are of arrays in a file; give file, too")
+        raise ValueError("names: these are names of arrays in a file; give file, too")
 
 
 def instability(A: Matrix, B: Matrix, K: Matrix) -> str | None:

@@ -19,7 +19,7 @@ from typing import Annotated, Literal, NamedTuple, TypeAlias, TypeVar, Union, ge
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from noack.core.errors import CallerError, did_you_mean, plain_mistake, printable, shortened
+from noack.core.errors import CallerError, did_you_mean, plain_mistake, printable, shortened, why
 from noack.core.file_access import read_regular
 from noack.settings.section import ReadTable, ScenarioSection, Table
 
@@ -63,12 +63,37 @@ def read(path: Path, model: type[ScenarioSection] = ScenarioSection, most_bytes:
         CallerError: the file does not exist, is too large, is not a regular file, or is not TOML.
     """
     try:
-        text = read_regular(path, most_bytes).decode("utf-8")
+        text = read_text(path, most_bytes)
     except FileNotFoundError:
         raise CallerError(_missing(path, model)) from None
-    except (OSError, ValueError) as error:
-        raise CallerError(f"{path}: cannot be read: {error}") from None
     return parsed(text, str(path))
+
+
+def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
+    """Return the text of a TOML file, which has at most ``most_bytes``.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        CallerError: it is empty, too large, not a regular file, or not a text file.
+    """
+    try:
+        text = read_regular(path, most_bytes).decode("utf-8")
+    except FileNotFoundError:
+        raise
+    except UnicodeDecodeError:
+        raise CallerError(f"{path}: not a text file; a TOML file is expected") from None
+    except (OSError, ValueError) as error:
+        raise CallerError(_why_not_read(path, error)) from None
+    if not text.strip():
+        raise CallerError(f"{path}: the file is empty")
+    return text
+
+
+def _why_not_read(path: Path, error: OSError | ValueError) -> str:
+    if not path.is_dir():
+        return f"{path}: cannot be read: {why(error)}"
+    inner = path / "scenario.toml"  # of a run directory
+    return f"{path}: a folder, not a file" + (f"; its scenario is {inner}" if inner.is_file() else "")
 
 
 def parsed(text: str, source: str) -> Table:
@@ -181,8 +206,8 @@ def _unfit(value: object) -> None:
         written = json.dumps({"kind": "python", "file": "my_plant.py", "name": value.__name__})
         raise TypeError(f"{value.__name__}: a class is given by its file and its name: {written}")
     if isinstance(value, date | time):
-        raise TypeError(f"{value}: a date or time is no value of a setting; write text in quotes")
-    raise TypeError(f"a value of type {type(value).__name__} is no value of a setting")
+        raise TypeError(f"{value}: a date or time cannot be the value of a setting; write text in quotes")
+    raise TypeError(f"a value of type {type(value).__name__} cannot be the value of a setting")
 
 
 _PATTERNS = {
@@ -219,6 +244,7 @@ def explain(error: ValidationError, source: str, root: type[ScenarioSection]) ->
         printable(f"{source}: {_explain(mistake, root)}")
         for mistake in mistakes[:_MOST_LINES]
         if not (mistake["type"] == "too_short" and _has_inner(mistake["loc"], places))
+        if mistake["type"] != "default_factory_not_called"  # after another mistake
     ]
     surplus = len(mistakes) - _MOST_LINES
     return [*lines, printable(f"{source}: {surplus} more mistakes")] if surplus > 0 else lines
@@ -457,8 +483,12 @@ def _purpose(section: type[ScenarioSection] | None, key: str) -> str:
 SYMBOLS = {
     "M": "M is network.mansd + 1; set network.mansd",
     "K": "K is model.gain",
+    "α": "α is trigger.alpha_per_s",
+    "β": "β is trigger.beta",
+    "h": "the sampling period is plant.measure_every / plant.rate_hz",
+    "delay": "a delay is an entry of network.impairments",
     "x0": "x(0) is plant.initial_state",
-    "seed": "seeds has one for each random part",
+    "seed": "each random part has a seed, e.g. seeds.loss",
 }
 """What is said of unknown keys that people write, such as the paper's symbols."""
 

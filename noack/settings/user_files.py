@@ -156,7 +156,7 @@ class ClassSettings(FileSettings):
     @model_validator(mode="after")
     def _check_file(self) -> Self:
         if self.file is None and self.sha256 is not None:
-            raise ValueError("sha256: it is of a file; give file, too")
+            raise ValueError("sha256: is that of a file; give file, too")
         return self
 
 
@@ -206,7 +206,7 @@ def real_vector(title: str, value: UserCode, size: int) -> Vector:
     """
     array = np.array(value)
     if array.dtype.kind not in "biuf":
-        raise TypeError(f"{title} is not of real numbers")
+        raise TypeError(f"{title} must have real numbers only")
     vector = array.astype(np.float64)
     if vector.shape != (size,):
         raise ValueError(f"{title} has shape {vector.shape}, expected ({size},)")

@@ -8,9 +8,8 @@ import json
 import os
 import signal
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -38,7 +37,6 @@ from tests.helpers.command_line import invoke
 from tests.helpers.live_runs import (
     AT_RATE,
     Finished,
-    Running,
     assert_complete,
     run_scenario,
     settings,
@@ -157,49 +155,81 @@ def set_parameters(*words: str) -> dict[str, Any]:
     return answer
 
 
-def test_a_run_is_changed_twice_and_stopped(
-    start: Callable[..., Running], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+class ChangedRun(NamedTuple):
+    """A run that was changed twice and then stopped, and what was answered while it ran."""
+
+    early_summary: Any
+    first: dict[str, Any]
+    second: dict[str, Any]
+    invalid: dict[str, Any]
+    finished: Finished
+    left_behind: list[Any]
+    active_runs: list[Path]
+    """Files of active runs that are left."""
+
+
+@pytest.fixture(scope="module")
+def changed(tmp_path_factory: pytest.TempPathFactory) -> ChangedRun:
+    folder = tmp_path_factory.mktemp("changed")
+    with start_runs(folder) as begin, pytest.MonkeyPatch.context() as patched:
+        patched.setenv("XDG_RUNTIME_DIR", str(folder))
+        running = begin(*AT_RATE, *settings(horizon_s=1000.0))
+        running.wait_recording()
+        early_summary = invoke("summary", running.runs / "latest")
+        first = set_parameters("loss.p", "0.5", "mansd=2")
+        second = set_parameters("setpoint", "[0.0, 0.0, 0.0, 1.0]")
+        invalid = set_parameters("loss.p", "1.5")
+        until_ns = (second["from_s"] + 1) * NS_PER_S
+        wait_for(lambda: spooled(running, PLANT_STEP)["t_ns"][-1] > until_ns)
+        running.process.send_signal(signal.SIGTERM)
+        finished, left_behind = running.finish(), running.left_behind()
+    active_runs = [*(folder / f"noack-{os.getuid()}" / "runs").iterdir()]
+    return ChangedRun(early_summary, first, second, invalid, finished, left_behind, active_runs)
+
+
+def test_there_is_no_summary_of_an_active_run(changed: ChangedRun) -> None:
+    assert changed.early_summary.exit_code == 2
+    assert "still under way" in changed.early_summary.stderr
+
+
+def test_a_change_is_answered_and_a_wrong_one_is_refused(changed: ChangedRun) -> None:
+    assert changed.second["runtime_parameters"]["network.mansd"] == 2
+    assert changed.invalid["exit"]["status"] == 2
+    assert "expected at most 1" in changed.invalid["error"]
+
+
+def test_a_stopped_run_leaves_nothing_behind(changed: ChangedRun) -> None:
+    assert changed.finished.status == 143, changed.finished.stderr
+    assert changed.finished.summary["exit"]["reason"] == "stopped on request (SIGTERM)"
+    assert changed.left_behind == []
+    assert changed.active_runs == []
+
+
+def test_the_record_of_a_stopped_run_is_complete_and_its_claims_are_checked_until_then(
+    changed: ChangedRun,
 ) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    running = start(*AT_RATE, *settings(horizon_s=1000.0))
-    running.wait_recording()
-    # While it runs: no summary yet, two changes, and one that is refused.
-    result = invoke("summary", running.runs / "latest")
-    assert result.exit_code == 2
-    assert "still under way" in result.stderr
-    first = set_parameters("loss.p", "0.5", "mansd=2")
-    second = set_parameters("setpoint", "[0.0, 0.0, 0.0, 1.0]")
-    assert second["runtime_parameters"]["network.mansd"] == 2
-    invalid = set_parameters("loss.p", "1.5")
-    assert invalid["exit"]["status"] == 2
-    assert "expected at most 1" in invalid["error"]
-    until_ns = (second["from_s"] + 1) * NS_PER_S
-    wait_for(lambda: spooled(running, PLANT_STEP)["t_ns"][-1] > until_ns)
-    running.process.send_signal(signal.SIGTERM)
-    finished = running.finish()
-    # It was stopped, and its record is complete up to then.
-    summary, record = finished.summary, load_record(finished.run_dir)
-    assert finished.status == 143, finished.stderr
-    assert summary["exit"]["reason"] == "stopped on request (SIGTERM)"
-    until_s = finished.loop["judged_until_s"]
-    assert 0 < until_s <= summary["reached_s"] + 0.1
-    assert all((claim["since_s"] or 0.0) <= until_s for claim in finished.loop["claims"])
-    assert [claim for claim in finished.loop["claims"] if claim["verdict"] == "violated"] == []
-    assert_complete(finished.loop)
-    assert finished.loop["identity_residual_relative"] < 1e-9
-    assert set(finished.loop["realtime"]) == set(LOOP_ROLES)
-    assert running.left_behind() == []
-    # Both changes are recorded, and are no violation.
-    assert [change["t_s"] for change in summary["changes"]] == [first["from_s"], second["from_s"]]
+    loop, reached_s = changed.finished.loop, changed.finished.summary["reached_s"]
+    until_s = loop["judged_until_s"]
+    assert 0 < until_s <= reached_s + 0.1
+    assert all((claim["since_s"] or 0.0) <= until_s for claim in loop["claims"])
+    assert [claim for claim in loop["claims"] if claim["verdict"] == "violated"] == []
+    assert_complete(loop)
+    assert loop["identity_residual_relative"] < 1e-9
+    assert set(loop["realtime"]) == set(LOOP_ROLES)
+
+
+def test_changes_are_recorded_and_are_no_violation(changed: ChangedRun) -> None:
+    summary, record = changed.finished.summary, load_record(changed.finished.run_dir)
+    times_s = [changed.first["from_s"], changed.second["from_s"]]
+    assert [change["t_s"] for change in summary["changes"]] == times_s
     assert summary["changes"][1]["settings"] == {"controller.setpoint": [0.0, 0.0, 0.0, 1.0]}
     assert record.scenario.network.mansd == 4  # as it was at the start
     changes = [notice["text"] for notice in record.notices if notice["level"] == "change"]
     assert len(changes) == 2
     assert all("; requested at " in text for text in changes)
     if not any(change.late for change in changes_of(record)):  # a late change is a recorded violation
-        causes = {violation["cause"] for violation in finished.loop["assumption_violations"]}
-        assert not causes & {"dropouts", "change"}
-    assert [*(tmp_path / f"noack-{os.getuid()}" / "runs").iterdir()] == []
+        violations = changed.finished.loop["assumption_violations"]
+        assert not {violation["cause"] for violation in violations} & {"dropouts", "change"}
 
 
 RATE_HZ = 5.0

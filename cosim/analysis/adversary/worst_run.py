@@ -11,7 +11,7 @@ from rich.table import Table
 from cosim.analysis.adversary.loop_flows import Measure, Objective, ObjectiveValue, Pattern
 from cosim.analysis.adversary.worst_disturbances import disturbance_bounds
 from noack.core.clock import NS_PER_S
-from noack.core.number_format import at_least, at_most, duration, number
+from noack.core.number_format import NONE, at_least, at_most, duration, number
 from noack.guarantee.loss_guarantee import outcome_letters
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import Constants
@@ -154,7 +154,7 @@ def print_worst(
         title=f"{resolved.name}: worst losses found, {resolved.network.guarantee.meaning}, "
         f"{resolved.horizon_s:g} s"
     )
-    for heading in ("", "no loss", "scenario's seed", "worst", "certified", "share of bound used"):
+    for heading in ("", "no loss", "scenario's seed", "worst", "certified", "share used"):
         table.add_column(heading, justify="right" if heading else "left")
     for worst in results:
         is_lower = worst.objective is Objective.INTER_EVENT
@@ -163,7 +163,7 @@ def print_worst(
             _quantity(worst.objective, certificate, trigger),
             *(number(value, 4) for value in (worst.lossless, worst.with_own_network, worst.value)),
             certified,
-            "[bold red]exceeded[/]" if worst.breaches else number(worst.tightness, 4),
+            "[bold red]exceeded[/]" if worst.breaches else _share_used(worst.tightness),
         )
     console.print(table)
     for worst in results:
@@ -177,6 +177,8 @@ def print_worst(
         console.print(f"  {worst.text}", soft_wrap=True, highlight=False)
     for note in _notes(resolved, trigger):
         console.print(note)
+    if any(worst.tightness is not None for worst in results):
+        console.print("[dim]share used: of the certified bound, by the worst losses[/]")
     if trigger == "sampled" and _is_shaped(certificate):
         console.print("[dim]Scaled: multiplied by bound(0) / bound(t)[/]")
     if certificate.void is not None:
@@ -184,6 +186,10 @@ def print_worst(
     elif trigger == "sampled":
         console.print("[dim]certified: for the scenario's schedule, without lateness[/]")
     console.print("[dim]One letter per event: D delivered, L lost. --json prints their times[/]")
+
+
+def _share_used(share: float | None) -> str:
+    return NONE if share is None else f"{100 * share:.4g} %"
 
 
 def _notes(resolved: Scenario, trigger: str) -> Iterator[str]:

@@ -232,7 +232,7 @@ def worst_loop(loops: Sequence[LoopSummary]) -> WorstLoop:
     used = [_share_used(loop.claims) for loop in loops]
     if max(used) > 0:
         number = int(np.argmax(used))
-        text = f"largest share of a certified bound of ‖e_c‖ or ‖x‖: {100 * used[number]:.3g} %"
+        text = f"largest share used of a certified bound of ‖e_c‖ or ‖x‖: {100 * used[number]:.3g} %"
         return WorstLoop(loops[number].number, text)
     errors = [-1.0 if loop.sup_e_c_norm is None else loop.sup_e_c_norm for loop in loops]
     number = int(np.argmax(errors))

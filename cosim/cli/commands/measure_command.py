@@ -223,7 +223,7 @@ def _result(
         refuse(live, {"silence": "--silence"}, "a sender; the listener has it")
         refuse(how, trace_sources.FILE_OPTIONS, "a live probe", "period_ns")
         return live_measurement.send_live(sources[0], live), f"probe of {sources[0]}"
-    refuse(live, options, f"{sources[0]}, which is no address of a listener", "rate")
+    refuse(live, options, f"{sources[0]}, which is not the address of a listener", "rate")
     trace = trace_sources.read_source([*map(packet_trace.find_trace, sources)], how)
     return probe_ends.ProbeResult(trace, trace.notes, None), " ".join(sources)
 

@@ -203,7 +203,14 @@ def adversary(
         noack adversary unstable_pendulum --horizon 2 --beam 64   a faster search
         noack adversary lane_following --trigger continuous   the paper's loop, in exact time
     """
-    resolved = resolution.resolve(source.load(*([] if horizon is None else [f"horizon_s={horizon}"])))
+    try:
+        loaded = source.load(*([] if horizon is None else [f"horizon_s={horizon}"]))
+    except CallerError as error:
+        if horizon is None:
+            raise
+        line = str(error).replace("--set horizon_s =", "--horizon")
+        raise CallerError(line.replace("--set horizon_s", "--horizon")) from None
+    resolved = resolution.resolve(loaded)
     continuous = trigger is opt.TriggerMode.CONTINUOUS
     if continuous:
         warn_of_left_out(resolved)

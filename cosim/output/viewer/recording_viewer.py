@@ -372,7 +372,7 @@ def view_recording(path: Path, *, native: bool | None = None) -> None:
         raise CallerError(f"{path}: no such recording")
     with path.open("rb") as file:
         if not file.read(len(_MAGIC)).startswith(_MAGIC):
-            raise CallerError(f"{path}: not a rerun recording, or empty")
+            raise CallerError(f"{path}: not a rerun recording, or empty; give a run directory")
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, _exit)
     with contextlib.suppress(KeyboardInterrupt), RecordingServer(path, follow=False) as server:

@@ -29,7 +29,7 @@ from cosim.output.figures.palette import Colour
 from cosim.studies.campaign import campaign_file
 from cosim.studies.campaign.campaign_summary import CampaignSummary, GridPointResult, runs_at
 from cosim.studies.campaign.chunk_store import Store
-from cosim.studies.campaign.metrics import METRICS, Estimate, Metric
+from cosim.studies.campaign.metrics import METRICS, Estimate, Metric, to_shown_unit
 from noack.core.linear_systems import Matrix, Vector
 
 _HEIGHT_IN = 3.4
@@ -184,8 +184,8 @@ def _pareto(
     for result in results:
         if spec.x in result.estimates and spec.y in result.estimates:
             xs, ys = series.setdefault(result.point.labels[spec.series], ([], []))
-            xs.append(result.estimates[spec.x])
-            ys.append(result.estimates[spec.y])
+            xs.append(to_shown_unit(spec.x, result.estimates[spec.x]))
+            ys.append(to_shown_unit(spec.y, result.estimates[spec.y]))
     series_name = summary.campaign.by_name[spec.series].name_in_figures
     return pareto_figure(series, spec.x, spec.y), (
         f"{_title(spec.y)} against {METRICS[spec.x].title}, means with 95 % confidence "
@@ -199,7 +199,11 @@ def _curve(
 ) -> tuple[FigureDescription, str]:
     axis = summary.campaign.by_name[spec.x]
     curves = {
-        name: {result.point.labels[axis.name]: result.estimates.get(spec.metric) for result in group}
+        name: {
+            result.point.labels[axis.name]: to_shown_unit(spec.metric, result.estimates[spec.metric])
+            for result in group
+            if spec.metric in result.estimates
+        }
         for name, group in _series(summary, results, (spec.x, *spec.where)).items()
     }
     measured = [i for i, x in enumerate(axis.labels) if any(curve.get(x) for curve in curves.values())]
@@ -223,7 +227,7 @@ def _heat_map(
         for result in group:
             if spec.metric in result.estimates:
                 row, column = (axis.labels.index(result.point.labels[axis.name]) for axis in (y, x))
-                maps[label][row, column] = result.estimates[spec.metric].mean
+                maps[label][row, column] = to_shown_unit(spec.metric, result.estimates[spec.metric]).mean
     figure = heat_map_figure(maps, (x.heading, x.labels), (y.heading, y.labels), spec.metric)
     return figure, f"{_title(spec.metric)} over {x.name_in_figures} and {y.name_in_figures}: means"
 
@@ -235,7 +239,7 @@ def _distribution(
     store: Store,
 ) -> tuple[FigureDescription, str]:
     series = {
-        label: runs_at(result.point, store)[0][spec.metric]
+        label: METRICS[spec.metric].scale * runs_at(result.point, store)[0][spec.metric]
         for label, group in _series(summary, results, tuple(spec.where)).items()
         for result in group
         if spec.metric in result.estimates

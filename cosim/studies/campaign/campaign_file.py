@@ -443,6 +443,8 @@ def load(path: Path) -> Campaign:
     content = toml_file.read(path, Campaign)
     if "model" in content and "axes" not in content:
         raise CallerError(f"{path}: a scenario, not a campaign; a campaign names one by scenario = FILE")
+    if content.keys().isdisjoint(("axes", "draws", "scenario")):
+        raise CallerError(f"{path}: not a campaign: scenario, draws and axes are missing")
     return toml_file.validated(Campaign, content, str(path))
 
 

@@ -22,7 +22,7 @@ from cosim.studies.campaign.campaign_grid import base_of, grid
 from cosim.studies.campaign.campaign_summary import CampaignSummary, summarise
 from cosim.studies.campaign.campaign_workers import Runner
 from cosim.studies.campaign.chunk_store import RUNS, Progress, Store, locked_folder, run_campaign
-from cosim.studies.campaign.metrics import METRICS, Estimate
+from cosim.studies.campaign.metrics import METRICS, Estimate, Metric, to_shown_unit
 from noack.core.file_access import write_whole
 from noack.core.number_format import plus_minus
 from noack.runtime.command_line import stop_requests_raised
@@ -68,7 +68,10 @@ def campaign_tables(summary: CampaignSummary, *, shares: bool = False) -> Iterat
         *(METRICS[name].heading for name in metric_names),
     ]
     means = [
-        (*result.point.labels.values(), *(estimate_text(result.estimates.get(name)) for name in metric_names))
+        (
+            *result.point.labels.values(),
+            *(metric_text(name, result.estimates.get(name)) for name in metric_names),
+        )
         for result in summary.results
     ]
     title = f"{campaign.name}: {summary.draws:,} draws; mean ± half-width of its 95 % interval"
@@ -77,8 +80,11 @@ def campaign_tables(summary: CampaignSummary, *, shares: bool = False) -> Iterat
         differences = []
         for compared in summary.compared:
             cells = []
-            for paired in map(compared.differences.get, metric_names):
-                cells.append(estimate_text(paired.estimate if paired and paired.estimate.finite else None))
+            for name in metric_names:
+                paired = compared.differences.get(name)
+                cells.append(
+                    metric_text(name, paired.estimate if paired and paired.estimate.finite else None)
+                )
                 if paired and shares:
                     cells[-1] += f", smaller in {100 * paired.smaller:.3g} %"
             differences.append((*compared.point.labels.values(), *cells))
@@ -231,10 +237,11 @@ def _reference(summary: CampaignSummary) -> str | None:
     return f"{campaign.by_name[campaign.compare.axis].name_in_figures} = {campaign.compare.reference}"
 
 
-def estimate_text(estimate: Estimate | None) -> str:
+def metric_text(metric: Metric, estimate: Estimate | None) -> str:
     """Return mean ± half-width, with the share of finite runs if it is below 100 %."""
     if estimate is None:
         return _NONE
+    estimate = to_shown_unit(metric, estimate)
     if not estimate.finite:
         return "never"
     text = plus_minus(estimate.mean, estimate.halfwidth)

@@ -106,7 +106,7 @@ def _evaluate_claim(claim: CampaignClaim, groups: dict[str, list[Point]], values
             holds.append(low < high)
             texts += [
                 f"{METRICS[term.metric].heading}{f' at {term.label}' if term.label else ''} "
-                + number(float(middle)).replace("inf", "∞")
+                + number(METRICS[term.metric].scale * float(middle)).replace("inf", "∞")
                 for term, middle in zip((smaller, larger), middles, strict=True)
                 if term.metric
             ]

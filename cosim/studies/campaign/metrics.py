@@ -56,6 +56,8 @@ class Description(NamedTuple):
     """Formula, if the title needs one."""
     logarithmic: bool = False
     """Whether the axis of a figure may be logarithmic."""
+    scale: float = 1.0
+    """Factor from the metric to the number that people read."""
 
     @property
     def heading(self) -> str:
@@ -84,7 +86,7 @@ METRICS: Mapping[Metric, Description] = {
     "updates_late": Description("share of updates that are late"),
     "delay_max_s": Description("largest delay in the network", "s", logarithmic=True),
     "sup_e_c_scaled": Description("largest error", "", "sup ‖e_c‖ e^(αt)"),
-    "certificate_used": Description("bound used", "", "sup ‖e_c‖ e^(αt) / Δβ"),
+    "certificate_used": Description("share used", "%", "sup ‖e_c‖ e^(αt) / Δβ", scale=100.0),
     "final_norm": Description("final state", "", "‖x‖", logarithmic=True),
 }
 
@@ -188,6 +190,12 @@ def estimate(values: Vector, finite: Vector | None = None) -> Estimate:
         median_high=high,
         largest=largest,
     )
+
+
+def to_shown_unit(metric: Metric, estimate: Estimate) -> Estimate:
+    """Return mean and interval in the unit of the metric's description."""
+    scale = METRICS[metric].scale
+    return estimate._replace(mean=scale * estimate.mean, halfwidth=scale * estimate.halfwidth)
 
 
 class Quartiles(NamedTuple):

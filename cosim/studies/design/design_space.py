@@ -160,7 +160,7 @@ def families_of(
         CallerError: a norm or a gain cannot be computed.
     """
     if not norms:
-        raise CallerError(f"--weights: name one at least of {', '.join(NORMS)}")
+        raise CallerError(f"--weights: name at least one of {', '.join(NORMS)}")
     gains = {"given": scenario} if lqr is None else dict(_with_regulators(scenario, *lqr))
     scenarios = {}
     for i, (gain, regulated) in enumerate(gains.items()):

@@ -391,7 +391,7 @@ def parse_vector(key: str, entries: object, size: int, meaning: str) -> Vector:
     try:
         values = np.zeros(size) if entries is None else np.array(entries, dtype=np.float64)
     except (TypeError, ValueError):
-        raise CallerError(f"{key}: {entries!r} is no list of numbers") from None
+        raise CallerError(f"{key}: {entries!r} is not a list of numbers") from None
     if values.shape != (size,):
         raise CallerError(f"{key}: {values.size} numbers; the plant has {size} {meaning}")
     if not np.isfinite(values).all():

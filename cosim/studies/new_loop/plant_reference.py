@@ -178,9 +178,11 @@ def _of_scenario(label: str, settings: ReadTable) -> PlantReference:
         path = find_shipped(label, "scenarios")
         content = toml_file.read(path)
     except CallerError as error:
+        if Path(label).exists():
+            raise
         if shipped := did_you_mean(label, [*PLANTS, *shipped_names("scenarios")]):
             raise CallerError(f"{label}: no such plant; {shipped}") from None
-        raise CallerError(f"{error}; {_FORMS}" if not Path(label).exists() else str(error)) from None
+        raise CallerError(f"{error}; {_FORMS}") from None
     for key, value in settings.items():
         scenario_file.put(content, key, value, f"--set {key}")
     if isinstance(model := content.get("model"), dict):  # its gain does not matter, and may be missing

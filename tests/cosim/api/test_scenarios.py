@@ -28,8 +28,8 @@ def test_files_are_found_relative_to_the_scenario(
         ({"horizon_s": None}, "settings: horizon_s: missing (simulated length of the run)"),
         ({"horizon_s.x": 1}, "settings: horizon_s.x: horizon_s is not a table"),
         ({"plant.initial_state": np.zeros(3)}, "plant.initial_state"),
-        ({"horizon_s": object()}, "is no value of a setting"),
-        (["network.mansd=2"], "settings: ['network.mansd=2'] is no table"),
+        ({"horizon_s": object()}, "cannot be the value of a setting"),
+        (["network.mansd=2"], "settings: ['network.mansd=2'] is not a table"),
         ({3: 1}, "settings: 3 is not a key"),
     ],
 )

@@ -3,6 +3,7 @@
 import json
 import os
 import shlex
+import shutil
 import socket
 import subprocess
 import sys
@@ -13,6 +14,13 @@ from click.testing import Result
 
 from tests.helpers.approved import compare_lines
 from tests.helpers.command_line import invoke
+
+SHIPPED = {
+    "scenarios/lane_following.toml": "scenario.toml",
+    "campaigns/mb_vs_zoh.toml": "campaign.toml",
+    "scenarios/double_integrator.toml": "run/scenario.toml",
+}
+"""Copies that are given to commands that expect something else."""
 
 
 def noack(line: str) -> Result:
@@ -30,6 +38,27 @@ def test_a_mistake_gives_the_approved_line(tmp_path: Path, monkeypatch: pytest.M
 
     compare_lines(Path(__file__).with_name("mistakes.txt"), mistake)
     assert not [*tmp_path.iterdir()]
+
+
+def test_a_wrong_kind_of_file_gives_the_approved_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The line says what the file is, or what was expected, and where it can, which command takes it."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run/record").mkdir(parents=True)
+    (tmp_path / "folder").mkdir()
+    for source, name in SHIPPED.items():
+        shutil.copy(Path(__file__).parents[3] / source, name)
+    Path("picture.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+    Path("empty.toml").touch()
+    Path("links.toml").write_text('[[link]]\nname = "a"\nlisten = ":0"\nto = ":9"\n')
+
+    def mistake(line: str) -> list[str]:
+        result = noack(line)
+        assert result.exit_code == 2
+        return [result.stderr.strip()]
+
+    compare_lines(Path(__file__).with_name("wrong_files.txt"), mistake)
 
 
 @pytest.mark.parametrize("line", ["certfy lane_following", "check nothing", "demo --set", "netem --session"])

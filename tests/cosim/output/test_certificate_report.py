@@ -134,6 +134,19 @@ def test_advice_is_for_a_loop_gain_and_no_norm_is_said_to_be_tried(gain: str, ad
     _, _, last = " ".join(result.stdout.split()).rpartition("no certificate for the schedule, ")
     assert last.startswith("so no bound of ‖x‖")
     assert ("plant.rate_hz" in last) == advised
+    advice = re.findall(r"[\w.]+ = \d+", last)
+    assert not advised or certificates_of(shipped("double_integrator", *settings, *advice)).schedule.exists
+
+
+def test_advice_names_only_what_helps() -> None:
+    """With this delay neither faster rates nor fewer losses give a certificate."""
+    settings = ['trigger={policy="absolute", delta=0.1}']
+    settings += ['network.impairments=[{kind="delay", delay_s=1.0}]']
+    result = invoke("certify", "double_integrator", *(word for s in settings for word in ("--set", s)))
+    _, _, last = " ".join(result.stdout.split()).rpartition("no certificate for the schedule, ")
+    assert "there is one with a delay of updates of at most " in last
+    assert "rate_hz =" not in last
+    assert "mansd" not in last
 
 
 def test_a_start_that_overflows_is_named() -> None:

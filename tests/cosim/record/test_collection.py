@@ -196,7 +196,7 @@ def huge_batch(host_files: HostFiles, full_record: RunRecord) -> None:
     [
         (other_role, "the controller has no table of this name"),
         (other_process, "the plant of this run did not run there"),
-        (unknown_process, "is of no process that joined this run"),
+        (unknown_process, "belongs to no process that joined this run"),
         (other_generation, "has rows of another process"),
         (report_of_another, "is the report of another process"),
         (part_of_a_row, "is damaged"),
@@ -253,9 +253,9 @@ def test_a_folder_without_kept_rows_of_this_run_is_refused(
         collect(run_dir, str(tmp_path), finish_record)
     host_files.keep()
     (host_files.folder / "run_name.txt").write_text("another")
-    with pytest.raises(CallerError, match="it was kept of another run"):
+    with pytest.raises(CallerError, match="it belongs to another run"):
         collect(run_dir, str(host_files.folder), finish_record)
     (host_files.folder / "run_name.txt").unlink()
     os.mkfifo(host_files.folder / "run_name.txt")
-    with pytest.raises(NoackError, match="it was kept of another run"):
+    with pytest.raises(NoackError, match="it belongs to another run"):
         collect(run_dir, str(host_files.folder), finish_record)

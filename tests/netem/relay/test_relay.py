@@ -171,7 +171,7 @@ def test_a_change_keeps_flows_and_datagrams_in_flight() -> None:
         report = emulator.report()
         assert report.forward.settings == lossy
         assert report.forward.flows[0].packets == 8
-        with pytest.raises(CallerError, match="none of this name"):
+        with pytest.raises(CallerError, match="no such link; links: "):
             emulator.relay.change("another", "reverse", late)
 
 

@@ -69,9 +69,9 @@ def test_a_link_whose_address_cannot_be_used_is_refused() -> None:
         for specs, message in (
             ([link(there, listen=("localhost", 0))], "not an address of IPv4 or IPv6"),
             ([link(there, listen=("192.0.2.1", 0))], "is no address of this machine"),
-            ([link(("127.0.0.1", 0))], "^link test: to 127.0.0.1:0: port 0 is no destination"),
+            ([link(("127.0.0.1", 0))], "^link test: to 127.0.0.1:0: port 0 is not a destination"),
             ([link(there, listen=name_of(other))], "already taken"),
-            ([link(there)] * 2, "two of this name"),
+            ([link(there)] * 2, "two links have this name"),
         ):
             with pytest.raises(CallerError, match=message):
                 open_and_close(specs)

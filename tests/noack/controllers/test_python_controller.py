@@ -117,7 +117,7 @@ def run_of(tmp_path: Path, **methods: str) -> RunRecord:
     ("methods", "message"),
     [
         ({"on_tick": "return [0.0, 1.0]"}, "on_tick has shape (2,), expected (1,)"),
-        ({"on_tick": "return 'left'"}, "on_tick is not of real numbers"),
+        ({"on_tick": "return 'left'"}, "on_tick must have real numbers only"),
         ({"on_tick": "return [float('nan')]"}, "on_tick is not finite: [nan]"),
         ({"on_tick": "x_c[0] = 1.0"}, "assignment destination is read-only (law.py, line 10)"),
         ({"on_update": "raise KeyError('x')"}, "KeyError: 'x' (law.py, line 7)"),

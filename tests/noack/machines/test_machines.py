@@ -209,7 +209,7 @@ def test_a_layout_with_a_word_that_the_machine_does_not_write_is_refused(word: i
     own = LoopMachines([controller(1, Sizes(1, 1)), controller(2, Sizes(3, 1))])
     assert text_of(own) is None
     own.core.tables[0].layouts[0][4] = word
-    assert text_of(own) == "the rows of a table have another size than the machines write"
+    assert text_of(own) == "the rows of a table do not have the size that the machines write"
 
 
 def test_a_machine_that_the_core_refuses_raises_its_text() -> None:

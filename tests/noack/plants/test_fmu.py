@@ -126,8 +126,8 @@ def test_settings_that_do_not_fit_the_fmu_are_refused_with_the_approved_line(
         (("CoSimulation modelId", "ModelExchange modelId"), "not for co-simulation"),
         (("{oscillator}", "{other}"), "cannot be started: Failed to instantiate"),
         (('modelIdentifier="oscillator"', 'modelIdentifier="other"'), "this machine needs"),
-        (('fmiVersion="2.0"', 'fmiVersion="1.0"'), "is no FMU of FMI 2 or 3, or a damaged one"),
-        (("</fmiModelDescription>", ""), "is no FMU of FMI 2 or 3"),
+        (('fmiVersion="2.0"', 'fmiVersion="1.0"'), "is not an FMU of FMI 2 or 3, or is damaged"),
+        (("</fmiModelDescription>", ""), "is not an FMU of FMI 2 or 3"),
     ],
 )  # fmt: skip
 def test_fmus_that_cannot_be_run_are_refused_in_one_line(

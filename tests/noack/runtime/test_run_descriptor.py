@@ -60,7 +60,7 @@ def _fifo(path: Path) -> None:
             lambda path: path.chmod(0o640),
             "other users can read or change it; make it yours alone: chmod 600 ",
         ),
-        (lambda path: path.write_bytes(b"\xff\xfe"), "not an invitation: it is no text"),
+        (lambda path: path.write_bytes(b"\xff\xfe"), "not an invitation: it is not text"),
         (lambda path: path.write_text("{"), "not an invitation: not a valid run descriptor: "),
         (_fifo, "cannot be read: not a regular file"),
         (lambda path: os.truncate(path, 10**9), "not an invitation: larger than 64 MiB"),
@@ -89,7 +89,7 @@ def test_a_spoiled_invitation_is_refused_in_one_line(
 def test_rows_must_have_a_place_before_a_process_joins(tmp_path: Path) -> None:
     path = tmp_path / "invitation.json"
     write_invitation(path, INVITED)
-    with pytest.raises(CallerError, match=r"rows could not be kept there: .* is no folder"):
+    with pytest.raises(CallerError, match=r"rows could not be kept there: .* is not a folder"):
         read_invitation(path, path / "runs")
     assert read_invitation(path, tmp_path / "no" / "folder" / "yet").run_dir.endswith("/yet/one")
     assert not (tmp_path / "no").exists()

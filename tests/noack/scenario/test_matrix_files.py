@@ -72,7 +72,7 @@ def test_a_mat_file_may_have_sparse_matrices_integers_and_text(tmp_path: Path) -
         ({"A": A, "B": B, "K": K, "dt": 0.01}, "dt is 0.01, so it is a system in discrete time"),
         ({"A": A, "B": B, "K": K, "C": np.eye(2)[:1]}, "C is not the identity"),
         ({"A": A, "B": B, "K": K, "D": np.ones((2, 1))}, "D is not zero"),
-        ({"A": A * 1j, "B": B}, "A is not of real numbers"),
+        ({"A": A * 1j, "B": B}, "A must have real numbers only"),
         ({"A": A, "B": B + np.inf}, "B has entries that are not finite"),
         ({"A": A, "B": B, "gain": K, "K": 2 * K}, "has gain and K; say which by names = { gain"),
         ({"A": A, "B": B, "K": K.T}, "gain = [[-8.0], [-4.0]]: expected 1 x 2"),
@@ -109,7 +109,7 @@ def test_a_file_on_which_scipy_crashes_is_refused(tmp_path: Path) -> None:
     place = content.index(b"\x09\x00\x00\x00\x20\x00\x00\x00")  # 32 bytes of doubles: A
     content[place + 1] = 2
     (tmp_path / "m.mat").write_bytes(content)
-    with pytest.raises(CallerError, match=r"is no \.mat file, or a damaged one"):
+    with pytest.raises(CallerError, match=r"is not a \.mat file, or is damaged"):
         scenario(tmp_path, 'file = "m.mat"')
 
 

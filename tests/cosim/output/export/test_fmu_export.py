@@ -280,7 +280,7 @@ def test_resources_that_are_damaged_give_one_line(folders: Folders) -> None:
         (content + b"?", "noack.bin is too long"),
         (content[:-1] + b"?", "noack.bin is damaged: its check sum is wrong"),
         (content[:16] + b"?" + content[17:], "for another version of noack than the library"),
-        ((other / "resources/noack.bin").read_bytes(), "its token is another one"),
+        ((other / "resources/noack.bin").read_bytes(), "their tokens differ"),
         (None, "noack.bin cannot be read"),
     ):
         path.unlink(missing_ok=True)

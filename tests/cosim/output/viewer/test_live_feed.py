@@ -1,7 +1,7 @@
 """The recording of several loops that is written while they run, against that of the record."""
 
 from pathlib import Path
-from unittest.mock import Mock
+from unittest.mock import Mock, create_autospec
 
 import numpy as np
 import pytest
@@ -11,6 +11,7 @@ from cosim.analysis.summary.run_summary import counts_inside, times_inside
 from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.live_feed import LiveFeed
 from cosim.output.viewer.loop_feed import LoopFeed
+from cosim.output.viewer.loop_recording import LoopView
 from cosim.output.viewer.run_recording import ALL_ERRORS, ALL_SIZES, MAP, QUEUE, SHARE, open_recording
 from cosim.record.run_directory import RECORDING_FILE
 from cosim.record.run_record import RecordedRun
@@ -106,7 +107,7 @@ def received(view: Mock) -> list[tuple[int, bool]]:
 
 
 def test_a_delivery_is_drawn_once_the_networks_row_has_arrived() -> None:
-    view = Mock()
+    view = create_autospec(LoopView, instance=True)
     feed = LoopFeed(SCENARIO, view)
     delivery = np.zeros(1, TYPES["controller_delivery"])
     delivery["t_ns"] = delivery["model_t_ns"] = 100 * MS

@@ -18,7 +18,7 @@ from cosim.studies.campaign.campaign_figures import (
     undominated,
 )
 from cosim.studies.campaign.campaign_file import CampaignAxis
-from cosim.studies.campaign.campaign_report import estimate_text
+from cosim.studies.campaign.campaign_report import metric_text
 from cosim.studies.campaign.metrics import estimate
 from tests.cosim.studies.campaign.conftest import HOSTILE
 
@@ -40,9 +40,10 @@ def test_the_front_is_what_nothing_dominates(drawn: list[tuple[int, int]]) -> No
 
 def test_figures_and_texts_accept_infinite_single_and_many_values() -> None:
     never, single = estimate(np.full(4, math.inf)), estimate(np.array([2.0]))
-    assert estimate_text(never) == "never"
-    assert estimate_text(estimate(np.array([1.0, 3.0]))) == "2 ± 13"
-    assert estimate_text(estimate(np.array([-1.0, math.inf]))) == "−1 (50 % of runs)"
+    assert metric_text("cost", never) == "never"
+    assert metric_text("cost", estimate(np.array([1.0, 3.0]))) == "2 ± 13"
+    assert metric_text("cost", estimate(np.array([-1.0, math.inf]))) == "−1 (50 % of runs)"
+    assert metric_text("certificate_used", estimate(np.array([0.5]))) == "50"
     many = estimate(np.geomspace(1e-9, 1e9, 50))
     drawn = []
     for values in ([never], [never, single, many]):

@@ -191,5 +191,5 @@ def test_what_cannot_be_sent_is_counted(content: dict[str, Any]) -> None:
 def test_numbers_that_it_cannot_act_on_are_refused(content: dict[str, Any]) -> None:
     with closing(Live("sensor", [scenario(content)])) as live:
         live.driver.core.receiver_count = 3
-        with pytest.raises(ValueError, match="receiver_count: not from 0 to 2"):
+        with pytest.raises(ValueError, match="receiver_count must be from 0 to 2"):
             LiveDriver._check(live.driver)
