@@ -88,8 +88,8 @@ RELAY_CORE, LOAD_CORE = _CORES[0], _CORES[-1]
 def on_core(core: int, priority: int = 1) -> Iterator[bool]:
     """Pin the calling thread to a core, with SCHED_FIFO if permitted.
 
-    With the lowest priority other programs of the machine do not affect a comparison of relays. The
-    processes that it starts within the context inherit both.
+    With the lowest priority other programs of the machine do not affect a comparison of relays. End
+    no process in it: the kernel may then wait for one of lower priority on this core, for ever.
 
     Yields:
         Whether SCHED_FIFO was permitted.

@@ -12,7 +12,7 @@ import struct
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -208,6 +208,8 @@ def running(kind: RelayKind) -> Iterator[LoadedRelay]:
         command[0] = program_path(command[0], kind.name)
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         os.sched_setaffinity(process.pid, {RELAY_CORE})
+        with suppress(PermissionError):
+            os.sched_setscheduler(process.pid, os.SCHED_FIFO, os.sched_param(1))
         stack.callback(process.communicate)
         stack.callback(process.kill)
         wait_for(lambda: process.poll() is not None or _is_bound(port))

@@ -42,7 +42,7 @@ def drained() -> Iterator[Row]:
     """Send bursts to each relay in turn; yield rates and costs."""
     ours = our_relay(PLAIN, f"{WORDS} --one-way"), our_relay(SEGMENTS, f"{WORDS} --one-way --segment")
     peers = SOCAT, c_relay(), c_relay("segment"), c_relay("names"), c_relay("segment", "names")
-    with on_core(LOAD_CORE), relay_load.started(*peers, *ours) as (rounds, relays):
+    with relay_load.started(*peers, *ours) as (rounds, relays), on_core(LOAD_CORE):
         rounds.measure_in_turn(ROUNDS, {name: relay.burst for name, relay in relays.items()})
     for side, peer, goal in RATES:
         yield rounds.row(f"{side}: drained", "datagrams/s", "per_s", side, peer, goal, paired=True)
@@ -64,7 +64,7 @@ def flows() -> Iterator[Row]:
     """
     single, many = relay_load.sources(1), relay_load.sources(FLOWS)
     kinds = c_relay(), c_relay("paths"), our_relay(PLAIN, f"{WORDS} --one-way"), our_relay(REVERSE, WORDS)
-    with on_core(LOAD_CORE), relay_load.started(*kinds) as (rounds, relays):
+    with relay_load.started(*kinds) as (rounds, relays), on_core(LOAD_CORE):
         sides = dict[str, Callable[[], Figures]]()
         for name, relay in relays.items():
             relay.burst(many)  # makes the states of the flows; not counted
@@ -123,9 +123,9 @@ def _added() -> Rounds:
 
     ours = our_relay(PLAIN, "loss 5% mansd 0 seed 7 --one-way", lossy=False)
     with (
-        on_core(RELAY_CORE),
         closing(relay_load.PathEnds()) as direct,
         relay_load.started(SOCAT, c_relay(), ours) as (rounds, relays),
+        on_core(RELAY_CORE),
     ):
         direct.out.connect(direct.sink.getsockname())
         sides = {name: partial(added, relay) for name, relay in relays.items()}
@@ -170,11 +170,10 @@ def steady_load(soak_s: int = 20) -> Iterator[Row]:
     ``--set soak_s=600`` is the full test; it must be at least 4.
     """
     kind = our_relay(PLAIN, f"loss 5% mansd {MANSD} seed 7 --one-way")
-    with on_core(LOAD_CORE):
-        with relay_load.running(kind) as relay:
-            maximum_per_s = median([relay.burst()["per_s"] for _ in range(_BURSTS)])
-        with relay_load.running(kind) as relay:
-            yield from _soak_rows(relay, soak_s, maximum_per_s)
+    with relay_load.running(kind) as relay, on_core(LOAD_CORE):
+        maximum_per_s = median([relay.burst()["per_s"] for _ in range(_BURSTS)])
+    with relay_load.running(kind) as relay:
+        yield from _soak_rows(relay, soak_s, maximum_per_s)
 
 
 def _soak_rows(relay: LoadedRelay, seconds: int, maximum_per_s: float) -> Iterator[Row]:
@@ -184,14 +183,15 @@ def _soak_rows(relay: LoadedRelay, seconds: int, maximum_per_s: float) -> Iterat
     groups_per_s = round(1e9 / period_ns)
     resident_kib = list[float]()
     began_s = time.monotonic()
-    for number in range(seconds):
-        if number % 60 == 0:
-            announce(f"{group * groups_per_s:,} datagrams/s, {number} of {seconds} s")
-        relay.ends.soak(groups_per_s, group, period_ns)
-        resident_kib.append(psutil.Process(relay.process.pid).memory_info().rss / 1024)
-    elapsed_s = time.monotonic() - began_s
-    # Empty groups: receive the datagrams still in flight.
-    relay.ends.soak(round(_LAST_S / _GROUP_S), 0, period_ns)
+    with on_core(LOAD_CORE):
+        for number in range(seconds):
+            if number % 60 == 0:
+                announce(f"{group * groups_per_s:,} datagrams/s, {number} of {seconds} s")
+            relay.ends.soak(groups_per_s, group, period_ns)
+            resident_kib.append(psutil.Process(relay.process.pid).memory_info().rss / 1024)
+        elapsed_s = time.monotonic() - began_s
+        # Empty groups: receive the datagrams still in flight.
+        relay.ends.soak(round(_LAST_S / _GROUP_S), 0, period_ns)
     counts, totals, quarter = relay.ends.soaked, relay.totals(), max(seconds // 4, 1)
     growth_kib = median(resident_kib[-quarter:]) - median(resident_kib[quarter : 2 * quarter])
     peer, note = Peer("drained maximum", maximum_per_s), f"for {elapsed_s:.0f} s"
