@@ -159,7 +159,6 @@ MEMORY_GOAL = Goal("<=", 1024)
 _BURSTS = 15
 _GROUP_S = 250e-6
 """Approximate time between two groups of datagrams."""
-_LAST_S = 0.1
 
 
 @benchmark("relay_soak", "Our relay under a steady load")
@@ -190,8 +189,8 @@ def _soak_rows(relay: LoadedRelay, seconds: int, maximum_per_s: float) -> Iterat
             relay.ends.soak(groups_per_s, group, period_ns)
             resident_kib.append(psutil.Process(relay.process.pid).memory_info().rss / 1024)
         elapsed_s = time.monotonic() - began_s
-        # Empty groups: receive the datagrams still in flight.
-        relay.ends.soak(round(_LAST_S / _GROUP_S), 0, period_ns)
+        # Empty groups for 0.1 s: receive the datagrams still in flight.
+        relay.ends.soak(round(0.1 / _GROUP_S), 0, period_ns)
     counts, totals, quarter = relay.ends.soaked, relay.totals(), max(seconds // 4, 1)
     growth_kib = median(resident_kib[-quarter:]) - median(resident_kib[quarter : 2 * quarter])
     peer, note = Peer("drained maximum", maximum_per_s), f"for {elapsed_s:.0f} s"

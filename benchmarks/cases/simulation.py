@@ -18,6 +18,7 @@ from benchmarks.programs import PRIORITY
 from benchmarks.report import Goal, MeasurementError, Peer, Row, announce, benchmark
 from benchmarks.rounds import compare, cpu_ms, per_cpu_s
 from cosim.analysis.replay import replay
+from cosim.api.scenarios import with_settings
 from cosim.cli.options import find_scenario
 from cosim.simulation.exact_simulation import Population, Setting, run_batch, run_with_events, setting_of
 from cosim.simulation.sampled_loop import SampledLoop, Scales
@@ -105,9 +106,9 @@ def sampled_runs(loop: SampledLoop) -> None:
 def simulation() -> Iterator[Row]:
     """Measure the simulators, a replay and a certificate with the paper's example."""
     lane = resolve(load(find_scenario("lane_following"), ()))
-    settings = [f"horizon_s={_LOOPS_S}", f'loops=[{{ name = "loop", count = {_LOOPS} }}]']
-    settings += [f"{part}.rate_hz={_LOOPS_HZ}" for part in ("plant", "controller")]
-    many = load(find_scenario("lane_following"), settings)
+    settings = dict.fromkeys(("plant.rate_hz", "controller.rate_hz"), _LOOPS_HZ)
+    loops = {"horizon_s": _LOOPS_S, "loops": [{"name": "loop", "count": _LOOPS}]}
+    many = with_settings(lane, settings | loops)  # equal loops: nothing is drawn
     horizon_s, loop, conditions = lane.horizon_s, SampledLoop(lane), ideal_conditions(lane)
     live = Peer("the live run", 1e3 * horizon_s / lane.speed)
     name = f"{horizon_s:g} s of the machines in virtual time"
