@@ -130,7 +130,7 @@ attack: setup-dev ## Send N=1000000 hostile datagrams to each port of a run (5 m
 	$(BIN)/python -m tests.attacks --number $(N) $(ARGS)
 
 soak: setup-dev ## Soak test: one hour, then a simulated day at speed 48; MINUTES=5 for a short test
-	$(BIN)/python -m benchmarks.soak $(if $(filter file,$(origin MINUTES)),,--minutes $(MINUTES)) $(ARGS)
+	$(BIN)/python -m benchmarks soak $(if $(filter file,$(origin MINUTES)),,--set minutes=$(MINUTES)) $(ARGS)
 
 check: setup-dev ## Lint, format, strict types, import rules; the core in C without a warning
 	$(BIN)/ruff check .

@@ -17,9 +17,10 @@
 
 #include "load.h"
 
-enum { BATCH = 64, MAX_BYTES = 2048, CONTROL_BYTES = 128 };
+enum { BATCH = 64, DATAGRAM_BYTES = 72, CONTROL_BYTES = 128 };
 static const int64_t SECOND_NS = 1000000000;
 static const int64_t QUIET_NS = 3000000;
+static const int64_t PATIENCE_NS = 300000000; /* after it, the rest of a burst counts as lost */
 static const int64_t POLL_NS = 500000;
 
 static int64_t now_ns(clockid_t clock)
@@ -44,13 +45,13 @@ struct arrival {
 /* Receive the datagrams queued at the sink, at most BATCH, without waiting; -1 if there is none. */
 static int take(int sink, struct arrival arrivals[BATCH])
 {
-    static char data[BATCH][MAX_BYTES];
+    static char data[BATCH][DATAGRAM_BYTES];
     static char control[BATCH][CONTROL_BYTES] __attribute__((aligned(16)));
     struct iovec parts[BATCH];
     struct mmsghdr batch[BATCH] = {0};
 
     for (int k = 0; k < BATCH; k++) {
-        parts[k] = (struct iovec){data[k], MAX_BYTES};
+        parts[k] = (struct iovec){data[k], DATAGRAM_BYTES};
         batch[k].msg_hdr.msg_iov = &parts[k];
         batch[k].msg_hdr.msg_iovlen = 1;
         batch[k].msg_hdr.msg_control = control[k];
@@ -73,10 +74,10 @@ static int take(int sink, struct arrival arrivals[BATCH])
 
 /* Send the datagrams number first to first + count - 1 as fast as possible; if there are sources
  * (IPv4 addresses in network order), send datagram k from sources[k % n_sources]. */
-static int send_all(int out, int64_t first, int64_t count, size_t size, const uint32_t *sources,
+static int send_all(int out, int64_t first, int64_t count, const uint32_t *sources,
                     int64_t n_sources)
 {
-    static char data[BATCH][MAX_BYTES];
+    static char data[BATCH][DATAGRAM_BYTES];
     static char control[BATCH][CMSG_SPACE(sizeof(struct in_pktinfo))] __attribute__((aligned(16)));
     struct iovec parts[BATCH];
     struct mmsghdr batch[BATCH] = {0};
@@ -86,7 +87,7 @@ static int send_all(int out, int64_t first, int64_t count, size_t size, const ui
         for (int k = 0; k < wanted; k++) {
             int64_t number = first + done + k;
             memcpy(data[k], &number, sizeof number);
-            parts[k] = (struct iovec){data[k], size};
+            parts[k] = (struct iovec){data[k], DATAGRAM_BYTES};
             batch[k].msg_hdr.msg_iov = &parts[k];
             batch[k].msg_hdr.msg_iovlen = 1;
             if (n_sources > 0) {
@@ -119,10 +120,10 @@ static int64_t waiting(int sink, int64_t *most)
 }
 
 /* Receive datagrams from number first on. End when datagram count - slack has arrived and none
- * follows, or when none has arrived for patience_ns. The sink is read when it does not grow or gets
+ * follows, or when none has arrived for PATIENCE_NS. The sink is read when it does not grow or gets
  * full: reading it while the relay writes to it would slow the relay down. */
 static void gather(int sink, int64_t first, int64_t count, int64_t slack, int64_t begun_ns,
-                   int64_t patience_ns, struct burst *found)
+                   struct burst *found)
 {
     struct arrival arrivals[BATCH];
     int64_t changed_ns = now_ns(CLOCK_MONOTONIC), held_before = 0, most;
@@ -145,38 +146,37 @@ static void gather(int sink, int64_t first, int64_t count, int64_t slack, int64_
                     }
                 }
         held_before = held;
-        if (now - changed_ns > (found->last >= count - 1 - slack ? QUIET_NS : patience_ns))
+        if (now - changed_ns > (found->last >= count - 1 - slack ? QUIET_NS : PATIENCE_NS))
             return;
         sleep_until(now + POLL_NS);
     }
 }
 
 /* Stop a child process, fill its receive buffer, continue it, wait until the buffer is empty. */
-int load_burst(int out, int sink, int relay, int64_t first, int64_t count, int64_t size,
-               const uint32_t *sources, int64_t n_sources, int64_t slack, int64_t patience_ns,
-               struct burst *found)
+int load_burst(int out, int sink, int64_t first, int64_t count, int relay, const uint32_t *sources,
+               int64_t n_sources, int64_t slack, struct burst *found)
 {
     siginfo_t info;
     if (kill(relay, SIGSTOP) != 0 || waitid(P_PID, (id_t)relay, &info, WSTOPPED) != 0)
         return errno;
-    int failed = send_all(out, first, count, (size_t)size, sources, n_sources);
+    int failed = send_all(out, first, count, sources, n_sources);
     int64_t begun_ns = now_ns(CLOCK_REALTIME);
     if (kill(relay, SIGCONT) != 0)
         return errno;
-    gather(sink, first, count, slack, begun_ns, patience_ns, found);
+    gather(sink, first, count, slack, begun_ns, found);
     return failed;
 }
 
 /* Send datagrams one by one, each after the previous one has arrived or timed out (the sink's
  * SO_RCVTIMEO); delay_ns[k] is -1 after a timeout. */
-int load_ping(int out, int sink, int64_t first, int64_t count, int64_t size, int64_t *delay_ns)
+int load_ping(int out, int sink, int64_t first, int64_t count, int64_t *delay_ns)
 {
-    char data[MAX_BYTES] = {0};
+    char data[DATAGRAM_BYTES] = {0};
     for (int64_t k = 0; k < count; k++) {
         int64_t number = first + k, found = -1;
         memcpy(data, &number, sizeof number);
         int64_t begun_ns = now_ns(CLOCK_MONOTONIC);
-        if (send(out, data, (size_t)size, 0) < 0)
+        if (send(out, data, sizeof data, 0) < 0)
             return errno;
         ssize_t taken;
         while (found != number && (taken = recv(sink, data, sizeof data, 0)) >= 0)
@@ -186,35 +186,29 @@ int load_ping(int out, int sink, int64_t first, int64_t count, int64_t size, int
     return 0;
 }
 
-/* Send a datagram every period_ns and record its time (CLOCK_REALTIME). */
-int load_pace(int out, int64_t first, int64_t count, int64_t size, int64_t period_ns,
-              int64_t *departure_ns)
+/* Send a datagram every period_ns, then collect them until all have arrived or none has for
+ * PATIENCE_NS; delay_ns of missing datagrams is negative. */
+int load_pace(int out, int sink, int64_t first, int64_t count, int64_t period_ns,
+              int64_t *delay_ns)
 {
-    char data[MAX_BYTES] = {0};
-    int64_t begun_ns = now_ns(CLOCK_MONOTONIC);
+    char data[DATAGRAM_BYTES] = {0};
+    struct arrival arrivals[BATCH];
+    int64_t begun_ns = now_ns(CLOCK_MONOTONIC), missing = count;
     for (int64_t k = 0; k < count; k++) {
         int64_t number = first + k;
         memcpy(data, &number, sizeof number);
         sleep_until(begun_ns + (k + 1) * period_ns);
-        departure_ns[k] = now_ns(CLOCK_REALTIME);
-        if (send(out, data, (size_t)size, 0) < 0)
+        delay_ns[k] = -now_ns(CLOCK_REALTIME);
+        if (send(out, data, sizeof data, 0) < 0)
             return errno;
     }
-    return 0;
-}
-
-/* Collect the arrival times of datagrams from number first on, until all have arrived or none has
- * for patience_ns; arrival_ns of missing datagrams is not changed. */
-int load_collect(int sink, int64_t first, int64_t count, int64_t patience_ns, int64_t *arrival_ns)
-{
-    struct arrival arrivals[BATCH];
-    int64_t missing = count, quiet_since_ns = now_ns(CLOCK_MONOTONIC);
-    while (missing > 0 && now_ns(CLOCK_MONOTONIC) - quiet_since_ns < patience_ns) {
+    int64_t quiet_since_ns = now_ns(CLOCK_MONOTONIC);
+    while (missing > 0 && now_ns(CLOCK_MONOTONIC) - quiet_since_ns < PATIENCE_NS) {
         for (int taken; (taken = take(sink, arrivals)) > 0;) {
             for (int k = 0; k < taken; k++) {
                 int64_t number = arrivals[k].number - first;
                 if (number >= 0 && number < count) {
-                    arrival_ns[number] = arrivals[k].stamp_ns;
+                    delay_ns[number] += arrivals[k].stamp_ns;
                     missing--;
                 }
             }
@@ -243,13 +237,13 @@ static void count_arrivals(int sink, struct soak *state)
 
 /* Send `groups` groups of `group` datagrams, one group every period_ns, and receive arrivals in
  * between; continues the numbering of `state`. */
-int load_soak(int out, int sink, int64_t groups, int64_t group, int64_t size, int64_t period_ns,
+int load_soak(int out, int sink, int64_t groups, int64_t group, int64_t period_ns,
               struct soak *state)
 {
     int64_t begun_ns = now_ns(CLOCK_MONOTONIC);
     for (int64_t k = 0; k < groups; k++) {
         sleep_until(begun_ns + (k + 1) * period_ns);
-        int failed = send_all(out, state->sent, group, (size_t)size, NULL, 0);
+        int failed = send_all(out, state->sent, group, NULL, 0);
         if (failed)
             return failed;
         state->sent += group;

@@ -1,9 +1,9 @@
 /* A peer of the latency benchmark: a ping through a relay, in C, with the settings of a run.
  *
  * ping COUNT PERIOD_NS PRIORITY sends COUNT datagrams of 72 bytes on loopback, one every PERIOD_NS.
- * Sender, relay and receiver are processes; relay and receiver block in recv. Writes the one-way
- * latencies, int64_t in ns, to standard output: from the reading of the clock before the sender's
- * send to that after the receiver's recv. PRIORITY is the receiver's SCHED_FIFO priority; with 0
+ * Sender, relay and receiver are processes; relay and receiver block in recv. Prints the one-way
+ * latencies in ns: from the reading of the clock before the sender's send to that after the
+ * receiver's recv. PRIORITY is the receiver's SCHED_FIFO priority; with 0
  * the processes have no real-time settings. Standard error names the settings that were refused.
  *
  * ping COUNT PERIOD_NS PRIORITY BURST sends BURST datagrams every PERIOD_NS, as one message that
@@ -13,10 +13,10 @@
 #include <arpa/inet.h>
 #include <errno.h>
 #include <fcntl.h>
+#include <inttypes.h>
 #include <netinet/in.h>
 #include <netinet/udp.h>
 #include <sched.h>
-#include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -107,7 +107,8 @@ static void receive(int in, long count) {
     require(latencies_ns != NULL, "calloc");
     while (recv(in, data, sizeof data, 0) > 0 && received < count)
         latencies_ns[received++] = now_ns() - data[0];
-    fwrite(latencies_ns, sizeof *latencies_ns, (size_t)received, stdout);
+    for (long k = 0; k < received; k++)
+        printf("%" PRId64 "\n", latencies_ns[k]);
     require(fflush(stdout) == 0, "write");
 }
 

@@ -1,14 +1,13 @@
 """What is guaranteed: losses over very many decisions, and certificates beside attacks."""
 
-import argparse
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.report import ZERO, Goal, Peer, Row, announce, benchmark, option
+from benchmarks.report import ZERO, Goal, MeasurementError, Peer, Row, announce, benchmark
 from cosim.analysis.adversary import Objective, WorstRun, conditions_of, find_worst
 from cosim.cli.options import find_scenario
 from netem.link_state import LinkState
@@ -38,28 +37,19 @@ _SPACING_NS = 2_000_000
 """Time between two packets."""
 
 
-class Decider:
-    """Decides one flow after another, datagrams `spacing_ns` apart."""
-
-    def __init__(self, words: str, spacing_ns: int = 10_000) -> None:
-        self._link, self._flow = LinkState(settings_of(words), 7, "relay", "forward"), 0
-        count = _FLOW_DECISIONS
-        self._columns = np.zeros(count, np.int64), np.full(count, 72), np.arange(count) * spacing_ns
-
-    def decide(self) -> NDArray[Any]:
-        """Return the decisions for the datagrams of the next flow."""
-        self._link.start_flow(0, self._flow)
-        self._link.core.in_flight = 0
-        self._flow += 1
-        return self._link.decide_many(*self._columns)
+def decide(words: str, flow: int = 0, spacing_ns: int = 10_000) -> NDArray[Any]:
+    """Return the decisions for the datagrams of a flow, ``spacing_ns`` apart."""
+    link, count = LinkState(settings_of(words), 7, "relay", "forward"), _FLOW_DECISIONS
+    link.start_flow(0, flow)
+    return link.decide_many(np.zeros(count, np.int64), np.full(count, 72), np.arange(count) * spacing_ns)
 
 
 def check_rows(impairments: str, guarantee: str, count: int) -> Iterator[Row]:
     """Yield the flows with a violation in ``count`` decisions, and the loss rate if it can be predicted."""
     words, guarantee_settings = f"{impairments} {guarantee}", settings_of(guarantee)
     announce(f"{count:,} decisions, {words}")
-    decider = Decider(f"{words} limit 1000000")
-    flows = [outcomes_of(decider.decide()) for _ in range(count // _FLOW_DECISIONS)]
+    numbers = range(count // _FLOW_DECISIONS)
+    flows = [outcomes_of(decide(f"{words} limit 1000000", flow)) for flow in numbers]
     number = sum(not is_allowed(lost, guarantee_settings) for lost in flows)
     yield Row(f"{words}: flows with a violation", number, "", goal=ZERO, note=f"{count:,} decisions")
     if "delay" not in words and (predicted_rate := expected_loss(settings_of(words)).rate):
@@ -69,13 +59,12 @@ def check_rows(impairments: str, guarantee: str, count: int) -> Iterator[Row]:
 def network_rows() -> Iterator[Row]:
     """Yield the losses at the receiver of three networks with the same random numbers."""
     cap = f"mansd {CAP}"
-    drops = Decider(f"{_LOSS} {cap}", _SPACING_NS).decide()["release_ns"] < 0
-    capped = Decider(_DELAY, _SPACING_NS).decide().copy()
-    capped["release_ns"][drops] = -1
+    capped = decide(_DELAY, spacing_ns=_SPACING_NS)
+    capped["release_ns"][decide(f"{_LOSS} {cap}", spacing_ns=_SPACING_NS)["release_ns"] < 0] = -1
     networks = {
-        "no cap": Decider(f"{_LOSS} {_DELAY}", _SPACING_NS).decide().copy(),
+        "no cap": decide(f"{_LOSS} {_DELAY}", spacing_ns=_SPACING_NS),
         f"cap {CAP} on drops only": capped,
-        cap: Decider(f"{_LOSS} {_DELAY} {cap}", _SPACING_NS).decide(),
+        cap: decide(f"{_LOSS} {_DELAY} {cap}", spacing_ns=_SPACING_NS),
     }
     for name, decisions in networks.items():
         lost, dropped = outcomes_of(decisions), decisions["release_ns"] < 0
@@ -90,17 +79,12 @@ def network_rows() -> Iterator[Row]:
 
 
 @benchmark("guarantee", "Emulator: the guarantee over many decisions")
-def guarantee(options: argparse.Namespace) -> Iterator[Row]:
+def guarantee() -> Iterator[Row]:
     """Measure networks, then violations and loss rates over very many decisions.
 
-    Each combination is decided by the core, a million datagrams per flow. A check that uses nothing
-    of netem looks for violations at the receiver: outcomes come from the times at which intact
-    datagrams leave.
-
-    A reordering network is compared without a cap, with a cap on drops only, and with the
-    guarantee. A cap on drops only forces a datagram after m drops, and leaves the delays as they
-    are, as the loss models of quic-network-simulator and Rattan do. A datagram counts as lost if it
-    is dropped, or if a later one arrives before it.
+    A check that uses nothing of netem looks for violations at the receiver, a million datagrams per
+    flow: a datagram counts as lost if it is dropped, or if a later one arrives before it. A cap on
+    drops only forces a datagram after m drops, and leaves the delays as they are.
     """
     yield from network_rows()
     for constraint in COMBINATIONS:
@@ -112,13 +96,7 @@ LOOPS = ("lane_following", "double_integrator", "unstable_pendulum", "f16_latera
 MOST_NODES, BEAM = 200_000, 64
 _SIGMA, _PERIOD_S, _DEADLINE_S = 0.005, 0.01, 0.02
 _ROUNDING = 1 + 1e-9
-LEAST_SHARE = 0.5
-"""The share of every bound of e_c that the worst run is to use, in the norms that noack chooses."""
-QUANTITIES = {
-    Objective.ERROR: "e_c",
-    Objective.STATE: "x",
-    Objective.INTER_EVENT: "inter-event time",
-}
+QUANTITIES = {Objective.ERROR: "e_c", Objective.STATE: "x", Objective.INTER_EVENT: "inter-event time"}
 
 
 def triggers(paper: dict[str, Any], weight: Matrix) -> dict[str, dict[str, Any]]:
@@ -130,6 +108,7 @@ def triggers(paper: dict[str, Any], weight: Matrix) -> dict[str, dict[str, Any]]
     absolute = {"policy": "absolute", "delta": delta} | W
     deadline = {"policy": "deadline", "interval_s": _DEADLINE_S}
     dynamic = {"policy": "dynamic", "sigma": 0.5, "theta_s": 0.1, "decay_per_s": 1.0}
+    self_triggered = {"policy": "self_triggered", "growth_per_s": 1.0, "mismatch_per_s": 1.0}
     rules: list[dict[str, Any]] = [
         {"policy": "decaying"} | paper | W,
         absolute,
@@ -138,15 +117,7 @@ def triggers(paper: dict[str, Any], weight: Matrix) -> dict[str, dict[str, Any]]
         {"policy": "quadratic", "Q": Q.tolist(), "epsilon": delta**2, "period_s": _PERIOD_S} | W,
         {"policy": "send_on_area", "delta_s": delta * _PERIOD_S} | W,
         {"policy": "periodic", "period_s": _PERIOD_S} | W,
-        {
-            "policy": "self_triggered",
-            "growth_per_s": 1.0,
-            "mismatch_per_s": 1.0,
-            "shortest_s": _PERIOD_S,
-            "longest_s": _DEADLINE_S,
-        }
-        | paper
-        | W,
+        self_triggered | {"shortest_s": _PERIOD_S, "longest_s": _DEADLINE_S} | paper | W,
         deadline | {"rule": absolute},
         {"policy": "dwell", "interval_s": _PERIOD_S, "rule": absolute},
         deadline | {"rule": {"policy": "lyapunov", "rate_per_s": 0.2} | W},
@@ -193,39 +164,18 @@ def row_of(name: str, worst: WorstRun) -> Row:
     )
 
 
-def smallest_share(rows: Iterable[Row]) -> Row:
-    """Return the smallest share of a bound of e_c that the worst run of a loop and policy uses."""
-    shares = [(row.value, row.name) for row in rows if row.value is not None and row.name.endswith(": e_c")]
-    share, name = min(shares, default=(None, None))
-    goal = Goal(">=", LEAST_SHARE)
-    return Row("e_c, smallest share", share, "of the bound", goal=goal, note=name)
-
-
-@benchmark(
-    "tightness",
-    "The adversary against the certificates",
-    {
-        "--loop": {"action": "append", "choices": LOOPS, "help": "tightness: only this loop"},
-        "--policy": {"action": "append", "help": "tightness: only this policy"},
-        "--search-s": option(5.0, "tightness: horizon in s"),
-        "--norm": option("chosen", "tightness: the norm", choices=("chosen", "identity")),
-    },
-)
-def tightness(options: argparse.Namespace) -> Iterator[Row]:
+@benchmark("tightness", "The adversary against the certificates")
+def tightness(loop: str = "", policy: str = "", search_s: float = 5.0, norm: str = "chosen") -> Iterator[Row]:
     """Search the largest share of each certificate's bounds that the worst losses use, by policy.
 
-    The loops are the shipped linear ones, as their processes run them, with the schedule's
-    certificate, in the norm that ``noack certify --weight chosen`` finds for the paper's trigger.
+    The norm is the one that ``noack certify --weight chosen`` finds for the paper's trigger.
     """
-    rows = []
-    for name in options.loop or LOOPS:
+    if norm not in ("chosen", "identity"):
+        raise MeasurementError(f"no norm {norm}: chosen, or identity")
+    for name in (loop,) if loop else LOOPS:
         announce(f"{name}: the norm")
-        loop = loop_named(name, options.search_s, options.norm)
-        paper = loop.decaying.model_dump(include={"beta", "alpha_per_s", "floor"})
-        for policy, trigger in triggers(paper, np.array(loop.decaying.weight)).items():
-            if policy in (options.policy or (policy,)):
-                for row in tightness_rows(loop, policy, trigger):
-                    rows.append(row)
-                    yield row
-    if options.norm == "chosen":
-        yield smallest_share(rows)
+        scenario = loop_named(name, search_s, norm)
+        paper = scenario.decaying.model_dump(include={"beta", "alpha_per_s", "floor"})
+        for rule, trigger in triggers(paper, np.array(scenario.decaying.weight)).items():
+            if policy in ("", rule):
+                yield from tightness_rows(scenario, rule, trigger)

@@ -1,14 +1,12 @@
 """Two hosts: the bound of the offset between their clocks, and the loop across them.
 
 The hosts are network namespaces, which a veth link connects. For the bound, one end of an exchange
-of timestamps runs on each: a reference, and a client whose monotonic clock is a second ahead or
-behind, exactly, and drifts, so that the true offset is known at any time. Errors are those after
-the first half second. Both ends of a bare exchange are what a plain NTP client and server do: no
-authentication, timestamps of the program, and the newest midpoint as the offset, without a bound
+of timestamps runs on each: a reference, and a client whose monotonic clock is ahead and drifts, so
+that the true offset is known at any time. The alternative is what a plain NTP client and server do:
+no authentication, timestamps of the program, and the newest midpoint as the offset, without a bound
 (RFC 5905).
 """
 
-import argparse
 import select
 import socket
 import struct
@@ -22,18 +20,9 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import NamedTuple
 
-from benchmarks.programs import in_new_process
-from benchmarks.report import (
-    ZERO,
-    Figures,
-    Goal,
-    MeasurementError,
-    Rounds,
-    Row,
-    announce,
-    benchmark,
-    quantiles_us,
-)
+from benchmarks.programs import in_new_process, set_options
+from benchmarks.report import ZERO, Goal, MeasurementError, Row, announce, benchmark
+from benchmarks.rounds import Figures, Rounds, quantiles_us
 from noack.runtime.address import Address
 from noack.runtime.drivers.realtime_settings import realtime
 from noack.runtime.host_clocks.clock_offset import ClockOffset
@@ -48,42 +37,42 @@ _WAKE_S = 0.001
 _START_NS, _LENGTH_NS = 500_000_000, 6_000_000_000
 """Time of an exchange before it is checked, and while it is."""
 _PACKET = struct.Struct("<qqq24x")  # 48 bytes, as NTP's
+Clock = tuple[int, int]
+"""How far the client's clock is ahead, ns, and its drift, ppb."""
 
 
-class BareReference:
+class BareReference(socket.socket):
     """The answering end of a plain NTP exchange."""
 
     def __init__(self, at: Address) -> None:
-        self._endpoint = socket.socket(type=socket.SOCK_DGRAM)
-        self._endpoint.bind(at)
-        self.address: Address = self._endpoint.getsockname()
-        self.fileno, self.close = self._endpoint.fileno, self._endpoint.close
+        super().__init__(type=socket.SOCK_DGRAM)
+        self.bind(at)
+        self.address: Address = self.getsockname()
 
     def answer_all(self) -> None:
         """Answer the waiting request."""
-        data, source = self._endpoint.recvfrom(100)
+        data, source = self.recvfrom(100)
         received_ns = time.monotonic_ns()
         sent_ns = _PACKET.unpack(data)[0]
-        self._endpoint.sendto(_PACKET.pack(sent_ns, received_ns, time.monotonic_ns()), source)
+        self.sendto(_PACKET.pack(sent_ns, received_ns, time.monotonic_ns()), source)
 
 
-class BareClient:
+class BareClient(socket.socket):
     """The asking end of a plain NTP exchange, which takes the newest midpoint for the offset."""
 
     def __init__(self, to: Address, clocks: DrivenClocks) -> None:
-        self._clocks = clocks
-        self._endpoint = socket.socket(type=socket.SOCK_DGRAM)
-        self._endpoint.connect(to)
-        self._endpoint.setblocking(False)
+        super().__init__(type=socket.SOCK_DGRAM)
+        self.connect(to)
+        self.setblocking(False)
         self.midpoint_ns: int | None = None
-        self.fileno, self.close = self._endpoint.fileno, self._endpoint.close
+        self._clocks = clocks
 
     def poll(self) -> None:
         """Take the answer, or send a request if there is none."""
         try:
-            data = self._endpoint.recv(100)
+            data = self.recv(100)
         except BlockingIOError:
-            self._endpoint.send(_PACKET.pack(self._clocks.monotonic_ns(), 0, 0))
+            self.send(_PACKET.pack(self._clocks.monotonic_ns(), 0, 0))
             return
         now_ns = self._clocks.monotonic_ns()
         sent_ns, there_ns, answered_ns = _PACKET.unpack(data)
@@ -101,13 +90,6 @@ class ClockCase(NamedTuple):
     rate_ppb: int = ClockOffset().rate_ppb
     answer_every_s: float = 0.0
     """Seconds between two answers; 0: at once."""
-
-
-class Clock(NamedTuple):
-    """The client's clock."""
-
-    ahead_ns: int
-    drift_ppb: int
 
 
 def answer(hosts: TwoHosts, case: ClockCase, bare: bool, parent: Connection) -> None:
@@ -195,20 +177,16 @@ CASES = (
     ClockCase("50 ms, replies read 50 ms later, ρ = 201 ppm", Goal("<=", 50), 0.05, True, 201_000),
     ClockCase("20 ms, reference answers every 50 ms", answer_every_s=0.05),
 )
-CLOCKS = [Clock(ahead_s * 10**9, drift) for ahead_s in (1, -1) for drift in (100_000, -100_000)]
+CLOCKS = [(ahead_s * 10**9, drift) for ahead_s in (1, -1) for drift in (100_000, -100_000)]
 
 
 @benchmark("clock_offset_bound", "Bound of the offset between two clocks")
-def clock_offset_bound(options: argparse.Namespace) -> Iterator[Row]:
-    """Measure both sides in turn with each clock, then the other settings.
-
-    The programs request the real-time settings of a run. The alternative is a plain NTP exchange in
-    Python: the newest midpoint, without a bound, authentication or kernel timestamps.
-    """
+def clock_offset_bound() -> Iterator[Row]:
+    """Measure both sides in turn with each clock, then the other settings, with real-time settings."""
     rounds, alternatives = Rounds(), [(case, Rounds()) for case in CASES]
     with two_hosts() as hosts:
         for clock in CLOCKS:
-            announce(f"client {clock.ahead_ns / 1e9:+.0f} s, {clock.drift_ppb / 1000:+.0f} ppm")
+            announce("client {:+d} ns, {:+d} ppb".format(*clock))
             rounds.add(BARE, measured(hosts, clock, MAIN, bare=True))
             rounds.add(OURS, measured(hosts, clock, MAIN))
         for case, own in alternatives:
@@ -219,16 +197,13 @@ def clock_offset_bound(options: argparse.Namespace) -> Iterator[Row]:
     yield Row("checks of the bound against the true offset", checks, "", goal=Goal(">=", 1e5))
     yield Row("true offset outside the bound", outside, "", goal=ZERO)
     for case, own in cases:
-        note = f"largest: {max(own.values(OURS, 'error_max')):.0f} µs"
-        for q in ("p50", "p99"):
-            name = f"error bound, {q}, {case.name}"
-            yield own.row(name, "µs", f"error_{q}", OURS, goal=case.goal, note=note)
-    for quantity, name in (
-        ("estimate_p50", "error of the estimate, p50"),
-        ("estimate_p99", "error of the estimate, p99"),
-        ("cpu_us", "client's CPU per 20 ms"),
-    ):
-        yield rounds.row(name, "µs", quantity, OURS, BARE)
+        for quantile in ("p50", "p99"):
+            name = f"error bound, {quantile}, {case.name}"
+            yield own.row(name, "µs", f"error_{quantile}", OURS, goal=case.goal)
+    for quantile in ("p50", "p99"):
+        name = f"error of the estimate, {quantile}"
+        yield rounds.row(name, "µs", f"estimate_{quantile}", OURS, BARE)
+    yield rounds.row("client's CPU per 20 ms", "µs", "cpu_us", OURS, BARE)
 
 
 ROUNDS = 3
@@ -238,9 +213,8 @@ _CHANGES = ("horizon_s=10", "trigger.beta=1e-9", 'network.loss={model="lossless"
 
 def run_by_hand(hosts: TwoHosts | None) -> Figures:
     """Return the latency of a run with the controller on the second host, or all on this one."""
-    settings = (word for change in _CHANGES for word in ("--set", change))
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        run = RunByHand(stack, Path(folder), hosts, *settings).finish()
+        run = RunByHand(stack, Path(folder), hosts, *set_options(*_CHANGES)).finish()
     if run.status:
         raise MeasurementError(run.stderr.strip().splitlines()[-1])
     latency_us = run.summary["loops"][0]["latency_us"]
@@ -248,17 +222,13 @@ def run_by_hand(hosts: TwoHosts | None) -> Figures:
 
 
 @benchmark("hosts", "The loop across two hosts")
-def across_hosts(options: argparse.Namespace) -> Iterator[Row]:
-    """Compare the loop across two hosts with the same processes on loopback.
-
-    Plant, sensor and network are on the first host, the controller is on the second. Both sides are
-    runs by hand, without losses, in which every measurement is an event.
-    """
+def across_hosts() -> Iterator[Row]:
+    """Compare the loop with the controller on the second host with the same processes on loopback."""
     rounds = Rounds()
     with two_hosts() as hosts:
         sides = {ON_LOOPBACK: partial(run_by_hand, None), ACROSS: partial(run_by_hand, hosts)}
         rounds.measure_in_turn(ROUNDS, sides)
     note = f"{sum(rounds.values(ACROSS, 'updates')):.0f} updates"
     for quantile in ("p50", "p99"):
-        yield rounds.row(f"event → update, {quantile}", "µs", quantile, ACROSS, ON_LOOPBACK,
-                         Goal("<=", 1.5), note=note, paired=True)  # fmt: skip
+        name, goal = f"event → update, {quantile}", Goal("<=", 1.5)
+        yield rounds.row(name, "µs", quantile, ACROSS, ON_LOOPBACK, goal, note=note, paired=True)

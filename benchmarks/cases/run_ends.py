@@ -5,21 +5,18 @@ rows of all loops in the order of time. ``noack summary`` finalises it, as a run
 killed.
 """
 
-import argparse
-import os
 import resource
 import shutil
-import subprocess
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.programs import NOACK, in_new_process
-from benchmarks.report import Goal, MeasurementError, Peer, Row, announce, benchmark
+from benchmarks.programs import execute, in_new_process
+from benchmarks.report import Goal, Peer, Row, announce, benchmark
+from benchmarks.rounds import Figures
 from cosim.analysis.replay.run_replay import stored_verdict
 from cosim.cli.options import find_scenario
 from cosim.record.record_source import concatenate_rows
@@ -30,9 +27,8 @@ from noack.protocol.roles import RECORDER
 from noack.runtime.spool import SPOOL, SpoolWriter
 from noack.scenario.resolution import run_tables
 from noack.scenario.scenario_file import load
+from tests.helpers.live_runs import noack_command
 
-LENGTHS_S = (120.0, 600.0)
-"""Both are replayed in a process of its own; a shorter run is not."""
 _BATCH_NS = 50_000_000
 _SETTINGS = ("trigger.floor=1e-3",)  # without a floor, the threshold vanishes within an hour
 
@@ -64,74 +60,45 @@ def replay_s(run_dir: Path) -> float:
     return time.process_time() - began_s
 
 
-class End(NamedTuple):
-    """What the end of one run cost."""
-
-    wall_s: float
-    cpu_s: float
-    peak_mib: float
-    replay_s: float
-    """CPU time of the replay."""
-
-
-def completed(run_dir: Path) -> tuple[float, resource.struct_rusage]:
-    """Complete a run by ``noack summary``; return its wall time in s and what the process used.
+def completed(run_dir: Path) -> Figures:
+    """Complete a run by ``noack summary``; return its times in s and its peak memory.
 
     Call it in a small process: Linux counts the memory of the process that starts another one as used
     by that one.
-
-    Raises:
-        MeasurementError: the command failed.
     """
     began_s = time.monotonic()
-    process = subprocess.Popen([*NOACK, "summary", str(run_dir)], stdout=subprocess.DEVNULL)
-    _, status, usage = os.wait4(process.pid, 0)
-    wall_s = time.monotonic() - began_s
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode != 0:
-        raise MeasurementError(f"the end of the run failed with {process.returncode}")
-    return wall_s, usage
+    execute(*noack_command("summary", str(run_dir)))
+    wall_s, used = time.monotonic() - began_s, resource.getrusage(resource.RUSAGE_CHILDREN)
+    return {"wall_s": wall_s, "cpu_s": used.ru_utime + used.ru_stime, "peak_mib": used.ru_maxrss / 1024}
 
 
-def end_of(horizon_s: float, folder: Path) -> End:
-    """Simulate, spool and complete a run; replay it once more."""
+def end_of(horizon_s: float, folder: Path) -> Figures:
+    """Simulate, spool and complete a run; replay it once more. Return what this cost."""
     announce(f"a run of {horizon_s:g} s")
     run_dir = in_new_process(spooled_run, horizon_s, folder)
-    wall_s, usage = in_new_process(completed, run_dir)
-    cpu_s = usage.ru_utime + usage.ru_stime
-    end = End(wall_s, cpu_s, usage.ru_maxrss / 1024, in_new_process(replay_s, run_dir))
+    figures = in_new_process(completed, run_dir)
+    replayed_s = in_new_process(replay_s, run_dir)
     shutil.rmtree(run_dir)
-    return end
+    return {**figures, "replay_s": replayed_s}
 
 
-def rows_of(ends: Mapping[float, End]) -> Iterator[Row]:
-    """Yield the rows from the ends of runs, by length in s."""
-    shortest_s, longest_s = min(ends), max(ends)
-    short, long = ends[shortest_s], ends[longest_s]
-    times_s = (short.wall_s, long.wall_s), (short.cpu_s, long.cpu_s), (short.replay_s, long.replay_s)
-    # Start and end of the program cost the same for every length.
-    wall, cpu, replay = ((longest_s - shortest_s) / max(b - a, 1e-9) for a, b in times_s)
-    peer = Peer(f"end of {shortest_s:g} s", short.peak_mib)
-    note = "of the additional length, replay beside the rest"
-    yield Row(f"peak memory, end of {longest_s:g} s", long.peak_mib, "MiB", goal=Goal("<=", 300))
-    yield Row("the same, against a short run", long.peak_mib, "MiB", peer)
-    yield Row(f"end of {longest_s:g} s", long.wall_s, "s")
-    yield Row("speed of the end, as a multiple of real time", wall, "×", note=note)
-    yield Row("the same, by CPU time of all processes", cpu, "×", goal=Goal(">=", 200))
-    yield Row("of it, the replay", replay, "×", goal=Goal(">=", 2000))
+@benchmark("long_run", "The end of a long run")
+def long_run(short_s: float = 120.0, long_s: float = 600.0) -> Iterator[Row]:
+    """Complete a short and a long run; memory should not grow with the length.
 
-
-@benchmark(
-    "long_run",
-    "The end of a long run",
-    {"--long-run": {"type": float, "nargs": "+", "metavar": "SECONDS", "help": "lengths of long_run"}},
-)
-def long_run(options: argparse.Namespace) -> Iterator[Row]:
-    """Complete runs of several lengths, by ``noack summary``.
-
-    This writes the record, recording, summary and report, replays the run and checks its claims.
-    The alternative is the end of a short run: memory should not grow with the length.
+    At the end of both, a process of its own replays the run, as it does not for a shorter one.
     """
     with tempfile.TemporaryDirectory(prefix="noack-long-run-") as folder:
-        lengths_s = options.long_run or LENGTHS_S
-        yield from rows_of({length_s: end_of(length_s, Path(folder)) for length_s in lengths_s})
+        short, long = end_of(short_s, Path(folder)), end_of(long_s, Path(folder))
+    # Start and end of the program cost the same for every length.
+    wall, cpu, replay = (
+        (long_s - short_s) / max(long[key] - short[key], 1e-9) for key in ("wall_s", "cpu_s", "replay_s")
+    )
+    name, unit = f"end of a run of {long_s:g} s", "× real time"
+    peer = Peer(f"end of {short_s:g} s", short["peak_mib"])
+    note = "of the additional length"
+    yield Row(f"{name}: peak memory", long["peak_mib"], "MiB", peer, Goal("<=", 300, of_value=True))
+    yield Row(name, long["wall_s"], "s")
+    yield Row(f"{name}: speed by the wall clock", wall, unit, note=note)
+    yield Row(f"{name}: speed by the CPU time of all processes", cpu, unit, goal=Goal(">=", 200), note=note)
+    yield Row(f"{name}: speed of the replay in it", replay, unit, goal=Goal(">=", 2000), note=note)

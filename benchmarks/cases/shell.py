@@ -1,19 +1,17 @@
 """A shell (``netem shell``) beside a bare forwarder in C: throughput of TCP, and round-trip time."""
 
-import argparse
 import json
 import os
 import re
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import partial
-from pathlib import Path
 
 from benchmarks.programs import compile_program, program_path
-from benchmarks.report import Figures, Goal, MeasurementError, Rounds, Row, benchmark
+from benchmarks.report import Goal, MeasurementError, Row, benchmark
+from benchmarks.rounds import Figures, Rounds
 from netem.relay.relay_links import LinkSpec
 from netem.shell.devices import inside, open_devices
 from noack.impairments.link_settings import LinkSettings
@@ -25,11 +23,11 @@ _PORT = 5209
 _SHELL, _BARE_FORWARDER = "noack netem shell", "bare forwarder in C"
 
 
-def _run_beside_forwarder(forwarder: Path, command: str) -> str:
+def _run_beside_forwarder(command: str) -> str:
     link = open_devices(LinkSpec("bare", ("", 0), ("", 0), LinkSettings(), LinkSettings()))
     with ExitStack() as stack:
         stack.callback(link.close)
-        words = [str(forwarder), *map(str, link.devices)]
+        words = [compile_program("tun.c"), *map(str, link.devices)]
         process = stack.enter_context(subprocess.Popen(words, pass_fds=link.devices))
         stack.callback(process.kill)
         with inside(link):
@@ -45,10 +43,7 @@ def _run_in_shell(command: str) -> str:
 
 
 def _shell_figures(run: Callable[[str], str]) -> Figures:
-    """Measure throughput from inside to outside, and the time to there and back.
-
-    ``run`` runs a command line of sh inside, where ``$TO`` is the outside; it returns its output.
-    """
+    """Measure with ``run``, which runs a command line of sh inside, where ``$TO`` is the outside."""
     try:
         end = json.loads(run(f"iperf3 -J -c $TO -p {_PORT} -t {_THROUGHPUT_S}"))["end"]
         pings = run(f"ping -q -i 0.002 -c {_PINGS} $TO")
@@ -59,19 +54,17 @@ def _shell_figures(run: Callable[[str], str]) -> Figures:
 
 
 @benchmark("shell", "A shell: throughput of TCP, and time to the outside and back")
-def shell(_options: argparse.Namespace) -> Iterator[Row]:
+def shell() -> Iterator[Row]:
     """Measure a shell without impairments, in turn with the alternative, which needs root."""
     server = [program_path("iperf3", "iperf3"), "-s", "-p", str(_PORT)]
     rounds = Rounds()
-    with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder, ExitStack() as stack:
-        process = stack.enter_context(subprocess.Popen(server, stdout=subprocess.DEVNULL))
+    with subprocess.Popen(server, stdout=subprocess.DEVNULL) as process, ExitStack() as stack:
         stack.callback(process.kill)
-        bare = partial(_run_beside_forwarder, compile_program("tun.c", Path(folder)))
-        runs = {
-            _BARE_FORWARDER: partial(_shell_figures, bare),
+        sides = {
+            _BARE_FORWARDER: partial(_shell_figures, _run_beside_forwarder),
             _SHELL: partial(_shell_figures, _run_in_shell),
         }
-        rounds.measure_in_turn(_ROUNDS, runs)
+        rounds.measure_in_turn(_ROUNDS, sides)
     row = partial(rounds.row, ours=_SHELL, peer=_BARE_FORWARDER, paired=True)
     yield row("TCP", "Mbit/s", "mbit", goal=Goal(">=", 0.9))
     yield row("ping, mean", "µs", "us")

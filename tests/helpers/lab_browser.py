@@ -125,17 +125,24 @@ class Page:
         while not self.js("window.pressed"):
             assert time.monotonic() < deadline_s, text
             self.wait(f"!!{element}")
-            x, y = self.js(
-                "(e => { e.addEventListener('click', () => { window.pressed = true; }, "
-                "{ once: true }); e.scrollIntoView({ block: 'center' }); "
-                "const r = e.getBoundingClientRect(); "
-                f"return [r.x + r.width / 2, r.y + r.height / 2]; }})({element})"
+            self.js(
+                f"{element}.addEventListener('click', () => {{ window.pressed = true; }}, {{ once: true }})"
             )
+            x, y, width = self.box(element)
             for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
-                self.call(
-                    "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1,
-                    clickCount=1,
-                )  # fmt: skip
+                self.mouse(kind, x + width / 2, y)
+
+    def box(self, element: str) -> tuple[float, float, float]:
+        """Scroll to an element; return its left edge, its middle's height, and its width."""
+        x, y, width = self.js(
+            "(e => { e.scrollIntoView({ block: 'center' }); const r = e.getBoundingClientRect(); "
+            f"return [r.x, r.y + r.height / 2, r.width]; }})({element})"
+        )
+        return x, y, width
+
+    def mouse(self, kind: str, x: float, y: float) -> None:
+        """Move, press or release the mouse."""
+        self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
 
     def unfold(self, title: str) -> None:
         """Open a part of the settings."""
@@ -165,19 +172,14 @@ class Page:
 
     def drag(self, label: str, to: float) -> None:
         """Drag the slider with a label to a share of its length."""
-        box = (
-            f"(() => {{ const s = [...document.querySelectorAll('.lab-slider')].find(e => "
-            f"e.innerText.startsWith({json.dumps(label)})).querySelector('input'); "
-            "s.scrollIntoView({ block: 'center' }); const r = s.getBoundingClientRect(); "
-            "return [r.x, r.y + r.height / 2, r.width]; })()"
+        slider = (
+            "[...document.querySelectorAll('.lab-slider')].find(e => "
+            f"e.innerText.startsWith({json.dumps(label)})).querySelector('input')"
         )
-        x, y, width = self.js(box)
+        x, y, width = self.box(slider)
         for kind, share in (("mousePressed", 0.4), ("mouseMoved", 0.45), ("mouseMoved", to),
                             ("mouseReleased", to)):  # fmt: skip
-            self.call(
-                "Input.dispatchMouseEvent", type=kind, x=x + share * width, y=y, button="left",
-                buttons=1, clickCount=1,
-            )  # fmt: skip
+            self.mouse(kind, x + share * width, y)
             self.js(_TWO_FRAMES)  # the browser joins moves within a frame
 
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from benchmarks.cases import guarantees as bench
-from benchmarks.report import Row
 from cosim.analysis.adversary import Objective, find_worst
 from netem.tc_words import settings_of
 from noack.scenario.sections import POLICIES
@@ -22,7 +21,7 @@ def test_no_combination_is_violated_and_each_would_be_without_it(
         violations, *rates = bench.check_rows(before, words, 200_000)
         assert violations.value == 0
         assert all(rate.ratio == pytest.approx(1, abs=0.02) for rate in rates)
-        free = outcomes_of(bench.Decider(f"{before} limit 1000000").decide())
+        free = outcomes_of(bench.decide(f"{before} limit 1000000"))
         assert not is_allowed(free, settings_of(words))
 
 
@@ -59,17 +58,3 @@ def test_a_missing_certificate_fails() -> None:
     assert row.name == "double_integrator, relative: certificates"
     assert row.holds is False
     assert row.note
-
-
-def test_a_loose_bound_of_the_error_fails() -> None:
-    rows = [
-        Row("a: e_c", 0.9, ""),
-        Row("a: x", 0.1, ""),
-        Row("b: e_c", 0.45, ""),
-        Row("c: certificates", 0, ""),
-    ]
-    assert bench.smallest_share(rows).value == 0.45
-    assert bench.smallest_share(rows).note == "b: e_c"
-    assert bench.smallest_share(rows).holds is False
-    assert bench.smallest_share(rows[:2]).holds is True
-    assert bench.smallest_share(rows[1:2]).holds is None

@@ -1,12 +1,12 @@
-"""The random loops of the benchmark: no pattern that is allowed contradicts a proven bound."""
+"""Random loops: no pattern that is allowed contradicts a proven bound."""
 
 from itertools import product
 
 import numpy as np
 import pytest
 
-from benchmarks.cases.margins import random_loop
 from noack.guarantee.loss_guarantee import LossHistory
+from tests.oracles.random_loops import random_loop
 
 
 @pytest.mark.parametrize("seed", [3, 5, 7, 9, 10, 13, 14, 15])  # others take up to a minute

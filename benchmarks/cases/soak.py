@@ -1,29 +1,13 @@
-"""The soak test: a real run of several hours, observed from outside.
+"""The soak: a real run of several hours, as a user starts it, observed from outside.
 
-``python -m benchmarks.soak [hour] [day] [--minutes M] [--runs DIR]`` runs one hour at speed 1
-(``soak_hour.toml``), then a day of simulated time at speed 48, as a user starts them, and samples
-the processes every few seconds. Memory, descriptors and threads must stay flat, every claim must
-hold.
-
-The warm-up is ignored: the first fifth of a run, at most five minutes. The rest is divided into
-twelve windows. Each window counts with its lower median, which ignores short allocations. The slope
-is the median of the slopes between all pairs of windows (Theil and Sen), so that four of the twelve
-windows may be outliers or missing. Memory may gain
-
-* 1 MiB in total, or, in a run longer than an hour, per hour;
-* a quarter of this if, in half an hour or more, at least nine in ten pairs of windows rise: a leak
-  is steady, the memory of a cache or an allocator is not;
-* 9.5 MiB in a run of less than half an hour, since the recorder's memory varies by 9 MiB. In the
-  four minutes that a run of five minutes leaves, at 500 Hz, this is 83 bytes per step, so that a
-  leak of one row per step is detected. A leak per event needs a longer run. With less than two
-  minutes after the warm-up, memory is not checked.
+The processes are sampled every few seconds. Memory, descriptors and threads must stay flat, every
+claim must hold. docs/benchmarks.md says what is checked, and how.
 """
 
-import argparse
 import json
-import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,14 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.stats import theilslopes
 
-from benchmarks.programs import LAUNCHER, ObservedRun, Sample, observed_run
-from benchmarks.report import ZERO, Goal, MeasurementError, Row, print_table
-from cosim.output.figures import palette
-from cosim.output.figures.figure_description import Axis, FigureDescription, Line, Panel, PanelRow, time_axis
-from cosim.output.figures.figure_files import save_figure
+from benchmarks.observed_runs import LAUNCHER, ObservedRun, Sample, observed_run
+from benchmarks.programs import set_options
+from benchmarks.report import ZERO, Goal, MeasurementError, Row, benchmark
 from cosim.record.run_directory import RECORD
 from cosim.record.run_record import load_record
-from noack.core.errors import NoackError
 from noack.protocol.record_tables import NETEM_RELEASE
 from noack.protocol.roles import LOOP_ROLES, RECORDER
 from noack.runtime.spool import SPOOL
@@ -67,16 +48,15 @@ KINDS: Mapping[str, Sequence[str]] = {
     ),
 }
 """The runs, with the settings in which they differ from the scenario."""
-_SCENARIO = Path(__file__).with_name("soak_hour.toml")
+_SCENARIO = Path(__file__).parents[1] / "soak_hour.toml"
 ROLES = (*LOOP_ROLES, RECORDER, LAUNCHER)
 COUNTS = {"fds": "file descriptors", "sockets": "sockets", "threads": "threads"}
-_LEAST_MINUTES = 0.2
 _LEAST_SAMPLES, _LONGEST_PAUSE_S = 150, 5.0
 """Samples of a run, so that each window has several, and the longest time between two."""
 
 
 class Trend(NamedTuple):
-    """The growth of memory after the warm-up, from the slope, and what is allowed, KiB."""
+    """The growth of memory after the warm-up, from the slope, and what is allowed."""
 
     growth_kib: float
     allowed_kib: float
@@ -90,6 +70,9 @@ def warm_up_s(length_s: float) -> float:
 
 def memory_trend(at_s: Sequence[float], kib: Sequence[float], length_s: float) -> Trend | None:
     """Check memory over a run; return None if it is too short for that.
+
+    The slope is that of Theil and Sen between the lower medians of windows, which ignore short
+    allocations.
 
     Args:
         at_s: times of the samples since the run's start, ascending, (k,).
@@ -151,11 +134,9 @@ def process_rows(role: str, samples: Sequence[Sample], began_s: float, length_s:
 
 
 def end_rows(summary: Mapping[str, Any], delivered_out_of_order: int) -> Iterator[Row]:
-    """Yield the rows of the run's end, from its summary.
+    """Yield the rows of the run's end.
 
-    Args:
-        summary: summary of the run.
-        delivered_out_of_order: updates that left the network after a newer one.
+    ``delivered_out_of_order`` is the number of updates that left the network after a newer one.
     """
     (loop,) = summary["loops"]
     ending, replay, claims = summary["exit"], loop["replay"] or {}, loop["claims"]
@@ -171,12 +152,12 @@ def end_rows(summary: Mapping[str, Any], delivered_out_of_order: int) -> Iterato
     yield Row("missing samples", loop["missing_samples"], "", goal=ZERO)
     yield Row("unintended losses", loop["unintended_losses"], "", goal=ZERO)
     yield Row("rejected datagrams", sum(rejected.values()), "", goal=ZERO, note=f"{rejected}")
-    yield Row("rejected as stale, without those delivered out of order", stale - delivered_out_of_order, "",
-              goal=ZERO)  # fmt: skip
+    name = "rejected as stale, without those delivered out of order"
+    yield Row(name, stale - delivered_out_of_order, "", goal=ZERO)
     yield Row("loss bursts beyond the guarantee", len(bursts), "", goal=ZERO)
     yield Row("longest loss burst", loop["longest_loss_burst"], "")
-    yield Row("replayed bit for bit and completely", bool(replay.get("bit_exact") and replay.get("complete")),
-              "", goal=Goal("==", 1), note=f"{replay.get('inputs') or 0:,} inputs")  # fmt: skip
+    exact, note = replay.get("bit_exact") and replay.get("complete"), f"{replay.get('inputs') or 0:,} inputs"
+    yield Row("replayed bit for bit and completely", bool(exact), "", goal=Goal("==", 1), note=note)
     yield Row("claims checked", len(claims), "", goal=Goal(">=", 1))
     yield Row("claims violated", len(violated), "", goal=ZERO, note="; ".join(violated))
 
@@ -200,80 +181,41 @@ def run_rows(run: ObservedRun) -> Iterator[Row]:
     yield Row("processes left behind", len(run.left_behind), "", goal=ZERO, note=", ".join(run.left_behind))
 
 
-def memory_figure(run: ObservedRun) -> FigureDescription:
-    """Describe each process's private memory minus its first value, in KiB, over the run."""
-    rows = []
-    for i, role in enumerate(ROLES):
-        samples = run.in_loops(role)
-        at_s, kib = np.array([(sample.at_s - run.began_s, sample.uss_kib) for sample in samples]).T
-        line = Line(x=at_s, y=kib - kib[0], colour=palette.PROCESSES.get(role, palette.SERIES[i]))
-        x = time_axis(at_s, numbers=i == len(ROLES) - 1, label="wall time [s]")
-        title = "" if i else "private memory since the start"
-        panel = Panel(title=title, items=[line], x=x, y=Axis(label=f"{role} [KiB]"))
-        rows.append(PanelRow(panels=[panel], height_in=0.95))
-    return FigureDescription(name="memory", rows=rows)
-
-
-def soak(path: Path, settings: Sequence[str], runs: Path) -> list[Row]:
-    """Soak a scenario; write ``soak.json`` and ``soak.png`` into its run directory.
-
-    Args:
-        path: the scenario file.
-        settings: values to replace, as after ``--set``.
-        runs: folder in which the run directory is made, in its own subfolder.
-    """
-    scenario = load(path, settings)
+def soaked(settings: Sequence[str], runs: Path) -> list[Row]:
+    """Run the soak's scenario with changed settings; write ``soak.json`` into its run directory."""
+    scenario = load(_SCENARIO, settings)
     length_s = scenario.horizon_s / scenario.speed
     runs.mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(prefix="soak-", dir=runs))
-    changes = [word for setting in settings for word in ("--set", setting)]
     pause_s = min(length_s / _LEAST_SAMPLES, _LONGEST_PAUSE_S)
-    run = observed_run([str(path), "--report", *changes], folder, length_s, pause_s)
+    run = observed_run([str(_SCENARIO), "--report", *set_options(*settings)], folder, length_s, pause_s)
     rows = [*run_rows(run)]
     content = {
         "rows": [row.to_json() for row in rows],
         "samples": {role: [sample._asdict() for sample in run.in_loops(role)] for role in ROLES},
     }
     (run.run_dir / "soak.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    save_figure(memory_figure(run), run.run_dir / "soak.png")
     return rows
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the soak; return 0 if everything was as it should be."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.soak",
-        description="Run the loop for an hour at speed 1, then for a day of simulated time in half "
-        "an hour, and watch it: memory, descriptors and threads must stay flat, every claim must "
-        "hold.",
-    )
-    add = parser.add_argument
-    add("kinds", nargs="*", metavar="KIND", choices=[[], *KINDS], help=f"of {', '.join(KINDS)}")
-    add("--minutes", type=_minutes, metavar="M", help="a shorter one; of the first kind only")
-    add("--runs", type=Path, default=Path("runs"), help="where runs are kept")
-    add("--set", action="append", default=[], metavar="KEY=VALUE", help="replace a value")
-    options = parser.parse_args(arguments)
-    status = 0
-    for kind in options.kinds or (KINDS if options.minutes is None else ["hour"]):
-        settings = [*KINDS[kind], *options.set]
-        try:
-            if options.minutes is not None:
-                settings.append(f"horizon_s={60 * options.minutes * load(_SCENARIO, settings).speed!r}")
-            rows = soak(_SCENARIO, settings, options.runs)
-        except (MeasurementError, NoackError, AssertionError) as error:  # of the tests' helpers
-            print(f"soak: {error}", file=sys.stderr)
-            return 2
-        print_table(f"soak_{kind}", rows)
-        status |= any(row.holds is False for row in rows)
-    return status
+@benchmark("soak", "An hour at speed 1, then a day of simulated time at speed 48")
+def soak(kind: str = "", minutes: float = 0.0, runs: str = "runs") -> Iterator[Row]:
+    """Soak the loop; fail if a row does not hold.
 
-
-def _minutes(text: str) -> float:
-    minutes = float(text)
-    if not _LEAST_MINUTES <= minutes <= 1e4:
-        raise argparse.ArgumentTypeError(f"must be a number of at least {_LEAST_MINUTES}")
-    return minutes
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    Args:
+        kind: only this one of :data:`KINDS`.
+        minutes: length of a shorter soak, of the first kind by default.
+        runs: folder in which the run directories are made, in subfolders of their own.
+    """
+    if kind not in ("", *KINDS):
+        raise MeasurementError(f"no kind {kind}: {', '.join(KINDS)}")
+    faults = 0
+    for name in (kind,) if kind else ("hour",) if minutes else KINDS:
+        settings = [*KINDS[name]]
+        if minutes:
+            settings.append(f"horizon_s={60 * minutes * load(_SCENARIO, settings).speed!r}")
+        rows = soaked(settings, Path(runs))
+        yield from (replace(row, name=f"{name}: {row.name}") for row in rows)
+        faults += sum(row.holds is False for row in rows)
+    if faults:
+        raise MeasurementError(f"{faults} rows do not hold")

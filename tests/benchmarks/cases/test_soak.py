@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.cases.soak import Trend, end_rows, lasting_range, memory_trend, warm_up_s
 from benchmarks.report import MeasurementError
-from benchmarks.soak import Trend, end_rows, lasting_range, memory_trend, warm_up_s
 
 GOOD: dict[str, Any] = {
     "missing_samples": 0,

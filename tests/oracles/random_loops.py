@@ -1,0 +1,93 @@
+"""Random time-triggered loops whose growth under losses is at a chosen distance from 1."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import block_diag, solve_continuous_are
+
+from cosim.analysis.margin_search import read_guarantee
+from cosim.cli.options import find_scenario
+from noack.core.linear_systems import Matrix
+from noack.guarantee.loss_guarantee import LossGuarantee
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import load, validate
+from noack.theory.margins.exact_matrices import IntervalMatrix, exactly
+from noack.theory.margins.loss_margin import LossMargin
+from noack.theory.margins.switched_system import SwitchedSystem, find_cycle
+
+GUARANTEES = ("M", "(m, K)", "M, recovery", "(m, K), recovery")
+
+
+class RandomLoop(NamedTuple):
+    """A loop whose growth has been scaled to a chosen distance from 1."""
+
+    margin: LossMargin
+    guarantee: LossGuarantee
+    kind: str
+    growth: float
+    """The growth of the worst pattern that a search of its own found, after scaling."""
+    scale: float
+    """s."""
+
+
+def _matrices(rng: np.random.Generator, largest: int) -> tuple[Matrix, Matrix, Matrix]:
+    n, m = int(rng.integers(1, largest + 1)), int(rng.integers(1, largest // 2 + 1))
+    A, B = rng.normal(size=(n, n)), rng.normal(size=(n, m))
+    K = -B.T @ solve_continuous_are(A, B, np.eye(n), np.eye(m))
+    return A, B, K
+
+
+def random_loop(seed: int) -> RandomLoop:
+    """Return the loop with a number: linear-quadratic regulators of random plants.
+
+    One of six consists of two loops that do not influence each other. The maps between deliveries
+    are multiplied by s^duration, so that the worst pattern's growth is 10^-3 to 0.1
+    above 1, or below for three of four.
+    """
+    rng = np.random.default_rng([seed, 43])
+    # The plant, its regulator, and how it is sampled.
+    if rng.random() < 1 / 6:
+        both = zip(_matrices(rng, 2), _matrices(rng, 2), strict=True)
+        A, B, K = (block_diag(nominal, other) for nominal, other in both)
+    else:
+        A, B, K = _matrices(rng, 4)
+    mode, step_s = ("model", "zoh")[seed % 2], 0.02
+    period_s = step_s * int(rng.integers(2, 21))
+    delay_s = 0.0 if rng.random() < 0.7 else 0.4 * step_s
+    content = load(find_scenario("double_integrator")).model_dump(mode="json", exclude_none=True)
+    content |= {
+        "mode": mode,
+        "model": {"A": A.tolist(), "B": B.tolist(), "gain": K.tolist()},
+        "plant": {"initial_state": [1.0] * len(A), "rate_hz": 1 / step_s},
+        "controller": {"rate_hz": 1 / step_s},
+        "trigger": {"policy": "periodic", "period_s": period_s},
+    }
+    content["network"]["impairments"] = [{"kind": "delay", "delay_s": delay_s}] * (delay_s > 0)
+    margin = LossMargin(resolve(validate(content, f"loop {seed}")))
+    # The guarantee: M, with a limit in a window, and with deliveries between bursts, in turn.
+    number = seed // 2 % len(GUARANTEES)
+    burst = int(rng.integers(1, 8))
+    words = f"mansd {burst}"
+    if number % 2:
+        words += f" atmost {rng.integers(1, burst + 2)} in {burst + rng.integers(2, 6)}"
+    if number >= 2:
+        words += f" recover {rng.integers(2, 4)}"
+    guarantee = read_guarantee(words)
+    # The growth of the worst pattern, scaled to a distance from 1.
+    distance = 10 ** rng.uniform(-3, -1)
+    wanted = 1 + distance if rng.random() < 0.25 else 1 - distance
+    scale = wanted / _fastest(margin, guarantee)
+    original = margin.maps
+
+    def scaled(slot: int, usable_ns: int, losses: int) -> IntervalMatrix:
+        matrix = original(slot, usable_ns, losses)
+        return matrix @ exactly(np.eye(len(matrix.middle[0])) * scale ** (losses + 1))
+
+    margin.maps = scaled
+    return RandomLoop(margin, guarantee, f"{mode}, {GUARANTEES[number]}", wanted, scale)
+
+
+def _fastest(margin: LossMargin, guarantee: LossGuarantee) -> float:
+    system = SwitchedSystem.of(margin.edges(margin.bursts(guarantee)))
+    parts = [system.at(numbers).balanced() for numbers in system.graph.strongly_connected()]
+    return max(find_cycle(part, 30, 200).growth for part in parts)
