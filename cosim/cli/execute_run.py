@@ -266,6 +266,6 @@ def execute_campaign(
         lambda: start(print_line),
         draws=draws,
         figure_files=figure_files,
-        show=console.status,
+        show=progress.activity,
         bar=progress.runs_bar(console),
     )

@@ -114,7 +114,7 @@ def margin(
     if play and json:
         raise CallerError("--play: has an output of its own; leave out --json")
     resolved = resolution.resolve(source.load())
-    with cli.status("examining") as status:
+    with cli.status("examining") as change:
         result = margin_search.find_margin(
             resolved,
             most_m=most,
@@ -122,7 +122,7 @@ def margin(
             with_period=period,
             guarantees=guarantee or (),
             effort=effort,
-            progress=lambda text: status.update(f"examining {text}"),
+            progress=lambda text: change(f"examining {text}"),
         )
     cli.show(json, result.to_json, certificate_report.print_margin, result)
     cli.write_tables(certificate_report.margin_tables(result), tables, json=json)
@@ -210,7 +210,7 @@ def adversary(
     conditions = adversary_search.conditions_of(resolved, continuous=continuous)
     certificate = scenario_certificates.certify(resolved, conditions)
     kinds, is_all = adversary_search.Objective, objective is AdversaryAim.ALL
-    with progress.search_status() as report:
+    with progress.search_activity() as report:
         worst_cases = [
             adversary_search.find_worst(
                 resolved,
