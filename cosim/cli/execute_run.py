@@ -211,7 +211,7 @@ def finalize_run(ending: "run_directory.RunEnding", options: OutputOptions) -> i
         with cli.status(_COMPLETING):
             outcome = finalize.finalize(ending, report=options.report)
     except KeyboardInterrupt as error:
-        error.add_note(f"`noack summary {ending.run_dir}` completes its record")
+        error.add_note(run_directory.how_to_complete(ending.run_dir))
         raise
     run_watcher.log_end(outcome.status, outcome.reason, outcome.run_dir)
     document, text = outcome.summary.to_json, terminal_output.print_outcome
