@@ -259,6 +259,12 @@ def execute_campaign(
     def print_line(line: str) -> None:
         console.print(f"noack: {line}", highlight=False, markup=False, soft_wrap=True)
 
+    shown = draws or plan.draws
+    if (earlier := campaign_report.replaced_draws(folder, shown)) is not None:
+        print_line(
+            f"{folder}: page and summary will be those of the first {shown:,} draws; the runs of all "
+            f"{earlier:,} are kept, and --draws {earlier} writes page and summary of them again"
+        )
     return campaign_report.finish_campaign(
         plan,
         path,
