@@ -163,12 +163,8 @@ def warn_of_violations(loaded: "scenario.Scenario") -> None:
     for section in scenario.loop_sections(loaded):
         prefix = f"{section.name}: " if shares else ""
         resolved = resolution.resolve(scenario.loop_scenario(loaded, section))
-        for assumption in assumptions.assumptions(resolved):
-            is_violated = assumption.verdict == assumptions.AssumptionStatus.VIOLATED
-            if is_violated and assumption.source == "Theorem 2":
-                print(
-                    f"noack: warning: {prefix}violated: {assumption.what}: {assumption.why}", file=sys.stderr
-                )
+        for line in assumptions.violations_of_theorem_2(resolved):
+            print(f"noack: warning: {prefix}{line}", file=sys.stderr)
 
 
 def warn_of_left_out(loaded: "scenario.Scenario") -> None:
