@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 _PLAIN_LINES = 10
 """Progress lines of a run on a terminal that cannot redraw a line."""
-_LINE_EVERY_S = 5.0
+_LINE_EVERY_S = 10.0
 """Time between two lines about some work, if there is no terminal."""
 _LEAST_SHARE = 0.1
 """Of the work, from which on the remaining time is estimated: the first tries may take longer."""

@@ -106,10 +106,10 @@ def test_long_work_prints_its_share_and_the_remaining_time_as_lines_without_a_te
     for lines in (True, False):
         with work_bar("trying gains", lines=lines) as show:
             for share in (0.1, 0.2, 0.25, 1.0):
-                now_s[0] += 3
+                now_s[0] += 6
                 show(share)
         text = capsys.readouterr().err
-        assert text == lines * "noack: trying gains: 20 % after 6 s, about 24 s left\n"
+        assert text == lines * "noack: trying gains: 20 % after 12 s, about 48 s left\n"
 
 
 def test_what_a_command_does_is_printed_as_lines_without_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
