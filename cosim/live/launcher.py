@@ -84,16 +84,14 @@ def launch(
 
     Raises:
         CallerError, MachineError: the run could not be prepared.
-        NeverStartedError: the run ended before all processes were ready.
-        StopRequestError: a second signal came while the processes were ending.
+        NeverStartedError, StopRequestError: not all processes were ready; a second signal came.
     """
     began_ns = time.monotonic_ns()
     with contextlib.ExitStack() as stack:
         server = server or stack.enter_context(fork_server())
         resolved = _prepare(scenario, runs, spawn, across_hosts=listening is not None)
-        signals = stack.enter_context(Signals().handled())
         run_dir = new_run_dir(runs, resolved.name)
-        stack.enter_context(_record_named(run_dir, signals))
+        signals = stack.enter_context(_stop_signals(run_dir))
         resolved = write_scenario(resolved, run_dir)
         descriptor = new_descriptor(resolved, run_dir.resolve(), launched=True)
         stack.enter_context(active_run(run_dir))
@@ -167,16 +165,17 @@ def _no_directory_if_refused(run_dir: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _record_named(run_dir: Path, signals: Signals) -> Iterator[None]:
-    """Say where the incomplete record is, if a second signal ends the launcher at once."""
-    try:
-        yield
-    except SystemExit:
-        if signals.received is None:
-            raise
-        error = StopRequestError(signals.received)
-        error.add_note(how_to_complete(run_dir))
-        raise error from None
+def _stop_signals(run_dir: Path) -> Iterator[Signals]:
+    """Handle signals; if a second one ends the launcher, say where the incomplete record is."""
+    with Signals().handled() as signals:
+        try:
+            yield signals
+        except SystemExit:
+            if signals.received is None:
+                raise
+            error = StopRequestError(signals.received)
+            error.add_note(how_to_complete(run_dir))
+            raise error from None
 
 
 def _publish_run(stack: contextlib.ExitStack, descriptor: RunDescriptor, session: str | None) -> None:

@@ -1,6 +1,8 @@
 """``noack certify``, ``margin``, ``adversary``, ``cost``: all losses, bad ones, random ones."""
 
+from collections.abc import Callable, Iterable
 from enum import StrEnum
+from functools import partial
 from typing import Annotated
 
 import typer
@@ -222,24 +224,20 @@ def adversary(
     certificate = scenario_certificates.certify(resolved, conditions)
     kinds, is_all = adversary_search.Objective, objective is AdversaryAim.ALL
     aims = list(kinds) if is_all else [kinds(objective.value)]
-    worst_cases, stopped = [], None
     with progress.search_activity() as report:
-        try:
-            for aim in aims:
-                worst = adversary_search.find_worst(
-                    resolved,
-                    aim,
-                    continuous=continuous,
-                    most_nodes=nodes,
-                    beam=beam,
-                    certificate=certificate,
-                    report=report(aim.value),
-                )
-                worst_cases.append(worst)
-        except StopRequestError as stop:
-            if not worst_cases:
-                raise
-            stopped = stop
+        worst_cases, stopped = _until_stopped(
+            partial(
+                adversary_search.find_worst,
+                resolved,
+                aim,
+                continuous=continuous,
+                most_nodes=nodes,
+                beam=beam,
+                certificate=certificate,
+                report=report(aim.value),
+            )
+            for aim in aims
+        )
     results = worst_cases, resolved, certificate, trigger.value
     cli.show(json, lambda: worst_run.document(*results), worst_run.print_worst, *results)
     if stopped is not None:
@@ -247,3 +245,22 @@ def adversary(
         print_to_stderr(f"noack: {stopped}; missing: {missing}")
         return stopped.exit_status
     return ExitStatus.FAILED if any(worst.breaches for worst in worst_cases) else ExitStatus.OK
+
+
+def _until_stopped(
+    searches: "Iterable[Callable[[], worst_run.WorstRun]]",
+) -> "tuple[list[worst_run.WorstRun], StopRequestError | None]":
+    """Run searches; return the results until a signal came, and the signal.
+
+    Raise StopRequestError if there is no result.
+    """
+    worst_cases: list[worst_run.WorstRun] = []
+    try:
+        for search in searches:
+            worst = search()
+            worst_cases.append(worst)
+    except StopRequestError as stop:
+        if not worst_cases:
+            raise
+        return worst_cases, stop
+    return worst_cases, None
