@@ -82,7 +82,7 @@ def certify(
 @cli.command(
     cli.THEORY,
     30,
-    takes="some seconds for a periodic sensor; minutes where events may be at many times, as with deadline",
+    takes="some seconds; minutes where the times of events vary, as with a deadline",
 )
 def margin(
     context: typer.Context,
@@ -183,8 +183,7 @@ class AdversaryAim(StrEnum):
 @cli.command(
     cli.THEORY,
     20,
-    takes="some 20 s for lane_following, of which all patterns are tried; with more patterns than "
-    "--nodes allows, about 20 s for each objective on an idle core",
+    takes="some 20 s if all patterns can be tried; otherwise about as long for each objective",
 )
 def adversary(
     source: opt.OneLoopOptions,
