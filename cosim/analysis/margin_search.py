@@ -336,7 +336,7 @@ def find_margin(
     caps: list[LossCap] = []
     every_m = False
     for m in range(1, most_m + 1):
-        caps.append(LossCap(m, examine(capped(other_rules, m - 1), f"M = {m}")))
+        caps.append(LossCap(m, examine(capped(other_rules, m - 1), f"M = {m} of at most {most_m}")))
         every_m = other_rules.longest_burst is not None and other_rules.longest_burst < m
         if every_m or caps[-1].stability.verdict == "destabilised":
             break
@@ -403,7 +403,7 @@ def find_longest_period(resolved: Scenario, progress: MarginProgress = lambda te
     examined: dict[int, Stability] = {}
 
     def is_stable(steps: int) -> bool:
-        progress(f"period {steps * step_ns / NS_PER_S:g} s")
+        progress(f"the longest period: {steps * step_ns / NS_PER_S:g} s")
         examined[steps] = LossMargin(resolved, steps * step_ns).coarse_bounds()
         return examined[steps].verdict == "stable"
 

@@ -38,7 +38,6 @@ with lazy_modules():
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.status import Status
     from typer._click.core import Command, Context, Parameter
     from typer._click.formatting import HelpFormatter
 
@@ -391,9 +390,9 @@ def console() -> "Console":
     return Console()
 
 
-def status(activity: str) -> "AbstractContextManager[Status]":
-    """Show within the context what a command is doing, on a terminal only."""
-    return progress.error_console().status(activity)
+def status(activity: str) -> "AbstractContextManager[Callable[[str], None]]":
+    """Show within the context what a command is doing; the result replaces it."""
+    return progress.activity(activity)
 
 
 def write_tables(tables: "Iterable[result_tables.ResultTable]", folder: Path | None, *, json: bool) -> None:

@@ -163,12 +163,8 @@ def warn_of_violations(loaded: "scenario.Scenario") -> None:
     for section in scenario.loop_sections(loaded):
         prefix = f"{section.name}: " if shares else ""
         resolved = resolution.resolve(scenario.loop_scenario(loaded, section))
-        for assumption in assumptions.assumptions(resolved):
-            is_violated = assumption.verdict == assumptions.AssumptionStatus.VIOLATED
-            if is_violated and assumption.source == "Theorem 2":
-                print(
-                    f"noack: warning: {prefix}violated: {assumption.what}: {assumption.why}", file=sys.stderr
-                )
+        for line in assumptions.violations_of_theorem_2(resolved):
+            print(f"noack: warning: {prefix}{line}", file=sys.stderr)
 
 
 def warn_of_left_out(loaded: "scenario.Scenario") -> None:
@@ -211,7 +207,7 @@ def finalize_run(ending: "run_directory.RunEnding", options: OutputOptions) -> i
         with cli.status(_COMPLETING):
             outcome = finalize.finalize(ending, report=options.report)
     except KeyboardInterrupt as error:
-        error.add_note(f"`noack summary {ending.run_dir}` completes its record")
+        error.add_note(run_directory.how_to_complete(ending.run_dir))
         raise
     run_watcher.log_end(outcome.status, outcome.reason, outcome.run_dir)
     document, text = outcome.summary.to_json, terminal_output.print_outcome
@@ -259,6 +255,12 @@ def execute_campaign(
     def print_line(line: str) -> None:
         console.print(f"noack: {line}", highlight=False, markup=False, soft_wrap=True)
 
+    shown = draws or plan.draws
+    if (earlier := campaign_report.replaced_draws(folder, shown)) is not None:
+        print_line(
+            f"{folder}: page and summary will be those of the first {shown:,} draws; the runs of all "
+            f"{earlier:,} are kept, and --draws {earlier} writes page and summary of them again"
+        )
     return campaign_report.finish_campaign(
         plan,
         path,
@@ -266,6 +268,6 @@ def execute_campaign(
         lambda: start(print_line),
         draws=draws,
         figure_files=figure_files,
-        show=console.status,
+        show=progress.activity,
         bar=progress.runs_bar(console),
     )

@@ -25,6 +25,7 @@ from netem.shell import process
 from noack.core.errors import ExitStatus, NoackError
 from noack.core.system_processes import python_command
 from noack.protocol.roles import LOOP_ROLES
+from noack.runtime.command_line import StopRequestError
 from noack.runtime.control_messages import RunProgress, parse_message
 
 if TYPE_CHECKING:
@@ -208,7 +209,7 @@ def main() -> int:
         from cosim.output.run_verdict import verdict
 
         outcome = finalize(ending, report=False)
-    except NoackError as error:
+    except (NoackError, StopRequestError) as error:
         _report("error", text=str(error))
         return error.exit_status
     _report(

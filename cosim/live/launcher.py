@@ -30,6 +30,7 @@ from cosim.record.run_directory import (
     PROCESSES_FILE,
     EndingFile,
     active_run,
+    how_to_complete,
     new_run_dir,
     point_to_latest,
     write_environment,
@@ -40,7 +41,7 @@ from noack.core.file_access import write_whole
 from noack.protocol.roles import PLANT, RECORDER, ROLES
 from noack.runtime.active_runs import registered_run, run_name
 from noack.runtime.address import address_text
-from noack.runtime.command_line import Signals, stop_reason
+from noack.runtime.command_line import Signals, StopRequestError, stop_reason
 from noack.runtime.life_cycle import HORIZON
 from noack.runtime.run_descriptor import RunDescriptor, descriptor_file, invitation_file, new_descriptor
 from noack.scenario.resolution import resolve_run, resolved_loops
@@ -83,14 +84,14 @@ def launch(
 
     Raises:
         CallerError, MachineError: the run could not be prepared.
-        NeverStartedError: the run ended before all processes were ready.
+        NeverStartedError, StopRequestError: not all processes were ready; a second signal came.
     """
     began_ns = time.monotonic_ns()
     with contextlib.ExitStack() as stack:
         server = server or stack.enter_context(fork_server())
         resolved = _prepare(scenario, runs, spawn, across_hosts=listening is not None)
-        signals = stack.enter_context(Signals().handled())
         run_dir = new_run_dir(runs, resolved.name)
+        signals = stack.enter_context(_stop_signals(run_dir))
         resolved = write_scenario(resolved, run_dir)
         descriptor = new_descriptor(resolved, run_dir.resolve(), launched=True)
         stack.enter_context(active_run(run_dir))
@@ -161,6 +162,20 @@ def _no_directory_if_refused(run_dir: Path) -> Iterator[None]:
     except NoackError:
         shutil.rmtree(run_dir, ignore_errors=True)
         raise
+
+
+@contextlib.contextmanager
+def _stop_signals(run_dir: Path) -> Iterator[Signals]:
+    """Handle signals; if a second one ends the launcher, say where the incomplete record is."""
+    with Signals().handled() as signals:
+        try:
+            yield signals
+        except SystemExit:
+            if signals.received is None:
+                raise
+            error = StopRequestError(signals.received)
+            error.add_note(how_to_complete(run_dir))
+            raise error from None
 
 
 def _publish_run(stack: contextlib.ExitStack, descriptor: RunDescriptor, session: str | None) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
-from cosim.live.monitoring.progress import error_console
+from cosim.live.monitoring.progress import activity
 from cosim.measurement.certificate_time import CertificateTime
 from cosim.measurement.interval_estimates import LEVEL, IntervalEstimate
 from cosim.measurement.loss_bursts import histogram, most_losses
@@ -66,7 +66,7 @@ def report(
     Raises:
         NoackError: one line; a file cannot be written, or the scenario cannot be resolved.
     """
-    with error_console().status("measuring"):
+    with activity("measuring"):
         void = None if request.scenario is None else measurement.certificate_time(request.scenario)
         document = measurement.to_json()
     if console is not None:

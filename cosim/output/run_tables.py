@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from cosim.analysis.fidelity import is_against
+from cosim.analysis.fidelity import Fidelity, SignalDifference, is_against
 from cosim.analysis.summary.plant_linearisation import linearisation_rows
 from cosim.analysis.summary.summary_model import (
     ChangePart,
@@ -450,3 +450,51 @@ def loop_row(loop: LoopSummary) -> tuple[str, ...]:
         number(loop.sup_e_c_norm),
         ", ".join([held_text, *worse]),
     )
+
+
+# The ideal loop
+
+
+def fidelity_tables(fidelity: Fidelity) -> Iterator[ResultTable]:
+    """Yield the effects from the ideal loop to the run, and their RMS by state."""
+    headings = ("effect", "RMS", "max", "share", "events", "Δt, ms", "split at event")
+    stages = [
+        (
+            stage.name,
+            *_sizes(stage.difference),
+            percent(stage.share),
+            str(stage.events),
+            _milliseconds(stage.max_event_difference_s),
+            _event(stage.first_different_event),
+        )
+        for stage in fidelity.stages
+    ]
+    total = (
+        "total",
+        *_sizes(fidelity.total),
+        "100.0 %",
+        str(fidelity.events_live),
+        _milliseconds(fidelity.max_event_difference_s),
+        _event(fidelity.first_different_event),
+    )
+    ideal = ("(ideal loop)", "", "", "", str(fidelity.events_ideal), "", "")
+    caption = f"{fidelity.scenario}: difference in x to the ideal loop"
+    differences = [(stage.name, stage.difference) for stage in fidelity.stages]
+    by_state = [
+        (name, *(f"{value:.2e}" for value in difference.rms_by_state))
+        for name, difference in [*differences, ("total", fidelity.total)]
+    ]
+    yield ResultTable("effects", caption, headings, [ideal, *stages, total])
+    yield ResultTable("by-state", "RMS by state", ("effect", *fidelity.state_names), by_state)
+
+
+def _sizes(difference: SignalDifference) -> tuple[str, str]:
+    return f"{difference.rms:.2e}", f"{difference.max:.2e}"
+
+
+def _milliseconds(value_s: float | None) -> str:
+    return NONE if value_s is None else f"{1e3 * value_s:.1f}"
+
+
+def _event(number: int | None) -> str:
+    return NONE if number is None else f"{number}"

@@ -16,13 +16,14 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from cosim.analysis.fidelity import Fidelity, SignalDifference
+from cosim.analysis.fidelity import Fidelity
 from cosim.analysis.summary.run_summary import Outcome
 from cosim.analysis.summary.summary_model import AssumptionPart, Claim, LoopSummary, RunSummary
 from cosim.output.result_tables import KEY_VALUE, ResultTable, terminal_table
 from cosim.output.run_tables import (
     LOOPS_CAPTION,
     badness,
+    fidelity_tables,
     loops_table,
     network_rows,
     run_title,
@@ -32,7 +33,6 @@ from cosim.output.run_tables import (
 )
 from cosim.output.run_verdict import Tone, VerdictLine, remarks, verdict
 from cosim.record.run_directory import RECORDING_FILE, REPORT_FILE, file_of_loop
-from noack.core.number_format import NONE, percent
 from noack.theory.certificates.assumptions import Assumption, AssumptionStatus
 
 _GOOD, _DOUBTFUL, _BAD = "green", "yellow", "bold red"
@@ -204,37 +204,7 @@ def print_assumptions(console: Console, assumptions: Sequence[Assumption | Assum
 
 def print_fidelity(console: Console, fidelity: Fidelity) -> None:
     """Print the effects from the ideal loop to the run, and the verdict."""
-    headings = ("effect", "RMS", "max", "share", "events", "Δt, ms", "split at event")
-    stages = [
-        (
-            stage.name,
-            *_sizes(stage.difference),
-            percent(stage.share),
-            str(stage.events),
-            _milliseconds(stage.max_event_difference_s),
-            _event(stage.first_different_event),
-        )
-        for stage in fidelity.stages
-    ]
-    total = (
-        "total",
-        *_sizes(fidelity.total),
-        "100.0 %",
-        str(fidelity.events_live),
-        _milliseconds(fidelity.max_event_difference_s),
-        _event(fidelity.first_different_event),
-    )
-    ideal = ("(ideal loop)", "", "", "", str(fidelity.events_ideal), "", "")
-    caption = f"{fidelity.scenario}: difference in x to the ideal loop"
-    differences = [(stage.name, stage.difference) for stage in fidelity.stages]
-    by_state = [
-        (name, *(f"{value:.2e}" for value in difference.rms_by_state))
-        for name, difference in [*differences, ("total", fidelity.total)]
-    ]
-    for table in (
-        ResultTable("effects", caption, headings, [ideal, *stages, total]),
-        ResultTable("by-state", "RMS by state", ("effect", *fidelity.state_names), by_state),
-    ):
+    for table in fidelity_tables(fidelity):
         console.print(terminal_table(table))
     console.print(
         "Each row adds one effect to the rows above. RMS, max: of the norm, in model units. Δt: "
@@ -246,18 +216,6 @@ def print_fidelity(console: Console, fidelity: Fidelity) -> None:
     )
     colour = "green" if fidelity.explained else "bold red"
     console.print(f"[{colour}]{escape(fidelity.verdict)}[/]", highlight=False)
-
-
-def _sizes(difference: SignalDifference) -> tuple[str, str]:
-    return f"{difference.rms:.2e}", f"{difference.max:.2e}"
-
-
-def _milliseconds(value_s: float | None) -> str:
-    return NONE if value_s is None else f"{1e3 * value_s:.1f}"
-
-
-def _event(number: int | None) -> str:
-    return NONE if number is None else f"{number}"
 
 
 def _where(outcome: Outcome, *, verbose: bool) -> Iterator[str]:

@@ -129,6 +129,11 @@ def write_scenario(scenario: "Scenario", run_dir: Path) -> "Scenario":
     return scenario_in(f"{run_dir.absolute()}/")
 
 
+def how_to_complete(run_dir: Path) -> str:
+    """Return what to do about a run whose end was interrupted."""
+    return f"its record is incomplete: `noack summary {run_dir}` completes it"
+
+
 def read_object(path: Path) -> dict[str, Any]:
     """Return the object of a JSON file of a run; empty if the file is missing or damaged."""
     try:

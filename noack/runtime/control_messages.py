@@ -97,13 +97,16 @@ class ChangeReply(ControlMessage):
     run_dir: str
     t_s: FiniteFloat
     from_s: FiniteFloat | None
-    """Simulated time from which the change applies; None if none was requested."""
+    """Simulated time from which the change applies; None if none was requested, or the values are in
+    force already."""
     runtime_parameters: Table
     """Values by scenario key, all announced changes included."""
     loops: dict[str, Table]
     """The same for the loops of each entry of [[loops]], by its name."""
     changed_loops: tuple[str, ...]
     """The entries with another value than before the request."""
+    warnings: tuple[str, ...] = ()
+    """The assumptions of the theory that the change violates."""
 
 
 class RunStart(ControlMessage):

@@ -134,6 +134,10 @@ class ScenarioTables(ScenarioSection):
 
     @property
     def decaying(self) -> DecayingSettings:
+        """The trigger, if it is the paper's; raise CallerError for another policy."""
+        return self.require_decaying()
+
+    def require_decaying(self) -> DecayingSettings:
         """Return the trigger, if it is the paper's; raise CallerError for another policy."""
         if not isinstance(self.trigger, DecayingSettings):
             raise CallerError(

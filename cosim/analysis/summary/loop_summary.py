@@ -58,7 +58,7 @@ def summarise_loop(
     """Return the summary of a loop, without the results of replay, fidelity and claims.
 
     ``exit_status`` and ``reason`` are those of the run; the loop may have failed nevertheless. The
-    assumptions of its scenario may be known: ``assumed``.
+    assumptions of its scenario at the start may be known: ``assumed``.
     """
     scenario, live = record.scenario, record.kind == "live"
     missing, lost, diverged = missing_rows(record), unintended_losses(record), _divergence(record)
@@ -77,7 +77,7 @@ def summarise_loop(
         actuations=flow_outcome(record, Flow.ACTUATION),
         **signals.for_summary(),
         assumption_violations=reported_violations(record),
-        assumptions=[AssumptionPart(**status._asdict()) for status in assumed or assumptions(scenario)],
+        assumptions=_assumptions(record, assumed or assumptions(scenario)),
         restarts=_restarts(record),
         changes=change_parts(record),
         missing_samples=sum(missing.values()),
@@ -197,6 +197,16 @@ def _divergence(record: RunRecord) -> Divergence | None:
             text = f"the plant failed at {diverged.at_s:g} s: {notice['text']}"
             return diverged._replace(text=text)
     return diverged
+
+
+def _assumptions(record: RunRecord, at_start: Sequence[Assumption]) -> list[AssumptionPart]:
+    """Return the paper's assumptions; of those after a change of settings, the ones that differ."""
+    shown, latest = [*at_start], at_start
+    for change in changes_of(record):
+        since = f"from {change.change.t_ns / NS_PER_S:.3f} s on: "
+        before, latest = latest, assumptions(change.scenario)
+        shown += [status._replace(what=since + status.what) for status in latest if status not in before]
+    return [AssumptionPart(**status._asdict()) for status in shown]
 
 
 def change_parts(record: RunRecord) -> list[ChangePart]:

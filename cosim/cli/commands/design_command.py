@@ -272,7 +272,7 @@ def _trigger_of(
     seed: int,
 ) -> "design_search.DesignResult":
     """Choose the trigger with the fewest transmissions that meets the limits."""
-    loaded.decaying  # noqa: B018 - raises for another policy
+    loaded.require_decaying()
     norms = [norm.strip() for norm in weights.split(",") if norm.strip()]
     with progress.work_bar("choosing norms", lines=True) as bar:
         families = design_space.families_of(loaded, norms, feedback.regulator(loaded), bar)

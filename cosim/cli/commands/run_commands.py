@@ -22,6 +22,7 @@ from cosim.lazy_modules import lazy_modules
 from cosim.record.run_directory import DEFAULT_RUNS
 from noack.core.errors import CallerError
 from noack.core.number_format import number
+from noack.runtime.command_line import print_to_stderr
 
 with lazy_modules():
     from cosim.analysis.summary import summary_model
@@ -282,13 +283,18 @@ def set_(
     """
     changes = parse_settings(settings or ())
     answer = active_runs.request_change(active_runs.find_run(session, run), changes)
+    for line in answer.warnings:
+        print_to_stderr(f"noack: warning: {line}")
     if json:
         cli.print_json(answer.fields())
     elif changes:
         loops, entries = answer.changed_loops, answer.loops
         suffix = "" if len(entries) == 1 else f"; changed: {', '.join(loops) or 'no loop'}"
         text = runtime_parameters.text_of(changes)
-        print(f"{answer.name}: {text} from {answer.from_s or 0.0:.3f} s on{suffix}")
+        if answer.from_s is None:
+            print(f"{answer.name}: in force already: {text}")
+        else:
+            print(f"{answer.name}: {text} from {answer.from_s:.3f} s on{suffix}")
     else:
         _print_parameters(cli.console(), answer)
 

@@ -392,13 +392,13 @@ def new(
         raise CallerError(f"{file}: exists; give another name, or remove it first")
     if not file.parent.is_dir():
         raise CallerError(f"{file}: there is no folder {file.parent}")
-    with cli.status("linearising") as status:
+    with cli.status("linearising") as change:
         result = new_scenario.new(
             plant,
             file,
             initial_state=_numbers("--x0", x0),
             settings=_settings(settings),
-            report=status.update,
+            report=change,
         )
     result.save(file)
     following = f"wrote {file}; now noack check, certify, simulate or run {file}"

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
+from cosim.lazy_modules import lazy_modules
 from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import CallerError, PeerError
 from noack.core.system_processes import cores
@@ -42,9 +43,13 @@ from noack.scenario.parameter_changes import (
     current_parameters,
     scheduled,
 )
+from noack.scenario.resolution import resolve
 from noack.scenario.scenario import loop_scenario, loop_sections
 from noack.scenario.scenario_tables import MOST_CHANGES
-from noack.settings.section import Table
+from noack.settings.section import ReadTable, Table
+
+with lazy_modules():
+    from noack.theory.certificates import assumptions
 
 _RESTART_DELAY_S = 0.3
 """Wall time from the admission of a restarted process to its first deadline."""
@@ -376,6 +381,15 @@ def _payload(query: zenoh.Query) -> bytes:
     return b"" if query.payload is None else query.payload.to_bytes()
 
 
+def _is_new(settings: ReadTable, schedule: ChangeSchedule[None], now_ns: int) -> bool:
+    """Return whether settings differ from those in force, or another change is still to come.
+
+    Raise CallerError if the settings are not valid.
+    """
+    before, after = (current_parameters(of) for of in (schedule.last, changed(schedule.last, settings)))
+    return before != after or schedule.at(now_ns).scenario is not schedule.last
+
+
 class ChangeRequests:
     """The changes of a run."""
 
@@ -401,25 +415,17 @@ class ChangeRequests:
         """
         settings = parse_message(ChangeRequest, request).settings
         from_s, now_ns, before = None, clock(), self._parameters()
+        warnings: list[str] = []
         if settings:
             if obstacle is not None:
                 raise CallerError(obstacle)
-            if len(self.announced) >= MOST_CHANGES:
-                raise CallerError(f"this run has had {MOST_CHANGES} changes, the maximum")
             # Before the time is chosen, as it may take long.
-            for schedule in self._schedules:
-                changed(schedule.last, settings)
-            now_ns = clock()
-            delay_ns = int(_CHANGE_DELAY_S * NS_PER_S * self._scenario.speed)
-            t_ns = -(-max(now_ns + delay_ns, 0) // _MILLISECOND_NS) * _MILLISECOND_NS
-            if t_ns >= self._scenario.timing.horizon_ns:
-                raise CallerError(
-                    f"the run ends at {self._scenario.horizon_s:g} s, before a change could apply"
-                )
-            change = ParameterChange(len(self.announced), t_ns, settings)
-            requested_at = datetime.now(UTC).isoformat(timespec="milliseconds")
-            self._plane.announce_change(self._add(change, now_ns, requested_at))
-            from_s = t_ns / NS_PER_S
+            are_new = [_is_new(settings, schedule, now_ns) for schedule in self._schedules]
+            if any(are_new):
+                violated_before = self._violations()
+                now_ns = clock()
+                from_s = self._announce(settings, now_ns) / NS_PER_S
+                warnings = [line for line in self._violations() if line not in violated_before]
         loops = self._parameters()
         return ChangeReply(
             name=self._scenario.name,
@@ -429,7 +435,34 @@ class ChangeRequests:
             runtime_parameters=current_parameters(self._schedule.last),
             loops=loops,
             changed_loops=tuple(name for name in loops if loops[name] != before[name]),
+            warnings=tuple(warnings),
         )
+
+    def _announce(self, settings: ReadTable, now_ns: int) -> int:
+        """Announce a change; return the time from which it applies.
+
+        Raise CallerError if it is not valid for this run, or comes too late.
+        """
+        if len(self.announced) >= MOST_CHANGES:
+            raise CallerError(f"this run has had {MOST_CHANGES} changes, the maximum")
+        delay_ns = int(_CHANGE_DELAY_S * NS_PER_S * self._scenario.speed)
+        t_ns = -(-max(now_ns + delay_ns, 0) // _MILLISECOND_NS) * _MILLISECOND_NS
+        if t_ns >= self._scenario.timing.horizon_ns:
+            raise CallerError(f"the run ends at {self._scenario.horizon_s:g} s, before a change could apply")
+        change = ParameterChange(len(self.announced), t_ns, settings)
+        requested_at = datetime.now(UTC).isoformat(timespec="milliseconds")
+        self._plane.announce_change(self._add(change, now_ns, requested_at))
+        return t_ns
+
+    def _violations(self) -> list[str]:
+        """Return the violated assumptions of Theorem 2, each as a line."""
+        prefixes = {name: f"{name}: " if len(self._entries) > 1 else "" for name in self._entries}
+        lines: list[str] = []
+        with suppress(Exception):  # a failed analysis must not cost the run
+            for name, schedule in self._entries.items():
+                violated = assumptions.violations_of_theorem_2(resolve(schedule.last))
+                lines += [f"{prefixes[name]}{line}" for line in violated]
+        return lines
 
     @property
     def _schedules(self) -> tuple[ChangeSchedule[None], ...]:

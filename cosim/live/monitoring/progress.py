@@ -5,14 +5,24 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Event, Thread
 from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    SpinnerColumn,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from cosim.live.monitoring.run_watcher import Watcher
 from noack.core.clock import NS_PER_S
+from noack.runtime.command_line import print_to_stderr
 from noack.runtime.control_messages import RunProgress
 from noack.runtime.run_descriptor import DEFAULT_SESSION
 from noack.scenario.scenario import Scenario, loop_names
@@ -22,8 +32,8 @@ if TYPE_CHECKING:
 
 _PLAIN_LINES = 10
 """Progress lines of a run on a terminal that cannot redraw a line."""
-_LINE_EVERY_S = 5.0
-"""Time between two lines about the completed runs, if there is no terminal."""
+_LINE_EVERY_S = 10.0
+"""Time between two lines about some work, if there is no terminal."""
 _LEAST_SHARE = 0.1
 """Of the work, from which on the remaining time is estimated: the first tries may take longer."""
 
@@ -171,7 +181,38 @@ class _SparseLines:
         now_s = time.monotonic()
         if not self._console.is_terminal and now_s - self._printed_s >= _LINE_EVERY_S:
             self._printed_s = now_s
-            self._console.print(f"noack: {line}", highlight=False, markup=False, soft_wrap=True)
+            print_to_stderr(f"noack: {line}")
+
+
+@contextmanager
+def activity(text: str) -> Iterator[Callable[[str], None]]:
+    """Show what is done and for how long, while the context lasts; yields what changes the text.
+
+    Where there is no terminal, print it as a line at intervals.
+    """
+    console = error_console()
+    columns = SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn()
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
+        task = progress.add_task(text)
+
+        def change(new_text: str) -> None:
+            nonlocal text
+            text = new_text
+            progress.update(task, description=text)
+
+        def print_lines() -> None:
+            began_s = time.monotonic()
+            while not has_ended.wait(_LINE_EVERY_S):
+                print_to_stderr(f"noack: {text}, {time.monotonic() - began_s:.0f} s")
+
+        has_ended = Event()
+        printer = Thread(target=print_lines, daemon=True)
+        if not console.is_terminal:
+            printer.start()
+        try:
+            yield change
+        finally:
+            has_ended.set()
 
 
 @contextmanager
@@ -233,19 +274,14 @@ def runs_bar(console: Console) -> Iterator[Callable[[int, int], None]]:
 
 
 @contextmanager
-def search_status() -> Iterator[Callable[[str], Callable[[str, int, float], None]]]:
-    """Show the state of an adversary's search; where there is no terminal, a line at intervals."""
-    console = error_console()
-    sparse_lines = _SparseLines(console)
-    with console.status("searching") as status:
+def search_activity() -> Iterator[Callable[[str], Callable[[str, int, float], None]]]:
+    """Show the state of an adversary's search as :func:`activity` does."""
+    with activity("searching") as change:
 
         def named(aim: str) -> Callable[[str, int, float], None]:
-            def report(search: str, nodes: int, value: float) -> None:
-                state = f"{nodes:,} segments, {abs(value):.6g} so far, {sparse_lines.spent_s:.0f} s"
-                status.update(f"worst {aim}: {search}, {state}")
-                sparse_lines.print(f"worst {aim}: {search}, {state}")
-
-            return report
+            return lambda search, nodes, value: change(
+                f"worst {aim}: {search}, {nodes:,} segments, {abs(value):.6g} so far"
+            )
 
         yield named
 

@@ -16,6 +16,7 @@ from cosim.output.figures.figure_files import save_figures
 from cosim.output.figures.figure_format import FigureFiles
 from cosim.output.page_kit import templates
 from cosim.output.result_tables import ResultTable, terminal_table
+from cosim.record.run_directory import read_object
 from cosim.studies.campaign.campaign_figures import figures
 from cosim.studies.campaign.campaign_file import Campaign
 from cosim.studies.campaign.campaign_grid import base_of, grid
@@ -55,6 +56,12 @@ def write_report(
         store.folder / RUNS,
         *save_figures(figures(summary, store), store.folder / PAGE, figure_files),
     ]
+
+
+def replaced_draws(folder: Path, draws: int) -> int | None:
+    """Return the draws of the summary in a folder, if they are more than those of the next one."""
+    earlier = read_object(folder / SUMMARY).get("draws")
+    return earlier if isinstance(earlier, int) and earlier > draws else None
 
 
 def campaign_tables(summary: CampaignSummary, *, shares: bool = False) -> Iterator[ResultTable]:

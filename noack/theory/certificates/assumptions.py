@@ -77,6 +77,15 @@ def assumptions(resolved: Scenario) -> list[Assumption]:
     return checked + _estimated(loop, resolved)
 
 
+def violations_of_theorem_2(resolved: Scenario) -> list[str]:
+    """Return the assumptions of Theorem 2 that a resolved scenario violates, each as a line."""
+    return [
+        f"violated: {assumption.what}: {assumption.why}"
+        for assumption in assumptions(resolved)
+        if assumption.verdict == AssumptionStatus.VIOLATED and assumption.source == "Theorem 2"
+    ]
+
+
 def _violated(assumed: str, source: str, why: str) -> Assumption:
     return Assumption(assumed, source, AssumptionStatus.VIOLATED, why)
 

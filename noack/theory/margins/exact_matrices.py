@@ -102,20 +102,20 @@ def inverse(matrices: Matrix) -> IntervalMatrix | None:
 
 @dataclass(frozen=True)
 class FixedPointMatrix:
-    """A matrix; each entry differs from the exact one by at most ``error``."""
+    """A matrix; each entry differs from the exact one by at most its error.
+
+    One error for all entries would grow in every product, although the products do not.
+    """
 
     entries: NDArray[np.object_]
     """Integers in units of 2⁻³⁸⁴, an array of objects."""
-    error: int = 0
-    """In the same unit."""
+    errors: NDArray[np.object_]
+    """In the same unit, of the same shape."""
 
     def __matmul__(self, other: "FixedPointMatrix") -> "FixedPointMatrix":
         """Return the product."""
-        rows = int(abs(self.entries).sum(axis=1).max())
-        columns = int(abs(other.entries).sum(axis=0).max())
-        crossed = self.error * other.error * len(other.entries)
-        error = ((rows * other.error + self.error * columns + crossed) >> _DIGITS) + 2
-        return FixedPointMatrix((self.entries @ other.entries) >> _DIGITS, error)
+        errors = abs(self.entries) @ other.errors + self.errors @ (abs(other.entries) + other.errors)
+        return FixedPointMatrix((self.entries @ other.entries) >> _DIGITS, (errors >> _DIGITS) + 2)
 
     def then(self, later: "FixedPointMatrix") -> "FixedPointMatrix":
         """Return the product that applies this matrix first, and then a later one."""
@@ -123,19 +123,17 @@ class FixedPointMatrix:
 
     def __add__(self, other: "FixedPointMatrix") -> "FixedPointMatrix":
         """Return the sum."""
-        return FixedPointMatrix(self.entries + other.entries, self.error + other.error)
+        return FixedPointMatrix(self.entries + other.entries, self.errors + other.errors)
 
     def rows(self, numbers: slice | list[int]) -> "FixedPointMatrix":
         """Return some of the rows."""
-        return FixedPointMatrix(self.entries[numbers], self.error)
+        return FixedPointMatrix(self.entries[numbers], self.errors[numbers])
 
     def interval(self) -> IntervalMatrix:
         """Return the matrix in double precision, with its error."""
-        middle = np.array(
-            [[entry / _ONE for entry in row] for row in self.entries.tolist()], dtype=np.float64
-        ).reshape(self.entries.shape)
         # A quotient of integers is rounded correctly.
-        return IntervalMatrix(middle, np.abs(middle) * 2.0**-52 + (self.error / _ONE) * (1 + 1e-9) + 1e-290)
+        middle, errors = (np.asarray(part / _ONE, np.float64) for part in (self.entries, self.errors))
+        return IntervalMatrix(middle, np.abs(middle) * 2.0**-52 + errors * (1 + 1e-9) + 1e-290)
 
 
 def fixed(matrix: Matrix) -> FixedPointMatrix:
@@ -144,13 +142,13 @@ def fixed(matrix: Matrix) -> FixedPointMatrix:
     for index, value in np.ndenumerate(matrix):
         numerator, denominator = float(value).as_integer_ratio()
         entries[index] = numerator * _ONE // denominator
-    return FixedPointMatrix(entries, 1)
+    return FixedPointMatrix(entries, np.full_like(entries, 1))
 
 
 def stacked(*parts: FixedPointMatrix) -> FixedPointMatrix:
     """Return matrices on top of each other."""
     entries = np.concatenate([part.entries for part in parts])
-    return FixedPointMatrix(entries, max(part.error for part in parts))
+    return FixedPointMatrix(entries, np.concatenate([part.errors for part in parts]))
 
 
 def exponential(generator: Matrix, dt_ns: int) -> FixedPointMatrix:
@@ -165,15 +163,15 @@ def exponential(generator: Matrix, dt_ns: int) -> FixedPointMatrix:
     halvings = max(norm.bit_length() - _DIGITS + 4, 0)
     entries = np.empty(generator.shape, dtype=object)
     entries.ravel()[:] = [value >> halvings for value in scaled]
-    step = FixedPointMatrix(entries, dt_ns // NS_PER_S + 3)
+    step = FixedPointMatrix(entries, np.full_like(entries, dt_ns // NS_PER_S + 3))
     total = term = fixed(np.eye(len(generator)))
     for order in range(1, _TAYLOR_TERMS):
         term = term @ step
-        term = FixedPointMatrix(term.entries // order, term.error // order + 2)
+        term = FixedPointMatrix(term.entries // order, term.errors // order + 2)
         total = total + term
-    total = FixedPointMatrix(total.entries, total.error + 1)
+    total = FixedPointMatrix(total.entries, total.errors + 1)
     for _ in range(halvings):
         total = total @ total
-        if max(int(abs(total.entries).max()), total.error) >> _DIGITS > _LARGEST_DOUBLE:
+        if max(abs(total.entries).max(), total.errors.max()) >> _DIGITS > _LARGEST_DOUBLE:
             raise OverflowError  # further squares would take more and more memory
     return total

@@ -246,22 +246,37 @@ class _EdgeInequalities(NamedTuple):
         """
         from scipy.sparse import coo_array  # slow to import
 
-        n, size = G.shape[1], basis.shape[1]
+        size = basis.shape[1]
         sources, targets = self.graph.sources, self.graph.targets
-
-        def products(factors: Stack) -> Stack:
-            squares = np.einsum("eij,ekl->eikjl", factors, factors)
-            return np.asarray(basis.T @ squares.reshape(-1, n * n, n * n) @ basis)
-
-        crossed = -products(mixed)
-        blocks = np.concatenate([products(G), products(carried), crossed, crossed.swapaxes(1, 2)])
-        rows = np.concatenate([sources, targets, sources, targets]) * size
-        columns = np.concatenate([sources, targets, targets, sources]) * size
+        parts: list[tuple[Stack, Numbers, Numbers]] = []
+        for factors, first, second in ((G, sources, sources), (carried, targets, targets)):
+            parts.append(_sum_by_pair(basis, factors, first, second))
+        crossed, first, second = _sum_by_pair(basis, mixed, sources, targets)
+        parts += [(-crossed, first, second), (-crossed.swapaxes(1, 2), second, first)]
+        blocks, block_rows, block_columns = map(np.concatenate, zip(*parts, strict=True))
+        rows, columns = block_rows * size, block_columns * size
         inner = np.arange(size)
         i = np.broadcast_to(rows[:, None, None] + inner[:, None], blocks.shape)
         j = np.broadcast_to(columns[:, None, None] + inner, blocks.shape)
         shape = (count * size, count * size)
         return coo_array((blocks.ravel(), (i.ravel(), j.ravel())), shape=shape).tocsc()
+
+
+def _sum_by_pair(
+    basis: Matrix, factors: Stack, first: Numbers, second: Numbers
+) -> tuple[Stack, Numbers, Numbers]:
+    """Return the sum of basisᵀ (G ⊗ G) basis over the edges between each two nodes, and the nodes.
+
+    Summed before anything else is done: many edges have the same nodes.
+    """
+    n = factors.shape[1]
+    order = np.lexsort((second, first))
+    ends = np.stack([first, second])[:, order]
+    begins = np.flatnonzero(np.any(np.diff(ends, prepend=-1), axis=0))
+    groups = np.split(factors.reshape(-1, n * n)[order], begins[1:])
+    squares = np.array([np.einsum("ea,eb->ab", group, group) for group in groups])
+    squares = squares.reshape(-1, n, n, n, n).swapaxes(2, 3).reshape(-1, n * n, n * n)
+    return basis.T @ squares @ basis, *ends[:, begins]
 
 
 def _symmetric_basis(n: int) -> Matrix:

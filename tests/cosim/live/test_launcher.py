@@ -1,5 +1,6 @@
 """Which processes the launcher restarts, when it ends the run, and the reason it reports."""
 
+import signal
 import time
 from pathlib import Path
 from queue import SimpleQueue
@@ -7,12 +8,15 @@ from typing import Any, cast
 
 import pytest
 
+import noack
+from cosim.live.finalize import reopen
 from cosim.live.launcher import _Run, launch
 from cosim.live.monitoring.run_watcher import Watcher
 from cosim.live.processes.child_processes import ChildProcesses, EndReason
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.protocol.roles import RECORDER, ROLES
-from noack.runtime.command_line import Signals
+from noack.runtime import command_line
+from noack.runtime.command_line import Signals, StopRequestError
 from noack.runtime.run_descriptor import descriptor_file, new_descriptor
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
@@ -218,3 +222,20 @@ def test_a_refused_session_leaves_no_run_directory(
     with descriptor_file(descriptor, "lab"), pytest.raises(CallerError, match="another run is open in it"):
         launch(scenario, tmp_path / "runs", spawn=(), session="lab")
     assert list((tmp_path / "runs").iterdir()) == []
+
+
+def test_after_a_second_signal_the_record_is_incomplete_and_can_be_completed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(command_line, "_ECHO_NS", -1)  # the second one may follow at once
+
+    def interrupt(_: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+    watcher = Watcher(started=interrupt, stopping=interrupt)
+    with pytest.raises(StopRequestError, match=r"stopped by the user \(SIGINT\)") as stopped:
+        launch(noack.load("double_integrator"), tmp_path, watcher=watcher)
+    (run_dir,) = (path for path in tmp_path.iterdir() if not path.is_symlink())
+    how = f"its record is incomplete: `noack summary {run_dir}` completes it"
+    assert (stopped.value.exit_status, stopped.value.__notes__) == (ExitStatus.INTERRUPTED, [how])
+    assert reopen(run_dir, view=False).status == ExitStatus.INTERRUPTED

@@ -1,10 +1,13 @@
 """``noack adversary``: the search that a policy gets, and a bound of zero."""
 
 import json
+import signal
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from cosim.analysis import adversary
 from noack.core.errors import ExitStatus
 from tests.helpers.command_line import invoke
 
@@ -46,3 +49,21 @@ def test_a_bound_of_zero_is_searched(start: str) -> None:
     assert result.exit_code == ExitStatus.OK, result.output
     for worst in json.loads(result.stdout)["worst"].values():
         assert worst["tightness"] is None or worst["tightness"] <= 1 + 1e-9
+
+
+@pytest.mark.usefixtures("usual_signals")
+def test_ctrl_c_leaves_the_finished_objectives(monkeypatch: pytest.MonkeyPatch) -> None:
+    find_worst = adversary.find_worst
+
+    def interrupted(resolved: Any, aim: adversary.Objective, **settings: Any) -> Any:
+        if aim is adversary.Objective.COST:
+            signal.raise_signal(signal.SIGINT)
+        return find_worst(resolved, aim, **settings)
+
+    monkeypatch.setattr(adversary, "find_worst", interrupted)
+    arguments = ["--horizon", "0.5", "--nodes", "100", "--beam", "0"]
+    result = invoke("adversary", "double_integrator", *arguments, "--json")
+    assert list(json.loads(result.stdout)["worst"]) == ["error", "state"]
+    line = "noack: stopped by the user (SIGINT); missing: cost, inter-event"
+    assert (result.exit_code, result.stderr.splitlines()[-1]) == (130, line)
+    assert "state: " in invoke("adversary", "double_integrator", *arguments).stdout

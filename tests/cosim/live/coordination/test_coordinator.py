@@ -10,6 +10,7 @@ import zenoh
 
 from cosim.live.coordination import coordinator
 from cosim.live.coordination.coordinator import ChangeRequests, Coordinator, TokenScope
+from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.protocol.roles import LOOP_ROLES, RECORDER, ROLES
 from noack.scenario.scenario_file import load
@@ -155,8 +156,9 @@ def requests_of(loops: str, *settings: str) -> ChangeRequests:
     return ChangeRequests(cast("Any", descriptor), cast("Any", plane))
 
 
-def requested(requests: ChangeRequests, settings: dict[str, Any]) -> dict[str, Any]:
-    return requests.answer(json.dumps({"settings": settings}).encode(), lambda: 0, None).fields()
+def requested(requests: ChangeRequests, settings: dict[str, Any], now_s: float = 0.0) -> dict[str, Any]:
+    request = json.dumps({"settings": settings}).encode()
+    return requests.answer(request, lambda: round(now_s * NS_PER_S), None).fields()
 
 
 @pytest.mark.parametrize("loops", [1, 4])
@@ -165,9 +167,26 @@ def test_every_listed_parameter_can_be_changed(loops: int) -> None:
     listed = requested(requests_of(entry), {})["runtime_parameters"]
     assert {"trigger.beta", "network.mansd", "controller.setpoint"} <= listed.keys()
     for key, value in listed.items():
-        assert requested(requests_of(entry), {key: value})["from_s"] > 0
+        assert requested(requests_of(entry), {key: value})["from_s"] is None  # it is in force already
     with pytest.raises(CallerError, match=r"plant\.rate_hz"):
         requested(requests_of(entry), {"plant.rate_hz": 100.0})
+
+
+def test_a_value_that_is_in_force_is_no_change_unless_another_one_is_to_come() -> None:
+    requests = requests_of('{ name = "p" }')  # with M − 1 = 3
+    from_s = [
+        requested(requests, {"network.mansd": mansd}, now_s)["from_s"]
+        for mansd, now_s in ((3, 0.0), (2, 0.0), (2, 0.1), (2, 1.0), (3, 1.0))
+    ]
+    assert from_s == [None, 0.2, 0.3, None, 1.2]
+    assert len(requests.announced) == 3
+
+
+def test_a_change_warns_of_the_assumptions_that_it_violates() -> None:
+    requests = requests_of('{ name = "p" }')
+    (warning,) = requested(requests, {"trigger.alpha_per_s": 5.0})["warnings"]
+    assert warning.startswith("violated: 0 < α < ᾱ: the threshold decays more slowly than the closed loop")
+    assert not requested(requests, {"network.mansd": 2})["warnings"]
 
 
 def test_a_refused_change_has_no_effect_on_the_next_one() -> None:

@@ -1,17 +1,19 @@
 """What follows a live run: callbacks, and its metrics, read while it goes on."""
 
 import json
+import re
 import socket
 import threading
 import urllib.error
 from contextlib import ExitStack
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 import pytest
 
 import noack
-from cosim.live.monitoring.progress import work_bar
+from cosim.live.monitoring.progress import activity, work_bar
 from cosim.live.monitoring.run_watcher import RunMetrics, Watcher, joint_watcher
 from noack.runtime.control_messages import RunProgress
 from tests.helpers.command_line import invoke
@@ -104,7 +106,18 @@ def test_long_work_prints_its_share_and_the_remaining_time_as_lines_without_a_te
     for lines in (True, False):
         with work_bar("trying gains", lines=lines) as show:
             for share in (0.1, 0.2, 0.25, 1.0):
-                now_s[0] += 3
+                now_s[0] += 6
                 show(share)
         text = capsys.readouterr().err
-        assert text == lines * "noack: trying gains: 20 % after 6 s, about 24 s left\n"
+        assert text == lines * "noack: trying gains: 20 % after 12 s, about 48 s left\n"
+
+
+def test_what_a_command_does_is_printed_as_lines_without_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    lines: SimpleQueue[str] = SimpleQueue()
+    monkeypatch.setattr("cosim.live.monitoring.progress._LINE_EVERY_S", 0.001)
+    monkeypatch.setattr("cosim.live.monitoring.progress.print_to_stderr", lines.put)
+    with activity("examining M = 1") as change:
+        assert re.fullmatch(r"noack: examining M = 1, \d+ s", lines.get(timeout=60))
+        change("examining M = 2")
+        while not lines.get(timeout=60).startswith("noack: examining M = 2, "):
+            pass

@@ -83,6 +83,15 @@ def test_maps_are_those_of_a_simulated_run(name: str, settings: Sequence[str]) -
         )
 
 
+def test_maps_over_thousands_of_steps_keep_their_digits() -> None:
+    deadline = 'trigger={policy="deadline", interval_s=0.5, rule={policy="absolute", delta=1}}'
+    # The same 3 s, with measurements every 2 ms and every 50 ms.
+    fine = LossMargin(scenario("lane_periodic", deadline)).maps(0, 0, 1499)
+    coarse = LossMargin(scenario("lane_periodic", deadline, "plant.measure_every=25")).maps(0, 0, 59)
+    assert fine.radius.max() < 1e-14
+    assert (abs(fine.middle - coarse.middle) <= fine.radius + coarse.radius).all()
+
+
 def test_the_margin_does_not_depend_on_the_unit_of_the_input() -> None:
     resolved = scenario("unstable_pendulum", "mode=zoh")
     loop, margin, guarantee = loop_of(resolved), LossMargin(resolved), LossGuarantee((LongestBurst(3),))
