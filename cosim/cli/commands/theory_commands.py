@@ -23,7 +23,7 @@ with lazy_modules():
     from cosim.live.monitoring import progress
     from cosim.output import certificate_report
     from cosim.output.export import mat_export
-    from noack.scenario import resolution
+    from noack.scenario import resolution, scenario
     from noack.theory.certificates import scenario_certificates
 
 
@@ -215,14 +215,7 @@ def adversary(
         noack adversary unstable_pendulum --horizon 2 --beam 64   a faster search
         noack adversary lane_following --trigger continuous   the paper's loop, in exact time
     """
-    try:
-        loaded = source.load(*([] if horizon is None else [f"horizon_s={horizon}"]))
-    except CallerError as error:
-        if horizon is None:
-            raise
-        line = str(error).replace("--set horizon_s =", "--horizon")
-        raise CallerError(line.replace("--set horizon_s", "--horizon")) from None
-    resolved = resolution.resolve(loaded)
+    resolved = resolution.resolve(_with_horizon(source, horizon))
     continuous = trigger is opt.TriggerMode.CONTINUOUS
     if continuous:
         warn_of_left_out(resolved)
@@ -251,6 +244,17 @@ def adversary(
         print_to_stderr(f"noack: {stopped}; missing: {missing}")
         return stopped.exit_status
     return ExitStatus.FAILED if any(worst.breaches for worst in worst_cases) else ExitStatus.OK
+
+
+def _with_horizon(source: opt.OneLoopOptions, horizon_s: float | None) -> "scenario.Scenario":
+    """Return the scenario with another horizon; a message about it names the option that set it."""
+    if horizon_s is None:
+        return source.load()
+    try:
+        return source.load(f"horizon_s={horizon_s}")
+    except CallerError as error:
+        line = str(error).replace("--set horizon_s =", "--horizon")
+        raise CallerError(line.replace("--set horizon_s", "--horizon")) from None
 
 
 def _until_stopped(
