@@ -38,7 +38,7 @@ def test_a_missing_or_broken_or_other_library_is_refused_in_one_line(tmp_path: P
             path.write_bytes(content)
         with pytest.raises(CallerError) as error:
             load_core(path)
-        says = str(path) if number < 3 else "not of the same sources"
+        says = str(path) if number < 3 else "built from other sources"
         assert says in str(error.value)
         assert "make setup" in str(error.value)
         assert str(error.value).isprintable()

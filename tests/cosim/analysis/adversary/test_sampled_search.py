@@ -224,5 +224,5 @@ def test_disturbances_for_too_few_steps_are_refused() -> None:
     loop = SampledLoop(scenario_of(EXAMPLES["mixed"]))
     runs, ones = loop.start(), np.ones(loop.last + 1)
     short = loop.with_disturbances(np.zeros((0, 2)), np.zeros((3, 2)))
-    with pytest.raises(ValueError, match="do not reach"):
+    with pytest.raises(ValueError, match="end before the last step"):
         short.follow(runs, Scales(loop.weight, ones, ones), np.array([loop.last]))
