@@ -109,13 +109,15 @@ def _helpful_changes(results: Certificates) -> Iterator[str]:
     }
     for name, text in times.items():
         limit_s = getattr(results.limits, f"{name}_s")
-        if 0 < limit_s < getattr(results.scheduled, f"{name}_s"):
+        if limit_s is not None and 0 < limit_s < getattr(results.scheduled, f"{name}_s"):
             yield text.format(_limit(limit_s))
     scenario = results.scenario
     rates = {"plant.rate_hz": scenario.plant.rate_hz, "controller.rate_hz": scenario.controller.rate_hz}
+    # An observer's gain belongs to its period.
+    faster = (2, 5, 10) if scenario.observer is None else ()
     sigma = getattr(scenario.trigger, "sigma", 0.0)
     candidates: tuple[list[dict[str, float]], ...] = (
-        [{name: factor * rate for name, rate in rates.items()} for factor in (2, 5, 10)],
+        [{name: factor * rate for name, rate in rates.items()} for factor in faster],
         [{"network.mansd": most} for most in range(scenario.network.mansd - 1, -1, -1)],
         [{"trigger.sigma": sigma / 2**k} for k in range(1, 10) if sigma],
     )

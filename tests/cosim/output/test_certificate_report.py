@@ -149,6 +149,14 @@ def test_advice_names_only_what_helps() -> None:
     assert "mansd" not in last
 
 
+def test_advice_with_an_observer_leaves_its_period_alone() -> None:
+    delay = 'network.impairments=[{kind="delay", delay_s=1.0}]'
+    result = invoke("certify", "pendulum_observed", "--set", delay)
+    _, _, last = " ".join(result.stdout.split()).rpartition("no certificate for the schedule, ")
+    assert "there is one with a delay of updates of at most " in last
+    assert "rate_hz" not in last
+
+
 def test_a_start_that_overflows_is_named() -> None:
     certificates = certificates_of(shipped("double_integrator", "plant.initial_state=[1e200, 0]"))
     reasons = {certificate.void for _, certificate in certificates}
