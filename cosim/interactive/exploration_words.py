@@ -155,7 +155,7 @@ def _guarantee_line(run: Exploration, guarantee: Guarantee | None) -> VerdictLin
     if above.any():
         return VerdictLine(f"guarantee broken since {run.t_s[above][0]:.3f} s", Tone.BAD)
     share = percent(float(np.nanmax(np.append(shares[0], 0.0))))
-    return VerdictLine(f"guarantee kept: share used of the bound of ‖e_c‖: {share}", Tone.GOOD)
+    return VerdictLine(f"guarantee kept: ‖e_c‖ was at most {share} of its bound", Tone.GOOD)
 
 
 def _loss_too_many(run: Exploration) -> str:

@@ -146,7 +146,7 @@ def test_a_verdict_says_what_became_of_the_run_and_of_its_guarantee() -> None:
     certified = guarantee.certify(run.scenario)
     ending, kept, sent = (line.text for line in verdict_of(run, certified))
     assert ending.startswith("completed 20 s: stable, ‖x‖ fell from 3.0")
-    share = float(kept.removeprefix("guarantee kept: share used of the bound of ‖e_c‖: ").split(" %")[0])
+    share = float(kept.removeprefix("guarantee kept: ‖e_c‖ was at most ").split(" %")[0])
     bound = np.interp(run.t_s, certified.t_s, certified.e_c)
     assert share == pytest.approx(100 * np.max(run.e_c_norm / bound), rel=0.02, abs=0.06)
     assert sent.startswith(f"{len(run.event_s)} transmissions, ")
