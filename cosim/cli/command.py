@@ -128,9 +128,10 @@ def _setting_hint(option: str, command: "Command | None") -> str:
     if command is None or not any("--set" in parameter.opts for parameter in command.params):
         return ""
     name = option.lstrip("-").replace("-", "_")
-    known = {*runtime_parameters.SHORT, *toml_file.keys(scenario.Scenario)}
-    keys = [key for key in (name, f"{name}_s") if key in known]
-    return f"did you mean --set {keys[0]}=...?" if keys else toml_file.SYMBOLS.get(name, "")
+    keys = {key: key for key in toml_file.keys(scenario.Scenario)}
+    keys |= {short: short for short, key in runtime_parameters.SHORT.items() if key in keys}
+    near = [key for key in (name, f"{name}_s", f"{name}.p", f"loss.{name}") if key in keys]
+    return f"did you mean --set {near[0]}=...?" if near else toml_file.SYMBOLS.get(name, "")
 
 
 def _with_value(message: str, words: Sequence[str]) -> str:

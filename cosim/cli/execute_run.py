@@ -256,12 +256,8 @@ def execute_campaign(
         console.print(f"noack: {line}", highlight=False, markup=False, soft_wrap=True)
 
     shown = draws or plan.draws
-    if (earlier := campaign_report.replaced_draws(folder, shown)) is not None:
-        print_line(
-            f"{folder}: page and summary will be those of the first {shown:,} draws; the runs of all "
-            f"{earlier:,} are kept, and --draws {earlier} writes page and summary of them again"
-        )
-    return campaign_report.finish_campaign(
+    has_fewer = campaign_report.had_more_draws(folder, shown)
+    finished = campaign_report.finish_campaign(
         plan,
         path,
         folder,
@@ -271,3 +267,9 @@ def execute_campaign(
         show=progress.activity,
         bar=progress.runs_bar(console),
     )
+    if has_fewer:
+        print_line(
+            f"{folder}: page and summary are now those of the first {shown:,} draws; all other runs are "
+            "kept, and a larger --draws shows them again"
+        )
+    return finished

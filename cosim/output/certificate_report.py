@@ -28,7 +28,7 @@ from noack.core.number_format import NONE, at_least, at_most, duration, duration
 from noack.scenario.resolution import loop_of, policy_of
 from noack.theory.certificates.assumptions import assumptions
 from noack.theory.certificates.certified_bounds import envelope_formula
-from noack.theory.certificates.conditions import BOX, REGION
+from noack.theory.certificates.conditions import BOX, REGION, nominal_conditions
 from noack.theory.certificates.network_limits import MOST_S
 from noack.theory.certificates.scenario_certificates import outside_box
 from noack.theory.margins.loss_margin import Stability
@@ -107,11 +107,16 @@ def _helpful_changes(results: Certificates) -> Iterator[str]:
         "delay": "a delay of updates of at most {} (the network's, and certificate.late_periods)",
         "hold": "an age of inputs of at most {} (controller.rate_hz, certificate.late_periods)",
     }
+    scenario = results.scenario
+    prompt_network = scenario.network.model_copy(update={"impairments": ()})
+    # The clocks alone delay updates, whatever the network does.
+    prompt = nominal_conditions(scenario.model_copy(update={"network": prompt_network}))
+    least_s = {"sampling": 0.0, "delay": prompt.delay_s, "hold": prompt.hold_s}
     for name, text in times.items():
         limit_s = getattr(results.limits, f"{name}_s")
-        if limit_s is not None and 0 < limit_s < getattr(results.scheduled, f"{name}_s"):
+        scheduled_s = getattr(results.scheduled, f"{name}_s")
+        if limit_s is not None and 0 < limit_s < scheduled_s and least_s[name] <= limit_s:
             yield text.format(_limit(limit_s))
-    scenario = results.scenario
     rates = {"plant.rate_hz": scenario.plant.rate_hz, "controller.rate_hz": scenario.controller.rate_hz}
     # An observer's gain belongs to its period.
     faster = (2, 5, 10) if scenario.observer is None else ()

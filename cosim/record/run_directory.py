@@ -212,7 +212,7 @@ def require_run_directory(path: Path) -> None:
         if not hint and (folder / SCENARIO_FILE).is_file() and (folder / RECORD).is_dir():
             hint = f"; did you mean {folder}?"
     if not hint and path.suffix == ".toml":
-        hint = "; `noack simulate` makes one from a scenario"
+        hint = "; `noack simulate` and `noack run` make one from a scenario"
     raise CallerError(f"{path}: a file, not a run directory{hint}")
 
 

@@ -455,14 +455,16 @@ class ChangeRequests:
         return t_ns
 
     def _violations(self) -> list[str]:
-        """Return the violated assumptions of Theorem 2, each as a line."""
-        prefixes = {name: f"{name}: " if len(self._entries) > 1 else "" for name in self._entries}
-        lines: list[str] = []
+        """Return the violated assumptions of Theorem 2, each as a line, with its loops if not all."""
+        violated: dict[str, list[str]] = {}
         with suppress(Exception):  # a failed analysis must not cost the run
             for name, schedule in self._entries.items():
-                violated = assumptions.violations_of_theorem_2(resolve(schedule.last))
-                lines += [f"{prefixes[name]}{line}" for line in violated]
-        return lines
+                for line in assumptions.violations_of_theorem_2(resolve(schedule.last)):
+                    violated.setdefault(line, []).append(name)
+        return [
+            line if len(names) == len(self._entries) else f"{', '.join(names)}: {line}"
+            for line, names in violated.items()
+        ]
 
     @property
     def _schedules(self) -> tuple[ChangeSchedule[None], ...]:

@@ -58,10 +58,10 @@ def write_report(
     ]
 
 
-def replaced_draws(folder: Path, draws: int) -> int | None:
-    """Return the draws of the summary in a folder, if they are more than those of the next one."""
+def had_more_draws(folder: Path, draws: int) -> bool:
+    """Return whether the summary in a folder is that of more draws."""
     earlier = read_object(folder / SUMMARY).get("draws")
-    return earlier if isinstance(earlier, int) and earlier > draws else None
+    return isinstance(earlier, int) and earlier > draws
 
 
 def campaign_tables(summary: CampaignSummary, *, shares: bool = False) -> Iterator[ResultTable]:

@@ -47,7 +47,7 @@ def test_the_command_writes_the_reported_files_and_keeps_complete_chunks(
     assert "draws" not in result.stderr
     result = run_command(path, "--json", "--draws", "4")  # of which page and summary then are
     assert json.loads(result.stdout)["made"] == 0
-    assert "the runs of all 7 are kept, and --draws 7 writes" in result.stderr
+    assert "all other runs are kept, and a larger --draws shows them again" in result.stderr
 
 
 def test_the_page_is_one_file_and_escapes_user_text(write: Write, plan: dict[str, Any], full: Store) -> None:
