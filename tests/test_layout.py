@@ -53,7 +53,7 @@ LINES = {
     "sensor_node": 400,
     "controller_node": 415,
     "benchmarks": 3000,
-    "native": 11490,
+    "native": 11495,
     "tests": 52130,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.

@@ -1,4 +1,6 @@
-/* Exact simulation in continuous time: what Python calls.
+/* Exact simulation in continuous time: what Python calls. states.c follows a run from event to
+   event; the event is located in norm_crossing.h, quadratic_crossing.h, integral_crossing.h and
+   level_crossing.c, by the rule's comparison.
 
    A size of vectors that has code serves all smaller loops, which are padded with states that stay
    0; the last bits of a loop do not depend on the size chosen. */
