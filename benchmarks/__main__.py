@@ -120,4 +120,8 @@ def write_docs(page: Path, goals: Iterable[Row]) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(run(all_benchmarks()))
+    try:
+        found = all_benchmarks()
+    except ModuleNotFoundError as error:  # the tests' helpers need it
+        sys.exit(f"{error}; `make setup-dev` installs what the benchmarks need")
+    sys.exit(run(found))

@@ -87,11 +87,11 @@ def _print_nonlinear(console: Console, results: Certificates, why_nonlinear: str
 
 
 def _print_advice(console: Console, results: Certificates) -> None:
-    """Print that there is no certificate, and which changes give one; each was computed."""
+    """Print that there is no certificate, and what gives one; settings that are named were tried."""
     advice = ""
     if (results.schedule.void or "").startswith("the loop gain"):
         changes = list(_helpful_changes(results))
-        advice = "; neither shorter times nor a smaller network.mansd alone give one"
+        advice = "; no higher rates and no smaller network.mansd that were tried alone give one"
         if changes:
             advice = f"; there is one with {', or with '.join(changes)}"
     console.print(
@@ -103,9 +103,9 @@ def _print_advice(console: Console, results: Certificates) -> None:
 def _helpful_changes(results: Certificates) -> Iterator[str]:
     """Yield, in words, changes of which each gives a certificate for the plant."""
     times = {
-        "sampling": "a sampling period of at most {} (plant.measure_every, plant.rate_hz)",
-        "delay": "a delay of updates of at most {} (the network's, and certificate.late_periods)",
-        "hold": "an age of inputs of at most {} (controller.rate_hz, certificate.late_periods)",
+        "sampling": "a sampling period of at most {}",
+        "delay": "a total delay of updates of at most {}, waits for clocks included",
+        "hold": "inputs that are at most {} old",
     }
     scenario = results.scenario
     prompt_network = scenario.network.model_copy(update={"impairments": ()})

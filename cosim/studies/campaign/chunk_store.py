@@ -18,6 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from cosim.record.run_directory import SCENARIO_FILE, SUMMARY_FILE
 from cosim.studies.campaign.arithmetic import arithmetic, difference
 from cosim.studies.campaign.campaign_file import Campaign
 from cosim.studies.campaign.campaign_grid import Point, row_type
@@ -169,8 +170,8 @@ def _claim(folder: Path, manifest: Mapping[str, object]) -> Mapping[str, str]:
     try:
         stored_manifest = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        if (folder / RUNS).exists():
-            raise CallerError(f"{folder}: holds runs, but no {MANIFEST}; give another --out") from None
+        if any((folder / name).exists() for name in (RUNS, SUMMARY_FILE, SCENARIO_FILE)):
+            raise CallerError(f"{folder}: holds results, but no {MANIFEST}; give another --out") from None
         write_whole(path, json.dumps(manifest, indent=1))
         stored_manifest = dict(manifest)
     except ValueError:

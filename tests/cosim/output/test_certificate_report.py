@@ -144,7 +144,7 @@ def test_advice_names_only_what_helps() -> None:
     settings += ['network.impairments=[{kind="delay", delay_s=1.0}]']
     result = invoke("certify", "double_integrator", *(word for s in settings for word in ("--set", s)))
     _, _, last = " ".join(result.stdout.split()).rpartition("no certificate for the schedule, ")
-    assert "there is one with a delay of updates of at most " in last
+    assert "there is one with a total delay of updates of at most " in last
     assert "rate_hz =" not in last
     assert "mansd" not in last
 
@@ -153,7 +153,7 @@ def test_advice_with_an_observer_leaves_its_period_alone() -> None:
     delay = 'network.impairments=[{kind="delay", delay_s=1.0}]'
     result = invoke("certify", "pendulum_observed", "--set", delay)
     _, _, last = " ".join(result.stdout.split()).rpartition("no certificate for the schedule, ")
-    assert "there is one with a delay of updates of at most " in last
+    assert "there is one with a total delay of updates of at most " in last
     assert "rate_hz" not in last
 
 

@@ -163,8 +163,11 @@ def test_a_folder_in_use_or_of_other_content_is_refused(
     ):
         use(path, store.folder)
     (tmp_path / "mine" / "runs").mkdir(parents=True)
-    with pytest.raises(CallerError, match="holds runs"):
-        use(path, tmp_path / "mine")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "summary.json").write_text("{}")  # a run directory, whose summary must not be replaced
+    for folder in ("mine", "run"):
+        with pytest.raises(CallerError, match="holds results"):
+            use(path, tmp_path / folder)
     for text in ("nonsense", '{"arithmetic": 3}'):
         (tmp_path / "mine" / "campaign.json").write_text(text)
         with pytest.raises(CallerError, match=r"campaign\.json: not a manifest of a campaign; "):
