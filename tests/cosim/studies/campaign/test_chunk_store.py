@@ -164,7 +164,7 @@ def test_a_folder_in_use_or_of_other_content_is_refused(
         use(path, store.folder)
     (tmp_path / "mine" / "runs").mkdir(parents=True)
     (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "summary.json").write_text("{}")  # a run directory, whose summary must not be replaced
+    (tmp_path / "run" / "summary.json").write_text("{}")  # a run directory
     for folder in ("mine", "run"):
         with pytest.raises(CallerError, match="holds results"):
             use(path, tmp_path / folder)
