@@ -1,0 +1,26 @@
+"""Keys and kinds that earlier builds had: a file that uses one is told the plain way instead."""
+
+from collections.abc import Mapping
+
+REMOVED: Mapping[str, str] = {
+    "recovery.rejoin_within_s": "a process that dies ends the run, whose record is complete up to then",
+}
+"""The plain way by what was removed: a key with dots (``table.key``), or the kind of a table
+(``table.kind = value``). Numbers of entries in lists are left out: ``network.impairments.kind``."""
+
+
+def plain_way(key: str, value: object) -> str | None:
+    """Return what to do instead of an unknown key, or of an unknown kind; None if it never existed.
+
+    Args:
+        key: the whole key. It may lie within other tables than in :data:`REMOVED`, as those of an
+            entry of ``[[loops]]``.
+        value: its value. If this is a table, the keys in it are looked up, too.
+    """
+    name = ".".join(part for part in key.split(".") if not part.isdecimal())
+    inner = value if isinstance(value, Mapping) else ()
+    for candidate in (name, f"{name} = {value}", *(f"{name}.{part}" for part in inner)):
+        for removed, instead in REMOVED.items():
+            if f".{candidate}".endswith(f".{removed}"):
+                return f"was removed; {instead}"
+    return None
