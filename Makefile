@@ -32,7 +32,7 @@ help: ## List the targets
 	@printf '\nVariables: SCENARIO=NAME or FILE  CAMPAIGN=NAME or FILE  LIVE=1 (live viewer)  ARGS="--set speed=2"  SESSION=NAME\n'
 
 ##@ Run
-.PHONY: lab doctor demo demo-zoh run simulate view summary replay fidelity compare report certify adversary paper campaign design
+.PHONY: lab doctor demo demo-zoh run simulate view summary replay compare report certify adversary campaign design
 lab: setup $(VENV)/.installed-lab ## Open the lab page: drag settings, see the loop change, run it live
 	@$(BIN)/noack lab "$(SCENARIO)" $(ARGS)
 
@@ -60,9 +60,6 @@ summary: setup ## Show the last run's summary
 replay: setup ## Replay the last run's inputs; compare the outputs bit for bit
 	@$(BIN)/noack replay $(ARGS)
 
-fidelity: setup ## Compare the last run with the ideal loop, effect by effect
-	@$(BIN)/noack fidelity $(ARGS)
-
 compare: setup ## Compare RUNS="runs/A runs/B": key numbers, and curves overlaid
 	@$(BIN)/noack compare $(RUNS) $(ARGS)
 
@@ -74,9 +71,6 @@ certify: setup ## Compute the guaranteed bounds of SCENARIO and their conditions
 
 adversary: setup ## Search for the worst losses that SCENARIO's network may cause
 	@$(BIN)/noack adversary "$(SCENARIO)" $(ARGS)
-
-paper: setup ## Reproduce the paper's Section V over 1,000 draws into docs/
-	@$(BIN)/noack paper --out docs $(ARGS)
 
 campaign: setup ## Run CAMPAIGN: many random draws over a grid of settings
 	@$(BIN)/noack campaign "$(CAMPAIGN)" $(ARGS)

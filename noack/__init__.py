@@ -29,7 +29,7 @@ else:
 __all__ = [
     "CampaignResult", "Certificates", "Explorer", "Measurement", "NoackError", "Run", "Scenario",
     "__version__", "campaign", "certify", "compare", "cost", "explore", "from_system", "gain",
-    "linearise", "load", "margin", "measure", "new", "open_run", "reproduce", "run",
+    "linearise", "load", "margin", "measure", "new", "open_run", "run",
     "save_tables", "simulate", "with_settings",
 ]  # fmt: skip
 _NOT_EVERYWHERE = ("LossyChannel", "LossyUdp")

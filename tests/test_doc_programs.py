@@ -44,7 +44,6 @@ SHORTER = {
     "campaign": ("--workers", "1"),
     "adversary": ("--set", "horizon_s=2", "--nodes", "2000"),
     "design": ("--draws", "80"),
-    "capacity": ("--draws", "1", "--loops", "11", "--set", "horizon_s=1"),
     "margin": ("--no-period", "--most", "2"),
     "doctor": ("--seconds", "0.1"),
 }

@@ -15,7 +15,6 @@ from cosim.api.explorer import explore as explore
 from cosim.api.runs import Run as Run
 from cosim.api.runs import compare as compare
 from cosim.api.runs import open_run as open_run
-from cosim.api.runs import reproduce as reproduce
 from cosim.api.runs import run as run
 from cosim.api.runs import simulate as simulate
 from cosim.api.scenarios import from_system as from_system

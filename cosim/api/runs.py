@@ -31,7 +31,7 @@ with lazy_modules():
     from cosim.output.figures import figure_drawing, figure_files, figure_format, network_figures, run_figures
     from cosim.record import data_frames, run_record, table_files
     from cosim.simulation import virtual_time
-    from cosim.studies import run_archive, run_comparison
+    from cosim.studies import run_comparison
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -248,16 +248,6 @@ class Run:
             self.directory, Path(path), loop=self._loop, certificates=certificates
         )
 
-    def archive(self, path: PathLike) -> Path:
-        """Write the run as one file, which :func:`noack.reproduce` repeats; return its path.
-
-        Raises:
-            NoackError: the file cannot be written.
-        """
-        self._ensure_summary()
-        run_archive.write_archive(self.directory, Path(path))
-        return Path(path)
-
     def replay(self) -> "ReplayResult":
         """Feed every machine its recorded inputs again and compare the outputs bit for bit.
 
@@ -375,26 +365,6 @@ def open_run(directory: PathLike = "runs/latest") -> Run:
     require_run_directory(path)
     outcome = run_end.reopen(path.resolve())
     return Run(outcome.run_dir, lambda: outcome)
-
-
-def reproduce(path: PathLike, *, run_code: bool = False, long: bool = False) -> "run_archive.Repetition":
-    """Repeat an archived run, and compare it bit for bit.
-
-    Args:
-        path: an archive, written by :meth:`Run.archive` or ``noack archive``.
-        run_code: run the code that the archive contains, if its plant, trigger or controller is a
-            Python class or an FMU.
-        long: repeat a run of more than a million steps, too, which takes minutes and gigabytes.
-
-    Returns:
-        The result: ``bit_exact``; ``differences``, the first one of the run and of each loop;
-        ``changes`` of versions and machine since the archived run; ``numbers`` that differ.
-
-    Raises:
-        NoackError: the file is not such an archive, is damaged, or contains code without
-            ``run_code`` or a long run without ``long``.
-    """
-    return run_archive.repeat_archive(Path(path), run_code=run_code, long=long)
 
 
 def compare(*runs: Run | PathLike) -> "run_comparison.RunComparison":

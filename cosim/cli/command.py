@@ -170,7 +170,6 @@ _TOUR = (
     ("noack view", "view the last run"),
     ("noack simulate lane_following", "run it in virtual time, in some seconds"),
     ("noack certify lane_following", "compute guaranteed bounds"),
-    ("noack fidelity", "compare the last run with the ideal loop"),
     ("noack compare A B", "compare two or more runs"),
     ("noack campaign mb_vs_zoh", "run a grid of settings many times"),
     ("noack netem --explain loss 5%", "use the network emulator alone"),

@@ -18,7 +18,6 @@ from cosim.shipped_files import find_shipped, shipped_names
 from noack.core.errors import CallerError
 
 with lazy_modules():
-    from cosim.studies.paper import results
     from noack.scenario import resolution, runtime_parameters, scenario, scenario_file, toml_file
 
 if TYPE_CHECKING:
@@ -41,11 +40,6 @@ def complete_campaigns(incomplete: str) -> list[str]:
 def complete_shipped(incomplete: str) -> list[str]:
     """Return matching names of shipped scenarios and campaigns."""
     return complete_scenarios(incomplete) + complete_campaigns(incomplete)
-
-
-def complete_papers(incomplete: str) -> list[str]:
-    """Return matching names of published results."""
-    return _matching(incomplete, list(results.NAMES))
 
 
 def complete_runs(incomplete: str) -> list[str]:
@@ -202,23 +196,17 @@ class ExampleOptions(ScenarioOptions):
 
 
 @option_group
-class RunOptions:
-    """An earlier run."""
+class LoopOptions:
+    """An earlier run, or one of its loops."""
 
     run_dir: RunArgument = None
     runs: RunsOption = DEFAULT_RUNS
+    loop: LoopOption = None
 
     @property
     def path(self) -> Path:
-        """Its directory; raise CallerError if there is none."""
+        """The run's directory; raise CallerError if there is none."""
         return chosen_run(self.run_dir, self.runs)
-
-
-@option_group
-class LoopOptions(RunOptions):
-    """An earlier run, or one of its loops."""
-
-    loop: LoopOption = None
 
 
 def weight_matrix(option: str, text: str | None, size: int) -> "Matrix":

@@ -11,7 +11,7 @@ import os
 import platform
 import shutil
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -368,21 +368,13 @@ def kind_of(run_dir: Path) -> Kind:
 
 def changed_since(run_dir: Path) -> list[str]:
     """Return the changes since the run that may affect its arithmetic, in words."""
-    return _changes(run_dir, ("python", "machine", "processor"), _ARITHMETIC)
-
-
-def all_changes_since(run_dir: Path) -> list[str]:
-    """Return all changes of versions and machine since the run, in words."""
-    return _changes(run_dir, ("python", "system", "machine", "processor", "cores"), _PACKAGES)
-
-
-def _changes(run_dir: Path, keys: Sequence[str], names: Sequence[str]) -> list[str]:
     recorded_environment, current_environment = read_object(run_dir / ENVIRONMENT_FILE), environment("live")
     packages = recorded_environment.get("packages")
     packages = packages if isinstance(packages, dict) else {}
+    keys = ("python", "machine", "processor")
     pairs = [
         *((key, recorded_environment.get(key), current_environment[key]) for key in keys),
-        *((name, packages.get(name), current_environment["packages"][name]) for name in names),
+        *((name, packages.get(name), current_environment["packages"][name]) for name in _ARITHMETIC),
     ]
     return [f"{name} was {old}, is {new}" for name, old, new in pairs if old != new]
 

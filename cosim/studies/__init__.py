@@ -1,1 +1,1 @@
-"""Studies: campaigns, capacity, design, new loops, the paper; comparison and archives of runs."""
+"""Studies: campaigns, design, new loops, the paper; comparison of runs."""

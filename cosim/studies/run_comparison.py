@@ -188,10 +188,7 @@ def compare_runs(directories: Sequence[Path]) -> RunComparison:
             plants have different numbers of states.
     """
     if not 2 <= len(directories) <= len(LABELS):
-        raise CallerError(
-            f"give 2 to {len(LABELS)} run directories to compare, not {len(directories)}; "
-            "`noack fidelity` compares one with the ideal loop"
-        )
+        raise CallerError(f"give 2 to {len(LABELS)} run directories to compare, not {len(directories)}")
     runs = tuple(map(_open_run, LABELS, directories))
     first = runs[0].record.loop.n
     for run in runs[1:]:

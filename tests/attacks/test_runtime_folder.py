@@ -189,8 +189,6 @@ PRIVATE = b"mine alone"
 ENDS = ("127.0.0.1", 9000), ("127.0.0.1", 9001)
 SPEC = LinkSpec("link", *ENDS, LinkSettings(), LinkSettings())
 COMMANDS = (
-    "archive {run} --out {out}/a.noack.zip",
-    "paper tabuada --tables {out}/tables",
     "export {run} --format mat --out {out}/run.mat",
     "export {run} --format mcap --out {out}/run.mcap",
     "compare {run} {run} --out {out}/compare.html",
@@ -329,7 +327,7 @@ def test_a_file_that_grows_or_is_locked_follows_no_planted_name(
 def test_a_folder_that_is_another_users_link_is_not_written_to(common: Path, private: Path) -> None:
     (common / "tables").symlink_to(private.parent)
     os.chown(common / "tables", NOBODY, NOBODY, follow_symlinks=False)
-    words = ["paper", "tabuada", "--tables", str(common / "tables")]
+    words = ["certify", "double_integrator", "--tables", str(common / "tables")]
     result = invoke(*words)
     assert result.exit_code == 1
     assert result.stderr.endswith(f"{common / 'tables'} is a symbolic link of another user\n")

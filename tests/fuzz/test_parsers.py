@@ -1,15 +1,10 @@
 """Test each parser on its corpus and on similar inputs; the long run is ``make fuzz``."""
 
-from pathlib import Path
-
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosim.studies.run_archive import unpack
-from noack.core.errors import NoackError
 from tests.fuzz.harness import kept_inputs, parsers
-from tests.fuzz.parsers.files import ARCHIVES_SEEDS
 
 EXAMPLES = {"record": 10, "telemetry": 15, "campaign": 15}
 """Number of examples for slow parsers; 25 for the others. The long run is `make fuzz`."""
@@ -30,17 +25,6 @@ def test_every_input_of_the_corpus_is_read_or_refused_in_one_line(name: str) -> 
     assert len(inputs) > 3
     for data in inputs:
         under_test.run(data)
-
-
-def test_a_whole_archive_is_unpacked_and_a_name_outside_the_folder_is_refused(tmp_path: Path) -> None:
-    """Else no seed reaches what follows the check of the manifest."""
-    path, folder = tmp_path / "a.zip", tmp_path / "out"
-    path.write_bytes(ARCHIVES_SEEDS[0])
-    assert {*unpack(path, folder).files} == {file.name for file in folder.iterdir()}
-    (outside,) = (seed for seed in ARCHIVES_SEEDS if b"../evil" in seed)
-    path.write_bytes(outside)
-    with pytest.raises(NoackError, match=r"\.\./evil"):
-        unpack(path, tmp_path / "other")
 
 
 @pytest.mark.parametrize("name", NAMES)

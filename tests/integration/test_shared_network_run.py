@@ -1,6 +1,6 @@
 """Real processes that serve several loops, of different plants.
 
-A loop that diverges is in cosim/simulation/test_simulated_run.py; exports and archives of several loops
+A loop that diverges is in cosim/simulation/test_simulated_run.py; exports of several loops
 have tests of their own.
 """
 

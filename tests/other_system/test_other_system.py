@@ -21,7 +21,6 @@ COMMANDS = (
     ["simulate", "lane_following", "--set", "horizon_s=1", "--json"],
     ["summary", "--json"],
     ["replay", "--json"],
-    ["fidelity", "--json"],
     *CERTIFIED,
     ["measure", "rural_n8_10kmh", "--deadline", "100ms", "--out", "measured.html", "--json"],
     ["campaign", "mb_vs_zoh", "--draws", "1", "--workers", "1", "--json"],

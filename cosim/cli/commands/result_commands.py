@@ -1,4 +1,4 @@
-"""Commands about earlier runs: results, figures and pages, replay, export, archives, comparison."""
+"""Commands about earlier runs: results, figures and pages, replay, export, comparison."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -20,14 +20,12 @@ with lazy_modules():
     import cosim.analysis.replay.replay_result as replay_result
     import cosim.analysis.replay.run_replay as run_replay
     import cosim.api.runs as run_library
-    from cosim.analysis import fidelity as fidelity_analysis
     from cosim.analysis.summary import run_summary
     from cosim.live import finalize
     from cosim.output import result_tables, run_tables, terminal_output
-    from cosim.output.figures import figure_files, run_figures
     from cosim.output.viewer import recording_viewer, rerun_program
     from cosim.record import collection, run_directory, run_record
-    from cosim.studies import run_archive, run_comparison
+    from cosim.studies import run_comparison
 
 
 @cli.command(cli.RUNS, 50)
@@ -151,32 +149,6 @@ def replay(run: opt.LoopOptions, *, json: opt.JsonOption = False) -> int:
     return ExitStatus.OK if result.bit_exact else ExitStatus.FAILED
 
 
-@cli.command(cli.RUNS, 60, takes="about a second")
-def fidelity(
-    run: opt.LoopOptions,
-    *,
-    out: opt.OutOption = None,
-    width: opt.WidthOption = None,
-    json: opt.JsonOption = False,
-) -> int:
-    """Compare a run with the ideal loop in continuous time, effect by effect.
-
-    Options:
-        out: Write a figure of the differences over time (.svg, .png, .pdf).
-
-    Examples:
-        noack fidelity   effects of sampling, delay and hold on the last run
-        noack fidelity --out fidelity.png   with a figure
-        noack fidelity runs/latest --json   as JSON
-    """
-    with cli.status("comparing"):
-        result = fidelity_analysis.compute_fidelity(run_record.load_record(run.path, run.loop))
-        if out is not None:
-            figure_files.save_figure(run_figures.fidelity_figure(result), out, width)
-    cli.show(json, result.to_json, terminal_output.print_fidelity, result)
-    return ExitStatus.OK if result.explained else ExitStatus.FAILED
-
-
 def _known_format(name: str) -> str:
     if name not in FORMATS:
         raise typer.BadParameter(f"'{name}' is not one of {', '.join(FORMATS)}")
@@ -242,56 +214,6 @@ def _scenario_name(run: opt.LoopOptions) -> str:
     if run_dir is not None and not (run_dir / SCENARIO_FILE).is_file():
         return str(run_dir)
     return str(run.path / SCENARIO_FILE)
-
-
-@cli.command(cli.RUNS, 92, takes="about a second")
-def archive(run: opt.RunOptions, *, out: opt.OutOption = None, json: opt.JsonOption = False) -> None:
-    """Archive a run: one file with everything that its repetition needs.
-
-    `noack reproduce` repeats it.
-
-    Options:
-        out: File of the archive; NAME.noack.zip in this folder by default.
-
-    Examples:
-        noack archive   the last run, as NAME.noack.zip in this folder
-        noack archive runs/latest --out result.noack.zip --json   to another file
-    """
-    chosen = run.path
-    path = out or Path(f"{chosen.resolve().name}{run_archive.SUFFIX}")
-    with cli.status("archiving"):
-        manifest = run_archive.write_archive(chosen, path)
-    cli.print_lines(json, {"archive": str(path)} | manifest.model_dump(mode="json"), path)
-
-
-@cli.command(cli.RUNS, 94, takes="as long as the archived command did")
-def reproduce(
-    file: Annotated[Path, Argument(metavar="FILE")],
-    *,
-    run_code: Annotated[bool, Option("--run-code")] = False,
-    long: Annotated[bool, Option("--long")] = False,
-    into: Path | None = None,
-    json: opt.JsonOption = False,
-) -> int:
-    """Repeat an archived run: simulate it again, or replay its record, bit for bit.
-
-    Versions, machine and numbers that differ are listed. Exit status 1: a bit differs.
-
-    Options:
-        file: Archive of a run.
-        run_code: Run the code that the archive contains, if its plant, trigger or controller is a
-            Python class or an FMU.
-        long: Repeat a run of more than a million steps, too.
-        into: Keep the archived run and its repetition in this new folder.
-
-    Examples:
-        noack reproduce result.noack.zip   exit status 1 if a bit differs
-        noack reproduce result.noack.zip --into again --json   keep both runs; print JSON
-    """
-    with cli.status("repeating"):
-        repetition = run_archive.repeat_archive(file, run_code=run_code, long=long, into=into)
-    cli.show(json, repetition.to_json, run_archive.print_repetition, repetition)
-    return ExitStatus.OK if repetition.bit_exact else ExitStatus.FAILED
 
 
 @cli.command(cli.RUNS, 55)

@@ -29,7 +29,6 @@ def run(simulated: noack.Run) -> Path:
     [
         ("summary", ["summary", "RUN"]),
         ("summary-verbose", ["summary", "RUN", "--verbose"]),
-        ("fidelity", ["fidelity", "RUN"]),
         ("certify", ["certify", "lane_following"]),
         ("certify-unlimited", ["certify", "lane_weighted", "--set", "network.enforce_mansd=false",
                                "--set", "network.loss.probability=0.05"]),

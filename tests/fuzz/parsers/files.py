@@ -1,13 +1,9 @@
-"""Files of users and of others: scenarios, campaigns, matrices, traces, captures, archives."""
+"""Files of users and of others: scenarios, campaigns, matrices, traces, captures."""
 
-import hashlib
 import io
 import json
 import struct
-import tempfile
 import tomllib
-import zipfile
-from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
@@ -17,7 +13,6 @@ import tomli_w
 from cosim.measurement.trace_sources import SourceOptions, read_source
 from cosim.studies.campaign import campaign_file
 from cosim.studies.campaign.campaign_grid import grid
-from cosim.studies.run_archive import MANIFEST, Manifest, unpack
 from noack.core.errors import NoackError
 from noack.impairments.kinds.blackout import Blackout
 from noack.impairments.kinds.delay import Delay
@@ -289,52 +284,10 @@ def _damaged(choices: Choices, content: bytes) -> bytes:
     return bytes(changed)
 
 
-_ARCHIVED_NAMES = ("scenario.toml", "record/plant_step.parquet", "../evil", "loops/a/summary.json", "a\\b")
-
-
-def _zip(files: dict[str, bytes], *, valid: bool = True) -> bytes:
-    entries = {
-        name: {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
-        for name, content in files.items()
-    }
-    manifest = {
-        "format": Manifest.model_fields["format"].default, "scenario": "a", "kind": "simulated",
-        "files": entries if valid else {},
-    }  # fmt: skip
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as file:
-        for name, content in {MANIFEST: json.dumps(manifest).encode(), **files}.items():
-            file.writestr(zipfile.ZipInfo(name), content)
-    return buffer.getvalue()
-
-
-ARCHIVES_SEEDS = [
-    _zip({"scenario.toml": b"", "summary.json": b"{}"}),
-    _zip({"scenario.toml": b"x" * 50}, valid=False),
-    *(_zip({name: b"content"}) for name in _ARCHIVED_NAMES),
-    b"PK\x05\x06" + bytes(18),
-]
-ARCHIVES_WORDS = [b"PK\x01\x02", b"PK\x03\x04", b"PK\x05\x06", MANIFEST.encode(), b"../", b"sha256"]
-
-
-def archives_input(data: bytes) -> None:
-    """An archive is refused, or unpacks exactly its files, inside the folder."""
-    with tempfile.TemporaryDirectory(dir=workspace()) as parent:
-        path, folder = Path(parent, "a.zip"), Path(parent, "inner", "out")
-        path.write_bytes(data)
-        with refusal((f"{path}: ", f"{folder}: ")):
-            manifest = unpack(path, folder)
-            files = {path for path in folder.rglob("*") if path.is_file()}
-            assert files == {folder / name for name in manifest.files}
-        inside = {path, folder.parent, *folder.parent.rglob("*")}
-        assert set(Path(parent).rglob("*")) <= inside, "a file outside the folder"
-
-
 PARSERS = {
     "scenario": Harness(scenario_input, seeds=SCENARIO_SEEDS, words=SCENARIO_WORDS),
     "campaign": Harness(campaign_input, seeds=CAMPAIGN_SEEDS, words=CAMPAIGN_WORDS),
     "matrices": Harness(matrices_input, seeds=MATRICES_SEEDS, words=MATRICES_WORDS),
     "traces": Harness(traces_input, seeds=TRACES_SEEDS, words=TRACES_WORDS),
     "captures": Harness(captures_input),
-    "archives": Harness(archives_input, seeds=ARCHIVES_SEEDS, words=ARCHIVES_WORDS),
 }

@@ -13,13 +13,12 @@ from scipy.linalg import expm
 
 from cosim.studies.campaign.campaign_file import load
 from cosim.studies.campaign.campaign_grid import grid
-from cosim.studies.paper import paper_evidence, paper_page
+from cosim.studies.paper import paper_evidence
 from cosim.studies.paper.paper_evidence import Numbers, evidence, resolved_draw
 from cosim.studies.paper.paper_page import render, rounded_numbers
 from noack.core.errors import CallerError
 from noack.plants.linear import lane_following
 from noack.scenario.resolution import loop_of
-from tests.helpers.command_line import invoke
 
 ROOT = Path(__file__).parents[4]
 CAMPAIGN = ROOT / "campaigns" / "paper.toml"
@@ -171,32 +170,6 @@ def test_the_committed_campaign_is_complete() -> None:
     assert summary["draws"] == campaign.draws >= 1000
     assert len(summary["points"]) == math.prod(len(axis.labels) for axis in campaign.axes)
     assert [claim["says"] for claim in summary["claims"]] == [claim.says for claim in campaign.claims]
-
-
-def test_the_command_runs_the_campaign_and_writes_the_page(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("cosim.cli.execute_run.cores", lambda: 1)
-    monkeypatch.setattr("cosim.cli.commands.study_commands.DEFAULT_RUNS", tmp_path / "runs")
-    # test_paper_evidence.py computes it
-    monkeypatch.setattr(paper_page, "evidence", lambda *_: COMMITTED["evidence"])
-    result = invoke("paper", "--draws", "5", "--out", tmp_path, "--json")
-    assert result.exit_code == 0, result.output
-    report = json.loads(result.stdout)
-    assert report["draws"] == 5
-    assert all(Path(file).is_file() for file in report["files"])
-    assert (tmp_path / "runs" / "campaigns" / "paper" / "campaign.html").is_file()
-    document = json.loads((tmp_path / "figures" / "paper.json").read_bytes())
-    assert (tmp_path / "paper.md").read_text(encoding="utf-8") == render(document)
-    assert 0 <= document["representative"] < 5
-
-
-def test_a_folder_that_cannot_be_written_gives_one_line_before_any_simulation(
-    tmp_path: Path,
-) -> None:
-    (tmp_path / "file").touch()
-    blocked = invoke("paper", "--out", tmp_path / "file")
-    assert (blocked.exit_code, blocked.stderr.count("\n")) == (1, 1)
 
 
 def test_without_an_unstable_plant_there_is_no_page(monkeypatch: pytest.MonkeyPatch) -> None:
