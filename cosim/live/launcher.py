@@ -24,7 +24,6 @@ from cosim.live.monitoring.run_watcher import Watcher, joint_watcher
 from cosim.live.processes.child_processes import ChildProcesses, EndReason, RestartPolicy
 from cosim.live.processes.finalize_helpers import RunEndingWithHelpers, lasting_helpers
 from cosim.live.processes.fork_server import ForkServer, fork_server
-from cosim.live.processes.remote_hosts import RemoteStart
 from cosim.live.wait_limit import WaitLimit
 from cosim.record.run_directory import (
     PROCESSES_FILE,
@@ -80,7 +79,7 @@ def launch(
         live: show the run in a viewer while it runs.
         watcher: callbacks.
         server: starts the processes; by default a new one.
-        listening: how processes on other hosts join, and which of ``spawn`` run there.
+        listening: how processes on other hosts join.
 
     Raises:
         CallerError, MachineError: the run could not be prepared.
@@ -97,8 +96,7 @@ def launch(
         stack.enter_context(active_run(run_dir))
         ending = stack.enter_context(EndingFile(run_dir))
         _publish_run(stack, descriptor, session)  # first: its file leads to a killed run's socket
-        remote_hosts = {} if listening is None else listening.hosts
-        coordinator = Coordinator(descriptor, [role for role in spawn if role not in remote_hosts])
+        coordinator = Coordinator(descriptor, spawn)
         stack.callback(coordinator.close)
         helpers = stack.enter_context(lasting_helpers(resolved))
         watcher = joint_watcher([watcher or Watcher(), Watcher(started=helpers.prepare)])
@@ -106,11 +104,9 @@ def launch(
             descriptor = descriptor.model_copy(update={"host": listening.address[0]})
         with _no_directory_if_refused(run_dir):
             listener = _open_to_others(stack, descriptor, session, listening, coordinator)
-        remote = None
         if listening is not None and listener is not None:
-            remote = RemoteStart(remote_hosts, listener.invitation.model_dump_json())
             watcher.listening(address_text(listener.address), listening)
-        children = ChildProcesses(descriptor, run_dir, spawn, server, remote)
+        children = ChildProcesses(descriptor, run_dir, spawn, server)
         stack.enter_context(children.started(live=live))
         run = _Run(descriptor, run_dir, coordinator, children, watcher, listener and listener.notices)
         status, reason = run.watch(signals, ending.store)
@@ -148,7 +144,7 @@ def _open_to_others(
     if session is not None:
         by_hand = descriptor.model_copy(update={"launched": False})
         stack.enter_context(descriptor_file(by_hand, session))
-    if listener is not None and listening is not None and listening.invitation is not None:
+    if listener is not None and listening is not None:
         # last: it replaces that of an earlier run
         stack.enter_context(invitation_file(listening.invitation, listener.invitation))
     return listener

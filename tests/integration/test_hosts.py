@@ -2,7 +2,6 @@
 
 import json
 import os
-import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -208,71 +207,3 @@ def _cut_off(hosts: TwoHosts) -> Iterator[None]:
         yield
     finally:
         subprocess.run([*command, "up"], check=True)
-
-
-@pytest.fixture
-def ssh(hosts: TwoHosts, tmp_path: Path) -> Path:
-    """A folder with a command ssh that knows one host, `robot`, which is the second one."""
-    folder = tmp_path / "bin"
-    folder.mkdir()
-    inside = shlex.join(hosts.inside(1))
-    runtime = tmp_path / "host 1"
-    runtime.mkdir()
-    script = folder / "ssh"
-    script.write_text(
-        "#!/bin/sh\n"
-        'while [ "$1" != -- ]; do shift; done\n'
-        "shift 2\n"
-        f"cd {shlex.quote(str(runtime))}\n"
-        f'XDG_RUNTIME_DIR=$PWD exec {inside} sh -c "$*"\n'
-    )
-    script.chmod(0o755)
-    return folder
-
-
-def on_path(folder: Path) -> dict[str, str]:
-    return {"PATH": f"{folder}:{os.environ['PATH']}"}
-
-
-def hosts_file(folder: Path, address: str, command: str = "") -> str:
-    """Write a file that places network and controller on another host."""
-    place = f"{{ ssh = 'robot', command = '{command or shlex.join(live.noack_command())}' }}"
-    path = folder / "hosts.toml"
-    path.write_text(f"listen = '{address}'\nnetem = {place}\ncontroller = {place}\n")
-    return str(path)
-
-
-def test_a_run_starts_its_processes_on_another_host(
-    start: Start, hosts: TwoHosts, tmp_path: Path, ssh: Path
-) -> None:
-    (first_host, _), (second_host, _) = hosts.addresses
-    run = start(
-        0, "run", "lane_following", "--hosts", hosts_file(tmp_path, first_host), "--json", *live.BARE,
-        *live.AT_RATE, *live.settings(horizon_s=3.0, network__encrypted=True),
-        environment=on_path(ssh),
-    )  # fmt: skip
-    stdout, stderr = wait_for_end(run)
-    assert run.returncode == 0, stderr
-    live.assert_complete(json.loads(stdout)["loops"][0])
-    run_dir = (tmp_path / "runs" / "latest").resolve()
-    reports = json.loads((run_dir / "reports.json").read_text())
-    addresses = {role: reports[role]["channel"]["local"].rpartition(":")[0] for role in LOOP_ROLES}
-    assert addresses == {
-        "plant": first_host,
-        "sensor": first_host,
-        "netem": second_host,
-        "controller": second_host,
-    }
-    assert "netem on robot, controller on robot" in stderr
-    assert not list(tmp_path.rglob("invitation*"))  # the keys were in no file
-
-
-def test_a_process_that_does_not_start_on_its_host_ends_the_run(
-    start: Start, hosts: TwoHosts, tmp_path: Path, ssh: Path
-) -> None:
-    file = hosts_file(tmp_path, hosts.addresses[0][0], "/missing/noack")
-    run = start(0, "run", "lane_following", "--hosts", file, *live.BARE, environment=on_path(ssh))
-    _, stderr = wait_for_end(run)
-    assert run.returncode == 1
-    assert "set `command` in the hosts file to the path of noack" in stderr.splitlines()[-1]
-    assert "Traceback" not in stderr

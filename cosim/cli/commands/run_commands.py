@@ -28,7 +28,6 @@ with lazy_modules():
     from cosim.analysis.summary import summary_model
     from cosim.interactive import scenario_draft
     from cosim.lab import lab_server
-    from cosim.live.coordination import remote_access
     from cosim.live.monitoring import progress, ros2_bridge
     from cosim.output import result_tables, run_tables, run_verdict, terminal_output
     from cosim.simulation import continuous, virtual_time
@@ -86,22 +85,16 @@ def run(
     context: typer.Context,
     source: opt.ScenarioOptions,
     *,
-    hosts: Annotated[Path | None, Option(metavar="FILE")] = None,
     options: LiveOptions,
 ) -> int:
     """Run a scenario live: start all processes and record everything.
-
-    Options:
-        hosts: TOML file that places processes on other hosts.
 
     Examples:
         noack run lane_following   the paper's example, 20 s
         noack run unstable_pendulum --set horizon_s=5 --live   5 s, with the live viewer
         noack run lane_following --set network.mansd=9 --json   M − 1 = 9; print JSON
-        noack run lane_following --hosts hosts.toml   some processes on other hosts, over ssh
     """
-    listening = None if hosts is None else remote_access.listening_for(hosts)
-    return run_processes(source.load(), options, server=context.obj, listening=listening)
+    return run_processes(source.load(), options, server=context.obj)
 
 
 @cli.command(cli.RUNS, 10, takes="20 s and a few", on_linux=True)

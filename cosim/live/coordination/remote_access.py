@@ -11,11 +11,10 @@ import socket
 import ssl
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from queue import SimpleQueue
-from types import MappingProxyType
 from typing import NamedTuple
 
 from cryptography import x509
@@ -24,7 +23,6 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 from cosim.live.coordination.coordinator import Coordinator, TokenScope
-from cosim.live.processes.remote_hosts import Host, load_hosts
 from noack.core.errors import CallerError, PeerError, why
 from noack.protocol.roles import LOOP_ROLES
 from noack.runtime.active_runs import RUNS, run_name
@@ -49,13 +47,11 @@ class ListenSettings(NamedTuple):
     """Where a run listens, and whom it invites."""
 
     address: Address
-    invitation: Path | None = None
-    """Where the invitation is written; None: it is in no file."""
+    invitation: Path
+    """Where the invitation is written."""
     role: str | None = None
     """The one role that the invitation is for; None for all."""
     valid_s: float = 3600.0
-    hosts: Mapping[str, Host] = MappingProxyType({})
-    """Where the launcher starts processes, by role."""
 
 
 class RunListener(NamedTuple):
@@ -65,15 +61,6 @@ class RunListener(NamedTuple):
     invitation: RunDescriptor
     notices: SimpleQueue[str]
     """Lines for the person who watches the run: floods."""
-
-
-def listening_for(path: Path) -> ListenSettings:
-    """Return how processes join that the launcher starts on the hosts of a file.
-
-    Raise CallerError if the file is wrong, or others cannot reach this host at its address.
-    """
-    hosts = load_hosts(path)
-    return ListenSettings(listen_address(hosts.listen, f"{path}: listen"), hosts=hosts.by_role)
 
 
 def listen_address(text: str, option: str = "--listen") -> Address:

@@ -87,10 +87,6 @@ class _RunProgress:
 
     def listening(self, address: str, settings: "ListenSettings") -> None:
         """Say how processes on other hosts join."""
-        if settings.invitation is None:
-            remote = (f"{role} on {host.ssh}" for role, host in settings.hosts.items())
-            self._print(f"listening on {escape(address)} (TCP); by ssh: {escape(', '.join(remote))}")
-            return
         role = settings.role or "plant|sensor|netem|controller"
         self._print(
             f"listening on {escape(address)}; copy the invitation to the other hosts, and start "

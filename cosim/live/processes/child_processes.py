@@ -1,7 +1,7 @@
 """The processes that a launcher starts: start, exit status, reason of a failure, restart, end.
 
-They run on this host, or over ssh on others (``remote_hosts.py``). :class:`RestartPolicy` says which
-failed processes are restarted or waited for, and which failures end the run.
+:class:`RestartPolicy` says which failed processes are restarted or waited for, and which failures end
+the run.
 """
 
 import contextlib
@@ -17,7 +17,6 @@ from typing import IO, NamedTuple
 from cosim.live.coordination.coordinator import Coordinator
 from cosim.live.monitoring.run_watcher import Watcher
 from cosim.live.processes.fork_server import ENVIRONMENT, ForkedProcess, ForkServer
-from cosim.live.processes.remote_hosts import SSH_FAILED, RemoteStart, start_over_ssh
 from noack.core.errors import ExitStatus, MachineError
 from noack.core.file_access import open_append
 from noack.core.system_processes import python_command
@@ -44,16 +43,11 @@ class EndReason(NamedTuple):
     reason: str
 
 
-_NOT_EXECUTABLE, _NOT_FOUND = 126, 127
-"""Exit statuses of a shell."""
-
-
 class ChildProcesses:
     """The launched processes of a run, by role.
 
     Each receives the run descriptor on its standard input, which stays open until the
-    launcher ends. One on another host receives an invitation instead, and outlives a broken
-    connection.
+    launcher ends.
     """
 
     def __init__(
@@ -62,11 +56,8 @@ class ChildProcesses:
         run_dir: Path,
         roles: Sequence[str],
         server: ForkServer | None = None,
-        remote: RemoteStart | None = None,
     ) -> None:
         self._server = server
-        self._invitation = "" if remote is None else remote.invitation
-        self._hosts = {} if remote is None else remote.hosts
         self._descriptor = descriptor
         self._run_dir = run_dir
         self._roles = [role for role in MODULES if role in roles]
@@ -108,10 +99,9 @@ class ChildProcesses:
         return child is not None and child.poll() in (ExitStatus.FAILED, ExitStatus.CALLER)
 
     def is_dead(self, role: str) -> bool:
-        """Whether a launched process runs no more; behind a broken ssh it may still run."""
+        """Whether a launched process runs no more."""
         child = self._children.get(role)
-        code = None if child is None else child.poll()
-        return code is not None and not (role in self._hosts and code == SSH_FAILED)
+        return child is not None and child.poll() is not None
 
     def failures(self, reported: Callable[[str], str | None]) -> dict[str, EndReason]:
         """How launched processes failed, by role."""
@@ -122,8 +112,6 @@ class ChildProcesses:
         arguments = ["--live"] if role == RECORDER and live else []
         try:
             with os.fdopen(open_append(self._run_dir / "logs" / f"{role}.log"), "a") as log:
-                if role in self._hosts:
-                    return start_over_ssh(role, self._hosts[role], self._invitation, log)
                 child = self._start_python(role, arguments, log)
         except OSError as error:
             raise MachineError(f"{role} cannot be started: {error}") from None
@@ -147,8 +135,6 @@ class ChildProcesses:
         )
 
     def _failure(self, role: str, code: int, reported: Callable[[str], str | None]) -> EndReason:
-        if role in self._hosts and (why := self._remote_failure(role, code)) is not None:
-            return EndReason(ExitStatus.FAILED, why)
         if code < 0:
             return EndReason(ExitStatus.FAILED, f"{role} died: killed by {signal_name(-code)}")
         if code in (ExitStatus.INTERRUPTED, ExitStatus.TERMINATED):
@@ -159,16 +145,6 @@ class ChildProcesses:
         logged = next((line.removeprefix(own) for line in lines[::-1] if line.startswith(own)), None)
         why = logged or reported(role) or "".join(lines[-1:]) or f"exit status {code}"
         return EndReason(ExitStatus(code) if known else ExitStatus.FAILED, f"{role}: {why}")
-
-    def _remote_failure(self, role: str, code: int) -> str | None:
-        """Why a process did not run on another host, or is out of reach; None if it ran."""
-        newest = "".join(self._log_lines(role)[-1:])
-        where = f"{role} on {self._hosts[role].ssh}"
-        if code == SSH_FAILED:
-            return f"{where}: {newest or 'the connection by ssh broke'}"
-        if code in (_NOT_EXECUTABLE, _NOT_FOUND):
-            return f"{where}: {newest}; set `command` in the hosts file to the path of noack"
-        return None
 
     def _log_lines(self, role: str) -> list[str]:
         log = self._run_dir / "logs" / f"{role}.log"

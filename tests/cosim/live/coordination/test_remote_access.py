@@ -1,18 +1,14 @@
-"""Where a run listens for other hosts, floods of connections, and the file of hosts."""
+"""Where a run listens for other hosts, and floods of connections."""
 
 import json
 from collections import Counter
 from pathlib import Path
 
-import pytest
-
 from cosim.live.coordination import remote_access
 from noack.core.errors import CallerError
 from noack.scenario.run_sections import ClocksSection
 from noack.scenario.scenario_file import load
-from tests.helpers.approved import compare_lines, lines_of_error
-
-ROBOT = '[controller]\nssh = "robot"\n'
+from tests.helpers.approved import compare_lines
 
 
 def test_a_run_listens_at_addresses_that_others_can_reach() -> None:
@@ -52,33 +48,3 @@ def test_a_flood_of_connections_is_reported_at_its_begin_and_end() -> None:
     assert lines(0) == ["the flood is over: 18000 connections without an invitation ended"]
     assert len(lines(4000, 0, 0, 0)) == 1  # the next end is reported later
     assert len(lines(0, 0, 0)) == 1
-
-
-@pytest.fixture
-def hosts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A file of hosts, on a machine with an ssh client."""
-    script = tmp_path / "bin" / "ssh"
-    script.parent.mkdir()
-    script.write_text("#!/bin/sh\n")
-    script.chmod(0o755)
-    monkeypatch.setenv("PATH", str(script.parent))
-    return tmp_path / "hosts.toml"
-
-
-def test_processes_without_a_table_run_on_this_host(hosts: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    hosts.write_text(f'listen = "192.0.2.1:7400"\n{ROBOT}')
-    remote = remote_access.listening_for(hosts)
-    assert remote.address == ("192.0.2.1", 7400)
-    assert remote.invitation is None
-    assert {role: host.ssh for role, host in remote.hosts.items()} == {"controller": "robot"}
-    monkeypatch.setenv("PATH", str(hosts.parent))
-    with pytest.raises(CallerError, match="no ssh client is installed"):
-        remote_access.listening_for(hosts)
-
-
-def test_a_mistake_in_a_file_of_hosts_gives_the_approved_line(hosts: Path) -> None:
-    def mistake(line: str) -> list[str]:
-        hosts.write_text(json.loads(line))
-        return lines_of_error(lambda: remote_access.listening_for(hosts), FILE=hosts)
-
-    compare_lines(Path(__file__).with_name("host_mistakes.txt"), mistake)
