@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from cosim.api.scenarios import Source, load, plain
 from cosim.lazy_modules import lazy_modules
-from noack.core.errors import CallerError, NoackError
+from noack.core.errors import CallerError
 from noack.core.file_access import write_whole
 from noack.core.number_format import as_text
 
@@ -17,7 +17,6 @@ with lazy_modules():
     from cosim.output.figures import figure_drawing
 
 if TYPE_CHECKING:
-    from ipywidgets import Widget
     from matplotlib.figure import Figure
 
     from cosim.interactive.exploration import Ensemble, Exploration
@@ -28,13 +27,11 @@ if TYPE_CHECKING:
 class Explorer:
     """A scenario and what follows from its settings; :func:`noack.explore` returns it.
 
-    Results are computed when they are first asked for, and anew after a change. A notebook shows
-    the explorer as sliders beside the figure.
+    Results are computed when they are first asked for, and anew after a change.
     """
 
     def __init__(self, results: "draft_results.DraftResults") -> None:
         self._results = results
-        self._widget: Widget | None = None
 
     @property
     def scenario(self) -> "Scenario":
@@ -122,25 +119,6 @@ class Explorer:
         write_whole(Path(path), self.toml.encode())
         return Path(path)
 
-    def widget(self) -> "Widget":
-        """Return sliders and choices beside the figure, as an ``ipywidgets.Widget``.
-
-        Raises:
-            NoackError: ipywidgets is not installed.
-        """
-        if self._widget is None:
-            try:
-                from cosim.api.explorer_widget import ExplorerWidget  # imports ipywidgets
-            except ModuleNotFoundError as error:
-                if error.name != "ipywidgets":
-                    raise
-                raise CallerError(
-                    "sliders need ipywidgets: pip install 'noack[notebook]'; set() and figure() "
-                    "work without it"
-                ) from None
-            self._widget = ExplorerWidget(self._results).whole
-        return self._widget
-
     def _state(self, state: int | str) -> int:
         names = self.run.state_names
         if state in names:
@@ -158,20 +136,9 @@ class Explorer:
         ]
         return as_text([*rows, *([("warning", self.warning)] if self.warning else [])])
 
-    def _ipython_display_(self) -> None:
-        from IPython.display import display  # of a notebook
-
-        try:
-            display(self.widget())  # type: ignore[no-untyped-call]
-        except NoackError as error:
-            print(f"{self!r}\n{error}")
-
 
 def explore(source: Source, settings: Mapping[str, object] | None = None) -> Explorer:
     """Explore a loop: change settings and see what follows, as on the page of ``noack lab``.
-
-    At the end of a notebook's cell the explorer shows sliders beside the figure, which follows
-    while they are dragged (``pip install 'noack[notebook]'``).
 
     >>> import noack
     >>> explorer = noack.explore("lane_following")

@@ -46,7 +46,6 @@ EXTRAS = {
     "mcap": ("mcap", "`noack export --format mcap`"),
     "metrics": ("prometheus_client", "`--metrics`"),
     "lab": ("nicegui", "`noack lab`"),
-    "notebook": ("ipywidgets", "sliders of `noack.explore`"),
 }
 """Extras of noack by name: one module that each installs, and what it is for."""
 _DATAGRAM = bytes(72)

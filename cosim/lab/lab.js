@@ -75,7 +75,6 @@ const LAB_PARTS = {
     labFill(select, names.map((name, i) => [String(i), name]), String(chosen));
   },
   controls(content) { labShowControls(content); },
-  form(content) { labShowForm(content); },
   query(text) {  // the browser limits how often the address may change
     clearTimeout(LAB.query);
     LAB.query = setTimeout(() => history.replaceState(null, '', text), 300);
@@ -152,84 +151,6 @@ function labSlider(slider) {
   });
   return labNode('div', {class: 'lab-slider'},
     labNode('label', {for: input.id}), labNode('output', {for: input.id}), input);
-}
-
-/* The form of all keys. A group is built when it is opened. */
-function labShowForm(form) {
-  const shape = group => [group.key, group.fields.map(field => field.key), group.groups.map(shape)];
-  const place = labById('form'), text = JSON.stringify(shape(form));
-  LAB.form = form;
-  if (LAB.formShape !== text) {
-    const open = [...place.querySelectorAll('details[open]')].map(details => details.labKey);
-    LAB.formShape = text;
-    LAB.fields = new Map();
-    place.replaceChildren(labGroup(form, open));
-  }
-  labFillForm(form);
-}
-
-function labGroup(group, open) {
-  const inside = labNode('div', {});
-  const details = labNode('details', {}, labNode('summary', {}, group.title), inside);
-  const build = () => {
-    if (inside.firstChild) return;
-    inside.append(labNode('p', {}, group.help), ...group.fields.map(labField),
-      ...group.groups.map(inner => labGroup(inner, open)));
-  };
-  details.labKey = group.key;
-  details.open = open.includes(group.key);
-  if (details.open) build();
-  details.addEventListener('toggle', () => {
-    if (!details.isConnected) return; // the form was made anew since
-    build();
-    labFillForm(LAB.form);
-  });
-  return details;
-}
-
-function labField(field) {
-  const name = `lab-field-${field.key}`;
-  const input = labNode(field.options ? 'select' : 'input', {
-    id: name, title: field.help, placeholder: field.default, autocomplete: 'off',
-    'aria-describedby': `${name}-error`});
-  const send = () => {
-    clearTimeout(input.labUnsent);
-    input.labUnsent = null;
-    labSend('fill', {key: field.key, text: input.value});
-  };
-  input.addEventListener(field.options ? 'change' : 'input', () => {
-    clearTimeout(input.labUnsent);
-    input.labUnsent = setTimeout(send, field.options ? 0 : 400);
-  });
-  input.addEventListener('blur', () => input.labUnsent ? send() : labFillForm(LAB.form));
-  LAB.fields.set(field.key, input);
-  return labNode('div', {class: 'lab-choice'}, labNode('label', {for: name}, field.label), input,
-    labNode('p', {id: `${name}-error`, class: 'lab-bad', role: 'status'}));
-}
-
-/* Show values and mistakes. What is being typed stays, and what the server does not know yet.
-   Return whether there is a mistake. */
-function labFillForm(group) {
-  let wrong = false;
-  for (const field of group.fields) {
-    const input = LAB.fields.get(field.key);
-    wrong ||= Boolean(field.error);
-    if (!input) continue;
-    if (field.options) {
-      const known = field.options.some(([value]) => value === field.text);
-      labFill(input, known ? field.options : [...field.options, [field.text, field.text]],
-        field.text);
-    } else if (input !== document.activeElement && !input.labUnsent && input.value !== field.text) {
-      input.value = field.text;
-    }
-    input.ariaInvalid = String(Boolean(field.error));
-    labSet(input.nextSibling, field.error);
-  }
-  for (const inner of group.groups) wrong = labFillForm(inner) || wrong;
-  for (const details of labById('form').querySelectorAll('details')) {
-    if (details.labKey === group.key) details.classList.toggle('lab-wrong', wrong);
-  }
-  return wrong;
 }
 
 /* Open or close the drawer; whether it is open is remembered. */

@@ -19,12 +19,11 @@ from cosim.interactive.exploration import EXACT, Fact
 from cosim.interactive.exploration_figure import ExploredRun, exploration_figure
 from cosim.interactive.exploration_words import Reference, compare, verdict_of
 from cosim.interactive.scenario_draft import Draft, DraftError, draft_of_query, open_draft
-from cosim.interactive.settings_form import by_field, fill_in, form_of
 from cosim.interactive.sliders import Controls, choose, controls_of, drag
 from cosim.lab.figure_sources import LiveSource, RecordedSource, report_address
 from cosim.lab.file_menu import FileMenu
 from cosim.lab.lab_services import ANSWER_S, LabServices, PageCalls, Session
-from cosim.lab.page_parts import PageParts, TextPanel, controls_part, figure_part, form_part, value_text
+from cosim.lab.page_parts import PageParts, TextPanel, controls_part, figure_part, value_text
 from cosim.output.run_verdict import Tone, VerdictLine
 from noack.core.errors import NoackError
 
@@ -71,7 +70,6 @@ class _Page:
         self._source, self._drawn_state, self._comparing = EXPLORE, 0, True
         self._kept: Reference | None = None
         self._controls: Controls | None = None
-        self._form = form_of(draft)
         self._moved = _MovedSlider("", "")
         self._last = _LastChange("", 0.0)
         self._unsettled = {""}
@@ -108,7 +106,7 @@ class _Page:
             )
         with ui.element("main").classes("lab-body w-full"):
             with ui.element("aside").props("id=lab-drawer aria-label=settings tabindex=-1"):
-                for name in ("guide hidden", "controls", "form"):
+                for name in ("guide hidden", "controls"):
                     ui.element("div").props(f"id=lab-{name}")
                 self._text_panel = TextPanel(self._session.draft, self._apply)
             with ui.element("div").classes("lab-main"):
@@ -252,8 +250,6 @@ class _Page:
         match message["what"]:
             case "slide":
                 await self._move_slider(message["key"], float(message["position"]))
-            case "fill":
-                await self._fill_field(message["key"], str(message["text"]).strip())
             case "choose":
                 key, value = message["key"], str(message["value"])
                 await self._apply(lambda draft: choose(draft, key, value), key)
@@ -269,12 +265,6 @@ class _Page:
             value = slider.value_at(position)
             self._moved = _MovedSlider(key, value_text(value))
             await self._apply(lambda draft: drag(draft, slider, value), key)
-
-    async def _fill_field(self, key: str, text: str) -> None:
-        field = next((field for field in self._form.all_fields() if field.key == key), None)
-        # The form may have been made anew without the field.
-        if field is not None and text != field.text(self._session.draft):
-            await self._apply(lambda draft: fill_in(draft, field, text), key)
 
     async def _begin_tutorial_step(self, step: "TutorialStep") -> None:
         draft = open_draft(step.scenario)
@@ -312,10 +302,8 @@ class _Page:
             if keys:
                 mistakes = self._session.mistakes
                 self._text_panel.show(draft, mistakes)
-                with suppress(DraftError):  # the text is no TOML; the form stays
-                    self._form = form_of(draft)
-                    form = form_part(self._form, draft, by_field(self._form, mistakes))
-                    await self._parts.show(query=f"?{draft.query()}", form=form)
+                with suppress(DraftError):  # the text is no TOML
+                    await self._parts.show(query=f"?{draft.query()}")
                 if not mistakes:
                     await self._live.change(draft, keys)
             await self._show()

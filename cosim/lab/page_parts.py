@@ -1,4 +1,4 @@
-"""The parts of the page that the browser is sent: figure, choices and sliders, form, texts.
+"""The parts of the page that the browser is sent: figure, choices and sliders, texts.
 
 Each is sent when it changes. ``figure.js`` draws the figure, ``lab.js`` makes and shows the other
 parts. Nothing of the framework is between them, so that a slider's new curve is drawn within a few
@@ -15,7 +15,6 @@ from nicegui import Client, ui
 from nicegui.events import ValueChangeEventArguments
 
 from cosim.interactive.scenario_draft import Draft, Mistake
-from cosim.interactive.settings_form import Field, FieldKind, Group
 from cosim.interactive.sliders import Controls
 from cosim.output.figures.figure_description import (
     Band,
@@ -224,33 +223,3 @@ def controls_part(controls: Controls, wrong: set[str], *, live: bool) -> Json:
 def value_text(value: float) -> str:
     """Return the value of a slider as text."""
     return f"{value:g}" if isinstance(value, int) else number(value, 3)
-
-
-def form_part(group: Group, draft: Draft, mistakes: dict[str, str]) -> Json:
-    """Return a group of the form for the browser, with the mistakes by key."""
-    return {
-        "key": group.key,
-        "title": group.key.rpartition(".")[2] or "all settings (form)",
-        "help": group.help,
-        "fields": [
-            {
-                "key": field.key,
-                "label": field.label,
-                "help": field.help,
-                "default": field.default,
-                "options": _options(field),
-                "text": field.text(draft),
-                "error": mistakes.get(field.key, ""),
-            }
-            for field in group.fields
-        ],
-        "groups": [form_part(inner, draft, mistakes) for inner in group.groups],
-    }
-
-
-def _options(field: Field) -> list[tuple[str, str]] | None:
-    """Return the values of a choice with their texts; None for a field with any text."""
-    if field.kind is not FieldKind.CHOICE:
-        return None
-    without = f"default: {field.default}" if field.default else "not given"
-    return [("", without), *((option, option) for option in field.options)]

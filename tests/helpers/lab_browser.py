@@ -153,17 +153,6 @@ class Page:
         self.wait(f"{element}.length > 0")
         self.js(f"{element}[0].click()")
 
-    def fill(self, key: str, text: str) -> None:
-        """Type a text into a field of the form; again if another element took the focus meanwhile."""
-        element = f"document.getElementById({json.dumps(f'lab-field-{key}')})"
-        deadline_s, typed = time.monotonic() + PATIENCE_S, None
-        while typed != text:
-            assert time.monotonic() < deadline_s, (key, text, typed)
-            self.wait(f"!!{element}")
-            self.js(f"{element}.focus(), {element}.select()")
-            self.call("Input.insertText", text=text)
-            typed = self.js(f"{element}?.value")
-
     def resize(self, width: int, height: int) -> None:
         """Give the window another size."""
         self.call("Emulation.setDeviceMetricsOverride", width=width, height=height,

@@ -1,8 +1,6 @@
-"""``noack.explore``: without widgets, and with widgets driven from Python."""
+"""``noack.explore``: what follows from changed settings."""
 
-import sys
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -62,46 +60,6 @@ def test_a_saved_scenario_has_the_settings_and_the_comments(tmp_path: Path) -> N
 def few_draws(monkeypatch: pytest.MonkeyPatch) -> None:
     few = partial(draft_results.explore_ensemble, draws=20)
     monkeypatch.setattr(draft_results, "explore_ensemble", few)
-
-
-@pytest.mark.usefixtures("few_draws")
-def test_sliders_change_the_explorer_and_the_other_way_round(monkeypatch: pytest.MonkeyPatch) -> None:
-    ipywidgets = pytest.importorskip("ipywidgets", reason="the extra `notebook` is not installed")
-    explorer = noack.explore("lane_following", {"horizon_s": 4.0})
-    controls, figure = explorer.widget().children
-    rows = controls.children[0].children
-    sliders = {label.value: slider for label, slider in pairwise(rows)
-               if isinstance(label, ipywidgets.Label)}  # fmt: skip
-    message, image, facts, margin = figure.children
-    first = bytes(image.value)
-    assert first.startswith(b"\x89PNG")
-    sliders["loss probability"].value = 0.0
-    assert explorer.scenario.network.loss.probability == 0.0  # type: ignore[union-attr]
-    assert bytes(image.value) != first
-    monkeypatch.setattr("cosim.api.explorer_widget._png", lambda *_: first)  # it takes most of the time
-    assert ">0 (0 %)</td>" in facts.value
-    explorer.set({"trigger.beta": 0.25})
-    assert sliders["β, threshold at the start"].value == 0.25
-    sliders["model error, as a multiple of the scenario's uncertainty"].value = 18.0
-    assert "no certificate" in facts.value
-    assert "grows" in message.value
-    (choice,) = [row.children[1] for row in rows if isinstance(row, ipywidgets.VBox)
-                 and row.children[0].value == "loss model"]  # fmt: skip
-    choice.value = "lossless"
-    assert explorer.scenario.network.loss.model == "lossless"
-    labels = [row.value for row in controls.children[0].children
-              if isinstance(row, ipywidgets.Label)]  # fmt: skip
-    assert "loss probability" not in labels
-    margin.click()
-    assert ">margin</th>" in facts.value
-    assert explorer.widget() is explorer.widget()
-
-
-def test_without_ipywidgets_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "ipywidgets", None)
-    monkeypatch.delitem(sys.modules, "cosim.api.explorer_widget", raising=False)
-    with pytest.raises(noack.NoackError, match=r"pip install 'noack\[notebook\]'"):
-        noack.explore("double_integrator").widget()
 
 
 def test_errors_are_said_to_decay_as_far_as_the_threshold_does() -> None:

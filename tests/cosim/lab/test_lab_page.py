@@ -78,34 +78,6 @@ def test_a_kept_run_is_drawn_beside_the_next_one_and_the_difference_is_said(
     page.wait(f"document.getElementById('lab-compare').hidden && {PIXELS} !== {json.dumps(pixels)}")
 
 
-def test_the_form_shows_mistakes_at_their_fields_and_keeps_what_is_typed(
-    browser: Browser, address: str
-) -> None:
-    page = Page(browser, address)
-    page.unfold("all settings (form)")
-    page.js(  # the event of a group that opens comes after the new form
-        "[...document.querySelectorAll('#lab-form details')].find(e => e.labKey === 'trigger').open = true, "
-        "LAB.formShape = '', labShowForm(LAB.form), null"
-    )
-    page.fill("trigger.beta", "abc")
-    wrong = "[...document.querySelectorAll('[aria-invalid=true]')].map(e => e.id + ': ' + "
-    wrong += "e.nextSibling.innerText).join('|')"
-    page.wait(f"{wrong} === 'lab-field-trigger.beta: expected a number'")
-    field = "document.getElementById('lab-field-trigger.beta')"
-    assert page.js(f"{field}.value") == "abc"
-    page.fill("trigger.beta", "0.15")
-    page.wait(f"{wrong} === '' && location.search.includes('trigger.beta=0.15')")
-    # It stays when the field is left, or the form shown again.
-    page.js(f"{field}.focus()")
-    for value, event in (("0.25", f"{field}.blur()"), ("0.35", "labShowForm(LAB.form)")):
-        page.js(f"{field}.value = '{value}', {field}.dispatchEvent(new Event('input')), {event}")
-        assert page.js(f"{field}.value") == value
-        page.wait(f"location.search.includes('trigger.beta={value}')")
-    # A slider moves the field, too.
-    page.drag("β, threshold at the start", 1.0)
-    page.wait(f"{field}.value === '5.0'")
-
-
 SOURCES = ("explore", "live", "recorded")
 WIDTHS = {"light": (390, 600, 801, 1000, 1400), "dark": (390,)}
 """The layout does not depend on the colours."""
@@ -143,7 +115,7 @@ def test_text_is_large_and_has_contrast_and_nothing_is_wider_than_the_page(
     page = Page(browser, address, size=size, scheme=scheme)
     page.js("document.head.insertAdjacentHTML('beforeend', '<style>*{transition:none !important}')")
     page.js("localStorage.removeItem('lab-drawer'), labDrawer(true, false), labToggleGuide()")
-    for part in ("all settings (form)", "trigger", "all settings (TOML)"):
+    for part in ("all settings (TOML)",):
         page.unfold(part)
     page.wait("!!document.querySelector('.cm-content[aria-label]')")
     page.wait(f"getComputedStyle(document.querySelector('.cm-editor')).backgroundColor {EDITOR[scheme]}")
@@ -160,9 +132,6 @@ def test_text_is_large_and_has_contrast_and_nothing_is_wider_than_the_page(
             place = page.js("document.getElementById('lab-figure').getBoundingClientRect().top")
             assert place < 260, (source, width)  # it is the first thing below the bar
         page.resize(*size)
-    page.fill("trigger.beta", "abc")
-    page.wait("!!document.querySelector('[aria-invalid=true]')")
-    assert violations(page, *RULES[scheme]) == []
 
 
 FOCUSED = """(() => {
