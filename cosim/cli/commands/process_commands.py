@@ -1,6 +1,5 @@
-"""``noack record``, ``plant``, ``sensor``, ``controller``, ``netem``, ``helics``: by terminal."""
+"""``noack record``, ``plant``, ``sensor``, ``controller``, ``netem``: by terminal."""
 
-import signal
 import sys
 from enum import StrEnum
 from importlib import import_module
@@ -19,7 +18,6 @@ from noack.core.errors import CallerError
 
 with lazy_modules():
     from cosim.live.coordination import remote_access
-    from cosim.simulation import helics_federate
     from netem import __main__ as emulator
     from noack.protocol import roles
 
@@ -130,37 +128,6 @@ def netem(context: typer.Context) -> int:
     """Join the open run as the network; or relay any UDP program: `noack netem --help`."""
     # typer removes the first `--`, which begins the command of a shell.
     return emulator.main(sys.argv[2:] if "--" in sys.argv else context.args)
-
-
-@cli.command(cli.PROCESSES, 60)
-def helics(
-    source: opt.ScenarioOptions,
-    *,
-    endpoint: Annotated[list[str], Option("--endpoint", metavar="NAME")],
-    broker: Annotated[str, Option(metavar="ADDRESS")] = "",
-    core: Annotated[str, Option(metavar="TYPE")] = "zmq",
-    name: Annotated[str, Option(metavar="NAME")] = "noack",
-    json: opt.JsonOption = False,
-) -> None:
-    """Join a federation of HELICS as its network, with the network of a scenario.
-
-    A message that is sent to the endpoint noack/NAME reaches the endpoint NAME later, or not.
-
-    Options:
-        endpoint: An endpoint that messages shall reach over the network; repeatable.
-        broker: Address of the broker, e.g. tcp://127.0.0.1:23404; by default on this host.
-        core: The kind of HELICS' core, as that of the broker: zmq, tcp and so on.
-        name: Name of the federate.
-
-    Examples:
-        noack helics lane_following --endpoint a   beside a helics_broker
-        noack helics lane_following --endpoint a --endpoint b --json   two flows
-    """
-    for number in (signal.SIGINT, signal.SIGTERM):  # HELICS waits in C, and so would Ctrl-C
-        signal.signal(number, signal.SIG_DFL)
-    options = helics_federate.FederateOptions(name, core, broker)
-    routes = helics_federate.run(source.load(), endpoint, options)
-    cli.print_lines(json, {"endpoints": [route.to_json() for route in routes]}, *routes)
 
 
 def _require_none_of(context: typer.Context, *options: str) -> None:
