@@ -377,13 +377,13 @@ Result = Run | Certificates | MarginResult | MeanCost | CampaignResult
 
 
 def save_tables(result: Result, folder: str | PathLike[str]) -> list[Path]:
-    """Write the tables of a result, each as LaTeX (booktabs) and as CSV, as ``--tables`` does.
+    """Write the tables of a result, each as CSV, as ``--tables`` does.
 
     >>> import noack, tempfile
     >>> folder = tempfile.TemporaryDirectory()
     >>> files = noack.save_tables(noack.certify("lane_following"), folder.name)
     >>> [file.name for file in files]
-    ['certificates.tex', 'certificates.csv', 'limits.tex', 'limits.csv']
+    ['certificates.csv', 'limits.csv']
     >>> folder.cleanup()
 
     Args:

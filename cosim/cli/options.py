@@ -148,7 +148,7 @@ TablesOption = Annotated[
         "--tables",
         callback=_usable_folder,
         metavar="FOLDER",
-        help="Write the tables into this folder, as LaTeX (booktabs) and as CSV.",
+        help="Write the tables into this folder, as CSV.",
     ),
 ]
 VerboseOption = Annotated[

@@ -44,7 +44,7 @@ def summary(
     Examples:
         noack summary   the last run
         noack summary --verbose   with timing, assumptions and each claim
-        noack summary --tables tables   its tables for a paper, as LaTeX and CSV
+        noack summary --tables tables   its tables as CSV
         noack summary runs/latest --json   all numbers, as JSON
     """
     outcome = run_summary.outcome_of_loop(reopen_run(run.path), run.loop)

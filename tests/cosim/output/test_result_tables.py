@@ -1,4 +1,4 @@
-"""Tables of results for papers: LaTeX, CSV, and the files of library and command line."""
+"""Tables of results as CSV, and the files of library and command line."""
 
 import csv
 import io
@@ -18,31 +18,10 @@ def rows_of(path: Path) -> list[list[str]]:
     return list(csv.reader(io.StringIO(path.read_text())))
 
 
-@pytest.mark.parametrize(("text", "latex"), [
-    ("a_b & 5 %", r"a\textsubscript{b} \& 5 \%"),
-    (r"\input{a} #1~$x$", r"\textbackslash{}input\{a\} \#1\textasciitilde{}\$x\$"),
-    ("my_name", r"my\_name"),
-    ("1.2e-05", r"\ensuremath{1.2\times10^{-5}}"),
-    ("e^(−a(t))", r"e\textsuperscript{\ensuremath{-}a(t)}"),
-    ("e^(−αt_k)", r"e\textsuperscript{\ensuremath{-}\ensuremath{\alpha}t\textsubscript{k}}"),
-    ("e^(open", r"e\textasciicircum{}(open"),
-    ("x̂ Â β̃ ᾱ", r"\ensuremath{\hat{x}} Â \ensuremath{\tilde{\beta}} \ensuremath{\bar{\alpha}}"),
-    ("\\漢\n--x", r"\textbackslash{}? {-}{-}x"),
-])  # fmt: skip
-def test_a_text_is_escaped(text: str, latex: str) -> None:
-    assert result_tables.latex_text(text) == latex
-
-
-def test_units_move_to_the_heads_and_numbers_are_aligned() -> None:
+def test_units_move_to_the_heads() -> None:
     table = result_tables.ResultTable("t", "c", ("", "time", "mixed"), [
         ("a", "0.5 s", "1 s"), ("b", "12 s", "2 ms"), ("c", "−1.25 s", "-"),
     ])  # fmt: skip
-    text = result_tables.as_latex(table)
-    assert r"\begin{tabular}{@{}lrr@{}}" in text
-    assert r" & time [s] & mixed \tabularnewline" in text
-    assert r"a & 0.5\phantom{0} & 1 s \tabularnewline" in text
-    assert r"b & 12\phantom{.00} & 2 ms \tabularnewline" in text
-    assert r"c & \ensuremath{-}1.25 & -- \tabularnewline" in text
     assert result_tables.as_csv(table) == ",time [s],mixed\na,0.5,1 s\nb,12,2 ms\nc,-1.25,\n"
     rows = result_tables.ResultTable(
         "t", "c", result_tables.KEY_VALUE, [("delay", "3 ms"), ("lost", "3 (60 %)")]
@@ -72,11 +51,10 @@ def test_the_library_writes_the_tables_of_the_command_line(tmp_path: Path) -> No
         (noack.simulate(noack.load("double_integrator", {"horizon_s": 0.1})), "numbers"),
     ):  # fmt: skip
         files = noack.save_tables(result, tmp_path / name)
-        assert [file.name for file in files[:2]] == [f"{name}.tex", f"{name}.csv"]
+        assert files[0].name == f"{name}.csv"
     result = invoke("margin", "lane_periodic", "--most", "2", "--no-period", "--tables", tmp_path)
     assert result.exit_code == 0, result.output
-    for ending in ("tex", "csv"):
-        own = tmp_path / "margin" / f"margin.{ending}"
-        assert own.read_bytes() == (tmp_path / f"margin.{ending}").read_bytes()
+    own = tmp_path / "margin" / "margin.csv"
+    assert own.read_bytes() == (tmp_path / "margin.csv").read_bytes()
     with pytest.raises(CallerError, match="str: has no tables"):
         noack.save_tables("lane_following", tmp_path)  # type: ignore[arg-type]
