@@ -867,11 +867,6 @@ typedef struct {
 /* Set the key. */
 void noack_wire_key(noack_wire *wire, const uint8_t key[NOACK_KEY_BYTES]);
 
-/* The tag of at least one byte of content. */
-void noack_wire_tag(
-    const noack_wire *wire, int64_t size_bytes, const uint8_t *content,
-    uint8_t tag[NOACK_TAG_BYTES]);
-
 /* Write the datagram of a message of at most NOACK_MAX_ENTRIES entries; return its size in bytes.
    If it is to be encrypted, its vector is still readable, and its tag missing. */
 int64_t noack_wire_encode(const noack_wire *wire, const noack_message *message, uint8_t *datagram);
@@ -1460,61 +1455,6 @@ const char *noack_replay_check(const noack_input_replay *replay);
 /* Replay the next inputs: compare each row bit for bit, and the times of ticks with the deadlines.
    Return NOACK_DONE, or why Python is needed. */
 int64_t noack_replay_inputs(noack_input_replay *replay);
-
-/* ---- Functional Mock-up Units: native/fmi/ --------------------------------------------------- */
-
-/* An instance of an FMU is an image: a block of memory without pointers to elsewhere. The file in
-   the FMU is its start, as if the block were at address 0. */
-
-/* The value references of the variables. */
-enum noack_fmu_variable {
-    NOACK_FMU_TIME_S,
-    NOACK_FMU_SEND,     /* of the channel: number of packets that have been sent */
-    NOACK_FMU_X,
-    NOACK_FMU_ARRIVALS, /* from the channel to the controller, the newest one first */
-    NOACK_FMU_NUMBERS,
-    NOACK_FMU_SENT_S,
-    NOACK_FMU_ARRIVAL_S,
-    NOACK_FMU_PACKETS,
-    NOACK_FMU_RECEIVED, /* of the channel: the newest packet that has arrived */
-    NOACK_FMU_RECEIVED_S,
-    NOACK_FMU_RECEIVED_X,
-    NOACK_FMU_LOST,
-    NOACK_FMU_LONGEST_BURST,
-    NOACK_FMU_IN_FLIGHT,
-    NOACK_FMU_U,        /* of the controller */
-    NOACK_FMU_X_C,
-    NOACK_FMU_UPDATES,
-    NOACK_FMU_VARIABLES
-};
-
-/* Where an image has the numbers of a variable. */
-typedef struct {
-    int64_t count; /* 0: this FMU has no such variable */
-    int64_t is_real, is_input;
-    int64_t at;    /* place of its numbers in the image, in bytes */
-} noack_fmu_values;
-
-/* Where an image has a pointer, and what it points to, in bytes. */
-typedef struct {
-    int64_t place, target;
-} noack_fmu_pointer;
-
-/* The head of an image. */
-typedef struct {
-    /* check sum of all that follows: noack_wire_tag with the key 0 */
-    uint8_t tag[NOACK_TAG_BYTES];
-    char sources[32];                   /* noack_sources() of the library that it is for */
-    int64_t bytes;                      /* of the image */
-    int64_t pointer_count, pointers_at; /* (pointer_count,) of noack_fmu_pointer */
-    int64_t channel_at, controller_at;  /* one of them is 0 */
-    int64_t n, packets;                 /* packets: most of them that can arrive in a step */
-    noack_fmu_values values[NOACK_FMU_VARIABLES];
-    int64_t mode, now_ns;
-    /* packets that have been sent, or of those that have arrived */
-    int64_t packets_taken;
-    int64_t arrivals_before;            /* this step */
-} noack_fmu_image;
 
 /* ---- Exact simulation in continuous time: native/exact/ -------------------------------------- */
 

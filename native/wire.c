@@ -90,7 +90,8 @@ void noack_wire_key(noack_wire *wire, const uint8_t key[NOACK_KEY_BYTES]) {
     compress(wire->keyed_state, block, BLOCK_BYTES, 0);
 }
 
-void noack_wire_tag(
+/* The tag of at least one byte of content. */
+static void tag_of(
     const noack_wire *wire, int64_t size_bytes, const uint8_t *content,
     uint8_t tag[NOACK_TAG_BYTES]) {
     uint64_t chain[8], block[16];
@@ -127,7 +128,7 @@ int64_t noack_wire_encode(const noack_wire *wire, const noack_message *message, 
     noack_wire_header(wire, message, datagram);
     memcpy(datagram + VECTOR, message->vector, 8 * (size_t)message->entries);
     if (!wire->encrypted)
-        noack_wire_tag(wire, content_bytes, datagram, datagram + content_bytes);
+        tag_of(wire, content_bytes, datagram, datagram + content_bytes);
     return content_bytes + NOACK_TAG_BYTES;
 }
 
@@ -168,7 +169,7 @@ static int64_t examine_header(
 
 static int has_tag(const noack_wire *wire, const uint8_t *datagram, int64_t content_bytes) {
     uint64_t tag[2], received[2];
-    noack_wire_tag(wire, content_bytes, datagram, (uint8_t *)tag);
+    tag_of(wire, content_bytes, datagram, (uint8_t *)tag);
     memcpy(received, datagram + content_bytes, sizeof received);
     /* Both words are compared in any case: the time must not depend on the first. */
     return ((tag[0] ^ received[0]) | (tag[1] ^ received[1])) == 0;

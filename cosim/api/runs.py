@@ -235,8 +235,8 @@ class Run:
         """Write the run for other programs; return the written files.
 
         Args:
-            path: ``.mat`` for MATLAB and Octave, ``.mcap`` for Foxglove, ``.fmu`` for tools of
-                FMI; without an ending, a folder of CSV files.
+            path: ``.mat`` for MATLAB and Octave, ``.mcap`` for Foxglove; without an
+                ending, a folder of CSV files.
             certificates: whether a ``.mat`` file has the certificates of each loop, which take
                 about a second each.
 

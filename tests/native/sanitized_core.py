@@ -56,8 +56,7 @@ def main() -> None:
     from noack.core import core_library
 
     assert not any(name.startswith(("netem", "noack.impairments")) for name in sys.modules)
-    core_library.LIBRARY = Path(library)  # exported FMUs have a copy of it
-    core_library.core = core_library.load_core(core_library.LIBRARY)
+    core_library.core = core_library.load_core(Path(library))
     sys.argv = [module, *arguments]
     runpy.run_module(module, run_name="__main__", alter_sys=True)
 

@@ -11,7 +11,7 @@ from cosim.cli import command as cli
 from cosim.cli import options as opt
 from cosim.cli.execute_run import reopen_run
 from cosim.lazy_modules import lazy_modules
-from cosim.output.export.export_formats import FORMATS, ScenarioFormat, export_run, find_format
+from cosim.output.export.export_formats import FORMATS, export_run, find_format
 from cosim.record.run_directory import DEFAULT_RUNS, RECORDING_FILE, SCENARIO_FILE, chosen_run, file_of_loop
 from noack.core.errors import CallerError, ExitStatus, NoackError
 from noack.runtime.command_line import print_to_stderr
@@ -169,51 +169,26 @@ def export(
         ),
     ],
     out: opt.OutOption = None,
-    settings: opt.SetOption = None,
     certificates: bool = True,
     json: opt.JsonOption = False,
 ) -> None:
     """Export a run for other programs: its tables, its summary and its certificates.
 
-    fmu: the channel and the controller of a scenario, whose name or file may be given as RUN.
-
     Options:
         file_format: Format of the file, or of the folder's files.
-        out: File, or folder of CSV or FMUs; RUN.mat and so on by default.
-        settings: Change one setting of the scenario, for fmu only.
+        out: File, or folder of CSV; RUN.mat and so on by default.
         certificates: Certificates of each loop in a file of MATLAB; about a second for each loop.
 
     Examples:
         noack export --format mat   the last run for MATLAB and Octave
         noack export --format mcap --out run.mcap   for Foxglove and PlotJuggler
         noack export runs/latest --format csv --json   a folder of CSV files
-        noack export lane_following --format fmu   FMUs of its channel and its controller
     """
-    chosen_format = find_format(file_format)
-    if not isinstance(chosen_format, ScenarioFormat):
-        if settings:
-            raise CallerError(f"--set: a run has its settings; {file_format} is a format of runs")
-        reopen_run(chosen := run.path)
-        name = run.loop or chosen.resolve().name
-        path = out or Path(f"{name}{chosen_format.SUFFIX}")
-        with cli.status("exporting"):
-            written = export_run(chosen, path, file_format, loop=run.loop, certificates=certificates)
-    else:
-        if run.loop or not certificates:
-            option = "--loop" if run.loop else "--no-certificates"
-            raise CallerError(f"{option}: not with {file_format}, which is made of a scenario")
-        scenario = opt.load_scenario(_scenario_name(run), settings)
-        path = out or Path(f"{scenario.name}{chosen_format.SUFFIX}")
-        written = chosen_format.write_scenario(scenario, path)
+    reopen_run(chosen := run.path)
+    path = out or Path(f"{run.loop or chosen.resolve().name}{find_format(file_format).SUFFIX}")
+    with cli.status("exporting"):
+        written = export_run(chosen, path, file_format, loop=run.loop, certificates=certificates)
     cli.print_lines(json, {"files": [str(path) for path in written]}, *written)
-
-
-def _scenario_name(run: opt.LoopOptions) -> str:
-    """Return the file of a run's scenario, or the scenario that is given instead of a run."""
-    run_dir = run.run_dir
-    if run_dir is not None and not (run_dir / SCENARIO_FILE).is_file():
-        return str(run_dir)
-    return str(run.path / SCENARIO_FILE)
 
 
 @cli.command(cli.RUNS, 55)

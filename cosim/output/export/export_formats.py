@@ -1,11 +1,11 @@
-"""The formats of exports, and what they write: a run, one of its loops, or a scenario."""
+"""The formats of exports, and what they write: a run, or one of its loops."""
 
 import pkgutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, cast, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, cast
 
 from cosim.lazy_modules import lazy_modules
 from cosim.record.run_directory import ENVIRONMENT_FILE, SUMMARY_FILE, read_object
@@ -17,7 +17,6 @@ with lazy_modules():
 
 if TYPE_CHECKING:
     from cosim.record.run_record import RunRecord
-    from noack.scenario.scenario import Scenario
 
 _ENDING = "_export"
 FORMATS = tuple(
@@ -36,19 +35,6 @@ class ExportFormat(Protocol):
 
     def write(self, run: "ExportedRun", path: Path, *, certificates: bool) -> list[Path]:
         """Write a run; return the written files. Raise MachineError if a file cannot be written."""
-
-
-@runtime_checkable
-class ScenarioFormat(ExportFormat, Protocol):
-    """A format that needs no run."""
-
-    def write_scenario(self, scenario: "Scenario", path: Path) -> list[Path]:
-        """Write what is exported of a scenario; return the written files.
-
-        Raises:
-            CallerError: the format cannot have something of the scenario.
-            MachineError: a file cannot be written.
-        """
 
 
 @dataclass(frozen=True)

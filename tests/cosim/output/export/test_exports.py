@@ -169,7 +169,7 @@ def test_csv_files_have_the_tables(run: noack.Run, tmp_path: Path) -> None:
 def test_another_ending_and_a_missing_package_are_named(
     run: noack.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(CallerError, match=r"run\.xls: .* to a folder, \.fmu, \.mat or \.mcap"):
+    with pytest.raises(CallerError, match=r"run\.xls: .* to a folder, \.mat or \.mcap"):
         run.export(tmp_path / "run.xls")
     monkeypatch.setitem(sys.modules, "mcap.writer", None)
     with pytest.raises(CallerError, match=r"pip install 'noack\[mcap\]'"):
