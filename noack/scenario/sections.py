@@ -1,7 +1,7 @@
 """The tables of a scenario that describe one loop: model, plant and network.
 
 The kinds of controllers, disturbances, observers, plants and triggers are those that their folders
-have (:func:`noack.settings.section.kinds_in`).
+and installed extensions have (:func:`noack.settings.section.kinds_in`).
 """
 
 from collections.abc import Mapping
@@ -49,12 +49,12 @@ from noack.settings.section import (
 )
 from noack.trigger_policies.policy_settings import ModelMatrices, PolicySettings
 
-# Settings classes by kind: a module in the folder adds its kind.
-CONTROLLERS = kinds_in("noack.controllers", ControllerSettings)
-DISTURBANCES = kinds_in("noack.disturbances", DisturbanceSettings)
+# Settings classes by kind: a module in the folder, or of an extension, adds its kind.
+CONTROLLERS = kinds_in("noack.controllers", ControllerSettings, group="noack.controllers")
+DISTURBANCES = kinds_in("noack.disturbances", DisturbanceSettings, group="noack.disturbances")
 OBSERVERS = kinds_in("noack.observers", ObserverSettings)
-PLANTS = kinds_in("noack.plants", PlantSettings)
-POLICIES = kinds_in("noack.trigger_policies", PolicySettings, "policy")
+PLANTS = kinds_in("noack.plants", PlantSettings, group="noack.plants")
+POLICIES = kinds_in("noack.trigger_policies", PolicySettings, "policy", group="noack.triggers")
 
 if TYPE_CHECKING:
     AnyController = ControllerSettings

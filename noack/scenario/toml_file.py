@@ -20,6 +20,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from noack.core.errors import CallerError, did_you_mean, plain_mistake, printable, shortened, why
+from noack.core.extension_points import missing_extension
 from noack.core.file_access import read_regular
 from noack.scenario.removed_keys import plain_way
 from noack.settings.section import ReadTable, ScenarioSection, Table
@@ -322,6 +323,10 @@ def _explain(mistake: ErrorDetails, root: type[ScenarioSection]) -> str:
     return f"{assignment}: {message}{_share(value, place)}"
 
 
+_GROUPS = {"system": "noack.plants", "controller": "noack.controllers"}
+"""The tables of which extensions have kinds, and the groups of their entry points."""
+
+
 class _Place(NamedTuple):
     """The place of a mistake in a file."""
 
@@ -444,6 +449,8 @@ def _choice(key: str, value: object, place: _Place) -> str:
     chosen = value[place.discriminator]
     if instead := plain_way(key, chosen):
         return f"{key} = {show_value(chosen)}: {instead}"
+    if missing := missing_extension(_GROUPS.get(str(place.path[-1]), ""), str(chosen)):
+        return f"{key} = {show_value(chosen)}: {missing}"
     close = difflib.get_close_matches(str(chosen), place.choices, n=1)
     hint = f"; did you mean {close[0]}?" if close else ""
     return f"{key} = {show_value(chosen)}: must be one of {choices_text}{hint}"

@@ -1,6 +1,7 @@
 """Parts of every table of a settings file: base class, numbers, vectors, matrices, kinds.
 
-A kind of settings is one module: a module in the kind's folder adds it (:func:`kinds_in`).
+A kind of settings is one module: a module in the kind's folder, or of an extension, adds it
+(:func:`kinds_in`).
 """
 
 import ast
@@ -10,10 +11,9 @@ import math
 import sys
 from collections.abc import Iterable, Mapping
 from functools import cache, reduce
-from importlib import import_module
 from itertools import pairwise
 from operator import or_
-from pkgutil import iter_modules
+from types import ModuleType
 from typing import Annotated, Self, TypeVar, get_args
 
 from pydantic import (
@@ -28,6 +28,7 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema
 
+from noack.core import extension_points
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
 from noack.protocol.wire_format import MAX_DIMENSION
@@ -202,20 +203,32 @@ def require_length(row: tuple[object, ...] | None, key: str, expected: int, reas
 Settings = TypeVar("Settings", bound=ScenarioSection)
 
 
-def kinds_in(package: str, base: type[Settings], key: str = "kind") -> Mapping[str, type[Settings]]:
-    """Return the settings classes that the modules of a package define, by their kind.
+def kinds_in(
+    package: str, base: type[Settings], key: str = "kind", group: str = ""
+) -> Mapping[str, type[Settings]]:
+    """Return the settings classes that modules define, by their kind.
 
     They are subclasses of ``base``. The field ``key``, a ``Literal`` of one value, names the kind.
-    Subpackages are not searched.
+    The modules are those of a package of noack and, with ``group``, those of installed extensions
+    (:func:`noack.core.extension_points.parts`).
     """
     kinds: dict[str, type[Settings]] = {}
-    for entry in iter_modules(import_module(package).__path__, f"{package}."):
-        if entry.ispkg:
-            continue
-        for member in vars(import_module(entry.name)).values():
-            if isinstance(member, type) and issubclass(member, base) and member.__module__ == entry.name:
+
+    def read(module: ModuleType) -> dict[str, type[Settings]] | None:
+        found: dict[str, type[Settings]] = {}
+        for member in vars(module).values():
+            if isinstance(member, type) and issubclass(member, base) and member.__module__ == module.__name__:
                 names = get_args(member.model_fields[key].annotation)  # empty for a base class
-                kinds |= dict.fromkeys(names, member)
+                found |= dict.fromkeys(names, member)
+        if not module.__name__.startswith(f"{package}."):
+            for settings in found.values():
+                settings.model_rebuild()  # an annotation that is wrong concerns this extension alone
+        if taken := found.keys() & kinds.keys():
+            raise ValueError(f"{key} = {', '.join(sorted(taken))} exists already")
+        return found or None
+
+    for part in extension_points.parts(package, group, read):
+        kinds |= part
     return kinds
 
 

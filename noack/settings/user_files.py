@@ -222,7 +222,8 @@ def _class(settings: ClassSettings, place: str) -> tuple[UserCode, str]:
         return _attribute(import_module(module), name), f"class {settings.name}"
     from importlib import metadata  # slow to import
 
-    entry_points = metadata.entry_points(group=settings.group)
+    found = metadata.entry_points(group=settings.group)
+    entry_points = metadata.EntryPoints(point for point in found if point.attr)  # others are of kinds
     if settings.name not in entry_points.names:
         names = ", ".join(sorted(entry_points.names)) or "none"
         raise LookupError(

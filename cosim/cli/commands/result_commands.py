@@ -11,7 +11,7 @@ from cosim.cli import command as cli
 from cosim.cli import options as opt
 from cosim.cli.execute_run import reopen_run
 from cosim.lazy_modules import lazy_modules
-from cosim.output.export.export_formats import FORMATS, export_run, find_format
+from cosim.output.export.export_formats import export_run, find_format, formats
 from cosim.record.run_directory import DEFAULT_RUNS, RECORDING_FILE, SCENARIO_FILE, chosen_run, file_of_loop
 from noack.core.errors import CallerError, ExitStatus, NoackError
 from noack.runtime.command_line import print_to_stderr
@@ -150,8 +150,10 @@ def replay(run: opt.LoopOptions, *, json: opt.JsonOption = False) -> int:
 
 
 def _known_format(name: str) -> str:
-    if name not in FORMATS:
-        raise typer.BadParameter(f"'{name}' is not one of {', '.join(FORMATS)}")
+    try:
+        find_format(name)
+    except CallerError as error:
+        raise typer.BadParameter(str(error)) from None
     return name
 
 
@@ -164,8 +166,8 @@ def export(
         Option(
             "--format",
             parser=_known_format,
-            metavar="|".join(FORMATS),
-            autocompletion=lambda: [*FORMATS],
+            metavar="FORMAT",
+            autocompletion=lambda: [*formats()],
         ),
     ],
     out: opt.OutOption = None,
@@ -175,7 +177,7 @@ def export(
     """Export a run for other programs: its tables, its summary and its certificates.
 
     Options:
-        file_format: Format of the file, or of the folder's files.
+        file_format: Format of the file, or of the folder's files: csv, mat, or an extension's.
         out: File, or folder of CSV; RUN.mat and so on by default.
         certificates: Certificates of each loop in a file of MATLAB; about a second for each loop.
 

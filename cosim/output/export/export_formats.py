@@ -1,15 +1,16 @@
 """The formats of exports, and what they write: a run, or one of its loops."""
 
-import pkgutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib import import_module
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, cast
+from types import ModuleType
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from cosim.lazy_modules import lazy_modules
 from cosim.record.run_directory import ENVIRONMENT_FILE, SUMMARY_FILE, read_object
 from noack.core.errors import CallerError
+from noack.core.extension_points import missing_extension, parts
 
 with lazy_modules():
     from cosim.analysis.summary import summary_model
@@ -19,16 +20,11 @@ if TYPE_CHECKING:
     from cosim.record.run_record import RunRecord
 
 _ENDING = "_export"
-FORMATS = tuple(
-    module.name.removesuffix(_ENDING)
-    for module in pkgutil.iter_modules([str(Path(__file__).parent)])
-    if module.name.endswith(_ENDING)
-)
-"""Names of the formats; their files are imported when they are used."""
 
 
+@runtime_checkable
 class ExportFormat(Protocol):
-    """What a file ``NAME_export.py`` has."""
+    """What a module ``NAME_export`` has."""
 
     SUFFIX: str
     """Ending of its files; empty: a folder."""
@@ -81,19 +77,41 @@ def export_run(
             damaged.
         MachineError: a file cannot be written.
     """
-    suffixes = {name: find_format(name).SUFFIX for name in FORMATS}
-    by_ending = {suffix: name for name, suffix in suffixes.items()}
+    suffixes = {name: each.SUFFIX for name, each in formats().items()}
+    by_ending = {suffix: name for name, suffix in reversed(suffixes.items())}  # noack's own first
     chosen = by_ending.get(path.suffix) if file_format is None else file_format
     if chosen is None or suffixes[chosen] not in ("", path.suffix):
         *first, last = (suffix or "a folder" for suffix in suffixes.values())
         expected = f"{', '.join(first)} or {last}" if file_format is None else suffixes[file_format]
-        raise CallerError(f"{path}: an export is written to {expected}")
-    return find_format(chosen).write(_exported_run(run_dir, loop), path, certificates=certificates)
+        missing = missing_extension("noack.exports", path.suffix.removeprefix("."))
+        raise CallerError(f"{path}: {missing or f'an export is written to {expected}'}")
+    return formats()[chosen].write(_exported_run(run_dir, loop), path, certificates=certificates)
 
 
-def find_format(file_format: str) -> ExportFormat:
-    """Return a format by its name."""
-    return cast("ExportFormat", import_module(f"{__package__}.{file_format}{_ENDING}"))
+@cache
+def formats() -> Mapping[str, ExportFormat]:
+    """Return the formats by their names: those of this folder, and those of installed extensions."""
+
+    def read(module: ModuleType) -> tuple[str, ExportFormat] | None:
+        name = module.__name__.rpartition(".")[2]
+        is_format = name.endswith(_ENDING) and isinstance(module, ExportFormat)
+        return (name.removesuffix(_ENDING), module) if is_format else None
+
+    own_folder = __name__.rpartition(".")[0]
+    return dict(parts(own_folder, "noack.exports", read))
+
+
+def find_format(name: str) -> ExportFormat:
+    """Return a format by its name.
+
+    Raises:
+        CallerError: there is none.
+    """
+    if name not in formats():
+        missing = missing_extension("noack.exports", name)
+        reason = missing or f"must be one of {', '.join(formats())}"
+        raise CallerError(f"format {name}: {reason}")
+    return formats()[name]
 
 
 def _exported_run(run_dir: Path, loop: str | None) -> ExportedRun:

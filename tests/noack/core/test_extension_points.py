@@ -1,0 +1,96 @@
+"""Parts of installed packages, right and wrong ones, in programs of their own."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from noack.core.errors import CallerError
+from noack.core.extension_points import NO_EXTENSIONS
+from tests.helpers.shipped import shipped
+
+PLANT = """
+from typing import Literal
+from noack.plants.plant_settings import EquationSettings, PlantEquations
+
+class SwingSettings(EquationSettings):
+    "A pendulum of which only small angles are considered."
+    kind: Literal["KIND"]
+    length_m: float = 1.0
+
+    def equations(self):
+        return PlantEquations(lambda t, z, v: (z[1], -9.81 / self.length_m * z[0] + v[0]))
+"""
+EXPORT = 'SUFFIX = ".txt"\n\ndef write(run, path, *, certificates=True):\n    return [path]\n'
+KINDS = "from noack.scenario.sections import PLANTS; print(*[kind for kind in PLANTS if 's' in kind])"
+
+
+def install(folder: Path, name: str, entry_points: str, **modules: str) -> None:
+    """Install a package as pip does: modules, beside a folder that describes the package."""
+    about = folder / f"{name.replace('-', '_')}-1.0.dist-info"
+    about.mkdir(parents=True)
+    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(entry_points)
+    for module, text in modules.items():
+        (folder / f"{module}.py").write_text(text)
+
+
+def run(folder: Path, *words: str, **environment: str) -> tuple[str, list[str]]:
+    """Run Python where the packages of a folder are installed; return its output and its warnings."""
+    done = subprocess.run(
+        [sys.executable, *words],
+        env={**os.environ, "PYTHONPATH": str(folder), **environment},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return done.stdout.strip(), done.stderr.splitlines()
+
+
+def test_a_plant_and_an_export_of_a_package_are_parts_of_noack(tmp_path: Path) -> None:
+    groups = "[noack.plants]\nswing = swing_plant\n[noack.exports]\nname = swing_export\n"
+    install(tmp_path, "noack-swing", groups, swing_plant=PLANT.replace("KIND", "swing"), swing_export=EXPORT)
+    system = '--set=plant.system={kind="swing",length_m=2.0}'
+    others = ("--set=plant.draw=nominal", "--set=plant.uncertainty_B=[[0],[0]]")
+    _, warnings = run(tmp_path, "-m", "cosim.cli", "check", "double_integrator", system, *others)
+    assert warnings == []
+    schema, _ = run(tmp_path, "-m", "cosim.cli", "schema")
+    assert "SwingSettings" in schema
+    schema, _ = run(tmp_path, "-m", "cosim.cli", "schema", **{NO_EXTENSIONS: "1"})
+    assert "SwingSettings" not in schema
+    formats = "from cosim.output.export.export_formats import formats; print('swing' in formats())"
+    assert run(tmp_path, "-c", formats) == ("True", [])
+
+
+@pytest.mark.parametrize(
+    ("module", "reason"),
+    [
+        ("import not_there", "ModuleNotFoundError: No module named 'not_there'"),
+        ("raise SystemExit('I end')", "SystemExit: I end"),
+        ("x = (", "SyntaxError: '(' was never closed (swing_plant.py, line 1)"),
+        ("", "it has nothing for the group noack.plants"),
+        (PLANT.replace("KIND", "linear"), "ValueError: kind = linear exists already"),
+        (PLANT.replace("float", "'Length'").replace("KIND", "swing"), "PydanticUndefinedAnnotation: "),
+    ],
+)  # fmt: skip
+def test_a_broken_package_costs_one_line(tmp_path: Path, module: str, reason: str) -> None:
+    install(tmp_path, "noack-swing", "[noack.plants]\nswing = swing_plant\n", swing_plant=module)
+    again = "import subprocess, sys; subprocess.run([sys.executable, '-c', sys.argv[1]], check=True)"
+    output, warnings = run(tmp_path, "-c", f"{KINDS}; {again}", KINDS)
+    assert "swing" not in output
+    (line,) = warnings  # the program that it starts prints no other
+    assert line.startswith(f"noack: warning: the extension noack-swing is ignored: swing_plant: {reason}")
+    assert run(tmp_path, "-c", KINDS, **{NO_EXTENSIONS: "1"})[1] == []
+
+
+def test_an_entry_point_that_is_a_class_is_for_plants_in_python(tmp_path: Path) -> None:
+    install(tmp_path, "swings", "[noack.plants]\nswing = missing:Swing\n")
+    assert run(tmp_path, "-c", KINDS)[1] == []
+
+
+@pytest.mark.parametrize("table", ["plant.system"])
+def test_an_unknown_kind_of_a_known_extension_names_its_package(table: str) -> None:
+    with pytest.raises(CallerError, match=rf'{table}.kind = "nosuch": must be one of'):
+        shipped("double_integrator", f'{table}.kind="nosuch"')
