@@ -78,7 +78,7 @@ def load_scenario(name: str, settings: Sequence[str] | None) -> "Scenario":
 ScenarioArgument = Annotated[
     str,
     Argument(
-        help="Scenario file (TOML), or the name of a shipped scenario.",
+        help="Scenario file (TOML), the name of a shipped scenario, or a run directory.",
         autocompletion=complete_scenarios,
     ),
 ]

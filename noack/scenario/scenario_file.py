@@ -39,13 +39,15 @@ def load(path: Path, overrides: Iterable[str] = (), most_bytes: int = toml_file.
     """Read and validate a scenario file.
 
     Args:
-        path: the TOML file.
+        path: the TOML file, or a run directory: its scenario has all that the run read from files.
         overrides: ``key=value`` settings that replace the file's, e.g. ``trigger.beta=0.3``.
         most_bytes: largest size of the file.
 
     Raises:
         CallerError: one line per mistake, each with file (or ``--set``), key, value and remedy.
     """
+    if (recorded := path / "scenario.toml").is_file():
+        path, most_bytes = recorded, MOST_RECORDED_BYTES
     content = toml_file.read(path, Scenario, most_bytes)
     assignments = [*overrides]
     keys = [_apply(content, override) for override in assignments]

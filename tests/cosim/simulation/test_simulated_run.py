@@ -95,6 +95,16 @@ def test_a_run_and_each_loop_can_be_summarised_and_replayed(run_dir: Path) -> No
     assert "--loop x: the run has no such loop; it has pendulum-01, " in result.stderr
 
 
+def test_a_run_that_is_simulated_again_has_the_same_bits(run_dir: Path, tmp_path: Path) -> None:
+    result = invoke("simulate", run_dir, "--runs", tmp_path, "--no-report")
+    assert result.exit_code == 0, result.output
+    names = {path.name for path in (run_dir / "record").glob("*.parquet")}
+    assert "netem_packet.parquet" in names
+    for name in names:
+        repeated = tmp_path / "latest" / "record" / name
+        assert repeated.read_bytes() == (run_dir / "record" / name).read_bytes()
+
+
 def test_commands_refuse_a_damaged_table_in_one_line(run_dir: Path, tmp_path: Path) -> None:
     damaged = tmp_path / "damaged"
     shutil.copytree(run_dir, damaged)
@@ -272,5 +282,6 @@ def test_a_recorded_scenario_may_exceed_the_size_limit_of_scenarios(tmp_path: Pa
     trace = f'network.loss={{model="trace",file="{tmp_path}/long.txt"}}'
     ending = simulate_run(load(ONE_LOOP, (*SETTINGS, trace)), tmp_path)
     assert load_record(ending.run_dir).scenario.network.loss.model == "scripted"
+    assert load(ending.run_dir).network.loss.model == "scripted"  # to repeat the run
     with pytest.raises(CallerError, match=r"scenario.toml: cannot be read: larger than 1 MiB$"):
         load(ending.run_dir / "scenario.toml")
