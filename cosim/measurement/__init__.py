@@ -2,8 +2,7 @@
 
 From a packet trace to the outputs, in this order:
 
-1. ``trace_sources.py`` reads a trace from files; ``live_measurement.py`` makes one with a live
-   probe, whose two ends are in ``probe_ends.py``.
+1. ``trace_sources.py`` reads a trace from files.
 2. ``loss_bursts.py``: which packets are effective, the bursts of consecutive losses, and M.
 3. ``chain_fits.py``: loss models that fit the bursts, with confidence intervals of
    ``interval_estimates.py``; ``outages.py``: bursts that are too long for them.

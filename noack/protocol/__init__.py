@@ -2,5 +2,5 @@
 
 ``roles.py`` says who sends what to whom, ``wire_format.py`` has the datagrams, ``record_tables.py``
 the rows that are recorded of them. ``ros2_messages.py`` and ``ros2_node.py`` do the same for nodes
-of ROS 2; ``probe_format.py`` has the datagrams of ``noack measure``.
+of ROS 2.
 """

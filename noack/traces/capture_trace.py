@@ -3,8 +3,8 @@
 * Two captures, of the sender's and of the receiver's end: the datagrams are matched by payload. The
   clocks differ, unless the user says otherwise.
 * One capture with both ends, such as the emulator writes: the same, with one clock.
-* One capture of the receiver's end: numbers and sending times from the datagrams of ``noack
-  measure``; or numbers at a known place of the payload, for a sender with a fixed period.
+* One capture of the receiver's end: numbers at a known place of the payload, for a sender with a
+  fixed period.
 
 A flow is a pair of addresses at an interface. The largest is taken, unless the user names another.
 """
@@ -13,8 +13,7 @@ import hashlib
 import os
 import re
 from array import array
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import IO, NamedTuple
 
@@ -22,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.row_operations import firsts_of_equal
-from noack.protocol.probe_format import MAGIC, ProbeKind, decode_probe
 from noack.traces.capture_packets import CapturedFlow, CutCaptureError, captured_packets, find_udp, is_capture
 from noack.traces.packet_trace import (
     MAX_PACKETS,
@@ -113,21 +111,17 @@ class Capture:
         return [index for index, name in enumerate(self.flows) if name.is_reverse_of(flow)]
 
     def read(self, notes: list[str] | None = None) -> Iterator[CapturedDatagram]:
-        """Yield the UDP datagrams, but not the last ones of a probe, which have no numbers."""
+        """Yield the UDP datagrams."""
         try:
             for packet in captured_packets(self._file):
                 datagram = find_udp(packet.interface, packet.link_type, packet.data)
-                if datagram is None or _is_end_of_probe(datagram[1]):
+                if datagram is None:
                     continue
                 flow, payload, is_complete = datagram
                 yield CapturedDatagram(packet.t_ns, flow, payload, not is_complete, packet.is_outbound)
         except CutCaptureError as error:
             if notes is not None:
                 notes.append(f"the capture {error}; what is before is used")
-
-
-def _is_end_of_probe(payload: bytes) -> bool:
-    return payload[:4] == MAGIC and payload[5:6] in (b"\4", b"\5")
 
 
 def two_captures(sender: Capture, flow: CapturedFlow, receiver: Capture) -> tuple[Datagrams, Datagrams]:
@@ -228,37 +222,34 @@ class SequenceField(NamedTuple):
         return cls(int(match[1]), int(match[2]), match[3] is not None)
 
     def read(self, payload: bytes) -> int | None:
-        """Return the number; None if the payload is too short."""
+        """Return the number; None if the payload is too short, or the number too large."""
         part = payload[self.offset : self.offset + self.size_bytes]
         if len(part) < self.size_bytes:
             return None
-        return int.from_bytes(part, "little" if self.is_little else "big")
+        number = int.from_bytes(part, "little" if self.is_little else "big")
+        return number if number < _MOST else None
 
 
 class _Numbered(NamedTuple):
     number: Int64s
     received_ns: Int64s
-    sent_ns: Int64s
 
 
-def _numbered(
-    capture: Capture, flow: CapturedFlow, read: Callable[[bytes], tuple[int, int] | None]
-) -> _Numbered:
-    """Return the numbers, times of arrival and of sending of a flow, and check its direction."""
-    columns = array("q"), array("q"), array("q")
+def _numbered(capture: Capture, flow: CapturedFlow, field: SequenceField) -> _Numbered:
+    """Return the numbers and times of arrival of a flow, and check its direction."""
+    numbers, received_ns = array("q"), array("q")
     outbound = 0
     for datagram in capture.read():
-        if datagram.flow == flow and (fields := read(datagram.payload)) is not None:
+        if datagram.flow == flow and (number := field.read(datagram.payload)) is not None:
             outbound += datagram.is_outbound
-            values = fields[0], datagram.t_ns, fields[1]
-            for column, value in zip(columns, values, strict=True):
-                column.append(value)
-    if columns[0] and outbound == len(columns[0]):
+            numbers.append(number)
+            received_ns.append(datagram.t_ns)
+    if numbers and outbound == len(numbers):
         raise ValueError(
             "shows the sender's end only, where nothing is lost yet; capture at the receiver, or "
             "give the captures of both ends"
         )
-    return _Numbered(*map(np.array, columns))
+    return _Numbered(np.array(numbers), np.array(received_ns))
 
 
 def _first_of_each(numbered: _Numbered, notes: list[str]) -> _Numbered:
@@ -270,63 +261,19 @@ def _first_of_each(numbered: _Numbered, notes: list[str]) -> _Numbered:
     return _Numbered(*(column[first] for column in numbered))
 
 
-def trace_of_probe(capture: Capture, flow: CapturedFlow, most_packets: int) -> PacketTrace:
-    """Return the trace of a probe of `noack measure`: the datagrams have their sending times."""
-    sessions: Counter[int] = Counter()
-
-    def read(payload: bytes) -> tuple[int, int] | None:
-        try:
-            content = decode_probe(payload)
-        except ValueError:
-            return None
-        if content.kind not in (ProbeKind.PROBE, ProbeKind.REQUEST):
-            return None
-        sessions[content.session] += 1
-        return content.sequence, content.sent_ns
-
-    numbered = _numbered(capture, flow, read)
-    if not len(numbered.number):
-        raise ValueError(
-            "has one end only, and no datagrams of `noack measure`; give the captures of both "
-            "ends, or say where the payload has a sequence number: --sequence-at OFFSET:BYTES"
-        )
-    if len(sessions) > 1:
-        raise ValueError(f"the flow has {len(sessions)} probes; capture them one by one")
-    # What is missing among the numbers is lost.
-    numbered = _first_of_each(numbered, capture.notes)
-    nothing_lost = np.zeros(len(numbered.number), bool)
-    trace = packet_trace(
-        numbered.sent_ns,
-        numbered.received_ns,
-        nothing_lost,
-        numbered.number,
-        clocks_differ=True,
-        most_packets=most_packets,
-    )
-    return relative_delays(trace)
-
-
 def trace_of_numbers(
     capture: Capture, flow: CapturedFlow, field: SequenceField, most_packets: int
 ) -> PacketTrace:
     """Return the trace of a sender with a constant period; the payloads have a number each."""
-    bits = 8 * field.size_bytes
-
-    def read(payload: bytes) -> tuple[int, int] | None:
-        number = field.read(payload)
-        return None if number is None or number >= _MOST else (number, 0)
-
-    numbered = _numbered(capture, flow, read)
+    numbered = _numbered(capture, flow, field)
     if len(numbered.number) < 2:
         raise ValueError(
             f"fewer than two datagrams have a sequence number at {field.offset}:{field.size_bytes}"
         )
     # Numbers that begin again at 0 go on, in the order of the arrivals.
     order = np.argsort(numbered.received_ns, kind="stable")
-    number = _unwrapped(numbered.number[order], bits)
-    numbered = _first_of_each(
-        numbered._replace(number=number, received_ns=numbered.received_ns[order]), capture.notes
-    )
+    number = _unwrapped(numbered.number[order], 8 * field.size_bytes)
+    numbered = _first_of_each(_Numbered(number, numbered.received_ns[order]), capture.notes)
     k = numbered.number - numbered.number[0]
     received_ns = numbered.received_ns - numbered.received_ns.min()
     if k[-1] >= most_packets:
@@ -400,7 +347,10 @@ def _trace(
     else:
         both_ends = one_capture(capture, flow)
         if both_ends is None:
-            return trace_of_probe(capture, flow, most)
+            raise ValueError(
+                "has one end only; give the captures of both ends, or say where the payload has a "
+                "sequence number: --sequence-at OFFSET:BYTES"
+            )
         ends = both_ends
     differ = bool(others) if options.clocks_differ is None else options.clocks_differ
     return matched_trace(*ends, differ, most, capture.notes)

@@ -27,7 +27,7 @@ from noack.traces.packet_trace import (
 
 _UNITS_NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 _TIME_COLUMN = re.compile(f"(sent|received(?:_other_clock)?)_({'|'.join(_UNITS_NS)})")
-_HEADER = re.compile(rb"(\xef\xbb\xbf)?[^\r\n]*(sent|received|sequence)")
+_HEADER = re.compile(rb"(?!\{)(\xef\xbb\xbf)?[^\r\n]*(sent|received|sequence)")
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,4})?")
 _OTHER = "_other_clock"
 _LOST = re.compile(r"(-1(\.0*)?)?")

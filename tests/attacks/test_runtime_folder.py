@@ -15,7 +15,6 @@ import rerun.blueprint as rrb
 
 import noack
 from cosim.doctor.machine_measures import _runtime_folder_problem
-from cosim.measurement.live_measurement import ProbeRows
 from cosim.output.viewer.loop_recording import RecordingFile
 from cosim.record.run_directory import ENDING_FILE, RECORD, RECORDING_FILE, EndingFile, finished_run
 from netem.capture import CaptureWriter
@@ -283,18 +282,12 @@ def test_a_command_follows_no_planted_name(
             assert all((common / name).stat().st_nlink == 1 for name in names)
 
 
-def probe_rows(path: Path) -> None:
-    with ProbeRows(path, print) as rows:
-        rows.add(1, 2)
-
-
 def lock_file(path: Path) -> None:
     with finished_run(path.parent):
         pass
 
 
 WRITERS: dict[str, Callable[[Path], object]] = {
-    "trace.csv": probe_rows,
     ".lock": lock_file,
     "a.pcapng": lambda path: CaptureWriter(path, [SPEC]).close(),
     "fates.parquet": lambda path: FateRecorder(path, [SPEC]).__exit__(),

@@ -15,6 +15,7 @@ from tests.cosim.measurement.chains import chain_losses, trace_of
 from tests.helpers.command_line import invoke
 
 RURAL = Path(__file__).parents[3] / "noack/traces/shipped/cicv5g" / "rural_n8_10kmh.csv"
+IRTT = Path(__file__).parents[2] / "noack/traces" / "irtt.json"
 
 
 def measure(*words: object) -> Result:
@@ -48,6 +49,21 @@ def test_json_tables_and_page_have_the_same_numbers(tmp_path: Path) -> None:
     for text in ("616 (28.3 %)", "175 packets, 10.9 s, from 81.312 s"):
         assert text in html
         assert text in " ".join(result.output.split())
+
+
+def test_a_document_of_irtt_is_measured_as_irtt_counts_it() -> None:
+    """The file is the output of `irtt client -i 20ms -d 800ms -l 100 -o FILE`, irtt 0.9.0."""
+    own = json.loads(IRTT.read_text())["stats"]
+    document = json.loads(measure(IRTT, "--json").stdout)
+    assert document["packets"] == own["packets_sent"]
+    assert document["lost"] == own["packets_sent"] - own["packets_received"]
+    up, down = (own["packets_sent"] - own["server_packets_received"],
+                own["server_packets_received"] - own["packets_received"])  # fmt: skip
+    text = measure(IRTT).output
+    assert f"lost forward: {up}" in text
+    assert f"lost in reverse: {down}" in text
+    # irtt subtracts the time that its server takes for a packet, some 10 µs.
+    assert document["delay_s"]["0.5"] == pytest.approx(own["rtt"]["median"] * 1e-9, abs=100e-6)
 
 
 def test_the_written_model_is_a_network_with_the_fitted_parameters(chain_csv: Path, tmp_path: Path) -> None:

@@ -5,13 +5,10 @@ import struct
 
 import numpy as np
 
-from cosim.measurement.probe_ends import ProbePlan, ProbeReceiver, ProbeSender
-from noack.core.errors import PeerError
-from noack.protocol.probe_format import ProbeDatagram, ProbeKind, encode_probe
 from noack.protocol.wire_format import Encoder, Flow, Message, Rejection, loop_number, read_header
 from noack.runtime.host_clocks.time_exchange import TIME_BYTES, TimeDatagram, TimeFormat, TimeKind
 from tests.fuzz.edits import Choices
-from tests.fuzz.harness import Harness, refusal
+from tests.fuzz.harness import Harness
 from tests.helpers.wire_decoder import Decoder
 from tests.oracles.wire import KEY, RUN, BothReceivers, tag
 
@@ -122,57 +119,7 @@ def times_input(data: bytes) -> None:
                 assert form.encode(decoded) == datagram
 
 
-_PERIOD_NS = 20_000_000
-_FIELDS = ("session", "host", "sequence", "sent_ns", "start_ns", "period_ns", "planned", "number",
-           "newest", "seen")  # fmt: skip
-_SIGNED = ("sent_ns", "start_ns")
-
-
-def probes_input(data: bytes) -> None:
-    """Both ends of a probe take any datagram; an answer is as long as the request."""
-    choices = Choices(data)
-    receiver = ProbeReceiver(5, 0, 10**9)
-    sender = ProbeSender(ProbePlan(_PERIOD_NS, 20, is_round_trip=True), 1, 5, 0)
-    for _ in range(4):
-        sender.on_timer(sender.next_deadline_ns())
-    now_ns = 0
-    while choices.left and now_ns < 200 * _PERIOD_NS:
-        datagram = _datagram(choices, now_ns // _PERIOD_NS)
-        now_ns += choices.below(256) * _PERIOD_NS // 8
-        answer = receiver.handle(datagram, "somewhere", now_ns)
-        assert answer is None or len(answer) == len(datagram)  # never amplifies
-        sender.handle(datagram, now_ns)
-        if answer is not None:
-            sender.handle(answer, now_ns)
-        receiver.is_over(now_ns)
-    with refusal():
-        try:
-            reports = [sender.finish(0), receiver.finish(0)]
-        except ValueError as error:
-            raise PeerError(str(error)) from None
-        for report in reports:
-            assert report is None or report.trace is None or len(report.trace) < 10**7
-
-
-def _datagram(choices: Choices, sequence: int) -> bytes:
-    kind = choices.choose([ProbeKind.PROBE, *ProbeKind])
-    content = ProbeDatagram(
-        kind, 1, 5, sequence % 4, max(sequence, 4) * _PERIOD_NS, 0, _PERIOD_NS, 20, sequence, sequence
-    )
-    for _ in range(choices.below(3)):
-        name = choices.choose(_FIELDS)
-        value = choices.integer() & (2**63 - 1 if name != "seen" else 2**128 - 1)
-        sign = -1 if name in _SIGNED and choices.flag() else 1
-        content = content._replace(**{name: sign * value})
-    datagram = bytearray(encode_probe(content, 100 + choices.below(20)))
-    if choices.below(8) == 1:
-        datagram[choices.below(len(datagram))] ^= 1 << choices.below(8)
-        del datagram[100 + choices.below(20) :]
-    return bytes(datagram)
-
-
 PARSERS = {
     "wire": Harness(wire_input, words=WIRE_WORDS),
     "times": Harness(times_input, words=TIMES_WORDS),
-    "probes": Harness(probes_input),
 }

@@ -22,7 +22,6 @@ from noack.impairments.kinds.replay import Replay
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_models.trace import TraceLoss
 from noack.impairments.target_loss import read_files
-from noack.protocol.probe_format import ProbeDatagram, ProbeKind, encode_probe
 from noack.scenario.matrix_files import read_matrices
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
@@ -217,13 +216,6 @@ def traces_input(data: bytes) -> None:
 _PERIOD_NS = 20_000_000
 _SENT = [Sent(10**18 + k * _PERIOD_NS, struct.pack(">I", k)) for k in range(6)]
 _ARRIVED = [packet._replace(t_ns=packet.t_ns + 5_000_000, interface=1, source_port=7) for packet in _SENT[1:]]
-_PROBES = [
-    Sent(
-        10**18 + k * _PERIOD_NS,
-        encode_probe(ProbeDatagram(ProbeKind.PROBE, 1, 2, k, k * _PERIOD_NS, 0, _PERIOD_NS, 6)),
-    )
-    for k in (0, 1, 3, 2, 5)
-]
 _V6 = [packet._replace(source="2001:db8::1", destination="2001:db8::2") for packet in _SENT]
 _IRTT = json.dumps({
     "version": {"irtt": "0.9.0"},
@@ -237,7 +229,7 @@ _IRTT = json.dumps({
 _CAPTURES = [
     pcapng_of(*_SENT, *_ARRIVED),
     pcap_of(*_SENT, link_type=ETHERNET, vlans=1),
-    pcap_of(*_PROBES, order=">", nano=False),
+    pcap_of(*(_SENT[k] for k in (0, 1, 3, 2, 5)), order=">", nano=False),
     pcapng_of(*_V6, order=">", link_type=ETHERNET),
     *(pcap_of(*_SENT, link_type=link) for link in LINKS),
     _IRTT,
