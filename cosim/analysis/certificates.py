@@ -9,7 +9,6 @@ import numpy as np
 from noack.core.errors import CallerError, one_line
 from noack.core.linear_systems import Matrix
 from noack.core.number_format import NONE, TextRows, as_html, as_text, at_least, at_most
-from noack.impairments.markov_chain import NotPredictableError
 from noack.plants.linear import LinearSettings
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
@@ -32,7 +31,6 @@ from noack.theory.certificates.scenario_certificates import box_scope, own_plant
 from noack.theory.certificates.trigger_weight import choose_weight
 from noack.theory.margins.loss_margin import LossMargin, Stability
 from noack.theory.paper import Theorem2, theorem_2
-from noack.theory.random_losses.unlimited_losses import UnlimitedLosses, unlimited_losses
 from noack.trigger_policies.decaying import DecayingSettings
 from noack.trigger_policies.periodic_trigger import PeriodicSettings
 
@@ -79,10 +77,6 @@ class Certificates:
     """W of the trigger's norm, (n, n), if this call chose it; else None."""
     late_periods: int
     """Allowed lateness in steps of the plant."""
-    unlimited: UnlimitedLosses | None
-    """What holds without a limit on the losses; None if the network enforces its guarantee, or if
-    the losses are no Markov chain over the packets (``unpredictable`` is the reason)."""
-    unpredictable: str | None
     nonlinear: str | None = None
     """Why the certificates are for the model as the plant, not for the plant itself; else None."""
 
@@ -118,7 +112,6 @@ class Certificates:
         ]
         self._own_weight = np.eye(loop_of(scenario).n) if given is None else given
         self.theorem_2 = _theorem_2(scenario, self.paper)
-        self.unlimited, self.unpredictable = self._unlimited()
 
     def __reduce__(self) -> tuple[object, ...]:
         """Pickle what they are computed from; it is computed again."""
@@ -208,20 +201,11 @@ class Certificates:
             },
             "certificates": [{"under": under, **certificate.to_json()} for under, certificate in self],
             "stability": None if self.stability is None else self.stability._asdict(),
-            "unlimited_losses": None if self.unlimited is None else self.unlimited.to_json(),
             "schedule": {
                 f"{name}_s": getattr(self.scheduled, f"{name}_s") for name in ("sampling", "delay", "hold")
             },
             "limits": {scope: limits._asdict() for scope, limits in self.limits_by_scope.items()},
         }
-
-    def _unlimited(self) -> tuple[UnlimitedLosses | None, str | None]:
-        if self.scenario.network.enforce_mansd:
-            return None, None
-        try:
-            return unlimited_losses(self.scenario, self._scopes[0], self.scheduled), None
-        except NotPredictableError as error:
-            return None, str(error)
 
     def _covering(self, plants: str, conditions: str) -> ScenarioCertificate | None:
         fitting = (certificate for certificate in self._of(conditions) if certificate.scope == plants)

@@ -22,7 +22,7 @@ from noack.impairments.target_loss import loss_process
 from noack.scenario.scenario import Scenario
 from noack.theory.margins.joint_spectral_radius import ACCURACY
 from noack.theory.margins.loss_margin import LossMargin, Stability, capped, uncapped
-from noack.theory.random_losses.almost_sure_growth import RandomGrowth, random_growth
+from noack.theory.random_losses.mean_square_growth import MeanSquareGrowth, growth_without_guarantee
 
 MOST_M = 16
 """Largest M that is examined by default."""
@@ -206,7 +206,7 @@ class MarginResult:
     """The constraints of the network allow no more losses with a larger M."""
     period: PeriodLimit | None
     """None if it was not searched for."""
-    without_guarantee: RandomGrowth | str
+    without_guarantee: MeanSquareGrowth | str
     """The growth under the scenario's losses if nothing limits them, or why it is not known."""
     effort: float = 1.0
     """Factor of the limits of the work for a decision."""
@@ -384,10 +384,10 @@ def _require_in_range(most_m: int, accuracy: float, effort: float) -> None:
         raise CallerError(f"effort {effort:g}: expected a factor of the work up to 1e6, e.g. 10")
 
 
-def _without_guarantee(resolved: Scenario, progress: MarginProgress) -> RandomGrowth | str:
+def _without_guarantee(resolved: Scenario, progress: MarginProgress) -> MeanSquareGrowth | str:
     progress("random losses")
     try:
-        return random_growth(resolved, loss_process(resolved.network.link))
+        return growth_without_guarantee(resolved, loss_process(resolved.network.link))
     except NotPredictableError as error:
         return f"not known: {error}"
 

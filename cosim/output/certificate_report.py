@@ -5,7 +5,6 @@ losses are not limited, what holds for random ones; :func:`print_margin` prints 
 time-triggered loop, :func:`print_mean_cost` its mean cost under random losses.
 """
 
-import math
 from collections.abc import Iterable, Iterator
 from functools import partial
 
@@ -32,7 +31,6 @@ from noack.theory.certificates.conditions import BOX, REGION, nominal_conditions
 from noack.theory.certificates.network_limits import MOST_S
 from noack.theory.certificates.scenario_certificates import outside_box
 from noack.theory.margins.loss_margin import Stability
-from noack.theory.random_losses.unlimited_losses import UnlimitedLosses
 
 
 def print_certificates(console: Console, results: Certificates, chosen: Certificates | None = None) -> None:
@@ -58,7 +56,6 @@ def print_certificates(console: Console, results: Certificates, chosen: Certific
     print_assumptions(console, (results.schedule_region or results.schedule).assumptions)
     console.print("assumptions of the paper's theorems:")
     print_assumptions(console, assumptions(results.scenario))
-    _print_unlimited(console, results)
     for sentence in (*_in_words(results), *_stability_in_words(results)):
         console.print(sentence, markup=False, highlight=False)
     exists = results.schedule.constants is not None
@@ -367,106 +364,3 @@ def mean_cost_tables(costs: MeanCost) -> Iterator[ResultTable]:
     transients = (cost.transient_cost for cost in known)
     add("mean cost from x(0), without disturbances and noise", transients)
     yield ResultTable("cost", title, headings, rows)
-
-
-_RARE = 1e-4
-"""Rows are shown from this probability on, up to the first one that is exceeded less often."""
-_MOMENT = {1: "mean", 2: "rms"}
-
-
-def _print_unlimited(console: Console, results: Certificates) -> None:
-    """Print what holds although the network does not limit the losses."""
-    if results.unpredictable is not None:
-        console.print(f"[yellow]no statement without the guarantee:[/] {results.unpredictable}")
-    if (unlimited := results.unlimited) is None:
-        return
-    likely = [burst for burst in unlimited.bursts if burst.probability < 1 - _RARE]
-    if (
-        bursts := [burst for burst in likely if burst.probability > _RARE]
-        + [burst for burst in unlimited.bursts if burst not in likely][:1]
-    ):
-        table = ResultTable(
-            "bursts",
-            "without the guarantee: a run's longest burst of losses, and the bounds that "
-            f"hold as long as none is longer; runs of {unlimited.horizon_s:g} s",
-            ("longest burst", "P(longer burst)", "events", "Δ", "X"),
-            [
-                (
-                    f"{burst.most}",
-                    f"≤ {at_most(1 - burst.probability, 3)}",
-                    f"≤ {burst.events}",
-                    at_most(burst.delta),
-                    at_most(burst.state),
-                )
-                for burst in bursts
-            ],
-        )
-        console.print(terminal_table(table, left=()))
-    error = "‖W e_c‖" if results.scenario.trigger.weight is not None else "‖e_c‖"
-    beta = results.scenario.decaying.beta if unlimited.at_events else math.nan
-    if (table := moments_table(unlimited, error, beta)).rows:
-        console.print(terminal_table(table))
-    for sentence in sentences(unlimited):
-        console.print(sentence, markup=False, highlight=False)
-
-
-def moments_table(unlimited: UnlimitedLosses, error: str, beta: float) -> ResultTable:
-    """Return the bounds of means and root mean squares; a bound that does not exist is a dash.
-
-    Args:
-        unlimited: what is certified without a limit of the losses.
-        error: how the norm of e_c is written, in the trigger's norm.
-        beta: β of the trigger, by which the bounds at events are multiplied.
-    """
-    bounds: list[tuple[str, float, int, float | None, float]] = []
-    if (moments := unlimited.root_mean_squares) is not None:  # a mean is at most the root mean square
-        values = moments.state, moments.controller_error
-        bounds += [("at every time", moments.rate_per_s, order, *values) for order in _MOMENT]
-    bounds += [
-        *(("largest of a run", m.rate_per_s, m.order, m.state, m.controller_error) for m in unlimited.runs),
-        *(
-            ("before an event", unlimited.paper_rate_per_s or 0.0, order, None, beta * value)
-            for order, value in enumerate(unlimited.at_events, start=1)
-        ),
-    ]
-    cells: dict[tuple[str, str], dict[str, str]] = {}
-    for label, rate_per_s, order, state, controller_error in bounds:
-        row = cells.setdefault((label, at_least(rate_per_s, 3)), {})
-        row[f"{_MOMENT[order]}\n{error}"] = at_most(controller_error)
-        if state is not None:
-            row[f"{_MOMENT[order]}\n‖x‖"] = at_most(state)
-    columns = [f"{moment}\n{norm}" for norm in ("‖x‖", error) for moment in _MOMENT.values()]
-    losses = f"independent losses with probability {unlimited.largest_probability:.4g}"
-    if not unlimited.is_independent:
-        losses = f"losses with probability at most {at_most(unlimited.largest_probability)} given any past"
-    return ResultTable(
-        "moments",
-        f"without the guarantee, {losses}: bounds of means over runs, multiplied by e^(−rate·t)",
-        ("", "rate,\n1/s", *columns),
-        [(*key, *(row.get(column, NONE) for column in columns)) for key, row in cells.items()],
-    )
-
-
-def sentences(unlimited: UnlimitedLosses) -> Iterator[str]:
-    """Yield the conditions of the bounds of means, and what is certified almost surely."""
-    if unlimited.runs:
-        run = unlimited.runs[0]
-        yield (
-            f"Largest of a run: of e^(rate·t) times the norm, within {unlimited.horizon_s:g} s. Runs with a "
-            f"burst of more than {run.most} losses, a share of at most "
-            f"{at_most(1 - run.probability, 2)}, count as 0."
-        )
-    if unlimited.at_events:
-        yield "Before an event: under the paper's conditions (no sampling, no delay, no hold)."
-    if unlimited.void is not None:
-        yield f"At every time no mean is certified: {unlimited.void}."
-    rates = {"": unlimited.sure_rate_per_s, " under the paper's conditions": unlimited.paper_rate_per_s}
-    for conditions, rate_per_s in rates.items():
-        if rate_per_s is not None:
-            yield f"x decays almost surely{conditions}, at every rate below {at_least(rate_per_s, 3)} /s."
-    if unlimited.root_mean_squares or unlimited.bursts:
-        yield (
-            "These are statements about many runs: one run cannot violate a mean. The "
-            "probabilities are bounds; a campaign shows the frequencies, and with the metrics "
-            "final_norm and sup_e_c_scaled the means."
-        )

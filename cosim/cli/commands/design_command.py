@@ -18,14 +18,7 @@ from noack.runtime.command_line import print_to_stderr
 
 with lazy_modules():
     from cosim.live.monitoring import progress
-    from cosim.studies.design import (
-        design_page,
-        design_search,
-        design_space,
-        event_design,
-        hold_strategies,
-        network_search,
-    )
+    from cosim.studies.design import design_outcome, design_page, design_search, design_space, network_search
     from noack.core import linear_systems
     from noack.scenario import scenario, scenario_file
 
@@ -85,7 +78,6 @@ class DesignAim(StrEnum):
 
     SETTLING = "settling"
     NETWORK = "network"
-    TRANSMISSIONS = "transmissions"
 
 
 @opt.option_group
@@ -94,56 +86,39 @@ class NetworkOptions:
 
     Options:
         aim: `settling`: the trigger with the fewest transmissions that settles in time. `network`:
-            the gain and hold strategy that are proven stable for the largest M. `transmissions`:
-            those with the longest period for the scenario's guarantee.
-        period: Time between two updates of a time-triggered sensor; by default that of a periodic
-            scenario. Without it, the paper's trigger is kept, with other α and β.
-        window: Maximise L in "at most L losses in WINDOW updates" instead of M.
-        most: Largest M to examine; 16 with a period, else 1,000.
-        cost: Largest cost ∫ xᵀQx + uᵀRu dt, as a multiple of the given loop's. With a period, that
-            without losses; else the mean over draws.
-        share: Most transmissions of events, as a multiple of the given loop's.
-        holds: What to try between two updates: `zero`, `zoh` to hold the last input, `model`, or
-            `predictions:N`: the model for N periods, then zero (`predictions:N:hold`: the last
-            input); `predictions`: N = 2, 4 and 8.
-            By default all of these, and what the given loop does.
+            the gain of a time-triggered loop that is proven stable for the largest M.
+        period: Time between two updates; by default that of a periodic scenario.
+        most: Largest M to examine; 16 by default.
+        cost: Largest cost ∫ xᵀQx + uᵀRu dt without losses, as a multiple of the given loop's; 1.2 by
+            default.
         effort: Number of loops that the search may try; 1,500 by default.
     """
 
     aim: Annotated[DesignAim, Option("--for")] = DesignAim.SETTLING
     period: Annotated[float | None, Option(metavar="SECONDS")] = None
-    window: Annotated[int | None, Option(metavar="UPDATES")] = None
     most: Annotated[int | None, Option(min=1, max=10_000)] = None
-    cost: float = 1.2
-    share: float = 1.0
-    holds: str | None = None
+    cost: float | None = None
     effort: Annotated[int | None, Option(min=0)] = None
 
     def refuse(self) -> None:
         """Raise CallerError for an option that has no effect for --for settling."""
-        for option in ("period", "window", "most", "holds", "effort"):
+        for option in ("period", "most", "cost", "effort"):
             if getattr(self, option) is not None:
-                raise CallerError(f"--{option}: is for --for network and --for transmissions only")
+                raise CallerError(f"--{option}: is for --for network only")
 
     def request(
-        self, weights: "tuple[linear_systems.Matrix, linear_systems.Matrix]", bounds: "design_search.Bounds"
+        self, weights: "tuple[linear_systems.Matrix, linear_systems.Matrix]"
     ) -> "network_search.DesignRequest":
         """Return what is asked for; raise CallerError if an option is wrong."""
         if self.period is not None and not 1e-6 <= self.period <= 1e7:
             raise CallerError(f"--period: from 1e-6 to 1e7 seconds, not {self.period:g}")
-        if not 0 < self.share < math.inf:
-            raise CallerError(f"--share: must be positive, not {self.share:g}")
+        default = network_search.DesignRequest()
         return network_search.DesignRequest(
-            goal="transmissions" if self.aim is DesignAim.TRANSMISSIONS else "network",
-            window=self.window,
-            most=self.most,
-            transmissions=self.share,
+            most=self.most or default.most,
             period_s=self.period,
-            cost=self.cost,
-            bounds=bounds,
+            cost=default.cost if self.cost is None else self.cost,
             weights=weights,
-            holds=None if self.holds is None else hold_strategies.read_holds(self.holds),
-            **({} if self.effort is None else {"effort": self.effort}),
+            effort=default.effort if self.effort is None else self.effort,
         )
 
 
@@ -219,9 +194,8 @@ def design(
     """Choose a trigger that transmits least, or a gain that tolerates the most losses.
 
     Without --for: α, β and the norm with the fewest transmissions that meet your limits. With --for
-    network or --for transmissions: K, by LQR and a search without gradients, with α and β, or with
-    the hold strategy of a time-triggered loop; the result is certified, as by noack certify or
-    noack margin.
+    network: the gain K of a time-triggered loop, by LQR and a search without gradients; the result is
+    proven, as by noack margin.
 
     Exit status 1: no choice meets the limits or is proven stable, or fresh draws do not confirm it.
 
@@ -235,18 +209,15 @@ def design(
         noack design double_integrator --settling 8 --gain lqr --Q '[1, 1]' --json
         noack design lane_periodic --for network   a gain for the largest M
         noack design unstable_pendulum --for network --period 0.25 --out mine.toml
-        noack design lane_periodic --for transmissions --cost 1   the longest period
     """
     figure_files, loaded = figures.files, source.load()
     if network.aim is not DesignAim.SETTLING:
-        if requirements.settling is not None or feedback.gain != "given":
-            raise CallerError(f"--settling, --gain: are not for --for {network.aim.value}")
+        if requirements.settling is not None or requirements.bound or feedback.gain != "given":
+            raise CallerError(f"--settling, --bound, --gain: are not for --for {network.aim.value}")
         page = files.page_of(f"{loaded.name}-network")
-        request = network.request(feedback.matrices(loaded), requirements.bounds())
-        if request.period_s is None and loaded.trigger.policy == "decaying":
-            warn_of_left_out(loaded)
+        request = network.request(feedback.matrices(loaded))
         with progress.work_bar("trying gains", lines=True) as bar:
-            outcome = event_design.design_for_network(loaded, request, seed, bar)
+            outcome = design_outcome.design_for_network(loaded, request, bar)
         written = design_page.write_outcome(outcome, page, figure_files)
         written += files.write(outcome.scenario_toml()) if outcome.is_certified else []
         cli.show_with_files(json, outcome.to_json(), written, design_page.print_loop_design, outcome)

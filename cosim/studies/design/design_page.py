@@ -42,8 +42,6 @@ _FRONT_CAPTION = "The trade-off curve; intervals have 95 % confidence, not corre
 _MOST_ROWS = 20
 HEADINGS = ("transmissions", "settling time", "α [1/s]", "β", "weight", "gain")
 _LOOP_HEADINGS = ("", "given", "designed")
-_HOLD_HEADINGS = ("between updates", "no destabilising pattern found for")
-_HOLD_CAPTION = "best loop tried with each hold strategy (proven is only what the designed loop tolerates)"
 
 
 def _write(
@@ -169,7 +167,6 @@ def write_outcome(outcome: DesignOutcome, path: Path, figure_files: FigureFiles 
     Raises:
         MachineError: they cannot be written.
     """
-    by_hold = (_HOLD_CAPTION, _HOLD_HEADINGS, outcome.by_hold, 1)
     return _write(
         path,
         outcome.figure,
@@ -181,7 +178,7 @@ def write_outcome(outcome: DesignOutcome, path: Path, figure_files: FigureFiles 
         tone="good" if outcome.is_better else "doubt",
         notes=outcome.notes,
         heading="Worst losses",
-        tables=[("Both loops", _LOOP_HEADINGS, outcome.rows, 1), *[by_hold] * (len(outcome.by_hold) > 1)],
+        tables=[("Both loops", _LOOP_HEADINGS, outcome.rows, 1)],
         scenario_toml=outcome.scenario_toml(),
     )
 
@@ -191,9 +188,6 @@ def print_loop_design(console: Console, outcome: DesignOutcome) -> None:
     title = f"{outcome.name}: loops under the worst losses"
     table = ResultTable("design", title, _LOOP_HEADINGS, outcome.rows)
     console.print(terminal_table(table, left=range(3)))
-    if len(outcome.by_hold) > 1:
-        table = ResultTable("holds", _HOLD_CAPTION, _HOLD_HEADINGS, outcome.by_hold)
-        console.print(terminal_table(table))
     lines = [outcome.verdict, *outcome.notes]
     if outcome.is_certified:
         lines.append(f"for the scenario:\n{outcome.lines.rstrip()}")

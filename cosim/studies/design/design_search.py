@@ -22,7 +22,6 @@ from noack.core.errors import CallerError
 from noack.core.number_format import at_most, plus_minus
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
-from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import ideal_conditions, nominal_conditions
 from noack.theory.certificates.scenario_certificates import certify, certify_box, outside_box
 
@@ -149,19 +148,18 @@ def _require_certifiable(scenario: Scenario) -> None:
 
 
 def certified_bounds(scenario: Scenario, limits: DesignLimits) -> Bounds:
-    """Return the bounds for all plants in the box, or for the plant if there is no box."""
+    """Return sup‖x‖ and sup‖e_c‖ for all plants in the box, or for the plant if there is no box.
+
+    ‖e_c‖ ≤ ‖W⁻¹‖ ‖e_c‖_W.
+    """
     resolved = resolve(scenario)
     late_periods = resolved.certificate.late_periods
     conditions = nominal_conditions(resolved, late_periods) if limits.schedule else ideal_conditions(resolved)
-    return bounds_of(certify_box(resolved, conditions) or certify(resolved, conditions), scenario)
-
-
-def bounds_of(certificate: ScenarioCertificate, scenario: Scenario) -> Bounds:
-    """Return certified sup‖x‖ and sup‖e_c‖ over all times; ‖e_c‖ ≤ ‖W⁻¹‖ ‖e_c‖_W."""
+    certificate = certify_box(resolved, conditions) or certify(resolved, conditions)
     if certificate.constants is None:
         return {"state": math.inf, "error": math.inf}
     t_s = np.array([0.0, certificate.floor_from_s if math.isfinite(certificate.floor_from_s) else 0.0])
-    weight = loop_of(resolve(scenario)).weight
+    weight = loop_of(resolved).weight
     shrinks = 1.0 if weight is None else float(np.linalg.norm(np.linalg.inv(weight), 2))
     return {
         "state": float(certificate.state(t_s).max()),

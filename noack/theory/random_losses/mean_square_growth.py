@@ -7,9 +7,7 @@ X_j = E[z zᵀ; state j] therefore follow
 
     X_j ← Σ_i (L_ij M₁ X_i M₁ᵀ + P_ij M₀ X_i M₀ᵀ),
 
-and E‖z‖² grows exactly like the powers of this operator's spectral radius. Almost surely, ‖z‖ grows
-per period by at most the root of that; :mod:`noack.theory.random_losses.almost_sure_growth` has a
-smaller bound.
+and E‖z‖² grows exactly like the powers of this operator's spectral radius.
 
 The spectral radius is computed in double precision, in coordinates of the maps' common range. That
 it is below a bound γ is proven: for some X_j > 0 the operator's image is below γ X_j, with all
@@ -22,14 +20,19 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from noack.core.clock import NEVER_NS
 from noack.core.linear_systems import Matrix, Vector, balancing_exponents
-from noack.impairments.loss_prediction import OutcomeChain
+from noack.guarantee.loss_guarantee import LossGuarantee
+from noack.impairments.loss_prediction import LossProcess, OutcomeChain
 from noack.impairments.markov_chain import NotPredictableError
+from noack.scenario.resolution import loop_of
+from noack.scenario.scenario import Scenario
 from noack.theory.bounds.contraction import EPSILON
 from noack.theory.bounds.stacked_norms import Stack
 from noack.theory.margins.exact_matrices import IntervalMatrix, exactly, inverse
+from noack.theory.margins.scenario_times import intervals_ns, loop_times
 from noack.theory.margins.switched_system import Graph
-from noack.theory.margins.time_triggered_loop import LoopTimes
+from noack.theory.margins.time_triggered_loop import LoopTimes, TimeTriggeredLoop
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array  # slow to import
@@ -46,6 +49,44 @@ _SMALLEST = 1e-30
 """Smallest bound of a spectral radius that is tried."""
 _OTHERS = 1e-3
 """X_j in the coordinates beyond the common range, relative to the square of the largest map."""
+
+
+class MeanSquareGrowth(NamedTuple):
+    """The growth of a loop under random losses that nothing limits."""
+
+    per_period: float
+    """Upper bound of the growth of √(E‖z‖²) per period, exact up to 1e-6."""
+
+    @property
+    def text(self) -> str:
+        """The conclusion as a sentence."""
+        verdict = "stable" if self.per_period < 1 else "not stable"
+        return (
+            f"√E‖z‖² of the loop's state z changes by the factor {self.per_period:.6g} per period: "
+            f"{verdict} in mean square"
+        )
+
+
+def growth_without_guarantee(resolved: Scenario, losses: LossProcess) -> MeanSquareGrowth:
+    """Return the growth of a scenario's loop under random losses that nothing limits.
+
+    Raises:
+        NotPredictableError: loop and losses have too many states, or the sensor is not
+            time-triggered.
+    """
+    shortest_ns, longest_ns = intervals_ns(resolved)
+    if shortest_ns != longest_ns:
+        raise NotPredictableError("the times between updates are not known")
+    loop, times = loop_of(resolved), loop_times(resolved, longest_ns)
+    if times.timeout_ns < NEVER_NS:
+        raise NotPredictableError("controller.update_timeout_s: the input depends on the update's age")
+    require_few_slots(times)
+    exact = TimeTriggeredLoop(loop.A, loop.B, loop.K, loop.H, times)
+    try:
+        maps = [(exact.period(slot, True), exact.period(slot, False)) for slot in range(times.slots)]
+    except OverflowError:
+        raise NotPredictableError("the loop grows beyond 1e308 within a period") from None
+    return MeanSquareGrowth(mean_square_growth(maps, losses.outcomes(LossGuarantee())))
 
 
 def require_few_slots(times: LoopTimes) -> None:

@@ -1,9 +1,7 @@
 """``noack certify``: its text and JSON output, and the figures quoted in the documentation."""
 
 import re
-from dataclasses import replace
 from io import StringIO
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +12,8 @@ from scipy.linalg import expm
 
 from cosim.analysis.certificates import Certificates, certificates_of, with_weight
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
-from cosim.output.certificate_report import moments_table, sentences
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
-from noack.core.number_format import at_most
 from noack.scenario.resolution import loop_of
 from noack.theory.bounds.certificate_terms import Constants
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
@@ -255,40 +251,6 @@ def without_a_cap() -> Certificates:
     return Certificates(resolved("lane_weighted", *WITHOUT_CAP), 2)
 
 
-def test_without_a_cap_the_mean_at_events_in_the_chosen_norm_is_beta_over_1_minus_p(
-    without_a_cap: Certificates,
-) -> None:
-    unlimited = without_a_cap.unlimited
-    assert unlimited is not None
-    mean, root_mean_square = unlimited.at_events
-    assert mean == pytest.approx(1 / (1 - P), rel=1e-6)
-    assert root_mean_square == pytest.approx((1 + P) ** 0.5 / (1 - P), rel=1e-6)
-    for shorter, longer in pairwise(unlimited.bursts):
-        assert shorter.probability < longer.probability
-        assert shorter.state < longer.state
-    gain = "the loop gain of the mean squares is 1.32, not below 1"
-    texts = list(sentences(replace(unlimited, root_mean_squares=None, void=gain, sure_rate_per_s=None)))
-    assert f"At every time no mean is certified: {gain}." in texts
-
-
-def test_the_bounds_of_means_are_one_table_with_rounding_up(without_a_cap: Certificates) -> None:
-    unlimited = without_a_cap.unlimited
-    assert unlimited is not None
-    runs = tuple(run._replace(controller_error=1.00001 + run.order) for run in unlimited.runs)
-    assert unlimited.root_mean_squares is not None
-    fixed = unlimited.root_mean_squares._replace(rate_per_s=0.125, state=7.00001)
-    unlimited = replace(unlimited, runs=runs, root_mean_squares=fixed, at_events=(1.5, 2.00001))
-    table = moments_table(unlimited, "‖W e_c‖", beta=0.5)
-    assert table.headings == (
-        "", "rate,\n1/s", "mean\n‖x‖", "rms\n‖x‖", "mean\n‖W e_c‖", "rms\n‖W e_c‖",
-    )  # fmt: skip
-    at_fixed_times, of_run, at_event = (tuple(row) for row in table.rows)
-    error = at_most(fixed.controller_error)
-    assert at_fixed_times == ("at every time", "0.125", "7.001", "7.001", error, error)
-    assert (of_run[0], *of_run[4:]) == ("largest of a run", "2.001", "3.001")
-    assert at_event == ("before an event", "0.25", "-", "-", "0.75", "1.001")
-
-
 def test_a_run_of_the_largest_number_of_events_keeps_the_assumption_as_often_as_stated(
     without_a_cap: Certificates,
 ) -> None:
@@ -303,16 +265,6 @@ def test_a_run_of_the_largest_number_of_events_keeps_the_assumption_as_often_as_
     (why,) = (assumption.why for assumption in scheduled.assumptions if "not enforced" in assumption.why)
     stated = float(why.split("probability ")[1].split()[0])
     assert abs(allowed_count / 4000 - stated) < 5 * (stated * (1 - stated) / 4000) ** 0.5
-
-
-def test_there_is_no_statement_where_losses_depend_on_times_and_the_reason_is_named(
-    weighted: Certificates,
-) -> None:
-    limited = "network.impairments=[{kind='rate', rate_bps=1_000_000}]"
-    certificates = Certificates(resolved("double_integrator", *WITHOUT_CAP, limited), 2)
-    assert certificates.unlimited is None
-    assert certificates.unpredictable is not None
-    assert weighted.unlimited is None
 
 
 WRONG_SIGN = "model.gain=[[15.0, 5.0]]"

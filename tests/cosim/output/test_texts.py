@@ -30,8 +30,6 @@ def run(simulated: noack.Run) -> Path:
         ("summary", ["summary", "RUN"]),
         ("summary-verbose", ["summary", "RUN", "--verbose"]),
         ("certify", ["certify", "lane_following"]),
-        ("certify-unlimited", ["certify", "lane_weighted", "--set", "network.enforce_mansd=false",
-                               "--set", "network.loss.probability=0.05"]),
         ("margin", ["margin", "lane_periodic", "--most", "3", "--no-period"]),
     ],
 )  # fmt: skip

@@ -19,14 +19,14 @@ def test_quick_bounds_are_those_of_the_exact_maps() -> None:
     ]
     for more in ((), settings, (*settings, "mode=zoh"), *timeouts):
         given = shipped("double_integrator", *more)
-        search = NetworkSearch(given, DesignRequest(period_s=0.31, most=5))
+        search = NetworkSearch(given, DesignRequest(period_s=0.31))
         exact = LossMargin(resolve(search.scenario))
-        bursts = exact.bursts(search.requirements[4].guarantee)
-        quick = search.quick_loop(search.original, exact.longest_ns).maps(bursts)
+        bursts = exact.bursts(search.guarantee(5))
+        quick = search.quick_loop(search.given_gain).maps(bursts)
         maps = np.array([exact.maps(burst.slot, burst.usable_ns, burst.losses).middle for burst in bursts])
         if not more or more == timeouts[0]:
             np.testing.assert_allclose(quick, maps, rtol=0, atol=1e-11 * np.abs(maps).max())
-        stability = exact.coarse_bounds(search.requirements[4].guarantee)
+        stability = exact.coarse_bounds(search.guarantee(5))
         lower = np.exp(PatternGraph(bursts).growth(quick))
         assert lower <= stability.upper
         assert lower == pytest.approx(stability.lower, rel=2e-2)

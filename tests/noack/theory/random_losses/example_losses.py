@@ -8,7 +8,6 @@ from noack.impairments.loss_prediction import LossProcess, OutcomeChain
 from noack.impairments.markov_chain import Array
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
-from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.margins.exact_matrices import exactly
 from noack.theory.random_losses import mean_square_growth as mean_square_module
 
@@ -38,13 +37,6 @@ def independent(p: float) -> LossProcess:
 
 def unlimited(process: LossProcess) -> OutcomeChain:
     return process.outcomes(LossGuarantee())
-
-
-def scalar_loop(rate: float, gain: float, mismatch: float) -> PlantGains:
-    """x' = −(rate + mismatch) x + p, a model that decays at ``rate``, and u = −gain x_c."""
-    unit = np.eye(1)
-    error = ErrorGains(-rate * unit, -gain * unit, unit, 0.0)
-    return PlantGains(error, (gain - rate - mismatch) * unit, unit, unit, 0.0)
 
 
 def mean_square_growth(maps: list[tuple[Array, Array]], chain: OutcomeChain) -> float:

@@ -15,19 +15,17 @@ from cosim.live.processes.process_pool import process_starts, processes
 from tests.noack.theory.certificates.certificate_kinds import Broken, Kind, Tally
 from tests.noack.theory.certificates.certificate_kinds.continuous import CONTINUOUS, SCHEDULED
 from tests.noack.theory.certificates.certificate_kinds.decaying import DECAYING
-from tests.noack.theory.certificates.certificate_kinds.designs import DESIGNS
 from tests.noack.theory.certificates.certificate_kinds.disturbed_policies import DISTURBED_POLICIES
 from tests.noack.theory.certificates.certificate_kinds.margins import MARGINS
 from tests.noack.theory.certificates.certificate_kinds.policies import POLICIES
-from tests.noack.theory.certificates.certificate_kinds.random_losses import MOMENT, RANDOM_LOSSES
 from tests.noack.theory.certificates.certificate_kinds.regions import REGIONS
 from tests.noack.theory.certificates.certificate_kinds.shares import DISTURBED, KNOWN_STATE, OBSERVED
 
 KINDS: Mapping[str, Kind] = {
     kind.name: kind
     for kind in (
-        DECAYING, CONTINUOUS, SCHEDULED, DISTURBED, OBSERVED, RANDOM_LOSSES, MOMENT, KNOWN_STATE,
-        *POLICIES, *DISTURBED_POLICIES, MARGINS, REGIONS, DESIGNS,
+        DECAYING, CONTINUOUS, SCHEDULED, DISTURBED, OBSERVED, KNOWN_STATE,
+        *POLICIES, *DISTURBED_POLICIES, MARGINS, REGIONS,
     )
 }  # fmt: skip
 
