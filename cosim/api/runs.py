@@ -16,7 +16,7 @@ from cosim.lazy_modules import lazy_modules
 from cosim.record.run_directory import RECORD, REPORT_FILE, chosen_run, file_of_loop, require_run_directory
 from noack.core.errors import CallerError, ExitStatus
 from noack.core.number_format import as_html, as_text
-from noack.scenario import link_load, resolution
+from noack.scenario import resolution
 from noack.scenario.scenario import Scenario
 
 with lazy_modules():
@@ -315,7 +315,7 @@ def simulate(scenario: Source, *, runs: PathLike | None = None) -> Run:
     Raises:
         NoackError: the scenario is wrong, or the run directory cannot be written.
     """
-    link_load.require_slots(loaded := load(scenario))
+    loaded = load(scenario)
     with _folder(runs) as (folder, temporary):
         ending, view = virtual_time.simulate_run(loaded, folder), temporary is None
         simulated = Run(ending.run_dir, lambda: run_end.finalize(ending, report=False, view=view), temporary)
@@ -340,7 +340,7 @@ def run(scenario: Source, *, runs: PathLike | None = None, progress: bool = Fals
         NoackError: the scenario is wrong; the run could not start, e.g. because a port is in use;
             or the caller is not the main thread, which receives the signals.
     """
-    link_load.require_slots(loaded := load(scenario))
+    loaded = load(scenario)
     if threading.current_thread() is not threading.main_thread():
         raise CallerError("noack.run: a live run is started by the main thread, which signals go to")
     with _folder(runs) as (folder, temporary):

@@ -34,7 +34,7 @@ with lazy_modules():
     from noack.protocol import roles
     from noack.runtime import active_runs, address
     from noack.runtime.connections import metrics_server
-    from noack.scenario import link_load, resolution, scenario
+    from noack.scenario import resolution, scenario
     from noack.theory.certificates import assumptions
 
 if TYPE_CHECKING:
@@ -109,7 +109,6 @@ def run_processes(
     core_library.require_live_runs()
     with fork_server.fork_server(server) as server:
         ending = None
-        link_load.require_capacity(loaded)
         if options.live:
             rerun_program.require_viewer()
         warn_of_other_runs()
@@ -153,13 +152,8 @@ def _serve_metrics(loaded: "scenario.Scenario", requested_address: str) -> "Iter
 
 
 def warn_of_violations(loaded: "scenario.Scenario") -> None:
-    """Print the assumptions of Theorem 2 that the scenario violates, on standard error.
-
-    Loops that share a network: also what may go wrong at their bottleneck.
-    """
+    """Print the assumptions of Theorem 2 that the scenario violates, on standard error."""
     shares = len(scenario.loop_names(loaded)) > 1
-    for line in link_load.load_warnings(link_load.link_loads(loaded), loaded) if shares else ():
-        print(f"noack: warning: {line}", file=sys.stderr)
     for section in scenario.loop_sections(loaded):
         prefix = f"{section.name}: " if shares else ""
         resolved = resolution.resolve(scenario.loop_scenario(loaded, section))

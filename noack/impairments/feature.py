@@ -124,17 +124,6 @@ class Scheduler(QueueDiscipline):
     def numbers(self) -> Sequence[int]:
         """The number of each flow, from which the key of its packets follows."""
 
-    @abstractmethod
-    def yields_ns(self, number: int, other_number: int) -> float:
-        """Return how long after a packet of a flow one of the other flow may arrive and still be sent first.
-
-        Negative: it must arrive before; ∞: it is always sent first; −∞: never.
-        """
-
-    def number(self, flow: int) -> int:
-        """Return the number of a flow; flows count from 0."""
-        return self.numbers[min(flow, len(self.numbers) - 1)]
-
     def queue_stage(self, bottleneck: Mapping[str, int], queue_places: int, tables: StageTables) -> Stage:
         begin, _ = add_numbers(tables.integers, self.numbers)
         numbers = {**bottleneck, "begin": begin, "flows": len(self.numbers)}
@@ -242,8 +231,8 @@ class Impairment(StageFeature):
     """Whether it changes payloads."""
     delays: ClassVar[bool] = False
     """Whether it may delay packets."""
-    copies: ClassVar[bool] = False
-    """Whether it may send packets twice."""
+    queues: ClassVar[bool] = False
+    """Whether packets wait in a queue, for a time that depends on what else is sent."""
 
     @property
     def longest_s(self) -> float:
@@ -254,16 +243,6 @@ class Impairment(StageFeature):
     def is_bounded(self) -> bool:
         """Whether no packet is delayed for longer than :attr:`longest_s`."""
         return True
-
-    @property
-    def shortest_s(self) -> float:
-        """A time in seconds by which every packet is delayed at least."""
-        return 0.0
-
-    def delay_range_s(self, least_s: float, largest_s: float) -> tuple[float, float]:
-        """Return bounds of a packet's delay after it, given those before it; infinite: none."""
-        own_s = self.longest_s if self.is_bounded else math.inf
-        return least_s + self.shortest_s, largest_s + own_s
 
     def order_after(self, before: PacketOrder) -> PacketOrder:
         """Return the order of the packets after it, given that before it."""

@@ -56,6 +56,11 @@ class LinkSettings(ScenarioSection):
         return all(impairment.is_bounded for impairment in self.impairments)
 
     @property
+    def queues(self) -> bool:
+        """Whether packets wait in a queue, for a time that depends on what else is sent."""
+        return any(impairment.queues for impairment in self.impairments)
+
+    @property
     def chooses(self) -> bool:
         """Whether the queue of a rate chooses what it sends when the link is free."""
         return any(isinstance(impairment, Rate) and impairment.scheduler for impairment in self.impairments)
@@ -106,9 +111,8 @@ def require_order(impairments: Sequence[AnyImpairment]) -> None:
     for i, rate in rates[:1]:
         for number, beside in enumerate(impairments):
             side = "before" if number < i else "after"
-            least_s, largest_s = beside.delay_range_s(0.0, 0.0)
             fits = number == i or isinstance(beside, Corrupt)
-            fits = fits or (isinstance(beside, Delay) and least_s == largest_s)
+            fits = fits or (isinstance(beside, Delay) and beside.is_constant)
             if not fits and not (side == "before" and isinstance(beside, LossOf | Blackout)):
                 raise ValueError(
                     f"impairments.{number}: {beside.kind} cannot stand {side} a rate with "

@@ -6,7 +6,6 @@ What follows from it is here, too: matrices, the trigger's policy, and the table
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from itertools import cycle
 from typing import Literal
 
@@ -18,8 +17,15 @@ from noack.core.linear_systems import Matrix, Vector, discretise, transition
 from noack.core.random_streams import stream
 from noack.observers.observer_settings import unobservable_mode
 from noack.protocol.record_tables import LOOP, RecordShape, entry_names, has_loop, largest, tables
-from noack.scenario.link_load import proven_delays
-from noack.scenario.scenario import Scenario, few_of, loop_names, loop_scenario, loop_sections, loops_by_entry
+from noack.scenario.scenario import (
+    Scenario,
+    few_of,
+    loop_names,
+    loop_scenario,
+    loop_sections,
+    loops_by_entry,
+    loops_of,
+)
 from noack.scenario.scenario_checks import input_at
 from noack.scenario.sections import AnyObserver, ModelSection, PlantSection
 from noack.settings.section import rows_of
@@ -103,13 +109,11 @@ def resolved_loops(scenario: Scenario) -> tuple[Scenario, ...]:
     Raises:
         CallerError: as :func:`resolve`.
     """
-    return tuple(loop for loops in _loops_with_delays(scenario) for loop in _resolved(loops))
+    return tuple(loop for loops in loops_by_entry(scenario) for loop in _resolved(loops))
 
 
 def loop_named(scenario: Scenario, name: str | None) -> Scenario:
-    """Return the scenario of the loop of a name; without a name, the scenario.
-
-    It is one of a loop alone, except that its certificates allow for the delay in the run.
+    """Return the scenario of the loop of a name, alone; without a name, the scenario.
 
     Raises:
         CallerError: there is no such loop.
@@ -118,20 +122,7 @@ def loop_named(scenario: Scenario, name: str | None) -> Scenario:
         return scenario
     if name not in (names := loop_names(scenario)):
         raise CallerError(f"--loop {name}: the loops of the scenario are {few_of(names)}")
-    return [loop for loops in _loops_with_delays(scenario) for loop in loops][names.index(name)]
-
-
-def _loops_with_delays(scenario: Scenario) -> list[list[Scenario]]:
-    """Return the loops of each entry, each with the bound of its updates' delay in this run."""
-    entries, proven_delay = loops_by_entry(scenario), scenario.certificate.proven_delay
-    if proven_delay is not None and proven_delay.loops > 1:  # a loop of several, by loop_named
-        return entries
-    delays = proven_delays(scenario)
-    if proven_delay is None and not any(delays):
-        return entries
-    with_delay = cache(scenario.certificate.with_proven_delay)  # loops with equal delays share it
-    sections = map(with_delay, delays)
-    return [[loop.model_copy(update={"certificate": next(sections)}) for loop in loops] for loops in entries]
+    return loops_of(scenario)[names.index(name)]
 
 
 def _resolved(loops: Sequence[Scenario]) -> list[Scenario]:

@@ -1,6 +1,6 @@
 """The tables of a scenario that describe the run: all but those of a loop, and ``[[loops]]``."""
 
-from typing import Annotated, Literal, NamedTuple, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, FiniteFloat, field_validator, model_validator
 
@@ -11,15 +11,6 @@ from noack.settings.section import ScenarioSection, Seed, Table
 Port = Annotated[int, Field(ge=0, le=65535)]
 
 
-class ProvenDelay(NamedTuple):
-    """A bound of the delay of a loop's updates that follows from all senders on its link."""
-
-    delay_s: float
-    """The bound in virtual time; infinite: none is known."""
-    loops: int
-    """The number of loops of the run."""
-
-
 class CertificateSection(ScenarioSection):
     """Additional tolerance of the certificates, beyond the run's own schedule."""
 
@@ -27,23 +18,10 @@ class CertificateSection(ScenarioSection):
     """Updates and inputs may be late by this number of plant steps."""
     network_delay_s: Annotated[FiniteFloat, Field(ge=0, le=3600)] | None = None
     """The network may delay updates by this time; a longer delay voids the certificates. By default
-    the proven bound of the loop's delay, where one is known; else the longest delay of the network's
-    impairments."""
+    the longest delay of the network's impairments; with a queue, certificates need this key."""
     exceedance_probability: Annotated[FiniteFloat, Field(gt=0, le=0.5)] = 1e-6
     """Normally distributed disturbances and noise have no bound. The certificates assume one that a
     run exceeds with at most this probability."""
-    _proven_delay: ProvenDelay | None = None
-
-    @property
-    def proven_delay(self) -> ProvenDelay | None:
-        """The bound that a resolved loop has from its run; None: no queue, or a delay is given."""
-        return self._proven_delay
-
-    def with_proven_delay(self, delay: ProvenDelay | None) -> Self:
-        """Return the section of a loop with this bound, which is no key of a file."""
-        section = self.model_copy()
-        section._proven_delay = delay
-        return section
 
 
 class ClocksSection(ScenarioSection):

@@ -19,6 +19,7 @@ from noack.core.errors import CallerError, did_you_mean, printable, shortened
 from noack.core.file_access import shipped_folder
 from noack.scenario import toml_file
 from noack.scenario.matrix_files import with_matrices
+from noack.scenario.overload import refuse_overload
 from noack.scenario.runtime_parameters import SHORT, full_key
 from noack.scenario.scenario import LOOP_NEEDS, PARTS, Scenario, parts_model, with_loop_tables
 from noack.scenario.scenario_checks import check_target_loss
@@ -103,7 +104,12 @@ def _with_files(scenario: Scenario, path: Path, source: str) -> Scenario:
         }
 
     scenario = with_tables(scenario, tables("", scenario))
-    return with_loop_tables(scenario, lambda place, loop: tables(f"{place}.", loop))
+    scenario = with_loop_tables(scenario, lambda place, loop: tables(f"{place}.", loop))
+    try:
+        refuse_overload(scenario)
+    except ValueError as error:
+        raise CallerError(f"{source}: {error}") from None
+    return scenario
 
 
 def _without_files(section: DirectionSection, folder: Path, place: str) -> Table:

@@ -32,7 +32,7 @@ with lazy_modules():
     from cosim.output import result_tables, run_tables, run_verdict, terminal_output
     from cosim.simulation import continuous, virtual_time
     from noack.runtime import active_runs, control_messages
-    from noack.scenario import link_load, resolution, runtime_parameters, scenario, scenario_file
+    from noack.scenario import resolution, runtime_parameters, scenario, scenario_file
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -163,7 +163,6 @@ def simulate(
         noack simulate reactor_petc --no-report --json   print the summary as JSON
     """
     loaded = source.load()
-    link_load.require_capacity(loaded)
     warn_of_violations(loaded)
     if trigger is opt.TriggerMode.CONTINUOUS:
         return _simulate_continuously(loaded, json=options.json)

@@ -4,7 +4,6 @@ The other six are about scenario files. The last three lead from a plant to a sc
 """
 
 import json as json_format
-import math
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeVar
@@ -19,7 +18,6 @@ from cosim.shipped_files import KINDS, ShippedFile, all_shipped, text_of
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, ExitStatus
 from noack.core.file_access import write_whole
-from noack.core.number_format import at_least, at_most
 
 with lazy_modules():
     from controller_node import controller
@@ -31,7 +29,7 @@ with lazy_modules():
     from cosim.studies.campaign import campaign_file
     from cosim.studies.new_loop import linear_model, new_scenario
     from netem import links_file
-    from noack.scenario import link_load, resolution, scenario, scenario_file, toml_file
+    from noack.scenario import resolution, scenario, scenario_file, toml_file
     from noack.theory.certificates import assumptions
     from noack.trigger_policies import periodic_trigger, trigger_rule
     from plant_server import plant
@@ -162,7 +160,6 @@ def check(source: opt.ScenarioOptions, *, json: opt.JsonOption = False) -> None:
         return
     resolved = resolution.resolve(loaded)
     _make_trigger(resolved)
-    link_load.require_capacity(loaded)
     console = cli.console()
     console.width -= len(_COMMENT)
     with console.capture() as captured:  # printed last: the plant may be rejected
@@ -185,11 +182,10 @@ def _make_trigger(resolved: "scenario.Scenario") -> None:
 
 
 def _check_loops(loaded: "scenario.Scenario", *, json: bool) -> None:
-    """Check each loop and the bottleneck; print the scenario, which is not resolved."""
-    loops, loads = resolution.resolved_loops(loaded), link_load.link_loads(loaded)
+    """Check each loop; print the scenario, which is not resolved."""
+    loops = resolution.resolved_loops(loaded)
     for loop in loops:
         _make_trigger(loop)
-    link_load.require_capacity(loaded)
     if json:
         cli.print_json(loaded.model_dump(mode="json"))
         return
@@ -197,29 +193,6 @@ def _check_loops(loaded: "scenario.Scenario", *, json: bool) -> None:
     for loop, phase_ns in zip(loops, scenario.phases_ns(loaded), strict=True):
         x0 = ", ".join(f"{value:.4g}" for value in loop.plant.initial_state)
         print(f"{_COMMENT}{loop.name}: begins at {phase_ns / NS_PER_S:.6f} s, x(0) = ({x0})")
-    for load in loads:
-        delay = load.delay_bound_s
-        by_loops = "; ".join(f"{loops}: {_bound(own_s)}" for loops, own_s in load.loop_bounds)
-        print(
-            f"{_COMMENT}{load.key}: {load.scope}{load.rate_bps:.0f} bit/s; "
-            f"datagrams that must pass: {load.mandatory_at_least_bps:.0f} to "
-            f"{load.mandatory_at_most_bps:.0f} bit/s; delay: "
-            + ("no bound" if delay is None else f"{_bound(delay)} in virtual time")
-            + (f" ({by_loops})" if by_loops else "")
-        )
-    updates = link_load.update_delay(loaded)
-    is_less = updates.largest_s < 0.99 * updates.certified_s
-    print(
-        f"{_COMMENT}delay of updates in the network: {_bound(updates.largest_s)} in virtual time; "
-        f"the certificates cover {at_least(updates.certified_s)} s"
-        + ("; with a smaller certificate.network_delay_s they have smaller bounds" if is_less else "")
-    )
-    for line in link_load.load_warnings(loads, loaded):
-        print(f"{_COMMENT}warning: {line}")
-
-
-def _bound(delay_s: float) -> str:
-    return f"at most {at_most(delay_s)} s" if math.isfinite(delay_s) else "no bound"
 
 
 def _print_plant(console: "Console", resolved: "scenario.Scenario") -> None:

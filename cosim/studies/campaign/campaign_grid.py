@@ -22,7 +22,6 @@ from cosim.studies.campaign.random_draws import Box, box_of
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.scenario import toml_file
-from noack.scenario.link_load import require_slots
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import completed, put
@@ -108,7 +107,6 @@ def grid(campaign: Campaign, path: Path) -> list[Point]:
             content[LOOPS] = _scaled(content[LOOPS], value, source)
         scenario = completed(content, scenario_path, source)
         try:
-            require_slots(scenario)
             work, certified = _work(campaign, scenario)
         except (CallerError, ValueError) as error:
             raise CallerError(f"{source}: {error}") from None

@@ -35,9 +35,6 @@ class EarliestDeadline(Scheduler):
     def numbers(self) -> tuple[int, ...]:
         return tuple(round(deadline_s * NS_PER_S) for deadline_s in self.deadlines_s)
 
-    def yields_ns(self, number: int, other_number: int) -> float:
-        return number - other_number
-
     def meaning(self) -> str:
         times = numbers_text([time_text(deadline_s) for deadline_s in self.deadlines_s])
         return f"more are dropped; it sends first what has the earliest deadline, {times} by flow"

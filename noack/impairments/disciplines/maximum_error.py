@@ -4,7 +4,6 @@ Walsh, Ye and Bushnell (Stability analysis of networked control systems, IEEE Tr
 Technology 10(3), 2002) give the network to the node with the largest weighted error.
 """
 
-import math
 from typing import ClassVar, Literal
 
 from noack.impairments.clauses import Clause
@@ -24,9 +23,6 @@ class MaximumError(Scheduler):
     )
     tc_missing: ClassVar = "the discipline maximum_error"
     numbers: ClassVar = (0,)
-
-    def yields_ns(self, number: int, other_number: int) -> float:
-        return math.inf
 
     def meaning(self) -> str:
         return "more are dropped; it sends first what is of the flow with the largest error"

@@ -1,6 +1,5 @@
 """Priorities of flows; see native/impairments/priority.c."""
 
-import math
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
@@ -34,10 +33,6 @@ class Priority(Scheduler):
     @property
     def numbers(self) -> tuple[int, ...]:
         return self.levels
-
-    def yields_ns(self, number: int, other_number: int) -> float:
-        difference = number - other_number
-        return math.copysign(math.inf, difference) if difference else 0.0
 
     def meaning(self) -> str:
         levels = numbers_text(self.levels)

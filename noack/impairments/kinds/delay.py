@@ -168,19 +168,17 @@ class Delay(FileFeature, Impairment):
         return self.delay_s + self.jitter_s * (1 if self.distribution == "uniform" else 4)
 
     @property
-    def shortest_s(self) -> float:
-        if not self.is_bounded or self.file is not None:
-            return 0.0
-        lowest_s = -self.jitter_s if self.samples_s is None else min(self.samples_s)
-        return max(self.delay_s + lowest_s, 0.0)
+    def is_constant(self) -> bool:
+        """Whether it delays all packets by the same time."""
+        return not (self.jitter_s or self.samples_s or self.file)
 
     @property
     def is_bounded(self) -> bool:
         return not self.jitter_s or self.distribution in ("uniform", "empirical")
 
     def order_after(self, before: PacketOrder) -> PacketOrder:
-        varies = bool(self.jitter_s or self.samples_s or self.file)
-        return PacketOrder(before.delayed or varies or self.delay_s > 0, before.reordered or varies)
+        delayed = before.delayed or not self.is_constant or self.delay_s > 0
+        return PacketOrder(delayed, before.reordered or not self.is_constant)
 
     def meaning(self) -> str:
         text = f"delays each packet by {time_text(self.delay_s)}"

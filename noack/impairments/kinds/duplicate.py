@@ -18,7 +18,6 @@ class Duplicate(CorrelatedChance, Impairment):
     clauses: ClassVar = (Clause("duplicate", "duplicate 1%", *CHANCE),)
     behaviour: ClassVar = "duplicate"
     action: ClassVar = "duplicate"
-    copies: ClassVar = True
 
     def meaning(self) -> str:
         correlation = self.correlation_meaning

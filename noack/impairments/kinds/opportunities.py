@@ -71,6 +71,7 @@ class Opportunities(FileFeature, Impairment):
         ),
     )
     delays: ClassVar = True
+    queues: ClassVar = True
     tc_missing: ClassVar = "delivery opportunities"
 
     @model_validator(mode="after")

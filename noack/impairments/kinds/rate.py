@@ -80,6 +80,7 @@ class Rate(Impairment):
         ),
     )
     delays: ClassVar = True
+    queues: ClassVar = True
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -35,9 +35,6 @@ class Reorder(CorrelatedChance, Impairment):
         reorders = before.delayed and self.probability > 0
         return before._replace(reordered=before.reordered or reorders)
 
-    def delay_range_s(self, least_s: float, largest_s: float) -> tuple[float, float]:
-        return 0.0, largest_s
-
     def meaning(self) -> str:
         packets = f"{brief_percent(self.probability)} of the packets"
         if self.gap != 1:

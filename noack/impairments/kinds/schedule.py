@@ -47,6 +47,7 @@ class Schedule(Impairment):
         ),
     )
     delays: ClassVar = True
+    queues: ClassVar = True
     tc_missing: ClassVar = "a schedule of slots"
 
     @model_validator(mode="after")

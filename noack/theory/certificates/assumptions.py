@@ -20,7 +20,7 @@ from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_tables import UNCERTIFIED_ACKNOWLEDGEMENTS
 from noack.theory.bounds.certificate_terms import CertificateNotCheckedError, Constants, NetworkConditions
 from noack.theory.bounds.disturbances import normal_bounds
-from noack.theory.certificates.conditions import network_delay_texts
+from noack.theory.certificates.conditions import network_delay_text
 
 _NOT_COVERED = "not covered by the theorems and the certificates"
 _NOT_BY_THEOREMS = "not covered by the theorems"
@@ -232,7 +232,7 @@ def _continuous_time(resolved: Scenario) -> Assumption:
         AssumptionStatus.IDEALISED,
         "never true of a sampled loop; the certificates allow for the difference. Here: sampled "
         f"every {period_ms:g} ms, input held for {control_ms:g} ms"
-        + "".join(f"; {delay}" for delay in network_delay_texts(resolved)[:1])
+        + (f"; {delay}" if (delay := network_delay_text(resolved)) else "")
         + _actuation_gap(resolved),
     )
 
@@ -333,7 +333,7 @@ def _conditions(
     )
     # The times of the loop, which each run checks.
     sampling = f"every {1e3 * conditions.sampling_s:g} ms" if conditions.sampling_s else "continuously"
-    delay = "".join(network_delay_texts(resolved)) if conditions.delay_s else ""
+    delay = network_delay_text(resolved) if conditions.delay_s else ""
     network = f"; {delay}" if delay else ""
     schedule = (
         (f"the trigger is tested {sampling}", ""),

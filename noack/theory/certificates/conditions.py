@@ -90,44 +90,48 @@ def void_by_safe_input(resolved: Scenario, conditions: NetworkConditions) -> str
     return "controller.safe_input: it may be the input before the first update, where bounds assume 0"
 
 
+def void_without_delay(resolved: Scenario, conditions: NetworkConditions) -> str | None:
+    """Return why there is no certificate if a queue delays updates and no largest delay is stated."""
+    network = resolved.network
+    if not conditions.delay_s or resolved.certificate.network_delay_s is not None:
+        return None
+    queues = [index for index, impairment in enumerate(network.impairments) if impairment.queues]
+    if not queues:
+        return None
+    return (
+        "certificate.network_delay_s: state the largest delay of updates, which the run checks; that in "
+        f"the queue of network.impairments.{queues[0]} is not known before"
+    )
+
+
+def void_beforehand(resolved: Scenario, conditions: NetworkConditions) -> str | None:
+    """Return why there is no certificate before a run; see the two functions above."""
+    return void_without_delay(resolved, conditions) or void_by_safe_input(resolved, conditions)
+
+
 def certified_delay_s(resolved: Scenario) -> float:
     """The network delay that the certificates allow for.
 
-    As given; else the proven bound of the loop in its run, if one is known; else the longest delay
-    of the impairments, in which a rate counts as a full queue, and an unbounded jitter four times.
+    As given; else the longest delay of the impairments, in which a queue counts as full, and an
+    unbounded jitter four times.
     """
-    certificate = resolved.certificate
-    proven = certificate.proven_delay
-    if certificate.network_delay_s is not None:
-        return certificate.network_delay_s
-    if proven is not None and math.isfinite(proven.delay_s):
-        return proven.delay_s
-    return resolved.network.link.longest_delay_s
+    given_s = resolved.certificate.network_delay_s
+    return resolved.network.link.longest_delay_s if given_s is None else given_s
 
 
-def network_delay_texts(resolved: Scenario) -> list[str]:
-    """Return in words which network delay the certificates allow for, and what a proof of it needs.
-
-    A proof needs settings, which the certificates know, and what is said here.
-    """
-    certificate, link, proven = resolved.certificate, resolved.network.link, resolved.certificate.proven_delay
-    certified_ms, longest_ms = (
-        1e3 * delay_s for delay_s in (certified_delay_s(resolved), link.longest_delay_s)
-    )
-    delays = f"the network delays updates by up to {longest_ms:g} ms" if link.delay_is_bounded else ""
-    if certificate.network_delay_s is not None and certified_ms != longest_ms:
-        allowance = f"certificate.network_delay_s allows for a delay of {certified_ms:g} ms"
-        return [f"{delays}; {allowance}" if delays and longest_ms else allowance]
+def network_delay_text(resolved: Scenario) -> str:
+    """Return in words which network delay the certificates allow for; empty: none is needed."""
+    link, given_s = resolved.network.link, resolved.certificate.network_delay_s
+    longest_s = link.longest_delay_s
+    delays = f"the network delays updates by up to {1e3 * longest_s:g} ms" if link.delay_is_bounded else ""
+    if given_s is not None and given_s != longest_s:
+        allowance = f"certificate.network_delay_s allows for a delay of {1e3 * given_s:g} ms"
+        return f"{delays}; {allowance}" if delays and longest_s else allowance
     if link.delay_is_bounded:
-        return [delays] if longest_ms else []
-    if proven is None or math.isinf(proven.delay_s):
-        return [f"no bound of the network's delay is known; the certificates allow for {certified_ms:g} ms"]
-    owner = "its loop" if proven.loops == 1 else f"each of the {proven.loops} loops"
-    return [
-        f"the network delays updates by up to {certified_ms:g} ms in virtual time",
-        f", if {owner} keeps the least time between transmissions that its trigger and rate give, no "
-        "sensor is restarted, and settings change only as in [[changes]]",
-    ]
+        return delays if longest_s else ""
+    if link.queues:
+        return "no bound of the delay in the network's queue is known: state certificate.network_delay_s"
+    return f"no bound of the network's delay is known; the certificates allow for {1e3 * longest_s:g} ms"
 
 
 def network_delay_ns(resolved: Scenario, late_periods: int) -> int:

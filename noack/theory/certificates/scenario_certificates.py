@@ -22,7 +22,13 @@ from noack.theory.bounds.gains import ErrorGains, PlantGains, error_gains
 from noack.theory.bounds.trigger_bounds import TriggerBounds
 from noack.theory.certificates.assumptions import certificate_assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.conditions import BOX, OWN_PLANT, kept_probability, void_by_safe_input
+from noack.theory.certificates.conditions import (
+    BOX,
+    OWN_PLANT,
+    kept_probability,
+    void_beforehand,
+    void_by_safe_input,
+)
 from noack.theory.certificates.constants_search import ConstantsSearch, Phases, is_within
 from noack.theory.certificates.deliveries.due_deliveries import Deliveries
 from noack.theory.certificates.persistent_bounds import PlantAt
@@ -172,7 +178,7 @@ class CertificateScope:
         void: NotDecayingError | NoCertificateError | None = None
         phases: Sequence[tuple[Constants | None, ...]] = [(None, None, None)]
         try:
-            if beforehand and (why := void_by_safe_input(self._resolved, conditions)) is not None:
+            if beforehand and (why := void_beforehand(self._resolved, conditions)) is not None:
                 raise NoCertificateError(why)
             if math.isinf(self._start_error):
                 raise NoCertificateError(_OUTSIDE_RANGE)
