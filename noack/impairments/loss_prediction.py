@@ -51,8 +51,6 @@ _MOST_SQUARED = 600
 """States of chain and guarantee up to which powers of their matrix are computed."""
 _MOST_STEPS = 20_000
 """Most packets, and most states of chain and guarantee, that are followed one by one."""
-_ROUNDING = 1e-12
-"""Probabilities that differ by less are equal."""
 
 
 class LossPrediction(NamedTuple):
@@ -227,32 +225,6 @@ class LossProcess:
     lost: Array  # (n,) probability of a loss in each state
     first_delivered: bool = True  # Whether the first packet is delivered in any case
 
-    @property
-    def is_independent(self) -> bool:
-        """Whether every packet is lost with the same probability, independently."""
-        loss_given_state = self._loss_given_state
-        return bool(np.ptp(loss_given_state) <= _ROUNDING)
-
-    @property
-    def largest_probability(self) -> float:
-        """The largest probability that a packet is lost, given any outcomes before it."""
-        return float(self._loss_given_state.max())
-
-    def tails(self, count: int) -> tuple[Array, float]:
-        """Bound the probability that a packet and the j − 1 packets before it are all lost.
-
-        Returns:
-            The bounds, (count,), for j = 1, 2, …; exact if the chain is stationary. And the largest
-            probability, given any past, that the next ``count`` packets are all lost.
-        """
-        lost, weights, tails = self.transitions * self.lost, np.ones(len(self.start)), []
-        # One step would not show that a slow chain is far from its mean distribution.
-        stationary = np.abs(_stationary(self.start, self.transitions) - self.start).max() <= _ROUNDING
-        for _ in range(count):
-            weights = lost @ weights
-            tails.append(self.start @ weights if stationary else weights.max())
-        return np.array(tails), float(weights.max())
-
     def outcomes(self, guarantee: LossGuarantee) -> "OutcomeChain":
         """Return the chain of the packets' outcomes under a guarantee, with its reachable states.
 
@@ -311,15 +283,6 @@ class LossProcess:
             np.add.at(following, after_loss[allowed], weights[allowed] @ lost)
             weights = following
         return float(min(weights.sum(), 1.0))
-
-    @property
-    def _loss_given_state(self) -> Array:
-        """The probability of a loss, given each state before it that can be reached; (k,)."""
-        reached, count = self.start > 0, -1
-        while count != (count := int(np.count_nonzero(reached))):
-            reached = reached | (reached @ self.transitions > 0)
-        loss_given_state: Array = (self.transitions @ self.lost)[reached]
-        return loss_given_state
 
 
 class OutcomeChain(NamedTuple):
