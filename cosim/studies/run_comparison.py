@@ -10,11 +10,11 @@ import numpy as np
 
 from cosim.analysis.summary.summary_model import FidelityPart, LoopSummary, RunSummary
 from cosim.live.finalize import reopen
+from cosim.output.curves import Dash
 from cosim.output.figures import palette
 from cosim.output.figures.figure_description import (
     TIME,
     Axis,
-    Dash,
     FigureDescription,
     Item,
     Line,
