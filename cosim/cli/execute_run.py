@@ -117,9 +117,7 @@ def run_processes(
         try:
             with ExitStack() as stack:
                 line = run_watcher.later_watcher(
-                    lambda: stack.enter_context(
-                        progress.progress_line(progress.error_console(), loaded, session)
-                    )
+                    lambda: stack.enter_context(progress.progress_line(progress.error_console(), loaded))
                 )
                 watchers = [warnings, line, run_watcher.RunLog().watcher()]
                 watchers += [] if watcher is None else [watcher]

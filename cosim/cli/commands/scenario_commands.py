@@ -24,7 +24,6 @@ with lazy_modules():
     from cosim.analysis.summary import plant_linearisation
     from cosim.doctor import findings, machine_measures
     from cosim.live import launcher
-    from cosim.live.processes import child_processes
     from cosim.output import terminal_output
     from cosim.studies.campaign import campaign_file
     from cosim.studies.new_loop import linear_model, new_scenario
@@ -225,11 +224,6 @@ def _dependent_defaults(resolved: "scenario.Scenario") -> Iterator[str]:
         yield (f"plant.watchdog: policy {watchdog.policy}, after {timeout_s:g} s without an actuation")
     if resolved.controller.safe_input is None:
         yield "controller.safe_input: 0, the input before the first update"
-    if resolved.recovery.rejoin_within_s is None:
-        yield (
-            "recovery.rejoin_within_s: 0, a process that dies ends the run; with `noack record`: "
-            f"{child_processes.RESTART_BY_HAND_S:g} s to restart it"
-        )
     if resolved.start_within_s is None:
         yield (
             f"start_within_s: {launcher.DEFAULT_START_S:g}, longer on a busy machine; with "
