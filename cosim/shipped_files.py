@@ -1,15 +1,12 @@
 """Files that come with noack, found by name: scenarios and campaigns."""
 
 import re
+import tomllib
 from pathlib import Path
 from typing import NamedTuple
 
-from cosim.lazy_modules import lazy_modules
 from noack.core.errors import CallerError, did_you_mean, shortened
 from noack.core.file_access import shipped_folder
-
-with lazy_modules():
-    from noack.scenario import toml_file
 
 KINDS = ("scenarios", "campaigns")
 """Kinds of shipped files, and their folders."""
@@ -69,8 +66,12 @@ def shipped_names(folder: str) -> list[str]:
 
 def all_shipped(folder: str) -> list[ShippedFile]:
     """Return the scenarios or campaigns that come with noack, by name."""
-    paths = (_path_of(name, folder) for name in shipped_names(folder))
-    return [ShippedFile(path.stem, str(toml_file.read(path)["description"]), path) for path in paths]
+    paths = [_path_of(name, folder) for name in shipped_names(folder)]
+    contents = [tomllib.loads(path.read_text(encoding="utf-8")) for path in paths]
+    return [
+        ShippedFile(path.stem, content["description"], path)
+        for path, content in zip(paths, contents, strict=True)
+    ]
 
 
 def text_of(name: str) -> str:

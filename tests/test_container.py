@@ -8,7 +8,7 @@ import pytest
 import typer
 import yaml
 
-from cosim.cli import app
+from cosim.cli.application import app
 from noack.protocol.roles import LOOP_ROLES
 from noack.runtime.command_line import Parser
 from noack.runtime.join_run import add_options

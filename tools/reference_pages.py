@@ -15,7 +15,7 @@ from unittest.mock import patch
 
 from typer.main import get_command
 
-from cosim.cli import app
+from cosim.cli.application import app
 from netem.__main__ import main as netem_main
 
 ROOT = Path(__file__).parents[1]
@@ -36,7 +36,7 @@ def commands() -> str:
 
 def _command(name: str, command: Any, parent: Any) -> str:
     context = command.context_class(command, info_name=name, parent=parent)
-    lines = [f"### noack {name}", "", _plain(command.help), ""]
+    lines = [f"### noack {name}", "", command.help or "", ""]
     if name == "netem":
         return "\n".join([*lines, "```text", _netem_help(), "```", ""])
     usage = " ".join(["noack", name, *command.collect_usage_pieces(context)])
@@ -47,29 +47,18 @@ def _command(name: str, command: Any, parent: Any) -> str:
         lines += ["| | |", "|---|---|"]
         lines += [f"| `{_cell(what)}` | {_cell(meaning).replace('<', '&lt;')} |" for what, meaning in rows]
     if command.epilog:
-        lines += ["", "```text", _examples(command.epilog), "```"]
+        lines += ["", command.epilog]
     return "\n".join([*lines, ""])
-
-
-def _plain(markup: str | None) -> str:
-    return (markup or "").replace("\b", "").strip()
 
 
 def _meaning(record: str) -> str:
     """Return an option's help, and the text in brackets after it: default, required."""
     text, gap, more = record.rpartition("  [")
-    return f"{_plain(text)} ({more.removesuffix(']')})" if gap else _plain(record)
+    return f"{text} ({more.removesuffix(']')})" if gap else record
 
 
 def _cell(text: str) -> str:
     return " ".join(text.split()).replace("|", "\\|")
-
-
-def _examples(epilog: str) -> str:
-    lines = _plain(epilog).splitlines()
-    if lines and lines[0].strip() == "Examples:":
-        del lines[0]
-    return "\n".join(line.removeprefix("  ") for line in lines)
 
 
 def _netem_help() -> str:

@@ -76,8 +76,9 @@ def recorded_loop(record: RunRecord) -> RecordedLoop:
     """Read the schedule of a run.
 
     Raises:
-        IncomparableError: the run diverged, settings were changed, the record is too short or has
-            gaps, or some inputs were not those of the controller's model.
+        IncomparableError: the run diverged, a process was restarted, settings were changed, the
+            record is too short or has gaps, or some inputs were not those of the controller's
+            model.
         CallerError: exact simulation does not support the scenario.
     """
     _require_ideal(record)
@@ -116,10 +117,13 @@ def recorded_loop(record: RunRecord) -> RecordedLoop:
 
 
 def _require_ideal(record: RunRecord) -> None:
-    """Require settings that stayed the same, and a loop with an exact simulation."""
-    _require(not changes_of(record), "the ideal loop has no changes of settings, as this run has")
+    """Require settings and processes that stayed the same, and a loop with an exact simulation."""
+    changed, restarted = bool(changes_of(record)), record.restarted_role()
+    _require(not changed, "the ideal loop has no changes of settings, as this run has")
     record.scenario.coverage.require_unchanging()
     record.scenario.coverage.require_exact()
+    why = f"the ideal loop has no restarts: {restarted} was restarted during the run"
+    _require(restarted is None, why)
 
 
 def _whole_steps(record: RunRecord, steps: Rows, sensor: Rows, ticks: Rows, deliveries: Rows) -> Rows:

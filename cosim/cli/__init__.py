@@ -5,23 +5,6 @@
 
 import signal
 
-TYPE_CHECKING = False  # importing typing takes longer than all else before the handler
-if TYPE_CHECKING:
-    from cosim.cli.command import app
-else:
-
-    def __getattr__(name: str) -> object:
-        """Import the program with all its commands when a name of it is first used (PEP 562)."""
-        if name not in __all__:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        from cosim.cli import command  # `main` imports nothing before its handler
-
-        command.register_commands()
-        return getattr(command, name)
-
-
-__all__ = ["app", "main"]
-
 
 def main() -> None:
     """Entry point."""

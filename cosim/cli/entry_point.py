@@ -3,16 +3,16 @@
 import gc
 import os
 import sys
-from contextlib import ExitStack, closing, suppress
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
+from typing import TYPE_CHECKING
 
-from cosim.lazy_modules import lazy_modules
 from noack.core.errors import NoackError
 from noack.core.system_processes import exhausted_limit
 from noack.runtime.command_line import report_failure, stoppable_imports
 
-with lazy_modules():
-    from cosim.cli import command
-    from cosim.live.processes import fork_server
+if TYPE_CHECKING:
+    from cosim.live.processes.fork_server import ForkServer
 
 _LIVE = ("run", "demo", "record")
 _NEW_OBJECTS = 100_000
@@ -23,32 +23,36 @@ def run() -> None:
     """Run the command of the command line."""
     gc.set_threshold(_NEW_OBJECTS)
     words = sys.argv[1:]
-    as_json = "--json" in words
-    with stoppable_imports(), ExitStack() as stack:
-        try:
-            if (server := _fork_server(words)) is not None:
-                stack.enter_context(closing(server))
-            command.register_commands(*(words or _completed_words())[:1])
-            command.run_program(server)  # a command handles signals itself
-        except NoackError as error:
-            sys.exit(report_failure(str(error), error.exit_status, source="noack", as_json=as_json))
-        except Exception as error:
-            if (line := exhausted_limit(error)) is None:
-                raise
-            sys.exit(report_failure(line, NoackError.exit_status, source="noack", as_json=as_json))
+    try:
+        with stoppable_imports(), _fork_server(words) as server:
+            from cosim.cli.application import app
+            from cosim.cli.pipe_safe_streams import ignore_broken_pipes
+
+            if words[:1] != ["netem"]:  # the emulator ends when its output is closed
+                ignore_broken_pipes()
+            app(prog_name="noack", obj=server)  # it handles signals itself
+    except Exception as error:
+        line = str(error) if isinstance(error, NoackError) else exhausted_limit(error)
+        if line is None:
+            raise
+        status = error.exit_status if isinstance(error, NoackError) else NoackError.exit_status
+        sys.exit(report_failure(line, status, source="noack", as_json="--json" in words))
 
 
-def _completed_words() -> list[str]:
-    """Return the words before which a shell asks for completions; none if it does not ask."""
-    line = os.environ.get("_TYPER_COMPLETE_ARGS", os.environ.get("COMP_WORDS", ""))
-    return line.split()[1:] if "_NOACK_COMPLETE" in os.environ else []
-
-
-def _fork_server(words: list[str]) -> "fork_server.ForkServer | None":
+@contextmanager
+def _fork_server(words: list[str]) -> "Iterator[ForkServer | None]":
     """Fork the fork server of a live run, which imports while this process does."""
     if sys.platform != "linux" or "--help" in words or not words or words[0] not in _LIVE:
-        return None
-    os.environ.update(fork_server.QUICK_IMPORTS)
+        yield None
+        return
+    from cosim.live.processes.fork_server import QUICK_IMPORTS, ForkServer
+
+    os.environ.update(QUICK_IMPORTS)
+    server = None
     with suppress(OSError):  # the command reports it
-        return fork_server.ForkServer(of_itself=True)
-    return None
+        server = ForkServer(of_itself=True)
+    if server is None:
+        yield None
+        return
+    with closing(server):
+        yield server

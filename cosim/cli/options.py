@@ -1,30 +1,37 @@
-"""The arguments and options that commands share, and how a shell completes them."""
+"""What commands share: the panels of the help, arguments and options, and how a shell completes them.
+
+A command imports what is large within its function. So help and completion need none of it.
+"""
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import ExitStack
 from enum import StrEnum
-from json import dumps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar, dataclass_transform
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from typer import Argument, Option
 
-from cosim.lazy_modules import lazy_modules
-from cosim.output.figures.figure_format import FigureFiles, FigureFormat, requested_files
-from cosim.record.run_directory import DEFAULT_RUNS, LATEST, SCENARIO_FILE, chosen_run
+from cosim.output.figures.figure_format import FigureFormat
+from cosim.record.run_directory import DEFAULT_RUNS, LATEST, SCENARIO_FILE
 from cosim.shipped_files import find_shipped, shipped_names
-from noack.core.errors import CallerError
-
-with lazy_modules():
-    from noack.scenario import resolution, runtime_parameters, scenario, scenario_file, toml_file
+from noack.runtime.command_line import LogFormat, log_format
 
 if TYPE_CHECKING:
-    from noack.core.linear_systems import Matrix
     from noack.scenario.scenario import Scenario
 
-T = TypeVar("T")
+RUNS, THEORY, CAMPAIGNS = "Runs", "Theory", "Campaigns"
+MEASURING = "Real networks"
+FILES = "Scenario files and this machine"
+PROCESSES = "One terminal per process"
+PANELS = (RUNS, THEORY, CAMPAIGNS, MEASURING, FILES, PROCESSES)
+"""The panels of the help, in order."""
+
+
+def examples(*rows: tuple[str, str]) -> str:
+    """Return the end of a command's help (Markdown): commands, each with its description."""
+    return "\n".join(["Examples:", "", *(f"- `{command}` – {meaning}" for command, meaning in rows)])
 
 
 def complete_scenarios(incomplete: str) -> list[str]:
@@ -51,51 +58,22 @@ def complete_runs(incomplete: str) -> list[str]:
 
 def complete_settings(incomplete: str) -> list[str]:
     """Return matching keys for ``--set``, each with its =."""
-    known = (*runtime_parameters.SHORT, *toml_file.keys(scenario.Scenario))
-    return _matching(incomplete, [f"{key}=" for key in known])
+    from noack.scenario.runtime_parameters import SHORT
+    from noack.scenario.scenario import Scenario
+    from noack.scenario.toml_file import keys
+
+    return _matching(incomplete, [f"{key}=" for key in (*SHORT, *keys(Scenario))])
 
 
 def complete_runtime_parameters(incomplete: str) -> list[str]:
     """Return matching names of the runtime parameters, short and full."""
-    short = runtime_parameters.SHORT
-    return _matching(incomplete, [*short, *short.values()])
+    from noack.scenario.runtime_parameters import SHORT
+
+    return _matching(incomplete, [*SHORT, *SHORT.values()])
 
 
 def _matching(incomplete: str, words: list[str]) -> list[str]:
     return [word for word in words if word.startswith(incomplete)]
-
-
-def find_scenario(name: str) -> Path:
-    """Return the path of a scenario given by path, or by the name of a shipped one."""
-    return find_shipped(name, "scenarios")
-
-
-def load_scenario(name: str, settings: Sequence[str] | None) -> "Scenario":
-    """Load a scenario given by path or name, with the values of ``--set``."""
-    return scenario_file.load(find_scenario(name), settings or ())
-
-
-ScenarioArgument = Annotated[
-    str,
-    Argument(
-        help="Scenario file (TOML), the name of a shipped scenario, or a run directory.",
-        autocompletion=complete_scenarios,
-    ),
-]
-RunArgument = Annotated[
-    Path | None,
-    Argument(help="Run directory; the last run by default.", autocompletion=complete_runs),
-]
-LoopOption = Annotated[str | None, Option("--loop", metavar="NAME", help="Only the loop of this name.")]
-SetOption = Annotated[
-    list[str] | None,
-    Option(
-        "--set",
-        metavar="KEY=VALUE",
-        help="Replace a value of the scenario, e.g. trigger.beta=0.3, or for short beta=0.3.",
-        autocompletion=complete_settings,
-    ),
-]
 
 
 def _usable_folder(folder: Path | None) -> Path | None:
@@ -115,8 +93,30 @@ def usable_path(path: Path | None) -> Path | None:
     return path
 
 
-OutOption = Annotated[Path | None, Option("--out", callback=usable_path)]
-OutWithDefault = Annotated[Path, Option("--out", callback=usable_path)]
+def find_scenario(name: str) -> Path:
+    """Return the path of a scenario given by path, or by the name of a shipped one."""
+    return find_shipped(name, "scenarios")
+
+
+def load_scenario(name: str, settings: Sequence[str] | None) -> "Scenario":
+    """Load a scenario given by path or name, with the values of ``--set``."""
+    from noack.scenario.scenario_file import load
+
+    return load(find_scenario(name), settings or ())
+
+
+def load_loop(name: str, settings: Sequence[str] | None, loop: str | None) -> "Scenario":
+    """Load the scenario of one loop; of a scenario with several, that of the loop named."""
+    from noack.scenario.resolution import loop_named
+
+    return loop_named(load_scenario(name, settings), loop)
+
+
+def require_linux() -> None:
+    """Raise CallerError where there are no live runs; what a live run imports may be missing there."""
+    from noack.core.core_library import require_live_runs
+
+    require_live_runs()
 
 
 class TriggerMode(StrEnum):
@@ -126,11 +126,78 @@ class TriggerMode(StrEnum):
     CONTINUOUS = "continuous"
 
 
+ScenarioArgument = Annotated[
+    str,
+    Argument(
+        help="Scenario file (TOML), the name of a shipped scenario, or a run directory.",
+        autocompletion=complete_scenarios,
+    ),
+]
+SetOption = Annotated[
+    list[str] | None,
+    Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Replace a value of the scenario, e.g. trigger.beta=0.3, or for short beta=0.3.",
+        autocompletion=complete_settings,
+    ),
+]
+RunArgument = Annotated[
+    Path | None,
+    Argument(help="Run directory; the last run by default.", autocompletion=complete_runs),
+]
+RunsOption = Annotated[Path, Option("--runs", help="Folder of the run directories.")]
+LoopOption = Annotated[str | None, Option("--loop", metavar="NAME", help="Only the loop of this name.")]
+SESSION = Option("--session", help="Session name that the processes of a run share.")
 TriggerOption = Annotated[
     TriggerMode,
     Option(help="sampled: test the trigger at each measurement, as in a live run; continuous: at all times."),
 ]
-RunsOption = Annotated[Path, Option("--runs", help="Folder of the run directories.")]
+ReportOption = Annotated[
+    bool,
+    Option(
+        "--report/--no-report",
+        help="Write report.html, which takes about 2 s; `noack report` writes it later.",
+    ),
+]
+LiveOption = Annotated[
+    bool,
+    Option(
+        "--live",
+        help="Show the run in the rerun viewer: in a window, or without a display in a browser, at "
+        "the address that is printed.",
+    ),
+]
+MetricsOption = Annotated[
+    str | None,
+    Option(
+        metavar="[HOST]:PORT",
+        help="Serve the run's metrics for Prometheus (OpenMetrics) at this address; the loopback "
+        "without a HOST.",
+    ),
+]
+
+
+def _log_format(context: typer.Context, chosen: LogFormat) -> LogFormat:
+    """Write standard error in this format until the command ends."""
+    stack = ExitStack()
+    stack.enter_context(log_format(chosen))
+    context.find_root().call_on_close(stack.close)
+    return chosen
+
+
+LogFormatOption = Annotated[
+    LogFormat,
+    Option(
+        callback=_log_format,
+        is_eager=True,
+        help="Format of standard error: text, or JSON Lines for log collectors.",
+    ),
+]
+FigureFormatOption = Annotated[
+    FigureFormat | None,
+    Option("--format", help="Write each figure as a file, too; a PDF has the fonts of LaTeX."),
+]
 WidthOption = Annotated[
     str | None,
     Option(
@@ -140,8 +207,6 @@ WidthOption = Annotated[
         "column for pdf, 10 in for svg and png.",
     ),
 ]
-
-
 TablesOption = Annotated[
     Path | None,
     Option(
@@ -151,115 +216,16 @@ TablesOption = Annotated[
         help="Write the tables into this folder, as CSV.",
     ),
 ]
+StateWeightOption = Annotated[
+    str | None,
+    Option("--Q", help="Weight of the state: rows, or a diagonal, e.g. '[1, 1]'; by default the identity."),
+]
+InputWeightOption = Annotated[
+    str | None,
+    Option("--R", help="Weight of the input: rows, or a diagonal; by default the identity."),
+]
+SeedOption = Annotated[int, Option(help="Seed of the draws.", min=0, max=2**63 - 1)]
 VerboseOption = Annotated[
     bool, Option("--verbose", help="Print all tables: timing, assumptions, each claim.")
 ]
 JsonOption = Annotated[bool, Option("--json", help="Print one JSON document on stdout, and nothing else.")]
-SeedOption = Annotated[int, Option(help="Seed of the draws.", min=0, max=2**63 - 1)]
-SESSION = Option("--session", help="Session name that the processes of a run share.")
-
-
-@dataclass_transform()
-def option_group(group: type[T]) -> type[T]:
-    """Make a dataclass of options. With all methods that it could have, it would take 1 ms."""
-    return dataclass(eq=False, repr=False)(group)
-
-
-@option_group
-class ScenarioOptions:
-    """A scenario, and the values of ``--set``."""
-
-    scenario: ScenarioArgument
-    settings: SetOption = None
-
-    def load(self, *more: str) -> "Scenario":
-        """Load the scenario, with more settings as for ``--set``."""
-        return load_scenario(self.scenario, [*(self.settings or ()), *more])
-
-
-@option_group
-class OneLoopOptions(ScenarioOptions):
-    """The scenario of one loop; of a scenario with several, that of the loop named."""
-
-    loop: LoopOption = None
-
-    def load(self, *more: str) -> "Scenario":
-        """Load it, with more settings of the whole scenario as for ``--set``."""
-        return resolution.loop_named(super().load(*more), self.loop)
-
-
-@option_group
-class ExampleOptions(ScenarioOptions):
-    """The same; the paper's example by default."""
-
-    scenario: ScenarioArgument = "lane_following"
-
-
-@option_group
-class LoopOptions:
-    """An earlier run, or one of its loops."""
-
-    run_dir: RunArgument = None
-    runs: RunsOption = DEFAULT_RUNS
-    loop: LoopOption = None
-
-    @property
-    def path(self) -> Path:
-        """The run's directory; raise CallerError if there is none."""
-        return chosen_run(self.run_dir, self.runs)
-
-
-def weight_matrix(option: str, text: str | None, size: int) -> "Matrix":
-    """Return the weight that an option gives by rows, or its diagonal; None: the identity."""
-    import numpy as np  # help and completion need none
-
-    if text is None:
-        return np.eye(size)
-    try:
-        value = np.array(scenario_file.value_of(text, option), dtype=np.float64)
-    except (CallerError, ValueError, TypeError):
-        value = np.empty(0)
-    if value.ndim == 1:
-        value = np.diag(value)
-    if value.shape != (size, size) or not np.isfinite(value).all():
-        example = dumps([1] * size)
-        raise CallerError(
-            f"{option} {text}: expected {size} x {size} numbers by rows, or {size} for the "
-            f"diagonal, e.g. '{example}'"
-        )
-    return value
-
-
-@option_group
-class CostOptions:
-    """The weights of a cost ∫ xᵀQx + uᵀRu dt.
-
-    Options:
-        Q: Weight of the state: rows, or a diagonal, e.g. '[1, 1]'; by default the identity.
-        R: Weight of the input: rows, or a diagonal; by default the identity.
-    """
-
-    Q: Annotated[str | None, Option("--Q")] = None
-    R: Annotated[str | None, Option("--R")] = None
-
-    def matrices(self, loaded: "Scenario") -> "tuple[Matrix, Matrix]":
-        """Return Q and R; raise CallerError if one is wrong."""
-        n, m = loaded.model.dimensions
-        return weight_matrix("--Q", self.Q, n), weight_matrix("--R", self.R, m)
-
-
-@option_group
-class FigureOptions:
-    """How figures are written as files.
-
-    Options:
-        figure_format: Write each figure as a file, too; a PDF has the fonts of LaTeX.
-    """
-
-    figure_format: Annotated[FigureFormat | None, Option("--format")] = None
-    width: WidthOption = None
-
-    @property
-    def files(self) -> FigureFiles | None:
-        """The files of the figures, if any; raise CallerError if the width is wrong."""
-        return requested_files(self.figure_format, self.width)

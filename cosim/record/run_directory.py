@@ -15,25 +15,14 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from importlib import metadata
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import Any, Literal, Self
 
-from cosim.lazy_modules import lazy_modules
 from noack.core.errors import CallerError, ExitStatus, MachineError, NoackError, why
-from noack.core.file_access import copy_whole, locked, open_growing, read_regular, write_whole
+from noack.core.file_access import locked, open_growing, read_regular, write_whole
 from noack.core.system_processes import cores
-
-with lazy_modules():
-    from importlib import metadata
-
-    from noack.scenario import scenario as scenarios
-    from noack.scenario import scenario_file
-    from noack.settings import user_files
-
-if TYPE_CHECKING:
-    from noack.scenario.scenario import Scenario
-    from noack.settings.user_files import FileSettings
 
 DEFAULT_RUNS = Path("runs")
 """Folder for run directories, relative to the current folder."""
@@ -88,45 +77,6 @@ def _require_utf8(path: Path) -> None:
         os.fspath(path.absolute()).encode()
     except UnicodeEncodeError:
         raise CallerError(f"{path}: the name of a folder is not UTF-8; rename it") from None
-
-
-def write_scenario(scenario: "Scenario", run_dir: Path) -> "Scenario":
-    """Write the scenario of a run into its directory, with the files that the run executes.
-
-    The copies allow a replay after a file has changed, and the directory can be moved. The file of
-    a plant is copied to ``plant/``, that of a trigger to ``trigger/``, and so on. The names of the
-    files of an entry of [[loops]] begin with ``loops_0_``, and so on.
-
-    Returns:
-        The scenario for the run's processes, which use the copies.
-
-    Raises:
-        CallerError: a file has changed since the scenario was loaded.
-        MachineError, OSError: the directory cannot be written.
-    """
-    common = dict(user_files.file_tables(scenario))
-
-    def copy_files(prefix: str, within_scenario: "Scenario", folder: str) -> dict[str, "FileSettings"]:
-        copies = {}
-        for key, table in user_files.file_tables(within_scenario):
-            if prefix and table == common.get(key):
-                continue  # the entry does not set it
-            file = user_files.checked_path(table, f"{prefix}{key}")
-            name = f"{key.split('.')[0]}/{prefix.replace('.', '_')}{file.name}"
-            if not (run_dir / name).is_file():
-                (run_dir / name).parent.mkdir(exist_ok=True)
-                copy_whole(file, run_dir / name)
-            copies[key] = table.model_copy(update={"file": f"{folder}{name}"})
-        return copies
-
-    def scenario_in(folder: str) -> "Scenario":
-        relocated = scenarios.with_loop_tables(
-            scenario, lambda entry, loop: copy_files(f"{entry}.", loop, folder)
-        )
-        return user_files.with_tables(relocated, copy_files("", scenario, folder))
-
-    write_whole(run_dir / SCENARIO_FILE, scenario_file.dumps(scenario_in("")))
-    return scenario_in(f"{run_dir.absolute()}/")
 
 
 def how_to_complete(run_dir: Path) -> str:

@@ -24,9 +24,9 @@ from cosim.record.run_directory import (
     new_run_dir,
     point_to_latest,
     write_environment,
-    write_scenario,
 )
 from cosim.record.run_record import NETWORK_ROLES, RecordedRun, Rows, RunRecord, loop_roles
+from cosim.record.run_scenario import write_scenario
 from netem.channel import RUN_ID, UserNetwork, channel_of
 from noack.core.clock import NEVER_NS
 from noack.core.core_library import CData, core, ffi
@@ -348,7 +348,7 @@ def _simulate(
         reports = _reports(run, own_counts, scenario, number)
         notices = run.record.notices(number)
         roles = loop_roles(len(loops))
-        records.append(RunRecord(loop, rows, notices, reports, "simulated", number, roles))
+        records.append(RunRecord(loop, rows, notices, reports, "simulated", (), number, roles))
     of_all = {table: len(rows) for table, rows in of_network.items()}
     reports = {"netem": _report(of_all, "netem", {"rejected": {}})}
     common = RunRecord(scenario, of_network, run.record.notices(), reports, "simulated", roles=NETWORK_ROLES)

@@ -7,14 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from rich.console import Console
 
 from cosim.analysis.summary.summary_model import FidelityPart, LoopSummary, RunSummary
 from cosim.live.finalize import reopen
-from cosim.output.curves import Dash
 from cosim.output.figures import palette
 from cosim.output.figures.figure_description import (
     TIME,
     Axis,
+    Dash,
     FigureDescription,
     Item,
     Line,
@@ -25,6 +26,7 @@ from cosim.output.figures.figure_description import (
     series_colour,
     time_axis,
 )
+from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.output.run_tables import caps_text
 from cosim.record.align import Reals, Times, align_tables
 from cosim.record.run_directory import chosen_run
@@ -345,3 +347,18 @@ def _events(runs: Sequence[ComparedRun]) -> Panel:
     y = Axis(ticks=ticks, ends=(-0.6, len(runs) - 0.4), grid=False)
     title = "Transmissions (bar: delivered, cross: lost)"
     return Panel(title=title, items=items, x=Axis(), y=y)
+
+
+def print_comparison(console: Console, comparison: RunComparison, overlay: Path) -> None:
+    """Print the runs, their key numbers, the settings that differ, and the file of the overlay."""
+    for run in comparison.runs:
+        line = f"{run.label}  {run.title}  {run.directory}"
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    labels = [run.label for run in comparison.runs]
+    tables = {"key numbers (in brackets: difference to A)": comparison.rows}
+    if comparison.settings:
+        tables["settings that differ"] = comparison.setting_rows
+    for title, rows in tables.items():
+        table = ResultTable("", title, ("", *labels), rows)
+        console.print(terminal_table(table))
+    console.print(f"overlay: {overlay}", markup=False, highlight=False, soft_wrap=True)

@@ -6,7 +6,7 @@ import typer.main
 import typer.testing
 from typer.testing import CliRunner, Result
 
-from cosim.cli import app
+from cosim.cli.application import app
 
 # The commands are built from their signatures once, not for each invocation (0.05 s of CPU).
 typer.testing._get_command = cache(typer.main.get_command)

@@ -1,76 +1,26 @@
 """``noack design``: a trigger that transmits least, or a gain that tolerates the most losses."""
 
 import math
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
+import typer
 from typer import Option
 
-from cosim.cli import command as cli
 from cosim.cli import options as opt
-from cosim.cli.execute_run import warn_of_left_out
-from cosim.lazy_modules import lazy_modules
+from cosim.cli.options import CAMPAIGNS, examples
+from cosim.cli.printing import console, print_json
+from cosim.output.figures.figure_format import requested_files
 from cosim.record.run_directory import DEFAULT_RUNS
 from noack.core.errors import CallerError, ExitStatus
-from noack.core.file_access import write_whole
 from noack.runtime.command_line import print_to_stderr
 
-with lazy_modules():
-    from cosim.live.monitoring import progress
-    from cosim.studies.design import design_outcome, design_page, design_search, design_space, network_search
-    from noack.core import linear_systems
-    from noack.scenario import scenario, scenario_file
+if TYPE_CHECKING:
+    from cosim.studies.design.design_search import BoundedQuantity
 
-
-@opt.option_group
-class LimitOptions:
-    """What a design must meet.
-
-    Options:
-        settling: Largest settling time allowed; required for --for settling.
-        quantile: Share of the draws that must settle in time.
-        settle: A run has settled when ‖x‖ stays below this share of ‖x(0)‖.
-        bound: Largest certified sup‖x‖ (state) or sup‖e_c‖ (error) allowed over the box.
-        under: Conditions of the certificates: the `paper`'s, or the scenario's `schedule`.
-    """
-
-    settling: Annotated[float | None, Option(metavar="SECONDS")] = None
-    quantile: float = 0.95
-    settle: float = 0.02
-    bound: Annotated[list[str] | None, Option(metavar="state=X|error=X")] = None
-    under: str = "paper"
-
-    def limits(self) -> "design_search.DesignLimits":
-        """Return the limits; raise CallerError if one is wrong."""
-        if self.settling is None:
-            raise CallerError("--settling: give the largest settling time, e.g. --settling 14")
-        for option, upper in (("settling", math.inf), ("quantile", 1), ("settle", 1)):
-            if not 0 < (value := getattr(self, option)) < upper:
-                allowed = "positive" if upper == math.inf else "between 0 and 1"
-                raise CallerError(f"--{option}: must be {allowed}, not {value:g}")
-        if self.under not in ("paper", "schedule"):
-            raise CallerError(f'--under: paper or schedule, not "{self.under}"')
-        return design_search.DesignLimits(
-            self.settling, self.quantile, self.settle, self.bounds(), self.under == "schedule"
-        )
-
-    def bounds(self) -> "dict[design_search.BoundedQuantity, float]":
-        """Return the limits of certified bounds; raise CallerError if one is wrong."""
-        by_quantity: dict[design_search.BoundedQuantity, float] = {}
-        for text in self.bound or ():
-            name, _, value = text.partition("=")
-            try:
-                limit = float(value)
-            except ValueError:
-                limit = math.nan
-            bounded: dict[str, design_search.BoundedQuantity] = {"state": "state", "error": "error"}
-            if name not in bounded or not 0 < limit < math.inf:
-                raise CallerError(f"--bound {text}: write it as state=X or error=X, X positive")
-            if bounded[name] in by_quantity:
-                raise CallerError(f"--bound {text}: {name} is given twice")
-            by_quantity[bounded[name]] = limit
-        return by_quantity
+app = typer.Typer()
 
 
 class DesignAim(StrEnum):
@@ -80,115 +30,121 @@ class DesignAim(StrEnum):
     NETWORK = "network"
 
 
-@opt.option_group
-class NetworkOptions:
-    """What a design for a network must meet.
+class DesignGain(StrEnum):
+    """The gain with which a trigger is chosen."""
 
-    Options:
-        aim: `settling`: the trigger with the fewest transmissions that settles in time. `network`:
-            the gain of a time-triggered loop that is proven stable for the largest M.
-        period: Time between two updates; by default that of a periodic scenario.
-        most: Largest M to examine; 16 by default.
-        cost: Largest cost ∫ xᵀQx + uᵀRu dt without losses, as a multiple of the given loop's; 1.2 by
-            default.
-        effort: Number of loops that the search may try; 1,500 by default.
-    """
-
-    aim: Annotated[DesignAim, Option("--for")] = DesignAim.SETTLING
-    period: Annotated[float | None, Option(metavar="SECONDS")] = None
-    most: Annotated[int | None, Option(min=1, max=10_000)] = None
-    cost: float | None = None
-    effort: Annotated[int | None, Option(min=0)] = None
-
-    def refuse(self) -> None:
-        """Raise CallerError for an option that has no effect for --for settling."""
-        for option in ("period", "most", "cost", "effort"):
-            if getattr(self, option) is not None:
-                raise CallerError(f"--{option}: is for --for network only")
-
-    def request(
-        self, weights: "tuple[linear_systems.Matrix, linear_systems.Matrix]"
-    ) -> "network_search.DesignRequest":
-        """Return what is asked for; raise CallerError if an option is wrong."""
-        if self.period is not None and not 1e-6 <= self.period <= 1e7:
-            raise CallerError(f"--period: from 1e-6 to 1e7 seconds, not {self.period:g}")
-        default = network_search.DesignRequest()
-        return network_search.DesignRequest(
-            most=self.most or default.most,
-            period_s=self.period,
-            cost=default.cost if self.cost is None else self.cost,
-            weights=weights,
-            effort=default.effort if self.effort is None else self.effort,
-        )
+    GIVEN = "given"
+    LQR = "lqr"
 
 
-@opt.option_group
-class GainOptions(opt.CostOptions):
-    """The gain of a design, and the costs of its regulator.
+class CertificateConditions(StrEnum):
+    """The conditions of the certificates that a trigger must have."""
 
-    Options:
-        gain: Gain K: `given` in the scenario, or `lqr` of the nominal model.
-    """
-
-    gain: str = "given"
-
-    def regulator(
-        self, loaded: "scenario.Scenario"
-    ) -> "tuple[linear_systems.Matrix, linear_systems.Matrix] | None":
-        """Return the LQR costs, None for the scenario's gain; raise CallerError if one is wrong."""
-        if self.gain not in ("given", "lqr"):
-            raise CallerError(f'--gain: given or lqr, not "{self.gain}"')
-        if self.gain == "lqr":
-            return self.matrices(loaded)
-        if self.Q or self.R:
-            raise CallerError("--Q, --R: are for --gain lqr only")
-        return None
+    PAPER = "paper"
+    SCHEDULE = "schedule"
 
 
-@opt.option_group
-class DesignFiles:
-    """The files of a design.
-
-    Options:
-        out: Write the chosen scenario to this file (TOML).
-        page: File of the page (HTML); runs/design/NAME.html by default.
-    """
-
-    out: opt.OutOption = None
-    page: Annotated[Path | None, Option(callback=opt.usable_path)] = None
-
-    def page_of(self, name: str) -> Path:
-        """Return the file of the page.
-
-        Raise CallerError if the scenario has no folder, or would replace a file that is none.
-        """
-        if self.out is not None and not self.out.parent.is_dir():
-            raise CallerError(f"--out {self.out}: there is no folder {self.out.parent}")
-        if self.out is not None and self.out.exists():
-            try:
-                scenario_file.load(self.out)
-            except CallerError:
-                message = f"--out {self.out}: exists, and is no scenario; give another name"
-                raise CallerError(message) from None
-        return self.page or DEFAULT_RUNS / "design" / f"{name}.html"
-
-    def write(self, scenario_toml: str) -> list[Path]:
-        """Write the chosen scenario, if it is wanted; return the written files."""
-        return [] if self.out is None else [write_whole(self.out, scenario_toml)]
-
-
-@cli.command(cli.CAMPAIGNS, 20, takes="up to two minutes")
+@app.command(
+    rich_help_panel=CAMPAIGNS,
+    epilog=examples(
+        ("noack design lane_following --settling 14", "the fewest transmissions"),
+        (
+            "noack design lane_following --settling 14 --bound error=3 --out mine.toml",
+            "with a certified bound",
+        ),
+        (
+            "noack design double_integrator --settling 8 --gain lqr --Q '[1, 1]' --json",
+            "with another gain",
+        ),
+        ("noack design lane_periodic --for network", "a gain for the largest M"),
+        (
+            "noack design unstable_pendulum --for network --period 0.25 --out mine.toml",
+            "for a time-triggered loop",
+        ),
+    ),
+)
 def design(
-    source: opt.OneLoopOptions,
-    *,
-    network: NetworkOptions,
-    requirements: LimitOptions,
-    weights: str = "identity,chosen",
-    feedback: GainOptions,
-    draws: Annotated[int, Option(min=20)] = 2000,
+    scenario: opt.ScenarioArgument,
+    settings: opt.SetOption = None,
+    loop: opt.LoopOption = None,
+    aim: Annotated[
+        DesignAim,
+        Option(
+            "--for",
+            help="`settling`: the trigger with the fewest transmissions that settles in time. "
+            "`network`: the gain of a time-triggered loop that is proven stable for the largest M.",
+        ),
+    ] = DesignAim.SETTLING,
+    settling: Annotated[
+        float | None,
+        Option(metavar="SECONDS", help="Largest settling time allowed; required for --for settling."),
+    ] = None,
+    quantile: Annotated[float, Option(help="Share of the draws that must settle in time.")] = 0.95,
+    settle: Annotated[
+        float, Option(help="A run has settled when ‖x‖ stays below this share of ‖x(0)‖.")
+    ] = 0.02,
+    bound: Annotated[
+        list[str] | None,
+        Option(
+            metavar="state=X|error=X",
+            help="Largest certified sup‖x‖ (state) or sup‖e_c‖ (error) allowed over the box.",
+        ),
+    ] = None,
+    under: Annotated[
+        CertificateConditions,
+        Option(help="Conditions of the certificates: the `paper`'s, or the scenario's `schedule`."),
+    ] = CertificateConditions.PAPER,
+    weights: Annotated[
+        str, Option(help="Norms to try: `identity`, `given` in the scenario, `chosen` by noack.")
+    ] = "identity,chosen",
+    gain: Annotated[
+        DesignGain, Option(help="Gain K: `given` in the scenario, or `lqr` of the nominal model.")
+    ] = DesignGain.GIVEN,
+    Q: opt.StateWeightOption = None,
+    R: opt.InputWeightOption = None,
+    draws: Annotated[
+        int,
+        Option(min=20, help="Draws that choose the trigger; the same number of new draws confirm it."),
+    ] = 2000,
     seed: opt.SeedOption = 0,
-    files: DesignFiles,
-    figures: opt.FigureOptions,
+    period: Annotated[
+        float | None,
+        Option(
+            metavar="SECONDS",
+            help="With --for network: time between two updates; by default that of a periodic scenario.",
+        ),
+    ] = None,
+    most: Annotated[
+        int | None,
+        Option(min=1, max=10_000, help="With --for network: largest M to examine; 16 by default."),
+    ] = None,
+    cost: Annotated[
+        float | None,
+        Option(
+            help="With --for network: largest cost ∫ xᵀQx + uᵀRu dt without losses, as a multiple of "
+            "the given loop's; 1.2 by default."
+        ),
+    ] = None,
+    effort: Annotated[
+        int | None,
+        Option(
+            min=0,
+            help="With --for network: number of loops that the search may try; 1,500 by default.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        Option(callback=opt.usable_path, help="Write the chosen scenario to this file (TOML)."),
+    ] = None,
+    page: Annotated[
+        Path | None,
+        Option(
+            callback=opt.usable_path,
+            help="File of the page (HTML); runs/design/NAME.html by default.",
+        ),
+    ] = None,
+    figure_format: opt.FigureFormatOption = None,
+    width: opt.WidthOption = None,
     json: opt.JsonOption = False,
 ) -> int:
     """Choose a trigger that transmits least, or a gain that tolerates the most losses.
@@ -199,53 +155,111 @@ def design(
 
     Exit status 1: no choice meets the limits or is proven stable, or fresh draws do not confirm it.
 
-    Options:
-        weights: Norms to try: `identity`, `given` in the scenario, `chosen` by noack.
-        draws: Draws that choose the trigger; the same number of new draws confirm it.
-
-    Examples:
-        noack design lane_following --settling 14   the fewest transmissions
-        noack design lane_following --settling 14 --bound error=3 --out mine.toml
-        noack design double_integrator --settling 8 --gain lqr --Q '[1, 1]' --json
-        noack design lane_periodic --for network   a gain for the largest M
-        noack design unstable_pendulum --for network --period 0.25 --out mine.toml
+    Takes up to two minutes.
     """
-    figure_files, loaded = figures.files, source.load()
-    if network.aim is not DesignAim.SETTLING:
-        if requirements.settling is not None or requirements.bound or feedback.gain != "given":
-            raise CallerError(f"--settling, --bound, --gain: are not for --for {network.aim.value}")
-        page = files.page_of(f"{loaded.name}-network")
-        request = network.request(feedback.matrices(loaded))
-        with progress.work_bar("trying gains", lines=True) as bar:
-            outcome = design_outcome.design_for_network(loaded, request, bar)
+    from cosim.cli.cost_weights import cost_weights
+    from cosim.cli.execute_run import warn_of_left_out
+    from cosim.live.monitoring.progress import work_bar
+    from cosim.studies.design import design_page, design_search
+    from cosim.studies.design.design_outcome import design_for_network
+    from cosim.studies.design.design_space import families_of
+    from cosim.studies.design.network_search import DesignRequest
+    from noack.core.file_access import write_whole
+    from noack.scenario.scenario_file import dumps
+
+    figure_files = requested_files(figure_format, width)
+    loaded = opt.load_loop(scenario, settings, loop)
+    _require_writable(out)
+    if aim is DesignAim.NETWORK:
+        if settling is not None or bound or gain is not DesignGain.GIVEN:
+            raise CallerError("--settling, --bound, --gain: are not for --for network")
+        if period is not None and not 1e-6 <= period <= 1e7:
+            raise CallerError(f"--period: from 1e-6 to 1e7 seconds, not {period:g}")
+        default = DesignRequest()
+        request = DesignRequest(
+            most=most or default.most,
+            period_s=period,
+            cost=default.cost if cost is None else cost,
+            weights=cost_weights(loaded, Q, R),
+            effort=default.effort if effort is None else effort,
+        )
+        with work_bar("trying gains", lines=True) as bar:
+            outcome = design_for_network(loaded, request, bar)
+        page = page or DEFAULT_RUNS / "design" / f"{loaded.name}-network.html"
         written = design_page.write_outcome(outcome, page, figure_files)
-        written += files.write(outcome.scenario_toml()) if outcome.is_certified else []
-        cli.show_with_files(json, outcome.to_json(), written, design_page.print_loop_design, outcome)
+        if out is not None and outcome.is_certified:
+            written.append(write_whole(out, outcome.scenario_toml()))
+        if json:
+            print_json(outcome.to_json() | {"files": [str(file) for file in written]})
+        else:
+            design_page.print_loop_design(console(), outcome)
+            print(*written, sep="\n")
         return ExitStatus.OK if outcome.is_certified else ExitStatus.FAILED
-    network.refuse()
+
+    for option, value in (("period", period), ("most", most), ("cost", cost), ("effort", effort)):
+        if value is not None:
+            raise CallerError(f"--{option}: is for --for network only")
+    if settling is None:
+        raise CallerError("--settling: give the largest settling time, e.g. --settling 14")
+    if not 0 < settling < math.inf:
+        raise CallerError(f"--settling: must be positive, not {settling:g}")
+    for option, share in (("quantile", quantile), ("settle", settle)):
+        if not 0 < share < 1:
+            raise CallerError(f"--{option}: must be between 0 and 1, not {share:g}")
+    if gain is DesignGain.GIVEN and (Q or R):
+        raise CallerError("--Q, --R: are for --gain lqr only")
     warn_of_left_out(loaded)
-    page = files.page_of(loaded.name)
-    result = _trigger_of(loaded, requirements.limits(), weights, feedback, draws, seed)
+    limits = design_search.DesignLimits(
+        settling, quantile, settle, _bounds(bound or ()), under is CertificateConditions.SCHEDULE
+    )
+    loaded.require_decaying()
+    norms = [norm.strip() for norm in weights.split(",") if norm.strip()]
+    regulator = cost_weights(loaded, Q, R) if gain is DesignGain.LQR else None
+    with work_bar("choosing norms", lines=True) as bar:
+        families = families_of(loaded, norms, regulator, bar)
+    with work_bar("trying candidates", lines=True) as bar:
+        result = design_search.design(families, limits, draws=draws, seed=seed, progress=bar)
+    page = page or DEFAULT_RUNS / "design" / f"{loaded.name}.html"
     written = design_page.write_page(result, page, figure_files)
-    written += files.write(scenario_file.dumps(result.scenario)) if result.feasible else []
-    cli.show_with_files(json, result.to_json(), written, design_page.print_trigger_design, result)
+    if out is not None and result.feasible:
+        written.append(write_whole(out, dumps(result.scenario)))
+    if json:
+        print_json(result.to_json() | {"files": [str(file) for file in written]})
+    else:
+        design_page.print_trigger_design(console(), result)
+        print(*written, sep="\n")
     if not result.confirmed:
         print_to_stderr(f"noack: {result.verdict()}")
     return ExitStatus.OK if result.confirmed else ExitStatus.FAILED
 
 
-def _trigger_of(
-    loaded: "scenario.Scenario",
-    limits: "design_search.DesignLimits",
-    weights: str,
-    feedback: GainOptions,
-    draws: int,
-    seed: int,
-) -> "design_search.DesignResult":
-    """Choose the trigger with the fewest transmissions that meets the limits."""
-    loaded.require_decaying()
-    norms = [norm.strip() for norm in weights.split(",") if norm.strip()]
-    with progress.work_bar("choosing norms", lines=True) as bar:
-        families = design_space.families_of(loaded, norms, feedback.regulator(loaded), bar)
-    with progress.work_bar("trying candidates", lines=True) as bar:
-        return design_search.design(families, limits, draws=draws, seed=seed, progress=bar)
+def _require_writable(out: Path | None) -> None:
+    """Raise CallerError if the scenario has no folder, or would replace a file that is none."""
+    from noack.scenario.scenario_file import load
+
+    if out is not None and not out.parent.is_dir():
+        raise CallerError(f"--out {out}: there is no folder {out.parent}")
+    if out is not None and out.exists():
+        try:
+            load(out)
+        except CallerError:
+            message = f"--out {out}: exists, and is no scenario; give another name"
+            raise CallerError(message) from None
+
+
+def _bounds(texts: Sequence[str]) -> "dict[BoundedQuantity, float]":
+    """Return the limits of certified bounds; raise CallerError if one is wrong."""
+    by_quantity: dict[BoundedQuantity, float] = {}
+    bounded: dict[str, BoundedQuantity] = {"state": "state", "error": "error"}
+    for text in texts:
+        name, _, value = text.partition("=")
+        try:
+            limit = float(value)
+        except ValueError:
+            limit = math.nan
+        if name not in bounded or not 0 < limit < math.inf:
+            raise CallerError(f"--bound {text}: write it as state=X or error=X, X positive")
+        if bounded[name] in by_quantity:
+            raise CallerError(f"--bound {text}: {name} is given twice")
+        by_quantity[bounded[name]] = limit
+    return by_quantity

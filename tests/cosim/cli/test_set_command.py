@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 import tomli_w
 
-from cosim.cli.commands.run_commands import parse_settings
 from cosim.cli.execute_run import warn_of_other_runs
+from cosim.cli.live_settings import parse_settings
 from cosim.live.coordination.coordinator import Coordinator
 from noack.core.errors import CallerError
 from noack.runtime import active_runs

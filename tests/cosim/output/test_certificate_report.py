@@ -12,6 +12,7 @@ from scipy.linalg import expm
 
 from cosim.analysis.certificates import Certificates, certificates_of, with_weight
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
+from cosim.output.certificate_report import print_certificates
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
 from noack.scenario.resolution import loop_of
@@ -290,17 +291,19 @@ def test_a_loop_without_any_certificate_has_the_reasons(words: list[str], reason
 def test_a_norm_with_certificates_is_found_and_can_be_pasted(
     chosen: Certificates, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shows = list[Any]()
+    printed = list[Any]()
     monkeypatch.setattr("cosim.analysis.certificates.choose_weight", lambda *_: chosen.weight)
-    monkeypatch.setattr("cosim.cli.command.show", lambda *given: shows.append(given))
+    monkeypatch.setattr(
+        "cosim.output.certificate_report.print_certificates", lambda *given: printed.append(given)
+    )
     invoke("certify", "lane_following", *(f"--set={setting}" for setting in SLOW))
-    ((_, to_json, print_text, *arguments),) = shows
-    print_text(Console(file=(output := StringIO()), width=100), *arguments)
-    text, document = output.getvalue(), to_json()
+    ((_, result, in_chosen_norm),) = printed
+    print_certificates(Console(file=(output := StringIO()), width=100), result, in_chosen_norm)
+    text = output.getvalue()
     pasted_lines = text[text.index("\nweight = [") :].splitlines()[1:]
     rows = "".join(line.strip() for line in pasted_lines)
     weighted = certificates_of(shipped("lane_following", *SLOW, f"trigger.{rows}"))
     assert weighted.schedule.constants is not None
-    assert document["certificates"][1]["constants"] is None
-    in_chosen_norm = document["in_chosen_norm"]["certificates"][1]["constants"]
-    assert in_chosen_norm["state"] == pytest.approx(weighted.schedule.constants.state, rel=1e-3)
+    assert result.schedule.constants is None
+    constants = in_chosen_norm.schedule.constants
+    assert constants.state == pytest.approx(weighted.schedule.constants.state, rel=1e-3)

@@ -11,8 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosim.record.run_directory import REPORTS_FILE, write_environment, write_scenario
+from cosim.record.run_directory import REPORTS_FILE, write_environment
 from cosim.record.run_record import RecordedRun, Rows, load_run
+from cosim.record.run_scenario import write_scenario
 from cosim.record.spool_conversion import Segment, finish_record, merge_segments, write_early
 from cosim.record.table_files import StoredTables, TableFile, write_table
 from cosim.simulation.virtual_time import simulate_loops

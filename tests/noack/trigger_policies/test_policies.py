@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from cosim.analysis.replay import replay
-from cosim.record.run_directory import write_scenario
 from cosim.record.run_record import RunRecord
+from cosim.record.run_scenario import write_scenario
 from cosim.simulation.continuous import continuous_loop_of
 from cosim.simulation.exact_simulation import setting_of
 from cosim.simulation.virtual_time import simulate

@@ -13,8 +13,9 @@ from cosim.output.viewer.loop_recording import ViewError
 from cosim.output.viewer.run_recording import write_loop_view
 from cosim.record import decimation, run_record
 from cosim.record.record_writing import write_run
-from cosim.record.run_directory import RECORDING_FILE, RunEnding, write_environment, write_scenario
+from cosim.record.run_directory import RECORDING_FILE, RunEnding, write_environment
 from cosim.record.run_record import RunRecord
+from cosim.record.run_scenario import write_scenario
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import ExitStatus
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT

@@ -1,0 +1,309 @@
+"""Commands about earlier runs: results, figures and pages, replay, export, comparison."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from typer import Argument, Option
+
+from cosim.cli import options as opt
+from cosim.cli.options import RUNS, examples
+from cosim.cli.printing import console, print_json, print_lines, status, write_tables
+from cosim.output.figures.figure_format import requested_files
+from cosim.record.run_directory import DEFAULT_RUNS, RECORDING_FILE, SCENARIO_FILE, chosen_run, file_of_loop
+from noack.core.errors import CallerError, ExitStatus, NoackError
+from noack.runtime.command_line import print_to_stderr
+
+app = typer.Typer()
+
+
+@app.command(
+    rich_help_panel=RUNS,
+    epilog=examples(
+        ("noack view", "the last run, in a window if there is a display"),
+        ("noack view runs/latest --web", "in a browser on this machine"),
+        ("noack view --loop pendulum-07", "one loop of a run of several, in detail"),
+    ),
+)
+def view(
+    recording: Annotated[
+        Path | None,
+        Argument(
+            help="Run directory or .rrd file; the last run by default.", autocompletion=opt.complete_runs
+        ),
+    ] = None,
+    runs: opt.RunsOption = DEFAULT_RUNS,
+    loop: opt.LoopOption = None,
+    web: Annotated[bool, Option("--web", help="Show it in a browser on this machine.")] = False,
+    json: opt.JsonOption = False,
+) -> int:
+    """Show a run in the rerun viewer.
+
+    A missing recording, as that of one loop alone, is written first.
+    """
+    from cosim.live.finalize import write_recording
+    from cosim.output.viewer.recording_viewer import view_recording
+    from cosim.output.viewer.rerun_program import require_viewer
+
+    path = chosen_run(recording, runs)
+    path = path / file_of_loop(RECORDING_FILE, loop) if path.is_dir() else path
+    if (path.parent / SCENARIO_FILE).is_file() and not path.is_file():
+        with status("writing the recording"):
+            write_recording(path.parent, loop)
+    if json:
+        print_json({"recording": str(path), "exists": path.is_file()})
+        return ExitStatus.OK if path.is_file() else ExitStatus.CALLER
+    require_viewer()
+    view_recording(path, native=False if web else None)
+    return ExitStatus.OK
+
+
+@app.command(
+    rich_help_panel=RUNS,
+    epilog=examples(
+        ("noack summary", "the last run"),
+        ("noack summary --verbose", "with timing, assumptions and each claim"),
+        ("noack summary --tables tables", "its tables as CSV"),
+        ("noack summary runs/latest --json", "all numbers, as JSON"),
+    ),
+)
+def summary(
+    run_dir: opt.RunArgument = None,
+    runs: opt.RunsOption = DEFAULT_RUNS,
+    loop: opt.LoopOption = None,
+    verbose: opt.VerboseOption = False,
+    tables: opt.TablesOption = None,
+    json: opt.JsonOption = False,
+) -> int:
+    """Show a run's summary; finalise an interrupted run first.
+
+    Exit status 0: the summary was shown, also that of a failed run; 2: a table of the run's record
+    is missing or cannot be opened.
+    """
+    from cosim.analysis.summary.run_summary import outcome_of_loop
+    from cosim.cli.execute_run import reopen_run
+    from cosim.output.run_tables import summary_tables
+    from cosim.output.terminal_output import print_outcome
+    from cosim.record.run_record import load_run
+
+    path = chosen_run(run_dir, runs)
+    outcome = outcome_of_loop(reopen_run(path), loop)
+    if json:
+        print_json(outcome.summary.to_json())
+    else:
+        print_outcome(console(), outcome, verbose=verbose)
+    write_tables(summary_tables(outcome.summary), tables, json=json)
+    try:
+        load_run(path)
+    except NoackError as error:
+        print_to_stderr(f"noack: {error}")
+        return error.exit_status
+    return ExitStatus.OK
+
+
+@app.command(
+    rich_help_panel=RUNS,
+    epilog=examples(
+        ("noack collect runs/latest robot:noack/runs/RUN", "by scp from the host robot"),
+        ("noack collect runs/latest copy", "from a folder that was copied here"),
+    ),
+)
+def collect(
+    run_dir: Annotated[Path, Argument(help="Run directory.")],
+    sources: Annotated[
+        list[str], Argument(help="Folders named by the processes: FOLDER, or HOST:FOLDER for scp.")
+    ],
+    json: opt.JsonOption = False,
+) -> None:
+    """Add what processes on other hosts kept of a run, and finalise it again.
+
+    A process that was invited keeps its rows on its host when the recorder is out of reach at the
+    end. It then prints their folder.
+    """
+    from cosim.cli.execute_run import reopen_run
+    from cosim.live.finalize import reopen
+    from cosim.output.terminal_output import print_outcome
+    from cosim.record.collection import collect as collect_rows
+
+    run_dir = chosen_run(run_dir, DEFAULT_RUNS)
+    outcome = reopen_run(run_dir)  # refuses a run that is under way
+    for source in sources:
+        merged, roles = collect_rows(run_dir, source, reopen)
+        outcome = replace(merged, run_dir=run_dir)
+        print_to_stderr(f"noack: {source}: took what {', '.join(roles) or 'no process'} kept")
+    if json:
+        print_json(outcome.summary.to_json())
+    else:
+        print_outcome(console(), outcome)
+
+
+@app.command(
+    rich_help_panel=RUNS,
+    epilog=examples(
+        ("noack replay", "the last run; exit status 1 if a bit differs"),
+        ("noack replay runs/latest --json", "as JSON"),
+    ),
+)
+def replay(
+    run_dir: opt.RunArgument = None,
+    runs: opt.RunsOption = DEFAULT_RUNS,
+    loop: opt.LoopOption = None,
+    json: opt.JsonOption = False,
+) -> int:
+    """Replay a run's recorded inputs; compare the outputs bit for bit.
+
+    Takes about a second.
+    """
+    from cosim.analysis.replay.replay_result import print_replay
+    from cosim.analysis.replay.run_replay import replay_run
+    from cosim.record.run_directory import changed_since
+    from cosim.record.run_record import load_run
+
+    path = chosen_run(run_dir, runs)
+    with status("replaying"):
+        result = replay_run(load_run(path), loop)
+    changed = changed_since(path)
+    if json:
+        print_json(result.to_json() | {"changed_since": changed})
+    else:
+        print_replay(console(), result, changed)
+    return ExitStatus.OK if result.bit_exact else ExitStatus.FAILED
+
+
+@app.command(
+    rich_help_panel=RUNS,
+    epilog=examples(
+        ("noack compare runs/A runs/B", "key numbers, and a page with the curves overlaid"),
+        ("noack compare runs/A runs/B runs/C --out overlay.png", "the overlay as a picture"),
+        ("noack compare runs/A:left runs/A:right", "two loops of a run"),
+        ("noack compare runs/A runs/B --json", "as JSON"),
+    ),
+)
+def compare(
+    directories: Annotated[
+        list[Path],
+        Argument(
+            metavar="RUN...",
+            autocompletion=opt.complete_runs,
+            help="Two to seven run directories, live or simulated; RUN:NAME is a loop.",
+        ),
+    ],
+    out: Annotated[
+        Path,
+        Option(
+            callback=opt.usable_path,
+            help="File of the overlay: a page (.html), or a figure (.svg, .png, .pdf).",
+        ),
+    ] = DEFAULT_RUNS / "comparison.html",
+    width: opt.WidthOption = None,
+    json: opt.JsonOption = False,
+) -> None:
+    """Compare runs: key numbers, settings that differ, curves overlaid.
+
+    Takes about a second.
+    """
+    from cosim.studies.run_comparison import compare_runs, print_comparison
+
+    with status("comparing"):
+        comparison = compare_runs(directories)
+        comparison.save(out, width)
+    if json:
+        print_json(comparison.to_json() | {"overlay": str(out)})
+    else:
+        print_comparison(console(), comparison, out)
+
+
+@app.command(
+    rich_help_panel=RUNS,
+    epilog=examples(
+        ("noack report", "the report of the last run"),
+        ("noack report --format pdf", "with its figures for a paper"),
+        ("noack report --format svg --figure errors", "with one of its figures"),
+        ("noack report runs/latest --json", "print the path as JSON"),
+    ),
+)
+def report(
+    run_dir: opt.RunArgument = None,
+    runs: opt.RunsOption = DEFAULT_RUNS,
+    loop: opt.LoopOption = None,
+    again: Annotated[bool, Option("--again", help="Write the report again, even if there is one.")] = False,
+    figure_format: opt.FigureFormatOption = None,
+    width: opt.WidthOption = None,
+    figure: Annotated[
+        str | None,
+        Option(
+            metavar="NAME",
+            help="Write only this figure, e.g. states, errors, state-norm, input or inter-event.",
+        ),
+    ] = None,
+    json: opt.JsonOption = False,
+) -> None:
+    """Print the path of a run's report (one HTML page with all figures); write it if missing.
+
+    Takes some seconds where it is not there yet.
+    """
+    from cosim.api.runs import open_run
+    from cosim.live.finalize import run_report
+
+    files = requested_files(figure_format, width)  # refuses a wrong width before anything is drawn
+    if figure is not None and files is None:
+        raise CallerError(f"--figure {figure}: give the format of its file, too, e.g. --format svg")
+    chosen = chosen_run(run_dir, runs)
+    with status("writing the report"):
+        path, drawn = run_report(chosen, loop, again=again), []
+    if files is not None:
+        whole_run = open_run(chosen)
+        loop_run = whole_run if loop is None else whole_run.loops[loop]
+        drawn = loop_run.save_figures(files.kind, files.width_in, figure)
+    written = {"figures": [str(figure) for figure in drawn]} if drawn else {}
+    print_lines(json, {"report": str(path)} | written, path, *drawn)
+
+
+def _complete_formats(incomplete: str) -> list[str]:
+    from cosim.output.export.export_formats import formats
+
+    return [name for name in formats() if name.startswith(incomplete)]
+
+
+@app.command(
+    rich_help_panel=RUNS,
+    epilog=examples(
+        ("noack export --format mat", "the last run for MATLAB and Octave"),
+        ("noack export --format mcap --out run.mcap", "for Foxglove and PlotJuggler"),
+        ("noack export runs/latest --format csv --json", "a folder of CSV files"),
+    ),
+)
+def export(
+    file_format: Annotated[
+        str,
+        Option(
+            "--format",
+            metavar="FORMAT",
+            autocompletion=_complete_formats,
+            help="Format of the file, or of the folder's files: csv, mat, or an extension's.",
+        ),
+    ],
+    run_dir: opt.RunArgument = None,
+    runs: opt.RunsOption = DEFAULT_RUNS,
+    loop: opt.LoopOption = None,
+    out: Annotated[
+        Path | None,
+        Option(callback=opt.usable_path, help="File, or folder of CSV; RUN.mat and so on by default."),
+    ] = None,
+    certificates: Annotated[
+        bool,
+        Option(help="Certificates of each loop in a file of MATLAB; about a second for each loop."),
+    ] = True,
+    json: opt.JsonOption = False,
+) -> None:
+    """Export a run for other programs: its tables, its summary and its certificates."""
+    from cosim.cli.execute_run import reopen_run
+    from cosim.output.export.export_formats import export_run, find_format
+
+    suffix = find_format(file_format).SUFFIX
+    reopen_run(chosen := chosen_run(run_dir, runs))
+    path = out or Path(f"{loop or chosen.resolve().name}{suffix}")
+    with status("exporting"):
+        written = export_run(chosen, path, file_format, loop=loop, certificates=certificates)
+    print_lines(json, {"files": [str(path) for path in written]}, *written)

@@ -1,0 +1,58 @@
+"""What commands print: the result as text or as JSON, tables in files, what is being done."""
+
+import math
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
+from json import dumps
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from cosim.output.result_tables import ResultTable
+
+
+def console() -> "Console":
+    """Return a console on standard output."""
+    from rich.console import Console  # a program that reads JSON waits for no rich
+
+    return Console()
+
+
+def status(activity: str) -> AbstractContextManager[Callable[[str], None]]:
+    """Show within the context what a command is doing; the result replaces it."""
+    from cosim.live.monitoring.progress import activity as shown_activity
+
+    return shown_activity(activity)
+
+
+def write_tables(tables: "Iterable[ResultTable]", folder: Path | None, *, json: bool) -> None:
+    """Write the tables of ``--tables``, if it is given; print the paths, unless with ``--json``."""
+    from cosim.output.result_tables import save_tables
+
+    if folder is not None:
+        paths = save_tables(tables, folder)
+        if not json:
+            print(*paths, sep="\n")
+
+
+def print_lines(json: bool, document: object, *lines: object) -> None:
+    """Print a result that is one line or few: the document of ``--json``, or the lines."""
+    if json:
+        print_json(document)
+    else:
+        print(*lines, sep="\n")
+
+
+def print_json(document: object) -> None:
+    """Print the document of ``--json``; a number that is not finite becomes null."""
+    print(dumps(_finite(document), indent=2, allow_nan=False))
+
+
+def _finite(value: object) -> object:
+    if isinstance(value, dict):
+        return {key: _finite(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
