@@ -10,6 +10,6 @@ Of a scenario:
 Of a run, from its record:
 
 * ``summary`` has its numbers, ``claims`` compares them with the certificates.
-* ``fidelity.py`` splits the difference from the ideal loop by cause.
+* ``ideal_loop.py`` compares a run with the ideal loop.
 * ``replay`` repeats every step from the recorded inputs, bit for bit.
 """

@@ -21,7 +21,6 @@ from noack.scenario.scenario import Scenario
 
 with lazy_modules():
     import cosim.analysis.replay.run_replay as run_replay
-    from cosim.analysis import fidelity as fidelity_analysis
     from cosim.analysis.summary import run_summary
     from cosim.live import finalize as run_end
     from cosim.live import launcher
@@ -97,8 +96,7 @@ class Run:
     def loops(self) -> "Mapping[str, Run]":
         """The loops of the run, each as a run, by name; their times are their own.
 
-        ``samples``, ``events`` and ``fidelity`` are of one loop: the only one of the run, or one of
-        these.
+        ``samples`` and ``events`` are of one loop: the only one of the run, or one of these.
         """
         return {name: self._of(name) for name in self._run.names if self._loop in (None, name)}
 
@@ -256,17 +254,6 @@ class Run:
         """
         return run_replay.replay_run(self._run, self._loop)
 
-    def fidelity(self) -> "fidelity_analysis.Fidelity":
-        """Compare the run with the ideal loop in continuous time, effect by effect.
-
-        Returns:
-            The differences: ``verdict`` in words, ``stages``, ``explained_relative``, and more.
-
-        Raises:
-            NoackError: the scenario has no ideal loop, or the record is incomplete.
-        """
-        return fidelity_analysis.compute_fidelity(self._record)
-
     def _figures(self, *, bounded: bool) -> "Mapping[str, Callable[[], FigureDescription]]":
         """Return functions that describe the figures, by name; ``bounded`` with their bounds."""
         return network_figures.page_figures(self._run, lambda: self.summary, self._loop, bounded=bounded)
@@ -368,7 +355,7 @@ def open_run(directory: PathLike = "runs/latest") -> Run:
 
 
 def compare(*runs: Run | PathLike) -> "run_comparison.RunComparison":
-    """Compare two or more runs; :meth:`Run.fidelity` compares a run with the ideal loop.
+    """Compare two or more runs.
 
     Args:
         runs: two to seven, each as a :class:`Run` or a run directory, live or simulated.

@@ -17,7 +17,7 @@ from cosim.interactive.scenario_draft import Draft, DraftError
 from cosim.interactive.sliders import controls_of
 from cosim.lab.lab_services import LabServices, PageCalls
 from cosim.lab.live_run import MOST_LINES, LiveRun
-from cosim.lab.recorded_views import RunView, compare_with_ideal, recorded_view, replay_run
+from cosim.lab.recorded_views import RunView, recorded_view, replay_run
 from cosim.output.run_verdict import Tone, VerdictLine, transmission_line
 from noack.core.errors import NoackError
 from noack.core.number_format import number
@@ -224,11 +224,9 @@ class RecordedSource:
         ui.button(icon="refresh", on_click=self.refresh).props('flat dense aria-label="look for new runs"')
 
     def build_details(self) -> None:
-        """Build the buttons for a run, below the words about it."""
-        for text, function in (("replay", replay_run), ("compare with the ideal loop", compare_with_ideal)):
-            ui.button(text, on_click=partial(self._show_answer, function)).props(
-                "outline no-caps dense"
-            ).classes("mr-2")
+        """Build the button for a run, below the words about it."""
+        answer = partial(self._show_answer, replay_run)
+        ui.button("replay", on_click=answer).props("outline no-caps dense").classes("mr-2")
 
     @property
     def chosen(self) -> str:

@@ -103,11 +103,6 @@ def replay_run(directory: Path) -> str:
     )
 
 
-def compare_with_ideal(directory: Path) -> str:
-    """Compare a run with the ideal loop."""
-    return f"ideal loop: {runs.open_run(directory).fidelity().verdict}"
-
-
 def report_page(directory: Path) -> bytes:
     """Return the report of a run, which is written if missing."""
     return finalize.run_report(directory).read_bytes()

@@ -11,7 +11,7 @@ import numpy as np
 
 from cosim.analysis.claims.claim_evaluation import RunClaims, certify_late, claims_of, list_violations
 from cosim.analysis.claims.run_certificates import certificates_together
-from cosim.analysis.fidelity import fidelity_for_summary
+from cosim.analysis.ideal_loop import ideal_loop_part
 from cosim.analysis.replay.machine_replay import SharedMachines
 from cosim.analysis.replay.run_replay import replay, stored_verdict
 from cosim.analysis.summary.loop_summary import summarise_loop
@@ -327,9 +327,9 @@ def _with_results(
     shared: SharedMachines,
     replay_in_helper: ReplayInHelper | None,
 ) -> _LoopResults:
-    """Add the results of replay, fidelity and claims; a failure of one is a line or a warning."""
+    """Add the results of replay, ideal loop and claims; a failure of one is a line or a warning."""
     record = claims.record
-    results: dict[str, Any] = {"fidelity": fidelity_for_summary(record, len(run.loops))}
+    results: dict[str, Any] = {"ideal_loop": ideal_loop_part(record, summary)}
     try:
         results["linearisation"] = linearisation(record.scenario)
     except Exception as error:  # a failed analysis must not cost the run its summary

@@ -11,11 +11,10 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from cosim.analysis.fidelity import is_against
 from cosim.output.figures.figure_description import FigureDescription
 from cosim.output.figures.figure_files import inline
 from cosim.output.run_tables import interval_text
-from noack.core.number_format import number, percent
+from noack.core.number_format import number
 
 PAGES = Path(__file__).with_name("pages")
 TERMS: tuple[tuple[str, str], ...] = tuple(
@@ -42,12 +41,10 @@ def templates(folder: Path = PAGES) -> Environment:
         "inline": _markup,
         "interval": interval_text,
         "number": number,
-        "percent": percent,
         "shown": value_text,
         "words": words,
     }
     environment.filters |= filters
-    environment.tests["is_against"] = is_against
     return environment
 
 

@@ -198,8 +198,7 @@ def _worst_loop(report: Report) -> Content | None:
 
 @section
 def _numbers(report: Report) -> Content:
-    # Fidelity and replay have their own sections.
-    loop = report.loop.model_copy(update={"fidelity": None, "replay": None})
+    loop = report.loop.model_copy(update={"replay": None})  # has its own section
     detail = report.detail.model_copy(update={"loops": [loop]})
     return {"numbers": key_numbers(detail), "parameters": [*_parameters(report.scenario)]}
 
@@ -225,11 +224,6 @@ def _timing(report: Report) -> Content | None:
     figures = [figure for figure in report.figures if figure.name in PROCESS_FIGURES]
     table = timing_table(report.loop)
     return {"table": table, "figures": figures} if table.rows or figures else None
-
-
-@section
-def _fidelity(report: Report) -> Content | None:
-    return {"fidelity": report.loop.fidelity} if report.loop.fidelity else None
 
 
 @section

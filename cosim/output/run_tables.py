@@ -8,15 +8,14 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from cosim.analysis.fidelity import Fidelity, SignalDifference, is_against
 from cosim.analysis.summary.plant_linearisation import linearisation_rows
 from cosim.analysis.summary.summary_model import (
     ChangePart,
     Claim,
     DeadlinesPart,
-    FidelityPart,
+    IdealLoopPart,
     LoopSummary,
-    NoFidelityPart,
+    NoIdealLoopPart,
     Quantiles,
     ReplayPart,
     RestartPart,
@@ -26,7 +25,7 @@ from cosim.analysis.summary.summary_model import (
 from cosim.output.result_tables import KEY_VALUE, ResultTable
 from netem.tc_words import settings_of
 from noack.core.errors import ExitStatus
-from noack.core.number_format import NONE, duration, duration_at_least, number, percent, ratio, seconds, whole
+from noack.core.number_format import NONE, duration, duration_at_least, number, ratio, seconds, whole
 from noack.scenario.runtime_parameters import MANSD
 
 Numbers = tuple[tuple[str, str], ...]
@@ -152,7 +151,7 @@ def key_numbers(summary: RunSummary) -> Numbers:
         *(linearisation_rows(loop.linearisation) if loop.linearisation else ()),
         *_estimation(loop),
         *_replay(loop.replay),
-        *fidelity_rows(loop.fidelity),
+        *_ideal_loop(loop.ideal_loop),
     )
 
 
@@ -281,21 +280,13 @@ def _estimation(loop: LoopSummary) -> Iterator[tuple[str, str]]:
         yield f"disturbance at the {disturbance.at}: RMS, maximum", sizes
 
 
-def fidelity_rows(fidelity: FidelityPart | NoFidelityPart | None) -> Iterator[tuple[str, str]]:
-    """Yield the rows of a run's fidelity: its difference from the ideal loop, effect by effect."""
-    if fidelity is None:
-        return
-    if isinstance(fidelity, NoFidelityPart):
-        yield "difference to the ideal loop", f"not compared: {fidelity.reason}"
-        return
-    scale = fidelity.rms_x_live
-    of_x = f" ({number(100 * fidelity.rms_x / scale, 3)} % of x)" if scale else ""
-    yield "difference to the ideal loop, RMS", f"{fidelity.rms_x:.3g}{of_x}"
-    for name, share in fidelity.shares.items():
-        if name != "residual":
-            against = " (partly cancels the other effects)" if is_against(share) else ""
-            yield f"  {name.replace('_', ' ')}", percent(share) + against
-    yield "  residual, RMS", f"{100 * fidelity.explained_relative:.2g} % of the difference"
+def _ideal_loop(ideal: IdealLoopPart | NoIdealLoopPart | None) -> Iterator[tuple[str, str]]:
+    if isinstance(ideal, NoIdealLoopPart):
+        yield "difference to the ideal loop", f"not compared: {ideal.reason}"
+    elif ideal is not None:
+        of_x = f" ({number(100 * ideal.rms_difference / ideal.rms_x, 3)} % of x)" if ideal.rms_x else ""
+        yield "difference to the ideal loop, RMS", f"{ideal.rms_difference:.3g}{of_x}"
+        yield "transmissions of the ideal loop", str(ideal.events)
 
 
 def _claims_table(claims: Claims, title: str) -> ResultTable:
@@ -450,51 +441,3 @@ def loop_row(loop: LoopSummary) -> tuple[str, ...]:
         number(loop.sup_e_c_norm),
         ", ".join([held_text, *worse]),
     )
-
-
-# The ideal loop
-
-
-def fidelity_tables(fidelity: Fidelity) -> Iterator[ResultTable]:
-    """Yield the effects from the ideal loop to the run, and their RMS by state."""
-    headings = ("effect", "RMS", "max", "share", "events", "Δt, ms", "split at event")
-    stages = [
-        (
-            stage.name,
-            *_sizes(stage.difference),
-            percent(stage.share),
-            str(stage.events),
-            _milliseconds(stage.max_event_difference_s),
-            _event(stage.first_different_event),
-        )
-        for stage in fidelity.stages
-    ]
-    total = (
-        "total",
-        *_sizes(fidelity.total),
-        "100.0 %",
-        str(fidelity.events_live),
-        _milliseconds(fidelity.max_event_difference_s),
-        _event(fidelity.first_different_event),
-    )
-    ideal = ("(ideal loop)", "", "", "", str(fidelity.events_ideal), "", "")
-    caption = f"{fidelity.scenario}: difference in x to the ideal loop"
-    differences = [(stage.name, stage.difference) for stage in fidelity.stages]
-    by_state = [
-        (name, *(f"{value:.2e}" for value in difference.rms_by_state))
-        for name, difference in [*differences, ("total", fidelity.total)]
-    ]
-    yield ResultTable("effects", caption, headings, [ideal, *stages, total])
-    yield ResultTable("by-state", "RMS by state", ("effect", *fidelity.state_names), by_state)
-
-
-def _sizes(difference: SignalDifference) -> tuple[str, str]:
-    return f"{difference.rms:.2e}", f"{difference.max:.2e}"
-
-
-def _milliseconds(value_s: float | None) -> str:
-    return NONE if value_s is None else f"{1e3 * value_s:.1f}"
-
-
-def _event(number: int | None) -> str:
-    return NONE if number is None else f"{number}"

@@ -10,7 +10,7 @@ from enum import StrEnum
 from typing import NamedTuple
 
 from cosim.analysis.claims.observed_conditions import BEYOND_CERTIFICATE, CAUSES, SCHEDULE, worst_time
-from cosim.analysis.summary.summary_model import Claim, ExitPart, FidelityPart, LoopSummary, RunSummary
+from cosim.analysis.summary.summary_model import Claim, ExitPart, IdealLoopPart, LoopSummary, RunSummary
 from cosim.output.run_tables import changes_in, downtime_text, shares_network, state_norm
 from noack.core.errors import ExitStatus
 from noack.runtime.life_cycle import HORIZON
@@ -47,8 +47,8 @@ def verdict(summary: RunSummary) -> tuple[VerdictLine, ...]:
     loops = summary.loops
     events, deliveries = sum(loop.events for loop in loops), sum(loop.deliveries for loop in loops)
     ideal = None
-    if isinstance(loops[0].fidelity, FidelityPart) and not shares_network(summary):
-        ideal = loops[0].fidelity.events_ideal
+    if isinstance(loops[0].ideal_loop, IdealLoopPart) and not shares_network(summary):
+        ideal = loops[0].ideal_loop.events
     diverged = any(loop.diverged_at_s is not None for loop in loops)
     return (
         ending_line(
@@ -311,8 +311,6 @@ def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
     grew = first is not None and last is not None and last > _MOST_GROWTH * first > 0
     if grew and loop.diverged_at_s is None:  # else it is the reason why the run ended
         yield f"{state_norm(loop)} grew from {first:.3g} to {last:.3g} during the run"
-    if isinstance(loop.fidelity, FidelityPart) and not loop.fidelity.explained:
-        yield "sampling, delay and hold do not explain the difference to the ideal loop"
     if loop.missing_samples:
         where = ", ".join(f"{n} of {t}" for t, n in loop.missing_by_table.items())
         yield f"{loop.missing_samples} samples are missing from the record: {where}"

@@ -16,14 +16,12 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from cosim.analysis.fidelity import Fidelity
 from cosim.analysis.summary.run_summary import Outcome
 from cosim.analysis.summary.summary_model import AssumptionPart, Claim, LoopSummary, RunSummary
 from cosim.output.result_tables import KEY_VALUE, ResultTable, terminal_table
 from cosim.output.run_tables import (
     LOOPS_CAPTION,
     badness,
-    fidelity_tables,
     loops_table,
     network_rows,
     run_title,
@@ -200,22 +198,6 @@ def print_assumptions(console: Console, assumptions: Sequence[Assumption | Assum
         text = escape(f"{assumption.what} {source}: {assumption.why}")
         table.add_row(Text(assumption.verdict, _ASSUMPTION_STYLES.get(assumption.verdict, "")), text)
     console.print(table)
-
-
-def print_fidelity(console: Console, fidelity: Fidelity) -> None:
-    """Print the effects from the ideal loop to the run, and the verdict."""
-    for table in fidelity_tables(fidelity):
-        console.print(terminal_table(table))
-    console.print(
-        "Each row adds one effect to the rows above. RMS, max: of the norm, in model units. Δt: "
-        "largest change of an event's time. All rows lose the packets of the same event numbers. "
-        "split at event: number of the first event that moves by more than ten measurement periods, "
-        "or that one of the two lacks; from there on, an event of the same number happens at another "
-        "time. A negative share partly cancels the other effects.",
-        highlight=False,
-    )
-    colour = "green" if fidelity.explained else "bold red"
-    console.print(f"[{colour}]{escape(fidelity.verdict)}[/]", highlight=False)
 
 
 def _where(outcome: Outcome, *, verbose: bool) -> Iterator[str]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from rich.console import Console
 
-from cosim.analysis.summary.summary_model import FidelityPart, LoopSummary, RunSummary
+from cosim.analysis.summary.summary_model import IdealLoopPart, LoopSummary, RunSummary
 from cosim.live.finalize import reopen
 from cosim.output.figures import palette
 from cosim.output.figures.figure_description import (
@@ -223,7 +223,7 @@ def _count_late_steps(loop: LoopSummary) -> int | None:
 
 
 def _ideal(loop: LoopSummary) -> int | None:
-    return loop.fidelity.events_ideal if isinstance(loop.fidelity, FidelityPart) else None
+    return loop.ideal_loop.events if isinstance(loop.ideal_loop, IdealLoopPart) else None
 
 
 _NUMBERS: dict[str, Callable[[LoopSummary], float | None]] = {

@@ -77,10 +77,8 @@ def test_a_run_completes_with_a_complete_summary(finished: Finished) -> None:
     assert "violated" not in verdicts.values()
     # States of a few units and some thousand steps: far below any physical difference.
     assert finished.loop["identity_residual_max"] < 1e-11
-    fidelity = finished.loop["fidelity"]
-    # All effects together explain the run up to rounding: 1e-14 of x, relative to a few per cent.
-    assert fidelity["explained_relative"] < 1e-6
-    assert 0 < fidelity["rms_x"] < 0.5 * fidelity["rms_x_live"]
+    ideal = finished.loop["ideal_loop"]
+    assert 0 < ideal["rms_difference"] < 0.5 * ideal["rms_x"]
 
 
 def test_the_run_directory_holds_everything(finished: Finished) -> None:

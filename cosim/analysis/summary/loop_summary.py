@@ -55,7 +55,7 @@ def summarise_loop(
     phase_ns: int = 0,
     assumed: Sequence[Assumption] = (),
 ) -> LoopSummary:
-    """Return the summary of a loop, without the results of replay, fidelity and claims.
+    """Return the summary of a loop, without the results of replay, ideal loop and claims.
 
     ``exit_status`` and ``reason`` are those of the run; the loop may have failed nevertheless. The
     assumptions of its scenario at the start may be known: ``assumed``.

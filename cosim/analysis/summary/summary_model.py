@@ -175,23 +175,19 @@ class ReplayPart(SummaryPart):
         return self
 
 
-class FidelityPart(SummaryPart):
-    """The comparison with the ideal loop."""
+class IdealLoopPart(SummaryPart):
+    """The ideal loop, and the difference of the run's states to its states."""
 
     reason: None
-    explained: bool
-    explained_relative: float
+    rms_difference: float
+    """Root mean square of ‖x − x_ideal‖ over all steps of the plant."""
     rms_x: float
-    max_x: float
-    rms_x_live: float
-    shares: dict[Text, float]
-    events_ideal: Count
-    events_live: Count
-    max_event_difference_s: Real
-    first_different_event: Count | None
+    """The same of ‖x‖ in the run."""
+    events: Count
+    """Transmissions of the ideal loop."""
 
 
-class NoFidelityPart(SummaryPart):
+class NoIdealLoopPart(SummaryPart):
     """Why the run was not compared with the ideal loop."""
 
     reason: str
@@ -390,7 +386,7 @@ class LoopSummary(SummaryPart):
     replay: ReplayPart | None = None
     """Of its processes; with the network, if no other loop shares it."""
     linearisation: LinearisationPart | NoLinearisationPart | None = None
-    fidelity: FidelityPart | NoFidelityPart | None = None
+    ideal_loop: IdealLoopPart | NoIdealLoopPart | None = None
     conditions: ConditionsPart | None = None
     allowed: SchedulePart | None = None
     """The schedule that the scenario allows; None where there are no certificates."""

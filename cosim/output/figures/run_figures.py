@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.claims.claim_evaluation import claims_of
-from cosim.analysis.fidelity import Fidelity
 from cosim.output.figures import palette
 from cosim.output.figures.figure_description import (
     DASHES,
@@ -385,17 +384,6 @@ def _state_norm(record: RunRecord, bounds: list[Line]) -> FigureDescription:
         "Norm of the plant's state." + _dashed(bounds),
         f"Norm of the state over time on a logarithmic axis{ends}.",
     )
-
-
-def fidelity_figure(fidelity: Fidelity) -> FigureDescription:
-    """Change of x by each effect, over time: ‖x_(with the effect) − x_(without)‖."""
-    t_s, stages = fidelity.t_s, zip(fidelity.stages, fidelity.stage_norms, strict=True)
-    lines = [
-        Line(x=t_s, y=y, label=part.name, colour=series_colour(i), dash=DASHES[i], width=1.6)
-        for i, (part, y) in enumerate(stages)
-    ]
-    title = f"{label_text(fidelity.scenario, _LONGEST_TITLE)}: effects on x"
-    return _norms("fidelity", title, lines, 2.7)
 
 
 def _input(record: RunRecord) -> FigureDescription:

@@ -57,11 +57,7 @@ CLAIM = {
     "observed": 0.5, "ratio": 0.5, "verdict": "void", "since_s": 0.01, "why": "late",
     "from_s": 0.0, "until_s": None,
 }  # fmt: skip
-FIDELITY = {
-    "reason": None, "explained": True, "explained_relative": 0.01, "rms_x": 0.1, "max_x": 0.2,
-    "rms_x_live": 1.0, "shares": {"sampling": 1.0, "residual": 0.0}, "events_ideal": 1,
-    "events_live": 1, "max_event_difference_s": None, "first_different_event": None,
-}  # fmt: skip
+IDEAL_LOOP = {"reason": None, "rms_difference": 0.1, "rms_x": 1.0, "events": 1}
 RECORD_KNOWN = Vocabulary(
     ("rows", "ended", "channel", "rejected", "acknowledgements", "realtime", "pid", "plant",
      "netem", "plant_step", "netem_packet", "t_ns", "level", "text", "process", "kind"),
@@ -99,7 +95,7 @@ def files(acknowledged: bool, live: bool) -> Mapping[str, bytes]:
     own |= {
         "replay": replay(record).verdict().model_dump(),
         "claims": [CLAIM],
-        "fidelity": FIDELITY,
+        "ideal_loop": IDEAL_LOOP,
     }
     end, loop = ExitPart(status=0, reason="finished"), LoopSummary.model_validate(own)
     summary = summarise_run(run.network, [loop], end).to_json()

@@ -9,7 +9,6 @@ from scipy.linalg import expm
 from scipy.stats import chi2
 
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
-from cosim.analysis.fidelity import recorded_loop
 from cosim.analysis.replay import replay
 from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.record.align import align_tables, true_states
@@ -159,7 +158,7 @@ def test_exact_simulation_is_refused_in_one_line(
     disturbed = resolved(observed)
     del observed["plant"]["disturbances"]
     observed["observer"] = KALMAN | {"input_std": [0.5]}
-    for take in (continuous_loop_of, setting_of, lambda scenario: recorded_loop(simulate(scenario))):
+    for take in (continuous_loop_of, setting_of):
         for scenario, key in ((disturbed, r"plant\.disturbances"), (resolved(observed), "observer")):
             with pytest.raises(CallerError, match=key) as refusal:
                 take(scenario)

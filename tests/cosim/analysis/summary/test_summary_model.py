@@ -37,7 +37,7 @@ VALUES = [None, HUGE, "[/b]", [[[[]]]], {"a": [1]}, DELETED, RENAMED]
 PARTS = (
     "restarts", "changes", "watchdog", "estimation", "disturbances", "assumption_violations",
     "acknowledgements", "actuations", "lateness_us", "latency_us", "realtime", "replay",
-    "conditions", "certified_for", "claims", "linearisation", "fidelity",
+    "conditions", "certified_for", "claims", "linearisation", "ideal_loop",
 )  # fmt: skip
 """What only some runs have."""
 
