@@ -17,7 +17,7 @@ with stoppable_imports():
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the controller of each loop in the run that a recorder or launcher has opened."""
     with join_run("controller", arguments) as run:
-        controllers = controllers_of(run.loops, run.phases_ns, start=run.start)
+        controllers = controllers_of(run.loops, run.phases_ns)
         settings = run.loops[0].controller
         if isinstance(settings, ProgramControllerSettings):
             run_program(run, controllers, settings)

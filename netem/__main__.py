@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run_network(run: RunProcess) -> None:
     """Relay the datagrams of a run by the core."""
-    network = RunNetwork(run.scenario, run.start, len(run.phases_ns))
+    network = RunNetwork(run.scenario, loops=len(run.phases_ns))
     with run.open_socket() as endpoint:
         addresses = run.join(endpoint.getsockname()[:2])
         routes = [

@@ -16,7 +16,7 @@ from noack.core.clock import RunClock
 from noack.core.core_library import StructRows, core
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE
-from noack.protocol.roles import Notice, Record, Start
+from noack.protocol.roles import BEGINNING, Notice, Record, Start
 from noack.protocol.wire_format import loop_number
 from noack.runtime.address import Address, SocketName, packed_name
 from noack.runtime.drivers.real_time_loop import RecordSink, RowSink
@@ -35,11 +35,10 @@ class RunNetwork:
 
     Args:
         resolved: the resolved scenario.
-        start: where in the run it begins.
         loops: number of the run's loops; each datagram has the number of its loop.
     """
 
-    def __init__(self, resolved: Scenario, start: Start, loops: int = 1) -> None:
+    def __init__(self, resolved: Scenario, start: Start = BEGINNING, loops: int = 1) -> None:
         self._loops = loops
         self._memory = RelayMemory(1, row_count=_ROWS)
         while len(self._memory.clients) < self._loops:

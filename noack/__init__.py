@@ -27,7 +27,8 @@ else:
 
 
 __all__ = [
-    "CampaignResult", "Certificates", "Explorer", "Measurement", "NoackError", "Run", "Scenario",
+    "CampaignResult", "Certificates", "Curve", "CurveStyle", "Explorer", "Measurement", "NoackError",
+    "Run", "Scenario",
     "__version__", "campaign", "certify", "compare", "cost", "explore", "from_system", "gain",
     "linearise", "load", "margin", "measure", "new", "open_run", "run",
     "save_tables", "simulate", "with_settings",

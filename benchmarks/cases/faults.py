@@ -1,4 +1,4 @@
-"""Live runs of the lane example at speed 1 with a fault: a process that dies or stops, a flood."""
+"""Live runs of the lane example at speed 1 with a fault: a process that stops, a flood."""
 
 import itertools
 import os
@@ -9,7 +9,6 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import NamedTuple
@@ -17,20 +16,17 @@ from typing import NamedTuple
 import numpy as np
 import psutil
 
-from benchmarks.programs import imported_s
-from benchmarks.report import MeasurementError, Peer, Row, announce, benchmark
-from benchmarks.rounds import Figures, Rounds
+from benchmarks.report import MeasurementError, Row, announce, benchmark
 from cosim.analysis.summary.loop_statistics import lateness_us
 from cosim.analysis.summary.summary_model import LoopSummary
 from cosim.cli.options import find_scenario
 from cosim.live.finalize import finalize
 from cosim.live.launcher import launch
-from cosim.live.processes.child_processes import MODULES
 from cosim.record.run_record import RunRecord, load_record
 from noack.core.errors import ExitStatus
 from noack.core.linear_systems import Vector
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
-from noack.protocol.roles import GENERATION, LOOP_ROLES, ROLES
+from noack.protocol.roles import LOOP_ROLES, ROLES
 from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, Message
 from noack.runtime.address import LOOPBACK
 from noack.scenario.scenario_file import load
@@ -114,13 +110,6 @@ def run_recovery_ms(run: FaultedRun) -> float:
 
 ROUNDS = 3
 STOPPED_S = 0.7
-_RESTARTS = ("horizon_s=9", "recovery.rejoin_within_s=30")
-IMPORT = "Python that imports as much"
-
-
-def kill(role: str) -> FaultedRun:
-    """Kill a process of a run, which the launcher restarts."""
-    return faulted_run(f"{role} killed", _RESTARTS, lambda processes: processes[role].kill())
 
 
 def stopped_late_ms(role: str) -> float:
@@ -131,59 +120,12 @@ def stopped_late_ms(role: str) -> float:
         time.sleep(STOPPED_S)
         processes[role].send_signal(signal.SIGCONT)
 
-    return run_recovery_ms(faulted_run(f"{role} stopped", _RESTARTS, fault))
+    return run_recovery_ms(faulted_run(f"{role} stopped", ["horizon_s=9"], fault))
 
 
-def measure_kill(role: str) -> Figures:
-    """Kill a process of the loop.
-
-    Returns:
-        ``acted_s``: wall time until the restarted process acted; ``updated_s``: until the
-        controller had an update again; ``unwritten_ms``: age of the last recorded row of the
-        killed process at its death.
-    """
-    run = kill(role)
-    (restart,) = run.summary.restarts
-    deliveries = run.record[CONTROLLER_DELIVERY]
-    if restart.first_s is None or restart.last_s is None:
-        raise MeasurementError(f"{role}: has no rows before or after")
-    fresh = deliveries["now_ns"] * 1e-9 >= restart.first_s
-    if role == "sensor":
-        fresh &= deliveries["sequence"] >= GENERATION
-    if not fresh.any():
-        raise MeasurementError(f"{role}: no update was delivered afterwards")
-    return {
-        "acted_s": restart.first_s - run.ended_s,
-        "updated_s": float(deliveries["now_ns"][fresh][0]) * 1e-9 - run.ended_s,
-        "unwritten_ms": 1e3 * (run.ended_s - restart.last_s),
-    }
-
-
-def bare_start(role: str) -> Figures:
-    """Return the time of the alternative."""
-    return dict.fromkeys(("acted_s", "updated_s"), imported_s(MODULES[role]))
-
-
-@benchmark("recovery", "A run whose processes die or stop")
+@benchmark("recovery", "A run whose processes stop for a while")
 def recovery() -> Iterator[Row]:
-    """Kill and stop each process, several times, and measure the time until the run has recovered.
-
-    The alternative is a Python that only imports the modules of that process.
-    """
-    for role in ("sensor", "controller", "netem"):
-        rounds, row = Rounds(), f"{role} killed: "
-        sides = {role: partial(measure_kill, role), IMPORT: partial(bare_start, role)}
-        rounds.measure_in_turn(ROUNDS, sides, row)
-        yield rounds.row(f"{row}until another acts in its place", "s", "acted_s", role, IMPORT)
-        yield rounds.row(f"{row}until the controller has an update again", "s", "updated_s", role, IMPORT)
-        yield rounds.row(f"{row}age of its last recorded row", "ms", "unwritten_ms", role)
-    run = kill("recorder")
-    steps = run.record[PLANT_STEP]["sequence"]
-    back_s = [restart.first_s for restart in run.summary.restarts if restart.first_s is not None]
-    if not back_s or len(steps) != steps[-1] + 1:
-        raise MeasurementError("recorder: it was not restarted, or rows are missing")
-    peer = Peer(IMPORT, imported_s(MODULES["recorder"]))
-    yield Row("recorder killed: until another records", back_s[0] - run.ended_s, "s", peer)
+    """Stop each process, several times, and measure the time until the run has recovered."""
     for role in ("plant", "sensor", "netem", "controller", "recorder"):
         late_ms = median(stopped_late_ms(role) for _ in range(ROUNDS))
         yield Row(f"{role} stopped for {STOPPED_S:g} s: last late step", late_ms, "ms")

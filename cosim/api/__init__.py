@@ -28,6 +28,8 @@ from cosim.api.studies import cost as cost
 from cosim.api.studies import margin as margin
 from cosim.api.studies import measure as measure
 from cosim.api.studies import save_tables as save_tables
+from cosim.output.curves import Curve as Curve
+from cosim.output.curves import CurveStyle as CurveStyle
 from cosim.studies.new_loop.linear_model import gain as gain
 from cosim.studies.new_loop.linear_model import linearise as linearise
 from cosim.studies.new_loop.new_scenario import new as new

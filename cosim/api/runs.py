@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
     from cosim.analysis.replay import ReplayResult
     from cosim.analysis.summary.summary_model import Claim, RunSummary
+    from cosim.output.curves import Curve
     from cosim.output.figures.figure_description import FigureDescription
 
 PathLike = str | os.PathLike[str]
@@ -164,6 +165,16 @@ class Run:
             the controller processed it.
         """
         return data_frames.events(self._record)
+
+    def curves(self) -> "list[Curve]":
+        """Return the curves of a loop as a table, to be drawn by other means.
+
+        Returns:
+            A :class:`noack.Curve` for each signal: the states of plant and models, the errors with
+            the threshold, ‖x‖, the inputs, the transmissions, and the certified bounds of these. A
+            long run has only as many times as a figure shows.
+        """
+        return run_figures.run_curves(self._record)
 
     def plot(self, figure: str = "states") -> "Figure":
         """Draw a figure of the report.

@@ -77,7 +77,7 @@ def run_processes(
         warnings = Watcher(started=lambda run_dir: warn_of_violations(loaded))
         try:
             with ExitStack() as stack:
-                line = later_watcher(lambda: stack.enter_context(_progress_line(loaded, session)))
+                line = later_watcher(lambda: stack.enter_context(_progress_line(loaded)))
                 watchers = [warnings, line, RunLog().watcher()]
                 watchers += [] if watcher is None else [watcher]
                 if metrics is not None:
@@ -99,10 +99,10 @@ def run_processes(
 
 
 @contextmanager
-def _progress_line(loaded: Scenario, session: str | None) -> Iterator[Watcher]:
+def _progress_line(loaded: Scenario) -> Iterator[Watcher]:
     from cosim.live.monitoring.progress import error_console, progress_line  # imports rich
 
-    with progress_line(error_console(), loaded, session) as watcher:
+    with progress_line(error_console(), loaded) as watcher:
         yield watcher
 
 

@@ -9,7 +9,6 @@ from cosim.analysis.summary.plant_linearisation import linearisation, linearisat
 from cosim.cli.printing import console as standard_console
 from cosim.cli.printing import print_json
 from cosim.live.launcher import DEFAULT_START_S
-from cosim.live.processes.child_processes import RESTART_BY_HAND_S
 from cosim.output.terminal_output import print_assumptions
 from noack.core.clock import NS_PER_S
 from noack.scenario.resolution import policy_of, resolve, resolved_loops
@@ -95,11 +94,6 @@ def _dependent_defaults(resolved: Scenario) -> Iterator[str]:
         yield (f"plant.watchdog: policy {watchdog.policy}, after {timeout_s:g} s without an actuation")
     if resolved.controller.safe_input is None:
         yield "controller.safe_input: 0, the input before the first update"
-    if resolved.recovery.rejoin_within_s is None:
-        yield (
-            "recovery.rejoin_within_s: 0, a process that dies ends the run; with `noack record`: "
-            f"{RESTART_BY_HAND_S:g} s to restart it"
-        )
     if resolved.start_within_s is None:
         yield (
             f"start_within_s: {DEFAULT_START_S:g}, longer on a busy machine; with `noack record`: unlimited"

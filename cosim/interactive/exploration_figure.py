@@ -8,8 +8,8 @@ import numpy as np
 
 from cosim.interactive.exploration import Ensemble, Exploration
 from cosim.interactive.scenario_guarantee import Guarantee
+from cosim.output.curves import DASHED
 from cosim.output.figures.figure_description import (
-    DASHED,
     DOTTED,
     Axis,
     Band,

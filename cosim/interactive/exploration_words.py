@@ -20,7 +20,7 @@ _MOST_SETTINGS, _LONGEST_VALUE = 4, 28
 _EQUAL_LENGTH_RATIO = 1.001
 """Runs whose ends differ by a smaller factor are compared as equally long."""
 _END = "‖x‖ at the end"
-_NOT_COMPARED = ("name", "ports", "recovery", "realtime")
+_NOT_COMPARED = ("name", "ports", "realtime")
 """Tables and keys that do not change what the loop does."""
 
 

@@ -24,14 +24,12 @@ from noack.core.number_format import number
 from noack.runtime.active_runs import find_run, request_change
 
 Changed = Callable[[], Awaitable[None]]
-_REJOIN_S = 5.0
-"""Time within which a killed process rejoins the run."""
 _KILLABLE = ("sensor", "netem", "controller")
 _ABOUT = (
     "“run live” starts plant, sensor, network emulator (netem), controller and recorder as five "
     "processes on this machine, which exchange real UDP packets in real time. The figure then "
     "shows what they record, dashed beside it the ideal loop. The kill buttons end a process by "
-    "SIGKILL; if killed processes are restarted, the loop goes on."
+    "SIGKILL: the run ends, and says so; nothing that was recorded is lost."
 )
 
 
@@ -65,7 +63,6 @@ class LiveSource:
     def build_details(self) -> None:
         """Build kill buttons, log and viewer, which are below the words about the run."""
         with ui.row().classes("items-center gap-2"):
-            self._restarts = ui.checkbox("restart killed processes", value=True).props("dense")
             self._kill_buttons = [
                 ui.button(f"kill {role}", icon="dangerous", on_click=self._killer(role)).props(
                     "outline color=negative no-caps dense"
@@ -164,8 +161,6 @@ class LiveSource:
         try:
             if draft.value("ports") is not None:
                 draft = draft.without("ports")  # fixed ports may be taken by another run
-            if self._restarts.value:
-                draft = draft.with_value("recovery.rejoin_within_s", _REJOIN_S)
             horizon_s = draft.scenario.horizon_s
         except DraftError as error:
             ui.notify(str(error), type="negative")

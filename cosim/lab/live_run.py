@@ -145,10 +145,6 @@ class LiveRun:
                 self._add_line("all processes run")
             case "progress":
                 self._handle_progress(parse_message(RunProgress, line))
-            case "failed":
-                self._add_line(f"{message['why']} at {message['t_s']:.1f} s; it is restarted")
-            case "restarted":
-                self._add_line(f"{message['role']} runs again at {message['t_s']:.1f} s")
             case "finalising":
                 self.state = "finalising"
                 self._add_line(f"ended: {message['reason']}; replaying it and checking its claims")
@@ -196,8 +192,6 @@ def main() -> int:
     folder, runs = map(Path, sys.argv[1:3])
     watcher = Watcher(
         started=lambda run_dir: _report("started", run_dir=str(run_dir)),
-        failed=lambda why, t_s, by_hand: _report("failed", why=why, t_s=t_s),
-        restarted=lambda role, t_s: _report("restarted", role=role, t_s=t_s),
         progress=lambda report: _report("progress", **report.fields()),
     )
     try:

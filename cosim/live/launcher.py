@@ -1,6 +1,6 @@
 """The launcher: starts the processes of a run, follows them, and ends the run.
 
-When a process fails, the launcher names it, stops the run or restarts the process, and leaves a run
+When a process fails, the launcher stops the run, says which process failed and why, and leaves a run
 directory with everything that was recorded. Read :func:`launch` first; ``_Run.watch`` follows the
 run.
 """
@@ -21,7 +21,7 @@ from cosim.lazy_modules import lazy_modules
 from cosim.live.coordination.coordinator import Coordinator
 from cosim.live.disk_space import require_disk_space
 from cosim.live.monitoring.run_watcher import Watcher, joint_watcher
-from cosim.live.processes.child_processes import ChildProcesses, EndReason, RestartPolicy
+from cosim.live.processes.child_processes import ChildProcesses, EndReason
 from cosim.live.processes.finalize_helpers import RunEndingWithHelpers, lasting_helpers
 from cosim.live.processes.fork_server import ForkServer, fork_server
 from cosim.live.wait_limit import WaitLimit
@@ -206,7 +206,6 @@ class _Run:
         self._joined = 0
         self._limit = WaitLimit(self._start_within_s())
         """How long the launcher still waits: for the start, for the end, or for the stop."""
-        self._policy = RestartPolicy(descriptor.scenario, coordinator, children, watcher)
 
     def watch(self, signals: Signals, store: Callable[[ExitStatus, str], None]) -> EndReason:
         """Follow the run to its end; return its exit status and the reason of the end.
@@ -223,7 +222,7 @@ class _Run:
             last_s = now_s
             self._follow_phase(stopping=result is not None)
             if result is None:
-                result = _signalled(signals) or self._policy.check()
+                result = _signalled(signals) or self._failure()
                 if result is None and self._limit.is_reached:
                     result = EndReason(ExitStatus.FAILED, self._overdue())
                 if result is not None:
@@ -233,13 +232,7 @@ class _Run:
                 break
             time.sleep(_POLL_S if self._has_started else _STARTING_POLL_S)
         self._notify_progress()  # the last report may have arrived with the end
-        return (
-            result
-            or _signalled(signals)
-            or self._policy.check()
-            or self._policy.unfinished()
-            or EndReason(ExitStatus.OK, HORIZON)
-        )
+        return result or _signalled(signals) or self._failure() or EndReason(ExitStatus.OK, HORIZON)
 
     def _follow_phase(self, *, stopping: bool) -> None:
         """Do what is due once: when the loop starts, when it has ended, when a process joins."""
@@ -260,6 +253,20 @@ class _Run:
             self._joined = len(self._coordinator.joined)
             self._write_processes()
         self._notify_progress()
+
+    def _failure(self) -> EndReason | None:
+        """How a process failed; None if none did."""
+        exited = self._children.failures(self._coordinator.await_reported_failure)
+        running = self._children.running()
+        failures = {
+            role: EndReason(ExitStatus.FAILED, why)
+            for role, why in self._coordinator.failures().items()
+            # The exit status of a launched process explains more than its report.
+            if not (role in running and self._coordinator.is_exiting(role))
+        }
+        if RECORDER in running and self._coordinator.now_ns() >= self._scenario.timing.horizon_ns:
+            failures.pop(RECORDER, None)  # sorting a long record, it may not respond
+        return next(iter((failures | exited).values()), None)
 
     def _stop(self, reason: str) -> None:
         self._coordinator.stop(reason)

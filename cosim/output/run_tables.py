@@ -18,7 +18,6 @@ from cosim.analysis.summary.summary_model import (
     NoIdealLoopPart,
     Quantiles,
     ReplayPart,
-    RestartPart,
     RunSummary,
     WatchdogPart,
 )
@@ -219,8 +218,6 @@ def _record(loop: LoopSummary) -> Iterator[tuple[str, str]]:
     yield "lost elsewhere (kernel)", str(loop.unintended_losses)
     if loop.conditions is not None and (error_s := loop.conditions.clock_error_s):
         yield "largest bound of a clock's error", duration(error_s)
-    for restart in loop.restarts:
-        yield f"{restart.process} was restarted", downtime_text(restart)
     yield from changes_in(loop.changes)
 
 
@@ -250,14 +247,6 @@ def interval_text(claim: Claim) -> str:
     if from_s == 0 and until_s is None:
         return ""
     return f"from {from_s:.3f} s " + ("on" if until_s is None else f"to {until_s:.3f} s")
-
-
-def downtime_text(restart: RestartPart) -> str:
-    """Return the interval in which a process was down, and the reason."""
-    begin, end = seconds(restart.last_s), seconds(restart.first_s)
-    reason = (restart.what or "").partition(": ")[2]
-    interval = f"at {end}" if restart.last_s is None else f"down from {begin} to {end}"
-    return f"{interval}: {reason}" if reason else interval
 
 
 def _watchdog(watchdog: WatchdogPart) -> Iterator[tuple[str, str]]:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from cosim.analysis.claims.observed_conditions import BEYOND_CERTIFICATE, CAUSES, SCHEDULE, worst_time
 from cosim.analysis.summary.summary_model import Claim, ExitPart, IdealLoopPart, LoopSummary, RunSummary
-from cosim.output.run_tables import changes_in, downtime_text, shares_network, state_norm
+from cosim.output.run_tables import changes_in, shares_network, state_norm
 from noack.core.errors import ExitStatus
 from noack.runtime.life_cycle import HORIZON
 from noack.theory.certificates.assumptions import AssumptionStatus
@@ -321,9 +321,6 @@ def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
             yield f"{lost} (kernel, or between the hosts; firewalls must pass the ports): {where}"
         else:
             yield f"{lost} (kernel): {where}"
-    for restart in loop.restarts:
-        consequence = "; claims are void from then on" if _void_claims(loop) else ""
-        yield f"{restart.process} was restarted, {downtime_text(restart)}{consequence}"
     for role, reasons in loop.rejected_datagrams.items():
         counts = ", ".join(f"{reason.replace('_', ' ')} {n}" for reason, n in reasons.items())
         yield f"{role} rejected datagrams: {counts}"
@@ -334,7 +331,7 @@ def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
         )
     unchecked = any(_is_late(loop, claim) for claim in _void_claims(loop))
     ended_well = summary.exit.status != ExitStatus.FAILED and not loop.missing_samples
-    if unchecked and ended_well and summary.kind == "live" and not loop.restarts:
+    if unchecked and ended_well and summary.kind == "live":
         culprit = "A host or the network between hosts" if _has_clocks(loop) else "This machine"
         yield (
             f"{culprit} was later than any certificate of this loop allows, so some claims were not "

@@ -8,13 +8,10 @@ At each measurement time t:
 * x_c(t) is the controller's last state with a model time t' ≤ t, propagated by e^{H(t−t')};
 * :func:`identity_residual` compares x_c − x_s with (I1), and :class:`EventFollower` has what is
   known at the newest event.
-
-If a controller dies, there is no x_c until the restarted controller has its first update.
 """
 
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -32,7 +29,6 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
-from noack.protocol.roles import GENERATION
 from noack.scenario.resolution import LoopMatrices, loop_of, policy_of
 from noack.scenario.scenario import Scenario
 from noack.theory.paper import ErrorMonitor
@@ -62,8 +58,6 @@ class AlignedRun(NamedTuple):
     """(k,) ‖e_c‖_W."""
     received: NDArray[np.int64]
     """(k,) sequence number of the controller's newest update at t, −1 for none."""
-    sensor_generation: NDArray[np.int64]
-    """(k,) generation of the sensor."""
 
     def since_delivery(self, scenario: Scenario) -> NDArray[np.bool_]:
         """Return where the controller's error is recorded, from its first update on, (k,)."""
@@ -81,8 +75,6 @@ class ControllerTrack(NamedTuple):
     """(k, n)"""
     received: NDArray[np.int64]
     """(k,) sequence number of the newest update in each state, −1 for none."""
-    generation: int = 0
-    """Generation of the controller in the last state."""
 
     def since(self, index: int) -> "ControllerTrack":
         """Return the track from its ``index``-th state on."""
@@ -92,13 +84,8 @@ class ControllerTrack(NamedTuple):
 
 
 def shares_update(scenario: Scenario, aligned: AlignedRun) -> NDArray[np.bool_]:
-    """Return where x_c is recorded, and sensor and controller share an update, (k,).
-
-    After a restart of the sensor they share none until an update of the restarted one is delivered.
-    """
-    known = scenario.network.initial_sync == "known_state"
-    generation = aligned.sensor_generation
-    first = np.where(known & (generation == 0), NO_SEQUENCE, generation * GENERATION)
+    """Return where x_c is recorded, and sensor and controller share an update, (k,)."""
+    first = NO_SEQUENCE if scenario.network.initial_sync == "known_state" else 0
     return np.asarray(all_entries(~np.isnan(aligned.x_c)) & (aligned.received >= first))
 
 
@@ -117,32 +104,10 @@ def controller_track(before: ControllerTrack, steps: Rows, deliveries: Rows) -> 
     newest = np.concatenate([np.full(len(steps), NO_SEQUENCE), deliveries["sequence"]])[order]
     model_ns = np.concatenate([steps["model_t_ns"], deliveries["model_t_ns"]])[order]
     x_c = np.concatenate([steps["x_c"], deliveries["x_c"]]).take(order, axis=0)
-    generations = inputs[order] // GENERATION
-    track, begins = before, firsts_of_equal(generations).tolist()
-    for begin, end in pairwise([*begins, len(generations)]):
-        rows = slice(begin, end)
-        track = _extend(track, int(generations[begin]), model_ns[rows], x_c[rows], newest[rows])
-    return track
-
-
-def _extend(
-    track: ControllerTrack, generation: int, model_ns: Times, x_c: Reals, newest: NDArray[np.int64]
-) -> ControllerTrack:
-    """Append the states of one generation of the controller to a track."""
-    if generation != track.generation:  # no state between two generations of the controller
-        track = ControllerTrack(
-            np.append(track.model_ns, track.model_ns[-1] + 1),
-            np.vstack([track.x_c, np.full_like(track.x_c[-1:], np.nan)]),
-            np.append(track.received, NO_SEQUENCE),
-            generation,
-        )
-    received = np.maximum.accumulate(np.concatenate([track.received[-1:], newest]))[1:]
-    x_c[(received == NO_SEQUENCE) & (generation > 0)] = np.nan
     return ControllerTrack(
-        np.concatenate([track.model_ns, model_ns]),
-        np.concatenate([track.x_c, x_c]),
-        np.concatenate([track.received, received]),
-        generation,
+        np.concatenate([before.model_ns, model_ns]),
+        np.concatenate([before.x_c, x_c]),
+        np.maximum.accumulate(np.concatenate([before.received, newest])),
     )
 
 
@@ -186,7 +151,6 @@ def align_measurements(
         threshold=_threshold(measurements),
         e_c_norm=row_norms(e_c),
         received=received,
-        sensor_generation=measurements["input"] // GENERATION,
     )
 
 

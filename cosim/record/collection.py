@@ -28,7 +28,7 @@ from cosim.record.run_directory import (
 from cosim.record.run_record import RunRecord, load_run
 from noack.core.errors import CallerError, MachineError, NoackError, PeerError, why
 from noack.protocol.record_tables import OWNER
-from noack.protocol.roles import GENERATION, LOOP_ROLES
+from noack.protocol.roles import LOOP_ROLES
 from noack.runtime.control_messages import ProcessReport, parse_message
 from noack.runtime.spool import (
     KEPT_KEY,
@@ -54,7 +54,6 @@ class _Process(NamedTuple):
     """A process that joined the run."""
 
     role: str
-    generation: int
     writer: str
 
 
@@ -151,7 +150,7 @@ def _joined_processes(run_dir: Path) -> Iterator[_Process]:
     """Yield the processes that joined a run."""
     for writer, entry in read_object(run_dir / PROCESSES_FILE).items():
         if isinstance(entry, dict) and entry.get("process") in LOOP_ROLES:
-            yield _Process(entry["process"], int(entry.get("generation", 0)), writer)
+            yield _Process(entry["process"], writer)
 
 
 def _has_secret(folder: Path, process: _Process, source: str) -> bool:
@@ -198,15 +197,10 @@ def _checked_batches(
                 report = parse_message(ProcessReport, batch.rows).fields()
             except PeerError as error:
                 raise PeerError(f"{name}: {error}") from None
-            sender = (report.get("process"), report.get("generation", 0), report.get("instance"))
-            if sender != (process.role, process.generation, process.writer):
+            if (report.get("process"), report.get("instance")) != (process.role, process.writer):
                 raise PeerError(f"{name} is the report of another process")
-        elif table in types:
-            if len(batch.rows) % types[table].itemsize:
-                raise PeerError(f"{name} is damaged: it has a batch with part of a row")
-            inputs = np.frombuffer(batch.rows, types[table])["input"]
-            if (inputs // GENERATION != process.generation).any():
-                raise PeerError(f"{name} has rows of another process")
+        elif table in types and len(batch.rows) % types[table].itemsize:
+            raise PeerError(f"{name} is damaged: it has a batch with part of a row")
         yield batch.first, batch.rows
 
 
@@ -221,13 +215,13 @@ def _require_consistent(before_dir: Path, after_dir: Path, source: str) -> None:
             if not _contains(before, after, table):
                 raise PeerError(f"{source}: it has other rows of {table} than were recorded")
         for role in LOOP_ROLES:
-            for generation in after.generations(role):
-                reported_rows = {} if generation.report is None else generation.report["rows"]
-                for table in reported_rows.keys() & generation.rows.keys():
-                    if (surplus := generation.rows[table] - reported_rows[table]) > 0:
-                        raise PeerError(
-                            f"{source}: with its rows, {table} has {surplus} more than the {role} reported"
-                        )
+            reported_rows = after.reports[role]["rows"] if role in after.reports else {}
+            counts = after.row_counts(role)
+            for table in reported_rows.keys() & counts.keys():
+                if (surplus := counts[table] - reported_rows[table]) > 0:
+                    raise PeerError(
+                        f"{source}: with its rows, {table} has {surplus} more than the {role} reported"
+                    )
 
 
 def _records(run_dir: Path) -> Iterator[RunRecord]:

@@ -23,7 +23,6 @@ from noack.protocol.record_tables import (
     is_of_network,
     network_tables,
 )
-from noack.protocol.roles import GENERATION
 
 if TYPE_CHECKING:
     from cosim.record.table_files import StoredTables
@@ -296,7 +295,6 @@ class NetworkRows:
             order = np.argsort(loops, kind="stable").astype(np.int32)
             self._indices[table] = np.split(order, ends[:-1])
         self._in_order = np.sort(np.concatenate([*self._inputs.values()]))
-        self._counts: dict[tuple[str, int], int] = {}
 
     def counts(self) -> dict[str, NDArray[np.int64]]:
         """Return the number of rows of each loop by table, shape (loops,)."""
@@ -330,27 +328,15 @@ class NetworkRows:
     def _numbered_before(
         self, numbers: NDArray[np.int64], own_inputs: NDArray[np.int64]
     ) -> NDArray[np.int64]:
-        """Return how many inputs of other loops precede those of a loop, in their generation.
+        """Return how many inputs of other loops precede those of a loop.
 
         ``own_inputs`` has all numbers of the loop, ascending. Rows that are missing count as the loop's.
         """
-        begin = numbers // GENERATION * GENERATION
-        of_all, of_loop = (
-            np.searchsorted(ascending, numbers) - np.searchsorted(ascending, begin)
-            for ascending in (self._in_order, own_inputs)
-        )
-        return np.asarray(of_all - of_loop)
+        return np.asarray(np.searchsorted(self._in_order, numbers) - np.searchsorted(own_inputs, numbers))
 
-    def count_of_others(self, number: int, table: str, generation: int) -> int:
-        """Return how many rows of a generation of the emulator are of other loops than a loop."""
-        inputs, key = self._inputs[table], (table, generation)
-        if key not in self._counts:
-            self._counts[key] = _count_of(inputs, generation)
-        return self._counts[key] - _count_of(inputs[self._indices[table][number]], generation)
-
-
-def _count_of(inputs: NDArray[np.int64], generation: int) -> int:
-    return int((inputs // GENERATION == generation).sum())
+    def count_of_others(self, number: int, table: str) -> int:
+        """Return how many rows of a table are of other loops than a loop."""
+        return len(self._inputs[table]) - len(self._indices[table][number])
 
 
 class LoopTables(RecordSource):

@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from cosim.lazy_modules import lazy_modules
 from cosim.record.processes import (
-    GENERATION_COLUMNS,
-    ProcessGeneration,
+    ROW_COLUMNS,
+    ProcessRows,
     Report,
     entries_of_loop,
-    generation_numbers,
-    read_generations,
+    read_rows,
     report_entries,
     valid_reports,
 )
@@ -57,7 +56,7 @@ from noack.protocol.record_tables import (
     has_loop,
     network_tables,
 )
-from noack.protocol.roles import LOOP_ROLES, RESTART
+from noack.protocol.roles import LOOP_ROLES
 from noack.runtime.control_messages import LogLine, parse_message
 from noack.scenario.resolution import LoopMatrices, loop_of, resolved_loops, run_tables, tables_of
 from noack.scenario.scenario import Scenario, few_of, loop_names, loop_scenario, loop_sections, phases_ns
@@ -70,7 +69,7 @@ NOTICES_FILE = "notices.jsonl"
 Notice = dict[str, Any]
 """A line of the run's log: t_ns, level, text, process, and the number of a loop if it has one."""
 _ROWS_PER_STEP, _MORE_ROWS = 4, 100_000
-"""A table has at most this number of rows per step of the loops, and more for restarts."""
+"""A table has at most this number of rows per step of the loops, and some more."""
 _CLOCK_EXCHANGE_NS = 20_000_000
 """Shortest wall time between two rows of a clock's offset."""
 _COLUMNS = 6_000
@@ -96,7 +95,6 @@ class RunRecord:
         notices: the lines of the run's log, each with t_ns, level, text and process.
         reports: each process's final report; a process that died has none.
         kind: live or simulated.
-        earlier: the final reports of processes that were restarted later.
         number: the number of the loop; 0 for the network.
         roles: the processes whose inputs are all in the record: those of a loop, with the emulator
             if it serves no other loop; the emulator alone for the network.
@@ -109,18 +107,15 @@ class RunRecord:
         notices: list[Notice],
         reports: Mapping[str, Report],
         kind: Kind = "live",
-        earlier: Sequence[Report] = (),
         number: int = 0,
         roles: Sequence[str] = LOOP_ROLES,
     ) -> None:
         self.scenario, self.number, self.roles = scenario, number, roles
         self.notices = notices
         self.reports = reports
-        self.earlier = earlier
         self.kind: Kind = kind
         self.source = rows if isinstance(rows, RecordSource) else RowsInMemory(rows)
         self.tables = network_tables() if self.is_network else tables_of(scenario)
-        self._generations: dict[str, list[ProcessGeneration]] = {}
 
     @cached_property
     def loop(self) -> LoopMatrices:
@@ -227,56 +222,32 @@ class RunRecord:
             self.notices,
             self.reports,
             self.kind,
-            self.earlier,
             self.number,
             self.roles,
         )
         derived.tables = self.tables  # they are those of the run that was recorded
         return derived
 
-    def generations(self, role: str) -> list[ProcessGeneration]:
-        """The generations of a process, in order."""
-        if role not in self._generations:
-            tables, reports = self.owned_by(role), self._reports_of(role)
-            parts = self.slices(*tables, columns=GENERATION_COLUMNS) if tables else ()
-            self._generations[role] = read_generations(parts, tables, self.generation_numbers(role), reports)
-        return self._generations[role]
-
     @cached_method
-    def row_counts(self, role: str) -> list[ProcessGeneration]:
-        """The generations of a process in order, of which only rows and reports may be known."""
-        if role in self._generations or len(self.generation_numbers(role)) > 1:
-            return self.generations(role)
-        counts = {table: self.count(table) for table in self.owned_by(role)}
-        return [ProcessGeneration(0, counts, self._reports_of(role).get(0))]
+    def rows_of(self, role: str) -> ProcessRows:
+        """The recorded rows of a process, with the gaps in them."""
+        tables = self.owned_by(role)
+        parts = self.slices(*tables, columns=ROW_COLUMNS) if tables else ()
+        return read_rows(parts, tables, self.reports.get(role))
+
+    def row_counts(self, role: str) -> dict[str, int]:
+        """The numbers of recorded rows of a process, by table."""
+        return {table: self.count(table) for table in self.owned_by(role)}
 
     def is_complete(self, role: str) -> bool:
-        """Whether the record has all rows that a process reported, of all its generations."""
-        return all(
-            generation.report is not None and generation.report["rows"].items() >= generation.rows.items()
-            for generation in self.row_counts(role)
-        )
-
-    def _reports_of(self, role: str) -> Mapping[int, Report]:
-        """The final reports of a process, by generation."""
-        newest = [] if role not in self.reports else [self.reports[role]]
-        earlier = [report for report in self.earlier if report["process"] == role]
-        return {report.get("generation", 0): report for report in (*newest, *earlier)}
-
-    @cached_method
-    def generation_numbers(self, role: str) -> list[int]:
-        """The numbers of the recorded generations of a process, ascending."""
-        again = any((notice["process"], notice["level"]) == (role, RESTART) for notice in self.notices)
-        return generation_numbers(self.source, self.owned_by(role)) if again else [0]
+        """Whether the record has all rows that a process reported."""
+        report = self.reports.get(role)
+        return report is not None and report["rows"].items() >= self.row_counts(role).items()
 
     def owned_by(self, role: str) -> list[str]:
         """Return the tables with the inputs of a process's machine."""
         owned = [table for table in self.tables if OWNER[table] == role]
         return [table for table in owned if table not in CLOCK_TABLES]
-
-    def restarted_role(self) -> str | None:
-        """A role whose process was restarted; None if there is none."""
-        return next((role for role in LOOP_ROLES if len(self.generation_numbers(role)) > 1), None)
 
     @property
     def is_network(self) -> bool:
@@ -405,14 +376,14 @@ class StoredLoops(Sequence[RunRecord]):
         loop = self._loops[number]
         entries = entries_of_loop(self._entries, number, self._shared.count_of_others)
         source = LoopTables(number, tables_of(loop), self._stored, self._shared, self._phases_ns[number])
-        reports, earlier = valid_reports(entries, source, source.types)
+        reports = valid_reports(entries, source.types)
         notices = [
             {key: value for key, value in notice.items() if key != LOOP}
             for notice in self._notices
             if notice.get(LOOP, number) == number
         ]
         roles = loop_roles(len(self))
-        return RunRecord(loop, source, notices, reports, self._kind, earlier, number, roles)
+        return RunRecord(loop, source, notices, reports, self._kind, number, roles)
 
     @cached_property
     def _shared(self) -> NetworkRows:
@@ -451,10 +422,10 @@ def load_run(run_dir: Path) -> RecordedRun:
     scenario, loops = scenarios_of(run_dir)
     most_rows = _ROWS_PER_STEP * steps_of(scenario) + _MORE_ROWS
     stored = table_files.StoredTables(folder, run_tables(scenario), most_rows)
-    reports, earlier = valid_reports(report_entries(run_dir), stored, network_tables())
+    reports = valid_reports(report_entries(run_dir), network_tables())
     notices = [notice for notice in read_notices(folder) if LOOP not in notice]
     kind = kind_of(run_dir)
-    network = RunRecord(scenario, stored, notices, reports, kind, earlier, roles=NETWORK_ROLES)
+    network = RunRecord(scenario, stored, notices, reports, kind, roles=NETWORK_ROLES)
     return RecordedRun(network, StoredLoops(run_dir, network, stored, loops))
 
 

@@ -348,7 +348,7 @@ def _simulate(
         reports = _reports(run, own_counts, scenario, number)
         notices = run.record.notices(number)
         roles = loop_roles(len(loops))
-        records.append(RunRecord(loop, rows, notices, reports, "simulated", (), number, roles))
+        records.append(RunRecord(loop, rows, notices, reports, "simulated", number, roles))
     of_all = {table: len(rows) for table, rows in of_network.items()}
     reports = {"netem": _report(of_all, "netem", {"rejected": {}})}
     common = RunRecord(scenario, of_network, run.record.notices(), reports, "simulated", roles=NETWORK_ROLES)

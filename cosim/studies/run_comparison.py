@@ -11,11 +11,11 @@ from rich.console import Console
 
 from cosim.analysis.summary.summary_model import IdealLoopPart, LoopSummary, RunSummary
 from cosim.live.finalize import reopen
+from cosim.output.curves import Dash
 from cosim.output.figures import palette
 from cosim.output.figures.figure_description import (
     TIME,
     Axis,
-    Dash,
     FigureDescription,
     Item,
     Line,

@@ -17,7 +17,6 @@ from noack.settings.section import Table
 
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 Nanoseconds = Annotated[int, Field(ge=-(2**63), lt=2**63)]
-Generation = Annotated[int, Field(ge=0, lt=2**20)]
 Ranges = tuple[tuple[Count, Count], ...]  # half-open ranges of numbers
 
 
@@ -50,14 +49,6 @@ class AdmissionRequest(ControlMessage):
 
 class Admission(ControlMessage):
     """The coordinator admits a process."""
-
-    generation: Generation  # how many processes of its role were in the run before it
-    admitted_ns: Nanoseconds
-    """Simulated time of the admission; older messages were meant for the process before it."""
-    from_ns: Nanoseconds  # simulated time at which its work begins
-    address: SocketAddress | None
-    """Receiving address of the process before it, which it takes over; None at the run's start."""
-    replaces: str | None  # how the process before it ended; None at the run's start
 
 
 class JoinRequest(ControlMessage):
@@ -120,14 +111,12 @@ class RunStart(ControlMessage):
 class BatchHeader(ControlMessage):
     """Header of a batch of rows."""
 
-    first: Count  # number of its first row among this generation's rows of the table
-    generation: Generation = 0
+    first: Count  # number of its first row among its process's rows of the table
 
 
 class PersistedAck(ControlMessage):
     """The recorder confirms the rows of a process that are on disk."""
 
-    generation: Count
     rows: dict[str, Ranges]
 
 
@@ -161,7 +150,6 @@ class ProcessReport(ControlMessage):
     rows: dict[str, Count]  # number of recorded rows, by table
     stored: dict[str, Ranges] = {}
     """Those of them that the process has written to disk itself, by table."""
-    generation: Count = 0
     instance: str = ""
     realtime: dict[str, str] = Field({})  # whether each real-time setting was applied
     reached_ns: Nanoseconds | None = None

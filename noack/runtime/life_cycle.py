@@ -51,7 +51,6 @@ class Event(Enum):
     DISCONNECT = "loses its connection"
     RECONNECT = "is connected again"
     TIME_OUT = "does not come back in time"
-    REPLACE = "is replaced by a restarted process"
 
     @property
     def side(self) -> Side:
@@ -78,9 +77,9 @@ TRANSITIONS: Mapping[State, Mapping[Event, State]] = {
                      _E.DISCONNECT: _S.UNREACHABLE, _E.RECONNECT: _S.RUNNING,
                      _E.TIME_OUT: _S.LOST},
     _S.LOST: {_E.JOIN: _S.RUNNING, _E.STOP: _S.LOST, _E.END: _S.GONE,
-              _E.DISCONNECT: _S.LOST, _E.RECONNECT: _S.RUNNING, _E.REPLACE: _S.GONE},
+              _E.DISCONNECT: _S.LOST, _E.RECONNECT: _S.RUNNING},
     _S.GONE: {_E.STOP: _S.GONE, _E.END: _S.GONE,
-              _E.DISCONNECT: _S.GONE, _E.RECONNECT: _S.GONE, _E.REPLACE: _S.GONE},
+              _E.DISCONNECT: _S.GONE, _E.RECONNECT: _S.GONE},
 }
 # fmt: on
 """The next state, by state and event. What is missing is not allowed."""
@@ -115,7 +114,7 @@ class LifeCycle:
 
     @property
     def is_over(self) -> bool:
-        """Whether it has ended or is lost, so that a restarted process may replace it."""
+        """Whether it has ended or is lost."""
         return self.state in (State.LOST, State.GONE)
 
     def age_s(self) -> float:

@@ -21,17 +21,7 @@ from typing import Protocol
 from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import CallerError, NoackError, PeerError, one_line
 from noack.protocol.record_tables import OWNER, clock_table
-from noack.protocol.roles import (
-    BEGINNING,
-    CHANGEABLE,
-    LOOP_ROLES,
-    RECORDER,
-    RESTART,
-    WITH_DEADLINES,
-    Notice,
-    Record,
-    Start,
-)
+from noack.protocol.roles import CHANGEABLE, LOOP_ROLES, RECORDER, WITH_DEADLINES, Notice, Record
 from noack.protocol.wire_format import Wire
 from noack.runtime.active_runs import run_name
 from noack.runtime.address import Address
@@ -95,12 +85,6 @@ class RunProcess:
         self.life = LifeCycle(role, Side.PROCESS)
         self.updates = ParameterUpdates(plane)
         self._signals = signals
-        self.admitted_ns = 0
-        self._address: Address | None = None
-        self.start: Start = BEGINNING
-        """The point of the run at which its work begins."""
-        self.replaces: str | None = None
-        """Of a restarted process: how the one before it ended."""
         self.report: dict[str, object] = {}
         self._realtime: dict[str, str] = {}
         self._clock_record: ClockRecord | None = None
@@ -111,11 +95,8 @@ class RunProcess:
         Raise NoAnswerError without an answer within ten seconds, PeerError if it refuses.
         """
         request = AdmissionRequest(instance=self.plane.instance, join_token=self.descriptor.join_token)
-        admission = self._request("admit", request, Admission, _ADMISSION_TIMEOUT_S)
+        self._request("admit", request, Admission, _ADMISSION_TIMEOUT_S)
         self.life.apply(Event.ADMIT)
-        self.start = Start(admission.generation, admission.from_ns)
-        self._address, self.replaces = admission.address, admission.replaces
-        self.admitted_ns = admission.admitted_ns
 
     def join(self, address: Address | None) -> Mapping[str, Address]:
         """Wait at the start barrier; return all addresses. Sets the common epoch.
@@ -138,8 +119,7 @@ class RunProcess:
             raise PeerError("the coordinator did not send the addresses of all processes")
         self.life.apply(Event.START)
         if not self.descriptor.launched:
-            verb = f"replaces a process ({self.replaces})" if self.replaces else "started"
-            print_to_stderr(f"noack {self.role}: {verb}")
+            print_to_stderr(f"noack {self.role}: started")
         return begin.addresses
 
     def _request(self, query: str, request: ControlMessage, answer: type[M], timeout_s: float) -> M:
@@ -188,7 +168,6 @@ class RunProcess:
         Raise CallerError if the port is taken.
         """
         settings, port = self.scenario.realtime, getattr(self.scenario.ports, self.role)
-        port = port if self._address is None else self._address[1]
         place = LOOP_ROLES.index(self.role) if settings.pin_cores else None
         with (
             closing(bind(port, f"ports.{self.role}", self.descriptor.host)) as endpoint,
@@ -208,8 +187,6 @@ class RunProcess:
             machine: takes changes of settings.
         """
         telemetry = self._telemetry()
-        if self.replaces is not None:
-            telemetry.notice(Notice(self.start.from_ns, RESTART, f"restarted: {self.replaces}"))
         reached_ns: int | None = None
         try:
             reached_ns = self._drive(driver, channel, machine, telemetry)
@@ -228,7 +205,6 @@ class RunProcess:
                 "rows": telemetry.totals(),
                 "stored": telemetry.stored(),
                 "rows_by_loop": telemetry.totals_by_loop(),
-                "generation": self.start.generation,
                 "instance": self.plane.instance,
                 "reached_ns": reached_ns,
                 **({} if self._clock_record is None else self._clock_record.summary()),
@@ -248,12 +224,10 @@ class RunProcess:
     def _telemetry(self) -> TelemetryBuffer:
         tables = run_tables(self.scenario)
         owned = {table: dtype for table, dtype in tables.items() if OWNER[table] == self.role}
-        generation = self.start.generation
         return TelemetryBuffer(
             owned,
             self.plane.publish_telemetry,
-            generation,
-            lambda: persisted_rows(self.plane, generation),
+            lambda: persisted_rows(self.plane),
             self._spool.append,
         )
 
@@ -263,9 +237,7 @@ class RunProcess:
         """Run the loop; return the simulated time up to which the machines have done their work."""
         has_table = clock_table(self.role) in run_tables(self.scenario)
         if has_table or self._reference is not None:
-            self._clock_record = ClockRecord(
-                self.role, self.start, self.clock, self._reference, has_table=has_table
-            )
+            self._clock_record = ClockRecord(self.role, self.clock, self._reference, has_table=has_table)
         limits = chain([None], repeat(_CHANGES_AT_ONCE))  # before the first step: all of them
         late_ns = run_loop(
             driver,

@@ -16,7 +16,6 @@ from typing import IO, BinaryIO, NamedTuple
 
 from noack.core.errors import MachineError, why
 from noack.core.file_access import open_append, read_regular
-from noack.protocol.roles import GENERATION
 
 SPOOL = "spool"  # the spool's folder in the run directory
 EARLY = "early"
@@ -181,11 +180,6 @@ def read_batches(folder: Path, table: str) -> Iterator[SpoolBatch]:
 def notices_of(role: str) -> str:
     """Name of a process's log lines in the spool."""
     return f"{NOTICES}_{role}"
-
-
-def notice_number(generation: int, first: int) -> int:
-    """Number of a process's log line in the spool; it contains the generation."""
-    return generation * GENERATION + first
 
 
 def batch_of(lines: Iterable[bytes]) -> bytes:

@@ -34,7 +34,6 @@ from noack.runtime.spool import (
     SpoolWriter,
     batch_of,
     kept_run_name,
-    notice_number,
     notices_of,
     writer_of,
 )
@@ -115,13 +114,11 @@ class TelemetryBuffer:
         self,
         tables: Mapping[str, np.dtype[np.void]],
         publish: Publish,
-        generation: int = 0,
         persisted: Callable[[], Mapping[str, Ranges]] = dict,
         store: Publish = lambda table, header, rows: None,
     ) -> None:
         self._publish, self._store = publish, store
         self._stored_rows: dict[str, ReceivedRows] = {}
-        self._generation = generation
         self._persisted = persisted
         self._rows = {table: np.zeros(_BATCH_ROWS, dtype) for table, dtype in tables.items()}
         self._row_counts = dict.fromkeys(tables, 0)
@@ -239,22 +236,19 @@ class TelemetryBuffer:
         self._kept_bytes = sum(len(batch.payload) for batch in remaining)
 
     def _header(self, batch: _RowBatch) -> bytes:
-        header = {"first": batch.first, "rows": batch.rows, "generation": self._generation}
-        return json.dumps(header).encode()
+        return json.dumps({"first": batch.first, "rows": batch.rows}).encode()
 
 
-def first_row(header: bytes) -> tuple[int, int]:
-    """Generation and number of a batch's first row, from its header; raise PeerError if invalid."""
-    message = parse_message(BatchHeader, header)
-    return message.generation, message.first
+def first_row(header: bytes) -> int:
+    """Number of a batch's first row, from its header; raise PeerError if invalid."""
+    return parse_message(BatchHeader, header).first
 
 
-def persisted_rows(plane: ControlPlane, generation: int) -> Mapping[str, Sequence[tuple[int, int]]]:
+def persisted_rows(plane: ControlPlane) -> Mapping[str, Sequence[tuple[int, int]]]:
     """Ranges of this process's rows that are on disk, by table; empty without a new message."""
     with suppress(PeerError):  # not from the recorder
         if (message := plane.next_persisted_ack()) is not None:
-            acknowledged = parse_message(PersistedAck, message)
-            return acknowledged.rows if acknowledged.generation == generation else {}
+            return parse_message(PersistedAck, message).rows
     return {}
 
 
@@ -310,10 +304,8 @@ class OwnSpool:
 
     def append(self, table: str, header: bytes, payload: bytes) -> None:
         """Write a batch; raise MachineError if it cannot be written."""
-        generation, first = first_row(header)
-        if table == NOTICES:
-            table, first = notices_of(self._role), notice_number(generation, first)
-        self.files.append(table, first, payload)
+        name = notices_of(self._role) if table == NOTICES else table
+        self.files.append(name, first_row(header), payload)
 
     def keep_report(self, report: Mapping[str, object]) -> None:
         """Write the final report; raise MachineError if it cannot be written."""

@@ -37,16 +37,6 @@ class ClocksSection(ScenarioSection):
     most 500 ppm; 201: clocks that are not slewed."""
 
 
-class RecoverySection(ScenarioSection):
-    """Whether a run continues after one of its processes has ended unexpectedly."""
-
-    rejoin_within_s: Annotated[FiniteFloat, Field(ge=0, le=86_400)] | None = None
-    """Wall time for which the run continues without its sensor, controller, network or recorder.
-    Within this time a new process may replace it; the launcher starts one by itself. 0: the run
-    ends. By default 0 for processes that the launcher started, and 60 for processes started by
-    hand. Without its plant the run ends."""
-
-
 class ScheduledChange(ScenarioSection):
     """Settings that change at a time during the run."""
 
@@ -130,8 +120,8 @@ NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
 MOST_LOOPS = 65_535
 """Largest number of loops in a run: datagrams carry the loop's number in 16 bits."""
 SHARED = (
-    "horizon_s", "speed", "start_within_s", "network", "certificate", "clocks", "recovery",
-    "changes", "ports", "realtime", "loops",
+    "horizon_s", "speed", "start_within_s", "network", "certificate", "clocks", "changes",
+    "ports", "realtime", "loops",
 )  # fmt: skip
 """Keys of a scenario that all its loops share."""
 

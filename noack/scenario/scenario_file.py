@@ -3,7 +3,7 @@
 An entry of ``[[loops]]`` may name another scenario file; loading the scenario replaces the name by
 tables. A loop takes that file's mode, model, plant, trigger, observer and controller. What the
 loops of a run share is the run's: a file that sets it to something else is refused. Seeds, horizon,
-speed, ports, real-time settings and recovery of the file have no effect.
+speed, ports and real-time settings of the file have no effect.
 """
 
 import copy

@@ -23,7 +23,6 @@ from noack.scenario.run_sections import (
     LoopSection,
     PortsSection,
     RealtimeSection,
-    RecoverySection,
     ScheduledChange,
     SeedsSection,
 )
@@ -69,7 +68,6 @@ class ScenarioTables(ScenarioSection):
     certificate: CertificateSection = CertificateSection.model_construct()
     clocks: ClocksSection | None = None
     """The clocks of a run on several hosts. Without it, claims assume one clock."""
-    recovery: RecoverySection = RecoverySection.model_construct()
     changes: Annotated[tuple[ScheduledChange, ...], Field(max_length=MOST_CHANGES)] = ()
     """Changes of settings during the run, in the order of time."""
     loops: Annotated[tuple[LoopSection, ...], Field(min_length=1)] | None = None

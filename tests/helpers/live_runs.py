@@ -15,7 +15,7 @@ import psutil
 import pytest
 
 from cosim.record.run_record import Rows
-from noack.protocol.roles import GENERATION, ROLES
+from noack.protocol.roles import ROLES
 from noack.runtime.spool import read_batches
 from noack.scenario.resolution import run_tables
 from noack.scenario.scenario_file import load
@@ -252,27 +252,9 @@ def start_runs(folder: Path) -> Iterator[Callable[..., Running]]:
         yield begin
 
 
-ROWS_OF = {
-    "sensor": "sensor_measurement",
-    "controller": "controller_delivery",
-    "netem": "netem_packet",
-    "recorder": "plant_step",
-}
-"""A table of each process, by which its rows are counted."""
-
-
 def spooled(running: Running, table: str) -> Rows:
     """Return the rows of a table that are on disk."""
     spool = running.runs / "latest" / "spool"
     dtype = run_tables(load(running.runs / "latest" / "scenario.toml"))[table]
     batches = [np.frombuffer(data, dtype) for _, data in read_batches(spool, table)]
     return np.concatenate([np.zeros(0, dtype), *batches])
-
-
-def goes_on(running: Running, role: str) -> bool:
-    """Whether the restarted process of a role has recorded rows; fail if the run has ended."""
-    assert running.process.poll() is None, running.process.communicate()
-    if role == "recorder":
-        written = (running.runs / "latest" / "spool").glob("plant_step.*")
-        return sum(path.stat().st_size > 0 for path in written) > 1
-    return bool((spooled(running, ROWS_OF[role])["input"] >= GENERATION).any())

@@ -10,10 +10,7 @@ from cosim.record.run_record import NETWORK_ROLES, RecordedRun, RunRecord
 
 def run_of_one_loop(record: RunRecord) -> RecordedRun:
     """Return the record of a run whose only loop has the network for itself."""
-    network = RunRecord(
-        record.scenario, record.source, [], record.reports, record.kind, record.earlier,
-        roles=NETWORK_ROLES,
-    )  # fmt: skip
+    network = RunRecord(record.scenario, record.source, [], record.reports, record.kind, roles=NETWORK_ROLES)
     return RecordedRun(network, [record])
 
 

@@ -17,7 +17,7 @@ import pytest
 from cosim.live.finalize import reopen
 from cosim.record.run_record import load_record
 from noack.core.errors import MachineError
-from noack.protocol.roles import ROLES
+from noack.protocol.roles import LOOP_ROLES, ROLES
 from tests.helpers import live_runs as live
 from tests.helpers.command_line import invoke
 
@@ -40,6 +40,31 @@ def test_a_frozen_recorder_is_named_and_no_row_is_lost(start: Start) -> None:
     assert np.array_equal(steps["sequence"], np.arange(len(steps)))
     assert not (finished.run_dir / "spool").exists()
     assert live.private_files(running.runs.parent) == []
+    assert running.left_behind() == []
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_a_killed_process_ends_the_run_and_no_recorded_row_is_lost(start: Start, role: str) -> None:
+    """The rows of the others are complete; the killed one may not have handed over its last ones."""
+    running = start(*LONG)
+    running.wait_recording()
+    live.wait_for(lambda: len(live.spooled(running, "netem_packet")) > 0)
+    running.child(role).kill()
+    finished = running.finish()
+    assert finished.status == 1
+    reason = f"{role} died: killed by SIGKILL"
+    assert finished.summary["exit"] == {"status": 1, "reason": reason}
+    assert len([line for line in finished.stderr.splitlines() if reason in line]) == 1
+    assert finished.loop["missing_by_table"] == {}
+    assert finished.loop["identity_residual_relative"] < 1e-11
+    assert finished.loop["replay"]["bit_exact"], finished.loop["replay"]
+    record = load_record(finished.run_dir)
+    assert record.reports.keys() == set(LOOP_ROLES) - {role}
+    for table in ("plant_step", "controller_step"):
+        numbers = record[table]["sequence"]
+        assert np.array_equal(numbers, np.arange(len(numbers)))
+        assert len(numbers) > 10
+    assert not (finished.run_dir / "spool").exists()
     assert running.left_behind() == []
 
 

@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -132,23 +131,6 @@ def test_a_killed_program_ends_the_run_and_its_rows_are_kept(start: Start, node:
     assert running.left_behind() == []
 
 
-def test_a_stopped_program_ends_with_its_process_and_another_goes_on(start: Start, node: Path) -> None:
-    """A program that is stopped does not see the end of its input."""
-    options = options_for(node, speed=2.0, horizon_s=60.0, recovery__rejoin_within_s=60.0)
-    running = start(*options)
-    running.wait_recording()
-    live.wait_for(lambda: len(live.spooled(running, "controller_delivery")) > 0)
-    program = program_of(running)
-    program.send_signal(signal.SIGSTOP)
-    running.child("controller").kill()
-    live.wait_for(lambda: live.is_over(program))
-    live.wait_for(lambda: live.goes_on(running, "controller"))
-    running.process.send_signal(signal.SIGINT)
-    finished = running.finish()
-    assert finished.loop["replay"]["bit_exact"], finished.loop["replay"]
-    assert running.left_behind() == []
-
-
 def driver_of(program: Path, content: dict[str, Any]) -> NodeDriver:
     """The driver of a program, without a run."""
     settings = with_absolute_path(
@@ -156,7 +138,7 @@ def driver_of(program: Path, content: dict[str, Any]) -> NodeDriver:
     )
     assert isinstance(settings, ProgramControllerSettings)
     descriptor = SimpleNamespace(key=KEY)
-    process: Any = SimpleNamespace(wire=Wire(RUN_ID, KEY), admitted_ns=0, descriptor=descriptor)
+    process: Any = SimpleNamespace(wire=Wire(RUN_ID, KEY), descriptor=descriptor)
     return NodeDriver(process, controllers_of([scenario(content)]), settings)
 
 

@@ -52,7 +52,7 @@ from noack.protocol.record_tables import (
     SENSOR_MEASUREMENT,
     effective,
 )
-from noack.protocol.roles import GENERATION, LOOP_ROLES
+from noack.protocol.roles import LOOP_ROLES
 from noack.scenario.run_sections import ClocksSection
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.conditions import allowed_conditions
@@ -81,22 +81,17 @@ class _ClockErrors:
 
 
 class _Measurements:
-    """Times between measurements, from the start of the run to its end; restarts of the sensor."""
+    """Times between measurements, from the start of the run to its end."""
 
     def __init__(self) -> None:
         self._times: list[Times] = []
-        self._restarts: Batches = []
-        self._generation = 0
         self.newest_ns = 0
 
     def add(self, rows: Rows) -> None:
         """Add measurements, in their order."""
-        t_ns, generations = rows["t_ns"], rows["input"] // GENERATION
+        t_ns = rows["t_ns"]
         self._times.append(np.append(self.newest_ns, t_ns))
         self.newest_ns = int(t_ns[-1])
-        first = np.diff(generations, prepend=self._generation) > 0
-        self._generation = int(generations[-1])
-        self._restarts.append((t_ns[first], generations[first]))
 
     def gaps(self, end_ns: int | None) -> SampledSeries:
         """Return the times between measurements since the last call, with the end of the run if given."""
@@ -107,12 +102,6 @@ class _Measurements:
         gaps_ns = np.concatenate([NO_TIMES, *map(np.diff, times)])
         longer = gaps_ns > 0
         return SampledSeries(since_ns[longer] * 1e-9, gaps_ns[longer] * 1e-9)
-
-    def restarts(self) -> SampledSeries:
-        """Return the generations of restarted sensors since the last call."""
-        t_ns, generations = columns(self._restarts, 2)
-        self._restarts = []
-        return SampledSeries(t_ns * 1e-9, generations * 1.0)
 
 
 class _Updates:
@@ -281,7 +270,6 @@ class ConditionReader:
             start_s=start_s,
             watchdog=watchdog,
             safe_input=safe_input,
-            restarts=self._measurements.restarts(),
             timeout_s=self._timeout_s,
             clocks={} if self._clocks is None else self._clocks.take(),
             largest_clock_error_s=np.inf if self._clocks is None else self._clocks.largest_s,

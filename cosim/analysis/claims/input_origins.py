@@ -18,7 +18,6 @@ from cosim.record.run_events import ActuationTimes
 from cosim.record.run_record import Rows
 from noack.core.row_operations import largest_sizes
 from noack.protocol.record_tables import NO_SEQUENCE
-from noack.protocol.roles import GENERATION
 from noack.scenario.scenario import Scenario
 from plant_server.plant import too_old
 
@@ -81,10 +80,7 @@ class TickMatcher:
         self._deliveries = [(received[known:], sequence[known:], model_ns[known:])]
         self._ticks = [(inputs[-_KEPT_TICKS:], ticks[-_KEPT_TICKS:])]
         tick = np.append(ticks, NO_INPUT)[first[:known]]
-        # If the controller died before its next tick, the restarted one does not have the update.
-        generations = received[:known] // GENERATION
-        same = (tick == NO_INPUT) | (tick // GENERATION == generations)
-        return Receipts(sequence[:known][same], model_ns[:known][same], tick[same])
+        return Receipts(sequence[:known], model_ns[:known], tick)
 
 
 class InputOrigins:
@@ -96,8 +92,8 @@ class InputOrigins:
         self._timeout_ns = scenario.timing.actuation_timeout_ns
         self._replaces = scenario.plant.watchdog.policy != "hold"
         known = scenario.network.initial_sync == "known_state"
-        self._first_state: dict[int, int] = {0: 0} if known else {}
-        """By generation of the controller: its first tick with a state."""
+        self._first_state = 0 if known else NO_INPUT
+        """The controller's first tick with a state."""
         self._ticked = NO_SEQUENCE
         self._steps: Batches = []
         self._actuations = ActuationTimes()
@@ -134,9 +130,8 @@ class InputOrigins:
 
     def add_receipts(self, receipts: Receipts, ticked: int) -> None:
         """Add updates that the controller received, and the number of its newest tick."""
-        ticks = receipts.tick
-        for tick in ticks[np.diff(ticks // GENERATION, prepend=-1) > 0].tolist():
-            self._first_state.setdefault(tick // GENERATION, tick)
+        if len(receipts.tick):
+            self._first_state = min(self._first_state, int(receipts.tick[0]))
         self._receipts.append(receipts)
         self._ticked = ticked
 
@@ -148,7 +143,7 @@ class InputOrigins:
         """
         t_ns, newest, sizes, ahead_ns = columns(self._steps, 4)
         ready = newest <= (NO_INPUT if ended else self._received)
-        ready &= (newest <= self._ticked) | (self._first_with_state(newest) < NO_INPUT)
+        ready &= (newest <= self._ticked) | (self._first_state < NO_INPUT)
         count = int(np.minimum.accumulate(ready).sum())
         self._steps = [(t_ns[count:], newest[count:], sizes[count:], ahead_ns[count:])]
         t_ns, newest, sizes = t_ns[:count], newest[:count], sizes[:count]
@@ -156,8 +151,7 @@ class InputOrigins:
         model_ns = sent_ns + ahead_ns[:count]
         highest = np.maximum.accumulate(np.append(self._latched, newest))
         is_input = newest != NO_SEQUENCE
-        controlled = is_input & (highest[1:] >= self._first_with_state(highest[1:]))
-        began = np.logical_or.accumulate(np.append(self.started, controlled))[:-1]
+        controlled = is_input & (highest[1:] >= self._first_state)
         if count:
             self.classified_ns = int(t_ns[-1])
             rises = np.diff(highest) > 0
@@ -169,20 +163,13 @@ class InputOrigins:
         age_ns = np.maximum(t_ns + self._period_ns - model_ns, model_ns - t_ns)
         replaced = controlled & self._replaces & too_old(t_ns, sent_ns, self._timeout_ns)
         # Until the first input with a state, the certificates assume that the input is 0.
-        safe = is_input & ~controlled & (began | ~(sizes == 0))
+        safe = is_input & ~controlled & ~(sizes == 0)
         step_s, is_held = t_ns * 1e-9, controlled & ~replaced
         return (
             SampledSeries(step_s[is_held], age_ns[is_held] * 1e-9),
             SampledSeries(step_s[replaced], (t_ns - sent_ns)[replaced] * 1e-9),
             SampledSeries(step_s[safe], sizes[safe]),
         )
-
-    def _first_with_state(self, ticks: Times) -> Times:
-        """The first tick with a state, of the same generation of the controller."""
-        first_tick, generations = np.full(len(ticks), NO_INPUT), ticks // GENERATION
-        for generation, first in self._first_state.items():
-            first_tick[generations == generation] = first
-        return first_tick
 
     def take_applied(self, *, ended: bool) -> list[tuple[int, int, int | None]]:
         """Return the updates that took effect on the plant since the last call, in order.

@@ -45,7 +45,6 @@ CAUSES = {
     "start": "the plant applied no input until {:.4g} s, {:.4g} s allowed",
     "watchdog": "the watchdog replaced the input: the newest actuation was {:.4g} s old, {:.4g} s allowed",
     "safe input": "the controller had no state and sent its safe input, largest entry {:.4g}",
-    "restart": "the sensor was restarted: its first transmission is no event of the trigger",
     **{
         clock_cause(role): f"the clock of {role} may have been off by {{:.4g}} s, {{:.4g}} s allowed"
         for role in LOOP_ROLES
@@ -186,10 +185,8 @@ class ObservedConditions(NamedTuple):
     watchdog: SampledSeries
     """Age of the newest actuation at every step at which the watchdog replaced the input."""
     safe_input: SampledSeries
-    """Largest entry of the input at every step at which it came from a controller without a state:
-    only inputs other than 0 before ``start_s``, and any input after that."""
-    restarts: SampledSeries
-    """Generation of every restarted sensor, at its first measurement."""
+    """Largest entry of the input, if it is not 0, at every step at which it came from a controller
+    without a state, before ``start_s``."""
     timeout_s: float
     """Age at which the watchdog acts."""
     clocks: Mapping[str, SampledSeries] = MappingProxyType({})
@@ -237,7 +234,6 @@ class ObservedConditions(NamedTuple):
             "start": (self._first_input(conditions.start_s), conditions.start_s),
             "watchdog": (self.watchdog, self.timeout_s),
             "safe input": (self.safe_input, -1.0),  # every value is a violation
-            "restart": (self.restarts, 0.0),
         }
         for cause, series in self.clocks.items():
             lost = cause.endswith("lost")  # every value is a violation
@@ -311,8 +307,7 @@ def combine(parts: Sequence[ObservedConditions]) -> ObservedConditions:
         delay=SampledSeries(*join(part.delay for part in parts)).peaks(),
         hold=SampledSeries(*join(part.hold for part in parts)).peaks(),
         watchdog=SampledSeries(*join(part.watchdog for part in parts)).peaks(),
-        safe_input=SampledSeries(*join(part.safe_input for part in parts)).peaks(last.start_s),
-        restarts=SampledSeries(*join(part.restarts for part in parts)),
+        safe_input=SampledSeries(*join(part.safe_input for part in parts)).peaks(),
         clocks={
             cause: SampledSeries(*join(part.clocks[cause] for part in parts)).in_order().peaks()
             for cause in last.clocks

@@ -216,12 +216,11 @@ class RunEvidence:
         if self.part.start_error is None:
             return conditions
         # The certificate's start error covers the inputs before the part's first one.
-        safe, restarts = conditions.safe_input, conditions.restarts
-        later, restarted = safe.t_s >= conditions.start_s, restarts.t_s > 0
+        safe = conditions.safe_input
+        later = safe.t_s >= conditions.start_s
         return conditions._replace(
             start_s=0.0 if np.isfinite(conditions.start_s) else conditions.start_s,
             safe_input=SampledSeries(safe.t_s[later], safe.value[later]),
-            restarts=SampledSeries(restarts.t_s[restarted], restarts.value[restarted]),
         )
 
     @cached_property
@@ -264,12 +263,9 @@ class RunEvidence:
         end_ns = common_end_ns(whole_record)
         end_s = math.inf if end_ns is None else end_ns * 1e-9 - self.part.from_s
         for role in LOOP_ROLES:
-            if whole_record.is_complete(role):
-                continue
-            gaps_ns = filter(None, (generation.gap_ns for generation in whole_record.generations(role)))
-            times_s = [ns * 1e-9 - self.part.from_s for ns in gaps_ns]
-            why = f"rows of {role} are missing from the record"
-            gaps += [VoidFrom(t_s, why) for t_s in times_s if 0 <= t_s <= end_s]
+            gap_ns = None if whole_record.is_complete(role) else whole_record.rows_of(role).gap_ns
+            if gap_ns is not None and 0 <= (at_s := gap_ns * 1e-9 - self.part.from_s) <= end_s:
+                gaps.append(VoidFrom(at_s, f"rows of {role} are missing from the record"))
         if (gap_s := self.facts.gap_s) is not None:
             why = "the controller's error is not on record, or not finite"
             gaps.append(VoidFrom(gap_s, why))
@@ -280,7 +276,7 @@ class RunEvidence:
         """First violation of the guarantee or of u = K x_c, which the paper's theorems assume."""
         schedule, rules = self._schedule, guarantee_causes(self.record.scenario)
         limit = _ANY._replace(dropouts=schedule.dropouts, constraints=schedule.constraints)
-        causes = (*rules, "watchdog", "safe input", "restart")
+        causes = (*rules, "watchdog", "safe input")
         return earliest([self.observed.first_violation(limit, causes), self.first_gap])
 
     def violation_of(self, certificate: ScenarioCertificate) -> VoidFrom | None:

@@ -1,7 +1,7 @@
 """Replays machines, and the network, from their recorded rows.
 
-:class:`MachineReplay` has the machines of a role, one for each generation, each up to the first gap
-in its rows. :class:`InputReplay` is one machine; native/driver/replay.c does the work: it feeds the
+:class:`MachineReplay` follows the machine of a role up to the first gap in its rows.
+:class:`InputReplay` is the machine; native/driver/replay.c does the work: it feeds the
 recorded inputs and compares each row that the machine writes. The class explains the first
 difference, and answers what the core asks: for users' code, and for changes of settings.
 """
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from controller_node.controller import controllers_of
 from cosim.analysis.replay.replay_result import ProcessReplay, difference, first_row_difference
 from cosim.analysis.summary.summary_model import ReplayDifference
-from cosim.record.processes import ProcessGeneration, split_by_generation
 from cosim.record.record_source import Rows, Slice
 from cosim.record.run_record import RunRecord
 from netem.channel import Channel, channel_of
@@ -24,7 +23,6 @@ from noack.core.core_library import CData, core, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.machines.loop_machines import LoopMachines
 from noack.protocol.record_tables import (
-    CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
     LOOP,
     NETEM_RELEASE,
@@ -35,7 +33,7 @@ from noack.protocol.record_tables import (
     SETTINGS,
     entry_names,
 )
-from noack.protocol.roles import GENERATION, RECEIVES, SENDS, Record, Start
+from noack.protocol.roles import RECEIVES, SENDS, Record
 from noack.protocol.wire_format import Flow
 from noack.scenario.parameter_changes import ParameterChange, settings_of
 from noack.scenario.scenario import Scenario, loops_of
@@ -306,7 +304,7 @@ _MACHINES: Mapping[str, Callable[..., LoopMachines]] = {
 
 
 class SharedMachines:
-    """The first machines of several loops without changes of settings, which are made at once.
+    """The machines of several loops without changes of settings, which are made at once.
 
     Args:
         records: the records of the loops, each in memory as a whole.
@@ -324,101 +322,74 @@ class SharedMachines:
     @cached_method
     def of(self, role: str) -> LoopMachines:
         """Return the machines of a role."""
-        return _MACHINES[role](self._loops, start=Start(0))
+        return _MACHINES[role](self._loops)
 
 
 class MachineReplay:
-    """Replays the machines of a role, part by part of the record; one for each generation.
+    """Replays the machine of a role, part by part of the record.
 
-    Each machine gets its recorded inputs, up to the first gap, and its rows are compared.
+    The machine gets its recorded inputs, up to the first gap, and its rows are compared.
     """
 
     def __init__(self, role: str, record: RunRecord, shared: SharedMachines) -> None:
-        self._tables = record.owned_by(role)
-        self._begun = record.generation_numbers(role)
-        self._parts = [_GenerationReplay(role, record, own, shared) for own in record.row_counts(role)]
-        self.newest: list[InputReplay] = []
-        """The replays of the newest part; they have what was sent."""
-
-    def take(self, part: Slice) -> None:
-        """Replay the next part of the record."""
-        self.newest = []
-        owned = {table: part[table] for table in self._tables}
-        for own, part_replay in zip(split_by_generation(owned, self._begun), self._parts, strict=True):
-            if any(map(len, own.values())):
-                self.newest += part_replay.take(own)
-
-    @property
-    def results(self) -> tuple[ProcessReplay, ...]:
-        """The result of each generation; final after the last part."""
-        return tuple(part.result() for part in self._parts)
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether every input was replayed."""
-        return all(result.is_complete for result in self.results)
-
-
-class _GenerationReplay:
-    """The replay of one generation."""
-
-    def __init__(self, role: str, record: RunRecord, own: ProcessGeneration, shared: SharedMachines) -> None:
-        self._role, self._record, self._own, self._shared = role, record, own, shared
+        self._role, self._record, self._shared = role, record, shared
+        counts, report = record.row_counts(role), record.reports.get(role)
         self._run: InputReplay | None = None
-        self._count = sum(own.rows.values())
-        report = own.report
-        self._written = None if report is None else sum(report["rows"][table] for table in own.rows)
+        self._count = sum(counts.values())
+        self._written = None if report is None else sum(report["rows"][table] for table in counts)
         ends_early = self._written is not None and self._written > self._count
         self._missing_from = self._count if ends_early else None
         self._damage: ReplayDifference | None = None
         self._compared = 0
-        self._before = dict.fromkeys(own.rows, 0)
+        self._before = dict.fromkeys(counts, 0)
         """Rows in the parts before, by table."""
         self._stopped = False
+        self.newest: InputReplay | None = None
+        """The replay of the newest part, which has what was sent; None if there was nothing to replay."""
 
-    def take(self, owned: Slice) -> list[InputReplay]:
-        """Replay the next rows; return the replay, unless it has stopped before."""
-        if self._stopped:
-            return []
+    def take(self, part: Slice) -> None:
+        """Replay the next part of the record, unless the replay has stopped before."""
+        self.newest = None
+        owned = {table: part[table] for table in self._before}
+        if self._stopped or not any(map(len, owned.values())):
+            return
         order = self._in_order(owned)
         if self._run is None:
-            self._run = self._begin(owned)
+            self._run = self._begin()
         compared = self._run.replay(owned, order, self._before)
         self._stopped |= compared < len(order)
         self._compared += compared
         for table, rows in owned.items():
             self._before[table] += len(rows)
-        return [self._run]
+        self.newest = self._run
 
-    def _begin(self, owned: Slice) -> InputReplay:
+    def _begin(self) -> InputReplay:
         """Return the replay of a new machine."""
-        role, scenario, generation = self._role, self._record.scenario, self._own.number
-        start, sizes = _start(generation, owned), _sizes(role, scenario)
+        role, scenario = self._role, self._record.scenario
+        sizes = _sizes(role, scenario)
         if role == "netem":
-            channel = channel_of(scenario, start, loops=len(loops_of(scenario)))
-            return InputReplay(role, channel, sizes)
-        index = None if generation else self._shared.index(self._record)
-        if index is not None:
+            return InputReplay(role, channel_of(scenario, loops=len(loops_of(scenario))), sizes)
+        if (index := self._shared.index(self._record)) is not None:
             return InputReplay(role, self._shared.of(role), sizes, index)
-        return InputReplay(role, _MACHINES[role]((scenario,), start=start), sizes)
+        return InputReplay(role, _MACHINES[role]((scenario,)), sizes)
 
+    @property
     def result(self) -> ProcessReplay:
-        generation = self._own.number
+        """The result; final after the last part."""
         differs = None if self._run is None else self._run.difference
         differences = [first for first in (differs, self._damage) if first is not None]
         return ProcessReplay(
-            process=f"{self._role} ({generation + 1})" if generation else self._role,
+            process=self._role,
             inputs=self._count,
             compared=self._compared,
             missing_from=self._missing_from,
-            end_known=self._own.report is not None,
+            end_known=self._written is not None,
             difference=min(differences, key=lambda difference: difference.now_ns, default=None),
         )
 
     def _in_order(self, owned: Slice) -> Numbers:
         """Return the indices of the inputs in order, among the rows of all tables, up to a gap."""
         numbers = np.concatenate([rows["input"] for rows in owned.values()])
-        numbers = numbers - self._own.number * GENERATION
         order = np.argsort(numbers, kind="stable")
         numbers = numbers[order]
         unexpected = np.flatnonzero(numbers != self._compared + np.arange(len(numbers)))
@@ -460,15 +431,3 @@ def _sizes(role: str, scenario: Scenario) -> Mapping[Flow, int]:
         return {}
     sizes = {SENDS[role]: scenario.message_sizes.entries(SENDS[role])}
     return sizes | ({Flow.ACKNOWLEDGEMENT: 0} if role == "controller" else {})
-
-
-def _start(generation: int, owned: Slice) -> Start:
-    """Return the start of a process: for the controller, its first tick.
-
-    If the controller died before its first tick, its first message determines the start.
-    """
-    if not generation or CONTROLLER_STEP not in owned:
-        return Start(generation)
-    steps, deliveries = owned[CONTROLLER_STEP], owned[CONTROLLER_DELIVERY]
-    first_ns = (*steps["t_ns"][:1], *deliveries["model_t_ns"][:1])
-    return Start(generation, int(min(first_ns, default=0)))

@@ -72,7 +72,7 @@ class MessageComparison:
             packets = part[NETEM_PACKET][part[NETEM_PACKET]["release_ns"] >= 0]
             forwarded = [(packets["flow"], packets["head"])]
         else:
-            forwarded = [packets.forwarded() for packets in netem.newest]
+            forwarded = [] if netem.newest is None else [netem.newest.forwarded()]
         survivors = [(flows, headers_of(heads)) for flows, heads in forwarded]
         for hop in self._hops:
             hop.take(part, survivors)
@@ -81,7 +81,7 @@ class MessageComparison:
         """Return the result of each hop after the last part."""
         netem = self._machines.get("netem")
         # A killed emulator may have forwarded messages whose rows are missing.
-        is_complete = self._record.is_complete("netem") if netem is None else netem.is_complete
+        is_complete = self._record.is_complete("netem") if netem is None else netem.result.is_complete
         results = [hop.result(network_is_complete=is_complete) for hop in self._hops]
         return (*results, *_compare_changes(self._record))
 
@@ -176,8 +176,8 @@ class _HopComparison:
         By its receiver's clock, a message may be received before it was sent by its sender's, if
         they are on different hosts, and so in the part before.
         """
-        for packets in self._sender.newest:
-            self._add(packets.sent_in(self._flow))
+        if self._sender.newest is not None:
+            self._add(self._sender.newest.sent_in(self._flow))
         if self._was_forwarded:
             for flows, headers in survivors:
                 own_headers = headers[(flows == self._direction) & (headers["magic"] == MAGIC)]
@@ -212,7 +212,7 @@ class _HopComparison:
     def result(self, *, network_is_complete: bool) -> MessagesReplay:
         """Return the first difference of all messages, after the last part."""
         self._compare_waiting()
-        counts = {_SENT: self._sender.is_complete, _FORWARDED: network_is_complete}
+        counts = {_SENT: self._sender.result.is_complete, _FORWARDED: network_is_complete}
         kinds = [kind for kind in (_CONTENT, _SENT, _FORWARDED) if counts.get(kind, True)]
         firsts = [self._first[kind] for kind in kinds if kind in self._first]
         first, first_difference = min(firsts, key=lambda difference: difference.row, default=None), None
@@ -351,7 +351,7 @@ def replay(record: RunRecord, shared: SharedMachines | None = None) -> ReplayRes
                 machine.take(part)
             if messages is not None:
                 messages.take(part)
-    results = tuple(result for machine in machines.values() for result in machine.results)
+    results = tuple(machine.result for machine in machines.values())
     return ReplayResult(processes=results, messages=() if messages is None else messages.results())
 
 
@@ -364,10 +364,9 @@ def replay_run(run: RecordedRun, loop: str | None = None) -> ReplayResult:
     if loop is not None or len(run.loops) == 1:
         return replay(run.loop(loop))
     replays = [replay(run.network), *map(replay, run.loops)]
-    # A restarted process has a result of its own.
     processes = _by_name((result.process, result) for replayed in replays for result in replayed.processes)
     messages = _by_name((result.hop, result) for replayed in replays for result in replayed.messages)
-    in_order = sorted(processes, key=lambda name: LOOP_ROLES.index(name.split()[0]))
+    in_order = sorted(processes, key=LOOP_ROLES.index)
     return ReplayResult(
         processes=tuple(_add_up(processes[name]) for name in in_order),
         messages=tuple(map(_add_up, messages.values())),

@@ -216,12 +216,11 @@ def missing_rows(record: RunRecord) -> Counter[str]:
     """
     missing: Counter[str] = Counter()
     for role in LOOP_ROLES:
-        for generation, counts in enumerate(record.row_counts(role)):
-            if counts.report is None:
-                missing[role] += record.generations(role)[generation].missing_inputs
-                continue
-            for table, count in counts.rows.items():
-                missing[table] += counts.report["rows"][table] - count
+        if role not in record.reports:
+            missing[role] += record.rows_of(role).missing_inputs
+            continue
+        for table, count in record.row_counts(role).items():
+            missing[table] += record.reports[role]["rows"][table] - count
     return missing
 
 

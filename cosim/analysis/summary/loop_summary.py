@@ -1,6 +1,5 @@
 """The summary of a loop, computed from its record."""
 
-import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, SupportsFloat, TypedDict
@@ -19,13 +18,7 @@ from cosim.analysis.summary.loop_statistics import (
     watchdog_actions,
 )
 from cosim.analysis.summary.signal_statistics import disturbances, signal_statistics
-from cosim.analysis.summary.summary_model import (
-    AssumptionPart,
-    ChangePart,
-    ExitPart,
-    LoopSummary,
-    RestartPart,
-)
+from cosim.analysis.summary.summary_model import AssumptionPart, ChangePart, ExitPart, LoopSummary
 from cosim.record.divergence import Divergence, divergence
 from cosim.record.run_events import changes_of, packet_outcomes
 from cosim.record.run_record import RunRecord
@@ -41,7 +34,7 @@ from noack.protocol.record_tables import (
     Fate,
     effective,
 )
-from noack.protocol.roles import FAILED, LOOP_ROLES, RECORDER, RESTART
+from noack.protocol.roles import FAILED, LOOP_ROLES
 from noack.protocol.wire_format import Flow
 from noack.scenario.runtime_parameters import text_of
 from noack.theory.certificates.assumptions import Assumption, assumptions
@@ -78,7 +71,6 @@ def summarise_loop(
         **signals.for_summary(),
         assumption_violations=reported_violations(record),
         assumptions=_assumptions(record, assumed or assumptions(scenario)),
-        restarts=_restarts(record),
         changes=change_parts(record),
         missing_samples=sum(missing.values()),
         missing_by_table={table: n for table, n in missing.items() if n},
@@ -182,7 +174,6 @@ def _why_failed(record: RunRecord, missing: Mapping[str, int], diverged: Diverge
     surplus = [f"{-n:,} of {table}" for table, n in missing.items() if n < 0]
     if surplus:
         return f"the record has more rows than the processes reported: {', '.join(surplus)}"
-    # Missing last rows of a killed process are no failure: a restarted process replaced it.
     incomplete = [f"{missing[table]:,} of {table}" for table in record.tables if missing[table] > 0]
     return f"rows are missing from the record: {', '.join(incomplete)}" if incomplete else None
 
@@ -221,43 +212,6 @@ def change_parts(record: RunRecord) -> list[ChangePart]:
         )
         for change in changes_of(record)
     ]
-
-
-def _restarts(record: RunRecord) -> list[RestartPart]:
-    """Return the processes that were restarted during the run, in order of time."""
-    restarts: list[RestartPart] = []
-    for role in (*LOOP_ROLES, RECORDER):
-        notices = [n for n in record.notices if (n["process"], n["level"]) == (role, RESTART)]
-        if role == RECORDER:  # the recorder has no rows
-            restarts += [
-                RestartPart(
-                    process=role,
-                    generation=number,
-                    last_s=None,
-                    first_s=notice["t_ns"] * 1e-9,
-                    what=notice["text"],
-                )
-                for number, notice in enumerate(notices, 1)
-            ]
-            continue
-        if not notices and len(record.generation_numbers(role)) == 1:
-            continue
-        active_s = {
-            generation.number: (_seconds(generation.first_ns), _seconds(generation.last_ns))
-            for generation in record.generations(role)
-        }
-        # Each restart has one notice. It is lost only if the process ended soon after, so the
-        # notices belong to the last generations.
-        reported = dict(enumerate(notices, max(max(active_s) - len(notices), 0) + 1))
-        last_s = active_s.pop(0)[-1]
-        for number in sorted(active_s.keys() | reported.keys()):
-            first_s, until_s = active_s.get(number, (None, last_s))
-            notice = reported[number]["text"] if number in reported else None
-            restarts.append(
-                RestartPart(process=role, generation=number, last_s=last_s, first_s=first_s, what=notice)
-            )
-            last_s = until_s
-    return sorted(restarts, key=lambda restart: restart.first_s or restart.last_s or math.inf)
 
 
 def _seconds(t_ns: int | None) -> float | None:

@@ -313,16 +313,6 @@ class ChangePart(SummaryPart):
     in_force_from_s: dict[Text, float]
 
 
-class RestartPart(SummaryPart):
-    """A process that was restarted during the run."""
-
-    process: Text
-    generation: Count
-    last_s: Real
-    first_s: Real
-    what: str | None
-
-
 class ExitPart(SummaryPart):
     """How the run, or a loop, ended."""
 
@@ -357,7 +347,6 @@ class LoopSummary(SummaryPart):
     """Only if they cross the network."""
     assumption_violations: list[ViolationPart]
     assumptions: list[AssumptionPart]
-    restarts: list[RestartPart]
     changes: list[ChangePart]
     missing_samples: Count
     missing_by_table: Counts

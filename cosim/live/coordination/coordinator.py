@@ -1,8 +1,7 @@
 """The coordinator of a run: admission, start barrier, liveliness, stop, changes of settings.
 
-It keeps the life cycle (:mod:`noack.runtime.life_cycle`) of each process. A restarted process takes
-over the address of the one before it, and numbers its messages above all earlier ones. A requested
-change of runtime parameters is checked, given a time, and announced.
+It keeps the life cycle (:mod:`noack.runtime.life_cycle`) of each process. A requested change of
+runtime parameters is checked, given a time, and announced.
 """
 
 import os
@@ -51,8 +50,6 @@ from noack.settings.section import ReadTable, Table
 with lazy_modules():
     from noack.theory.certificates import assumptions
 
-_RESTART_DELAY_S = 0.3
-"""Wall time from the admission of a restarted process to its first deadline."""
 _REPORT_GRACE_S = 0.3
 """A process's last message may arrive this much later than its exit is seen."""
 _EXIT_GRACE_S = 5.0
@@ -75,10 +72,9 @@ class TokenScope(NamedTuple):
 class _Member(LifeCycle):
     """A process that has asked for admission."""
 
-    def __init__(self, role: str, instance: str, generation: int) -> None:
+    def __init__(self, role: str, instance: str) -> None:
         super().__init__(role, Side.COORDINATOR)
         self.instance = instance
-        self.generation = generation
         self.address: tuple[str, int] | None = None
         self.query: zenoh.Query | None = None
         """Its unanswered join request."""
@@ -120,11 +116,9 @@ class Coordinator:
         self._admitted: dict[tuple[str, str], _Member] = {}
         """By role and instance."""
         self._members: dict[str, _Member] = {}
-        """The process of each role that has joined last."""
-        self._replaceable: dict[str, str] = {}
-        """Roles that a restarted process may take, and how the process before it ended."""
-        self.joined: dict[str, dict[str, str | int]] = {}
-        """The processes that passed the start barrier, by instance: ``process``, ``generation``."""
+        """The process of each role that has joined."""
+        self.joined: dict[str, dict[str, str]] = {}
+        """The processes that passed the start barrier, by instance: ``process``."""
         self._reported: dict[str, str] = {}
         self._stopped: str | None = None
 
@@ -210,24 +204,6 @@ class Coordinator:
         reason = self._reported.get(role)
         return None if reason == HORIZON else reason
 
-    def running_generation(self, role: str) -> int | None:
-        """Generation of the running process of a role; None if none is running."""
-        member = self._members.get(role)
-        return member.generation if member is not None and member.state is State.RUNNING else None
-
-    def allow_restart(self, role: str, failure: str, *, dead: bool) -> None:
-        """Let a restarted process replace one that has failed.
-
-        Args:
-            role: the role.
-            failure: how the process ended.
-            dead: the process has exited; otherwise it may come back with its connection.
-        """
-        self._replaceable[role] = failure
-        self._reported.pop(role, None)
-        if dead:
-            self._members[role].apply(Event.END, failure)
-
     def progress(self) -> RunProgress | None:
         """The recorder's newest progress report; None without a new one."""
         with suppress(PeerError):  # not from the recorder
@@ -280,15 +256,12 @@ class Coordinator:
         if role not in ROLES:
             raise PeerError("a run has no such process")
         self._require_token(role, request.join_token)
-        before, failure = self._finished_predecessor(role), self._replaceable.get(role)
-        if self._clock is not None and (before is None or failure is None):
-            raise PeerError("the run has started without it")
-        admission = _admission(before, failure, self._clock)
-        member = _Member(role, request.instance, admission.generation)
-        member.address = admission.address
+        if role in self._members:
+            raise PeerError(f"another {role} is in this run already")
+        member = _Member(role, request.instance)
         member.apply(Event.ADMIT)
         self._admitted[role, request.instance] = member
-        self.plane.answer(query, admission)
+        self.plane.answer(query, Admission())
 
     def _require_token(self, role: str, join_token: str) -> None:
         """Raise PeerError unless a join token admits a role now."""
@@ -307,34 +280,19 @@ class Coordinator:
         """
         request = parse_message(JoinRequest, _payload(query))
         member = self._admitted.get((role, request.instance))
-        other = None if self._members.get(role) is member else self._finished_predecessor(role)
-        if member is None or (other is not None and member.generation <= other.generation):
+        if member is None:
             raise PeerError("it was not admitted")
+        if self._members.get(role, member) is not member:
+            raise PeerError(f"another {role} is in this run already")
         if (request.address is None) == (role in LOOP_ROLES):
             raise PeerError("a process of the loop needs an address, the recorder has none")
         if self._clock is not None and request.address != member.address:
-            raise PeerError("it must use the address of the process before it")
+            raise PeerError("its address must not change during the run")
         member.apply(Event.JOIN)
-        if other is not None:
-            other.apply(Event.REPLACE)
         member.address, member.query = request.address, query
         self._members[role] = member
         if self._clock is not None:
-            self._replaceable.pop(role, None)
             self._let_pass(member)
-
-    def _finished_predecessor(self, role: str) -> _Member | None:
-        """Return the process that had the role before, which must be over.
-
-        Raise PeerError if it is not over.
-        """
-        before = self._members.get(role)
-        if before is not None and before.state is State.UNREACHABLE:
-            left = f"{self._remaining_s(before):.0f} s"
-            raise PeerError(f"the {role} before it may still come back; try again in {left}")
-        if before is not None and not before.is_over:
-            raise PeerError(f"another {role} is in this run already")
-        return before
 
     def _start(self) -> None:
         is_quick = {*self._launched} == {*ROLES} and os.getloadavg()[0] <= cores()
@@ -347,7 +305,7 @@ class Coordinator:
         """Answer a join request with the start of the run."""
         if member.state is State.AT_BARRIER:
             member.apply(Event.START)
-        self.joined[member.instance] = {"process": member.role, "generation": member.generation}
+        self.joined[member.instance] = {"process": member.role}
         members = [self._members[role] for role in LOOP_ROLES]
         addresses = {member.role: member.address for member in members if member.address is not None}
         query, member.query = member.query, None
@@ -355,20 +313,6 @@ class Coordinator:
         assert self._clock is not None
         epoch_ns, changes = self._clock.epoch_ns, self._changes.announced
         self.plane.answer(query, RunStart(epoch_ns=epoch_ns, addresses=addresses, changes=changes))
-
-
-def _admission(before: _Member | None, failure: str | None, clock: RunClock | None) -> Admission:
-    """The admission of a process: to a run that has not started, or in the place of another."""
-    if clock is None or before is None:
-        return Admission(generation=0, admitted_ns=0, from_ns=0, address=None, replaces=None)
-    now_ns = clock.now_ns()
-    return Admission(
-        generation=before.generation + 1,
-        admitted_ns=now_ns,
-        from_ns=now_ns + int(_RESTART_DELAY_S * NS_PER_S * clock.speed),
-        address=before.address,
-        replaces=failure,
-    )
 
 
 def _sender(key_expr: object) -> tuple[str, str]:

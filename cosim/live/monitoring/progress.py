@@ -24,7 +24,6 @@ from cosim.live.monitoring.run_watcher import Watcher
 from noack.core.clock import NS_PER_S
 from noack.runtime.command_line import print_to_stderr
 from noack.runtime.control_messages import RunProgress
-from noack.runtime.run_descriptor import DEFAULT_SESSION
 from noack.scenario.scenario import Scenario, loop_names
 
 if TYPE_CHECKING:
@@ -51,18 +50,16 @@ def error_console() -> Console:
 
 
 @contextmanager
-def progress_line(console: Console, scenario: Scenario, session: str | None = None) -> Iterator[Watcher]:
+def progress_line(console: Console, scenario: Scenario) -> Iterator[Watcher]:
     """Show the progress of a run while the context lasts."""
     live = console.is_terminal and not console.is_dumb_terminal
     columns = (BarColumn(bar_width=12), TextColumn("{task.description}"))
     with Progress(*columns, console=console, disable=not live, transient=False) as progress:
-        shown = _RunProgress(console, progress, scenario, session)
+        shown = _RunProgress(console, progress, scenario)
         yield Watcher(
             waiting=shown.waiting,
             listening=shown.listening,
             started=shown.started,
-            failed=shown.failed,
-            restarted=shown.restarted,
             progress=shown.update,
             stopping=shown.stopping,
             notice=shown.notice,
@@ -72,9 +69,8 @@ def progress_line(console: Console, scenario: Scenario, session: str | None = No
 class _RunProgress:
     """What has been shown of a run."""
 
-    def __init__(self, console: Console, progress: Progress, scenario: Scenario, session: str | None) -> None:
+    def __init__(self, console: Console, progress: Progress, scenario: Scenario) -> None:
         self._console, self._progress, self._scenario = console, progress, scenario
-        self._options = "" if session in (None, DEFAULT_SESSION) else f" --session {session}"
         self._task: TaskID | None = None
         self._plain_lines = 0
         self._lines: dict[str, int] = {}
@@ -102,19 +98,6 @@ class _RunProgress:
     def started(self, run_dir: Path) -> None:
         """Begin the bar."""
         self._task = self._progress.add_task(self._scenario.name, total=self._scenario.horizon_s)
-
-    def failed(self, why: str, t_s: float, by_hand: str | None) -> None:
-        """Name a process that failed and may be restarted."""
-        remedy = (
-            "the process is restarted"
-            if by_hand is None
-            else f"restart it with: noack {by_hand}{self._options}"
-        )
-        self._print(f"{escape(why)} at {t_s:.1f} s; the run goes on, {remedy}")
-
-    def restarted(self, role: str, t_s: float) -> None:
-        """Name a process that runs again."""
-        self._print(f"{role} runs again at {t_s:.1f} s")
 
     def stopping(self, why: str) -> None:
         """Say why the run ends early: the completion of its record may take minutes."""

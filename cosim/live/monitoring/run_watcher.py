@@ -1,7 +1,6 @@
 """What follows a launched run: callbacks, several of them together, the log, and the metrics."""
 
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
@@ -42,10 +41,6 @@ class Watcher:
     """Processes on other hosts can join at this address."""
     started: Callable[[Path], None] = lambda run_dir: None
     """The loop has started; its run directory exists."""
-    failed: Callable[[str, float, str | None], None] = lambda why, t_s, by_hand: None
-    """A process failed; the role is given if it must be restarted by hand."""
-    restarted: Callable[[str, float], None] = lambda role, t_s: None
-    """A process that failed runs again."""
     progress: Callable[[RunProgress], None] = lambda progress: None
     """The recorder has sent a progress report."""
     stopping: Callable[[str], None] = lambda why: None
@@ -126,16 +121,12 @@ class RunMetrics:
         self._directory = ""
         self._report: RunProgress | None = None
         self._waiting = 0
-        self._failures: Counter[str] = Counter()
-        self._restarts: Counter[str] = Counter()
 
     def watcher(self) -> Watcher:
         """Return the callbacks of the launcher."""
         return Watcher(
             waiting=self._wait,
             started=self._start,
-            failed=self._fail,
-            restarted=self._restart,
             progress=self._progress,
         )
 
@@ -144,12 +135,6 @@ class RunMetrics:
 
     def _start(self, run_dir: Path) -> None:
         self._directory = str(run_dir)
-
-    def _fail(self, why: str, t_s: float, by_hand: str | None) -> None:
-        self._failures["process"] += 1
-
-    def _restart(self, role: str, t_s: float) -> None:
-        self._restarts[role] += 1
 
     def _progress(self, report: RunProgress) -> None:
         self._report = report
@@ -172,11 +157,6 @@ class RunMetrics:
             ("missing_processes", "processes that the start barrier waits for", self._waiting),
         ):
             yield GaugeMetricFamily(f"{_PREFIX}_{name}", text, value)
-        restarts = CounterMetricFamily(f"{_PREFIX}_restarts", "restarted processes", labels=["process"])
-        for role, count in self._restarts.items():
-            restarts.add_metric([role], count)
-        yield restarts
-        yield CounterMetricFamily(f"{_PREFIX}_failures", "processes that failed", self._failures.total())
         if (report := self._report) is None:
             return
         for name, (key, text) in _GAUGES.items():

@@ -1,8 +1,7 @@
 """The fork server: a process that imports what a run needs once, and forks the run's processes.
 
-Otherwise each process would spend a third of a second on the same imports, when it starts and when
-it is restarted. The server has one thread, so that it can be forked, and ends with its launcher.
-Linux only.
+Otherwise each process would spend a third of a second on the same imports when it starts. The server
+has one thread, so that it can be forked, and ends with its launcher. Linux only.
 
 A command that begins a run imports what it has in common with the processes, and then forks the
 server of itself: these imports, most of all, are done once. The server imports the rest while the

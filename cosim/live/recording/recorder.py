@@ -35,7 +35,7 @@ from noack.protocol.record_tables import (
     SENSOR_MEASUREMENT,
     effective,
 )
-from noack.protocol.roles import BEGINNING, LOOP_ROLES, RECORDER, RESTART, Notice, Start
+from noack.protocol.roles import LOOP_ROLES, RECORDER, Notice
 from noack.runtime.command_line import print_to_stderr
 from noack.runtime.connections.zenoh_session import header_of
 from noack.runtime.control_messages import ChangeAnnouncement, ProcessReport, RunProgress, message_json
@@ -59,8 +59,6 @@ if TYPE_CHECKING:
     from cosim.output.viewer.recording_viewer import LiveView
     from cosim.output.viewer.run_recording import RunRecording
 
-_DISCOVERY_S = 5.0
-"""By then a restarted recorder has received the tokens of all running processes."""
 _MOST_LINES = 30
 """Warnings in the progress report."""
 _POLL_FOR_S = 0.2
@@ -78,15 +76,11 @@ _STOP_TIMEOUT_S = 8.0
 
 
 class ProcessTokens:
-    """Which processes of the loop have been in the run, and which are gone.
+    """Which processes of the loop have been in the run, and which are gone."""
 
-    With ``restarted``, a process without a token ended before the recorder was restarted.
-    """
-
-    def __init__(self, plane: ControlPlane, *, restarted: bool) -> None:
+    def __init__(self, plane: ControlPlane) -> None:
         self._plane = plane
-        self._restarted = restarted
-        self._began_s = self._connected_s = time.monotonic()
+        self._connected_s = time.monotonic()
         self._changes = plane.session.liveliness().declare_subscriber(
             plane.key("alive", "*", "*"), RingChannel(256), history=True
         )
@@ -105,19 +99,17 @@ class ProcessTokens:
         """Whether each process has reported its end, or is gone.
 
         A token may vanish because a busy machine broke a connection, also the recorder's own. The
-        process is gone if it does not come back, or if one that replaced it has reported. A run
-        that is ``stopping`` does not wait for it.
+        process is gone if it does not come back. A run that is ``stopping`` does not wait for it.
         """
         now_s = time.monotonic()
         if self._plane.coordinator_gone():
             self._connected_s = now_s
             return False
         disconnect_timeout_s = 0.0 if stopping else LAUNCHED_LOST_S
-        discovered = self._restarted and now_s - self._began_s > _DISCOVERY_S
 
         def is_done(known: Mapping[str, float]) -> bool:
             if not known:
-                return discovered
+                return False
             waiting = [vanished for instance, vanished in known.items() if instance not in reported]
             if len(waiting) < len(known):
                 return math.inf not in waiting
@@ -169,12 +161,10 @@ class Recorder:
         run_dir: Path,
         plane: ControlPlane,
         live: str | None = None,
-        *,
-        start: Start = BEGINNING,
     ) -> None:
         self._run_dir = run_dir
         self._plane = plane
-        self.store = TelemetryStore(scenario, run_dir, plane.instance, start)
+        self.store = TelemetryStore(scenario, run_dir)
         self._scenario = scenario
         self._feed: LiveFeed | None = None
         self.lost: MachineError | None = None
@@ -189,18 +179,15 @@ class Recorder:
             RingChannel(max(_WAITING_BATCHES // len(loop_names(scenario)), _LEAST_BATCHES)),
         )
         self._report_queries = session.declare_queryable(key("report", "*"), FifoChannel(64))
-        self._tokens = ProcessTokens(plane, restarted=start.is_restart)
+        self._tokens = ProcessTokens(plane)
         self._reports: dict[str, tuple[str, ProcessReport]] = {}
         """Roles and final reports, by instance."""
-        self.view_is_incomplete = start.is_restart
+        self.view_is_incomplete = False
         """Whether batches came late or out of order, so that the view must be written again."""
         self._invalid = 0
         self._progress = ProgressReport(
             t_s=0.0, events=0, deliveries=0, longest_loss_burst=0, x_norm=None, live=live
         )
-        if start.is_restart:
-            self._monitor.stop("the recorder was restarted")
-            self.store.load(self._progress.count)
 
     @cached_property
     def _monitor(self) -> "ClaimMonitor":
@@ -285,12 +272,8 @@ class Recorder:
 
     def report(self) -> None:
         """Write the final reports of the processes; raise MachineError if that fails."""
-        defaults = {"generation": 0, "instance": ""}
         reports = self._reports.values()
-        write_reports(
-            self._run_dir,
-            [defaults | report.fields() | {"process": role} for role, report in reports],
-        )
+        write_reports(self._run_dir, [report.fields() | {"process": role} for role, report in reports])
 
     def _take(self, sample: zenoh.Sample) -> None:
         role, table = str(sample.key_expr).split("/")[-2:]
@@ -298,14 +281,14 @@ class Recorder:
         try:
             if (header := header_of(sample)) is None:
                 raise PeerError("it was sent with another key")
-            generation, first = first_row(header)
+            first = first_row(header)
             if table == NOTICES and role in LOOP_ROLES:
-                lines = self.store.add_notices(role, generation, first, payload)
+                lines = self.store.add_notices(role, first, payload)
                 if self._feed is not None:
                     for line in lines:
                         self._feed.log(line)
             else:
-                rows, follows = self.store.add_rows(role, table, generation, first, payload)
+                rows, follows = self.store.add_rows(role, table, first, payload)
                 self._take_rows(table, rows, follows=follows)
         except (PeerError, ValueError) as error:
             if not self._invalid:
@@ -382,7 +365,7 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     with join_run(RECORDER, ()) as process, ExitStack() as stack:
         stack.enter_context(active_run(Path(process.descriptor.run_dir)))
         live_view = None
-        if live and not process.start.is_restart:
+        if live:
             live_view = recording_viewer.LiveView()
             stack.callback(live_view.close)  # it would not exit by itself
         _record(process, live_view)
@@ -396,16 +379,12 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
     # load: the other processes do not wait for them.
     view = _open_view(process, live_view) if live_view else None
     status = live_view.status if live_view else None
-    recorder = Recorder(process.scenario, run_dir, process.plane, status, start=process.start)
-    if process.replaces is not None:
-        recorder.store.add_own_notice(
-            Notice(process.start.from_ns, RESTART, f"restarted: {process.replaces}")
-        )
+    recorder = Recorder(process.scenario, run_dir, process.plane, status)
     process.join(None)
     core.noack_prefer_others()  # without real-time settings, the loop would wait for milliseconds
-    # The launcher writes the view of a restarted recorder, of a long run, and of several loops.
+    # The launcher writes the view of a long run, and of several loops.
     unseen = len(process.phases_ns) > 1 or is_long(process.scenario)
-    can_record = rerun_program.is_installed() and not (process.start.is_restart or unseen)
+    can_record = rerun_program.is_installed() and not unseen
     if view is not None or can_record:
         try:
             view = view or _open_view(process, None)

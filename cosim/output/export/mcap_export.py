@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 SUFFIX = ".mcap"
 _CHUNK_BYTES = 2**20
 _SEQUENCE_MASK = 0xFFFF_FFFF  # MCAP's sequence numbers have 32 bits
-_LEVELS = {"info": 2, "restart": 3, "warning": 3, "error": 4}
+_LEVELS = {"info": 2, "warning": 3, "error": 4}
 """Numbers of the levels of foxglove.Log."""
 ERRORS, LOG = "/loop/errors", "/log"
 _SCHEMA_DIALECT = "https://json-schema.org/draft/2020-12/schema"
@@ -45,7 +45,7 @@ _SCHEMAS = json.loads(Path(__file__).with_name("mcap_schemas.json").read_bytes()
 Message = tuple[int, int, int, bytes]
 """Log time, publish time, sequence, and content."""
 _ROS_SUFFIX = ".ros2.mcap"
-_ROS_LEVELS = {"warning": 30, "restart": 30, "error": 40}
+_ROS_LEVELS = {"warning": 30, "error": 40}
 _ROS_INFO = 20
 """Numbers of the levels of ROS 2; the second is that of all others."""
 

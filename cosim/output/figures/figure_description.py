@@ -6,13 +6,13 @@ Arrays may have any length, including 0. Values that are not finite are drawn as
 """
 
 import math
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
+from cosim.output.curves import DASHED, SOLID, Dash
 from cosim.output.figures import palette
 from cosim.output.figures.palette import Colour
 from cosim.record.align import Reals
@@ -22,25 +22,11 @@ TIME = "time t [s]"
 LARGEST = 1e150
 """Larger values are not drawn."""
 
-Dash = tuple[float, ...]
-"""Lengths of strokes and gaps, in widths of the line; empty: a solid line."""
-SOLID: Dash = ()
-DASHED: Dash = (6, 2.5)
 DOTTED: Dash = (1, 1.6)
-DASHES: tuple[Dash, ...] = (SOLID, (6, 1.5), (2, 1.2), (6, 1.5, 1.5, 1.5))
-"""Dashes that distinguish series in addition to their colours."""
 MARKERS = "os^Dv<>PXph*"
 """Markers that distinguish series in addition to their colours, by matplotlib's names."""
 Steps = Literal["", "pre", "mid", "post"]
 """Whether a curve is a staircase, and where its steps are."""
-BoundKind = Literal["certified", "identity", "printed"]
-"""Source of a bound: a certificate, identity (I1), or ("printed") a formula of the paper."""
-_BOUND_STYLES: dict[BoundKind, tuple[Colour, tuple[Dash, ...]]] = {
-    # There may be several certificates, for different conditions.
-    "certified": (palette.CERTIFIED, (DASHED, (3, 1.5), (6, 2, 1.5, 2), (10, 3))),
-    "identity": (palette.IDENTITY, ((1.2, 1.4),)),
-    "printed": (palette.PRINTED, ((6, 1.5, 1, 1.5, 1, 1.5),)),
-}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -267,21 +253,6 @@ def time_axis(t_s: Reals, *, numbers: bool = True, label: str = TIME) -> Axis:
         start = 0.0 if 0 <= t_s[0] < 0.05 * t_s[-1] else float(t_s[0])
         ends = (start, float(t_s[-1]))
     return Axis(label=label if numbers else "", ends=ends, numbers=numbers)
-
-
-def bound_lines(bounds: Iterable[tuple[str, Reals, Reals, BoundKind]]) -> list[Line]:
-    """Return the curves of bounds; each kind has its colour, each bound of a kind its dashes.
-
-    A bound has a label, points (k,), values (k,) and its source.
-    """
-    lines, counts = [], Counter[BoundKind]()
-    for label, x, y, kind in bounds:
-        colour, dashes = _BOUND_STYLES[kind]
-        dash = dashes[counts[kind] % len(dashes)]
-        counts[kind] += 1
-        y = finite(y, positive=True)  # a gap after a reset shows the curve behind
-        lines.append(Line(x=x, y=y, label=label, colour=colour, dash=dash, width=1.6))
-    return lines
 
 
 def series_colour(i: int) -> Colour:

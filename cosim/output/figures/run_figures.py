@@ -9,18 +9,28 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
+from itertools import groupby
 from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.claims.claim_evaluation import claims_of
+from cosim.output.curves import (
+    BoundKind,
+    Curve,
+    Quantity,
+    bound_curves,
+    error_curves,
+    input_curves,
+    norm_curve,
+    state_curves,
+    transmission_curves,
+)
 from cosim.output.figures import palette
 from cosim.output.figures.figure_description import (
-    DASHES,
     Axis,
     Bars,
-    BoundKind,
     FigureDescription,
     Item,
     Line,
@@ -28,14 +38,13 @@ from cosim.output.figures.figure_description import (
     Panel,
     PanelRow,
     Rule,
-    bound_lines,
     finite,
     label_text,
     one_panel,
     series_colour,
     time_axis,
 )
-from cosim.output.figures.palette import CONTROLLER, FORCED, LOST, PLANT, SENSOR, THRESHOLD, Colour
+from cosim.output.figures.palette import CONTROLLER, FORCED, LOST, SENSOR
 from cosim.output.figures.timing_figures import (
     clock_errors,
     clocks_figure,
@@ -56,7 +65,7 @@ from noack.protocol.wire_format import Flow
 from noack.scenario.scenario import Scenario
 
 Flags = NDArray[np.bool_]
-Envelope = tuple[str, Literal["e_c", "x", "inter_event"], Reals, Reals, BoundKind]
+Envelope = tuple[str, Quantity, Reals, Reals, BoundKind]
 """A bound: label, bounded quantity, times in s (k,), values (k,), source."""
 
 BOUNDED = ("errors", "state-norm", "inter-event")
@@ -70,6 +79,16 @@ _DECADES = 6
 _FAR_RATIO, _FAR_OPACITY = 20.0, 0.45
 """A bound that is mostly over this ratio times the curve is drawn with this opacity."""
 _MOST_NUMBERED_BARS = 12
+_SYMBOLS = {
+    "x": "$x$",
+    "x_s": "$x_s$",
+    "x_c": "$x_c$",
+    "x̂": r"$\hat{x}$",
+    "‖x‖": r"$\|x\|$",
+    "‖e_s‖": r"$\|e_s\|$",
+    "‖e_c‖": r"$\|e_c\|$",
+}
+"""The symbols with which the names of curves begin, and how a figure writes them."""
 
 
 def run_figures(
@@ -88,9 +107,9 @@ def run_figures(
         with np.errstate(all="ignore"):  # a diverged run has figures, too
             return _thinned(record)
 
-    def bounds(quantity: str) -> list[Line]:
-        curves = (curve for curve in certified if curve[1] == quantity)
-        return bound_lines((label, t_s, values, kind) for label, _, t_s, values, kind in curves)
+    def bounds(quantity: Quantity) -> list[Line]:
+        curves = bound_curves(envelope for envelope in certified if envelope[1] == quantity)
+        return [_bound_line(curve) for curve in curves]
 
     figures = {
         "states": lambda: _states(record, aligned()),
@@ -108,6 +127,43 @@ def run_figures(
     if errors := clock_errors(record):
         figures["clocks"] = lambda: clocks_figure(record.scenario, errors)
     return figures
+
+
+def run_curves(record: RunRecord) -> list[Curve]:
+    """Return the curves of a loop: states, errors, ‖x‖, inputs, transmissions, certified bounds."""
+    with np.errstate(all="ignore"):  # a diverged run has curves, too
+        samples = _thinned(record)
+    events = record.events()
+    delivered = np.isin(events["event"], record.columns(CONTROLLER_DELIVERY, "sequence")["sequence"])
+    return [
+        *_states_of(record, samples),
+        *_errors_of(samples.run),
+        norm_curve(*_decimated(record, PLANT_STEP, "x", row_norms)),
+        *input_curves(record.loop.input_names, *_decimated(record, CONTROLLER_STEP, "u")),
+        *transmission_curves(_seconds(events["t_ns"]), delivered),
+        *bound_curves(envelopes(record)),
+    ]
+
+
+def _line(curve: Curve, order: float = 2.0) -> Line:
+    """Return a curve for a figure, whose text names it by its symbol."""
+    symbol, _, source = curve.name.partition(" ")
+    label, style = f"{_SYMBOLS.get(symbol, symbol)} {source}".strip(), curve.style
+    return Line(
+        x=curve.t_s,
+        y=curve.values,
+        label=label,
+        colour=style.colour,
+        width=style.width,
+        dash=style.dash,
+        steps="post" if style.is_held else "",
+        order=order,
+    )
+
+
+def _bound_line(curve: Curve) -> Line:
+    """Return the curve of a bound, with gaps where it is 0: they show the curve behind."""
+    return replace(_line(curve), label=curve.name, y=finite(curve.values, positive=True))
 
 
 def envelopes(record: RunRecord) -> Sequence[Envelope]:
@@ -166,38 +222,6 @@ def _decimated(
 # States, and times of transmissions and deliveries
 
 
-class Trajectory(NamedTuple):
-    """The states of a loop at k times."""
-
-    names: Sequence[str]
-    """Of the n states."""
-    t_s: Reals
-    x: Reals
-    """(k, n) of the plant."""
-    x_s: Reals
-    """(k, n) of the sensor's model."""
-    x_c: Reals
-    """(k, n) of the controller's model; NaN where unknown."""
-    x_hat: Reals | None = None
-    """(k, n) the sensor's estimate of x; None if it measures x exactly."""
-
-    def items(self, i: int) -> list[Item]:
-        """Describe state i; curves in front are thinner, so that equal curves stay visible."""
-
-        def line(x: Reals, label: str, colour: Colour, width: float, order: float) -> Line:
-            return Line(x=self.t_s, y=x[:, i], label=label, colour=colour, width=width, order=order)
-
-        items = [
-            line(self.x, "$x$ plant", PLANT, 4.2, 2.0),
-            line(self.x_s, "$x_s$ sensor", SENSOR, 1.3, 2.2),
-            line(self.x_c, "$x_c$ controller", CONTROLLER, 2.4, 2.1),
-        ]
-        if self.x_hat is not None:
-            estimate = line(self.x_hat, r"$\hat{x}$ sensor", SENSOR, 1.0, 2.3)
-            items.insert(1, replace(estimate, dash=(1, 1)))
-        return [*items]
-
-
 class Transmissions(NamedTuple):
     """The transmissions of a loop, and which of them arrived."""
 
@@ -212,27 +236,34 @@ class Transmissions(NamedTuple):
 
 
 def states_figure(
-    mode: Literal["model", "zoh"], title: str, states: Trajectory, transmissions: Transmissions
+    mode: Literal["model", "zoh"],
+    title: str,
+    t_s: Reals,
+    states: Sequence[Curve],
+    transmissions: Transmissions,
 ) -> FigureDescription:
     """States, and broadcasting and receiving intervals: the paper's Fig. 2 and 3.
 
     Args:
         mode: ``model`` is the paper's MB-ET (Fig. 2), ``zoh`` its ZOH-ET (Fig. 3).
         title: shown after "MB-ET" or "ZOH-ET".
-        states: the first 16 states are drawn.
+        t_s: the times of the run.
+        states: their curves; the first 16 states are drawn.
         transmissions: what was sent and received.
     """
-    n, t_s = len(states.names), states.t_s
+    by_state = [(name, [*curves]) for name, curves in groupby(states, lambda curve: curve.panel)]
+    n = len(by_state)
     count = min(n, _MOST_STATES)
     # A panel for each state; below, both kinds of intervals with a common vertical axis.
     panels = [
         Panel(
-            items=states.items(i),
+            # Curves in front are thinner, so that equal curves stay visible.
+            items=[_line(curve, order=2.5 - 0.1 * curve.style.width) for curve in curves],
             x=time_axis(t_s),
-            y=Axis(label=label_text(states.names[i])),
+            y=Axis(label=label_text(name)),
             legend=() if i else None,
         )
-        for i in range(count)
+        for i, (name, curves) in enumerate(by_state[:count])
     ]
     columns = _state_columns(count)
     times_s = transmissions.sent_s, transmissions.received_s
@@ -308,10 +339,9 @@ def _states(record: RunRecord, aligned: _Thinned) -> FigureDescription:
         np.isin(deliveries["sequence"], outcomes.sequence[outcomes.fate == Fate.FORCED]),
     )
     scenario, names = record.scenario, record.loop.state_names
-    x, x_hat = (run.x, None) if aligned.true_x is None else (aligned.true_x, run.x)
-    states = Trajectory(names, _seconds(run.t_ns), x, run.x_s, run.x_c, x_hat)
-    known = "x" if scenario.coverage.knows_state else "x̂"
-    return states_figure(scenario.mode, scenario.name, states, transmissions).captioned(
+    known, states = "x" if scenario.coverage.knows_state else "x̂", _states_of(record, aligned)
+    figure = states_figure(scenario.mode, scenario.name, _seconds(run.t_ns), states, transmissions)
+    return figure.captioned(
         "States, and the times between transmissions and between deliveries: each stem is the time "
         "since the one before, so the first packet has none. "
         + scenario.protocol.states_caption.format(known=known)
@@ -322,6 +352,16 @@ def _states(record: RunRecord, aligned: _Thinned) -> FigureDescription:
         f"lost, and for {len(deliveries)} deliveries, of which {int(transmissions.forced.sum())} were "
         "forced.",
     )
+
+
+def _states_of(record: RunRecord, samples: _Thinned) -> list[Curve]:
+    run, true_x = samples
+    x, x_hat = (run.x, None) if true_x is None else (true_x, run.x)
+    return state_curves(record.loop.state_names, _seconds(run.t_ns), x, run.x_s, run.x_c, x_hat)
+
+
+def _errors_of(run: AlignedRun) -> list[Curve]:
+    return error_curves(_seconds(run.t_ns), run.e_s_norm, run.e_c_norm, run.threshold)
 
 
 def _estimate_text(scenario: Scenario) -> str:
@@ -360,25 +400,20 @@ def _is_far(bound: Line, curves: Sequence[Line]) -> bool:
 
 
 def _errors(scenario: Scenario, run: AlignedRun, bounds: list[Line]) -> FigureDescription:
-    t_s, e_s, e_c = _seconds(run.t_ns), run.e_s_norm, run.e_c_norm
-    lines = [
-        Line(x=t_s, y=e_c, label=r"$\|e_c\|$ controller", colour=CONTROLLER, width=2.6),
-        Line(x=t_s, y=e_s, label=r"$\|e_s\|$ sensor", colour=SENSOR, width=1.1),
-        Line(x=t_s, y=run.threshold, label="threshold", colour=THRESHOLD, width=1.8),
-    ]
+    lines = [_line(curve) for curve in _errors_of(run)]
     relative = " Both are relative to x̂, the sensor's estimate of x."
     return _norms("errors", "Error norms", lines, 2.7, bounds).captioned(
         scenario.protocol.error_caption
         + ("" if scenario.coverage.knows_state else relative)
         + _dashed(bounds),
         "Error norms over time on a logarithmic axis: "
-        f"‖e_s‖ up to {largest_text(e_s)}, ‖e_c‖ up to {largest_text(e_c)}.",
+        f"‖e_s‖ up to {largest_text(run.e_s_norm)}, ‖e_c‖ up to {largest_text(run.e_c_norm)}.",
     )
 
 
 def _state_norm(record: RunRecord, bounds: list[Line]) -> FigureDescription:
     t_s, norm = _decimated(record, PLANT_STEP, "x", row_norms)
-    line = Line(x=t_s, y=norm, label=r"$\|x\|$ plant", colour=PLANT, width=2.4)
+    line = _line(norm_curve(t_s, norm))
     ends = f", from {norm[0]:.3g} to {norm[-1]:.3g}" if len(norm) else ""
     return _norms("state-norm", "Norm of the state", [line], 2.1, bounds).captioned(
         "Norm of the plant's state." + _dashed(bounds),
@@ -396,20 +431,7 @@ def _input(record: RunRecord) -> FigureDescription:
         table, title = PLANT_STEP, "Applied input"
         caption = "Input that the plant applied, also while actuations were missing."
     t_s, u = _decimated(record, table, "u")
-    m, colours = len(names), len(palette.SERIES)
-    lines = [
-        Line(
-            x=t_s,
-            y=u[:, i],
-            label=label_text(name) or f"u_{i + 1}",
-            colour=series_colour(i),
-            dash=DASHES[i // colours % len(DASHES)],
-            steps="post",
-            # Inputs often coincide: the first ones are wider, and stay visible under the last.
-            width=1.3 + 2.6 * (m - 1 - i) / m,
-        )
-        for i, name in enumerate(names)
-    ]
+    lines = [replace(_line(curve), label=label_text(curve.name)) for curve in input_curves(names, t_s, u)]
     panel = Panel(title=title, items=lines, x=time_axis(t_s), y=Axis(label="input"))
     return one_panel("input", panel, 1.7).captioned(
         f"{caption} Equal inputs are drawn one inside the other.",

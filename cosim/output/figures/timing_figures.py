@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from cosim.analysis.summary.loop_statistics import latency_us, lateness_parts
 from cosim.analysis.summary.quantiles import QuantileSketch
+from cosim.output.curves import DASHES
 from cosim.output.figures import palette
 from cosim.output.figures.figure_description import (
-    DASHES,
     TIME,
     Axis,
     Bars,

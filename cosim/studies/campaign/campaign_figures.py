@@ -7,13 +7,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.output.curves import DASHES, Dash
 from cosim.output.figures.figure_description import (
-    DASHES,
     MARKERS,
     Axis,
     Band,
     ColourScale,
-    Dash,
     FigureDescription,
     Heat,
     Item,

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from cosim.output.curves import state_curves
 from cosim.output.figures.figure_description import FigureDescription
 from cosim.output.figures.figure_files import save_figure
-from cosim.output.figures.run_figures import Trajectory, Transmissions, states_figure
+from cosim.output.figures.run_figures import Transmissions, states_figure
 from cosim.simulation.continuous import run_continuous
 from cosim.simulation.exact_simulation import timeless
 from cosim.studies.campaign.campaign_figures import figures
@@ -152,8 +153,8 @@ def draw_figure(scenario: Scenario, draw: int, mode: str) -> FigureDescription:
     arrived = effective(fates)
     sent = Transmissions(event_s, ~arrived, event_s[arrived], fates[arrived] == Fate.FORCED)
     names = run.system.loop.state_names
-    states = Trajectory(names, samples.t_s, samples.x, samples.x_s, samples.x_c)
-    return states_figure(resolved.mode, f"draw {draw}", states, sent)
+    states = state_curves(names, samples.t_s, samples.x, samples.x_s, samples.x_c)
+    return states_figure(resolved.mode, f"draw {draw}", samples.t_s, states, sent)
 
 
 def render(document: Document) -> str:

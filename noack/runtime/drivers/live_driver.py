@@ -47,7 +47,6 @@ def run_machines(process: RunProcess, machines: LoopMachines) -> None:
     driver = LiveDriver(
         machines,
         process.wire,
-        admitted_ns=process.admitted_ns,
         spin_ns=process.spin_ns,
         coalescing_ns=process.coalescing_ns,
     )
@@ -89,7 +88,6 @@ class LiveDriver:
     Args:
         machines: the machines.
         wire: what their datagrams have in common.
-        admitted_ns: messages from before this time of the run are stale.
         spin_ns: busy-wait for this time before a tick.
         coalescing_ns: sleep for this time if the next tick is nearer, to do several at once.
     """
@@ -99,7 +97,6 @@ class LiveDriver:
         machines: LoopMachines,
         wire: Wire,
         *,
-        admitted_ns: int = 0,
         spin_ns: int = 0,
         coalescing_ns: int = 0,
     ) -> None:
@@ -116,9 +113,6 @@ class LiveDriver:
                 "scratch": ffi.cast("void *", -(-self._scratch.ctypes.data // 64) * 64),
             },
         )
-        for machine, phase_ns in zip(self._each_machine(), machines.phases_ns, strict=True):
-            machine.received.not_before_ns = admitted_ns - phase_ns
-            machine.acknowledgements.not_before_ns = admitted_ns - phase_ns
         self._check()
         _raise_error(core.noack_driver_open(self.core))
         self.close = weakref.finalize(self, core.noack_driver_close, self.core)

@@ -77,7 +77,7 @@ class NodeDriver(LiveDriver):
     def __init__(
         self, process: RunProcess, machines: LoopMachines, settings: ProgramControllerSettings
     ) -> None:
-        super().__init__(machines, process.wire, admitted_ns=process.admitted_ns)
+        super().__init__(machines, process.wire)
         # The file's name alone: the process is given a copy in the run directory.
         self._label = f"controller.file ({Path(settings.file).name})"
         self._key, self._sockets = process.descriptor.key, list[socket.socket]()

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from noack.core.clock import NS_PER_S, RunClock, clock_identity
 from noack.core.errors import PeerError
 from noack.protocol.record_tables import LOST_NS, clock_table
-from noack.protocol.roles import Notice, Record, Start
+from noack.protocol.roles import Notice, Record
 from noack.runtime.address import Address, address_text
 from noack.runtime.host_clocks.clock_offset import SLEW_PPB, ClockOffset, Restart, RestartCause, SlewedClock
 from noack.runtime.host_clocks.time_exchange import HostClocks, TimeClient
@@ -194,7 +194,6 @@ class ClockRecord:
 
     Args:
         role: the process.
-        start: where in the run it begins; a restarted process numbers its rows above all others.
         clock: its clock in the run.
         reference: what follows the coordinator's clock; None if the process reads that clock.
         has_table: whether the run has the table.
@@ -203,7 +202,6 @@ class ClockRecord:
     def __init__(
         self,
         role: str,
-        start: Start,
         clock: RunClock,
         reference: ReferenceClock | None,
         *,
@@ -211,7 +209,7 @@ class ClockRecord:
     ) -> None:
         self._role, self._clock, self._reference = role, clock, reference
         self._has_table = has_table
-        self._number = start.first_number
+        self._number = 0
         self._since_ns = monotonic_ns()
         self._lost: str | None = None
         self._largest_ns = 0

@@ -28,11 +28,9 @@ def test_check_prints_the_defaults_that_depend_on_other_keys(tmp_path: Path, con
 
     silent = message()
     assert "watchdog: policy hold" in silent
-    assert "rejoin_within_s: 0" in silent
     content["plant"]["watchdog"] = {"timeout_s": 0.2}
     assert "timeout_input: no effect" not in silent
     content["controller"] = {"safe_input": [0.1], "timeout_input": "hold"}
-    content["recovery"] = {"rejoin_within_s": 5.0}
     content["start_within_s"] = 60.0
     content["trigger"] = {"policy": "periodic", "period_s": 0.0031}
     explicit = message()

@@ -1,7 +1,6 @@
-"""Which processes the launcher restarts, when it ends the run, and the reason it reports."""
+"""When the launcher ends a run, and the reason it reports."""
 
 import signal
-import time
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, cast
@@ -13,7 +12,7 @@ from cosim.live.finalize import reopen
 from cosim.live.launcher import _Run, launch
 from cosim.live.monitoring.run_watcher import Watcher
 from cosim.live.processes.child_processes import ChildProcesses, EndReason
-from noack.core.errors import CallerError, ExitStatus, MachineError
+from noack.core.errors import CallerError, ExitStatus
 from noack.protocol.roles import RECORDER, ROLES
 from noack.runtime import command_line
 from noack.runtime.command_line import Signals, StopRequestError
@@ -21,7 +20,6 @@ from noack.runtime.run_descriptor import descriptor_file, new_descriptor
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 
-KILLED = "sensor died: killed by SIGKILL"
 LOG = "noack sensor: no room\n"
 
 
@@ -47,7 +45,6 @@ class FakeCoordinator:
     def __init__(self, now_s: float, exiting: str = "", **failures: str) -> None:
         self._now_s, self._exiting, self._failures = now_s, exiting, failures
         self._running: tuple[str, ...] = ROLES
-        self.restarts: list[str] = []
         self.joined: dict[str, Any] = {}
 
     def now_ns(self) -> int:
@@ -55,9 +52,6 @@ class FakeCoordinator:
 
     def failures(self) -> dict[str, str]:
         return self._failures
-
-    def running_generation(self, role: str) -> None:
-        return None
 
     def is_over(self, role: str) -> bool:
         return role not in self._running
@@ -71,9 +65,6 @@ class FakeCoordinator:
     def await_reported_failure(self, role: str) -> str | None:
         return "the disk is full"
 
-    def allow_restart(self, role: str, failure: str, *, dead: bool) -> None:
-        self.restarts.append(role)
-
 
 class FakeChildren(ChildProcesses):
     """All processes run except the sensor, which has exited."""
@@ -81,22 +72,16 @@ class FakeChildren(ChildProcesses):
     def __init__(self, descriptor: Any, run_dir: Path, code: int | None) -> None:
         super().__init__(descriptor, run_dir, ROLES)
         self._children = cast(Any, {role: Child() for role in ROLES} | {"sensor": Child(code)})
-        self.can_start = True
-
-    def _start(self, role: str, *, live: bool) -> Any:
-        if not self.can_start:
-            raise MachineError(f"{role} cannot be started: no more processes")
-        return Child()
 
     def exit(self, role: str, code: int) -> None:
         cast(Any, self._children[role]).code = code
 
 
 class Case:
-    """A run of one second whose scenario allows restarts."""
+    """A run of one second."""
 
     def __init__(self, content: dict[str, Any], run_dir: Path) -> None:
-        resolved = resolve(validate(content | {"recovery": {"rejoin_within_s": 60}}, ""))
+        resolved = resolve(validate(content, ""))
         self.descriptor = new_descriptor(resolved, run_dir, launched=True)
         self.run_dir = run_dir
         (run_dir / "logs").mkdir()
@@ -119,47 +104,24 @@ def case(content: dict[str, Any], tmp_path: Path) -> Case:
 @pytest.mark.parametrize(
     ("code", "now_s", "log", "expected"),
     [
-        (-9, 0.5, LOG, None),
-        (143, 0.5, LOG, None),
-        (-9, 1.0, LOG, (ExitStatus.FAILED, KILLED)),  # after the horizon
+        (None, 0.5, LOG, None),
+        (-9, 0.5, LOG, (ExitStatus.FAILED, "sensor died: killed by SIGKILL")),
+        (143, 0.5, LOG, (ExitStatus.FAILED, "sensor ended early: SIGTERM")),
         (1, 0.5, LOG, (ExitStatus.FAILED, "sensor: no room")),
         (2, 0.5, f"{LOG}ERROR of a library\n", (ExitStatus.CALLER, "sensor: no room")),
         (1, 0.5, "ERROR of a library\n", (ExitStatus.FAILED, "sensor: the disk is full")),
         (1, 0.5, None, (ExitStatus.FAILED, "sensor: the disk is full")),
     ],
 )
-def test_only_a_killed_process_is_restarted(
-    case: Case, code: int, now_s: float, log: str | None, expected: EndReason | None
+def test_a_process_that_fails_ends_the_run_with_its_reason(
+    case: Case, code: int | None, now_s: float, log: str | None, expected: EndReason | None
 ) -> None:
     """The reason is taken from the log, or else from the report."""
     case.log.unlink()
     if log is not None:
         case.log.write_text(log)
     coordinator = FakeCoordinator(now_s)
-    assert case.run(case.children(code), coordinator)._policy.check() == expected
-    assert coordinator.restarts == ["sensor"] * (expected is None)
-
-
-def test_a_restart_that_fails_ends_the_run_with_both_reasons(
-    case: Case, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    children = case.children(-9)
-    children.can_start = False
-    reason = f"{KILLED}; sensor cannot be started: no more processes"
-    assert case.run(children, FakeCoordinator(0.5))._policy.check() == (ExitStatus.FAILED, reason)
-    children = case.children(-9)
-    policy = case.run(children, FakeCoordinator(0.5))._policy
-    assert policy.check() is None
-    assert policy.unfinished() == (ExitStatus.FAILED, f"{KILLED}; not restarted before the end")
-    with monkeypatch.context() as patch:
-        now_s = time.monotonic()
-        patch.setattr(time, "monotonic", lambda: now_s + 61.0)
-        late = (ExitStatus.FAILED, f"{KILLED}; not restarted within 60 s")
-        assert policy.check() == late
-    policy = case.run(children := case.children(-9), FakeCoordinator(0.5))._policy
-    assert policy.check() is None
-    children.exit("sensor", 2)
-    assert policy.check() == (ExitStatus.CALLER, f"{KILLED}; restarted, sensor: no room")
+    assert case.run(case.children(code), coordinator)._failure() == expected
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,6 @@ from cosim.record.align import (
 from cosim.record.run_record import Rows
 from noack.core.linear_systems import ModelFlow
 from noack.protocol.record_tables import NO_SEQUENCE
-from noack.protocol.roles import GENERATION
 from noack.scenario.resolution import LoopMatrices
 from noack.scenario.scenario import Scenario
 from tests.helpers.shipped import resolved
@@ -60,13 +59,11 @@ def deliveries(*rows: tuple[int, int, list[float], int]) -> Rows:
     return np.array([(number, t_ms * MS, *rest) for number, t_ms, *rest in rows], DELIVERY)
 
 
-def align(
-    track: ControllerTrack, t_ms: list[int], until_ms: int = 1000, *, generation: int = 0, **more: Any
-) -> AlignedRun:
-    """Align measurements of x = x_s = 0, without events, of a generation of the sensor."""
+def align(track: ControllerTrack, t_ms: list[int], until_ms: int = 1000, **more: Any) -> AlignedRun:
+    """Align measurements of x = x_s = 0, without events."""
     rows = np.zeros(len(t_ms), MEASUREMENT)
     rows["t_ns"], rows["event"] = np.array(t_ms) * MS, NO_SEQUENCE
-    rows["input"] = generation * GENERATION + np.arange(len(t_ms))
+    rows["input"] = np.arange(len(t_ms))
     return align_measurements(LOOP, rows, track, until_ms * MS, **more)
 
 
@@ -81,10 +78,10 @@ def scenario(initial_sync: str) -> Scenario:
 TICKS = steps(
     (1, 10, [9.0, 9.0]),
     (3, 20, [1.5, 1.25]),
-    (GENERATION, 40, [7.0, 7.0]),
-    (GENERATION + 2, 60, [0.5, 0.25]),
+    (4, 40, [7.0, 7.0]),
+    (6, 60, [0.5, 0.25]),
 )
-UPDATES = deliveries((2, 10, [2.0, 1.0], 0), (GENERATION + 1, 50, [3.0, 4.0], 6))
+UPDATES = deliveries((2, 10, [2.0, 1.0], 0), (5, 50, [3.0, 4.0], 6))
 
 
 def test_the_newest_state_is_propagated_to_each_measurement() -> None:
@@ -100,14 +97,6 @@ def test_the_newest_state_is_propagated_to_each_measurement() -> None:
     np.testing.assert_allclose(aligned.x_c, expected, rtol=1e-14)
     assert aligned.received.tolist() == [NO_SEQUENCE, 0, 0, 0, 0, NO_SEQUENCE]
     np.testing.assert_allclose(aligned.e_c_norm, np.linalg.norm(expected, axis=1), rtol=1e-14)
-
-
-def test_a_restarted_controller_has_no_state_before_its_first_update() -> None:
-    aligned = align(controller_track(START, TICKS, UPDATES), [20, 21, 40, 45, 50, 55, 60])
-    nothing = [math.nan, math.nan]
-    expected = [[1.5, 1.25], nothing, nothing, nothing, [3.0, 4.0], decayed([3.0, 4.0], 5), [0.5, 0.25]]
-    np.testing.assert_allclose(aligned.x_c, expected, rtol=1e-14)
-    assert aligned.received.tolist() == [0, *[NO_SEQUENCE] * 3, 6, 6, 6]
 
 
 @pytest.mark.parametrize("split", range(7))
@@ -134,15 +123,13 @@ def test_the_model_follows_its_set_point_from_the_change_on() -> None:
     np.testing.assert_allclose(aligned.x_c, expected, rtol=1e-14)
 
 
-def test_a_restarted_sensor_shares_no_update_until_its_own_is_delivered() -> None:
-    ticks, updates = steps(), deliveries((1, 10, [1.0, 1.0], 5), (2, 20, [1.0, 1.0], GENERATION))
+def test_sensor_and_controller_share_an_update_once_one_is_delivered() -> None:
+    ticks, updates = steps(), deliveries((1, 10, [1.0, 1.0], 5), (2, 20, [1.0, 1.0], 6))
     track = controller_track(START, ticks, updates)
     for initial_sync, before_the_first in (("first_packet", False), ("known_state", True)):
         given = scenario(initial_sync)
         shared = shares_update(given, align(track, [0, 10, 20]))
         assert shared.tolist() == [before_the_first, True, True]
-        restarted = shares_update(given, align(track, [0, 10, 20], generation=1))
-        assert restarted.tolist() == [False, False, True]
 
 
 def test_the_controller_starts_from_the_known_state_or_from_0() -> None:

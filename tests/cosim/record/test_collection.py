@@ -47,12 +47,10 @@ def run_dir(full_record: RunRecord, tmp_path: Path) -> Path:
     folder.mkdir(parents=True)
     write_scenario(full_record.scenario, folder)
     run_directory.write_environment(folder, "live", RUN)
-    reports = {
-        role: report | {"process": role, "generation": 0} for role, report in full_record.reports.items()
-    }
+    reports = {role: report | {"process": role} for role, report in full_record.reports.items()}
     del reports["controller"]
     (folder / run_directory.REPORTS_FILE).write_text(json.dumps(reports))
-    processes = {WRITER[role]: {"process": role, "generation": 0} for role in SECRETS}
+    processes = {WRITER[role]: {"process": role} for role in SECRETS}
     (folder / run_directory.PROCESSES_FILE).write_text(json.dumps(processes))
     tables = {table: full_record[table] for table in full_record.tables}
     tables[CONTROLLER_STEP] = tables[CONTROLLER_STEP][:100]
@@ -71,7 +69,7 @@ class HostFiles:
     def __init__(self, folder: Path, full_record: RunRecord, role: str = "controller") -> None:
         self.folder, self.role = folder, role
         self.ticks = stored(full_record, CONTROLLER_STEP)[100:]
-        self.report = full_record.reports["controller"] | {"instance": WRITER[role], "generation": 0}
+        self.report = full_record.reports["controller"] | {"instance": WRITER[role]}
         self.spool = OwnSpool(folder, role, SECRETS[role], RUN)
 
     def path(self, table: str) -> Path:
@@ -146,11 +144,6 @@ def renumbered(host_files: HostFiles, full_record: RunRecord) -> None:
     host_files.add(CONTROLLER_STEP, host_files.ticks)
 
 
-def other_generation(host_files: HostFiles, full_record: RunRecord) -> None:
-    host_files.ticks["input"] += 2**40
-    host_files.keep()
-
-
 def changed(host_files: HostFiles, full_record: RunRecord) -> None:
     rows = stored(full_record, CONTROLLER_STEP)
     rows["u"][50] += 1.0
@@ -198,7 +191,6 @@ def huge_batch(host_files: HostFiles, full_record: RunRecord) -> None:
         (other_role, "the controller has no table of this name"),
         (other_process, "the plant of this run did not run there"),
         (unknown_process, "belongs to no process that joined this run"),
-        (other_generation, "has rows of another process"),
         (report_of_another, "is the report of another process"),
         (part_of_a_row, "is damaged"),
         (renumbered, "has 100 more than the controller reported"),

@@ -15,14 +15,14 @@ from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_SETTING
-from noack.protocol.roles import Notice, Record, Start
+from noack.protocol.roles import Notice
 from noack.protocol.wire_format import Flow, Message
 from noack.scenario.parameter_changes import ParameterChange
-from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from tests.cosim.record.changed_records import CONTENT, changed, identity_residual
 from tests.cosim.simulation.event_scheduler import EventScheduler
-from tests.helpers.machine_parts import controller_of, sensor_of
+from tests.helpers.machine_parts import controller_of
 
 MS = 1_000_000
 
@@ -66,23 +66,6 @@ def test_dropouts_are_compared_with_the_cap_of_their_time() -> None:
     (text,) = delivered(8, 90 * MS)
     assert "2 consecutive losses" in text
     assert "at most 1 assumed" in text
-
-
-def test_a_restarted_process_applies_the_parameters_in_force() -> None:
-    resolved = resolve(validate(CONTENT, "here"))
-    change = ParameterChange(0, 500 * MS, {"trigger.beta": 0.5, "controller.setpoint": [2.0, 0.0]})
-    sensor = sensor_of(resolved, Start(1, 2_000 * MS))
-    (setting,) = sensor.announce(change, 2_000 * MS)
-    assert isinstance(setting, Record)
-    assert setting.row[4] == change.t_ns  # not late: the process had no time of its own yet
-    x = np.array([1.0, 0.0])
-    sensor.handle(Message(Flow.MEASUREMENT, 0, 2_000 * MS, x), 2_000 * MS)
-    outputs = sensor.handle(Message(Flow.MEASUREMENT, 1, 2_010 * MS, x), 2_010 * MS)
-    (row,) = [output.row for output in outputs if isinstance(output, Record)]
-    loop, x_r = loop_of(resolved), np.array([2.0, 0.0])
-    assert row[8] == pytest.approx(0.5 * np.exp(-0.25 * 2.01))
-    rate = (row[5] - x) / 0.01
-    assert rate == pytest.approx(loop.H @ (x - x_r), rel=0.02, abs=0.02)
 
 
 def test_a_change_received_too_late_is_reported_and_voids_its_claims() -> None:

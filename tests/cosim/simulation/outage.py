@@ -78,33 +78,6 @@ class LosingMachine:
         return self._machine.handle(message, now_ns) if self._arrives(self._sent - 1) else ()
 
 
-class RestartedMachine:
-    """A machine, and from a time on the restarted one that replaces it.
-
-    Args:
-        machine: the machine that ends.
-        successor: the restarted machine.
-        at_ns: time of the restart.
-    """
-
-    def __init__(self, machine: Machine[Any], successor: Machine[Any], at_ns: int) -> None:
-        self._machine, self._successor, self._at_ns = machine, successor, at_ns
-
-    def next_deadline_ns(self) -> int | None:
-        due_ns = self._machine.next_deadline_ns()
-        is_present = due_ns is not None and due_ns < self._at_ns
-        return due_ns if is_present else self._successor.next_deadline_ns()
-
-    def handle(self, message: Any, now_ns: int) -> Sequence[Any]:
-        return self._at(now_ns).handle(message, now_ns)
-
-    def on_timer(self, now_ns: int) -> Sequence[Any]:
-        return self._at(now_ns).on_timer(now_ns)
-
-    def _at(self, now_ns: int) -> Machine[Any]:
-        return self._machine if now_ns < self._at_ns else self._successor
-
-
 def simulate_with(
     resolved: Scenario,
     role: str,

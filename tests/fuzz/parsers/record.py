@@ -210,11 +210,11 @@ RESOLVED = resolve(validate(SCENARIO, "short"))
 REPORT = {
     "pid": 1, "ended": "horizon", "realtime": {},
     "channel": {"accepted": 1, "rejected": {"tag": 1}},
-    "rows": {"plant_step": 4, "plant_actuation": 0, "notices": 1}, "generation": 0,
+    "rows": {"plant_step": 4, "plant_actuation": 0, "notices": 1},
     "instance": "one",
 }  # fmt: skip
 _TYPES = run_tables(RESOLVED)
-HEADER = {"first": 0, "rows": 4, "generation": 0}
+HEADER = {"first": 0, "rows": 4}
 TELEMETRY_KNOWN = Vocabulary(
     (*REPORT, *HEADER, *NOTICE, *OWNER, "accepted", "rejected"), (*OWNER, "horizon", "violation")
 )

@@ -20,14 +20,11 @@ from noack.core.errors import CallerError
 from noack.core.row_operations import row_norms
 from noack.observers.observer_settings import observer_gain, unobservable_mode
 from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
-from noack.protocol.roles import GENERATION, RESTART, Start
 from noack.scenario.estimation import assumed_model, steady_state, true_model
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
-from tests.cosim.record.changed_records import changed
-from tests.cosim.simulation.outage import LosingMachine, RestartedMachine, simulate_with
-from tests.helpers.machine_parts import sensor_of
+from tests.cosim.simulation.outage import LosingMachine, simulate_with
 
 NOISE = {"C": [[1.0, 0.0]], "noise_std": [0.02]}
 KALMAN = {"kind": "kalman", "initial_std": [0.4, 0.4]}
@@ -68,32 +65,6 @@ def test_the_estimation_error_agrees_with_the_filters_covariance(observed: dict[
     assert low < distance < high
     # so an error that is 30 % off would be detected
     assert 2 * N / 1.3**2 < low < high < 2 * N * 1.3**2
-
-
-def test_a_restarted_sensor_restarts_its_estimate_and_is_replayed(
-    observed: dict[str, Any],
-) -> None:
-    observed["horizon_s"] = 2.0
-    observed["observer"] = KALMAN | {"initial_estimate": [0.5, 0.0]}
-    scenario, at_ns = resolved(observed), 800_000_000
-    successor = sensor_of(scenario, Start(1, at_ns))
-    record = simulate_with(scenario, "sensor", lambda machine: RestartedMachine(machine, successor, at_ns))
-    notices = [notice for notice in record.notices if "observer" in notice["text"]]
-    assert [(notice["t_ns"], notice["process"]) for notice in notices] == [(at_ns, "sensor")]
-    rows = record[SENSOR_MEASUREMENT]
-    again = np.flatnonzero(rows["input"] >= GENERATION)[0]
-    assert rows["t_ns"][again] == at_ns
-    assert rows["event"][again] == GENERATION
-    weight = 0.4**2 / (0.4**2 + 0.02**2)  # of the first estimate relative to the first output
-    expected = 0.5 + weight * (rows["y"][again, 0] - 0.5)
-    np.testing.assert_allclose(rows["x"][again], [expected, 0.0], rtol=1e-12)
-    notice = {"process": "sensor", "level": RESTART, "t_ns": at_ns, "text": "started anew"}
-    again_record = changed(record, notices=[notice], reports={}, kind="live")
-    result = replay(again_record)
-    assert result.bit_exact, result.first_difference
-    assert result.inputs == sum(map(record.count, record.tables))
-    verdicts = {str(claim.verdict) for claim in ClaimEvaluation(again_record).evaluate()}
-    assert verdicts <= {"held", "void"}
 
 
 def test_measurements_that_are_lost_are_bridged_and_replayed(observed: dict[str, Any]) -> None:

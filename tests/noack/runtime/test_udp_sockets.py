@@ -77,7 +77,7 @@ def test_a_flood_displaces_no_peer_datagram_and_all_are_counted(content: dict[st
 
 
 def test_datagrams_before_the_peer_sockets_are_read_first(content: dict[str, Any]) -> None:
-    """A restarted process receives datagrams before it has a socket per peer."""
+    """A process receives datagrams before it has a socket per peer."""
     early = 9000  # more than Python reads in one turn later
 
     def before(live: Live) -> None:

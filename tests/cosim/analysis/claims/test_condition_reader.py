@@ -31,22 +31,21 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
-from noack.protocol.roles import LOOP_ROLES, Start
+from noack.protocol.roles import LOOP_ROLES
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from noack.theory.certificates.conditions import allowed_conditions, nominal_conditions
 from tests.cosim.analysis.claims.conftest import Make, event_s, network_of, without
 from tests.cosim.record.changed_records import changed
-from tests.cosim.simulation.outage import LosingMachine, RestartedMachine, simulate_with, with_outage
-from tests.helpers.machine_parts import controller_of, sensor_of
+from tests.cosim.simulation.outage import LosingMachine, simulate_with, with_outage
 
 Batches = Iterator[tuple[str, Rows] | None]
 """A table and some of its rows; None where the result so far is queried."""
 IN_WINDOW = {"kind": "at_most", "losses": 2, "window": 6}
 RECOVERY = {"kind": "recovery", "deliveries": 2}
 NO_DELAY = network_of(lambda n: 0)
-SERIES = ("losses", "sampling", "delay", "hold", "watchdog", "safe_input", "restarts")
+SERIES = ("losses", "sampling", "delay", "hold", "watchdog", "safe_input")
 
 
 def batches(record: RunRecord, seed: int) -> Batches:
@@ -150,10 +149,7 @@ def test_batches_in_any_order_show_what_the_whole_record_shows(make: Make) -> No
         causes.update(cause for _, cause in violations)
 
     check()
-    assert causes == {*CAUSES, "dropouts", "atmost 2 in 6", "recover 2"} - {
-        "restart",
-        *CLOCK_CAUSES,
-    }
+    assert causes == {*CAUSES, "dropouts", "atmost 2 in 6", "recover 2"} - {*CLOCK_CAUSES}
 
 
 # --- violation of each condition: the live report, and the evaluation after the run ---------------
@@ -189,23 +185,6 @@ def safe_input(make: Make) -> RunRecord:
     return simulate(make(controller={"safe_input": [0.5]}, network=late))
 
 
-def restarted_controller(make: Make) -> RunRecord:
-    """A controller that is restarted at once without a known state, in steps of 10 ms."""
-    resolved, at_ns = make(network={"initial_sync": "known_state"}), 2_000_000_000
-    successor = controller_of(resolved, Start(1, at_ns))
-    return simulate_with(resolved, "controller", lambda machine: RestartedMachine(machine, successor, at_ns))
-
-
-def restarted_sensor(make: Make) -> RunRecord:
-    """A sensor that is restarted between two measurements, soon after an event."""
-    resolved, at_ns = make(), 50_000_000
-    successor = sensor_of(resolved, Start(1, at_ns))
-    record = simulate_with(resolved, "sensor", lambda machine: RestartedMachine(machine, successor, at_ns))
-    period_ns = resolved.timing.measurement_period_ns
-    assert (np.diff(record[SENSOR_MEASUREMENT]["t_ns"]) == period_ns).all()
-    return record
-
-
 @pytest.mark.parametrize(
     ("violate", "at", "reason"),
     [
@@ -217,8 +196,6 @@ def restarted_sensor(make: Make) -> RunRecord:
         (watchdog("zero"), 2.02, "the watchdog replaced the input: the newest actuation was "),
         (watchdog("model"), 2.02, "the watchdog replaced the input: the newest actuation was "),
         (safe_input, 0.01, "the controller had no state and sent its safe input, largest entry "),
-        (restarted_controller, 2.01, "the controller had no state and sent its safe input"),
-        (restarted_sensor, 0.05, "the sensor was restarted"),
     ],
 )  # fmt: skip
 def test_claims_are_void_from_the_time_and_for_the_reason_that_the_monitor_reports(

@@ -6,7 +6,6 @@ The record is a simulated one; live records are replayed in tests/integration.
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -27,12 +26,10 @@ from noack.protocol.record_tables import (
     SENSOR_MEASUREMENT,
     SETTINGS,
 )
-from noack.protocol.roles import GENERATION, LOOP_ROLES, RESTART, Start
+from noack.protocol.roles import LOOP_ROLES
 from noack.scenario.resolution import resolve
-from noack.scenario.scenario_file import load, validate
+from noack.scenario.scenario_file import load
 from tests.cosim.record.changed_records import changed, flipped
-from tests.cosim.simulation.outage import RestartedMachine, simulate_with
-from tests.helpers.machine_parts import controller_of
 
 ROOT = Path(__file__).parents[4]
 SHORT = (
@@ -239,33 +236,6 @@ def test_a_recorded_measurement_after_the_runs_end_is_not_taken() -> None:
     assert sensor.difference is not None
     assert "cannot take this input" in sensor.difference.what
     assert sensor.compared == 20
-
-
-@pytest.mark.sanitized
-@pytest.mark.parametrize("ticks", [True, False])
-def test_an_update_before_the_first_tick_of_a_restarted_controller_is_replayed(
-    content: dict[str, Any], ticks: bool
-) -> None:
-    """Only the rows of the second generation are recorded."""
-    content |= {"trigger": {"policy": "periodic", "period_s": 0.002}}
-    resolved = resolve(validate(content | {"network": {"mansd": 0, "loss": {"model": "lossless"}}}, ""))
-    at_ns = 500_000_000 - 300_000  # between ticks, just before an update
-    successor = controller_of(resolved, Start(1, at_ns))
-    record = simulate_with(
-        resolved, "controller", lambda machine: RestartedMachine(machine, successor, at_ns)
-    )
-    rows = {table: record[table] for table in record.tables}
-    deliveries, is_restarted = rows[CONTROLLER_DELIVERY], rows[CONTROLLER_STEP]["input"] >= GENERATION
-    first = deliveries[deliveries["input"] == GENERATION]
-    assert len(first) == 1
-    assert first["now_ns"][0] < rows[CONTROLLER_STEP]["t_ns"][is_restarted][0]
-    if not ticks:  # the process died before it had one
-        rows[CONTROLLER_STEP] = rows[CONTROLLER_STEP][~is_restarted]
-        rows[CONTROLLER_DELIVERY] = deliveries[deliveries["input"] <= GENERATION]
-    notice = {"process": "controller", "level": RESTART, "t_ns": 0, "text": "restarted"}
-    result = replay(changed(record, rows, notices=[notice], reports={}, kind="live"))
-    assert result.bit_exact, result.verdict()
-    assert result.verdict().inputs == sum(map(len, rows.values()))
 
 
 @pytest.mark.sanitized

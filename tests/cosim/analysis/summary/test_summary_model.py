@@ -8,13 +8,11 @@ from enum import Enum
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
 
-import numpy as np
 import pytest
 from pydantic import BaseModel
 from rich.console import Console
 
 import noack
-from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.analysis.summary.run_summary import Outcome
 from cosim.analysis.summary.summary_model import LoopSummary, NetworkPart, RunSummary, read_summary
 from cosim.output.report_page import Report, page
@@ -23,11 +21,8 @@ from cosim.output.terminal_output import print_outcome
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import ExitStatus
-from noack.protocol.record_tables import SENSOR_MEASUREMENT
-from noack.protocol.roles import GENERATION, RESTART
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
-from tests.cosim.record.changed_records import changed as altered
 from tests.helpers.summaries import summary_of, with_values
 
 HUGE = 10**400
@@ -35,7 +30,7 @@ DELETED = object()
 RENAMED = object()
 VALUES = [None, HUGE, "[/b]", [[[[]]]], {"a": [1]}, DELETED, RENAMED]
 PARTS = (
-    "restarts", "changes", "watchdog", "estimation", "disturbances", "assumption_violations",
+    "changes", "watchdog", "estimation", "disturbances", "assumption_violations",
     "acknowledgements", "actuations", "lateness_us", "latency_us", "realtime", "replay",
     "conditions", "certified_for", "claims", "linearisation", "ideal_loop",
 )  # fmt: skip
@@ -165,22 +160,3 @@ def test_no_loss_rate_is_expected_where_some_losses_are_not_predicted(content: d
     """Updates that are delivered out of order are lost, and are not in the predicted rate."""
     content["network"]["impairments"] = [{"kind": "delay", "delay_s": 0.1, "jitter_s": 0.09}]
     assert summary_of(simulated(content)).loops[0].loss_expected is None
-
-
-def test_restarts_and_their_missing_first_rows_are_listed(content: dict[str, Any]) -> None:
-    """One generation died before a recorder was back to which it could have sent its rows."""
-    record = simulated(content)
-    rows = record[SENSOR_MEASUREMENT].copy()
-    rows["input"][50:80] = GENERATION + 7 + np.arange(30)
-    rows["input"][80:] = 3 * GENERATION + np.arange(len(rows) - 80)
-    notices = [
-        {"process": "sensor", "level": RESTART, "t_ns": k * 10_000_000, "text": f"after {k}"} for k in (2, 3)
-    ]
-    restarted = altered(record, {SENSOR_MEASUREMENT: rows}, notices=notices, reports={})
-    summary = summarise_loop(restarted, 0, "").to_json()
-    assert summary["missing_by_table"]["sensor"] == 7
-    first_s = (rows["now_ns"][[50, 80]] * 1e-9).tolist()
-    restarts = {part["generation"]: (part["first_s"], part["what"]) for part in summary["restarts"]}
-    assert restarts == {
-        1: (first_s[0], None), 2: (None, "after 2"), 3: (first_s[1], "after 3"),
-    }  # fmt: skip

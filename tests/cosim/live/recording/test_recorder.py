@@ -1,10 +1,10 @@
-"""The recorder: invalid telemetry, restarts, full disks, and claims that become void in the run."""
+"""The recorder: invalid telemetry, full disks, and claims that become void in the run."""
 
 import errno
 import io
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +20,10 @@ from cosim.record.run_directory import SCENARIO_FILE
 from cosim.record.run_record import RunRecord, load_record
 from cosim.record.spool_conversion import finish_record
 from noack.core.errors import MachineError
-from noack.protocol.record_tables import OWNER, PLANT_STEP, SENSOR_MEASUREMENT
-from noack.protocol.roles import BEGINNING, GENERATION, LOOP_ROLES, RECORDER, Start
+from noack.protocol.record_tables import OWNER, PLANT_STEP
+from noack.protocol.roles import LOOP_ROLES, RECORDER
 from noack.runtime.control_messages import RunProgress, parse_message
-from noack.runtime.spool import NOTICES, SPOOL, batch_of, read_batches
+from noack.runtime.spool import NOTICES, SPOOL, read_batches
 from noack.scenario.resolution import resolve, run_tables
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import dumps, validate
@@ -46,28 +46,20 @@ class RecordingPlane(FakePlane):
 
 
 class Run:
-    """A run directory and its successive recorders."""
+    """A run directory and its recorder."""
 
     def __init__(self, scenario: Scenario, run_dir: Path) -> None:
         self.scenario, self.run_dir = scenario, run_dir
         (run_dir / SCENARIO_FILE).write_text(dumps(scenario))
         self.sent: dict[str, int] = {}
-        self.begin(BEGINNING, "f")
-
-    def begin(self, start: Start, instance: str, present: Sequence[str] = LOOP_ROLES) -> None:
         self.plane = plane = RecordingPlane()
-        plane.instance = instance
-        self.recorder = Recorder(self.scenario, self.run_dir, plane, start=start)  # type: ignore[arg-type]
-        for role in present:
+        self.recorder = Recorder(scenario, run_dir, plane)  # type: ignore[arg-type]
+        for role in LOOP_ROLES:
             plane.put("alive", Sample(f"noack/0/alive/{role}/{role}"))
         self.recorder.poll()
 
-    def follow(self, start: Start, instance: str, present: Sequence[str] = LOOP_ROLES) -> None:
-        self.recorder.store.writer.close()
-        self.begin(start, instance, present)
-
-    def send(self, table: str, first: int, payload: bytes, role: str, generation: int = 0) -> None:
-        header = json.dumps({"first": first, "generation": generation}).encode()
+    def send(self, table: str, first: int, payload: bytes, role: str) -> None:
+        header = json.dumps({"first": first}).encode()
         self.plane.put("telemetry", Sample(f"t/{role}/{table}", payload, header))
         self.recorder.poll()
 
@@ -80,22 +72,16 @@ class Run:
                 sent = with_loop(rows, 0, run_tables(record.scenario)[table])
                 self.send(table, first, sent.tobytes(), OWNER[table])
 
-    def rows(self, table: str, count: int, generation: int = 0) -> None:
+    def rows(self, table: str, count: int) -> None:
         rows = np.zeros(count, self.recorder.store.types[table])
-        rows["input"] = generation * GENERATION + np.arange(count)
-        self.send(table, 0, rows.tobytes(), OWNER[table], generation)
+        rows["input"] = np.arange(count)
+        self.send(table, 0, rows.tobytes(), OWNER[table])
 
-    def notices(self, role: str, count: int, generation: int = 0) -> None:
-        line = json.dumps({"t_ns": 0, "level": "info", "text": role}).encode()
-        self.send(NOTICES, 0, batch_of([line] * count), role, generation)
-
-    def report(
-        self, role: str, generation: int = 0, stored: Any = None, instance: str = "", **rows: int
-    ) -> Any:
+    def report(self, role: str, stored: Any = None, instance: str = "", **rows: int) -> Any:
         tables = {table: 0 for table in OWNER if OWNER[table] == role}
         report = {
             "ended": "horizon", "channel": {}, "rows": tables | {NOTICES: 0} | rows,
-            "generation": generation, "instance": instance or role, "stored": stored or {},
+            "instance": instance or role, "stored": stored or {},
         }  # fmt: skip
         query = Query(f"report/{role}", json.dumps(report).encode())
         self.plane.put("report", query)
@@ -139,19 +125,6 @@ def test_invalid_telemetry_is_ignored_and_the_rest_is_stored(
     assert capsys.readouterr().err.count("ignored an invalid telemetry message") == 1
 
 
-# --- restarts -------------------------------------------------------------------------------------
-
-
-def test_a_restarted_recorder_requests_no_rows_that_are_on_disk(run: Run) -> None:
-    run.rows(PLANT_STEP, 5)
-    run.notices("plant", 3)
-    run.notices("sensor", 1, generation=1)
-    run.follow(Start(1, 0), "a")
-    assert run.report("plant", **{PLANT_STEP: 5, NOTICES: 3}) == {}
-    assert run.report("sensor", 1, **{NOTICES: 1}) == {}
-    assert run.report("controller", **{NOTICES: 1}) == {NOTICES: [[0, 1]]}
-
-
 def test_rows_that_a_process_has_stored_are_not_requested_and_are_logged(run: Run) -> None:
     run.rows(PLANT_STEP, 5)
     stored = {PLANT_STEP: [[3, 7], [8, 10]]}
@@ -160,37 +133,9 @@ def test_rows_that_a_process_has_stored_are_not_requested_and_are_logged(run: Ru
     assert "plant: 4 rows were written to disk by itself" in line.decode()
 
 
-def test_a_process_gets_the_acknowledgement_of_its_own_rows_only(run: Run) -> None:
-    run.rows(SENSOR_MEASUREMENT, 7)
-    run.follow(Start(1, 0), "b")
-    run.rows(SENSOR_MEASUREMENT, 3, generation=1)
-    run.follow(Start(2, 0), "a")
-    run.rows(PLANT_STEP, 2)
-    run.recorder.acknowledge()
-    assert run.plane.acknowledged["sensor"] == {
-        "generation": 1,
-        "rows": {SENSOR_MEASUREMENT: [[0, 3]]},
-    }
-    assert run.plane.acknowledged["plant"] == {"generation": 0, "rows": {PLANT_STEP: [[0, 2]]}}
-
-
-def test_a_restarted_recorder_does_not_wait_for_ended_processes(
-    run: Run, monkeypatch: pytest.MonkeyPatch
+def test_a_process_that_left_the_start_barrier_is_gone_once_the_one_in_its_place_has_reported(
+    run: Run,
 ) -> None:
-    run.follow(Start(1, 0), "a")
-    assert not run.recorder.finished
-    for role in LOOP_ROLES:
-        assert run.report(role) == {}
-    assert run.recorder.finished
-    run.follow(Start(2, 0), "b", present=["plant"])
-    assert not run.recorder.finished
-    monkeypatch.setattr(recorder, "_DISCOVERY_S", -1.0)
-    assert not run.recorder.finished
-    assert run.report("plant") == {}
-    assert run.recorder.finished
-
-
-def test_a_process_is_gone_once_the_one_that_replaced_it_has_reported(run: Run) -> None:
     vanished = Sample("noack/0/alive/plant/plant")
     vanished.kind = zenoh.SampleKind.DELETE  # type: ignore[assignment]
     run.plane.put("alive", vanished)
@@ -200,7 +145,7 @@ def test_a_process_is_gone_once_the_one_that_replaced_it_has_reported(run: Run) 
     run.plane.put("alive", Sample("noack/0/alive/plant/plant2"))
     run.recorder.poll()
     assert not run.recorder.finished
-    assert run.report("plant", generation=1, instance="plant2") == {}
+    assert run.report("plant", instance="plant2") == {}
     assert run.recorder.finished
 
 

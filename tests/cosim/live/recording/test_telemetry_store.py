@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,6 @@ import pytest
 from cosim.live.recording.telemetry_store import TelemetryStore
 from noack.core.errors import MachineError, PeerError
 from noack.protocol.record_tables import PLANT_STEP
-from noack.protocol.roles import BEGINNING, GENERATION, Start
 from noack.runtime.control_messages import ChannelCounters, ProcessReport
 from noack.runtime.spool import NOTICES, SPOOL, batch_of, read_batches
 from noack.scenario.resolution import resolve
@@ -29,21 +27,21 @@ def scenario(content: dict[str, Any]) -> Scenario:
 
 @pytest.fixture
 def store(scenario: Scenario, tmp_path: Path) -> Iterator[TelemetryStore]:
-    telemetry_store = TelemetryStore(scenario, tmp_path, "first", BEGINNING)
+    telemetry_store = TelemetryStore(scenario, tmp_path)
     yield telemetry_store
     telemetry_store.writer.close()
 
 
-def batch(store: TelemetryStore, first: int, generation: int = 0, count: int = BATCH) -> bytes:
+def batch(store: TelemetryStore, first: int, count: int = BATCH) -> bytes:
     rows = np.zeros(count, store.types[PLANT_STEP])
-    rows["input"] = generation * GENERATION + first + np.arange(count)
+    rows["input"] = first + np.arange(count)
     return rows.tobytes()
 
 
-def add(store: TelemetryStore, first: int, generation: int = 0) -> bool:
+def add(store: TelemetryStore, first: int) -> bool:
     """Add a batch of the plant's steps; return whether it follows the rows before."""
-    payload = batch(store, first, generation)
-    rows, follows = store.add_rows("plant", PLANT_STEP, generation, first, payload)
+    payload = batch(store, first)
+    rows, follows = store.add_rows("plant", PLANT_STEP, first, payload)
     assert rows.tobytes() == payload
     return follows
 
@@ -72,37 +70,33 @@ def test_batches_may_arrive_in_any_order_and_twice(store: TelemetryStore, seed: 
         end = max(end, first + BATCH)
         absent = {row for begin, until in missing(store, BATCH * batches) for row in range(begin, until)}
         assert absent == set(range(BATCH * batches)) - stored_batches
-    assert acknowledged(store)["plant"] == {"generation": 0, "rows": {PLANT_STEP: [(0, BATCH * batches)]}}
+    assert acknowledged(store)["plant"] == {"rows": {PLANT_STEP: [(0, BATCH * batches)]}}
 
 
 def test_a_batch_of_another_process_is_refused_and_not_stored(store: TelemetryStore, tmp_path: Path) -> None:
     payload = batch(store, 0)
-    refused: list[tuple[str, str, int, bytes]] = [
-        ("sensor", PLANT_STEP, 0, payload),  # the table of another role
-        ("plant", "plant_steps", 0, payload),  # no table
-        ("plant", PLANT_STEP, 1, payload),  # another generation than its rows
-        ("plant", PLANT_STEP, 0, b""),
+    refused = [
+        ("sensor", PLANT_STEP, payload),  # the table of another role
+        ("plant", "plant_steps", payload),  # no table
+        ("plant", PLANT_STEP, b""),
     ]
-    for role, table, generation, rows in refused:
+    for role, table, rows in refused:
         with pytest.raises(PeerError):
-            store.add_rows(role, table, generation, 0, rows)
+            store.add_rows(role, table, 0, rows)
     with pytest.raises(ValueError, match="buffer size"):
-        store.add_rows("plant", PLANT_STEP, 0, 0, payload[:-1])
+        store.add_rows("plant", PLANT_STEP, 0, payload[:-1])
     with pytest.raises(PeerError):
-        store.add_notices("plant", 0, 0, b"no JSON")
+        store.add_notices("plant", 0, b"no JSON")
     assert acknowledged(store) == {}
     assert list(read_batches(tmp_path / SPOOL, PLANT_STEP)) == []
 
 
-def test_rows_are_acknowledged_for_the_newest_process_of_a_role(store: TelemetryStore) -> None:
+def test_rows_and_lines_of_the_log_are_acknowledged(store: TelemetryStore) -> None:
     line = json.dumps({"t_ns": 0, "level": "info", "text": "here"}).encode()
     add(store, 0)
-    assert len(store.add_notices("plant", 0, 0, batch_of([line] * 3))) == 3
+    assert len(store.add_notices("plant", 0, batch_of([line] * 3))) == 3
     rows: dict[str, Any] = {PLANT_STEP: [(0, BATCH)], NOTICES: [(0, 3)]}
-    assert acknowledged(store) == {"plant": {"generation": 0, "rows": rows}}
-    add(store, 5 * BATCH, generation=1)
-    rows = {PLANT_STEP: [(5 * BATCH, 6 * BATCH)]}
-    assert acknowledged(store) == {"plant": {"generation": 1, "rows": rows}}
+    assert acknowledged(store) == {"plant": {"rows": rows}}
     assert missing(store, 2 * BATCH) == [(BATCH, 2 * BATCH)]
 
 
@@ -112,20 +106,6 @@ def test_of_the_rows_that_a_process_stored_itself_the_new_ones_are_counted(store
     assert store.add_stored("plant", report) == 2 * BATCH
     assert store.add_stored("plant", report) == 0
     assert missing(store, 3 * BATCH) == []
-
-
-def test_a_restarted_recorder_has_the_rows_of_the_one_before(
-    store: TelemetryStore, scenario: Scenario, tmp_path: Path
-) -> None:
-    for first in (0, 3 * BATCH):
-        add(store, first)
-    store.writer.close()
-    restarted = TelemetryStore(scenario, tmp_path, "second", Start(generation=1))
-    with closing(restarted.writer):
-        loaded: list[tuple[str, int]] = []
-        restarted.load(lambda table, rows: loaded.append((table, int(rows["input"][0]))))
-        assert loaded == [(PLANT_STEP, 0), (PLANT_STEP, 3 * BATCH)]
-        assert missing(restarted, 4 * BATCH) == missing(store, 4 * BATCH) == [(BATCH, 3 * BATCH)]
 
 
 def test_a_spool_that_was_moved_is_reported(store: TelemetryStore, tmp_path: Path) -> None:

@@ -15,13 +15,13 @@ from matplotlib.text import Text
 
 import noack
 from cosim.analysis.summary.quantiles import QuantileSketch
+from cosim.output.curves import DASHED, ERRORS, INPUT, STATE_NORM, bound_curves, state_curves
 from cosim.output.figures import palette
 from cosim.output.figures.figure_description import (
     Axis,
     FigureDescription,
     Line,
     Panel,
-    bound_lines,
     label_text,
     one_panel,
     time_axis,
@@ -30,7 +30,7 @@ from cosim.output.figures.figure_drawing import draw
 from cosim.output.figures.figure_files import inline, save_figure, save_figures
 from cosim.output.figures.figure_format import requested_files
 from cosim.output.figures.figure_layout import use_figure_width
-from cosim.output.figures.run_figures import Trajectory, Transmissions, run_figures, states_figure
+from cosim.output.figures.run_figures import Transmissions, run_curves, run_figures, states_figure
 from cosim.output.figures.timing_figures import later_than
 from cosim.output.run_tables import key_numbers
 from cosim.record.run_record import RunRecord
@@ -46,7 +46,11 @@ T_S = np.arange(1.0, 5.0)
 
 
 def bounds(*labels: str) -> list[Line]:
-    return bound_lines((label, T_S, 3.0 + T_S, "certified") for label in labels)
+    curves = bound_curves((label, "x", T_S, 3.0 + T_S, "certified") for label in labels)
+    return [
+        Line(x=T_S, y=curve.values, label=curve.name, colour=curve.style.colour, dash=curve.style.dash)
+        for curve in curves
+    ]
 
 
 def norms(*lines: Line, bounds: Sequence[Line] = ()) -> FigureDescription:
@@ -106,7 +110,8 @@ def test_intervals_and_fates_are_drawn_at_their_times() -> None:
     figure = states_figure(
         "model",
         "one draw",
-        Trajectory(["x"], np.linspace(0, 4, 10), x, x, x, x),
+        np.linspace(0, 4, 10),
+        state_curves(["x"], np.linspace(0, 4, 10), x, x, x, x),
         Transmissions(sent_s, lost, sent_s[~lost], np.array([True, False, True])),
     )
     _, above, below = draw(figure).axes
@@ -247,3 +252,19 @@ def test_a_large_figure_becomes_a_bitmap(monkeypatch: pytest.MonkeyPatch) -> Non
     (image,) = Page(inline(figure)).attributes("img")
     assert image["alt"] == 'named "so"'
     assert (image["src"] or "").startswith("data:image/png;base64,")
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_curves_of_a_run_are_those_of_its_figures(case: str) -> None:
+    record = CASES[case]()
+    curves, figures = run_curves(record), run_figures(record)
+    for name, panel in (("errors", ERRORS), ("state-norm", STATE_NORM), ("input", INPUT)):
+        lines = [item for item in figures[name]().rows[0].panels[0].items if isinstance(item, Line)]
+        ours = [curve for curve in curves if curve.panel == panel and curve.style.dash != DASHED]
+        for line, curve in zip(lines, ours, strict=False):
+            np.testing.assert_array_equal(line.x, curve.t_s)
+            np.testing.assert_array_equal(line.y, curve.values)
+            assert line.colour == curve.style.colour
+    assert all(curve.t_s.shape == curve.values.shape for curve in curves)
+    sent = sum(len(curve.t_s) for curve in curves if curve.name in ("delivered", "lost"))
+    assert sent == len(record.events())

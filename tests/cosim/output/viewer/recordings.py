@@ -44,7 +44,7 @@ def add_samples(view: RunRecording, batches: int, n: int = 4) -> None:
         x: Floats = norm[:, None] + np.arange(n)
         bounds, none = np.stack([norm + 3, norm + 4], axis=1), np.full(K, -1)
         states, norms = (x, x + 100, x + 200), (norm, norm + 1, norm + 2)
-        aligned = AlignedRun(t_ns, *states, norm, *norms, received=none, sensor_generation=none)
+        aligned = AlignedRun(t_ns, *states, norm, *norms, received=none)
         view.views[0].add_samples(aligned, bounds, bounds + 2)
 
 

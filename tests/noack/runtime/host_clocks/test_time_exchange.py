@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import CallerError, PeerError
 from noack.protocol.record_tables import LOST_NS
-from noack.protocol.roles import BEGINNING, Notice, Record
+from noack.protocol.roles import Notice, Record
 from noack.protocol.wire_format import Rejection
 from noack.runtime.address import Address
 from noack.runtime.host_clocks.clock_offset import ClockOffset
@@ -351,7 +351,7 @@ def test_each_clock_report_is_a_row_and_each_change_a_line_of_the_log() -> None:
         ClockReport(200 * ms, 250 * ms, 9, 4000, 13),
     ]
     clock = RunClock(0, 2.0, lambda: 0)
-    record = ClockRecord("sensor", BEGINNING, clock, Scripted(reports), has_table=True)
+    record = ClockRecord("sensor", clock, Scripted(reports), has_table=True)
     outputs = [record.compare(2 * output.now_ns) for output in list(reports)]
     rows = [output for each in outputs for output in each if isinstance(output, Record)]
     assert [output.table for output in rows] == ["sensor_clock"] * 5
@@ -370,7 +370,7 @@ def test_each_clock_report_is_a_row_and_each_change_a_line_of_the_log() -> None:
 
 
 def test_the_coordinators_own_clock_has_no_error() -> None:
-    record = ClockRecord("plant", BEGINNING, RunClock(time.monotonic_ns()), None, has_table=True)
+    record = ClockRecord("plant", RunClock(time.monotonic_ns()), None, has_table=True)
     for number in range(3):
         (output,) = record.compare(0)
         assert isinstance(output, Record)
