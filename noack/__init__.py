@@ -27,11 +27,11 @@ else:
 
 
 __all__ = [
-    "CampaignResult", "Certificates", "Curve", "CurveStyle", "Explorer", "Measurement", "NoackError",
-    "Run", "Scenario",
-    "__version__", "campaign", "certify", "compare", "cost", "explore", "from_system", "gain",
-    "linearise", "load", "margin", "measure", "new", "open_run", "run",
-    "save_tables", "simulate", "with_settings",
+    "CampaignResult", "Certificates", "Curve", "CurveStyle", "ExactRun", "Explorer", "Measurement",
+    "NoackError", "Run", "Scenario", "__version__", "campaign", "certify", "compare", "cost",
+    "explore", "from_system", "gain", "linearise", "load", "margin", "measure", "new", "open_run",
+    "run", "save_tables", "scenarios", "simulate", "simulate_exactly",
+    "with_settings",
 ]  # fmt: skip
 _NOT_EVERYWHERE = ("LossyChannel", "LossyUdp")
 """Names that need an extra, or Linux: no star import takes them."""

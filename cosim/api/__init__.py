@@ -10,6 +10,8 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from cosim.analysis.certificates import Certificates as Certificates
+from cosim.api.exact_runs import ExactRun as ExactRun
+from cosim.api.exact_runs import simulate_exactly as simulate_exactly
 from cosim.api.explorer import Explorer as Explorer
 from cosim.api.explorer import explore as explore
 from cosim.api.runs import Run as Run
@@ -19,6 +21,7 @@ from cosim.api.runs import run as run
 from cosim.api.runs import simulate as simulate
 from cosim.api.scenarios import from_system as from_system
 from cosim.api.scenarios import load as load
+from cosim.api.scenarios import scenarios as scenarios
 from cosim.api.scenarios import with_settings as with_settings
 from cosim.api.studies import CampaignResult as CampaignResult
 from cosim.api.studies import Measurement as Measurement

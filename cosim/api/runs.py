@@ -25,7 +25,7 @@ with lazy_modules():
     from cosim.live import finalize as run_end
     from cosim.live import launcher
     from cosim.live.monitoring import progress as progress_display
-    from cosim.output import result_tables, run_tables
+    from cosim.output import result_tables, run_tables, run_verdict
     from cosim.output.export import export_formats
     from cosim.output.figures import figure_drawing, figure_files, figure_format, network_figures, run_figures
     from cosim.record import data_frames, run_record, table_files
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from cosim.analysis.summary.summary_model import Claim, RunSummary
     from cosim.output.curves import Curve
     from cosim.output.figures.figure_description import FigureDescription
+    from cosim.output.run_verdict import VerdictLine
 
 PathLike = str | os.PathLike[str]
 
@@ -87,6 +88,14 @@ class Run:
     def reason(self) -> str:
         """The reason for the end of the run: ``horizon``, or an error."""
         return self._outcome.reason
+
+    @property
+    def verdict(self) -> "list[VerdictLine]":
+        """How the run ended, whether its guarantee was kept, its transmissions.
+
+        Each line has a ``text``, and a ``tone``: good, doubt, bad or empty.
+        """
+        return [*run_verdict.verdict(self.summary)]
 
     @property
     def claims(self) -> "list[Claim]":

@@ -9,7 +9,7 @@ from typing import TypeGuard
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cosim.shipped_files import find_shipped
+from cosim.shipped_files import find_shipped, shipped_names, text_of
 from cosim.studies.new_loop import (
     ALPHA_SHARE,
     BETA_SHARE,
@@ -53,6 +53,11 @@ def load(source: Source, settings: ReadTable | None = None) -> Scenario:
         return _complete(plain_table(source), settings, Path("scenario"))
     path = find_shipped(str(source), "scenarios")
     return _complete(toml_file.read(path, Scenario), settings, path)
+
+
+def scenarios() -> dict[str, str]:
+    """Return the texts of the scenarios that come with noack, by name, to be copied and edited."""
+    return {name: text_of(name) for name in shipped_names("scenarios")}
 
 
 def with_settings(scenario: Scenario, settings: ReadTable) -> Scenario:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 from cosim.analysis.claims.observed_conditions import BEYOND_CERTIFICATE, CAUSES, SCHEDULE, worst_time
 from cosim.analysis.summary.summary_model import Claim, ExitPart, IdealLoopPart, LoopSummary, RunSummary
 from cosim.output.run_tables import changes_in, shares_network, state_norm
+from cosim.simulation.continuous import ContinuousSummary
 from noack.core.errors import ExitStatus
 from noack.runtime.life_cycle import HORIZON
 from noack.theory.certificates.assumptions import AssumptionStatus
@@ -60,6 +61,18 @@ def verdict(summary: RunSummary) -> tuple[VerdictLine, ...]:
         _guarantee_line(loops),
         transmission_line(events, deliveries, ideal),
     )
+
+
+def verdict_of_exact_run(summary: ContinuousSummary) -> list[VerdictLine]:
+    """Return how a run in continuous time ended, and its transmissions."""
+    state, failed = "", summary.exit_status == ExitStatus.FAILED
+    if not failed:
+        state = state_text(summary.initial_state_norm, summary.sup_state_norm, summary.final_state_norm, None)
+    end = ExitPart(status=summary.exit_status, reason=summary.reason)
+    return [
+        ending_line(end, summary.reached_s, summary.horizon_s, state),
+        transmission_line(summary.events, summary.deliveries),
+    ]
 
 
 def ending_line(end: ExitPart, reached_s: float, horizon_s: float, states: str = "") -> VerdictLine:

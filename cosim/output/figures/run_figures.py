@@ -41,7 +41,6 @@ from cosim.output.figures.figure_description import (
     finite,
     label_text,
     one_panel,
-    series_colour,
     time_axis,
 )
 from cosim.output.figures.palette import CONTROLLER, FORCED, LOST, SENSOR

@@ -1,0 +1,136 @@
+"""Runs in exact continuous time, without a record."""
+
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.api.scenarios import Source, load
+from cosim.lazy_modules import lazy_modules
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Matrix, Vector
+from noack.scenario.resolution import policy_of, resolve
+from noack.scenario.scenario import Scenario
+from noack.trigger_policies.trigger_rule import TriggerRule
+
+with lazy_modules():
+    from cosim.output import curves as curve_table
+    from cosim.output import run_verdict
+    from cosim.simulation import continuous, exact_simulation
+
+if TYPE_CHECKING:
+    from cosim.output.curves import Curve
+    from cosim.output.run_verdict import VerdictLine
+
+_POINTS = 400
+"""Number of evenly spaced times; each event adds the times just before and after it."""
+_MOST_EVENT_POINTS = 600
+"""With more events, only the evenly spaced times are in the curves."""
+
+
+class ExactRun:
+    """A run in exact continuous time; :func:`noack.simulate_exactly` returns it."""
+
+    scenario: Scenario
+    """The resolved scenario."""
+
+    def __init__(self, scenario: Scenario, run: "continuous.ContinuousRun") -> None:
+        self.scenario, self._run = scenario, run
+
+    @property
+    def event_s(self) -> Vector:
+        """Times of the transmissions, (k,)."""
+        return self._run.event_s
+
+    @property
+    def delivered(self) -> NDArray[np.bool_]:
+        """Whether each transmission arrived, (k,)."""
+        return self._run.delivered
+
+    @cached_property
+    def summary(self) -> "continuous.ContinuousSummary":
+        """The numbers of the run, with the names of a loop's in ``summary.json``."""
+        return continuous.summary(self._run, self.scenario)
+
+    @property
+    def verdict(self) -> "list[VerdictLine]":
+        """How the run ended and its transmissions: lines with ``text`` and ``tone``."""
+        return run_verdict.verdict_of_exact_run(self.summary)
+
+    @np.errstate(all="ignore")  # a run may diverge
+    def curves(self) -> "list[Curve]":
+        """Return the run's signals as a table, as :meth:`noack.Run.curves`, without inputs and bounds."""
+        run, scenario = self._run, self.scenario
+        samples = run.at(np.linspace(0.0, run.reached_s, _POINTS))
+        parts = [(samples.t_s, samples.x, samples.e_s, samples.e_c)]
+        if 0 < len(run.before) <= _MOST_EVENT_POINTS:  # at an event: before, after, then the even times
+            parts = [_stacked(run.before), _stacked(run.after), *parts]
+        t_s, x, e_s, e_c = (np.concatenate(column) for column in zip(*parts, strict=True))
+        order = np.argsort(t_s, kind="stable")
+        t_s, x, e_s, e_c = t_s[order], x[order], e_s[order], e_c[order]
+        unknown = ~self._has_controller_state(t_s)
+        e_c_norm = run.system.norms(e_c)
+        e_c[unknown], e_c_norm[unknown] = np.nan, np.nan
+        return [
+            *curve_table.state_curves(run.system.loop.state_names, t_s, x, x + e_s, x + e_c),
+            *curve_table.error_curves(t_s, run.system.norms(e_s), e_c_norm, _threshold(scenario, t_s)),
+            curve_table.norm_curve(t_s, np.linalg.norm(x, axis=1)),
+            *curve_table.transmission_curves(run.event_s, run.delivered),
+        ]
+
+    def _has_controller_state(self, t_s: Vector) -> NDArray[np.bool_]:
+        """Return whether the controller has a state at times (k,): not before its first update."""
+        if self.scenario.network.initial_sync == "known_state":
+            return np.ones(len(t_s), np.bool_)
+        first_s = self.event_s[self.delivered].min(initial=np.inf)
+        # If the time of the event occurs twice, it is first the time before the reset.
+        start = np.searchsorted(t_s, first_s) + (np.count_nonzero(t_s == first_s) > 1)
+        return np.asarray(np.arange(len(t_s)) >= start)
+
+    def __repr__(self) -> str:
+        return "\n".join(line.text for line in self.verdict)
+
+
+def _stacked(states: "tuple[continuous.LoopState, ...]") -> tuple[Vector, Matrix, Matrix, Matrix]:
+    t_s, x, e_s, e_c = zip(*states, strict=True)
+    return np.array(t_s), np.array(x), np.array(e_s), np.array(e_c)
+
+
+def _threshold(scenario: Scenario, t_s: Vector) -> Vector | None:
+    """Return the trigger's threshold at times (k,), if it is a function of time."""
+    trigger = policy_of(scenario)
+    if not (isinstance(trigger, TriggerRule) and trigger.is_decaying):
+        return None
+    level: Vector = trigger.level * np.exp(-trigger.rate_per_s * t_s)
+    return np.maximum(level, trigger.floor)
+
+
+def simulate_exactly(scenario: Source, *, most_events: int = 100_000) -> ExactRun:
+    """Run the loop of the theory: continuous time, no sampling, no delay; event times are exact.
+
+    It has the scenario's own losses. This takes milliseconds and writes no record;
+    :func:`noack.simulate` runs the loop as the processes run it.
+
+    >>> import noack
+    >>> run = noack.simulate_exactly("lane_following")
+    >>> len(run.event_s), run.summary.deliveries
+    (20, 7)
+
+    Args:
+        scenario: a scenario, or a source that :func:`noack.load` accepts.
+        most_events: largest number of transmissions.
+
+    Raises:
+        NoackError: the scenario is wrong; the exact simulation does not cover it, since the plant is
+            nonlinear, or has noise, or the network delays; or there are too many transmissions.
+    """
+    loaded = load(scenario)
+    if loaded.loops:
+        raise CallerError("loops: one loop is simulated exactly; noack.simulate takes several")
+    if kinds := exact_simulation.left_out(loaded.network.link):
+        raise CallerError(f"network.impairments: {kinds}: the exact simulation has no delay")
+    resolved = resolve(loaded)
+    resolved.coverage.require_unchanging()
+    resolved.coverage.require_exact()
+    return ExactRun(resolved, continuous.run_continuous(resolved, most_events))
