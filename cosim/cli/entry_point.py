@@ -8,7 +8,7 @@ from contextlib import closing, contextmanager, suppress
 from typing import TYPE_CHECKING
 
 from noack.core.errors import NoackError
-from noack.core.system_processes import exhausted_limit
+from noack.core.system_processes import QUICK_IMPORTS, exhausted_limit
 from noack.runtime.command_line import report_failure, stoppable_imports
 
 if TYPE_CHECKING:
@@ -45,9 +45,9 @@ def _fork_server(words: list[str]) -> "Iterator[ForkServer | None]":
     if sys.platform != "linux" or "--help" in words or not words or words[0] not in _LIVE:
         yield None
         return
-    from cosim.live.processes.fork_server import QUICK_IMPORTS, ForkServer
-
     os.environ.update(QUICK_IMPORTS)
+    from cosim.live.processes.fork_server import ForkServer
+
     server = None
     with suppress(OSError):  # the command reports it
         server = ForkServer(of_itself=True)

@@ -20,9 +20,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 from scipy.special import expit, logit, xlogy
 
-from cosim.lazy_modules import lazy_modules
 from cosim.measurement.interval_estimates import (
     IntervalEstimate,
     Minimum,
@@ -31,9 +31,6 @@ from cosim.measurement.interval_estimates import (
     profile_interval,
 )
 from cosim.measurement.loss_bursts import Flags, LossBursts
-
-with lazy_modules():
-    from scipy import stats
 
 Reals = NDArray[np.float64]
 

@@ -9,12 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import optimize, stats
 from scipy.special import chdtri, xlogy
-
-from cosim.lazy_modules import lazy_modules
-
-with lazy_modules():  # the library imports this module, and seldom needs them
-    from scipy import optimize, stats
 
 Reals = NDArray[np.float64]
 LEVEL = 0.95

@@ -13,14 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
-from cosim.lazy_modules import lazy_modules
 from cosim.measurement.interval_estimates import LEVEL
 from noack.core.clock import NEVER_NS
 from noack.traces.packet_trace import LOST_NS, Int64s, PacketTrace
-
-with lazy_modules():  # the library imports this module, and seldom needs it
-    from scipy import stats
 
 Flags = NDArray[np.bool_]
 

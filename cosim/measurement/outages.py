@@ -17,15 +17,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 from scipy.special import gammaln
 
-from cosim.lazy_modules import lazy_modules
 from cosim.measurement.chain_fits import SIGNIFICANCE, ChainFits
 from cosim.measurement.interval_estimates import IntervalEstimate, exponential_estimate, poisson_estimate
 from cosim.measurement.loss_bursts import Flags, LossBursts
-
-with lazy_modules():
-    from scipy import stats
 
 OUTAGE_LEVEL = 1e-3
 """Nominal probability with which a network without outages has one by this rule."""

@@ -23,6 +23,7 @@ from noack.protocol.record_tables import (
     is_of_network,
     network_tables,
 )
+from noack.protocol.wire_format import HEADER_ROW, MAGIC, VERSIONS, Flow
 
 if TYPE_CHECKING:
     from cosim.record.table_files import StoredTables
@@ -410,3 +411,22 @@ def _shift(rows: Rows, phase_ns: int) -> None:
             rows[name][is_time] -= phase_ns
             if "since_ns" in (rows.dtype.names or ()) and name != "now_ns":
                 np.maximum(rows[name], 0, out=rows[name])  # a change before the loop begins
+
+
+def messages_in(packets: Rows, flow: Flow = Flow.UPDATE) -> tuple[Rows, NDArray[np.int64], NDArray[np.int64]]:
+    """Select the loop's messages of a flow from the packets that reached the network emulator.
+
+    The emulator reads no payload, so the packets' headers are read here.
+
+    Returns:
+        Their rows of ``netem_packet``, sequence numbers and event times.
+    """
+    headers = np.ascontiguousarray(packets["head"]).view(HEADER_ROW)
+    is_of_flow = np.logical_or.reduce([headers["version"] == version for version in VERSIONS])
+    is_of_flow &= (headers["magic"] == MAGIC) & (headers["flow"] == flow) & (headers["t_ns"] >= 0)
+    is_of_flow &= headers["sequence"] < 2**63  # others do not fit the record's columns
+    return (
+        packets.compress(is_of_flow),
+        headers["sequence"].compress(is_of_flow).astype(np.int64),
+        headers["t_ns"].compress(is_of_flow),
+    )

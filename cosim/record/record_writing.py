@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
-from cosim.lazy_modules import lazy_modules
+from cosim.record import table_files
 from cosim.record.processes import joint_reports
 from cosim.record.record_source import Rows, with_loop
 from cosim.record.run_directory import RECORD, REPORTS_FILE
@@ -16,9 +16,6 @@ from noack.core.system_processes import cores
 from noack.protocol.record_tables import CLOCK_TABLES, LOOP, is_of_network
 from noack.scenario.resolution import resolve, run_tables
 from noack.scenario.scenario import Scenario, loop_scenario, loop_sections
-
-with lazy_modules():  # pyarrow takes 0.1 s: a run does not wait for it
-    from cosim.record import table_files
 
 
 def write_run(run: RecordedRun, run_dir: Path) -> None:

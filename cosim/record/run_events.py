@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.record.run_record import Rows, RunRecord
+from cosim.record.record_source import Rows, messages_in
+from cosim.record.run_record import RunRecord
 from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import ModelFlow
@@ -22,7 +23,7 @@ from noack.protocol.record_tables import (
     effective,
 )
 from noack.protocol.roles import CHANGEABLE
-from noack.protocol.wire_format import HEADER_ROW, MAGIC, VERSIONS, Flow
+from noack.protocol.wire_format import Flow
 from noack.scenario.parameter_changes import ChangeSchedule, ParameterChange, settings_of
 from noack.scenario.resolution import loop_of
 from noack.scenario.runtime_parameters import is_of_loss_alone
@@ -206,25 +207,6 @@ def _outcomes(
     in_flight[in_flight] = ~np.isin(numbers[in_flight], forwarded)
     fate, lost = rows["fate"].astype(np.int8), ~effectively | stale
     return PacketOutcome(sequence, event_ns, rows["now_ns"].copy(), fate, lost, in_flight, due_ns)
-
-
-def messages_in(packets: Rows, flow: Flow = Flow.UPDATE) -> tuple[Rows, NDArray[np.int64], NDArray[np.int64]]:
-    """Select the loop's messages of a flow from the packets that reached the network emulator.
-
-    The emulator reads no payload, so the packets' headers are read here.
-
-    Returns:
-        Their rows of ``netem_packet``, sequence numbers and event times.
-    """
-    headers = np.ascontiguousarray(packets["head"]).view(HEADER_ROW)
-    is_of_flow = np.logical_or.reduce([headers["version"] == version for version in VERSIONS])
-    is_of_flow &= (headers["magic"] == MAGIC) & (headers["flow"] == flow) & (headers["t_ns"] >= 0)
-    is_of_flow &= headers["sequence"] < 2**63  # others do not fit the record's columns
-    return (
-        packets.compress(is_of_flow),
-        headers["sequence"].compress(is_of_flow).astype(np.int64),
-        headers["t_ns"].compress(is_of_flow),
-    )
 
 
 class ActuationTimes:

@@ -11,7 +11,7 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.lazy_modules import lazy_modules
+from cosim.record import table_files
 from cosim.record.processes import (
     ROW_COLUMNS,
     ProcessRows,
@@ -61,9 +61,6 @@ from noack.runtime.control_messages import LogLine, parse_message
 from noack.scenario.resolution import LoopMatrices, loop_of, resolved_loops, run_tables, tables_of
 from noack.scenario.scenario import Scenario, few_of, loop_names, loop_scenario, loop_sections, phases_ns
 from noack.scenario.scenario_file import MOST_RECORDED_BYTES, load
-
-with lazy_modules():  # pyarrow takes 0.1 s: a run does not wait for it
-    from cosim.record import table_files
 
 NOTICES_FILE = "notices.jsonl"
 Notice = dict[str, Any]
@@ -333,7 +330,7 @@ class StoredLoops(Sequence[RunRecord]):
         self,
         run_dir: Path,
         network: RunRecord,
-        stored: "table_files.StoredTables",
+        stored: table_files.StoredTables,
         loops: Sequence[Scenario],
     ) -> None:
         self._kind, self._stored, self._scenario = network.kind, stored, network.scenario

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cosim.lazy_modules import lazy_modules
+from cosim.record import table_files
 from cosim.record.processes import add_kept_reports
 from cosim.record.record_source import BATCH_ROWS, Rows, Segment, concatenate_rows
 from cosim.record.record_writing import record_folder, vector_names
@@ -38,9 +38,6 @@ from noack.runtime.control_messages import LogLine, parse_message
 from noack.runtime.spool import EARLY, EARLY_ENDED, SPOOL, batch_bytes, batches_in, spool_files, stored_lines
 from noack.scenario.resolution import run_tables
 from noack.scenario.scenario import loop_names
-
-with lazy_modules():  # pyarrow takes 0.1 s: a run does not wait for it
-    from cosim.record import table_files
 
 _SEGMENT_BYTES = 1024 * 1024
 """Bytes of consecutive batches that are read at once."""
@@ -184,12 +181,10 @@ def convert_table(run_dir: Path, table: str) -> None:
     Raises:
         OSError: it cannot be written.
     """
-    from cosim.record.table_files import write_table  # imports pyarrow
-
     scenario, _ = scenarios_of(run_dir)
     dtype = run_tables(scenario)[table]
     rows = _rows_loop_after_loop(run_dir, table, dtype, len(loop_names(scenario)))
-    write_table(run_dir / RECORD / f"{table}.parquet", rows, dtype, vector_names(scenario))
+    table_files.write_table(run_dir / RECORD / f"{table}.parquet", rows, dtype, vector_names(scenario))
 
 
 def _bytes_of(run_dir: Path, table: str) -> int:

@@ -36,7 +36,7 @@ from cosim.analysis.claims.observed_conditions import (
     combine,
     lost_cause,
 )
-from cosim.record.run_events import messages_in
+from cosim.record.record_source import messages_in
 from cosim.record.run_record import Rows, RunRecord
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import (

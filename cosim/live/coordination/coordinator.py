@@ -14,7 +14,6 @@ from typing import NamedTuple
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
-from cosim.lazy_modules import lazy_modules
 from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import CallerError, PeerError
 from noack.core.system_processes import cores
@@ -46,9 +45,6 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario import loop_scenario, loop_sections
 from noack.scenario.scenario_tables import MOST_CHANGES
 from noack.settings.section import ReadTable, Table
-
-with lazy_modules():
-    from noack.theory.certificates import assumptions
 
 _REPORT_GRACE_S = 0.3
 """A process's last message may arrive this much later than its exit is seen."""
@@ -400,10 +396,13 @@ class ChangeRequests:
 
     def _violations(self) -> list[str]:
         """Return the violated assumptions of Theorem 2, each as a line, with its loops if not all."""
+        # Imports the theory, for which the start of a run does not wait.
+        from noack.theory.certificates.assumptions import violations_of_theorem_2
+
         violated: dict[str, list[str]] = {}
         with suppress(Exception):  # a failed analysis must not cost the run
             for name, schedule in self._entries.items():
-                for line in assumptions.violations_of_theorem_2(resolve(schedule.last)):
+                for line in violations_of_theorem_2(resolve(schedule.last)):
                     violated.setdefault(line, []).append(name)
         return [
             line if len(names) == len(self._entries) else f"{', '.join(names)}: {line}"

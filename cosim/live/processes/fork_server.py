@@ -21,31 +21,27 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import IO
 
-from cosim.lazy_modules import lazy_modules, load_module
+from pydantic import BaseModel
+
 from noack.core.errors import MachineError
-from noack.core.system_processes import python_command, require_limits
+from noack.core.system_processes import QUICK_IMPORTS, python_command, require_limits
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.link_settings import LinkSettings
 from noack.runtime.command_line import DESCRIPTOR_ON_STDIN
-
-with lazy_modules():
-    import noack.impairments.kinds.loss as loss
-    from noack.impairments import link_settings
-    from noack.runtime import control_messages, run_descriptor
-    from noack.scenario import scenario, scenario_checks
-
-if TYPE_CHECKING:
-    from pydantic import BaseModel
+from noack.runtime.control_messages import ControlMessage
+from noack.runtime.run_descriptor import RunDescriptor
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_checks import prepare_changes
 
 _COMMON = (
     "noack.runtime.control_plane",
-    "noack.runtime.run_descriptor",
     "noack.scenario.scenario_file",
     "noack.scenario.resolution",
     "noack.core.random_streams",
-    "cosim.record.run_directory",
 )
-"""What the processes and the launcher import."""
+"""What the processes and the launcher import, beside the imports of this module."""
 _IMPORTS = (
     *_COMMON,
     "plant_server.__main__",
@@ -56,10 +52,6 @@ _IMPORTS = (
     "numpy.random",
     "zenoh",
 )
-QUICK_IMPORTS = {
-    "OPENBLAS_NUM_THREADS": "1",  # numpy starts no threads
-    "PYDANTIC_DISABLE_PLUGINS": "__all__",  # no search among all installed packages
-}
 ENVIRONMENT = {
     DESCRIPTOR_ON_STDIN: "1",
     **QUICK_IMPORTS,
@@ -153,7 +145,7 @@ class ForkServer:
         That is one thread, open standard streams, and UTF-8 for files and streams.
         """
         _import(_COMMON)
-        scenario.Scenario.model_rebuild()  # the launcher needs its validators, too
+        Scenario.model_rebuild()  # the launcher needs its validators, too
         threads = len([*Path("/proc/self/task").iterdir()])
         is_closed = None in (sys.stdin, sys.stdout, sys.stderr)
         if threads > 1 or is_closed or sys.getfilesystemencoding() != "utf-8":
@@ -283,15 +275,15 @@ def _fork_twice() -> int:
 def _build_validators() -> None:
     """Build what would otherwise be built in each process."""
     models: list[type[BaseModel]] = [
-        scenario.Scenario,
-        run_descriptor.RunDescriptor,
-        link_settings.LinkSettings,
-        loss.LossOf,
-        *control_messages.ControlMessage.__subclasses__(),
+        Scenario,
+        RunDescriptor,
+        LinkSettings,
+        LossOf,
+        *ControlMessage.__subclasses__(),
     ]
     for model in models:
         model.model_rebuild()
-    scenario_checks.prepare_changes()
+    prepare_changes()
 
 
 def main() -> None:
@@ -301,7 +293,7 @@ def main() -> None:
 
 def _import(modules: Sequence[str]) -> None:
     for module in modules:
-        load_module(module)
+        import_module(module)
 
 
 def _run(connection: socket.socket) -> None:

@@ -13,8 +13,7 @@ import numpy as np
 from cosim.analysis.claims.condition_reader import READ, AssumptionMonitor
 from cosim.analysis.claims.observed_conditions import SCHEDULE, AssumptionViolation, worst_time
 from cosim.record.divergence import GrowthMonitor
-from cosim.record.record_source import rows_by_loop
-from cosim.record.run_record import Rows
+from cosim.record.record_source import Rows, rows_by_loop
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import LOOP, SENSOR_MEASUREMENT
 from noack.protocol.roles import Notice

@@ -18,13 +18,11 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict
 from zenoh.handlers import FifoChannel, RingChannel
 
-from cosim.lazy_modules import lazy_modules
 from cosim.live.recording.telemetry_store import TelemetryStore
 from cosim.record.decimation import is_long
 from cosim.record.processes import report_of, write_reports
+from cosim.record.record_source import Rows, messages_in
 from cosim.record.run_directory import RECORDING_FILE, active_run
-from cosim.record.run_events import messages_in
-from cosim.record.run_record import Rows
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core
 from noack.core.errors import ExitStatus, MachineError, PeerError
@@ -48,10 +46,6 @@ from noack.runtime.telemetry import first_row
 from noack.scenario.parameter_changes import change_notice
 from noack.scenario.runtime_parameters import is_of_loss_alone
 from noack.scenario.scenario import Scenario, loop_names
-
-with lazy_modules():
-    from cosim.live.recording import claim_monitor
-    from cosim.output.viewer import live_feed, recording_viewer, rerun_program, run_recording
 
 if TYPE_CHECKING:
     from cosim.live.recording.claim_monitor import ClaimMonitor, Finding
@@ -191,8 +185,11 @@ class Recorder:
 
     @cached_property
     def _monitor(self) -> "ClaimMonitor":
-        """Checks claims. It imports the theory, for which the other processes do not wait."""
-        return claim_monitor.ClaimMonitor(self._scenario)
+        """Checks claims."""
+        # It imports the theory, for which the other processes do not wait.
+        from cosim.live.recording.claim_monitor import ClaimMonitor
+
+        return ClaimMonitor(self._scenario)
 
     @property
     def finished(self) -> bool:
@@ -207,7 +204,9 @@ class Recorder:
 
     def show_in(self, view: "RunRecording") -> None:
         """Show the telemetry in a view, from the first batch that is handled afterwards."""
-        self._feed = live_feed.LiveFeed(self._scenario, view, self._progress.add_warning)
+        from cosim.output.viewer.live_feed import LiveFeed  # imports rerun
+
+        self._feed = LiveFeed(self._scenario, view, self._progress.add_warning)
 
     def poll(self) -> bool:
         """Handle messages that have arrived; return whether there may be more.
@@ -366,7 +365,9 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
         stack.enter_context(active_run(Path(process.descriptor.run_dir)))
         live_view = None
         if live:
-            live_view = recording_viewer.LiveView()
+            from cosim.output.viewer.recording_viewer import LiveView  # imports rerun
+
+            live_view = LiveView()
             stack.callback(live_view.close)  # it would not exit by itself
         _record(process, live_view)
     return ExitStatus.OK
@@ -374,6 +375,8 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
 
 def _record(process: RunProcess, live_view: "LiveView | None") -> None:
     """Record a run to its end."""
+    from cosim.output.viewer.rerun_program import is_installed
+
     run_dir = Path(process.descriptor.run_dir)
     # A live view is ready when the run begins. The libraries of a recording take half a second to
     # load: the other processes do not wait for them.
@@ -384,7 +387,7 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
     core.noack_prefer_others()  # without real-time settings, the loop would wait for milliseconds
     # The launcher writes the view of a long run, and of several loops.
     unseen = len(process.phases_ns) > 1 or is_long(process.scenario)
-    can_record = rerun_program.is_installed() and not unseen
+    can_record = is_installed() and not unseen
     if view is not None or can_record:
         try:
             view = view or _open_view(process, None)
@@ -416,8 +419,10 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
 
 
 def _open_view(process: RunProcess, live_view: "LiveView | None") -> "RunRecording":
+    from cosim.output.viewer.run_recording import open_recording  # imports rerun
+
     run_dir, run_id = Path(process.descriptor.run_dir), process.descriptor.run_id
-    return run_recording.open_recording(process.scenario, run_dir, run_id, live_view)
+    return open_recording(process.scenario, run_dir, run_id, live_view)
 
 
 def _poll_to_the_end(process: RunProcess, recorder: Recorder) -> bool:

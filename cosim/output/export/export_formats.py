@@ -5,19 +5,13 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
-from cosim.lazy_modules import lazy_modules
+from cosim.analysis.summary.summary_model import read_summary
 from cosim.record.run_directory import ENVIRONMENT_FILE, SUMMARY_FILE, read_object
+from cosim.record.run_record import RunRecord, load_run
 from noack.core.errors import CallerError
 from noack.core.extension_points import missing_extension, parts
-
-with lazy_modules():
-    from cosim.analysis.summary import summary_model
-    from cosim.record import run_record
-
-if TYPE_CHECKING:
-    from cosim.record.run_record import RunRecord
 
 _ENDING = "_export"
 
@@ -38,7 +32,7 @@ class ExportedRun:
     """A run, or one of the loops of a run."""
 
     directory: Path
-    record: "RunRecord"
+    record: RunRecord
     """Of the only loop, or of the network that the loops share."""
     summary: dict[str, object]
     """The content of ``summary.json``, or its part about the loop."""
@@ -120,10 +114,10 @@ def _exported_run(run_dir: Path, loop: str | None) -> ExportedRun:
     Raises:
         CallerError: it is not a run directory, its record is damaged, or there is no such loop.
     """
-    run, content = run_record.load_run(run_dir), read_object(run_dir / SUMMARY_FILE)
+    run, content = load_run(run_dir), read_object(run_dir / SUMMARY_FILE)
     if loop is not None or not run.names[1:]:
         record = run.loop(loop)
-        summary = summary_model.read_summary(content)
+        summary = read_summary(content)
         loop_summary = summary.of_loop(record.scenario.name).to_json() if summary else content
         return ExportedRun(run_dir, record, loop_summary)
     parts = dict(zip(run.names, content.get("loops", []), strict=False))

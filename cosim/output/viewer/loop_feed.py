@@ -22,9 +22,8 @@ from cosim.record.align import (
     true_states,
 )
 from cosim.record.decimation import decimate_all
-from cosim.record.record_source import concatenate_rows
-from cosim.record.run_events import claimed_until_s, messages_in, model_flow
-from cosim.record.run_record import Rows
+from cosim.record.record_source import Rows, concatenate_rows, messages_in
+from cosim.record.run_events import claimed_until_s, model_flow
 from noack.core.clock import NS_PER_S
 from noack.core.row_operations import row_norms
 from noack.protocol.record_tables import (

@@ -19,7 +19,6 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from cosim.lazy_modules import load_module
 from cosim.output.figures.palette import CONTROLLER, PLANT, SENSOR, Colour
 from cosim.record.align import Reals
 from noack.core.linear_systems import Propagator
@@ -250,7 +249,7 @@ def picture_of(scenario: Scenario) -> Picture:
     plant = DrawnPlant(scenario, loop, reach_of(loop, scenario.timing.horizon_ns))
     package = __name__.rpartition(".")[0]
     for module in pkgutil.iter_modules(import_module(package).__path__):
-        load_module(f"{package}.{module.name}")
+        import_module(f"{package}.{module.name}")
     kind = scenario.plant.system.kind
     for drawing in sorted(
         Picture.__subclasses__(), key=lambda each: (each.draws_any, kind not in each.kinds)
