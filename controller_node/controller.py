@@ -7,7 +7,6 @@ guarantee.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +19,7 @@ from noack.core.linear_systems import Matrix, Vector
 from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee, LossHistory, LossRule
 from noack.machines.loop_machines import LoopMachines, MachinePart, Role, parts_of, set_machine, take_changes
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_SETTING, CONTROLLER_STEP, RecordShape
-from noack.protocol.roles import BEGINNING, FAILED, External, Notice, Start
+from noack.protocol.roles import FAILED, External, Notice
 from noack.protocol.wire_format import Flow
 from noack.scenario.parameter_changes import ChangeSchedule
 from noack.scenario.resolution import loop_of, setpoint_of
@@ -151,7 +150,6 @@ class Controller(MachinePart):
         guarantee: losses that it does not allow violate the assumption.
         x0: x(0), if sensor and controller start from it; else None.
         acknowledges: whether it acknowledges each update, as the acknowledgement baseline does.
-        start: the beginning of the run, or a restart during the run.
         safe_input: the input before the first update, shape (m,); by default 0.
         carries_model: whether an actuation also carries x_c, for the plant's watchdog.
         predictions: number of inputs of an actuation: that of the tick, and those for the
@@ -171,7 +169,6 @@ class Controller(MachinePart):
     guarantee: LossGuarantee
     x0: Vector | None = None
     acknowledges: bool = False
-    start: Start = BEGINNING
     safe_input: Vector | None = None
     carries_model: bool = False
     predictions: int = 1
@@ -205,20 +202,18 @@ class Controller(MachinePart):
 
     def fill(self, controller: CData, memory: CoreMemory) -> None:
         """Fill a ``noack_controller`` at its start."""
-        n, m, start, period_ns = len(self.H), self.inputs, self.start, self.period_ns
+        n, m, period_ns = len(self.H), self.inputs, self.period_ns
         self._memory = memory
-        step = max(-(-(start.from_ns - self.first_ns) // period_ns), 0)
         set_machine(
             controller.machine,
             n=n,
             m=m,
             entries=n,
             flow=Flow.UPDATE,
-            first_number=start.first_number,
             period_ns=period_ns,
             horizon_ns=self.horizon_ns,
         )
-        controller.machine.first_ns, controller.machine.step = self.first_ns, step
+        controller.machine.first_ns = self.first_ns
         steps_ns = (period_ns, self.first_ns, period_ns - self.first_ns)
         transitions = memory.transitions(self.H, steps_ns)
         memory.set_model(controller.model, transitions, (), self._points)
@@ -235,11 +230,8 @@ class Controller(MachinePart):
                 "holds_input": self.holds_input,
                 "carries_model": self.carries_model,
                 "x_c": np.zeros(n) if self.x0 is None else self.x0,
-                # A model without a state starts at the first tick, which is recorded.
-                "model_ns": self.first_ns + step * period_ns if start.is_restart else 0,
                 "has_state": self.x0 is not None,
-                # After a restart the updates before it are unknown.
-                "newest": core.NOACK_UNKNOWN_SEQUENCE if start.is_restart else core.NOACK_NO_SEQUENCE,
+                "newest": core.NOACK_NO_SEQUENCE,
                 "x": np.zeros(n),
                 "u": np.zeros(m),
                 "scratch": np.zeros(3 * n + m),
@@ -314,22 +306,13 @@ class Controller(MachinePart):
         self._memory.fill(controller, {"has_point": setpoint is not None, "x_r": x_r, "u_r": u_r})
 
 
-def controllers_of(
-    loops: Sequence[Scenario], phases_ns: Sequence[int] | None = None, *, start: Start = BEGINNING
-) -> LoopMachines:
+def controllers_of(loops: Sequence[Scenario], phases_ns: Sequence[int] | None = None) -> LoopMachines:
     """Return the controllers of resolved loops as the machines of a process.
 
     Of the plant's data they use at most x(0).
     """
-    parts, templates = parts_of(loops, partial(_part, start), _with_draws_of)
-    if not start.is_restart:
-        return LoopMachines(parts, phases_ns, templates=templates)
-    phases = tuple(phases_ns or (0,) * len(loops))  # they determine the first ticks
-    parts = [
-        replace(part, start=start._replace(from_ns=start.from_ns - phase_ns))
-        for part, phase_ns in zip(parts, phases, strict=True)
-    ]
-    return LoopMachines(parts, phases)
+    parts, templates = parts_of(loops, _part, _with_draws_of)
+    return LoopMachines(parts, phases_ns, templates=templates)
 
 
 def _with_draws_of(controller: Controller, resolved: Scenario) -> Controller:
@@ -343,9 +326,9 @@ def _with_draws_of(controller: Controller, resolved: Scenario) -> Controller:
     )
 
 
-def _part(start: Start, resolved: Scenario) -> Controller:
+def _part(resolved: Scenario) -> Controller:
     loop = loop_of(resolved)
-    starts_from_x0 = resolved.network.initial_sync == "known_state" and not start.is_restart
+    starts_from_x0 = resolved.network.initial_sync == "known_state"
     safe_input, acknowledges = resolved.controller.safe_input, resolved.protocol.acknowledges
     changes = not (acknowledges or resolved.controller.is_program)
     return Controller(
@@ -358,7 +341,6 @@ def _part(start: Start, resolved: Scenario) -> Controller:
         guarantee=resolved.network.guarantee,
         x0=loop.x0 if starts_from_x0 else None,
         acknowledges=acknowledges,
-        start=start,
         safe_input=None if safe_input is None else np.array(safe_input),
         carries_model=resolved.message_sizes.carries_model,
         predictions=resolved.controller.predictions,

@@ -111,8 +111,8 @@ void note_outcome(const noack_link *link, int64_t row, int64_t packet, int lost)
 
 /* The row of the record of a decision; data: the datagram, of decision->size_bytes. */
 noack_packet_row packet_row(
-    const noack_decision *decision, int64_t input, int64_t first_number, int64_t arrival_ns,
-    int64_t flow, const uint8_t *data);
+    const noack_decision *decision, int64_t input, int64_t arrival_ns, int64_t flow,
+    const uint8_t *data);
 /* Whether a datagram, or its copy, is the first of both that is intact. */
 int is_first_intact(const noack_decision *decision, int copy);
 /* At equal times, datagrams leave in order of direction, then of arrival, which is counted. */

@@ -315,9 +315,9 @@ const char *noack_link_check(const noack_link *link);
 /* The same for its recorded decisions, of which there may be millions. */
 const char *noack_recorded_check(const noack_link *link);
 
-/* Begin a flow in a row. restarted: packets of the flow may have been lost before. */
+/* Begin a flow in a row. */
 void noack_link_start_flow(
-    noack_link *link, int64_t row, int64_t number, int64_t first_delivered, int64_t restarted);
+    noack_link *link, int64_t row, int64_t number, int64_t first_delivered);
 
 /* Decide for a packet that arrives at now_ns; row is that of its flow. */
 void noack_link_decide(
@@ -443,7 +443,7 @@ enum {
     NOACK_REJECTIONS = 10
 };
 
-enum noack_sequence { NOACK_NO_SEQUENCE = -1, NOACK_UNKNOWN_SEQUENCE = -2 };
+enum noack_sequence { NOACK_NO_SEQUENCE = -1 };
 
 /* What a message is, as noack.protocol.wire_format.Flow. */
 enum noack_message_kind {
@@ -480,7 +480,6 @@ typedef struct {
     int64_t entries;
     /* sequence number of the newest message accepted; -1: none */
     int64_t newest;
-    int64_t not_before_ns;              /* earlier messages are stale */
     int64_t not_after_ns;               /* later messages are out of range: no run has them */
     int64_t accepted;
     int64_t rejected[NOACK_REJECTIONS]; /* by noack.protocol.wire_format.Rejection */
@@ -521,7 +520,6 @@ typedef struct {
     int64_t step;                /* number of the next tick */
     int64_t first_ns, period_ns; /* tick k is due at first_ns + k period_ns; 0: no ticks */
     int64_t horizon_ns;          /* no tick is later */
-    int64_t first_number;        /* of the messages */
     int64_t inputs;              /* number of the next input */
     /* time up to which the present settings have been used; -1: none */
     int64_t reached_ns;
@@ -653,8 +651,7 @@ typedef struct {
     double *x_c;                        /* (n,) */
     int64_t model_ns;
     int64_t has_state;
-    /* number of the last update; NOACK_UNKNOWN_SEQUENCE after a restart */
-    int64_t newest;
+    int64_t newest;                     /* number of the last update; -1: none */
     int64_t update_ns;                  /* time of its event; 0: that of x(0) */
     /* (n,), (m,) the question to the user's law, and its answer; else the last input */
     double *x, *u;
@@ -1120,7 +1117,6 @@ typedef struct {
     int64_t loops;
     int64_t no_loop;             /* datagrams refused because of this number */
     int64_t inputs;              /* number of the next row of the record */
-    int64_t first_number;        /* number of the first packet in the record */
     int64_t no_memory;           /* 1: no memory for more delayed datagrams */
 
     /* Tables; after the sockets of the links (listening, then sending), those of the clients. */
@@ -1267,7 +1263,6 @@ typedef struct {
     int64_t directions;          /* 1 or 2 */
     noack_link *links[2];        /* from the sensors; from the controllers */
     int64_t is_scripted;         /* 1: Python decides for what comes from the sensors */
-    int64_t first_number;        /* of the inputs, and of each flow's datagrams */
     int64_t inputs;              /* number of the next input */
     int64_t reached_ns;          /* arrival of the last datagram; -1: none */
     /* time from which the first link has other settings; INT64_MAX: none */

@@ -182,7 +182,7 @@ int64_t noack_wire_examine_message(
     /* Sequence numbers from 2^63 on are negative here. */
     if (message->sequence < 0 || message->t_ns < 0 || message->t_ns > reception->not_after_ns)
         return NOACK_BAD_RANGE;
-    if (message->sequence <= reception->newest || message->t_ns < reception->not_before_ns)
+    if (message->sequence <= reception->newest)
         return NOACK_STALE;
     for (int64_t k = 0; k < message->entries; k++)
         if (!isfinite(message->vector[k]))

@@ -19,7 +19,7 @@ from noack.core.core_library import CData, core, dtype_of, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, NETEM_SETTING, PACKET_HEAD_BYTES, Fate
-from noack.protocol.roles import BEGINNING, Notice, Record, Start
+from noack.protocol.roles import Notice, Record
 from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, Message
 from noack.scenario.parameter_changes import ChangeSchedule, ParameterChange
 from noack.scenario.scenario import Scenario
@@ -75,7 +75,6 @@ class Channel:
         links: the direction from the sensors, and that from the controllers if there is one; each
             has room for ``loops`` flows.
         loops: number of loops.
-        first_number: number of the first input and of each flow's first packet.
         schedule: announced changes of the first direction's settings; None: there can be none.
         network: decides for the datagrams from the sensors, instead of their link.
     """
@@ -85,7 +84,6 @@ class Channel:
         links: Sequence[LinkState],
         *,
         loops: int = 1,
-        first_number: int = 0,
         schedule: ChangeSchedule[LinkSettings] | None = None,
         network: UserNetwork | None = None,
     ) -> None:
@@ -96,8 +94,7 @@ class Channel:
                 link.start_flow(loop, number * loops + loop)
         self.core: CData = ffi.new("noack_channel *", {
             "loops": loops, "directions": len(links), "links": [link.core for link in links],
-            "is_scripted": network is not None, "first_number": first_number,
-            "inputs": first_number, "reached_ns": -1, "change_ns": NEVER_NS, "free_place": -1,
+            "is_scripted": network is not None, "reached_ns": -1, "change_ns": NEVER_NS, "free_place": -1,
             "row_places": _ROWS,
         })  # fmt: skip
         """The channel, as the core's functions take it; valid as long as this object lives."""
@@ -218,27 +215,24 @@ class Channel:
         core.noack_channel_add_places(channel, earlier_places)
 
 
-def channel_of(
-    resolved: Scenario, start: Start = BEGINNING, *, loops: int = 1, network: UserNetwork | None = None
-) -> Channel:
+def channel_of(resolved: Scenario, *, loops: int = 1, network: UserNetwork | None = None) -> Channel:
     """Return the network of a resolved scenario; ``network`` replaces the link of the updates."""
     links: list[LinkState] = []
     for flow in resolved.network.flows:
-        settings, names = settings_at_start(resolved.network.link_of(flow), link_name(flow), start)
+        settings = resolved.network.link_of(flow)
         if network is not None and not links:
             settings = LinkSettings(mansd=None, first_delivered=False)
         links.append(
             LinkState(
                 settings,
                 resolved.seeds.loss,
-                *names,
+                link_name(flow),
                 rows=loops,
-                restarted=start.is_restart,
                 decisions=[()] if network else (),
             )
         )
     schedule = None if network else ChangeSchedule(resolved, lambda scenario: scenario.network.link)
-    return Channel(links, loops=loops, first_number=start.first_number, schedule=schedule, network=network)
+    return Channel(links, loops=loops, schedule=schedule, network=network)
 
 
 def require_stand_alone(scenario: Scenario) -> Scenario:
@@ -258,19 +252,6 @@ def require_stand_alone(scenario: Scenario) -> Scenario:
     if scenario.network.link.reads_errors:
         raise CallerError("network: maximum_error is for noack's own sensors; take another discipline")
     return scenario
-
-
-def settings_at_start(settings: LinkSettings, name: str, start: Start) -> tuple[LinkSettings, list[str]]:
-    """Return the settings of a link of a run, and the names of its random streams.
-
-    A restarted emulator does not know the losses before. Therefore its first datagrams pass
-    (see :class:`netem.link_state.LinkState`), and later ones are drawn from other random streams
-    than before.
-    """
-    if not start.is_restart:
-        return settings, [name]
-    settings = settings.model_copy(update={"first_delivered": True})
-    return settings, [name, f"again-{start.generation}"]
 
 
 def announce_change(
@@ -293,7 +274,7 @@ def due_settings(
     """Yield the settings that replace the present ones before a datagram that arrives now."""
     for change in schedule.take(now_ns):
         assert change.prepared is not None
-        first = present.first_delivered  # a restarted emulator has its own value
+        first = present.first_delivered
         settings = change.prepared.model_copy(update={"first_delivered": first})
         if settings != present:
             present = settings

@@ -32,8 +32,6 @@ class LinkState:
         name: names of the link and the direction.
         decisions: recorded decisions per flow; each flow repeats them before the settings apply.
         rows: number of flows that have room; more are added as needed.
-        restarted: packets of its flows may have been lost before. The guarantee then counts as many
-            losses directly before a flow's first packet as a window may have.
 
     Raises:
         ValueError: the settings name a file that has not been read, a loss rate cannot be kept, or
@@ -52,10 +50,9 @@ class LinkState:
         *name: str,
         decisions: Decisions = (),
         rows: int = 1,
-        restarted: bool = False,
     ) -> None:
         self.settings = settings
-        self._seed, self._name, self._restarted = seed, name, restarted
+        self._seed, self._name = seed, name
         recorded = chain.from_iterable(decisions)
         self._decisions = np.fromiter(recorded, dtype_of("noack_recorded"))
         begins = [*accumulate(map(len, decisions), initial=0)] if decisions else [0]
@@ -96,7 +93,7 @@ class LinkState:
         while row >= self.rows:
             self._add_rows()
         first = self.settings.first_delivered
-        core.noack_link_start_flow(self.core, row, number, first, self._restarted)
+        core.noack_link_start_flow(self.core, row, number, first)
 
     def decide(self, row: int, size_bytes: int, now_ns: int) -> CData:
         """Decide for the next packet of the flow in a row; return :attr:`decision`."""

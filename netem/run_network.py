@@ -9,14 +9,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from netem.channel import PACKET_ROW, Datagram, announce_change, due_settings, link_name, settings_at_start
+from netem.channel import PACKET_ROW, Datagram, announce_change, due_settings, link_name
 from netem.relay.link_sockets import set_receive_timeout, stamp_arrivals
 from netem.relay.relay_memory import RelayDirection, RelayMemory, name_array
 from noack.core.clock import RunClock
 from noack.core.core_library import StructRows, core
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE
-from noack.protocol.roles import BEGINNING, Notice, Record, Start
+from noack.protocol.roles import Notice, Record
 from noack.protocol.wire_format import loop_number
 from noack.runtime.address import Address, SocketName, packed_name
 from noack.runtime.drivers.real_time_loop import RecordSink, RowSink
@@ -38,13 +38,12 @@ class RunNetwork:
         loops: number of the run's loops; each datagram has the number of its loop.
     """
 
-    def __init__(self, resolved: Scenario, start: Start = BEGINNING, loops: int = 1) -> None:
+    def __init__(self, resolved: Scenario, loops: int = 1) -> None:
         self._loops = loops
         self._memory = RelayMemory(1, row_count=_ROWS)
         while len(self._memory.clients) < self._loops:
             self._memory.add_clients()
         self._relay, clients = self._memory.core, self._memory.clients
-        self._relay.inputs = self._relay.first_number = start.first_number
         self._relay.loops = self._loops
         flows = np.arange(self._loops)
         clients["number"][flows] = clients["flow_row"][flows] = flows
@@ -54,14 +53,7 @@ class RunNetwork:
         if len(links) == 1:  # the relay has two directions; nothing arrives in the second
             links.append((LinkSettings(), "none"))
         for number, (settings, name) in enumerate(links):
-            first, names = settings_at_start(settings, name, start)
-            direction = RelayDirection(
-                first,
-                resolved.seeds.loss,
-                names,
-                self._memory.directions[number],
-                restarted=start.is_restart,
-            )
+            direction = RelayDirection(settings, resolved.seeds.loss, [name], self._memory.directions[number])
             for loop in range(self._loops):
                 direction.start_flow(loop, number * self._loops + loop)
             self._directions.append(direction)

@@ -35,7 +35,7 @@ from noack.machines.loop_machines import LoopMachines, MachinePart, Role, parts_
 from noack.plants.linear import LinearSystem
 from noack.plants.plant_settings import PlantStart, PlantSystem, SystemFailedError
 from noack.protocol.record_tables import NO_SEQUENCE, PLANT_ACTUATION, PLANT_STEP, RecordShape
-from noack.protocol.roles import BEGINNING, FAILED, External, Notice, Start
+from noack.protocol.roles import FAILED, External, Notice
 from noack.protocol.wire_format import Flow
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
@@ -292,13 +292,8 @@ class Plant(MachinePart):
             reals_at(plant.noise.values, BLOCK, plant.noise.width)[:] = self.measurement.noise(number)
 
 
-def plants_of(
-    loops: Sequence[Scenario], phases_ns: Sequence[int] | None = None, *, start: Start = BEGINNING
-) -> LoopMachines:
-    """Return the plants of resolved loops as the machines of a process.
-
-    A plant cannot be restarted during the run: ``start`` has no effect.
-    """
+def plants_of(loops: Sequence[Scenario], phases_ns: Sequence[int] | None = None) -> LoopMachines:
+    """Return the plants of resolved loops as the machines of a process."""
     parts, templates = parts_of(loops, _part, _with_draws_of)
     return LoopMachines(parts, phases_ns, templates=templates)
 

@@ -18,10 +18,8 @@ are unknown, and the first known input is used.
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from noack.core.core_library import CData, CoreMemory, core, ffi, reals_at
 from noack.core.linear_systems import Matrix, Vector
@@ -33,7 +31,7 @@ from noack.protocol.record_tables import (
     SENSOR_SETTING,
     RecordShape,
 )
-from noack.protocol.roles import BEGINNING, Notice, Start
+from noack.protocol.roles import Notice
 from noack.protocol.wire_format import Flow
 from noack.scenario.estimation import assumed_model
 from noack.scenario.parameter_changes import ChangeSchedule
@@ -65,7 +63,6 @@ class Observer:
         reported: entries of a measurement that are inputs.
         period_ns: the plant's step.
         starts_from_x0: True: x̂ is the estimate at time 0; False: at the first measurement.
-        restarted: whether the sensor replaces one that died; the earlier estimate is lost.
     """
 
     settings: ObserverSettings
@@ -74,7 +71,6 @@ class Observer:
     reported: int
     period_ns: int
     starts_from_x0: bool
-    restarted: bool = False
 
     @property
     def p(self) -> int:
@@ -86,13 +82,6 @@ class Observer:
         self.settings.fill(sensor.observer, self.model, self.x, memory)
         sensor.observer.t_ns = 0 if self.starts_from_x0 else -1
         sensor.plant_period_ns = self.period_ns
-
-    def first_notice(self, t_ns: int) -> Sequence[Notice]:
-        """Return the log line of a restarted observer, once: at its first measurement."""
-        if not self.restarted:
-            return ()
-        self.restarted = False
-        return (Notice(t_ns, "info", "the observer restarts from its initial estimate"),)
 
 
 @dataclass
@@ -110,7 +99,6 @@ class Sensor(MachinePart):
         inputs: m.
         period_ns: expected time between measurements, for precomputed matrices; others are
             possible.
-        first_number: number of its first event and first input.
         setpoint: x_r, shape (n,); None is 0.
         schedule: the announced changes of its settings; None if they cannot change.
         timeout_ns: how long to wait for an acknowledgement; None: updates are not acknowledged.
@@ -124,7 +112,6 @@ class Sensor(MachinePart):
     x0: Vector | None = None
     inputs: int = 1
     period_ns: int | None = None
-    first_number: int = 0
     setpoint: Vector | None = None
     schedule: ChangeSchedule[tuple[Vector | None, Policy]] | None = None
     timeout_ns: int | None = None
@@ -139,11 +126,6 @@ class Sensor(MachinePart):
         if isinstance(self.policy, CodedPolicy):
             self._trigger = self.policy.new_trigger()
         self._points, self._since_ns = [self.setpoint], list[int]()
-
-    @property
-    def counts_every_message(self) -> bool:
-        """Whether the next measurement is the first of a restarted observer."""
-        return self.observer is not None and self.observer.restarted
 
     @property
     def shape(self) -> RecordShape:
@@ -169,7 +151,6 @@ class Sensor(MachinePart):
             m=self.inputs,
             flow=Flow.MEASUREMENT,
             entries=n if observer is None else observer.p + observer.reported,
-            first_number=self.first_number,
             horizon_ns=self.horizon_ns,
         )
         memory.set_model(sensor.model, memory.transitions(self.H, steps_ns), (), self._points)
@@ -177,7 +158,7 @@ class Sensor(MachinePart):
         memory.fill(sensor, {
             "is_user": self._trigger is not None, "acknowledged": self.timeout_ns is not None,
             "timeout_ns": self.timeout_ns or 0, "has_state": self.x0 is not None,
-            "events": self.first_number, "wait_ns": -1, "reports_error": self.reports_error,
+            "wait_ns": -1, "reports_error": self.reports_error,
             "x_s": start, "event_x": np.zeros(n), "x": np.zeros(n), "e_s": np.zeros(n),
         })  # fmt: skip
         sensor.trigger.event_ns = -1
@@ -218,12 +199,6 @@ class Sensor(MachinePart):
             assert question == core.NOACK_ASK_DECISION
             self._decide(sensor)
         return ()
-
-    def inspect(self, rows: NDArray[np.void]) -> Sequence[Notice]:
-        """Return a log line at the first measurement of a restarted observer."""
-        if self.observer is None:
-            return ()
-        return self.observer.first_notice(int(rows["t_ns"][0]))
 
     def _decide(self, sensor: CData) -> None:
         """Ask the user's trigger about a measurement."""
@@ -302,45 +277,41 @@ def _or_zero(setpoint: Vector | None) -> Vector:
     return np.zeros(1) if setpoint is None else setpoint
 
 
-def sensors_of(
-    loops: Sequence[Scenario], phases_ns: Sequence[int] | None = None, *, start: Start = BEGINNING
-) -> LoopMachines:
+def sensors_of(loops: Sequence[Scenario], phases_ns: Sequence[int] | None = None) -> LoopMachines:
     """Return the sensors of resolved loops as the machines of a process.
 
-    Of the plant's data they use at most x(0). After a restart, a sensor transmits its first
-    measurement.
+    Of the plant's data they use at most x(0).
     """
-    parts, templates = parts_of(loops, partial(_part, start), partial(_with_draws_of, start))
+    parts, templates = parts_of(loops, _part, _with_draws_of)
     return LoopMachines(parts, phases_ns, templates=templates)
 
 
-def _part(start: Start, resolved: Scenario) -> Sensor:
+def _part(resolved: Scenario) -> Sensor:
     loop, acknowledges = loop_of(resolved), resolved.protocol.acknowledges
-    starts_from_x0 = resolved.network.initial_sync == "known_state" and not start.is_restart
+    starts_from_x0 = resolved.network.initial_sync == "known_state"
     return Sensor(
         loop.H,
         policy_of(resolved),
         loop.x0 if starts_from_x0 else None,
         inputs=loop.m,
         period_ns=resolved.timing.measurement_period_ns,
-        first_number=start.first_number,
         setpoint=None if acknowledges else loop.setpoint,
         schedule=None if acknowledges else ChangeSchedule(resolved, _prepared),
         timeout_ns=resolved.timing.acknowledgement_timeout_ns if acknowledges else None,
-        observer=observer_of(resolved, restarted=start.is_restart),
+        observer=observer_of(resolved),
         reports_error=resolved.network.link.reads_errors,
         horizon_ns=resolved.timing.horizon_ns,
     )
 
 
-def _with_draws_of(start: Start, sensor: Sensor, resolved: Scenario) -> Sensor:
+def _with_draws_of(sensor: Sensor, resolved: Scenario) -> Sensor:
     """Return a sensor with the draws of a loop that is alike otherwise."""
     schedule, observer = sensor.schedule, sensor.observer
     return replace(
         sensor,
         x0=None if sensor.x0 is None else np.array(resolved.plant.initial_state),
         schedule=None if schedule is None else schedule.for_similar_loop(resolved),
-        observer=None if observer is None else observer_of(resolved, restarted=start.is_restart),
+        observer=None if observer is None else observer_of(resolved),
     )
 
 
@@ -350,15 +321,12 @@ def _prepared(resolved: Scenario) -> tuple[Vector | None, Policy]:
     return None if setpoint is None else setpoint[0], policy_of(resolved)
 
 
-def observer_of(resolved: Scenario, *, restarted: bool) -> Observer | None:
-    """Return the observer of a resolved scenario; None if it has none.
-
-    If the sensor restarts during the run, x(0) is not used.
-    """
+def observer_of(resolved: Scenario) -> Observer | None:
+    """Return the observer of a resolved scenario; None if it has none."""
     settings, loop = resolved.observer, loop_of(resolved)
     if settings is None:
         return None
-    starts_from_x0 = resolved.network.initial_sync == "known_state" and not restarted
+    starts_from_x0 = resolved.network.initial_sync == "known_state"
     x = loop.x0 if starts_from_x0 else np.zeros(loop.n)
     if settings.initial_estimate is not None:
         x = np.array(settings.initial_estimate)
@@ -369,5 +337,4 @@ def observer_of(resolved: Scenario, *, restarted: bool) -> Observer | None:
         resolved.message_sizes.inputs_reported,
         resolved.timing.plant_period_ns,
         starts_from_x0,
-        restarted,
     )

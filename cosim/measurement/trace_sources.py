@@ -234,7 +234,6 @@ def updates_trace(record: RunRecord) -> PacketTrace:
     ended = ~(outcomes.in_flight & lost)
     if not ended.any():
         raise ValueError("no updates reached the network emulator")
-    # Numbers of restarted sensors begin anew far above; the order at the emulator has no gaps.
     trace = packet_trace(sent_ns[ended], np.maximum(received_ns, sent_ns)[ended], lost[ended])
     in_flight = int((~ended).sum())
     notes = [f"left out: {in_flight} updates in flight at the end"] if in_flight else []

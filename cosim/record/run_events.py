@@ -88,11 +88,9 @@ def changes_of(record: RunRecord) -> list[RecordedChange]:
 def model_flow(scenario: Scenario, rows: Rows) -> ModelFlow:
     """The flow of the controller's model in a run, with its set-points."""
     loop, schedule = loop_of(scenario), ChangeSchedule[None](scenario)
-    flow, numbers = ModelFlow(loop.H, loop.setpoint), set()
+    flow = ModelFlow(loop.H, loop.setpoint)
     for change, since_ns in _changes_in(rows):
-        if change.number not in numbers:  # a restarted controller receives it again
-            numbers.add(change.number)
-            _add(schedule, change, since_ns)
+        _add(schedule, change, since_ns)
     for applied in schedule.take(NEVER_NS):
         flow.change(applied.since_ns, loop_of(applied.scenario).setpoint)
     return flow

@@ -8,14 +8,6 @@
    than the last tick is propagated to the time of that tick, a newer one advances the model. */
 #include "loop.h"
 
-/* Updates lost between two; losses before a restart of the sensor are unknown. */
-static int64_t lost_between(int64_t newest, int64_t sequence) {
-    if (newest == NOACK_UNKNOWN_SEQUENCE)
-        return 0;
-    int restarted = floor_div(sequence, GENERATION) != floor_div(newest, GENERATION);
-    return restarted ? floor_mod(sequence, GENERATION) : sequence - newest - 1;
-}
-
 int64_t noack_controller_handle(
     noack_controller *controller, const noack_message *message, int64_t now_ns,
     noack_output *output) {
@@ -42,7 +34,7 @@ int64_t noack_controller_handle(
     put_reals(output, n, message->vector);
     put_reals(output, n, x_c_before);
     put_reals(output, n, controller->x_c);
-    put(output, lost_between(controller->newest, message->sequence));
+    put(output, message->sequence - controller->newest - 1);
     controller->newest = message->sequence;
     if (controller->acknowledges)
         begin_message(output, NOACK_ACKNOWLEDGEMENT, message->sequence, event_ns);
@@ -113,7 +105,7 @@ int64_t noack_controller_tick(noack_controller *controller, int64_t now_ns, noac
     machine->answered = 0;
     copy(n, x_c, controller->x_c);
     controller->model_ns = machine->reached_ns = model_ns;
-    int64_t sequence = machine->first_number + machine->step++;
+    int64_t sequence = machine->step++;
     begin_row(output, NOACK_TICKS, machine, sequence, t_ns, now_ns);
     begin_message(output, NOACK_ACTUATION, sequence, model_ns);
     double *u = output->message.vector;

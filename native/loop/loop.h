@@ -6,7 +6,6 @@
 
 #include "../core.h"
 
-#define GENERATION (INT64_C(1) << 40) /* noack.protocol.roles.GENERATION */
 #define NO_TICK INT64_MAX
 #define MESSAGE_TIMES_NS (INT64_C(1) << 62) /* times of messages are below; see native/wire.c */
 

@@ -21,9 +21,8 @@ static const char *check_machine(const noack_machine *machine) {
         || !is_between(0, machine->period_ns, MOST_NS))
         return "a machine has a phase, a horizon or a period out of range";
     if (!is_between(0, machine->step, MOST_NUMBER) || !is_between(0, machine->inputs, MOST_NUMBER)
-        || !is_between(0, machine->first_number, MOST_NUMBER)
         || (machine->period_ns > 0 && machine->step > MOST_NS / machine->period_ns))
-        return "a machine's step, count of inputs or first number is out of range";
+        return "a machine's step or count of inputs is out of range";
     if (!is_between(0, machine->received.entries, NOACK_MAX_ENTRIES)
         || machine->acknowledgements.entries != 0)
         return "a machine receives vectors of more than 64 entries";
@@ -180,7 +179,7 @@ static const char *check_controller(const noack_controller *controller) {
         return "a controller has no state";
     if (!is_model_time(controller->model_ns) || !is_model_time(controller->update_ns)
         || controller->timeout_ns < 1
-        || !is_between(NOACK_UNKNOWN_SEQUENCE, controller->newest, INT64_MAX))
+        || !is_between(NOACK_NO_SEQUENCE, controller->newest, INT64_MAX))
         return "a controller has a time or a newest update out of range";
     return check_model(&controller->model, n);
 }

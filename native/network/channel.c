@@ -111,8 +111,7 @@ int64_t noack_channel_handle(
     else
         noack_link_decide(link, row, datagram->size_bytes, now_ns, &decision);
     channel->packets[channel->packet_count++] = packet_row(
-        &decision, channel->inputs++, channel->first_number, datagram->arrival_ns, datagram->flow,
-        datagram->head);
+        &decision, channel->inputs++, datagram->arrival_ns, datagram->flow, datagram->head);
     if (decision.release_ns != NOACK_NEVER_NS)
         release(channel, datagram, &decision, 0);
     if (decision.copy_ns != NOACK_NEVER_NS)
@@ -130,7 +129,7 @@ int64_t noack_channel_release(noack_channel *channel, int64_t now_ns) {
     noack_heap_pop(channel->heap, &channel->heap_count);
     channel->releases[channel->release_count++] = (noack_release_row){
         .input = channel->inputs++,
-        .sequence = channel->first_number + leaving->packet,
+        .sequence = leaving->packet,
         .t_ns = entry.due_ns,
         .now_ns = now_ns,
         .flow = leaving->datagram.flow,

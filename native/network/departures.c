@@ -5,11 +5,11 @@
 #include "../core.h"
 
 noack_packet_row packet_row(
-    const noack_decision *decision, int64_t input, int64_t first_number, int64_t arrival_ns,
-    int64_t flow, const uint8_t *data) {
+    const noack_decision *decision, int64_t input, int64_t arrival_ns, int64_t flow,
+    const uint8_t *data) {
     noack_packet_row row = {
         .input = input,
-        .sequence = first_number + decision->packet,
+        .sequence = decision->packet,
         .t_ns = min_of(arrival_ns, decision->arrival_ns),
         .now_ns = decision->arrival_ns,
         .flow = flow,

@@ -25,8 +25,7 @@ static stage_function *const APPLY[NOACK_STAGE_KINDS] = {
     [NOACK_SCHEDULE] = apply_schedule,
 };
 
-void noack_link_start_flow(
-    noack_link *link, int64_t row, int64_t number, int64_t first_delivered, int64_t restarted) {
+void noack_link_start_flow(noack_link *link, int64_t row, int64_t number, int64_t first_delivered) {
     link->flows[row] = (noack_flow){
         .number = number,
         .forced_first = first_delivered != 0,
@@ -38,21 +37,12 @@ void noack_link_start_flow(
         (size_t)link->stage_count * sizeof *link->memory);
     for (int64_t i = 0; i < link->recent_width; i++)
         link->recent_ns[row * link->recent_width + i] = NOACK_NEVER_NS;
-    /* Behind an unknown past, the guarantee counts as many losses directly before the first packet
-       as a window may have. */
-    int64_t assumed = 0;
-    if (restarted) {
-        assumed = link->window_count > 0 ? 0 : 1;
-        for (int64_t i = 0; i < link->window_count; i++)
-            assumed = max_of(assumed, link->windows[i].losses);
-    }
     for (int64_t i = 0; i < link->loss_width; i++)
-        link->losses[row * link->loss_width + i] =
-            -min_of(floor_mod(-i, link->loss_width), assumed);
+        link->losses[row * link->loss_width + i] = 0;
 }
 
 void noack_link_renew(noack_link *link, const int64_t *keys, int64_t first_delivered) {
-    noack_link_start_flow(link, 0, 0, first_delivered, 0);
+    noack_link_start_flow(link, 0, 0, first_delivered);
     for (int64_t i = 0; i < link->stage_count; i++) {
         link->stages[i].key0 = keys[2 * i];
         link->stages[i].key1 = keys[2 * i + 1];

@@ -119,15 +119,15 @@ void record_packet(
     noack_relay *relay, int64_t direction, int64_t client, const uint8_t *data,
     const noack_decision *decision) {
     relay->packets[relay->packet_rows++] = packet_row(
-        decision, relay->inputs++, relay->first_number, scratch_of(relay)->arrival_ns,
-        relay->loops * direction + client, data);
+        decision, relay->inputs++, scratch_of(relay)->arrival_ns, relay->loops * direction + client,
+        data);
 }
 
 /* The delayed datagram leaves at now_ns. */
 void record_release(noack_relay *relay, const departure *leaving, int64_t now_ns) {
     relay->releases[relay->release_rows++] = (noack_release_row){
         .input = relay->inputs++,
-        .sequence = relay->first_number + leaving->datagram.packet,
+        .sequence = leaving->datagram.packet,
         .t_ns = leaving->release_ns,
         .now_ns = now_ns,
         .flow = relay->loops * leaving->datagram.direction + leaving->datagram.client,

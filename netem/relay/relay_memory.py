@@ -197,7 +197,7 @@ class RelayDirection(LinkState):
     """One direction of a link in a relay's memory; see :class:`netem.link_state.LinkState`.
 
     Args:
-        settings, seed, name, decisions, restarted: see there.
+        settings, seed, name, decisions: see there.
         row: its ``noack_direction``.
     """
 
@@ -208,9 +208,8 @@ class RelayDirection(LinkState):
         name: Sequence[str],
         row: CData,
         decisions: Decisions = (),
-        restarted: bool = False,
     ) -> None:
-        super().__init__(settings, seed, *name, decisions=decisions, rows=_ROWS, restarted=restarted)
+        super().__init__(settings, seed, *name, decisions=decisions, rows=_ROWS)
         self.row = row
         row.link = self.core
         self._set_keeps()

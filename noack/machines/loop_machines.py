@@ -123,13 +123,11 @@ def set_machine(
     m: int,
     entries: int,
     flow: Flow,
-    first_number: int = 0,
     period_ns: int = 0,
     horizon_ns: int,
 ) -> None:
     """Fill a new ``noack_machine``; its ticks begin at time 0."""
     machine.n, machine.m = n, m
-    machine.first_number = machine.inputs = first_number
     machine.period_ns, machine.horizon_ns = period_ns, horizon_ns
     machine.reached_ns, machine.change_ns = -1, NEVER_NS
     machine.received.flow, machine.received.entries = flow, entries

@@ -98,31 +98,6 @@ PROTOCOLS: Mapping[str, LoopProtocol] = {
 }
 
 
-GENERATION = 2**40
-"""A restarted process numbers its messages from generation · 2⁴⁰ on, above all earlier ones."""
-
-
-class Start(NamedTuple):
-    """The point of a run at which a machine begins its work."""
-
-    generation: int = 0
-    """Number of restarts of its process in this run; a restarted process knows no state."""
-    from_ns: int = 0  # no timer is due before
-
-    @property
-    def first_number(self) -> int:
-        """The first of its sequence numbers, and of the numbers of its inputs."""
-        return self.generation * GENERATION
-
-    @property
-    def is_restart(self) -> bool:
-        """Whether the process was restarted during the run."""
-        return self.generation > 0
-
-
-BEGINNING = Start()  # the start of the run
-
-
 class Record(NamedTuple):
     """A row for the numeric record; ``noack.protocol.record_tables`` documents the tables."""
 
@@ -130,7 +105,6 @@ class Record(NamedTuple):
     row: tuple[object, ...]
 
 
-RESTART = "restart"  # level of the notice of a restarted process
 FAILED = "failed"  # level of the notice of a plant or controller that cannot continue
 
 

@@ -84,7 +84,7 @@ class EncryptedSeal:
     read what is encrypted.
 
     The nonce is the flow, the loop and the sequence number. No two datagrams of a run have the same
-    ones: a restarted process numbers its messages above all of its predecessor's.
+    ones.
     """
 
     version = 2

@@ -8,7 +8,7 @@ import numpy as np
 from controller_node.controller import Controller, controllers_of
 from noack.core.core_library import core, ffi
 from noack.machines.loop_machines import LoopMachines
-from noack.protocol.roles import BEGINNING, Notice, Output, Record, Start
+from noack.protocol.roles import Notice, Output, Record
 from noack.protocol.wire_format import Flow, Message
 from noack.scenario.parameter_changes import ParameterChange
 from noack.scenario.scenario import Scenario
@@ -97,14 +97,14 @@ def plant_of(resolved: Scenario) -> OneLoop:
     return OneLoop(plants_of((resolved,)).parts)
 
 
-def sensor_of(resolved: Scenario, start: Start = BEGINNING) -> OneLoop:
+def sensor_of(resolved: Scenario) -> OneLoop:
     """The sensor of a resolved scenario."""
-    return OneLoop(sensors_of((resolved,), start=start).parts)
+    return OneLoop(sensors_of((resolved,)).parts)
 
 
-def controller_of(resolved: Scenario, start: Start = BEGINNING) -> OneLoop:
+def controller_of(resolved: Scenario) -> OneLoop:
     """The controller of a resolved scenario."""
-    return OneLoop(controllers_of((resolved,), start=start).parts)
+    return OneLoop(controllers_of((resolved,)).parts)
 
 
 def machine(part: Plant | Sensor | Controller) -> OneLoop:

@@ -12,8 +12,7 @@ NO_VECTOR: Vector = np.zeros(0)  # the vector of an acknowledgement
 class Decoder:
     """Turns the datagrams of one flow of a loop into messages; others are counted and rejected.
 
-    Only a datagram that is newer than every one accepted before is accepted. A datagram from before
-    ``not_before_ns`` is stale: the process before a restart may have accepted it.
+    Only a datagram that is newer than every one accepted before is accepted.
     """
 
     def __init__(
@@ -23,7 +22,6 @@ class Decoder:
         run_id: int,
         key: bytes,
         *,
-        not_before_ns: int = 0,
         not_after_ns: int = wire_format.TIMES_NS - 1,
         loop: int = 0,
         encrypted: bool = False,
@@ -34,7 +32,7 @@ class Decoder:
             "noack_reception *",
             {
                 "flow": flow, "entries": dimension, "newest": -1,
-                "not_before_ns": not_before_ns, "not_after_ns": not_after_ns,
+                "not_after_ns": not_after_ns,
             },
         )  # fmt: skip
         self._message = ffi.new("noack_message *")

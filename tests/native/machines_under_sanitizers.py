@@ -32,7 +32,7 @@ WHOLE = (0, 1, -1, 7, MS, 2**40, 2**60, 2**61, 2**62 - 1, 2**62, 2**63 - 1, -(2*
 _MACHINE = tuple(
     f"machine.{name}"
     for name in ("phase_ns", "first_ns", "period_ns", "horizon_ns", "step", "inputs",
-                 "first_number", "reached_ns", "change_ns")
+                 "reached_ns", "change_ns")
 )  # fmt: skip
 NUMBERS_OF = {
     "plant": (

@@ -43,19 +43,18 @@ def plain(value: Any) -> bytes | int:
 
 
 @pytest.mark.sanitized
-@given(any_link, any_link, st.none() | any_link, arrivals, st.sampled_from([0, 2**40]))
+@given(any_link, any_link, st.none() | any_link, arrivals)
 def test_the_channel_does_what_the_plain_network_does(
     first: LinkSettings,
     second: LinkSettings,
     later: LinkSettings | None,
     arriving: Sequence[tuple[int, int, int, bool]],
-    number: int,
 ) -> None:
     named = (first, 5, "update"), (second, 5, "actuation")
-    forward, reverse = (Link(*arguments, first_number=number, loops=LOOPS) for arguments in named)
-    expected = Duplex(forward, reverse, first_number=number, loops=LOOPS)
+    forward, reverse = (Link(*arguments, loops=LOOPS) for arguments in named)
+    expected = Duplex(forward, reverse, loops=LOOPS)
     links = [LinkState(*arguments, rows=LOOPS) for arguments in named]
-    channel = SteppedChannel(Channel(links, loops=LOOPS, first_number=number))
+    channel = SteppedChannel(Channel(links, loops=LOOPS))
     now_ns, rng = 0, np.random.default_rng(1)
     for k, (flow, size, step_ns, leaves) in enumerate(arriving):
         if later is not None and k == len(arriving) // 2:

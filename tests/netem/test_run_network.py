@@ -21,7 +21,7 @@ from netem.run_network import NetworkSockets, RunNetwork
 from noack.core.clock import RunClock
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, OWNER
-from noack.protocol.roles import BEGINNING, Notice, Record, Start
+from noack.protocol.roles import Notice, Record
 from noack.protocol.wire_format import Encoder, Flow, Message
 from noack.runtime.address import address_text
 from noack.runtime.drivers.real_time_loop import run_loop
@@ -51,10 +51,10 @@ arrivals = st.lists(
 class ComparedNetworks:
     """The network in the core and the oracle in Python; each input is given to both."""
 
-    def __init__(self, resolved: Any, start: Start, sockets: list[socket.socket], loops: int) -> None:
+    def __init__(self, resolved: Any, sockets: list[socket.socket], loops: int) -> None:
         self.loops = loops
-        self.oracle: Machine[Datagram] = network_of(resolved, start, loops=self.loops)
-        self.core: Any = RunNetwork(resolved, start, self.loops)
+        self.oracle: Machine[Datagram] = network_of(resolved, loops=self.loops)
+        self.core: Any = RunNetwork(resolved, self.loops)
         sender, sensor, plant, self._controller, *receivers = sockets
         peers = {name_of(sensor): receivers[0], name_of(self._controller): receivers[1]}
         self._other = plant if Flow.ACTUATION in resolved.network.flows else sensor
@@ -99,9 +99,9 @@ class ComparedNetworks:
 
 
 @contextmanager
-def compared(resolved: Any, start: Start = BEGINNING, loops: int = 1) -> Iterator[ComparedNetworks]:
+def compared(resolved: Any, loops: int = 1) -> Iterator[ComparedNetworks]:
     with endpoints(*["127.0.0.1"] * 6) as sockets:
-        networks = ComparedNetworks(resolved, start, sockets, loops)
+        networks = ComparedNetworks(resolved, sockets, loops)
         with closing(networks.core):
             yield networks
 
@@ -121,7 +121,7 @@ CROSSING = st.sampled_from([
 
 @settings(max_examples=40)
 @given(
-    any_settings.harsh, any_settings.harsh, CROSSING, arrivals, st.integers(0, 2),
+    any_settings.harsh, any_settings.harsh, CROSSING, arrivals,
     st.sampled_from([1, 1, 2, 200]),
 )  # fmt: skip
 def test_the_network_of_a_run_gives_the_rows_and_datagrams_of_the_plain_machine(
@@ -129,13 +129,11 @@ def test_the_network_of_a_run_gives_the_rows_and_datagrams_of_the_plain_machine(
     reverse: LinkSettings,
     crossing: tuple[Flow, ...],
     steps: list[Arrival],
-    lives: int,
     loops: int,
 ) -> None:
     """The two directions have 2 · ``loops`` flows in all, which the header tells apart."""
     now_ns = 0
-    start = Start(generation=lives)
-    with compared(network(forward, reverse, *crossing), start, loops) as networks:
+    with compared(network(forward, reverse, *crossing), loops) as networks:
         for number, (gap_ns, size, direction) in enumerate(steps):
             now_ns += gap_ns
             if gap_ns % 3 == 1:
@@ -150,7 +148,7 @@ def test_the_network_of_a_run_gives_the_rows_and_datagrams_of_the_plain_machine(
         networks.received()
         assert networks.core.of_no_loop == 2
     inputs = [record.row[0] for record in networks.rows]
-    assert inputs == list(range(inputs[0], inputs[0] + len(inputs)))
+    assert inputs == list(range(len(inputs)))
 
 
 class _Rows(list[Any]):
@@ -164,7 +162,7 @@ def test_arrival_is_when_the_datagram_reached_the_socket() -> None:
     resolved = network(LinkSettings(), LinkSettings(), Flow.UPDATE)
     with endpoints(*["127.0.0.1"] * 5) as (sender, sensor, controller, *receivers):
         peers = dict(zip((name_of(sensor), name_of(controller)), receivers, strict=True))
-        with closing(RunNetwork(cast(Scenario, resolved), BEGINNING)) as run_network:
+        with closing(RunNetwork(cast(Scenario, resolved))) as run_network:
             sender.connect(name_of(controller))
             run_network.open(clock, sender, peers, [name_of(controller)])
             for _ in range(20):  # a process that is stalled meanwhile cannot compare its clocks
@@ -204,7 +202,7 @@ def test_early_and_later_datagrams_are_relayed_and_foreign_ones_counted() -> Non
         for _ in range(foreign):
             other.sendto(b"?", here)
         clock = RunClock(time.monotonic_ns(), scenario.speed)
-        network = RunNetwork(scenario, BEGINNING)
+        network = RunNetwork(scenario)
         ends = [(name_of(sensor), name_of(controller))]
         received: Received = []
         waiting = iter(sent[early:])

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from netem.channel import UPDATE_LINK, Datagram, due_settings, link_name, settings_at_start
+from netem.channel import UPDATE_LINK, Datagram, due_settings, link_name
 from netem.link_state import LinkState
 from noack.core.core_library import core
 from noack.impairments.disciplines.earliest_deadline import EarliestDeadline
@@ -23,7 +23,7 @@ from noack.impairments.disciplines.priority import Priority
 from noack.impairments.kinds.rate import Rate
 from noack.impairments.link_settings import Counters, Decisions, LinkSettings
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, NETEM_SETTING, PACKET_HEAD_BYTES, Fate
-from noack.protocol.roles import BEGINNING, Notice, Record, Start
+from noack.protocol.roles import Notice, Record
 from noack.scenario.parameter_changes import ChangeSchedule, ParameterChange
 from noack.scenario.scenario import Scenario
 from tests.helpers.machine_parts import Machine
@@ -65,10 +65,7 @@ class Link:
         seed: seed of its random streams.
         name: names of the link and the direction; part of its random streams' names.
         decisions: recorded decisions per flow; each flow repeats them before the settings apply.
-        first_number: number of the first input and of the first packet.
         schedule: announced changes of the settings; None: nothing can be announced.
-        restarted: the link has replaced another in a run; see
-            :class:`netem.link_state.LinkState`.
         loops: loops of a run, whose numbers are their rows; 0: rows in the order of first packets.
     """
 
@@ -78,13 +75,11 @@ class Link:
         seed: int,
         *name: str,
         decisions: Decisions = (),
-        first_number: int = 0,
         schedule: ChangeSchedule | None = None,
-        restarted: bool = False,
         loops: int = 0,
     ) -> None:
         self._loops = loops
-        self._state = LinkState(settings, seed, *name, decisions=decisions, restarted=restarted)
+        self._state = LinkState(settings, seed, *name, decisions=decisions)
         self._schedule = schedule
         self._reached_ns = -1
         self._rows: dict[int, int] = {}
@@ -92,7 +87,7 @@ class Link:
         self._put_in_flight = 0
         self._waiting: list[_Waiting] = []
         self._free = Fraction(0)
-        self._inputs = self._first_number = first_number
+        self._inputs = 0
 
     @property
     def counters(self) -> Counters:
@@ -146,7 +141,7 @@ class Link:
         due = heapq.heappop(self._in_flight)
         stale = self._leave(due)
         row = (
-            self._inputs, self._first_number + due.packet, due.release_ns, now_ns,
+            self._inputs, due.packet, due.release_ns, now_ns,
             due.datagram.flow, int(due.copy), int(stale),
         )  # fmt: skip
         self._inputs += 1
@@ -160,7 +155,7 @@ class Link:
         decision = self.decide(message.flow, len(message.data), now_ns)
         head = message.data[:PACKET_HEAD_BYTES].ljust(PACKET_HEAD_BYTES, b"\0")
         row = (
-            self._inputs, self._first_number + decision.packet, now_ns, now_ns,
+            self._inputs, decision.packet, now_ns, now_ns,
             message.flow, Fate(decision.fate), decision.consecutive_losses,
             decision.release_ns, decision.copy_ns, decision.bit, len(message.data), head,
         )  # fmt: skip
@@ -273,22 +268,10 @@ def _is_update(data: bytes) -> bool:
     return len(data) >= 32 and data[:2] == b"NA" and data[2] in (1, 2) and data[3] == 2
 
 
-def update_link_of(resolved: Scenario, start: Start = BEGINNING) -> Link:
+def update_link_of(resolved: Scenario) -> Link:
     """Return the link from sensor to controller of a resolved scenario."""
     schedule = ChangeSchedule(resolved, lambda scenario: scenario.network.link)
-    return link_of(resolved.network.link, resolved.seeds.loss, UPDATE_LINK, start, schedule)
-
-
-def link_of(
-    settings: LinkSettings, seed: int, name: str, start: Start,
-    schedule: ChangeSchedule | None = None,
-) -> Link:  # fmt: skip
-    """Return a link of a run."""
-    settings, names = settings_at_start(settings, name, start)
-    return Link(
-        settings, seed, *names, first_number=start.first_number, schedule=schedule,
-        restarted=start.is_restart,
-    )  # fmt: skip
+    return Link(resolved.network.link, resolved.seeds.loss, UPDATE_LINK, schedule=schedule)
 
 
 class Duplex:
@@ -302,12 +285,11 @@ class Duplex:
         forward: Machine[Datagram],
         reverse: Machine[Datagram],
         *,
-        first_number: int = 0,
         loops: int = 1,
     ) -> None:
         self._links = (forward, reverse)
         self._loops = loops
-        self._inputs = first_number
+        self._inputs = 0
 
     def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
         """Accept a change of the forward direction; see :class:`Link`."""
@@ -345,18 +327,17 @@ class Duplex:
 
 def network_of(
     resolved: Scenario,
-    start: Start = BEGINNING,
     forward: Machine[Datagram] | None = None,
     loops: int = 1,
 ) -> Machine[Datagram]:
     """Return the network of a resolved scenario; ``forward`` replaces the link of the updates."""
-    forward = update_link_of(resolved, start) if forward is None else forward
+    forward = update_link_of(resolved) if forward is None else forward
     _, *others = resolved.network.flows
     if not others:
         return forward
     settings, name = resolved.network.link_of(others[0]), link_name(others[0])
-    reverse = link_of(settings, resolved.seeds.loss, name, start)
-    return Duplex(forward, reverse, first_number=start.first_number, loops=loops)
+    reverse = Link(settings, resolved.seeds.loss, name)
+    return Duplex(forward, reverse, loops=loops)
 
 
 def flipped(data: bytes, bit: int) -> bytes:

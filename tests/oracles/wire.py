@@ -67,17 +67,16 @@ class Receiver:
         dimension: number of entries of a vector.
         run_id: number of the run.
         loop: number of the loop.
-        not_before_ns: earlier datagrams are stale.
         not_after_ns: time of the last datagram.
     """
 
     def __init__(
         self, key: bytes, *, version: int, flow: int, dimension: int, run_id: int, loop: int,
-        not_before_ns: int, not_after_ns: int,
+        not_after_ns: int,
     ) -> None:  # fmt: skip
         self._key, self._version, self._flow, self._dimension = key, version, flow, dimension
         self._run_id, self._loop = run_id, loop
-        self._not_before_ns, self._not_after_ns = not_before_ns, not_after_ns
+        self._not_after_ns = not_after_ns
         self._newest = -1
 
     def examine(self, data: bytes, *, from_peer: bool) -> tuple[str, dict[str, Any]]:
@@ -100,7 +99,7 @@ class Receiver:
         for reason, holds in (
             ("source", from_peer),
             ("range", sequence < 2**63 and 0 <= t_ns <= self._not_after_ns),
-            ("stale", sequence > self._newest and t_ns >= self._not_before_ns),
+            ("stale", sequence > self._newest),
             ("not_finite", all(map(math.isfinite, vector))),
         ):
             if not holds:
@@ -122,15 +121,15 @@ class BothReceivers:
 
     def __init__(
         self, flow: int = 2, dimension: int = 3, *, run_id: int = RUN, loop: int = 0, encrypted: bool = False,
-        not_before_ns: int = 0, not_after_ns: int = TIMES_NS - 1,
+        not_after_ns: int = TIMES_NS - 1,
     ) -> None:  # fmt: skip
         self.core = Decoder(
-            Flow(flow), dimension, run_id, KEY, not_before_ns=not_before_ns, not_after_ns=not_after_ns,
+            Flow(flow), dimension, run_id, KEY, not_after_ns=not_after_ns,
             loop=loop, encrypted=encrypted,
         )  # fmt: skip
         self._page = Receiver(
             KEY, version=1 + encrypted, flow=flow, dimension=dimension, run_id=run_id, loop=loop,
-            not_before_ns=not_before_ns, not_after_ns=not_after_ns,
+            not_after_ns=not_after_ns,
         )  # fmt: skip
         self.message: Message | None = None
         """The message of the last datagram; None if it was rejected."""

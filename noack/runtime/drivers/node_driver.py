@@ -303,7 +303,7 @@ class NodeDriver(LiveDriver):
             table.count += 1
             if kind == core.NOACK_TICKS:
                 sequence = struct.unpack_from("<q", content, 8)[0]
-                if sequence != (due := machine.first_number + machine.step):
+                if sequence != (due := machine.step):
                     raise PeerError(f"{self._label}: has sent tick {sequence} in place of {due}")
                 machine.step += 1
                 self._tick_s = time.monotonic()

@@ -26,7 +26,7 @@ from noack.observers.luenberger import LuenbergerSettings
 from noack.observers.observer_settings import EstimationModel
 from noack.plants.linear import LinearSystem
 from noack.plants.plant_settings import SystemFailedError
-from noack.protocol.roles import GENERATION, Notice, Output, Start
+from noack.protocol.roles import Notice, Output
 from noack.protocol.wire_format import Flow, Message
 from noack.trigger_policies.trigger_rule import CodedPolicy, Policy, TriggerDecision
 from plant_server.plant import Disturbance, MeasurementModel, Plant, Watchdog
@@ -196,7 +196,6 @@ def sensor(seed: int, of: Sizes, form: int, scale: float = 1.0) -> Sensor:
         x0=matrix(rng, scale, n) if chance(rng) else None,
         inputs=m,
         period_ns=10 * MS,
-        first_number=GENERATION * chance(rng),
         setpoint=matrix(rng, scale, n) if chance(rng) else None,
         timeout_ns=int(rng.integers(0, 50)) * MS if of.acknowledged else None,
         observer=observer(rng, of.outputs, n, m, steps, scale) if of.outputs else None,
@@ -220,7 +219,6 @@ def observer(rng: Rng, p: int, n: int, m: int, steps: int, scale: float) -> Obse
         reported=steps * m,
         period_ns=10 * MS,
         starts_from_x0=chance(rng),
-        restarted=chance(rng),
     )
 
 
@@ -244,7 +242,6 @@ def controller(
         guarantee=LossGuarantee(tuple(chosen)),
         x0=matrix(rng, scale, n) if chance(rng) else None,
         acknowledges=of.acknowledged,
-        start=Start(int(chance(rng)), 33 * MS),
         safe_input=matrix(rng, scale, m),
         carries_model=of.carries_model,
         predictions=of.predictions,
