@@ -16,11 +16,10 @@ cannot be distinguished from a transient. A run that is disturbed, saturated or 
 does not meet the criterion.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.row_operations import all_entries, row_norms
@@ -84,47 +83,6 @@ def divergence(
         f"diverged: ‖x‖ passed {GROWTH * scale:.3g} ({GROWTH:g} times its expected size) at "
         f"{at_s:g} s, reached {last:.3g}, and was still growing at the end",
     )
-
-
-class GrowthMonitor:
-    """Finds the loops whose state leaves its scale, while they run; each loop is found once.
-
-    Whether it then keeps growing, as :func:`divergence` asks, is known at the end only.
-
-    Args:
-        loops: the resolved scenario of each loop.
-    """
-
-    def __init__(self, loops: Sequence[Scenario]) -> None:
-        self._early_ns = loops[0].timing.horizon_ns // 10
-        self._scales = np.array([_scale(loop) for loop in loops])
-        self._is_reported = np.zeros(len(loops), np.bool_)
-        sizes = np.array([loop.model.dimensions[0] for loop in loops])
-        self._entries = np.arange(sizes.max()) < sizes[:, None]
-        """(loops, n) which entries of a vector each loop has."""
-
-    @np.errstate(all="ignore")
-    def take(
-        self, loops: NDArray[np.integer], t_ns: NDArray[np.int64], x: Matrix
-    ) -> list[tuple[int, int, str]]:
-        """Add states x, (k, n), of loops, (k,), at their times; return loop, time and text.
-
-        Of a loop with fewer states than n, the others are not used.
-        """
-        norms = row_norms(np.where(self._entries[loops], x, 0.0))
-        lost, early = ~np.isfinite(norms), t_ns < self._early_ns
-        np.fmax.at(self._scales, loops[early & ~lost], norms[early & ~lost])
-        limits = GROWTH * self._scales[loops]
-        beyond = np.flatnonzero(lost | (~early & (limits > 0) & (norms > limits)))
-        new = []
-        for row in beyond[~self._is_reported[loops[beyond]]].tolist():
-            if self._is_reported[loop := int(loops[row])]:
-                continue
-            self._is_reported[loop] = True
-            growth = f"‖x‖ passed {limits[row]:.3g} ({GROWTH:g} times its expected size)"
-            text = "x is not finite" if lost[row] else growth
-            new.append((loop, int(t_ns[row]), text))
-        return new
 
 
 def _scale(scenario: Scenario) -> float:

@@ -164,10 +164,10 @@ class RunProgress(ControlMessage):
     deliveries: Count
     longest_loss_burst: Count
     x_norm: float | None
+    late_us: FiniteFloat = 0.0
+    """The largest lateness of a step of the plant or the controller, in microseconds of wall time."""
     live: str | None
-    warnings: list[str] = Field([])
-    """The claims that are void so far, with reasons; loops that diverge; what cannot be checked or
-    shown during the run."""
+    warnings: list[str] = Field([])  # what cannot be shown during the run
     changes: list[str] = Field([])  # changes of runtime parameters during the run
 
 

@@ -272,5 +272,5 @@ def progress_text(report: RunProgress, horizon_s: float, loops: int = 1) -> str:
     return (
         f"{report.t_s:.1f}/{horizon_s:g} s  {of_loops}events {report.events}  "
         f"delivered {report.deliveries}  longest loss burst {report.longest_loss_burst}  "
-        f"‖x‖ {norm}"
+        f"late by up to {report.late_us / 1e3:.2g} ms  ‖x‖ {norm}"
     )

@@ -26,7 +26,7 @@ _GAUGES = {
 _COUNTERS = {
     "events": "updates sent by the sensor",
     "deliveries": "updates received by the controller",
-    "warnings": "void claims and diverging loops",
+    "warnings": "what cannot be shown during the run",
     "changes": "changes of settings during the run",
 }
 

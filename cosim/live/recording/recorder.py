@@ -6,9 +6,8 @@
 import math
 import sys
 import time
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from contextlib import ExitStack
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,8 +27,10 @@ from noack.core.core_library import core
 from noack.core.errors import ExitStatus, MachineError, PeerError
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
+    CONTROLLER_STEP,
     LOOP,
     NETEM_PACKET,
+    PLANT_STEP,
     SENSOR_MEASUREMENT,
     effective,
 )
@@ -44,17 +45,13 @@ from noack.runtime.run_process import RunProcess
 from noack.runtime.spool import NOTICES
 from noack.runtime.telemetry import first_row
 from noack.scenario.parameter_changes import change_notice
-from noack.scenario.runtime_parameters import is_of_loss_alone
 from noack.scenario.scenario import Scenario, loop_names
 
 if TYPE_CHECKING:
-    from cosim.live.recording.claim_monitor import ClaimMonitor, Finding
     from cosim.output.viewer.live_feed import LiveFeed
     from cosim.output.viewer.recording_viewer import LiveView
     from cosim.output.viewer.run_recording import RunRecording
 
-_MOST_LINES = 30
-"""Warnings in the progress report."""
 _POLL_FOR_S = 0.2
 """Longest time for which batches are handled before anything else is done."""
 _WAITING_BATCHES = 4096
@@ -117,13 +114,6 @@ class ProgressReport(RunProgress):
 
     model_config = ConfigDict(frozen=False)
 
-    def add_warning(self, text: str) -> None:
-        """Add a line, e.g. about void claims; of many, the last names the place of the others."""
-        if len(self.warnings) < _MOST_LINES:
-            self.warnings.append(text)
-        elif len(self.warnings) == _MOST_LINES:
-            self.warnings.append("further void claims and diverging loops are in the logs of the loops")
-
     @np.errstate(all="ignore")  # a run may diverge
     def count(self, table: str, rows: Rows) -> None:
         """Count rows of a table."""
@@ -163,10 +153,8 @@ class Recorder:
         self._feed: LiveFeed | None = None
         self.lost: MachineError | None = None
         """Why some stored rows are no longer on disk; known at the end."""
-        self._stop_reported = False
-        """Whether a warning says that claims are no longer checked."""
         self.is_stopping = False
-        """Whether the processes of the run end one by one: no more assumptions are checked."""
+        """Whether the processes of the run end one by one."""
         session, key = plane.session, plane.key
         self._batches = session.declare_subscriber(
             key("telemetry", "*", "*"),
@@ -183,14 +171,6 @@ class Recorder:
             t_s=0.0, events=0, deliveries=0, longest_loss_burst=0, x_norm=None, live=live
         )
 
-    @cached_property
-    def _monitor(self) -> "ClaimMonitor":
-        """Checks claims."""
-        # It imports the theory, for which the other processes do not wait.
-        from cosim.live.recording.claim_monitor import ClaimMonitor
-
-        return ClaimMonitor(self._scenario)
-
     @property
     def finished(self) -> bool:
         """Whether every process of the loop has handed over its rows, or is gone."""
@@ -206,7 +186,7 @@ class Recorder:
         """Show the telemetry in a view, from the first batch that is handled afterwards."""
         from cosim.output.viewer.live_feed import LiveFeed  # imports rerun
 
-        self._feed = LiveFeed(self._scenario, view, self._progress.add_warning)
+        self._feed = LiveFeed(self._scenario, view, self._progress.warnings.append)
 
     def poll(self) -> bool:
         """Handle messages that have arrived; return whether there may be more.
@@ -226,7 +206,6 @@ class Recorder:
 
     def show(self) -> None:
         """Bring the view and the progress report up to date."""
-        self._monitor_assumptions(self._monitor.advance)
         self._publish_progress()
         if self._feed is not None:
             try:
@@ -241,8 +220,6 @@ class Recorder:
         notice = change_notice(announced.change, requested)
         self.store.add_own_notice(notice)
         self._progress.changes.append(notice.text)
-        if not is_of_loss_alone(announced.settings):
-            self._monitor.end_at(announced.t_ns / NS_PER_S)
         if self._feed is not None:
             self._feed.log(notice.line())
 
@@ -256,7 +233,6 @@ class Recorder:
 
     def finish(self) -> None:
         """Complete spool and view; the launcher writes the record."""
-        self._monitor_assumptions(self._monitor.end)
         self._publish_progress()
         try:
             self.store.writer.require_present()
@@ -295,33 +271,16 @@ class Recorder:
             self._invalid += 1
 
     def _take_rows(self, table: str, rows: Rows, *, follows: bool) -> None:
-        """Count, check and show rows that are stored."""
+        """Count and show rows that are stored."""
         if not follows:
             self.view_is_incomplete = True
-            self._monitor.stop("telemetry is missing or arrived out of order")
             return
         self._progress.count(table, rows)
-        self._monitor.take(table, rows)
+        if table in (PLANT_STEP, CONTROLLER_STEP):
+            late_us = float((rows["now_ns"] - rows["t_ns"]).max()) / (1e3 * self._scenario.speed)
+            self._progress.late_us = max(self._progress.late_us, late_us)
         if self._feed is not None:
             self._feed.add(table, rows)
-
-    def _monitor_assumptions(self, check: "Callable[[], list[Finding]]") -> None:
-        """Report violated assumptions in the log, the view and the progress report."""
-        if self.is_stopping:
-            return
-        try:
-            findings = check()
-        except Exception as error:  # whatever it is: recording goes on
-            findings = []
-            self._monitor.stop(repr(error))
-        for notice, text in findings:
-            self.store.add_own_notice(notice)
-            self._progress.add_warning(text)
-            if self._feed is not None:
-                self._feed.log(notice.line())
-        if self._monitor.stopped is not None and not self._stop_reported:
-            self._stop_reported = True
-            self._progress.add_warning(f"claims are checked after the run only: {self._monitor.stopped}")
 
     def _publish_progress(self) -> None:
         self._plane.publish("progress", content=message_json(self._progress))

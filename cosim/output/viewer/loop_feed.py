@@ -65,7 +65,7 @@ SHOWN_TABLES = (
     SENSOR_MEASUREMENT,
 )
 
-_WARNINGS = ("failed", "violation", "void", "late", "diverges", "watchdog", "clock lost")
+_WARNINGS = ("failed", "violation", "watchdog", "clock lost")
 
 
 def log_level(notice: Mapping[str, object]) -> str:

@@ -10,13 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
-from cosim.analysis.claims.condition_reader import AssumptionMonitor, ConditionReader, read_conditions
+from cosim.analysis.claims.condition_reader import ConditionReader, read_conditions
 from cosim.analysis.claims.observed_conditions import (
     BEYOND_CERTIFICATE,
     CAUSES,
     CLOCK_CAUSES,
     AssumptionViolation,
     ObservedConditions,
+    causes_of,
     combine,
 )
 from cosim.analysis.claims.run_certificates import certificates_together
@@ -67,18 +68,10 @@ def batches(record: RunRecord, seed: int) -> Batches:
             yield None
 
 
-def reported(record: RunRecord, seed: int = 0) -> list[AssumptionViolation]:
-    """The violations that a monitor reports if it receives the run in batches."""
-    monitor, violations = AssumptionMonitor(record.scenario), []
-    for batch in batches(record, seed):
-        if batch is None:
-            violations += monitor.advance()
-        else:
-            monitor.take(*batch)
-    violations += monitor.end()
-    assert monitor.stopped is None
-    assert len({violation.cause for violation in violations}) == len(violations)
-    return violations
+def reported(record: RunRecord) -> list[AssumptionViolation]:
+    """The violations of the assumptions that claims about a run need."""
+    scenario = record.scenario
+    return read_conditions(record).violations(allowed_conditions(scenario), causes_of(scenario))
 
 
 def hostile(seed: int) -> Any:
@@ -144,7 +137,7 @@ def test_batches_in_any_order_show_what_the_whole_record_shows(make: Make) -> No
             np.testing.assert_array_equal(getattr(in_parts, name), getattr(whole, name))
         assert parts[-1].start_s == whole.start_s
         assert all(part.start_s <= whole.start_s for part in parts)
-        violations = {violation[:2] for violation in reported(record, seed)}
+        violations = {violation[:2] for violation in reported(record)}
         assert violations == {violation[:2] for violation in whole.violations(allowed_conditions(resolved))}
         causes.update(cause for _, cause in violations)
 
@@ -263,44 +256,6 @@ def test_a_run_is_certified_until_it_is_later_than_any_certificate_covers(
     later = covered._replace(**{f"{time}_s": most})
     (beyond,) = certificates_together([record.scenario], None, [later])
     assert {certificate.constants for certificate in beyond} == {None}
-
-
-# --- reports are timely and cost little memory ----------------------------------------------------
-
-
-def test_an_input_that_is_too_old_is_reported_during_the_outage(make: Make) -> None:
-    """The report does not need the controller's own rows, and nothing follows the end."""
-    record = with_outage(make(), 2.0, 3.0)
-    for end_s, expected in ((9.0, [(pytest.approx(2.01), "hold")]), (1.0, [])):
-        monitor = AssumptionMonitor(record.scenario)
-        monitor.end_at(end_s)
-        for table in record.tables:
-            until_ns = 2.0e9 if OWNER[table] == "controller" else 2.1e9
-            monitor.take(table, record[table][record[table]["now_ns"] < until_ns])
-        assert [(violation.t_s, violation.cause) for violation in monitor.advance()] == expected
-
-
-def test_only_rows_that_are_still_needed_are_stored(make: Make) -> None:
-    """The memory does not grow with the run; here all processes send every 0.5 s."""
-    record = simulate(make(horizon_s=10.0, trigger={"beta": 1e-9}), hostile(1))
-    monitor, waiting = AssumptionMonitor(record.scenario), []
-    for end_ns in range(500_000_000, 10_500_000_000, 500_000_000):
-        for table in record.tables:
-            t_ns = record[table]["now_ns"]
-            monitor.take(table, record[table][(t_ns >= end_ns - 500_000_000) & (t_ns < end_ns)])
-        monitor.advance()
-        waiting.append(monitor.waiting)
-    assert max(waiting) < 150
-    # It stops instead of storing everything, if no rows of the controller arrive.
-    silent, rows = AssumptionMonitor(record.scenario), record[SENSOR_MEASUREMENT].copy()
-    rows["event"] = np.arange(len(rows))
-    for _ in range(200):
-        silent.take(SENSOR_MEASUREMENT, rows)
-        silent.advance()
-        rows["t_ns"] += 10_010_000_000
-        rows["event"] += len(rows)
-    assert silent.stopped == "a process has sent no rows for too long"
-    assert silent.end() == []
 
 
 # --- the conditions that a run has met ------------------------------------------------------------

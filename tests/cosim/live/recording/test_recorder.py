@@ -1,4 +1,4 @@
-"""The recorder: invalid telemetry, full disks, and claims that become void in the run."""
+"""The recorder: invalid telemetry, full disks, and progress."""
 
 import errno
 import io
@@ -12,15 +12,14 @@ import numpy as np
 import pytest
 import zenoh
 
-from cosim.live.recording import recorder
 from cosim.live.recording.recorder import Recorder
 from cosim.output.viewer.loop_recording import ViewError
 from cosim.record.record_source import with_loop
 from cosim.record.run_directory import SCENARIO_FILE
-from cosim.record.run_record import RunRecord, load_record
+from cosim.record.run_record import RunRecord
 from cosim.record.spool_conversion import finish_record
 from noack.core.errors import MachineError
-from noack.protocol.record_tables import OWNER, PLANT_STEP
+from noack.protocol.record_tables import OWNER, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.roles import LOOP_ROLES, RECORDER
 from noack.runtime.control_messages import RunProgress, parse_message
 from noack.runtime.spool import NOTICES, SPOOL, read_batches
@@ -93,10 +92,6 @@ class Run:
         self.recorder.finish()
         self.recorder.report()
         return finish_record(self.run_dir).loop()
-
-    @property
-    def warnings(self) -> list[list[str]]:
-        return [report.warnings for report in self.plane.reports]
 
 
 @pytest.fixture
@@ -174,61 +169,18 @@ def test_a_log_on_a_full_disk_does_not_stop_the_record(run: Run, monkeypatch: py
     assert len(list(read_batches(run.run_dir / SPOOL, PLANT_STEP))) == 1
 
 
-# --- claims ---------------------------------------------------------------------------------------
+# --- progress -------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def outage() -> RunRecord:
+def test_the_progress_has_the_largest_lateness_and_state(tmp_path: Path) -> None:
     """The controller stands still from 0.5 s to 0.7 s."""
-    return with_outage(resolved("lane_following", "horizon_s=1"), 0.5, 0.7)
-
-
-@pytest.fixture
-def late(outage: RunRecord, tmp_path: Path) -> Run:
-    return Run(outage.scenario, tmp_path)
-
-
-def test_a_violation_is_reported_once_and_recorded(outage: RunRecord, late: Run) -> None:
+    record = with_outage(resolved("lane_following", "horizon_s=1"), 0.5, 0.7)
+    late = Run(record.scenario, tmp_path)
     for until_ns in range(100_000_000, 1_200_000_000, 100_000_000):
-        late.send_until(outage, until_ns)
+        late.send_until(record, until_ns)
         late.recorder.show()
-    cause = "an input was 0.101 s old, 0.007 s allowed (worst 0.092 s later)"
-    limit = "there are certificates for up to 0.06441 s, if nothing else is later than allowed"
-    line = f"later than allowed from 0.506 s on: {cause}; {limit}"
-    assert late.warnings == [[]] * 5 + [[line]] * 6
-    notices = late.finished().notices
-    assert notices == [{"t_ns": 506_000_000, "level": "late", "text": line, "process": "recorder"}]
-    assert load_record(late.run_dir).notices == notices
-
-
-@pytest.mark.parametrize("is_stopping", [False, True])
-def test_a_violation_found_at_the_end_is_reported_unless_the_run_was_stopped(
-    outage: RunRecord, late: Run, is_stopping: bool
-) -> None:
-    late.recorder.is_stopping = is_stopping
-    late.send_until(outage, 1_200_000_000)
-    notices = late.finished().notices
-    assert len(notices) == (not is_stopping)
-    assert [notice for notice in late.warnings if notice] == [[notice["text"]] for notice in notices]
-
-
-def test_of_many_warnings_the_last_names_the_place_of_the_others() -> None:
-    report = recorder.ProgressReport(
-        t_s=0.0, events=0, deliveries=0, longest_loss_burst=0, x_norm=None, live=None
-    )
-    for number in range(40):
-        report.add_warning(f"warning {number}")
-    assert report.warnings[:-1] == [f"warning {number}" for number in range(30)]
-    assert report.warnings[-1].endswith("are in the logs of the loops")
-
-
-def test_missing_rows_are_reported_as_an_unknown_result(outage: RunRecord, late: Run) -> None:
-    late.send_until(outage, 300_000_000)
-    late.sent["sensor_measurement"] += 10  # a batch is lost and sent again at the end
-    late.send_until(outage, 1_200_000_000)
-    late.recorder.show()
-    late.recorder.show()
-    assert late.warnings[-1] == [
-        "claims are checked after the run only: telemetry is missing or arrived out of order"
-    ]
+    late_us = [report.late_us for report in late.plane.reports]
+    assert late_us[:4] == [0.0] * 4
+    assert late_us[-1] == pytest.approx(200e3, abs=5e3)
+    assert late.plane.reports[-1].x_norm == np.linalg.norm(record[SENSOR_MEASUREMENT]["x"][-1])
     assert late.finished().notices == []

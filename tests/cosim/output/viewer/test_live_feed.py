@@ -42,7 +42,7 @@ def shown(folder: Path, count: int, *settings: str) -> tuple[RecordedRun, Chunks
         for table, rows in live_rows(run):
             feed.add(table, rows)
             feed.advance()
-        feed.log(Notice(10**9, "diverges", "x is not finite", loop=1).line())
+        feed.log(Notice(10**9, "violation", "x is not finite", loop=1).line())
         feed.advance(final=True)
     return run, read(folder / RECORDING_FILE), messages
 
