@@ -1,7 +1,7 @@
 """Every shipped scenario in virtual time, and the classic plants against their literature.
 
-The published cases are in ``studies/paper/test_published_results.py``, the cart-pole
-in ``tests/noack/plants/test_physical_laws.py``.
+The published cases are in ``tests/published``, the cart-pole in
+``tests/noack/plants/test_physical_laws.py``.
 """
 
 import math

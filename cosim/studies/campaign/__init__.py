@@ -7,6 +7,6 @@
 3. ``campaign_workers.py`` computes chunks of draws, ``chunk_store.py`` stores them; all processes
    must have the same code, libraries and arithmetic (``arithmetic.py``).
 4. ``metrics.py``: the metrics and their confidence intervals. ``campaign_summary.py``: every metric
-   at every grid point, and the verdicts of the campaign's claims.
+   at every grid point.
 5. ``campaign_figures.py``, ``campaign_report.py``: figures, page, JSON and tables.
 """

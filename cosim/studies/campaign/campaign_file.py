@@ -6,11 +6,10 @@ Settings have the keys of a scenario, as in ``--set``. A key with dots, in quote
 
 import itertools
 import math
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, NamedTuple, Self, cast
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import BeforeValidator, Field, FiniteFloat, JsonValue, model_validator
 
@@ -18,14 +17,11 @@ from cosim.simulation.exact_simulation import ROW
 from cosim.studies.campaign.metrics import METRICS, Metric
 from noack.core.errors import CallerError
 from noack.scenario import toml_file
-from noack.settings.section import MatrixRows, NonNegative, ScenarioSection, Seed
+from noack.settings.section import MatrixRows, ScenarioSection, Seed
 
 MOST_POINTS = 10_000
 MOST_SERIES = 12
 """Largest number of curves in a figure."""
-
-LOOPS = "loops"
-"""The key of [[loops]]; see :func:`scales_loops`."""
 
 Identifier = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
 Settings = Annotated[dict[str, JsonValue], Field(min_length=1)]
@@ -62,11 +58,6 @@ def find_replaced_key(earlier_keys: Iterable[str], later_keys: Iterable[str]) ->
     """Return a key and a later key that replaces its value or its table; None if there is none."""
     pairs = itertools.product(earlier_keys, later_keys)
     return next(((old, new) for old, new in pairs if f"{old}.".startswith(f"{new}.")), None)
-
-
-def scales_loops(key: str, value: object) -> bool:
-    """Whether a setting is a number of loops, which is applied after all other settings."""
-    return key == LOOPS and isinstance(value, int)
 
 
 def _require_kept(table: str, settings: Mapping[str, JsonValue]) -> None:
@@ -138,12 +129,6 @@ class CampaignAxis(ScenarioSection):
         return tuple({key: None for settings in self.settings for key in settings})
 
     @property
-    def replaced_keys(self) -> tuple[str, ...]:
-        """The keys whose value or table the axis replaces."""
-        items = (item for settings in self.settings for item in settings.items())
-        return tuple({key: None for key, value in items if not scales_loops(key, value)})
-
-    @property
     def numbers(self) -> list[float] | None:
         """The values as numbers, if all are numbers."""
         values = self.values or ()
@@ -172,9 +157,6 @@ class Metrics(ScenarioSection):
     """A run has settled when ‖x − x_r‖ stays below this share of its first value; x_r is 0 by default."""
     most_events: Annotated[int, Field(ge=1, le=10_000_000)] = 100_000
     """A run with more transmissions is stopped."""
-    count_from_s: NonNegative = 0.0
-    """With several loops: updates that were sent earlier do not count in loops_guarantee_used,
-    updates_late and delay_max_s."""
 
 
 class PairedComparison(ScenarioSection):
@@ -246,65 +228,6 @@ AnyFigure = Pareto | Curve | HeatMap | Distribution
 Figure = Annotated[AnyFigure, Field(discriminator="kind")]
 
 
-class Term(NamedTuple):
-    """One side of a condition of a claim: a metric, or a number."""
-
-    metric: Metric | None
-    label: str | None
-    """Label of the value of the claim's axis at which the metric is taken."""
-    number: float = math.nan
-
-    @classmethod
-    def parse(cls, text: str) -> Self:
-        """Read ``METRIC``, ``METRIC @ VALUE`` or a number; ValueError if it is none of them."""
-        name, separator, label = (part.strip() for part in text.partition("@"))
-        if name in METRICS:
-            return cls(cast(Metric, name), label if separator else None)
-        try:
-            return cls(None, None, float(text))
-        except ValueError:
-            names = ", ".join(METRICS)
-            raise ValueError(f"holds: {text.strip()}: expected a number or one of {names}") from None
-
-
-class CampaignClaim(ScenarioSection):
-    """A statement about the runs; the draws give its verdict."""
-
-    says: Annotated[str, Field(min_length=1)]
-    """The statement."""
-    source: str = ""
-    """Where it is made."""
-    holds: Annotated[tuple[str, ...], Field(min_length=1)]
-    """The conditions, ``A < B`` or ``A > B``; all of them hold in a draw in which the statement is
-    true. A and B are metrics or numbers; ``METRIC @ VALUE`` is the metric at this value of the
-    axis, in the same draw."""
-    axis: Identifier | None = None
-    """The axis of these values."""
-    where: dict[str, Value] = Field({})
-    """Only grid points with these values of these axes."""
-    medians: bool = False
-    """Compare the medians over the draws instead of the draws."""
-
-    @cached_property
-    def conditions(self) -> list[tuple[Term, Term]]:
-        """The smaller and the larger side of each condition."""
-        conditions = []
-        for text in self.holds:
-            sides = re.split("([<>])", text)
-            if len(sides) != 3:
-                raise ValueError(f"holds: {text}: write a condition as A < B or A > B")
-            left_side, right_side = Term.parse(sides[0]), Term.parse(sides[2])
-            conditions.append((left_side, right_side) if sides[1] == "<" else (right_side, left_side))
-        return conditions
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        labels = {term.label for pair in self.conditions for term in pair if term.metric}
-        if (self.axis is None) != (labels == {None}) or (self.axis and None in labels):
-            raise ValueError("axis: give an axis, and a value of it after each metric, or neither")
-        return self
-
-
 _CHUNK_DRAWS, _SAMPLED_DRAWS = 2000, 20
 """Draws per file: each file takes some seconds."""
 
@@ -340,12 +263,6 @@ class Campaign(ScenarioSection):
     compare: PairedComparison | None = None
     figures: tuple[Figure, ...] = ()
     """The figures of the page."""
-    claims: tuple[CampaignClaim, ...] = ()
-    """Statements that are checked. A claim is confirmed if it holds in at least 95 % of the draws
-    at each grid point, or group of them, that it is about. It is partly confirmed if it holds in
-    at least half of the draws at the first of them."""
-    claims_at: dict[str, tuple[Value, ...]] = Field({})
-    """Values of axes at which claims are evaluated that do not name them; by default all."""
 
     @cached_property
     def by_name(self) -> Mapping[str, CampaignAxis]:
@@ -354,10 +271,9 @@ class Campaign(ScenarioSection):
 
     @property
     def measured_metrics(self) -> set[Metric]:
-        """The metrics of the tables, the figures and the claims."""
+        """The metrics of the tables and the figures."""
         of_figures = {getattr(figure, key, None) for figure in self.figures for key in ("metric", "x", "y")}
-        of_claims = {term.metric for claim in self.claims for pair in claim.conditions for term in pair}
-        return {*self.metrics.shown, *(metric for metric in METRICS if metric in of_figures | of_claims)}
+        return {*self.metrics.shown, *(metric for metric in METRICS if metric in of_figures)}
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -365,7 +281,7 @@ class Campaign(ScenarioSection):
             raise ValueError(f"axes.{twice}.name: another axis has this name")
         for i, axis in enumerate(self.axes):
             for earlier_axis in self.axes[:i]:
-                if (lost := find_replaced_key(earlier_axis.replaced_keys, axis.replaced_keys)) is not None:
+                if (lost := find_replaced_key(earlier_axis.keys, axis.keys)) is not None:
                     raise ValueError(
                         f"axes.{i}.name: {lost[1]} would replace {lost[0]} of axis {earlier_axis.name}; "
                         "an axis that sets a whole table comes first, "
@@ -380,13 +296,6 @@ class Campaign(ScenarioSection):
             self._require_value("compare.reference", self.compare.axis, self.compare.reference)
         for i, figure in enumerate(self.figures):
             self._check_figure(f"figures.{i}", figure)
-        for i, claim in enumerate(self.claims):
-            self._require_values(f"claims.{i}.where", claim.where.items())
-            for term in (term for pair in claim.conditions for term in pair):
-                if claim.axis is not None and term.label is not None:
-                    self._require_values(f"claims.{i}.holds", [(claim.axis, term.label)])
-        for name, values in self.claims_at.items():
-            self._require_values("claims_at", ((name, value) for value in values))
         return self
 
     def _check_figure(self, path: str, figure: AnyFigure) -> None:

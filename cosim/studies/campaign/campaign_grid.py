@@ -1,7 +1,6 @@
 """The grid points of a campaign file: each has a scenario and the work for its draws."""
 
 import copy
-import math
 import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,9 +13,9 @@ from numpy.typing import NDArray
 
 from cosim.shipped_files import find_shipped
 from cosim.simulation.exact_simulation import ROW, Setting, left_out, run_batch, setting_of
-from cosim.studies.campaign.campaign_file import LOOPS, Campaign, Value, scales_loops
+from cosim.studies.campaign.campaign_file import Campaign, Value
 from cosim.studies.campaign.campaign_workers import Work
-from cosim.studies.campaign.drawn_runs import SampledWork, SharedNetworkWork, in_virtual_time
+from cosim.studies.campaign.drawn_runs import LOOPS_ROW, SampledWork, SharedNetworkWork, in_virtual_time
 from cosim.studies.campaign.metrics import certified_error
 from cosim.studies.campaign.random_draws import Box, box_of
 from noack.core.errors import CallerError
@@ -97,14 +96,8 @@ def grid(campaign: Campaign, path: Path) -> list[Point]:
         values = {axis.name: (axis.numbers or axis.labels)[i] for axis, i in chosen}
         source = f"{path}: at {', '.join(f'{name} = {label}' for name, label in labels.items())}"
         settings = [item for axis, i in chosen for item in axis.settings[i].items()]
-        scaled = [value for key, value in settings if key == LOOPS and isinstance(value, int)]
-        if scaled:
-            content.setdefault(LOOPS, [{"name": "loop"}])
         for key, value in settings:
-            if not scales_loops(key, value):
-                put(content, key, value, source)
-        for value in scaled:
-            content[LOOPS] = _scaled(content[LOOPS], value, source)
+            put(content, key, value, source)
         scenario = completed(content, scenario_path, source)
         try:
             work, certified = _work(campaign, scenario)
@@ -114,42 +107,12 @@ def grid(campaign: Campaign, path: Path) -> list[Point]:
     if len({type(point.work) for point in points}) > 1:
         raise CallerError(f"{path}: axes: either all grid points have loops, or none has")
     _require_effects(campaign, points, path)
-    entries = (entry.name for point in points for entry in point.scenario.loops or ())
-    if len(names := tuple(dict.fromkeys(entries))) > 1:
-        return [_with_entries(point, names) for point in points]
     return points
-
-
-def _with_entries(point: Point, names: tuple[str, ...]) -> Point:
-    assert isinstance(point.work, SharedNetworkWork)
-    return replace(point, work=replace(point.work, entries=names))
 
 
 def row_type(points: Sequence[Point]) -> np.dtype[np.void]:
     """Return the type of the rows of runs."""
-    work = points[0].work
-    return work.row_type if isinstance(work, SharedNetworkWork) else ROW
-
-
-def _scaled(entries: object, value: int, source: str) -> list[Table]:
-    """Return the entries of [[loops]] with ``value`` loops in all, in the same proportions."""
-    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise CallerError(f"{source}: loops: expected a list of tables")
-    if len(entries) == 1:
-        return [entries[0] | {"count": value}]
-    counts = [entry.get("count", 1) for entry in entries]
-    if not all(isinstance(count, int) and count > 0 for count in counts):
-        return entries  # the scenario's validation says what is wrong
-    smallest = sum(counts) // math.gcd(*counts)
-    if value < 1 or value % smallest:
-        pairs = zip(entries, counts, strict=True)
-        names = ", ".join(f"{count} {entry.get('name')}" for entry, count in pairs)
-        raise CallerError(
-            f"{source}: loops = {value}: expected a multiple of {smallest}, to keep the proportions "
-            f"of [[loops]]: {names}"
-        )
-    total = sum(counts)
-    return [entry | {"count": count * value // total} for entry, count in zip(entries, counts, strict=True)]
+    return LOOPS_ROW if isinstance(points[0].work, SharedNetworkWork) else ROW
 
 
 def _require_effects(campaign: Campaign, points: Sequence[Point], path: Path) -> None:
@@ -189,12 +152,7 @@ def _work(campaign: Campaign, scenario: Scenario) -> tuple[Work, float | None]:
     if scenario.loops:
         if campaign.time != "sampled":
             raise CallerError('loops: a network that loops share needs time = "sampled"')
-        checks_claims = "loops_claims_held" in campaign.measured_metrics
-        loops, from_s = in_virtual_time(scenario), metrics.count_from_s
-        work = SharedNetworkWork(
-            loops, campaign.seed, **measured, checks_claims=checks_claims, count_from_s=from_s
-        )
-        return work, None
+        return SharedNetworkWork(in_virtual_time(scenario), campaign.seed, **measured), None
     resolved = resolve(scenario)
     if campaign.time == "sampled":
         return SampledWork(in_virtual_time(scenario), campaign.seed, **measured), None

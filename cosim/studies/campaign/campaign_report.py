@@ -15,7 +15,7 @@ from rich.table import Table
 from cosim.output.figures.figure_files import save_figures
 from cosim.output.figures.figure_format import FigureFiles
 from cosim.output.page_kit import templates
-from cosim.output.result_tables import ResultTable, terminal_table
+from cosim.output.result_tables import ResultTable
 from cosim.record.run_directory import read_object
 from cosim.studies.campaign.campaign_figures import figures
 from cosim.studies.campaign.campaign_file import Campaign
@@ -65,7 +65,7 @@ def had_more_draws(folder: Path, draws: int) -> bool:
 
 
 def campaign_tables(summary: CampaignSummary, *, shares: bool = False) -> Iterator[ResultTable]:
-    """Yield the means of all grid points, their paired differences, and the claims.
+    """Yield the means of all grid points, and their paired differences.
 
     With ``shares``, the differences have the share of draws in which a metric is smaller, too.
     """
@@ -97,15 +97,6 @@ def campaign_tables(summary: CampaignSummary, *, shares: bool = False) -> Iterat
             differences.append((*compared.point.labels.values(), *cells))
         title = f"{campaign.name}: paired difference to {_reference(summary)}"
         yield ResultTable("differences", title, headings, differences)
-    if summary.claims:
-        yield claims_table(summary)
-
-
-def claims_table(summary: CampaignSummary) -> ResultTable:
-    """Return the claims with their verdicts."""
-    title = f"{summary.campaign.name}: claims, over {summary.draws:,} draws"
-    rows = [(claim.says, claim.source, claim.reason, claim.verdict) for claim in summary.claims]
-    return ResultTable("claims", title, ("claim", "where", "draws", "verdict"), rows)
 
 
 def page(summary: CampaignSummary, store: Store, base: Mapping[str, object]) -> str:
@@ -143,9 +134,6 @@ def print_summary(console: Console, summary: CampaignSummary) -> None:
     """Print the tables of a summary."""
     campaign = summary.campaign
     for full_table in campaign_tables(summary):
-        if full_table.name == "claims":
-            console.print(terminal_table(full_table, left=range(3)))
-            continue
         table, names = without_constants(full_table, len(campaign.axes))
         table = table._replace(rows=table.rows[:_MOST_ROWS])
         for part in split_table(table, names, console.width):

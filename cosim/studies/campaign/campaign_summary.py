@@ -1,22 +1,17 @@
-"""The results of a campaign: claims with their verdicts, every metric at every grid point.
+"""The results of a campaign: every metric at every grid point, and paired differences."""
 
-The verdicts of the claims come first, then the summary with its paired differences.
-"""
-
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import lru_cache
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS, UNDECIDED
-from cosim.studies.campaign.campaign_file import Campaign, CampaignClaim, Term, label_of
+from cosim.studies.campaign.campaign_file import Campaign, label_of
 from cosim.studies.campaign.campaign_grid import Point
 from cosim.studies.campaign.chunk_store import Store
 from cosim.studies.campaign.metrics import (
     CONFIDENCE,
-    METRICS,
     BurstFrequency,
     Estimate,
     Metric,
@@ -27,103 +22,6 @@ from cosim.studies.campaign.metrics import (
     estimate,
 )
 from noack.core.linear_systems import Vector
-from noack.core.number_format import number
-
-CONFIRMED_FROM, PARTLY_FROM = 0.95, 0.5
-"""Least shares of the runs for which a claim is confirmed, and partly confirmed."""
-_POINTS_AT_ONCE = 4
-"""Number of grid points whose runs are in memory."""
-Values = Callable[[Point], Mapping[Metric, Vector]]
-"""Returns the metrics of all draws at a grid point, (draws,) each."""
-
-
-class EvaluatedClaim(NamedTuple):
-    """A claim with the shares of the draws in which it holds."""
-
-    says: str
-    source: str
-    share: float
-    """At the first of the grid points that it is about."""
-    least: float
-    """The smallest share at one of these grid points."""
-    least_at: str
-    """The labels of this grid point."""
-    medians: str
-    """The medians of both sides of each condition, at the first grid point."""
-
-    @property
-    def verdict(self) -> str:
-        """``confirmed``, ``partly`` or ``not confirmed``; the campaign file has the rule."""
-        if min(self.share, self.least) >= CONFIRMED_FROM:
-            return "confirmed"
-        return "partly" if self.share >= PARTLY_FROM else "not confirmed"
-
-    @property
-    def reason(self) -> str:
-        """The shares and medians in words."""
-        least = f" (least: {share_text(self.least)}, {self.least_at})"
-        share = f"in {share_text(self.share)} of the draws{'' if self.least == self.share else least}"
-        return f"{share}; medians: {self.medians}"
-
-
-def share_text(share: float) -> str:
-    """Return a share in percent; only exactly all or none is written as 100 % or 0 %."""
-    text = f"{100 * share:.0f}"
-    rounded = text in ("0", "100") and share not in (0.0, 1.0)
-    return f"{100 * share:.1f} %" if rounded else f"{text} %"
-
-
-def evaluate_claims(campaign: Campaign, points: Sequence[Point], values: Values) -> Iterator[EvaluatedClaim]:
-    """Yield the claims of a campaign with their verdicts."""
-    by_number = {point.number: point for point in points}
-    values_of_point = lru_cache(_POINTS_AT_ONCE)(lambda number: values(by_number[number]))
-    common = {
-        axis: {label_of(value) for value in values_at} for axis, values_at in campaign.claims_at.items()
-    }
-    for claim in campaign.claims:
-        of_claim = {axis: {label_of(value)} for axis, value in claim.where.items()}
-        groups: dict[str, list[Point]] = {}
-        for point in points:
-            allowed = common | of_claim | ({} if claim.axis is None else {claim.axis: point.labels.values()})
-            if all(point.labels[axis] in labels for axis, labels in allowed.items()):
-                other_labels = (
-                    f"{axis} {label}"
-                    for axis, label in point.labels.items()
-                    if axis != claim.axis and axis not in of_claim
-                )
-                groups.setdefault(", ".join(other_labels), []).append(point)
-        yield _evaluate_claim(claim, groups, lambda point: values_of_point(point.number))
-
-
-def _evaluate_claim(claim: CampaignClaim, groups: dict[str, list[Point]], values: Values) -> EvaluatedClaim:
-    shares, medians = dict[str, float](), ""
-    for name, group in groups.items():
-        holds, texts = [], []
-        for smaller, larger in claim.conditions:
-            sides = [_side(term, claim, group, values) for term in (smaller, larger)]
-            middles = [np.quantile(side, 0.5, method="inverted_cdf") for side in sides]
-            low, high = middles if claim.medians else sides
-            holds.append(low < high)
-            texts += [
-                f"{METRICS[term.metric].heading}{f' at {term.label}' if term.label else ''} "
-                + number(METRICS[term.metric].scale * float(middle)).replace("inf", "∞")
-                for term, middle in zip((smaller, larger), middles, strict=True)
-                if term.metric
-            ]
-        shares[name] = float(np.mean(np.logical_and.reduce(np.broadcast_arrays(*holds))))
-        medians = medians or ", ".join(dict.fromkeys(texts))
-    least_at = min(shares, key=shares.__getitem__)
-    first = next(iter(shares.values()))
-    return EvaluatedClaim(claim.says, claim.source, first, shares[least_at], least_at, medians)
-
-
-def _side(term: Term, claim: CampaignClaim, group: Sequence[Point], values: Values) -> Vector:
-    if term.metric is None:
-        return np.array([term.number])
-    (point,) = (p for p in group if term.label is None or p.labels[claim.axis or ""] == term.label)
-    # A metric that the grid point does not have fulfils no condition.
-    return values(point).get(term.metric, np.array([np.nan]))
-
 
 _ROUNDING = 1e-9
 """A bound is exceeded only by a larger share of it than this."""
@@ -164,7 +62,6 @@ class CampaignSummary(NamedTuple):
     draws: int
     results: Sequence[GridPointResult]
     compared: Sequence[ComparedResult]
-    claims: Sequence[EvaluatedClaim] = ()
 
     @property
     def breaches(self) -> int:
@@ -199,21 +96,13 @@ class CampaignSummary(NamedTuple):
                 }
                 for compared in self.compared
             ],
-            "claims": [
-                {**claim._asdict(), "verdict": claim.verdict, "reason": claim.reason} for claim in self.claims
-            ],
         }
 
 
 def summarise(campaign: Campaign, store: Store) -> CampaignSummary:
-    """Estimate all metrics and evaluate the claims; the runs of a few grid points are in memory."""
+    """Estimate all metrics; the runs of a few grid points are in memory."""
     results = [_point_result(point, store) for point in store.points]
-
-    def values(point: Point) -> Mapping[Metric, Vector]:
-        return runs_at(point, store)[0]
-
-    claims = list(evaluate_claims(campaign, store.points, values))
-    return CampaignSummary(campaign, store.draws, results, list(_comparisons(campaign, store)), claims)
+    return CampaignSummary(campaign, store.draws, results, list(_comparisons(campaign, store)))
 
 
 def runs_at(point: Point, store: Store) -> tuple[dict[Metric, Vector], NDArray[np.generic]]:

@@ -191,7 +191,7 @@ def _identity(campaign: Campaign) -> dict[str, object]:
     """Return the settings on which the results depend."""
     content = campaign.model_dump(
         mode="json",
-        exclude={"draws", "description", "figures", "compare", "claims", "claims_at"},
+        exclude={"draws", "description", "figures", "compare"},
     )
     del content["metrics"]["shown"]
     for axis in content["axes"]:

@@ -18,9 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.analysis.summary.signal_statistics import setpoints_of
-from cosim.analysis.summary.summary_model import ClaimVerdict
 from cosim.record.align import align_tables, shares_update
 from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import Rows, RunRecord
@@ -35,7 +33,6 @@ from noack.protocol.record_tables import (
     NO_SEQUENCE,
     PLANT_STEP,
     SENSOR_MEASUREMENT,
-    Fate,
     effective,
 )
 from noack.scenario.resolution import policy_of
@@ -164,26 +161,14 @@ def in_virtual_time(scenario: Scenario) -> Scenario:
 LOOPS_ROW = np.dtype(
     [
         *ROW.descr,
-        *(
-            (name, "<f8")
-            for name in (
-                "cost_worst",
-                "loops_failed",
-                "loops_claims_held",
-                "loops_guarantee_used",
-                "updates_late",
-                "delay_max_s",
-            )
-        ),
+        *((name, "<f8") for name in ("cost_worst", "loops_failed", "updates_late", "delay_max_s")),
     ]
 )
 """The row of a run of loops that share a network.
 
 cost_worst: the largest cost of a loop. loops_failed: share of the loops that diverged or exceeded
-the largest number of events. loops_claims_held: share of the loops of which every claim held.
-loops_guarantee_used: share of the loops that used up the guarantee in a full queue (see
-:func:`used_up`). updates_late: share of the delivered updates that were late. delay_max_s: largest
-time of a delivered update in the network.
+the largest number of events. updates_late: share of the delivered updates that were late.
+delay_max_s: largest time of a delivered update in the network.
 """
 _OF_ALL: Mapping[str, Callable[[NDArray[np.float64]], float]] = {
     "transmissions": np.sum,
@@ -205,87 +190,40 @@ class SharedNetworkWork(SampledWork):
     Loop k of draw i has the same plant, initial state and phase for any number of loops.
     """
 
-    entries: tuple[str, ...] = ()
-    """Names of the entries of [[loops]] at all grid points, if there are several."""
-
-    checks_claims: bool = False
-    """Whether the claims of each loop are evaluated, which takes as long as the run."""
-
-    count_from_s: float = 0.0
-    """Updates that were sent earlier do not count in the last three columns of the row."""
-
-    @property
-    def row_type(self) -> np.dtype[np.void]:
-        """The type of the rows: that of a run, and the mean cost of the loops of each entry."""
-        return np.dtype([*LOOPS_ROW.descr, *((cost_of(name), "<f8") for name in self.entries)])
-
     def run(self, draws: range) -> NDArray[np.void]:
-        """Compute consecutive draws; one row each."""
-        rows = np.zeros(len(draws), self.row_type)
+        """Compute consecutive draws; one row of ``LOOPS_ROW`` each."""
+        rows = np.zeros(len(draws), LOOPS_ROW)
         for row, draw in zip(rows, draws, strict=True):
             seeds = seeds_of(self.seed, draw)
-            shared = simulate_loops(self.scenario.model_copy(update={"seeds": seeds}))
-            self.measure_loops(shared.loops, row)
+            records = simulate_loops(self.scenario.model_copy(update={"seeds": seeds})).loops
+            loops = np.zeros(len(records), ROW)
+            with np.errstate(all="ignore"):  # loops may diverge
+                for loop_row, record in zip(loops, records, strict=True):
+                    self._measure(record, loop_row)
+            for name, of_all in _OF_ALL.items():
+                row[name] = of_all(loops[name])
+            row["diverged_at_s"] = np.nanmin(np.append(loops["diverged_at_s"], np.inf))
+            row["status"] = OK
+            row["cost_worst"] = np.max(loops["cost"])
+            row["loops_failed"] = np.mean(loops["status"] != OK)
+            _measure_delays(records, row)
         return rows
 
-    def measure_loops(self, records: Sequence[RunRecord], row: np.void) -> None:
-        """Fill a row from the records of the loops of a run."""
-        loops = np.zeros(len(records), ROW)
-        with np.errstate(all="ignore"):  # loops may diverge
-            for loop_row, record in zip(loops, records, strict=True):
-                self._measure(record, loop_row)
-            if self.checks_claims:
-                have_held = [
-                    all(claim.verdict == ClaimVerdict.HELD for claim in RunClaims(record).evaluate())
-                    for record in records
-                ]
-        for name, of_all in _OF_ALL.items():
-            row[name] = of_all(loops[name])
-        row["diverged_at_s"] = np.nanmin(np.append(loops["diverged_at_s"], np.inf))
-        row["status"] = OK
-        row["cost_worst"] = np.max(loops["cost"])
-        for name in self.entries:
-            row[cost_of(name)] = np.nan
-        if self.entries:
-            sections = self.scenario.loops or ()
-            ends = np.cumsum([section.count for section in sections])[:-1]
-            for section, costs in zip(sections, np.split(loops["cost"], ends), strict=True):
-                row[cost_of(section.name)] = np.mean(costs)
-        row["loops_failed"] = np.mean(loops["status"] != OK)
-        row["loops_claims_held"] = np.mean(have_held) if self.checks_claims else np.nan
-        self._measure_network(records, row)
 
-    def _measure_network(self, records: Sequence[RunRecord], row: np.void) -> None:
-        scenario = records[0].scenario
-        updates = [_updates(record, self.count_from_s) for record in records]
-        burst = scenario.network.longest_burst
-        row["loops_guarantee_used"] = np.mean([used_up(packets["fate"], burst) for packets in updates])
-        delays_ns = np.concatenate(
-            [(packets["release_ns"] - packets["now_ns"])[effective(packets["fate"])] for packets in updates]
-        )
-        due_s = scenario.certificate.network_delay_s
-        due_ns = scenario.timing.measurement_period_ns if due_s is None else due_s * NS_PER_S
-        row["updates_late"] = np.mean(delays_ns > due_ns) if len(delays_ns) else 0.0
-        row["delay_max_s"] = delays_ns.max(initial=0) / NS_PER_S
+def _measure_delays(records: Sequence[RunRecord], row: np.void) -> None:
+    """Fill what a row says of the updates' time in the network."""
+    updates = [_updates(record) for record in records]
+    delays_ns = np.concatenate(
+        [(packets["release_ns"] - packets["now_ns"])[effective(packets["fate"])] for packets in updates]
+    )
+    scenario = records[0].scenario
+    due_s = scenario.certificate.network_delay_s
+    due_ns = scenario.timing.measurement_period_ns if due_s is None else due_s * NS_PER_S
+    row["updates_late"] = np.mean(delays_ns > due_ns) if len(delays_ns) else 0.0
+    row["delay_max_s"] = delays_ns.max(initial=0) / NS_PER_S
 
 
-def cost_of(entry: str) -> str:
-    """Return the column with the mean cost of the loops of an entry of [[loops]]."""
-    return f"cost_of_{entry}"
-
-
-def _updates(record: RunRecord, from_s: float) -> Rows:
+def _updates(record: RunRecord) -> Rows:
     packets = record.with_departures(record[NETEM_PACKET])
-    updates: Rows = packets[(packets["flow"] == 0) & (packets["now_ns"] >= from_s * NS_PER_S)]
+    updates: Rows = packets[packets["flow"] == 0]
     return updates
-
-
-def used_up(fates: NDArray[np.int64], burst: int) -> bool:
-    """Whether ``burst`` ≥ 1 consecutive losses include one in a full queue."""
-    losses = overflows = 0
-    for fate, delivered in zip(fates, effective(fates), strict=True):
-        losses = 0 if delivered else losses + 1
-        overflows = 0 if delivered else overflows + (fate == Fate.OVERFLOWED)
-        if overflows and losses >= burst:
-            return True
-    return False

@@ -37,8 +37,6 @@ Metric = Literal[
     "cost",
     "cost_worst",
     "loops_failed",
-    "loops_claims_held",
-    "loops_guarantee_used",
     "updates_late",
     "delay_max_s",
     "sup_e_c_scaled",
@@ -81,8 +79,6 @@ METRICS: Mapping[Metric, Description] = {
     "cost": Description("cost", "", "∫ xᵀQx + uᵀRu dt", logarithmic=True),
     "cost_worst": Description("cost of the worst loop", logarithmic=True),
     "loops_failed": Description("share of loops that failed"),
-    "loops_claims_held": Description("share of loops that hold all claims"),
-    "loops_guarantee_used": Description("share of loops that used up the guarantee in a full queue"),
     "updates_late": Description("share of updates that are late"),
     "delay_max_s": Description("largest delay in the network", "s", logarithmic=True),
     "sup_e_c_scaled": Description("largest error", "", "sup ‖e_c‖ e^(αt)"),
@@ -104,8 +100,6 @@ def compute_metrics(
     for name in METRICS:
         if name in columns:
             values = np.asarray(columns[name], dtype=np.float64)
-            if name == "loops_claims_held" and np.isnan(values).all():  # no claims were evaluated
-                continue
             values_of[name] = np.where(np.isnan(values) | failed, np.inf, values)
     delivered_share = columns["deliveries"] / np.maximum(columns["transmissions"], 1)
     values_of["lost_share"] = np.where(failed, np.inf, 1.0 - delivered_share)
@@ -196,19 +190,6 @@ def to_shown_unit(metric: Metric, estimate: Estimate) -> Estimate:
     """Return mean and interval in the unit of the metric's description."""
     scale = METRICS[metric].scale
     return estimate._replace(mean=scale * estimate.mean, halfwidth=scale * estimate.halfwidth)
-
-
-class Quartiles(NamedTuple):
-    """Quartiles of a metric; each is the value of a draw, possibly infinite."""
-
-    lower: float
-    median: float
-    upper: float
-
-
-def quartiles(values: Vector) -> Quartiles:
-    """Return lower quartile, median and upper quartile of k ≥ 1 draws, (k,)."""
-    return Quartiles(*_quantiles(values, (0.25, 0.5, 0.75)))
 
 
 def paired_differences(values: Vector, reference: Vector) -> Vector:

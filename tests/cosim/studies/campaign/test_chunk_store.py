@@ -137,7 +137,6 @@ def test_a_changed_scenario_makes_another_campaign_and_changed_figures_do_not(
     use(write(plan, draws=1), folder)
     plan["axes"][1]["title"] = "threshold"
     presentation = {"figures": [], "compare": None, "draws": 2, "description": "new"}
-    presentation |= {"claims": [{"says": "It settles.", "holds": ["settling_s < 9"]}]}
     assert use(write(plan, **presentation, metrics={"shown": ["cost"]}), folder) == 8
     scenario = tmp_path / "small.toml"
     text = scenario.read_text()

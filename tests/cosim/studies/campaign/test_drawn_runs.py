@@ -1,7 +1,6 @@
 """Draws, and the measures of their runs in virtual time, of one loop and of several."""
 
 import math
-import re
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,19 +16,11 @@ from cosim.simulation.continuous import run_continuous
 from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from cosim.studies.campaign.campaign_grid import row_type
-from cosim.studies.campaign.drawn_runs import (
-    LOOPS_ROW,
-    SampledWork,
-    SharedNetworkWork,
-    in_virtual_time,
-    used_up,
-)
-from cosim.studies.campaign.metrics import METRICS
+from cosim.studies.campaign.drawn_runs import LOOPS_ROW, SampledWork, SharedNetworkWork, in_virtual_time
 from cosim.studies.campaign.random_draws import box_of, drawn_scenario, seeds_of
 from noack.core.errors import CallerError, ExitStatus
 from noack.impairments.kinds.replay import Replay
 from noack.impairments.loss_models.lossless import NoLoss
-from noack.protocol.record_tables import Fate
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
@@ -145,7 +136,7 @@ def test_a_failed_run_has_the_status_of_its_failure() -> None:
     assert (row["status"], np.isnan(row["cost"])) == (TOO_MANY_EVENTS, True)
 
 
-AXIS = {"name": "number", "key": "loops", "values": [1, 3]}
+AXIS = {"name": "number", "key": "loops.0.count", "values": [1, 3]}
 
 
 def shared_work(*overrides: str, **settings: Any) -> SharedNetworkWork:
@@ -155,7 +146,7 @@ def shared_work(*overrides: str, **settings: Any) -> SharedNetworkWork:
 
 
 def test_a_row_agrees_with_the_summaries_of_the_loops() -> None:
-    loops_work = shared_work("network.impairments=[]", "loops.0.count=2", checks_claims=True)
+    loops_work = shared_work("network.impairments=[]", "loops.0.count=2")
     rows = loops_work.run(range(2))
     assert rows.dtype == LOOPS_ROW
     seeds = seeds_of(loops_work.seed, 1)
@@ -168,7 +159,6 @@ def test_a_row_agrees_with_the_summaries_of_the_loops() -> None:
     assert row["final_norm"] == pytest.approx(max(loop["final_state_norm"] for loop in loops))
     assert 0 < row["cost"] < row["cost_worst"]
     assert row["loops_failed"] == 0
-    assert 0 <= row["loops_claims_held"] <= 1
 
 
 def test_a_loop_that_diverges_costs_an_infinite_amount_and_is_counted() -> None:
@@ -180,43 +170,20 @@ def test_a_loop_that_diverges_costs_an_infinite_amount_and_is_counted() -> None:
     (row,) = loops_work.run(range(1))
     assert row["loops_failed"] == 0.25
     assert np.isnan(row["cost"])
-    assert np.isnan(row["loops_claims_held"])
 
 
 def test_the_number_of_loops_is_an_axis(write: Write, plan: dict[str, Any]) -> None:
     sampled: dict[str, Any] = {"time": "sampled", "compare": None, "figures": []}
-    _, points = few_of(write(plan, axes=[AXIS], **sampled))
+    loops = {"loops": [{"name": "loop"}]}
+    _, points = few_of(write(plan, axes=[AXIS], settings=loops, **sampled))
     assert [point.scenario.loops[0].count for point in points] == [1, 3]
     assert row_type(points) == LOOPS_ROW
     assert [type(point.work) for point in points] == [SharedNetworkWork, SharedNetworkWork]
     with pytest.raises(CallerError, match='needs time = "sampled"'):
-        few_of(write(plan, axes=[AXIS], **sampled | {"time": "continuous"}))
-    some = {"name": "some", "variants": {"one": {"mode": "zoh"}, "two": {"loops": 2}}}
+        few_of(write(plan, axes=[AXIS], settings=loops, **sampled | {"time": "continuous"}))
+    some = {"name": "some", "variants": {"one": {"mode": "zoh"}, "two": loops}}
     with pytest.raises(CallerError, match="either all grid points have loops, or none has"):
         few_of(write(plan, axes=[some], **sampled))
-
-
-def test_different_loops_keep_their_proportions(write: Write, plan: dict[str, Any]) -> None:
-    """The number of loops applies after all other settings."""
-    loops = [{"name": "a", "count": 4}, {"name": "b", "count": 2, "mode": "zoh"}]
-    sampled: dict[str, Any] = {"time": "sampled", "compare": None, "figures": []}
-
-    def axes(*numbers: int) -> list[dict[str, Any]]:
-        variants = {f"v{value}": {"loops": value} for value in numbers}
-        own = {"slow": {"loops.1.plant": {"initial_state": [2.0, 0.0]}}, "same": {"loops": loops}}
-        return [{"name": "number", "variants": variants}, {"name": "own", "variants": own}]
-
-    settings = {"loops": loops}
-    _, points = few_of(write(plan, axes=axes(3, 9), settings=settings, **sampled))
-    counts = [[(loop.name, loop.count) for loop in point.scenario.loops] for point in points[::2]]
-    assert counts == [[("a", 2), ("b", 1)], [("a", 6), ("b", 3)]]
-    assert points[0].scenario.loops[1].plant == {"initial_state": [2.0, 0.0]}
-    rows = points[0].work.run(range(1))
-    assert row_type(points) == rows.dtype
-    mean = (2 * rows["cost_of_a"] + rows["cost_of_b"]) / 3
-    assert rows["cost"] == pytest.approx(mean, rel=1e-12)
-    with pytest.raises(CallerError, match="expected a multiple of 3"):
-        few_of(write(plan, axes=axes(3, 4), settings=settings, **sampled))
 
 
 def with_plant(scenario: Scenario, **changed: object) -> Scenario:
@@ -287,18 +254,3 @@ def test_each_draw_has_its_own_window_of_a_trace() -> None:
     ]
     assert len(set(begins_ms)) > 30
     assert min(begins_ms) < 200 < 800 < max(begins_ms)
-
-
-def test_the_guarantee_is_used_up_by_a_burst_with_a_full_queue() -> None:
-    letters = {"d": Fate.DELIVERED, "f": Fate.FORCED, "x": Fate.DROPPED, "o": Fate.OVERFLOWED}
-    random = np.random.default_rng(3)
-    seen = set()
-    for _ in range(300):
-        text = "".join(random.choice([*letters], 12))
-        burst = int(random.integers(1, 5))
-        bursts = re.findall("[xo]+", text)
-        expected = any(len(letter_burst) >= burst and "o" in letter_burst for letter_burst in bursts)
-        assert used_up(np.array([letters[letter] for letter in text]), burst) == expected, (text, burst)
-        seen.add(expected)
-    assert seen == {True, False}
-    assert "full queue" in METRICS["loops_guarantee_used"].title

@@ -1,6 +1,6 @@
 """The bounds of joint spectral radii, against closed forms.
 
-``certificate_kinds/margins.py`` has brute force; a published value is in ``noack paper philippe``.
+``certificate_kinds/margins.py`` has brute force; a published value is in ``tests/published``.
 """
 
 import numpy as np
