@@ -1,4 +1,4 @@
-"""What watches and changes a relay while it runs: control, statistics lines, metrics, the live screen.
+"""What watches and changes a relay while it runs: control, statistics lines, the live screen.
 
 :func:`add_watching_options` declares the options, :func:`watch_relay` starts what they ask for.
 """
@@ -21,9 +21,7 @@ from netem.relay.relay import Relay
 from netem.relay.relay_reports import report_line
 from noack.core.errors import CallerError, why
 from noack.core.file_access import open_growing
-from noack.runtime.address import address_text
 from noack.runtime.command_line import LogFormat, discard_output
-from noack.runtime.connections.metrics_server import OPTION, metrics_server, require_package
 
 _VIEW_S = 1.0
 _POLL_S = 0.05
@@ -42,11 +40,6 @@ def add_watching_options(parser: argparse.ArgumentParser) -> None:
         help="print statistics as JSON lines every SECONDS",
     )
     group.add_argument("--stats-file", metavar="FILE", type=Path, help="write these lines to FILE instead")
-    group.add_argument(
-        OPTION,
-        metavar="[HOST]:PORT",
-        help="serve the statistics for Prometheus (OpenMetrics); the loopback without a HOST",
-    )
     group.add_argument(
         "--log-format",
         choices=[*LogFormat],
@@ -100,8 +93,6 @@ def watch_relay(relay: Relay, options: argparse.Namespace) -> Iterator[RelayWatc
     with ExitStack() as stack:
         if options.stats is not None:
             stack.enter_context(_statistics_lines(commands, options.stats, options.stats_file))
-        if options.metrics is not None:
-            stack.enter_context(_metrics(commands, options.metrics))
         if options.control is not None:
             stack.enter_context(ControlServer(options.control, commands))
         if options.view:
@@ -113,16 +104,6 @@ def watch_relay(relay: Relay, options: argparse.Namespace) -> Iterator[RelayWatc
         stack.callback(sys.setswitchinterval, sys.getswitchinterval())
         sys.setswitchinterval(_SWITCH_S)
         yield RelayWatch(commands, screen)
-
-
-@contextmanager
-def _metrics(commands: CommandQueue, host_port: str) -> Iterator[None]:
-    require_package()
-    from netem.control.emulator_metrics import EmulatorMetrics  # an optional package
-
-    with metrics_server(host_port, EmulatorMetrics(commands).collect) as address:
-        report_line(f"metrics: http://{address_text(address)}/metrics")
-        yield
 
 
 @contextmanager

@@ -11,21 +11,13 @@ from typing import TYPE_CHECKING
 
 from cosim.cli.printing import console, print_json, status
 from cosim.live import launcher
-from cosim.live.monitoring.run_watcher import (
-    RunLog,
-    RunMetrics,
-    Watcher,
-    joint_watcher,
-    later_watcher,
-    log_end,
-)
+from cosim.live.monitoring.run_watcher import RunLog, Watcher, joint_watcher, later_watcher, log_end
 from cosim.live.processes.fork_server import ForkServer, fork_server
 from cosim.record.run_directory import RunEnding, how_to_complete
 from noack.core.core_library import require_live_runs
 from noack.core.errors import PeerError
 from noack.protocol.roles import ROLES
 from noack.runtime.active_runs import active_runs
-from noack.runtime.command_line import print_to_stderr
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario, loop_names, loop_scenario, loop_sections
 
@@ -39,7 +31,6 @@ def run_processes(
     runs: Path,
     *,
     live: bool = False,
-    metrics: str | None = None,
     report: bool = True,
     verbose: bool = False,
     json: bool = False,
@@ -55,7 +46,6 @@ def run_processes(
         loaded: the scenario.
         runs: folder of the run directories.
         live: show the run in the rerun viewer.
-        metrics: address at which the metrics of the run are served.
         report: write the report.
         verbose: print all tables.
         json: print the summary as JSON.
@@ -80,8 +70,6 @@ def run_processes(
                 line = later_watcher(lambda: stack.enter_context(_progress_line(loaded)))
                 watchers = [warnings, line, RunLog().watcher()]
                 watchers += [] if watcher is None else [watcher]
-                if metrics is not None:
-                    watchers.append(stack.enter_context(_serve_metrics(loaded, metrics)))
                 ending = launcher.launch(
                     loaded,
                     runs,
@@ -104,19 +92,6 @@ def _progress_line(loaded: Scenario) -> Iterator[Watcher]:
 
     with progress_line(error_console(), loaded) as watcher:
         yield watcher
-
-
-@contextmanager
-def _serve_metrics(loaded: Scenario, requested_address: str) -> Iterator[Watcher]:
-    """Serve the metrics of a run within the context; yield what updates them."""
-    from noack.runtime.address import address_text
-    from noack.runtime.connections.metrics_server import metrics_server, require_package
-
-    require_package()
-    metrics = RunMetrics(loaded)
-    with metrics_server(requested_address, metrics.collect) as bound:
-        print_to_stderr(f"noack: metrics: http://{address_text(bound)}/metrics")
-        yield metrics.watcher()
 
 
 def warn_of_violations(loaded: Scenario) -> None:

@@ -168,14 +168,6 @@ LiveOption = Annotated[
         "the address that is printed.",
     ),
 ]
-MetricsOption = Annotated[
-    str | None,
-    Option(
-        metavar="[HOST]:PORT",
-        help="Serve the run's metrics for Prometheus (OpenMetrics) at this address; the loopback "
-        "without a HOST.",
-    ),
-]
 
 
 def _log_format(context: typer.Context, chosen: LogFormat) -> LogFormat:

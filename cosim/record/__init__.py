@@ -6,6 +6,6 @@ simulated run, and any run's log. ``collection.py`` adds what other hosts kept.
 
 Read: ``run_directory.py`` finds the files of a run, ``record_source.py`` reads rows batch by batch,
 ``run_record.py`` has the record of a run and of each loop. From it follow ``run_events.py``
-(changes, packet outcomes), ``divergence.py``, ``processes.py`` (final reports, generations),
+(changes, packet outcomes), ``divergence.py``, ``processes.py`` (final reports, gaps in rows),
 ``align.py`` (one time grid), ``decimation.py`` (fewer points) and ``data_frames.py``.
 """

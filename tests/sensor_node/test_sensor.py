@@ -1,8 +1,7 @@
 """The sensor's events and what it rejects.
 
 Whole runs are compared with a reference loop in tests/cosim/simulation/test_whole_loop.py: with
-acknowledgements, set points and their changes, and every trigger policy. A restarted sensor is in
-tests/noack/observers/test_observers.py and tests/cosim/record/test_recorded_changes.py.
+acknowledgements, set points and their changes, and every trigger policy.
 """
 
 import math

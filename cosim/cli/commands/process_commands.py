@@ -58,7 +58,6 @@ def record(
     ] = 60.0,
     runs: opt.RunsOption = DEFAULT_RUNS,
     live: opt.LiveOption = False,
-    metrics: opt.MetricsOption = None,
     log_format: opt.LogFormatOption = LogFormat.TEXT,
     report: opt.ReportOption = True,
     verbose: opt.VerboseOption = False,
@@ -79,7 +78,7 @@ def record(
         listening = ListenSettings(listen_address(listen), invitation, role, 60 * valid_minutes)
     loaded = opt.load_scenario(scenario, settings)
     return run_processes(
-        loaded, runs, live=live, metrics=metrics, report=report, verbose=verbose, json=json,
+        loaded, runs, live=live, report=report, verbose=verbose, json=json,
         server=context.obj, spawn=(RECORDER,), session=session, listening=listening,
     )  # fmt: skip
 

@@ -80,7 +80,6 @@ def demo(
     settings: opt.SetOption = None,
     runs: opt.RunsOption = DEFAULT_RUNS,
     live: opt.LiveOption = False,
-    metrics: opt.MetricsOption = None,
     log_format: opt.LogFormatOption = LogFormat.TEXT,
     report: opt.ReportOption = True,
     verbose: opt.VerboseOption = False,
@@ -95,7 +94,7 @@ def demo(
 
     loaded = opt.load_scenario("lane_following", [*(['mode="zoh"'] if zoh else []), *(settings or ())])
     return run_processes(
-        loaded, runs, live=live, metrics=metrics, report=report, verbose=verbose, json=json,
+        loaded, runs, live=live, report=report, verbose=verbose, json=json,
         server=context.obj,
     )  # fmt: skip
 
@@ -114,7 +113,6 @@ def run(
     settings: opt.SetOption = None,
     runs: opt.RunsOption = DEFAULT_RUNS,
     live: opt.LiveOption = False,
-    metrics: opt.MetricsOption = None,
     log_format: opt.LogFormatOption = LogFormat.TEXT,
     report: opt.ReportOption = True,
     verbose: opt.VerboseOption = False,
@@ -129,7 +127,7 @@ def run(
 
     loaded = opt.load_scenario(scenario, settings)
     return run_processes(
-        loaded, runs, live=live, metrics=metrics, report=report, verbose=verbose, json=json,
+        loaded, runs, live=live, report=report, verbose=verbose, json=json,
         server=context.obj,
     )  # fmt: skip
 

@@ -196,27 +196,6 @@ def test_the_guarantee_holds_in_any_replay(
     assert_kept(settings, link, receiver, sent)
 
 
-HISTORIES = list(itertools.product([False, True], repeat=9))
-
-
-@pytest.mark.sanitized
-@pytest.mark.parametrize(
-    "words",
-    ["mansd 2", "atmost 3 in 10", "mansd 2 recover 4", "atmost 3 in 8 atmost 4 in 9 recover 3"],
-)
-def test_a_restarted_link_keeps_the_guarantee_behind_any_history(words: str) -> None:
-    """And no longer than necessary: some history makes each forced datagram necessary."""
-    settings = settings_of(f"loss worst first {words}")
-    link = Link(settings, 1, "a", restarted=True)
-    lost = [link.decide(0, 100, t_ns).fate == core.NOACK_DROPPED for t_ns in range(30)]
-    before = [list(history) for history in HISTORIES if is_allowed(history, settings)]
-    assert all(is_allowed([*history, *lost], settings) for history in before)
-    earlier = lost.index(True) - 1
-    assert earlier == 0 or any(
-        not is_allowed([*history, *[False] * earlier, True], settings) for history in before
-    )
-
-
 @pytest.mark.sanitized
 @pytest.mark.parametrize("first", ["mansd 4", "", "delay 1ms", "delay 1ms mansd 1"])
 @pytest.mark.parametrize("lost", [0, 1])

@@ -1,75 +1,20 @@
-"""What runs beside a relay: metrics, statistics, commands. prometheus_client reads the metrics."""
+"""What runs beside a relay: statistics, commands, the live screen."""
 
 import io
 import json
 import sys
 import threading
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, redirect_stderr
+from contextlib import redirect_stderr
 from pathlib import Path
 
 import pytest
 
-from netem import relay_watch
-from netem.control.command_queue import CommandQueue
 from netem.control.control_server import running_emulators
-from netem.control.emulator_metrics import EmulatorMetrics, metrics
-from netem.control.emulator_statistics import statistics
 from netem.relay_watch import watch_relay
 from noack.core.errors import CallerError
-from noack.runtime.address import address_text
-from noack.runtime.connections import metrics_server as servers
-from tests.helpers.metrics_readers import exposed, read, slow_reader, values_of
 from tests.helpers.waiting import wait_for
 from tests.netem.control.fake_relay import FakeRelay, options, press_q, read_until, terminal
-
-
-class Fixed:
-    def __init__(self, collect: Callable[[], object]) -> None:
-        self.collect = collect
-
-
-def test_metrics_are_the_statistics(relay: FakeRelay) -> None:
-    counters = relay.counters["up", "forward"]
-    counters.received, counters.dropped, counters.delivered = 10, 3, 7
-    commands = CommandQueue(relay)
-    document = statistics(commands.snapshot_here())
-    values = values_of(exposed(Fixed(lambda: metrics(document))))
-    assert values["noack_netem_received_datagrams_total,forward,up"] == 10
-    assert values["noack_netem_datagrams_total,dropped,forward,up"] == 3
-    assert values["noack_netem_loss_ratio,forward,up"] == pytest.approx(0.3)
-    limit = document["links"][0]["forward"]["mansd"]
-    assert values.get("noack_netem_loss_burst_limit,forward,up") == limit
-    assert values["noack_netem_elapsed_seconds"] == document["elapsed_s"]
-    unintended = document["links"][0]["forward"]["unintended"]
-    for cause, count in unintended.items():
-        labels = ",".join(sorted([cause, "forward", "up"]))
-        assert values[f"noack_netem_unintended_losses_total,{labels}"] == count
-    commands.close()
-    assert list(EmulatorMetrics(commands).collect()) == []  # of a relay that has ended
-
-
-def test_an_emulator_serves_its_metrics_and_ends_beside_a_slow_reader(
-    relay: FakeRelay, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    threads = threading.active_count()
-    monkeypatch.setattr(servers, "_REQUEST_S", 3600.0)
-    asked: list[tuple[str, int]] = []
-    monkeypatch.setattr(relay_watch, "address_text", lambda at: asked.append(at) or address_text(at))
-    with (
-        ExitStack() as stack,
-        watch_relay(relay, options("--metrics", ":0")) as side,
-        ThreadPoolExecutor() as pool,
-    ):
-        stack.enter_context(slow_reader(asked[0]))
-        relay.counters["up", "forward"].received = 4
-        reading = pool.submit(read, asked[0])
-        wait_for(lambda: side.commands.run_pending() or reading.done())
-        values = values_of(reading.result())
-    assert threading.active_count() == threads
-    assert values["noack_netem_received_datagrams_total,forward,up"] == 4
-    assert capfd.readouterr().err == f"noack netem: metrics: http://127.0.0.1:{asked[0][1]}/metrics\n"
 
 
 def test_invalid_options_are_refused_before_the_relay_runs(relay: FakeRelay) -> None:
