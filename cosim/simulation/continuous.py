@@ -249,7 +249,6 @@ def simulate_continuous(
     horizon_s: float,
     delivered: Callable[[int], bool] | Sequence[bool],
     known_start: bool,
-    x0: Vector | None = None,
     max_events: int = MAX_EVENTS,
 ) -> ContinuousRun:
     """Run the loop from t = 0; every event time is exact up to rounding.
@@ -261,7 +260,6 @@ def simulate_continuous(
             sequence is shorter than the number of events, all updates after its end arrive.
         known_start: sensor and controller start from x(0). Otherwise x_c = 0 and event 0 happens at
             t = 0, the paper's t_0; the paper assumes that it is delivered.
-        x0: x(0), shape (n,); by default the loop's own.
         max_events: largest number of events.
 
     Raises:
@@ -270,8 +268,7 @@ def simulate_continuous(
             the run cannot be decided.
     """
     until_s = min(horizon_s, vanishes_s(system.trigger))
-    x0 = np.array(system.loop.x0 if x0 is None else x0, np.float64)
-    row, log = _simulate_with_log(system, until_s, x0, delivered, known_start, max_events)
+    row, log = _simulate_with_log(system, until_s, delivered, known_start, max_events)
     if row["status"] == OK and until_s < horizon_s:
         raise vanished_error(until_s)
     if row["status"] not in (OK, DIVERGED, TOO_MANY_EVENTS):
@@ -280,7 +277,7 @@ def simulate_continuous(
             "too close to its threshold, or the plant is too fast"
         )
     diverged_at_s = float(row["diverged_at_s"]) if row["status"] == DIVERGED else None
-    run = _read_run(system, horizon_s, x0, log, int(row["transmissions"]), diverged_at_s, known_start)
+    run = _read_run(system, horizon_s, log, int(row["transmissions"]), diverged_at_s, known_start)
     if row["status"] == TOO_MANY_EVENTS:
         last_s = run.event_s[-1] if len(run.event_s) else 0.0
         too_many = TooManyEventsError(
@@ -295,7 +292,6 @@ def simulate_continuous(
 def _simulate_with_log(
     system: ContinuousLoop,
     until_s: float,
-    x0: Vector,
     delivered: Callable[[int], bool] | Sequence[bool],
     known_start: bool,
     max_events: int,
@@ -313,7 +309,7 @@ def _simulate_with_log(
             delivered=np.array(fates, bool),
             measure=core.NOACK_EXACT_TIMES,
         )
-        rows, log = simulation.runs(loop.A[None], loop.B[None], x0[None], places=log_events, states=True)
+        rows, log = simulation.runs(loop.A[None], loop.B[None], loop.x0[None], places=log_events, states=True)
         row: np.void = rows[0]
         full = row["status"] == TOO_MANY_EVENTS and row["transmissions"] == log_events
         if not full or log_events == max_events:
@@ -324,7 +320,6 @@ def _simulate_with_log(
 def _read_run(
     system: ContinuousLoop,
     horizon_s: float,
-    x0: Vector,
     log: EventLog,
     events: int,
     diverged_at_s: float | None,
@@ -332,6 +327,7 @@ def _read_run(
 ) -> ContinuousRun:
     """Read a run from its events."""
     assert log.states is not None
+    x0 = system.loop.x0
     delivered, zero = log.delivered[0, :events], np.zeros_like(x0)
     times_s, states = log.event_s[0, :events].tolist(), log.states[0, :events]
     start = LoopState(0.0, x0, zero, zero if known_start else -x0)

@@ -5,6 +5,7 @@ The statements of Section V are those of docs/paper.md, over some draws of the s
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -74,9 +75,13 @@ def test_the_example_violates_assumptions_and_needs_its_sign_of_u() -> None:
     assert rates == [pytest.approx(-0.365, abs=5e-4), pytest.approx(0.336, abs=5e-4)]
 
 
+def from_state(loop: ContinuousLoop, x0: Vector) -> ContinuousLoop:
+    return ContinuousLoop(replace(loop.loop, x0=x0), loop.trigger)
+
+
 def only_the_first_arrives(loop: ContinuousLoop, horizon_s: float, x0: Vector) -> ContinuousRun:
     return simulate_continuous(
-        loop, horizon_s=horizon_s, delivered=lambda event: event == 0, known_start=False, x0=x0
+        from_state(loop, x0), horizon_s=horizon_s, delivered=lambda event: event == 0, known_start=False
     )
 
 
@@ -136,8 +141,8 @@ def test_small_states_overshoot_by_any_factor(mode: str) -> None:
     loop = shipped_loop("lane_following", f"mode={mode}")
     overshoots = []
     for scale in (1.0, 1e-2, 1e-4):
-        x0 = scale * loop.loop.x0
-        run = simulate_continuous(loop, horizon_s=100.0, delivered=[], known_start=False, x0=x0)
+        scaled = from_state(loop, scale * loop.loop.x0)
+        run = simulate_continuous(scaled, horizon_s=100.0, delivered=[], known_start=False)
         norms = np.linalg.norm(run.at(np.linspace(0.0, 100.0, 2001)).x, axis=1)
         overshoots.append(norms.max() / norms[0])
     assert overshoots == sorted(overshoots)

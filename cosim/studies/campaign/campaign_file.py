@@ -269,12 +269,6 @@ class Campaign(ScenarioSection):
         """The axes by name."""
         return {axis.name: axis for axis in self.axes}
 
-    @property
-    def measured_metrics(self) -> set[Metric]:
-        """The metrics of the tables and the figures."""
-        of_figures = {getattr(figure, key, None) for figure in self.figures for key in ("metric", "x", "y")}
-        return {*self.metrics.shown, *(metric for metric in METRICS if metric in of_figures)}
-
     @model_validator(mode="after")
     def _check(self) -> Self:
         if (twice := _repeated([axis.name for axis in self.axes])) is not None:

@@ -274,8 +274,6 @@ class FinishedCampaign(NamedTuple):
 
     summary: CampaignSummary
     store: Store
-    base: Mapping[str, object]
-    """The content of the scenario of all runs."""
     made: int
     """Number of runs that were computed now."""
     files: list[Path]
@@ -319,4 +317,4 @@ def finish_campaign(
         with show("summarising"):
             summary = summarise(plan, store)
             files = write_report(summary, store, base, figure_files)
-    return FinishedCampaign(summary, store, base, new_runs, files)
+    return FinishedCampaign(summary, store, new_runs, files)

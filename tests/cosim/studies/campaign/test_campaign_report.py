@@ -40,7 +40,7 @@ def test_the_command_writes_the_reported_files_and_keeps_complete_chunks(
     result = run_command(path, "--json", "--tables", str(tmp_path / "tables"))
     assert json.loads(result.stdout)["made"] == 4 * (7 - 3)
     names = {file.name for file in (tmp_path / "tables").iterdir()}
-    assert names == {"campaign.csv", "campaign.tex", "differences.csv", "differences.tex"}
+    assert names == {"campaign.csv", "differences.csv"}
     rows = (tmp_path / "tables/campaign.csv").read_text().splitlines()
     assert len(rows) == 1 + 4
     assert "transmissions" in rows[0]
