@@ -166,9 +166,9 @@ int64_t noack_wire_examine_message(
 /* loop/machine_check.c: NULL, or what is wrong with a rule whose times are at most most_ns. */
 const char *noack_check_rule(const noack_trigger_rule *rule, int64_t most_ns);
 
-/* link.c: repeat a recorded decision; if it is NULL, decide by the stages. */
-void decide_or_repeat(
-    noack_link *link, int64_t row, int64_t size_bytes, int64_t now_ns,
-    const noack_recorded *recorded, noack_decision *decision);
+/* link.c: decide by the stages, or, unless it is NULL, as the user's network did. */
+void decide_for(
+    noack_link *link, int64_t row, int64_t size_bytes, int64_t now_ns, const int64_t *outcome_ns,
+    noack_decision *decision);
 
 #endif

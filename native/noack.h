@@ -50,15 +50,6 @@ typedef struct {
     int64_t after_ns;
 } noack_decision;
 
-/* A recorded decision, which a flow repeats. */
-typedef struct {
-    int64_t fate;
-    int64_t delay_ns; /* time from arrival to departure; -1: it never left */
-    int64_t copy_delay_ns;
-    int64_t bit;
-    int64_t copy_bit;
-} noack_recorded;
-
 /* ---- Stages: the settings of an impairment as numbers ---------------------------------------- */
 
 /* The kinds of impairments; native/impairments/ has a file for each. */
@@ -276,14 +267,11 @@ typedef struct {
 /* One direction of a link. */
 typedef struct {
     /* Settings */
-    int64_t stage_count, integer_count, real_count, window_count, decision_count;
+    int64_t stage_count, integer_count, real_count, window_count;
     noack_stage *stages;        /* in order of application */
     int64_t *integers;          /* tables of the stages */
     double *reals;
     noack_window *windows;      /* further maxima of losses */
-    noack_recorded *decisions;  /* recorded decisions, flow by flow */
-    int64_t *decisions_begin;   /* (recorded_flows + 1,) */
-    int64_t recorded_flows;
     /* minimum of consecutive deliveries between two loss bursts; 0: none */
     int64_t recovery;
     int64_t mansd;              /* maximum of consecutive losses, M - 1; -1: none */
@@ -311,9 +299,6 @@ typedef struct {
 
 /* Return NULL, or what is wrong with the numbers of a link: all that the other functions assume. */
 const char *noack_link_check(const noack_link *link);
-
-/* The same for its recorded decisions, of which there may be millions. */
-const char *noack_recorded_check(const noack_link *link);
 
 /* Begin a flow in a row. */
 void noack_link_start_flow(
@@ -978,7 +963,7 @@ enum noack_reason {
     NOACK_HOUSEKEEPING, /* the time for housekeeping has come */
     NOACK_NEW_CLIENT,   /* the current datagram is from a new client */
     NOACK_STORE_FULL,   /* there is no room to store the current datagram */
-    NOACK_EVENTS_FULL,  /* a buffer of events or of record rows is full and must be emptied */
+    NOACK_RECORD_FULL,  /* a buffer of the record's rows is full and must be emptied */
     NOACK_CHANGE_DUE,   /* other settings apply from the current datagram on */
     NOACK_INTERRUPTED,  /* by a signal: Python handles it */
     NOACK_LEAVING_FULL, /* the list of departures is full and must be sent */
@@ -1011,7 +996,6 @@ typedef struct {
     int32_t name_bytes;
     int64_t number;                  /* number of its flows; -1: the row is free */
     uint8_t name[NOACK_NAME_BYTES];
-    uint8_t local[NOACK_NAME_BYTES]; /* address of its return path */
 } noack_client;
 
 /* One direction of a link in the relay. */
@@ -1021,7 +1005,6 @@ typedef struct {
     int64_t sends;
     int64_t name_bytes;
     uint8_t name[NOACK_NAME_BYTES];   /* forward: the server's */
-    uint8_t listen[NOACK_NAME_BYTES]; /* the link's address */
     int64_t full;                     /* forward: 1: further clients are refused */
     int64_t refused;
     int64_t port_unreachable;         /* forward: ICMP port-unreachable errors */
@@ -1038,9 +1021,9 @@ typedef struct {
     int32_t block;  /* first block of the payload */
     int32_t direction, client;
     int32_t next;   /* next free slot */
-    uint8_t copy, fate;
+    uint8_t copy;
     uint8_t counts; /* 1: it is the first intact copy */
-    uint8_t unused;
+    uint8_t unused[2];
 } noack_slot;
 
 /* A stored datagram that waits until the link is free; see native/network/waiting.c. */
@@ -1049,35 +1032,6 @@ typedef struct {
     int64_t left, right, parent; /* the heap: places + 1; 0: none */
     int64_t before;              /* the place of the one before it in its flow, if that waits */
 } noack_waiting;
-
-/* A datagram that arrives or departs; a tap receives it. */
-typedef struct {
-    int64_t t_ns;               /* Unix time */
-    int64_t flow;               /* number of the flow within the link */
-    int64_t packet;             /* number of the datagram within its flow */
-    int64_t consecutive_losses; /* arrival: up to and including this datagram */
-    int64_t mansd;              /* the maximum of consecutive losses (M - 1); -1: none */
-    /* arrival: decided delay, -1: never leaves; departure: actual delay */
-    int64_t delay_ns;
-    int64_t copy_delay_ns;      /* arrival: decided delay of its copy; -1: no copy */
-    int64_t hold_back_ns;       /* arrival: time held back for the guarantee */
-    int64_t bit;                /* the corrupted bit of the payload; -1: none */
-    int64_t copy_bit;           /* arrival: the corrupted bit of its copy; -1: none */
-    uint64_t offset;            /* place of the payload in the batch's data, if a tap needs data */
-    uint32_t size_bytes;        /* of the payload */
-    uint32_t link;              /* number of the link */
-    uint32_t interface;         /* 2 link is the link's client side, 2 link + 1 the server side */
-    uint16_t source_port, destination_port;
-    uint8_t source[16];         /* an IPv4 address is in the first 4 bytes */
-    uint8_t destination[16];
-    uint8_t family;             /* 4 or 6: the version of IP; 0: the payload is a whole packet */
-    uint8_t departure;          /* 0: a datagram arrived here; 1: it or its copy departed here */
-    uint8_t direction;          /* 0: forward, from client to server; 1: reverse */
-    uint8_t fate;
-    uint8_t copy;               /* departure: 1 is the duplicate */
-    uint8_t stale;              /* departure: a newer datagram of the flow had left before */
-    uint8_t unused[2];
-} noack_event;
 
 /* A row of the record's table netem_packet. */
 typedef struct {
@@ -1102,7 +1056,6 @@ typedef struct {
     int64_t only_socket;
     int64_t receive_wait_ns;     /* how long it waits (SO_RCVTIMEO) */
     noack_clock clock;           /* its epoch is the relay's start */
-    int64_t unix_ns;             /* Unix time at the relay's start */
     /* arrival of the current datagram, or its release time; never decreases */
     int64_t now_ns;
     int64_t read_ns;             /* the last reading of the clock; never decreases */
@@ -1110,7 +1063,6 @@ typedef struct {
     int64_t spin_ns;             /* time before a departure in which it does not sleep */
     int64_t segment;             /* 1: send datagrams of equal size as one message */
     int64_t segment_below;       /* the kernel does not segment datagrams of this size */
-    int64_t taps;                /* 0: none; 1: without data; 2: with data */
     int64_t records;             /* 1: write rows of the record */
     /* of a run: its loops, whose numbers are in the headers; their clients' rows begin at 0; 0: not
        of a run */
@@ -1120,7 +1072,7 @@ typedef struct {
     int64_t no_memory;           /* 1: no memory for more delayed datagrams */
 
     /* Tables; after the sockets of the links (listening, then sending), those of the clients. */
-    int64_t client_rows, table_places, slot_count, block_count, event_count, data_bytes, row_count;
+    int64_t client_rows, table_places, slot_count, block_count, row_count;
     noack_socket *sockets;       /* (2 links + client_rows,) */
     noack_client *clients;
     /* (table_places, a power of 2) rows of clients by the hash of their key */
@@ -1131,11 +1083,9 @@ typedef struct {
     noack_waiting *waiting;      /* (slot_count,) */
     uint8_t **chunks;            /* chunks of blocks */
     int32_t *block_next;         /* (block_count,) */
-    noack_event *events;
-    uint8_t *data;               /* payloads of the events */
     noack_packet_row *packets;
     noack_release_row *releases;
-    int64_t heap_length, event_length, data_length, packet_rows, release_rows;
+    int64_t heap_length, packet_rows, release_rows;
     int64_t delayed_count;       /* datagrams that have been delayed so far */
     int64_t free_slot, free_slots, free_block, free_blocks;
     void *scratch;               /* noack_relay_scratch_bytes() bytes, which are 0 at first */
@@ -1176,23 +1126,6 @@ void noack_client_remove(noack_relay *relay, int64_t row);
 
 /* The bucket of a time in a histogram: 32 for each doubling. */
 int64_t noack_bucket_of(int64_t t_ns);
-
-/* ---- A capture (pcapng): an interface is a side of a link ------------------------------------ */
-
-/* Bytes of a block beside its payload, at most. */
-enum { NOACK_CAPTURE_BYTES = 600 };
-
-/* Return NULL, or what is wrong with the events of a batch: all that noack_capture_blocks assumes.
-   data_bytes: size of the batch's payloads. */
-const char *noack_capture_check(
-    const noack_event *events, int64_t count, int64_t data_bytes, int64_t interfaces);
-
-/* Write the events' blocks into out, which has room for count NOACK_CAPTURE_BYTES and the payloads;
-   return their bytes. missing: (interfaces,) events that are missing before these, which the next
-   block states, and which are 0 then; written: (interfaces,) counts the blocks. */
-int64_t noack_capture_blocks(
-    const noack_event *events, int64_t count, const uint8_t *data, int64_t *missing,
-    int64_t *written, uint8_t *out);
 
 /* ---- A node that is a program of its own (docs/node.md) -------------------------------------- */
 
@@ -1253,7 +1186,7 @@ typedef struct {
 
 /* Questions of a channel besides NOACK_ASK_CHANGE and NOACK_ROWS_FULL. */
 enum noack_channel_question {
-    NOACK_ASK_OUTCOME = 16, /* the user's network: set outcome for the datagram in asked */
+    NOACK_ASK_OUTCOME = 16, /* the user's network: set outcome_ns for the datagram in asked */
     NOACK_ASK_PLACES        /* there is no room for more delayed datagrams */
 };
 
@@ -1268,7 +1201,7 @@ typedef struct {
     /* time from which the first link has other settings; INT64_MAX: none */
     int64_t change_ns;
     int64_t answered;            /* 1: Python has decided for this datagram */
-    noack_recorded outcome;
+    int64_t outcome_ns;          /* its time from arrival to departure; -1: it is lost */
     noack_datagram asked;
     int64_t asked_ns;
     int64_t delayed_count;       /* datagrams that have been delayed so far */

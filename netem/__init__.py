@@ -5,5 +5,5 @@
 used by ``run_network.py`` in a run, ``stand_alone.py`` as a program, ``lossy_udp.py`` in tests, and
 ``shell`` around a command. The program's options are in ``emulator_options.py``, words in
 ``tc_words.py``, files of links in ``links_file.py``, ``--explain`` in ``explanation.py``,
-recordings in ``capture.py`` and ``fates.py``, live control in ``control``.
+live control in ``control``.
 """

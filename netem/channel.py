@@ -18,7 +18,7 @@ from noack.core.clock import NEVER_NS
 from noack.core.core_library import CData, core, dtype_of, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings
-from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, NETEM_SETTING, PACKET_HEAD_BYTES, Fate
+from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, NETEM_SETTING, PACKET_HEAD_BYTES
 from noack.protocol.roles import Notice, Record
 from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, Message
 from noack.scenario.parameter_changes import ChangeSchedule, ParameterChange
@@ -194,8 +194,7 @@ class Channel:
         """Let the user's network decide for the datagram that the core asked about."""
         assert self._network is not None
         delay_ns = self._network(data, self.core.asked_ns)
-        fate = Fate.DROPPED if delay_ns is None else Fate.DELIVERED
-        self.core.outcome = (fate, -1 if delay_ns is None else delay_ns, -1, -1, -1)
+        self.core.outcome_ns = -1 if delay_ns is None else delay_ns
         self.core.answered = 1
 
     def _add_places(self, count: int) -> None:
@@ -228,7 +227,7 @@ def channel_of(resolved: Scenario, *, loops: int = 1, network: UserNetwork | Non
                 resolved.seeds.loss,
                 link_name(flow),
                 rows=loops,
-                decisions=[()] if network else (),
+                any_order=network is not None,
             )
         )
     schedule = None if network else ChangeSchedule(resolved, lambda scenario: scenario.network.link)

@@ -6,7 +6,6 @@ are several of a kind. Hence adding a delay does not change which packets are lo
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from itertools import accumulate, chain
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +15,7 @@ from noack.core.core_library import AnyArray, CData, core, dtype_of, ffi, pointe
 from noack.core.random_streams import stream_key
 from noack.guarantee.loss_guarantee import DeliveriesBetweenBursts, LossesInWindow
 from noack.impairments.feature import Stage, StageTables
-from noack.impairments.link_settings import Counters, Decisions, LinkSettings
+from noack.impairments.link_settings import Counters, LinkSettings
 from noack.impairments.target_loss import with_target_loss
 
 Integers = NDArray[np.int64]
@@ -30,12 +29,11 @@ class LinkState:
         settings: the settings; they must not name files.
         seed: seed of its random streams.
         name: names of the link and the direction.
-        decisions: recorded decisions per flow; each flow repeats them before the settings apply.
+        any_order: whether packets may be delivered out of order whatever the settings are.
         rows: number of flows that have room; more are added as needed.
 
     Raises:
-        ValueError: the settings name a file that has not been read, a loss rate cannot be kept, or
-            a recorded decision is wrong.
+        ValueError: the settings name a file that has not been read, or a loss rate cannot be kept.
 
     >>> link = LinkState(LinkSettings(mansd=4), 1, "update")
     >>> link.start_flow(0, 0)
@@ -48,15 +46,11 @@ class LinkState:
         settings: LinkSettings,
         seed: int,
         *name: str,
-        decisions: Decisions = (),
+        any_order: bool = False,
         rows: int = 1,
     ) -> None:
         self.settings = settings
         self._seed, self._name = seed, name
-        recorded = chain.from_iterable(decisions)
-        self._decisions = np.fromiter(recorded, dtype_of("noack_recorded"))
-        begins = [*accumulate(map(len, decisions), initial=0)] if decisions else [0]
-        self._decisions_begin = np.array(begins, np.int64)
         self.flows: NDArray[np.void] = np.zeros(rows, dtype_of("noack_flow"))
         """(rows,) of ``noack_flow``."""
         self.decision: CData = ffi.new("noack_decision *")
@@ -66,8 +60,7 @@ class LinkState:
         long as this object lives."""
         self._memory: dict[str, AnyArray] = {}
         self._stages: CData = None
-        self.core[0] = self._new_link(settings, rows, tracks=bool(decisions))[0]
-        _require(core.noack_recorded_check(self.core))
+        self.core[0] = self._new_link(settings, rows, tracks=any_order)[0]
 
     @property
     def rows(self) -> int:
@@ -160,7 +153,6 @@ class LinkState:
             {
                 "stages": stage_array,
                 "stage_count": len(keyed_stages),
-                "recorded_flows": len(self._decisions_begin) - 1,
                 "limit": settings.limit,
                 "tracks": tracks,
                 "scheduler": next((index for index, stage in enumerate(stages) if stage.schedules), -1),
@@ -175,11 +167,9 @@ class LinkState:
             "integers": np.array(tables.integers, np.int64),
             "reals": np.array(tables.reals, np.float64),
             "windows": np.array(windows, dtype_of("noack_window")),
-            "decisions": self._decisions,
         }
         for name, array in read_only.items():
             setattr(link, f"{name.removesuffix('s')}_count", len(array))
-        read_only["decisions_begin"] = self._decisions_begin
         self._stages, self._memory = stage_array, read_only | _link_memory(link) | {"flows": self.flows}
         self._point(link)
         _require(core.noack_link_check(link))

@@ -1,4 +1,4 @@
-"""A stand-alone emulator: runs a relay, with what watches, changes and records it; prints totals.
+"""A stand-alone emulator: runs a relay, with what watches and changes it; prints totals.
 
 :func:`run_stand_alone` reads the command line, :func:`run_relay` relays until Ctrl-C.
 """
@@ -7,28 +7,24 @@ import argparse
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from pathlib import Path
 from typing import Protocol
 
 from rich.console import Console
 
-from netem.capture import CaptureWriter
 from netem.control.control_server import starting
 from netem.control.emulator_statistics import Statistics, statistics, unintended_losses
 from netem.control.statistics_view import picture_of
 from netem.emulator_options import command_line_parser, parse_options, specs_of
 from netem.explanation import explain
-from netem.fates import FateRecorder, read_fates
 from netem.relay.link_sockets import raise_file_limit
 from netem.relay.relay import Relay
 from netem.relay.relay_links import DeviceLink, LinkSpec
-from netem.relay.relay_reports import DIRECTIONS, Direction, Tap, report_line
+from netem.relay.relay_reports import report_line
 from netem.relay_watch import add_watching_options, check_watching_options, watch_relay
 from noack.core.errors import CallerError, ExitStatus, MachineError, NoackError, why
-from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import address_text
 from noack.runtime.command_line import Signals, log_event, log_format, report_failure
 from noack.runtime.drivers.realtime_settings import realtime
@@ -48,7 +44,7 @@ class RelayedProgram(Protocol):
         """Run within the context; yields whether it has ended."""
 
 
-def add_recording_options(parser: argparse.ArgumentParser, *, shell: bool = False) -> None:
+def add_relay_options(parser: argparse.ArgumentParser, *, shell: bool = False) -> None:
     """Add the options of an emulator on its own, or of a shell, that do not describe links."""
     group = parser.add_argument_group("relay")
     if shell:
@@ -65,20 +61,6 @@ def add_recording_options(parser: argparse.ArgumentParser, *, shell: bool = Fals
         help="request SCHED_FIFO, locked memory and no deep idle states, each where permitted; "
         "poll during the last 50 µs before a delayed datagram is due",
     )
-    group = parser.add_argument_group("recording")
-    group.add_argument(
-        "--capture",
-        metavar="FILE.pcapng",
-        help="capture all datagrams, with their fates as comments; - for standard output",
-    )
-    group.add_argument("--record-fates", metavar="FILE.parquet", type=Path, help="record packet fates")
-    group.add_argument(
-        "--replay-fates",
-        metavar="FILE.parquet",
-        type=Path,
-        help="replay recorded packet fates, matched by flow and packet number; the recorded cap "
-        "applies unless mansd sets another",
-    )
     add_watching_options(parser)
 
 
@@ -92,7 +74,7 @@ def run_stand_alone(arguments: Sequence[str]) -> ExitStatus:
         CallerError: the command line has a mistake.
     """
     parser = command_line_parser()
-    add_recording_options(parser)
+    add_relay_options(parser)
     options = parse_options(parser, arguments)
     specs = specs_of(options)
     if options.explain:
@@ -110,9 +92,6 @@ def run_stand_alone(arguments: Sequence[str]) -> ExitStatus:
 
 def report_totals(totals: Statistics, options: argparse.Namespace) -> None:
     """Print the totals of a relay that has ended."""
-    if options.replay_fates is not None:  # the settings do not predict the loss of replayed fates
-        for direction in (link[name] for link in totals["links"] for name in DIRECTIONS):
-            direction["loss"]["predicted"] = None
     if options.json:
         print(json.dumps(totals, indent=2))
     logged = log_event("info", "noack netem", "ended", event="totals", totals=totals)
@@ -130,25 +109,18 @@ def run_relay(
 ) -> Statistics:
     """Relay until Ctrl-C, or the program's end; return the totals.
 
-    ``options`` are those of :func:`add_recording_options`.
+    ``options`` are those of :func:`add_relay_options`.
 
     Raises:
         CallerError: an address is in use, or a file cannot be written.
         MachineError: the sockets cannot be opened.
     """
     check_options(options)
-    if options.replay_fates is not None:
-        specs = _replaying(specs, options.replay_fates)
     # Signals stay handled until all files are complete.
     with ExitStack() as signal_stack, ExitStack() as stack:
-        # Open what records the relay, the relay, and what watches it.
+        # Open the relay, and what watches it.
         with starting(options.control):
-            taps: list[Tap] = []
-            if options.capture is not None:
-                taps.append(stack.enter_context(_capture(options.capture, specs)))
-            if options.record_fates is not None:
-                taps.append(stack.enter_context(FateRecorder(options.record_fates, specs)))
-            relay = _open_relay(specs, options, taps, None if program is None else program.devices)
+            relay = _open_relay(specs, options, None if program is None else program.devices)
             stack.callback(relay.close)
             signals = signal_stack.enter_context(Signals().handled())
             watch = stack.enter_context(watch_relay(relay, options))
@@ -160,8 +132,7 @@ def run_relay(
                 report_line(f"{setting} {answer}")
         takes_output = options.view or (options.stats is not None and options.stats_file is None)
         if program is None:
-            is_free = options.capture != "-" and not takes_output
-            _report_ready(relay, print_it=is_free, as_json=options.json)
+            _report_ready(relay, print_it=not takes_output, as_json=options.json)
         relay.run(
             lambda: watch.quit_requested or signals.received is not None or has_ended(),
             watch.commands.run_pending,
@@ -169,72 +140,26 @@ def run_relay(
         return statistics(watch.commands.snapshot_here())
 
 
-def _open_relay(
-    specs: Sequence[LinkSpec],
-    options: argparse.Namespace,
-    taps: Sequence[Tap],
-    devices: DeviceLink | None,
-) -> Relay:
+def _open_relay(specs: Sequence[LinkSpec], options: argparse.Namespace, devices: DeviceLink | None) -> Relay:
     raise_file_limit()
     spin_ns = _SPIN_NS if options.realtime else 0
     try:
-        return Relay(specs, segment=options.segment, taps=taps, spin_ns=spin_ns, devices=devices)
+        return Relay(specs, segment=options.segment, spin_ns=spin_ns, devices=devices)
     except OSError as error:  # no IPv6, or too many open files
         raise MachineError(f"the sockets of the links cannot be opened: {why(error)}") from None
 
 
-def _replaying(specs: Sequence[LinkSpec], path: Path) -> Sequence[LinkSpec]:
-    """Return links that replay a trace; a link without a guarantee gets that of the trace."""
-    fates = read_fates(path, [spec.name for spec in specs])
-
-    def settings(spec: LinkSpec, direction: Direction) -> LinkSettings:
-        own_settings: LinkSettings = getattr(spec, direction)
-        if own_settings.longest_burst is not None:
-            return own_settings
-        return own_settings.model_copy(update=fates.guarantees[spec.name, direction])
-
-    return [
-        replace(
-            spec,
-            forward=settings(spec, "forward"),
-            reverse=settings(spec, "reverse"),
-            decisions={side: fates.decisions[spec.name, side] for side in DIRECTIONS},
-        )
-        for spec in specs
-    ]
-
-
 def check_options(options: argparse.Namespace) -> None:
-    """Check the options of :func:`add_recording_options`, and that no file is given for two.
+    """Check the options of :func:`add_relay_options`, and that the statistics replace no input.
 
     Raises:
         CallerError: two options contradict each other.
     """
     check_watching_options(options)
-    if options.capture == "-" and (options.json or options.stats is not None):
-        raise CallerError("--capture -: --json and --stats use standard output, too")
-    files = {
-        f"--{name.replace('_', '-')}": Path(file).resolve()
-        for name in ("links", "replay_fates", "record_fates", "capture", "stats_file")
-        if (file := getattr(options, name, None)) is not None and str(file) != "-"
-    }
-    for name, path in files.items():
-        for other_name, other_path in files.items():
-            if name > other_name and path == other_path and not path.is_char_device():
-                raise CallerError(f"{name} {path}: {other_name} has the same file; choose another")
-
-
-@contextmanager
-def _capture(path: str, specs: Sequence[LinkSpec]) -> Iterator[Tap]:
-    writer = CaptureWriter(path, specs)
-    try:
-        yield writer
-    finally:
-        writer.close()
-        if writer.error is not None:
-            report_line(writer.error)
-        elif writer.missing_events:
-            report_line(f"the capture lacks {writer.missing_events} events")
+    links: Path | None = getattr(options, "links", None)
+    stats: Path | None = options.stats_file
+    if links is not None and stats is not None and links.resolve() == stats.resolve():
+        raise CallerError(f"--stats-file {stats}: --links has the same file; choose another")
 
 
 def _report_ready(relay: Relay, *, print_it: bool, as_json: bool) -> None:

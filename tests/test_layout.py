@@ -50,7 +50,6 @@ WALL_CLOCK = {
     "cosim/live/coordination/coordinator.py": "when a change was requested",
     "cosim/live/coordination/remote_access.py": "the validity of an invitation",
     "noack/protocol/ros2_node.py": "the time stamps of messages of ROS 2",
-    "netem/relay/relay.py": "the times of a capture",
     "netem/control/command_queue.py": "lines of statistics",
     "native/relay/loop.c": "time stamps of the kernel, compared with the monotonic clock",
     "noack/runtime/host_clocks/time_exchange.py": "the same",

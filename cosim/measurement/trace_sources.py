@@ -1,30 +1,22 @@
 """Packet traces from all that can be measured.
 
-The sources are files of known formats, fate files of the emulator (``noack netem --record-fates``),
-run directories (the updates, from the emulator to the controller), and the delivery opportunities
-of mahimahi. The latter say when the link could deliver, and nothing about losses. So their trace is
-that of a simulated probe through the emulator's link: its delays are those of waiting for the next
-opportunity.
+The sources are files of known formats, run directories (the updates, from the emulator to the
+controller), and the delivery opportunities of mahimahi. The latter say when the link could deliver,
+and nothing about losses. So their trace is that of a simulated probe through the emulator's link:
+its delays are those of waiting for the next opportunity.
 """
 
 import re
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, fields
-from functools import reduce
-from operator import and_
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
-from numpy.typing import NDArray
 
 from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import RunRecord, load_record
-from netem.fates import open_trace
 from netem.link_state import LinkState
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core
@@ -32,25 +24,18 @@ from noack.core.errors import CallerError, one_line, why
 from noack.core.file_access import open_regular
 from noack.impairments.kinds.opportunities import OPPORTUNITY_BYTES, Opportunities
 from noack.impairments.link_settings import LinkSettings
-from noack.protocol.record_tables import CONTROLLER_DELIVERY, Fate
+from noack.protocol.record_tables import CONTROLLER_DELIVERY
 from noack.settings.user_files import NamedFile
 from noack.traces.capture_packets import is_capture
 from noack.traces.capture_trace import CaptureOptions, SequenceField, read_captures
-from noack.traces.packet_trace import (
-    LOST_NS,
-    MAX_PACKETS,
-    PacketTrace,
-    TraceRecordError,
-    packet_trace,
-    read_trace,
-)
+from noack.traces.packet_trace import LOST_NS, PacketTrace, packet_trace, read_trace
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 _HEAD_BYTES = 64
 """Bytes by which a file is recognised."""
-_OTHER_SOURCES = ("fate files", "run directories", "delivery opportunities")
+_OTHER_SOURCES = ("run directories", "delivery opportunities")
 
 
 @dataclass(frozen=True)
@@ -61,7 +46,7 @@ class SourceOptions:
     """Whether sending and receiving times were read on different clocks; None: what is usual for
     the source: only in captures of both ends they were."""
     flow: int = 1
-    """Which flow of a capture or a fate file, by its number of packets; 1 is the largest."""
+    """Which flow of a capture, by its number of packets; 1 is the largest."""
     sequence_at: str | None = None
     """Where the payloads of a capture have sequence numbers: ``OFFSET:BYTES[:little]``."""
     period_ns: int = 20_000_000
@@ -111,9 +96,6 @@ def read_source(paths: Sequence[Path], options: SourceOptions | None = None) -> 
             "expected one file, or two captures (pcap, pcapng): that of the sender's end, then "
             "that of the receiver's"
         )
-    if is_fate_file(heads[0]):
-        refuse_unused(options, FILE_OPTIONS, "a fate file", "flow")
-        return read_fate_file(first_path, options.flow)
     if is_opportunity_file(heads[0]):
         refuse_unused(options, FILE_OPTIONS, "delivery opportunities", "period_ns")
         return read_opportunities(first_path, options.period_ns)
@@ -142,67 +124,6 @@ def _from_captures(paths: Sequence[Path], options: SourceOptions) -> PacketTrace
     except (OSError, ValueError) as error:
         names = ", ".join(map(str, paths))
         raise CallerError(f"{names}: {one_line(error)}") from None
-
-
-_FLOW = ("link", "direction", "flow")
-_COLUMNS = (*_FLOW, "packet", "arrival_ns", "fate", "delay_ns", "copy_delay_ns", "bit", "copy_bit")
-_LATEST_NS = 2**61
-"""Later times, whose differences may not fit 64 bits, are refused."""
-
-
-def is_fate_file(head: bytes) -> bool:
-    """Whether a file that begins with these bytes may be a fate file: it is Parquet."""
-    return head[:4] == b"PAR1"
-
-
-def read_fate_file(path: Path, number: int) -> PacketTrace:
-    """Return the trace of a flow, chosen by its number of packets; 1 is the largest.
-
-    A corrupted datagram is a lost one; of a datagram and its copy, the first intact one counts.
-
-    Raises:
-        CallerError: one line; it is not a complete fate file, or has no such flow.
-    """
-    with open_trace(path) as (file, _):
-        counts: Counter[tuple[object, ...]] = Counter()
-        for batch in file.iter_batches(columns=list(_FLOW)):
-            table = pa.Table.from_batches([batch]).group_by([*_FLOW]).aggregate([([], "count_all")])
-            for row in table.to_pylist():
-                counts[tuple(row[name] for name in _FLOW)] += row["count_all"]
-        if not 1 <= number <= len(counts):
-            raise CallerError(f"{path}: has no flow {number}; its flows are 1 to {len(counts)}")
-        chosen, packets = counts.most_common(number)[-1]
-        if packets > MAX_PACKETS:
-            raise CallerError(f"{path}: the flow has more than {MAX_PACKETS} packets")
-        is_chosen = reduce(and_, (pc.field(name) == value for name, value in zip(_FLOW, chosen, strict=True)))
-        tables = (pa.Table.from_batches([batch]) for batch in file.iter_batches(columns=[*_COLUMNS]))
-        table = pa.concat_tables([part.filter(is_chosen) for part in tables])
-    rows = {name: np.asarray(table[name].to_numpy()) for name in _COLUMNS[len(_FLOW) :]}
-    received_ns, lost = _received(path, rows)
-    try:
-        trace = packet_trace(rows["arrival_ns"], received_ns, lost, rows["packet"])
-    except TraceRecordError as error:
-        raise CallerError(f"{path}: packet {rows['packet'][error.row]} {error}") from None
-    link, direction, flow = chosen
-    hint = f"; --flow chooses another of the {len(counts)} flows" if len(counts) > 1 else ""
-    return trace.noted(f"flow {number}: {link} {direction}, flow {flow}, {packets} packets{hint}")
-
-
-def _received(path: Path, rows: dict[str, NDArray[np.int64]]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the times of the first intact delivery, and which packets have none."""
-    times = (rows[name] for name in ("delay_ns", "copy_delay_ns", "arrival_ns"))
-    if max(int(np.abs(time_ns).max(initial=0)) for time_ns in times) > _LATEST_NS:
-        raise CallerError(f"{path}: has a time that is too large")
-    never_ns = np.iinfo(np.int64).max
-    dropped = np.isin(rows["fate"], [Fate.DROPPED, Fate.OVERFLOWED, Fate.BLACKED_OUT])
-    delay_ns = np.minimum(
-        *(
-            np.where((rows[delay] >= 0) & (rows[bit] < 0) & ~dropped, rows[delay], never_ns)
-            for delay, bit in (("delay_ns", "bit"), ("copy_delay_ns", "copy_bit"))
-        )
-    )
-    lost = delay_ns == never_ns
-    return np.where(lost, LOST_NS, rows["arrival_ns"] + np.where(lost, 0, delay_ns)), lost
 
 
 def read_run(run_dir: Path) -> PacketTrace:

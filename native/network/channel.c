@@ -107,7 +107,7 @@ int64_t noack_channel_handle(
     serve(link, channel->waiting, now_ns, channel->heap, &channel->heap_count);
     link->flows[row].error_level = noack_wire_error_level(datagram->head, datagram->size_bytes);
     if (asks)
-        decide_or_repeat(link, row, datagram->size_bytes, now_ns, &channel->outcome, &decision);
+        decide_for(link, row, datagram->size_bytes, now_ns, &channel->outcome_ns, &decision);
     else
         noack_link_decide(link, row, datagram->size_bytes, now_ns, &decision);
     channel->packets[channel->packet_count++] = packet_row(

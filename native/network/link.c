@@ -49,44 +49,14 @@ void noack_link_renew(noack_link *link, const int64_t *keys, int64_t first_deliv
     }
 }
 
-/* Map a bit number to one within a payload; -1 (no bit) stays -1. */
-static int64_t within(int64_t bit, int64_t size_bytes) {
-    return bit < 0 || size_bytes == 0 ? -1 : bit % (size_bytes * 8);
-}
-
-/* Repeat a recorded decision; the guarantee holds nevertheless.
-
-   If packets arrive at other times than in the record, other packets may have to pass or to be held
-   back: a packet that must pass is delivered here, and noack_settle holds packets back. A packet
-   shorter than the recorded one is corrupted in another bit, an empty one in none. */
-static void repeat(const noack_recorded *recorded, noack_decision *decision) {
-    int64_t fate = recorded->fate, now_ns = decision->arrival_ns;
-    decision->bit = within(recorded->bit, decision->size_bytes);
-    decision->copy_bit = within(recorded->copy_bit, decision->size_bytes);
-    decision->release_ns = NOACK_NEVER_NS;
-    decision->loss_suppressed = fate == NOACK_FORCED;
-    int intact = decision->bit < 0 || (recorded->copy_delay_ns >= 0 && decision->copy_bit < 0);
-    int delivers = fate == NOACK_DELIVERED || fate == NOACK_FORCED;
-    if (decision->must_pass && !(delivers && intact)) {
-        fate = NOACK_FORCED;
-        decision->loss_suppressed = 1;
-        decision->bit = decision->copy_bit = -1;
-    }
-    decision->fate = fate;
-    if (fate == NOACK_DELIVERED || fate == NOACK_FORCED || fate == NOACK_CORRUPTED) {
-        decision->fate = NOACK_DELIVERED;
-        decision->release_ns = now_ns + max_of(recorded->delay_ns, 0);
-        if (recorded->copy_delay_ns >= 0)
-            decision->copy_ns = max_of(now_ns + recorded->copy_delay_ns, decision->release_ns);
-    }
-}
-
-/* The recorded decision for a flow's next packet; NULL: there is none. */
-static const noack_recorded *recorded_for(const noack_link *link, const noack_flow *flow) {
-    if (flow->number >= link->recorded_flows)
-        return NULL;
-    int64_t place = link->decisions_begin[flow->number] + flow->packets;
-    return place < link->decisions_begin[flow->number + 1] ? &link->decisions[place] : NULL;
+/* Decide as the user's network did; a packet that must pass leaves nevertheless. */
+static void apply_outcome(int64_t outcome_ns, noack_decision *decision) {
+    if (outcome_ns < 0)
+        refuse(decision, NOACK_DROPPED);
+    if (decision->fate == NOACK_DELIVERED)
+        decision->release_ns = decision->arrival_ns + max_of(outcome_ns, 0);
+    else
+        decision->release_ns = NOACK_NEVER_NS;
 }
 
 /* Swap a packet and its copy if the copy leaves first. */
@@ -118,11 +88,10 @@ static void keep_limit(int64_t free_places, noack_decision *decision) {
     }
 }
 
-/* Repeat a recorded decision; if it is NULL, apply the stages. A packet that must pass is exempt
-   from everything that would lose it. */
-void decide_or_repeat(
-    noack_link *link, int64_t row, int64_t size_bytes, int64_t now_ns,
-    const noack_recorded *recorded, noack_decision *decision) {
+/* A packet that must pass is exempt from everything that would lose it. */
+void decide_for(
+    noack_link *link, int64_t row, int64_t size_bytes, int64_t now_ns, const int64_t *outcome_ns,
+    noack_decision *decision) {
     noack_flow *flow = &link->flows[row];
     *decision = (noack_decision){
         /* every field, since the compiler's filling with 0 is slow */
@@ -146,8 +115,8 @@ void decide_or_repeat(
     flow->packets++;
     link->counters.received++;
     link->counters.received_bytes += size_bytes;
-    if (recorded != NULL) {
-        repeat(recorded, decision);
+    if (outcome_ns != NULL) {
+        apply_outcome(*outcome_ns, decision);
     } else {
         packet arriving = {link, flow, decision, 0};
         noack_stage_memory *memory = link->memory + row * link->stage_count;
@@ -164,8 +133,7 @@ void decide_or_repeat(
 
 void noack_link_decide(
     noack_link *link, int64_t row, int64_t size_bytes, int64_t now_ns, noack_decision *decision) {
-    const noack_recorded *recorded = recorded_for(link, &link->flows[row]);
-    decide_or_repeat(link, row, size_bytes, now_ns, recorded, decision);
+    decide_for(link, row, size_bytes, now_ns, NULL, decision);
 }
 
 void noack_link_decide_many(

@@ -167,20 +167,6 @@ static const char *check_stage(const noack_link *link, const noack_stage *stage)
     }
 }
 
-const char *noack_recorded_check(const noack_link *link) {
-    for (int64_t i = 0; i < link->recorded_flows; i++)
-        if (!in_range(link->decisions_begin[i], link->decisions_begin[i + 1], link->decision_count))
-            return "recorded decisions are outside their table";
-    for (int64_t i = 0; i < link->decision_count; i++) {
-        const noack_recorded *recorded = &link->decisions[i];
-        if (recorded->fate < NOACK_DELIVERED || recorded->fate > NOACK_BLACKED_OUT)
-            return "a recorded decision has no fate";
-        if (recorded->delay_ns > FAR_NS || recorded->copy_delay_ns > FAR_NS)
-            return "a recorded delay is longer than 73 years";
-    }
-    return NULL;
-}
-
 static const char *check_guarantee(const noack_link *link) {
     if (!is_between(-1, link->mansd, MOST_EVER) || !is_between(0, link->recovery, MOST_EVER)
         || !is_between(0, link->limit, MOST_EVER))
@@ -204,9 +190,9 @@ static const char *check_guarantee(const noack_link *link) {
 
 static const char *check_lengths(const noack_link *link) {
     const int64_t lengths[] = {
-        link->rows,         link->stage_count,  link->departure_places, link->integer_count,
-        link->real_count,   link->window_count, link->decision_count,   link->recorded_flows,
-        link->recent_width, link->loss_width,   link->in_flight,
+        link->rows,          link->stage_count, link->departure_places,
+        link->integer_count, link->real_count,  link->window_count,
+        link->recent_width,  link->loss_width,  link->in_flight,
     };
     for (size_t i = 0; i < sizeof lengths / sizeof *lengths; i++)
         if (!is_between(0, lengths[i], MOST_EVER))

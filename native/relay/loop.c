@@ -83,7 +83,6 @@ static void enqueue_departure(noack_relay *relay) {
         leaving->datagram.packet, max_of(leaving->datagram.size_bytes - headers_bytes(relay), 0),
         leaving->delayed, leaving->datagram.counts);
     leaving->error = 0;
-    scratch->leaving_bytes += leaving->datagram.size_bytes;
     int64_t link = leaving->datagram.direction >> 1;
     if (direction->sends == NOACK_OWN_SOCKET)
         leaving->socket = (int32_t)socket_of_client(relay, leaving->datagram.client);
@@ -111,8 +110,8 @@ static int64_t release_due(noack_relay *relay, int64_t until_ns) {
         const noack_slot *slot = &relay->slots[entry.slot];
         if (scratch->leaving_count == LEAVING)
             return NOACK_LEAVING_FULL;
-        if (!has_room(relay, slot->size_bytes))
-            return NOACK_EVENTS_FULL;
+        if (!has_room(relay))
+            return NOACK_RECORD_FULL;
         noack_heap_pop(relay->heap, &relay->heap_length);
         relay->now_ns = max_of(relay->now_ns, entry.due_ns);
         relay->clients[slot->client].in_flight--;
@@ -210,7 +209,6 @@ static void release(
     datagram->client = (int32_t)client;
     datagram->copy = (uint8_t)copy;
     datagram->counts = (uint8_t)is_first_intact(decision, copy);
-    datagram->fate = (uint8_t)decision->fate;
     leaving->address = data;
     leaving->release_ns = release_ns;
     leaving->slot = -1;
@@ -247,8 +245,6 @@ static void decide(noack_relay *relay, int64_t direction, int64_t row, int64_t s
     noack_link_decide(
         link, client->flow_row, max_of(size_bytes - headers_bytes(relay), 0), relay->now_ns,
         &decision);
-    if (relay->taps)
-        report_arrival(relay, direction, row, data, size_bytes, &decision);
     if (relay->records)
         record_packet(relay, direction, row, data, &decision);
     if (decision.release_ns != NOACK_NEVER_NS)
@@ -284,8 +280,8 @@ static int64_t decide_batch(noack_relay *relay) {
             return NOACK_CHANGE_DUE;
         if (scratch->leaving_count + 2 > LEAVING)
             return NOACK_LEAVING_FULL;
-        if (!has_room(relay, size_bytes))
-            return NOACK_EVENTS_FULL;
+        if (!has_room(relay))
+            return NOACK_RECORD_FULL;
         int64_t row = client_of(relay, 2 * link + reverse, size_bytes);
         if (row == NO_CLIENT)
             return NOACK_NEW_CLIENT;

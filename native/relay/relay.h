@@ -56,7 +56,7 @@ typedef struct {
     int64_t ready_count, ready_next;
     int64_t batch_socket, batch_next, batch_end; /* the receive buffers that are filled */
     int32_t hints[BUFFERS]; /* rows that the senders in the buffers may have; -1: none */
-    int64_t leaving_count, leaving_bytes;
+    int64_t leaving_count;
     int64_t arrival_ns;    /* arrival of the datagram in the current receive buffer */
     int64_t real_ns;       /* the real-time clock at the last receiving of datagrams */
     int64_t stamps;        /* 1: the kernel adds arrival timestamps */
@@ -85,7 +85,6 @@ static inline int64_t client_of_socket(const noack_relay *relay, int64_t socket)
 int64_t blocks_for(int64_t size_bytes);
 uint8_t *block_address(const noack_relay *relay, int64_t block);
 int64_t store_payload(noack_relay *relay, const uint8_t *data, noack_slot *datagram);
-void copy_payload(const noack_relay *relay, int64_t slot, uint8_t *into);
 void free_payload(noack_relay *relay, int64_t slot_number);
 
 /* device.c */
@@ -97,12 +96,8 @@ int write_packets(int fd, const struct mmsghdr *headers, int count);
 void touch_clients(noack_relay *relay);
 int64_t find_sender(noack_relay *relay);
 
-/* events.c */
-int has_room(const noack_relay *relay, int64_t size_bytes);
-void report_arrival(
-    noack_relay *relay, int64_t direction, int64_t client, const uint8_t *data, int64_t size_bytes,
-    const noack_decision *decision);
-void report_departure(noack_relay *relay, const departure *leaving, int64_t now_ns);
+/* record.c */
+int has_room(const noack_relay *relay);
 void record_packet(
     noack_relay *relay, int64_t direction, int64_t client, const uint8_t *data,
     const noack_decision *decision);

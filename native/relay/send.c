@@ -268,8 +268,6 @@ static void account(noack_relay *relay, const departure *leaving, int64_t now_ns
         direction->delays[noack_bucket_of(now_ns - leaving->datagram.arrival_ns)]++;
         if (leaving->delayed)
             direction->lateness[noack_bucket_of(now_ns - leaving->release_ns)]++;
-        if (relay->taps)
-            report_departure(relay, leaving, now_ns);
     } else {
         direction->errors[leaving->error & (NOACK_ERRNOS - 1)]++;
     }
@@ -295,15 +293,13 @@ static int64_t send_queued(noack_relay *relay, int32_t place) {
     return calls;
 }
 
-/* Send all that is queued; return the time afterwards.
-
-   The clock is read once for several calls, but for taps, which receive the time of each. */
+/* Send all that is queued; return the time afterwards. The clock is read once for several calls. */
 int64_t send_all(noack_relay *relay) {
     relay_scratch *scratch = scratch_of(relay);
     int64_t accounted = 0, calls = 0, now_ns = relay->read_ns;
     for (int64_t place = 0; place < scratch->order_count; place++) {
         calls += send_queued(relay, scratch->order[place]);
-        if (calls < CALLS_PER_READING && !relay->taps && place + 1 < scratch->order_count)
+        if (calls < CALLS_PER_READING && place + 1 < scratch->order_count)
             continue;
         calls = 0;
         now_ns = run_time_ns(&relay->clock);
@@ -316,6 +312,5 @@ int64_t send_all(noack_relay *relay) {
     }
     scratch->order_count = 0;
     scratch->leaving_count = 0;
-    scratch->leaving_bytes = 0;
     return now_ns;
 }

@@ -39,17 +39,6 @@ int64_t store_payload(noack_relay *relay, const uint8_t *data, noack_slot *datag
     return slot_number;
 }
 
-void copy_payload(const noack_relay *relay, int64_t slot, uint8_t *into) {
-    int64_t block = relay->slots[slot].block, left_bytes = relay->slots[slot].size_bytes;
-    while (left_bytes > 0) {
-        int64_t length = min_of(left_bytes, NOACK_BLOCK_BYTES);
-        memcpy(into, block_address(relay, block), (size_t)length);
-        into += length;
-        left_bytes -= length;
-        block = relay->block_next[block];
-    }
-}
-
 /* Free a slot and its blocks. */
 void free_payload(noack_relay *relay, int64_t slot_number) {
     noack_slot *slot = &relay->slots[slot_number];

@@ -145,13 +145,12 @@ class ClientTable:
             direction.start_flow(flow_row, number)
         memory = self._memory
         _, name_bytes = packed_name(self._links[link].name)
-        local, _ = packed_name(self._links[link].local)
         client = memory.clients[row]
         client["last_ns"] = memory.core.now_ns
         client["number"], client["link"], client["flow_row"] = number, link, flow_row
         client["in_flight"] = 0
         client["name_bytes"] = name_bytes
-        client["name"], client["local"] = name_array(name), name_array(local)
+        client["name"] = name_array(name)
         core.noack_client_insert(memory.core, row)
         memory.sockets["error"][self._memory.first_path + row] = error
         memory.sockets["fd"][self._memory.first_path + row] = -1
@@ -164,8 +163,6 @@ class ClientTable:
             stamp_arrivals(path)
         self._paths[row] = path
         self._drops[row] = 0
-        local, _ = packed_name(path.getsockname())
-        memory.clients["local"][row] = name_array(local)
         memory.watch(path.fileno(), memory.first_path + row)
 
     def _forget(self, row: int) -> None:

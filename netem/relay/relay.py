@@ -12,11 +12,11 @@ from netem.relay.link_sockets import set_receive_timeout, stamp_arrivals
 from netem.relay.loss_warnings import LinkWarnings, UnintendedLosses
 from netem.relay.relay_links import DeviceLink, LinkSpec, OpenLink, open_links
 from netem.relay.relay_memory import RelayDirection, RelayMemory
-from netem.relay.relay_reports import DIRECTIONS, Direction, DirectionReport, FlowReport, LinkReport, Tap
+from netem.relay.relay_reports import DIRECTIONS, Direction, DirectionReport, FlowReport, LinkReport
 from noack.core.core_library import core, ffi
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings
-from noack.runtime.address import Address, packed_name
+from noack.runtime.address import Address
 
 _PERIOD_NS = 40_000_000
 """Time between two turns of housekeeping."""
@@ -36,7 +36,6 @@ class Relay:
         specs: the links, at least one.
         segment: send successive datagrams of equal size as one message, which the kernel segments,
             if the kernel supports it.
-        taps: receivers of all events.
         spin_ns: busy-wait instead of sleeping for this time before a delayed datagram is due, to
             avoid the delay of a wake-up.
         devices: those of a shell, in the place of sockets; its link is the only one.
@@ -45,15 +44,11 @@ class Relay:
         CallerError: a socket cannot be bound, or a link is invalid.
     """
 
-    began_unix_ns: int | None = None
-    """Unix time at which it started to run; the origin of its times, including blackouts."""
-
     def __init__(
         self,
         specs: Sequence[LinkSpec],
         *,
         segment: bool = False,
-        taps: Sequence[Tap] = (),
         spin_ns: int = 0,
         devices: DeviceLink | None = None,
     ) -> None:
@@ -65,12 +60,7 @@ class Relay:
         self._warnings = [LinkWarnings(spec) for spec in self.specs]
         self._losses = [UnintendedLosses(spec.name, side) for spec in specs for side in DIRECTIONS]
         self._epoch_ns = self._next_check_ns = 0
-        # Taps see each datagram; without any, the core records no events.
-        self._taps = tuple(taps)
-        payloads = any(tap.wants_data for tap in self._taps)
-        self._memory = RelayMemory(
-            len(self.specs), segment=segment, events=bool(self._taps), payloads=payloads
-        )
+        self._memory = RelayMemory(len(self.specs), segment=segment)
         self._memory.core.spin_ns = spin_ns
         # Direction 2k is forward of link k, and 2k + 1 is its reverse, as in the core.
         self._directions = [
@@ -79,7 +69,6 @@ class Relay:
                 spec.seed,
                 (spec.name, side),
                 self._memory.directions[2 * number + reverse],
-                spec.decisions.get(side, ()),
             )
             for number, spec in enumerate(self.specs)
             for reverse, side in enumerate(DIRECTIONS)
@@ -108,8 +97,8 @@ class Relay:
             prctl(_PR_SET_TIMERSLACK, slack_ns, 0, 0, 0)
 
     def _run(self, stop: Callable[[], bool], housekeeping: Callable[[], None]) -> None:
-        if self.began_unix_ns is None:
-            self._epoch_ns, self.began_unix_ns = time.monotonic_ns(), time.time_ns()
+        if self._epoch_ns == 0:
+            self._epoch_ns = time.monotonic_ns()
         while not stop():
             housekeeping()
             now_ns = self._now_ns()
@@ -176,24 +165,15 @@ class Relay:
             self._losses[direction].set_not_sent(error, datagrams)
 
     def _relay_until(self, until_ns: int) -> None:
-        """Relay datagrams, and pass their events to the taps."""
+        """Relay datagrams, and do what the core needs meanwhile."""
         relay = self._memory.core
-        relay.clock.epoch_ns, relay.unix_ns = self._epoch_ns, self.began_unix_ns
+        relay.clock.epoch_ns = self._epoch_ns
         while (reason := core.noack_relay_run(relay, until_ns)) != core.NOACK_HOUSEKEEPING:
             if reason == core.NOACK_NEW_CLIENT:
                 name = bytes(ffi.buffer(core.noack_relay_sender(relay), core.NOACK_NAME_BYTES))
                 self._clients.add(core.noack_relay_receiver(relay) % len(self.specs), name)
             elif reason == core.NOACK_STORE_FULL:
                 self._memory.add_room()
-            elif reason == core.NOACK_EVENTS_FULL:
-                self._report_events()
-        self._report_events()
-
-    def _report_events(self) -> None:
-        events, data = self._memory.take_events()
-        if len(events):
-            for tap in self._taps:
-                tap.take(events, data)
 
     def _do_housekeeping(self, now_ns: int) -> None:
         """Remove idle clients, open return paths again, check for losses."""
@@ -269,7 +249,6 @@ class Relay:
                 sends = core.NOACK_LINK_SOCKET
         forward.set_server(link.server, sends)
         reverse.set_server(link.server, core.NOACK_CLIENT_NAME)
-        forward.row.listen, _ = packed_name(link.name)
 
     def _stamp_arrivals(self, direction: int) -> None:
         """Enable arrival timestamps where datagrams are delayed: delays count from the arrival."""

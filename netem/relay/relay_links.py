@@ -7,14 +7,14 @@ import os
 import socket
 import struct
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from netem.relay.link_sockets import Endpoint, leads_to, listen, one_way_path, socket_name
 from netem.relay.relay_reports import DIRECTIONS, Direction
 from noack.core.errors import CallerError
-from noack.impairments.link_settings import Decisions, LinkSettings
+from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import Address, SocketName, address_of, address_text, unpacked_address
 from noack.runtime.udp_sockets import drops_of
 
@@ -41,8 +41,6 @@ class LinkSpec:
     """A client without a datagram in either direction for this time is removed."""
     most_clients: int = 65_536
     """Maximum number of clients; datagrams of further clients are refused and counted."""
-    decisions: Mapping[Direction, Decisions] = field(default_factory=dict)
-    """Recorded decisions per flow; each flow repeats them before the settings apply."""
 
 
 @dataclass(frozen=True)
@@ -61,11 +59,6 @@ class OpenLink:
     def name(self) -> SocketName:
         """The address at which the link listens, in the form that sockets use."""
         return tuple(self.endpoint.getsockname())
-
-    @property
-    def local(self) -> SocketName:
-        """The address that sends to the server, unless each client has its own return path."""
-        return tuple((self.path or self.endpoint).getsockname())
 
     @property
     def address(self) -> Address:
@@ -121,12 +114,9 @@ class DeviceLink:
         return self.spec.listen
 
     @property
-    def local(self) -> SocketName:
-        """The address outside."""
+    def server(self) -> SocketName:
+        """The address outside. Nothing is sent there by address."""
         return self.spec.to
-
-    server = local
-    """The same: nothing is sent there by address."""
 
     @property
     def address(self) -> Address:

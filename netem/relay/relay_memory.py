@@ -8,19 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from netem.link_state import Integers, LinkState
-from netem.relay.relay_reports import EVENT, Bytes
+from netem.relay.relay_reports import Bytes
 from noack.core.clock import NEVER_NS
 from noack.core.core_library import CData, StructRows, core, dtype_of, ffi, pointer_to
-from noack.impairments.link_settings import Decisions, LinkSettings
+from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import NAME_BYTES, SocketName, packed_name
 
 CLIENT, SOCKET, SLOT = map(dtype_of, ("noack_client", "noack_socket", "noack_slot"))
 ENTRY = dtype_of("noack_heap_entry")
 _CLIENTS, _SLOTS, _ROWS = 64, 256, 16
 """Clients, delayed datagrams, and flows of a direction for which there is room at first."""
-_EVENTS = 8192
-_DATA_BYTES = 16 * 1024 * 1024
-"""Events, and bytes of payloads, for which there is room until taps take them."""
 _TABLE_SHARE = 4
 """Places of the hash table per client."""
 _HEADROOM_BYTES = 48 * 1024 * 1024
@@ -34,8 +31,6 @@ class RelayMemory:
     Args:
         links: the links; their directions are numbered 2·link forward, 2·link + 1 reverse.
         segment: send successive datagrams of equal size as one message.
-        events: collect events for taps.
-        payloads: with the payloads of their datagrams.
         row_count: number of rows of the record that are kept for each table; 0: no record.
     """
 
@@ -44,25 +39,20 @@ class RelayMemory:
         links: int,
         *,
         segment: bool = False,
-        events: bool = False,
-        payloads: bool = False,
         row_count: int = 0,
     ) -> None:
         self.first_path = 2 * links
         self._chunks: list[Bytes] = []
         self._epoll = select.epoll()
         self.directions: CData = ffi.new("noack_direction[]", 2 * links)
-        self.events: StructRows = np.zeros(_EVENTS if events else 0, EVENT)
-        self.data: Bytes = np.zeros(_DATA_BYTES if payloads else 0, np.uint8)
         self.packets: StructRows = np.zeros(row_count, dtype_of("noack_packet_row"))
         self.releases: StructRows = np.zeros(row_count, dtype_of("noack_release_row"))
         self._scratch = zeros_in_lines(core.noack_relay_scratch_bytes(), np.dtype(np.uint8))
         self.core: CData = ffi.new("noack_relay *", {
             "links": links, "epoll": self._epoll.fileno(), "only_socket": -1,
             "clock": {"speed": 1.0}, "change_ns": NEVER_NS, "segment": segment,
-            "segment_below": 2**16, "taps": events + payloads, "records": row_count > 0,
+            "segment_below": 2**16, "records": row_count > 0,
             "directions": self.directions,
-            "event_count": len(self.events), "data_bytes": len(self.data),
             "row_count": row_count, "free_slot": -1, "free_block": -1,
         })  # fmt: skip
         """The relay, as the core's functions take it: a ``noack_relay``."""
@@ -74,8 +64,6 @@ class RelayMemory:
         self._block_next = np.zeros(0, np.int32)
         self._add_chunk()
         for name, kind in (
-            ("events", "noack_event *"),
-            ("data", "uint8_t *"),
             ("packets", "noack_packet_row *"),
             ("releases", "noack_release_row *"),
         ):
@@ -132,12 +120,6 @@ class RelayMemory:
         self._set_clients(clients, sockets)
         for row in np.flatnonzero(clients["number"] >= 0).tolist():
             core.noack_client_insert(self.core, row)
-
-    def take_events(self) -> tuple[StructRows, Bytes]:
-        """Return the collected events and their payloads, which the next ones overwrite."""
-        events, data = self.core.event_length, self.core.data_length
-        self.core.event_length = self.core.data_length = 0
-        return self.events[:events], self.data[:data]
 
     def take_rows(self) -> tuple[StructRows, StructRows]:
         """Return the collected rows of the two tables, which the next ones overwrite."""
@@ -197,7 +179,7 @@ class RelayDirection(LinkState):
     """One direction of a link in a relay's memory; see :class:`netem.link_state.LinkState`.
 
     Args:
-        settings, seed, name, decisions: see there.
+        settings, seed, name: see there.
         row: its ``noack_direction``.
     """
 
@@ -207,9 +189,8 @@ class RelayDirection(LinkState):
         seed: int,
         name: Sequence[str],
         row: CData,
-        decisions: Decisions = (),
     ) -> None:
-        super().__init__(settings, seed, *name, decisions=decisions, rows=_ROWS)
+        super().__init__(settings, seed, *name, rows=_ROWS)
         self.row = row
         row.link = self.core
         self._set_keeps()

@@ -1,28 +1,21 @@
-"""What a relay reports: lines for the user, events, which taps receive, and counts of its links.
+"""What a relay reports: lines for the user, and counts of its links.
 
-The core counts times in histograms (``native/relay/events.c``).
+The core counts times in histograms (``native/relay/record.c``).
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.core_library import core, dtype_of
+from noack.core.core_library import core
 from noack.impairments.link_settings import Counters, LinkSettings
 from noack.runtime.address import Address
 from noack.runtime.command_line import print_to_stderr
 
 Bytes = NDArray[np.uint8]
-Events = NDArray[np.void]
-
-EVENT = dtype_of("noack_event")
-"""One event, with the fields of ``noack_event`` in native/noack.h; the payload is ``data[offset :
-offset + size_bytes]``."""
-
-
 Direction = Literal["forward", "reverse"]
 DIRECTIONS: tuple[Direction, Direction] = ("forward", "reverse")
 """From client to server, and from server to client."""
@@ -91,19 +84,6 @@ class LinkReport:
     there."""
     forward: DirectionReport
     reverse: DirectionReport
-
-
-class Tap(Protocol):
-    """Receives the events of a relay in batches, in the relay's thread; must return quickly."""
-
-    wants_data: bool
-    """Whether it needs payloads."""
-
-    def take(self, events: Events, data: Bytes) -> None:
-        """Receive events, (k,) of :data:`netem.relay.relay_reports.EVENT`, and their payloads.
-
-        Both arrays are overwritten after the call.
-        """
 
 
 def bucket_start_ns(bucket: int) -> int:

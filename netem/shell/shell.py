@@ -17,7 +17,7 @@ from netem.relay.relay_links import DeviceLink
 from netem.relay.relay_reports import report_line
 from netem.shell import process
 from netem.shell.devices import inside, open_devices
-from netem.stand_alone import add_recording_options, check_options, report_totals, run_relay
+from netem.stand_alone import add_relay_options, check_options, report_totals, run_relay
 from noack.core.errors import CallerError, ExitStatus
 from noack.core.system_processes import python_command
 from noack.runtime.command_line import Signals, log_format
@@ -37,11 +37,11 @@ def run_in_shell(arguments: Sequence[str]) -> int:
         index = words.index("--")
         words, command = words[:index], words[index + 1 :]
     parser = shell_parser()
-    add_recording_options(parser, shell=True)
+    add_relay_options(parser, shell=True)
     options = parse_options(parser, words)
     spec = shell_spec(options)
-    if options.view or options.capture == "-":
-        raise CallerError("--view and --capture - take the terminal, which the command has")
+    if options.view:
+        raise CallerError("--view takes the terminal, which the command has")
     check_options(options)
     command = command or [os.environ.get("SHELL") or "/bin/sh"]
     outside = [_split(text) for text in options.outside or ()]

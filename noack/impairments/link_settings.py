@@ -5,9 +5,9 @@ between successive packets of a flow. The probability itself stays exact, unlike
 the end are what reports and recorded packet fates use of a link; native/noack.h declares the rest.
 """
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import astuple, dataclass
-from typing import Annotated, NamedTuple, Self
+from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
@@ -119,20 +119,6 @@ def require_order(impairments: Sequence[AnyImpairment]) -> None:
                     f"{rate.discipline.kind}; losses and blackouts can stand before such a rate, "
                     "constant delays and corruption before or after it"
                 )
-
-
-class RecordedDecision(NamedTuple):
-    """A recorded decision for a packet: the fields of ``noack_recorded``."""
-
-    fate: int
-    delay_ns: int  # Time from arrival to departure; −1: it never left
-    copy_delay_ns: int
-    bit: int
-    copy_bit: int
-
-
-Decisions = Sequence[Collection[RecordedDecision]]
-"""Recorded decisions of each flow, in the order of its packets; or arrays of ``noack_recorded``."""
 
 
 @dataclass(slots=True)

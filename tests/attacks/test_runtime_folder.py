@@ -17,12 +17,8 @@ import noack
 from cosim.doctor.machine_measures import _runtime_folder_problem
 from cosim.output.viewer.loop_recording import RecordingFile
 from cosim.record.run_directory import ENDING_FILE, RECORD, RECORDING_FILE, EndingFile, finished_run
-from netem.capture import CaptureWriter
 from netem.control import control_server as emulator_session
-from netem.fates import FateRecorder
-from netem.relay.relay_links import LinkSpec
 from noack.core.errors import CallerError, NoackError
-from noack.impairments.link_settings import LinkSettings
 from noack.runtime import active_runs
 from noack.runtime.run_descriptor import (
     RunDescriptor,
@@ -185,8 +181,6 @@ def test_a_run_without_a_usable_folder_is_refused(shared: Path) -> None:
 
 
 PRIVATE = b"mine alone"
-ENDS = ("127.0.0.1", 9000), ("127.0.0.1", 9001)
-SPEC = LinkSpec("link", *ENDS, LinkSettings(), LinkSettings())
 COMMANDS = (
     "export {run} --format mat --out {out}/run.mat",
     "export {run} --format mcap --out {out}/run.mcap",
@@ -289,8 +283,6 @@ def lock_file(path: Path) -> None:
 
 WRITERS: dict[str, Callable[[Path], object]] = {
     ".lock": lock_file,
-    "a.pcapng": lambda path: CaptureWriter(path, [SPEC]).close(),
-    "fates.parquet": lambda path: FateRecorder(path, [SPEC]).__exit__(),
     "recording.rrd": lambda path: RecordingFile(path, "a", rrb.Blueprint(), indexed=True).close(),
     ENDING_FILE: lambda path: EndingFile(path.parent).__exit__(None, None, None),
     "plant_step.recorder": lambda path: SpoolWriter(path.parent, "recorder").append("plant_step", 0, b"rows"),

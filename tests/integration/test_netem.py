@@ -9,9 +9,8 @@ from pathlib import Path
 from tests.netem.relay.relays import endpoints
 
 
-def test_several_links_are_captured_and_counted(tmp_path: Path) -> None:
-    links, capture = tmp_path / "links.toml", tmp_path / "all.pcapng"
-    lines = tmp_path / "lines.json"
+def test_several_links_are_relayed_and_counted(tmp_path: Path) -> None:
+    links, lines = tmp_path / "links.toml", tmp_path / "lines.json"
     with endpoints(*["127.0.0.1"] * 2) as (server, client):
         server.settimeout(60)
         address = "{}:{}".format(*server.getsockname())
@@ -28,7 +27,7 @@ def test_several_links_are_captured_and_counted(tmp_path: Path) -> None:
             to = "{address}"
             """
         )
-        arguments = ["--links", str(links), "--capture", str(capture), "--realtime"]
+        arguments = ["--links", str(links), "--realtime"]
         arguments += ["--stats", "0.05", "--stats-file", str(lines), "--json"]
         with subprocess.Popen(
             [sys.executable, "-m", "cosim.cli", "netem", *arguments],
@@ -45,10 +44,6 @@ def test_several_links_are_captured_and_counted(tmp_path: Path) -> None:
             process.send_signal(signal.SIGINT)
             _, stderr = process.communicate(timeout=60)
             assert process.returncode == 0, stderr
-    content = capture.read_bytes()
-    assert content.startswith(b"\x0a\x0d\x0d\x0a")
-    assert b"passes" in content
-    assert b"dropped by the loss model" in content
     newest = json.loads(lines.read_text().splitlines()[-1])["links"]
     assert [link["name"] for link in newest] == ["first", "second"]
     assert [link["forward"]["received"] for link in newest] == [2, 1]

@@ -14,7 +14,7 @@ from native.build import HEADER, NO_COMPILER, is_current
 from noack.core.core_library import LIBRARY, address_of, core, dtype_of, ffi, load_core, pointer_to
 from noack.core.errors import CallerError
 from noack.impairments.feature import StageTables
-from noack.impairments.link_settings import Counters, RecordedDecision
+from noack.impairments.link_settings import Counters
 from noack.protocol.record_tables import Fate
 from tests.noack.impairments.feature_examples import IMPAIRED, names_file
 
@@ -66,7 +66,6 @@ def constants(name: str) -> dict[str, int]:
 def test_python_has_the_numbers_and_fields_of_c() -> None:
     assert constants("noack_fate") == {f"NOACK_{fate.name}": fate.value for fate in Fate}
     assert dtype_of("noack_counters").names == tuple(Counters.__dataclass_fields__)
-    assert dtype_of("noack_recorded").names == RecordedDecision._fields
 
 
 def test_each_stage_kind_has_a_file_in_c_and_a_feature_in_python() -> None:

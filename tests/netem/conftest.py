@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import pyarrow.parquet as pq
 import pytest
 
 
@@ -16,7 +15,7 @@ class Emulator:
     """``python -m netem`` with one link, in a separate folder.
 
     Args:
-        folder: the folder for its fate trace.
+        folder: where it runs.
         to: the server, HOST:PORT.
         words: impairments and options.
         listen: the address to which clients send.
@@ -24,11 +23,10 @@ class Emulator:
     """
 
     def __init__(self, folder: Path, to: str, *words: str, listen: str, inside: Sequence[str] = ()) -> None:
-        self._trace = folder / "fates.parquet"
         self.process = subprocess.Popen(
             [
                 *inside, sys.executable, "-m", "netem", "--listen", listen, "--to", to, "--json",
-                "--record-fates", str(self._trace), *words,
+                *words,
             ],
             cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
@@ -55,11 +53,6 @@ class Emulator:
         stdout, stderr = self.process.communicate(timeout=60)
         (link,) = json.loads(stdout)["links"]
         return dict(link), self.process.returncode, stderr
-
-    def fates(self, direction: str) -> list[dict[str, Any]]:
-        """Return the fate of each datagram of the first flow, in the order of arrival."""
-        rows: list[dict[str, Any]] = pq.read_table(self._trace).to_pylist()
-        return [row for row in rows if row["direction"] == direction and row["flow"] == 0]
 
 
 Emulate = Callable[..., Emulator]

@@ -8,7 +8,6 @@ from noack.core.core_library import core, ffi
 from noack.protocol.record_tables import PACKET_HEAD_BYTES
 from noack.protocol.roles import Notice, Record
 from noack.scenario.parameter_changes import ParameterChange
-from tests.oracles.link import flipped
 
 _UNKNOWN_NS = 2**62
 """An arrival at the socket that is later than its handling is unknown."""
@@ -85,3 +84,12 @@ class SteppedChannel:
         """Forget a payload after its last departure."""
         if not self._copies[number]:
             del self._copies[number], self._payloads[number]
+
+
+def flipped(data: bytes, bit: int) -> bytes:
+    """The data with one bit flipped; bit 0 is the least significant bit of byte 0; -1: none."""
+    if bit < 0:
+        return data
+    changed = bytearray(data)
+    changed[bit // 8] ^= 1 << (bit % 8)
+    return bytes(changed)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from noack.protocol.wire_format import HEADER_BYTES, TAG_BYTES, Encoder, Flow, Message
-from tests.netem.capture_reader import file_of
+from tests.oracles.capture_files import Sent, pcapng_of
 
 Tshark = Callable[..., str]
 
@@ -42,13 +42,15 @@ def tshark(tmp_path: Path) -> Tshark:
 
 
 DOCS = Path(__file__).parents[2] / "docs"
+PORT = 40_002
+T_NS = 1_767_225_600_123_456_789
 RUN = 0x0123_4567_89AB_CDEF
 Fields = dict[str, list[dict[str, str]]]
 
 
 def capture_of(folder: Path, *payloads: bytes) -> Path:
     path = folder / "capture.pcapng"
-    path.write_bytes(file_of(*({"payload": payload} for payload in payloads)))
+    path.write_bytes(pcapng_of(*(Sent(T_NS, payload, destination_port=PORT) for payload in payloads)))
     return path
 
 

@@ -50,6 +50,17 @@ def test_a_command_line_describes_a_link(
     assert specs(f"{ADDRESSES} {arguments}") == (link,)
 
 
+def test_statistics_do_not_replace_the_file_of_links(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    links = tmp_path / "links.toml"
+    links.write_text('link = [{name = "a", listen = ":0", to = ":9001"}]\n')
+    before = links.read_bytes()
+    assert main(["--links", str(links), "--stats-file", str(links)]) == 2
+    assert capsys.readouterr().err.endswith("--links has the same file; choose another\n")
+    assert links.read_bytes() == before
+
+
 _OF_THE_SYSTEM = re.compile(r"\((\[Errno|Name or service).*\)$")
 """Texts that depend on the system, or on a library."""
 

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from netem import link_state
+from netem.channel import Datagram, channel_of
 from netem.link_state import LinkState
 from netem.tc_words import settings_of
 from noack.core.core_library import address_of, core
@@ -19,7 +20,7 @@ from noack.protocol.record_tables import NETEM_PACKET, Fate, tables
 from noack.protocol.roles import Notice, Record
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
-from tests.oracles.link import Datagram, Link, update_link_of
+from tests.netem.stepped_link import Link
 from tests.oracles.loss_decisions import fates_of_flow
 
 MS = 1_000_000
@@ -161,8 +162,8 @@ def test_the_link_of_a_scenario_keeps_its_mansd(
     content: dict[str, Any], network: dict[str, Any], expected: str
 ) -> None:
     content["network"] |= {"loss": {"model": "worst_case"}, **network}
-    link = update_link_of(resolve(validate(content, "here")))
-    letters = "".join("dF"[fate is Fate.FORCED] for fate in fates(link, 0, 7))
+    (link,) = channel_of(resolve(validate(content, "here"))).links
+    letters = "".join("dF"[link.decide(0, 72, 0).fate == Fate.FORCED] for _ in range(7))
     assert letters == expected
 
 

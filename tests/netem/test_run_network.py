@@ -1,8 +1,8 @@
-"""The network of a run, and the relay, do what the machine in Python does that replays them."""
+"""The network of a run, with sockets, does what the network without sockets does that replays it."""
 
 import socket
 import time
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from itertools import islice
@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from cosim.shipped_files import find_shipped
-from netem.relay.relay_links import LinkSpec
+from netem.channel import Datagram, channel_of
 from netem.run_network import NetworkSockets, RunNetwork
 from noack.core.clock import RunClock
 from noack.impairments.link_settings import LinkSettings
@@ -30,10 +29,9 @@ from noack.runtime.udp_sockets import bind
 from noack.scenario.resolution import resolve, tables_of
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
-from tests.helpers.machine_parts import Machine
-from tests.netem.relay.relays import PATIENCE_S, KeepAll, Received, drain, endpoints, name_of, relayed
+from tests.netem.relay.relays import PATIENCE_S, Received, drain, endpoints, name_of
+from tests.netem.stepped_channel import SteppedChannel
 from tests.noack.impairments import any_link_settings as any_settings
-from tests.oracles.link import Datagram, Link, network_of
 
 NEVER_NS = 2**61
 Arrival = tuple[int, int, int]
@@ -49,12 +47,12 @@ arrivals = st.lists(
 
 
 class ComparedNetworks:
-    """The network in the core and the oracle in Python; each input is given to both."""
+    """The network with sockets and the one without; each input is given to both."""
 
     def __init__(self, resolved: Any, sockets: list[socket.socket], loops: int) -> None:
         self.loops = loops
-        self.oracle: Machine[Datagram] = network_of(resolved, loops=self.loops)
-        self.core: Any = RunNetwork(resolved, self.loops)
+        self.channel = SteppedChannel(channel_of(resolved, loops=self.loops))
+        self.sockets: Any = RunNetwork(resolved, self.loops)
         sender, sensor, plant, self._controller, *receivers = sockets
         peers = {name_of(sensor): receivers[0], name_of(self._controller): receivers[1]}
         self._other = plant if Flow.ACTUATION in resolved.network.flows else sensor
@@ -62,17 +60,17 @@ class ComparedNetworks:
         clock = RunClock(time.monotonic_ns() + NEVER_NS)
         ends = name_of(self._controller), name_of(self._other)
         sender.connect(ends[0])
-        self.core.open(clock, sender, peers, ends)
+        self.sockets.open(clock, sender, peers, ends)
         self._expected: dict[int, list[bytes]] = {0: [], 1: []}
         self.rows: list[Record] = []
 
     def arrive(self, data: bytes, flow: int, now_ns: int) -> None:
-        rows = self._release_oracle(now_ns)
-        rows += self._forwarded(self.oracle.handle(Datagram(flow, data), now_ns))
-        self._compare(rows, self.core.handle(Datagram(flow, data), now_ns))
+        rows = self._release_channel(now_ns)
+        rows += self._forwarded(self.channel.handle(Datagram(flow, data), now_ns))
+        self._compare(rows, self.sockets.handle(Datagram(flow, data), now_ns))
 
     def release(self, now_ns: int) -> None:
-        self._compare(self._release_oracle(now_ns), self.core.on_timer(now_ns))
+        self._compare(self._release_channel(now_ns), self.sockets.on_timer(now_ns))
 
     def received(self) -> tuple[list[bytes], list[bytes]]:
         """Return what the two receivers should have received; check that they did."""
@@ -80,10 +78,10 @@ class ComparedNetworks:
         assert {flow: [data for data, _ in drained[flow]] for flow in drained} == self._expected
         return self._expected[0], self._expected[1]
 
-    def _release_oracle(self, now_ns: int) -> list[Any]:
+    def _release_channel(self, now_ns: int) -> list[Any]:
         rows = []
-        while (due_ns := self.oracle.next_deadline_ns()) is not None and due_ns <= now_ns:
-            rows += self._forwarded(self.oracle.on_timer(now_ns))
+        while (due_ns := self.channel.next_deadline_ns()) is not None and due_ns <= now_ns:
+            rows += self._forwarded(self.channel.on_timer(now_ns))
         return rows
 
     def _forwarded(self, outputs: Any) -> list[Any]:
@@ -94,7 +92,7 @@ class ComparedNetworks:
 
     def _compare(self, expected: Any, outputs: Any) -> None:
         assert list(outputs) == list(expected)
-        assert self.core.next_deadline_ns() == self.oracle.next_deadline_ns()
+        assert self.sockets.next_deadline_ns() == self.channel.next_deadline_ns()
         self.rows += expected
 
 
@@ -102,7 +100,7 @@ class ComparedNetworks:
 def compared(resolved: Any, loops: int = 1) -> Iterator[ComparedNetworks]:
     with endpoints(*["127.0.0.1"] * 6) as sockets:
         networks = ComparedNetworks(resolved, sockets, loops)
-        with closing(networks.core):
+        with closing(networks.sockets):
             yield networks
 
 
@@ -124,7 +122,7 @@ CROSSING = st.sampled_from([
     any_settings.harsh, any_settings.harsh, CROSSING, arrivals,
     st.sampled_from([1, 1, 2, 200]),
 )  # fmt: skip
-def test_the_network_of_a_run_gives_the_rows_and_datagrams_of_the_plain_machine(
+def test_the_network_of_a_run_gives_the_rows_and_datagrams_of_its_replay(
     forward: LinkSettings,
     reverse: LinkSettings,
     crossing: tuple[Flow, ...],
@@ -143,10 +141,10 @@ def test_the_network_of_a_run_gives_the_rows_and_datagrams_of_the_plain_machine(
             data = (head + number.to_bytes(4, "big") * (size // 4))[:size]
             networks.arrive(data, loop + loops * direction * (len(crossing) == 2), now_ns)
         for data in (bytes(31), bytes(6) + loops.to_bytes(2, "little") + bytes(24)):
-            networks.core.handle(Datagram(0, data), now_ns)
+            networks.sockets.handle(Datagram(0, data), now_ns)
         networks.release(NEVER_NS)
         networks.received()
-        assert networks.core.of_no_loop == 2
+        assert networks.sockets.of_no_loop == 2
     inputs = [record.row[0] for record in networks.rows]
     assert inputs == list(range(len(inputs)))
 
@@ -231,93 +229,3 @@ def test_early_and_later_datagrams_are_relayed_and_foreign_ones_counted() -> Non
     assert report["received_from"].keys() == senders
     for table in (NETEM_PACKET, NETEM_RELEASE):
         assert published[table] == len(sent) * tables[table].itemsize
-
-
-CLIENTS = 3
-DECIDED = ("packet", "fate", "consecutive_losses", "hold_back_ns", "bit", "copy_bit")
-
-
-def replayed(
-    spec: LinkSpec, side: int, events: NDArray[Any], payloads: list[bytes], began_ns: int
-) -> dict[int, list[bytes]]:
-    """Pass the arrivals to the machine, check its decisions; return the departures by flow."""
-    own: LinkSettings = (spec.forward, spec.reverse)[side]
-    machine = Link(own, spec.seed, spec.name, ("forward", "reverse")[side])
-    left: dict[int, list[bytes]] = defaultdict(list)
-
-    def take(outputs: Any) -> None:
-        for output in outputs:
-            if isinstance(output, Datagram):
-                left[output.flow].append(output.data)
-
-    def let_out(now_ns: float) -> None:
-        while (due_ns := machine.next_deadline_ns()) is not None and due_ns <= now_ns:
-            take(machine.on_timer(due_ns))
-
-    for event, payload in zip(events, payloads, strict=True):
-        if event["direction"] != side or event["departure"]:
-            continue
-        now_ns = int(event["t_ns"]) - began_ns
-        let_out(now_ns)
-        take(machine.handle(Datagram(int(event["flow"]), payload), now_ns))
-        decision = machine.decision
-        assert [event[field] for field in DECIDED] == [getattr(decision, f) for f in DECIDED]
-        for field, t_ns in (("delay_ns", decision.release_ns), ("copy_delay_ns", decision.copy_ns)):
-            assert event[field] == (-1 if t_ns < 0 else t_ns - now_ns)
-    let_out(np.inf)
-    return left
-
-
-@settings(max_examples=15)
-@given(
-    forward=any_settings.harsh,
-    reverse=any_settings.harsh,
-    sizes=st.lists(st.sampled_from([0, 1, 8, 72, 1472, 9000]), min_size=20, max_size=60),
-    segment=st.booleans(),
-)
-def test_the_relay_gives_datagrams_the_fates_and_the_order_of_the_plain_machine(
-    forward: LinkSettings, reverse: LinkSettings, sizes: list[int], segment: bool
-) -> None:
-    tap = KeepAll()
-    parts = relayed(forward, reverse, clients=CLIENTS, taps=[tap], segment=segment)
-    with parts as (server, *clients, emulator):
-        for k, size in enumerate(sizes):
-            clients[k % CLIENTS].sendto(payload_of(k, size), emulator.address())
-        emulator.settle(len(sizes))
-        received = drain(server)
-        for data, source in received:
-            server.sendto(data, source)
-        emulator.settle(len(received), "reverse")
-        sides = emulator.report().forward, emulator.report().reverse
-        (spec,) = emulator.relay.specs
-        ports = [name_of(client)[1] for client in clients]
-        at_clients = [[data for data, _ in drain(client)] for client in clients]
-        events, began_ns = tap.events, emulator.relay.began_unix_ns
-        assert began_ns is not None
-    by_flow: dict[int, list[bytes]] = defaultdict(list)
-    flow_of = {
-        (bytes(event["source"][:4]), int(event["source_port"])): int(event["flow"])
-        for event in events
-        if event["departure"] and not event["direction"]
-    }
-    for data, (_, port) in received:
-        by_flow[flow_of[b"\x7f\0\0\1", port]].append(data)
-    assert by_flow == replayed(spec, 0, events, tap.payloads, began_ns)
-    flow_at = {
-        int(event["source_port"]): int(event["flow"])
-        for event in events
-        if not event["departure"] and not event["direction"]
-    }
-    expected = replayed(spec, 1, events, tap.payloads, began_ns)
-    for port, at_client in zip(ports, at_clients, strict=True):
-        assert at_client == expected.get(flow_at[port], [])
-    departures = events[events["departure"] == 1]
-    assert len(departures) == len(received) + sum(map(len, at_clients))
-    # A stale datagram counts once; a copy counts if the original is corrupted.
-    intact = departures[departures["bit"] < 0]
-    counted = sum(side.counters.delivered_out_of_order for side in sides)
-    assert intact["stale"][intact["copy"] == 0].sum() <= counted <= intact["stale"].sum()
-
-
-def payload_of(number: int, size: int) -> bytes:
-    return (number.to_bytes(8, "little") * (size // 8 + 1))[:size]

@@ -62,11 +62,11 @@ def measure(
         list[str],
         Argument(
             metavar="FILE",
-            help="A packet trace, the name of a shipped one, JSON of irtt, captures of both ends, a "
-            "fate file, a run directory, or delivery opportunities.",
+            help="A packet trace, the name of a shipped one, JSON of irtt, captures of both ends, "
+            "a run directory, or delivery opportunities.",
         ),
     ],
-    flow: Annotated[int, Option(min=1, help="Flow of a capture or a fate file; 1 is the largest.")] = 1,
+    flow: Annotated[int, Option(min=1, help="Flow of a capture; 1 is the largest.")] = 1,
     sequence_at: Annotated[
         str | None,
         Option(

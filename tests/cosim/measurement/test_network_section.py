@@ -14,7 +14,7 @@ from noack.scenario import toml_file
 from noack.scenario.sections import NetworkSection
 from noack.traces.packet_trace import LOST_NS, PacketTrace, packet_trace
 from tests.cosim.measurement.chains import PERIOD_NS, chain_losses, trace_of
-from tests.oracles.link import Link
+from tests.netem.stepped_link import Link
 
 
 def through(path: Path, sent_ns: np.ndarray) -> PacketTrace:

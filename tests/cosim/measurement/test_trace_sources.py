@@ -1,41 +1,17 @@
-"""Sources of a measurement: fate files, runs, delivery opportunities, and what is refused."""
+"""Sources of a measurement: runs, delivery opportunities, and what is refused."""
 
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 from cosim.measurement.trace_sources import SourceOptions, read_source, updates_trace
 from cosim.record.run_events import packet_outcomes
 from cosim.simulation.virtual_time import simulate
-from netem.fates import description
 from noack.core.errors import CallerError
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
-from tests.fuzz.parsers.fates import SPECS, TABLE
-
-
-def test_a_fate_file_gives_the_first_intact_delivery(tmp_path: Path) -> None:
-    path = tmp_path / "fates.parquet"
-    pq.write_table(TABLE.replace_schema_metadata(description(SPECS, 0)), path)
-    trace = read_source([path])
-    assert trace.notes[0] == "flow 1: up forward, flow 0, 4 packets; --flow chooses another of the 3 flows"
-    assert trace.sent_ns.tolist() == [0, 10, 20, 30]
-    # Delivered; dropped; corrupted, but its copy is intact and arrives 9 ns later; forced.
-    assert trace.delay_ns.tolist() == [5, -1, 9, 5]
-    assert len(read_source([path], SourceOptions(flow=3))) == 1
-    with pytest.raises(CallerError, match="has no flow 4; its flows are 1 to 3"):
-        read_source([path], SourceOptions(flow=4))
-    incomplete = TABLE.replace_schema_metadata(description(SPECS, 7))
-    pq.write_table(incomplete, path)
-    with pytest.raises(CallerError, match="7 events are missing"):
-        read_source([path])
-    pq.write_table(pa.table({"a": [1]}), path)
-    with pytest.raises(CallerError, match="not a fate trace"):
-        read_source([path])
 
 
 def test_a_run_gives_its_effective_losses(content: dict[str, Any]) -> None:

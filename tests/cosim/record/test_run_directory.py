@@ -34,7 +34,7 @@ from noack.core.errors import CallerError
 from noack.protocol.record_tables import COMMON, LOOP, PLANT_STEP, TABLES, Column, Table
 from noack.runtime.spool import SPOOL, SpoolWriter, notices_of
 from tests.fuzz.parsers.record import NOTICE, files, spooled
-from tests.oracles.link import flipped
+from tests.netem.stepped_channel import flipped
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ from scipy.integrate import solve_ivp
 
 from cosim.simulation.continuous import ContinuousLoop, ContinuousRun, simulate_continuous
 from cosim.simulation.exact_simulation import OK, Events, Population, Setting, run_batch, run_with_events
+from netem.channel import UPDATE_LINK
 from noack.core.linear_systems import Vector
 from noack.impairments.constraints.at_most import AtMost
 from noack.impairments.kinds.corrupt import Corrupt
@@ -26,7 +27,7 @@ from noack.protocol.record_tables import Fate
 from noack.scenario.resolution import LoopMatrices
 from noack.trigger_policies.trigger_rule import QuadraticForm
 from tests.helpers.example_rules import decaying_rule
-from tests.oracles.link import UPDATE_LINK, Link
+from tests.netem.stepped_link import Link
 
 LOSSES = (
     NoLoss(),

@@ -26,7 +26,7 @@ from noack.protocol.record_tables import (
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
 from tests.helpers.shipped import resolved
-from tests.oracles.link import Link
+from tests.netem.stepped_link import Link
 
 COARSE = ("plant.rate_hz=100", "controller.rate_hz=100", "horizon_s=6")
 

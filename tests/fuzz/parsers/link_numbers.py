@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from netem.link_state import LinkState
 from noack.core.core_library import core, dtype_of, ffi, pointer_to
-from noack.impairments.link_settings import LinkSettings, RecordedDecision
+from noack.impairments.link_settings import LinkSettings
 from tests.fuzz.edits import Choices
 from tests.fuzz.harness import Harness
 from tests.noack.impairments.feature_examples import CONSTRAINED, IMPAIRED, keeps_loss, names_file
@@ -23,10 +23,9 @@ SEEDS = (
 _COMPUTABLE = [
     impairment for impairment in IMPAIRED if not names_file(impairment) and not keeps_loss(impairment)
 ]
-_RECORDED = (RecordedDecision(0, 10, 20, 3, -1), RecordedDecision(3, 5, -1, 900, 7))
 _FIELDS = [(name, of.type.cname) for name, of in ffi.typeof("noack_link").fields]
 _SCALARS = [name for name, kind in _FIELDS if kind == "int64_t"]
-_COUNTED = ("stages", "integers", "reals", "windows", "decisions")
+_COUNTED = ("stages", "integers", "reals", "windows")
 """The tables, of which ``noack_link`` has the length."""
 _MOST = 4096
 LATEST_NS, LARGEST_BYTES = 2**61, 65_535
@@ -42,7 +41,7 @@ def link_numbers_input(data: bytes) -> None:
     for number, (link, kept) in enumerate(links):
         if number == 0:
             for row in range(link.rows):
-                core.noack_link_start_flow(link, row, row, choices.below(2), choices.below(2))
+                core.noack_link_start_flow(link, row, row, choices.below(2))
         else:
             before, owner = links[0]
             if link.rows != before.rows:
@@ -72,7 +71,6 @@ def _decide(link: Any, choices: Choices) -> None:
 
 def _link(choices: Choices) -> tuple[Any, dict[str, Any]] | None:
     """Return a link of numbers that the core accepts, and the arrays that it has; or None."""
-    recorded = _RECORDED if choices.below(4) == 1 else ()
     chain = [choices.choose(_COMPUTABLE) for _ in range(choices.below(4))]
     # A link has one scheduler at most.
     chosen = [impairment for impairment in chain if getattr(impairment, "scheduler", None)][1:]
@@ -81,7 +79,7 @@ def _link(choices: Choices) -> tuple[Any, dict[str, Any]] | None:
         constraints=tuple(choices.choose(CONSTRAINED) for _ in range(choices.below(3))),
         mansd=choices.choose((None, 0, 1, 5)),
     )
-    state = LinkState(settings, 1, "fuzz", decisions=(recorded,), rows=1 + choices.below(3))
+    state = LinkState(settings, 1, "fuzz", any_order=choices.below(4) == 1, rows=1 + choices.below(3))
     valid = state.core
     link = ffi.new("noack_link *", valid[0])
     tables = {
@@ -89,7 +87,7 @@ def _link(choices: Choices) -> tuple[Any, dict[str, Any]] | None:
             ffi.buffer(getattr(valid, name), _length(valid, name) * ffi.sizeof(_kind(name))),
             np.int64,
         ).copy()
-        for name in (*_COUNTED, "decisions_begin")
+        for name in _COUNTED
     }
     keys = tables["stages"].reshape(-1, ffi.sizeof("noack_stage") // 8)[:, 1:3]
     keys[:] = choices.below(2)  # a change of settings transfers states between equal keys
@@ -104,8 +102,6 @@ def _link(choices: Choices) -> tuple[Any, dict[str, Any]] | None:
             setattr(link, choices.choose(_SCALARS), number)
     kept = _allocate(link, tables)
     wrong = core.noack_link_check(link)
-    if wrong == ffi.NULL:
-        wrong = core.noack_recorded_check(link)
     if wrong != ffi.NULL:
         assert ffi.string(wrong).decode().isprintable()
         return None
@@ -124,8 +120,6 @@ def _kind(name: str) -> Any:
 
 
 def _length(link: Any, name: str) -> int:
-    if name == "decisions_begin":
-        return int(link.recorded_flows) + 1
     return int(getattr(link, f"{name.removesuffix('s')}_count"))
 
 

@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 from zenoh.handlers import FifoChannel
 
-from netem import stand_alone
 from netem.control import control_server, emulator_commands
 from netem.control.command_queue import CommandQueue
 from netem.control.control_server import (
@@ -25,7 +24,6 @@ from netem.control.control_server import (
 )
 from netem.control.emulator_commands import Client
 from netem.control.statistics_view import Screen
-from netem.fates import FateRecorder
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError, ExitStatus
 from noack.runtime.connections.zenoh_session import open_session
@@ -33,7 +31,6 @@ from tests.helpers.approved import compare_lines, lines_of_error
 from tests.netem.conftest import Emulate
 from tests.netem.control import fake_relay as relays
 from tests.netem.control.fake_relay import FakeRelay, press_q, read_until, terminal
-from tests.netem.fate_links import spec_of
 from tests.netem.relay.relays import endpoints
 
 
@@ -258,13 +255,3 @@ def test_a_cap_set_at_runtime_is_kept(emulate: Emulate, capsys: pytest.CaptureFi
         )
         emulator.finish()
     assert running_emulators() == []
-
-
-def test_a_replay_uses_the_cap_of_its_trace_by_default(tmp_path: Path) -> None:
-    path = tmp_path / "fates.parquet"
-    with FateRecorder(path, [spec_of(settings_of("loss 60% mansd 2"), "relay")]):
-        pass
-    for words, cap in (("loss 100%", 2), ("loss 100% mansd 4", 4)):
-        (spec,) = stand_alone._replaying([spec_of(settings_of(words), "relay")], path)
-        assert (spec.forward.mansd, spec.reverse.mansd) == (cap, None)
-        assert spec.decisions == {"forward": [], "reverse": []}

@@ -6,7 +6,6 @@ import re
 from collections.abc import Sequence
 from contextlib import redirect_stdout
 from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, cast, get_type_hints
 
@@ -19,14 +18,12 @@ from netem.control.command_queue import AppliedSettings, Snapshot
 from netem.control.control_server import ControlServer
 from netem.control.emulator_statistics import DirectionStatistics, Statistics, statistics
 from netem.control.statistics_view import History, render
-from netem.fates import SCHEMA, FateRecorder
 from netem.relay.relay_reports import FlowReport
 from netem.tc_words import settings_of
 from noack.core.clock import NS_PER_S
 from noack.impairments.link_settings import Counters
 from tests.helpers.approved import compare_text
 from tests.netem.control.fake_relay import FakeRelay, running, times
-from tests.netem.fate_links import spec_of
 
 UNIX_NS = 1_790_000_000 * NS_PER_S + 250_000_000
 
@@ -199,7 +196,6 @@ def explained() -> dict[str, Any]:
         ("link", get_type_hints(emulator_statistics.LinkStatistics)),
         ("direction", get_type_hints(emulator_statistics.DirectionStatistics)),
         ("recent", get_type_hints(emulator_statistics.RecentRates)),
-        ("column", dict.fromkeys(SCHEMA.names)),
         ("key", dict.fromkeys(("report", "settings", "change", "statistics"))),
         ("explained link", explained()),
         ("explained direction", explained()["forward"]),
@@ -213,18 +209,10 @@ def test_every_key_is_documented_and_no_other(title: str, keys: dict[str, Any]) 
     assert names(text["`delay_ns`"]) == set(get_type_hints(emulator_statistics.DelayQuantiles))
 
 
-def test_the_documented_programs_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The first controls an emulator, the second reads the metadata of a fate trace."""
+def test_the_documented_program_runs(capsys: pytest.CaptureFixture[str]) -> None:
     relay = FakeRelay("relay")
-    change, read = re.findall(r"^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
+    (change,) = re.findall(r"^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
     with running(relay) as commands, ControlServer("lab", commands):
         exec(change, {})
     assert capsys.readouterr().out == "None\n"
     assert relay.settings["relay", "reverse"].mansd == 2
-    with FateRecorder(tmp_path / "monday.parquet", [spec_of(settings_of("mansd 3"), "relay")]):
-        pass
-    monkeypatch.chdir(tmp_path)
-    exec(read, {})
-    assert capsys.readouterr().out.split() == [version("noack"), "0", "3"]

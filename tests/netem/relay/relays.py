@@ -1,4 +1,4 @@
-"""A relay that runs in the thread of its test, sockets for clients and servers, and a tap."""
+"""A relay that runs in the thread of its test, and sockets for clients and servers."""
 
 import socket
 import time
@@ -6,12 +6,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from netem.relay.relay import Relay
 from netem.relay.relay_links import LinkSpec
-from netem.relay.relay_reports import LinkReport, Tap
+from netem.relay.relay_reports import LinkReport
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import Address
 from noack.runtime.udp_sockets import enlarge_buffer
@@ -20,27 +17,6 @@ PATIENCE_S = 60
 """Timeout for events that never happen; no test measures time with it."""
 HOSTS = {4: "127.0.0.1", 6: "::1"}
 Received = list[tuple[bytes, Address]]
-
-
-class KeepAll:
-    """A tap that keeps all events and payloads."""
-
-    wants_data = True
-
-    def __init__(self) -> None:
-        self._events: list[NDArray[Any]] = []
-        self.payloads: list[bytes] = []
-
-    def take(self, events: NDArray[Any], data: NDArray[np.uint8]) -> None:
-        self._events.append(events.copy())
-        whole = data.tobytes()
-        for event in events:
-            begin = int(event["offset"])
-            self.payloads.append(whole[begin : begin + int(event["size_bytes"])])
-
-    @property
-    def events(self) -> NDArray[Any]:
-        return np.concatenate(self._events)
 
 
 class Running:
@@ -83,11 +59,9 @@ class Running:
 
 
 @contextmanager
-def running(
-    specs: Sequence[LinkSpec], *, segment: bool = False, taps: Sequence[Tap] = ()
-) -> Iterator[Running]:
+def running(specs: Sequence[LinkSpec], *, segment: bool = False) -> Iterator[Running]:
     """Yield an open relay; it is closed at the end of the block."""
-    with closing(Relay(specs, segment=segment, taps=taps)) as relay:
+    with closing(Relay(specs, segment=segment)) as relay:
         yield Running(relay)
 
 
@@ -142,11 +116,10 @@ def relayed(
     clients: int = 1,
     host: str = HOSTS[4],
     segment: bool = False,
-    taps: Sequence[Tap] = (),
     **link_settings: Any,
 ) -> Iterator[Any]:
     """Yield a server, clients, and a relay with a link between them; see :func:`link`."""
     with endpoints(host, *[host] * clients) as (server, *sockets):
         spec = link(name_of(server), *settings, host=host, **link_settings)
-        with running([spec], segment=segment, taps=taps) as emulator:
+        with running([spec], segment=segment) as emulator:
             yield server, *sockets, emulator

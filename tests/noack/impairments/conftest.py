@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from netem.link_state import LinkState
 from netem.tc_words import settings_of
-from noack.impairments.link_settings import Decisions, LinkSettings
+from noack.impairments.link_settings import LinkSettings
 
 MOST = 1_000_000
 
@@ -48,7 +48,6 @@ def decide() -> Decide:
         flows: ArrayLike = 0,
         sizes_bytes: ArrayLike = 100,
         arrivals_ns: ArrayLike | None = None,
-        recorded: Decisions = (),
         name: Sequence[str] = ("test",),
     ) -> Decided:
         if isinstance(settings, str):
@@ -58,7 +57,7 @@ def decide() -> Decide:
             arrivals_ns = np.arange(count) * 1_000
         arrivals = np.array(np.broadcast_to(np.asarray(arrivals_ns, np.int64), count))
         sizes = np.array(np.broadcast_to(np.asarray(sizes_bytes, np.int64), count))
-        link = LinkState(settings, seed, *name, decisions=recorded)
+        link = LinkState(settings, seed, *name)
         for flow in range(int(all_flows.max(initial=0)) + 1):
             link.start_flow(flow, flow)
         return Decided(link.decide_many(all_flows, sizes, arrivals), all_flows, arrivals, link)

@@ -18,7 +18,7 @@ from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
 from noack.impairments.loss_models.trace import TraceLoss
 from noack.impairments.target_loss import read_files
 from noack.protocol.record_tables import Fate
-from tests.oracles.link import Link
+from tests.netem.stepped_link import Link
 
 COUNT = 400_000
 Joint = Callable[[int], float]

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from netem.channel import Datagram
 from netem.tc_words import settings_of
 from noack.guarantee.loss_guarantee import (
     DeliveriesBetweenBursts,
@@ -21,7 +22,7 @@ from noack.impairments.markov_chain import NotPredictableError
 from noack.impairments.target_loss import loss_process, read_files
 from noack.protocol.record_tables import Fate
 from tests.helpers.approved import compare_lines, lines_of_error
-from tests.oracles.link import Datagram, Link
+from tests.netem.stepped_link import Link
 
 DECISIONS = 400_000
 EXACT = {
@@ -237,12 +238,11 @@ def test_losses_are_not_predicted_if_few_packets_may_be_delayed_at_once() -> Non
     assert predict(settings) == LossPrediction(0.25, note)
     with pytest.raises(NotPredictableError, match=note):
         loss_process(settings)
-    link, corrupted = Link(settings, 1, "a"), 0
+    link = Link(settings, 1, "a")
     for t_ns in range(0, 1000 * 10**9, 10**9):
         link.handle(Datagram(0, bytes(72)), t_ns)
-        corrupted += link.decision.fate == Fate.CORRUPTED
         link.on_timer(t_ns)
-    assert corrupted == pytest.approx(500, abs=60)
+    assert link.counters.corrupted == pytest.approx(500, abs=60)
 
 
 def test_losses_of_which_no_rate_can_be_kept_have_no_prediction() -> None:

@@ -14,16 +14,18 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from netem.channel import Datagram
 from netem.link_state import LinkState
 from netem.tc_words import settings_of
 from noack.core.core_library import core, ffi
 from noack.impairments.constraints.at_most import AtMost
 from noack.impairments.kinds.loss import LossOf
-from noack.impairments.link_settings import LinkSettings, RecordedDecision
+from noack.impairments.kinds.replay import Replay
+from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_models.scripted import ScriptedLoss
 from noack.protocol.record_tables import Fate
+from tests.netem.stepped_link import Link
 from tests.noack.impairments import any_link_settings as any_settings
-from tests.oracles.link import Datagram, Link
 from tests.oracles.loss_language import allowed_rows, is_allowed, longest_burst
 
 MS = 1_000_000
@@ -171,27 +173,19 @@ def test_the_guarantee_needs_no_clock(settings: LinkSettings, seed: int, count: 
         assert is_allowed(receiver.lost(flow, sent_count), settings)
 
 
-decisions = st.builds(
-    RecordedDecision,
-    fate=st.integers(0, 5),
-    delay_ns=st.sampled_from([-1, 0, 1, MS, 5 * MS]),
-    copy_delay_ns=st.sampled_from([-1, -1, 5 * MS]),
-    bit=st.sampled_from([-1, -1, 3]),
-    copy_bit=st.sampled_from([-1, 5]),
-)
-
-
 @given(
-    st.lists(decisions, max_size=40), st.lists(st.sampled_from(GAPS_NS), min_size=1, max_size=60),
+    st.lists(st.sampled_from([None, 0, 1, MS, 5 * MS]), min_size=1, max_size=40),
+    st.lists(st.sampled_from(GAPS_NS), min_size=1, max_size=60),
     st.integers(0, 4), any_settings.constraints, st.booleans(),
 )  # fmt: skip
-def test_the_guarantee_holds_in_any_replay(
-    recorded: list[RecordedDecision], gaps: list[int], mansd: int, constraints: Any, first: bool
+def test_the_guarantee_holds_whatever_a_network_decides(
+    delays_ns: list[int | None], gaps: list[int], mansd: int, constraints: Any, first: bool
 ) -> None:
-    """Also of decisions that no link makes, at other times."""
+    """Also of decisions that no impairment makes. None is a loss."""
+    outcomes = itertools.cycle(delays_ns)
     update = {"mansd": mansd, "constraints": constraints}
-    settings = settings_of(f"loss worst {'first' * first}").model_copy(update=update)
-    link = Link(settings, 1, "a", decisions=[recorded])
+    settings = settings_of("first" * first).model_copy(update=update)
+    link = Link(settings, 1, "a", network=lambda data, now_ns: next(outcomes))
     receiver, sent = send_all(link, [(0, gap) for gap in gaps])
     assert_kept(settings, link, receiver, sent)
 
@@ -279,12 +273,12 @@ def test_the_link_decides_the_example_as_documented(words: str, column: int) -> 
     cells = [line.strip("| ").split(" | ") for line in lines if "|" in line]
     rows = [[cell.strip() for cell in row] for row in cells[2:]]
     assert [int(row[0]) for row in rows] == list(range(6))
-    decisions = []
-    for k, comes, wish, *_ in rows:
-        fate = Fate.DROPPED if k in ("3", "4") else Fate.DELIVERED  # as the text states
-        delay_ns = core.NOACK_NEVER_NS if wish == NEVER else ns(wish) - ns(comes)
-        decisions.append(RecordedDecision(fate, delay_ns, -1, -1, -1))
-    link = Link(settings_of(words), 0, "test", decisions=[decisions])
+    arrivals_ns = [ns(comes) for _, comes, *_ in rows]
+    delays_ns = [0 if wish == NEVER else ns(wish) - ns(comes) for _, comes, wish, *_ in rows]
+    wishes = Replay(sent_ns=tuple(arrivals_ns), delays_ns=tuple(delays_ns), by="packet")
+    lost = LossOf(loss=ScriptedLoss(lost=(3, 4)))  # as the text states
+    settings = settings_of(words).model_copy(update={"impairments": (lost, wishes)})
+    link = Link(settings, 0, "test")
     for row in rows:
         decision = link.decide(0, 100, ns(row[1]))
         assert decision.release_ns == ns(row[column])

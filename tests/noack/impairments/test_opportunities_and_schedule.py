@@ -12,7 +12,7 @@ from noack.impairments.kinds.opportunities import Opportunities
 from noack.impairments.kinds.schedule import Schedule
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.record_tables import Fate
-from tests.oracles.link import Link
+from tests.netem.stepped_link import Link
 
 MS = 10**6
 
@@ -160,10 +160,11 @@ def test_a_packet_leaves_in_its_flows_next_free_slot(
     for number, (name, gap_ns) in enumerate(steps):
         now_ns += gap_ns
         flow = names.setdefault(name, len(names) + 1)  # in the order of the first packets
-        releases_ns.append(link.decide(name, 100, now_ns).release_ns)
+        decision = link.decide(flow - 1, 100, now_ns)
+        releases_ns.append(decision.release_ns)
         lost = model.enqueue(flow, number, now_ns, losses[flow] == mansd)
         losses[flow] = (losses[flow] + 1) * lost
-        assert link.decision.consecutive_losses == losses[flow] <= (80 if mansd is None else mansd)
+        assert decision.consecutive_losses == losses[flow] <= (80 if mansd is None else mansd)
     model.run_before(now_ns + 81 * len(order) * slot_ns)
     assert releases_ns == [model.departures[number] for number in range(len(steps))]
 

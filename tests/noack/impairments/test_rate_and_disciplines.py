@@ -26,7 +26,7 @@ from noack.impairments.feature import Scheduler
 from noack.impairments.kinds.rate import Rate
 from noack.impairments.link_settings import LinkSettings
 from tests.netem.stepped_channel import send
-from tests.oracles.link import Link
+from tests.netem.stepped_link import Link
 
 NS = 10**9
 

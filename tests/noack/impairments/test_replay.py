@@ -15,7 +15,7 @@ from noack.impairments.kinds.replay import Replay
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.target_loss import read_files
 from noack.traces.packet_trace import read_trace
-from tests.oracles.link import Link
+from tests.netem.stepped_link import Link
 
 CICV5G = Path(__file__).parents[3] / "noack/traces/shipped/cicv5g"
 MS = 10**6

@@ -18,6 +18,7 @@ from cosim.simulation.virtual_time import simulate, simulate_loops
 from cosim.studies.campaign.campaign_grid import row_type
 from cosim.studies.campaign.drawn_runs import LOOPS_ROW, SampledWork, SharedNetworkWork, in_virtual_time
 from cosim.studies.campaign.random_draws import box_of, drawn_scenario, seeds_of
+from netem.channel import channel_of
 from noack.core.errors import CallerError, ExitStatus
 from noack.impairments.kinds.replay import Replay
 from noack.impairments.loss_models.lossless import NoLoss
@@ -25,7 +26,6 @@ from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from tests.cosim.studies.campaign.conftest import Few, Write, few_of
-from tests.oracles.link import update_link_of
 
 SHIPPED = Path(__file__).parents[4] / "scenarios"
 COARSE = ("horizon_s=4.0", "plant.rate_hz=50.0", "controller.rate_hz=50.0")
@@ -249,7 +249,7 @@ def test_each_draw_has_its_own_window_of_a_trace() -> None:
     network = scenario.network.model_copy(update={"loss": NoLoss(), "impairments": (replay,)})
     scenario = scenario.model_copy(update={"network": network})
     begins_ms = [
-        update_link_of(drawn_scenario(scenario, 5, draw)).decide(0, 1, 0).release_ns // 10**6
+        channel_of(drawn_scenario(scenario, 5, draw)).links[0].decide(0, 1, 0).release_ns // 10**6
         for draw in range(40)
     ]
     assert len(set(begins_ms)) > 30
