@@ -1,7 +1,6 @@
 """The library: the names that ``import noack`` offers to programs and notebooks.
 
-``docs/library.md`` documents it. The import loads neither viewer nor control plane nor plots. Each
-function imports these modules when it is first called.
+``docs/library.md`` documents it. What takes long to import is looked up when it is first used.
 """
 
 from importlib import import_module
@@ -10,6 +9,9 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from cosim.analysis.certificates import Certificates as Certificates
+from cosim.api.analyses import certify as certify
+from cosim.api.analyses import cost as cost
+from cosim.api.analyses import margin as margin
 from cosim.api.exact_runs import ExactRun as ExactRun
 from cosim.api.exact_runs import simulate_exactly as simulate_exactly
 from cosim.api.explorer import Explorer as Explorer
@@ -23,14 +25,6 @@ from cosim.api.scenarios import from_system as from_system
 from cosim.api.scenarios import load as load
 from cosim.api.scenarios import scenarios as scenarios
 from cosim.api.scenarios import with_settings as with_settings
-from cosim.api.studies import CampaignResult as CampaignResult
-from cosim.api.studies import Measurement as Measurement
-from cosim.api.studies import campaign as campaign
-from cosim.api.studies import certify as certify
-from cosim.api.studies import cost as cost
-from cosim.api.studies import margin as margin
-from cosim.api.studies import measure as measure
-from cosim.api.studies import save_tables as save_tables
 from cosim.output.curves import Curve as Curve
 from cosim.output.curves import CurveStyle as CurveStyle
 from cosim.studies.new_loop.linear_model import gain as gain
@@ -41,30 +35,48 @@ from noack.core.errors import CallerError as _CallerError
 from noack.core.errors import NoackError as NoackError
 from noack.scenario.scenario import Scenario as Scenario
 
-if TYPE_CHECKING:  # the one needs an extra, the other needs Linux
+if TYPE_CHECKING:
+    from cosim.api.campaigns import CampaignResult as CampaignResult
+    from cosim.api.campaigns import campaign as campaign
     from cosim.api.lossy_channel import LossyChannel as LossyChannel
+    from cosim.api.measurements import Measurement as Measurement
+    from cosim.api.measurements import measure as measure
+    from cosim.api.tables import save_tables as save_tables
     from netem.lossy_udp import LossyUdp as LossyUdp
+
+_LATER = {
+    "CampaignResult": "cosim.api.campaigns",
+    "campaign": "cosim.api.campaigns",
+    "Measurement": "cosim.api.measurements",
+    "measure": "cosim.api.measurements",
+    "save_tables": "cosim.api.tables",
+    "LossyChannel": "cosim.api.lossy_channel",
+    "LossyUdp": "netem.lossy_udp",
+}
+"""Names whose modules import scipy's statistics or matplotlib, need an extra, or need Linux."""
 
 __version__ = version("noack")
 
-# `help(noack.simulate)` names the module that programs import.
-for _public in list(globals().values()):
-    if getattr(_public, "__module__", "").startswith("cosim."):
-        _public.__module__ = "noack"
-
 
 def __getattr__(name: str) -> object:
-    """Return one of the names that not every machine has (PEP 562)."""
+    """Import one of the names that are looked up later (PEP 562)."""
+    if name not in _LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     if name == "LossyUdp":
         require_live_runs()
-        module = "netem.lossy_udp"
-    elif name == "LossyChannel":
-        if find_spec("gymnasium") is None:
-            raise _CallerError(
-                "noack.LossyChannel needs a package that is not installed; pip install 'noack[gymnasium]'"
-            )
-        module = "cosim.api.lossy_channel"
-    else:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    member: object = getattr(import_module(module), name)
+    if name == "LossyChannel" and find_spec("gymnasium") is None:
+        raise _CallerError(
+            "noack.LossyChannel needs a package that is not installed; pip install 'noack[gymnasium]'"
+        )
+    return _public(getattr(import_module(_LATER[name]), name))
+
+
+def _public(member: object) -> object:
+    """Let ``help(noack.simulate)`` name the module that programs import."""
+    if getattr(member, "__module__", "").startswith("cosim."):
+        member.__module__ = "noack"
     return member
+
+
+for _member in list(globals().values()):
+    _public(_member)

@@ -1,27 +1,21 @@
 """Runs in exact continuous time, without a record."""
 
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cosim.api.scenarios import Source, load
-from cosim.lazy_modules import lazy_modules
+from cosim.output import curves
+from cosim.output.curves import Curve
+from cosim.output.run_verdict import VerdictLine, verdict_of_exact_run
+from cosim.simulation import continuous
+from cosim.simulation.exact_simulation import left_out
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.scenario.resolution import policy_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.trigger_policies.trigger_rule import TriggerRule
-
-with lazy_modules():
-    from cosim.output import curves as curve_table
-    from cosim.output import run_verdict
-    from cosim.simulation import continuous, exact_simulation
-
-if TYPE_CHECKING:
-    from cosim.output.curves import Curve
-    from cosim.output.run_verdict import VerdictLine
 
 _POINTS = 400
 """Number of evenly spaced times; each event adds the times just before and after it."""
@@ -35,7 +29,7 @@ class ExactRun:
     scenario: Scenario
     """The resolved scenario."""
 
-    def __init__(self, scenario: Scenario, run: "continuous.ContinuousRun") -> None:
+    def __init__(self, scenario: Scenario, run: continuous.ContinuousRun) -> None:
         self.scenario, self._run = scenario, run
 
     @property
@@ -49,17 +43,17 @@ class ExactRun:
         return self._run.delivered
 
     @cached_property
-    def summary(self) -> "continuous.ContinuousSummary":
+    def summary(self) -> continuous.ContinuousSummary:
         """The numbers of the run, with the names of a loop's in ``summary.json``."""
         return continuous.summary(self._run, self.scenario)
 
     @property
-    def verdict(self) -> "list[VerdictLine]":
+    def verdict(self) -> list[VerdictLine]:
         """How the run ended and its transmissions: lines with ``text`` and ``tone``."""
-        return run_verdict.verdict_of_exact_run(self.summary)
+        return verdict_of_exact_run(self.summary)
 
     @np.errstate(all="ignore")  # a run may diverge
-    def curves(self) -> "list[Curve]":
+    def curves(self) -> list[Curve]:
         """Return the run's signals as a table, as :meth:`noack.Run.curves`, without inputs and bounds."""
         run, scenario = self._run, self.scenario
         samples = run.at(np.linspace(0.0, run.reached_s, _POINTS))
@@ -73,10 +67,10 @@ class ExactRun:
         e_c_norm = run.system.norms(e_c)
         e_c[unknown], e_c_norm[unknown] = np.nan, np.nan
         return [
-            *curve_table.state_curves(run.system.loop.state_names, t_s, x, x + e_s, x + e_c),
-            *curve_table.error_curves(t_s, run.system.norms(e_s), e_c_norm, _threshold(scenario, t_s)),
-            curve_table.norm_curve(t_s, np.linalg.norm(x, axis=1)),
-            *curve_table.transmission_curves(run.event_s, run.delivered),
+            *curves.state_curves(run.system.loop.state_names, t_s, x, x + e_s, x + e_c),
+            *curves.error_curves(t_s, run.system.norms(e_s), e_c_norm, _threshold(scenario, t_s)),
+            curves.norm_curve(t_s, np.linalg.norm(x, axis=1)),
+            *curves.transmission_curves(run.event_s, run.delivered),
         ]
 
     def _has_controller_state(self, t_s: Vector) -> NDArray[np.bool_]:
@@ -92,7 +86,7 @@ class ExactRun:
         return "\n".join(line.text for line in self.verdict)
 
 
-def _stacked(states: "tuple[continuous.LoopState, ...]") -> tuple[Vector, Matrix, Matrix, Matrix]:
+def _stacked(states: tuple[continuous.LoopState, ...]) -> tuple[Vector, Matrix, Matrix, Matrix]:
     t_s, x, e_s, e_c = zip(*states, strict=True)
     return np.array(t_s), np.array(x), np.array(e_s), np.array(e_c)
 
@@ -128,7 +122,7 @@ def simulate_exactly(scenario: Source, *, most_events: int = 100_000) -> ExactRu
     loaded = load(scenario)
     if loaded.loops:
         raise CallerError("loops: one loop is simulated exactly; noack.simulate takes several")
-    if kinds := exact_simulation.left_out(loaded.network.link):
+    if kinds := left_out(loaded.network.link):
         raise CallerError(f"network.impairments: {kinds}: the exact simulation has no delay")
     resolved = resolve(loaded)
     resolved.coverage.require_unchanging()

@@ -11,36 +11,36 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import pyarrow as pa
+
+from cosim.analysis.replay import ReplayResult
+from cosim.analysis.replay.run_replay import replay_run
+from cosim.analysis.summary.run_summary import Outcome, outcome_of_loop
+from cosim.analysis.summary.summary_model import Claim, RunSummary
 from cosim.api.scenarios import Source, load
-from cosim.lazy_modules import lazy_modules
+from cosim.live import finalize as run_end
+from cosim.live.monitoring.progress import PipeSafeConsole, progress_line
+from cosim.output import result_tables, run_tables, run_verdict
+from cosim.output.curves import Curve
+from cosim.output.export.export_formats import export_run
+from cosim.output.figures.figure_description import FigureDescription
+from cosim.output.figures.figure_format import requested_files
+from cosim.output.figures.network_figures import page_figures
+from cosim.output.figures.run_figures import BOUNDED, run_curves
+from cosim.output.run_verdict import VerdictLine
+from cosim.record import data_frames
 from cosim.record.run_directory import RECORD, REPORT_FILE, chosen_run, file_of_loop, require_run_directory
+from cosim.record.run_record import RecordedRun, RunRecord, load_run
+from cosim.record.table_files import TableFile, arrow_table
+from cosim.simulation.virtual_time import simulate_run
+from cosim.studies.run_comparison import RunComparison, compare_runs
 from noack.core.errors import CallerError, ExitStatus
 from noack.core.number_format import as_html, as_text
 from noack.scenario import resolution
 from noack.scenario.scenario import Scenario
 
-with lazy_modules():
-    import cosim.analysis.replay.run_replay as run_replay
-    from cosim.analysis.summary import run_summary
-    from cosim.live import finalize as run_end
-    from cosim.live import launcher
-    from cosim.live.monitoring import progress as progress_display
-    from cosim.output import result_tables, run_tables, run_verdict
-    from cosim.output.export import export_formats
-    from cosim.output.figures import figure_drawing, figure_files, figure_format, network_figures, run_figures
-    from cosim.record import data_frames, run_record, table_files
-    from cosim.simulation import virtual_time
-    from cosim.studies import run_comparison
-
 if TYPE_CHECKING:
-    import pyarrow as pa
     from matplotlib.figure import Figure
-
-    from cosim.analysis.replay import ReplayResult
-    from cosim.analysis.summary.summary_model import Claim, RunSummary
-    from cosim.output.curves import Curve
-    from cosim.output.figures.figure_description import FigureDescription
-    from cosim.output.run_verdict import VerdictLine
 
 PathLike = str | os.PathLike[str]
 
@@ -58,7 +58,7 @@ class Run:
     def __init__(
         self,
         directory: Path,
-        finalize: "Callable[[], run_summary.Outcome]",
+        finalize: Callable[[], Outcome],
         temporary: Path | None = None,
         loop: str | None = None,
     ) -> None:
@@ -68,7 +68,7 @@ class Run:
             weakref.finalize(self, shutil.rmtree, temporary, ignore_errors=True)
 
     @property
-    def summary(self) -> "RunSummary":
+    def summary(self) -> RunSummary:
         """The results of the run, such as ``summary.loops[0].events``; see ``docs/record.md``.
 
         ``summary.to_json()`` is the content of ``summary.json``.
@@ -90,7 +90,7 @@ class Run:
         return self._outcome.reason
 
     @property
-    def verdict(self) -> "list[VerdictLine]":
+    def verdict(self) -> list[VerdictLine]:
         """How the run ended, whether its guarantee was kept, its transmissions.
 
         Each line has a ``text``, and a ``tone``: good, doubt, bad or empty.
@@ -98,7 +98,7 @@ class Run:
         return [*run_verdict.verdict(self.summary)]
 
     @property
-    def claims(self) -> "list[Claim]":
+    def claims(self) -> list[Claim]:
         """The claims about all loops, each with its ``verdict``: held, violated or void."""
         return [claim for loop in self.summary.loops for claim in loop.claims]
 
@@ -111,7 +111,7 @@ class Run:
         return {name: self._of(name) for name in self._run.names if self._loop in (None, name)}
 
     def _of(self, loop: str) -> "Run":
-        return Run(self.directory, lambda: run_summary.outcome_of_loop(self._outcome, loop), loop=loop)
+        return Run(self.directory, lambda: outcome_of_loop(self._outcome, loop), loop=loop)
 
     @property
     def scenario(self) -> Scenario:
@@ -127,7 +127,7 @@ class Run:
         """Names of the record's tables."""
         return tuple(resolution.run_tables(self._run.scenario))
 
-    def table(self, name: str) -> "pa.Table":
+    def table(self, name: str) -> pa.Table:
         """Return a table of the record, one row per input of a machine.
 
         Args:
@@ -146,12 +146,12 @@ class Run:
             known = ", ".join(self.tables)
             raise CallerError(f'"{name}": the record has no such table; it has {known}')
         if self._loop is not None:
-            return data_frames.with_seconds(table_files.arrow_table(self._record[name]))
+            return data_frames.with_seconds(arrow_table(self._record[name]))
         path = self.directory / RECORD / f"{name}.parquet"
-        file = table_files.TableFile(path, resolution.run_tables(self._run.scenario)[name])
+        file = TableFile(path, resolution.run_tables(self._run.scenario)[name])
         return data_frames.with_seconds(file.whole())
 
-    def samples(self) -> "pa.Table":
+    def samples(self) -> pa.Table:
         """Return plant, sensor and controller side by side, one row per measurement.
 
         Returns:
@@ -163,7 +163,7 @@ class Run:
         """
         return data_frames.samples(self._record)
 
-    def events(self) -> "pa.Table":
+    def events(self) -> pa.Table:
         """Return the sensor's transmissions, one row each.
 
         Returns:
@@ -175,7 +175,7 @@ class Run:
         """
         return data_frames.events(self._record)
 
-    def curves(self) -> "list[Curve]":
+    def curves(self) -> list[Curve]:
         """Return the curves of a loop as a table, to be drawn by other means.
 
         Returns:
@@ -183,7 +183,7 @@ class Run:
             the threshold, ‖x‖, the inputs, the transmissions, and the certified bounds of these. A
             long run has only as many times as a figure shows.
         """
-        return run_figures.run_curves(self._record)
+        return run_curves(self._record)
 
     def plot(self, figure: str = "states") -> "Figure":
         """Draw a figure of the report.
@@ -196,11 +196,13 @@ class Run:
         Raises:
             NoackError: the run has no such figure.
         """
-        return figure_drawing.draw(self._describe(figure))
+        from cosim.output.figures.figure_drawing import draw  # imports matplotlib
 
-    def _describe(self, figure: str) -> "FigureDescription":
+        return draw(self._describe(figure))
+
+    def _describe(self, figure: str) -> FigureDescription:
         """Return a figure of the report; raise CallerError if the run has no such figure."""
-        known = self._figures(bounded=figure in run_figures.BOUNDED)
+        known = self._figures(bounded=figure in BOUNDED)
         if figure not in known:
             raise CallerError(f'"{figure}": no such figure of this run; it has {", ".join(known)}')
         return known[figure]()
@@ -225,12 +227,14 @@ class Run:
         Raises:
             NoackError: there is no such format, width or figure, or a file cannot be written.
         """
+        from cosim.output.figures.figure_files import save_figures  # imports matplotlib
+
         page = self.directory / file_of_loop(REPORT_FILE, self._loop)
-        files = figure_format.requested_files(format, width)
+        files = requested_files(format, width)
         if figure is not None:
-            return figure_files.save_figures([self._describe(figure)], page, files)
+            return save_figures([self._describe(figure)], page, files)
         figures = (describe() for describe in self._figures(bounded=True).values())
-        return figure_files.save_figures(figures, page, files)
+        return save_figures(figures, page, files)
 
     def save_tables(self, folder: PathLike) -> list[Path]:
         """Write the tables of the summary: :func:`noack.save_tables` of this run.
@@ -262,36 +266,34 @@ class Run:
             NoackError: the path has another ending, or a file cannot be written.
         """
         self._ensure_summary()
-        return export_formats.export_run(
-            self.directory, Path(path), loop=self._loop, certificates=certificates
-        )
+        return export_run(self.directory, Path(path), loop=self._loop, certificates=certificates)
 
-    def replay(self) -> "ReplayResult":
+    def replay(self) -> ReplayResult:
         """Feed every machine its recorded inputs again and compare the outputs bit for bit.
 
         Returns:
             The result: ``bit_exact``, ``first_difference``, ``gaps``, and more.
         """
-        return run_replay.replay_run(self._run, self._loop)
+        return replay_run(self._run, self._loop)
 
-    def _figures(self, *, bounded: bool) -> "Mapping[str, Callable[[], FigureDescription]]":
+    def _figures(self, *, bounded: bool) -> Mapping[str, Callable[[], FigureDescription]]:
         """Return functions that describe the figures, by name; ``bounded`` with their bounds."""
-        return network_figures.page_figures(self._run, lambda: self.summary, self._loop, bounded=bounded)
+        return page_figures(self._run, lambda: self.summary, self._loop, bounded=bounded)
 
     def _ensure_summary(self) -> None:
         """Write the summary into the run directory: a temporary run computes it when it is used."""
         _ = self._outcome
 
     @cached_property
-    def _outcome(self) -> "run_summary.Outcome":
+    def _outcome(self) -> Outcome:
         return self._finalize()
 
     @cached_property
-    def _run(self) -> "run_record.RecordedRun":
-        return run_record.load_run(self.directory)
+    def _run(self) -> RecordedRun:
+        return load_run(self.directory)
 
     @cached_property
-    def _record(self) -> "run_record.RunRecord":
+    def _record(self) -> RunRecord:
         return self._run.loop(self._loop)
 
     def _facts(self) -> list[tuple[str, str]]:
@@ -324,7 +326,7 @@ def simulate(scenario: Source, *, runs: PathLike | None = None) -> Run:
     """
     loaded = load(scenario)
     with _folder(runs) as (folder, temporary):
-        ending, view = virtual_time.simulate_run(loaded, folder), temporary is None
+        ending, view = simulate_run(loaded, folder), temporary is None
         simulated = Run(ending.run_dir, lambda: run_end.finalize(ending, report=False, view=view), temporary)
     if temporary is None:
         simulated._ensure_summary()
@@ -347,13 +349,15 @@ def run(scenario: Source, *, runs: PathLike | None = None, progress: bool = Fals
         NoackError: the scenario is wrong; the run could not start, e.g. because a port is in use;
             or the caller is not the main thread, which receives the signals.
     """
+    from cosim.live.launcher import launch  # imports zenoh
+
     loaded = load(scenario)
     if threading.current_thread() is not threading.main_thread():
         raise CallerError("noack.run: a live run is started by the main thread, which signals go to")
     with _folder(runs) as (folder, temporary):
-        console = progress_display.PipeSafeConsole(stderr=True, quiet=not progress)
-        with progress_display.progress_line(console, loaded) as watcher:
-            ending = launcher.launch(loaded, folder, watcher=watcher)
+        console = PipeSafeConsole(stderr=True, quiet=not progress)
+        with progress_line(console, loaded) as watcher:
+            ending = launch(loaded, folder, watcher=watcher)
         outcome = run_end.finalize(ending, report=False, view=temporary is None)
         return Run(ending.run_dir, lambda: outcome, temporary)
 
@@ -374,7 +378,7 @@ def open_run(directory: PathLike = "runs/latest") -> Run:
     return Run(outcome.run_dir, lambda: outcome)
 
 
-def compare(*runs: Run | PathLike) -> "run_comparison.RunComparison":
+def compare(*runs: Run | PathLike) -> RunComparison:
     """Compare two or more runs.
 
     Args:
@@ -392,7 +396,7 @@ def compare(*runs: Run | PathLike) -> "run_comparison.RunComparison":
         if isinstance(source, Run):
             source._ensure_summary()
     directories = [source.directory if isinstance(source, Run) else Path(source) for source in runs]
-    return run_comparison.compare_runs(directories)
+    return compare_runs(directories)
 
 
 @contextmanager

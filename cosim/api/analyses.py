@@ -1,0 +1,101 @@
+"""Certificates, margins and mean costs of a scenario."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from cosim.analysis.certificates import Certificates, certificates_of
+from cosim.analysis.margin_search import MOST_M, MarginResult, find_margin
+from cosim.analysis.mean_cost import MeanCost, find_mean_cost
+from cosim.api.scenarios import Source, load
+from noack.scenario.resolution import resolve
+from noack.theory.margins.joint_spectral_radius import ACCURACY
+
+
+def certify(scenario: Source, *, weight: str = "given", late: int | None = None) -> Certificates:
+    """Return the certificates of a scenario, with their constants and conditions.
+
+    >>> import noack
+    >>> certificates = noack.certify("lane_following")
+    >>> certificates.schedule.constants is None  # there is one
+    False
+    >>> print(f"no two events closer than {1e3 * certificates.schedule.inter_event_s:.0f} ms")
+    no two events closer than 10 ms
+
+    If the plant is not linear, the model is certified as the plant, and ``nonlinear`` says so.
+
+    Args:
+        scenario: a scenario, or a source that :func:`noack.load` accepts.
+        weight: W of the trigger's norm: ``given`` by the scenario, ``identity``, or ``chosen`` so
+            that more can be certified, which takes some seconds.
+        late: plant steps by which the schedule may be late, 0 to 1000; by default the scenario's
+            own value.
+
+    Raises:
+        NoackError: the scenario is wrong, or there are no certificates for it: its trigger is not
+            the paper's, its updates are acknowledged, or u is not K x_c.
+    """
+    return certificates_of(load(scenario), weight, late, of_model=True)
+
+
+def margin(
+    scenario: Source,
+    *,
+    most_m: int = MOST_M,
+    accuracy: float = ACCURACY,
+    period: bool = True,
+    guarantees: Sequence[str] = (),
+    effort: float = 1.0,
+) -> MarginResult:
+    """Return the largest M for which a loop is stable under every loss pattern.
+
+    >>> import noack
+    >>> noack.margin("lane_periodic", most_m=3, period=False).stable_m
+    3
+
+    Args:
+        scenario: a scenario whose trigger has a longest time between two events, as ``periodic``
+            and ``deadline`` have, or a source that :func:`noack.load` accepts.
+        most_m: largest M to examine.
+        accuracy: wanted ratio of upper and lower bound of the growth, minus 1.
+        period: whether to search for the longest period with the scenario's own M, too.
+        guarantees: other guarantees to examine, in words such as ``mansd 4 atmost 3 in 10``.
+        effort: factor of the work that a decision may take.
+
+    Raises:
+        NoackError: the scenario is wrong; or its trigger has no longest time, its loop is not
+            linear, or its delay varies or is not below the shortest period.
+    """
+    return find_margin(
+        resolve(load(scenario)),
+        most_m=most_m,
+        accuracy=accuracy,
+        with_period=period,
+        guarantees=guarantees,
+        effort=effort,
+    )
+
+
+def cost(
+    scenario: Source, *, Q: Sequence[object] | None = None, R: Sequence[object] | None = None
+) -> MeanCost:
+    """Return the mean cost ∫ xᵀQx + uᵀRu dt, and the rms of all states, under random losses.
+
+    >>> import noack
+    >>> mean_cost = noack.cost("lane_periodic")
+    >>> round(mean_cost.with_guarantee.growth, 6)  # below 1: stable in mean square
+    0.862511
+
+    Args:
+        scenario: a scenario with a time-triggered sensor (policy ``periodic``), or a source that
+            :func:`noack.load` accepts.
+        Q: weight of the state, (n, n); None: the identity.
+        R: weight of the input, (m, m); None: the identity.
+
+    Raises:
+        NoackError: the scenario is wrong, or its loop is not covered; the message names the
+            setting.
+    """
+    resolved = resolve(load(scenario))
+    weights = (None if weight is None else np.array(weight, np.float64) for weight in (Q, R))
+    return find_mean_cost(resolved, *weights)
