@@ -7,10 +7,8 @@ from noack.runtime.command_line import stoppable_imports
 
 with stoppable_imports():
     from controller_node.controller import controllers_of
-    from noack.controllers.program_controller import ProgramControllerSettings
     from noack.core.errors import ExitStatus
     from noack.runtime.drivers.live_driver import run_machines
-    from noack.runtime.drivers.node_driver import run_program
     from noack.runtime.join_run import join_run
 
 
@@ -18,12 +16,8 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the controller of each loop in the run that a recorder or launcher has opened."""
     with join_run("controller", arguments) as run:
         controllers = controllers_of(run.loops, run.phases_ns)
-        settings = run.loops[0].controller
-        if isinstance(settings, ProgramControllerSettings):
-            run_program(run, controllers, settings)
-        else:
-            controllers.connect()
-            run_machines(run, controllers)
+        controllers.connect()
+        run_machines(run, controllers)
     return ExitStatus.OK
 
 

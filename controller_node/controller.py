@@ -330,7 +330,6 @@ def _part(resolved: Scenario) -> Controller:
     loop = loop_of(resolved)
     starts_from_x0 = resolved.network.initial_sync == "known_state"
     safe_input, acknowledges = resolved.controller.safe_input, resolved.protocol.acknowledges
-    changes = not (acknowledges or resolved.controller.is_program)
     return Controller(
         loop.H,
         law_of(resolved),
@@ -347,7 +346,7 @@ def _part(resolved: Scenario) -> Controller:
         timeout_ns=resolved.timing.update_timeout_ns,
         holds_input=resolved.controller.timeout_input == "hold",
         setpoint=setpoint_of(resolved),
-        schedule=ChangeSchedule(resolved, setpoint_of) if changes else None,
+        schedule=None if acknowledges else ChangeSchedule(resolved, setpoint_of),
     )
 
 

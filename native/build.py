@@ -37,10 +37,6 @@ OWN = f"{sys.platform}_{platform.machine()}".lower()
 """The platform of this machine."""
 _LIVE = ("driver/driver.c", "driver/sockets.c", "relay/*.c")
 """Sockets and timers of live runs: only Linux has them. Elsewhere the library is without them."""
-MACHINES = ("loop/*.c", "elementary.c", "heap.c", "wire.c", "clock.c")
-"""What a node needs: the steps of every role, wire format and clock. No sockets, no allocation, no
-files; of the C library only memcpy and its like, and mathematical functions (docs/node.md)."""
-_EXAMPLES = HERE / "examples"
 _SCRATCH = ".building-"
 _STATES = "states.c"
 """The exact simulator's code for a fixed number of states; it is compiled for each of these:"""
@@ -104,27 +100,7 @@ def compiler(target: str = OWN) -> list[str]:
 def sources(target: str = OWN) -> list[Path]:
     """Return the C files of a platform's core, in a fixed order."""
     live = {file for pattern in _LIVE for file in HERE.glob(pattern)}
-    others = {*_EXAMPLES.glob("*.c")} | (set() if "linux" in target else live)
-    return sorted({*HERE.glob("**/*.c")} - others)
-
-
-def build_node(into: Path, example: Path | None = None) -> None:
-    """Compile a node: an example, linked with the machines; or the machines alone, as an object.
-
-    Any compiler in $CC will do, also one for another processor, with its options.
-
-    Raises:
-        NoCompilerError: there is no C compiler.
-        subprocess.CalledProcessError: the compiler reports a mistake.
-    """
-    own = [flag for flag in FLAGS if flag not in ("-fPIC", "-O3")]
-    own += ["-Os", "-ffunction-sections", "-fdata-sections"]
-    files = sorted(file for pattern in MACHINES for file in HERE.glob(pattern))
-    if example is None:
-        own += ["-ffreestanding", "-nostdlib", "-r"]
-    more = [] if example is None else [str(example), "-Wl,--gc-sections", "-lm"]
-    command = [*compiler(), *own, *map(str, files), *more, "-o", str(into)]
-    subprocess.run(command, check=True)
+    return sorted({*HERE.glob("**/*.c")} - (set() if "linux" in target else live))
 
 
 def declarations() -> str:
@@ -248,10 +224,6 @@ def main() -> int:
     parser.add_argument("--sanitized", action="store_true", help="with ASan and UBSan; needs --into")
     parser.add_argument("--library", action="store_true", help="build only the library (cffi is not needed)")
     parser.add_argument("--platforms", action="store_true", help="print the platforms of the wheels")
-    parser.add_argument("--node", type=Path, metavar="FILE", help="build the example of a node")
-    parser.add_argument(
-        "--machines", type=Path, metavar="FILE.o", help="build what a node needs without a system"
-    )
     given = parser.parse_args()
     if given.platforms:
         print(*PLATFORMS)
@@ -259,10 +231,7 @@ def main() -> int:
     if given.sanitized and given.into == INTO:
         parser.error("--sanitized: noack cannot load this library; give another folder by --into")
     try:
-        if given.node or given.machines:
-            example = _EXAMPLES / "controller_node.c" if given.node else None
-            build_node(given.node or given.machines, example)
-        elif given.check:
+        if given.check:
             with tempfile.TemporaryDirectory() as scratch:
                 # In a fifth of the time. tests/native builds the whole with sanitizers, -Werror too.
                 _compile(Path(scratch), ("-Werror", "-O1"), one_size=True)

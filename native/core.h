@@ -1,7 +1,4 @@
-/* What the files of the core share.
-
-   Names of what a node on a board links (MACHINES in build.py) begin with noack_, since a firmware
-   has names of its own; others need not, since the library hides all but those of noack.h. */
+/* What the files of the core share. The library hides all names but those of noack.h. */
 #ifndef NOACK_CORE_H
 #define NOACK_CORE_H
 

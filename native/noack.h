@@ -1127,41 +1127,6 @@ void noack_client_remove(noack_relay *relay, int64_t row);
 /* The bucket of a time in a histogram: 32 for each doubling. */
 int64_t noack_bucket_of(int64_t t_ns);
 
-/* ---- A node that is a program of its own (docs/node.md) -------------------------------------- */
-
-/* noack and the node exchange frames over the node's standard input and output: the kind, the
-   number of bytes that follow, and these. All is little endian, in words of 64 bits. */
-
-/* Version of the frames; the node begins with it, in a line of text. */
-enum { NOACK_NODE_VERSION = 1 };
-
-/* Kinds of frames; the first are rows of enum noack_table_number, from the node. */
-enum noack_node_frame {
-    NOACK_NODE_COUNTS = 8, /* from the node: noack_node_counts, from time to time and at its end */
-    NOACK_NODE_UNSENT,     /* from the node: a datagram could not be sent; errno */
-    NOACK_NODE_SETTINGS,   /* to the node, once and first: noack_node_settings, then arrays */
-    NOACK_NODE_CLOCK,      /* to the node: another noack_clock, from now on */
-    NOACK_NODE_DATAGRAM    /* to the node: 1 if it is from the peer's address, and a datagram */
-};
-
-/* The settings of a controller; then H (n, n), K (m, n), x_r (n,), u_r (m,), safe_input (m,) and
-   x_c (n,), as in noack_controller. */
-typedef struct {
-    int64_t run_id;
-    uint8_t key[NOACK_KEY_BYTES];
-    noack_clock clock;
-    noack_machine machine;
-    int64_t is_static, has_point, acknowledges, predictions, carries_model;
-    int64_t timeout_ns, holds_input;
-    int64_t model_ns, has_state, newest;
-} noack_node_settings;
-
-/* The datagrams of a node so far. */
-typedef struct {
-    int64_t sent, received, unknown_source; /* unknown_source: not from the peer's address */
-    int64_t accepted, rejected[NOACK_REJECTIONS];
-} noack_node_counts;
-
 /* ---- The network of a run, without sockets --------------------------------------------------- */
 
 /* A datagram in the network. */

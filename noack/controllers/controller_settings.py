@@ -52,8 +52,6 @@ class ControllerSettings(ScenarioSection):
 
     is_linear: ClassVar[bool] = False
     """Whether u = K(x_c − x_r) + u_r, as the theory assumes."""
-    is_program: ClassVar[bool] = False
-    """Whether a program of its own is the controller of a live run."""
 
     kind: str
     """The kind of controller."""

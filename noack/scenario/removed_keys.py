@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 REMOVED: Mapping[str, str] = {
+    "controller.kind = program": "use python: a class of your own; docs/wire.md has the datagrams",
     "recovery.rejoin_within_s": "a process that dies ends the run, whose record is complete up to then",
 }
 """The plain way by what was removed: a key with dots (``table.key``), or the kind of a table

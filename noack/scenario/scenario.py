@@ -184,10 +184,9 @@ def _with_parts(scenario: Scenario, content: ReadTable, parts: Iterable[str], pl
 def check_loops(scenario: Scenario) -> None:
     """Raise ValueError unless the loops can run together; the message begins with the key."""
     names: dict[str, int] = {}
-    has_program = False
     for index, section in enumerate(scenario.loops or ()):
         try:
-            has_program |= loop_scenario(scenario, section).controller.is_program
+            loop_scenario(scenario, section)
         except ValueError as error:
             raise ValueError(f"loops.{index}.{error}") from None
         for name in section.names:
@@ -198,11 +197,6 @@ def check_loops(scenario: Scenario) -> None:
             names[name] = index
         if len(names) > MOST_LOOPS:
             raise ValueError(f"loops.{index}.count: a run has at most {MOST_LOOPS} loops")
-        if has_program and len(names) > 1:
-            raise ValueError(
-                f'loops.{index}: a run of several loops has no controller.kind = "program", whose '
-                'program has one loop; use "linear"'
-            )
 
 
 def _period_ns(loop: Scenario) -> int:

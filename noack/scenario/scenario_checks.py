@@ -62,7 +62,6 @@ def check_sections(scenario: ScenarioTables) -> None:
     m = scenario.model.dimensions[1]
     require_length(scenario.controller.safe_input, "controller.safe_input", m, "one per input")
     check_setpoint(scenario)
-    _check_program(scenario)
     _check_observer(scenario)
     _check_watchdog(scenario)
     _check_use_of_gain(scenario)
@@ -166,14 +165,6 @@ def _check_disturbances(scenario: ScenarioTables) -> None:
         require_length(disturbance.entries, key, size, f'at = "{disturbance.at}": {reason}')
 
 
-def _check_program(scenario: ScenarioTables) -> None:
-    if scenario.controller.is_program and scenario.network.encrypted:
-        raise ValueError(
-            'network.encrypted: not with controller.kind = "program": the core in C authenticates '
-            "but does not encrypt; leave it out"
-        )
-
-
 def _check_observer(scenario: ScenarioTables) -> None:
     (n, m), plant, observer = scenario.model.dimensions, scenario.plant, scenario.observer
     sizes = scenario.message_sizes
@@ -271,8 +262,6 @@ def with_settings(scenario: S, settings: ReadTable) -> S:
     """
     if scenario.protocol.acknowledges:
         raise ValueError('network.protocol: with "ack", nothing can be changed during a run')
-    if scenario.controller.is_program:
-        raise ValueError('controller.kind: with "program", nothing can be changed during a run')
     require_runtime_parameters(settings, scenario.trigger)
     sections = {key.split(".")[0] for key in settings}
     changes_loss = any(key.startswith(LOSS) for key in settings)

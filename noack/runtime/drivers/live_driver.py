@@ -10,7 +10,6 @@ import socket
 import weakref
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from typing import TypedDict
 
 import numpy as np
 
@@ -52,29 +51,18 @@ def run_machines(process: RunProcess, machines: LoopMachines) -> None:
     )
     with process.open_socket() as endpoint:
         addresses = process.join(endpoint.getsockname()[:2])
-        sockets = LoopSockets(endpoint, driver, SENDS[process.role], **ends_of(process, addresses))
+        role, network = process.role, process.scenario.network.flows
+        answers, end = Flow.ACKNOWLEDGEMENT in network, ENDS[Flow.ACKNOWLEDGEMENT]
+        sockets = LoopSockets(
+            endpoint,
+            driver,
+            SENDS[role],
+            source=addresses[sender_to(role, RECEIVES[role], network)],
+            destination=addresses[receiver_of(role, SENDS[role], network)],
+            acknowledged_by=addresses["netem"] if answers and role == end.receiver else None,
+            acknowledges_to=addresses["netem"] if answers and role == end.sender else None,
+        )
         process.run(driver, sockets, machines)
-
-
-class FlowAddresses(TypedDict):
-    """The other ends of a process's flows; see :class:`LoopSockets`."""
-
-    source: Address
-    destination: Address
-    acknowledged_by: Address | None
-    acknowledges_to: Address | None
-
-
-def ends_of(process: RunProcess, addresses: Mapping[str, Address]) -> FlowAddresses:
-    """Return the other ends of a process's flows, by what the coordinator has sent."""
-    role, network, answer = process.role, process.scenario.network.flows, Flow.ACKNOWLEDGEMENT
-    answers = answer in network
-    return {
-        "source": addresses[sender_to(role, RECEIVES[role], network)],
-        "destination": addresses[receiver_of(role, SENDS[role], network)],
-        "acknowledged_by": (addresses["netem"] if answers and role == ENDS[answer].receiver else None),
-        "acknowledges_to": addresses["netem"] if answers and role == ENDS[answer].sender else None,
-    }
 
 
 def _raise_error(number: int) -> None:
@@ -172,9 +160,6 @@ class LiveDriver:
         name, _ = packed_name(source)
         core.noack_driver_add_datagram(self.core, name, data, len(data))
         self.drive(_AT_ONCE_NS, sink)
-
-    def finish(self, sink: RecordSink) -> None:
-        """End the work, after the last datagram."""
 
     @property
     def accepted(self) -> int:
@@ -276,11 +261,6 @@ class LoopSockets(CountingSockets):
     def take(self, data: bytes, source: SocketName, now_ns: int, sink: RecordSink) -> None:
         """Pass a datagram to the driver, which rejects all but those of the peers."""
         self._driver.take(data, source, sink)
-
-    def finish(self, now_ns: int, sink: RecordSink) -> None:
-        """Read the datagrams that still wait, so that the counters are complete."""
-        super().finish(now_ns, sink)
-        self._driver.finish(sink)
 
     def report(self) -> dict[str, object]:
         """Counters, for the run's summary."""
