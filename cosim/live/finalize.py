@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cosim.analysis.claims.claim_evaluation import RunClaims, certify_late, claims_of, list_violations
-from cosim.analysis.claims.run_certificates import certificates_together
+from cosim.analysis.claims.claim_evaluation import RunClaims, claims_of, list_violations
+from cosim.analysis.claims.run_certificates import scheduled_certificates
 from cosim.analysis.ideal_loop import ideal_loop_part
 from cosim.analysis.replay.machine_replay import SharedMachines
 from cosim.analysis.replay.run_replay import replay, stored_verdict
@@ -175,7 +175,7 @@ def _write_summary(run_dir: Path, summary: RunSummary) -> None:
         raise MachineError(f"{error}; try `noack summary {run_dir}` later") from None
 
 
-class Expectations(NamedTuple):
+class _Expectations(NamedTuple):
     """What follows from the scenario of a loop alone."""
 
     assumptions: Sequence[Assumption]
@@ -199,11 +199,11 @@ def _evaluate_run(
     replay_in_helper = ReplayInHelper(helpers, ending.run_dir) if helpers.count and loops == 1 else None
 
     def evaluate_here(block: range) -> list[_LoopResults]:
-        return _evaluate_loops(run, ending, replay_in_helper, block, helpers.expectations(block))
+        return _evaluate_loops(run, ending, replay_in_helper, block)
 
     def evaluate_in_helper(block: range) -> list[_LoopResults]:
         own = RunEnding(ending.run_dir, ending.run_id, ending.status, ending.reason)
-        return helpers.call(_evaluate_stored_loops, own, block, helpers.expectations(block))
+        return helpers.call(_evaluate_stored_loops, own, block)
 
     with (
         work_bar(f"claims of {loops} loops", lines=True) as show,
@@ -251,10 +251,8 @@ _stored_run = cache(load_run)
 
 
 @np.errstate(all="ignore")
-def _evaluate_stored_loops(
-    ending: RunEnding, block: range, expectations: Sequence[Expectations] | None
-) -> list[_LoopResults]:
-    return _evaluate_loops(_stored_run(ending.run_dir), ending, None, block, expectations)
+def _evaluate_stored_loops(ending: RunEnding, block: range) -> list[_LoopResults]:
+    return _evaluate_loops(_stored_run(ending.run_dir), ending, None, block)
 
 
 def _record_stored(run_dir: Path, summary: RunSummary, over_time: Sequence[LoopOverTime] | None) -> None:
@@ -266,44 +264,32 @@ def _evaluate_loops(
     ending: RunEnding,
     replay_in_helper: "ReplayInHelper | None",
     block: range,
-    expectations: Sequence[Expectations] | None,
 ) -> list[_LoopResults]:
-    """Evaluate some loops, whose ``expectations`` may be given; a helper may replay the only one."""
-    records = run.together(block)
-    expected = expectations or _expectations([record.scenario for record in records])
+    """Evaluate some loops; a helper may replay the only one."""
+    records, results, expected = run.together(block), list[_LoopResults](), dict[str, _Expectations]()
     shared = SharedMachines(records if len(block) > 1 else ())
-    results, claims = [], [*map(claims_of, records)]
-    for claims_of_loop, own in zip(claims, expected, strict=True):
-        claims_of_loop.certificates = own.certificates
-    with suppress(Exception):  # the claims of the loop concerned report it
-        certify_late(claims)
-    for record, own in zip(records, expected, strict=True):
+    for record in records:
+        key = record.scenario.model_dump_json(exclude={"name", "seeds"})
+        if key not in expected:  # equal loops share it
+            expected[key] = _expectations(record.scenario)
+        own, claims = expected[key], claims_of(record)
+        claims.certificates = own.certificates
         phase_ns = run.phases_ns[record.number]
         status, reason = int(ending.status), ending.reason
         summary = summarise_loop(record, status, reason, phase_ns, own.assumptions)
         if len(run.loops) == 1:
             # Written again with the results, so that none of them can cost the summary.
             _write_summary(ending.run_dir, _summary(run, ending, [summary]))
-        results.append(_with_results(run, summary, claims[0], shared, replay_in_helper))
-        del claims[0]  # with its samples
+        results.append(_with_results(run, summary, claims, shared, replay_in_helper))
     return results
 
 
-def expectations_of(run_dir: Path, block: range) -> Sequence[Expectations]:
-    """Return what to expect of some loops of a run that may still go on."""
-    return _expectations(scenarios_of(run_dir)[1][block.start : block.stop])
-
-
-def _expectations(scenarios: Sequence[Scenario]) -> Sequence[Expectations]:
-    """Return what to expect of some loops; equal loops share it."""
-    keys = [scenario.model_dump_json(exclude={"name", "seeds"}) for scenario in scenarios]
-    distinct = dict(zip(keys, scenarios, strict=True))
-    certificates: Sequence[Sequence[ScenarioCertificate] | None] = [None] * len(distinct)
+def _expectations(scenario: Scenario) -> _Expectations:
+    """Return what to expect of a loop."""
+    certificates = None
     with suppress(Exception):
-        certificates = certificates_together([*distinct.values()])
-    expected = map(Expectations, map(assumptions, distinct.values()), certificates)
-    shared = dict(zip(distinct, expected, strict=True))
-    return [shared[key] for key in keys]
+        certificates = scheduled_certificates(scenario)
+    return _Expectations(assumptions(scenario), certificates)
 
 
 class ReplayInHelper:

@@ -243,10 +243,7 @@ def changes_in(changes: Sequence[ChangePart]) -> Iterator[tuple[str, str]]:
 
 def interval_text(claim: Claim) -> str:
     """Return the interval of a claim; empty for the whole run."""
-    from_s, until_s = claim.from_s, claim.until_s
-    if from_s == 0 and until_s is None:
-        return ""
-    return f"from {from_s:.3f} s " + ("on" if until_s is None else f"to {until_s:.3f} s")
+    return "" if claim.until_s is None else f"until the change at {claim.until_s:.3f} s"
 
 
 def _watchdog(watchdog: WatchdogPart) -> Iterator[tuple[str, str]]:
@@ -313,7 +310,7 @@ def schedule_tables(loop: LoopSummary) -> Iterator[ResultTable]:
     rows = []
     for name, words in _SCHEDULE.items():
         times_s = [getattr(part, name) if part else None for part in (allowed, observed, certified)]
-        # After a change a certificate needs no first input: it is 0 there.
+        # At a set-point a certificate needs no first input: it is 0 there.
         texts = (duration, duration, duration_at_least)
         cells = [text(time_s) if time_s else NONE for text, time_s in zip(texts, times_s, strict=True)]
         if (times_s[1] or 0.0) > (times_s[0] or 0.0):

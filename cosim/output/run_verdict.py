@@ -9,11 +9,12 @@ from collections.abc import Iterator, Sequence
 from enum import StrEnum
 from typing import NamedTuple
 
-from cosim.analysis.claims.observed_conditions import BEYOND_CERTIFICATE, CAUSES, SCHEDULE, worst_time
+from cosim.analysis.claims.observed_conditions import CAUSES, SCHEDULE, worst_time
 from cosim.analysis.summary.summary_model import Claim, ExitPart, IdealLoopPart, LoopSummary, RunSummary
 from cosim.output.run_tables import changes_in, shares_network, state_norm
 from cosim.simulation.continuous import ContinuousSummary
 from noack.core.errors import ExitStatus
+from noack.core.number_format import duration_at_least
 from noack.runtime.life_cycle import HORIZON
 from noack.theory.certificates.assumptions import AssumptionStatus
 
@@ -25,6 +26,14 @@ _MOST_VIOLATIONS = 5
 """Violations that are listed."""
 _MOST_GROWTH, _MOST_LATE = 10.0, 0.01
 """Least ratio of ‖x‖ at the end to that at the start, and least share of late steps, for a warning."""
+
+
+_TIMES = {
+    "delay_s": "updates that take effect after up to {}",
+    "hold_s": "inputs up to {} old",
+    "start_s": "a first input after up to {}",
+}
+"""The times of a certificate, in words."""
 
 
 class Tone(StrEnum):
@@ -177,9 +186,7 @@ def _if_kept(loop: LoopSummary) -> GuaranteeVerdict | None:
     certified = [claim for claim in loop.claims if claim.is_certified]
     if not certified:
         return None
-    late, coverage = _lateness(loop), ""
-    if late and _covers_lateness(loop):
-        coverage = f"certificate recomputed for the lateness of this run: {'; '.join(dict.fromkeys(late))}"
+    coverage = "; ".join(filter(None, (_certified_times(loop), _end_of_certificates(loop))))
     if not (void := _void_claims(loop)):
         return GuaranteeVerdict(Tone.GOOD, 0.0, coverage)
     if _without_certificate(loop) or not any(claim.verdict == "held" for claim in certified):
@@ -201,25 +208,21 @@ def _void_claims(loop: LoopSummary) -> list[Claim]:
 
 
 def _without_certificate(loop: LoopSummary) -> list[Claim]:
-    """Return the void claims of the parts of the run in which no certificate held.
-
-    Each part of the run between changes of settings needs a certificate that held.
-    """
+    """Return the void claims of certificates, if no claim of a certificate held."""
     certified = [claim for claim in loop.claims if claim.is_certified]
-    parts = {claim.from_s for claim in certified if claim.verdict == "held"}
-    return [claim for claim in certified if claim.verdict == "void" and claim.from_s not in parts]
+    if any(claim.verdict == "held" for claim in certified):
+        return []
+    return [claim for claim in certified if claim.verdict == "void"]
 
 
 def _reason(loop: LoopSummary) -> GuaranteeVerdict:
     """Return from when on, and why, the first of the void claims of a loop cannot be checked."""
     uncovered = _without_certificate(loop)
-    # A certificate that covered a part for some time says more than one that does not exist.
+    # A certificate that covered the run for some time says more than one that does not exist.
     candidates = [claim for claim in uncovered if claim.has_bound] or uncovered or _void_claims(loop)
     claim = min(candidates, key=lambda claim: (claim.since_s or 0.0, _why(claim)))
     reason, late = _why(claim), _lateness(loop)
-    if reason.endswith(BEYOND_CERTIFICATE):
-        reason = f"at worst {reason}"
-    elif late and late[0] == reason and not loop.missing_samples:
+    if late and late[0] == reason and not loop.missing_samples:
         reason = f"at worst {reason}; no certificate covers that"
     return GuaranteeVerdict(Tone.DOUBTFUL, claim.since_s or 0.0, reason, claim.lacks_loop_gain)
 
@@ -235,7 +238,24 @@ def _lateness(loop: LoopSummary) -> list[str]:
 
 def _is_late(loop: LoopSummary, claim: Claim) -> bool:
     """Whether a claim is void because the loop was too late for it."""
-    return claim.why in _lateness(loop) or claim.why.endswith(BEYOND_CERTIFICATE)
+    return claim.why in _lateness(loop)
+
+
+def _certified_times(loop: LoopSummary) -> str:
+    """Return the times for which a run that was later than allowed is certified; else empty."""
+    if loop.allowed is None or loop.certified_for is None or not _covers_lateness(loop):
+        return ""
+    names = [name for name in _TIMES if getattr(loop.certified_for, name) > getattr(loop.allowed, name)]
+    times = [_TIMES[name].format(duration_at_least(getattr(loop.certified_for, name))) for name in names]
+    return f"certified for {', '.join(times)}"
+
+
+def _end_of_certificates(loop: LoopSummary) -> str:
+    """Return up to when certificates claim something, if settings changed; else empty."""
+    until_s = next((claim.until_s for claim in loop.claims if claim.is_certified and claim.until_s), None)
+    if until_s is None:
+        return ""
+    return f"certificates end at the change of settings at {until_s:.3f} s, (I1) was checked to the end"
 
 
 def _covers_lateness(loop: LoopSummary) -> bool:

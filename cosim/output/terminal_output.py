@@ -158,8 +158,6 @@ def _print_claims(console: Console, table: ResultTable, claims: Sequence[Claim])
     left = [i for i, heading in enumerate(table.headings) if heading != "share used"]
     console.print(terminal_table(table, left=left, styles=_CLAIM_STYLES))
     if any(claim.ratio is not None for claim in claims):
-        if any(claim.from_s > 0 for claim in claims):
-            console.print("[dim]interval: t counts from its start t₀, and β is the threshold at t₀[/]")
         console.print(
             "[dim]share used: largest share of the bound reached during the run; a bound "
             "computed from the run itself is reached by construction. ε: the trigger's floor; t_k: "

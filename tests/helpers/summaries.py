@@ -36,5 +36,5 @@ def claim(verdict: str, **more: Any) -> dict[str, Any]:
     """A claim about a loop, in the form of the summary."""
     return {
         "what": "a", "source": "certificate", "bound": "c", "ratio": 1.0, "since_s": 1.0, "why": "",
-        "verdict": verdict, "certified": 1.0, "observed": 1.0, "from_s": 0.0, "until_s": None, **more,
+        "verdict": verdict, "certified": 1.0, "observed": 1.0, "until_s": None, **more,
     }  # fmt: skip

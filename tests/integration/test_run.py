@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import rerun.chunk
 
-from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
+from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.analysis.replay import replay
 from cosim.output.viewer import blueprint
 from cosim.record.run_events import changes_of
@@ -123,8 +123,8 @@ def test_the_recording_shows_the_record(finished: Finished, record: RunRecord) -
 
 def test_the_recording_shows_the_bounds(finished: Finished, record: RunRecord) -> None:
     """The curves drawn during the run equal those that its end evaluates for its schedule."""
-    claims = ClaimEvaluation(record)
-    claims.wider = None  # the recording has the bounds of the scenario's schedule
+    claims = RunClaims(record)
+    claims.evidence.late = None  # the recording has the bounds of the scenario's schedule
     envelopes = claims.envelopes()
     (identity,) = [e.values for e in envelopes if e.label == "bound from (I1)"]
     certified = [

@@ -75,6 +75,8 @@ class ClaimDefinition:
     find: Callable[[RunEvidence, Samples], ClaimBound]
     needs_ideal_loop: bool
     """A run that exceeds the bound does not refute it."""
+    to_the_end: bool
+    """It holds across changes of settings."""
 
 
 @dataclass(frozen=True)
@@ -87,10 +89,10 @@ class CertifiedClaim:
 
 
 def claim(
-    statement: str, source: str, assumes: str, *, needs_ideal_loop: bool = False
+    statement: str, source: str, assumes: str, *, needs_ideal_loop: bool = False, to_the_end: bool = False
 ) -> Callable[[Callable[[RunEvidence, Samples], ClaimBound]], ClaimDefinition]:
     """Make a function the definition of a claim."""
-    return lambda find: ClaimDefinition(statement, source, assumes, find, needs_ideal_loop)
+    return lambda find: ClaimDefinition(statement, source, assumes, find, needs_ideal_loop, to_the_end)
 
 
 def certified(
@@ -154,7 +156,12 @@ def least_inter_event_time(
 # Identity (I1), and the paper's theorems.
 
 
-@claim("the controller's error is at most the sensor's error plus the missed jumps", "(I1)", _COMPLETE)
+@claim(
+    "the controller's error is at most the sensor's error plus the missed jumps",
+    "(I1)",
+    _COMPLETE,
+    to_the_end=True,
+)
 def i1_controller_error(run: RunEvidence, samples: Samples) -> ClaimBound:
     """The triangle inequality for (I1)."""
     error, values = (
@@ -164,21 +171,22 @@ def i1_controller_error(run: RunEvidence, samples: Samples) -> ClaimBound:
     jump = norm_text(run, "e^(H(t−t_k)) e_s(t_k)")
     formula = f"{norm_text(run, error)} ≤ {norm_text(run, 'e_s')} + Σ {jump}"
     return ClaimBound(
-        controller_error_bound(run, samples, formula, values),
+        controller_error_bound(run, samples, formula, values, void=run.models_apart),
         Envelope("bound from (I1)", "e_c", samples.t_s, values, "identity"),
     )
 
 
-@claim("x_c − x_s is the sum of the missed jumps", "(I1)", _COMPLETE)
+@claim("x_c − x_s is the sum of the missed jumps", "(I1)", _COMPLETE, to_the_end=True)
 def i1_model_difference(run: RunEvidence, samples: Samples) -> ClaimBound:
     """(I1) itself, up to rounding."""
     here, margin = samples.is_bounded, _margin(run)
     residual = samples.residual[here]
     # Use the larger model state, since a missed update may have moved x_c far from x_s.
-    scale = max(run.facts.largest_state + run.part.offset, float(np.finfo(float).tiny))
+    scale = max(run.facts.largest_state, float(np.finfo(float).tiny))
     formula = "x_c − x_s = Σ e^(H(t−t_k)) e_s(t_k), relative residual ≤ {}"
     shares = residual / (margin * scale)
-    return ClaimBound(Bound(formula, samples.t_s[here], shares, run.first_gap, margin))
+    void = earliest([run.models_apart, run.first_gap])
+    return ClaimBound(Bound(formula, samples.t_s[here], shares, void, margin))
 
 
 def _margin(run: RunEvidence) -> float:
@@ -252,7 +260,7 @@ def theorem_2_state(run: RunEvidence, samples: Samples) -> ClaimBound:
     envelope = Envelope("Theorem 2 (eq:normXt)", "x", samples.t_s, values, "printed")
     if not run.record.scenario.coverage.knows_state:
         return ClaimBound(None, envelope)
-    slack = ROUNDING * run.part.offset
+    slack = ROUNDING * run.offset
     shares = upper_shares(samples.aligned.x_norm, values + slack)
     formula = "‖x‖ ≤ c x₀ e^(−ᾱt) + g (e^(−αt) − e^(−ᾱt))"
     return ClaimBound(Bound(formula, samples.t_s, shares, run.paper_violation), envelope)
@@ -341,7 +349,7 @@ def state(
     """‖x‖ over time."""
     formula = envelope_formula("‖x‖", certificate, "state")
     here, values = samples.with_x, certificate.state(samples.t_s)
-    slack = ROUNDING * run.part.offset
+    slack = ROUNDING * run.offset
     shares = upper_shares(row_norms(samples.true_x.compress(here, axis=0)), values[here] + slack)
     void = run.violation_of(certificate)
     return ClaimBound(

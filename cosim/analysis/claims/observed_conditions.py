@@ -61,8 +61,6 @@ SCHEDULE = ("delay", "hold", "start")
 A certificate holds for every run that meets its conditions, however they were chosen. So a run that
 was later than its scenario allows has the certificate for the times that it took, if there is one.
 """
-BEYOND_CERTIFICATE = " s certified"
-"""How a violation of the widest certificate ends, in place of " s allowed"."""
 DROPOUTS = LongestBurst(0).name
 _NO_INPUT = "the plant applied no input at all, the first within {1:.4g} s required"
 """In place of a time until the first input, which is the only condition without an upper limit."""
@@ -254,13 +252,6 @@ class ObservedConditions(NamedTuple):
     ) -> VoidFrom | None:
         """Return the time at which the run first violated a condition; None if never."""
         return earliest(VoidFrom(first.t_s, first.text) for first in self.violations(conditions, causes))
-
-    def later_times(self, allowed: NetworkConditions) -> list[float]:
-        """Return when the run became later than ``allowed``, and later than it had been so far."""
-        start = self._first_input(allowed.start_s)
-        every = ((self.delay, allowed.delay_s), (self.hold, allowed.hold_s), (start, allowed.start_s))
-        peaks = [(series.peaks(), limit_s + _TOLERANCE_S) for series, limit_s in every]
-        return sorted({t_s for series, most_s in peaks for t_s in series.t_s[series.value > most_s].tolist()})
 
     def widen(self, allowed: NetworkConditions, until_s: float = np.inf) -> NetworkConditions:
         """Return conditions that the run's schedule meets up to a time.

@@ -2,18 +2,17 @@
 
 import math
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.analysis.claims.common_end import common_end_ns
 from cosim.analysis.claims.condition_reader import read_conditions
 from cosim.analysis.claims.observed_conditions import (
-    BEYOND_CERTIFICATE,
     CLOCK_CAUSES,
-    SCHEDULE,
     AssumptionViolation,
     ObservedConditions,
     Reals,
@@ -23,15 +22,17 @@ from cosim.analysis.claims.observed_conditions import (
     earliest,
     guarantee_causes,
 )
-from cosim.analysis.claims.run_certificates import LateSchedules, late_certificates, scheduled_certificates
-from cosim.analysis.claims.run_parts import RunPart, common_end_ns
+from cosim.analysis.claims.run_certificates import certificates_under, scheduled_certificates
 from cosim.analysis.claims.trajectory_delta import trajectory_delta
-from cosim.analysis.summary.signal_statistics import SampleFacts, SampleFactsReader, signal_statistics
+from cosim.analysis.summary.signal_statistics import SampleFacts, signal_statistics
 from cosim.record.align import NOT_SHARED, AlignedRun, EventFollower, SinceEvent, aligned_parts, bounded_parts
+from cosim.record.run_events import changes_of
 from cosim.record.run_record import RunRecord
+from noack.core.clock import NEVER_NS
 from noack.core.row_operations import all_entries
 from noack.protocol.record_tables import NO_SEQUENCE
 from noack.protocol.roles import LOOP_ROLES
+from noack.scenario.runtime_parameters import SETPOINT
 from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.certificates.certified_bounds import (
     KnownStateBounds,
@@ -81,13 +82,23 @@ class Samples:
 
 @dataclass(eq=False)
 class RunEvidence:
-    """The data of a run for checking claims; each property is computed once, when first used.
-
-    The record is that of the whole run, or of the ``part`` in the form of a separate run.
-    """
+    """The data of a run for checking claims; each property is computed once, when first used."""
 
     record: RunRecord
-    part: RunPart = field(default_factory=RunPart)
+    """That of the run; of a run with a set-point, in deviations from it; of a stopped run, up to its
+    common end."""
+    whole_record: RunRecord | None = None
+    """That of the whole run, if it is another one."""
+    until_s: float = math.inf
+    """End of what certificates claim: the first change of a setting on which they depend."""
+    start_error: float | None = None
+    """‖u − Kx‖, scaled, until the plant applied the first input; None if u was 0 as certificates assume."""
+    void: Mapping[str, str] = field(default_factory=dict)
+    """By scope: why there is no certificate."""
+    scheduled: Sequence[ScenarioCertificate] | None = None
+    """The certificates under the scenario's schedule, if they are known."""
+    offset: float = 0.0
+    """‖x_r‖ of the set-point: x in deviations has the rounding errors of x."""
     _known_states: dict[int, KnownStateBounds | None] = field(default_factory=dict, init=False)
     """Bounds from the newest event that are known already, by the ``id`` of their certificate."""
     _violations: dict[int, VoidFrom | None] = field(default_factory=dict, init=False)
@@ -111,7 +122,7 @@ class RunEvidence:
     @cached_property
     def lost_in_rounding(self) -> VoidFrom | None:
         """When the threshold falls below the rounding of x at a set-point: events are chance."""
-        for part in aligned_parts(self.record) if self.part.offset else ():
+        for part in aligned_parts(self.record) if self.offset else ():
             aligned = part.aligned
             compared = aligned.threshold > 0  # a periodic trigger compares nothing
             below = np.flatnonzero(compared & (aligned.threshold < self.rounding(aligned.x_norm)))
@@ -121,88 +132,64 @@ class RunEvidence:
         return None
 
     def rounding(self, x_norm: Reals) -> Reals:
-        """Return the rounding error of states of the part, from their norms, (k,) each."""
-        return np.asarray(ROUNDING * (x_norm + self.part.offset))
+        """Return the rounding error of states, from their norms, (k,) each."""
+        return np.asarray(ROUNDING * (x_norm + self.offset))
 
     @cached_property
     def facts(self) -> SampleFacts:
         """What must be known about all samples before the claims are checked."""
-        if math.isinf(self.part.until_s):
-            return signal_statistics(self.record).facts
-        reader = SampleFactsReader(self.record.scenario, self.part.until_s)
-        for part in aligned_parts(self.record):
-            reader.take(part.aligned)
-        return reader.facts
+        return signal_statistics(self.record).facts
 
     @cached_property
     def trajectory_delta(self) -> float | None:
         """Theorem 1's Δ from the trajectory, up to the first violation of its assumptions."""
         void = self.paper_violation
-        until_s = self.part.until_s if void is None else min(self.part.until_s, void.t_s)
+        until_s = self.until_s if void is None else min(self.until_s, void.t_s)
         return trajectory_delta(self.record, until_s)
 
     @cached_property
     def _scheduled(self) -> Sequence[ScenarioCertificate]:
         """The certificates under the scenario's schedule."""
-        if self.part.certificates is not None:
-            return self.part.certificates
-        return scheduled_certificates(self.record.scenario, self.part.start_error)
+        if self.scheduled is not None:
+            return self.scheduled
+        return scheduled_certificates(self.record.scenario, self.start_error)
 
-    def late_schedules(self) -> LateSchedules:
-        """Yield schedules of a run that was later than its scenario allows, until one is certified.
+    @cached_property
+    def late(self) -> Sequence[ScenarioCertificate] | None:
+        """The certificates for the times that occurred, of a run that was later than allowed.
 
-        They are the one that the whole run kept, and then those that it kept up to a time: the
-        generator is sent the certificates of each, and returns those of the latest time. A
-        certificate holds for every run that meets its conditions, whenever they were chosen.
+        A certificate holds for every run that meets its conditions, whenever they were chosen. None:
+        the run was not late, rows that are missing may be later, or there is no such certificate.
         """
-        whole_record, until_s = self.part.whole_record or self.record, self.part.until_s
-        if not all(map(whole_record.is_complete, LOOP_ROLES)):  # rows that are missing may be later
+        whole_record, widest = (
+            self.whole_record or self.record,
+            self.observed.widen(self.allowed, self.until_s),
+        )
+        if widest == self.allowed or not all(map(whole_record.is_complete, LOOP_ROLES)):
             return None
         if not any(certificate.exists for certificate in self._scheduled):
             return None
-        allowed = self.allowed
-        times_s = [t_s for t_s in self.observed.later_times(allowed) if t_s < until_s]
-        widest = self.observed.widen(allowed, until_s)
-        if not times_s or widest == allowed:
-            return None
-        certificates: Sequence[ScenarioCertificate] = yield widest
-        if any(certificate.exists for certificate in certificates):
-            return certificates
-        best, kept, beyond = None, 0, len(times_s)
-        while beyond - kept > 1:
-            middle = (kept + beyond) // 2
-            certificates = yield self.observed.widen(allowed, times_s[middle])
-            if any(certificate.exists for certificate in certificates):
-                best, kept = certificates, middle
-            else:
-                beyond = middle
-        return best
-
-    @cached_property
-    def wider(self) -> Sequence[ScenarioCertificate] | None:
-        """The certificates under the widest of the :meth:`late_schedules`; None without one."""
-        return late_certificates([self])[0]
+        certificates = certificates_under(widest, self.record.scenario, self.start_error)
+        return certificates if any(certificate.exists for certificate in certificates) else None
 
     @cached_property
     def certificates(self) -> list[ScenarioCertificate]:
-        """The certificates of the run's scenario under the schedule that the run kept.
-
-        This is the scenario's schedule; or a wider one, if the run was later than allowed and there
-        is a certificate nevertheless.
-        """
-        certificates, void = [], self.part.void
-        for scheduled, late in zip(self._scheduled, self.wider or self._scheduled, strict=True):
+        """The certificates of the run: those of its scenario, or of its lateness, where there are some."""
+        certificates = []
+        for scheduled, late in zip(self._scheduled, self.late or self._scheduled, strict=True):
             used = late if late.exists else scheduled
-            if scheduled.scope in void:
-                used = replace(scheduled, constants=None, floor_constants=None, void=void[scheduled.scope])
+            if scheduled.scope in self.void:
+                used = replace(
+                    scheduled, constants=None, floor_constants=None, void=self.void[scheduled.scope]
+                )
             certificates.append(used)
         return certificates
 
     @property
     def certified_for(self) -> NetworkConditions | None:
-        """The wider schedule, if a certificate of it is used."""
+        """The conditions of the certificates of the run's lateness, if one of them is used."""
         used = [certificate.conditions for certificate in self.certificates if certificate.exists]
-        late = [certificate.conditions for certificate in self.wider or () if certificate.conditions in used]
+        late = [certificate.conditions for certificate in self.late or () if certificate.conditions in used]
         return late[0] if late else None
 
     @cached_property
@@ -213,9 +200,9 @@ class RunEvidence:
     def observed(self) -> ObservedConditions:
         """The conditions under which the run took place."""
         conditions = self._as_read
-        if self.part.start_error is None:
+        if self.start_error is None:
             return conditions
-        # The certificate's start error covers the inputs before the part's first one.
+        # The certificate's start error covers the inputs before the first one of the controller.
         safe = conditions.safe_input
         later = safe.t_s >= conditions.start_s
         return conditions._replace(
@@ -243,13 +230,16 @@ class RunEvidence:
         return np.asarray((t_s >= self.started_s - 1e-9) & ~is_behind)
 
     def violations(self) -> list[AssumptionViolation]:
-        """The assumptions that the run violated, the guarantee included, each at the first time."""
+        """The assumptions of certificates that the run violated, each at the first time.
+
+        Whether the guarantee was kept later on, the controller reports with the limits of the time.
+        """
         scenario = self.record.scenario
         rules = {*guarantee_causes(scenario)}
         violations = self.observed.violations(self.allowed, {*causes_of(scenario)} - rules)
         # An update that a newer one replaced within the certified delay is not lost.
         violations += self.observed.violations(self.certified_for or self.allowed, rules)
-        return [violation for violation in violations if violation.t_s < self.part.until_s]
+        return [violation for violation in violations if violation.t_s < self.until_s]
 
     @cached_property
     def first_gap(self) -> VoidFrom | None:
@@ -259,17 +249,27 @@ class RunEvidence:
         """
         limit = _ANY._replace(sampling_s=self._schedule.sampling_s)
         gaps = [self.observed.first_violation(limit, ("sampling", *CLOCK_CAUSES))]
-        whole_record = self.part.whole_record or self.record
+        whole_record = self.whole_record or self.record
         end_ns = common_end_ns(whole_record)
-        end_s = math.inf if end_ns is None else end_ns * 1e-9 - self.part.from_s
+        end_s = math.inf if end_ns is None else end_ns * 1e-9
         for role in LOOP_ROLES:
             gap_ns = None if whole_record.is_complete(role) else whole_record.rows_of(role).gap_ns
-            if gap_ns is not None and 0 <= (at_s := gap_ns * 1e-9 - self.part.from_s) <= end_s:
+            if gap_ns is not None and 0 <= (at_s := gap_ns * 1e-9) <= end_s:
                 gaps.append(VoidFrom(at_s, f"rows of {role} are missing from the record"))
         if (gap_s := self.facts.gap_s) is not None:
             why = "the controller's error is not on record, or not finite"
             gaps.append(VoidFrom(gap_s, why))
         return earliest(gaps)
+
+    @cached_property
+    def models_apart(self) -> VoidFrom | None:
+        """When sensor and controller first had different set-points: then (I1) does not hold."""
+        for change in changes_of(self.record):
+            times_ns = {change.since_ns.get(role, NEVER_NS) for role in ("sensor", "controller")}
+            if SETPOINT in change.change.settings and len(times_ns) > 1:
+                why = "sensor and controller took the change of the set-point at different times"
+                return VoidFrom(min(times_ns) * 1e-9, why)
+        return None
 
     @cached_property
     def paper_violation(self) -> VoidFrom | None:
@@ -284,10 +284,7 @@ class RunEvidence:
         known, conditions = self._violations, certificate.conditions
         if id(certificate) not in known:
             first = min(self.observed.violations(conditions), default=None)
-            why = "" if first is None else first.text
-            if first is not None and first.cause in SCHEDULE and conditions == self.certified_for:
-                why = why.replace(" s allowed", BEYOND_CERTIFICATE)
-            known[id(certificate)] = None if first is None else VoidFrom(first.t_s, why)
+            known[id(certificate)] = None if first is None else VoidFrom(first.t_s, first.text)
         return known[id(certificate)]
 
     def missing_events(
@@ -313,11 +310,11 @@ class RunEvidence:
     def allowed(self) -> NetworkConditions:
         """The conditions of the scenario's certificates."""
         allowed = allowed_conditions(self.record.scenario)
-        return allowed if self.part.start_error is None else allowed._replace(start_s=0.0)
+        return allowed if self.start_error is None else allowed._replace(start_s=0.0)
 
     @cached_property
     def _schedule(self) -> NetworkConditions:
-        scenario, is_allowed = self.record.scenario, self.part.start_error is None
+        scenario, is_allowed = self.record.scenario, self.start_error is None
         is_allowed &= not scenario.certificate.late_periods
         return self.allowed if is_allowed else nominal_conditions(scenario)
 

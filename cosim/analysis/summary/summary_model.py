@@ -245,10 +245,9 @@ class Claim(SummaryPart):
     since_s: Real
     """Time from which the claim was violated, void or not applicable."""
     why: str
-    from_s: float
-    """The claim begins here: at the start of the run, or after a change of settings."""
     until_s: Real
-    """The claim ends here, at a change of settings; None: at the end of the run."""
+    """The claim ends here, at the first change of a setting on which it depends; None: at the end of
+    the run."""
 
     @property
     def is_certified(self) -> bool:

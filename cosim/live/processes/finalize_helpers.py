@@ -1,13 +1,12 @@
 """Processes that help to finalise a long run, and prepare this while the run goes on.
 
-What follows from the scenario alone is computed at idle priority: a process of the run that wakes
-up takes the core at once. What is not computed when the run ends, or is lost with a helper, is
-computed then.
+They import libraries and write tables at idle priority: a process of the run that wakes up takes the
+core at once. What is not done when the run ends, or is lost with a helper, is done then.
 """
 
 import time
 from collections import deque
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager, suppress
@@ -24,7 +23,7 @@ from noack.runtime.spool import EARLY, EARLY_ENDED, SPOOL
 from noack.scenario.scenario import Scenario, loop_names
 
 if TYPE_CHECKING:
-    from cosim.live.finalize import Expectations
+    pass
 
 Result = TypeVar("Result")
 Item = TypeVar("Item", bound=Hashable)
@@ -33,8 +32,8 @@ _MANY_STEPS = 50_000
 start."""
 _GRACE_S = 2.0
 """Wall time for what is being prepared when the run ends."""
-_LOOPS_PREPARED_AT_ONCE = 16
-"""The end of a run waits for the preparation of at most this number of loops."""
+_FEW_LOOPS = 16
+"""The end of a run of at most this number of loops is not prepared."""
 _POLL_S = 0.005
 
 
@@ -46,14 +45,13 @@ class FinalizeHelpers:
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        timing, self._loops = scenario.timing, range(len(loop_names(scenario)))
-        steps = len(self._loops) * (timing.horizon_ns // timing.plant_period_ns)
+        timing, self._loops = scenario.timing, len(loop_names(scenario))
+        steps = self._loops * (timing.horizon_ns // timing.plant_period_ns)
         self.count = cores() - 1 if steps >= _MANY_STEPS else 0
         self._stack, self._threads = ExitStack(), list[Thread]()
         self._pool: ProcessPoolExecutor | None = None
         self._due: deque[Callable[[], object]] = deque()
         """What is still to be prepared."""
-        self._expected: dict[int, Expectations] = {}
         self._end_file: Path | None = None
         """Its existence is the sign for the process that writes tables that the run has ended; see
         ``cosim.record.spool_conversion``."""
@@ -64,14 +62,11 @@ class FinalizeHelpers:
 
     def prepare(self, run_dir: Path) -> None:
         """Prepare the end of a run of many loops from now on."""
-        if len(self._loops) <= _LOOPS_PREPARED_AT_ONCE:
+        if self._loops <= _FEW_LOOPS:
             return
         self.end_preparation()
         # This process keeps them, too.
         self._due.append(partial(call_by_name, "cosim.record.run_record", "scenarios_of", run_dir))
-        for first in self._loops[::_LOOPS_PREPARED_AT_ONCE]:
-            block = self._loops[first:][:_LOOPS_PREPARED_AT_ONCE]
-            self._due.append(partial(self._prepare_loops, run_dir, block))
         self._due.append(lambda: self._call_at_idle_priority("import_libraries"))
         self._due.append(partial(self._write_early, run_dir))
         for _ in range(self.count):
@@ -86,12 +81,6 @@ class FinalizeHelpers:
             self._pool = None
         except Exception:  # the end of the run reports an error; IndexError: all is prepared
             pass
-
-    def _prepare_loops(self, run_dir: Path, block: range) -> None:
-        expectations = cast(
-            "Sequence[Expectations]", self._call_at_idle_priority("expectations_of", run_dir, block)
-        )
-        self._expected |= zip(block, expectations, strict=True)
 
     def _write_early(self, run_dir: Path) -> None:
         self._end_file, self._writer = run_dir / SPOOL / EARLY / EARLY_ENDED, current_thread()
@@ -117,11 +106,6 @@ class FinalizeHelpers:
     def _call_at_idle_priority(self, function: str, *arguments: object) -> object:
         """Return the result of a function of :mod:`cosim.live.finalize`, which a process calls."""
         return self.submit(at_idle_priority, "cosim.live.finalize", function, *arguments).result()
-
-    def expectations(self, loops: range) -> "Sequence[Expectations] | None":
-        """Return what to expect of some loops, if all of them are prepared."""
-        expectations = [self._expected[number] for number in loops if number in self._expected]
-        return expectations if len(expectations) == len(loops) else None
 
     def end_preparation(self) -> None:
         """End the preparation; afterwards there are free processes.

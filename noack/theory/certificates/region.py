@@ -128,11 +128,9 @@ class RegionScope(_Box):
         model = Inclusion(loop.A_model, loop.B_model, 0 * loop.A_model, 0 * loop.B_model)
         super().__init__(resolved, model, start_error, start)
 
-    def search(
-        self, conditions: NetworkConditions, *, beforehand: bool = False
-    ) -> Search[ScenarioCertificate]:
+    def search(self, conditions: NetworkConditions, why: str | None = None) -> Search[ScenarioCertificate]:
         """Search for the certificate under some conditions, and its region."""
-        certificate = yield from super().search(conditions, beforehand=beforehand)
+        certificate = yield from super().search(conditions, why)
         if certificate.constants is None:
             return certificate
         region = self._proven[conditions].region

@@ -165,20 +165,18 @@ class CertificateScope:
 
     def certificate(self, conditions: NetworkConditions) -> ScenarioCertificate:
         """Return the certificate under some conditions; a void certificate has the reason."""
-        return run_search(self.search(conditions, beforehand=True))
+        return run_search(self.search(conditions, void_beforehand(self._resolved, conditions)))
 
-    def search(
-        self, conditions: NetworkConditions, *, beforehand: bool = False
-    ) -> Search[ScenarioCertificate]:
+    def search(self, conditions: NetworkConditions, why: str | None = None) -> Search[ScenarioCertificate]:
         """Search for the certificate under some conditions, perhaps together with others.
 
-        ``beforehand``: no run shows whether its input was 0 at the start.
+        ``why``: why there is none, if that is known.
         """
         # The constants, or the reason for having none.
         void: NotDecayingError | NoCertificateError | None = None
         phases: Sequence[tuple[Constants | None, ...]] = [(None, None, None)]
         try:
-            if beforehand and (why := void_beforehand(self._resolved, conditions)) is not None:
+            if why is not None:
                 raise NoCertificateError(why)
             if math.isinf(self._start_error):
                 raise NoCertificateError(_OUTSIDE_RANGE)

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, RunClaims
+from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.analysis.replay import replay
 from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.record import run_record
@@ -52,7 +52,7 @@ def results(record: RunRecord) -> dict[str, Any]:
         ],
         "inter_event_s": [
             passed_s
-            for part in ClaimEvaluation(record).samples()
+            for part in RunClaims(record).evidence.samples()
             for passed_s in part.inter_event_s[1].tolist()
         ],
         "aligned": [column.tobytes() for column in align_tables(record)],

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
+from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.analysis.replay import replay
 from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.analysis.summary.summary_model import ClaimVerdict
@@ -53,7 +53,7 @@ def require_sound(record: RunRecord, status: ExitStatus = ExitStatus.OK) -> dict
     assert summarised["exit"]["status"] == status, summarised["exit"]
     assert replay(record).bit_exact is True
     with np.errstate(all="ignore"):
-        claims = ClaimEvaluation(record).evaluate()
+        claims = RunClaims(record).evaluate()
     assert claims
     assert [c for c in claims if c.verdict is ClaimVerdict.VIOLATED] == []
     return summarised

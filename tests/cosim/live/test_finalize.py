@@ -245,7 +245,7 @@ def many_loops(
 ) -> Path:
     """A copy of the run, whose end processes help with."""
     monkeypatch.setattr(finalize_helpers, "_MANY_STEPS", 10)
-    monkeypatch.setattr(finalize_helpers, "_LOOPS_PREPARED_AT_ONCE", LOOPS - 1)
+    monkeypatch.setattr(finalize_helpers, "_FEW_LOOPS", LOOPS - 1)
     monkeypatch.setattr(cosim.live.finalize, "_LEAST_LOOPS", LOOPS - 1)  # helpers judge loops, too
     monkeypatch.setattr(finalize_helpers, "cores", lambda: 2)
     run_dir, _ = judged_alone
@@ -267,8 +267,6 @@ def test_a_prepared_end_is_that_of_a_run_without_preparation(
     helpers.prepare(many_loops)
     for thread in helpers._threads:
         thread.join()
-    assert helpers.expectations(range(LOOPS)) is not None
-    monkeypatch.setattr(cosim.live.finalize, "_expectations", _killed)
     if is_killed:
         assert helpers.submit(os.getpid).result() != os.getpid()
         with pytest.raises(BrokenProcessPool):
@@ -278,7 +276,7 @@ def test_a_prepared_end_is_that_of_a_run_without_preparation(
     assert finalize(ending, report=False, view=not is_killed).summary == expected
 
 
-@pytest.mark.parametrize("part", ["_prepare_loops", "_write_early"])
+@pytest.mark.parametrize("part", ["_call_at_idle_priority", "_write_early"])
 def test_the_end_does_not_wait_for_a_preparation_that_gets_no_time(
     many_loops: Path, monkeypatch: pytest.MonkeyPatch, part: str
 ) -> None:
@@ -292,7 +290,7 @@ def test_the_end_does_not_wait_for_a_preparation_that_gets_no_time(
         preparation_started.set()
         waiting.result()
 
-    for method in ("_prepare_loops", "_write_early", "_call_at_idle_priority"):
+    for method in ("_write_early", "_call_at_idle_priority"):
         monkeypatch.setattr(FinalizeHelpers, method, endless if method == part else lambda *_: None)
     monkeypatch.setattr(finalize_helpers, "_GRACE_S", 0.0)
     helpers = FinalizeHelpers(load(many_loops / SCENARIO_FILE))
@@ -318,8 +316,7 @@ def test_the_end_waits_for_the_table_writer(many_loops: Path, monkeypatch: pytes
 
     for method, replacement in (("_write_early", write), ("_make_end_file", make_end_file)):
         monkeypatch.setattr(FinalizeHelpers, method, replacement)
-    for method in ("_prepare_loops", "_call_at_idle_priority"):
-        monkeypatch.setattr(FinalizeHelpers, method, lambda *_: None)
+    monkeypatch.setattr(FinalizeHelpers, "_call_at_idle_priority", lambda *_: None)
     monkeypatch.setattr(finalize_helpers, "_GRACE_S", 0.0)
     helpers = FinalizeHelpers(load(many_loops / SCENARIO_FILE))
     helpers.prepare(many_loops)

@@ -11,7 +11,7 @@ from rich.console import Console
 from scipy.linalg import expm
 
 from cosim.analysis.certificates import Certificates, certificates_of, with_weight
-from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
+from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.output.certificate_report import print_certificates
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
@@ -211,7 +211,7 @@ def test_a_plant_outside_its_box_is_named() -> None:
     )  # fmt: skip
     message = outside_box(outside)
     assert message == ("the plant lies outside: A[2, 1] is 2 from the model's, the half-width is 0.3")
-    claims = [c for c in ClaimEvaluation(simulate(outside)).evaluate() if c.source == "box certificate"]
+    claims = [c for c in RunClaims(simulate(outside)).evaluate() if c.source == "box certificate"]
     assert claims
     assert {(c.verdict, c.since_s) for c in claims} == {("void", 0.0)}
 

@@ -28,7 +28,7 @@ TIMED = ["lateness", "latency"]
 CLAIM = {
     "what": "controller error", "source": "theorem T", "bound": "‖e_c‖ ≤ 5 β e^(−αt)",
     "certified": 2.5, "observed": 0.4371, "ratio": 0.17484, "verdict": "held", "since_s": None,
-    "why": "", "from_s": 0.0, "until_s": None,
+    "why": "", "until_s": None,
 }  # fmt: skip
 CLAIMS = [
     CLAIM,

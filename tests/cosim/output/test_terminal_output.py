@@ -48,13 +48,6 @@ def test_the_table_of_times_marks_what_was_later_than_allowed(outcome: Outcome) 
     assert "12.5 ms" in row
 
 
-def test_times_of_a_later_part_are_explained(outcome: Outcome) -> None:
-    legend = "t counts from its start"
-    for from_s, is_explained in ((0.0, False), (1.0, True)):
-        shown = printed(outcome, verbose=True, claims=[claim("held", from_s=from_s)])
-        assert (legend in shown) is is_explained
-
-
 def test_reasons_of_several_loops_that_differ_only_in_numbers_are_one_line(tmp_path: Path) -> None:
     outcome = finalize(simulate_run(shipped("different_loops"), tmp_path), report=False, view=False)
     reasons = ["an input was old", "gain 1.5, not below 1", "gain 2.25, not below 1", "gain 1.5, not below 1"]

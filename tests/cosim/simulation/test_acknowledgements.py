@@ -5,7 +5,7 @@ from functools import cache
 import pytest
 
 from cosim.analysis.certificates import Certificates
-from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
+from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.analysis.summary.summary_model import ClaimVerdict
 from cosim.record.run_record import RunRecord
@@ -78,10 +78,10 @@ def test_the_summary_counts_acknowledgements() -> None:
 
 def test_the_baseline_has_no_claims() -> None:
     record = run_of()
-    (claim,) = ClaimEvaluation(record).evaluate()
+    (claim,) = RunClaims(record).evaluate()
     assert claim.verdict is ClaimVerdict.VOID
     assert 'network.protocol = "ack"' in claim.why
-    assert ClaimEvaluation(record).envelopes() == []
+    assert RunClaims(record).envelopes() == []
     (assumption,) = [a for a in assumptions(record.scenario) if "acknowledged" in a.what]
     assert assumption.verdict is AssumptionStatus.VIOLATED
     for refuse in (continuous_loop_of, lambda scenario: Certificates(scenario, 2)):

@@ -55,7 +55,7 @@ NOTICE = {"t_ns": 10_000_000, "level": "violation", "text": "MANSD violated", "p
 CLAIM = {
     "what": "the error is bounded", "source": "Theorem 1", "bound": "‖e‖ ≤ 1", "certified": 1.0,
     "observed": 0.5, "ratio": 0.5, "verdict": "void", "since_s": 0.01, "why": "late",
-    "from_s": 0.0, "until_s": None,
+    "until_s": None,
 }  # fmt: skip
 IDEAL_LOOP = {"reason": None, "rms_difference": 0.1, "rms_x": 1.0, "events": 1}
 RECORD_KNOWN = Vocabulary(

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.stats import chi2
 
-from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
+from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.analysis.replay import replay
 from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.record.align import align_tables, true_states
@@ -89,7 +89,7 @@ def test_i1_and_the_certificate_are_claimed_of_the_estimate(
 ) -> None:
     observed["horizon_s"] = 4.0
     record = run(observed)
-    claims = ClaimEvaluation(record)
+    claims = RunClaims(record)
     evaluated = claims.evaluate()
     assert {claim.source for claim in evaluated} == {"(I1)", "certificate"}
     assert any("‖x̂ − x‖" in claim.bound for claim in evaluated)
@@ -119,7 +119,7 @@ def test_the_summary_contains_the_estimation_error(observed: dict[str, Any]) -> 
     noisy = run(observed)
     sizes = estimation_error(noisy).std(axis=0)
     assert 0.01 < sizes[0] < 0.03 < sizes[1] < 0.08
-    assert {claim.verdict for claim in ClaimEvaluation(noisy).evaluate()} == {"held"}
+    assert {claim.verdict for claim in RunClaims(noisy).evaluate()} == {"held"}
     assert summarise_loop(noisy, 0, "horizon").to_json()["estimation"]["observer"] is None
 
 

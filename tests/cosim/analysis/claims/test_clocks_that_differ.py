@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, RunClaims
+from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.analysis.claims.condition_reader import ConditionReader, read_conditions
 from cosim.analysis.claims.observed_conditions import ObservedConditions, combine
 from cosim.analysis.replay import replay
@@ -84,7 +84,7 @@ def test_every_claim_holds_whatever_the_clocks(make: Make, delay_s: float) -> No
             for name in ("controller", "netem", "sensor")
         }
         record = simulated(scenario, clocks)
-        claims = ClaimEvaluation(record)
+        claims = RunClaims(record)
         verdicts = {claim.verdict for claim in claims.evaluate() if claim.source == "certificate"}
         assert verdicts == {ClaimVerdict.HELD}, clocks
         seen.add(claims.certified_for is not None)
@@ -108,10 +108,10 @@ def test_nothing_is_claimed_of_an_older_x_c_than_that_of_the_input() -> None:
     }  # fmt: skip
     scenario = resolve(validate(content, "test"))
     record = simulated(scenario, {"controller": (150 * MS, 0)})
-    claims = ClaimEvaluation(record)
+    claims = RunClaims(record)
     verdicts = {claim.verdict for claim in claims.evaluate() if claim.source == "certificate"}
     assert verdicts == {ClaimVerdict.HELD}
-    (certificate,), (part,) = claims.certificates, aligned_parts(record)
+    (certificate,), (part,) = claims.certified_evidence.certificates, aligned_parts(record)
     t_s = np.asarray(part.aligned.t_ns * 1e-9)
     largest = float((part.aligned.e_c_norm / certificate.controller_error(t_s)).max())
     assert largest == pytest.approx(1.245, abs=0.01)
@@ -150,7 +150,7 @@ def with_errors(record: RunRecord, errors: Errors, **t_ns: int) -> RunRecord:
 
 
 def judged(record: RunRecord) -> list[Claim]:
-    return ClaimEvaluation(record).evaluate()
+    return RunClaims(record).evaluate()
 
 
 def test_small_bounds_change_no_verdict(make: Make, clocked: RunRecord) -> None:

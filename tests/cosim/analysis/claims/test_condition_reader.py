@@ -9,10 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
+from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.analysis.claims.condition_reader import ConditionReader, read_conditions
 from cosim.analysis.claims.observed_conditions import (
-    BEYOND_CERTIFICATE,
     CAUSES,
     CLOCK_CAUSES,
     AssumptionViolation,
@@ -20,7 +19,7 @@ from cosim.analysis.claims.observed_conditions import (
     causes_of,
     combine,
 )
-from cosim.analysis.claims.run_certificates import certificates_together
+from cosim.analysis.claims.run_certificates import certificates_under
 from cosim.analysis.summary.summary_model import ClaimVerdict
 from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.virtual_time import simulate
@@ -197,7 +196,7 @@ def test_claims_are_void_from_the_time_and_for_the_reason_that_the_monitor_repor
     """``at`` is a time, or the number of an event."""
     record = violate(make)
     when_s = event_s(record, at) if isinstance(at, int) else at
-    judged = [claim for claim in ClaimEvaluation(record).evaluate() if claim.source == "certificate"]
+    judged = [claim for claim in RunClaims(record).evaluate() if claim.source == "certificate"]
     assert {claim.verdict for claim in judged} == {ClaimVerdict.VOID}
     # Nothing is recorded of ‖e_c‖ while there is no controller.
     claims = [claim for claim in judged if "e_c" not in claim.bound]
@@ -223,7 +222,7 @@ def test_a_late_run_has_the_certificate_of_its_lateness(
 ) -> None:
     record = violate(make)
     assert time in [f"{violation.cause}_s" for violation in reported(record)]
-    claims = ClaimEvaluation(record)
+    claims = RunClaims(record)
     assert (covered := claims.certified_for) is not None
     assert least_s <= getattr(covered, time) == claims.conditions[time]
     assert {claim.verdict for claim in claims.evaluate() if claim.source in ("certificate", "(I1)")} == {
@@ -232,30 +231,25 @@ def test_a_late_run_has_the_certificate_of_its_lateness(
 
 
 @pytest.mark.parametrize(
-    ("violate", "time", "why"),
+    ("violate", "why"),
     [
-        (lambda make: with_outage(make(), 2.0, 2.3), "hold", "an input was 0.315 s old, "),
-        (delayed(lambda n: 500), "delay", "an update took effect after 0.51 s, 0.01 s certified"),
+        (lambda make: with_outage(make(), 2.0, 2.3), "an input was 0.315 s old, "),
+        (delayed(lambda n: 500), "the plant applied no input until 0.51 s, 0.01 s allowed"),
     ],
 )  # fmt: skip
-def test_a_run_is_certified_until_it_is_later_than_any_certificate_covers(
-    violate: Callable[[Make], RunRecord], time: str, why: str, make: Make
+def test_a_run_that_is_later_than_any_certificate_covers_is_void_from_then_on(
+    violate: Callable[[Make], RunRecord], why: str, make: Make
 ) -> None:
     record = violate(make)
-    claims = ClaimEvaluation(record)
-    covered, series = claims.certified_for, getattr(claims.observed, time)
-    assert covered is not None
+    claims = RunClaims(record)
+    assert claims.certified_for is None
     (since_s,) = {claim.since_s for claim in claims.evaluate() if claim.source == "certificate"}
-    assert since_s > min(reported(record)).t_s  # when it was later than allowed
-    assert series.before(since_s).value.max(initial=0.01) == getattr(covered, f"{time}_s")
+    assert since_s == min(reported(record)).t_s  # when it was later than allowed
     (reason,) = {claim.why for claim in claims.evaluate() if claim.source == "certificate"}
     assert reason.startswith(why)
-    assert reason.endswith(BEYOND_CERTIFICATE)
-    # The next lateness has none.
-    (most,) = series.peaks().value[series.peaks().t_s == since_s]
-    later = covered._replace(**{f"{time}_s": most})
-    (beyond,) = certificates_together([record.scenario], None, [later])
-    assert {certificate.constants for certificate in beyond} == {None}
+    largest = claims.evidence.observed.widen(allowed_conditions(record.scenario))
+    (beyond,) = certificates_under(largest, record.scenario)
+    assert beyond.constants is None
 
 
 # --- the conditions that a run has met ------------------------------------------------------------
