@@ -22,7 +22,8 @@ LIVE ?=
 SETTABLE := PYTHON VENV CC SCENARIO CAMPAIGN SETTLING SESSION RUNS MINUTES N ARGS LIVE
 UNKNOWN := $(foreach v,$(filter-out $(SETTABLE) SHELL MAKE% -%,$(.VARIABLES)),$(if $(filter command,$(origin $v)),$v))
 $(if $(strip $(UNKNOWN)),$(error no such variable: $(strip $(UNKNOWN)); there are $(SETTABLE)))
-C_FILES := $(wildcard native/*.[ch] native/*/*.[ch])
+C_FILES := $(wildcard native/*.[ch] native/*/*.[ch] extensions/*/*/*.c)
+EXTENSIONS := $(patsubst %/pyproject.toml,%,$(wildcard extensions/*/pyproject.toml))
 override FLAGS := $(if $(filter-out 0 no,$(LIVE)),--live) $(ARGS)
 
 .PHONY: help
@@ -96,7 +97,7 @@ netem: setup ## The network: loses at most M - 1 consecutive packets
 	@$(BIN)/noack netem --session $(SESSION) $(ARGS)
 
 ##@ Work on noack
-.PHONY: setup setup-dev test test-system pytest fuzz attack soak check format bench screenshots schema docs docs-serve lock dist clean
+.PHONY: setup setup-dev test test-system pytest pytest-extensions fuzz attack soak check format bench screenshots schema docs docs-serve lock dist clean
 setup: $(VENV)/.installed ## Create the environment in .venv (the other targets do this if needed)
 
 setup-dev: $(VENV)/.installed-dev
@@ -108,6 +109,7 @@ endif
 test: setup-dev ## Lint, types, import rules, and tests (ARGS are pytest's, e.g. ARGS="-k mansd")
 	@$(MAKE) --no-print-directory check >$(VENV)/.checks.txt 2>&1 & checks=$$!; \
 	$(MAKE) --no-print-directory pytest; tested=$$?; \
+	$(if $(ARGS),,$(MAKE) --no-print-directory pytest-extensions || tested=$$?;) \
 	wait $$checks; checked=$$?; cat $(VENV)/.checks.txt; exit $$((tested || checked))
 
 test-system: setup-dev ## Test what needs a browser, root or a system package, and other builds
@@ -115,6 +117,10 @@ test-system: setup-dev ## Test what needs a browser, root or a system package, a
 
 pytest: setup-dev
 	$(BIN)/python -m pytest \
+		$(or $(ARGS),-m "not system" --numprocesses=3 --dist=loadfile --no-loadscope-reorder)
+
+pytest-extensions: setup-dev
+	$(BIN)/python -m pytest extensions \
 		$(or $(ARGS),-m "not system" --numprocesses=3 --dist=loadfile --no-loadscope-reorder)
 
 fuzz: setup-dev ## Fuzz every parser for MINUTES=10 in total; exit status 1 if an input fails
@@ -146,6 +152,7 @@ screenshots: setup ## Make docs/run.png; needs Chromium
 	@$(BIN)/noack simulate lane_following --no-report
 	@$(BIN)/python tools/screenshot_recording.py runs/latest/recording.rrd docs/run.png --size 1600x900
 
+schema: export NOACK_NO_EXTENSIONS = 1
 schema: setup ## Write the JSON Schemas of scenario, campaign and links files to docs/
 	$(BIN)/noack schema > docs/scenario.schema.json
 	$(BIN)/noack schema --campaign > docs/campaign.schema.json
@@ -161,8 +168,9 @@ docs-serve: docs ## Build the site and serve it on http://127.0.0.1:8000
 lock: setup-dev ## Update the pinned dependencies
 	$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 		--no-header pyproject.toml --extra mcap --extra viewer --group build -o requirements.lock
-	$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
-		--no-header pyproject.toml --extra viewer --group build --group dev --group docs -c requirements.lock -o requirements-dev.lock
+	$(BIN)/python tools/extension_requirements.py | \
+		$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
+		--no-header pyproject.toml - --extra viewer --group build --group dev --group docs -c requirements.lock -o requirements-dev.lock
 	$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 		--no-header pyproject.toml --extra lab --extra viewer -c requirements-dev.lock -o requirements-lab.lock
 	$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
@@ -215,8 +223,9 @@ $(VENV)/.installed-lab: requirements-lab.lock $(VENV)/.installed
 	@$(PIP) -r requirements-lab.lock
 	@touch $@
 
-$(VENV)/.installed-dev: requirements-dev.lock $(VENV)/.installed
+$(VENV)/.installed-dev: requirements-dev.lock $(EXTENSIONS:=/pyproject.toml) $(VENV)/.installed
 	@echo "installing development tools ..."
 	@# A tool's modules are compiled when it first runs: most never are.
 	@$(PIP) --no-compile -r requirements-dev.lock
+	@$(EDITABLE) $(addprefix -e ,$(EXTENSIONS))
 	@touch $@

@@ -1,4 +1,4 @@
-"""Files that come with noack, found by name: scenarios and campaigns."""
+"""Files that come with noack and its extensions, found by name: scenarios and campaigns."""
 
 import re
 import tomllib
@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from noack.core.errors import CallerError, did_you_mean, shortened
-from noack.core.file_access import shipped_folder
+from noack.core.file_access import shipped_files
 
 KINDS = ("scenarios", "campaigns")
 """Kinds of shipped files, and their folders."""
@@ -61,7 +61,7 @@ def find_shipped(name: str, folder: str) -> Path:
 
 def shipped_names(folder: str) -> list[str]:
     """Return the names of the scenarios or campaigns that come with noack."""
-    return sorted(file.stem for file in shipped_folder(folder).glob("*.toml"))
+    return [*shipped_files(folder)]
 
 
 def all_shipped(folder: str) -> list[ShippedFile]:
@@ -92,5 +92,5 @@ def text_of(name: str) -> str:
 
 def _path_of(name: str, folder: str) -> Path:
     """Return the path of a shipped file, relative to the working directory if inside it."""
-    path = shipped_folder(folder) / f"{name}.toml"
+    path = shipped_files(folder)[name]
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path

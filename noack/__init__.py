@@ -28,10 +28,9 @@ else:
 
 __all__ = [
     "CampaignResult", "Certificates", "Curve", "CurveStyle", "ExactRun", "Explorer", "Measurement",
-    "NoackError", "Run", "Scenario", "__version__", "campaign", "certify", "compare", "cost",
-    "explore", "from_system", "gain", "linearise", "load", "margin", "measure", "new", "open_run",
-    "run", "save_tables", "scenarios", "simulate", "simulate_exactly",
-    "with_settings",
+    "NoackError", "Run", "Scenario", "VirtualNetwork", "__version__", "campaign", "certify", "compare",
+    "cost", "explore", "from_system", "gain", "linearise", "load", "margin", "measure", "new", "open_run",
+    "run", "save_tables", "scenarios", "simulate", "simulate_exactly", "with_settings",
 ]  # fmt: skip
-_NOT_EVERYWHERE = ("LossyChannel", "LossyUdp")
-"""Names that need an extra, or Linux: no star import takes them."""
+_NOT_EVERYWHERE = ("ExportedRun", "LossyUdp")
+"""Names that are for extensions, or need Linux: no star import takes them."""

@@ -16,6 +16,7 @@ from typing import Any
 # Before numpy is imported: threads slow small matrices down.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 os.environ["MPLBACKEND"] = "Agg"  # no window, also where there is a display
+os.environ["NOACK_NO_EXTENSIONS"] = "1"  # their tests are beside them, in a run of their own
 
 import pytest
 from hypothesis import HealthCheck, settings

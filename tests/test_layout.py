@@ -14,12 +14,13 @@ from native.build import HEADER
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("noack", "plant_server", "sensor_node", "controller_node", "netem", "cosim")
+EXTENSIONS = sorted(str(path.relative_to(ROOT)) for path in ROOT.glob("extensions/*/noack_*"))
 
 
 def test_names_of_classes_are_unique() -> None:
     names = Counter(
         node.name
-        for folder in (*PACKAGES, "benchmarks")
+        for folder in (*PACKAGES, "benchmarks", *EXTENSIONS)
         for path in (ROOT / folder).rglob("*.py")
         if path.name != HEADER
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
@@ -43,6 +44,20 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
     assert {name for name, place in number.items() if (label == label[place]).sum() > 1} == set()
 
 
+def test_an_extension_imports_public_names_alone() -> None:
+    imports = {
+        (path.name, module)
+        for folder in EXTENSIONS
+        for path in (ROOT / folder).rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for module in ([node.module or ""] if isinstance(node, ast.ImportFrom) else
+                       [alias.name for alias in node.names] if isinstance(node, ast.Import) else [])
+    }  # fmt: skip
+    ours = {(name, module) for name, module in imports if module.split(".")[0] in PACKAGES}
+    assert len(ours) > 2
+    assert [(name, module) for name, module in ours if module not in ("noack", "noack.extend")] == []
+
+
 WALL_CLOCK = {
     "noack/runtime/command_line.py": "lines of the log",
     "noack/plants/systems/code_cache.py": "ages of files",
@@ -61,7 +76,7 @@ def test_no_time_of_a_run_is_read_from_the_wall_clock() -> None:
     reads = re.compile(r"\btime\.time(_ns)?\(|CLOCK_REALTIME\)|datetime\.(now|today)\(|utcnow")
     readers = {
         str(path.relative_to(ROOT))
-        for folder in (*PACKAGES, "native")
+        for folder in (*PACKAGES, "native", *EXTENSIONS)
         for path in (ROOT / folder).rglob("*.[pc]*")
         if path.suffix in (".py", ".c") and reads.search(path.read_text())
     }

@@ -5,7 +5,6 @@
 
 from importlib import import_module
 from importlib.metadata import version
-from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from cosim.analysis.certificates import Certificates as Certificates
@@ -25,23 +24,23 @@ from cosim.api.scenarios import from_system as from_system
 from cosim.api.scenarios import load as load
 from cosim.api.scenarios import scenarios as scenarios
 from cosim.api.scenarios import with_settings as with_settings
+from cosim.api.virtual_network import VirtualNetwork as VirtualNetwork
 from cosim.output.curves import Curve as Curve
 from cosim.output.curves import CurveStyle as CurveStyle
 from cosim.studies.new_loop.linear_model import gain as gain
 from cosim.studies.new_loop.linear_model import linearise as linearise
 from cosim.studies.new_loop.new_scenario import new as new
 from noack.core.core_library import require_live_runs
-from noack.core.errors import CallerError as _CallerError
 from noack.core.errors import NoackError as NoackError
 from noack.scenario.scenario import Scenario as Scenario
 
 if TYPE_CHECKING:
     from cosim.api.campaigns import CampaignResult as CampaignResult
     from cosim.api.campaigns import campaign as campaign
-    from cosim.api.lossy_channel import LossyChannel as LossyChannel
     from cosim.api.measurements import Measurement as Measurement
     from cosim.api.measurements import measure as measure
     from cosim.api.tables import save_tables as save_tables
+    from cosim.output.export.export_formats import ExportedRun as ExportedRun
     from netem.lossy_udp import LossyUdp as LossyUdp
 
 _LATER = {
@@ -50,10 +49,10 @@ _LATER = {
     "Measurement": "cosim.api.measurements",
     "measure": "cosim.api.measurements",
     "save_tables": "cosim.api.tables",
-    "LossyChannel": "cosim.api.lossy_channel",
+    "ExportedRun": "cosim.output.export.export_formats",
     "LossyUdp": "netem.lossy_udp",
 }
-"""Names whose modules import scipy's statistics or matplotlib, need an extra, or need Linux."""
+"""Names whose modules import scipy's statistics or matplotlib, or need Linux."""
 
 __version__ = version("noack")
 
@@ -64,10 +63,6 @@ def __getattr__(name: str) -> object:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     if name == "LossyUdp":
         require_live_runs()
-    if name == "LossyChannel" and find_spec("gymnasium") is None:
-        raise _CallerError(
-            "noack.LossyChannel needs a package that is not installed; pip install 'noack[gymnasium]'"
-        )
     return _public(getattr(import_module(_LATER[name]), name))
 
 

@@ -37,9 +37,6 @@ from noack.scenario.scenario import Scenario
 
 T = TypeVar("T")
 EXTRAS = {
-    "fmi": ("fmpy", 'plants of kind "fmu"'),
-    "gymnasium": ("gymnasium", 'plants of kind "gymnasium"'),
-    "mujoco": ("mujoco", 'environments of MuJoCo as plants of kind "gymnasium"'),
     "regions": ("flint", "certificates of nonlinear plants on a region"),
     "vehicle": ("vehiclemodels", 'plants of kind "vehicle"'),
     "cluster": ("distributed", "`noack campaign --scheduler`"),

@@ -225,7 +225,7 @@ def _code(content: ReadTable) -> list[object]:
         table
         for table in tables
         if isinstance(table, Mapping)
-        and ("file" in table or {"python", "fmu"} & {table.get("kind"), table.get("policy")})
+        and ("file" in table or "python" in (table.get("kind"), table.get("policy")))
     ]
 
 

@@ -47,14 +47,14 @@ def parts(package: str | None, group: str, read: Callable[[ModuleType], Part | N
 
     Args:
         package: the package of noack; None if noack itself has no such part.
-        group: the group of entry points.
+        group: the group of entry points; empty if extensions have no such part.
         read: returns the part that a module defines, or None.
     """
     path = import_module(package).__path__ if package is not None else ()
     for entry in iter_modules(path, f"{package}."):
         if not entry.ispkg and (part := read(import_module(entry.name))) is not None:
             yield part
-    for point in _entry_points():
+    for point in _entry_points() if group else ():
         if point.group != group or (point.attr and group in WITH_CLASSES):
             continue
         try:

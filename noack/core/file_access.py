@@ -4,12 +4,15 @@ import errno
 import os
 import shutil
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
+from types import ModuleType
 from typing import IO, NamedTuple
 
 from noack.core.errors import CallerError, MachineError, printable, why
+from noack.core.extension_points import parts
 
 with suppress(ImportError):  # Windows has other locks
     import fcntl
@@ -25,11 +28,25 @@ _SAFE_FLAGS = _UNBLOCKED_FLAGS | (os.O_NOFOLLOW | os.O_CLOEXEC if _HAS_LINKS els
 """Follow no link, and do not wait for the reader of a FIFO."""
 
 
-def shipped_folder(name: str) -> Path:
-    """Return the folder of files that come with noack: in the package, or in the repository."""
+@cache
+def shipped_files(kind: str) -> Mapping[str, Path]:
+    """Return the TOML files that come with noack and its extensions by their names, sorted.
+
+    Those of noack are in the package, or in the repository, those of an extension beside a module.
+
+    Args:
+        kind: scenarios or campaigns.
+    """
+
+    def folder_of(module: ModuleType) -> Path | None:
+        return Path(module.__file__).parent if module.__file__ else None
+
     root = Path(__file__).parents[2]
-    packaged = root / "cosim" / name
-    return packaged if packaged.is_dir() else root / name
+    packaged = root / "cosim" / kind
+    own = packaged if packaged.is_dir() else root / kind
+    folders = [*parts(None, f"noack.{kind}", folder_of), own]  # noack's own last, which win
+    files = {file.stem: file for folder in folders for file in folder.glob("*.toml")}
+    return dict(sorted(files.items()))
 
 
 def require_suffix(path: Path, option: str, suffix: str) -> None:

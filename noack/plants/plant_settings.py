@@ -86,6 +86,21 @@ class PlantStart(NamedTuple):
     """Step of the plant."""
 
 
+class PlantOutline(NamedTuple):
+    """What a plant's settings say of it without a scenario."""
+
+    n: int
+    """Number of states."""
+    m: int
+    """Number of inputs."""
+    states: tuple[str, ...] | None = None
+    """Names of the states, if they have any."""
+    inputs: tuple[str, ...] | None = None
+    """Names of the inputs, if they have any."""
+    rate_hz: float | None = None
+    """Steps per second, if only steps of one length are possible."""
+
+
 class PlantSettings(ScenarioSection):
     """Settings of a plant."""
 
@@ -97,6 +112,8 @@ class PlantSettings(ScenarioSection):
     """The module that this kind needs, and the extra of noack that installs it."""
     has_own_step: ClassVar[bool] = False
     """Whether the system makes steps of one length only, which the plant's rate must be."""
+    has_operating_point: ClassVar[bool] = False
+    """Whether it has ``operating_state`` and ``operating_input``, from which x and u deviate."""
     has_equations: ClassVar[bool] = False
     """Whether the system may have equations that can be enclosed, for a certificate on a region."""
     runs_user_code: ClassVar[bool] = False
@@ -118,6 +135,25 @@ class PlantSettings(ScenarioSection):
     def internal_names(self) -> tuple[str, ...]:
         """Names of the entries of z that are recorded; empty if z is not recorded."""
         return ()
+
+    @classmethod
+    def named_by(cls, label: str) -> Table | None:
+        """Return the table ``plant.system`` of the plant that a text names; None if it names none.
+
+        With it, ``noack linearise``, ``gain`` and ``new`` take such a text, e.g. a file's name.
+
+        Raises:
+            CallerError: the text names a plant that cannot be read.
+        """
+        return None
+
+    def outline(self) -> PlantOutline | None:
+        """Return what the settings say of the plant; None if they do not determine its size.
+
+        Raises:
+            CallerError: the plant cannot be read.
+        """
+        return None
 
     def check(self, n: int, m: int) -> None:
         """Require that this kind of plant can have n states and m inputs.

@@ -16,7 +16,7 @@ from pathlib import Path
 import tomli_w
 
 from noack.core.errors import CallerError, did_you_mean, printable, shortened
-from noack.core.file_access import shipped_folder
+from noack.core.file_access import shipped_files
 from noack.scenario import toml_file
 from noack.scenario.matrix_files import with_matrices
 from noack.scenario.overload import refuse_overload
@@ -159,13 +159,13 @@ def _loop_tables(path: Path, setting: str) -> Table:
 
 def _path(name: str, folder: Path, setting: str) -> Path:
     """Return the path of a file, or of the shipped scenario of that name."""
-    shipped = {file.stem: file for file in shipped_folder("scenarios").glob("*.toml")}
+    shipped = shipped_files("scenarios")
     with suppress(OSError, ValueError):  # too long, or with a zero byte
         if name and (path := folder / name).exists():
             return path
     if name in shipped:
         return shipped[name]
-    names = [*sorted(shipped), *sorted(file.name for file in folder.glob("*.toml"))]
+    names = [*shipped, *sorted(file.name for file in folder.glob("*.toml"))]
     hint = did_you_mean(name, names) or "`noack scenarios` lists the shipped ones"
     raise CallerError(f"{setting}: no such file, nor a shipped scenario; {hint}")
 

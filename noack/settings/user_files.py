@@ -1,7 +1,7 @@
 """Files that a scenario names; relative names are relative to the scenario file.
 
-The content of data files is read into the scenario. Files that a run executes (an FMU, a Python
-source file) are not: a loaded scenario holds their absolute paths and their SHA-256, and a run
+The content of data files is read into the scenario. Files that a run executes (a Python source
+file, a model) are not: a loaded scenario holds their absolute paths and their SHA-256, and a run
 refuses a file with another SHA-256.
 
 A user's class is in a Python source file or in an installed package. Its code runs in the process
@@ -31,7 +31,6 @@ UserCode = Any
 MOST_BYTES = 64 * 2**20
 """Largest size of a file that is read completely."""
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
-FileSettingsT = TypeVar("FileSettingsT", bound="FileSettings")
 SectionT = TypeVar("SectionT", bound=BaseModel)
 
 FILE_TABLES = ("plant.system", "trigger", "controller")
@@ -110,14 +109,14 @@ def with_tables(section: SectionT, tables: Mapping[str, BaseModel]) -> SectionT:
     return section.model_copy(update=update)
 
 
-def with_absolute_path(settings: FileSettingsT, folder: Path, place: str) -> FileSettingsT:
+def with_absolute_path(settings: SectionT, folder: Path, place: str) -> SectionT:
     """Return settings with the absolute path of their file (relative to a folder), and its SHA-256.
 
     If a SHA-256 is already given, it is used and the file is not read: so the record of a run can
     be read without the file. Settings that name no file are returned unchanged. Raise CallerError
     if the file cannot be read; ``place`` names the table.
     """
-    if settings.file is None:
+    if not isinstance(settings, FileSettings) or settings.file is None:
         return settings
     file = NamedFile(settings.file, folder, place)
     sha256 = settings.sha256 or file.sha256()

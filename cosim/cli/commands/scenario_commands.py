@@ -29,8 +29,8 @@ PlantArgument = Annotated[
     str,
     Argument(
         metavar="PLANT",
-        help="FILE.py:Class, FILE.fmu, gymnasium:ID, a kind of plant such as cart_pole, a "
-        "scenario, or a file that linearise or gain wrote.",
+        help="FILE.py:Class, a kind of plant such as cart_pole, a scenario, or a file that "
+        "linearise or gain wrote.",
     ),
 ]
 

@@ -1,17 +1,23 @@
 """The formats of exports, and what they write: a run, or one of its loops."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Protocol, runtime_checkable
 
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
 from cosim.analysis.summary.summary_model import read_summary
+from cosim.record import data_frames
 from cosim.record.run_directory import ENVIRONMENT_FILE, SUMMARY_FILE, read_object
-from cosim.record.run_record import RunRecord, load_run
+from cosim.record.run_record import Notice, RunRecord, load_run
 from noack.core.errors import CallerError
 from noack.core.extension_points import missing_extension, parts
+from noack.scenario.scenario import Scenario
 
 _ENDING = "_export"
 
@@ -42,6 +48,42 @@ class ExportedRun:
     """Of the loop; empty for the run itself."""
     phase_ns: int = 0
     """Time of the run at which the loop's own time begins."""
+
+    @property
+    def scenario(self) -> Scenario:
+        """The resolved scenario of the loop, or of the run."""
+        return self.record.scenario
+
+    @property
+    def tables(self) -> Mapping[str, np.dtype[np.void]]:
+        """The tables of the record, each with the type of its rows; ``docs/record.md`` has them."""
+        return self.record.tables
+
+    @property
+    def is_network(self) -> bool:
+        """Whether this is the network of several loops, of which ``loops`` has the others' tables."""
+        return self.record.is_network
+
+    @property
+    def names(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Names of the loop's states and of its inputs."""
+        return self.record.loop.state_names, self.record.loop.input_names
+
+    @property
+    def notices(self) -> Sequence[Notice]:
+        """The lines of the run's log, each with ``t_ns``, ``level``, ``text`` and ``process``."""
+        return self.record.notices
+
+    def parts(self, *tables: str) -> Iterator[Mapping[str, NDArray[np.void]]]:
+        """Yield the rows of some tables, as structured arrays, in consecutive parts of the run.
+
+        A short run is one part. Those of a long one fit into memory.
+        """
+        return self.record.slices(*tables)
+
+    def samples(self) -> pa.Table:
+        """Return plant, sensor and controller of a loop on one time grid, as ``noack.Run.samples``."""
+        return data_frames.samples(self.record)
 
     @property
     def environment(self) -> dict[str, object]:

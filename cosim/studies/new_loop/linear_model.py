@@ -14,7 +14,6 @@ from cosim.studies.new_loop.plant_reference import PlantReference, plant_referen
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, norm
 from noack.core.number_format import TextRows, as_text, to_digits
-from noack.plants.fmu import unpacked_once
 from noack.plants.systems.linearisation import LinearMotion, largest_errors
 from noack.plants.systems.linearisation import linearise as linear_motion
 from noack.scenario.sections import instability
@@ -201,7 +200,6 @@ class LoopGain:
         )
 
 
-@unpacked_once()
 def linearise(
     plant: str,
     *,
@@ -217,8 +215,8 @@ def linearise(
     4
 
     Args:
-        plant: ``"file.py:Class"``, ``"file.fmu"``, ``"gymnasium:ID"``, a kind of plant, a scenario,
-            or a file that ``noack linearise`` or ``noack gain`` wrote.
+        plant: ``"file.py:Class"``, a kind of plant, a scenario, a file that ``noack linearise`` or
+            ``noack gain`` wrote, or what a kind of an extension takes, e.g. a file.
         at: x at the point, n entries, or a number if n is 1; by default 0.
         input: u there, m entries, or a number if m is 1; by default 0.
         settings: values by the keys of a scenario, e.g. ``{"plant.system.cart_kg": 1.0}``.

@@ -39,10 +39,7 @@ from noack.core.errors import CallerError, MachineError, why
 from noack.core.file_access import new_file
 from noack.core.linear_systems import Matrix, Vector, norm
 from noack.core.number_format import at_most, to_digits
-from noack.plants.fmu import FmuSettings
-from noack.plants.gymnasium import GymnasiumSettings
 from noack.plants.linear import LinearSettings
-from noack.plants.python_plant import PythonPlantSettings
 from noack.scenario.resolution import resolve, resolve_run
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import completed, put, toml_text
@@ -51,7 +48,6 @@ from noack.theory.certificates.certified_bounds import ScenarioCertificate, enve
 from noack.theory.certificates.conditions import nominal_conditions
 from noack.theory.certificates.scenario_certificates import own_plant_scope
 
-_PLANTS_WITH_FILE = (FmuSettings, GymnasiumSettings, PythonPlantSettings)
 _FLOOR_SHARE = 0.05
 """The floor of the threshold, as a share of beta."""
 _FASTEST_ALPHA_PER_S = 1.0
@@ -164,7 +160,7 @@ def new(
 
 def _require_rest(model: LinearModel) -> None:
     label, is_moved = model.plant.label, model.at.any() or model.input.any()
-    if is_moved and not isinstance(model.plant.system, FmuSettings):
+    if is_moved and not model.plant.system.has_operating_point:
         raise CallerError(
             f"{label}: a scenario needs x and u as deviations from its operating point; let the "
             "plant subtract this point, and linearise it at 0"
@@ -266,10 +262,10 @@ class _TrialScenarios:
         """Return the table plant.system, with a file's name relative to the scenario's folder."""
         system, model = self._model.plant.system, self._model
         table = system.content()
-        if isinstance(system, _PLANTS_WITH_FILE) and system.file is not None:
-            table["file"] = os.path.relpath(system.file, self._path.absolute().parent)
+        if isinstance(file := table.get("file"), str):
+            table["file"] = os.path.relpath(file, self._path.absolute().parent)
             table.pop("sha256", None)
-        if isinstance(system, FmuSettings):
+        if system.has_operating_point:
             for key, value in (("operating_state", model.at), ("operating_input", model.input)):
                 if value.any():
                     table[key] = (value + np.array(getattr(system, key) or 0.0)).tolist()

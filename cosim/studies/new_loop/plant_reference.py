@@ -1,8 +1,8 @@
-"""What PLANT may be on the command line: a class, an FMU, a kind of plant, an environment."""
+"""What PLANT may be on the command line: a class, a kind of plant, or what a kind gives a name."""
 
 import ast
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import product
@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from cosim.shipped_files import find_shipped, shipped_names
+from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, did_you_mean
+from noack.core.extension_points import missing_extension
 from noack.core.linear_systems import Matrix, Vector
-from noack.plants.fmu import FmuSettings, variables_of
-from noack.plants.gymnasium import GymnasiumSettings
 from noack.plants.linear import LinearSettings
 from noack.plants.plant_settings import PlantSettings, PlantStart, PlantSystem
 from noack.plants.python_plant import PythonPlantSettings
@@ -25,15 +25,13 @@ from noack.scenario.sections import PLANTS
 from noack.settings.section import ReadTable, Table
 from noack.settings.user_files import with_absolute_path
 
-_GYMNASIUM = "gymnasium:"
-"""What the name of an environment begins with."""
 _LARGEST_TRIED_SIZE = 16
 """Largest number of states and of inputs that is tried with a class that names neither."""
 _KINDS = sorted(kind for kind, plant in PLANTS.items() if plant.scenario and plant is not LinearSettings)
 """Kinds that name a plant by themselves."""
 _FORMS = (
-    f"PLANT is FILE.py:Class, FILE.fmu, gymnasium:ID, a kind of plant ({', '.join(_KINDS)}), a "
-    "scenario, or a file that `noack linearise` or `noack gain` wrote"
+    f"PLANT is FILE.py:Class, a kind of plant ({', '.join(_KINDS)}), a scenario, or a file that "
+    "`noack linearise` or `noack gain` wrote"
 )
 
 
@@ -70,10 +68,8 @@ class PlantReference:
 
     @property
     def step_ns(self) -> int:
-        """Step of its motion: that of an environment, or 10 ms."""
-        if isinstance(self.system, GymnasiumSettings):
-            return round(1e9 / self.rate_hz)
-        return STEP_NS
+        """Step of its motion: its own, if it makes no others, or 10 ms."""
+        return round(NS_PER_S / self.rate_hz) if self.system.has_own_step else STEP_NS
 
     @property
     def rate_hz(self) -> float:
@@ -113,12 +109,11 @@ def plant_reference(
         raise CallerError(f"--set plant.system: the plant is {label}; set its values, one by one")
     system = _validated_settings(plant["system"], label)
     rates = {key: _positive_rate(key, plant[key]) for key in ("rate_hz", "measure_every") if key in plant}
-    if isinstance(system, GymnasiumSettings):
-        return _of_environment(label, settings, system)
-    if isinstance(system, FmuSettings):
-        n, m = len(system.state_variables), len(system.input_variables)
-        names = _plain_names(system.state_variables), _plain_names(system.input_variables)
-        return PlantReference(label, settings, system, n, m, names, rates)
+    if (outline := system.outline()) is not None:
+        if outline.rate_hz is not None:
+            rates = {"rate_hz": float(f"{outline.rate_hz:.12g}")}
+        names = _plain_names(outline.states), _plain_names(outline.inputs)
+        return PlantReference(label, settings, system, outline.n, outline.m, names, rates)
     if isinstance(system, PythonPlantSettings):
         n, m = _sizes_of_class(system, label, sizes)
         return PlantReference(label, settings, system, n, m, (None, None), rates)
@@ -132,18 +127,20 @@ def plant_reference(
 def _system_table(label: str) -> Table | None:
     """Return the table plant.system that a text names; None if it may be a scenario."""
     file, colon, name = label.rpartition(":")
-    if label.startswith(_GYMNASIUM):
-        return {"kind": "gymnasium", "id": label.removeprefix(_GYMNASIUM)}
+    for kind in PLANTS.values():
+        if (table := kind.named_by(label)) is not None:
+            return table
     if label.endswith(".py"):
         raise CallerError(f"{label}: which class of it? {_class_hint(Path(label))}")
     if colon and file.endswith(".py"):
         return {"kind": "python", "file": file, "name": name}
-    if label.endswith(".fmu"):
-        return {"kind": "fmu", "file": label}
     if label in PLANTS:
         if label not in _KINDS:
             raise CallerError(f"{label}: names no plant by itself; {_FORMS}")
         return {"kind": label}
+    for kind_name in (label.partition(":")[0], Path(label).suffix.removeprefix(".")):
+        if missing := missing_extension("noack.plants", kind_name):
+            raise CallerError(f"{label}: {missing}")
     return {"kind": "python", "name": label} if colon else None
 
 
@@ -162,15 +159,11 @@ def _class_hint(path: Path) -> str:
 
 
 def _validated_settings(table: object, label: str) -> PlantSettings:
-    """Return validated settings whose file is found; an FMU may lack the names of variables."""
+    """Return validated settings whose file is found."""
     assert isinstance(table, dict)
-    if table["kind"] == "fmu" and not {"state_variables", "input_variables"} <= table.keys():
-        table = variables_of(Path(str(table["file"]))) | table
     system = toml_file.validated(PLANTS[str(table["kind"])], table, f"{label}: plant.system")
     system.require_installed()
-    if isinstance(system, FmuSettings | GymnasiumSettings | PythonPlantSettings):
-        return with_absolute_path(system, Path.cwd(), "plant.system")
-    return system
+    return with_absolute_path(system, Path.cwd(), "plant.system")
 
 
 def _of_scenario(label: str, settings: ReadTable) -> PlantReference:
@@ -205,14 +198,8 @@ def _of_scenario(label: str, settings: ReadTable) -> PlantReference:
     )
 
 
-def _of_environment(label: str, settings: ReadTable, system: GymnasiumSettings) -> PlantReference:
-    environment = system.environment()
-    rates = {"rate_hz": float(f"{1 / environment.step_s:.12g}")}
-    return PlantReference(label, settings, system, environment.n, environment.m, (None, None), rates)
-
-
-def _plain_names(names: Sequence[str]) -> tuple[str, ...]:
-    return tuple(re.sub(r"\W", "_", name) for name in names)
+def _plain_names(names: tuple[str, ...] | None) -> tuple[str, ...] | None:
+    return names and tuple(re.sub(r"\W", "_", name) for name in names)
 
 
 def _sizes_of_class(

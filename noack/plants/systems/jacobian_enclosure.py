@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
-from noack.core.errors import NoackError
+from noack.core.errors import NoackError, one_line
 from noack.core.linear_systems import Matrix, Vector
 from noack.plants.plant_settings import PlantSystem
 
@@ -330,7 +330,10 @@ class EnclosedMotion:
         x, u = np.split(np.array(enclosed, dtype=object), [self.n])
         of_time = [_ball(float(j == len(enclosed))) for j in coordinates]
         time = Enclosed(_ball(_LONGEST_S / 2, _LONGEST_S / 2), of_time)
-        expressions = self.system.expressions(time, x, u)  # type: ignore[attr-defined]
+        try:
+            expressions = self.system.expressions(time, x, u)  # type: ignore[attr-defined]
+        except TypeError as error:  # of an extension that uses math.sin
+            raise NotEnclosedError(f"its equations are for floats alone: {one_line(error)}") from None
         if expressions is None:
             raise NotEnclosedError("x is neither its state nor its state minus a constant")
         rates, states = (

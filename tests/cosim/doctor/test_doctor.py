@@ -34,7 +34,7 @@ IDEAL = MachineFacts(
     timer_resolution_ns=1, timer_slack_ns=50_000, plain=PROMPT, realtime=PROMPT,
     round_trips=RoundTrips(1000, 0, 20.0, 60.0), buffer=Buffer(10_000, 8_388_608, 4_194_304),
     ports_taken=(), control=1e-3, disk=Disk("runs", 10**10, 10**7, 5e8), runtime_folder=None,
-    display=True, viewer="0.41.0", extras={"fmi": True, "vehicle": True},
+    display=True, viewer="0.41.0", extras={"cluster": True, "vehicle": True},
     versions={"python": "3.12.1", "noack": "0.1.0"},
 )  # fmt: skip
 
@@ -72,7 +72,7 @@ def test_a_machine_without_limits_is_good() -> None:
     ("runtime folder", {"runtime_folder": "/run/x: must be yours"}, MachineVerdict.LIMITED),
     ("viewer", {"display": False}, MachineVerdict.LIMITED),
     ("viewer", {"viewer": None}, MachineVerdict.LIMITED),
-    ("extra: fmi", {"extras": {"fmi": False}}, MachineVerdict.LIMITED),
+    ("extra: cluster", {"extras": {"cluster": False}}, MachineVerdict.LIMITED),
     ("versions", {"versions": {"python": "3.12.1", "noack": None}}, MachineVerdict.LIMITED),
 ])  # fmt: skip
 def test_each_finding_has_a_verdict_and_a_remedy(

@@ -41,7 +41,7 @@ def run(folder: Path, *words: str, **environment: str) -> tuple[str, list[str]]:
     """Run Python where the packages of a folder are installed; return its output and its warnings."""
     done = subprocess.run(
         [sys.executable, *words],
-        env={**os.environ, "PYTHONPATH": str(folder), **environment},
+        env={**os.environ, NO_EXTENSIONS: "", "PYTHONPATH": str(folder), **environment},
         capture_output=True,
         text=True,
         check=True,

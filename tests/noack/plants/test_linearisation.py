@@ -6,11 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.linalg import expm, logm
 
-from noack.core.errors import CallerError
-from noack.plants.gymnasium import GymnasiumSettings
-from noack.plants.plant_settings import OdeSystem, PlantEquations, PlantStart, SystemFailedError
+from noack.plants.plant_settings import OdeSystem, PlantEquations
 from noack.plants.systems.linearisation import (
     NO_LOGARITHM,
     NOT_FINITE,
@@ -118,37 +115,3 @@ def test_dry_friction_is_found_by_the_error() -> None:
     linear = linearise(at, 1, 1, x0=x)
     assert largest_errors(at, linear, np.full(2, 0.1), x0=x, u0=u)[0] == 0.0
     assert largest_errors(at, linear, np.full(2, 0.5), x0=x, u0=u)[0] > 0.1
-
-
-def start(n: int = 2, m: int = 1, step_ns: int = 50_000_000) -> PlantStart:
-    return PlantStart(np.zeros(n), np.zeros((n, n)), np.zeros((n, m)), step_ns)
-
-
-def test_the_pendulum_of_gymnasium_has_the_logarithm_of_its_step() -> None:
-    """ω' = ω + (15 sin θ + 3u) h and θ' = θ + ω' h, with θ = 0 upright, h = 0.05 s."""
-    pytest.importorskip("gymnasium", reason="the extra `gymnasium` is not installed")
-    settings, h = GymnasiumSettings(kind="gymnasium", id="Pendulum-v1"), 0.05
-    linear = linearise(lambda x0: settings.system(start()._replace(x0=x0)), 2, 1, step_ns=round(h * 1e9))
-    step = np.array([[1 + 15 * h * h, h, 3 * h * h], [15 * h, 1, 3 * h], [0, 0, 1]])
-    expected = logm(step) / h
-    np.testing.assert_allclose(linear.A, expected[:2, :2], atol=1e-6)
-    np.testing.assert_allclose(linear.B, expected[:2, 2:], atol=1e-6)
-    np.testing.assert_allclose(expm(linear.A * h), step[:2, :2], atol=1e-7)
-    moved = settings.system(start()._replace(x0=np.array([0.1, 0.2])))
-    moved.advance(np.array([0.5]), 0, 50_000_000)
-    speed = 0.2 + (15 * math.sin(0.1) + 1.5) * h
-    np.testing.assert_allclose(moved.x, [0.1 + speed * h, speed], rtol=1e-12)
-
-
-def test_an_environment_that_fails_stops_the_motion(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("gymnasium", reason="the extra `gymnasium` is not installed")
-    made = GymnasiumSettings(kind="gymnasium", id="Pendulum-v1").system(start())
-    monkeypatch.setattr(made._environment, "step", lambda u: 1 / 0)
-    with pytest.raises(SystemFailedError, match=r"Pendulum-v1.*ZeroDivisionError"):
-        made.advance(np.zeros(1), 0, 50_000_000)
-
-
-def test_without_gymnasium_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("noack.plants.plant_settings.find_spec", lambda name: None)
-    with pytest.raises(CallerError, match=r"pip install 'noack\[gymnasium\]'"):
-        GymnasiumSettings(kind="gymnasium", id="Pendulum-v1").system(start())

@@ -1,4 +1,4 @@
-"""Runs with a user's plant, a class or an FMU: moved, stored, replayed, failed, refused."""
+"""Runs with a user's plant, a class: stored, replayed, failed, refused."""
 
 import json
 import shutil
@@ -9,17 +9,13 @@ import numpy as np
 import pytest
 
 from cosim.analysis.replay import replay
-from cosim.analysis.summary.plant_linearisation import linearisation
-from cosim.analysis.summary.summary_model import NoLinearisationPart
 from cosim.live.finalize import finalize
 from cosim.record.run_record import load_record
 from cosim.simulation.virtual_time import simulate_run
 from noack.core.errors import CallerError
 from noack.protocol.record_tables import PLANT_STEP
-from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
 from tests.helpers.command_line import invoke
-from tests.plant_server.fmus.build import build
 
 PLANT_SCENARIO = """
 name = "own"
@@ -39,10 +35,6 @@ floor = 0.002
 mansd = 3
 loss = { model = "bernoulli", probability = 0.5 }
 """
-FMU = (
-    '{ kind = "fmu", file = "models/oscillator.fmu", on_record = ["energy"], '
-    'state_variables = ["x0", "x1"], input_variables = ["u"], parameters = PARAMETERS }'
-)
 PYTHON = '{ kind = "python", file = "models/mine.py", name = "VanDerPol", parameters = PARAMETERS }'
 PLANT_CODE = """
 class VanDerPol:
@@ -68,29 +60,8 @@ def simulated(path: Path, horizon_s: float = 1.0) -> Path:
     return simulate_run(load(path, [f"horizon_s={horizon_s}"]), path.parent / "runs").run_dir
 
 
-@pytest.mark.parametrize("version", [2, 3])
-def test_an_fmu_moves_like_a_python_class_with_the_same_equations(version: int, tmp_path: Path) -> None:
-    path = prepared(tmp_path, FMU, "{ mu = 1.0 }")
-    build(tmp_path, version).rename(tmp_path / "models" / "oscillator.fmu")
-    of_fmu = load_record(simulated(path, 3.0))
-    path.write_text(PLANT_SCENARIO.replace("SYSTEM", PYTHON).replace("PARAMETERS", "{ mu = 1.0 }"))
-    of_class = load_record(simulated(path, 3.0))
-    x = of_fmu[PLANT_STEP]["x"]
-    np.testing.assert_allclose(x, of_class[PLANT_STEP]["x"], atol=1e-9)
-    assert np.linalg.norm(x[-1]) < 0.2  # the loop is closed
-    energy = (x**2).sum(axis=1, keepdims=True) / 2
-    np.testing.assert_allclose(of_fmu[PLANT_STEP]["z"], energy, rtol=1e-12)
-    assert replay(of_fmu).bit_exact
-    assert replay(of_class).bit_exact
-    path.write_text(PLANT_SCENARIO.replace("SYSTEM", FMU).replace("PARAMETERS", "{}, initial_variables = []"))
-    at_rest = resolve(load(path, ["plant.initial_state=[0.0, 0.0]"]))
-    assert isinstance(linearisation(at_rest), NoLinearisationPart)
-
-
-@pytest.mark.parametrize("kind", ["fmu", "python"])
-def test_a_run_stores_its_plant_and_is_replayed_without_the_original(kind: str, tmp_path: Path) -> None:
-    path = prepared(tmp_path, FMU if kind == "fmu" else PYTHON, "{ mu = 2.0 }")
-    build(tmp_path, 2).rename(tmp_path / "models" / "oscillator.fmu")
+def test_a_run_stores_its_plant_and_is_replayed_without_the_original(tmp_path: Path) -> None:
+    path = prepared(tmp_path, PYTHON, "{ mu = 2.0 }")
     run_dir = simulated(path)
     shutil.rmtree(tmp_path / "models")
     elsewhere = tmp_path / "elsewhere"
@@ -104,22 +75,12 @@ def test_a_run_stores_its_plant_and_is_replayed_without_the_original(kind: str, 
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize(
-    ("kind", "parameters", "expected"),
-    [
-        ("fmu", "{ fail_at_s = 0.5, fail_status = 3 }",
-         'the plant failed at 0.502 s: plant.system.file = "oscillator.fmu": fmi2DoStep failed '
-         "with status 3 (error). (the spring broke at 0.5)"),
-        ("python", "{ broken_at_s = 0.5 }",
-         'the plant failed at 0.502 s: plant.system.name = "VanDerPol": RuntimeError: no more '
-         "grease (mine.py, line 8)"),
-    ],
-)  # fmt: skip
-def test_a_failed_plant_stops_moving_and_the_run_is_recorded(
-    kind: str, parameters: str, expected: str, tmp_path: Path
-) -> None:
-    path = prepared(tmp_path, FMU if kind == "fmu" else PYTHON, parameters)
-    build(tmp_path, 2).rename(tmp_path / "models" / "oscillator.fmu")
+def test_a_failed_plant_stops_moving_and_the_run_is_recorded(tmp_path: Path) -> None:
+    path = prepared(tmp_path, PYTHON, "{ broken_at_s = 0.5 }")
+    expected = (
+        'the plant failed at 0.502 s: plant.system.name = "VanDerPol": RuntimeError: no more '
+        "grease (mine.py, line 8)"
+    )
     ending = simulate_run(load(path), tmp_path / "runs")
     outcome = finalize(ending, report=False, view=False)
     assert outcome.status == 1
@@ -146,8 +107,6 @@ def test_check_describes_the_plant_and_refuses_invalid_settings(tmp_path: Path) 
     system: dict[str, Any] = json.loads(done.stdout)["plant"]["system"]
     assert (system["kind"], len(system["sha256"])) == ("python", 64)
     for wrong, expected in (
-        (FMU, 'plant.system.file = "models/oscillator.fmu": cannot be read: No such'),
-        (FMU.replace('"x0", ', ""), 'plant.system.state_variables = ["x1"]: expected 2 entries'),
         ('{ kind = "python", name = "a b" }', "use an entry point's name, or package.module:Class"),
         (f'{{ kind = "python", name = "a", sha256 = "{64 * "0"}" }}', "give file, too"),
         ('{ kind = "python", file = ".", name = "a" }', "cannot be read: not a regular file"),

@@ -6,7 +6,6 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -20,7 +19,6 @@ from noack.plants.systems import linearisation
 from noack.scenario.resolution import loop_of, resolve
 from tests.helpers.approved import compare_lines
 from tests.helpers.command_line import invoke
-from tests.plant_server.fmus.build import build
 
 POLE = '''
 import math
@@ -195,28 +193,6 @@ def test_the_double_integrators_gain_is_the_textbooks_whatever_plant_is_drawn() 
     assert "from the scenario's [model], which sensor and controller know" in repr(regulator)
 
 
-def test_an_fmu_is_linearised_and_its_operating_point_goes_into_the_scenario(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """ẍ = u − k x + μ (1 − x²) ẋ: [[0, 1], [−1, 1]] at 0; at x = 1 it rests with u = 1."""
-    fmpy = pytest.importorskip("fmpy")
-    unpack = Mock(wraps=fmpy.extract)
-    monkeypatch.setattr(fmpy, "extract", unpack)
-    fmu = build(folder, 2)
-    at_rest = noack.linearise(str(fmu))
-    assert unpack.call_count == 1  # for hundreds of instances
-    assert not Path(unpack.call_args.args[1]).exists()
-    np.testing.assert_allclose(at_rest.A, [[0, 1], [-1, 1]], atol=1e-4)
-    np.testing.assert_allclose(at_rest.B, [[0], [1]], atol=1e-4)
-    moved = noack.linearise(str(fmu), at=[1.0, 0.0], input=[1.0])
-    np.testing.assert_allclose(moved.A, [[0, 1], [-1, 0]], atol=1e-4)
-    made = noack.new(moved, "made.toml")
-    assert made.scenario.plant.system.content()["operating_state"] == [1.0, 0.0]
-    assert made.scenario.plant.system.content()["operating_input"] == [1.0]
-    made.save("made.toml")
-    assert noack.simulate(noack.load("made.toml", {"horizon_s": 0.5})).ok
-
-
 def test_a_plant_that_makes_its_own_steps_is_linearised() -> None:
     model = noack.linearise("pole.py:Stepped")
     np.testing.assert_allclose([model.A[0, 0], model.B[0, 0]], [-2.0, 1.0], atol=1e-6)
@@ -261,7 +237,6 @@ def test_a_stable_uncontrollable_part_stays_where_it_is() -> None:
 
 def test_the_lines_about_mistakes_are_those_that_were_approved() -> None:
     pytest.importorskip("vehiclemodels")
-    pytest.importorskip("fmpy")
 
     def mistake(line: str) -> list[str]:
         result = invoke(*line.split())
@@ -286,13 +261,3 @@ def test_a_damaged_file_of_a_model_is_refused(edit: dict[str, Any], reason: str)
     Path("model.json").write_text(json.dumps(document | edit))
     with pytest.raises(CallerError, match=reason):
         noack.new("model.json")
-
-
-def test_a_gymnasium_environment_becomes_a_scenario() -> None:
-    pytest.importorskip("gymnasium", reason="the extra `gymnasium` is not installed")
-    made = noack.new("gymnasium:Pendulum-v1", "made.toml", settings={"network.mansd": 0})
-    made.save("made.toml")
-    assert made.scenario.plant.rate_hz == 20.0
-    run = noack.simulate("made.toml")
-    assert run.ok
-    assert run.replay().bit_exact

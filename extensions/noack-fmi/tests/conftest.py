@@ -7,8 +7,11 @@ import zipfile
 from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp
+from typing import Protocol
 
+import fmpy
 import pytest
+from fmpy import fmi2, fmi3
 
 SOURCE = Path(__file__).with_name("oscillator.c")
 VARIABLES = (
@@ -28,9 +31,18 @@ VARIABLES = (
 _TYPES_3 = {"Real": "Float64", "Integer": "Int32"}
 
 
-def build(folder: Path, version: int, *, edit: tuple[str, str] | None = None) -> Path:
+class Build(Protocol):
     """Build the oscillator for an FMI version; ``edit`` replaces text of its model description."""
-    fmpy = pytest.importorskip("fmpy")
+
+    def __call__(self, folder: Path, version: int, *, edit: tuple[str, str] | None = None) -> Path: ...
+
+
+@pytest.fixture
+def build() -> Build:
+    return _build
+
+
+def _build(folder: Path, version: int, *, edit: tuple[str, str] | None = None) -> Path:
     description = _description(version)
     if edit is not None:
         assert edit[0] in description
@@ -50,8 +62,6 @@ def _compiled(version: int) -> bytes:
     compiler = shutil.which("cc")
     if compiler is None:
         pytest.skip("no C compiler (cc) to build an FMU with")
-    from fmpy import fmi2, fmi3
-
     slave = fmi2.FMU2Slave if version == 2 else fmi3.FMU3Slave
     source = SOURCE.read_text()
     wanted = [name for name, _ in inspect.getmembers(slave) if name.startswith(f"fmi{version}")]

@@ -9,31 +9,44 @@ discarded; the last error in its log is kept.
 import contextlib
 import ctypes
 import difflib
+import fcntl
 import io
 import os
 import shutil
 import tempfile
 import weakref
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from contextvars import ContextVar
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple, NoReturn
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NoReturn
 
 import numpy as np
 from pydantic import Field, FiniteFloat
 
-from noack.core.errors import CallerError, one_line, shortened
-from noack.core.file_access import lock
-from noack.core.linear_systems import Vector
-from noack.plants.plant_settings import Names, PlantSettings, PlantStart, PlantSystem, SystemFailedError
-from noack.settings.section import Row, require_length
-from noack.settings.user_files import FileSettings, NamedFile, checked_path
+from noack.extend import (
+    CallerError,
+    FileSettings,
+    NamedFile,
+    Names,
+    PlantOutline,
+    PlantSettings,
+    PlantStart,
+    PlantSystem,
+    Row,
+    SystemFailedError,
+    Table,
+    Vector,
+    checked_path,
+    one_line,
+    require_length,
+    shortened,
+)
 
-if TYPE_CHECKING:  # an extra of noack, and slow to import
+if TYPE_CHECKING:  # slow to import
     from fmpy.fmi1 import _FMU
     from fmpy.model_description import ModelDescription, ScalarVariable
 
@@ -59,10 +72,10 @@ Refusal = Callable[["ScalarVariable"], str | None]
 class FmuSettings(FileSettings, PlantSettings):
     """A Functional Mock-up Unit for co-simulation, FMI 2 or 3: a model from another tool.
 
-    It is native code that runs in the plant's process; see docs/plants.md.
+    It is native code that runs in the plant's process.
     """
 
-    needs: ClassVar = ("fmpy", "fmi")
+    has_operating_point: ClassVar = True
 
     kind: Literal["fmu"]
     file: str
@@ -83,6 +96,16 @@ class FmuSettings(FileSettings, PlantSettings):
     """Start values of further variables of the FMU."""
     on_record: Names = ()
     """Further variables of the FMU that are recorded, as z."""
+
+    @classmethod
+    def named_by(cls, label: str) -> Table | None:
+        if not label.endswith(".fmu"):
+            return None
+        return {"kind": "fmu", "file": label, **variables_of(Path(label))}
+
+    def outline(self) -> PlantOutline:
+        states, inputs = self.state_variables, self.input_variables
+        return PlantOutline(len(states), len(inputs), states, inputs)
 
     @property
     def internal_names(self) -> tuple[str, ...]:
@@ -113,7 +136,6 @@ class FmuSystem:
     """
 
     def __init__(self, settings: FmuSettings, x0: Vector) -> None:
-        settings.require_installed()
         path = checked_path(settings, "plant.system")
         self._place = f'plant.system.file = "{path.name}"'
         self._operating_state = np.array(settings.operating_state or np.zeros_like(x0))
@@ -121,6 +143,7 @@ class FmuSystem:
         self._operating_input = np.array(settings.operating_input or np.zeros(m))
         self._log = _Log()
         end = ExitStack()
+        _unpacked_fmus()  # their folders are removed after this instance has ended
         weakref.finalize(self, end.close)  # when the object is deleted, or the process ends
         try:
             description = _described(path)
@@ -220,37 +243,42 @@ class FmuSystem:
             )
 
 
-class _UnpackedFmus(NamedTuple):
-    """Folders of unpacked FMUs by path and SHA-256, and when they are removed."""
+class _UnpackedFmus:
+    """Folders of unpacked FMUs that no instance uses, by path and SHA-256.
 
-    folders: dict[tuple[Path, str | None], Path]
-    end: ExitStack
-
-
-_KEPT = ContextVar[_UnpackedFmus | None]("kept", default=None)
-
-
-@contextmanager
-def unpacked_once() -> Iterator[None]:
-    """Unpack an FMU once for all its instances in this context; otherwise each has its own copy.
-
-    The instances share the FMU's library: they should follow one another.
+    Two instances at the same time have a folder each, and so a library each. The next instance takes
+    the folder of one that has ended: a linearisation makes hundreds of them. The folders are removed
+    when this process ends.
     """
-    with ExitStack() as end:
-        end.callback(_KEPT.reset, _KEPT.set(_UnpackedFmus({}, end)))
-        yield
+
+    def __init__(self) -> None:
+        self._idle: dict[tuple[Path, str | None], list[Path]] = defaultdict(list)
+        self._end = ExitStack()
+        weakref.finalize(self, self._end.close)
+
+    def take(self, path: Path, sha256: str | None, end: ExitStack) -> Path:
+        """Return a folder with the content of an FMU, until ``end`` gives it back."""
+        idle = self._idle[path, sha256]
+        if not idle:
+            folder = self._end.enter_context(temporary_folder())
+            _fmpy().extract(str(path), str(folder))
+            idle.append(folder)
+        folder = idle.pop()
+        end.callback(idle.append, folder)
+        return folder
+
+
+_unpacked_fmus = cache(_UnpackedFmus)
+"""Returns those of this process."""
 
 
 def _unpacked(path: Path, settings: FmuSettings, description: "ModelDescription", end: ExitStack) -> Path:
-    """Return a folder with the content of an FMU; without a context for it, it is removed at the end."""
-    kept, key = _KEPT.get(), (path, settings.sha256)
-    if kept is None or description.coSimulation.canBeInstantiatedOnlyOncePerProcess:
-        kept = _UnpackedFmus({}, end)
-    if key not in kept.folders:
-        folder = kept.end.enter_context(temporary_folder())
-        _fmpy().extract(str(path), str(folder))
-        kept.folders[key] = folder
-    return kept.folders[key]
+    """Return a folder with the content of an FMU."""
+    if not description.coSimulation.canBeInstantiatedOnlyOncePerProcess:
+        return _unpacked_fmus().take(path, settings.sha256, end)
+    folder = end.enter_context(temporary_folder())
+    _fmpy().extract(str(path), str(folder))
+    return folder
 
 
 def variables_of(path: Path) -> dict[str, list[str]]:
@@ -415,7 +443,7 @@ def _not_an_input(variable: "ScalarVariable") -> str | None:
 
 def _not_settable(variable: "ScalarVariable") -> str | None:
     """Refuse a variable that cannot be set before the initialisation."""
-    from fmpy.simulation import settable_in_instantiated  # an extra of noack
+    from fmpy.simulation import settable_in_instantiated
 
     if settable_in_instantiated(variable):
         return None
@@ -450,8 +478,6 @@ def temporary_folder() -> Iterator[Path]:
     A lock marks a folder that is in use. The lock ends with its process, even if that process is
     killed; a folder without a lock is abandoned.
     """
-    if not hasattr(os, "getuid"):
-        raise CallerError('plant.system.kind: "fmu" needs Linux or macOS')
     for abandoned in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
         _remove_if_left(abandoned)
     while True:
@@ -485,8 +511,8 @@ def _locked(folder: Path) -> int | None:
     except OSError:
         return None
     with suppress(OSError):
-        if lock(descriptor):
-            return descriptor
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return descriptor
     os.close(descriptor)
     return None
 

@@ -1,31 +1,34 @@
 """Environments of Gymnasium and MuJoCo as plants: maps, the shipped scenarios, mistakes."""
 
 import json
+import math
+from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
+from scipy.linalg import expm, logm
 
 import noack
 from cosim.analysis.summary.plant_linearisation import linearisation
 from cosim.analysis.summary.summary_model import LinearisationPart
 from noack.core.errors import CallerError
-from noack.plants.gymnasium import GymnasiumSettings
-from noack.plants.plant_settings import PlantStart
+from noack.extend import PlantStart, SystemFailedError
+from noack.plants.systems.linearisation import linearise
 from noack.scenario.resolution import resolve
 from noack.scenario.toml_file import validated
+from noack_gymnasium.gymnasium_plant import GymnasiumSettings
 from tests.helpers.approved import compare_lines, lines_of_error
 from tests.helpers.command_line import invoke
-from tests.helpers.shipped import skip_without_plant
 
-gymnasium = pytest.importorskip("gymnasium", reason="the extra `gymnasium` is not installed")
-SCENARIOS = Path(__file__).parents[3] / "scenarios"
+needs_mujoco = pytest.mark.skipif(find_spec("mujoco") is None, reason="the extra `mujoco` is not installed")
 STEP_NS = 100_000_000
 
 
-class Cart(gymnasium.Env):  # type: ignore[misc, name-defined]
+class Cart(gymnasium.Env):  # type: ignore[type-arg]
     """Two carts: the first one's speed is the first action, the second one is at rest."""
 
     action_space = gymnasium.spaces.Box(-10.0, 10.0, (2,))
@@ -100,9 +103,9 @@ def test_a_mistake_gives_the_approved_line() -> None:
 
 
 def test_without_mujoco_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("noack.plants.gymnasium.find_spec", lambda name: None)
-    with pytest.raises(CallerError, match=r"^plant.system.id: .*pip install 'noack\[mujoco\]'$"):
-        settings_of("Hopper-v5").require_installed()
+    monkeypatch.setattr("noack_gymnasium.gymnasium_plant.find_spec", lambda name: None)
+    with pytest.raises(CallerError, match=r"^plant.system.id: .*pip install 'noack-gymnasium\[mujoco\]'$"):
+        settings_of("Hopper-v5").environment()
 
 
 def columns(run: noack.Run) -> np.ndarray:
@@ -110,9 +113,9 @@ def columns(run: noack.Run) -> np.ndarray:
     return np.array([table[f"x_{i}"] for i in range(1, 5)])
 
 
+@needs_mujoco
 def test_mujocos_cart_pole_agrees_with_noacks() -> None:
     """MuJoCo's Runge-Kutta steps of 2 ms against adaptive ones; A in closed form."""
-    skip_without_plant(SCENARIOS / "cart_pole_mujoco.toml")
     ours, theirs = (noack.simulate(name) for name in ("cart_pole", "cart_pole_mujoco"))
     np.testing.assert_allclose(columns(theirs), columns(ours), atol=1e-7)
     assert theirs.replay().bit_exact
@@ -125,9 +128,9 @@ def test_mujocos_cart_pole_agrees_with_noacks() -> None:
     np.testing.assert_allclose(linear["B"], model.B, atol=1e-6)
 
 
+@needs_mujoco
 def test_a_motion_that_diverges_is_not_reset(tmp_path: Path, monkeypatch: Any) -> None:
     """MuJoCo would put the state of such a motion back to 0, and the loop would go on."""
-    skip_without_plant(SCENARIOS / "cart_pole_mujoco.toml")
     monkeypatch.chdir(tmp_path)  # in which MuJoCo writes a log
     settings = settings_of("InvertedPendulum-v5")
     start = PlantStart(np.array([0, 0.1, 0, 1e150]), np.zeros((4, 4)), np.zeros((4, 1)), 40_000_000)
@@ -136,10 +139,10 @@ def test_a_motion_that_diverges_is_not_reset(tmp_path: Path, monkeypatch: Any) -
     assert np.isnan(made.x).all()
 
 
+@needs_mujoco
 @pytest.mark.parametrize("name", ["cart_pole_mujoco", "double_pendulum_mujoco"])
 def test_a_run_is_replayed_bit_for_bit(name: str, tmp_path: Path) -> None:
     """Also if the plant is Gymnasium's own, without a model of the user's."""
-    skip_without_plant(SCENARIOS / f"{name}.toml")
     done = invoke("simulate", name, "--set", "horizon_s=1", "--runs", tmp_path, "--no-report")
     assert done.exit_code == 0, done.output
     (folder,) = (path for path in tmp_path.iterdir() if path.name != "latest")
@@ -147,3 +150,39 @@ def test_a_run_is_replayed_bit_for_bit(name: str, tmp_path: Path) -> None:
     replayed = invoke("replay", folder)
     assert replayed.exit_code == 0, replayed.output
     assert "bit" in replayed.output
+
+
+def start(n: int = 2, m: int = 1, step_ns: int = 50_000_000) -> PlantStart:
+    return PlantStart(np.zeros(n), np.zeros((n, n)), np.zeros((n, m)), step_ns)
+
+
+def test_the_pendulum_of_gymnasium_has_the_logarithm_of_its_step() -> None:
+    """ω' = ω + (15 sin θ + 3u) h and θ' = θ + ω' h, with θ = 0 upright, h = 0.05 s."""
+    settings, h = GymnasiumSettings(kind="gymnasium", id="Pendulum-v1"), 0.05
+    linear = linearise(lambda x0: settings.system(start()._replace(x0=x0)), 2, 1, step_ns=round(h * 1e9))
+    step = np.array([[1 + 15 * h * h, h, 3 * h * h], [15 * h, 1, 3 * h], [0, 0, 1]])
+    expected = logm(step) / h
+    np.testing.assert_allclose(linear.A, expected[:2, :2], atol=1e-6)
+    np.testing.assert_allclose(linear.B, expected[:2, 2:], atol=1e-6)
+    np.testing.assert_allclose(expm(linear.A * h), step[:2, :2], atol=1e-7)
+    moved = settings.system(start()._replace(x0=np.array([0.1, 0.2])))
+    moved.advance(np.array([0.5]), 0, 50_000_000)
+    speed = 0.2 + (15 * math.sin(0.1) + 1.5) * h
+    np.testing.assert_allclose(moved.x, [0.1 + speed * h, speed], rtol=1e-12)
+
+
+def test_an_environment_that_fails_stops_the_motion(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = GymnasiumSettings(kind="gymnasium", id="Pendulum-v1").system(start())
+    monkeypatch.setattr(made._environment, "step", lambda u: 1 / 0)
+    with pytest.raises(SystemFailedError, match=r"Pendulum-v1.*ZeroDivisionError"):
+        made.advance(np.zeros(1), 0, 50_000_000)
+
+
+def test_a_gymnasium_environment_becomes_a_scenario(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    made = noack.new("gymnasium:Pendulum-v1", "made.toml", settings={"network.mansd": 0})
+    made.save("made.toml")
+    assert made.scenario.plant.rate_hz == 20.0
+    run = noack.simulate("made.toml")
+    assert run.ok
+    assert run.replay().bit_exact

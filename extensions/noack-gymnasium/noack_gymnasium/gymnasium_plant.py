@@ -8,19 +8,35 @@ import math
 from importlib import import_module
 from importlib.util import find_spec
 from operator import attrgetter
-from typing import Annotated, ClassVar, Literal, NoReturn
+from typing import Annotated, Any, ClassVar, Literal, NoReturn
 
 import numpy as np
 from pydantic import Field, FiniteFloat
 
-from noack.core.errors import CallerError, one_line
-from noack.core.linear_systems import Vector
-from noack.plants.plant_settings import Names, PlantSettings, PlantStart, SystemFailedError
-from noack.protocol.wire_format import MAX_DIMENSION
-from noack.settings.section import MatrixRows, Positive, Row, require_length, require_shape
-from noack.settings.user_files import FileSettings, UserCode, checked_path, real_vector
+from noack.extend import (
+    MAX_DIMENSION,
+    CallerError,
+    FileSettings,
+    MatrixRows,
+    Names,
+    PlantOutline,
+    PlantSettings,
+    PlantStart,
+    Positive,
+    Row,
+    SystemFailedError,
+    Table,
+    Vector,
+    checked_path,
+    one_line,
+    real_vector,
+    require_length,
+    require_shape,
+)
 
 Indices = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1, max_length=MAX_DIMENSION)]
+_LABEL = "gymnasium:"
+"""What the name of an environment begins with, as `noack linearise` takes it."""
 _OBSERVATION = "observation"
 _MUJOCO = ("data.qpos", "data.qvel")
 _TOLERANCE = 1e-6
@@ -35,7 +51,6 @@ class GymnasiumSettings(FileSettings, PlantSettings):
     actuation u.
     """
 
-    needs: ClassVar = ("gymnasium", "gymnasium")
     has_own_step: ClassVar = True
 
     kind: Literal["gymnasium"]
@@ -79,15 +94,15 @@ class GymnasiumSettings(FileSettings, PlantSettings):
             reason = f"{key} has {rows} rows"
             require_length(self.operating_action, "plant.system.operating_action", rows, reason)
 
-    def require_installed(self) -> None:
-        super().require_installed()
-        entry = import_module("gymnasium").registry.get(self.id)
-        is_mujoco = entry is not None and "gymnasium.envs.mujoco" in str(entry.entry_point)
-        if is_mujoco and find_spec("mujoco") is None:
-            raise CallerError(
-                f'plant.system.id: "{self.id}" needs a package that is not installed; '
-                "pip install 'noack[mujoco]'"
-            )
+    @classmethod
+    def named_by(cls, label: str) -> Table | None:
+        if not label.startswith(_LABEL):
+            return None
+        return {"kind": "gymnasium", "id": label.removeprefix(_LABEL)}
+
+    def outline(self) -> PlantOutline:
+        environment = self.environment()
+        return PlantOutline(environment.n, environment.m, rate_hz=1 / environment.step_s)
 
     def environment(self) -> "Environment":
         """Return the environment, after reset(seed=0); MuJoCo's is at its initial state.
@@ -95,14 +110,20 @@ class GymnasiumSettings(FileSettings, PlantSettings):
         Raises:
             CallerError: there is no such environment, or it cannot be a plant.
         """
-        self.require_installed()
+        entry = import_module("gymnasium").registry.get(self.id)
+        is_mujoco = entry is not None and "gymnasium.envs.mujoco" in str(entry.entry_point)
+        if is_mujoco and find_spec("mujoco") is None:
+            raise CallerError(
+                f'plant.system.id: "{self.id}" needs a package that is not installed; '
+                "pip install 'noack-gymnasium[mujoco]'"
+            )
         return Environment(self)
 
     def system(self, start: PlantStart) -> "GymnasiumSystem":
         return GymnasiumSystem(self, start)
 
 
-def own_step_s(environment: UserCode) -> float | None:
+def own_step_s(environment: Any) -> float | None:
     """Return the time of a step that an environment itself has, s; None if it has none."""
     steps = (getattr(environment, name, None) for name in ("dt", "tau"))
     return next((float(step) for step in steps if step), None)
@@ -126,7 +147,7 @@ class Environment:
             arguments["xml_file"] = str(checked_path(settings, "plant.system"))
         gymnasium = import_module("gymnasium")
         try:
-            self._environment: UserCode = gymnasium.make(settings.id, **arguments).unwrapped
+            self._environment: Any = gymnasium.make(settings.id, **arguments).unwrapped
             self._observation, _ = self._environment.reset(seed=0)
         except Exception as error:  # an environment can raise any error
             self.wrong(f"{type(error).__name__}: {one_line(error)}")

@@ -1,25 +1,26 @@
-"""noack.LossyChannel: the emulator's losses around an environment, the guarantee, the hold."""
+"""LossyChannel: the emulator's losses around an environment, the guarantee, the hold."""
 
 import subprocess
 import sys
 from itertools import pairwise
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 
 import noack
-from noack.core.errors import CallerError
+from noack.extend import CallerError
+from noack_gymnasium import LossyChannel
 
-gymnasium = pytest.importorskip("gymnasium", reason="the extra `gymnasium` is not installed")
-check_env = pytest.importorskip("gymnasium.utils.env_checker").check_env
 STEP_S = 0.02
 LOSSLESS: dict[str, Any] = {"mansd": 3, "loss": {"model": "lossless"}}
 HALF: dict[str, Any] = {"mansd": 3, "loss": {"model": "bernoulli", "probability": 0.5}}
 MOST: dict[str, Any] = {"mansd": 3, "loss": {"model": "bernoulli", "probability": 0.9}}
 
 
-class Clock(gymnasium.Env):  # type: ignore[misc, name-defined]
+class Clock(gymnasium.Env):  # type: ignore[type-arg]
     """Observes how many steps it has made, and the action that it got; in an array of its own."""
 
     action_space = gymnasium.spaces.Box(-1e6, 1e6, (1,), np.float64)
@@ -61,13 +62,13 @@ def test_the_losses_are_those_of_a_run_packet_by_packet() -> None:
     packets = run.table("netem_packet")
     expected = np.array(packets["consecutive_losses"])
     assert len(expected) > 50
-    env = noack.LossyChannel(Clock(), noack.load("lane_periodic", settings))
+    env = LossyChannel(Clock(), noack.load("lane_periodic", settings))
     _, infos = episode(env, len(expected) - 1, seed=run.scenario.seeds.loss)
     np.testing.assert_array_equal(losses(infos, "observation"), expected)
 
 
 def test_without_loss_and_delay_nothing_changes() -> None:
-    env = noack.LossyChannel(Clock(), {**LOSSLESS, "actuation": LOSSLESS})
+    env = LossyChannel(Clock(), {**LOSSLESS, "actuation": LOSSLESS})
     observations, infos = episode(env, 5)
     np.testing.assert_array_equal(observations, [[k, k] for k in range(6)])
     assert all(info["network"]["observation"]["arrived"] and info["own"] for info in infos)
@@ -78,7 +79,7 @@ def test_without_loss_and_delay_nothing_changes() -> None:
 ])  # fmt: skip
 def test_a_delay_takes_the_next_whole_number_of_steps(delay_s: float, late: int) -> None:
     delayed = {**LOSSLESS, "impairments": [{"kind": "delay", "delay_s": delay_s}]}
-    env = noack.LossyChannel(Clock(), {**delayed, "actuation": delayed})
+    env = LossyChannel(Clock(), {**delayed, "actuation": delayed})
     observations, infos = episode(env, 10)
     k = np.arange(11)
     np.testing.assert_array_equal(observations[:, 0], np.maximum(k - late, 0))
@@ -100,7 +101,7 @@ def test_a_packet_of_m_successive_ones_arrives_in_each_direction(settings: dict[
     """Over long runs; the newest packet that has arrived is in force, an older one never again."""
     lossy = {**MOST, **settings}
     late = 3 if settings.get("impairments", [{}])[0].get("kind") == "delay" else 0
-    env = noack.LossyChannel(Clock(), {**lossy, "actuation": lossy})
+    env = LossyChannel(Clock(), {**lossy, "actuation": lossy})
     longest = {"observation": 0, "action": 0}
     for seed in range(5):
         observations, infos = episode(env, 1000, seed=seed)
@@ -116,7 +117,7 @@ def test_a_packet_of_m_successive_ones_arrives_in_each_direction(settings: dict[
 
 def test_a_seed_gives_the_same_bits_and_each_episode_has_other_losses() -> None:
     lossy = {**HALF, "impairments": [{"kind": "delay", "delay_s": 0.03, "jitter_s": 0.03}]}
-    env, second_env = (noack.LossyChannel(Clock(), {**lossy, "actuation": HALF}) for _ in range(2))
+    env, second_env = (LossyChannel(Clock(), {**lossy, "actuation": HALF}) for _ in range(2))
     first, infos = episode(env, 300, seed=4)
     second, more_infos = episode(env, 300, seed=None)
     second_observations, second_infos = episode(second_env, 300, seed=4)
@@ -131,14 +132,14 @@ def test_a_seed_gives_the_same_bits_and_each_episode_has_other_losses() -> None:
 @pytest.mark.parametrize("name", ["CartPole-v1", "Pendulum-v1"])
 @pytest.mark.filterwarnings("ignore:.*WARN:UserWarning")  # of the environments' own spaces
 def test_the_environment_passes_the_check_of_gymnasium(name: str) -> None:
-    env = noack.LossyChannel(gymnasium.make(name), {**HALF, "actuation": HALF}, step_s=STEP_S)
+    env = LossyChannel(gymnasium.make(name), {**HALF, "actuation": HALF}, step_s=STEP_S)
     check_env(env, skip_render_check=True)
     made_again = gymnasium.make(env.spec)  # it records how it was made
-    assert isinstance(made_again, noack.LossyChannel)
+    assert isinstance(made_again, LossyChannel)
 
 
 def test_actions_cross_the_network_only_if_it_says_so() -> None:
-    observations, infos = episode(noack.LossyChannel(Clock(), MOST), 50)
+    observations, infos = episode(LossyChannel(Clock(), MOST), 50)
     arrived = observations[np.array([info["network"]["observation"]["arrived"] for info in infos])]
     np.testing.assert_array_equal(arrived[:, 0], arrived[:, 1])
     assert "action" not in infos[-1]["network"]
@@ -149,9 +150,9 @@ class NoStep(Clock):
 
 
 @pytest.mark.parametrize(("env", "network", "given", "reason"), [
-    (Clock, {"mansd": 3}, {}, r"^LossyChannel: network.loss: missing"),
-    (Clock, {**HALF, "mansd": -1}, {}, r"^LossyChannel: network.mansd"),
-    (Clock, {}, {}, r"^LossyChannel: network.loss: missing .*; network.mansd: missing"),
+    (Clock, {"mansd": 3}, {}, r"^network.loss: missing"),
+    (Clock, {**HALF, "mansd": -1}, {}, r"^network.mansd"),
+    (Clock, {}, {}, r"^network.loss: missing .*; network.mansd: missing"),
     (Clock, "no_such_scenario", {}, "no such file, nor a shipped scenario"),
     (Clock, "shared_channel", {}, "the scenario has loops; outside a run of noack"),
     (Clock, {**HALF, "protocol": "ack"}, {}, 'set protocol = "none"'),
@@ -165,18 +166,11 @@ class NoStep(Clock):
 ])  # fmt: skip
 def test_a_mistake_is_one_line(env: Any, network: Any, given: Any, reason: str) -> None:
     with pytest.raises(CallerError, match=reason) as error:
-        noack.LossyChannel(env(), network, **given)
+        LossyChannel(env(), network, **given)
     assert "\n" not in str(error.value)
 
 
-def test_without_gymnasium_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cosim.api.find_spec", lambda name: None)
-    monkeypatch.delitem(noack.__dict__, "LossyChannel", raising=False)
-    with pytest.raises(CallerError, match=r"pip install 'noack\[gymnasium\]'"):
-        _ = noack.LossyChannel
-
-
 def test_noack_does_not_import_gymnasium() -> None:
-    program = "import sys; from noack import *; import noack; noack.load; noack.simulate; " \
+    program = "import sys, noack; noack.simulate; noack.load('double_integrator'); " \
         "sys.exit('gymnasium' in sys.modules)"  # fmt: skip
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0

@@ -1,0 +1,1 @@
+"""Functional Mock-up Units as plants of noack: ``plant.system.kind = "fmu"``."""

@@ -1,0 +1,11 @@
+"""Print what the extensions and their tests need besides noack, for ``make lock``."""
+
+import tomllib
+from pathlib import Path
+
+for path in sorted(Path("extensions").glob("*/pyproject.toml")):
+    content = tomllib.loads(path.read_text(encoding="utf-8"))
+    project, groups = content["project"], content.get("dependency-groups", {})
+    extras = project.get("optional-dependencies", {})
+    for needed in (project["dependencies"], *extras.values(), *groups.values()):
+        print(*(text for text in needed if text != "noack"), sep="\n")
