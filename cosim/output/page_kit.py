@@ -42,7 +42,6 @@ def templates(folder: Path = PAGES) -> Environment:
         "interval": interval_text,
         "number": number,
         "shown": value_text,
-        "words": words,
     }
     environment.filters |= filters
     return environment
