@@ -176,7 +176,7 @@ def _loss_violations(
     until_ns = np.minimum(until_ns, end_ns)
     for rule in limits.guarantee.rules:
         losses, drops = (
-            PacketLosses(sent_s, times_s).values(rule, delay_ns * 1e-9, rule.start)[0].value
+            PacketLosses(sent_s, times_s).values(rule, delay_ns * 1e-9).value
             for times_s in (replaced_s, dropped_s)
         )
         by_drops = drops > rule.limit

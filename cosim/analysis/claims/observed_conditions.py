@@ -1,6 +1,6 @@
 """The conditions under which a run took place, in the plant's time."""
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -92,7 +92,7 @@ class SampledSeries(NamedTuple):
         beyond = np.flatnonzero(self.value > limit + _TOLERANCE_S)
         if not len(beyond):
             return None
-        largest = int(self.value.argmax())
+        largest = int(beyond[self.value[beyond].argmax()])
         return Excess(float(self.t_s[beyond[0]]), float(self.value[largest]), float(self.t_s[largest]))
 
     def before(self, t_s: float) -> "SampledSeries":
@@ -104,21 +104,6 @@ class SampledSeries(NamedTuple):
         """Return the values in the order of time."""
         order = np.argsort(self.t_s, kind="stable")
         return SampledSeries(self.t_s[order], self.value[order])
-
-    def peaks(self, since_s: float = 0.0) -> "SampledSeries":
-        """Return the values that exceed all values before; those from ``since_s`` on start anew.
-
-        Of these series, the first value above any limit and the largest value are the same.
-        """
-        if not len(self.value):
-            return self
-        early = self.t_s < since_s
-        records = []
-        for part in (early, ~early) if early.any() else (slice(None),):
-            t_s, value = self.t_s[part], self.value[part]
-            above = value > np.append(-np.inf, np.fmax.accumulate(value)[:-1])
-            records.append((t_s[above], value[above]))
-        return SampledSeries(*map(np.concatenate, zip(*records, strict=True)))
 
 
 class PacketLosses(NamedTuple):
@@ -132,20 +117,19 @@ class PacketLosses(NamedTuple):
 
     def consecutive(self, delay_s: float) -> SampledSeries:
         """Consecutive losses up to every event."""
-        rule = LongestBurst(0)
-        return self.values(rule, delay_s, rule.start)[0]
+        return self.values(LongestBurst(0), delay_s)
 
-    def values(self, rule: LossRule, delay_s: float, state: int) -> tuple[SampledSeries, int]:
-        """The values of a rule at every event, and its state after them, from its ``state``.
+    def values(self, rule: LossRule, delay_s: float) -> SampledSeries:
+        """The values of a rule at every event.
 
         An update that was replaced within the allowed delay is not lost.
         """
-        values = []
+        values, state = [], rule.start
         for replaced_s in self.replaced_after_s.tolist():
             lost = replaced_s == np.inf or replaced_s > delay_s + _TOLERANCE_S
             state, value = rule.after(state, lost)
             values.append(value)
-        return SampledSeries(self.t_s, np.array(values, dtype=np.float64)), state
+        return SampledSeries(self.t_s, np.array(values, dtype=np.float64))
 
 
 class AssumptionViolation(NamedTuple):
@@ -206,20 +190,13 @@ class ObservedConditions(NamedTuple):
         self,
         conditions: NetworkConditions,
         causes: Collection[str] | None = None,
-        states: dict[str, int] | None = None,
     ) -> list[AssumptionViolation]:
-        """The conditions that the run violated, among the ``causes``; by default, among all.
-
-        ``states`` has the rules' states before the first event, by name, and receives those after
-        the last; by default the run begins here.
-        """
+        """The conditions that the run violated, among the ``causes``; by default, among all."""
         violations: list[AssumptionViolation] = []
-        states = {} if states is None else states
         for rule in conditions.guarantee.rules:
             if causes is not None and rule.name not in causes:
                 continue
-            state = states.get(rule.name, rule.start)
-            values, states[rule.name] = self.losses.values(rule, conditions.delay_s, state)
+            values = self.losses.values(rule, conditions.delay_s)
             if (excess := values.excess(rule.limit)) is not None:
                 text = rule.violation(excess.worst)
                 violations.append(
@@ -282,29 +259,6 @@ class ObservedConditions(NamedTuple):
             "start_s": self.start_s if np.isfinite(self.start_s) else None,
             "clock_error_s": max((error_s for error_s in clocks if error_s is not None), default=None),
         }
-
-
-def combine(parts: Sequence[ObservedConditions]) -> ObservedConditions:
-    """Return the conditions of a run from those of its parts, in order; series are peaks."""
-    last = parts[-1]
-
-    def join(series: Iterable[tuple[Reals, Reals]]) -> tuple[Reals, Reals]:
-        t_s, values = zip(*series, strict=True)
-        return np.concatenate(t_s), np.concatenate(values)
-
-    return last._replace(
-        losses=PacketLosses(*join(part.losses for part in parts)),
-        sampling=SampledSeries(*join(part.sampling for part in parts)).peaks(),
-        delay=SampledSeries(*join(part.delay for part in parts)).peaks(),
-        hold=SampledSeries(*join(part.hold for part in parts)).peaks(),
-        watchdog=SampledSeries(*join(part.watchdog for part in parts)).peaks(),
-        safe_input=SampledSeries(*join(part.safe_input for part in parts)).peaks(),
-        clocks={
-            cause: SampledSeries(*join(part.clocks[cause] for part in parts)).in_order().peaks()
-            for cause in last.clocks
-        },
-        early=SampledSeries(*join(part.early for part in parts)),
-    )
 
 
 def earliest(candidates: Iterable[VoidFrom | None]) -> VoidFrom | None:

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from cosim.analysis.claims.claim_evaluation import RunClaims
-from cosim.analysis.claims.condition_reader import ConditionReader, read_conditions
-from cosim.analysis.claims.observed_conditions import ObservedConditions, combine
+from cosim.analysis.claims.condition_reader import read_conditions
 from cosim.analysis.replay import replay
 from cosim.analysis.summary.summary_model import Claim, ClaimVerdict
 from cosim.record.align import aligned_parts
@@ -190,26 +189,6 @@ def test_all_claims_are_void_from_then_on_for_that_reason(
     assert ClaimVerdict.VOID in {claim.verdict for claim in judged(record)}
     first = min(RunClaims(record).violations())
     assert (first.t_s, first.text) == (pytest.approx(since_s), reason)
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_batches_show_what_the_whole_record_shows(clocked: RunRecord, seed: int) -> None:
-    rng, errors, since_ns = np.random.default_rng(seed), {}, {}
-    for table in CLOCK_TABLES:
-        for number in rng.integers(1, 120, int(rng.integers(0, 4))).tolist():
-            errors[table, number] = int(rng.choice([LOST_NS, WIDE_NS, 2 * WIDE_NS]))
-        if rng.uniform() < 0.5:
-            since_ns[table] = int(rng.integers(0, 6000)) * MS
-    record = with_errors(clocked, errors, **since_ns)
-    reader, whole = ConditionReader(record.scenario), read_conditions(record)
-    parts: list[ObservedConditions] = []
-    cuts = np.sort(rng.integers(0, 121, 5))
-    for piece in zip(*(np.split(record[table], cuts) for table in CLOCK_TABLES), strict=True):
-        for table, rows in zip(CLOCK_TABLES, piece, strict=True):
-            reader.take(table, rows)
-        parts.append(reader.observed())
-    for cause, series in combine(parts).clocks.items():
-        np.testing.assert_array_equal(series, whole.clocks[cause])
 
 
 def test_each_of_several_loops_has_the_rows_in_its_own_time() -> None:
