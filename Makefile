@@ -171,8 +171,9 @@ lock: setup-dev ## Update the pinned dependencies
 	$(BIN)/python tools/extension_requirements.py | \
 		$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 		--no-header pyproject.toml - --extra viewer --group build --group dev --group docs -c requirements.lock -o requirements-dev.lock
-	$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
-		--no-header pyproject.toml --extra lab --extra viewer -c requirements-dev.lock -o requirements-lab.lock
+	$(BIN)/python tools/extension_requirements.py noack-lab | \
+		$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
+		--no-header pyproject.toml - --extra viewer -c requirements-dev.lock -o requirements-lab.lock
 	$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 		--no-header --group compiler -o requirements-compiler.lock
 
@@ -221,6 +222,7 @@ $(VENV)/.installed: $(VENV)/.dependencies pyproject.toml | core
 $(VENV)/.installed-lab: requirements-lab.lock $(VENV)/.installed
 	@echo "installing the lab page ..."
 	@$(PIP) -r requirements-lab.lock
+	@$(EDITABLE) -e extensions/noack-lab
 	@touch $@
 
 $(VENV)/.installed-dev: requirements-dev.lock $(EXTENSIONS:=/pyproject.toml) $(VENV)/.installed

@@ -27,10 +27,10 @@ else:
 
 
 __all__ = [
-    "CampaignResult", "Certificates", "Curve", "CurveStyle", "ExactRun", "Explorer", "Measurement",
-    "NoackError", "Run", "Scenario", "VirtualNetwork", "__version__", "campaign", "certify", "compare",
-    "cost", "explore", "from_system", "gain", "linearise", "load", "margin", "measure", "new", "open_run",
-    "run", "save_tables", "scenarios", "simulate", "simulate_exactly", "with_settings",
+    "CampaignResult", "Certificates", "Curve", "CurveStyle", "ExactRun", "Measurement", "NoackError",
+    "Run", "Scenario", "VirtualNetwork", "__version__", "campaign", "certify", "compare", "cost",
+    "from_system", "gain", "linearise", "load", "margin", "measure", "new", "open_run", "run",
+    "save_tables", "scenarios", "simulate", "simulate_exactly", "with_settings",
 ]  # fmt: skip
 _NOT_EVERYWHERE = ("ExportedRun", "LossyUdp")
 """Names that are for extensions, or need Linux: no star import takes them."""

@@ -28,7 +28,7 @@ sys.dont_write_bytecode = False
 gc.disable()  # until everything is loaded, of which nothing is garbage
 
 FIRST = (
-    "tests/native/test_sanitized.py", "tests/cosim/lab/test_lab_page.py", "tests/test_doc_programs.py",
+    "tests/native/test_sanitized.py", "tests/test_doc_programs.py",
     "tests/integration/", "tests/native/", "tests/cosim/simulation/test_whole_loop.py", "tests/test_docs.py",
     "tests/other_system/",
     "tests/noack/theory/certificates/test_certificate_kinds.py", "tests/attacks/", "tests/cosim/",

@@ -13,8 +13,6 @@ from cosim.api.analyses import cost as cost
 from cosim.api.analyses import margin as margin
 from cosim.api.exact_runs import ExactRun as ExactRun
 from cosim.api.exact_runs import simulate_exactly as simulate_exactly
-from cosim.api.explorer import Explorer as Explorer
-from cosim.api.explorer import explore as explore
 from cosim.api.runs import Run as Run
 from cosim.api.runs import compare as compare
 from cosim.api.runs import open_run as open_run

@@ -41,7 +41,6 @@ EXTRAS = {
     "vehicle": ("vehiclemodels", 'plants of kind "vehicle"'),
     "cluster": ("distributed", "`noack campaign --scheduler`"),
     "mcap": ("mcap", "`noack export --format mcap`"),
-    "lab": ("nicegui", "`noack lab`"),
 }
 """Extras of noack by name: one module that each installs, and what it is for."""
 _DATAGRAM = bytes(72)

@@ -1,6 +1,6 @@
 """A run's summary in words: a verdict of three lines, and remarks on its validity.
 
-The terminal (:mod:`cosim.output.terminal_output`), the report and the lab page show them.
+The terminal (:mod:`cosim.output.terminal_output`) and the report show them; :attr:`noack.Run.verdict`.
 """
 
 import math

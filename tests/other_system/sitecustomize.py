@@ -25,7 +25,7 @@ THIRD_PARTY = """
     socketserver subprocess tempfile uuid webbrowser zipfile cryptography.fernet jinja2
     matplotlib.backends.backend_pdf matplotlib.backends.backend_svg matplotlib.pyplot numpy.random
     pyarrow.parquet pydantic rich.console rich.progress scipy.linalg scipy.optimize scipy.sparse
-    scipy.stats setproctitle tomlkit typer zenoh
+    scipy.stats setproctitle typer zenoh
 """
 MODULES = {"fcntl", "grp", "pty", "pwd", "resource", "spwd", "syslog", "termios", "tty"}
 OF_WINDOWS = {"ABRT", "FPE", "ILL", "INT", "SEGV", "TERM"}

@@ -1,7 +1,5 @@
-"""``noack lab``, ``demo``, ``run``, ``bridge``, ``simulate``: make a run; ``set``: change a live one."""
+"""``noack demo``, ``run``, ``bridge``, ``simulate``: make a run; ``set``: change a live one."""
 
-import sys
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,58 +8,14 @@ from typer import Argument, Option
 
 from cosim.cli import options as opt
 from cosim.cli.options import RUNS, examples
-from cosim.cli.printing import console, print_json, print_lines, status
+from cosim.cli.printing import console, print_json, status
 from cosim.record.run_directory import DEFAULT_RUNS
-from noack.core.errors import CallerError
 from noack.runtime.command_line import LogFormat, print_to_stderr
 
 if TYPE_CHECKING:
     from noack.scenario.scenario import Scenario
 
 app = typer.Typer()
-
-
-@app.command(
-    rich_help_panel=RUNS,
-    epilog=examples(
-        ("noack lab", "open the paper's example"),
-        ("noack lab mine.toml --set trigger.beta=0.3", "open a file with other settings"),
-        ("noack lab --no-browser --port 8080", "print the address, for a browser elsewhere"),
-    ),
-)
-def lab(
-    scenario: opt.ScenarioArgument = "lane_following",
-    settings: opt.SetOption = None,
-    runs: opt.RunsOption = DEFAULT_RUNS,
-    port: Annotated[int, Option(min=0, max=65535, help="Port on 127.0.0.1; 0: a free one.")] = 0,
-    browser: Annotated[bool, Option(help="Open the page in a browser.")] = True,
-    json: opt.JsonOption = False,
-) -> None:
-    """Open a page in the browser: drag settings, watch the loop, run it live.
-
-    The page is on 127.0.0.1, at an address with a secret. Ctrl-C ends it.
-    """
-    opt.require_linux()
-    from cosim.interactive.scenario_draft import open_draft
-    from cosim.lab import lab_server
-    from noack.scenario.scenario_file import setting_of
-
-    if find_spec("nicegui") is None:
-        raise CallerError(
-            "the page needs the extra `lab`: pip install 'noack[lab]', or `make lab` in the repository"
-        )
-    edited = open_draft(scenario)
-    for key, value in map(setting_of, settings or ()):
-        edited = edited.with_value(key, value)
-    edited.require_valid()  # report mistakes here
-    query = edited.query() if settings else ""
-    options = lab_server.LabOptions(scenario, query, Path.cwd(), runs, port, browser)
-
-    def announce(address: str) -> None:
-        print_lines(json, {"address": address}, f"noack lab: {address}  (Ctrl-C ends)")
-        sys.stdout.flush()  # somebody waits for it
-
-    lab_server.serve(options, announce)
 
 
 @app.command(

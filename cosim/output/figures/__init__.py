@@ -1,4 +1,4 @@
-"""Figures: described once, and drawn by matplotlib or, on the lab page, in the browser.
+"""Figures: described once, and drawn by matplotlib.
 
 ``figure_description.py`` has the parts of a description. Those of a run are made in
 ``run_figures.py``, ``timing_figures.py`` and ``network_figures.py``, those of a study beside it.

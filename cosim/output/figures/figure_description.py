@@ -1,7 +1,7 @@
 """The content of a figure as plain data: rows of panels, their axes and their items.
 
 Reports, pages of studies, files and notebooks draw a :class:`FigureDescription` by matplotlib
-(:mod:`cosim.output.figures.figure_drawing`), the lab page in the browser (:mod:`cosim.lab.page_parts`).
+(:mod:`cosim.output.figures.figure_drawing`).
 Arrays may have any length, including 0. Values that are not finite are drawn as gaps.
 """
 

@@ -46,7 +46,6 @@ def test_the_members_of_results_are_the_documented_ones() -> None:
     assert documented("Runs") == members(noack.Run)
     assert documented("Exact runs") == members(noack.ExactRun)
     assert documented("Certificates") == members(noack.Certificates)
-    assert documented("Exploring a loop") == members(noack.Explorer)
 
 
 @pytest.mark.parametrize("name", sorted(set(noack.__all__) - {"__version__"}))
@@ -60,7 +59,7 @@ def test_every_public_name_has_a_docstring(name: str) -> None:
         assert not parameters or {"Args:", "Raises:"} <= set(text.split())
         for parameter in parameters:
             assert f"    {parameter}: " in text, parameter
-    if public in (noack.CampaignResult, noack.Run, noack.ExactRun, noack.Certificates, noack.Explorer):
+    if public in (noack.CampaignResult, noack.Run, noack.ExactRun, noack.Certificates):
         for member in vars(public).values():
             target = member.fget if isinstance(member, property) else member
             if inspect.isfunction(target) and not target.__name__.startswith("_"):

@@ -19,8 +19,8 @@ from noack.core.errors import ExitStatus
 from noack.scenario.scenario_file import dumps as scenario_toml
 from tests.cosim.output.conftest import CASES, HOSTILE, make_record, scenario_of
 from tests.cosim.output.parsed_page import Page
+from tests.helpers.browser import started
 from tests.helpers.command_line import invoke
-from tests.helpers.lab_browser import started
 from tests.helpers.summaries import run_of_one_loop, summary_of
 
 FIGURES = ["states", "errors", "state-norm", "input", "inter-event", "losses"]

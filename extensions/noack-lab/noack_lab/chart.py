@@ -1,0 +1,148 @@
+"""The table of curves as options of ECharts: a panel below another, with a common time axis."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import noack
+from noack_lab.results import ShownRun
+
+Json = dict[str, Any]
+
+REFERENCE = "for comparison"
+_GREY = (0, 120, 200)
+_CROSS = "path://M0 1L1 0L5 4L9 0L10 1L6 5L10 9L9 10L5 6L1 10L0 9L4 5Z"
+_PIXELS_PER_POINT = 4 / 3
+_DECADES = 7
+"""Below the largest value on a logarithmic axis: an error is 0 after a reset."""
+_HEAD, _PLOT, _GAP, _FOOT = 48, 120, 12, 40
+"""Heights in pixels: title and legend of a panel, its axes, the space below them, the last axis."""
+_LEFT, _RIGHT = 62, 14
+
+
+class Drawn(NamedTuple):
+    """What a chart shows."""
+
+    run: ShownRun
+    state: str
+    """Name of the state that is drawn; empty: the first."""
+    bounds: Sequence[noack.Curve] = ()
+    reference: ShownRun | None = None
+
+
+def height_px(options: Json) -> int:
+    """Return the height of a chart."""
+    return len(options["grid"]) * (_HEAD + _PLOT + _GAP) + _FOOT
+
+
+def chart_options(drawn: Drawn) -> Json:
+    """Return the options of ECharts."""
+    panels = _panels(drawn)
+    end_s = max((float(c.t_s[-1]) for curves in panels.values() for c in curves if len(c.t_s)), default=1.0)
+    options: Json = {
+        "animation": False,
+        "aria": {"enabled": True, "label": {"description": "; ".join(panels)}},
+        "textStyle": {"fontFamily": "Roboto, sans-serif"},
+        "tooltip": {
+            "trigger": "axis",
+            "confine": True,
+            ":valueFormatter": "value => value == null ? '–' : String(+(+value).toPrecision(4))",
+        },
+        "toolbox": {
+            "right": 8,
+            "top": 0,
+            "itemSize": 13,
+            "feature": {"dataZoom": {"yAxisIndex": "none"}, "saveAsImage": {}},
+        },
+        "title": [], "legend": [], "grid": [], "xAxis": [], "yAxis": [], "series": [],
+    }  # fmt: skip
+    for number, (title, curves) in enumerate(panels.items()):
+        top, is_last = number * (_HEAD + _PLOT + _GAP), number == len(panels) - 1
+        unit = next((f" [{curve.unit}]" for curve in curves if curve.unit), "")
+        scale = " (logarithmic)" if curves[0].is_logarithmic else ""
+        style = {"fontSize": 14, "fontWeight": 600}
+        options["title"].append(
+            {"text": f"{title}{unit}{scale}", "top": top + 2, "left": 4, "textStyle": style}
+        )
+        names = list(dict.fromkeys(curve.name for curve in curves))
+        legend = {"data": names, "top": top + 24, "left": _LEFT - 6, "type": "scroll"}
+        options["legend"].append(legend | {"itemGap": 14, "textStyle": {"fontSize": 13}})
+        options["grid"].append({"top": top + _HEAD, "height": _PLOT, "left": _LEFT, "right": _RIGHT})
+        axis: Json = {"type": "value", "gridIndex": number, "min": 0, "max": float(f"{end_s:.6g}")}
+        axis |= {"axisLabel": {"show": is_last, "fontSize": 13}, "splitLine": {"show": False}}
+        axis["axisLine"] = {"onZero": False}
+        if is_last:
+            axis |= {"name": "time t [s]", "nameLocation": "middle", "nameGap": 24}
+        options["xAxis"].append(axis | {"nameTextStyle": {"fontSize": 13}})
+        options["yAxis"].append(_value_axis(number, curves))
+        options["series"] += [_series(curve, number) for curve in curves]
+    return options
+
+
+def _panels(drawn: Drawn) -> dict[str, list[noack.Curve]]:
+    """Return the curves of each panel, in the order of the panels; of the states, one is drawn."""
+    run, states = drawn.run, drawn.run.states
+    state = drawn.state if drawn.state in states else next(iter(states), "")
+    panels: dict[str, list[noack.Curve]] = {}
+    if drawn.reference is not None:
+        for curve in drawn.reference.curves:
+            if curve.name in ("x plant", "‖e_c‖ controller", "‖x‖ plant"):
+                style = noack.CurveStyle(_GREY, 1.2, (4, 3))
+                faint = noack.Curve(curve.panel, REFERENCE, curve.unit, curve.t_s, curve.values, style)
+                panels.setdefault(curve.panel, []).append(faint)
+    shown: dict[str, list[noack.Curve]] = {}
+    for curve in (*run.curves, *drawn.bounds):
+        if len(curve.t_s) and np.isfinite(curve.values).any():
+            shown.setdefault(curve.panel, []).append(curve)
+    return {
+        panel: [*panels.get(panel, ()), *curves]
+        for panel, curves in shown.items()
+        if panel == state or panel not in states
+    }
+
+
+def _value_axis(number: int, curves: Sequence[noack.Curve]) -> Json:
+    """Return the vertical axis: logarithmic within some decades of the run's own largest value."""
+    axis: Json = {"gridIndex": number, "axisLabel": {"fontSize": 13}, "splitNumber": 4}
+    if not curves[0].is_logarithmic:
+        return axis | {"type": "value", "scale": True}
+    measured = [curve.values for curve in curves if not curve.style.dash]
+    values = np.concatenate([np.zeros(0), *(curve.values for curve in curves)])
+    values = values[np.isfinite(values) & (values > 0)]
+    own = np.concatenate([np.zeros(0), *measured])
+    own = own[np.isfinite(own) & (own > 0)]
+    if not len(own) or not len(values):
+        return axis | {"type": "value", "scale": True}
+    top = math.ceil(math.log10(min(values.max(), own.max() * 10.0**_DECADES)))
+    bottom = math.floor(math.log10(max(values.min(), own.max() / 10.0**_DECADES)))
+    ends = {"min": 10.0**bottom, "max": 10.0 ** max(top, bottom + 1)}
+    number_text = "value => Math.abs(Math.log10(value)) < 3.5 ? String(value) : value.toExponential(0)"
+    axis["axisLabel"] |= {":formatter": number_text}
+    return axis | {"type": "log", **ends, "minorSplitLine": {"show": False}}
+
+
+def _series(curve: noack.Curve, number: int) -> Json:
+    """Return a curve; what is not finite, or not positive on a logarithmic axis, is a gap."""
+    known, style = np.isfinite(curve.values), curve.style
+    if curve.is_logarithmic:
+        known &= curve.values > 0
+    colour = "rgb({}, {}, {})".format(*style.colour)
+    times, values = _rounded(curve.t_s), _rounded(np.where(known, curve.values, 0.0))
+    points = [[t, v if ok else None] for t, v, ok in zip(times, values, known.tolist(), strict=True)]
+    series: Json = {"name": curve.name, "xAxisIndex": number, "yAxisIndex": number, "data": points}
+    series |= {"itemStyle": {"color": colour}}
+    if style.marker:
+        symbol = "circle" if style.marker == "o" else _CROSS
+        return series | {"type": "scatter", "symbol": symbol, "symbolSize": 8}
+    line: Json = {"color": colour, "width": round(_PIXELS_PER_POINT * style.width, 1)}
+    if style.dash:
+        line["type"] = [round(length * style.width, 1) for length in style.dash]
+    series |= {"type": "line", "showSymbol": False, "lineStyle": line, "emphasis": {"disabled": True}}
+    return series | ({"step": "end"} if style.is_held else {})
+
+
+def _rounded(values: Any) -> list[float]:
+    """Return values with six significant digits, so that less is sent."""
+    return [float(f"{value:.6g}") for value in values.tolist()]

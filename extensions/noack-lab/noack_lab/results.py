@@ -1,0 +1,214 @@
+"""What the page and the explorer show, computed by the library: a run, its certificate, its margin.
+
+All of it can be computed in another process: arguments and results are plain data.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+import noack
+
+ERRORS, NORM, INTERVALS = "error norms", "norm of the state", "inter-event time"
+"""Panels of the curves; see :class:`noack.Curve`."""
+EXACT, SIMULATED, LIVE, RECORDED = "exact", "in virtual time", "live", "recorded"
+MOST_EVENTS = 3000
+"""Most transmissions of an exact run, so that dragging stays quick."""
+_POINTS = 121
+"""Times at which certified bounds are drawn."""
+_GREEN, _DASHED = (51, 162, 78), (6.0, 2.5)
+_MARGIN_ACCURACY = 1e-3
+
+
+class VerdictText(NamedTuple):
+    """A line of a verdict; its tone is good, doubt, bad or empty."""
+
+    text: str
+    tone: str = ""
+
+
+class Fact(NamedTuple):
+    """A key number in words."""
+
+    label: str
+    value: str
+
+
+@dataclass(frozen=True)
+class ShownRun:
+    """A run as the page shows it."""
+
+    kind: str
+    """EXACT, SIMULATED, LIVE or RECORDED."""
+    curves: list[noack.Curve]
+    verdict: list[VerdictText] = field(default_factory=list)
+    note: str = ""
+    loops: tuple[str, ...] = ()
+    """Names of the loops of a recorded run."""
+
+    @property
+    def states(self) -> list[str]:
+        """The names of the states."""
+        return list(dict.fromkeys(curve.panel for curve in self.curves if curve.name == "x plant"))
+
+    @property
+    def transmissions(self) -> NDArray[np.bool_]:
+        """Whether each transmission was delivered, (k,) in the order of their times."""
+        parts = [curve for curve in self.curves if curve.name in ("delivered", "lost")]
+        t_s = np.concatenate([np.zeros(0), *(curve.t_s for curve in parts)])
+        arrived = [np.full(len(curve.t_s), curve.name == "delivered") for curve in parts]
+        return np.concatenate([np.zeros(0, np.bool_), *arrived])[np.argsort(t_s, kind="stable")]
+
+    def values(self, name: str) -> NDArray[np.float64]:
+        """Return the values of a curve that are known, in the order of their times."""
+        values = next((curve.values for curve in self.curves if curve.name == name), np.zeros(0))
+        return values[np.isfinite(values)]
+
+    @property
+    def facts(self) -> list[Fact]:
+        """The key numbers."""
+        arrived, norm, e_c = self.transmissions, self.values("‖x‖ plant"), self.values("‖e_c‖ controller")
+        lost = int(np.sum(~arrived))
+        share = f" ({100 * lost / len(arrived):.0f} %)" if len(arrived) else ""
+        bursts = np.diff(np.flatnonzero(np.concatenate([[True], arrived, [True]]))) - 1
+        facts = [
+            Fact("transmissions", str(len(arrived))),
+            Fact("lost", f"{lost}{share}"),
+            Fact("longest loss burst", str(int(bursts.max(initial=0)))),
+        ]
+        if len(norm):
+            facts += [Fact("‖x‖ at the start", _number(norm[0])), Fact("‖x‖ at the end", _number(norm[-1]))]
+        return [*facts, *([Fact("largest ‖e_c‖", _number(e_c.max()))] if len(e_c) else [])]
+
+
+@dataclass(frozen=True)
+class Guarantee:
+    """What is guaranteed for a scenario's own plant and schedule."""
+
+    line: VerdictText
+    curves: list[noack.Curve]
+    """The bounds."""
+    facts: list[Fact]
+
+
+def run_of(scenario: noack.Scenario) -> ShownRun:
+    """Run a scenario exactly if the exact simulation covers it, else in virtual time.
+
+    Raises:
+        NoackError: the scenario has several loops.
+    """
+    try:
+        return exact_run_of(scenario)
+    except noack.NoackError as error:
+        if scenario.loops:
+            raise
+        note = str(error)
+    run = noack.simulate(scenario)
+    curves = [curve for curve in run.curves() if curve.style.colour != _GREEN]  # bounds come later
+    return ShownRun(SIMULATED, curves, _lines(run), note)
+
+
+def exact_run_of(scenario: noack.Scenario) -> ShownRun:
+    """Run a scenario exactly, in some milliseconds.
+
+    Raises:
+        NoackError: the exact simulation does not cover the scenario.
+    """
+    run = noack.simulate_exactly(scenario, most_events=MOST_EVENTS)
+    return ShownRun(EXACT, run.curves(), _lines(run))
+
+
+def guarantee_of(scenario: noack.Scenario) -> Guarantee:
+    """Return what is certified; that nothing is, is no error."""
+    try:
+        certificate = noack.certify(scenario).schedule
+    except noack.NoackError as error:
+        return Guarantee(VerdictText(f"no certificate: {error}", "doubt"), [], [])
+    constants = certificate.constants
+    if constants is None:
+        return Guarantee(VerdictText(f"no certificate: {certificate.void}", "doubt"), [], [])
+    t_s = np.linspace(0.0, scenario.horizon_s, _POINTS)
+    style = noack.CurveStyle(_GREEN, 1.6, _DASHED)
+    with np.errstate(all="ignore"):
+        bounds = [(ERRORS, certificate.controller_error(t_s)), (NORM, certificate.state(t_s))]
+    facts = [
+        Fact("minimum inter-event time", f"{_number(1e3 * (certificate.inter_event_s or 0.0))} ms"),
+        Fact("decay rate of all bounds", f"{_number(constants.rate_per_s)} /s"),
+        Fact("Δ of ‖e_c‖ ≤ Δ · threshold", _number(constants.delta)),
+    ]
+    facts += [
+        Fact(assumption.what, f"{assumption.verdict} ({assumption.why})")
+        for assumption in certificate.assumptions
+        if assumption.verdict != "holds"
+    ]
+    decay = f"all errors decay at {_number(constants.rate_per_s)} /s" if constants.rate_per_s > 0 else ""
+    words = decay or "all errors stay bounded"
+    line = VerdictText(f"certified: {words}, for every loss pattern that the guarantee allows", "good")
+    curves = [noack.Curve(panel, "certified bound", "", t_s, values, style) for panel, values in bounds]
+    return Guarantee(line, curves, facts)
+
+
+def kept_line(run: ShownRun, guarantee: Guarantee) -> VerdictText:
+    """Return the line of the certificate, with the largest share of its bound that ‖e_c‖ reached."""
+    error = next((curve for curve in run.curves if curve.name == "‖e_c‖ controller"), None)
+    bound = next((curve for curve in guarantee.curves if curve.panel == ERRORS), None)
+    if error is None or bound is None or not np.isfinite(error.values).any():
+        return guarantee.line
+    with np.errstate(all="ignore"):
+        limit = np.exp(np.interp(error.t_s, bound.t_s, np.log(bound.values)))
+        share = float(np.nanmax(error.values / limit))
+    if share > 1.0:
+        return VerdictText(f"guarantee broken: ‖e_c‖ reached {_number(100 * share)} % of its bound", "bad")
+    return VerdictText(
+        f"{guarantee.line.text}; ‖e_c‖ was at most {_number(100 * share)} % of its bound", "good"
+    )
+
+
+def margin_of(scenario: noack.Scenario) -> str:
+    """Return for which M the loop is stable under every loss pattern; this may take minutes."""
+    try:
+        return str(noack.margin(scenario, accuracy=_MARGIN_ACCURACY, period=False).verdict)
+    except noack.NoackError as error:
+        return str(error)
+
+
+def recorded_run(directory: Path, loop: str | None) -> ShownRun:
+    """Return a loop of a recorded run, by default its first, with its certified bounds.
+
+    Raises:
+        NoackError: the run is still active, or its record is damaged.
+    """
+    run = noack.open_run(directory)
+    loops = dict(run.loops)
+    chosen = loops[loop] if loop in loops else next(iter(loops.values()))
+    return ShownRun(RECORDED, chosen.curves(), _lines(run), loops=tuple(loops))
+
+
+def replay(directory: Path) -> str:
+    """Replay a run; return in words whether it is bit-exact."""
+    result = noack.open_run(directory).replay()
+    if result.bit_exact:
+        return "replay: bit-exact, the same numbers again"
+    return f"replay: differs: {result.first_difference}"
+
+
+def report_page(directory: Path) -> bytes:
+    """Return the report of a run."""
+    return noack.open_run(directory).report().read_bytes()
+
+
+def compare(reference: ShownRun, run: ShownRun) -> list[tuple[str, str, str]]:
+    """Return the key numbers of both, a row each."""
+    before = dict(reference.facts)
+    return [(label, before.get(label, "–"), value) for label, value in run.facts]
+
+
+def _lines(run: Any) -> list[VerdictText]:
+    return [VerdictText(line.text, str(line.tone)) for line in run.verdict]
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}"
