@@ -48,7 +48,7 @@ def figures(summary: CampaignSummary, store: Store) -> Iterator[FigureDescriptio
         match spec:
             case campaign_file.Pareto():
                 figure, caption = _pareto(summary, results, spec)
-            case campaign_file.Curve():
+            case campaign_file.MetricCurve():
                 figure, caption = _curve(summary, results, spec)
             case campaign_file.HeatMap():
                 figure, caption = _heat_map(summary, results, spec)
@@ -194,7 +194,7 @@ def _pareto(
 
 
 def _curve(
-    summary: CampaignSummary, results: Sequence[GridPointResult], spec: campaign_file.Curve
+    summary: CampaignSummary, results: Sequence[GridPointResult], spec: campaign_file.MetricCurve
 ) -> tuple[FigureDescription, str]:
     axis = summary.campaign.by_name[spec.x]
     curves = {

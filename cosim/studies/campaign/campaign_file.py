@@ -189,7 +189,7 @@ class Pareto(_Figure):
     """The vertical axis."""
 
 
-class Curve(_Figure):
+class MetricCurve(_Figure):
     """The mean of a metric over an axis; one curve per combination of the other axes."""
 
     spanned = ("x",)
@@ -224,7 +224,7 @@ class Distribution(_Figure):
     """The metric."""
 
 
-AnyFigure = Pareto | Curve | HeatMap | Distribution
+AnyFigure = Pareto | MetricCurve | HeatMap | Distribution
 Figure = Annotated[AnyFigure, Field(discriminator="kind")]
 
 
