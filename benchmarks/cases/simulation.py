@@ -199,7 +199,7 @@ def batches() -> Iterator[Row]:
 
 
 STEPS = 7500
-"""Maximum number: the whole scenario of the vehicles, whose slow steps are at its end."""
+"""Maximum number."""
 _PACE_NS = 2_000_000
 """Time between two pairs of steps."""
 _LINEAR = "lane_following"
@@ -251,7 +251,5 @@ def plants() -> Iterator[Row]:
     pair every 2 ms, so that the processor's caches are as in a run.
     """
     for kind, settings in PLANTS.items():
-        for variant in settings.variants if settings.scenario not in (None, _LINEAR) else ():
-            changes = [f"plant.system.{key}={value}" for key, value in variant.items()]
-            scenario = resolve(load(find_scenario(settings.scenario or ""), changes))
-            yield from plant_rows(", ".join((kind, *map(str, variant.values()))), scenario)
+        if settings.scenario not in (None, _LINEAR):
+            yield from plant_rows(kind, resolve(load(find_scenario(settings.scenario or ""))))

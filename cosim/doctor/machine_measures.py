@@ -38,7 +38,6 @@ from noack.scenario.scenario import Scenario
 T = TypeVar("T")
 EXTRAS = {
     "regions": ("flint", "certificates of nonlinear plants on a region"),
-    "vehicle": ("vehiclemodels", 'plants of kind "vehicle"'),
     "cluster": ("distributed", "`noack campaign --scheduler`"),
     "mcap": ("mcap", "`noack export --format mcap`"),
 }

@@ -37,7 +37,7 @@ from cosim.record.run_directory import (
 from cosim.record.run_scenario import write_scenario
 from noack.core.errors import ExitStatus, MachineError, NeverStartedError, NoackError
 from noack.core.file_access import write_whole
-from noack.protocol.roles import PLANT, RECORDER, ROLES
+from noack.protocol.roles import RECORDER, ROLES
 from noack.runtime.active_runs import registered_run, run_name
 from noack.runtime.address import address_text
 from noack.runtime.command_line import Signals, StopRequestError, stop_reason
@@ -123,10 +123,6 @@ def _prepare(scenario: Scenario, runs: Path, spawn: Sequence[str], *, across_hos
         scenario = remote_access.with_clocks(scenario)
     loops, resolved = resolved_loops(scenario), resolve_run(scenario)
     require_disk_space(loops, runs)
-    if PLANT in spawn:
-        # Compile now: the start barrier has a time limit.
-        for system in {repr(loop.plant.system): loop.plant.system for loop in loops}.values():
-            system.prepare()
     return resolved
 
 

@@ -80,60 +80,6 @@ def lane_following(
     return NamedModel(A, B, np.array([row, row]), ("V", "r", "psi", "Y_g"), ("u_1", "u_2"))
 
 
-def single_track_lane(
-    *,
-    mass_kg: float = 1093.3,
-    inertia_kg_m2: float = 1791.6,
-    front_m: float = 1.1562,
-    rear_m: float = 1.4227,
-    front_n_per_rad: float = 129_697.0,
-    rear_n_per_rad: float = 105_400.0,
-    speed_m_per_s: float = 15.0,
-    look_ahead_m: float = 20.0,
-    gain: float = 0.5,
-) -> NamedModel:
-    """A car on a lane, as the linear single-track model (Riekert and Schunck, 1940).
-
-    The car has mass m and moment of inertia I about the vertical axis. Its axles are at distances a
-    and b in front of and behind the centre of gravity, with cornering stiffnesses c_f and c_r. At
-    speed v and steering angle δ:
-
-        m (v̇_y + v r) = F_f + F_r,  I ṙ = a F_f − b F_r,
-        F_f = c_f (δ − (v_y + a r)/v),  F_r = −c_r (v_y − b r)/v.
-
-    The states are those of :func:`lane_following`, with its lateral axis, which has the opposite
-    direction: V = −v_y, yaw rate r, yaw ψ, lateral position Y_g with Ẏ_g = V − v ψ. Input: δ = gain
-    · (Y_g/look_ahead − ψ). By default the car is the BMW 320i of CommonRoad's vehicle models, with
-    its tyres under the static load.
-
-    Raises:
-        ValueError: a parameter that is a divisor is 0.
-    """
-    divisors = {
-        "mass_kg": mass_kg,
-        "inertia_kg_m2": inertia_kg_m2,
-        "speed_m_per_s": speed_m_per_s,
-        "look_ahead_m": look_ahead_m,
-    }
-    for name, value in divisors.items():
-        if value == 0:
-            raise ValueError(f"parameters.{name}: cannot be 0")
-    m, inertia, v = mass_kg, inertia_kg_m2, speed_m_per_s
-    a, b, c_f, c_r = front_m, rear_m, front_n_per_rad, rear_n_per_rad
-    uneven = a * c_f - b * c_r
-    A = np.array(
-        [
-            [-(c_f + c_r) / (m * v), uneven / (m * v) + v, 0.0, 0.0],
-            [uneven / (inertia * v), -(a * a * c_f + b * b * c_r) / (inertia * v), 0.0, 0.0],
-            [0.0, 1.0, 0.0, 0.0],
-            [1.0, 0.0, -v, 0.0],
-        ]
-    )
-    B = np.array([[-c_f / m], [a * c_f / inertia], [0.0], [0.0]])
-    K = np.array([[0.0, 0.0, -gain, gain / look_ahead_m]])
-    return NamedModel(A, B, K, ("V", "r", "psi", "Y_g"), ("steering",))
-
-
 def double_integrator(*, stiffness: float = 1.0, damping: float = 1.5) -> NamedModel:
     """A unit mass driven by a force: ``ẍ = u``, with ``u = −stiffness·x − damping·ẋ``."""
     A, B, K = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]]), [-stiffness, -damping]
@@ -142,7 +88,6 @@ def double_integrator(*, stiffness: float = 1.0, damping: float = 1.5) -> NamedM
 
 NAMED_MODELS: Mapping[str, Callable[..., NamedModel]] = {
     "lane_following": lane_following,
-    "single_track_lane": single_track_lane,
     "double_integrator": double_integrator,
 }
 

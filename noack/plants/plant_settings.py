@@ -20,16 +20,15 @@ from pydantic import Field
 from noack.core.errors import CallerError, NoackError
 from noack.core.linear_systems import Matrix, Vector
 from noack.protocol.wire_format import MAX_DIMENSION
-from noack.settings.section import ScenarioSection, Table
+from noack.settings.section import ScenarioSection
 
 Names = Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(max_length=MAX_DIMENSION)]
 Derivative = Callable[[float, Vector, Vector], Sequence[float] | Vector]
 """dz/dt = f(t, z, v), with t in seconds, z (N,) and the physical input v (m,)."""
-Advance = Callable[[Vector, Vector, float, float], tuple[int, float]]
-"""Advances z (N,) in place under a constant v from a time by a duration, in seconds; returns a
-status code of scipy's "dopri5", negative for a failure, and the time of the failure."""
 _MAX_STEPS = 10_000
 """Most steps of the integrator from one sample to the next."""
+_RELATIVE, _ABSOLUTE = 1e-9, 1e-12
+"""Tolerances of each step of the integrator; the absolute one in z's units."""
 _ESCAPE = 1e4
 """If a state grows by this factor within a step of the plant, it has diverged."""
 _GAVE_UP = {
@@ -120,16 +119,9 @@ class PlantSettings(ScenarioSection):
     """Whether the system is a class of the user's."""
     scenario: ClassVar[str | None] = None
     """A shipped scenario with this kind, for tests and benchmarks."""
-    variants: ClassVar[tuple[Table, ...]] = ({},)
-    """Settings that tests and benchmarks use one after the other."""
 
     kind: str
     """The kind of plant."""
-
-    @property
-    def settling_s(self) -> float:
-        """Time after which x and u determine z; 0 if they determine it at all times."""
-        return 0.0
 
     @property
     def internal_names(self) -> tuple[str, ...]:
@@ -186,13 +178,6 @@ class PlantSettings(ScenarioSection):
         """
         return None
 
-    def prepare(self) -> None:
-        """Do the slow work that is needed once per machine, before a run: compile equations.
-
-        Raises:
-            CallerError: a module that the plant needs is not installed.
-        """
-
     @abstractmethod
     def system(self, start: PlantStart) -> PlantSystem:
         """Return the system at x(0).
@@ -215,10 +200,7 @@ class PlantEquations:
     initial: Callable[[Vector], Vector] = _same  # z(0), (N,), as a function of x(0), (n,)
     output: Callable[[Vector], Vector] = _same  # x, (n,), as a function of z
     physical: Callable[[Vector], Vector] = _same  # v, (m,), as a function of u
-    relative: float = 1e-9  # Relative tolerance of each step of the integrator
-    absolute: float = 1e-12  # Absolute tolerance, in z's units
     is_recorded: bool = False  # Whether z is recorded
-    advance: Advance | None = None  # The equations' own integrator
 
 
 class EquationSettings(PlantSettings):
@@ -231,8 +213,7 @@ class EquationSettings(PlantSettings):
         """Return the equations.
 
         Raises:
-            CallerError: a module that the plant needs is not installed, or the settings exclude
-                each other.
+            CallerError: the settings exclude each other.
         """
 
     def system(self, start: PlantStart) -> PlantSystem:
@@ -252,15 +233,14 @@ class OdeSystem:
         self._equations = equations
         self._state = np.array(equations.initial(x0), dtype=np.float64)
         self._raised: list[BaseException] = []
-        self._advance = equations.advance or self._advance_by_derivative
         # Imported here: it takes time and 40 MB, which plants without equations do not need.
         from scipy.integrate import ode
 
         self._integrator = ode(self._guarded)
         self._integrator.set_integrator(
             "dopri5",
-            rtol=equations.relative,
-            atol=equations.absolute,
+            rtol=_RELATIVE,
+            atol=_ABSOLUTE,
             nsteps=_MAX_STEPS,
             verbosity=-1,
         )
@@ -310,11 +290,12 @@ class OdeSystem:
         """
         v = self._equations.physical(u)
         self._raised.clear()
-        reached, code, t_s = self._state.copy(), 0, t_ns * 1e-9
-        try:
-            code, t_s = self._advance(reached, v, t_s, dt_ns * 1e-9)
-        except ArithmeticError as raised:  # from compiled code
-            self._raised.append(raised)
+        reached, t_s = self._state.copy(), t_ns * 1e-9
+        self._integrator.set_f_params(v)
+        self._integrator.set_initial_value(reached, t_s)
+        with warnings.catch_warnings(action="ignore"):  # the status has the same information
+            reached[:] = self._integrator.integrate(t_s + dt_ns * 1e-9)
+        code, t_s = self._integrator.get_return_code(), self._integrator.t
         for error in self._raised:
             # Far outside the equations' domain an arithmetic error is divergence.
             if not isinstance(error, ArithmeticError | ValueError):
@@ -324,15 +305,6 @@ class OdeSystem:
             self._require_divergence(reached, v, t_s, code)
             reached = np.full_like(self._state, np.nan)
         self._state = reached
-
-    def _advance_by_derivative(
-        self, z: Vector, v: Vector, t_s: float, duration_s: float
-    ) -> tuple[int, float]:
-        self._integrator.set_f_params(v)
-        self._integrator.set_initial_value(z, t_s)
-        with warnings.catch_warnings(action="ignore"):  # the status has the same information
-            z[:] = self._integrator.integrate(t_s + duration_s)
-        return self._integrator.get_return_code(), self._integrator.t
 
     def _require_divergence(self, z: Vector, v: Vector, t_s: float, code: int) -> None:
         """Raise SystemFailedError if the integrator gave up although f is finite and z small."""

@@ -4,6 +4,8 @@ from collections.abc import Mapping
 
 REMOVED: Mapping[str, str] = {
     "controller.kind = program": "use python: a class of your own; docs/wire.md has the datagrams",
+    "plant.system.kind = vehicle": "write its equations as a class: plant.system.kind = python",
+    "model.name = single_track_lane": "give model.A and model.B",
     "recovery.rejoin_within_s": "a process that dies ends the run, whose record is complete up to then",
 }
 """The plain way by what was removed: a key with dots (``table.key``), or the kind of a table

@@ -80,7 +80,7 @@ class ModelSection(ScenarioSection):
     ``gain``, or by a ``file`` with these matrices.
     """
 
-    name: Literal["lane_following", "single_track_lane", "double_integrator"] | None = None
+    name: Literal["lane_following", "double_integrator"] | None = None
     """A named model; see noack/plants/linear.py."""
     parameters: dict[str, FiniteFloat] = Field({})
     """Parameters of the named model that differ from its defaults."""

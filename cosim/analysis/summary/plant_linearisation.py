@@ -41,7 +41,7 @@ def linearisation(resolved: Scenario) -> Linearisation | None:
             else:
                 is_fixed = plant.system.has_own_step
                 step_ns = resolved.timing.plant_period_ns if is_fixed else STEP_NS
-                linearised = linearise(system_at, n, m, settling_s=plant.system.settling_s, step_ns=step_ns)
+                linearised = linearise(system_at, n, m, step_ns=step_ns)
                 A, B = linearised.A, linearised.B
     except NoackError:  # a user's plant: its code fails, or it does not accept this x(0)
         A, B = np.full((n, n), np.nan), np.full((n, m), np.nan)

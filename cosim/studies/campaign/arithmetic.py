@@ -13,8 +13,7 @@ from scipy.linalg import expm
 
 from noack.core.core_library import SOURCES
 
-_PACKAGES = ("noack", "numpy", "scipy", "numba", "llvmlite")
-"""The last two, if they are installed, compile the equations of vehicles with tyres."""
+_PACKAGES = ("noack", "numpy", "scipy")
 _CODE = ("noack", "netem", "cosim", "plant_server", "sensor_node", "controller_node")
 _NO_CODE_OF_RUNS = ("cli", "output", "studies")
 

@@ -241,7 +241,7 @@ def linearise(
     sizes = (None if at is None else len(at), None if input is None else len(input))
     reference = plant_reference(plant, settings or {}, sizes)
     x, u = parse_vector("at", at, reference.n, "states"), parse_vector("input", input, reference.m, "inputs")
-    point = {"x0": x, "u0": u, "step_ns": reference.step_ns, "settling_s": reference.system.settling_s}
+    point = {"x0": x, "u0": u, "step_ns": reference.step_ns}
     with np.errstate(all="ignore"):
         exact = reference.matrices or reference.system.linearisation()
         if exact is None:

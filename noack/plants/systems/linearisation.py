@@ -6,9 +6,8 @@ differences over steps from 0.1 to 4e-7 times the size of the component, extrapo
 than that change becomes 0.
 
 Other systems are only moved: n + m small deviations of x and u are applied, each with both signs. x
-is taken after the rest of the state has settled, and again a step later. Central differences give
-x(t + h) = Ad x(t) + Bd u; the matrix logarithm of [[Ad, Bd], [0, I]] divided by h gives A and B. So
-a system with more states than x is described as far as the loop sees it.
+is taken at the beginning, and a step later. Central differences give x(t + h) = Ad x(t) + Bd u; the
+matrix logarithm of [[Ad, Bd], [0, I]] divided by h gives A and B.
 """
 
 import warnings
@@ -27,12 +26,7 @@ STEP_NS = 10_000_000
 """Step of the motion, for a system that allows any."""
 _OFF = 1e-4  # size of a deviation, relative to the component or 1
 _SINGULAR = 1e-9
-"""If the smallest singular value of the settled deviations is below this, x is not a state."""
-_AHEAD = 10
-"""Steps after the settling over which a prediction is compared with the motion."""
-_PREDICTION_TOLERANCE = 0.05
-"""If A and B predict x some steps after any deviation with a larger relative error, x is not a
-state."""
+"""If the smallest singular value of the deviations is below this, x is not a state."""
 _WIDEST, _FINER, _STEPS = 0.1, 4.0, 10
 """Steps of a difference: the widest, relative to the component or 1; the ratio of two; the number."""
 _NOISE = 100.0
@@ -69,7 +63,6 @@ def linearise(
     n: int,
     m: int,
     *,
-    settling_s: float = 0.0,
     x0: Vector | None = None,
     u0: Vector | None = None,
     step_ns: int = STEP_NS,
@@ -80,7 +73,6 @@ def linearise(
         system_at: makes the system at an initial state, (n,).
         n: number of states.
         m: number of inputs.
-        settling_s: time after which x and u determine the whole state.
         x0: x₀, (n,); by default 0.
         u0: u₀, (m,); by default 0.
         step_ns: step of a system that is moved.
@@ -88,7 +80,7 @@ def linearise(
     x0, u0 = np.zeros(n) if x0 is None else x0, np.zeros(m) if u0 is None else u0
     rates = getattr(system_at(x0), "rates", None)
     if rates is None or rates(x0, u0) is None:
-        return _by_motion(system_at, x0, u0, settling_s, step_ns)
+        return _by_motion(system_at, x0, u0, step_ns)
 
     def f(point: Vector) -> Vector:
         return np.asarray(rates(point[:n], point[n:]))
@@ -129,51 +121,41 @@ def _rounded(values: Matrix) -> Matrix:
     return np.array([float(f"{value:.{_DIGITS}g}") for value in values.ravel()]).reshape(values.shape)
 
 
-def _trajectory_points(
-    system_at: SystemAt, x0: Vector, u: Vector, settling: int, ahead: int, step_ns: int
-) -> Matrix:
-    """Return x after the settling, a step later, and at the end, (3, n)."""
-    system, states = system_at(x0), []
-    for step in range(settling + ahead):
-        states.append(system.x)
-        system.advance(u, step * step_ns, step_ns)
-    return np.array([*states, system.x])[[settling, settling + 1, -1]]
+def _moved(system_at: SystemAt, x0: Vector, u: Vector, step_ns: int) -> Matrix:
+    """Return x at the beginning and a step later, (2, n)."""
+    system = system_at(x0)
+    begin = system.x
+    system.advance(u, 0, step_ns)
+    return np.array([begin, system.x])
 
 
-def _by_motion(system_at: SystemAt, x0: Vector, u0: Vector, settling_s: float, step_ns: int) -> LinearMotion:
+def _by_motion(system_at: SystemAt, x0: Vector, u0: Vector, step_ns: int) -> LinearMotion:
     """Return the linear model of a system that is only moved."""
-    n, m, settling = len(x0), len(u0), round(settling_s * 1e9 / step_ns)
-    ahead = _AHEAD if settling else 1
-    resting = _trajectory_points(system_at, x0, u0, settling, ahead, step_ns)
+    n, m = len(x0), len(u0)
+    resting = _moved(system_at, x0, u0, step_ns)
     drift = (resting[1] - resting[0]) / (step_ns * 1e-9)
 
     def without(reason: str) -> LinearMotion:
         return LinearMotion(np.full((n, n), np.nan), np.full((n, m), np.nan), drift, "motion", reason)
 
-    # Central differences: by how much an offset at the beginning moves the three points.
-    start_offs, step_offs, ahead_offs = (np.eye(n + m) for _ in range(3))
+    # Central differences: by how much an offset at the beginning moves the two points.
+    start_offs, step_offs = np.eye(n + m), np.eye(n + m)
     for i, value in enumerate(np.concatenate([x0, u0])):
         off = np.zeros(n + m)
         off[i] = _OFF * max(1.0, abs(value))
         plus, minus = (
-            _trajectory_points(system_at, x0 + sign * off[:n], u0 + sign * off[n:], settling, ahead, step_ns)
-            for sign in (1.0, -1.0)
+            _moved(system_at, x0 + sign * off[:n], u0 + sign * off[n:], step_ns) for sign in (1.0, -1.0)
         )
-        start_offs[:n, i], step_offs[:n, i], ahead_offs[:n, i] = (plus - minus) / (2 * off[i])
+        start_offs[:n, i], step_offs[:n, i] = (plus - minus) / (2 * off[i])
     # The motion has no linear model unless it is finite and the same each time, and x determines it.
-    if not (np.isfinite(start_offs).all() and np.isfinite(ahead_offs).all()):
+    if not (np.isfinite(start_offs).all() and np.isfinite(step_offs).all()):
         return without(NOT_FINITE)
-    if not np.array_equal(resting, _trajectory_points(system_at, x0, u0, settling, ahead, step_ns)):
+    if not np.array_equal(resting, _moved(system_at, x0, u0, step_ns)):
         return without(NOT_REPEATED)
     if np.linalg.svd(start_offs, compute_uv=False)[-1] < _SINGULAR:
         return without(NO_STATE)
-    # The matrix of a step must predict the offsets further ahead.
+    # Â and B̂ are those of the real logarithm of a step.
     step = step_offs @ np.linalg.inv(start_offs)
-    errors = np.linalg.matrix_power(step, ahead) @ start_offs - ahead_offs
-    sizes = np.maximum(*(np.linalg.norm(deviations[:n], axis=0) for deviations in (start_offs, ahead_offs)))
-    if (np.linalg.norm(errors, axis=0) > _PREDICTION_TOLERANCE * sizes).any():
-        return without(NO_STATE)
-    # Â and B̂ are those of its real logarithm.
     if np.abs(np.linalg.eigvals(step)).min() < _SMALLEST_EIGENVALUE:
         return without(NO_LOGARITHM)
     logarithm = _logarithm(step)
@@ -200,7 +182,6 @@ def largest_errors(
     motion: LinearMotion,
     halfwidths: Vector,
     *,
-    settling_s: float = 0.0,
     x0: Vector,
     u0: Vector,
     step_ns: int = STEP_NS,
@@ -217,18 +198,17 @@ def largest_errors(
         system_at: makes the system.
         motion: its linear model.
         halfwidths: half-widths of the box, (n + m,).
-        settling_s: as for :func:`linearise`.
         x0: the point x₀, (n,).
         u0: u₀, (m,).
         step_ns: step of a system that is moved.
     """
-    n, settling = len(x0), round(settling_s * 1e9 / step_ns)
+    n = len(x0)
     rates = getattr(system_at(x0), "rates", None) if motion.source == "derivative" else None
 
     def change(x: Vector, u: Vector) -> tuple[Vector, Vector]:
         if rates is not None:
             return x, np.asarray(rates(x, u))
-        begin, end, _ = _trajectory_points(system_at, x, u, settling, 1, step_ns)
+        begin, end = _moved(system_at, x, u, step_ns)
         return begin, end - begin
 
     linear = np.hstack([motion.A, motion.B])

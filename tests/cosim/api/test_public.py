@@ -15,7 +15,7 @@ import noack
 
 ROOT = Path(__file__).parents[3]
 PAGE = (ROOT / "docs/library.md").read_text()
-HEAVY = ("cosim", "matplotlib", "numba", "numpy", "pyarrow", "pydantic", "rerun", "scipy", "zenoh")
+HEAVY = ("cosim", "matplotlib", "numpy", "pyarrow", "pydantic", "rerun", "scipy", "zenoh")
 
 
 def loaded_by(program: str) -> set[str]:
@@ -69,7 +69,7 @@ def test_every_public_name_has_a_docstring(name: str) -> None:
 
 @pytest.mark.parametrize(("program", "heavy"), [
     ("import noack; dir(noack)", HEAVY),
-    ("import noack; noack.load('lane_following')", ("matplotlib", "numba", "rerun", "scipy.stats", "zenoh")),
+    ("import noack; noack.load('lane_following')", ("matplotlib", "rerun", "scipy.stats", "zenoh")),
     ("import controller_node.__main__, plant_server.__main__", ("cosim",)),
 ])  # fmt: skip
 def test_a_program_loads_no_modules_that_it_does_not_need(program: str, heavy: tuple[str]) -> None:

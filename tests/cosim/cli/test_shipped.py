@@ -15,7 +15,7 @@ from tests.helpers.command_line import invoke
 ROOT = Path(__file__).parents[3]
 SCENARIOS = sorted(file.stem for file in (ROOT / "scenarios").glob("*.toml"))
 CAMPAIGNS = sorted(file.stem for file in (ROOT / "campaigns").glob("*.toml"))
-LANES = ("lane_following", "lane_acknowledged", "lane_actuation_loss", "lane_crosswind", "lane_vehicle")
+LANES = ("lane_following", "lane_acknowledged", "lane_actuation_loss", "lane_crosswind")
 """Of the scenarios of the lane, those whose recordings and summaries have parts of their own."""
 
 

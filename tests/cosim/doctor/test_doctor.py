@@ -34,7 +34,7 @@ IDEAL = MachineFacts(
     timer_resolution_ns=1, timer_slack_ns=50_000, plain=PROMPT, realtime=PROMPT,
     round_trips=RoundTrips(1000, 0, 20.0, 60.0), buffer=Buffer(10_000, 8_388_608, 4_194_304),
     ports_taken=(), control=1e-3, disk=Disk("runs", 10**10, 10**7, 5e8), runtime_folder=None,
-    display=True, viewer="0.41.0", extras={"cluster": True, "vehicle": True},
+    display=True, viewer="0.41.0", extras={"cluster": True, "regions": True},
     versions={"python": "3.12.1", "noack": "0.1.0"},
 )  # fmt: skip
 

@@ -1,9 +1,7 @@
 """User classes as plants, and where compiled code is stored."""
 
 import json
-import signal
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from textwrap import dedent
 from typing import Any
@@ -14,7 +12,6 @@ import pytest
 from noack.core.errors import CallerError
 from noack.plants.plant_settings import SystemFailedError
 from noack.plants.python_plant import PythonPlantSettings, PythonSystem
-from noack.plants.systems.code_cache import _one_at_a_time, cache_folder, compiler
 from noack.settings.user_files import with_absolute_path
 from tests.helpers.approved import compare_lines
 from tests.noack.plants.motion import H_NS, motion
@@ -158,75 +155,3 @@ def test_a_failed_integration_is_not_reported_as_divergence(
     with pytest.raises(SystemFailedError, match=expected):
         motion(system, [0.0] * 20)
     assert np.isfinite(system.x).all()
-
-
-# --- stored code ----------------------------------------------------------------------------------
-
-SOURCES = [Path(__file__)]
-
-
-@pytest.fixture
-def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    return tmp_path
-
-
-@pytest.fixture
-def folder(home: Path) -> Path:
-    folder = cache_folder("netem", SOURCES)
-    assert folder is not None
-    return folder
-
-
-def doubled(number: int) -> int:
-    return 2 * number
-
-
-def test_changed_sources_use_another_folder(home: Path) -> None:
-    other = home / "other.py"
-    other.write_text("None")
-    folders = {cache_folder("netem", sources) for sources in (SOURCES, [*SOURCES, other], SOURCES)}
-    assert len(folders) == 2
-    other.write_text("pass")
-    assert cache_folder("netem", [*SOURCES, other]) not in folders
-
-
-def test_compiled_code_is_cached(home: Path, folder: Path) -> None:
-    with ThreadPoolExecutor() as pool:
-        assert pool.submit(compiler(folder)(doubled), 21).result() == 42
-    assert list(folder.rglob("*.doubled-*.nbi"))
-    assert home in folder.parents
-
-
-def test_without_a_home_there_is_no_cache(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (home / "file").touch()
-    monkeypatch.setenv("XDG_CACHE_HOME", str(home / "file" / "below"))
-    assert cache_folder("netem", SOURCES) is None
-    function = compiler(None)(doubled)
-    assert function(21) == 42
-    # numba, under its older rules, has no location of its own for it either
-    assert function._cache.cache_path is None
-
-
-def test_empty_cache_files_are_compiled_again(folder: Path) -> None:
-    for suffix in ("nbi", "nbc"):
-        assert compiler(folder)(doubled)(21) == 42
-        (file,) = folder.rglob(f"*.doubled-*.{suffix}")
-        file.write_bytes(b"")
-        assert compiler(cache_folder("netem", SOURCES))(doubled)(21) == 42
-        assert file.stat().st_size > 0
-
-
-@pytest.mark.usefixtures("usual_signals")
-def test_ctrl_c_waits_for_the_compiler(folder: Path) -> None:
-    """LLVM calls Python back, and does not survive an exception there."""
-    compiled = []
-
-    def interrupted(signature: int) -> None:
-        signal.raise_signal(signal.SIGINT)
-        compiled.append(signature)
-
-    with pytest.raises(KeyboardInterrupt):
-        _one_at_a_time(interrupted, folder / ".lock")(1)
-    assert compiled == [1]
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -25,23 +25,17 @@ class LanePicture(draw.Picture):
         lateral, yaw: index of the lateral offset (m) and of the yaw (rad) in x.
         forward_mps: U of the model's dY_g/dt = V + U ψ. If it is negative, as in the paper, the
             picture is mirrored, so that the car moves to the right and a positive Y_g is up.
-        vehicle: the plant is a vehicle whose own state z contains more than x; it is turned
-            anticlockwise by its yaw, and mirrored with the rest.
     """
 
-    kinds = ("vehicle",)
     title = "The car on its lane"
 
-    def __init__(self, lateral: int, yaw: int, *, forward_mps: float = 0.0, vehicle: bool = False) -> None:
+    def __init__(self, lateral: int, yaw: int, *, forward_mps: float = 0.0) -> None:
         self._lateral, self._yaw = lateral, yaw
-        self._forward_mps, self._vehicle = forward_mps, vehicle
+        self._forward_mps = forward_mps
         self._hand = -1.0 if forward_mps < 0 else 1.0
 
     @classmethod
     def of(cls, plant: draw.DrawnPlant) -> "LanePicture | None":
-        if plant.scenario.plant.system.kind in cls.kinds:
-            # x is the state of the lane models: V, r, psi, Y_g.
-            return cls(3, 2, forward_mps=float(plant.loop.A_model[3, 2]), vehicle=True)
         at = plant.places("Y_g", "psi")
         # The paper's dY_g/dt = V + U ψ.
         return cls(*at, forward_mps=float(plant.loop.A_model[at])) if at else None
@@ -86,26 +80,12 @@ class LanePicture(draw.Picture):
             x = frames.of(who)
             columns[who] = draw.poses(zero, x[:, self._lateral], self._hand * x[:, self._yaw])
         along = abs(self._forward_mps) * frames.t_s
-        if self._vehicle and frames.z is not None:
-            # The first states of every vehicle model; the fourth is the speed.
-            along, across, steering, _, yaw = frames.z[:, :5].T
-            columns["plant"] = draw.poses(zero, self._hand * across, self._hand * yaw)
-            for side, y in (("left", _TRACK_M), ("right", -_TRACK_M)):
-                columns[f"plant/steered/{side}"] = draw.poses(
-                    np.full(k, _AXLE_M), np.full(k, y), self._hand * steering
-                )
         columns["road/passing"] = draw.poses(-np.remainder(along, _POSTS_EVERY_M), zero)
         return columns
 
     def _car(self) -> dict[str, draw.Shape]:
         half = _LENGTH_M / 2
-        wheels = [(-_AXLE_M, _TRACK_M), (-_AXLE_M, -_TRACK_M)]
-        steered: dict[str, draw.Shape] = {}
-        if not self._vehicle:
-            wheels += [(_AXLE_M, _TRACK_M), (_AXLE_M, -_TRACK_M)]
-        else:
-            for side in ("left", "right"):
-                steered[f"plant/steered/{side}"] = draw.lines([_wheel(0.0, 0.0)], _GLASS, 0.3, order=1.0)
+        wheels = [(x, y) for x in (-_AXLE_M, _AXLE_M) for y in (_TRACK_M, -_TRACK_M)]
         round_m = 0.35
         inner, across = half - round_m, _WIDTH_M / 2 - round_m
         panels = [[(-inner, y), (inner, y)] for y in np.linspace(-across, across, 4).tolist()]
@@ -113,7 +93,7 @@ class LanePicture(draw.Picture):
             [(0.75, -0.55), (0.95, 0.0), (0.75, 0.55)],
             [(-1.35, -0.5), (-1.35, 0.5)],
         ]
-        return steered | {
+        return {
             "plant/wheels": draw.lines([_wheel(x, y) for x, y in wheels], _GLASS, 0.3, order=1.0),
             "plant/body": draw.body("plant", panels, 2 * round_m),
             "plant/glass": draw.lines(glass, _GLASS, 0.3, order=2.5),

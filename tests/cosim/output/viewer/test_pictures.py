@@ -21,7 +21,6 @@ from tests.helpers.shipped import resolved
 S = 1_000_000_000
 PICTURES: dict[str, tuple[Picture, int, int]] = {
     "lane": (LanePicture(3, 2, forward_mps=-12.0), 4, 0),
-    "vehicle": (LanePicture(3, 2, forward_mps=-15.0, vehicle=True), 4, 7),
     "cart and pole": (PendulumPicture(0, 2, reach_m=1.0, pole_m=0.6), 4, 0),
     "pendulum": (PendulumPicture(None, 0), 2, 0),
     "cart": (PendulumPicture(0, None, reach_m=30.0), 2, 0),

@@ -110,12 +110,8 @@ def test_three_commands_lead_from_a_class_to_a_certified_run() -> None:
     command("new", "loop.toml", "--plant", "pole.json", ok=False)  # it exists
 
 
-@pytest.mark.parametrize(
-    "name", ["cart_pole", "quadrotor", "dc_motor", "four_tank", "vehicle", "unstable_pendulum"]
-)
+@pytest.mark.parametrize("name", ["cart_pole", "quadrotor", "dc_motor", "four_tank", "unstable_pendulum"])
 def test_each_plant_of_noack_gets_a_scenario(name: str) -> None:
-    if name == "vehicle":
-        pytest.importorskip("vehiclemodels")
     made = noack.new(name, "made.toml")
     made.save("made.toml")
     assert noack.load("made.toml") == made.scenario
@@ -236,7 +232,6 @@ def test_a_stable_uncontrollable_part_stays_where_it_is() -> None:
 
 
 def test_the_lines_about_mistakes_are_those_that_were_approved() -> None:
-    pytest.importorskip("vehiclemodels")
 
     def mistake(line: str) -> list[str]:
         result = invoke(*line.split())
