@@ -20,7 +20,7 @@ from pydantic import Field
 from noack.core.errors import CallerError, NoackError
 from noack.core.linear_systems import Matrix, Vector
 from noack.protocol.wire_format import MAX_DIMENSION
-from noack.settings.section import ScenarioSection
+from noack.settings.section import ScenarioSection, Table
 
 Names = Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(max_length=MAX_DIMENSION)]
 Derivative = Callable[[float, Vector, Vector], Sequence[float] | Vector]
