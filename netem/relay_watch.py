@@ -1,4 +1,4 @@
-"""What watches and changes a relay while it runs: control, statistics lines, the live screen.
+"""What watches and changes a relay while it runs: control, and lines of statistics.
 
 :func:`add_watching_options` declares the options, :func:`watch_relay` starts what they ask for.
 """
@@ -11,20 +11,16 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import NamedTuple
 
 from netem.control.command_queue import CommandQueue
 from netem.control.control_server import ControlServer
 from netem.control.emulator_statistics import Statistics, StatisticsThread
-from netem.control.statistics_view import Screen
 from netem.relay.relay import Relay
 from netem.relay.relay_reports import report_line
 from noack.core.errors import CallerError, why
 from noack.core.file_access import open_growing
 from noack.runtime.command_line import LogFormat, discard_output
 
-_VIEW_S = 1.0
-_POLL_S = 0.05
 _SWITCH_S = 0.0002
 """Maximum time for which another thread holds the interpreter lock before the relay's thread."""
 
@@ -47,39 +43,26 @@ def add_watching_options(parser: argparse.ArgumentParser) -> None:
         default=LogFormat.TEXT,
         help="format of standard error: text, or JSON Lines for log collectors (text)",
     )
-    group.add_argument("--view", action="store_true", help="show live statistics in this terminal")
 
 
 def check_watching_options(options: argparse.Namespace) -> None:
     """Check the options of :func:`add_watching_options`; a file alone gets a line each second.
 
     Raises:
-        CallerError: two options contradict each other.
+        CallerError: the time between two lines is too short.
     """
     if options.stats is not None and not (math.isfinite(options.stats) and options.stats >= 0.01):
         raise CallerError(f"--stats {options.stats:g}: must be 0.01 s or more")
     if options.stats is None and options.stats_file is not None:
         options.stats = 1.0
-    if options.view and options.stats is not None and options.stats_file is None:
-        raise CallerError("--view and --stats both use standard output; add --stats-file FILE")
-
-
-class RelayWatch(NamedTuple):
-    """The relay thread's access to the threads that watch the relay."""
-
-    commands: CommandQueue
-    """To be run in the relay's thread, at least every 50 ms."""
-    screen: Screen | None
-
-    @property
-    def quit_requested(self) -> bool:
-        """Whether the user has pressed q on the live screen."""
-        return self.screen is not None and self.screen.quit_requested
 
 
 @contextmanager
-def watch_relay(relay: Relay, options: argparse.Namespace) -> Iterator[RelayWatch]:
+def watch_relay(relay: Relay, options: argparse.Namespace) -> Iterator[CommandQueue]:
     """Watch a relay within the context; the relay runs within it and is closed after it.
+
+    Yields:
+        The commands of the threads that watch it, to be run in the relay's thread at least every 50 ms.
 
     Enter the context before the relay's thread applies real-time settings: new threads would
     inherit them.
@@ -89,21 +72,15 @@ def watch_relay(relay: Relay, options: argparse.Namespace) -> Iterator[RelayWatc
         MachineError: live control cannot be opened.
     """
     commands = CommandQueue(relay)
-    screen = None
     with ExitStack() as stack:
         if options.stats is not None:
             stack.enter_context(_statistics_lines(commands, options.stats, options.stats_file))
         if options.control is not None:
             stack.enter_context(ControlServer(options.control, commands))
-        if options.view:
-            screen = stack.enter_context(Screen(f"noack netem {options.control or ''}".strip()))
-            stack.enter_context(
-                StatisticsThread(commands, _VIEW_S, screen.show, poll=screen.poll, poll_s=_POLL_S)
-            )
         stack.callback(commands.close)
         stack.callback(sys.setswitchinterval, sys.getswitchinterval())
         sys.setswitchinterval(_SWITCH_S)
-        yield RelayWatch(commands, screen)
+        yield commands
 
 
 @contextmanager

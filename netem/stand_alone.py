@@ -12,11 +12,9 @@ from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from pathlib import Path
 from typing import Protocol
 
-from rich.console import Console
-
 from netem.control.control_server import starting
 from netem.control.emulator_statistics import Statistics, statistics, unintended_losses
-from netem.control.statistics_view import picture_of
+from netem.control.statistics_text import statistics_lines
 from netem.emulator_options import command_line_parser, parse_options, specs_of
 from netem.explanation import explain
 from netem.relay.link_sockets import raise_file_limit
@@ -96,12 +94,12 @@ def report_totals(totals: Statistics, options: argparse.Namespace) -> None:
         print(json.dumps(totals, indent=2))
     logged = log_event("info", "noack netem", "ended", event="totals", totals=totals)
     if not (options.json or logged):
-        console = Console(stderr=True, highlight=False)
-        console.print(picture_of(totals, "totals", console.width))
+        for line in statistics_lines(totals):
+            print(line, file=sys.stderr)
         if lost := unintended_losses(totals):
             status = ExitStatus.UNINTENDED_LOSSES
             text = f"{lost:,} datagrams; the guarantee does not hold (exit status {status})"
-            console.print(f"unintended losses: {text}", style="bold red", soft_wrap=True)
+            print(f"unintended losses: {text}", file=sys.stderr)
 
 
 def run_relay(
@@ -123,21 +121,18 @@ def run_relay(
             relay = _open_relay(specs, options, None if program is None else program.devices)
             stack.callback(relay.close)
             signals = signal_stack.enter_context(Signals().handled())
-            watch = stack.enter_context(watch_relay(relay, options))
+            commands = stack.enter_context(watch_relay(relay, options))
             running = nullcontext(lambda: False) if program is None else program.running(signals)
             has_ended = stack.enter_context(running)
         # Relay.
         for setting, answer in stack.enter_context(realtime(options.realtime, _FIFO_PRIORITY)).items():
             if answer.startswith("not permitted"):
                 report_line(f"{setting} {answer}")
-        takes_output = options.view or (options.stats is not None and options.stats_file is None)
+        takes_output = options.stats is not None and options.stats_file is None
         if program is None:
             _report_ready(relay, print_it=not takes_output, as_json=options.json)
-        relay.run(
-            lambda: watch.quit_requested or signals.received is not None or has_ended(),
-            watch.commands.run_pending,
-        )
-        return statistics(watch.commands.snapshot_here())
+        relay.run(lambda: signals.received is not None or has_ended(), commands.run_pending)
+        return statistics(commands.snapshot_here())
 
 
 def _open_relay(specs: Sequence[LinkSpec], options: argparse.Namespace, devices: DeviceLink | None) -> Relay:

@@ -13,12 +13,11 @@ from pathlib import Path
 from typing import Any, Self, cast
 
 import zenoh
-from rich.console import Console
 from zenoh.handlers import RingChannel
 
 from netem.control.control_server import EMULATORS, find_emulator, running_emulators
 from netem.control.emulator_statistics import Statistics
-from netem.control.statistics_view import Screen, picture_of
+from netem.control.statistics_text import statistics_lines
 from netem.relay.relay_reports import DIRECTIONS
 from netem.tc_words import guarantee_words, require_no_dashes, settings_of
 from noack.core.errors import CallerError, ExitStatus, NoackError, PeerError
@@ -142,8 +141,7 @@ def _show(arguments: Sequence[str]) -> ExitStatus:
     if options.json:
         print(json.dumps(statistics, indent=2), flush=True)
     else:
-        console = _Console()
-        console.print(picture_of(statistics, _title(name), console.width))
+        _print_lines(statistics)
     return ExitStatus.OK
 
 
@@ -222,37 +220,27 @@ def _name_and_settings(words: Sequence[str]) -> tuple[str | None, LinkSettings]:
 def _watch(arguments: Sequence[str]) -> ExitStatus:
     parser = _parser(
         "watch",
-        "Show a running emulator's statistics live. If the output is not a terminal, print one\n"
-        "line per second for each direction of a link that has received datagrams.",
+        "Print a running emulator's statistics every second: a line for each direction of a link\n"
+        "that has received datagrams.",
         ("noack netem watch", "noack netem watch dns --json"),
         "print one JSON document per second",
     )
     parser.add_argument("name", nargs="?", help=_NAME_HELP)
     options = parser.parse_args(arguments)
-    name = _named_emulator(options)
-    with (
-        Signals().handled() as signals,
-        Client(name) as client,
-        Screen(_title(name), as_json=options.json) as screen,
-    ):
-
-        def stop() -> bool:
-            screen.poll()
-            return screen.quit_requested or signals.received is not None
-
-        screen.show(client.ask("report"))
-        for statistics in client.follow(stop):
-            screen.show(statistics)
+    show = _print_document if options.json else _print_lines
+    with Signals().handled() as signals, Client(_named_emulator(options)) as client:
+        show(client.ask("report"))
+        for statistics in client.follow(lambda: signals.received is not None):
+            show(statistics)
     return ExitStatus.OK
 
 
-def _title(name: str) -> str:
-    return f"noack netem {name}"
+def _print_document(statistics: Statistics) -> None:
+    print(json.dumps(statistics), flush=True)
 
 
-class _Console(Console):
-    def on_broken_pipe(self) -> None:
-        raise BrokenPipeError
+def _print_lines(statistics: Statistics) -> None:
+    print("\n".join(statistics_lines(statistics)), flush=True)
 
 
 COMMANDS: Mapping[str, Callable[[Sequence[str]], ExitStatus]] = {"show": _show, "set": _set, "watch": _watch}

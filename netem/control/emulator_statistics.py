@@ -262,6 +262,7 @@ def quantiles(counts: NDArray[np.int64]) -> DelayQuantiles:
     return {"p50": p50, "p99": p99, "p999": p999, "max": largest}
 
 
+_POLL_S = 0.02
 _JOIN_S = 10.0
 """Longest wait for the end of the thread."""
 
@@ -269,7 +270,7 @@ _JOIN_S = 10.0
 class StatisticsThread:
     """Calls ``show`` with new statistics at once and then every ``period_s``, within the context.
 
-    It calls ``poll`` every ``poll_s``. With ``at_end``, it shows the final statistics at the end of
+    It calls ``poll`` every 20 ms. With ``at_end``, it shows the final statistics at the end of
     the context; the relay must have ended by then.
     """
 
@@ -280,14 +281,12 @@ class StatisticsThread:
         show: Callable[[Statistics], None],
         *,
         poll: Callable[[], None] = lambda: None,
-        poll_s: float = 0.02,
         at_end: bool = False,
     ) -> None:
         self._commands = commands
         self._period_s = period_s
         self._show = show
         self._poll = poll
-        self._poll_s = poll_s
         self._at_end = at_end
         self._snapshots: deque[Snapshot] = deque(maxlen=2)
         self._stopping = threading.Event()
@@ -312,7 +311,7 @@ class StatisticsThread:
 
     def _run(self) -> None:
         due_s = time.monotonic()
-        while not self._stopping.wait(min(self._poll_s, max(due_s - time.monotonic(), 0))):
+        while not self._stopping.wait(min(_POLL_S, max(due_s - time.monotonic(), 0))):
             self._poll()
             if time.monotonic() >= due_s:
                 due_s = max(due_s + self._period_s, time.monotonic())

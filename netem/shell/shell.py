@@ -40,8 +40,6 @@ def run_in_shell(arguments: Sequence[str]) -> int:
     add_relay_options(parser, shell=True)
     options = parse_options(parser, words)
     spec = shell_spec(options)
-    if options.view:
-        raise CallerError("--view takes the terminal, which the command has")
     check_options(options)
     command = command or [os.environ.get("SHELL") or "/bin/sh"]
     outside = [_split(text) for text in options.outside or ()]

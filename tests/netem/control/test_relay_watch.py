@@ -1,10 +1,9 @@
-"""What runs beside a relay: statistics, commands, the live screen."""
+"""What runs beside a relay: statistics and commands."""
 
 import io
 import json
 import sys
 import threading
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import redirect_stderr
 from pathlib import Path
 
@@ -14,15 +13,13 @@ from netem.control.control_server import running_emulators
 from netem.relay_watch import watch_relay
 from noack.core.errors import CallerError
 from tests.helpers.waiting import wait_for
-from tests.netem.control.fake_relay import FakeRelay, options, press_q, read_until, terminal
+from tests.netem.control.fake_relay import FakeRelay, options
 
 
 def test_invalid_options_are_refused_before_the_relay_runs(relay: FakeRelay) -> None:
     for period in ("0", "-1", "nan", "inf", "0.001"):
         with pytest.raises(CallerError, match=r"must be 0\.01 s or more"):
             options("--stats", period)
-    with pytest.raises(CallerError, match="both use standard output"):
-        options("--stats", "1", "--view")
     nowhere = options("--stats-file", "/nowhere/x")
     with (
         pytest.raises(CallerError, match=r"--stats-file /nowhere/x: cannot be written \(No such"),
@@ -38,13 +35,13 @@ def test_attachments_end_with_the_relay(relay: FakeRelay, tmp_path: Path) -> Non
     interval = sys.getswitchinterval()
     with watch_relay(
         relay, options("--control", "lab", "--stats", "0.01", "--stats-file", str(file))
-    ) as side:
+    ) as commands:
         assert running_emulators() == ["lab"]
         assert sys.getswitchinterval() < interval
         for _ in range(3):
-            side.commands.run_pending()
+            commands.run_pending()
         relay.counters["up", "forward"].received = 5
-        assert side.commands.snapshot_here().links[0].forward.counters.received == 5
+        assert commands.snapshot_here().links[0].forward.counters.received == 5
     assert running_emulators() == []
     assert threading.active_count() == threads
     assert sys.getswitchinterval() == interval
@@ -56,22 +53,7 @@ def test_a_full_disk_is_reported_and_the_relay_continues(relay: FakeRelay) -> No
     error = io.StringIO()
     with (
         redirect_stderr(error),
-        watch_relay(relay, options("--stats", "0.01", "--stats-file", "/dev/full")) as side,
+        watch_relay(relay, options("--stats", "0.01", "--stats-file", "/dev/full")) as commands,
     ):
-        wait_for(lambda: side.commands.run_pending() or error.getvalue().endswith("\n"))
+        wait_for(lambda: commands.run_pending() or error.getvalue().endswith("\n"))
     assert "cannot be written to /dev/full (No space left" in error.getvalue()
-
-
-def test_the_view_shows_the_relay_and_later_messages_until_q(
-    relay: FakeRelay, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    relay.counters["up", "forward"].received = 7
-    with terminal(monkeypatch) as user:
-        with ThreadPoolExecutor() as threads:
-            drawn = threads.submit(press_q, user, "q ends", "→ up", "a message")
-            with watch_relay(relay, options("--view")) as side:
-                print("a message", file=sys.stderr)
-                wait_for(lambda: side.commands.run_pending() or side.quit_requested)
-            assert drawn.exception() is None
-        read_until(user, lambda text: "forward →" in text.partition("\x1b[?1049l")[2])
-    assert capsys.readouterr().err == "a message\n"

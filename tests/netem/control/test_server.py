@@ -23,14 +23,13 @@ from netem.control.control_server import (
     running_emulators,
 )
 from netem.control.emulator_commands import Client
-from netem.control.statistics_view import Screen
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError, ExitStatus
 from noack.runtime.connections.zenoh_session import open_session
 from tests.helpers.approved import compare_lines, lines_of_error
 from tests.netem.conftest import Emulate
 from tests.netem.control import fake_relay as relays
-from tests.netem.control.fake_relay import FakeRelay, press_q, read_until, terminal
+from tests.netem.control.fake_relay import FakeRelay
 from tests.netem.relay.relays import endpoints
 
 
@@ -134,11 +133,12 @@ def run(arguments: str) -> ExitStatus:
 def test_show_prints_the_statistics(
     relay: FakeRelay, server: ControlServer, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    relay.counters["up", "forward"].dropped = 12
+    relay.counters["up", "forward"].received = relay.counters["up", "forward"].dropped = 12
     assert run("show") == run("show lab") == ExitStatus.OK
     out = capsys.readouterr().out
-    assert "noack netem lab" in out
+    assert "up forward  received 12 (" in out
     assert "12 dropped" in out
+    assert "down  no datagrams received" in out
     assert run("show lab --json") == ExitStatus.OK
     document = json.loads(capsys.readouterr().out)
     assert document["links"][0]["forward"]["fates"]["dropped"] == 12
@@ -184,14 +184,14 @@ def test_watch_prints_lines_to_a_pipe_until_its_reader_closes_it(
 
     def read_two() -> None:
         with os.fdopen(end) as reader:
-            lines.extend(reader.readline() for _ in range(2))
+            lines.extend(reader.readline() for _ in range(4))
 
     with os.fdopen(pipe, "w") as stdout, ThreadPoolExecutor() as threads:
         monkeypatch.setattr(sys, "stdout", stdout)
         reading = threads.submit(read_two)
         assert run("watch lab") == ExitStatus.OK
         reading.result()
-    assert all("  up forward  " in line for line in lines)
+    assert [line.split("  ")[1] for line in lines] == ["up forward", "down", "up forward", "down"]
 
 
 def test_watch_fails_when_the_emulator_ends(
@@ -203,21 +203,9 @@ def test_watch_fails_when_the_emulator_ends(
     monkeypatch.setattr(emulator_commands, "_SILENCE_S", 0.1)
     relay.counters["up", "forward"].received = 7
     emulator = ControlServer("lab", commands).__enter__()
-    monkeypatch.setattr(Screen, "show", lambda *_: emulator.__exit__())
+    monkeypatch.setattr(emulator_commands, "_print_lines", lambda _: emulator.__exit__())
     assert run("watch lab") == ExitStatus.FAILED
     assert capsys.readouterr().err == "noack netem watch: emulator 'lab' has ended\n"
-
-
-@pytest.mark.usefixtures("server")
-def test_watch_redraws_on_a_terminal_until_q(relay: FakeRelay, monkeypatch: pytest.MonkeyPatch) -> None:
-    relay.counters["up", "forward"].received = 7
-    with terminal(monkeypatch) as user:
-        with ThreadPoolExecutor() as threads:
-            drawn = threads.submit(press_q, user, "q ends", "→ up")
-            assert run("watch") == ExitStatus.OK
-        assert "\x1b[?1049l" not in drawn.result()
-        # The last screen stays visible.
-        read_until(user, lambda text: "╯" in text.partition("\x1b[?1049l")[2])
 
 
 def test_a_cap_set_at_runtime_is_kept(emulate: Emulate, capsys: pytest.CaptureFixture[str]) -> None:

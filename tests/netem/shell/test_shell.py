@@ -144,7 +144,6 @@ def test_the_status_of_the_command_is_that_of_the_shell(command: str, status: in
     [
         (["--", "no-such-program"], "no-such-program: there is no such program"),
         (["loss", "300%", "--", "true"], "loss 300%: expected a percentage from 0% to 100%"),
-        (["--view", "--", "true"], "--view takes the terminal"),
     ],
 )
 def test_a_mistake_is_one_line(words: list[str], line: str, capsys: pytest.CaptureFixture[str]) -> None:
