@@ -28,8 +28,8 @@ else:
 
 __all__ = [
     "CampaignResult", "Certificates", "Curve", "CurveStyle", "ExactRun", "Measurement", "NoackError",
-    "Run", "Scenario", "VirtualNetwork", "__version__", "campaign", "certify", "compare", "cost",
-    "from_system", "gain", "linearise", "load", "margin", "measure", "new", "open_run", "run",
+    "Run", "RunObserver", "Scenario", "VirtualNetwork", "__version__", "campaign", "certify", "compare",
+    "cost", "from_system", "gain", "linearise", "load", "margin", "measure", "new", "open_run", "run",
     "save_tables", "scenarios", "simulate", "simulate_exactly", "with_settings",
 ]  # fmt: skip
 _NOT_EVERYWHERE = ("ExportedRun", "LossyUdp")

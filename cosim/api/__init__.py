@@ -23,6 +23,7 @@ from cosim.api.scenarios import load as load
 from cosim.api.scenarios import scenarios as scenarios
 from cosim.api.scenarios import with_settings as with_settings
 from cosim.api.virtual_network import VirtualNetwork as VirtualNetwork
+from cosim.live.monitoring.run_observers import RunObserver as RunObserver
 from cosim.output.curves import Curve as Curve
 from cosim.output.curves import CurveStyle as CurveStyle
 from cosim.studies.new_loop.linear_model import gain as gain

@@ -5,7 +5,7 @@ import shutil
 import tempfile
 import threading
 import weakref
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +19,8 @@ from cosim.analysis.summary.run_summary import Outcome, outcome_of_loop
 from cosim.analysis.summary.summary_model import Claim, RunSummary
 from cosim.api.scenarios import Source, load
 from cosim.live import finalize as run_end
-from cosim.live.monitoring.progress import PipeSafeConsole, progress_line
+from cosim.live.monitoring.run_observers import RunObserver
+from cosim.live.monitoring.run_terminal import RunTerminal
 from cosim.output import result_tables, run_tables, run_verdict
 from cosim.output.curves import Curve
 from cosim.output.export.export_formats import export_run
@@ -333,7 +334,13 @@ def simulate(scenario: Source, *, runs: PathLike | None = None) -> Run:
     return simulated
 
 
-def run(scenario: Source, *, runs: PathLike | None = None, progress: bool = False) -> Run:
+def run(
+    scenario: Source,
+    *,
+    runs: PathLike | None = None,
+    progress: bool = False,
+    observers: Sequence[RunObserver] = (),
+) -> Run:
     """Run a scenario live: real processes over real UDP sockets on this machine.
 
     It takes the scenario's ``horizon_s`` divided by its ``speed``, plus a start of some seconds. If
@@ -344,6 +351,7 @@ def run(scenario: Source, *, runs: PathLike | None = None, progress: bool = Fals
         scenario: a scenario, or a source that :func:`noack.load` accepts.
         runs: folder for the run directory; without it, a temporary folder.
         progress: show a progress line on standard error.
+        observers: are told what happens during the run.
 
     Raises:
         NoackError: the scenario is wrong; the run could not start, e.g. because a port is in use;
@@ -355,9 +363,9 @@ def run(scenario: Source, *, runs: PathLike | None = None, progress: bool = Fals
     if threading.current_thread() is not threading.main_thread():
         raise CallerError("noack.run: a live run is started by the main thread, which signals go to")
     with _folder(runs) as (folder, temporary):
-        console = PipeSafeConsole(stderr=True, quiet=not progress)
-        with progress_line(console, loaded) as watcher:
-            ending = launch(loaded, folder, watcher=watcher)
+        with RunTerminal(loaded) as terminal:
+            shown = [terminal] if progress else []
+            ending = launch(loaded, folder, observers=[*shown, *observers])
         outcome = run_end.finalize(ending, report=False, view=temporary is None)
         return Run(ending.run_dir, lambda: outcome, temporary)
 

@@ -4,14 +4,14 @@ All processes of a run wait for the slowest one: what the start does not need is
 """
 
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cosim.cli.printing import console, print_json, status
 from cosim.live import launcher
-from cosim.live.monitoring.run_watcher import RunLog, Watcher, joint_watcher, later_watcher, log_end
+from cosim.live.monitoring.run_observers import RunLog, RunObserver, log_end
+from cosim.live.monitoring.run_terminal import RunTerminal
 from cosim.live.processes.fork_server import ForkServer, fork_server
 from cosim.record.run_directory import RunEnding, how_to_complete
 from noack.core.core_library import require_live_runs
@@ -38,7 +38,7 @@ def run_processes(
     session: str | None = None,
     server: ForkServer | None = None,
     listening: "ListenSettings | None" = None,
-    watcher: Watcher | None = None,
+    observers: Sequence[RunObserver] = (),
 ) -> int:
     """Run a scenario live; print its verdict and return the exit status.
 
@@ -53,7 +53,7 @@ def run_processes(
         session: name that the processes of the run share.
         server: starts the processes, and ends with the run; by default a new one.
         listening: how processes on other hosts join.
-        watcher: follows the run, too.
+        observers: follow the run, too.
     """
     require_live_runs()
     with fork_server(server) as server:
@@ -63,20 +63,15 @@ def run_processes(
 
             require_viewer()
         warn_of_other_runs()
-        # Those of the theory come at the start: nothing waits for the launcher then.
-        warnings = Watcher(started=lambda run_dir: warn_of_violations(loaded))
         try:
-            with ExitStack() as stack:
-                line = later_watcher(lambda: stack.enter_context(_progress_line(loaded)))
-                watchers = [warnings, line, RunLog().watcher()]
-                watchers += [] if watcher is None else [watcher]
+            with RunTerminal(loaded) as terminal:
                 ending = launcher.launch(
                     loaded,
                     runs,
                     spawn=spawn or ROLES,
                     session=session,
                     live=live,
-                    watcher=joint_watcher(watchers),
+                    observers=[_TheoryWarnings(loaded), terminal, RunLog(), *observers],
                     server=server,
                     listening=listening,
                 )
@@ -86,12 +81,15 @@ def run_processes(
     return finalize_run(ending, report=report, verbose=verbose, json=json)
 
 
-@contextmanager
-def _progress_line(loaded: Scenario) -> Iterator[Watcher]:
-    from cosim.live.monitoring.progress import error_console, progress_line  # imports rich
+class _TheoryWarnings(RunObserver):
+    """Warns of what the theory does not cover when the run has started: nothing waits for it then."""
 
-    with progress_line(error_console(), loaded) as watcher:
-        yield watcher
+    def __init__(self, loaded: Scenario) -> None:
+        self._loaded = loaded
+
+    def started(self, run_dir: Path) -> None:
+        """Print the warnings."""
+        warn_of_violations(self._loaded)
 
 
 def warn_of_violations(loaded: Scenario) -> None:

@@ -20,9 +20,9 @@ from threading import Thread
 from cosim.lazy_modules import lazy_modules
 from cosim.live.coordination.coordinator import Coordinator
 from cosim.live.disk_space import require_disk_space
-from cosim.live.monitoring.run_watcher import Watcher, joint_watcher
+from cosim.live.monitoring.run_observers import RunObserver, RunObservers, observers_of_extensions
 from cosim.live.processes.child_processes import ChildProcesses, EndReason
-from cosim.live.processes.finalize_helpers import RunEndingWithHelpers, lasting_helpers
+from cosim.live.processes.finalize_helpers import FinalizeHelpers, RunEndingWithHelpers, lasting_helpers
 from cosim.live.processes.fork_server import ForkServer, fork_server
 from cosim.live.wait_limit import WaitLimit
 from cosim.record.run_directory import (
@@ -65,7 +65,7 @@ def launch(
     spawn: Sequence[str] = ROLES,
     session: str | None = None,
     live: bool = False,
-    watcher: Watcher | None = None,
+    observers: Sequence[RunObserver] = (),
     server: ForkServer | None = None,
     listening: "remote_access.ListenSettings | None" = None,
 ) -> RunEndingWithHelpers:
@@ -77,7 +77,7 @@ def launch(
         spawn: the roles to launch; the others are started by hand and join by ``session``.
         session: session name for processes started by hand.
         live: show the run in a viewer while it runs.
-        watcher: callbacks.
+        observers: who follows the run; those of extensions do so, too.
         server: starts the processes; by default a new one.
         listening: how processes on other hosts join.
 
@@ -99,16 +99,17 @@ def launch(
         coordinator = Coordinator(descriptor, spawn)
         stack.callback(coordinator.close)
         helpers = stack.enter_context(lasting_helpers(resolved))
-        watcher = joint_watcher([watcher or Watcher(), Watcher(started=helpers.prepare)])
+        told = RunObservers([*observers, *observers_of_extensions(resolved)])
         if listening is not None:
             descriptor = descriptor.model_copy(update={"host": listening.address[0]})
         with _no_directory_if_refused(run_dir):
             listener = _open_to_others(stack, descriptor, session, listening, coordinator)
         if listening is not None and listener is not None:
-            watcher.listening(address_text(listener.address), listening)
+            address = address_text(listener.address)
+            told.tell(lambda observer: observer.listening(address, listening))
         children = ChildProcesses(descriptor, run_dir, spawn, server)
         stack.enter_context(children.started(live=live))
-        run = _Run(descriptor, run_dir, coordinator, children, watcher, listener and listener.notices)
+        run = _Run(descriptor, run_dir, coordinator, children, told, helpers, listener and listener.notices)
         status, reason = run.watch(signals, ending.store)
         if coordinator.epoch_ns is None:
             raise NeverStartedError(f"{reason} (logs in {run_dir / 'logs'})", status)
@@ -187,7 +188,8 @@ class _Run:
         run_dir: Path,
         coordinator: Coordinator,
         children: ChildProcesses,
-        watcher: Watcher,
+        observers: RunObservers,
+        helpers: FinalizeHelpers,
         notices: "SimpleQueue[str] | None" = None,
     ) -> None:
         self._notices = notices
@@ -195,7 +197,7 @@ class _Run:
         self._run_dir = run_dir
         self._coordinator = coordinator
         self._children = children
-        self._watcher = watcher
+        self._observers, self._helpers = observers, helpers
         self._by_hand = [role for role in ROLES if role not in children]
         self._missing: tuple[str, ...] = ()
         self._has_started = self._has_ended = False
@@ -240,7 +242,8 @@ class _Run:
             # Now, as nothing waits for the launcher: the versions of all packages take 0.02 s.
             write_environment(self._run_dir, "live", run_name(self._run_id))
             point_to_latest(self._run_dir)
-            self._watcher.started(self._run_dir)
+            self._observers.tell(lambda observer: observer.started(self._run_dir))
+            self._helpers.prepare(self._run_dir)
             self._limit = WaitLimit(overtime_s(self._scenario.horizon_s / self._scenario.speed))
         elif not self._has_ended and not self._is_in_loop():
             self._has_ended = True  # while the processes end: the imports take 0.3 s
@@ -267,7 +270,7 @@ class _Run:
     def _stop(self, reason: str) -> None:
         self._coordinator.stop(reason)
         if self._has_started:
-            self._watcher.stopping(reason)
+            self._observers.tell(lambda observer: observer.stopping(reason))
         self._limit = WaitLimit(_STOP_TIMEOUT_S)
 
     def _is_over(self, *, stopping: bool) -> bool:
@@ -293,13 +296,16 @@ class _Run:
         missing = tuple(role for role in self._coordinator.missing() if role in self._by_hand)
         if missing != self._missing:
             self._missing = missing
-            self._watcher.waiting(missing)
+            self._observers.tell(lambda observer: observer.waiting(missing))
 
     def _notify_progress(self) -> None:
         if (progress := self._coordinator.progress()) is not None:
-            self._watcher.progress(progress)
+            self._observers.tell(lambda observer: observer.progress(progress))
         while self._notices is not None and not self._notices.empty():
-            self._watcher.notice(self._notices.get_nowait())
+            self._notify_line(self._notices.get_nowait())
+
+    def _notify_line(self, line: str) -> None:
+        self._observers.tell(lambda observer: observer.notice(line))
 
     def _start_within_s(self) -> float:
         given_s = self._scenario.start_within_s

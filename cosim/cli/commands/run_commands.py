@@ -120,10 +120,10 @@ def bridge(
     from cosim.live.monitoring.ros2_bridge import bridge_process
 
     loaded = opt.load_scenario(scenario, settings)
-    with bridge_process(router, domain, listen=listen) as watcher:
+    with bridge_process(router, domain, listen=listen) as observer:
         return run_processes(
             loaded, runs, live=live, report=report, verbose=verbose, json=json,
-            server=context.obj, watcher=watcher,
+            server=context.obj, observers=[observer],
         )  # fmt: skip
 
 

@@ -1,36 +1,27 @@
-"""Progress of runs and computations on the terminal."""
+"""Progress of simulations and computations on the terminal."""
 
-import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from threading import Event, Thread
 from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import (
     BarColumn,
     Progress,
     SpinnerColumn,
-    TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
 
-from cosim.live.monitoring.run_watcher import Watcher
 from noack.core.clock import NS_PER_S
 from noack.runtime.command_line import print_to_stderr
-from noack.runtime.control_messages import RunProgress
-from noack.scenario.scenario import Scenario, loop_names
 
 if TYPE_CHECKING:
-    from cosim.live.coordination.remote_access import ListenSettings
+    pass
 
-_PLAIN_LINES = 10
-"""Progress lines of a run on a terminal that cannot redraw a line."""
 _LINE_EVERY_S = 10.0
 """Time between two lines about some work, if there is no terminal."""
 _LEAST_SHARE = 0.1
@@ -47,86 +38,6 @@ class PipeSafeConsole(Console):
 def error_console() -> Console:
     """Return such a console on standard error."""
     return PipeSafeConsole(stderr=True)
-
-
-@contextmanager
-def progress_line(console: Console, scenario: Scenario) -> Iterator[Watcher]:
-    """Show the progress of a run while the context lasts."""
-    live = console.is_terminal and not console.is_dumb_terminal
-    columns = (BarColumn(bar_width=12), TextColumn("{task.description}"))
-    with Progress(*columns, console=console, disable=not live, transient=False) as progress:
-        shown = _RunProgress(console, progress, scenario)
-        yield Watcher(
-            waiting=shown.waiting,
-            listening=shown.listening,
-            started=shown.started,
-            progress=shown.update,
-            stopping=shown.stopping,
-            notice=shown.notice,
-        )
-
-
-class _RunProgress:
-    """What has been shown of a run."""
-
-    def __init__(self, console: Console, progress: Progress, scenario: Scenario) -> None:
-        self._console, self._progress, self._scenario = console, progress, scenario
-        self._task: TaskID | None = None
-        self._plain_lines = 0
-        self._lines: dict[str, int] = {}
-        """How many lines of a list have been shown, by field."""
-
-    def waiting(self, roles: Sequence[str]) -> None:
-        """Name the processes that the start barrier waits for."""
-        if roles:
-            self._print(f"waiting for {', '.join(roles)}")
-
-    def listening(self, address: str, settings: "ListenSettings") -> None:
-        """Say how processes on other hosts join."""
-        role = settings.role or "plant|sensor|netem|controller"
-        self._print(
-            f"listening on {escape(address)}; copy the invitation to the other hosts, and start "
-            f"processes there within {settings.valid_s / 60:g} min; it has secret keys:\n"
-            f"  scp {escape(str(settings.invitation))} HOST:\n"
-            f"  noack {role} --invitation {escape(settings.invitation.name)}"
-        )
-
-    @property
-    def _loops(self) -> int:
-        return len(loop_names(self._scenario))
-
-    def started(self, run_dir: Path) -> None:
-        """Begin the bar."""
-        self._task = self._progress.add_task(self._scenario.name, total=self._scenario.horizon_s)
-
-    def stopping(self, why: str) -> None:
-        """Say why the run ends early: the completion of its record may take minutes."""
-        self._print(f"{escape(why)}; the run ends, and its record is completed")
-
-    def notice(self, line: str) -> None:
-        """Show a line about the run."""
-        self._print(escape(line))
-
-    def update(self, report: RunProgress) -> None:
-        """Show the recorder's progress report."""
-        self._print_new("live", [report.live] if report.live else [], "{}")
-        self._print_new("warnings", report.warnings, "[yellow]{}[/]")
-        self._print_new("changes", report.changes, "changed: {}")
-        text = progress_text(report, self._scenario.horizon_s, self._loops)
-        if self._task is not None:
-            self._progress.update(self._task, completed=report.t_s, description=text)
-        due = math.floor(report.t_s / self._scenario.horizon_s * _PLAIN_LINES)
-        if self._console.is_dumb_terminal and due > self._plain_lines:
-            self._plain_lines = due
-            self._print(text)
-
-    def _print_new(self, field: str, texts: Sequence[str], form: str) -> None:
-        for text in texts[self._lines.get(field, 0) :]:
-            self._print(form.format(escape(text)))
-        self._lines[field] = max(self._lines.get(field, 0), len(texts))
-
-    def _print(self, line: str) -> None:
-        self._console.print(line, highlight=False, soft_wrap=True)
 
 
 @contextmanager
@@ -263,14 +174,3 @@ def search_activity() -> Iterator[Callable[[str], Callable[[str, int, float], No
             )
 
         yield named
-
-
-def progress_text(report: RunProgress, horizon_s: float, loops: int = 1) -> str:
-    """The recorder's progress report as one line; ``loops`` is the number of loops."""
-    norm = "-" if report.x_norm is None else f"{report.x_norm:.3g}"
-    of_loops = f"{loops} loops  " if loops > 1 else ""
-    return (
-        f"{report.t_s:.1f}/{horizon_s:g} s  {of_loops}events {report.events}  "
-        f"delivered {report.deliveries}  longest loss burst {report.longest_loss_burst}  "
-        f"late by up to {report.late_us / 1e3:.2g} ms  ‖x‖ {norm}"
-    )

@@ -12,12 +12,13 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 import zenoh
 from zenoh.handlers import RingChannel
 
-from cosim.live.monitoring.run_watcher import Watcher
+from cosim.live.monitoring.run_observers import RunObserver
 from cosim.record.run_directory import SCENARIO_FILE
 from noack.core.errors import CallerError, ExitStatus, NoackError, PeerError
 from noack.core.system_processes import python_command
@@ -125,9 +126,21 @@ def wait_for_run(run_dir: Path, timeout_s: float) -> OpenRun:
             time.sleep(_POLL_S)
 
 
+class _RunDirectory(RunObserver):
+    """Writes the run directory of the run that it follows."""
+
+    def __init__(self, file: IO[str]) -> None:
+        self._file = file
+
+    def started(self, run_dir: Path) -> None:
+        """Write it."""
+        self._file.write(f"{run_dir.resolve()}\n")
+        self._file.flush()
+
+
 @contextmanager
-def bridge_process(router: str, domain: int, *, listen: bool) -> Iterator[Watcher]:
-    """Start the bridge's process within the context; yield the callbacks that send it the run directory.
+def bridge_process(router: str, domain: int, *, listen: bool) -> Iterator[RunObserver]:
+    """Start the bridge's process within the context; yield what sends it the run directory.
 
     Raises:
         CallerError: it cannot join the graph of ROS 2; its process has printed why.
@@ -140,14 +153,8 @@ def bridge_process(router: str, domain: int, *, listen: bool) -> Iterator[Watche
         assert process.stdout is not None
         if process.stdout.readline() != _READY:
             raise CallerError(process.communicate()[1].strip() or "the bridge did not start")
-        stdin = process.stdin
-
-        def started(run_dir: Path) -> None:
-            stdin.write(f"{run_dir.resolve()}\n")
-            stdin.flush()
-
         try:
-            yield Watcher(started=started)
+            yield _RunDirectory(process.stdin)
             sent, errors = process.communicate(timeout=_END_S)
         except subprocess.TimeoutExpired:
             sent, errors = "", "it did not end\n"

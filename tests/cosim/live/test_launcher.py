@@ -10,8 +10,9 @@ import pytest
 import noack
 from cosim.live.finalize import reopen
 from cosim.live.launcher import _Run, launch
-from cosim.live.monitoring.run_watcher import Watcher
+from cosim.live.monitoring.run_observers import RunObserver, RunObservers
 from cosim.live.processes.child_processes import ChildProcesses, EndReason
+from cosim.live.processes.finalize_helpers import FinalizeHelpers
 from noack.core.errors import CallerError, ExitStatus
 from noack.protocol.roles import RECORDER, ROLES
 from noack.runtime import command_line
@@ -77,6 +78,13 @@ class FakeChildren(ChildProcesses):
         cast(Any, self._children[role]).code = code
 
 
+class Calls(RunObserver):
+    """Calls functions, given by the names of methods."""
+
+    def __init__(self, **functions: Any) -> None:
+        vars(self).update(functions)
+
+
 class Case:
     """A run of one second."""
 
@@ -92,8 +100,9 @@ class Case:
         return FakeChildren(self.descriptor, self.run_dir, code)
 
     def run(self, children: FakeChildren, coordinator: FakeCoordinator, **watch: Any) -> _Run:
-        watcher = Watcher(**watch)
-        return _Run(self.descriptor, self.run_dir, cast(Any, coordinator), children, watcher, SimpleQueue())
+        observers, helpers = RunObservers([Calls(**watch)]), FinalizeHelpers(self.descriptor.scenario)
+        run_dir, plane = self.run_dir, cast(Any, coordinator)
+        return _Run(self.descriptor, run_dir, plane, children, observers, helpers, SimpleQueue())
 
 
 @pytest.fixture
@@ -194,9 +203,12 @@ def test_after_a_second_signal_the_record_is_incomplete_and_can_be_completed(
     def interrupt(_: object) -> None:
         signal.raise_signal(signal.SIGINT)
 
-    watcher = Watcher(started=interrupt, stopping=interrupt)
     with pytest.raises(StopRequestError, match=r"stopped by the user \(SIGINT\)") as stopped:
-        launch(noack.load("double_integrator"), tmp_path, watcher=watcher)
+        launch(
+            noack.load("double_integrator"),
+            tmp_path,
+            observers=[Calls(started=interrupt, stopping=interrupt)],
+        )
     (run_dir,) = (path for path in tmp_path.iterdir() if not path.is_symlink())
     how = f"its record is incomplete: `noack summary {run_dir}` completes it"
     assert (stopped.value.exit_status, stopped.value.__notes__) == (ExitStatus.INTERRUPTED, [how])

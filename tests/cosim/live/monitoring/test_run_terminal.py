@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from cosim.live.monitoring.progress import progress_line
+from cosim.live.monitoring.run_terminal import RunTerminal
 from noack.runtime.control_messages import RunProgress
 from tests.helpers.shipped import resolved
 
@@ -20,9 +20,9 @@ def test_the_terminal_reports_each_cause_once(terminal: bool) -> None:
         "live": None,
     }  # fmt: skip
     console = Console(file=output, force_terminal=terminal, width=200)
-    with progress_line(console, resolved("lane_following")) as watcher:
-        watcher.started(Path())
+    with RunTerminal(resolved("lane_following"), console) as terminal_line:
+        terminal_line.started(Path())
         for void in ([], ["one [cause]"], ["one [cause]"], ["one [cause]", "another"]):
-            watcher.progress(RunProgress(**report, warnings=void))
+            terminal_line.progress(RunProgress(**report, warnings=void))
     assert output.getvalue().count("one [cause]") == 1
     assert output.getvalue().count("another") == 1
