@@ -130,6 +130,24 @@ def warn_of_other_runs() -> None:
         )
 
 
+def simulate_continuously(loaded: Scenario, *, json: bool) -> int:
+    """Simulate a scenario in continuous time, print the result, and return the exit status."""
+    from cosim.output.continuous_report import print_continuous_run
+    from cosim.simulation import continuous
+
+    resolved = resolve(loaded)
+    warn_of_left_out(resolved)
+    with status("simulating"):
+        run = continuous.run_continuous(resolved)
+    summary = continuous.summary(run, resolved)
+    if json:
+        print_json(continuous.document(run, resolved))
+    else:
+        constraints = [rule.text() for rule in resolved.network.constraints]
+        print_continuous_run(console(), run, summary, constraints)
+    return summary.exit_status
+
+
 _COMPLETING = "replaying the run, checking its claims, writing its report"
 
 

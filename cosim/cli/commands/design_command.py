@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Literal
 
 import typer
 from typer import Option
@@ -16,9 +16,6 @@ from cosim.output.figures.figure_format import requested_files
 from cosim.record.run_directory import DEFAULT_RUNS
 from noack.core.errors import CallerError, ExitStatus
 from noack.runtime.command_line import print_to_stderr
-
-if TYPE_CHECKING:
-    from cosim.studies.design.design_search import BoundedQuantity
 
 app = typer.Typer()
 
@@ -247,10 +244,10 @@ def _require_writable(out: Path | None) -> None:
             raise CallerError(message) from None
 
 
-def _bounds(texts: Sequence[str]) -> "dict[BoundedQuantity, float]":
+def _bounds(texts: Sequence[str]) -> dict[Literal["state", "error"], float]:
     """Return the limits of certified bounds; raise CallerError if one is wrong."""
-    by_quantity: dict[BoundedQuantity, float] = {}
-    bounded: dict[str, BoundedQuantity] = {"state": "state", "error": "error"}
+    by_quantity: dict[Literal["state", "error"], float] = {}
+    bounded: dict[str, Literal["state", "error"]] = {"state": "state", "error": "error"}
     for text in texts:
         name, _, value = text.partition("=")
         try:

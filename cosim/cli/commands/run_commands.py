@@ -1,19 +1,16 @@
 """``noack demo``, ``run``, ``bridge``, ``simulate``: make a run; ``set``: change a live one."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from typer import Argument, Option
 
 from cosim.cli import options as opt
 from cosim.cli.options import RUNS, examples
-from cosim.cli.printing import console, print_json, status
+from cosim.cli.printing import console, print_json
 from cosim.record.run_directory import DEFAULT_RUNS
 from noack.runtime.command_line import LogFormat, print_to_stderr
-
-if TYPE_CHECKING:
-    from noack.scenario.scenario import Scenario
 
 app = typer.Typer()
 
@@ -153,36 +150,17 @@ def simulate(
 
     Takes about 4 s; with the report, 6 s.
     """
-    from cosim.cli.execute_run import finalize_run, warn_of_violations
+    from cosim.cli.execute_run import finalize_run, simulate_continuously, warn_of_violations
     from cosim.live.monitoring.progress import error_console, simulation_bar
     from cosim.simulation.virtual_time import simulate_run
 
     loaded = opt.load_scenario(scenario, settings)
     warn_of_violations(loaded)
     if trigger is opt.TriggerMode.CONTINUOUS:
-        return _simulate_continuously(loaded, json=json)
+        return simulate_continuously(loaded, json=json)
     with simulation_bar(error_console(), loaded.horizon_s) as bar:
         ending = simulate_run(loaded, runs, bar)
     return finalize_run(ending, report=report, verbose=verbose, json=json)
-
-
-def _simulate_continuously(loaded: "Scenario", *, json: bool) -> int:
-    from cosim.cli.execute_run import warn_of_left_out
-    from cosim.output.continuous_report import print_continuous_run
-    from cosim.simulation import continuous
-    from noack.scenario.resolution import resolve
-
-    resolved = resolve(loaded)
-    warn_of_left_out(resolved)
-    with status("simulating"):
-        run = continuous.run_continuous(resolved)
-    summary = continuous.summary(run, resolved)
-    if json:
-        print_json(continuous.document(run, resolved))
-    else:
-        constraints = [rule.text() for rule in resolved.network.constraints]
-        print_continuous_run(console(), run, summary, constraints)
-    return summary.exit_status
 
 
 @app.command(

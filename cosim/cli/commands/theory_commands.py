@@ -1,9 +1,8 @@
 """``noack certify``, ``margin``, ``adversary``, ``cost``: all losses, bad ones, random ones."""
 
-from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from typer import Option
@@ -14,9 +13,6 @@ from cosim.cli.printing import console, print_json, status, write_tables
 from cosim.record.run_directory import DEFAULT_RUNS
 from noack.core.errors import CallerError, ExitStatus
 from noack.runtime.command_line import StopRequestError, print_to_stderr
-
-if TYPE_CHECKING:
-    from noack.scenario.scenario import Scenario
 
 app = typer.Typer()
 
@@ -149,7 +145,14 @@ def adversary(
     from noack.scenario.resolution import resolve
     from noack.theory.certificates.scenario_certificates import certify as certify_scenario
 
-    resolved = resolve(_with_horizon(scenario, settings, loop, horizon))
+    try:
+        within = [] if horizon is None else [f"horizon_s={horizon}"]
+        resolved = resolve(opt.load_loop(scenario, [*(settings or ()), *within], loop))
+    except CallerError as error:  # a message about the horizon names the option that set it
+        if horizon is None:
+            raise
+        line = str(error).replace("--set horizon_s =", "--horizon")
+        raise CallerError(line.replace("--set horizon_s", "--horizon")) from None
     continuous = trigger is opt.TriggerMode.CONTINUOUS
     if continuous:
         warn_of_left_out(resolved)
@@ -185,19 +188,6 @@ def adversary(
         print_to_stderr(f"noack: {stopped}; missing: {missing}")
         return stopped.exit_status
     return ExitStatus.FAILED if any(worst.breaches for worst in worst_cases) else ExitStatus.OK
-
-
-def _with_horizon(
-    scenario: str, settings: Sequence[str] | None, loop: str | None, horizon_s: float | None
-) -> "Scenario":
-    """Return the scenario with another horizon; a message about it names the option that set it."""
-    if horizon_s is None:
-        return opt.load_loop(scenario, settings, loop)
-    try:
-        return opt.load_loop(scenario, [*(settings or ()), f"horizon_s={horizon_s}"], loop)
-    except CallerError as error:
-        line = str(error).replace("--set horizon_s =", "--horizon")
-        raise CallerError(line.replace("--set horizon_s", "--horizon")) from None
 
 
 @app.command(
