@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cosim.studies.new_loop.plant_reference import PlantReference, plant_reference
 from noack.core.errors import CallerError
+from noack.core.file_access import write_whole
 from noack.core.linear_systems import Matrix, Vector, norm
 from noack.core.number_format import TextRows, as_text, to_digits
 from noack.plants.systems.linearisation import LinearMotion, largest_errors
@@ -413,6 +414,21 @@ def read_document(path: Path) -> dict[str, UserCode]:
     ):
         raise CallerError(f"{path}: not written by `noack linearise` or `noack gain`")
     return document
+
+
+def write_document(result: LinearModel | LoopGain, path: Path) -> None:
+    """Write the document of a model or a gain, not over that of another plant.
+
+    Raises:
+        CallerError: the file has another ending, or the model of another plant.
+        MachineError: the file cannot be written.
+    """
+    if path.suffix != ".json":
+        raise CallerError(f"--out {path}: the name of a model ends in .json")
+    document = result.to_json()
+    if path.exists() and (other_plant := read_document(path)["plant"]) != document["plant"]:
+        raise CallerError(f"--out {path}: has the model of {other_plant}; give another name")
+    write_whole(path, json.dumps(document, indent=2))
 
 
 def model_or_gain(plant: str, settings: ReadTable) -> LinearModel | LoopGain:

@@ -1,0 +1,181 @@
+"""``noack linearise``, ``gain``, ``new``: from a plant to a scenario."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, TypeVar
+
+import typer
+from typer import Argument, Option
+
+from cosim.cli import options as opt
+from cosim.cli.options import FILES, examples
+from cosim.cli.printing import print_lines, status
+from noack.core.errors import CallerError
+
+app = typer.Typer()
+
+Number = TypeVar("Number", float, complex)
+PlantArgument = Annotated[
+    str,
+    Argument(
+        metavar="PLANT",
+        help="FILE.py:Class, a kind of plant such as cart_pole, a scenario, or a file that "
+        "linearise or gain wrote.",
+    ),
+]
+
+
+@app.command(
+    rich_help_panel=FILES,
+    epilog=examples(
+        ("noack linearise cart_pole", "a plant that comes with noack"),
+        ("noack linearise pole.py:Pole --out pole.json", "a class of yours; write the model"),
+        ("noack linearise four_tank --set plant.system.voltages_v=[4.0,4.0] --json", "as JSON"),
+    ),
+)
+def linearise(
+    plant: PlantArgument,
+    settings: opt.SetOption = None,
+    at: Annotated[str | None, Option(help="x at the point, e.g. 0,0,0.1,0; by default 0.")] = None,
+    operating_input: Annotated[str | None, Option("--input", help="u at the point; by default 0.")] = None,
+    within: Annotated[
+        float, Option(help="Half-width of the neighbourhood in which the error is sampled.")
+    ] = 0.1,
+    out: Annotated[
+        Path | None,
+        Option(callback=opt.usable_path, help="Write the model as JSON, for gain and new."),
+    ] = None,
+    json: opt.JsonOption = False,
+) -> None:
+    """Print the linear model of a plant, its error, its eigenvalues and its controllable part.
+
+    A plant with a derivative is differentiated; another one is moved, and the matrix logarithm of a
+    step is taken. This runs the code of a plant in Python.
+
+    Takes about a second.
+    """
+    from cosim.studies.new_loop.linear_model import linearise as linearise_plant
+    from cosim.studies.new_loop.linear_model import write_document
+
+    model = linearise_plant(
+        plant,
+        at=_numbers("--at", at),
+        input=_numbers("--input", operating_input),
+        settings=_table(settings),
+        within=within,
+    )
+    if out is not None:
+        write_document(model, out)
+    print_lines(json, model.to_json(), repr(model))
+
+
+@app.command(
+    rich_help_panel=FILES,
+    epilog=examples(
+        ("noack gain cart_pole --q 10,1,10,1 --r 0.1", "a regulator for these weights"),
+        ("noack gain pole.json --out pole.json", "add a gain to a model that linearise wrote"),
+        ("noack gain cart_pole --poles=-2,-3,-4,-5 --json", "given poles, as JSON"),
+    ),
+)
+def gain(
+    plant: PlantArgument,
+    settings: opt.SetOption = None,
+    q: Annotated[
+        str | None,
+        Option(
+            "--q",
+            help="Weight of the states in ∫ xᵀQx + uᵀRu dt: a number, or the diagonal, e.g. "
+            "10,1,10,1; by default 1.",
+        ),
+    ] = None,
+    r: Annotated[str | None, Option("--r", help="Weight of the inputs, likewise.")] = None,
+    poles: Annotated[
+        str | None,
+        Option(help="Eigenvalues of Â + B̂K instead, e.g. --poles=-1,-2,-3+1j,-3-1j."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        Option(callback=opt.usable_path, help="Write the model and the gain as JSON, for new."),
+    ] = None,
+    json: opt.JsonOption = False,
+) -> None:
+    """Compute the gain K of u = K x: a linear-quadratic regulator, or given closed-loop poles.
+
+    Takes about a second.
+    """
+    from cosim.studies.new_loop.linear_model import gain as gain_of_plant
+    from cosim.studies.new_loop.linear_model import write_document
+
+    result = gain_of_plant(
+        plant,
+        q=_numbers("--q", q),
+        r=_numbers("--r", r),
+        poles=_numbers("--poles", poles, complex),
+        settings=_table(settings),
+    )
+    if out is not None:
+        write_document(result, out)
+    print_lines(json, result.to_json(), repr(result))
+
+
+@app.command(
+    rich_help_panel=FILES,
+    epilog=examples(
+        ("noack new pole.toml --plant pole.py:Pole", "everything from a class of yours"),
+        ("noack new pole.toml --plant pole.json", "from the file of linearise or gain"),
+        ("noack new tanks.toml --plant four_tank --set network.mansd=2", "keep a setting"),
+    ),
+)
+def new(
+    file: Annotated[Path, Argument(metavar="FILE.toml", help="The scenario file to write.")],
+    plant: Annotated[str, Option("--plant", metavar="PLANT", help="As for linearise.")],
+    settings: opt.SetOption = None,
+    x0: Annotated[
+        str | None,
+        Option("--x0", help="The initial state x(0), e.g. 0.1,0,0.1,0; by default chosen."),
+    ] = None,
+    json: opt.JsonOption = False,
+) -> None:
+    """Write a complete scenario for a plant, with comments, and settings that are certified.
+
+    The gain is chosen, too, unless the plant is a file that gain wrote. Choose it by weights or
+    poles there: `noack gain PLANT --q 10,1 --r 0.1 --out pole.json`. If no certificate is found,
+    the scenario is written all the same, with the reason. --set fixes settings.
+
+    Takes some 10 s.
+    """
+    from cosim.studies.new_loop.new_scenario import new as new_scenario
+
+    if file.suffix != ".toml":
+        raise CallerError(f"{file}: the name of a scenario file ends in .toml")
+    if file.exists():
+        raise CallerError(f"{file}: exists; give another name, or remove it first")
+    if not file.parent.is_dir():
+        raise CallerError(f"{file}: there is no folder {file.parent}")
+    with status("linearising") as change:
+        result = new_scenario(
+            plant,
+            file,
+            initial_state=_numbers("--x0", x0),
+            settings=_table(settings),
+            report=change,
+        )
+    result.save(file)
+    following = f"wrote {file}; now noack check, certify, simulate or run {file}"
+    print_lines(json, result.to_json(), *result.notes, following)
+
+
+def _table(assignments: Sequence[str] | None) -> dict[str, object]:
+    """Return the values of --set by their keys."""
+    from noack.scenario.scenario_file import setting_of
+
+    return dict(setting_of(assignment, "plant.system.cart_kg=1.0") for assignment in assignments or ())
+
+
+def _numbers(option: str, text: str | None, kind: Callable[[str], Number] = float) -> list[Number] | None:
+    if text is None:
+        return None
+    try:
+        return [kind(word) for word in text.replace(" ", "").strip("[]()").split(",")]
+    except ValueError:
+        raise CallerError(f"{option} {text}: give numbers with commas, e.g. -1,-0.5") from None
