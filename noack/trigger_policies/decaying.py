@@ -6,15 +6,11 @@ with ‖v‖_W = ‖W v‖₂ and t counted from the run's start. W = I and ε =
 minimum inter-event time is positive by Theorem 2 for 0 < α < ᾱ; with ε > 0 stability is practical.
 """
 
-import math
-from typing import ClassVar, Literal, Self
+from typing import ClassVar, Literal
 
 from noack.settings.section import NonNegative, Positive
 from noack.trigger_policies.policy_settings import ModelMatrices, WeightedSettings
 from noack.trigger_policies.trigger_rule import TriggerRule, error_form
-
-_LEAST_BETA = 1e-300
-"""Least threshold: it stays above 0 for all times."""
 
 
 class DecayingSettings(WeightedSettings):
@@ -38,10 +34,6 @@ class DecayingSettings(WeightedSettings):
     @property
     def description(self) -> str:
         return f"‖e_s‖ > {decaying_text(self.beta, self.alpha_per_s, self.floor)}"
-
-    def at_origin(self, t_s: float) -> Self:
-        beta = max(self.beta * math.exp(-self.alpha_per_s * t_s), _LEAST_BETA)
-        return self.model_copy(update={"beta": beta})
 
 
 def decaying_text(beta: float, alpha_per_s: float, floor: float) -> str:

@@ -78,10 +78,6 @@ class PolicySettings(ScenarioSection):
         """Why exact simulation cannot apply the policy; None if it can."""
         return None
 
-    def at_origin(self, t_s: float) -> Self:
-        """Return the settings of the same trigger with times counted from ``t_s`` on."""
-        return self
-
     def check(self, n: int, why: str) -> None:
         """Require matrices of the right shapes for n states.
 
@@ -180,9 +176,6 @@ class CombinedSettings(PolicySettings):
     @property
     def weight(self) -> MatrixRows | None:
         return self.rule.weight
-
-    def at_origin(self, t_s: float) -> Self:
-        return self.model_copy(update={"rule": self.rule.at_origin(t_s)})
 
     def check(self, n: int, why: str) -> None:
         try:

@@ -5,7 +5,6 @@
 * :func:`disturbances` of u and of ẋ.
 """
 
-import math
 from functools import lru_cache
 from typing import NamedTuple, TypedDict
 
@@ -76,16 +75,16 @@ class SampleFacts(NamedTuple):
     gap_s: float | None = None
     """First time at which the controller's error is not known, although it was before."""
     largest_state: float = 0.0
-    """Largest entry of x_s, and of x_c where it is known, before the end of the claims."""
+    """Largest entry of x_s, and of x_c where it is known."""
     longest_update_ns: int = 0
     """Longest time between two updates of the controller, or to the end of the run."""
 
 
 class SampleFactsReader:
-    """Reads these facts, part by part of an aligned run; the claims end at ``until_s``."""
+    """Reads these facts, part by part of an aligned run."""
 
-    def __init__(self, scenario: Scenario, until_s: float = math.inf) -> None:
-        self._scenario, self._until_s = scenario, until_s
+    def __init__(self, scenario: Scenario) -> None:
+        self._scenario = scenario
         self._facts = SampleFacts()
         self._fresh_ns: int | None = None
         self._newest, self._last_ns = -1, 0
@@ -99,10 +98,7 @@ class SampleFactsReader:
         started = np.logical_or.accumulate(bounded) | facts.is_ever_bounded
         gaps = np.flatnonzero(started & ~bounded)
         gap_s = float(t_s[gaps[0]]) if facts.gap_s is None and len(gaps) else facts.gap_s
-        until = t_s < self._until_s
-        both = np.concatenate(
-            [aligned.x_s.compress(until, axis=0), aligned.x_c.compress(bounded & until, axis=0)]
-        )
+        both = np.concatenate([aligned.x_s, aligned.x_c.compress(bounded, axis=0)])
         largest = float(np.abs(both[np.isfinite(both)]).max(initial=facts.largest_state))
         changes = aligned.t_ns[np.flatnonzero(np.diff(aligned.received, prepend=self._newest))]
         ends_ns = changes if self._fresh_ns is None else np.append(self._fresh_ns, changes)

@@ -275,32 +275,6 @@ class EnclosedMotion:
             )
         return Inclusion(centre[:, :n], centre[:, n:], halves[:, :n], halves[:, n:])
 
-    def bound_bend(self, C: Matrix, reach: Vector, forcing: Vector, period_s: float) -> float:
-        """Return a bound of T² sup‖C ẍ‖/8 over steps of length T that begin in a region.
-
-        By that much C x differs at most from its chord over a step; u is constant within it.
-
-        Args:
-            C: (k, n).
-            reach: largest |(x, u)_j| at the beginnings, (n + m,).
-            forcing: bounds of what is added to ẋ, constant within a step, (n,).
-            period_s: T.
-
-        Raises:
-            NotEnclosedError: there is no enclosure over the region that the steps reach.
-        """
-        n, halfwidths = self.n, reach
-        for _ in range(_WIDENINGS):
-            rates = self._values(halfwidths, range(n + self.m + 1))
-            slopes = np.array([[_size(slope) for slope in rate.slopes] for rate in rates])
-            speed = np.array([_size(rate.value) for rate in rates]) + forcing
-            moved = np.concatenate([period_s * speed, np.zeros(self.m)])
-            if (reach + moved <= halfwidths).all():  # so x stays in the region: ẍ = f_x ẋ + f_t
-                bend = np.abs(C) @ (slopes[:, :n] @ speed + slopes[:, -1])
-                return period_s**2 / 8 * float(np.linalg.norm(bend))
-            halfwidths = reach + 2 * moved
-        raise NotEnclosedError("x moves too far within a step")
-
     @cached_property
     def at_rest(self) -> Vector:
         """Bounds of the entries of |f(0, 0)|, (n,): 0, or what rounding leaves.

@@ -119,8 +119,6 @@ class TriggerBounds:
     """Rate of the model's fastest mode."""
     largest: float = math.inf
     """A bound of the ‖W x‖ that the rule compares, if one is known."""
-    starts_on_grid: bool = True
-    """Whether the first event is at a time at which the rule compares, if it does so on a grid."""
 
     @cached_property
     def comparison(self) -> ComparisonBound | None:
@@ -185,9 +183,7 @@ class TriggerBounds:
             raise NoCertificateError("the rule compares on a grid, and measurements there may be missing")
         grid_s = spacing_s = _rounded_up(grid_s, step_s)
         due_ns = self.rule.longest_ns
-        if self.has_due_time and not self.starts_on_grid:  # all due events may be beside the grid
-            spacing_s = step_s
-        elif self.has_due_time and due_ns % self.rule.grid_ns:  # due between two points of the grid
+        if self.has_due_time and due_ns % self.rule.grid_ns:  # due between two points of the grid
             spacing_s = step_s or math.gcd(round(self.rule.grid_ns), round(due_ns)) / NS_PER_S
         return conditions._replace(sampling_s=grid_s, spacing_s=spacing_s)
 

@@ -55,7 +55,7 @@ class ConstantsSearch:
         plant_at: returns the plants' gains.
         trigger: what is used of the scenario's trigger.
         start: x(0), or a matrix that maps the unit ball to a set of x(0), (n, k).
-        start_error: sup‖u − Kx‖, scaled, of an earlier run's inputs at the start; 0 without one.
+        start_error: sup‖u − Kx‖, scaled, until the first input of the controller; 0: as bounds assume.
         decay_per_s: the smaller decay rate of the models and of A + BK.
     """
 

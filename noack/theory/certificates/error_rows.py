@@ -55,7 +55,7 @@ class ErrorRows:
         part: that of one loop, or of several, as in the inequalities.
         conditions: those of the network.
         first_input_error: bound of ‖p‖ before the first input.
-        begin_s: time of the first input; infinite if inputs of an earlier run are applied before.
+        begin_s: time of the first input; infinite if the first inputs at a set-point are applied before.
     """
 
     def __init__(

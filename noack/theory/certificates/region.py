@@ -67,22 +67,20 @@ def scopes(resolved: Scenario, start_error: float | None = None) -> list[Certifi
     if resolved.coverage.linear_certificates_apply:
         linear = own_plant_scope(resolved, start_error), box_scope(resolved, start_error)
         return [scope for scope in linear if scope is not None]
-    return [RegionScope(resolved, start_error)] if resolved.coverage.some_certificate_applies else []
+    return [RegionScope(resolved)] if resolved.coverage.some_certificate_applies else []
 
 
 class _Box(CertificateScope):
     """The plants of an inclusion."""
 
-    def __init__(
-        self, resolved: Scenario, inclusion: Inclusion, start_error: float | None, start: Matrix | None
-    ) -> None:
+    def __init__(self, resolved: Scenario, inclusion: Inclusion, start: Matrix | None) -> None:
         A, B, half_A, half_B = inclusion
 
         def plant_at(error: ErrorGains, start: Matrix, alpha_per_s: float) -> PlantGains:
             return BoxGains(error, A, B, start, alpha_per_s, half_A, half_B)
 
         closed_loop = A + B @ loop_of(resolved).K
-        super().__init__(REGION, resolved, closed_loop, plant_at, start_error, start)
+        super().__init__(REGION, resolved, closed_loop, plant_at, start=start)
 
     def bounded(self, conditions: NetworkConditions) -> Search[tuple[list[Phases], Vector]]:
         """Search for constants, and for bounds of |x_j| and |u_i| at all times, (n + m,).
@@ -119,14 +117,12 @@ class _ProvenRegion(NamedTuple):
 class RegionScope(_Box):
     """A nonlinear plant within a region; see :class:`CertificateScope`."""
 
-    def __init__(
-        self, resolved: Scenario, start_error: float | None = None, start: Matrix | None = None
-    ) -> None:
+    def __init__(self, resolved: Scenario, start: Matrix | None = None) -> None:
         loop, self._proven = loop_of(resolved), dict[NetworkConditions, _ProvenRegion]()
-        self._given_error, self._other_start = start_error, start
+        self._other_start = start
         # The plants of the model; those of each region take their place.
         model = Inclusion(loop.A_model, loop.B_model, 0 * loop.A_model, 0 * loop.B_model)
-        super().__init__(resolved, model, start_error, start)
+        super().__init__(resolved, model, start)
 
     def search(self, conditions: NetworkConditions, why: str | None = None) -> Search[ScenarioCertificate]:
         """Search for the certificate under some conditions, and its region."""
@@ -179,7 +175,7 @@ class RegionScope(_Box):
         for _ in range(_ATTEMPTS):
             try:
                 inclusion = self._motion.over(widths)
-                plants = _Box(self._resolved, inclusion, self._given_error, self._other_start)
+                plants = _Box(self._resolved, inclusion, self._other_start)
                 phases, reached = yield from plants.bounded(conditions)
             except (NotEnclosedError, SystemFailedError) as error:  # also from a user's class
                 if isinstance(error, NotInstalledError):

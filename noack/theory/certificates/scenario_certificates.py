@@ -42,12 +42,12 @@ _LARGEST_START = 1e150
 """The squares of larger entries of x(0) may overflow."""
 
 
-def trigger_bounds(resolved: Scenario, *, starts_on_grid: bool = True) -> TriggerBounds:
+def trigger_bounds(resolved: Scenario) -> TriggerBounds:
     """Return what a certificate uses of a resolved scenario's trigger."""
     loop = loop_of(resolved)
     weight = np.eye(loop.n) if loop.weight is None else loop.weight
     fastest = float(np.abs(np.linalg.eigvals(loop.A_model + loop.B_model @ loop.K)).max()) or 1.0
-    return TriggerBounds(rule_of(resolved), weight, fastest, starts_on_grid=starts_on_grid)
+    return TriggerBounds(rule_of(resolved), weight, fastest)
 
 
 def certify(resolved: Scenario, conditions: NetworkConditions) -> ScenarioCertificate:
@@ -117,10 +117,10 @@ class CertificateScope:
         resolved: the scenario.
         closed_loop: A + BK, for a box that of its centre, (n, n).
         plant_at: returns the plants' gains.
-        start_error: sup‖u − Kx‖, scaled, while the plant still applies inputs of an earlier run
-            at the start. The certificate exists only if its own π is at least that large, so that
-            it covers these inputs. Infinite: they are not in the range of K. None: no run came
-            before.
+        start_error: sup‖u − Kx‖, scaled, until the first input of the controller, at a set-point
+            whose u_r is not the 0 that the plant applies at first. The certificate exists only if
+            its own π is at least that large, so that it covers these inputs. Infinite: they are not
+            in the range of K. None: the input is 0 there, as bounds assume.
         start: x(0), or a matrix that maps the unit ball to a set of x(0), (n, k); by default that
             of the scenario.
     """
@@ -140,7 +140,7 @@ class CertificateScope:
         self._resolved = resolved
         self._loop = loop_of(resolved)
         self._start = self._loop.x0[:, None] if start is None else start
-        self._trigger = trigger_bounds(resolved, starts_on_grid=start_error is None)
+        self._trigger = trigger_bounds(resolved)
         is_limited = not self._loop.H.any() or self._trigger.has_due_time
         decays = math.inf if is_limited else -spectral_abscissa(self._loop.H)
         self.decay_per_s = {"the models": decays, "A + BK": -spectral_abscissa(closed_loop)}
@@ -239,7 +239,7 @@ class CertificateScope:
         """Return the loop gain of a certificate; at least 1, perhaps infinite, if there is none."""
         if void_by_safe_input(self._resolved, conditions) is not None:
             return math.inf
-        # Whether inputs of an earlier run are covered depends on the constants.
+        # Whether the first inputs at a set-point are covered depends on the constants.
         try:
             search = self._constants.phases(conditions, longest=self._start_error > 0)
             constants = run_search(search)

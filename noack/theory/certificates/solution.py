@@ -51,7 +51,7 @@ class Problem(NamedTuple):
     parts: tuple[CertificatePart, ...]
     conditions: NetworkConditions
     earlier_error: float = 0.0
-    """Bound of sup‖p‖ of the first part while the plant still applies inputs of an earlier run."""
+    """Bound of sup‖p‖ of the first part while the plant still applies its first inputs at a set-point."""
     structured: bool = True
     """Whether p = u − Kx consists at every time of the errors of the events and of the age of the
     input. Otherwise it is only known that its norm is at most π."""

@@ -24,7 +24,6 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from noack.scenario.sections import POLICIES
-from noack.trigger_policies.deadline import DeadlineSettings
 from noack.trigger_policies.lyapunov import LyapunovSettings
 from noack.trigger_policies.policy_settings import ModelMatrices
 from tests.helpers.approved import compare_lines, lines_of_error
@@ -45,12 +44,6 @@ def test_a_lyapunov_function_beyond_rounding_is_refused() -> None:
     settings = LyapunovSettings(policy="lyapunov", rate_per_s=0.3)
     with pytest.raises(CallerError, match="within rounding"):
         settings.trigger_policy(ModelMatrices(np.zeros((2, 2)), B, K))
-
-
-def test_a_deadlines_threshold_is_the_same_from_a_later_origin() -> None:
-    rule = {"policy": "decaying", "beta": 0.5, "alpha_per_s": 0.25}
-    deadline = DeadlineSettings(policy="deadline", rule=rule, interval_s=1.0)
-    assert deadline.at_origin(3.0).rule.beta == pytest.approx(0.5 * np.exp(-0.75), rel=1e-12)
 
 
 # --- a user's class -------------------------------------------------------------------------------
