@@ -8,6 +8,7 @@ the gain of u = -K x.
 """
 
 import io
+import warnings
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,7 +21,6 @@ from noack.core.errors import CallerError
 from noack.core.file_access import new_file
 from noack.core.linear_systems import Matrix
 from noack.protocol.wire_format import MAX_DIMENSION
-from noack.scenario.mat_file import matrices_as_npz
 from noack.scenario.sections import ModelSection, instability
 from noack.scenario.toml_file import brief
 from noack.settings.section import ReadTable, require_shape, rows_of
@@ -160,9 +160,7 @@ def _arrays(file: NamedFile) -> Arrays:
     if arrays > _MOST_ARRAYS:
         file.wrong(f"has {arrays:,} arrays; at most {_MOST_ARRAYS:,} are read")
     try:
-        if file.path.suffix == MAT:
-            content = matrices_as_npz(content, _MOST_ENTRIES)
-        return _npz_arrays(content)
+        return _npz_arrays(content) if file.path.suffix == NPZ else _mat_arrays(content)
     except NotImplementedError:
         file.wrong("is of MATLAB's v7.3, which is HDF5; save it as v7: save(name, '-v7')")
     except Exception:  # an invalid file can raise any error
@@ -183,6 +181,21 @@ def _npz_arrays(content: bytes) -> Arrays:
                 if np.prod(shape, dtype=float) <= _MOST_ENTRIES and kind.kind in _NUMBERS + "c":
                     array.seek(0)
                     arrays[name] = np.lib.format.read_array(array, allow_pickle=False)
+    return arrays
+
+
+def _mat_arrays(content: bytes) -> Arrays:
+    """Return the arrays of numbers that are not too large, by name."""
+    from scipy.io import loadmat  # imported here: it takes time and memory
+
+    with warnings.catch_warnings(action="ignore"):
+        variables = loadmat(io.BytesIO(content))  # type: ignore[arg-type] # accepts files, too
+    arrays = {}
+    for name, value in variables.items():
+        if np.prod(getattr(value, "shape", (np.inf,)), dtype=float) <= _MOST_ENTRIES:
+            array = value.toarray() if hasattr(value, "toarray") else value
+            if array.dtype.kind in _NUMBERS + "c":
+                arrays[name] = array
     return arrays
 
 

@@ -43,12 +43,10 @@ _STRING = re.compile(
     re.VERBOSE | re.DOTALL,
 )
 """Strings and comments of TOML; an unterminated one ends at the last possible place."""
-_TWICE = re.compile(
-    r"(?:Cannot (?:overwrite|declare|redefine|mutate)|Duplicate inline table key '(?P<inner>.*)').*"
-    r"\(at (?:line (?P<line>\d+)|end)"
-)
-"""Errors of :mod:`tomllib` about a key that is defined already: most do not name it."""
-_TABLE = re.compile(r"\s*\[+([^\]\n]+)\]")
+_PLACE = re.compile(r" \(at (?:line (\d+), column \d+|end of document)\)$")
+"""The end of :mod:`tomllib`'s messages."""
+_KEY = re.compile(r"\s*(?:[\w.'\"-]+\s*=|\[+\s*[A-Za-z_'\"])")
+"""A line that begins with a key or the head of a table."""
 _TOO_DEEP = f"tables and lists lie within each other more than {MOST_LEVELS} levels deep"
 _TOO_LARGE = "an integer is too large"
 _MOST_LOOKED_AT = 100
@@ -115,8 +113,7 @@ def parsed(text: str, source: str) -> Table:
     except RecursionError:
         raise CallerError(f"{source}: {_TOO_DEEP}") from None
     except tomllib.TOMLDecodeError as error:
-        wrong = _defined_twice(text, str(error)) or str(error)
-        raise CallerError(printable(f"{source}: not valid TOML: {wrong}")) from None
+        raise CallerError(printable(f"{source}: not valid TOML: {_with_line(text, str(error))}")) from None
     except ValueError:  # an integer has thousands of digits
         raise CallerError(f"{source}: {_TOO_LARGE}") from None
 
@@ -162,44 +159,18 @@ def _missing(path: Path, model: type[ScenarioSection]) -> str:
     return f"{path}: no such file" + (f"; {hint}" if hint else "")
 
 
-def _defined_twice(text: str, error: str) -> str | None:
-    """Return which key is defined twice, and in which lines; None if the error is another one."""
-    match = _TWICE.match(error)
+def _with_line(text: str, error: str) -> str:
+    """Return a message of :mod:`tomllib` with the text of its line, which has the key."""
+    match = _PLACE.search(error)
     if match is None:
-        return None
-    keys = _keys_of_lines(text, int(match["line"] or text.count("\n") + 1))
-    line, key = keys.pop()
-    if (inner := match["inner"]) is not None:
-        return f"line {line}: {shortened(f'{key}.{inner}')} is defined twice"
-    earlier = [number for number, other in keys if other == key] or [
-        number for number, other in keys if key.startswith(f"{other}.") or other.startswith(f"{key}.")
-    ]
-    status = f"already defined in line {earlier[-1]}" if earlier else "a table with a key twice"
-    return f"line {line}: {shortened(key)} is {status}"
-
-
-def _keys_of_lines(text: str, last: int) -> list[tuple[int, str]]:
-    """Return line and full key of each key and table that begins in the lines up to the last."""
-
-    def hidden(match: re.Match[str]) -> str:
-        return re.sub(r"[^\n]", " " if match["comment"] else "_", match[0])
-
-    keys, table, depth = list[tuple[int, str]](), "", 0
-    lines = zip(text.split("\n"), _STRING.sub(hidden, text).split("\n"), strict=True)
-    for number, (line, masked) in enumerate(list(lines)[:last], 1):
-        header = _TABLE.match(masked) if depth == 0 else None
-        if header is not None:
-            table = _plain(line[slice(*header.span(1))])
-            keys.append((number, table))
-        elif depth == 0 and "=" in masked:
-            key = _plain(line[: masked.index("=")])
-            keys.append((number, f"{table}.{key}" if table else key))
-        depth += sum(map(masked.count, "[{")) - sum(map(masked.count, "]}"))
-    return keys
-
-
-def _plain(key: str) -> str:
-    return ".".join(part.strip() for part in key.split("."))
+        return error
+    message = error[: match.start()]
+    lines = text.rstrip().split("\n")
+    number = min(int(match[1] or len(lines)), len(lines))
+    while message.startswith("Cannot") and number > 1 and not _KEY.match(lines[number - 1]):
+        number -= 1  # the place is the end of a value, the mistake its key
+    line = shortened(lines[number - 1].strip())
+    return f"line {number}{line and ': '}{line}: {message[:1].lower()}{message[1:]}"
 
 
 def _unfit(value: object) -> None:

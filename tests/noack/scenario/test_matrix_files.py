@@ -102,17 +102,6 @@ def test_a_wrong_file_or_key_is_refused_with_the_approved_lines(tmp_path: Path) 
     compare_lines(Path(__file__).with_name("matrix_mistakes.txt"), refusal)
 
 
-def test_a_file_on_which_scipy_crashes_is_refused(tmp_path: Path) -> None:
-    """An array type that the format does not define crashes SciPy 1.17's reader with SIGSEGV."""
-    savemat(tmp_path / "m.mat", {"A": A, "B": B, "K": K})
-    content = bytearray((tmp_path / "m.mat").read_bytes())
-    place = content.index(b"\x09\x00\x00\x00\x20\x00\x00\x00")  # 32 bytes of doubles: A
-    content[place + 1] = 2
-    (tmp_path / "m.mat").write_bytes(content)
-    with pytest.raises(CallerError, match=r"is not a \.mat file, or is damaged"):
-        scenario(tmp_path, 'file = "m.mat"')
-
-
 def test_a_file_of_very_many_arrays_is_refused_before_any_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
