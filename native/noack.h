@@ -789,18 +789,14 @@ void noack_observer_correct(noack_observer *observer, int64_t n, const double *y
 
 /* The clock of a run, as noack.core.clock: simulated time since the run's epoch. */
 typedef struct {
-    int64_t epoch_ns; /* reading of the coordinator's monotonic clock at simulated time 0 */
+    int64_t epoch_ns; /* reading of this host's monotonic clock at simulated time 0 */
     double speed;     /* simulated time per time of that clock */
-    int64_t slew_ppb; /* 0: this host has that clock; else the slew of SlewedClock */
-    /* as of SlewedClock */
-    int64_t since_ns, first_offset_ns, target_offset_ns;
 } noack_clock;
 
 /* The simulated time at a reading of this host's monotonic clock. */
 int64_t noack_clock_at_ns(const noack_clock *clock, int64_t own_ns);
 
-/* How long to wait on this host until simulated_ns has passed, or a little less, at any rate of the
-   clock. */
+/* How long to wait on this host until simulated_ns has passed. */
 int64_t noack_clock_wait_ns(const noack_clock *clock, int64_t simulated_ns);
 
 typedef struct { /* of a driver that returns to Python for housekeeping */

@@ -24,11 +24,12 @@ def test_each_process_has_a_container_with_a_command_of_noack(name: str) -> None
     assert command == {"recorder": "record"}.get(name, name)
     if command == "netem":
         add_options(parser := Parser(allow_abbrev=False))
-        assert parser.parse_args(arguments).invitation
+        assert str(parser.parse_args(arguments).credentials) == "/credentials/run/netem"
         return
     typer_command = typer.main.get_command(app).commands[command]  # type: ignore[attr-defined]
     context = typer_command.make_context(command, arguments)
-    assert str(context.params["invitation"]) == "/invitation/run.json"
+    folder = "/credentials/run" if command == "record" else f"/credentials/run/{name}"
+    assert str(context.params["credentials"]) == folder
 
 
 def test_the_recorder_listens_on_its_own_address() -> None:

@@ -63,11 +63,11 @@ WALL_CLOCK = {
     "noack/plants/systems/code_cache.py": "ages of files",
     "cosim/record/run_directory.py": "the run's name and its environment",
     "cosim/live/coordination/coordinator.py": "when a change was requested",
-    "cosim/live/coordination/remote_access.py": "the validity of an invitation",
+    "cosim/live/coordination/remote_access.py": "the validity of certificates",
     "noack/protocol/ros2_node.py": "the time stamps of messages of ROS 2",
     "netem/control/command_queue.py": "lines of statistics",
     "native/relay/loop.c": "time stamps of the kernel, compared with the monotonic clock",
-    "noack/runtime/host_clocks/time_exchange.py": "the same",
+    "noack/runtime/host_clocks.py": "the epoch of a run on several hosts",
 }
 """Files that read the wall clock, and for what."""
 

@@ -14,7 +14,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
-from queue import SimpleQueue
 from threading import Thread
 
 from cosim.lazy_modules import lazy_modules
@@ -39,14 +38,13 @@ from noack.core.errors import ExitStatus, MachineError, NeverStartedError, Noack
 from noack.core.file_access import write_whole
 from noack.protocol.roles import RECORDER, ROLES
 from noack.runtime.active_runs import registered_run, run_name
-from noack.runtime.address import address_text
 from noack.runtime.command_line import Signals, StopRequestError, stop_reason
 from noack.runtime.life_cycle import HORIZON
-from noack.runtime.run_descriptor import RunDescriptor, descriptor_file, invitation_file, new_descriptor
+from noack.runtime.run_descriptor import RunDescriptor, descriptor_file, new_descriptor
 from noack.scenario.resolution import resolve_run, resolved_loops
 from noack.scenario.scenario import Scenario
 
-with lazy_modules():  # asyncio and TLS
+with lazy_modules():  # certificates
     from cosim.live.coordination import remote_access
 
 _STOP_TIMEOUT_S = 15.0
@@ -96,20 +94,25 @@ def launch(
         stack.enter_context(active_run(run_dir))
         ending = stack.enter_context(EndingFile(run_dir))
         _publish_run(stack, descriptor, session)  # first: its file leads to a killed run's socket
-        coordinator = Coordinator(descriptor, spawn)
-        stack.callback(coordinator.close)
+        with _no_directory_if_refused(run_dir):
+            listening_descriptor, clock = descriptor, None
+            if listening is not None:
+                clock = remote_access.own_clock(resolved)
+                remote_access.require_free(listening.address)
+                listening_descriptor = stack.enter_context(remote_access.credentials(listening, descriptor))
+                descriptor = descriptor.model_copy(update={"host": listening.address[0]})
+            coordinator = Coordinator(listening_descriptor, spawn, clock)
+            stack.callback(coordinator.close)
+            if session is not None:
+                by_hand = descriptor.model_copy(update={"launched": False})
+                stack.enter_context(descriptor_file(by_hand, session))
         helpers = stack.enter_context(lasting_helpers(resolved))
         told = RunObservers([*observers, *observers_of_extensions(resolved)])
         if listening is not None:
-            descriptor = descriptor.model_copy(update={"host": listening.address[0]})
-        with _no_directory_if_refused(run_dir):
-            listener = _open_to_others(stack, descriptor, session, listening, coordinator)
-        if listening is not None and listener is not None:
-            address = address_text(listener.address)
-            told.tell(lambda observer: observer.listening(address, listening))
+            told.tell(lambda observer: observer.listening(listening))
         children = ChildProcesses(descriptor, run_dir, spawn, server)
         stack.enter_context(children.started(live=live))
-        run = _Run(descriptor, run_dir, coordinator, children, told, helpers, listener and listener.notices)
+        run = _Run(descriptor, run_dir, coordinator, children, told, helpers)
         status, reason = run.watch(signals, ending.store)
         if coordinator.epoch_ns is None:
             raise NeverStartedError(f"{reason} (logs in {run_dir / 'logs'})", status)
@@ -125,26 +128,6 @@ def _prepare(scenario: Scenario, runs: Path, spawn: Sequence[str], *, across_hos
     loops, resolved = resolved_loops(scenario), resolve_run(scenario)
     require_disk_space(loops, runs)
     return resolved
-
-
-def _open_to_others(
-    stack: contextlib.ExitStack,
-    descriptor: RunDescriptor,
-    session: str | None,
-    listening: "remote_access.ListenSettings | None",
-    coordinator: Coordinator,
-) -> "remote_access.RunListener | None":
-    """Let processes join that are started by hand; return how those of other hosts join."""
-    listener = None
-    if listening is not None:
-        listener = stack.enter_context(remote_access.open_to_hosts(listening, descriptor, coordinator))
-    if session is not None:
-        by_hand = descriptor.model_copy(update={"launched": False})
-        stack.enter_context(descriptor_file(by_hand, session))
-    if listener is not None and listening is not None:
-        # last: it replaces that of an earlier run
-        stack.enter_context(invitation_file(listening.invitation, listener.invitation))
-    return listener
 
 
 @contextlib.contextmanager
@@ -190,9 +173,7 @@ class _Run:
         children: ChildProcesses,
         observers: RunObservers,
         helpers: FinalizeHelpers,
-        notices: "SimpleQueue[str] | None" = None,
     ) -> None:
-        self._notices = notices
         self._scenario, self._run_id = descriptor.scenario, descriptor.run_id
         self._run_dir = run_dir
         self._coordinator = coordinator
@@ -301,8 +282,8 @@ class _Run:
     def _notify_progress(self) -> None:
         if (progress := self._coordinator.progress()) is not None:
             self._observers.tell(lambda observer: observer.progress(progress))
-        while self._notices is not None and not self._notices.empty():
-            self._notify_line(self._notices.get_nowait())
+        while self._coordinator.notices:
+            self._notify_line(self._coordinator.notices.pop(0))
 
     def _notify_line(self, line: str) -> None:
         self._observers.tell(lambda observer: observer.notice(line))

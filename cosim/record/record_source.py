@@ -15,14 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.row_operations import firsts_of_equal
-from noack.protocol.record_tables import (
-    CLOCK_TABLES,
-    LOOP,
-    NETEM_SETTING,
-    has_loop,
-    is_of_network,
-    network_tables,
-)
+from noack.protocol.record_tables import LOOP, NETEM_SETTING, is_of_network, network_tables
 from noack.protocol.wire_format import HEADER_ROW, MAGIC, VERSIONS, Flow
 
 if TYPE_CHECKING:
@@ -242,7 +235,7 @@ def rows_by_loop(
 ) -> Iterator[tuple[int, Rows]]:
     """Yield the number and the rows of each loop, from a part of a table of a live run.
 
-    The inputs of the emulator keep their numbers. The table of a process's clock is of every loop.
+    The inputs of the emulator keep their numbers.
 
     Args:
         table: the table.
@@ -250,13 +243,10 @@ def rows_by_loop(
         phases_ns: when each loop begins.
         types: the row types of the tables of each loop.
     """
-    if table in CLOCK_TABLES:
-        yield from enumerate(_shift_rows(rows, phase_ns) for phase_ns in phases_ns)
-        return
     numbers = np.zeros(len(rows), np.int64)
     if "flow" in (rows.dtype.names or ()):
         numbers = rows["flow"] % len(phases_ns)
-    elif has_loop(table):
+    else:
         numbers = rows[LOOP].astype(np.int64)
     order = np.argsort(numbers, kind="stable")
     ends = np.cumsum(np.bincount(numbers, minlength=len(phases_ns)))
@@ -348,7 +338,6 @@ class LoopTables(RecordSource):
         types: the types of its rows.
         stored: the tables of the run.
         network: the rows of the network.
-        phase_ns: when the loop begins.
     """
 
     def __init__(
@@ -357,11 +346,9 @@ class LoopTables(RecordSource):
         types: Mapping[str, np.dtype[np.void]],
         stored: "StoredTables",
         network: NetworkRows,
-        phase_ns: int = 0,
     ) -> None:
         super().__init__(types)
         self._number, self._stored, self._network = number, stored, network
-        self._phase_ns = phase_ns
         self._counts: dict[str, int] = {}
 
     def count(self, table: str) -> int:
@@ -382,8 +369,7 @@ class LoopTables(RecordSource):
             yield from self._network.of_loop(table, self._number)
             return
         dtype = with_columns(self.types[table], columns)
-        for rows in self._stored.of_loop(table, self._number, dtype):
-            yield _shift_rows(rows, self._phase_ns) if table in CLOCK_TABLES else rows
+        yield from self._stored.of_loop(table, self._number, dtype)
 
 
 def _of_loop(rows: Rows, number: int, phases_ns: Sequence[int]) -> Rows:
@@ -391,15 +377,6 @@ def _of_loop(rows: Rows, number: int, phases_ns: Sequence[int]) -> Rows:
     _shift(rows, phases_ns[number])
     if "flow" in (rows.dtype.names or ()):
         rows["flow"] //= len(phases_ns)
-    return rows
-
-
-def _shift_rows(rows: Rows, phase_ns: int) -> Rows:
-    """Return rows with times of a loop in place of those of the run."""
-    if not phase_ns:
-        return rows
-    rows = rows.copy()
-    _shift(rows, phase_ns)
     return rows
 
 

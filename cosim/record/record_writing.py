@@ -13,7 +13,7 @@ from cosim.record.run_directory import RECORD, REPORTS_FILE
 from cosim.record.run_record import NOTICES_FILE, Notice, RecordedRun
 from noack.core.file_access import PARTIAL, new_file, write_whole
 from noack.core.system_processes import cores
-from noack.protocol.record_tables import CLOCK_TABLES, LOOP, is_of_network
+from noack.protocol.record_tables import LOOP, is_of_network
 from noack.scenario.resolution import resolve, run_tables
 from noack.scenario.scenario import Scenario, loop_scenario, loop_sections
 
@@ -30,9 +30,7 @@ def write_run(run: RecordedRun, run_dir: Path) -> None:
         if is_of_network(table):
             yield from run.network.source.batches(table)
             return
-        # A process's clock is in the record of every loop; only simulated runs have several, and
-        # those compare no clocks.
-        for number, record in enumerate(run.loops[:1] if table in CLOCK_TABLES else run.loops):
+        for number, record in enumerate(run.loops):
             if table in record.tables:
                 for batch in record.source.batches(table):
                     yield with_loop(batch, number, types[table])

@@ -46,18 +46,18 @@ from cosim.record.run_directory import (
 from noack.core.cached_method import cached_method
 from noack.core.errors import CallerError, PeerError
 from noack.protocol.record_tables import (
-    CLOCK_TABLES,
     LOOP,
     NETEM_RELEASE,
     NO_SEQUENCE,
     OWNER,
     PLANT_STEP,
     SENSOR_MEASUREMENT,
-    has_loop,
+    is_of_network,
     network_tables,
 )
 from noack.protocol.roles import LOOP_ROLES
-from noack.runtime.control_messages import LogLine, parse_message
+from noack.runtime.control_messages import ClockError, LogLine, parse_message
+from noack.runtime.host_clocks import STATED
 from noack.scenario.resolution import LoopMatrices, loop_of, resolved_loops, run_tables, tables_of
 from noack.scenario.scenario import Scenario, few_of, loop_names, loop_scenario, loop_sections, phases_ns
 from noack.scenario.scenario_file import MOST_RECORDED_BYTES, load
@@ -243,8 +243,22 @@ class RunRecord:
 
     def owned_by(self, role: str) -> list[str]:
         """Return the tables with the inputs of a process's machine."""
-        owned = [table for table in self.tables if OWNER[table] == role]
-        return [table for table in owned if table not in CLOCK_TABLES]
+        return [table for table in self.tables if OWNER[table] == role]
+
+    @property
+    def clocks(self) -> dict[str, ClockError]:
+        """How far the clocks of the processes may have been off; empty if they had the same one.
+
+        Of a process without a report it is the largest error that the scenario allows.
+        """
+        reported = {role: self.reports[role].get("clock") for role in LOOP_ROLES if role in self.reports}
+        clocks = {role: ClockError(**clock) for role, clock in reported.items() if clock}
+        if clocks and self.scenario.clocks is not None:
+            largest_ns = round(self.scenario.clocks.largest_error_us * 1000)
+            for role in LOOP_ROLES:
+                unknown = ClockError(clock=f"of {role}", error_ns=largest_ns, source=STATED)
+                clocks.setdefault(role, unknown)
+        return clocks
 
     @property
     def is_network(self) -> bool:
@@ -357,7 +371,9 @@ class StoredLoops(Sequence[RunRecord]):
     def together(self, numbers: range) -> list[RunRecord]:
         """See :meth:`RecordedRun.together`."""
         records = [self._record_of(number) for number in numbers]
-        for table in filter(has_loop, run_tables(self._scenario)):
+        for table in run_tables(self._scenario):
+            if is_of_network(table):
+                continue
             having = [record for record in records if table in record.tables]
             types = [record.tables[table] for record in having]
             loops = [record.number for record in having]
@@ -372,7 +388,7 @@ class StoredLoops(Sequence[RunRecord]):
     def _record_of(self, number: int) -> RunRecord:
         loop = self._loops[number]
         entries = entries_of_loop(self._entries, number, self._shared.count_of_others)
-        source = LoopTables(number, tables_of(loop), self._stored, self._shared, self._phases_ns[number])
+        source = LoopTables(number, tables_of(loop), self._stored, self._shared)
         reports = valid_reports(entries, source.types)
         notices = [
             {key: value for key, value in notice.items() if key != LOOP}

@@ -32,7 +32,7 @@ from noack.core.errors import MachineError, PeerError, why
 from noack.core.file_access import remove_folder
 from noack.core.row_operations import firsts_of_equal
 from noack.core.system_processes import be_idle, cores
-from noack.protocol.record_tables import LOOP, has_loop
+from noack.protocol.record_tables import LOOP, is_of_network
 from noack.protocol.roles import LOOP_ROLES, RECORDER
 from noack.runtime.control_messages import LogLine, parse_message
 from noack.runtime.spool import EARLY, EARLY_ENDED, SPOOL, batch_bytes, batches_in, spool_files, stored_lines
@@ -206,7 +206,7 @@ def _rows_loop_after_loop(run_dir: Path, table: str, dtype: np.dtype[np.void], l
     path = run_dir / RECORD / f"{table}.parquet"
     segments = [*table_files.TableFile(path, dtype).segments()] if path.is_file() else []
     segments += spool_segments(run_dir / SPOOL, table, dtype)
-    if not has_loop(table):
+    if is_of_network(table):
         yield from merge_segments(segments, dtype)
         return
     at_once = max(loops * _BLOCK_BYTES // max(_bytes_of(run_dir, table), _BLOCK_BYTES), 1)
@@ -290,7 +290,7 @@ def _open_tables(run_dir: Path, stack: ExitStack) -> "list[_EarlyTable]":
     tables = []
     for table, dtype in run_tables(scenario).items():
         spool = run_dir / SPOOL / f"{table}.{RECORDER}"
-        if has_loop(table) and spool.exists():
+        if not is_of_network(table) and spool.exists():
             file = table_files.table_writer(folder / f"{table}.parquet", dtype, names)
             tables.append(_EarlyTable(spool, dtype, len(loops), stack.enter_context(file)))
     return tables

@@ -33,7 +33,7 @@ from noack.core.core_library import CData, core, ffi
 from noack.core.errors import ExitStatus, MachineError, why
 from noack.core.system_processes import require_limits
 from noack.machines.loop_machines import LoopMachines, row_types
-from noack.protocol.record_tables import LOOP, OWNER, has_loop, is_of_network, network_tables
+from noack.protocol.record_tables import LOOP, OWNER, is_of_network, network_tables
 from noack.protocol.roles import CHANGEABLE, LOOP_ROLES, RECORDER, Notice, Record
 from noack.protocol.wire_format import KEY_BYTES, Flow, Rejection
 from noack.runtime.life_cycle import HORIZON
@@ -382,7 +382,7 @@ class _LoopRows(RecordSource):
     def _read(self, table: str, columns: Sequence[str]) -> Iterator[Rows]:
         if is_of_network(table):
             yield from self._packets.of_loop(table, self._number)
-        elif has_loop(table):  # nothing in virtual time compares clocks
+        else:
             yield pack_rows(self._record.of_loop(table, self._number), self.types[table])
 
 

@@ -35,8 +35,6 @@ static int is_name(const noack_peer *peer) {
 const char *noack_driver_check(const noack_driver *driver) {
     if (!(driver->clock.speed > 0))
         return "clock.speed must be above 0";
-    if (driver->clock.slew_ppb < 0 || driver->clock.slew_ppb >= NS_PER_S)
-        return "clock.slew_ppb must be from 0 to 10^9";
     if (driver->spin_ns < 0 || driver->coalescing_ns < 0 || driver->coalescing_ns >= NS_PER_S)
         return "spin_ns and coalescing_ns must be from 0 to less than 1 s";
     if (driver->receiver_count < 0 || driver->receiver_count > 2)

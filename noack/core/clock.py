@@ -1,7 +1,7 @@
 """Simulated time: integer nanoseconds since the run's epoch.
 
 Machines never read a clock; shells pass ``now_ns`` in. ``speed`` is simulated time per wall time.
-On another host than the coordinator's, :mod:`noack.runtime.host_clocks` has the clock.
+On several hosts, :mod:`noack.runtime.host_clocks` gives each process its epoch.
 """
 
 import time
@@ -24,8 +24,7 @@ _NAMESPACE = Path("/proc/self/ns/time")
 class RunClock:
     """Simulated time tied to the machine's monotonic clock.
 
-    ``epoch_ns`` is the clock's reading at simulated time 0, common to all processes of a run;
-    ``speed`` is simulated seconds per wall second.
+    ``epoch_ns`` is the clock's reading at simulated time 0; ``speed`` is simulated seconds per wall second.
     """
 
     def __init__(
@@ -43,8 +42,8 @@ class RunClock:
         return wall_ns if self.speed == 1.0 else int(wall_ns * self.speed)
 
     def set_core(self, clock: "CData") -> None:
-        """Let a ``noack_clock`` of the core read as this clock does, if it reads this host's."""
-        clock.epoch_ns, clock.speed, clock.slew_ppb = self.epoch_ns, self.speed, 0
+        """Let a ``noack_clock`` of the core read as this clock does."""
+        clock.epoch_ns, clock.speed = self.epoch_ns, self.speed
 
 
 def clock_identity() -> str:

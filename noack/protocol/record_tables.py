@@ -47,9 +47,6 @@ PACKET_HEAD_BYTES = 32
 LOOP = "loop"
 """First column of the tables of plant, sensor and controller: the number of the loop."""
 
-LOST_NS = -1
-"""Stands for a bound that is lost, in the column of the bounds of a clock's error."""
-
 NO_SEQUENCE = -1  # stands for "none" in a column of sequence numbers
 
 
@@ -101,7 +98,6 @@ class RecordShape:
     outputs: int = 0
     """Measured outputs from which an observer estimates the state; 0 without an observer."""
     inputs_reported: int = 0  # numbers of a measurement that are inputs
-    clocks: bool = False  # whether the bounds of the clocks' errors are recorded
 
 
 class Column(NamedTuple):
@@ -163,23 +159,6 @@ _CHANGE = (
     ),
     _bytes("change", CHANGE_BYTES, "the settings by their keys, as JSON, padded with zero bytes"),
 )
-
-
-def clock_table(role: str) -> str:
-    """Return the name of the table about a process's clock."""
-    return f"{role}_clock"
-
-
-def _clock(role: str) -> Table:
-    return Table(clock_table(role), role, f"comparison of the {role}'s clock with the "
-        "coordinator's, with `[clocks]` only; `input` numbers these rows, `sequence` counts the "
-        "exchanges; the bound holds from `t_ns` to `now_ns`", (
-        Column("own_ns", "ns", "reading of the own monotonic clock"),
-        Column("offset_ns", "ns", "applied offset: the process's time minus `own_ns`; 0 on the "
-               "coordinator's host"),
-        Column("error_ns", "ns", "bound of the difference between the process's time and the "
-               f"coordinator's; {LOST_NS}: lost"),
-    ), lambda shape: shape.clocks)  # fmt: skip
 
 
 TABLES = (
@@ -267,15 +246,10 @@ TABLES = (
         _state("x_s_before", "the model before the reset"),
         _state("x_s", "the model after the reset"),
     ), lambda shape: shape.acknowledged),
-    *map(_clock, ("plant", "sensor", "netem", "controller")),
 )  # fmt: skip
 
 OWNER: Mapping[str, str] = {table.name: table.owner for table in TABLES}
 """The process that fills each table."""
-
-
-CLOCK_TABLES = tuple(table.name for table in TABLES if table.name == clock_table(table.owner))
-"""Tables of what the processes, not their machines, record: they are no input of a machine."""
 
 
 def largest(shapes: Iterable[RecordShape]) -> RecordShape:
@@ -311,14 +285,9 @@ def network_tables() -> Mapping[str, np.dtype[np.void]]:
     return {table: dtype for table, dtype in tables(1, 1).items() if OWNER[table] == "netem"}
 
 
-def has_loop(table: str) -> bool:
-    """Whether each row of a table in the record of a run has the number of its loop."""
-    return OWNER[table] != "netem" and table not in CLOCK_TABLES
-
-
 def is_of_network(table: str) -> bool:
     """Whether a table has the rows of the network, which its loops share."""
-    return OWNER[table] == "netem" and table not in CLOCK_TABLES
+    return OWNER[table] == "netem"
 
 
 UPDATES, ACKNOWLEDGEMENTS, ACTUATIONS = 0, 1, 1

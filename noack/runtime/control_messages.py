@@ -40,11 +40,19 @@ SocketAddress = tuple[NumericHost, Annotated[int, Field(ge=1, le=65_535)]]
 """Numeric host and port."""
 
 
+class ClockError(ControlMessage):
+    """How far the clock of a process's host may be off."""
+
+    clock: str  # name of the monotonic clock: processes with the same name share it
+    error_ns: Count  # of the host's CLOCK_REALTIME
+    source: str  # where this bound is from
+
+
 class AdmissionRequest(ControlMessage):
     """A process asks for admission to the run."""
 
     instance: str  # random name of this process
-    join_token: str = ""
+    clock: ClockError | None = None  # None: it reads the coordinator's
 
 
 class Admission(ControlMessage):
@@ -103,7 +111,9 @@ class ChangeReply(ControlMessage):
 class RunStart(ControlMessage):
     """The coordinator lets a process pass the start barrier."""
 
-    epoch_ns: Count  # monotonic clock reading at simulated time 0
+    epoch_ns: Count  # reading of the coordinator's CLOCK_MONOTONIC at simulated time 0
+    epoch_realtime_ns: Count  # of its CLOCK_REALTIME
+    clocks: dict[str, ClockError] = {}  # of all processes of the loop; empty if they read the same one
     addresses: dict[str, SocketAddress]
     changes: tuple[ChangeAnnouncement, ...] = ()  # the changes announced so far
 
@@ -151,6 +161,7 @@ class ProcessReport(ControlMessage):
     stored: dict[str, Ranges] = {}
     """Those of them that the process has written to disk itself, by table."""
     instance: str = ""
+    clock: ClockError | None = None  # in a run with several clocks
     realtime: dict[str, str] = Field({})  # whether each real-time setting was applied
     reached_ns: Nanoseconds | None = None
     """Simulated time up to which all its deadlines were served; None if it failed."""

@@ -2,15 +2,14 @@
 
 Loop data never travels here, and the loop never waits for it. The coordinator listens on a Unix
 socket in the user's runtime directory, which is closed to other users; all other processes connect
-to it. From another host, a session connects through ``connections/coordinator_link.py`` by TLS to
-:mod:`cosim.live.coordination.remote_access`, which forwards to that socket. Both ends have
-certificates of the run.
+to it. From another host they connect by TLS, with certificates of the run at both ends
+(``connections/credentials.py``).
 """
 
 import secrets
 import time
 from collections.abc import Callable, Iterable
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from typing import Self
 
 import zenoh
@@ -21,7 +20,9 @@ from noack.core.errors import NoAnswerError, PeerError
 from noack.impairments.target_loss import store_probabilities
 from noack.protocol.roles import COORDINATOR
 from noack.runtime.active_runs import RUNS, run_name
+from noack.runtime.connections.credentials import access_control, no_connection, tls_settings
 from noack.runtime.connections.zenoh_session import (
+    TlsEndpoint,
     cause_of,
     first_reply,
     label,
@@ -53,14 +54,19 @@ class ControlPlane:
         self.role = role
         self.secret = secrets.token_hex(32)
         self.instance = writer_of(self.secret)
-        self._resources = ExitStack()
+        remote = None
+        if (address := descriptor.remote) is not None:
+            rules = access_control(self._prefix) if listen else None
+            remote = TlsEndpoint(address, tls_settings(descriptor.credentials, listen=listen), rules)
         try:
             self.session = (
-                open_session(RUNS, run_name(descriptor.run_id), listen=listen)
-                if descriptor.remote is None
-                else self._resources.enter_context(open_remote_session(descriptor.remote, descriptor.key))
+                open_session(RUNS, run_name(descriptor.run_id), listen=listen, remote=remote)
+                if listen or remote is None
+                else open_remote_session(remote)
             )
         except zenoh.ZError as error:
+            if address is not None and not listen:
+                raise no_connection(address) from None
             task = "start the control plane" if listen else "reach the run's coordinator"
             raise NoAnswerError(f"cannot {task}: {cause_of(error)}") from None
         session, key = self.session, self.key
@@ -87,7 +93,6 @@ class ControlPlane:
         """Close the session; this process's liveliness token vanishes."""
         if not self.session.is_closed():
             self.session.close()  # type: ignore[no-untyped-call]
-        self._resources.close()
 
     def key(self, *parts: str) -> str:
         """Key expression below this run."""

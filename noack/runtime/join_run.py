@@ -1,6 +1,6 @@
 """A process becomes part of a run, from its command line to its exit status.
 
-It waits for a run descriptor or an invitation, and is admitted to the run. ``run_process.py`` has
+It waits for a run descriptor, and is admitted to the run. ``run_process.py`` has
 the rest. Read :func:`join_run` first.
 """
 
@@ -21,16 +21,10 @@ from noack.core.errors import ExitStatus, NoackError, NoAnswerError, PeerError
 from noack.core.system_processes import exhausted_limit, require_limits
 from noack.runtime.address import address_text
 from noack.runtime.command_line import DESCRIPTOR_ON_STDIN, Parser, Signals, report_failure
+from noack.runtime.connections.credentials import read_credentials
 from noack.runtime.control_plane import ControlPlane
 from noack.runtime.life_cycle import HORIZON, Event
-from noack.runtime.run_descriptor import (
-    DEFAULT_SESSION,
-    STANDARD_INPUT,
-    RunDescriptor,
-    find_descriptor,
-    loads,
-    read_invitation,
-)
+from noack.runtime.run_descriptor import DEFAULT_SESSION, RunDescriptor, find_descriptor, loads
 from noack.runtime.run_process import RunProcess, launcher_has_ended
 
 _RUNS = Path("runs")
@@ -43,13 +37,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that all processes have."""
     origin = parser.add_mutually_exclusive_group()
     origin.add_argument("--session", default=DEFAULT_SESSION, help="name of the recorder's session")
-    origin.add_argument("--invitation", type=Path, metavar="FILE", help="from `noack record --listen`")
+    origin.add_argument(
+        "--credentials", type=Path, metavar="FOLDER", help="of this role, from `noack record --listen`"
+    )
     parser.add_argument(
         "--runs",
         type=Path,
         default=_RUNS,
         metavar="DIRECTORY",
-        help="of an invited process: where rows stay that cannot be sent to the recorder",
+        help="with --credentials: where rows stay that cannot be sent to the recorder",
     )
     parser.add_argument("--json", action="store_true", help="print the final report as JSON")
 
@@ -58,7 +54,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def join_run(role: str, arguments: Sequence[str] | None = None) -> Iterator[RunProcess]:
     """Be a process of a run within the context: from its admission to the report of its end.
 
-    The run is that of an invitation, or else of a session on this host. A process that was invited
+    The run is that of its credentials, or else of a session on this host. A process on another host
     keeps below ``--runs`` what it cannot send to the recorder.
 
     Args:
@@ -81,10 +77,10 @@ def join_run(role: str, arguments: Sequence[str] | None = None) -> Iterator[RunP
         options = parser.parse_args(words)
         with signals.handled():
             require_limits()
-            if options.invitation is None:
+            if options.credentials is None:
                 descriptor = _find_descriptor(role, options.session, signals)
             else:
-                descriptor = _wait_for_invitation(role, options.invitation, options.runs, signals)
+                descriptor = _wait_for_credentials(role, options.credentials, options.runs, signals)
             if descriptor.launched:
                 setproctitle(f"noack {role}")  # in lists of processes
             process = _request_admission(role, descriptor, signals)
@@ -131,7 +127,7 @@ def _find_descriptor(role: str, session: str, signals: Signals) -> RunDescriptor
         lambda: find_descriptor(session),
         signals,
         f"noack {role}: waiting for `noack record SCENARIO` on this host (session {session!r}); of "
-        "a run on another host, give its --invitation; Ctrl-C ends",
+        "a run on another host, give its --credentials; Ctrl-C ends",
     )
     if descriptor is None:
         raise PeerError(f"no run to join in session {session!r}: start `noack record SCENARIO` first")
@@ -139,18 +135,17 @@ def _find_descriptor(role: str, session: str, signals: Signals) -> RunDescriptor
     return descriptor
 
 
-def _wait_for_invitation(role: str, invitation: Path, runs: Path, signals: Signals) -> RunDescriptor:
-    """Wait for an invitation and return its run descriptor.
+def _wait_for_credentials(role: str, folder: Path, runs: Path, signals: Signals) -> RunDescriptor:
+    """Wait for the folder of credentials and return its run descriptor.
 
     Raise CallerError or PeerError without one.
     """
-    if invitation != STANDARD_INPUT and invitation.parent.is_dir():
-        waiting = f"noack {role}: waiting for {invitation}; Ctrl-C ends"
-        if not _wait_for(invitation.exists, signals, waiting):
-            raise PeerError("no invitation")
-    descriptor = read_invitation(invitation, runs)
-    assert descriptor.remote is not None  # else it is no invitation
-    host_port = address_text((descriptor.remote.host, descriptor.remote.port))
+    waiting = f"noack {role}: waiting for {folder}; Ctrl-C ends"
+    if not _wait_for(folder.exists, signals, waiting):
+        raise PeerError("no credentials")
+    descriptor = read_credentials(folder, role, runs)
+    assert descriptor.remote is not None  # else read_credentials refuses it
+    host_port = address_text(descriptor.remote)
     print(f"noack {role}: joining run of {descriptor.scenario.name!r} at {host_port}", file=sys.stderr)
     return descriptor
 

@@ -18,9 +18,9 @@ from itertools import chain, repeat
 from pathlib import Path
 from typing import Protocol
 
-from noack.core.clock import NS_PER_S, RunClock
+from noack.core.clock import NS_PER_S, RunClock, clock_identity
 from noack.core.errors import CallerError, NoackError, PeerError, one_line
-from noack.protocol.record_tables import OWNER, clock_table
+from noack.protocol.record_tables import OWNER
 from noack.protocol.roles import CHANGEABLE, LOOP_ROLES, RECORDER, WITH_DEADLINES, Notice, Record
 from noack.protocol.wire_format import Wire
 from noack.runtime.active_runs import run_name
@@ -29,6 +29,7 @@ from noack.runtime.command_line import Signals, print_to_stderr
 from noack.runtime.control_messages import (
     Admission,
     AdmissionRequest,
+    ClockError,
     ControlMessage,
     JoinRequest,
     M,
@@ -38,8 +39,7 @@ from noack.runtime.control_messages import (
 from noack.runtime.control_plane import ControlPlane, ParameterUpdates
 from noack.runtime.drivers.real_time_loop import Driver, ProcessSockets, run_loop
 from noack.runtime.drivers.realtime_settings import realtime
-from noack.runtime.host_clocks.clock_offset import SlewedRunClock
-from noack.runtime.host_clocks.reference_clock import ClockRecord, ReferenceClock, reference_clock
+from noack.runtime.host_clocks import RECEIVED, CausalityCheck, clock_error, realtime_offset_ns
 from noack.runtime.life_cycle import HORIZON, LAUNCHER_GONE, LOST_AFTER_S, Event, LifeCycle, Side, State
 from noack.runtime.run_descriptor import RunDescriptor
 from noack.runtime.telemetry import OwnSpool, TelemetryBuffer, deliver_report, persisted_rows
@@ -81,20 +81,21 @@ class RunProcess:
         self.phases_ns = phases_ns(descriptor.scenario)
         """When each loop begins."""
         self.plane = plane
-        self._reference: ReferenceClock | None = None
         self.life = LifeCycle(role, Side.PROCESS)
         self.updates = ParameterUpdates(plane)
         self._signals = signals
         self.report: dict[str, object] = {}
         self._realtime: dict[str, str] = {}
-        self._clock_record: ClockRecord | None = None
+        self._clocks: Mapping[str, ClockError] = {}
+        """Of all processes, if they have several."""
 
     def request_admission(self) -> None:
         """Ask the coordinator for admission to the run.
 
-        Raise NoAnswerError without an answer within ten seconds, PeerError if it refuses.
+        Raise NoAnswerError without an answer within ten seconds, PeerError if it refuses; MachineError
+        if this host's clock is not synchronised.
         """
-        request = AdmissionRequest(instance=self.plane.instance, join_token=self.descriptor.join_token)
+        request = AdmissionRequest(instance=self.plane.instance, clock=self._clock_error())
         self._request("admit", request, Admission, _ADMISSION_TIMEOUT_S)
         self.life.apply(Event.ADMIT)
 
@@ -102,18 +103,16 @@ class RunProcess:
         """Wait at the start barrier; return all addresses. Sets the common epoch.
 
         ``address`` is None for the recorder, which is not in the loop. Raise PeerError if the run
-        never started, or if the coordinator's clock is another one and remains unknown.
+        never started.
         """
-        self._reference = reference_clock(self.descriptor)
-        if self._reference is not None:
-            self._reference.wait_until_known(lambda: self.stopping)
         prepare_changes()
         self.life.apply(Event.JOIN)
         request = JoinRequest(instance=self.plane.instance, address=address)
         begin = self._request("join", request, RunStart, _JOIN_TIMEOUT_S)
-        self.clock = RunClock(begin.epoch_ns, self.scenario.speed)
-        if (reference := self._reference) is not None:
-            self.clock = SlewedRunClock(begin.epoch_ns, self.scenario.speed, reference.slewed)
+        epoch_ns = begin.epoch_ns
+        if self.descriptor.clock != clock_identity():
+            epoch_ns = begin.epoch_realtime_ns - realtime_offset_ns()
+        self.clock, self._clocks = RunClock(epoch_ns, self.scenario.speed), begin.clocks
         self.updates.extend(begin.changes)
         if not begin.addresses.keys() >= set(LOOP_ROLES):
             raise PeerError("the coordinator did not send the addresses of all processes")
@@ -125,17 +124,23 @@ class RunProcess:
     def _request(self, query: str, request: ControlMessage, answer: type[M], timeout_s: float) -> M:
         """Send the coordinator a request of this process; return the answer."""
         try:
-            message = self.plane.request(query, request, timeout_s=timeout_s, give_up=self._gives_up)
+            message = self.plane.request(query, request, timeout_s=timeout_s, give_up=lambda: self.stopping)
         except PeerError as error:
             # The reason to stop explains more than a missing answer.
             raise PeerError(self.life.reason) if self.life.reason else error from None
         return parse_message(answer, message)
 
-    def _gives_up(self) -> bool:
-        """Whether to wait no longer; compares the clocks meanwhile."""
-        if self.life.state is State.AT_BARRIER and self._reference is not None:
-            self._reference.poll()
-        return self.stopping
+    def _clock_error(self) -> ClockError | None:
+        """How far this host's clock may be off; None if it is the coordinator's."""
+        settings, clock = self.scenario.clocks, clock_identity()
+        if clock == self.descriptor.clock:
+            return None
+        if settings is None:
+            raise PeerError(
+                "this process and the recorder have different clocks; open the run with "
+                "`noack record --listen`"
+            )
+        return clock_error(clock, settings.largest_error_us)
 
     @cached_property
     def loops(self) -> Sequence[Scenario]:
@@ -207,11 +212,10 @@ class RunProcess:
                 "rows_by_loop": telemetry.totals_by_loop(),
                 "instance": self.plane.instance,
                 "reached_ns": reached_ns,
-                **({} if self._clock_record is None else self._clock_record.summary()),
             }
+            if self.role in self._clocks:
+                self.report["clock"] = self._clocks[self.role].fields()
             channel.close()
-            if self._reference is not None:
-                self._reference.close()
             self._hand_over(telemetry)
 
     @cached_property
@@ -224,20 +228,21 @@ class RunProcess:
     def _telemetry(self) -> TelemetryBuffer:
         tables = run_tables(self.scenario)
         owned = {table: dtype for table, dtype in tables.items() if OWNER[table] == self.role}
+        check = None
+        if self._clocks and self.role in RECEIVED:
+            check = CausalityCheck(self.role, self._clocks, self.scenario.speed).check
         return TelemetryBuffer(
             owned,
             self.plane.publish_telemetry,
             lambda: persisted_rows(self.plane),
             self._spool.append,
+            check,
         )
 
     def _drive(
         self, driver: Driver, channel: ProcessSockets, machine: Reconfigurable, telemetry: TelemetryBuffer
     ) -> int:
         """Run the loop; return the simulated time up to which the machines have done their work."""
-        has_table = clock_table(self.role) in run_tables(self.scenario)
-        if has_table or self._reference is not None:
-            self._clock_record = ClockRecord(self.role, self.clock, self._reference, has_table=has_table)
         limits = chain([None], repeat(_CHANGES_AT_ONCE))  # before the first step: all of them
         late_ns = run_loop(
             driver,
@@ -303,15 +308,13 @@ class RunProcess:
         return None
 
     def _take_inputs(self, machine: Reconfigurable, now_ns: int, most: int | None) -> list[Record | Notice]:
-        """Pass announced changes on, and compare the clocks; return the outputs."""
+        """Pass announced changes on; return the outputs."""
         outputs: list[Record | Notice] = []
         for announced in self.updates.take(most) if self.role in CHANGEABLE else ():
             try:
                 outputs += machine.announce(announced.change, now_ns)
             except CallerError as error:  # not from the coordinator, which checks changes
                 print_to_stderr(f"noack {self.role}: ignored: {error}")
-        if self._clock_record is not None:
-            outputs += self._clock_record.compare(now_ns)
         return outputs
 
     def _hand_over(self, telemetry: TelemetryBuffer) -> None:

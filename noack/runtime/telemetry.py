@@ -107,7 +107,8 @@ class TelemetryBuffer:
     """Collects rows by table and passes them to ``publish``, which does not block.
 
     ``persisted`` returns the rows that are on disk, by table, if this was newly confirmed.
-    ``store`` writes a batch to disk, or raises MachineError.
+    ``store`` writes a batch to disk, or raises MachineError. ``check`` looks at the rows of each table
+    as they come, and may return a line for the log.
     """
 
     def __init__(
@@ -116,7 +117,9 @@ class TelemetryBuffer:
         publish: Publish,
         persisted: Callable[[], Mapping[str, Ranges]] = dict,
         store: Publish = lambda table, header, rows: None,
+        check: Callable[[str, NDArray[np.void]], Notice | None] | None = None,
     ) -> None:
+        self._check = check
         self._publish, self._store = publish, store
         self._stored_rows: dict[str, ReceivedRows] = {}
         self._persisted = persisted
@@ -139,6 +142,8 @@ class TelemetryBuffer:
 
     def extend_table(self, table: str, rows: NDArray[np.void]) -> None:
         """Add rows of a table; many are published at once."""
+        if self._check is not None and (notice := self._check(table, rows)) is not None:
+            self.notice(notice)
         if len(rows) >= _BATCH_ROWS:
             self.flush()
             self._publish_rows(table, rows)

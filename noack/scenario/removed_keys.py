@@ -6,6 +6,7 @@ REMOVED: Mapping[str, str] = {
     "controller.kind = program": "use python: a class of your own; docs/wire.md has the datagrams",
     "plant.system.kind = vehicle": "write its equations as a class: plant.system.kind = python",
     "model.name = single_track_lane": "give model.A and model.B",
+    "clocks.relative_rate_ppm": "let chrony or PTP discipline the clocks of all hosts",
     "recovery.rejoin_within_s": "a process that dies ends the run, whose record is complete up to then",
 }
 """The plain way by what was removed: a key with dots (``table.key``), or the kind of a table

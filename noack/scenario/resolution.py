@@ -16,7 +16,7 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, discretise, transition
 from noack.core.random_streams import stream
 from noack.observers.observer_settings import unobservable_mode
-from noack.protocol.record_tables import LOOP, RecordShape, entry_names, has_loop, largest, tables
+from noack.protocol.record_tables import LOOP, RecordShape, entry_names, is_of_network, largest, tables
 from noack.scenario.scenario import (
     Scenario,
     few_of,
@@ -303,7 +303,6 @@ def shape_of(resolved: Scenario) -> RecordShape:
         disturbed_state="state" in disturbed,
         outputs=0 if resolved.observer is None else resolved.message_sizes.outputs,
         inputs_reported=resolved.message_sizes.inputs_reported,
-        clocks=resolved.clocks is not None,
     )
 
 
@@ -315,6 +314,6 @@ def run_tables(scenario: Scenario) -> Mapping[str, np.dtype[np.void]]:
     """
     shapes = {shape_of(loop_scenario(scenario, section)) for section in loop_sections(scenario)}
     return {
-        table: np.dtype([(LOOP, "<u2"), *dtype.descr]) if has_loop(table) else dtype
+        table: dtype if is_of_network(table) else np.dtype([(LOOP, "<u2"), *dtype.descr])
         for table, dtype in tables(**vars(largest(shapes))).items()
     }

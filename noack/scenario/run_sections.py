@@ -25,16 +25,11 @@ class CertificateSection(ScenarioSection):
 
 
 class ClocksSection(ScenarioSection):
-    """The clocks of a run on several hosts: each process compares its own with the coordinator's.
-
-    The bounds of their errors are recorded. Claims need them.
-    """
+    """The clocks of a run on several hosts, which chrony or PTP disciplines."""
 
     largest_error_us: Annotated[FiniteFloat, Field(gt=0, le=1e6)] = 1000.0
-    """Claims are void from the time on at which the bound of a clock's error is larger, or lost."""
-    relative_rate_ppm: Annotated[FiniteFloat, Field(gt=0, le=100_000)] = 1201.0
-    """The largest rate at which two clocks move apart. 1201: crystals of ±100 ppm, slewed by at
-    most 500 ppm; 201: clocks that are not slewed."""
+    """How far the clock of a host may be off, in µs: the run does not start if chrony's bound is
+    larger. Without chrony this is taken as the bound."""
 
 
 class ScheduledChange(ScenarioSection):

@@ -67,7 +67,7 @@ class ScenarioTables(ScenarioSection):
     controller: AnyController = LinearFeedbackSettings.model_construct()
     certificate: CertificateSection = CertificateSection.model_construct()
     clocks: ClocksSection | None = None
-    """The clocks of a run on several hosts. Without it, claims assume one clock."""
+    """The clocks of a run on several hosts."""
     changes: Annotated[tuple[ScheduledChange, ...], Field(max_length=MOST_CHANGES)] = ()
     """Changes of settings during the run, in the order of time."""
     loops: Annotated[tuple[LoopSection, ...], Field(min_length=1)] | None = None

@@ -20,20 +20,13 @@ from cosim.record.run_directory import ENDING_FILE, RECORD, RECORDING_FILE, Endi
 from netem.control import control_server as emulator_session
 from noack.core.errors import CallerError, NoackError
 from noack.runtime import active_runs
-from noack.runtime.run_descriptor import (
-    RunDescriptor,
-    descriptor_file,
-    find_descriptor,
-    new_descriptor,
-    write_invitation,
-)
+from noack.runtime.run_descriptor import RunDescriptor, descriptor_file, find_descriptor, new_descriptor
 from noack.runtime.spool import SPOOL, SpoolWriter
 from noack.scenario.matrix_files import write_matrices
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from tests.attacks.other_user import NOBODY, needs_root
 from tests.helpers.command_line import invoke
-from tests.helpers.run_descriptors import INVITED
 
 OWN = f"noack-{os.getuid()}"
 EMULATOR = "lab"
@@ -286,7 +279,6 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "recording.rrd": lambda path: RecordingFile(path, "a", rrb.Blueprint(), indexed=True).close(),
     ENDING_FILE: lambda path: EndingFile(path.parent).__exit__(None, None, None),
     "plant_step.recorder": lambda path: SpoolWriter(path.parent, "recorder").append("plant_step", 0, b"rows"),
-    "invitation.json": lambda path: write_invitation(path, INVITED),
     "a.npz": lambda path: write_matrices(path, {"A": np.eye(2)}),
     "a.mat": lambda path: write_matrices(path, {"A": np.eye(2)}),
 }

@@ -29,9 +29,9 @@ WITHOUT_VIEWER = {"PYTHONPATH": str(Path(__file__).parents[1] / "integration" / 
 """Of commands whose recording is not looked at."""
 
 
-def noack_command(*arguments: str, impatient: bool = False) -> list[str]:
+def noack_command(*arguments: str, impatient: bool = False, module: str = "cosim.cli") -> list[str]:
     """Return a command of noack; an impatient one waits less for processes that do not respond."""
-    module = "tests.integration.impatient" if impatient else "cosim.cli"
+    module = "tests.integration.impatient" if impatient else module
     return [sys.executable, "-m", module, *arguments]
 
 
@@ -49,10 +49,11 @@ def start_commands() -> Iterator[Start]:
         before: Sequence[str] = (),
         environment: Mapping[str, str] | None = None,
         impatient: bool = False,
+        module: str = "cosim.cli",
         viewer: bool = False,
         cwd: Path | None = None,
     ) -> subprocess.Popen[str]:
-        command = noack_command(*map(str, arguments), impatient=impatient)
+        command = noack_command(*map(str, arguments), impatient=impatient, module=module)
         variables = {} if runtime is None else {"XDG_RUNTIME_DIR": str(runtime)}
         variables |= {} if viewer else WITHOUT_VIEWER
         started.append(subprocess.Popen(

@@ -23,17 +23,17 @@ class RunByHand:
     def __init__(self, stack: ExitStack, folder: Path, hosts: TwoHosts | None, *arguments: str) -> None:
         self._folder, self.hosts = folder, hosts
         self._begin = stack.enter_context(start_commands())
-        invitation = str(folder / "invitation.json")
+        credentials = folder / "credentials"
         network = (
             EPHEMERAL if hosts is None
-            else ("--listen", hosts.addresses[0][0], "--invitation", invitation)
+            else ("--listen", hosts.addresses[0][0], "--credentials", str(credentials))
         )  # fmt: skip
         self._recording = self._start(
             0, "record", "lane_following", "--runs", str(folder / "runs"), "--no-report",
             *network, *arguments,
         )  # fmt: skip
         self.processes = {
-            role: self._start(1, role, "--invitation", invitation)
+            role: self._start(1, role, "--credentials", str(credentials / role))
             if hosts is not None and role == AWAY
             else self._start(0, role)
             for role in LOOP_ROLES

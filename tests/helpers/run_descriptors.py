@@ -1,8 +1,8 @@
-"""A run descriptor, the same as an invitation, and messages that are none."""
+"""A run descriptor, and messages that are none."""
 
 from pathlib import Path
 
-from noack.runtime.run_descriptor import RemoteAccess, RunDescriptor, new_descriptor
+from noack.runtime.run_descriptor import RunDescriptor, new_descriptor
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from tests.fuzz.edits import bases
@@ -10,21 +10,8 @@ from tests.fuzz.edits import bases
 RUN_DESCRIPTOR: RunDescriptor = new_descriptor(
     resolve(validate(bases("scenarios")[0], "base")), Path("run"), launched=True
 ).model_copy(
-    update={"run_id": 7, "key": bytes(32), "join_token": "0" * 32, "clock": "one"}
+    update={"run_id": 7, "key": bytes(32), "clock": "one"}
 )  # fmt: skip
-INVITED: RunDescriptor = RUN_DESCRIPTOR.model_copy(
-    update={
-        "remote": RemoteAccess(
-            host="127.0.0.1",
-            port=7000,
-            coordinator="A",
-            certificate="C",
-            private_key="K",
-            valid_until="2030-01-01T00:00:00+00:00",
-        ),
-        "run_dir": "/elsewhere/runs/one",
-    }
-)
 JUNK: list[bytes | None] = [
     None, b"", b"{", b"\xff", b"[]", b"{}", b"null", b'{"rows": 1}', b"[" * 100_000,
     b'{"pid": 1, "address": ["127.0.0.1", 0]}', b'{"pid": 1, "address": null}',

@@ -6,7 +6,7 @@ They end some milliseconds apart, and the loop is incomplete after the first of 
 import numpy as np
 
 from cosim.record.run_record import Rows, RunRecord
-from noack.protocol.record_tables import CLOCK_TABLES, OWNER, SENSOR_MEASUREMENT, STEP_TABLES
+from noack.protocol.record_tables import OWNER, SENSOR_MEASUREMENT, STEP_TABLES
 from noack.protocol.roles import LOOP_ROLES
 from noack.runtime.life_cycle import HORIZON
 
@@ -44,8 +44,6 @@ def up_to_common_end(record: RunRecord) -> RunRecord:
         before[role] = int(np.iinfo(np.int64).max if first is None else first[0])
 
     def derive(table: str, rows: Rows) -> Rows:
-        if table in CLOCK_TABLES:  # their rows have numbers of their own
-            return rows.compress(rows["t_ns"] <= end_ns)
         return rows.compress(rows["input"] < before[OWNER[table]])
 
     return record.derived(record.scenario, derive)

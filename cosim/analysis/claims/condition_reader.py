@@ -13,21 +13,12 @@ from cosim.analysis.claims.observed_conditions import (
     PacketLosses,
     SampledSeries,
     clock_cause,
-    lost_cause,
 )
 from cosim.record.record_source import messages_in
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NS_PER_S
-from noack.protocol.record_tables import (
-    CLOCK_TABLES,
-    LOST_NS,
-    NETEM_PACKET,
-    NO_SEQUENCE,
-    OWNER,
-    PLANT_STEP,
-    SENSOR_MEASUREMENT,
-    effective,
-)
+from noack.protocol.record_tables import NETEM_PACKET, NO_SEQUENCE, PLANT_STEP, SENSOR_MEASUREMENT, effective
+from noack.runtime.host_clocks import RECEIVED, allowed_lead_ns
 
 _PACKET_COLUMNS = ("fate", "head")
 
@@ -51,7 +42,7 @@ def read_conditions(record: RunRecord) -> ObservedConditions:
         for update in inputs.updates
         if update.applied_ns is not None and update.applied_ns < update.model_ns
     ]
-    clocks = scenario.clocks
+    clocks = record.clocks
     return ObservedConditions(
         losses=losses,
         sampling=_gaps(measured["t_ns"], end_ns),
@@ -61,8 +52,12 @@ def read_conditions(record: RunRecord) -> ObservedConditions:
         watchdog=inputs.watchdog,
         safe_input=inputs.safe_input,
         timeout_s=scenario.timing.actuation_timeout_ns / NS_PER_S,
-        clocks={} if clocks is None else _clock_errors(record),
-        largest_clock_error_s=np.inf if clocks is None else clocks.largest_error_us * 1e-6,
+        early_messages=_early_messages(record) if clocks else {},
+        allowed_leads_s={
+            clock_cause(role): allowed_lead_ns(role, clocks) * scenario.speed / NS_PER_S
+            for role in (RECEIVED if clocks else ())
+        },
+        clock_error_s=max((clock.error_ns / NS_PER_S for clock in clocks.values()), default=None),
         reached_s=end_ns * 1e-9,
         early=SampledSeries(*np.array(early).reshape(-1, 2).T),
     )
@@ -76,16 +71,15 @@ def _gaps(t_ns: Times, end_ns: int) -> SampledSeries:
     return SampledSeries(times_ns[:-1][longer] * 1e-9, gaps_ns[longer] * 1e-9)
 
 
-def _clock_errors(record: RunRecord) -> dict[str, SampledSeries]:
-    """Return the recorded bounds of the clocks' errors, by the name of the assumption."""
-    errors: dict[str, SampledSeries] = {}
-    for table in CLOCK_TABLES:
-        rows = record.columns(table, "t_ns", "error_ns")
-        t_s, error_s = np.maximum(rows["t_ns"], 0) * 1e-9, rows["error_ns"] / NS_PER_S
-        lost = rows["error_ns"] == LOST_NS
-        errors[clock_cause(OWNER[table])] = SampledSeries(t_s[~lost], error_s[~lost]).in_order()
-        errors[lost_cause(OWNER[table])] = SampledSeries(t_s[lost], 0 * t_s[lost]).in_order()
-    return errors
+def _early_messages(record: RunRecord) -> dict[str, SampledSeries]:
+    """Return by how much messages were received before they were sent, by the name of the assumption."""
+    series: dict[str, SampledSeries] = {}
+    for role, (table, _) in RECEIVED.items():
+        rows = record.columns(table, "t_ns", "now_ns")
+        early = rows["t_ns"] > rows["now_ns"]
+        t_ns, now_ns = rows["t_ns"][early], rows["now_ns"][early]
+        series[clock_cause(role)] = SampledSeries(np.maximum(now_ns, 0) * 1e-9, (t_ns - now_ns) * 1e-9)
+    return series
 
 
 def _passed(record: RunRecord) -> dict[int, bool]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.guarantee.loss_guarantee import LongestBurst, LossRule
-from noack.protocol.roles import LOOP_ROLES
+from noack.runtime.host_clocks import RECEIVED, causality_text
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.certificates.conditions import ideal_conditions
@@ -27,16 +27,11 @@ class VoidFrom(NamedTuple):
 
 
 def clock_cause(role: str) -> str:
-    """Return the name of the assumption that the error of a process's clock is small."""
+    """Return the name of the assumption that no message reached a process before it was sent."""
     return f"{role} clock"
 
 
-def lost_cause(role: str) -> str:
-    """Return the name of the assumption that the error of a process's clock is bounded."""
-    return f"{role} clock lost"
-
-
-CLOCK_CAUSES = tuple(cause(role) for role in LOOP_ROLES for cause in (clock_cause, lost_cause))
+CLOCK_CAUSES = tuple(clock_cause(role) for role in RECEIVED)
 """The assumptions about clocks, on which all claims depend; see ``docs/derivations.md``."""
 CAUSES = {
     "sampling": "no measurement for {:.4g} s, {:.4g} s allowed",
@@ -45,11 +40,7 @@ CAUSES = {
     "start": "the plant applied no input until {:.4g} s, {:.4g} s allowed",
     "watchdog": "the watchdog replaced the input: the newest actuation was {:.4g} s old, {:.4g} s allowed",
     "safe input": "the controller had no state and sent its safe input, largest entry {:.4g}",
-    **{
-        clock_cause(role): f"the clock of {role} may have been off by {{:.4g}} s, {{:.4g}} s allowed"
-        for role in LOOP_ROLES
-    },
-    **{lost_cause(role): f"the bound of the error of {role}'s clock was lost" for role in LOOP_ROLES},
+    **{clock_cause(role): causality_text(role) for role in RECEIVED},
 }
 """The assumptions about the schedule, each with the message of a violation: worst value and limit.
 
@@ -99,11 +90,6 @@ class SampledSeries(NamedTuple):
         """Return the values before a time."""
         early = self.t_s < t_s
         return SampledSeries(self.t_s[early], self.value[early])
-
-    def in_order(self) -> "SampledSeries":
-        """Return the values in the order of time."""
-        order = np.argsort(self.t_s, kind="stable")
-        return SampledSeries(self.t_s[order], self.value[order])
 
 
 class PacketLosses(NamedTuple):
@@ -171,10 +157,13 @@ class ObservedConditions(NamedTuple):
     without a state, before ``start_s``."""
     timeout_s: float
     """Age at which the watchdog acts."""
-    clocks: Mapping[str, SampledSeries] = MappingProxyType({})
-    """By ``CLOCK_CAUSES``: the bound of the error of a clock, and the times when it was lost; only
-    with ``[clocks]``."""
-    largest_clock_error_s: float = np.inf
+    early_messages: Mapping[str, SampledSeries] = MappingProxyType({})
+    """By ``CLOCK_CAUSES``: by how much messages were received before they were sent, in a run with
+    several clocks."""
+    allowed_leads_s: Mapping[str, float] = MappingProxyType({})
+    """The largest such times that the bounds of both clocks explain."""
+    clock_error_s: float | None = None
+    """Largest error that a clock may have had at the start."""
     reached_s: float = np.inf
     """The end of the run, once it is known."""
     early: SampledSeries = SampledSeries(np.zeros(0), np.zeros(0))
@@ -210,9 +199,8 @@ class ObservedConditions(NamedTuple):
             "watchdog": (self.watchdog, self.timeout_s),
             "safe input": (self.safe_input, -1.0),  # every value is a violation
         }
-        for cause, series in self.clocks.items():
-            lost = cause.endswith("lost")  # every value is a violation
-            series_and_limits[cause] = (series, -1.0 if lost else self.largest_clock_error_s)
+        for cause, series in self.early_messages.items():
+            series_and_limits[cause] = (series, self.allowed_leads_s[cause])
         for cause, (series, limit) in series_and_limits.items():
             if causes is not None and cause not in causes:
                 continue
@@ -250,14 +238,13 @@ class ObservedConditions(NamedTuple):
 
     def summary(self) -> dict[str, float | None]:
         """The largest value of each condition."""
-        clocks = [self.clocks[cause].largest() for cause in map(clock_cause, LOOP_ROLES) if self.clocks]
         return {
             DROPOUTS: self.losses.consecutive(0.0).largest(),
             "sampling_s": self.sampling.largest(),
             "delay_s": self.delay.largest(),
             "hold_s": self.hold.largest(),
             "start_s": self.start_s if np.isfinite(self.start_s) else None,
-            "clock_error_s": max((error_s for error_s in clocks if error_s is not None), default=None),
+            "clock_error_s": self.clock_error_s,
         }
 
 

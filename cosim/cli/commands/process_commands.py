@@ -1,7 +1,6 @@
 """``noack record``, ``plant``, ``sensor``, ``controller``, ``netem``: one terminal per process."""
 
 import sys
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -15,16 +14,6 @@ from noack.core.errors import CallerError
 from noack.runtime.command_line import LogFormat
 
 app = typer.Typer()
-
-
-class Invited(StrEnum):
-    """Whom an invitation is for."""
-
-    ALL = "all"
-    PLANT = "plant"
-    SENSOR = "sensor"
-    NETEM = "netem"
-    CONTROLLER = "controller"
 
 
 @app.command(
@@ -47,15 +36,13 @@ def record(
             help="Let processes on other hosts join, at this address of this host.",
         ),
     ] = None,
-    invitation: Annotated[
-        Path, Option(metavar="FILE", help="With --listen: where the invitation is written.")
-    ] = Path("invitation.json"),
-    invite: Annotated[
-        Invited, Option(help="With --listen: which process the invitation is for.")
-    ] = Invited.ALL,
-    valid_minutes: Annotated[
-        float, Option(min=0.01, max=525_600, help="With --listen: how long one can join by it.")
-    ] = 60.0,
+    credentials: Annotated[
+        Path | None,
+        Option(
+            metavar="FOLDER",
+            help="With --listen: folder for what these processes need, by role; by default credentials.",
+        ),
+    ] = None,
     runs: opt.RunsOption = DEFAULT_RUNS,
     live: opt.LiveOption = False,
     log_format: opt.LogFormatOption = LogFormat.TEXT,
@@ -69,13 +56,13 @@ def record(
     from noack.protocol.roles import RECORDER
 
     listening = None
-    if listen is None:
-        _require_none_of(context, "invitation", "invite", "valid_minutes")
-    else:
+    if listen is not None:
         from cosim.live.coordination.remote_access import ListenSettings, listen_address  # TLS
 
-        role = None if invite is Invited.ALL else invite.value
-        listening = ListenSettings(listen_address(listen), invitation, role, 60 * valid_minutes)
+        folder = Path("credentials") if credentials is None else credentials
+        listening = ListenSettings(listen_address(listen), folder)
+    elif credentials is not None:
+        raise CallerError("--credentials needs --listen: processes of this host need no credentials")
     loaded = opt.load_scenario(scenario, settings)
     return run_processes(
         loaded, runs, live=live, report=report, verbose=verbose, json=json,
@@ -83,22 +70,13 @@ def record(
     )  # fmt: skip
 
 
-def _require_none_of(context: typer.Context, *options: str) -> None:
-    """Raise CallerError if one of the options that need ``--listen`` was given."""
-    for option in options:
-        source = context.get_parameter_source(option)
-        if source is not None and source.name == "COMMANDLINE":
-            name = "--" + option.replace("_", "-")
-            raise CallerError(f"{name} needs --listen: processes of this host need no invitation")
-
-
 JoinedSession = Annotated[str, opt.SESSION]
-InvitationOption = Annotated[
+CredentialsOption = Annotated[
     Path | None,
     Option(
-        "--invitation",
-        metavar="FILE",
-        help="Join a run on another host, by the file that `noack record --listen` wrote.",
+        "--credentials",
+        metavar="FOLDER",
+        help="Join a run on another host, by this role's folder of `noack record --listen`.",
     ),
 ]
 
@@ -107,14 +85,14 @@ def _join_examples(role: str) -> str:
     return examples(
         (f"noack {role}", "join the run that `noack record` has opened"),
         (f"noack {role} --session two --json", "in another session; print its report as JSON"),
-        (f"noack {role} --invitation invitation.json", "on another host"),
+        (f"noack {role} --credentials {role}", "on another host"),
     )
 
 
-def _arguments(session: str, invitation: Path | None, runs: Path, json: bool) -> list[str]:
+def _arguments(session: str, credentials: Path | None, runs: Path, json: bool) -> list[str]:
     """Return the arguments of a process that joins the open run."""
-    arguments = [] if invitation is None else ["--invitation", str(invitation)]
-    if invitation is None or session != "default":
+    arguments = [] if credentials is None else ["--credentials", str(credentials)]
+    if credentials is None or session != "default":
         arguments += ["--session", session]
     return [*arguments, "--runs", str(runs), *(["--json"] if json else [])]
 
@@ -122,7 +100,7 @@ def _arguments(session: str, invitation: Path | None, runs: Path, json: bool) ->
 @app.command(rich_help_panel=PROCESSES, epilog=_join_examples("plant"))
 def plant(
     session: JoinedSession = "default",
-    invitation: InvitationOption = None,
+    credentials: CredentialsOption = None,
     runs: opt.RunsOption = DEFAULT_RUNS,
     json: opt.JsonOption = False,
 ) -> int:
@@ -130,13 +108,13 @@ def plant(
     opt.require_linux()
     from plant_server.__main__ import main
 
-    return main(_arguments(session, invitation, runs, json))
+    return main(_arguments(session, credentials, runs, json))
 
 
 @app.command(rich_help_panel=PROCESSES, epilog=_join_examples("sensor"))
 def sensor(
     session: JoinedSession = "default",
-    invitation: InvitationOption = None,
+    credentials: CredentialsOption = None,
     runs: opt.RunsOption = DEFAULT_RUNS,
     json: opt.JsonOption = False,
 ) -> int:
@@ -144,13 +122,13 @@ def sensor(
     opt.require_linux()
     from sensor_node.__main__ import main
 
-    return main(_arguments(session, invitation, runs, json))
+    return main(_arguments(session, credentials, runs, json))
 
 
 @app.command(rich_help_panel=PROCESSES, epilog=_join_examples("controller"))
 def controller(
     session: JoinedSession = "default",
-    invitation: InvitationOption = None,
+    credentials: CredentialsOption = None,
     runs: opt.RunsOption = DEFAULT_RUNS,
     json: opt.JsonOption = False,
 ) -> int:
@@ -158,7 +136,7 @@ def controller(
     opt.require_linux()
     from controller_node.__main__ import main
 
-    return main(_arguments(session, invitation, runs, json))
+    return main(_arguments(session, credentials, runs, json))
 
 
 @app.command(

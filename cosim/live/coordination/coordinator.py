@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
-from typing import NamedTuple
 
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
@@ -26,12 +25,14 @@ from noack.runtime.control_messages import (
     ChangeAnnouncement,
     ChangeReply,
     ChangeRequest,
+    ClockError,
     JoinRequest,
     RunProgress,
     RunStart,
     parse_message,
 )
 from noack.runtime.control_plane import ControlPlane
+from noack.runtime.host_clocks import STATED, realtime_offset_ns
 from noack.runtime.life_cycle import HORIZON, LAUNCHED_LOST_S, LOST_AFTER_S, Event, LifeCycle, Side, State
 from noack.runtime.run_descriptor import RunDescriptor
 from noack.scenario.parameter_changes import (
@@ -42,6 +43,7 @@ from noack.scenario.parameter_changes import (
     scheduled,
 )
 from noack.scenario.resolution import resolve
+from noack.scenario.run_sections import ClocksSection
 from noack.scenario.scenario import loop_scenario, loop_sections
 from noack.scenario.scenario_tables import MOST_CHANGES
 from noack.settings.section import ReadTable, Table
@@ -58,19 +60,14 @@ _START_DELAY_NS, _LONG_START_DELAY_NS = 30_000_000, 100_000_000
 longer one is for processes on other hosts, and for a loaded machine."""
 
 
-class TokenScope(NamedTuple):
-    """The roles that a join token admits, and until when on the monotonic clock."""
-
-    roles: Collection[str] = ROLES
-    until_s: float = float("inf")
-
-
 class _Member(LifeCycle):
     """A process that has asked for admission."""
 
     def __init__(self, role: str, instance: str) -> None:
         super().__init__(role, Side.COORDINATOR)
         self.instance = instance
+        self.clock: ClockError | None = None
+        """Of a host with another clock than the coordinator's."""
         self.address: tuple[str, int] | None = None
         self.query: zenoh.Query | None = None
         """Its unanswered join request."""
@@ -90,13 +87,22 @@ class Coordinator:
     Args:
         descriptor: of the run.
         launched: roles of the processes that the launcher has started.
+        own_clock: how far this host's clock may be off, if processes of other hosts can join.
 
     Raises:
         PeerError: the control plane cannot be started.
     """
 
-    def __init__(self, descriptor: RunDescriptor, launched: Collection[str] = ()) -> None:
-        self._launched = launched
+    def __init__(
+        self,
+        descriptor: RunDescriptor,
+        launched: Collection[str] = (),
+        own_clock: ClockError | None = None,
+    ) -> None:
+        self._launched, self._own_clock = launched, own_clock
+        self._clock_settings = descriptor.scenario.clocks
+        self.notices: list[str] = []
+        """Lines for the person who watches the run, which have not been taken yet."""
         self.plane = ControlPlane(descriptor, COORDINATOR, listen=True)
         session, key = self.plane.session, self.plane.key
         self._admissions = session.declare_queryable(key("admit", "*"), FifoChannel(64))
@@ -107,8 +113,9 @@ class Coordinator:
         self._change_queries = session.declare_queryable(key("runtime_parameters"), FifoChannel(64))
         self._changes = ChangeRequests(descriptor, self.plane)
         self._speed = descriptor.scenario.speed
-        self.join_tokens = {descriptor.join_token: TokenScope()}
         self._clock: RunClock | None = None
+        self._realtime_offset_ns = 0
+        """This host's CLOCK_REALTIME minus its CLOCK_MONOTONIC, at the start of the run."""
         self._admitted: dict[tuple[str, str], _Member] = {}
         """By role and instance."""
         self._members: dict[str, _Member] = {}
@@ -251,23 +258,24 @@ class Coordinator:
         request = parse_message(AdmissionRequest, _payload(query))
         if role not in ROLES:
             raise PeerError("a run has no such process")
-        self._require_token(role, request.join_token)
         if role in self._members:
             raise PeerError(f"another {role} is in this run already")
         member = _Member(role, request.instance)
+        member.clock = self._checked_clock(role, request.clock)
         member.apply(Event.ADMIT)
         self._admitted[role, request.instance] = member
         self.plane.answer(query, Admission())
 
-    def _require_token(self, role: str, join_token: str) -> None:
-        """Raise PeerError unless a join token admits a role now."""
-        scope = self.join_tokens.get(join_token)
-        if scope is None:
-            raise PeerError("its run descriptor or invitation is not of this run")
-        if role not in scope.roles:
-            raise PeerError(f"its invitation is for the {', '.join(scope.roles)} only")
-        if time.monotonic() > scope.until_s:
-            raise PeerError("its invitation has expired")
+    def _checked_clock(self, role: str, clock: ClockError | None) -> ClockError | None:
+        """Return the clock of a process; raise PeerError if it may be off by more than is allowed."""
+        if clock is None or self._own_clock is None or self._clock_settings is None:
+            return None
+        require_small_error(f"the clock of the {role}'s host", clock, self._clock_settings)
+        bound = f"by at most {clock.error_ns / 1000:g} µs"
+        if clock.source == STATED:
+            bound += f", as {STATED} states: there is no chrony"
+        self.notices.append(f"the clock of the {role}'s host may be off {bound}")
+        return clock
 
     def _join(self, role: str, query: zenoh.Query) -> None:
         """Let a process wait at the start barrier; pass it if the run has started.
@@ -294,6 +302,7 @@ class Coordinator:
         is_quick = {*self._launched} == {*ROLES} and os.getloadavg()[0] <= cores()
         delay_ns = _START_DELAY_NS if is_quick else _LONG_START_DELAY_NS
         self._clock = RunClock(time.monotonic_ns() + delay_ns, self._speed)
+        self._realtime_offset_ns = realtime_offset_ns()
         for member in self._members.values():
             self._let_pass(member)
 
@@ -308,7 +317,29 @@ class Coordinator:
         assert query is not None
         assert self._clock is not None
         epoch_ns, changes = self._clock.epoch_ns, self._changes.announced
-        self.plane.answer(query, RunStart(epoch_ns=epoch_ns, addresses=addresses, changes=changes))
+        start = RunStart(
+            epoch_ns=epoch_ns,
+            epoch_realtime_ns=epoch_ns + self._realtime_offset_ns,
+            clocks=self._clocks(),
+            addresses=addresses,
+            changes=changes,
+        )
+        self.plane.answer(query, start)
+
+    def _clocks(self) -> dict[str, ClockError]:
+        """The clocks of the processes of the loop, if there are several."""
+        if self._own_clock is None or all(self._members[role].clock is None for role in LOOP_ROLES):
+            return {}
+        return {role: self._members[role].clock or self._own_clock for role in LOOP_ROLES}
+
+
+def require_small_error(which: str, clock: ClockError, settings: ClocksSection) -> None:
+    """Raise PeerError if a clock may be off by more than the scenario allows."""
+    if clock.error_ns > settings.largest_error_us * 1000:
+        raise PeerError(
+            f"{which} may be off by {clock.error_ns / 1000:g} µs by {clock.source}, "
+            f"clocks.largest_error_us = {settings.largest_error_us:g} allowed"
+        )
 
 
 def _sender(key_expr: object) -> tuple[str, str]:

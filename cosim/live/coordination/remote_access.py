@@ -1,20 +1,19 @@
-"""Opens a run to other hosts: TLS listener, invitation, and answers to questions about the time.
+"""Opens a run to other hosts: the credentials with which their processes reach it.
 
-The coordinator has a certificate, and all that join have one, each signed by itself. Each end
-accepts only the other one's.
+Each run has a certificate authority of its own, whose private key is nowhere but in this process. It
+signs a certificate for the recording host and one for each role; how they are used is in
+:mod:`noack.runtime.connections.credentials`.
 """
 
-import asyncio
 import datetime
 import ipaddress
+import os
+import shutil
 import socket
-import ssl
-import time
-from collections import Counter
+import tempfile
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from queue import SimpleQueue
 from typing import NamedTuple
 
 from cryptography import x509
@@ -22,199 +21,185 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
-from cosim.live.coordination.coordinator import Coordinator, TokenScope
+from cosim.live.coordination.coordinator import require_small_error
+from noack.core.clock import clock_identity
 from noack.core.errors import CallerError, PeerError, why
-from noack.protocol.roles import LOOP_ROLES
-from noack.runtime.active_runs import RUNS, run_name
-from noack.runtime.address import Address, address_text, family_of, parse_address
-from noack.runtime.connections.coordinator_link import InvitationProof, Protection, forwarding, tls_context
-from noack.runtime.connections.zenoh_session import socket_path
-from noack.runtime.host_clocks.time_exchange import TimeReference, answering
-from noack.runtime.run_descriptor import RemoteAccess, RunDescriptor, new_join_token, own_host
+from noack.protocol.roles import LOOP_ROLES, RECORDER
+from noack.runtime.address import Address, address_text, parse_address
+from noack.runtime.connections.credentials import CA_FILE, CERTIFICATE_FILE, KEY_FILE, RUN_FILE, own_host
+from noack.runtime.control_messages import ClockError
+from noack.runtime.host_clocks import clock_error
+from noack.runtime.run_descriptor import RunDescriptor
 from noack.scenario.run_sections import ClocksSection
 from noack.scenario.scenario import Scenario
 
-_MOST_PENDING_CONNECTIONS = 4096
-_FLOOD_PER_S = 100
-"""Connections without an invitation that are a flood."""
-_VALIDITY = datetime.timedelta(days=3650)
-"""A run may be long, and the hosts' dates may differ; an invitation ends with its join token."""
-_CALM_S, _MOST_CALM_S = 3, 60
-"""Time without a flood, after which it is over; and the longest such time."""
+DEFAULT_PORT = 7447
+"""Of zenoh."""
+_BEFORE, _TO_START = datetime.timedelta(hours=1), datetime.timedelta(days=1)
+"""Certificates are valid from so long before, as clocks differ, and for so long beside the run."""
 
 
 class ListenSettings(NamedTuple):
-    """Where a run listens, and whom it invites."""
+    """Where a run listens, and where the credentials for it are written."""
 
     address: Address
-    invitation: Path
-    """Where the invitation is written."""
-    role: str | None = None
-    """The one role that the invitation is for; None for all."""
-    valid_s: float = 3600.0
+    folder: Path
 
 
-class RunListener(NamedTuple):
-    """A run that is open to other hosts."""
-
-    address: Address
-    invitation: RunDescriptor
-    notices: SimpleQueue[str]
-    """Lines for the person who watches the run: floods."""
-
-
-def listen_address(text: str, option: str = "--listen") -> Address:
-    """Parse an address of this host: ``192.0.2.1``, ``192.0.2.1:7000``, ``2001:db8::1``.
+def listen_address(text: str) -> Address:
+    """Parse an address of this host, ``192.0.2.1`` or ``192.0.2.1:7000``.
 
     Raise CallerError if it is not an address at which others can reach this host.
     """
-    with suppress(ValueError):  # an IPv6 address without brackets
-        text = f"[{ipaddress.IPv6Address(text)}]"
-    if text.endswith("]") or ":" not in text:
-        text += ":0"
-    if text.startswith(":") or not text:
-        raise CallerError(f"{option}: expected an address of this host")
-    host, port = parse_address(text, option)
+    with suppress(ValueError):
+        ipaddress.IPv6Address(text.partition("]")[0].removeprefix("["))
+        raise CallerError(f"--listen: zenoh's TLS takes no IPv6 address; give an IPv4 address, not {text}")
+    if not text.partition(":")[0]:
+        raise CallerError("--listen: expected an address of this host")
+    host, port = parse_address(text if ":" in text else f"{text}:{DEFAULT_PORT}", "--listen")
     address = ipaddress.ip_address(host.partition("%")[0])
-    mapped = isinstance(address, ipaddress.IPv6Address) and address.ipv4_mapped is not None
-    if address.is_unspecified or address.is_multicast or address.is_link_local or mapped:
+    if not port:
+        raise CallerError(f"--listen: expected a port from 1 to 65535; found {text!r}")
+    if address.version != 4 or address.is_unspecified or address.is_multicast or address.is_link_local:
         raise CallerError(
-            f"{option}: {host} is not an address at which other hosts can reach this one; "
+            f"--listen: {host} is not an IPv4 address at which other hosts can reach this one; "
             "give one of `ip address`"
         )
     return host, port
 
 
 def with_clocks(scenario: Scenario) -> Scenario:
-    """Return a scenario whose run on several hosts records the bounds of its clocks' errors."""
+    """Return a scenario that says how far the clocks of its hosts may be off."""
     if scenario.clocks is not None:
         return scenario
     return scenario.model_copy(update={"clocks": ClocksSection()})
 
 
-def _listen(address: Address) -> socket.socket:
-    endpoint = socket.socket(family_of(address), socket.SOCK_STREAM)
-    endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        endpoint.bind(address)
-        endpoint.listen(_MOST_PENDING_CONNECTIONS)
-        own_host(endpoint.getsockname()[:2])  # refuses a broadcast address
-    except (OSError, PeerError) as error:
-        endpoint.close()
-        reason = why(error) if isinstance(error, OSError) else error
-        raise CallerError(f"cannot listen on {address_text(address)}: {reason}") from None
-    return endpoint
+def own_clock(scenario: Scenario) -> ClockError:
+    """Return how far this host's clock may be off.
+
+    Raise PeerError if that is more than the scenario allows, MachineError if chrony has not
+    synchronised it.
+    """
+    settings = scenario.clocks or ClocksSection()
+    error = clock_error(clock_identity(), settings.largest_error_us)
+    require_small_error("the clock of this host", error, settings)
+    return error
+
+
+def require_free(address: Address) -> None:
+    """Raise CallerError if this host cannot listen on an address."""
+    with socket.socket() as endpoint:
+        endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            endpoint.bind(address)
+            own_host(address)  # refuses a broadcast address
+        except (OSError, PeerError) as error:
+            reason = why(error) if isinstance(error, OSError) else error
+            raise CallerError(f"cannot listen on {address_text(address)}: {reason}") from None
 
 
 @contextmanager
-def open_to_hosts(
-    listening: ListenSettings, descriptor: RunDescriptor, coordinator: Coordinator
-) -> Iterator[RunListener]:
-    """Listen for processes of other hosts meanwhile, and make their invitation.
+def credentials(listening: ListenSettings, descriptor: RunDescriptor) -> Iterator[RunDescriptor]:
+    """Write the folder of credentials; yield the run descriptor of the end that listens.
 
-    Raise CallerError if the address cannot be used.
+    The folder is private: each role's part of it gives access to the run. It replaces that of an
+    earlier run, and is removed at the end. Raise CallerError if it cannot be written.
     """
-    keys, path = new_tls_keys(listening.address[0]), socket_path(RUNS, run_name(descriptor.run_id))
-    with ExitStack() as stack:
-        endpoint = stack.enter_context(_listen(listening.address))
-        host, port = endpoint.getsockname()[:2]
-        floods = ConnectionFloodWatch()
-        proof = InvitationProof(descriptor.key)
-        protection = Protection(coordinator_context(keys), proof, floods.next_interval)
-        stack.enter_context(forwarding(endpoint, lambda: asyncio.open_unix_connection(path), protection))
-        times = TimeReference((host, listening.address[1]), descriptor.key)
-        stack.callback(times.close)
-        stack.enter_context(answering(times))
-        until = datetime.datetime.now().astimezone() + datetime.timedelta(seconds=listening.valid_s)
-        remote = RemoteAccess(
-            host=host,
-            port=port,
-            coordinator=keys.coordinator.certificate,
-            **keys.joining._asdict(),
-            valid_until=until.isoformat(timespec="seconds"),
+    folder = listening.folder
+    descriptor = descriptor.model_copy(update={"remote": listening.address, "launched": False})
+    run_s = descriptor.scenario.horizon_s / descriptor.scenario.speed
+    authority = _Authority(_TO_START + datetime.timedelta(seconds=run_s))
+    try:
+        with _replacing(folder) as new:
+            for role in (RECORDER, *LOOP_ROLES):
+                part = new / role
+                part.mkdir(mode=0o700)
+                owner: x509.GeneralName = x509.DNSName(role)
+                if role == RECORDER:
+                    owner = x509.IPAddress(ipaddress.ip_address(listening.address[0]))
+                files = {CA_FILE: authority.certificate, **authority.key_pair(role, owner)}
+                if role != RECORDER:
+                    of_role = descriptor.model_copy(update={"credentials_for": role})
+                    files[RUN_FILE] = (of_role.model_dump_json(indent=1) + "\n").encode()
+                for name, content in files.items():
+                    _write_private(part / name, content)
+        identity = _identity(folder)
+    except OSError as error:
+        raise CallerError(f"{folder}: the credentials cannot be written: {why(error)}") from None
+    try:
+        yield descriptor.model_copy(update={"credentials": str((folder / RECORDER).resolve())})
+    finally:
+        with suppress(OSError):
+            if _identity(folder) == identity:  # else another run has replaced it
+                shutil.rmtree(folder)
+
+
+@contextmanager
+def _replacing(folder: Path) -> Iterator[Path]:
+    """Give a new private folder, which takes the place of an older folder of credentials.
+
+    Raise OSError or CallerError if that is impossible.
+    """
+    if folder.is_symlink() or (folder.exists() and not _is_of_credentials(folder)):
+        raise CallerError(f"{folder}: exists, and is not a folder of credentials; give another")
+    new = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
+    try:
+        yield new
+        if folder.exists():
+            shutil.rmtree(folder)
+        new.rename(folder)
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
+
+
+def _is_of_credentials(folder: Path) -> bool:
+    return folder.is_dir() and {path.name for path in folder.iterdir()} <= {RECORDER, *LOOP_ROLES}
+
+
+def _identity(folder: Path) -> tuple[int, int]:
+    status = folder.lstat()
+    return status.st_dev, status.st_ino
+
+
+def _write_private(path: Path, content: bytes) -> None:
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(descriptor, "wb") as file:
+        file.write(content)
+
+
+class _Authority:
+    """A certificate authority; its certificates are valid for ``valid`` from now on."""
+
+    def __init__(self, valid: datetime.timedelta) -> None:
+        now = datetime.datetime.now(datetime.UTC)
+        self._from, self._until = now - _BEFORE, now + valid
+        self._key = ec.generate_private_key(ec.SECP256R1())
+        self._name = _name("noack run")
+        builder = self._builder(self._name, self._key)
+        constraints = x509.BasicConstraints(ca=True, path_length=0)
+        self.certificate = self._signed(builder.add_extension(constraints, critical=True))
+        """Its own, as PEM text."""
+
+    def key_pair(self, role: str, owner: x509.GeneralName) -> dict[str, bytes]:
+        """Return a new certificate with its private key, as files; the common name is the role."""
+        key = ec.generate_private_key(ec.SECP256R1())
+        builder = self._builder(_name(role), key)
+        builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        builder = builder.add_extension(x509.SubjectAlternativeName([owner]), critical=False)
+        private = key.private_bytes(
+            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
         )
-        join_token = new_join_token()
-        roles = LOOP_ROLES if listening.role is None else (listening.role,)
-        coordinator.join_tokens[join_token] = TokenScope(roles, time.monotonic() + listening.valid_s)
-        invited = {
-            "launched": False,
-            "join_token": join_token,
-            "remote": remote,
-            "time_reference": times.address,
-        }
-        yield RunListener((host, port), descriptor.model_copy(update=invited), floods.lines)
+        return {CERTIFICATE_FILE: self._signed(builder), KEY_FILE: private}
+
+    def _builder(self, subject: x509.Name, key: ec.EllipticCurvePrivateKey) -> x509.CertificateBuilder:
+        number = x509.random_serial_number()
+        builder = x509.CertificateBuilder(self._name, subject, key.public_key(), number)
+        return builder.not_valid_before(self._from).not_valid_after(self._until)
+
+    def _signed(self, builder: x509.CertificateBuilder) -> bytes:
+        return builder.sign(self._key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
 
 
-class ConnectionFloodWatch:
-    """Reports the begin and the end of a flood of connections without an invitation.
-
-    The end is reported after a number of consecutive calm intervals, which doubles with each flood,
-    so that repeated floods print few lines.
-    """
-
-    def __init__(self) -> None:
-        self.lines: SimpleQueue[str] = SimpleQueue()
-        self._ended = self._calm = 0
-        self._needed = _CALM_S
-
-    def next_interval(self, count: Counter[str]) -> None:
-        """Count connections that ended in a second without an invitation, by host."""
-        total = count.total()
-        if total >= _FLOOD_PER_S:
-            self._calm = 0
-            if not self._ended:
-                self.lines.put(
-                    f"flood: {total} connections without an invitation in a second, from "
-                    f"{len(count)} addresses, most from {count.most_common(1)[0][0]}; "
-                    "processes with an invitation can still join"
-                )
-            self._ended += total
-        elif self._ended:
-            self._ended += total
-            self._calm += 1
-            if self._calm >= self._needed:
-                self.lines.put(f"the flood is over: {self._ended} connections without an invitation ended")
-                self._ended, self._needed = 0, min(2 * self._needed, _MOST_CALM_S)
-
-
-class KeyPair(NamedTuple):
-    """A certificate and its private key, as PEM text."""
-
-    certificate: str
-    private_key: str
-
-
-class TlsKeys(NamedTuple):
-    """The keys of one run."""
-
-    coordinator: KeyPair
-    joining: KeyPair
-
-
-def new_tls_keys(host: str) -> TlsKeys:
-    """Return keys for a coordinator at a numeric address."""
-    return TlsKeys(
-        _new_key_pair(x509.IPAddress(ipaddress.ip_address(host))),
-        _new_key_pair(x509.DNSName("joining")),
-    )
-
-
-def _new_key_pair(owner: x509.GeneralName) -> KeyPair:
-    key = ec.generate_private_key(ec.SECP256R1())
-    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "noack run")])
-    now = datetime.datetime.now(datetime.UTC)
-    certificate = (
-        x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number())
-        .not_valid_before(now - _VALIDITY)
-        .not_valid_after(now + _VALIDITY)
-        .add_extension(x509.SubjectAlternativeName([owner]), critical=False)
-        .sign(key, hashes.SHA256())
-    )
-    pem = serialization.Encoding.PEM
-    private = key.private_bytes(pem, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
-    return KeyPair(certificate.public_bytes(pem).decode(), private.decode())
-
-
-def coordinator_context(keys: TlsKeys) -> ssl.SSLContext:
-    """Return the TLS settings of the coordinator's end."""
-    return tls_context(keys.joining.certificate, *keys.coordinator, server=True)
+def _name(common_name: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])

@@ -4,7 +4,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from threading import Event, Thread
-from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import (
@@ -18,9 +17,6 @@ from rich.progress import (
 
 from noack.core.clock import NS_PER_S
 from noack.runtime.command_line import print_to_stderr
-
-if TYPE_CHECKING:
-    pass
 
 _LINE_EVERY_S = 10.0
 """Time between two lines about some work, if there is no terminal."""

@@ -27,8 +27,8 @@ class RunObserver:
     def waiting(self, roles: Sequence[str]) -> None:
         """The start barrier waits for these roles, which are started by hand."""
 
-    def listening(self, address: str, settings: "ListenSettings") -> None:
-        """Processes on other hosts can join at this address."""
+    def listening(self, settings: "ListenSettings") -> None:
+        """Processes on other hosts can join."""
 
     def started(self, run_dir: Path) -> None:
         """The loop has started; its run directory exists."""

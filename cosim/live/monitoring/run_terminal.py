@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from cosim.live.monitoring.run_observers import RunObserver
+from noack.runtime.address import address_text
 from noack.runtime.control_messages import RunProgress
 from noack.scenario.scenario import Scenario, loop_names
 
@@ -45,14 +46,14 @@ class RunTerminal(RunObserver):
         if roles:
             self._print(f"waiting for {', '.join(roles)}")
 
-    def listening(self, address: str, settings: "ListenSettings") -> None:
+    def listening(self, settings: "ListenSettings") -> None:
         """Say how processes on other hosts join."""
-        role = settings.role or "plant|sensor|netem|controller"
+        address, folder = address_text(settings.address), settings.folder
         self._print(
-            f"listening on {address}; copy the invitation to the other hosts, and start "
-            f"processes there within {settings.valid_s / 60:g} min; it has secret keys:\n"
-            f"  scp {settings.invitation} HOST:\n"
-            f"  noack {role} --invitation {settings.invitation.name}"
+            f"listening on {address}; copy the credentials of each role to the host where it runs, and "
+            "start it there; they are secret:\n"
+            f"  scp -r {folder / 'sensor'} HOST:\n"
+            "  noack sensor --credentials sensor"
         )
 
     def started(self, run_dir: Path) -> None:

@@ -45,8 +45,6 @@ from cosim.output.figures.figure_description import (
 )
 from cosim.output.figures.palette import CONTROLLER, FORCED, LOST, SENSOR
 from cosim.output.figures.timing_figures import (
-    clock_errors,
-    clocks_figure,
     inter_event_figure,
     largest_text,
     latency_figure,
@@ -123,8 +121,6 @@ def run_figures(
             "lateness": lambda: lateness_figure(record),
             "latency": lambda: latency_figure(record),
         }
-    if errors := clock_errors(record):
-        figures["clocks"] = lambda: clocks_figure(record.scenario, errors)
     return figures
 
 

@@ -1,8 +1,7 @@
 """The figures of a loop's times: between events, latencies, lateness of its processes, their clocks."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,15 +23,12 @@ from cosim.output.figures.figure_description import (
     finite,
     histogram,
     one_panel,
-    time_axis,
 )
 from cosim.output.figures.palette import CONTROLLER, SENSOR, THRESHOLD
 from cosim.record.align import Reals
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NS_PER_S
-from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER
 from noack.protocol.roles import LOOP_ROLES
-from noack.scenario.scenario import Scenario
 
 Flags = NDArray[np.bool_]
 _RANKS = 120
@@ -126,73 +122,3 @@ def later_than(values: QuantileSketch) -> tuple[Reals, Reals]:
     rank = np.concatenate([np.geomspace(1, k, _RANKS), np.linspace(1, k, _RANKS)])
     rank = np.unique(rank.round().astype(np.intp))[::-1]
     return np.maximum(finite(values.largest(rank)), _SHORTEST_US), rank / k
-
-
-class ClockErrors(NamedTuple):
-    """Bounds of the error of a process's clock: k comparisons with the recorder's clock."""
-
-    t_s: Reals
-    """(k,)"""
-    error_us: Reals
-    """(k,) wall µs; NaN: the bound was lost."""
-
-    @property
-    def lost(self) -> Flags:
-        """(k,) whether the bound was lost."""
-        return np.isnan(self.error_us)
-
-    @property
-    def largest_us(self) -> float | None:
-        """The largest known bound; None without one."""
-        errors_us = self.error_us[~self.lost]
-        return float(errors_us.max()) if len(errors_us) else None
-
-
-def clock_errors(record: RunRecord) -> dict[str, ClockErrors]:
-    """Return the bounds of the processes whose clock is not the recorder's, by process."""
-    errors = {}
-    for table in CLOCK_TABLES:
-        if table not in record.tables:
-            continue
-        rows = record.columns(table, "t_ns", "error_ns")
-        if (rows["error_ns"] != 0).any():
-            error_us = np.where(rows["error_ns"] == LOST_NS, np.nan, rows["error_ns"] * 1e-3)
-            errors[OWNER[table]] = ClockErrors(rows["t_ns"] / NS_PER_S, error_us)
-    return errors
-
-
-def clocks_figure(scenario: Scenario, errors: Mapping[str, ClockErrors]) -> FigureDescription:
-    """Describe the bound of each process's clock; it has a gap, and a cross, where it was lost."""
-    assert scenario.clocks is not None  # else the record has no tables of clocks
-    allowed_us, last_s = scenario.clocks.largest_error_us, scenario.horizon_s
-    lines, crosses, texts = list[Item](), list[Item](), list[str]()
-    for i, (process, error) in enumerate(errors.items()):
-        largest_us, colour, order = error.largest_us, palette.PROCESSES[process], 2 + 0.1 * i
-        texts.append(f"{process} " + ("never known" if largest_us is None else f"{largest_us:.3g} µs"))
-        keep = error.t_s <= last_s
-        t_s, error_us, lost = error.t_s[keep], error.error_us[keep], error.lost[keep]
-        # The curves often coincide: the first ones are wider, and stay visible under the last.
-        width = 1.3 + 1.2 * (len(errors) - 1 - i)
-        curve = Line(x=t_s, y=error_us, label=process, colour=colour, width=width)
-        lines.append(replace(curve, order=order))
-        began_s = t_s[lost & ~np.append(False, lost[:-1])]
-        heights = np.full(len(began_s), allowed_us)
-        cross = Marks(x=began_s, y=heights, colour=colour, marker="x", size=9.0, stroke=2.0)
-        crosses.append(replace(cross, order=order))
-    limit = Rule(at=allowed_us, colour=THRESHOLD, label="allowed", width=1.2, dash=(4, 3))
-    unknown = all(error.largest_us is None for error in errors.values())
-    ends = (allowed_us / 10, allowed_us * 10) if unknown else (None, None)
-    panel = Panel(
-        title="Clocks",
-        items=[*lines, *crosses, limit],
-        x=time_axis(np.array([0.0, last_s])),
-        y=Axis(label="bound of error [wall µs]", logarithmic=True, ends=ends),
-    )
-    largest, lost_clocks = ", ".join(texts), [name for name, error in errors.items() if error.lost.any()]
-    return one_panel("clocks", panel, 1.9).captioned(
-        "Bound of the difference between a process's time and the recorder's, for the "
-        f"processes on hosts with other clocks. Largest: {largest}. Dashed: the largest bound with "
-        "which claims hold."
-        + (f" Cross: from here on, the bound was lost ({', '.join(lost_clocks)})." if lost_clocks else ""),
-        f"Bounds of the clocks' errors over time on a logarithmic axis; largest: {largest}.",
-    )

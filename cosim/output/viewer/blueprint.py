@@ -18,7 +18,6 @@ Entities of the recording, all on the timeline ``t`` (simulated time since the r
 ``reception/stem``        the stems of both
 ``drop``                  0 at every lost update
 ``lateness/<process>``    lateness in microseconds
-``clock/<process>``       bound of the error of a process's clock in microseconds
 ``log``                   text
 ``picture/…``             the plant, animated (``cosim/output/viewer/pictures/``)
 ``network/…``             the loop's processes, and packets in flight
@@ -87,11 +86,6 @@ def lateness_path(process: str) -> str:
     return f"lateness/{rr.escape_entity_path_part(process)}"
 
 
-def clock_path(process: str) -> str:
-    """Return the entity of the bound of a clock's error; the process's name is escaped."""
-    return f"clock/{rr.escape_entity_path_part(process)}"
-
-
 @dataclass(frozen=True)
 class LoopLayout:
     """What the viewer shows of a loop."""
@@ -102,8 +96,6 @@ class LoopLayout:
     input_names: Sequence[str]
     processes: Sequence[str] = ()
     """Those whose lateness is shown; none in a simulated run."""
-    has_clocks: bool = False
-    """Whether the bounds of the clocks' errors are shown."""
     picture: Picture | None = None
     """Picture of the plant, if there is one."""
     diagram: NetworkDiagram | None = None
@@ -172,7 +164,6 @@ def _styles(layout: LoopLayout) -> dict[str, Static]:
     colours = [IDENTITY, SENSOR, THRESHOLD, CONTROLLER, CERTIFIED]
     widths = [3.5, 1.5, 2.0, 1.5, 2.0]
     lateness = {lateness_path(process): line for process, line in _process_styles(layout.processes).items()}
-    clocks = {clock_path(process): line for process, line in _process_styles(layout.processes).items()}
     return {
         **{state_path(name): triple for name in layout.state_names},
         ERROR: rr.SeriesLines(names=errors[:4], colors=colours[:4], widths=widths[:4]),
@@ -196,7 +187,6 @@ def _styles(layout: LoopLayout) -> dict[str, Static]:
         RECEPTION_FORCED: _mark("received (forced)", palette.FORCED, "diamond", 6.0),
         DROP: _mark("lost", LOST, "cross", 5.0),
         **lateness,
-        **(clocks if layout.has_clocks else {}),
     }
 
 
@@ -263,10 +253,9 @@ def _norms() -> rrb.Container:
 
 
 def _texts(layout: LoopLayout) -> rrb.Container:
-    """Return the tabs: the colour key, the text about the run, lateness, clocks, the log."""
+    """Return the tabs: the colour key, the text about the run, lateness, the log."""
     everything = ["$origin/**"]
     timing = [plot("Lateness [µs]", "lateness", everything)] if layout.processes else []
-    timing += [plot("Clock error [µs]", "clock", everything)] if layout.has_clocks else []
     key, text = colour_key_panel(layout.input_names), about_view()
     return rrb.Tabs(key, text, *timing, log_view())
 

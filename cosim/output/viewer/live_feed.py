@@ -23,7 +23,6 @@ from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.linear_systems import Propagator
 from noack.core.row_operations import row_norms
 from noack.protocol.record_tables import (
-    CLOCK_TABLES,
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
     LOOP,
@@ -63,7 +62,6 @@ class LiveFeed:
             number: LoopFeed(loops[number], loop_view, certified=not view.is_shared)
             for number, loop_view in view.views.items()
         }
-        self._tables = SHOWN_TABLES if view.is_shared else (*SHOWN_TABLES, *CLOCK_TABLES)
         self._waiting: dict[str, list[Rows]] = {}
         self._due: list[int] = []
         self._round_ns = self._shown_ns = 0
@@ -73,7 +71,7 @@ class LiveFeed:
         """Add rows that follow the previously added ones."""
         if self._all_loops is not None:
             self._all_loops.add(table, rows)
-        if self._feeds and table in self._tables and len(rows):
+        if self._feeds and table in SHOWN_TABLES and len(rows):
             self._waiting.setdefault(table, []).append(rows)
 
     def log(self, notice: Mapping[str, Any]) -> None:

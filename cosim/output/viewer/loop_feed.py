@@ -27,14 +27,11 @@ from cosim.record.run_events import claimed_until_s, model_flow
 from noack.core.clock import NS_PER_S
 from noack.core.row_operations import row_norms
 from noack.protocol.record_tables import (
-    CLOCK_TABLES,
     CONTROLLER_DELIVERY,
     CONTROLLER_SETTING,
     CONTROLLER_STEP,
-    LOST_NS,
     NETEM_PACKET,
     NO_SEQUENCE,
-    OWNER,
     PLANT_STEP,
     SENSOR_MEASUREMENT,
     Fate,
@@ -65,7 +62,7 @@ SHOWN_TABLES = (
     SENSOR_MEASUREMENT,
 )
 
-_WARNINGS = ("failed", "violation", "watchdog", "clock lost")
+_WARNINGS = ("failed", "violation", "watchdog")
 
 
 def log_level(notice: Mapping[str, object]) -> str:
@@ -98,8 +95,7 @@ class LoopFeed:
         self._view = view
         # Other tables are not shown.
         self._types = tables_of(scenario)
-        self._clock_tables = [table for table in CLOCK_TABLES if table in self._types]
-        self._pending: dict[str, list[Rows]] = {table: [] for table in (*SHOWN_TABLES, *self._clock_tables)}
+        self._pending: dict[str, list[Rows]] = {table: [] for table in SHOWN_TABLES}
         self._track: ControllerTrack = initial_track(scenario)
         self._undrawn: list[Rows] = []
         self._forced: set[int] = set()
@@ -155,14 +151,6 @@ class LoopFeed:
             self._steps = concatenate_rows([self._steps, plant_rows], self._steps.dtype)
         self._show_lateness("plant", plant_rows)
         self._show_measurements(self._take(SENSOR_MEASUREMENT, until_ns), reach_ns)
-        for table in self._clock_tables:
-            self._show_clock_errors(table, self._take(table, None))
-
-    def _show_clock_errors(self, table: str, rows: Rows) -> None:
-        if len(rows):
-            error_us = np.where(rows["error_ns"] == LOST_NS, np.nan, rows["error_ns"] * 1e-3)
-            keep = self._rows_to_show(rows["now_ns"], error_us)
-            self._view.add_clock_errors(OWNER[table], rows["now_ns"][keep], error_us[keep])
 
     def _take(self, table: str, until_ns: int | None) -> Rows:
         """Return the waiting rows of a table up to a time; they wait no longer."""

@@ -299,11 +299,6 @@ class LoopView:
         if process in self._layout.processes:
             self._send(bp.lateness_path(process), t_ns, lateness_us)
 
-    def add_clock_errors(self, process: str, t_ns: Times, error_us: Reals) -> None:
-        """Add bounds of the error of a process's clock in µs (k,) at times (k,); NaN: lost."""
-        if process in self._layout.processes:
-            self._send(bp.clock_path(process), t_ns, error_us)
-
 
 def _log10(norms: Reals, threshold: Reals) -> Reals:
     """Return the decimal logarithm of norms (k, series), cut off below the threshold (k,)."""

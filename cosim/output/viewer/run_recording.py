@@ -209,7 +209,6 @@ def _loop_layout(
         loop.state_names,
         loop.input_names,
         processes=LOOP_ROLES if is_timed else (),
-        has_clocks=is_timed and scenario.clocks is not None,
         picture=picture_of(scenario),
         diagram=NetworkDiagram(*scenario.network.flows[1:]) if animated else None,
         folder=folder,

@@ -1,6 +1,5 @@
-"""Connections: sessions of zenoh, a gate for others, the link to a coordinator.
+"""Connections of a process with other programs of noack.
 
-``zenoh_session.py`` opens the sessions of control planes, on this host or to another one.
-``connection_gate.py`` accepts connections on a thread and ends those that flood it; behind it
-``coordinator_link.py`` forwards processes on other hosts to the coordinator.
+``zenoh_session.py`` opens sessions of zenoh on a Unix socket, or with another host by TLS;
+``credentials.py`` has what a process on another host needs for that.
 """

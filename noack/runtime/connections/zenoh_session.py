@@ -1,4 +1,4 @@
-"""Sessions of zenoh over a Unix socket in the user's runtime directory, requests and replies.
+"""Sessions of zenoh over a Unix socket in the user's runtime directory, or TLS; requests and replies.
 
 Of a run's control plane, of the emulator's live control, and of the doctor's measurement of zenoh.
 """
@@ -6,17 +6,16 @@ Of a run's control plane, of the emulator's live control, and of the doctor's me
 import json
 import os
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
 from functools import cache
+from typing import NamedTuple
 
 import zenoh
 from zenoh.handlers import FifoChannel, Handler
 
-from noack.core.errors import CallerError, NoAnswerError
-from noack.runtime.address import address_text
+from noack.core.errors import CallerError
+from noack.runtime.address import Address, address_text
 from noack.runtime.private_folder import open_private
-from noack.runtime.run_descriptor import RemoteAccess
 
 _LEASE_MS = 6000
 """A connection whose other end is silent for longer breaks. On a busy machine a process may not run
@@ -29,36 +28,34 @@ _FIRST_POLL_S, _POLL_SHARE = 0.001, 0.05
 """Time between two checks for a reply: at first, and as a share of the time waited so far."""
 
 
-def open_session(kind: str, name: str, *, listen: bool) -> zenoh.Session:
+class TlsEndpoint(NamedTuple):
+    """Where a session is reached from other hosts, and zenoh's settings for that."""
+
+    address: Address
+    tls: dict[str, object]
+    access_control: dict[str, object] | None = None
+    """Of the end that listens: which messages each other end may send."""
+
+    @property
+    def endpoint(self) -> str:
+        """The endpoint in zenoh's form."""
+        return f"tls/{address_text(self.address)}"
+
+
+def open_session(kind: str, name: str, *, listen: bool, remote: TlsEndpoint | None = None) -> zenoh.Session:
     """Open a session that listens on a socket, or connects to it.
 
-    The socket is ``NAME.sock`` in the folder ``kind`` of the user's runtime directory. Raise
-    zenoh.ZError if that fails, CallerError if other users have access to the folder.
+    The socket is ``NAME.sock`` in the folder ``kind`` of the user's runtime directory. A session that
+    listens does so for other hosts, too, if ``remote`` is given. Raise zenoh.ZError if that fails,
+    CallerError if other users have access to the folder.
     """
-    return zenoh.open(session_config(socket_path(kind, name), listen=listen))
+    endpoints = [f"unixsock-stream/{socket_path(kind, name)}"]
+    return zenoh.open(session_config(endpoints, listen=listen, remote=remote))
 
 
-@contextmanager
-def open_remote_session(remote: RemoteAccess, key: bytes) -> Iterator[zenoh.Session]:
-    """Give a session with a coordinator on another host, in a run with this key.
-
-    Raise NoAnswerError if that fails, MachineError if the link to the coordinator cannot be
-    started, CallerError if other users have access to the user's runtime directory.
-    """
-    # Processes on the coordinator's host need neither TLS nor asyncio.
-    from noack.runtime.connections.coordinator_link import Destination, coordinator_link
-
-    credentials = remote.coordinator, remote.certificate, remote.private_key
-    destination = Destination(remote.host, remote.port, *credentials, key.hex())
-    address = address_text((remote.host, remote.port))
-    with ExitStack() as stack:
-        try:
-            path = stack.enter_context(coordinator_link(destination))
-            session = zenoh.open(session_config(path, listen=False))
-        except (NoAnswerError, zenoh.ZError) as error:
-            reason = error if isinstance(error, NoAnswerError) else cause_of(error)
-            raise NoAnswerError(f"cannot reach the run at {address}: {reason}") from None
-        yield session
+def open_remote_session(remote: TlsEndpoint) -> zenoh.Session:
+    """Connect to a session on another host; raise zenoh.ZError if that fails."""
+    return zenoh.open(session_config([], listen=False, remote=remote))
 
 
 def socket_path(kind: str, name: str) -> str:
@@ -78,13 +75,13 @@ def _lasting_copy(descriptor: int, device: int, inode: int) -> int:
     return os.dup(descriptor)
 
 
-def session_config(path: str, *, listen: bool) -> zenoh.Config:
-    """Return the zenoh configuration of a session that listens on a socket, or connects to it."""
+def session_config(endpoints: list[str], *, listen: bool, remote: TlsEndpoint | None = None) -> zenoh.Config:
+    """Return the zenoh configuration of a session that listens on endpoints, or connects to them."""
     config = zenoh.Config()
     side, other_side = ("listen", "connect") if listen else ("connect", "listen")
     settings: dict[str, object] = {
         "mode": "router" if listen else "client",
-        f"{side}/endpoints": [f"unixsock-stream/{path}"],
+        f"{side}/endpoints": endpoints if remote is None else [*endpoints, remote.endpoint],
         f"{other_side}/endpoints": [],
         f"{side}/exit_on_failure": True,
         f"{side}/timeout_ms": _CONNECT_MS,
@@ -101,6 +98,10 @@ def session_config(path: str, *, listen: bool) -> zenoh.Config:
         # A batch without room is dropped at once: the loop must not wait.
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
     }
+    if remote is not None:
+        settings["transport/link/tls"] = remote.tls
+        if remote.access_control is not None:
+            settings["access_control"] = remote.access_control
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config

@@ -50,7 +50,7 @@ class Driver(Protocol):
     """Drives the machines of a process: waits, receives, sends."""
 
     def set_clock(self, clock: RunClock) -> None:
-        """Read the time as this clock does; called at the start and every 50 ms."""
+        """Read the time as this clock does; called at the start."""
 
     def drive(self, until_ns: int, sink: RecordSink) -> None:
         """Work until about simulated time ``until_ns``; pass on the rows of the record."""
@@ -104,7 +104,6 @@ def run_loop(
         is_overloaded = cpu_s > _OVERLOAD_SHARE * (time.monotonic() - began_s)
         channel.do_housekeeping(clock.now_ns(), telemetry)
         _pass_on(external_inputs(clock.now_ns()), telemetry)
-        driver.set_clock(clock)
         telemetry.flush()
         if is_overloaded:
             # At real-time priority no other thread would get this core, not even the one that

@@ -2,7 +2,6 @@
 
 import signal
 from pathlib import Path
-from queue import SimpleQueue
 from typing import Any, cast
 
 import pytest
@@ -47,6 +46,7 @@ class FakeCoordinator:
         self._now_s, self._exiting, self._failures = now_s, exiting, failures
         self._running: tuple[str, ...] = ROLES
         self.joined: dict[str, Any] = {}
+        self.notices: list[str] = []
 
     def now_ns(self) -> int:
         return round(self._now_s * 1e9)
@@ -101,8 +101,7 @@ class Case:
 
     def run(self, children: FakeChildren, coordinator: FakeCoordinator, **watch: Any) -> _Run:
         observers, helpers = RunObservers([Calls(**watch)]), FinalizeHelpers(self.descriptor.scenario)
-        run_dir, plane = self.run_dir, cast(Any, coordinator)
-        return _Run(self.descriptor, run_dir, plane, children, observers, helpers, SimpleQueue())
+        return _Run(self.descriptor, self.run_dir, cast(Any, coordinator), children, observers, helpers)
 
 
 @pytest.fixture

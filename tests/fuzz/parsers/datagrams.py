@@ -1,12 +1,10 @@
 """Datagrams from outside: random, authentic but malformed, modified by an attacker."""
 
-import hashlib
 import struct
 
 import numpy as np
 
-from noack.protocol.wire_format import Encoder, Flow, Message, Rejection, loop_number, read_header
-from noack.runtime.host_clocks.time_exchange import TIME_BYTES, TimeDatagram, TimeFormat, TimeKind
+from noack.protocol.wire_format import Encoder, Flow, Message, loop_number, read_header
 from tests.fuzz.edits import Choices
 from tests.fuzz.harness import Harness
 from tests.helpers.wire_decoder import Decoder
@@ -85,41 +83,6 @@ def _changed(choices: Choices, datagram: bytes) -> bytes:
             return datagram + choices.take(1 + choices.below(16))
 
 
-TIMES_KEY = bytes(range(32))
-TIMES_WORDS = (b"NC\x01\x01\0\0\0\0", b"NC\x01\x02\0\0\0\0")
-_CONTENT = "<2sBBI16sQqq"
-
-
-def times_input(data: bytes) -> None:
-    """A datagram of an exchange of timestamps is accepted only if it is authentic and sound."""
-    form, choices = TimeFormat(TIMES_KEY), Choices(data)
-    for kind in TimeKind:
-        assert isinstance(form.decode(data, kind), Rejection)
-    while choices.left:
-        magic, version = choices.choose([b"NC", b"NA", b"\0\0"]), choices.choose([1, 0, 255])
-        number, reserved = choices.choose([1, 2, 0, 255]), choices.choose([0, 0, 1])
-        times = [(choices.integer() + 2**63) % 2**64 - 2**63 for _ in range(2)]
-        nonce, clock = choices.take(16), choices.integer() % 2**64
-        content = struct.pack(_CONTENT, magic, version, number, reserved, nonce, clock, *times)
-        datagram = whole = content + hashlib.blake2b(content, key=TIMES_KEY, digest_size=16).digest()
-        match choices.below(4):
-            case 1:
-                bits = int.from_bytes(datagram, "little") ^ (1 << choices.below(8 * TIME_BYTES))
-                datagram = bits.to_bytes(TIME_BYTES, "little")
-            case 2:
-                datagram = datagram[: choices.below(TIME_BYTES)]
-            case 3:
-                datagram += choices.take(1 + choices.below(16))
-        is_sound = datagram == whole and (magic, version, reserved) == (b"NC", 1, 0)
-        for kind in TimeKind:
-            decoded = form.decode(datagram, kind)
-            expected = is_sound and number == kind and 0 <= times[0] <= times[1] < 2**62
-            assert isinstance(decoded, TimeDatagram) == expected
-            if isinstance(decoded, TimeDatagram):
-                assert form.encode(decoded) == datagram
-
-
 PARSERS = {
     "wire": Harness(wire_input, words=WIRE_WORDS),
-    "times": Harness(times_input, words=TIMES_WORDS),
 }

@@ -44,8 +44,7 @@ def descriptor_input(data: bytes) -> None:
         assert isinstance(descriptor.launched, bool)
 
 
-TOKEN = RUN_DESCRIPTOR.join_token
-HELLO = {"pid": 1, "instance": "one", "address": ["127.0.0.1", 47001], "join_token": TOKEN}
+HELLO = {"pid": 1, "instance": "one", "address": ["127.0.0.1", 47001]}
 PROGRESS = {
     "t_s": 0.0, "events": 0, "deliveries": 0, "longest_loss_burst": 0, "x_norm": None, "live": None,
 }  # fmt: skip

@@ -1,6 +1,5 @@
 from noack.protocol import wire_format
 from noack.protocol.record_tables import (
-    CLOCK_TABLES,
     NETEM_PACKET,
     OWNER,
     PACKET_HEAD_BYTES,
@@ -11,8 +10,8 @@ from noack.protocol.roles import LOOP_ROLES
 
 
 def test_every_table_is_written_by_one_process_of_the_loop() -> None:
-    assert set(tables(1, 1, acknowledged=True, clocks=True)) == set(OWNER)
-    assert set(tables(1, 1)) == set(OWNER) - {SENSOR_ACKNOWLEDGEMENT, *CLOCK_TABLES}
+    assert set(tables(1, 1, acknowledged=True)) == set(OWNER)
+    assert set(tables(1, 1)) == set(OWNER) - {SENSOR_ACKNOWLEDGEMENT}
     assert set(OWNER.values()) == set(LOOP_ROLES)
 
 

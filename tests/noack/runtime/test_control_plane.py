@@ -131,7 +131,12 @@ def test_a_request_is_sent_again_when_its_answer_was_lost_and_its_answer_arrives
     coordinator: Coordinator, descriptor: RunDescriptor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(noack.runtime.control_plane, "_REQUEST_AGAIN_S", 0.2)
-    answer = {"epoch_ns": 7, "addresses": dict.fromkeys(LOOP_ROLES, ("127.0.0.1", 5)), "more": [1]}
+    answer = {
+        "epoch_ns": 7,
+        "epoch_realtime_ns": 8,
+        "addresses": dict.fromkeys(LOOP_ROLES, ("127.0.0.1", 5)),
+        "more": [1],
+    }
     queries = coordinator.plane.session.declare_queryable(coordinator.plane.key("ask", "*"), FifoChannel(4))
     unanswered = []
 
@@ -145,7 +150,7 @@ def test_a_request_is_sent_again_when_its_answer_was_lost_and_its_answer_arrives
     with ControlPlane(descriptor, "plant") as plant:
         received = parse_message(RunStart, plant.request("ask", {}, timeout_s=30))
         assert received.epoch_ns == 7
-        assert received.addresses == dict.fromkeys(LOOP_ROLES, ("127.0.0.1", 5))
+        assert received.addresses == answer["addresses"]
         # The message must not read ``noack plant: plant: no answer``.
         with pytest.raises(PeerError, match=r"^no answer to 'nothing'"):
             plant.request("nothing", {}, timeout_s=0.05)

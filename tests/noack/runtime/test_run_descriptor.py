@@ -1,9 +1,6 @@
-"""Invitations and run descriptors: who can read them, errors without the key, one per session."""
+"""Run descriptors: errors without the key, one per session."""
 
 import json
-import os
-import stat
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
@@ -12,115 +9,11 @@ from typing import Any
 
 import pytest
 
-from noack.core.errors import CallerError, PeerError
+from noack.core.errors import CallerError
 from noack.runtime.private_folder import private_folder
-from noack.runtime.run_descriptor import (
-    descriptor_file,
-    find_descriptor,
-    invitation_file,
-    loads,
-    new_descriptor,
-    own_host,
-    read_invitation,
-    write_invitation,
-)
+from noack.runtime.run_descriptor import descriptor_file, find_descriptor, loads, new_descriptor
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
-from tests.helpers.run_descriptors import INVITED, RUN_DESCRIPTOR
-
-INVITED_AS = INVITED.model_dump_json()
-
-
-def test_an_invitation_is_for_its_owner_only_and_is_read_again(tmp_path: Path) -> None:
-    path = tmp_path / "invitation.json"
-    path.write_text("an older one")
-    path.chmod(0o644)
-    write_invitation(path, INVITED)
-    assert stat.S_IMODE(path.stat().st_mode) == 0o600
-    descriptor = read_invitation(path, tmp_path / "kept")
-    expected = {"run_dir": str(tmp_path / "kept" / "one"), "host": "127.0.0.1"}
-    assert descriptor == INVITED.model_copy(update=expected)
-    assert [path.name for path in tmp_path.iterdir()] == ["invitation.json"]
-
-
-def _absent(path: Path) -> None:
-    path.unlink()
-
-
-def _fifo(path: Path) -> None:
-    path.unlink()
-    os.mkfifo(path, 0o600)
-
-
-@pytest.mark.parametrize(
-    ("spoil", "reason"),
-    [
-        (_absent, "cannot be read: No such file or directory"),
-        (
-            lambda path: path.chmod(0o640),
-            "other users can read or change it; make it yours alone: chmod 600 ",
-        ),
-        (lambda path: path.write_bytes(b"\xff\xfe"), "not an invitation: it is not text"),
-        (lambda path: path.write_text("{"), "not an invitation: not a valid run descriptor: "),
-        (_fifo, "cannot be read: not a regular file"),
-        (lambda path: os.truncate(path, 10**9), "not an invitation: larger than 64 MiB"),
-        (
-            lambda path: path.write_text(INVITED_AS.replace("/elsewhere/runs/one", "runs/..")),
-            "not an invitation: its run directory has no name",
-        ),
-        (
-            lambda path: path.write_text(RUN_DESCRIPTOR.model_dump_json()),
-            "not an invitation, but a run descriptor for this host",
-        ),
-    ],
-)
-def test_a_spoiled_invitation_is_refused_in_one_line(
-    tmp_path: Path, spoil: Callable[[Path], None], reason: str
-) -> None:
-    path = tmp_path / "invitation.json"
-    write_invitation(path, INVITED)
-    spoil(path)
-    with pytest.raises(CallerError, match=reason) as caught:
-        read_invitation(path, tmp_path)
-    assert str(caught.value).startswith(f"{path}: ")
-    assert "\n" not in str(caught.value)
-
-
-def test_rows_must_have_a_place_before_a_process_joins(tmp_path: Path) -> None:
-    path = tmp_path / "invitation.json"
-    write_invitation(path, INVITED)
-    with pytest.raises(CallerError, match=r"rows could not be kept there: .* is not a folder"):
-        read_invitation(path, path / "runs")
-    assert read_invitation(path, tmp_path / "no" / "folder" / "yet").run_dir.endswith("/yet/one")
-    assert not (tmp_path / "no").exists()
-
-
-def test_an_invitation_that_cannot_be_written_is_named(tmp_path: Path) -> None:
-    with pytest.raises(CallerError, match="the invitation cannot be written"):
-        write_invitation(tmp_path / "no_folder" / "invitation.json", INVITED)
-    (tmp_path / "folder").mkdir()
-    with pytest.raises(CallerError, match="the invitation cannot be written: not a regular file"):
-        write_invitation(tmp_path / "folder", INVITED)
-    assert [path.name for path in tmp_path.iterdir()] == ["folder"]  # no file with the keys is left
-
-
-def test_a_run_removes_its_own_invitation_only(tmp_path: Path) -> None:
-    path, other = tmp_path / "invitation.json", INVITED.model_copy(update={"run_id": 8})
-    with invitation_file(path, INVITED):
-        assert path.exists()
-    assert not path.exists()
-    with invitation_file(path, other):
-        with invitation_file(path, INVITED):
-            write_invitation(path, other)
-        assert path.exists()
-    assert not path.exists()
-
-
-def test_the_own_address_is_that_of_the_route() -> None:
-    assert own_host(("127.0.0.1", 9)) == "127.0.0.1"
-    with pytest.raises(PeerError, match=r"cannot reach 255\.255\.255\.255:9"):
-        own_host(("255.255.255.255", 9))
-
 
 KEY = "ab" * 32
 

@@ -17,10 +17,9 @@ from cosim.analysis.claims.condition_reader import read_conditions
 from cosim.analysis.replay import replay
 from cosim.analysis.summary.summary_model import Claim, ClaimVerdict
 from cosim.record.align import aligned_parts
-from cosim.record.record_source import rows_by_loop
-from cosim.record.run_record import Rows, RunRecord
-from cosim.simulation.virtual_time import simulate
-from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER, tables
+from cosim.record.run_record import RunRecord
+from noack.runtime.control_messages import ClockError
+from noack.runtime.host_clocks import CHRONY, RECEIVED, CausalityCheck
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
@@ -116,97 +115,76 @@ def test_nothing_is_claimed_of_an_older_x_c_than_that_of_the_input() -> None:
     assert largest == pytest.approx(1.245, abs=0.01)
 
 
-# --- bounds of the clocks' errors that a run has recorded -----------------------------------------
+# --- causality -----------------------------------------------------------------------------------
 
 
-GOOD_NS, WIDE_NS = 20_000, 3 * MS
-Errors = dict[tuple[str, int], int]
-"""The bounds that differ, by table and number of the row."""
+ERROR_NS = 500_000
 
 
-@pytest.fixture(scope="module")
-def clocked(make: Make) -> RunRecord:
-    """A run whose processes recorded the bounds of their clocks' errors every 50 ms."""
-    record = simulate(make(clocks={"largest_error_us": 1000.0}))
-    return changed(record, {table: clock_rows(record, table) for table in CLOCK_TABLES})
-
-
-def clock_rows(record: RunRecord, table: str) -> Rows:
-    ends_ns = np.arange(0, 6001, 50) * MS
-    rows = np.zeros(len(ends_ns), record.tables[table])
-    rows["input"] = np.arange(len(ends_ns))
-    rows["now_ns"], rows["t_ns"] = ends_ns, ends_ns - 50 * MS
-    rows["error_ns"] = 0 if OWNER[table] == "plant" else GOOD_NS
-    return rows
-
-
-def with_errors(record: RunRecord, errors: Errors, **t_ns: int) -> RunRecord:
-    rows = {table: record[table].copy() for table in CLOCK_TABLES}
-    for (table, number), error_ns in errors.items():
-        rows[table]["error_ns"][number] = error_ns
-        rows[table]["t_ns"][number] = t_ns.get(table, rows[table]["t_ns"][number])
-    return changed(record, rows)
+def across_hosts(record: RunRecord, **errors_ns: int) -> RunRecord:
+    """The record of a run whose processes had hosts of their own, with the reported errors of clocks."""
+    reports = {}
+    for role in ("plant", "sensor", "netem", "controller"):
+        error_ns = errors_ns.get(role, ERROR_NS)
+        clock = ClockError(clock=role, error_ns=error_ns, source=CHRONY).fields()
+        reports[role] = {**record.reports.get(role, {"ended": "horizon", "rows": {}}), "clock": clock}
+    return changed(record, reports=reports)
 
 
 def judged(record: RunRecord) -> list[Claim]:
     return RunClaims(record).evaluate()
 
 
-def test_small_bounds_change_no_verdict(make: Make, clocked: RunRecord) -> None:
-    without = judged(simulate(make()))
-    assert judged(clocked) == without
-    assert {claim.source for claim in without} >= {"certificate", "(I1)"}
-    assert ClaimVerdict.HELD in {claim.verdict for claim in without}
-    assert read_conditions(clocked).summary()["clock_error_s"] == pytest.approx(GOOD_NS * 1e-9)
-
-
-LOST = "the bound of the error of sensor's clock was lost"
+def test_clocks_within_their_bounds_change_no_verdict(make: Make) -> None:
+    alone = simulated(make(clocks={}), {"controller": (ERROR_NS, 0), "sensor": (-ERROR_NS, 0)})
+    apart = across_hosts(alone)
+    assert judged(apart) == judged(alone)
+    assert ClaimVerdict.HELD in {claim.verdict for claim in judged(apart)}
+    assert read_conditions(apart).summary()["clock_error_s"] == ERROR_NS * 1e-9
+    assert read_conditions(alone).summary()["clock_error_s"] is None
 
 
 @pytest.mark.parametrize(
-    ("errors", "t_ns", "since_s", "reason"),
+    ("clocks", "receiver", "lead_s"),
     [
-        (
-            {("netem_clock", 40): WIDE_NS}, {}, 1.95,
-            "the clock of netem may have been off by 0.003 s, 0.001 s allowed",
-        ),
-        ({("sensor_clock", 40): LOST_NS}, {}, 1.95, LOST),
-        ({("sensor_clock", 60): LOST_NS}, {"sensor_clock": 777 * MS}, 0.777, LOST),
-        ({("sensor_clock", 0): LOST_NS}, {"sensor_clock": -5 * MS}, 0.0, LOST),
-        ({("sensor_clock", 40): LOST_NS, ("sensor_clock", 60): LOST_NS},
-         {"sensor_clock": 777 * MS}, 0.777, LOST),
+        ({"controller": (20 * MS, 0)}, "plant", 0.02),
+        ({"controller": (-20 * MS, 0)}, "controller", 0.02),
+        ({"sensor": (-20 * MS, 0)}, "sensor", 0.02),
     ],
-)  # fmt: skip
-def test_all_claims_are_void_from_then_on_for_that_reason(
-    clocked: RunRecord, errors: Errors, t_ns: dict[str, int], since_s: float, reason: str
+)
+def test_a_message_that_came_before_it_was_sent_voids_all_claims(
+    make: Make, clocks: dict[str, tuple[int, int]], receiver: str, lead_s: float
 ) -> None:
-    record = with_errors(clocked, errors, **t_ns)
-    for claim in judged(record):
-        assert claim.verdict is not ClaimVerdict.HELD
-        if claim.verdict is ClaimVerdict.VOID and claim.since_s != 0:
-            assert claim.since_s == pytest.approx(since_s)
-            assert reason in claim.why
-    assert ClaimVerdict.VOID in {claim.verdict for claim in judged(record)}
-    first = min(RunClaims(record).violations())
-    assert (first.t_s, first.text) == (pytest.approx(since_s), reason)
+    record = across_hosts(simulated(make(clocks={}), clocks))
+    (violation,) = [one for one in RunClaims(record).violations() if one.cause == f"{receiver} clock"]
+    assert violation.text == (
+        f"{receiver} received a message {lead_s:.4g} s before it was sent; the clocks allow 0.001 s"
+    )
+    assert violation.worst == pytest.approx(lead_s)
+    assert ClaimVerdict.HELD not in {claim.verdict for claim in judged(record)}
+    # The same is reported during the run.
+    check = CausalityCheck(receiver, record.clocks, 1.0)
+    table, _ = RECEIVED[receiver]
+    notice = check.check(table, record[table])
+    assert notice is not None
+    assert notice.level == "violation"
+    assert notice.t_ns * 1e-9 == pytest.approx(violation.t_s, abs=1e-9)
+    assert check.check(table, record[table]) is None
 
 
-def test_each_of_several_loops_has_the_rows_in_its_own_time() -> None:
-    table, phases_ns = CLOCK_TABLES[0], (0, 7)
-    rows = np.zeros(2, tables(1, 1, clocks=True)[table])
-    rows["t_ns"] = 10, 20
-    by_loop = dict(rows_by_loop(table, rows, phases_ns, [{table: rows.dtype}] * 2))
-    assert [loop_rows["t_ns"].tolist() for loop_rows in by_loop.values()] == [[10, 20], [3, 13]]
+def test_a_larger_error_that_was_reported_explains_it(make: Make) -> None:
+    record = simulated(make(clocks={}), {"controller": (20 * MS, 0)})
+    causes = {one.cause for one in RunClaims(across_hosts(record, controller=25 * MS)).violations()}
+    assert "plant clock" not in causes
 
 
-def test_the_claims_of_a_stopped_run_end_with_it(clocked: RunRecord) -> None:
-    """What a clock does after the common end is not part of the claims."""
-    reports = {
-        role: {"ended": "stopped", "reached_ns": 3000 * MS, "rows": {}}
-        for role in ("plant", "sensor", "netem", "controller")
+def test_without_a_report_the_scenario_states_the_error(make: Make) -> None:
+    record = simulated(make(clocks={"largest_error_us": 7.0}), {})
+    known = across_hosts(record).reports
+    partly = changed(record, reports={"sensor": known["sensor"]})
+    assert {role: clock.error_ns for role, clock in partly.clocks.items()} == {
+        "plant": 7000,
+        "sensor": ERROR_NS,
+        "netem": 7000,
+        "controller": 7000,
     }
-    late = changed(with_errors(clocked, {("sensor_clock", 100): LOST_NS}), reports=reports)
-    assert RunClaims(late).violations() == []
-    early = changed(with_errors(clocked, {("sensor_clock", 50): LOST_NS}), reports=reports)
-    (violation,) = RunClaims(early).violations()
-    assert violation.cause == "sensor clock lost"

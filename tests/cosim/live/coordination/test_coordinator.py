@@ -9,10 +9,13 @@ import pytest
 import zenoh
 
 from cosim.live.coordination import coordinator
-from cosim.live.coordination.coordinator import ChangeRequests, Coordinator, TokenScope
+from cosim.live.coordination.coordinator import ChangeRequests, Coordinator
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.protocol.roles import LOOP_ROLES, RECORDER, ROLES
+from noack.runtime.control_messages import ClockError
+from noack.runtime.host_clocks import CHRONY
+from noack.scenario.run_sections import ClocksSection
 from noack.scenario.scenario_file import load
 from tests.fuzz.plane import FakePlane, Query, Sample
 from tests.helpers.run_descriptors import JUNK, RUN_DESCRIPTOR
@@ -38,10 +41,10 @@ def ask(
     what: str,
     instance: str = "one",
     role: str = "sensor",
-    join_token: str = RUN_DESCRIPTOR.join_token,
+    **more: object,
 ) -> Query:
     address = None if role == RECORDER else ["127.0.0.1", 5 + ROLES.index(role)]
-    request: dict[str, Any] = {"instance": instance, "address": address, "join_token": join_token}
+    request: dict[str, Any] = {"instance": instance, "address": address, **more}
     plane.put(what, query := Query(f"noack/0/{what}/{role}", json.dumps(request).encode()))
     barrier.poll()
     return query
@@ -121,26 +124,30 @@ def test_a_running_process_is_lost_only_if_its_connection_does_not_come_back(
     assert barrier.failures() == {"sensor": "sensor stopped responding"}
 
 
-@pytest.mark.parametrize(
-    ("known", "join_token", "role", "reason"),
-    [
-        (TokenScope(), "ab" * 16, "sensor", None),
-        (TokenScope(), "", "sensor", "its run descriptor or invitation is not of this run"),
-        (TokenScope(), "cd" * 16, "sensor", "its run descriptor or invitation is not of this run"),
-        (TokenScope(["plant"]), "ab" * 16, "plant", None),
-        (TokenScope(["plant"]), "ab" * 16, "sensor", "its invitation is for the plant only"),
-        (TokenScope(until_s=-1.0), "ab" * 16, "sensor", "its invitation has expired"),
-    ],
-)
-def test_a_join_token_admits_its_roles_until_it_expires(
-    plane: FakePlane, barrier: Coordinator, known: TokenScope, join_token: str, role: str,
-    reason: str | None,
-) -> None:  # fmt: skip
-    barrier.join_tokens["ab" * 16] = known
-    answer = ask(plane, barrier, "admit", role=role, join_token=join_token)
-    assert answer.error == (None if reason is None else f"cannot join: {reason}")
-    answer = ask(plane, barrier, "join", role=role)
-    assert answer.error == (None if reason is None else "cannot join: it was not admitted")
+@pytest.mark.parametrize(("error_us", "refused"), [(999, False), (1000, False), (1001, True)])
+def test_a_host_whose_clock_may_be_off_by_too_much_is_refused(
+    plane: FakePlane, monkeypatch: pytest.MonkeyPatch, error_us: int, refused: bool
+) -> None:
+    monkeypatch.setattr(coordinator, "ControlPlane", lambda *_, **__: plane)
+    scenario = RUN_DESCRIPTOR.scenario.model_copy(update={"clocks": ClocksSection()})
+    own = ClockError(clock="one", error_ns=7000, source=CHRONY)
+    descriptor = RUN_DESCRIPTOR.model_copy(update={"scenario": scenario})
+    barrier = Coordinator(descriptor, own_clock=own)
+    other = ClockError(clock="two", error_ns=error_us * 1000, source=CHRONY)
+    answer = ask(plane, barrier, "admit", role="sensor", clock=other.fields())
+    if refused:
+        assert answer.error == (
+            "cannot join: the clock of the sensor's host may be off by 1001 µs by chronyc tracking, "
+            "clocks.largest_error_us = 1000 allowed"
+        )
+        return
+    assert answer.error is None
+    assert barrier.notices == [f"the clock of the sensor's host may be off by at most {error_us} µs"]
+    for role in ROLES:
+        if role != "sensor":
+            ask(plane, barrier, "admit", role=role)
+        ask(plane, barrier, "join", role=role)
+    assert plane.answers[-1].clocks == {role: other if role == "sensor" else own for role in LOOP_ROLES}
 
 
 # --- requests to change a run ---------------------------------------------------------------------

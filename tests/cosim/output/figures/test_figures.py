@@ -32,15 +32,9 @@ from cosim.output.figures.figure_format import requested_files
 from cosim.output.figures.figure_layout import use_figure_width
 from cosim.output.figures.run_figures import Transmissions, run_curves, run_figures, states_figure
 from cosim.output.figures.timing_figures import later_than
-from cosim.output.run_tables import key_numbers
-from cosim.record.run_record import RunRecord
-from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
-from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER
-from tests.cosim.output.conftest import CASES, HOSTILE, scenario_of
+from tests.cosim.output.conftest import CASES, HOSTILE
 from tests.cosim.output.parsed_page import Page
-from tests.cosim.record.changed_records import changed
-from tests.helpers.summaries import summary_of
 
 T_S = np.arange(1.0, 5.0)
 
@@ -164,45 +158,6 @@ def test_the_same_figure_gives_the_same_bytes(tmp_path: Path, ending: str) -> No
     (content,) = contents
     for trace in (b"http://purl", b"matplotlib.org", b"dc:date", b"Software"):
         assert trace not in content
-
-
-ALLOWED_US, SENSOR_NS, MS = 1000.0, 63_200, 1_000_000
-FIRST_LOST = 7
-
-
-@pytest.fixture
-def clocked(content: dict[str, Any]) -> RunRecord:
-    """A run whose sensor is on a host with another clock, and loses its bound."""
-    clocks = {"largest_error_us": ALLOWED_US}
-    record = simulate(scenario_of(content | {"clocks": clocks}))
-    tables = {}
-    for table in CLOCK_TABLES:
-        rows = np.zeros(20, record.tables[table])
-        rows["input"] = np.arange(20)
-        rows["t_ns"] = np.arange(20) * 50 * MS
-        rows["now_ns"] = rows["t_ns"] + 50 * MS
-        if OWNER[table] == "sensor":
-            rows["error_ns"] = SENSOR_NS
-            rows["error_ns"][FIRST_LOST:10] = LOST_NS
-        tables[table] = rows
-    return changed(record, tables)
-
-
-def test_the_figure_has_the_bound_the_limit_and_a_cross_where_the_bound_is_lost(
-    clocked: RunRecord,
-) -> None:
-    described_clocks = run_figures(clocked)["clocks"]()
-    assert "Largest: sensor 63.2 µs." in described_clocks.caption
-    assert "the bound was lost (sensor)" in described_clocks.caption
-    curve, cross, limit = draw(described_clocks).axes[0].lines
-    assert np.nanmax(curve.get_ydata()) == pytest.approx(SENSOR_NS * 1e-3)
-    assert cross.get_xdata().tolist() == pytest.approx([FIRST_LOST * 0.05])
-    assert set(limit.get_ydata()) == {ALLOWED_US}
-    conditions: dict[str, float | None] = dict.fromkeys(
-        ("dropouts", "sampling_s", "delay_s", "hold_s", "start_s")
-    )
-    summary = summary_of(clocked, conditions=conditions | {"clock_error_s": SENSOR_NS * 1e-9})
-    assert ("largest bound of a clock's error", "63.2 µs") in key_numbers(summary)
 
 
 @pytest.mark.parametrize("factor", [1e-13, 1e10])
