@@ -3,6 +3,9 @@
 from collections.abc import Mapping
 
 REMOVED: Mapping[str, str] = {
+    "claims": "`noack campaign` writes every metric of each draw; compare them in a program",
+    "claims_at": "`noack campaign` writes every metric of each draw; compare them in a program",
+    "metrics.count_from_s": "all updates of a run count",
     "controller.kind = program": "use python: a class of your own; docs/wire.md has the datagrams",
     "plant.system.kind = vehicle": "write its equations as a class: plant.system.kind = python",
     "model.name = single_track_lane": "give model.A and model.B",
