@@ -167,7 +167,7 @@ docs-serve: docs ## Build the site and serve it on http://127.0.0.1:8000
 
 lock: setup-dev ## Update the pinned dependencies
 	$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
-		--no-header pyproject.toml --extra mcap --extra viewer --group build -o requirements.lock
+		--no-header pyproject.toml --extra viewer --group build -o requirements.lock
 	$(BIN)/python tools/extension_requirements.py | \
 		$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 		--no-header pyproject.toml - --extra viewer --group build --group dev --group docs -c requirements.lock -o requirements-dev.lock

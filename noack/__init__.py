@@ -32,5 +32,5 @@ __all__ = [
     "cost", "from_system", "gain", "linearise", "load", "margin", "measure", "new", "open_run", "run",
     "save_tables", "scenarios", "simulate", "simulate_exactly", "with_settings",
 ]  # fmt: skip
-_NOT_EVERYWHERE = ("ExportedRun", "LossyUdp")
+_NOT_EVERYWHERE = ("ExportedRun", "LossyUdp", "follow")
 """Names that are for extensions, or need Linux: no star import takes them."""

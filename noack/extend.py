@@ -32,6 +32,12 @@ from noack.plants.plant_settings import SystemFailedError as SystemFailedError
 from noack.plants.plant_settings import cos as cos
 from noack.plants.plant_settings import sin as sin
 from noack.plants.plant_settings import sqrt as sqrt
+from noack.protocol.record_tables import COMMON as COMMON
+from noack.protocol.record_tables import CONTROLLER_DELIVERY as CONTROLLER_DELIVERY
+from noack.protocol.record_tables import OWNER as OWNER
+from noack.protocol.record_tables import PLANT_STEP as PLANT_STEP
+from noack.protocol.record_tables import SENSOR_MEASUREMENT as SENSOR_MEASUREMENT
+from noack.protocol.record_tables import TABLES as TABLES
 from noack.protocol.record_tables import entry_names as entry_names
 from noack.protocol.roles import External as External
 from noack.protocol.wire_format import MAX_DIMENSION as MAX_DIMENSION

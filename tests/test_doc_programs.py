@@ -91,7 +91,7 @@ def test_every_snippet_runs(
     assert capsys.readouterr().out.strip()
 
 
-@pytest.mark.parametrize("name", FIGURES)  # tests/integration/test_ros2.py runs the others
+@pytest.mark.parametrize("name", FIGURES)
 def test_an_example_runs_and_leaves_its_figures(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -64,7 +64,7 @@ WALL_CLOCK = {
     "cosim/record/run_directory.py": "the run's name and its environment",
     "cosim/live/coordination/coordinator.py": "when a change was requested",
     "cosim/live/coordination/remote_access.py": "the validity of certificates",
-    "noack/protocol/ros2_node.py": "the time stamps of messages of ROS 2",
+    "extensions/noack-ros2/noack_ros2/ros2_node.py": "the time stamps of messages of ROS 2",
     "netem/control/command_queue.py": "lines of statistics",
     "native/relay/loop.c": "time stamps of the kernel, compared with the monotonic clock",
     "noack/runtime/host_clocks.py": "the epoch of a run on several hosts",

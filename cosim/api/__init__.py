@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from cosim.api.measurements import Measurement as Measurement
     from cosim.api.measurements import measure as measure
     from cosim.api.tables import save_tables as save_tables
+    from cosim.live.followed_run import follow as follow
     from cosim.output.export.export_formats import ExportedRun as ExportedRun
     from netem.lossy_udp import LossyUdp as LossyUdp
 
@@ -50,8 +51,9 @@ _LATER = {
     "save_tables": "cosim.api.tables",
     "ExportedRun": "cosim.output.export.export_formats",
     "LossyUdp": "netem.lossy_udp",
+    "follow": "cosim.live.followed_run",
 }
-"""Names whose modules import scipy's statistics or matplotlib, or need Linux."""
+"""Names whose modules import scipy's statistics, matplotlib or zenoh, or need Linux."""
 
 __version__ = version("noack")
 
@@ -60,7 +62,7 @@ def __getattr__(name: str) -> object:
     """Import one of the names that are looked up later (PEP 562)."""
     if name not in _LATER:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    if name == "LossyUdp":
+    if name in ("LossyUdp", "follow"):
         require_live_runs()
     return _public(getattr(import_module(_LATER[name]), name))
 

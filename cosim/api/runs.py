@@ -258,7 +258,7 @@ class Run:
         """Write the run for other programs; return the written files.
 
         Args:
-            path: ``.mat`` for MATLAB and Octave, ``.mcap`` for Foxglove; without an
+            path: ``.mat`` for MATLAB and Octave, or the ending of an extension's format; without an
                 ending, a folder of CSV files.
             certificates: whether a ``.mat`` file has the certificates of each loop, which take
                 about a second each.

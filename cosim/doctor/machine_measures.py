@@ -39,7 +39,6 @@ T = TypeVar("T")
 EXTRAS = {
     "regions": ("flint", "certificates of nonlinear plants on a region"),
     "cluster": ("distributed", "`noack campaign --scheduler`"),
-    "mcap": ("mcap", "`noack export --format mcap`"),
 }
 """Extras of noack by name: one module that each installs, and what it is for."""
 _DATAGRAM = bytes(72)

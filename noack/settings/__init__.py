@@ -1,5 +1,5 @@
 """The parts of settings.
 
 ``section.py`` has tables, kinds, vectors and matrices, ``user_files.py`` the files and classes that a
-table names, ``ros2_peer.py`` a node of ROS 2 that a table names.
+table names.
 """

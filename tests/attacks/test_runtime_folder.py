@@ -176,7 +176,6 @@ def test_a_run_without_a_usable_folder_is_refused(shared: Path) -> None:
 PRIVATE = b"mine alone"
 COMMANDS = (
     "export {run} --format mat --out {out}/run.mat",
-    "export {run} --format mcap --out {out}/run.mcap",
     "compare {run} {run} --out {out}/compare.html",
     "measure rural_n8_10kmh --out {out}/page.html --format svg --write {out}/network.toml",
     "campaign {campaign} --workers 1 --out {out}/campaign",

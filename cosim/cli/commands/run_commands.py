@@ -1,4 +1,4 @@
-"""``noack demo``, ``run``, ``bridge``, ``simulate``: make a run; ``set``: change a live one."""
+"""``noack demo``, ``run``, ``simulate``: make a run; ``set``: change a live one."""
 
 from pathlib import Path
 from typing import Annotated
@@ -81,47 +81,6 @@ def run(
         loaded, runs, live=live, report=report, verbose=verbose, json=json,
         server=context.obj,
     )  # fmt: skip
-
-
-@app.command(
-    rich_help_panel=RUNS,
-    epilog=examples(
-        ("noack bridge lane_following --listen", "without an installation of ROS"),
-        ("noack bridge lane_following --router tcp/127.0.0.1:7447 --json", "with rmw_zenohd"),
-    ),
-)
-def bridge(
-    context: typer.Context,
-    scenario: opt.ScenarioArgument,
-    settings: opt.SetOption = None,
-    router: Annotated[
-        str, Option(metavar="ENDPOINT", help="Where the router of ROS 2 listens, as zenoh writes it.")
-    ] = "tcp/127.0.0.1:7447",
-    listen: Annotated[
-        bool, Option("--listen", help="Be the router at this address, to which nodes connect.")
-    ] = False,
-    domain: Annotated[int, Option(min=0, max=232, help="ROS_DOMAIN_ID.")] = 0,
-    runs: opt.RunsOption = DEFAULT_RUNS,
-    live: opt.LiveOption = False,
-    log_format: opt.LogFormatOption = LogFormat.TEXT,
-    report: opt.ReportOption = True,
-    verbose: opt.VerboseOption = False,
-    json: opt.JsonOption = False,
-) -> int:
-    """Run a scenario live, and publish it as topics of ROS 2 (rmw_zenoh).
-
-    Takes as long as the scenario's horizon, and a few seconds.
-    """
-    opt.require_linux()
-    from cosim.cli.execute_run import run_processes
-    from cosim.live.monitoring.ros2_bridge import bridge_process
-
-    loaded = opt.load_scenario(scenario, settings)
-    with bridge_process(router, domain, listen=listen) as observer:
-        return run_processes(
-            loaded, runs, live=live, report=report, verbose=verbose, json=json,
-            server=context.obj, observers=[observer],
-        )  # fmt: skip
 
 
 @app.command(

@@ -270,7 +270,6 @@ def _complete_formats(incomplete: str) -> list[str]:
     rich_help_panel=RUNS,
     epilog=examples(
         ("noack export --format mat", "the last run for MATLAB and Octave"),
-        ("noack export --format mcap --out run.mcap", "for Foxglove and PlotJuggler"),
         ("noack export runs/latest --format csv --json", "a folder of CSV files"),
     ),
 )

@@ -1,1 +1,1 @@
-"""Who follows a live run: terminal, log, ROS 2."""
+"""Who follows a live run: terminal and log."""

@@ -122,7 +122,7 @@ def test_commands_refuse_a_damaged_table_in_one_line(run_dir: Path, tmp_path: Pa
     table.write_bytes(table_bytes[:middle] + changed_byte + table_bytes[middle + 1 :])
     for command in (["replay"], ["report"]):
         refused(*command)
-    for kind, name in (("csv", "tables"), ("mat", "run.mat"), ("mcap", "run.mcap")):
+    for kind, name in (("csv", "tables"), ("mat", "run.mat")):
         refused("export", "--format", kind, "--out", str(tmp_path / name))
     for content in (table_bytes[:middle], None):
         table.unlink()

@@ -8,13 +8,17 @@ from typing import Literal
 
 import numpy as np
 
-from noack.controllers.controller_settings import ControlFailedError, ControllerSettings, ControlModel
-from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError
-from noack.core.linear_systems import Vector
-from noack.protocol.record_tables import entry_names
-from noack.protocol.ros2_messages import Entries
-from noack.settings.ros2_peer import Ros2Peer, Ros2Settings, Topic
+from noack.extend import (
+    NS_PER_S,
+    CallerError,
+    ControlFailedError,
+    ControllerSettings,
+    ControlModel,
+    Vector,
+    entry_names,
+)
+from noack_ros2.ros2_messages import Entries
+from noack_ros2.ros2_peer import Ros2Peer, Ros2Settings, Topic
 
 
 class Ros2ControllerSettings(Ros2Settings, ControllerSettings):

@@ -16,9 +16,8 @@ from noack.core.errors import CallerError
 from tests.helpers.command_line import invoke
 from tests.helpers.live_runs import AT_RATE
 
-pytest.importorskip("rosbags", reason="the extra `ros` is not installed")
 pytest.importorskip("zenoh_ros2_sdk", reason="zenoh-ros2-sdk is not installed")
-EXAMPLE = Path(__file__).parents[2] / "docs/examples/ros2_plant.py"
+EXAMPLE = Path(__file__).parents[1] / "examples/ros2_plant.py"
 LISTENER = Path(__file__).with_name("ros2_listener.py")
 CONTROLLER = Path(__file__).with_name("ros2_controller_node.py")
 LOOP = {
@@ -75,7 +74,6 @@ def test_a_plant_in_ros2_moves_as_the_same_plant_in_noack(port: int) -> None:
     assert run.replay().bit_exact
 
 
-@pytest.mark.usefixtures("no_report", "no_recording")
 def test_a_plant_in_ros2_takes_part_in_a_live_run(port: int) -> None:
     with node(EXAMPLE, port):
         run = noack.run(noack.load(in_ros2(port)))
@@ -104,10 +102,9 @@ def test_a_ros2_node_that_does_not_answer_is_named(port: int) -> None:
     assert "router nonsense: give it as tcp/127.0.0.1:7447" in result.output
 
 
-@pytest.mark.usefixtures("no_recording")
 def test_an_independent_client_receives_a_live_run(port: int, tmp_path: Path) -> None:
     with node(LISTENER, port) as listener:
-        words = ("--listen", "--router", f"tcp/127.0.0.1:{port}", "--runs", tmp_path, "--no-report")
+        words = ("--listen", "--router", f"tcp/127.0.0.1:{port}", "--runs", tmp_path)
         result = invoke("bridge", "lane_following", "--set", "horizon_s=3", *AT_RATE, *words)
         assert result.exit_code == 0, result.output
         assert listener.stdout is not None

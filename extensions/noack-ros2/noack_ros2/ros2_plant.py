@@ -5,16 +5,21 @@ node advances to this time, and answers with the state, with the same stamp. The
 asks for x(0).
 """
 
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 
-from noack.core.errors import CallerError
-from noack.core.linear_systems import Matrix, Vector
-from noack.plants.plant_settings import PlantSettings, PlantStart, SystemFailedError
-from noack.protocol.record_tables import entry_names
-from noack.protocol.ros2_messages import Entries
-from noack.settings.ros2_peer import Ros2Peer, Ros2Settings, Topic
+from noack.extend import (
+    CallerError,
+    Matrix,
+    PlantSettings,
+    PlantStart,
+    SystemFailedError,
+    Vector,
+    entry_names,
+)
+from noack_ros2.ros2_messages import Entries
+from noack_ros2.ros2_peer import Ros2Peer, Ros2Settings, Topic
 
 _PLACE = "plant.system"
 _START_TOLERANCE = 1e-6
@@ -24,8 +29,6 @@ _START_TOLERANCE = 1e-6
 class Ros2PlantSettings(Ros2Settings, PlantSettings):
     """A node of ROS 2, which is asked in each step; a replay takes its states from the record."""
 
-    needs: ClassVar = ("rosbags", "ros")
-
     kind: Literal["ros2"]
     topic: Topic = "/noack/plant"
     """Namespace of the topics: the node receives TOPIC/input and sends TOPIC/state."""
@@ -34,7 +37,6 @@ class Ros2PlantSettings(Ros2Settings, PlantSettings):
         raise CallerError(f'{_PLACE}.kind = "ros2": it has no known linearisation')
 
     def system(self, start: PlantStart) -> "Ros2System":
-        self.require_installed()
         return Ros2System(self, start)
 
 

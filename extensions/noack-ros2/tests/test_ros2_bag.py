@@ -4,12 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rosbags import rosbag2, typesys
 
 import noack
 from noack.scenario.resolution import loop_of, resolve
 
-rosbag2 = pytest.importorskip("rosbags.rosbag2", reason="the extra `ros` is not installed")
-typesys = pytest.importorskip("rosbags.typesys", reason="the extra `ros` is not installed")
 mcap_ros2 = pytest.importorskip("mcap_ros2.reader", reason="mcap-ros2-support is not installed")
 
 

@@ -6,14 +6,11 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from noack.core.errors import CallerError
-from noack.core.linear_systems import Vector
-from noack.protocol.roles import External
-from noack.protocol.ros2_messages import DEFAULT_ROUTER, Entries
-from noack.settings.section import Positive, ScenarioSection
+from noack.extend import CallerError, External, Positive, ScenarioSection, Vector
+from noack_ros2.ros2_messages import DEFAULT_ROUTER, Entries
 
 if TYPE_CHECKING:
-    from noack.protocol.ros2_node import TopicExchange
+    from noack_ros2.ros2_node import TopicExchange
 
 _AGAIN_S = 0.2
 """Time after which the first question is asked again: the node may start later."""
@@ -76,7 +73,7 @@ class Ros2Peer(External):
         if self._exchange is not None:
             return
         # Scenarios without such a part do not wait for zenoh.
-        from noack.protocol.ros2_node import Node, TopicExchange
+        from noack_ros2.ros2_node import Node, TopicExchange
 
         settings, name = self._settings, self._place.replace(".", "_")
         node = Node(f"noack_{name}", settings.router, settings.domain, listen=settings.listen)

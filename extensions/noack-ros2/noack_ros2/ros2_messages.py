@@ -9,15 +9,12 @@ has the names of the entries, ``position`` their values, ``header.frame_id`` the
 import re
 from collections.abc import Iterator, Sequence
 from functools import cache
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError
-from noack.protocol.record_tables import CONTROLLER_DELIVERY, PLANT_STEP, SENSOR_MEASUREMENT
+from noack.extend import CONTROLLER_DELIVERY, NS_PER_S, PLANT_STEP, SENSOR_MEASUREMENT
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Msg, Typestore
@@ -57,22 +54,9 @@ class _JointState(Protocol):
     position: NDArray[np.float64]
 
 
-def is_installed() -> bool:
-    """Return whether the library for ROS 2 messages is installed."""
-    return find_spec("rosbags") is not None
-
-
-def require_installed(subject: str) -> None:
-    """Raise CallerError if the library for ROS 2 messages is not installed."""
-    if not is_installed():
-        raise CallerError(
-            f"{subject} needs the package rosbags, which is not installed; pip install 'noack[ros]'"
-        )
-
-
 @cache
 def _store() -> "Typestore":
-    from rosbags.typesys import Stores, get_typestore  # an extra
+    from rosbags.typesys import Stores, get_typestore  # slow to import
 
     return get_typestore(Stores.ROS2_JAZZY)
 
@@ -115,7 +99,7 @@ def read_joint_state(data: bytes) -> Entries:
     Raises:
         ValueError: the bytes are none.
     """
-    from rosbags.serde import SerdeError  # an extra
+    from rosbags.serde import SerdeError  # slow to import
 
     try:
         message: _JointState = _store().deserialize_cdr(data, JOINT_STATE)  # type: ignore[assignment]

@@ -1,11 +1,10 @@
-"""Messages and names of ROS 2. Two other readers read them in ``tests/cosim/output/export``."""
+"""Messages and names of ROS 2. Two other readers read them in ``test_ros2_bag.py``."""
 
 import numpy as np
 import pytest
 
-from noack.protocol import ros2_messages as ros2
+from noack_ros2 import ros2_messages as ros2
 
-pytestmark = pytest.mark.skipif(not ros2.is_installed(), reason="the extra `ros` is not installed")
 ENTRIES = ros2.Entries(1_234_567_890_123, ("y", "ψ"), np.array([0.1, -np.inf]))
 
 

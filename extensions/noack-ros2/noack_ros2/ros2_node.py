@@ -17,9 +17,9 @@ import zenoh
 from zenoh import CongestionControl, Priority
 from zenoh.handlers import Handler, RingChannel
 
-from noack.core.errors import CallerError
-from noack.protocol import ros2_messages as ros2
-from noack.protocol.ros2_messages import DEFAULT_ROUTER, JOINT_STATE, Entries
+from noack.extend import CallerError
+from noack_ros2 import ros2_messages as ros2
+from noack_ros2.ros2_messages import DEFAULT_ROUTER, JOINT_STATE, Entries
 
 _QOS = "::,10:,:,:,,"
 """Reliable, volatile, the last 10 messages; what is empty is rmw_zenoh's default."""
@@ -104,13 +104,12 @@ class Node:
         listen: whether the node is itself the router, to which the other nodes connect.
 
     Raises:
-        CallerError: rosbags is not installed, or there is no router.
+        CallerError: there is no router.
     """
 
     def __init__(
         self, name: str, endpoint: str = DEFAULT_ROUTER, domain: int = 0, *, listen: bool = False
     ) -> None:
-        ros2.require_installed("ROS 2")
         self._name, self._domain = name, domain
         self._session = _session(endpoint, listen=listen)
         self._tokens: list[zenoh.LivelinessToken] = []

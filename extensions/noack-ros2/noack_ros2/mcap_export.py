@@ -4,32 +4,25 @@ Foxglove, PlotJuggler and the libraries of MCAP read it. The log time of a messa
 time of its row, its publish time the nominal one, both in simulated nanoseconds since the run's
 epoch.
 
-Beside it, a file of its own has ROS 2 messages (profile ``ros2``, CDR, with ``ros2msg`` schemas), if
-rosbags is installed: rosbags and ``ros2 bag`` read files in which every channel is of ROS 2. Log
-time, publish time and topics are the same; the stamp in a message is its nominal time.
+Beside it, a file of its own has ROS 2 messages (profile ``ros2``, CDR, with ``ros2msg`` schemas):
+rosbags and ``ros2 bag`` read files in which every channel is of ROS 2. Log time, publish time and
+topics are the same; the stamp in a message is its nominal time.
 """
 
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from mcap.writer import CompressionType, Writer
+from numpy.typing import NDArray
 from pydantic_core import to_json
 
-from cosim.output.export.export_formats import ExportedRun
-from cosim.record.align import aligned_parts
-from cosim.record.record_source import Rows
-from cosim.record.run_directory import SCENARIO_FILE, SUMMARY_FILE
-from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError, MachineError, why
-from noack.core.file_access import new_file
-from noack.protocol import ros2_messages as ros2
-from noack.protocol.record_tables import COMMON, OWNER, TABLES
+from noack import ExportedRun
+from noack.extend import COMMON, NS_PER_S, OWNER, TABLES, MachineError, new_file, why
+from noack_ros2 import ros2_messages as ros2
 
-if TYPE_CHECKING:
-    from mcap.writer import Writer
-
+Rows = NDArray[np.void]
 SUFFIX = ".mcap"
 _CHUNK_BYTES = 2**20
 _SEQUENCE_MASK = 0xFFFF_FFFF  # MCAP's sequence numbers have 32 bits
@@ -53,18 +46,11 @@ _ROS_INFO = 20
 def write(run: ExportedRun, path: Path, *, certificates: bool = True) -> list[Path]:
     """Write a run as MCAP; the loops of a run of several have their names before their topics.
 
-    With the package rosbags a second file has ROS 2 messages: ``NAME.ros2.mcap``.
+    A second file has ROS 2 messages: ``NAME.ros2.mcap``.
 
     Raises:
-        CallerError: the package mcap is not installed.
-        MachineError: the file cannot be written.
+        MachineError: a file cannot be written.
     """
-    try:
-        from mcap.writer import CompressionType, Writer  # an extra
-    except ImportError:
-        raise CallerError(
-            "MCAP needs the package mcap, which is not installed; pip install 'noack[mcap]'"
-        ) from None
     file_path = path
     try:
         with new_file(path) as file:
@@ -72,8 +58,6 @@ def write(run: ExportedRun, path: Path, *, certificates: bool = True) -> list[Pa
             writer.start(profile="", library="noack")
             _write_content(writer, run)
             writer.finish()  # type: ignore[no-untyped-call]
-        if not ros2.is_installed():
-            return [path]
         file_path = path.with_suffix(_ROS_SUFFIX)
         _write_ros(run, file_path)
     except (OSError, ValueError) as error:
@@ -81,47 +65,45 @@ def write(run: ExportedRun, path: Path, *, certificates: bool = True) -> list[Pa
     return [path, file_path]
 
 
-def _write_content(writer: "Writer", run: ExportedRun) -> None:
-    record = run.record
+def _write_content(writer: Writer, run: ExportedRun) -> None:
     writer.add_metadata(
         "noack",
         {
-            "scenario": record.scenario.name,
-            "kind": record.kind,
+            "scenario": run.scenario.name,
+            "kind": str(run.environment["kind"]),
             "started": str(run.environment.get("started", "")),
             "time": "simulated nanoseconds since the epoch of the run",
         },
     )
-    for name, media in ((SCENARIO_FILE, "application/toml"), (SUMMARY_FILE, "application/json")):
+    for name, media in (("scenario.toml", "application/toml"), ("summary.json", "application/json")):
         if (run.directory / name).is_file():
             writer.add_attachment(0, 0, name, media, (run.directory / name).read_bytes())
     _write_log(writer, run)
-    _write_tables(writer, run, [*record.tables])
+    _write_tables(writer, run, [*run.tables])
     for loop in run.loops:
-        own = [table for table in loop.record.tables if OWNER[table] != "netem"]
+        own = [table for table in loop.tables if OWNER[table] != "netem"]
         _write_tables(writer, loop, own)
     for loop in run.loops or [run]:
         _write_errors(writer, loop)
 
 
-def _channel(writer: "Writer", run: ExportedRun, topic: str, schema: dict[str, object]) -> int:
+def _channel(writer: Writer, run: ExportedRun, topic: str, schema: dict[str, object]) -> int:
     prefix = f"/{run.name}" if run.name else ""
     schema_id = writer.register_schema(str(schema["title"]), "jsonschema", to_json(schema))
     names = {}
-    if not run.record.is_network:
-        loop = run.record.loop
-        names = {"states": ", ".join(loop.state_names), "inputs": ", ".join(loop.input_names)}
+    if not run.is_network:
+        states, inputs = run.names
+        names = {"states": ", ".join(states), "inputs": ", ".join(inputs)}
     return writer.register_channel(f"{prefix}{topic}", "json", schema_id, names)
 
 
-def _write_tables(writer: "Writer", run: ExportedRun, tables: list[str]) -> None:
+def _write_tables(writer: Writer, run: ExportedRun, tables: list[str]) -> None:
     """Write the rows of some tables in the order of their log time."""
-    record = run.record
     channels = {
-        table: _channel(writer, run, _table_topic(table), _table_schema(table, record.tables[table]))
+        table: _channel(writer, run, _table_topic(table), _table_schema(table, run.tables[table]))
         for table in tables
     }
-    for part in record.slices(*tables):
+    for part in run.parts(*tables):
         merged = [
             (*message[:2], channels[table], *message[2:])
             for table in tables
@@ -153,12 +135,12 @@ def _column_reader(name: str, column: Rows) -> Callable[[int], object]:
     return lambda i: column[i].tobytes().hex()
 
 
-def _write_log(writer: "Writer", run: ExportedRun) -> None:
+def _write_log(writer: Writer, run: ExportedRun) -> None:
     """Write the lines of the run's log as foxglove.Log."""
-    if not run.record.notices:
+    if not run.notices:
         return
     channel = _channel(writer, run, LOG, _SCHEMAS["log"])
-    for number, notice in enumerate(run.record.notices):
+    for number, notice in enumerate(run.notices):
         t_ns = max(int(notice["t_ns"]), 0)
         content = {
             "timestamp": {"sec": t_ns // NS_PER_S, "nsec": t_ns % NS_PER_S},
@@ -171,19 +153,17 @@ def _write_log(writer: "Writer", run: ExportedRun) -> None:
         writer.add_message(channel, t_ns, to_json(content), t_ns, number)
 
 
-@np.errstate(all="ignore")  # a run may diverge
-def _write_errors(writer: "Writer", run: ExportedRun) -> None:
+def _write_errors(writer: Writer, run: ExportedRun) -> None:
     """Write the norms of the errors at each measurement."""
-    channel, number = _channel(writer, run, ERRORS, _SCHEMAS["errors"]), 0
-    for part in aligned_parts(run.record):
-        aligned = part.aligned
-        columns = (aligned.e_s_norm, aligned.threshold, aligned.e_c_norm)
-        for t_ns, *norms in zip(aligned.t_ns.tolist(), *(c.tolist() for c in columns), strict=True):
-            keys = ("t_ns", "e_s_norm", "threshold", "e_c_norm")
-            content = to_json(dict(zip(keys, (t_ns, *norms), strict=True)), inf_nan_mode="null")
-            at_ns = max(t_ns + run.phase_ns, 0)  # damaged records have others
-            writer.add_message(channel, at_ns, content, at_ns, number & _SEQUENCE_MASK)
-            number += 1
+    channel, keys = (
+        _channel(writer, run, ERRORS, _SCHEMAS["errors"]),
+        ("t_ns", "e_s_norm", "threshold", "e_c_norm"),
+    )
+    columns = run.samples().select(keys).to_pydict()
+    for number, values in enumerate(zip(*columns.values(), strict=True)):
+        content = to_json(dict(zip(keys, values, strict=True)), inf_nan_mode="null")
+        at_ns = max(values[0] + run.phase_ns, 0)  # damaged records have others
+        writer.add_message(channel, at_ns, content, at_ns, number & _SEQUENCE_MASK)
 
 
 # Topics and schemas
@@ -231,8 +211,6 @@ def _json_type(name: str, field: np.dtype[np.generic]) -> dict[str, object]:
 
 def _write_ros(run: ExportedRun, path: Path) -> None:
     """Write the file with ROS 2 messages. Raise OSError if that fails."""
-    from mcap.writer import CompressionType, Writer  # an extra, whose absence the caller reports
-
     with new_file(path) as file:
         writer = Writer(file, compression=CompressionType.ZSTD)
         writer.start(profile="ros2", library="noack")
@@ -247,7 +225,7 @@ def _write_ros(run: ExportedRun, path: Path) -> None:
 class _Bag:
     """The topics of a file with ROS 2 messages, registered when their first message is written."""
 
-    def __init__(self, writer: "Writer") -> None:
+    def __init__(self, writer: Writer) -> None:
         self._writer, self._channels, self._schemas = writer, dict[str, int](), dict[str, int]()
 
     def _channel(self, topic: str, kind: str) -> int:
@@ -261,14 +239,13 @@ class _Bag:
 
     def write_loop(self, run: ExportedRun, *, is_only: bool) -> None:
         """Write the messages of a loop, each part of its record in the order of the log time."""
-        record = run.record
-        loop, name = record.loop, record.scenario.name
+        name = run.scenario.name
         prefix = ros2.namespace(run.name or name, is_only=is_only)
-        for part in record.slices(*ros2.TOPICS):
+        for part in run.parts(*ros2.TOPICS):
             messages: list[tuple[int, int, str, bytes, int]] = []
             for table in ros2.TOPICS:
                 rows = part[table]
-                for row, topic, entries in ros2.row_entries(table, rows, loop.state_names, loop.input_names):
+                for row, topic, entries in ros2.row_entries(table, rows, *run.names):
                     log_ns = max(int(rows["now_ns"][row]) + run.phase_ns, 0)
                     message_entries = entries._replace(stamp_ns=entries.stamp_ns + run.phase_ns)
                     number = int(rows["sequence"][row]) & _SEQUENCE_MASK
@@ -281,7 +258,7 @@ class _Bag:
 
     def write_log(self, run: ExportedRun) -> None:
         """Write the lines of the run's log to ``/rosout``."""
-        for number, notice in enumerate(run.record.notices):
+        for number, notice in enumerate(run.notices):
             t_ns, level = max(int(notice["t_ns"]), 0), _ROS_LEVELS.get(notice["level"], _ROS_INFO)
             line = ros2.log_line(t_ns, level, notice["process"], notice["text"])
             channel = self._channel("/rosout", ros2.LOG)

@@ -1,0 +1,125 @@
+"""An active run for a program beside it: the rows that its processes send to the recorder.
+
+They come from the router of the run's control plane. The run does not wait for who receives them,
+and does not know of it.
+"""
+
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import zenoh
+from numpy.typing import NDArray
+from zenoh.handlers import RingChannel
+
+from cosim.record.run_directory import SCENARIO_FILE
+from noack.core.errors import CallerError, PeerError
+from noack.protocol.record_tables import LOOP
+from noack.runtime.active_runs import RUNS, OpenRun, active_runs, find_run
+from noack.runtime.connections.zenoh_session import cause_of, header_of, open_session
+from noack.scenario import scenario_file
+from noack.scenario.resolution import loop_of, resolve_run, resolved_loops, run_tables
+from noack.scenario.scenario import phases_ns
+
+_WAITING_BATCHES = 4096
+_POLL_S, _LOOK_S = 0.005, 0.5
+"""Waits for rows, and for the end of the run."""
+
+
+class FollowedLoop(NamedTuple):
+    """A loop of an active run."""
+
+    name: str
+    states: tuple[str, ...]
+    """Names of the states."""
+    inputs: tuple[str, ...]
+    """Names of the inputs."""
+    phase_ns: int
+    """Time of the run at which the loop's own time begins."""
+
+
+class LiveRows(NamedTuple):
+    """Rows that a process of an active run has sent."""
+
+    table: str
+    """Name of the table; ``docs/record.md`` has them."""
+    loop: FollowedLoop
+    rows: NDArray[np.void]
+    """A structured array; times are those of the loop."""
+
+
+class FollowedRun:
+    """An active run; ``noack.follow`` returns it."""
+
+    def __init__(self, run: OpenRun) -> None:
+        self._run = run
+        self.directory = Path(run.run_dir)
+        """The run directory, which is being written."""
+        scenario = resolve_run(scenario_file.load(self.directory / SCENARIO_FILE))
+        self._types = run_tables(scenario)
+        matrices = [(loop.name, loop_of(loop)) for loop in resolved_loops(scenario)]
+        self.loops = tuple(
+            FollowedLoop(name, loop.state_names, loop.input_names, phase_ns)
+            for (name, loop), phase_ns in zip(matrices, phases_ns(scenario), strict=True)
+        )
+        """Its loops."""
+
+    def rows(self, *tables: str) -> Iterator[LiveRows]:
+        """Yield the rows of some tables, from now to the end of the run.
+
+        Each process sends a batch every 50 ms at most. Of each process and table the rows are in
+        order. Who is slower than the run misses the oldest ones; the recorder has them all.
+
+        Raises:
+            NoackError: the run cannot be reached.
+        """
+        with ExitStack() as stack:
+            try:
+                session = stack.enter_context(open_session(RUNS, self._run.name, listen=False))
+            except zenoh.ZError as error:
+                reason = cause_of(error)
+                raise PeerError(f"{self.directory}: the run cannot be reached: {reason}") from None
+            key = f"noack/{self._run.name}/telemetry/*/*"
+            batches = session.declare_subscriber(key, RingChannel(_WAITING_BATCHES))
+            looked_s, is_active = time.monotonic(), True
+            while True:
+                if (sample := batches.try_recv()) is not None:
+                    yield from self._rows_of(sample, tables)
+                    continue
+                if not is_active:
+                    return
+                if time.monotonic() - looked_s > _LOOK_S:
+                    looked_s = time.monotonic()
+                    is_active = any(active.name == self._run.name for active in active_runs())
+                time.sleep(_POLL_S)
+
+    def _rows_of(self, sample: zenoh.Sample, tables: tuple[str, ...]) -> Iterator[LiveRows]:
+        table = str(sample.key_expr).rpartition("/")[2]
+        if table not in tables or header_of(sample) is None:
+            return
+        rows = np.frombuffer(sample.payload.to_bytes(), self._types[table])
+        for loop in np.unique(rows[LOOP]).tolist():
+            yield LiveRows(table, self.loops[loop], rows[rows[LOOP] == loop])
+
+
+def follow(directory: str | Path, *, timeout_s: float = 30.0) -> FollowedRun:
+    """Return the active run of a run directory, to follow it from another thread or program.
+
+    Args:
+        directory: the run directory.
+        timeout_s: longest wait for a run that is about to start.
+
+    Raises:
+        NoackError: it is not active in time, or its scenario cannot be read.
+    """
+    until_s = time.monotonic() + timeout_s
+    while True:
+        try:
+            return FollowedRun(find_run(run_dir=Path(directory)))
+        except CallerError:
+            if time.monotonic() > until_s:
+                raise
+            time.sleep(_POLL_S)
