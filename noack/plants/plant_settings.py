@@ -11,13 +11,12 @@ import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from typing import Annotated, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from pydantic import Field
 
-from noack.core.errors import CallerError, NoackError
+from noack.core.errors import NoackError
 from noack.core.linear_systems import Matrix, Vector
 from noack.protocol.wire_format import MAX_DIMENSION
 from noack.settings.section import ScenarioSection, Table
@@ -107,8 +106,6 @@ class PlantSettings(ScenarioSection):
     """Names of the entries of x, with units; empty if the model names them."""
     inputs: ClassVar[tuple[str, ...]] = ()
     """Names of the entries of u, with units; empty if the model names them."""
-    needs: ClassVar[tuple[str, str] | None] = None
-    """The module that this kind needs, and the extra of noack that installs it."""
     has_own_step: ClassVar[bool] = False
     """Whether the system makes steps of one length only, which the plant's rate must be."""
     has_operating_point: ClassVar[bool] = False
@@ -158,18 +155,6 @@ class PlantSettings(ScenarioSection):
                 raise ValueError(
                     f"plant.system: it has {len(names)} {title} ({', '.join(names)}); the model has {count}"
                 )
-
-    def require_installed(self) -> None:
-        """Check that the module that this kind needs is installed.
-
-        Raises:
-            CallerError: it is not.
-        """
-        if self.needs is not None and find_spec(self.needs[0]) is None:
-            raise CallerError(
-                f'plant.system.kind: "{self.kind}" needs a package that is not installed; '
-                f"pip install 'noack[{self.needs[1]}]'"
-            )
 
     def linearisation(self) -> tuple[Matrix, Matrix] | None:
         """Return A and B at the operating point, (n, n) and (n, m), if they are known exactly.

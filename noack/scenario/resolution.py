@@ -128,7 +128,6 @@ def loop_named(scenario: Scenario, name: str | None) -> Scenario:
 def _resolved(loops: Sequence[Scenario]) -> list[Scenario]:
     """Return the resolved scenarios of loops that differ in their names and seeds only."""
     scenario, plant = loops[0], loops[0].plant
-    plant.system.require_installed()
     model = _explicit_model(scenario.model)
     is_drawn = plant.initial_state_halfwidth is not None or plant.draw in ("uniform", "vertex")
     plants = [_resolved_plant(loop, model) for loop in (loops if is_drawn else loops[:1])]

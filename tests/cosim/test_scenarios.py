@@ -28,7 +28,7 @@ from noack.plants.systems.linearisation import linearise
 from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.resolution import LoopMatrices, loop_of
 from noack.theory.certificates.conditions import allowed_conditions
-from tests.helpers.shipped import resolved, shipped, skip_without_plant
+from tests.helpers.shipped import resolved, shipped
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 SHARED = (
@@ -50,7 +50,6 @@ def run_of(name: str) -> RunRecord:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_shipped_scenario_meets_its_assumptions_and_settles(name: str) -> None:
-    skip_without_plant(SCENARIOS / f"{name}.toml")
     record = run_of(name)
     summary = summarise_loop(record, 0, "horizon").to_json()
     assert summary["exit"]["status"] == 0
