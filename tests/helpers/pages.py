@@ -18,13 +18,13 @@ PAGES = (
 )  # fmt: skip
 
 
-def fences(page: str) -> list[tuple[str, str]]:
+def fences(page: str | Path) -> list[tuple[str, str]]:
     """Language and content of the fenced blocks of a page, in order."""
     text = (ROOT / page).read_text(encoding="utf-8")
     return re.findall(r"^```(\w*)\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
 
 
-def blocks(page: str, language: str) -> list[str]:
+def blocks(page: str | Path, language: str) -> list[str]:
     """Return the fenced blocks of a language."""
     return [content for block_language, content in fences(page) if block_language == language]
 

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -13,6 +14,7 @@ from gymnasium.utils.env_checker import check_env
 import noack
 from noack.extend import CallerError
 from noack_gymnasium import LossyChannel
+from tests.helpers.pages import blocks
 
 STEP_S = 0.02
 LOSSLESS: dict[str, Any] = {"mansd": 3, "loss": {"model": "lossless"}}
@@ -174,3 +176,9 @@ def test_noack_does_not_import_gymnasium() -> None:
     program = "import sys, noack; noack.simulate; noack.load('double_integrator'); " \
         "sys.exit('gymnasium' in sys.modules)"  # fmt: skip
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+
+
+def test_the_readmes_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    (example,) = blocks(Path(__file__).parents[1] / "README.md", "python")
+    exec(compile(example, "README.md", "exec"), {"__name__": "__main__"})
+    assert capsys.readouterr().out.strip().endswith("3")  # the longest burst of losses
