@@ -22,7 +22,6 @@ TIME = "time t [s]"
 LARGEST = 1e150
 """Larger values are not drawn."""
 
-DOTTED: Dash = (1, 1.6)
 MARKERS = "os^Dv<>PXph*"
 """Markers that distinguish series in addition to their colours, by matplotlib's names."""
 Steps = Literal["", "pre", "mid", "post"]

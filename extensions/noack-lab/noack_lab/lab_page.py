@@ -243,14 +243,13 @@ class _Page:
 
     async def _explore(self) -> None:
         """Run the draft, and draw it; a wrong one leaves the figure as it was, but pale."""
-        note, self._guarantee, self._margin = "", None, ""
         try:
             scenario = self._draft.scenario
             try:
                 self._run = results.exact_run_of(scenario)
             except noack.NoackError:
                 self._run = await self._services.compute(results.run_of, scenario)
-            note = self._run.note
+            note, self._guarantee, self._margin = self._run.note, None, ""
         except noack.NoackError as error:
             note = f"{error}\nThe figure shows the settings before." if self._run else str(error)
             self._chart.classes("lab-stale")

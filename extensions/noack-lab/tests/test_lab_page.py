@@ -50,8 +50,8 @@ def test_dragging_changes_run_figure_and_text_and_is_compared_with_before(open_p
 def test_a_mistake_in_the_text_is_said_and_the_figure_pales(open_page: OpenPage) -> None:
     page = open_page()
     page.click("all settings (TOML)")
-    page.wait("!!document.querySelector('.cm-content')")
-    page.js("document.querySelector('.cm-content').focus()")
+    editor = "document.querySelector('.cm-content')"
+    page.wait(f"({editor}?.focus(), document.activeElement === {editor})")
     page.call("Input.insertText", text="horizon_s = -1\n")
     page.wait(f"{PALE} && {TEXT}.includes('not TOML: ')")  # the key is given twice
 
@@ -82,7 +82,7 @@ def test_text_is_large_and_has_contrast_and_nothing_is_wider_than_the_page(open_
         page.click(source)
         for width in (390, 800, 1280):
             page.resize(width, 844)
-            assert page.js("document.scrollingElement.scrollWidth <= innerWidth"), (source, width)
+            page.wait("document.scrollingElement.scrollWidth <= innerWidth")
 
 
 def test_a_live_run_ends_with_a_verdict_and_is_the_chosen_recorded_run(
