@@ -19,8 +19,7 @@ HEAVY = ("cosim", "matplotlib", "numpy", "pyarrow", "pydantic", "rerun", "scipy"
 
 
 def loaded_by(program: str) -> set[str]:
-    names = "[name for name, module in sys.modules.items() if type(module).__name__ != '_LazyModule']"
-    code = f"{program}\nimport json, sys\nprint(json.dumps({names}))"
+    code = f"{program}\nimport json, sys\nprint(json.dumps([*sys.modules]))"
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return set(json.loads(process.stdout.splitlines()[-1]))
 
