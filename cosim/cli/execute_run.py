@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from cosim.cli.printing import console, print_json, status
 from cosim.live import launcher
+from cosim.live.coordination.remote_access import ListenSettings
 from cosim.live.monitoring.run_observers import RunLog, RunObserver, log_end
 from cosim.live.monitoring.run_terminal import RunTerminal
 from cosim.live.processes.fork_server import ForkServer, fork_server
@@ -23,7 +24,6 @@ from noack.scenario.scenario import Scenario, loop_names, loop_scenario, loop_se
 
 if TYPE_CHECKING:
     from cosim.analysis.summary.run_summary import Outcome
-    from cosim.live.coordination.remote_access import ListenSettings
 
 
 def run_processes(
@@ -37,7 +37,7 @@ def run_processes(
     spawn: Sequence[str] | None = None,
     session: str | None = None,
     server: ForkServer | None = None,
-    listening: "ListenSettings | None" = None,
+    listening: ListenSettings | None = None,
     observers: Sequence[RunObserver] = (),
 ) -> int:
     """Run a scenario live; print its verdict and return the exit status.

@@ -16,7 +16,7 @@ from importlib import import_module
 from pathlib import Path
 from threading import Thread
 
-from cosim.lazy_modules import lazy_modules
+from cosim.live.coordination import remote_access
 from cosim.live.coordination.coordinator import Coordinator
 from cosim.live.disk_space import require_disk_space
 from cosim.live.monitoring.run_observers import RunObserver, RunObservers, observers_of_extensions
@@ -44,9 +44,6 @@ from noack.runtime.run_descriptor import RunDescriptor, descriptor_file, new_des
 from noack.scenario.resolution import resolve_run, resolved_loops
 from noack.scenario.scenario import Scenario
 
-with lazy_modules():  # certificates
-    from cosim.live.coordination import remote_access
-
 _STOP_TIMEOUT_S = 15.0
 """Wall time that the processes of a stopped run have to end."""
 DEFAULT_START_S = 30.0
@@ -65,7 +62,7 @@ def launch(
     live: bool = False,
     observers: Sequence[RunObserver] = (),
     server: ForkServer | None = None,
-    listening: "remote_access.ListenSettings | None" = None,
+    listening: remote_access.ListenSettings | None = None,
 ) -> RunEndingWithHelpers:
     """Run a scenario; :func:`cosim.live.finalize.finalize` completes its record.
 

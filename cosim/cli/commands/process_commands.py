@@ -53,12 +53,11 @@ def record(
     """Open a run and record it; the other four processes join from other terminals or hosts."""
     opt.require_linux()
     from cosim.cli.execute_run import run_processes
+    from cosim.live.coordination.remote_access import ListenSettings, listen_address
     from noack.protocol.roles import RECORDER
 
     listening = None
     if listen is not None:
-        from cosim.live.coordination.remote_access import ListenSettings, listen_address  # TLS
-
         folder = Path("credentials") if credentials is None else credentials
         listening = ListenSettings(listen_address(listen), folder)
     elif credentials is not None:

@@ -16,11 +16,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.x509.oid import NameOID
-
 from cosim.live.coordination.coordinator import require_small_error
 from noack.core.clock import clock_identity
 from noack.core.errors import CallerError, PeerError, why
@@ -35,8 +30,8 @@ from noack.scenario.scenario import Scenario
 
 DEFAULT_PORT = 7447
 """Of zenoh."""
-_BEFORE, _TO_START = datetime.timedelta(hours=1), datetime.timedelta(days=1)
-"""Certificates are valid from so long before, as clocks differ, and for so long beside the run."""
+_TO_START = datetime.timedelta(days=1)
+"""Certificates are valid for so long beside the run."""
 
 
 class ListenSettings(NamedTuple):
@@ -106,19 +101,20 @@ def credentials(listening: ListenSettings, descriptor: RunDescriptor) -> Iterato
     The folder is private: each role's part of it gives access to the run. It replaces that of an
     earlier run, and is removed at the end. Raise CallerError if it cannot be written.
     """
+    from cosim.live.coordination.certificate_authority import CertificateAuthority  # imports cryptography
+
     folder = listening.folder
     descriptor = descriptor.model_copy(update={"remote": listening.address, "launched": False})
     run_s = descriptor.scenario.horizon_s / descriptor.scenario.speed
-    authority = _Authority(_TO_START + datetime.timedelta(seconds=run_s))
+    authority = CertificateAuthority(_TO_START + datetime.timedelta(seconds=run_s))
     try:
         with _replacing(folder) as new:
             for role in (RECORDER, *LOOP_ROLES):
                 part = new / role
                 part.mkdir(mode=0o700)
-                owner: x509.GeneralName = x509.DNSName(role)
-                if role == RECORDER:
-                    owner = x509.IPAddress(ipaddress.ip_address(listening.address[0]))
-                files = {CA_FILE: authority.certificate, **authority.key_pair(role, owner)}
+                address = listening.address[0] if role == RECORDER else None
+                certificate, key = authority.key_pair(role, address)
+                files = {CA_FILE: authority.certificate, CERTIFICATE_FILE: certificate, KEY_FILE: key}
                 if role != RECORDER:
                     of_role = descriptor.model_copy(update={"credentials_for": role})
                     files[RUN_FILE] = (of_role.model_dump_json(indent=1) + "\n").encode()
@@ -166,40 +162,3 @@ def _write_private(path: Path, content: bytes) -> None:
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     with os.fdopen(descriptor, "wb") as file:
         file.write(content)
-
-
-class _Authority:
-    """A certificate authority; its certificates are valid for ``valid`` from now on."""
-
-    def __init__(self, valid: datetime.timedelta) -> None:
-        now = datetime.datetime.now(datetime.UTC)
-        self._from, self._until = now - _BEFORE, now + valid
-        self._key = ec.generate_private_key(ec.SECP256R1())
-        self._name = _name("noack run")
-        builder = self._builder(self._name, self._key)
-        constraints = x509.BasicConstraints(ca=True, path_length=0)
-        self.certificate = self._signed(builder.add_extension(constraints, critical=True))
-        """Its own, as PEM text."""
-
-    def key_pair(self, role: str, owner: x509.GeneralName) -> dict[str, bytes]:
-        """Return a new certificate with its private key, as files; the common name is the role."""
-        key = ec.generate_private_key(ec.SECP256R1())
-        builder = self._builder(_name(role), key)
-        builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        builder = builder.add_extension(x509.SubjectAlternativeName([owner]), critical=False)
-        private = key.private_bytes(
-            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-        )
-        return {CERTIFICATE_FILE: self._signed(builder), KEY_FILE: private}
-
-    def _builder(self, subject: x509.Name, key: ec.EllipticCurvePrivateKey) -> x509.CertificateBuilder:
-        number = x509.random_serial_number()
-        builder = x509.CertificateBuilder(self._name, subject, key.public_key(), number)
-        return builder.not_valid_before(self._from).not_valid_after(self._until)
-
-    def _signed(self, builder: x509.CertificateBuilder) -> bytes:
-        return builder.sign(self._key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
-
-
-def _name(common_name: str) -> x509.Name:
-    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])

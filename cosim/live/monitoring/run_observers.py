@@ -4,16 +4,13 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING
 
+from cosim.live.coordination.remote_access import ListenSettings
 from noack.core.errors import one_line
 from noack.core.extension_points import parts
 from noack.runtime.command_line import log_event, print_to_stderr
 from noack.runtime.control_messages import RunProgress
 from noack.scenario.scenario import Scenario
-
-if TYPE_CHECKING:
-    from cosim.live.coordination.remote_access import ListenSettings
 
 _SOURCE, _PERIOD_S = "noack", 1.0
 
@@ -27,7 +24,7 @@ class RunObserver:
     def waiting(self, roles: Sequence[str]) -> None:
         """The start barrier waits for these roles, which are started by hand."""
 
-    def listening(self, settings: "ListenSettings") -> None:
+    def listening(self, settings: ListenSettings) -> None:
         """Processes on other hosts can join."""
 
     def started(self, run_dir: Path) -> None:

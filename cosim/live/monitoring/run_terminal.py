@@ -6,6 +6,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
+from cosim.live.coordination.remote_access import ListenSettings
 from cosim.live.monitoring.run_observers import RunObserver
 from noack.runtime.address import address_text
 from noack.runtime.control_messages import RunProgress
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress, TaskID
 
-    from cosim.live.coordination.remote_access import ListenSettings
 
 _PLAIN_LINES = 10
 """Progress lines of a run on a terminal that cannot redraw a line."""
@@ -46,7 +46,7 @@ class RunTerminal(RunObserver):
         if roles:
             self._print(f"waiting for {', '.join(roles)}")
 
-    def listening(self, settings: "ListenSettings") -> None:
+    def listening(self, settings: ListenSettings) -> None:
         """Say how processes on other hosts join."""
         address, folder = address_text(settings.address), settings.folder
         self._print(
