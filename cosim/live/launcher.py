@@ -180,6 +180,7 @@ class _Run:
         self._missing: tuple[str, ...] = ()
         self._has_started = self._has_ended = False
         self._joined = 0
+        self._last_s = time.monotonic()
         self._limit = WaitLimit(self._start_within_s())
         """How long the launcher still waits: for the start, for the end, or for the stop."""
 
@@ -188,34 +189,48 @@ class _Run:
 
         ``store`` is called with the result of a run that ends early, before its processes end.
         """
-        result: EndReason | None = None
-        last_s = time.monotonic()
-        while not self._is_over(stopping=result is not None):
-            self._coordinator.poll()
-            now_s = time.monotonic()
-            if result is not None or not self._is_in_loop():
-                self._limit.wait(now_s - last_s, os.getloadavg()[0])
-            last_s = now_s
-            self._follow_phase(stopping=result is not None)
-            if result is None:
-                result = _signalled(signals) or self._failure()
-                if result is None and self._limit.is_reached:
-                    result = EndReason(ExitStatus.FAILED, self._overdue())
-                if result is not None:
-                    store(*result)
-                    self._stop(result.reason)
-            elif self._limit.is_reached:
-                break
-            time.sleep(_POLL_S if self._has_started else _STARTING_POLL_S)
+        early_end = self._follow(signals)
+        if early_end is not None:
+            store(*early_end)
+            self._stop(early_end.reason)
         self._notify_progress()  # the last report may have arrived with the end
-        return result or _signalled(signals) or self._failure() or EndReason(ExitStatus.OK, HORIZON)
+        return early_end or _signalled(signals) or self._failure() or EndReason(ExitStatus.OK, HORIZON)
 
-    def _follow_phase(self, *, stopping: bool) -> None:
-        """Do what is due once: when the loop starts, when it has ended, when a process joins."""
-        if self._coordinator.epoch_ns is None:
-            if not stopping:
+    def _follow(self, signals: Signals) -> EndReason | None:
+        """Follow the run until its processes have ended; return why it must end early, if it must."""
+        while self._children.running() or not all(map(self._coordinator.is_over, self._by_hand)):
+            self._advance(waits=not self._is_in_loop())
+            if self._coordinator.epoch_ns is None:
                 self._notify_missing()
-        elif not self._has_started:
+            if (early_end := _signalled(signals) or self._failure()) is not None:
+                return early_end
+            if self._limit.is_reached:
+                return EndReason(ExitStatus.FAILED, self._overdue())
+        return None
+
+    def _stop(self, reason: str) -> None:
+        """Stop the processes, and wait for their end; not for one that is frozen, which never exits."""
+        self._coordinator.stop(reason)
+        if self._has_started:
+            self._observers.tell(lambda observer: observer.stopping(reason))
+        self._limit = WaitLimit(_STOP_TIMEOUT_S)
+        while set(self._children.running()) - self._coordinator.failures().keys():
+            self._advance(waits=True)
+            if self._limit.is_reached:
+                return
+
+    def _advance(self, *, waits: bool) -> None:
+        """Handle messages, do what is due, and sleep a moment; ``waits``: it counts for the limit."""
+        self._coordinator.poll()
+        self._follow_phase()
+        time.sleep(_POLL_S if self._has_started else _STARTING_POLL_S)
+        last_s, self._last_s = self._last_s, time.monotonic()
+        if waits:
+            self._limit.wait(self._last_s - last_s, os.getloadavg()[0])
+
+    def _follow_phase(self) -> None:
+        """Do what is due once: when the loop starts, when it has ended, when a process joins."""
+        if self._coordinator.epoch_ns is not None and not self._has_started:
             self._has_started = True
             # Now, as nothing waits for the launcher: the versions of all packages take 0.02 s.
             write_environment(self._run_dir, "live", run_name(self._run_id))
@@ -223,7 +238,7 @@ class _Run:
             self._observers.tell(lambda observer: observer.started(self._run_dir))
             self._helpers.prepare(self._run_dir)
             self._limit = WaitLimit(overtime_s(self._scenario.horizon_s / self._scenario.speed))
-        elif not self._has_ended and not self._is_in_loop():
+        elif self._has_started and not self._has_ended and not self._is_in_loop():
             self._has_ended = True  # while the processes end: the imports take 0.3 s
             Thread(target=import_module, args=("cosim.live.finalize",), daemon=True).start()
         if len(self._coordinator.joined) > self._joined:
@@ -244,20 +259,6 @@ class _Run:
         if RECORDER in running and self._coordinator.now_ns() >= self._scenario.timing.horizon_ns:
             failures.pop(RECORDER, None)  # sorting a long record, it may not respond
         return next(iter((failures | exited).values()), None)
-
-    def _stop(self, reason: str) -> None:
-        self._coordinator.stop(reason)
-        if self._has_started:
-            self._observers.tell(lambda observer: observer.stopping(reason))
-        self._limit = WaitLimit(_STOP_TIMEOUT_S)
-
-    def _is_over(self, *, stopping: bool) -> bool:
-        running = self._children.running()
-        if running:
-            # A frozen process never exits; the run does not wait for it.
-            failures = self._coordinator.failures()
-            return stopping and all(role in failures for role in running)
-        return stopping or all(self._coordinator.is_over(role) for role in self._by_hand)
 
     def _is_in_loop(self) -> bool:
         """Whether the run has started and has not reached its horizon."""

@@ -1,30 +1,26 @@
 """The coordinator of a run: admission, start barrier, liveliness, stop, changes of settings.
 
-It keeps the life cycle (:mod:`noack.runtime.life_cycle`) of each process. A requested change of
-runtime parameters is checked, given a time, and announced.
+It keeps the life cycle (:mod:`noack.runtime.life_cycle`) of each process. ``change_requests.py`` has
+the changes of settings.
 """
 
 import os
 import time
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
-from datetime import UTC, datetime
 
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
-from noack.core.clock import NS_PER_S, RunClock
+from cosim.live.coordination.change_requests import ChangeRequests
+from noack.core.clock import RunClock
 from noack.core.errors import CallerError, PeerError
 from noack.core.system_processes import cores
-from noack.impairments.target_loss import find_probabilities
 from noack.protocol.roles import COORDINATOR, LOOP_ROLES, ROLES
 from noack.runtime.connections.zenoh_session import header_of, next_payload
 from noack.runtime.control_messages import (
     Admission,
     AdmissionRequest,
-    ChangeAnnouncement,
-    ChangeReply,
-    ChangeRequest,
     ClockError,
     JoinRequest,
     RunProgress,
@@ -35,26 +31,12 @@ from noack.runtime.control_plane import ControlPlane
 from noack.runtime.host_clocks import STATED, realtime_offset_ns
 from noack.runtime.life_cycle import HORIZON, LAUNCHED_LOST_S, LOST_AFTER_S, Event, LifeCycle, Side, State
 from noack.runtime.run_descriptor import RunDescriptor
-from noack.scenario.parameter_changes import (
-    ChangeSchedule,
-    ParameterChange,
-    changed,
-    current_parameters,
-    scheduled,
-)
-from noack.scenario.resolution import resolve
 from noack.scenario.run_sections import ClocksSection
-from noack.scenario.scenario import loop_scenario, loop_sections
-from noack.scenario.scenario_tables import MOST_CHANGES
-from noack.settings.section import ReadTable, Table
 
 _REPORT_GRACE_S = 0.3
 """A process's last message may arrive this much later than its exit is seen."""
 _EXIT_GRACE_S = 5.0
 """By then a process has exited that has reported its end."""
-_CHANGE_DELAY_S = 0.2
-"""Wall time from a change's announcement to its effect: processes check every 0.05 s."""
-_MILLISECOND_NS = 1_000_000
 _START_DELAY_NS, _LONG_START_DELAY_NS = 30_000_000, 100_000_000
 """From the last arrival to the common epoch: time for the message to reach all processes. The
 longer one is for processes on other hosts, and for a loaded machine."""
@@ -350,120 +332,3 @@ def _sender(key_expr: object) -> tuple[str, str]:
 
 def _payload(query: zenoh.Query) -> bytes:
     return b"" if query.payload is None else query.payload.to_bytes()
-
-
-def _is_new(settings: ReadTable, schedule: ChangeSchedule[None], now_ns: int) -> bool:
-    """Return whether settings differ from those in force, or another change is still to come.
-
-    Raise CallerError if the settings are not valid.
-    """
-    before, after = (current_parameters(of) for of in (schedule.last, changed(schedule.last, settings)))
-    return before != after or schedule.at(now_ns).scenario is not schedule.last
-
-
-class ChangeRequests:
-    """The changes of a run."""
-
-    def __init__(self, descriptor: RunDescriptor, plane: ControlPlane) -> None:
-        self._scenario, self._run_dir = descriptor.scenario, descriptor.run_dir
-        self._plane = plane
-        self._schedule = ChangeSchedule[None](descriptor.scenario)
-        self._entries = {
-            section.name: ChangeSchedule[None](loop_scenario(descriptor.scenario, section))
-            for section in loop_sections(descriptor.scenario)
-        }
-        """The changes of the loops of each entry of [[loops]], by its name."""
-        self.announced: tuple[ChangeAnnouncement, ...] = ()
-        """Announcements of all changes so far."""
-        for change in scheduled(descriptor.scenario):
-            self._add(change, 0, "in the scenario")
-
-    def answer(self, request: bytes, clock: Callable[[], int], obstacle: str | None) -> ChangeReply:
-        """Announce the requested change, unless there is an obstacle; return the parameters.
-
-        Raise CallerError if the settings cannot be changed, or not now; PeerError if the message is
-        not a change request.
-        """
-        settings = parse_message(ChangeRequest, request).settings
-        from_s, now_ns, before = None, clock(), self._parameters()
-        warnings: list[str] = []
-        if settings:
-            if obstacle is not None:
-                raise CallerError(obstacle)
-            # Before the time is chosen, as it may take long.
-            are_new = [_is_new(settings, schedule, now_ns) for schedule in self._schedules]
-            if any(are_new):
-                violated_before = self._violations()
-                now_ns = clock()
-                from_s = self._announce(settings, now_ns) / NS_PER_S
-                warnings = [line for line in self._violations() if line not in violated_before]
-        loops = self._parameters()
-        return ChangeReply(
-            name=self._scenario.name,
-            run_dir=self._run_dir,
-            t_s=now_ns / NS_PER_S,
-            from_s=from_s,
-            runtime_parameters=current_parameters(self._schedule.last),
-            loops=loops,
-            changed_loops=tuple(name for name in loops if loops[name] != before[name]),
-            warnings=tuple(warnings),
-        )
-
-    def _announce(self, settings: ReadTable, now_ns: int) -> int:
-        """Announce a change; return the time from which it applies.
-
-        Raise CallerError if it is not valid for this run, or comes too late.
-        """
-        if len(self.announced) >= MOST_CHANGES:
-            raise CallerError(f"this run has had {MOST_CHANGES} changes, the maximum")
-        delay_ns = int(_CHANGE_DELAY_S * NS_PER_S * self._scenario.speed)
-        t_ns = -(-max(now_ns + delay_ns, 0) // _MILLISECOND_NS) * _MILLISECOND_NS
-        if t_ns >= self._scenario.timing.horizon_ns:
-            raise CallerError(f"the run ends at {self._scenario.horizon_s:g} s, before a change could apply")
-        change = ParameterChange(len(self.announced), t_ns, settings)
-        requested_at = datetime.now(UTC).isoformat(timespec="milliseconds")
-        self._plane.announce_change(self._add(change, now_ns, requested_at))
-        return t_ns
-
-    def _violations(self) -> list[str]:
-        """Return the violated assumptions of Theorem 2, each as a line, with its loops if not all."""
-        # Imports the theory, for which the start of a run does not wait.
-        from noack.theory.certificates.assumptions import violations_of_theorem_2
-
-        violated: dict[str, list[str]] = {}
-        with suppress(Exception):  # a failed analysis must not cost the run
-            for name, schedule in self._entries.items():
-                for line in violations_of_theorem_2(resolve(schedule.last)):
-                    violated.setdefault(line, []).append(name)
-        return [
-            line if len(names) == len(self._entries) else f"{', '.join(names)}: {line}"
-            for line, names in violated.items()
-        ]
-
-    @property
-    def _schedules(self) -> tuple[ChangeSchedule[None], ...]:
-        return (self._schedule, *self._entries.values())
-
-    def _parameters(self) -> dict[str, Table]:
-        return {name: current_parameters(schedule.last) for name, schedule in self._entries.items()}
-
-    def _add(self, change: ParameterChange, requested_ns: int, requested_at: str) -> ChangeAnnouncement:
-        """Check and store a change; return its announcement.
-
-        Raise CallerError if the change is not valid for this run.
-        """
-        for schedule in self._schedules:
-            schedule.check(change, -1)
-        for schedule in self._schedules:
-            schedule.announce(table="", change=change, number=0, now_ns=0, reached_ns=-1)
-        later = self._schedule.between(change.t_ns, self._scenario.timing.horizon_ns)
-        announcement = ChangeAnnouncement(
-            number=change.number,
-            t_ns=change.t_ns,
-            settings=dict(change.settings),
-            requested_ns=requested_ns,
-            requested_at=requested_at,
-            target_losses=find_probabilities(*(changed_scenario.network.link for changed_scenario in later)),
-        )
-        self.announced += (announcement,)
-        return announcement

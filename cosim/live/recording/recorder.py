@@ -6,7 +6,7 @@
 import math
 import sys
 import time
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -98,15 +98,13 @@ class ProcessTokens:
             return False
         disconnect_timeout_s = 0.0 if stopping else LAUNCHED_LOST_S
 
-        def is_done(known: Mapping[str, float]) -> bool:
-            if not known:
-                return False
-            waiting = [vanished for instance, vanished in known.items() if instance not in reported]
-            if len(waiting) < len(known):
-                return math.inf not in waiting
-            return now_s - max(*waiting, self._connected_s) > disconnect_timeout_s
+        def is_done(role: str) -> bool:
+            if role in reported:
+                return True
+            vanished_s = self._vanished_s[role].values()
+            return bool(vanished_s) and now_s - max(*vanished_s, self._connected_s) > disconnect_timeout_s
 
-        return all(map(is_done, self._vanished_s.values()))
+        return all(map(is_done, LOOP_ROLES))
 
 
 class ProgressReport(RunProgress):
@@ -162,8 +160,8 @@ class Recorder:
         )
         self._report_queries = session.declare_queryable(key("report", "*"), FifoChannel(64))
         self._tokens = ProcessTokens(plane)
-        self._reports: dict[str, tuple[str, ProcessReport]] = {}
-        """Roles and final reports, by instance."""
+        self._reports: dict[str, ProcessReport] = {}
+        """Final reports by role."""
         self.view_is_incomplete = False
         """Whether batches came late or out of order, so that the view must be written again."""
         self._invalid = 0
@@ -179,8 +177,7 @@ class Recorder:
     @property
     def without_report(self) -> list[str]:
         """Processes of the loop that have not reported their end to this recorder."""
-        reported = dict(self._reports.values())
-        return [role for role in LOOP_ROLES if role not in reported]
+        return [role for role in LOOP_ROLES if role not in self._reports]
 
     def show_in(self, view: "RunRecording") -> None:
         """Show the telemetry in a view, from the first batch that is handled afterwards."""
@@ -247,7 +244,7 @@ class Recorder:
 
     def report(self) -> None:
         """Write the final reports of the processes; raise MachineError if that fails."""
-        reports = self._reports.values()
+        reports = self._reports.items()
         write_reports(self._run_dir, [report.fields() | {"process": role} for role, report in reports])
 
     def _take(self, sample: zenoh.Sample) -> None:
@@ -307,7 +304,7 @@ class Recorder:
             else:
                 self._take(sample)
         if not missing:
-            self._reports[report.instance] = role, report
+            self._reports[role] = report
         self._plane.answer(query, {"rows": missing})
 
     def give_up_view(self, error: MachineError) -> None:

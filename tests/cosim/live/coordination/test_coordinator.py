@@ -1,26 +1,19 @@
-"""The coordinator: admission, lost connections, changes of a run."""
+"""The coordinator: admission, lost connections."""
 
 import json
-from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 import zenoh
 
 from cosim.live.coordination import coordinator
-from cosim.live.coordination.coordinator import ChangeRequests, Coordinator
-from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError
+from cosim.live.coordination.coordinator import Coordinator
 from noack.protocol.roles import LOOP_ROLES, RECORDER, ROLES
 from noack.runtime.control_messages import ClockError
 from noack.runtime.host_clocks import CHRONY
 from noack.scenario.run_sections import ClocksSection
-from noack.scenario.scenario_file import load
 from tests.fuzz.plane import FakePlane, Query, Sample
 from tests.helpers.run_descriptors import JUNK, RUN_DESCRIPTOR
-
-SHARED = Path(__file__).parents[4] / "scenarios" / "shared_bottleneck.toml"
 
 
 @pytest.fixture
@@ -148,73 +141,3 @@ def test_a_host_whose_clock_may_be_off_by_too_much_is_refused(
             ask(plane, barrier, "admit", role=role)
         ask(plane, barrier, "join", role=role)
     assert plane.answers[-1].clocks == {role: other if role == "sensor" else own for role in LOOP_ROLES}
-
-
-# --- requests to change a run ---------------------------------------------------------------------
-
-
-def requests_of(loops: str, *settings: str) -> ChangeRequests:
-    descriptor = SimpleNamespace(scenario=load(SHARED, [f"loops=[{loops}]", *settings]), run_dir="here")
-    plane = SimpleNamespace(announce_change=lambda announcement: None)
-    return ChangeRequests(cast("Any", descriptor), cast("Any", plane))
-
-
-def requested(requests: ChangeRequests, settings: dict[str, Any], now_s: float = 0.0) -> dict[str, Any]:
-    request = json.dumps({"settings": settings}).encode()
-    return requests.answer(request, lambda: round(now_s * NS_PER_S), None).fields()
-
-
-@pytest.mark.parametrize("loops", [1, 4])
-def test_every_listed_parameter_can_be_changed(loops: int) -> None:
-    entry = f'{{ name = "p", count = {loops} }}'
-    listed = requested(requests_of(entry), {})["runtime_parameters"]
-    assert {"trigger.beta", "network.mansd", "controller.setpoint"} <= listed.keys()
-    for key, value in listed.items():
-        assert requested(requests_of(entry), {key: value})["from_s"] is None  # it is in force already
-    with pytest.raises(CallerError, match=r"plant\.rate_hz"):
-        requested(requests_of(entry), {"plant.rate_hz": 100.0})
-
-
-def test_a_value_that_is_in_force_is_no_change_unless_another_one_is_to_come() -> None:
-    requests = requests_of('{ name = "p" }')  # with M − 1 = 3
-    from_s = [
-        requested(requests, {"network.mansd": mansd}, now_s)["from_s"]
-        for mansd, now_s in ((3, 0.0), (2, 0.0), (2, 0.1), (2, 1.0), (3, 1.0))
-    ]
-    assert from_s == [None, 0.2, 0.3, None, 1.2]
-    assert len(requests.announced) == 3
-
-
-def test_a_change_warns_of_the_assumptions_that_it_violates() -> None:
-    requests = requests_of('{ name = "p" }')
-    (warning,) = requested(requests, {"trigger.alpha_per_s": 5.0})["warnings"]
-    assert warning.startswith("violated: 0 < α < ᾱ: the threshold decays more slowly than the closed loop")
-    assert not requested(requests, {"network.mansd": 2})["warnings"]
-
-
-def test_a_refused_change_has_no_effect_on_the_next_one() -> None:
-    """It is valid now and with the last settings, but not with the first of those scheduled."""
-    change = 'changes=[{ at_s = 8.0, set = { "network.mansd" = 2 } }]'
-    requests = requests_of('{ name = "p", count = 2 }', change)
-    impossible_loss = {"model": "bernoulli", "probability": 0.8, "keep": True}
-    with pytest.raises(CallerError, match=r"network\.loss: loss 80% keep: impossible"):
-        requested(requests, {"network.mansd": 10, "network.loss": impossible_loss})
-    loss = impossible_loss | {"probability": 0.2}
-    assert requested(requests, {"network.loss": loss})["from_s"] > 0
-    parameters = requested(requests, {})["runtime_parameters"]
-    assert (parameters["network.mansd"], parameters["network.loss"]["probability"]) == (2, 0.2)
-    assert [announcement.number for announcement in requests.announced] == [0, 1]
-
-
-def test_a_change_beyond_the_last_one_or_the_end_of_the_run_is_refused(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    requests, settings = requests_of('{ name = "p" }'), {"network.mansd": 2}
-    monkeypatch.setattr(coordinator, "MOST_CHANGES", 2)
-    for _ in range(2):
-        requested(requests, settings)
-    with pytest.raises(CallerError, match="this run has had 2 changes, the maximum"):
-        requested(requests, settings)
-    assert len(requests.announced) == 2
-    with pytest.raises(CallerError, match=r"the run ends at 0\.1 s, before a change could apply"):
-        requested(requests_of('{ name = "p" }', "horizon_s=0.1"), settings)
