@@ -30,7 +30,6 @@ gc.disable()  # until everything is loaded, of which nothing is garbage
 FIRST = (
     "tests/native/test_sanitized.py", "tests/test_doc_programs.py",
     "tests/integration/", "tests/native/", "tests/cosim/simulation/test_whole_loop.py", "tests/test_docs.py",
-    "tests/other_system/",
     "tests/noack/theory/certificates/test_certificate_kinds.py", "tests/attacks/", "tests/cosim/",
     "tests/netem/", "tests/noack/plants/", "tests/noack/theory/",
 )  # fmt: skip

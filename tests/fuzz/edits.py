@@ -1,14 +1,9 @@
-"""Structured inputs from bytes of any length, which determine each choice; edits of content.
-
-Beyond the end of the bytes, every choice is the first option. So all bytes give an input, and fewer
-bytes give a simpler one. No fuzzer is needed, so a kept input has the same meaning everywhere.
-"""
+"""Structured inputs, whose choices Hypothesis draws; edits of content."""
 
 import copy
 import datetime
 import io
 import json
-import struct
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
@@ -18,6 +13,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from hypothesis import strategies as st
 
 T = TypeVar("T")
 
@@ -30,38 +26,42 @@ FLOATS = (
     1.7976931348623157e308, 5e-324, float("inf"), float("-inf"), float("nan"),
 )  # fmt: skip
 
-SEEDS = (b"", bytes(range(256)), bytes(range(255, -1, -1)) * 2)
-"""Seeds with few choices and with many."""
-EDITS = tuple(b"\0" + seed for seed in SEEDS)
-"""The same seeds for parsers of text, where a zero byte selects edits of valid text."""
-
 
 class Choices:
-    """Reads choices from bytes, first to last."""
+    """Choices that Hypothesis draws, and reduces to the first option where an input fails."""
 
-    def __init__(self, data: bytes) -> None:
-        self._data = data
-        self._at = 0
+    def __init__(self, data: st.DataObject) -> None:
+        self._draw = data.draw
 
-    @property
-    def left(self) -> int:
-        """Number of unused bytes."""
-        return len(self._data) - self._at
+    def more(self) -> bool:
+        """Return whether a list of inputs goes on; 20 are the usual number."""
+        return self.below(20) > 0
 
     def take(self, count: int) -> bytes:
-        """Return the next ``count`` bytes."""
-        part = self._data[self._at : self._at + count]
-        self._at += len(part)
-        return part.ljust(count, b"\0")
+        """Return ``count`` bytes."""
+        return self._draw(st.binary(min_size=count, max_size=count))
 
-    def rest(self) -> bytes:
-        """Return all unused bytes."""
-        return self.take(self.left)
+    def junk(self) -> bytes:
+        """Return any bytes."""
+        return self._draw(st.binary(max_size=200))
+
+    def near(self, seeds: Sequence[bytes], words: Sequence[bytes] = ()) -> bytes:
+        """Return a text with some parts replaced by words, other bytes or parts of another text."""
+        data, other = self.choose(seeds), self.choose(seeds)
+        for _ in range(self.below(6)):
+            begin, end = sorted((self.below(len(data) + 1), self.below(len(data) + 1)))
+            match self.below(4):
+                case 0 if words:
+                    data = data[:begin] + self.choose(words) + data[begin:]
+                case 1:
+                    data = data[:begin] + other[self.below(len(other) + 1) :]
+                case _:
+                    data = data[:begin] + self._draw(st.binary(max_size=16)) + data[end:]
+        return data
 
     def below(self, limit: int) -> int:
         """Return a number from 0 to ``limit`` − 1."""
-        size = 1 if limit <= 256 else 2
-        return int.from_bytes(self.take(size), "little") % limit
+        return self._draw(st.integers(0, limit - 1))
 
     def choose(self, options: Sequence[T]) -> T:
         """Return one of these options."""
@@ -79,17 +79,17 @@ class Choices:
             case 1:
                 return self.below(256)
             case _:
-                return int(struct.unpack("<q", self.take(8))[0])
+                return self._draw(st.integers(-(2**63), 2**63 - 1))
 
     def real(self) -> float:
         """Return a float: a boundary value, or any 64 bits."""
         if self.flag():
-            return float(struct.unpack("<d", self.take(8))[0])
+            return self._draw(st.floats())
         return self.choose(FLOATS)
 
     def text(self) -> str:
-        """Return a short text of any UTF-8 characters."""
-        return self.take(self.below(16)).decode("utf-8", errors="replace")
+        """Return a short text of any characters."""
+        return self._draw(st.text(max_size=16))
 
 
 NAMED: Mapping[str, bytes] = {

@@ -1,27 +1,24 @@
 """With any input, every parser must return or report the mistake in one line.
 
-The modules below ``parsers`` have the parsers by name, in ``PARSERS``.
-``corpus/NAME.txt`` contains the kept inputs, one per line, escaped as Python escapes bytes.
+The modules below ``parsers`` have the parsers by name, in ``PARSERS``, each with one generator of
+inputs.
 """
 
 import importlib
-import re
 import resource
 import signal
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import FrameType
 
 from noack.core.errors import NoackError
-from tests.fuzz.edits import SEEDS
+from tests.fuzz.edits import Choices
 
 FOLDER = Path(__file__).parent
-CORPUS = FOLDER / "corpus"
 LONGEST_CPU_S = 10.0
 """CPU time limit for one input; valid inputs take milliseconds, large ones up to 100 times that."""
 _MOST_MEMORY_KIB = 1024 * 1024
@@ -31,58 +28,31 @@ class HangError(AssertionError):
     """An input takes too long."""
 
 
-@dataclass(frozen=True)
-class Harness:
-    """A parser under test."""
+OneInput = Callable[[Choices], None]
+"""Passes one input to a parser, and raises if the parser fails."""
 
-    one_input: Callable[[bytes], None]
-    """Passes one input to the parser, and raises if the parser fails."""
-    seeds: Sequence[bytes] = SEEDS
-    """Initial inputs in addition to the kept ones."""
-    words: Sequence[bytes] = ()
-    """Words from which the fuzzer builds inputs."""
-    sanitized: bool = False
-    """Whether the long run has the core that is built with ASan and UBSan."""
 
-    def run(self, data: bytes) -> None:
-        """Pass one input to the parser.
+def run(one_input: OneInput, choices: Choices) -> None:
+    """Pass one input to a parser.
 
-        Raises:
-            Exception: the parser fails; any type.
-        """
-        before_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        with _time_limit(), warnings.catch_warnings():
-            warnings.simplefilter("error")  # a warning would be a second line on standard error
-            self.one_input(data)
-        grown_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kib
-        assert grown_kib < _MOST_MEMORY_KIB, f"one input took {grown_kib} KiB"
+    Raises:
+        Exception: the parser fails; any type.
+    """
+    before_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with _time_limit(), warnings.catch_warnings():
+        warnings.simplefilter("error")  # a warning would be a second line on standard error
+        one_input(choices)
+    grown_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kib
+    assert grown_kib < _MOST_MEMORY_KIB, f"one input took {grown_kib} KiB"
 
 
 @cache
-def parsers() -> Mapping[str, Harness]:
+def parsers() -> Mapping[str, OneInput]:
     """Return all parsers by name."""
-    harnesses: dict[str, Harness] = {}
+    found: dict[str, OneInput] = {}
     for path in sorted((FOLDER / "parsers").glob("[a-z]*.py")):
-        harnesses |= importlib.import_module(f"tests.fuzz.parsers.{path.stem}").PARSERS
-    return harnesses
-
-
-def kept_inputs(name: str) -> list[bytes]:
-    """Return the kept inputs of a parser."""
-    path = CORPUS / f"{name}.txt"
-    lines = path.read_text(encoding="ascii").splitlines() if path.is_file() else []
-    return [from_line(line) for line in lines if not line.startswith("#")]
-
-
-def from_line(line: str) -> bytes:
-    """Return the input of a corpus line."""
-    return line.encode("ascii").decode("unicode_escape").encode("latin-1")
-
-
-def to_line(data: bytes) -> str:
-    """Return the corpus line for an input; ``#`` begins a comment."""
-    line = data.decode("latin-1").encode("unicode_escape").decode("ascii")
-    return re.sub("^#", r"\\x23", line)
+        found |= importlib.import_module(f"tests.fuzz.parsers.{path.stem}").PARSERS
+    return found
 
 
 def workspace() -> Path:

@@ -6,24 +6,20 @@ import numpy as np
 
 from noack.protocol.wire_format import Encoder, Flow, Message, loop_number, read_header
 from tests.fuzz.edits import Choices
-from tests.fuzz.harness import Harness
 from tests.helpers.wire_decoder import Decoder
 from tests.oracles.wire import KEY, RUN, BothReceivers, tag
 
-WIRE_WORDS = (b"NA\x01", struct.pack("<Q", RUN))
 
-
-def wire_input(data: bytes) -> None:
+def wire_input(choices: Choices) -> None:
     """Both receivers agree; what they accept is encoded to the same bytes again."""
-    _junk(data)
-    choices = Choices(data)
+    _junk(choices.choose((b"", b"NA", b"NA\1")) + choices.junk())
     dimension = 1 + choices.below(4)
     flow = choices.choose([Flow.MEASUREMENT, Flow.UPDATE, Flow.ACTUATION, Flow.ACKNOWLEDGEMENT])
     if flow is Flow.ACKNOWLEDGEMENT:
         dimension = 0
     receivers, encoder, seen = BothReceivers(flow, dimension, run_id=RUN), Encoder(RUN, KEY), b""
     for _ in range(20):
-        if not choices.left:
+        if not choices.more():
             return
         odd = choices.below(4) == 0
         datagram = _odd(choices, dimension) if odd else _sound(choices, encoder, flow, dimension)
@@ -84,5 +80,5 @@ def _changed(choices: Choices, datagram: bytes) -> bytes:
 
 
 PARSERS = {
-    "wire": Harness(wire_input, words=WIRE_WORDS),
+    "wire": wire_input,
 }

@@ -28,26 +28,12 @@ from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import dumps, load, validate
 from noack.scenario.toml_file import json_schema
 from noack.settings.user_files import NamedFile
-from tests.fuzz.edits import (
-    EDITS,
-    Choices,
-    Vocabulary,
-    bases,
-    edited,
-    key,
-    quoted,
-    value,
-    vocabulary,
-    write_named,
-)
-from tests.fuzz.harness import FOLDER, Harness, refusal, workspace
+from tests.fuzz.edits import Choices, Vocabulary, bases, edited, key, quoted, value, vocabulary, write_named
+from tests.fuzz.harness import FOLDER, refusal, workspace
 from tests.oracles.capture_files import ETHERNET, LINKS, Sent, pcap_of, pcapng_of
 
 SCENARIO_KNOWN = vocabulary(json_schema(Scenario), dates=True)
-SCENARIO_SEEDS = [
-    *EDITS,
-    *(path.read_bytes() for path in sorted((FOLDER.parents[1] / "scenarios").glob("*.toml"))),
-]
+SCENARIO_SEEDS = [path.read_bytes() for path in sorted((FOLDER.parents[1] / "scenarios").glob("*.toml"))]
 SCENARIO_WORDS = quoted(SCENARIO_KNOWN)
 SCENARIO_BASES = bases(
     "scenarios",
@@ -74,16 +60,17 @@ SCENARIO_BASES = bases(
 )  # fmt: skip
 
 
-def scenario_input(data: bytes) -> None:
+def scenario_input(choices: Choices) -> None:
     """A scenario is refused with all mistakes, or reads back the same, also when resolved."""
     overrides: list[str] = []
-    if data[:1] == b"\0":
-        choices = Choices(data[1:])
+    if choices.below(4):
         base = choices.choose(SCENARIO_BASES)
         for _ in range(choices.below(3)):
             name = ".".join(key(choices, SCENARIO_KNOWN) for _ in range(1 + choices.below(3)))
             overrides.append(f"{name}={_written(choices)}" if choices.below(8) else name)
         data = tomli_w.dumps(edited(choices, base, SCENARIO_KNOWN)).encode()
+    else:
+        data = choices.near(SCENARIO_SEEDS, SCENARIO_WORDS)
     path = write_named(workspace(), "scenario.toml", data)
     with refusal((str(path), "--set"), lines=True):
         scenario = load(path, overrides)
@@ -114,21 +101,19 @@ CAMPAIGN_KNOWN = Vocabulary(
     (*_SCHEMA.words, "lane_following", "decaying", "network.mansd", "beta", "policy"),
     dates=True,
 )
-CAMPAIGN_SEEDS = [
-    *EDITS,
-    *(path.read_bytes() for path in sorted((FOLDER.parents[1] / "campaigns").glob("*.toml"))),
-]
+CAMPAIGN_SEEDS = [path.read_bytes() for path in sorted((FOLDER.parents[1] / "campaigns").glob("*.toml"))]
 CAMPAIGN_WORDS = quoted(CAMPAIGN_KNOWN)
 CAMPAIGN_BASES = bases("campaigns")
 _MOST_POINTS = 8
 """Grid points for which scenarios are made; more points would add no coverage."""
 
 
-def campaign_input(data: bytes) -> None:
+def campaign_input(choices: Choices) -> None:
     """A campaign is refused, or its grid can be made."""
-    if data[:1] == b"\0":
-        choices = Choices(data[1:])
+    if choices.below(4):
         data = tomli_w.dumps(edited(choices, choices.choose(CAMPAIGN_BASES), CAMPAIGN_KNOWN)).encode()
+    else:
+        data = choices.near(CAMPAIGN_SEEDS, CAMPAIGN_WORDS)
     path = write_named(workspace(), "campaign.toml", data)
     with refusal(str(path), lines=True):
         campaign = campaign_file.load(path)
@@ -172,9 +157,9 @@ MATRICES_WORDS = [
 ]
 
 
-def matrices_input(data: bytes) -> None:
+def matrices_input(choices: Choices) -> None:
     """Matrices that are read are finite and two-dimensional."""
-    (workspace() / "any.npz").write_bytes(data)
+    (workspace() / "any.npz").write_bytes(choices.near(MATRICES_SEEDS, MATRICES_WORDS))
     with refusal('run.toml: model.file = "any.npz"'):
         matrices = read_matrices(NamedFile("any.npz", workspace(), "run.toml: model"))
         assert matrices.keys() <= {"A", "B", "gain"}
@@ -193,8 +178,9 @@ TRACES_WORDS = [
 ]  # fmt: skip
 
 
-def traces_input(data: bytes) -> None:
+def traces_input(choices: Choices) -> None:
     """A trace that is read satisfies the validation of settings."""
+    data = choices.near(TRACES_SEEDS, TRACES_WORDS)
     kind, content = data[:1], data[1:]
     name = "any.dist" if kind == b"\2" else "any.txt"
     (workspace() / name).write_bytes(content)
@@ -238,9 +224,8 @@ _CAPTURES = [
 _SEQUENCE_FIELDS = [None, "0:4", "2:2:little", "0:8", "9999:1", "x"]
 
 
-def captures_input(data: bytes) -> None:
+def captures_input(choices: Choices) -> None:
     """In a trace from captures, no packet is received before it was sent."""
-    choices = Choices(data)
     path, other = workspace() / "one.pcap", workspace() / "other.pcap"
     options = SourceOptions(
         clocks_differ=choices.choose([None, False, True]),
@@ -277,9 +262,9 @@ def _damaged(choices: Choices, content: bytes) -> bytes:
 
 
 PARSERS = {
-    "scenario": Harness(scenario_input, seeds=SCENARIO_SEEDS, words=SCENARIO_WORDS),
-    "campaign": Harness(campaign_input, seeds=CAMPAIGN_SEEDS, words=CAMPAIGN_WORDS),
-    "matrices": Harness(matrices_input, seeds=MATRICES_SEEDS, words=MATRICES_WORDS),
-    "traces": Harness(traces_input, seeds=TRACES_SEEDS, words=TRACES_WORDS),
-    "captures": Harness(captures_input),
+    "scenario": scenario_input,
+    "campaign": campaign_input,
+    "matrices": matrices_input,
+    "traces": traces_input,
+    "captures": captures_input,
 }

@@ -12,13 +12,7 @@ from netem.link_state import LinkState
 from noack.core.core_library import core, dtype_of, ffi, pointer_to
 from noack.impairments.link_settings import LinkSettings
 from tests.fuzz.edits import Choices
-from tests.fuzz.harness import Harness
 from tests.noack.impairments.feature_examples import CONSTRAINED, IMPAIRED, keeps_loss, names_file
-
-SEEDS = (
-    b"", bytes(range(256)), bytes(range(255, -1, -1)) * 2,
-    *(bytes([*range(at, at + 40)]) * 4 for at in range(0, 200, 11)),
-)  # fmt: skip
 
 _COMPUTABLE = [
     impairment for impairment in IMPAIRED if not names_file(impairment) and not keeps_loss(impairment)
@@ -34,9 +28,8 @@ LATEST_NS, LARGEST_BYTES = 2**61, 65_535
 Words = NDArray[np.int64]
 
 
-def link_numbers_input(data: bytes) -> None:
+def link_numbers_input(choices: Choices) -> None:
     """Make two links, decide for packets of the first, and go on with the second."""
-    choices = Choices(data)
     links = [link for link in (_link(choices), _link(choices)) if link is not None]
     for number, (link, kept) in enumerate(links):
         if number == 0:
@@ -155,5 +148,5 @@ def _resized(words: Words, length: int) -> Words:
 
 
 PARSERS = {
-    "link_numbers": Harness(link_numbers_input, seeds=SEEDS, sanitized=True),
+    "link_numbers": link_numbers_input,
 }

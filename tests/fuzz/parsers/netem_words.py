@@ -18,18 +18,8 @@ from netem.tc_words import parse, settings_of, words_of
 from noack.core.errors import CallerError
 from noack.impairments.kinds.delay import SHAPES
 from noack.impairments.link_settings import LinkSettings
-from tests.fuzz.edits import (
-    EDITS,
-    NAMED,
-    Choices,
-    Vocabulary,
-    damaged,
-    edited,
-    quoted,
-    vocabulary,
-    write_named,
-)
-from tests.fuzz.harness import Harness, refusal, workspace
+from tests.fuzz.edits import NAMED, Choices, Vocabulary, damaged, edited, quoted, vocabulary, write_named
+from tests.fuzz.harness import refusal, workspace
 from tests.fuzz.plane import Query
 from tests.netem.control.fake_relay import FakeRelay
 from tests.noack.impairments.any_link_settings import words_can_say
@@ -45,7 +35,7 @@ TOKENS = (
     "1mbit", "10tbps", "1/2", "3,4", "0s-1s", "1s-0s", "18446744073709551615", "1e-400", "'", '"',
     "a b", "\\", "",
 )  # fmt: skip
-WORDS_SEEDS = [*EDITS, *(example.encode() for example in EXAMPLES)]
+WORDS_SEEDS = [example.encode() for example in EXAMPLES]
 WORDS_WORDS = [token.encode() for token in TOKENS if token]
 
 
@@ -68,10 +58,12 @@ def sentence(choices: Choices) -> str:
     return " ".join(words)
 
 
-def words_input(data: bytes) -> None:
+def words_input(choices: Choices) -> None:
     """Words are refused, or mean the same when they are written again."""
-    structured = data[:1] == b"\0"
-    text = sentence(Choices(data[1:])) if structured else data.decode("utf-8", "replace")
+    if choices.below(4):
+        text = sentence(choices)
+    else:
+        text = choices.near(WORDS_SEEDS, WORDS_WORDS).decode("utf-8", "replace")
     for words in (text, text.split(" ")):
         with refusal():
             _check(words)
@@ -117,7 +109,7 @@ BASE = {
         {"name": "down", "listen": "[::1]:9000", "to": "[::1]:9001", "return_path": False},
     ]
 }  # fmt: skip
-LINKS_SEEDS = [tomli_w.dumps(BASE).encode(), *EDITS]
+LINKS_SEEDS = [tomli_w.dumps(BASE).encode()]
 LINKS_WORDS = (*quoted(LINKS_KNOWN), *WORDS_WORDS)
 _LOOK_UP: Callable[..., Any] = socket.getaddrinfo
 
@@ -128,14 +120,15 @@ def numeric(host: str, port: int, family: int, kind: int) -> Any:
     return _LOOK_UP(host, port, family=family, type=kind, flags=flags)
 
 
-def links_input(data: bytes) -> None:
+def links_input(choices: Choices) -> None:
     """A file of links is refused, or its settings survive JSON and words."""
-    if data[:1] == b"\0":
-        choices = Choices(data[1:])
+    if choices.below(4):
         content: dict[str, Any] = json.loads(json.dumps(BASE))
         if choices.flag():
             content["link"][0]["words"] = sentence(choices)
         data = tomli_w.dumps(edited(choices, content, LINKS_KNOWN)).encode()
+    else:
+        data = choices.near(LINKS_SEEDS, LINKS_WORDS)
     path = write_named(workspace(), "links.toml", data)
     with refusal(str(path), lines=True), patch("noack.runtime.address.socket.getaddrinfo", numeric):
         for spec in load_links(path):
@@ -163,7 +156,7 @@ BASES: list[dict[str, Any]] = [
         },
     },
 ]  # fmt: skip
-CONTROL_SEEDS = [*EDITS, *(json.dumps(base).encode() for base in BASES)]
+CONTROL_SEEDS = [json.dumps(base).encode() for base in BASES]
 CONTROL_WORDS = [json.dumps(word).encode() for word in (*CONTROL_KNOWN.keys, *CONTROL_KNOWN.words)]
 
 
@@ -185,14 +178,15 @@ class _AtOnce:
         return SimpleNamespace(links=self.relay.report())
 
 
-def control_input(data: bytes) -> None:
+def control_input(choices: Choices) -> None:
     """A request is answered once; a refused one changes no settings."""
-    if data[:1] == b"\0":
-        choices = Choices(data[1:])
+    if choices.below(4):
         base = json.loads(json.dumps(choices.choose(BASES)))
         if "words" in base and choices.flag():
             base["words"] = sentence(choices)
         data = damaged(choices, json.dumps(edited(choices, base, CONTROL_KNOWN)).encode())
+    else:
+        data = choices.near(CONTROL_SEEDS, CONTROL_WORDS)
     commands = _AtOnce()
     server = ControlServer("test", commands)  # type: ignore[arg-type]
     before = dict(commands.relay.settings)
@@ -211,7 +205,7 @@ def control_input(data: bytes) -> None:
 
 
 PARSERS = {
-    "words": Harness(words_input, seeds=WORDS_SEEDS, words=WORDS_WORDS),
-    "links": Harness(links_input, seeds=LINKS_SEEDS, words=LINKS_WORDS),
-    "control": Harness(control_input, seeds=CONTROL_SEEDS, words=CONTROL_WORDS),
+    "words": words_input,
+    "links": links_input,
+    "control": control_input,
 }

@@ -40,7 +40,7 @@ from noack.runtime.spool import NOTICES, SPOOL, SpoolWriter, batch_of, notices_o
 from noack.scenario.resolution import resolve, run_tables
 from noack.scenario.scenario_file import dumps, validate
 from tests.fuzz.edits import Choices, Vocabulary, damaged, edited, edited_table, written
-from tests.fuzz.harness import Harness, refusal, workspace
+from tests.fuzz.harness import refusal, workspace
 from tests.fuzz.plane import FakePlane, Query, Sample
 from tests.helpers.summaries import run_of_one_loop
 
@@ -114,9 +114,8 @@ def files(acknowledged: bool, live: bool) -> Mapping[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
 
 
-def record_input(data: bytes) -> None:
+def record_input(choices: Choices) -> None:
     """A damaged run directory is refused, or every command can show it."""
-    choices = Choices(data)
     content = dict(files(choices.flag(), choices.flag()))
     stage = choices.below(3)  # 0 recorded, 1 interrupted, 2 recorded with rows left in the spool
     for name in list(content):
@@ -220,25 +219,27 @@ TELEMETRY_KNOWN = Vocabulary(
 )
 
 
-def telemetry_input(data: bytes) -> None:
+def telemetry_input(choices: Choices) -> None:
     """The recorder takes any messages; the valid part of them is the record."""
-    choices = Choices(data)
     run_dir = workspace() / "telemetry"
     shutil.rmtree(run_dir, ignore_errors=True)
     run_dir.mkdir()
     (run_dir / SCENARIO_FILE).write_text(dumps(RESOLVED))
-    plane = FakePlane()
-    recorder = Recorder(RESOLVED, run_dir, plane)
-    queries = []
+    messages: list[tuple[str, Query | Sample]] = []
     for _ in range(1 + choices.below(6)):
         match choices.below(5):
             case 0:
-                queries.append(_report(choices))
-                plane.put("report", queries[-1])
+                messages.append(("report", _report(choices)))
             case 1:
-                plane.put("alive", Sample(f"noack/0/alive/{choices.choose([*OWNER.values(), ''])}/one"))
+                alive = Sample(f"noack/0/alive/{choices.choose([*OWNER.values(), ''])}/one")
+                messages.append(("alive", alive))
             case _:
-                plane.put("telemetry", _batch(choices))
+                messages.append(("telemetry", _batch(choices)))
+    plane = FakePlane()
+    recorder = Recorder(RESOLVED, run_dir, plane)
+    for key, message in messages:
+        plane.put(key, message)
+    queries = [message for _, message in messages if isinstance(message, Query)]
     with redirect_stderr(io.StringIO()) as errors:
         recorder.poll()
     assert errors.getvalue().count("\n") <= 1, "invalid messages fill the log"
@@ -279,6 +280,6 @@ def _report(choices: Choices) -> Query:
 
 
 PARSERS = {
-    "record": Harness(record_input),
-    "telemetry": Harness(telemetry_input),
+    "record": record_input,
+    "telemetry": telemetry_input,
 }

@@ -17,24 +17,24 @@ from noack.scenario.parameter_changes import ChangeSchedule, settings_bytes, set
 from noack.scenario.runtime_parameters import SHORT
 from noack.scenario.scenario import Scenario
 from noack.scenario.toml_file import json_schema
-from tests.fuzz.edits import EDITS, Choices, Vocabulary, damaged, edited, vocabulary
-from tests.fuzz.harness import Harness, refusal, workspace
+from tests.fuzz.edits import Choices, Vocabulary, damaged, edited, vocabulary
+from tests.fuzz.harness import refusal, workspace
 from tests.fuzz.plane import FakePlane, Query, Sample
 from tests.helpers.run_descriptors import RUN_DESCRIPTOR
 
 DESCRIPTOR: dict[str, Any] = json.loads(RUN_DESCRIPTOR.model_dump_json())
 _SCENARIO = vocabulary(json_schema(Scenario))
 DESCRIPTOR_KNOWN = Vocabulary((*DESCRIPTOR, *_SCENARIO.keys), (*_SCENARIO.words, "00" * 31, "0g"))
-SEEDS = [json.dumps(DESCRIPTOR).encode(), *EDITS]
+SEEDS = [json.dumps(DESCRIPTOR).encode()]
 WORDS = [json.dumps(word).encode() for word in DESCRIPTOR]
 
 
-def descriptor_input(data: bytes) -> None:
+def descriptor_input(choices: Choices) -> None:
     """A run descriptor is refused, or is valid and survives JSON."""
-    if data[:1] == b"\0":
-        choices = Choices(data[1:])
-        content = edited(choices, DESCRIPTOR, DESCRIPTOR_KNOWN)
-        data = json.dumps(content).encode()
+    if choices.below(4):
+        data = json.dumps(edited(choices, DESCRIPTOR, DESCRIPTOR_KNOWN)).encode()
+    else:
+        data = choices.near(SEEDS, WORDS)
     with refusal("not a valid run descriptor"):
         descriptor = run_descriptor.loads(data.decode("utf-8", "replace"))
         assert run_descriptor.loads(descriptor.model_dump_json()) == descriptor
@@ -51,9 +51,8 @@ PROGRESS = {
 BARRIER_KNOWN = Vocabulary((*HELLO, *PROGRESS), ("127.0.0.1", "", *ROLES))
 
 
-def barrier_input(data: bytes) -> None:
+def barrier_input(choices: Choices) -> None:
     """The coordinator takes any messages before the start; each request has one answer."""
-    choices = Choices(data)
     plane = FakePlane()
     with patch.object(coordinator, "ControlPlane", lambda *_, **__: plane):
         barrier = coordinator.Coordinator(RUN_DESCRIPTOR)
@@ -126,9 +125,8 @@ CHANGES_KNOWN = Vocabulary(
 )
 
 
-def changes_input(data: bytes) -> None:
+def changes_input(choices: Choices) -> None:
     """Requests, announcements and answers about changes are refused, or can be applied."""
-    choices = Choices(data)
     match choices.below(4):
         case 0:
             _request(_changes_bytes(choices, {"settings": SETTINGS}))
@@ -193,7 +191,7 @@ def _changes_bytes(choices: Choices, content: Any) -> bytes:
 
 
 PARSERS = {
-    "run_descriptor": Harness(descriptor_input, seeds=SEEDS, words=WORDS),
-    "barrier": Harness(barrier_input),
-    "changes": Harness(changes_input),
+    "run_descriptor": descriptor_input,
+    "barrier": barrier_input,
+    "changes": changes_input,
 }
