@@ -140,8 +140,8 @@ def test_the_recording_shows_the_bounds(finished: Finished, record: RunRecord) -
     np.testing.assert_allclose(certified_drawn, certified[0], rtol=1e-9)
     # If the plant's first input was late, the end of the run allows for it up to the next event.
     known_ns = np.append(record.events()["t_ns"], t_ns.max() + 1)
-    if claims.started_s > claims.allowed.delay_s:
-        known_ns = known_ns[known_ns >= claims.started_s * 1e9]
+    if claims.evidence.started_s > claims.allowed.delay_s:
+        known_ns = known_ns[known_ns >= claims.evidence.started_s * 1e9]
     known = t_ns[order] >= known_ns[0]
     np.testing.assert_allclose(of_event_drawn[known], certified[1][known], rtol=1e-9)
 

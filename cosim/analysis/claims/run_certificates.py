@@ -5,7 +5,6 @@ from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import allowed_conditions, void_without_delay
 from noack.theory.certificates.region import scopes
-from noack.theory.certificates.solution import run_searches
 
 
 def scheduled_certificates(scenario: Scenario, start_error: float | None = None) -> list[ScenarioCertificate]:
@@ -29,4 +28,4 @@ def certificates_under(
     """
     if start_error is not None:
         conditions = conditions._replace(start_s=0.0)
-    return run_searches([scope.search(conditions, void) for scope in scopes(scenario, start_error)])
+    return [scope.certificate_unless(void, conditions) for scope in scopes(scenario, start_error)]

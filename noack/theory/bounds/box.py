@@ -12,7 +12,7 @@ solution holds for all plants of the box, including time-varying ones.
 """
 
 import math
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, NamedTuple
@@ -20,7 +20,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from noack.core.cached_method import cached_method
-from noack.core.linear_systems import Matrix, Vector, matrix_key
+from noack.core.linear_systems import Matrix, Vector
 from noack.theory.bounds.contraction import logarithmic_norm
 from noack.theory.bounds.enclosure import NotDecayingError, Outputs, ResponseBounds, response
 from noack.theory.bounds.gains import Coefficients, Columns, Output, PlantGains
@@ -35,13 +35,6 @@ class BoxGains(PlantGains):
     halfwidth_B: Matrix
 
     is_one_plant: ClassVar = False
-
-    @property
-    def batch_key(self) -> Hashable:
-        """See :attr:`PlantGains.batch_key`: only x(0) may differ."""
-        matrices = self.A, self.B, self.halfwidth_A, self.halfwidth_B
-        key = super().batch_key
-        return None if key is None else (key, *map(matrix_key, matrices))
 
     @cached_property
     def states(self) -> Mapping[str, Coefficients]:

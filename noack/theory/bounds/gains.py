@@ -12,11 +12,11 @@ interest are the weighted norm W, the state itself, E x, and K H x (the error ra
 depend on the models alone; :class:`PlantGains` those of one known plant.
 """
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from functools import cached_property, lru_cache
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +40,6 @@ from noack.theory.bounds.enclosure import (
     constant_kernel,
     factors,
     norm_bounds,
-    ranks,
     response,
     response_until,
 )
@@ -337,38 +336,12 @@ class PlantGains:
     """Whether A and B are the plant's, and not the centre of a box."""
 
     @property
-    def batch_key(self) -> Hashable:
-        """The common properties of plants that allow for computing their gains together.
-
-        None: those of this plant are computed alone.
-        """
-        if self.forcing is not None:
-            return None
-        values = [getattr(self, entry.name) for entry in fields(self)]
-        shapes = [entry.shape for entry in values if isinstance(entry, np.ndarray)]
-        outputs = [(name, matrix_key(C)) for name, C in self.further_outputs.items()]
-        rank = int(ranks(self.error.weight @ self._mismatch))
-        return type(self), id(self.error), self.alpha_per_s, rank, *shapes, *outputs
-
-    @property
     def cache_key(self) -> Hashable:
         """The common properties of equal plants without disturbances."""
-        values = [getattr(self, value.name) for value in fields(self)]
-        return self.batch_key, *(matrix_key(value) for value in values if isinstance(value, np.ndarray))
-
-    @classmethod
-    def together(cls, plants: Sequence[Self]) -> Self:
-        """Return several plants of one :attr:`batch_key` as one object; a single one as it is."""
-        first, *others = plants
-        if not others:
-            return first
-        changed: dict[str, Any] = {}
-        for name in (entry.name for entry in fields(first)):
-            values = [getattr(plant, name) for plant in plants]
-            if isinstance(values[0], np.ndarray):
-                stack = np.array(values)
-                changed[name] = values[0] if (stack == stack[0]).all() else stack
-        return replace(first, **changed)
+        values = [getattr(self, entry.name) for entry in fields(self)]
+        outputs = [(name, matrix_key(C)) for name, C in self.further_outputs.items()]
+        matrices = [matrix_key(value) for value in values if isinstance(value, np.ndarray)]
+        return type(self), id(self.error), self.alpha_per_s, *outputs, *matrices
 
     @cached_property
     def input_matrix(self) -> Matrix:

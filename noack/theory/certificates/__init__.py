@@ -27,11 +27,6 @@ loop"):
 6. ``certified_bounds.py``. The guarantee as bounds over time; and sharper ones from the newest
    event on, at which the sensor knows x (docs/theory.md, "From the newest event").
 
-Certificates of several loops are computed together: a search (``solution.py``, ``Search``) yields
-the inequalities to be solved as a ``Problem``, and ``run_searches`` solves like problems of several
-loops as arrays with a leading axis. One loop is one such search. Its numbers may differ from those
-of the same loop among others in their last bits.
-
 What a certificate assumes: ``conditions.py`` derives h, d, σ and the losses from a scenario, and
 moves a set-point to 0; ``assumptions.py`` lists every assumption of the paper and of the
 certificate, with a verdict. A run that violates a condition voids the claims from that time on.

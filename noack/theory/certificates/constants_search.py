@@ -28,7 +28,7 @@ from noack.theory.bounds.gains import PlantGains, error_gains, first_equal
 from noack.theory.bounds.trigger_bounds import TriggerBounds
 from noack.theory.certificates.assumptions import is_below_decay_rate
 from noack.theory.certificates.persistent_bounds import DisturbedCertificate, PlantAt, choose_rate
-from noack.theory.certificates.solution import Problem, Search, sharpened
+from noack.theory.certificates.solution import Problem, sharpened
 
 _SLOWER = 0.9
 """Rate that is certified if α is too large, as a share of the decay rate of the loop."""
@@ -80,31 +80,31 @@ class ConstantsSearch:
         """Whether nothing persists whose bounds are added to those from the start."""
         return self._resolved.coverage.is_undisturbed and not self._trigger.is_constant
 
-    def phases(self, conditions: NetworkConditions, *, longest: bool) -> Search[list[Phases]]:
-        """Search for the constants that solve the inequalities.
+    def phases(self, conditions: NetworkConditions, *, longest: bool) -> list[Phases]:
+        """Return the constants that solve the inequalities.
 
         ``longest``: search for the tightest bounds and the longest δ; otherwise any suffice.
         """
         try:
             if self.is_simple:
-                return [(yield from self._simple_phases(conditions, longest=longest))]
-            return (yield from self._disturbed_phases(conditions, longest=longest))
+                return [self._simple_phases(conditions, longest=longest)]
+            return self._disturbed_phases(conditions, longest=longest)
         except (OverflowError, np.linalg.LinAlgError):
             raise NoCertificateError(_TOO_LARGE) from None
 
-    def without_decay(self, conditions: NetworkConditions) -> Search[list[Phases]]:
-        """Search for constants of bounds without decay.
+    def without_decay(self, conditions: NetworkConditions) -> list[Phases]:
+        """Return constants of bounds without decay.
 
         Raises:
             NoCertificateError, NotDecayingError: there are none.
         """
         if not self.is_simple:
-            pairs = yield from self._disturbed.constants(conditions, decays=False, longest=False)
+            pairs = self._disturbed.constants(conditions, decays=False, longest=False)
             return [self._checked(Phases(main, persistent=added)) for main, added in pairs]
         trigger = self._trigger
         level = 0.0 if trigger.is_homogeneous else max(trigger.beta, trigger.floor)
         tested, least_level = trigger.conditions_of_tests(conditions), trigger.floor or None
-        constants = yield from self._solve(tested, 0.0, level, least_level, longest=False)
+        constants = self._solve(tested, 0.0, level, least_level, longest=False)
         return [self._checked(Phases(constants))]
 
     def with_plants(self, phases: Phases) -> Sequence[tuple[PlantGains, Constants]]:
@@ -113,21 +113,20 @@ class ConstantsSearch:
             return [(self._plants[phases.main.rate_per_s], phases.main)]
         return self._disturbed.with_plants(phases.main, phases.persistent)
 
-    def _simple_phases(self, conditions: NetworkConditions, *, longest: bool) -> Search[Phases]:
-        """Search for the constants, and those after the threshold has reached its floor, if any."""
+    def _simple_phases(self, conditions: NetworkConditions, *, longest: bool) -> Phases:
+        """Return the constants, and those after the threshold has reached its floor, if any."""
         trigger, floor = self._trigger, None
         conditions = trigger.conditions_of_tests(conditions)
-        main = yield from self._first_phase(conditions, longest=longest)
+        main = self._first_phase(conditions, longest=longest)
         if 0 < trigger.floor < trigger.beta and main.rate_per_s == trigger.alpha_per_s:
             floor = _at_floor(main, trigger.floor / trigger.beta)
         return self._checked(Phases(main, floor))
 
-    def _disturbed_phases(self, conditions: NetworkConditions, *, longest: bool) -> Search[list[Phases]]:
-        """Search for the constants, and those to be added under persistent disturbances."""
+    def _disturbed_phases(self, conditions: NetworkConditions, *, longest: bool) -> list[Phases]:
+        """Return the constants, and those to be added under persistent disturbances."""
         alpha = self._trigger.alpha_per_s
         decays = not self._models_are_constant and is_below_decay_rate(alpha, self._decay_per_s)
-        search = self._disturbed.constants(conditions, decays=decays, longest=longest)
-        pairs = yield from search
+        pairs = self._disturbed.constants(conditions, decays=decays, longest=longest)
         return [self._checked(Phases(main, persistent=added)) for main, added in pairs]
 
     @cached_property
@@ -152,45 +151,45 @@ class ConstantsSearch:
                 raise NoCertificateError(_TOO_LARGE)
         return phases
 
-    def _first_phase(self, conditions: NetworkConditions, *, longest: bool) -> Search[Constants]:
+    def _first_phase(self, conditions: NetworkConditions, *, longest: bool) -> Constants:
         trigger, decay = self._trigger, self._decay_per_s
         beta, alpha, floor = trigger.beta, trigger.alpha_per_s, trigger.floor
         if trigger.is_homogeneous:
             if not longest:
                 with contextlib.suppress(NoCertificateError):
-                    return (yield from self._solve(conditions, 0.0, 0.0, None, longest=False))
-            return (yield from self._fastest(conditions, decay))
+                    return self._solve(conditions, 0.0, 0.0, None, longest=False)
+            return self._fastest(conditions, decay)
         if not self._models_are_constant and is_below_decay_rate(alpha, decay) and floor < beta:
             try:
-                return (yield from self._solve(conditions, alpha, beta, beta, longest=longest))
+                return self._solve(conditions, alpha, beta, beta, longest=longest)
             except NotDecayingError:
                 if floor > 0:
                     raise
-                return (yield from self._slower(conditions, alpha))
+                return self._slower(conditions, alpha)
         # Certify a slower decay or none; the smallest event level is then the floor, if any.
         slower = 0.0 if self._models_are_constant or floor > 0 else max(_SLOWER * decay, 0.0)
         level = max(beta, floor)
-        return (yield from self._solve(conditions, slower, level, floor or None, longest=longest))
+        return self._solve(conditions, slower, level, floor or None, longest=longest)
 
-    def _fastest(self, conditions: NetworkConditions, decay: float) -> Search[Constants]:
-        """Search for bounds for a threshold that is a share of the state, at any rate.
+    def _fastest(self, conditions: NetworkConditions, decay: float) -> Constants:
+        """Return the constants of bounds for a threshold that is a share of the state, at any rate.
 
         Raises:
             NoCertificateError: there are no bounds, not even without decay.
         """
 
-        def at_rate(rate_per_s: float) -> Search[tuple[Constants]]:
-            return ((yield from self._solve(conditions, rate_per_s, 0.0, None)),)
+        def at_rate(rate_per_s: float) -> tuple[Constants]:
+            return (self._solve(conditions, rate_per_s, 0.0, None),)
 
         # Inputs of an earlier run are bounded without a rate.
         if not self._models_are_constant and 0 < decay < math.inf and self._start_error == 0.0:
             with contextlib.suppress(NotDecayingError, NoCertificateError):
-                (constants,) = yield from choose_rate(at_rate, decay, self._loop.x0, self._start)
+                (constants,) = choose_rate(at_rate, decay, self._loop.x0, self._start)
                 return constants
-        return (yield from self._solve(conditions, 0.0, 0.0, None))
+        return self._solve(conditions, 0.0, 0.0, None)
 
-    def _slower(self, conditions: NetworkConditions, alpha_per_s: float) -> Search[Constants]:
-        """Search for bounds that decay more slowly than the threshold, for a box too large for α.
+    def _slower(self, conditions: NetworkConditions, alpha_per_s: float) -> Constants:
+        """Return bounds that decay more slowly than the threshold, for a box too large for α.
 
         Raises:
             NotDecayingError: there are no such bounds.
@@ -198,7 +197,7 @@ class ConstantsSearch:
         for share in _SHARES_OF_ALPHA:
             rate = share * alpha_per_s
             with contextlib.suppress(NotDecayingError):
-                return (yield from self._solve(conditions, rate, self._trigger.beta, None))
+                return self._solve(conditions, rate, self._trigger.beta, None)
         raise NotDecayingError("the uncertainty box is too large for the loop's gains")
 
     def _solve(
@@ -209,7 +208,7 @@ class ConstantsSearch:
         least_level: float | None,
         *,
         longest: bool = True,
-    ) -> Search[Constants]:
+    ) -> Constants:
         if alpha_per_s not in self._plants:
             error = error_gains(self._loop, alpha_per_s)
             plant = self._plant_at(error, self._start, alpha_per_s)
@@ -219,11 +218,7 @@ class ConstantsSearch:
         # Inputs of an earlier run are covered by their norm only.
         earlier = self._start_error
         part = CertificatePart(plant.error, plant, self._trigger.bound(conditions, level, least_level))
-        return (
-            yield from sharpened(
-                Problem((part,), conditions, earlier, structured=earlier == 0.0, longest=longest)
-            )
-        )
+        return sharpened(Problem((part,), conditions, earlier, structured=earlier == 0.0, longest=longest))
 
 
 _BOUNDS = (

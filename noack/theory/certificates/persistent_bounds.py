@@ -31,7 +31,7 @@ from noack.theory.bounds.disturbances import EstimationError, bound_forcing
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, Forcing, PlantGains, error_gains, first_equal
 from noack.theory.bounds.trigger_bounds import TriggerBounds
-from noack.theory.certificates.solution import Problem, Search, sharpened
+from noack.theory.certificates.solution import Problem, sharpened, solve_problem
 
 PlantAt = Callable[[ErrorGains, Matrix, float], PlantGains]
 """Returns the plant's gains from the gains of the models, the start of x, and α."""
@@ -66,8 +66,8 @@ class DisturbedCertificate:
 
     def constants(
         self, conditions: NetworkConditions, *, decays: bool, longest: bool = True
-    ) -> Search[list[AddedConstants]]:
-        """Search for the constants that decay and those to be added; without decay only one.
+    ) -> list[AddedConstants]:
+        """Return the constants that decay and those to be added; without decay only one.
 
         Where there are several such sums, each bounds the run.
 
@@ -87,7 +87,7 @@ class DisturbedCertificate:
         # A part that decays as the threshold does, if there is one.
         if decays and self.resolved.coverage.is_decaying:
             try:
-                parts = yield from solve_two_parts(
+                parts = solve_two_parts(
                     self._decaying,
                     self._persistent,
                     conditions,
@@ -98,7 +98,7 @@ class DisturbedCertificate:
                 return [AddedConstants(*parts)]
             except NotDecayingError:
                 pass
-        pairs = yield from self._without_decay(conditions, decays=decays, longest=longest)
+        pairs = self._without_decay(conditions, decays=decays, longest=longest)
         # With a bound of x the chord of the threshold is shorter, which makes the bounds smaller.
         for _ in range(_CHORD_ROUNDS if longest and self.trigger.has_chord else 0):
             state_bounds = [
@@ -111,13 +111,13 @@ class DisturbedCertificate:
             ]
             shorter_chord = replace(self.trigger, largest=min(state_bounds))
             sharper = replace(self, trigger=shorter_chord)
-            pairs = yield from sharper._without_decay(conditions, decays=decays, longest=longest)
+            pairs = sharper._without_decay(conditions, decays=decays, longest=longest)
         return pairs
 
     def _without_decay(
         self, conditions: NetworkConditions, *, decays: bool, longest: bool
-    ) -> Search[list[AddedConstants]]:
-        """Search for the constants of a threshold that does not decay, or more slowly than the loop.
+    ) -> list[AddedConstants]:
+        """Return the constants of a threshold that does not decay, or more slowly than the loop.
 
         Raises: as :meth:`constants`.
         """
@@ -125,13 +125,13 @@ class DisturbedCertificate:
         bound = self.trigger.bound(conditions, level, floor or None)
         part, structured = self._undivided._replace(bound=bound), self.start_error == 0.0
         problem = Problem((part,), conditions, self.start_error, structured, longest)
-        constants = yield from sharpened(problem)
+        constants = sharpened(problem)
         # The mean of an integral bounds e_s over a time that suits only one of several parts.
         is_divided = not self.trigger.beta and not self.trigger.area and not self.start_error
         divided: list[AddedConstants] = []
         if decays and is_divided and longest:
             inter_event_s = constants.inter_event_s or 0.0
-            divided = yield from self._of_constant_threshold(conditions, inter_event_s)
+            divided = self._of_constant_threshold(conditions, inter_event_s)
         return [*divided, AddedConstants(constants)]
 
     def with_plants(
@@ -146,8 +146,8 @@ class DisturbedCertificate:
 
     def _of_constant_threshold(
         self, conditions: NetworkConditions, inter_event_s: float
-    ) -> Search[list[AddedConstants]]:
-        """Search for the constants of what follows from the start, and of what persists, if any.
+    ) -> list[AddedConstants]:
+        """Return the constants of what follows from the start, and of what persists, if any.
 
         There is one pair for each bound of e_s that suffices, that with the smallest ultimate bound
         first. The threshold has no rate; that of :func:`choose_rate` is taken. ``inter_event_s`` is a
@@ -156,13 +156,13 @@ class DisturbedCertificate:
         pairs: list[AddedConstants] = []
         for start_bound, persistent_bound in self.trigger.divide(conditions, inter_event_s):
             with contextlib.suppress(NoCertificateError, NotDecayingError):
-                pairs.append((yield from self._divided(start_bound, persistent_bound, conditions)))
+                pairs.append(self._divided(start_bound, persistent_bound, conditions))
         return sorted(pairs, key=lambda pair: 0.0 if pair.persistent is None else pair.persistent.state)
 
     def _divided(
         self, start_bound: TriggerBound, persistent_bound: TriggerBound, conditions: NetworkConditions
-    ) -> Search[AddedConstants]:
-        """Search for the constants that one bound of e_s gives, divided into those of both parts.
+    ) -> AddedConstants:
+        """Return the constants that one bound of e_s gives, divided into those of both parts.
 
         Raises: as :func:`choose_rate`.
         """
@@ -172,11 +172,13 @@ class DisturbedCertificate:
         )
         persistent_parts = [persistent] if persists else []
 
-        def solve_at(rate_per_s: float) -> Search[list[Constants]]:
-            return (yield Problem((self._at_rate(rate_per_s, start_bound), *persistent_parts), conditions))
+        def solve_at(rate_per_s: float) -> list[Constants]:
+            return solve_problem(
+                Problem((self._at_rate(rate_per_s, start_bound), *persistent_parts), conditions)
+            )
 
         x0 = loop_of(self.resolved).x0
-        decaying, *added = yield from choose_rate(solve_at, self.slowest_per_s, x0, x0)
+        decaying, *added = choose_rate(solve_at, self.slowest_per_s, x0, x0)
         return AddedConstants(decaying, *added)
 
     @cached_property
@@ -242,8 +244,8 @@ def solve_two_parts(
     *,
     structured: bool = True,
     shares: Sequence[float] = SHARES,
-) -> Search[tuple[Constants, Constants]]:
-    """Search for the constants of both parts, with the λ of ``shares`` for which δ is longest.
+) -> tuple[Constants, Constants]:
+    """Return the constants of both parts, with the λ of ``shares`` for which δ is longest.
 
     Without ``shares`` δ is searched for only if there is no certificate otherwise.
 
@@ -253,23 +255,25 @@ def solve_two_parts(
     """
     beta, floor = decaying.bound.beta, persistent.bound.beta
 
-    def solve_with(share: float | None) -> Search[tuple[Constants, Constants]]:
+    def solve_with(share: float | None) -> tuple[Constants, Constants]:
         levels = (None, None) if share is None else (share * beta, (1 - share) * floor)
         parts = [
             part._replace(bound=part.bound._replace(least_event_error=level))
             for part, level in zip((decaying, persistent), levels, strict=True)
         ]
-        first_constants, second_constants = yield Problem(tuple(parts), conditions, earlier_error, structured)
+        first_constants, second_constants = solve_problem(
+            Problem(tuple(parts), conditions, earlier_error, structured)
+        )
         return first_constants, second_constants
 
     if floor == 0:
-        return (yield from solve_with(None))
+        return solve_with(None)
     if not shares:
         with contextlib.suppress(NoCertificateError):
-            return (yield from solve_with(None))
+            return solve_with(None)
     best: tuple[Constants, Constants] | None = None
     for share in shares or SHARES[:1]:
-        pair = yield from solve_with(share)
+        pair = solve_with(share)
         if best is None or (pair[0].inter_event_s or 0.0) > (best[0].inter_event_s or 0.0):
             best = pair
     assert best is not None
@@ -277,12 +281,12 @@ def solve_two_parts(
 
 
 def choose_rate(
-    solve_at: Callable[[float], Search[ConstantsOfParts]],
+    solve_at: Callable[[float], ConstantsOfParts],
     decay_per_s: float,
     start: Vector,
     start_set: Matrix,
-) -> Search[ConstantsOfParts]:
-    """Search for the constants for a rate, where none is given.
+) -> ConstantsOfParts:
+    """Return the constants for a rate, where none is given.
 
     It is the rate at which the first constants' bound of ‖x‖ falls to ‖x(0)‖/10 first.
 
@@ -302,7 +306,7 @@ def choose_rate(
         if best is not None and time_to_tenth_s(start_set_norm, rate_per_s, start) > best_s:
             break
         try:
-            constants = yield from solve_at(rate_per_s)
+            constants = solve_at(rate_per_s)
         except (NotDecayingError, NoCertificateError):
             if best is None and share == _RATE_SHARES[-1]:
                 raise

@@ -45,7 +45,6 @@ from noack.theory.certificates.certified_bounds import Region, ScenarioCertifica
 from noack.theory.certificates.conditions import REGION, void_by_safe_input
 from noack.theory.certificates.constants_search import Phases
 from noack.theory.certificates.scenario_certificates import CertificateScope, box_scope, own_plant_scope
-from noack.theory.certificates.solution import Search, run_search
 
 _WIDER = 1.02
 """The next region is larger than the bounds by this factor."""
@@ -82,8 +81,8 @@ class _Box(CertificateScope):
         closed_loop = A + B @ loop_of(resolved).K
         super().__init__(REGION, resolved, closed_loop, plant_at, start=start)
 
-    def bounded(self, conditions: NetworkConditions) -> Search[tuple[list[Phases], Vector]]:
-        """Search for constants, and for bounds of |x_j| and |u_i| at all times, (n + m,).
+    def bounded(self, conditions: NetworkConditions) -> tuple[list[Phases], Vector]:
+        """Return constants, and for bounds of |x_j| and |u_i| at all times, (n + m,).
 
         Without decay the bounds at all times are often smaller, and exist for larger boxes.
 
@@ -91,9 +90,9 @@ class _Box(CertificateScope):
             NoCertificateError, NotDecayingError: there are none.
         """
         try:
-            phases = yield from self._constants.without_decay(conditions)
+            phases = self._constants.without_decay(conditions)
         except (NoCertificateError, NotDecayingError, OverflowError, np.linalg.LinAlgError):
-            phases = yield from self.all_phases(conditions)
+            phases = self.all_phases(conditions)
         return phases, self._coordinate_bounds(phases, conditions)
 
     def _coordinate_bounds(self, phases: list[Phases], conditions: NetworkConditions) -> Vector:
@@ -124,9 +123,10 @@ class RegionScope(_Box):
         model = Inclusion(loop.A_model, loop.B_model, 0 * loop.A_model, 0 * loop.B_model)
         super().__init__(resolved, model, start)
 
-    def search(self, conditions: NetworkConditions, why: str | None = None) -> Search[ScenarioCertificate]:
-        """Search for the certificate under some conditions, and its region."""
-        certificate = yield from super().search(conditions, why)
+    @np.errstate(all="ignore")
+    def certificate_unless(self, why: str | None, conditions: NetworkConditions) -> ScenarioCertificate:
+        """Return the certificate under some conditions, and its region."""
+        certificate = super().certificate_unless(why, conditions)
         if certificate.constants is None:
             return certificate
         region = self._proven[conditions].region
@@ -148,12 +148,13 @@ class RegionScope(_Box):
         why = f"an entry of ẋ is at most {left:.2g} there; the bounds leave it out"
         return Assumption(assumed, "certificate", AssumptionStatus.ASSUMED, why)
 
+    @np.errstate(all="ignore")
     def loop_gain(self, conditions: NetworkConditions) -> float:
         """Return the loop gain on the region; at least 1, perhaps infinite, if there is none."""
         if void_by_safe_input(self._resolved, conditions) is not None:
             return math.inf
         try:
-            phases = run_search(self.all_phases(conditions, longest=False, near=True))
+            phases = self.all_phases(conditions, longest=False, near=True)
         except NoCertificateError as error:
             return max(error.loop_gain, 1.0)
         except NotDecayingError:
@@ -162,8 +163,8 @@ class RegionScope(_Box):
 
     def all_phases(
         self, conditions: NetworkConditions, *, longest: bool = True, near: bool = False
-    ) -> Search[list[Phases]]:
-        """Search for the constants on a region that x and u do not leave.
+    ) -> list[Phases]:
+        """Return the constants on a region that x and u do not leave.
 
         ``longest``: search for the tightest bounds on this region; otherwise any suffice. ``near``:
         begin with the region of shorter times; the search may end before it has found a region.
@@ -176,7 +177,7 @@ class RegionScope(_Box):
             try:
                 inclusion = self._motion.over(widths)
                 plants = _Box(self._resolved, inclusion, self._other_start)
-                phases, reached = yield from plants.bounded(conditions)
+                phases, reached = plants.bounded(conditions)
             except (NotEnclosedError, SystemFailedError) as error:  # also from a user's class
                 if isinstance(error, NotInstalledError):
                     raise CertificateNotCheckedError(str(error)) from None
@@ -191,7 +192,7 @@ class RegionScope(_Box):
                 self._proven[conditions] = _ProvenRegion(region, plants.decay_per_s)
                 if longest:
                     with contextlib.suppress(NoCertificateError, NotDecayingError):
-                        return (yield from plants.all_phases(conditions))
+                        return plants.all_phases(conditions)
                 return phases
             wider = np.maximum(widths, _WIDER * reached + _LEAST * reached.max())
             # The bounds grow faster than the region: towards a region that holds them, steps shrink.

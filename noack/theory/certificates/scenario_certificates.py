@@ -32,7 +32,6 @@ from noack.theory.certificates.conditions import (
 from noack.theory.certificates.constants_search import ConstantsSearch, Phases, is_within
 from noack.theory.certificates.deliveries.due_deliveries import Deliveries
 from noack.theory.certificates.persistent_bounds import PlantAt
-from noack.theory.certificates.solution import Search, run_search
 
 _TIMED_RATES = (0.7, 0.4, 0.1)
 """Rates that are tried where events are due, as shares of the decay rate of A + BK: the first that
@@ -165,13 +164,11 @@ class CertificateScope:
 
     def certificate(self, conditions: NetworkConditions) -> ScenarioCertificate:
         """Return the certificate under some conditions; a void certificate has the reason."""
-        return run_search(self.search(conditions, void_beforehand(self._resolved, conditions)))
+        return self.certificate_unless(void_beforehand(self._resolved, conditions), conditions)
 
-    def search(self, conditions: NetworkConditions, why: str | None = None) -> Search[ScenarioCertificate]:
-        """Search for the certificate under some conditions, perhaps together with others.
-
-        ``why``: why there is none, if that is known.
-        """
+    @np.errstate(all="ignore")
+    def certificate_unless(self, why: str | None, conditions: NetworkConditions) -> ScenarioCertificate:
+        """Return the certificate under some conditions; ``why`` there is none, if that is known."""
         # The constants, or the reason for having none.
         void: NotDecayingError | NoCertificateError | None = None
         phases: Sequence[tuple[Constants | None, ...]] = [(None, None, None)]
@@ -180,7 +177,7 @@ class CertificateScope:
                 raise NoCertificateError(why)
             if math.isinf(self._start_error):
                 raise NoCertificateError(_OUTSIDE_RANGE)
-            phases = yield from self.all_phases(conditions)
+            phases = self.all_phases(conditions)
         except (NotDecayingError, NoCertificateError) as error:
             void = self._overflow() or error
         unchecked = self._with_constants(phases, conditions, None if void is None else str(void))
@@ -235,14 +232,14 @@ class CertificateScope:
             f"bounds are computed up to {_LARGEST_START:g}"
         )
 
+    @np.errstate(all="ignore")
     def loop_gain(self, conditions: NetworkConditions) -> float:
         """Return the loop gain of a certificate; at least 1, perhaps infinite, if there is none."""
         if void_by_safe_input(self._resolved, conditions) is not None:
             return math.inf
         # Whether the first inputs at a set-point are covered depends on the constants.
         try:
-            search = self._constants.phases(conditions, longest=self._start_error > 0)
-            constants = run_search(search)
+            constants = self._constants.phases(conditions, longest=self._start_error > 0)
         except NoCertificateError as error:
             gain = max(error.loop_gain, 1.0)
         except NotDecayingError:
@@ -256,15 +253,15 @@ class CertificateScope:
         """Return the decay rates of the certificate under some conditions."""
         return self.decay_per_s
 
-    def all_phases(self, conditions: NetworkConditions) -> Search[list[Phases]]:
-        """Search for the constants of each bound of the run; all of them hold.
+    def all_phases(self, conditions: NetworkConditions) -> list[Phases]:
+        """Return the constants of each bound of the run; all of them hold.
 
         Raises:
             NoCertificateError: there is no certificate.
             NotDecayingError: a mode of the loop decays too slowly.
         """
         try:
-            solved = yield from self._constants.phases(conditions, longest=True)
+            solved = self._constants.phases(conditions, longest=True)
         except (NoCertificateError, NotDecayingError) as error:
             solved, void = [], error
         inter_event_s = max((main.inter_event_s or 0.0 for main, *_ in solved), default=0.0)

@@ -9,9 +9,8 @@ used. The constants are sharpened by the flow between two updates
 
 import contextlib
 import math
-from collections import defaultdict
-from collections.abc import Generator, Hashable, Sequence
-from typing import NamedTuple, TypeVar, cast
+from collections.abc import Hashable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,80 +57,6 @@ class Problem(NamedTuple):
     longest: bool = True
     """Whether the longest δ is sought; otherwise only if there is no certificate without it."""
 
-    @property
-    def batch_key(self) -> Hashable:
-        """The common properties of problems that are solved together; None if this one is alone."""
-        plants = [part.plant.batch_key for part in self.parts]
-        if None in plants:
-            return None
-        terms = [(part.bound, part.estimation) for part in self.parts]
-        return repr((*self[1:], *terms)), *plants
-
-
-Result = TypeVar("Result")
-Search = Generator[Problem, list[Constants], Result]
-"""A search for a certificate: it yields problems, and receives the constants of their parts.
-
-An error of a problem is raised where it was yielded.
-"""
-_MOST_TOGETHER = 256
-"""Number of one-state problems that are solved together: the memory grows with the squared states."""
-_UNSOLVED_ERRORS = (NotDecayingError, np.linalg.LinAlgError, OverflowError)
-
-
-def run_searches(searches: Sequence[Search[Result]]) -> list[Result]:
-    """Return the results of searches; their like problems are solved together.
-
-    Raises:
-        NoCertificateError, NotDecayingError: a search does not handle this error of its problem.
-    """
-    results: dict[int, Result] = {}
-    answers: dict[int, list[Constants] | Exception | None] = dict.fromkeys(range(len(searches)))
-    with np.errstate(all="ignore"):
-        while answers:
-            open_problems: dict[int, Problem] = {}
-            for number, answer in answers.items():
-                search = searches[number]
-                try:
-                    if isinstance(answer, Exception):
-                        open_problems[number] = search.throw(answer)
-                    else:  # the first value is None
-                        open_problems[number] = search.send(cast("list[Constants]", answer))
-                except StopIteration as end:
-                    results[number] = end.value
-            answers = dict(zip(open_problems, _answers([*open_problems.values()]), strict=True))
-    return [results[number] for number in range(len(searches))]
-
-
-def run_search(search: Search[Result]) -> Result:
-    """Return the result of one search; see :func:`run_searches`."""
-    (answer,) = run_searches([search])
-    return answer
-
-
-def _answers(problems: Sequence[Problem]) -> list[list[Constants] | Exception]:
-    """Return the constants of each problem, or its error."""
-    alike = defaultdict[Hashable, list[int]](list)
-    for index, problem in enumerate(problems):
-        key = problem.batch_key if len(problems) > 1 else None
-        alike[("alone", index) if key is None else key].append(index)
-    groups: list[list[int]] = []
-    for indices in alike.values():
-        states = len(problems[indices[0]].parts[0].error.H)
-        width = max(_MOST_TOGETHER // states**2, 1)
-        groups += (indices[begin : begin + width] for begin in range(0, len(indices), width))
-    answers: dict[int, list[Constants] | Exception] = {}
-    for indices in groups:
-        try:
-            solved = _solve_together([problems[index] for index in indices])
-            answers.update(zip(indices, solved, strict=True))
-        except _UNSOLVED_ERRORS as error:
-            if len(indices) == 1:
-                answers[indices[0]] = error
-            else:  # of one of them
-                answers.update((index, _answers([problems[index]])[0]) for index in indices)
-    return [answers[index] for index in range(len(problems))]
-
 
 def solve(
     error: ErrorGains,
@@ -147,16 +72,16 @@ def solve(
         NoCertificateError: the loop gain is not below 1.
         NotDecayingError: a mode of the loop decays more slowly than the threshold.
     """
-    problem = Problem((CertificatePart(error, plant, bound),), conditions, structured=structured)
-    return run_search(sharpened(problem))
+    return sharpened(Problem((CertificatePart(error, plant, bound),), conditions, structured=structured))
 
 
-def sharpened(problem: Problem) -> Search[Constants]:
-    """Search for the constants of a problem of one part, sharpened where that is possible.
+@np.errstate(all="ignore")
+def sharpened(problem: Problem) -> Constants:
+    """Return the constants of a problem of one part, sharpened where that is possible.
 
     Raises: as :func:`solve`.
     """
-    (constants,) = yield problem
+    (constants,) = solve_problem(problem)
     (part,), conditions, *_ = problem
     is_plain = problem.structured and problem.earlier_error == 0.0
     if problem.longest and is_plain and can_be_sharpened(part):
@@ -174,34 +99,32 @@ sharpened_once = cached_function(32, _sharpening_key)(sharpened_constants)
 """Sharpen constants; runs, their claims and reports need those of the same scenario repeatedly."""
 
 
-def _solve_together(problems: Sequence[Problem]) -> list[list[Constants] | Exception]:
-    """Return the constants of like problems, or the reason why there is no certificate.
+@np.errstate(all="ignore")
+def solve_problem(problem: Problem) -> list[Constants]:
+    """Return the constants of the parts of a problem.
 
     Raises:
+        NoCertificateError: there is no certificate.
         NotDecayingError: a mode of a loop decays more slowly than the threshold.
     """
-    example = problems[0]
-    conditions, count = example.conditions, len(problems)
-    inequalities = []
-    for index, part in enumerate(example.parts):
-        plants = [problem.parts[index].plant for problem in problems]
-        together = part._replace(plant=part.plant.together(plants))
-        earlier = example.earlier_error if index == 0 else 0.0
-        inequalities.append(ErrorInequalities(together, conditions, earlier))
-    guaranteed_s = max(part.bound.times.shortest_s for part in example.parts)
+    conditions, inequalities = problem.conditions, []
+    for index, part in enumerate(problem.parts):
+        earlier = problem.earlier_error if index == 0 else 0.0
+        inequalities.append(ErrorInequalities(part, conditions, earlier))
+    guaranteed_s = max(part.bound.times.shortest_s for part in problem.parts)
     least_s = max(conditions.spacing_s, guaranteed_s)
     is_separated = all(
-        any(bound.least_event_error is not None for bound in part.bound.all_bounds) for part in example.parts
+        any(bound.least_event_error is not None for bound in part.bound.all_bounds) for part in problem.parts
     )
-    searched = np.full(count, is_separated)
-    if is_separated and not example.longest:
-        searched = ~_smallest_constants(inequalities, np.full(count, least_s)).exists
+    searched = np.full(1, is_separated)
+    if is_separated and not problem.longest:
+        searched = ~_smallest_constants(inequalities, np.full(1, least_s)).exists
     inter_event_s = _longest_inter_event_s(inequalities, searched, least_s)
     smallest = _smallest_constants(inequalities, inter_event_s)
-    rates = [part.error.alpha_per_s for part in example.parts]
+    rates = [part.error.alpha_per_s for part in problem.parts]
     shortest_s = least_s if is_separated else guaranteed_s
-    between_s = np.where(inter_event_s > least_s, inter_event_s, shortest_s).tolist()
-    return [smallest.of_loop(loop, rates, between_s[loop] or None) for loop in range(count)]
+    between_s = float(inter_event_s[0]) if inter_event_s[0] > least_s else shortest_s
+    return smallest.of_loop(0, rates, between_s or None)
 
 
 def _longest_inter_event_s(
@@ -253,8 +176,8 @@ class _SmallestConstants(NamedTuple):
 
     def of_loop(
         self, loop: int, rates_per_s: Sequence[float], inter_event_s: float | None
-    ) -> list[Constants] | Exception:
-        """Return the constants of the parts of a loop, or the reason for having none."""
+    ) -> list[Constants]:
+        """Return the constants of the parts of a loop; raise NoCertificateError if there are none."""
         if self.exists[loop]:
             return [
                 part.of_loop(loop, rate, inter_event_s)
@@ -262,10 +185,10 @@ class _SmallestConstants(NamedTuple):
             ]
         gain = float(self.loop_gain[loop])
         if math.isinf(gain) and not self.is_spaced[loop]:
-            return NoCertificateError("events may be arbitrarily close, so that any number may be in flight")
+            raise NoCertificateError("events may be arbitrarily close, so that any number may be in flight")
         if gain < 1:
-            return NoCertificateError("its bounds are too large for floating point")
-        return NoCertificateError(f"the loop gain of the errors is {apart_from(1, gain)}, not below 1", gain)
+            raise NoCertificateError("its bounds are too large for floating point")
+        raise NoCertificateError(f"the loop gain of the errors is {apart_from(1, gain)}, not below 1", gain)
 
 
 def _smallest_constants(

@@ -18,7 +18,6 @@ from noack.theory.bounds.gains import ErrorGains, Forcing, PlantGains
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.persistent_bounds import solve_two_parts
 from noack.theory.certificates.scenario_certificates import own_plant_scope
-from noack.theory.certificates.solution import run_search
 from tests.noack.theory.certificates.certified_loops import conditions_of, gains_of
 from tests.oracles.lossy_loops import (
     DRIFTING,
@@ -67,11 +66,11 @@ class DisturbedLoop:
         decaying, pushed = gains_of(system), self.pushed()
         models = pushed.error
         estimation = EstimationBound(float(np.linalg.norm(np.abs(system.weight) @ self.noise)))
-        first, rest = run_search(solve_two_parts(
+        first, rest = solve_two_parts(
             CertificatePart(decaying.error, decaying, TriggerBound(system.beta, None)),
             CertificatePart(models, pushed, TriggerBound(floor, None, unit=1.0), estimation),
             conditions_of(system),
-        ))  # fmt: skip
+        )  # fmt: skip
         return Sum(self.system, first, rest)
 
 

@@ -16,7 +16,6 @@ from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import allowed_conditions
 from noack.theory.certificates.persistent_bounds import solve_two_parts
 from noack.theory.certificates.scenario_certificates import certify
-from noack.theory.certificates.solution import run_search
 from tests.noack.theory.certificates.certified_loops import conditions_of
 from tests.noack.theory.certificates.disturbed_loops import Sum, random_disturbed_loop, signals
 from tests.oracles.lossy_loops import RUNS, STEPS, Plants, System, networks, simulate
@@ -34,11 +33,11 @@ def box_certificate(system: System, columns: np.ndarray, half: float, floor: flo
     forcing = Forcing(columns, np.full(k, np.inf), np.zeros(m))
     first = plant(system.alpha, system.x0[:, None], None)
     rest = plant(0.0, np.zeros((len(system.A), 1)), forcing)
-    return Sum(system, *run_search(solve_two_parts(
+    return Sum(system, *solve_two_parts(
         CertificatePart(first.error, first, TriggerBound(system.beta, None)),
         CertificatePart(rest.error, rest, TriggerBound(floor, None, unit=1.0)),
         conditions_of(system),
-    )))  # fmt: skip
+    ))  # fmt: skip
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -15,14 +15,13 @@ from hypothesis import strategies as st
 
 from noack.core.linear_systems import spectral_abscissa
 from noack.scenario.resolution import resolve
-from noack.scenario.scenario import Scenario, loops_of
+from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load, validate
 from noack.theory.bounds.certificate_terms import Constants, NetworkConditions
 from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import allowed_conditions, ideal_conditions, nominal_conditions
 from noack.theory.certificates.scenario_certificates import box_scope, certify, certify_box, own_plant_scope
-from noack.theory.certificates.solution import run_searches
 from tests.noack.theory.certificates.certificate_kinds.policies import exceeded_by, scenario_with
 from tests.noack.theory.certificates.certified_loops import conditions_of
 from tests.oracles.lossy_loops import SEARCH, STEPS, System, Trace, networks, seeds, simulate, systems
@@ -115,46 +114,6 @@ def test_a_void_certificate_gives_the_reason_and_no_bounds() -> None:
     assert "not below 1" in str(certify(shipped(), NetworkConditions(4, 0.5, 0.5)).void)
     enormous = shipped("lane_following", "trigger.beta=1e308")
     assert "too large for floating point" in str(certify(enormous, ideal_conditions(enormous)).void)
-
-
-LOOPS = 'loops=[{name="loop", count=2}]'
-
-
-FILES = {
-    "lane_following": ["trigger.floor=0.001", LOOPS],
-    "tabuada_dynamic": ["plant.initial_state_halfwidth=[0.2, 0.1]", LOOPS],
-    "lane_crosswind": ["horizon_s=10"],
-    "different_loops": [],
-}
-
-
-def test_certificates_that_are_computed_together_are_those_of_each_loop() -> None:
-    loops = [
-        resolve(loop)
-        for name, overrides in FILES.items()
-        for loop in loops_of(load(ROOT / f"scenarios/{name}.toml", overrides))
-    ]
-    scopes = [
-        (scope, allowed_conditions(loop))
-        for loop in loops
-        for scope in (own_plant_scope(loop), box_scope(loop))
-        if scope is not None
-    ]
-    certificates = run_searches([scope.search(conditions) for scope, conditions in scopes])
-    assert any(certificate.constants is not None for certificate in certificates)
-    for together, (scope, conditions) in zip(certificates, scopes, strict=True):
-        # Sums over grids that end at different times are rounded differently.
-        alone = leaves(scope.certificate(conditions).to_json())
-        for entry, entry_alone in zip(leaves(together.to_json()), alone, strict=True):
-            is_real = isinstance(entry_alone, float)
-            assert entry == (pytest.approx(entry_alone, rel=1e-12, abs=0.0) if is_real else entry_alone)
-
-
-def leaves(value: Any) -> list[Any]:
-    """The entries of tables and lists within each other, in one list."""
-    if isinstance(value, dict):
-        value = [*value, *value.values()]
-    return [leaf for entry in value for leaf in leaves(entry)] if isinstance(value, list | tuple) else [value]
 
 
 @pytest.mark.parametrize("late_periods", [0, 2])

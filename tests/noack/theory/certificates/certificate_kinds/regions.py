@@ -18,7 +18,6 @@ from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.region import _Box
-from noack.theory.certificates.solution import Search
 from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificates.certificate_kinds.policies import scenario_of
 from tests.noack.theory.certificates.certificate_kinds.shares import Case, drawn, shares_of
@@ -148,8 +147,8 @@ def _no_remainder(motion: EnclosedMotion, widths: Vector) -> Inclusion:
 
 
 def _reaching(change: Callable[[_Box, Vector], Vector]) -> Callable[..., Any]:
-    def bounded(box: _Box, conditions: NetworkConditions) -> Search[Any]:
-        phases, reached = yield from _bounded(box, conditions)
+    def bounded(box: _Box, conditions: NetworkConditions) -> Any:
+        phases, reached = _bounded(box, conditions)
         return phases, change(box, reached)
 
     return bounded
