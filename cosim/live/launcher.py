@@ -266,7 +266,7 @@ class _Run:
         return started and self._coordinator.now_ns() < self._scenario.timing.horizon_ns
 
     def _write_processes(self) -> None:
-        """Write which processes joined, for `noack collect`; without that the run goes on."""
+        """Write which processes joined, for `noack summary --add`; without that the run goes on."""
         text = json.dumps(self._coordinator.joined, indent=2)
         with contextlib.suppress(MachineError):
             write_whole(self._run_dir / PROCESSES_FILE, text, make_folder=False)

@@ -372,6 +372,6 @@ def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
         )
     if _has_clocks(loop) and loop.replay is not None and not loop.replay.complete:
         yield (
-            "the record is incomplete. A process that could not reach the recorder prints the "
-            "folder of the rest; add it: noack collect RUN_DIRECTORY HOST:FOLDER"
+            "the record is incomplete. A process that could not reach the recorder names the file "
+            "with its rows; copy it, and add it: noack summary RUN --add FILE"
         )

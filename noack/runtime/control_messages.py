@@ -178,7 +178,8 @@ class RunProgress(ControlMessage):
     late_us: FiniteFloat = 0.0
     """The largest lateness of a step of the plant or the controller, in microseconds of wall time."""
     live: str | None
-    warnings: list[str] = Field([])  # what cannot be shown during the run
+    warnings: list[str] = Field([])
+    """What cannot be shown during the run; messages that arrived before they were sent."""
     changes: list[str] = Field([])  # changes of runtime parameters during the run
 
 

@@ -24,6 +24,8 @@ from noack.protocol.record_tables import CONTROLLER_DELIVERY, PLANT_ACTUATION, S
 from noack.protocol.roles import Notice
 from noack.runtime.control_messages import ClockError
 
+CLOCK_NOTICE = "clock"
+"""Level of the notice about a message that was not sent yet."""
 CHRONY, STATED = "chronyc tracking", "clocks.largest_error_us"
 """Where a bound is from."""
 RECEIVED: Mapping[str, tuple[str, str]] = {
@@ -120,7 +122,7 @@ class CausalityCheck:
         self._reported = True
         first = early[0]
         text = causality_text(self._role).format(lead_ns[first] / NS_PER_S, self._allowed_ns / NS_PER_S)
-        return Notice(max(int(rows["now_ns"][first]), 0), "violation", text)
+        return Notice(max(int(rows["now_ns"][first]), 0), CLOCK_NOTICE, text)
 
 
 def causality_text(role: str) -> str:

@@ -40,6 +40,7 @@ from noack.runtime.control_plane import ControlPlane, ParameterUpdates
 from noack.runtime.drivers.real_time_loop import Driver, ProcessSockets, run_loop
 from noack.runtime.drivers.realtime_settings import realtime
 from noack.runtime.host_clocks import RECEIVED, CausalityCheck, clock_error, realtime_offset_ns
+from noack.runtime.kept_rows import KeptFile, KeptHead
 from noack.runtime.life_cycle import HORIZON, LAUNCHER_GONE, LOST_AFTER_S, Event, LifeCycle, Side, State
 from noack.runtime.run_descriptor import RunDescriptor
 from noack.runtime.telemetry import OwnSpool, TelemetryBuffer, deliver_report, persisted_rows
@@ -219,11 +220,13 @@ class RunProcess:
             self._hand_over(telemetry)
 
     @cached_property
-    def _spool(self) -> OwnSpool:
-        """The recorder reads it, or `noack collect` on another host."""
-        descriptor = self.descriptor
-        remote_run_name = None if descriptor.remote is None else run_name(descriptor.run_id)
-        return OwnSpool(Path(descriptor.run_dir), self.role, self.plane.secret, remote_run_name)
+    def _spool(self) -> OwnSpool | KeptFile:
+        """The recorder reads it, or `noack summary RUN --add` on another host."""
+        descriptor, folder = self.descriptor, Path(self.descriptor.run_dir)
+        if descriptor.remote is None:
+            return OwnSpool(folder, self.role, self.plane.secret)
+        name = run_name(descriptor.run_id)
+        return KeptFile(folder, KeptHead(run=name, process=self.role, secret=self.plane.secret))
 
     def _telemetry(self) -> TelemetryBuffer:
         tables = run_tables(self.scenario)
@@ -326,11 +329,11 @@ class RunProcess:
         if not delivered:
             telemetry.store_all()
             self._spool.keep_report(self.report)
-        if self.descriptor.remote is not None and (not delivered or any(telemetry.stored().values())):
+        if isinstance(self._spool, KeptFile) and (not delivered or any(telemetry.stored().values())):
             reason = "the recorder was too slow" if delivered else "cannot reach the recorder"
             print_to_stderr(
-                f"noack {self.role}: {reason}; rows are kept in {self._spool.folder} until "
-                "`noack collect` on the recorder's host"
+                f"noack {self.role}: {reason}; rows are kept in {self._spool.path}; copy it to the "
+                f"recorder's host, and there: noack summary RUN --add {self._spool.path.name}"
             )
 
 

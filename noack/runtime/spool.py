@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import IO, BinaryIO, NamedTuple
 
 from noack.core.errors import MachineError, why
-from noack.core.file_access import open_append, read_regular
+from noack.core.file_access import open_append
 
 SPOOL = "spool"  # the spool's folder in the run directory
 EARLY = "early"
@@ -24,15 +24,9 @@ EARLY_ENDED = "ended"
 """File there: the run has ended; it vanishes when its writer writes the rest."""
 KEPT_REPORT = "report"
 """Name of a process's final report in the spool, in place of a table's."""
-KEPT_KEY = "key"
-"""Name of a process's secret in the spool that it keeps on another host; see `writer_of`."""
-RUN_NAME_FILE = "run_name.txt"
-"""In the folder of what a process on another host keeps: of which run it is."""
 _BATCH_HEAD = struct.Struct("<QQ")
 """Number of a batch's first row, and bytes of its rows."""
 _READ_BYTES = 256 * 1024
-_MOST_NAME_BYTES = 1024
-"""Longest name of a run's directory in its file."""
 NOTICES = "notices"
 _NEWLINE = b"\n"
 
@@ -121,13 +115,6 @@ class SpoolBatch(NamedTuple):
     rows: bytes
 
 
-def kept_run_name(folder: Path) -> str:
-    """Return of which run a folder on another host has rows; empty if none says so."""
-    with contextlib.suppress(OSError, ValueError):
-        return read_regular(folder / RUN_NAME_FILE, _MOST_NAME_BYTES).decode("ascii")
-    return ""
-
-
 def spool_files(folder: Path, table: str) -> list[Path]:
     """Return the files of a table, one per writer."""
     return sorted(folder.glob(f"{table}.*"))
@@ -153,11 +140,8 @@ def batch_bytes(data: memoryview) -> int | None:
     return None if len(data) < _BATCH_HEAD.size else _BATCH_HEAD.size + int(_BATCH_HEAD.unpack_from(data)[1])
 
 
-def batches_of_file(file: IO[bytes], most_bytes: int | None = None) -> Iterator[SpoolBatch]:
-    """Yield the complete batches of an open file, from its beginning.
-
-    Raise ValueError for a batch of more than ``most_bytes``.
-    """
+def batches_of_file(file: IO[bytes]) -> Iterator[SpoolBatch]:
+    """Yield the complete batches of an open file, from its beginning."""
     size, end = os.fstat(file.fileno()).st_size, 0
     file.seek(0)
     while len(head := file.read(_BATCH_HEAD.size)) == _BATCH_HEAD.size:
@@ -165,8 +149,6 @@ def batches_of_file(file: IO[bytes], most_bytes: int | None = None) -> Iterator[
         end += _BATCH_HEAD.size + length
         if end > size:  # incomplete, or damaged: a read could be endless
             break
-        if most_bytes is not None and length > most_bytes:
-            raise ValueError(f"a batch of {length} bytes")
         yield SpoolBatch(first, file.read(length))
 
 

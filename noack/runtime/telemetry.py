@@ -19,24 +19,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.errors import MachineError, PeerError
-from noack.core.file_access import write_whole
+from noack.core.errors import PeerError
 from noack.protocol.record_tables import LOOP
 from noack.protocol.roles import Notice, Record
 from noack.runtime.control_messages import BatchHeader, MissingRows, PersistedAck, parse_message
 from noack.runtime.control_plane import ControlPlane
-from noack.runtime.spool import (
-    KEPT_KEY,
-    KEPT_REPORT,
-    NOTICES,
-    RUN_NAME_FILE,
-    SPOOL,
-    SpoolWriter,
-    batch_of,
-    kept_run_name,
-    notices_of,
-    writer_of,
-)
+from noack.runtime.spool import KEPT_REPORT, NOTICES, SPOOL, SpoolWriter, batch_of, notices_of, writer_of
 
 _BATCH_ROWS = 256
 """Rows of a table that are sent together."""
@@ -284,28 +272,15 @@ class OwnSpool:
         run_dir: the run's directory.
         role: the process.
         secret: the process's; its files are named after it by `writer_of`.
-        remote_run_name: on another host than the recorder's, the name of the run. The secret is
-            kept there, too: it shows that the rows are those of this process.
     """
 
-    def __init__(self, run_dir: Path, role: str, secret: str, remote_run_name: str | None = None) -> None:
+    def __init__(self, run_dir: Path, role: str, secret: str) -> None:
         self._run_dir, self._role, self._secret = run_dir, role, secret
-        self._remote_run_name = remote_run_name
-
-    @cached_property
-    def folder(self) -> Path:
-        """The folder with the spool."""
-        if self._remote_run_name is None:
-            return self._run_dir
-        return _kept_folder(self._run_dir, self._remote_run_name)
 
     @cached_property
     def files(self) -> SpoolWriter:
         """The files of the spool."""
-        files = SpoolWriter(self.folder / SPOOL, writer_of(self._secret))
-        if self._remote_run_name is not None:
-            files.append(KEPT_KEY, 0, self._secret.encode())
-        return files
+        return SpoolWriter(self._run_dir / SPOOL, writer_of(self._secret))
 
     def append(self, table: str, header: bytes, payload: bytes) -> None:
         """Write a batch; raise MachineError if it cannot be written."""
@@ -315,15 +290,3 @@ class OwnSpool:
     def keep_report(self, report: Mapping[str, object]) -> None:
         """Write the final report; raise MachineError if it cannot be written."""
         self.files.append(KEPT_REPORT, 0, json.dumps({**report, "process": self._role}).encode())
-
-
-def _kept_folder(run_dir: Path, name: str) -> Path:
-    """Make the folder of what is kept of a run, with the run's name in it; return its path.
-
-    Runs of two recorders may have begun in the same second: then their directories have one name.
-    """
-    if kept_run_name(run_dir) not in ("", name):
-        run_dir = run_dir.with_name(f"{run_dir.name}-{name}")
-    with suppress(MachineError):  # another process may write it, too
-        write_whole(run_dir / RUN_NAME_FILE, name)
-    return run_dir

@@ -16,6 +16,7 @@ from cosim.record.run_record import load_record, load_run
 from noack.core.errors import MachineError
 from noack.protocol.roles import LOOP_ROLES
 from tests.helpers import live_runs as live
+from tests.helpers.command_line import invoke
 from tests.helpers.live_runs import Start, wait_for_end
 from tests.helpers.two_hosts import TwoHosts, two_hosts
 
@@ -163,7 +164,7 @@ def test_a_clock_that_is_off_violates_causality(start: Start, tmp_path: Path) ->
     assert {claim["verdict"] for claim in loop["claims"]} <= {"void", "not applicable"}
     notices = load_record((tmp_path / "runs" / "latest").resolve()).notices
     during_run = [notice for notice in notices if "before it was sent" in notice["text"]]
-    assert {(notice["process"], notice["level"]) for notice in during_run} == {("plant", "violation")}
+    assert {(notice["process"], notice["level"]) for notice in during_run} == {("plant", "clock")}
 
 
 def wait_recorded(folder: Path) -> Path:
@@ -189,6 +190,43 @@ def test_a_partition_of_five_seconds_costs_no_row(start: Start, hosts: TwoHosts,
     assert loop["unintended_losses"] > 0
     ticks = load_record((tmp_path / "runs" / "latest").resolve())["controller_step"]
     assert len(ticks) == 12 * 500
+
+
+def test_rows_of_a_host_that_stays_out_of_reach_are_added(
+    start: Start, hosts: TwoHosts, tmp_path: Path
+) -> None:
+    """The link goes down in the run; its processes work on, and keep their rows and reports."""
+    sets = (*live.settings(horizon_s=8.0), *live.AT_RATE)
+    recording = record(start, tmp_path, *sets, impatient=True)
+    at_home = [start(0, role) for role in ("plant", "sensor")]
+    away = {
+        role: start_away(start, role, "--runs", str(tmp_path / "kept"), impatient=True)
+        for role in ("netem", "controller")
+    }
+    run_dir = wait_recorded(tmp_path)
+    with _cut_off(hosts):
+        errors = {role: wait_for_end(process)[1] for role, process in away.items()}
+        for process in at_home:
+            wait_for_end(process)
+        stdout, _ = wait_for_end(recording)
+    assert recording.returncode == 1
+    (loop,) = json.loads(stdout)["loops"]
+    steps = len(load_record(run_dir)["controller_step"])
+    assert 0 < steps < 8 * live.RATE_HZ
+    assert loop["missing_by_table"]["controller_step"] > 0
+    shown = invoke("summary", run_dir)
+    assert "samples are missing from the record" in shown.stdout
+    assert "noack summary RUN --add FILE" in " ".join(shown.stdout.split())
+    for role in away:
+        kept = tmp_path / "kept" / run_dir.name / f"{role}.spool"
+        assert f"rows are kept in {kept}" in errors[role]
+        result = invoke("summary", run_dir, "--add", kept, "--json")
+        assert result.exit_code == 0, result.stderr
+    (loop,) = json.loads(result.stdout)["loops"]
+    assert loop["replay"]["bit_exact"]
+    assert loop["replay"]["complete"]
+    assert loop["missing_samples"] == 0
+    assert len(load_record(run_dir)["controller_step"]) == 8 * live.RATE_HZ
 
 
 @contextmanager

@@ -212,16 +212,36 @@ class _Unmatched:
 def missing_rows(record: RunRecord) -> Counter[str]:
     """Return the number of rows that a process wrote and the record does not contain, by table.
 
-    For a process that died without a report: by process, from the gaps in its input numbers.
+    For a process that died without a report: by process, from the gaps in its input numbers. Of one on
+    another host, which may have gone on, at least the steps up to the time that the others reached.
     """
     missing: Counter[str] = Counter()
     for role in LOOP_ROLES:
         if role not in record.reports:
             missing[role] += record.rows_of(role).missing_inputs
+            if record.clocks:
+                missing[STEP_TABLES[role]] += _steps_without(record, role)
             continue
         for table, count in record.row_counts(role).items():
             missing[table] += record.reports[role]["rows"][table] - count
     return missing
+
+
+def _steps_without(record: RunRecord, role: str) -> int:
+    """Return how many steps of a process are not in the record, up to the time that others reached.
+
+    Of the network, whose datagrams have no period, 0.
+    """
+    timing = record.scenario.timing
+    period_ns = {
+        "plant": timing.plant_period_ns,
+        "sensor": timing.measurement_period_ns,
+        "controller": timing.controller_period_ns,
+    }.get(role)
+    reached_ns = max((report.get("reached_ns") or 0 for report in record.reports.values()), default=0)
+    newest_ns = record.last_ns(STEP_TABLES[role]) or 0
+    missing_ns = max(min(reached_ns, timing.horizon_ns) - newest_ns, 0)
+    return 0 if period_ns is None else missing_ns // period_ns
 
 
 def reported_violations(record: RunRecord) -> list[ViolationPart]:

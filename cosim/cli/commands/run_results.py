@@ -66,10 +66,19 @@ def view(
         ("noack summary --verbose", "with timing, assumptions and each claim"),
         ("noack summary --tables tables", "its tables as CSV"),
         ("noack summary runs/latest --json", "all numbers, as JSON"),
+        ("noack summary runs/latest --add controller.spool", "first add rows that another host kept"),
     ),
 )
 def summary(
     run_dir: opt.RunArgument = None,
+    add: Annotated[
+        list[Path] | None,
+        Option(
+            metavar="FILE",
+            help="First add the rows that a process on another host kept because it could not send "
+            "them; repeatable.",
+        ),
+    ] = None,
     runs: opt.RunsOption = DEFAULT_RUNS,
     loop: opt.LoopOption = None,
     verbose: opt.VerboseOption = False,
@@ -83,12 +92,19 @@ def summary(
     """
     from cosim.analysis.summary.run_summary import outcome_of_loop
     from cosim.cli.execute_run import reopen_run
+    from cosim.live.finalize import reopen
     from cosim.output.run_tables import summary_tables
     from cosim.output.terminal_output import print_outcome
+    from cosim.record.added_rows import add_rows
     from cosim.record.run_record import load_run
 
     path = chosen_run(run_dir, runs)
-    outcome = outcome_of_loop(reopen_run(path), loop)
+    outcome = reopen_run(path)  # refuses a run that is under way
+    for file in add or ():
+        merged, role = add_rows(path, file, reopen)
+        outcome = replace(merged, run_dir=path)
+        print_to_stderr(f"noack: {file}: added what the {role} kept")
+    outcome = outcome_of_loop(outcome, loop)
     if json:
         print_json(outcome.summary.to_json())
     else:
@@ -100,42 +116,6 @@ def summary(
         print_to_stderr(f"noack: {error}")
         return error.exit_status
     return ExitStatus.OK
-
-
-@app.command(
-    rich_help_panel=RUNS,
-    epilog=examples(
-        ("noack collect runs/latest robot:noack/runs/RUN", "by scp from the host robot"),
-        ("noack collect runs/latest copy", "from a folder that was copied here"),
-    ),
-)
-def collect(
-    run_dir: Annotated[Path, Argument(help="Run directory.")],
-    sources: Annotated[
-        list[str], Argument(help="Folders named by the processes: FOLDER, or HOST:FOLDER for scp.")
-    ],
-    json: opt.JsonOption = False,
-) -> None:
-    """Add what processes on other hosts kept of a run, and finalise it again.
-
-    A process that was invited keeps its rows on its host when the recorder is out of reach at the
-    end. It then prints their folder.
-    """
-    from cosim.cli.execute_run import reopen_run
-    from cosim.live.finalize import reopen
-    from cosim.output.terminal_output import print_outcome
-    from cosim.record.collection import collect as collect_rows
-
-    run_dir = chosen_run(run_dir, DEFAULT_RUNS)
-    outcome = reopen_run(run_dir)  # refuses a run that is under way
-    for source in sources:
-        merged, roles = collect_rows(run_dir, source, reopen)
-        outcome = replace(merged, run_dir=run_dir)
-        print_to_stderr(f"noack: {source}: took what {', '.join(roles) or 'no process'} kept")
-    if json:
-        print_json(outcome.summary.to_json())
-    else:
-        print_outcome(console(), outcome)
 
 
 @app.command(

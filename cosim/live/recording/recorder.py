@@ -39,6 +39,7 @@ from noack.runtime.command_line import print_to_stderr
 from noack.runtime.connections.zenoh_session import header_of
 from noack.runtime.control_messages import ChangeAnnouncement, ProcessReport, RunProgress, message_json
 from noack.runtime.control_plane import ControlPlane
+from noack.runtime.host_clocks import CLOCK_NOTICE
 from noack.runtime.join_run import join_run
 from noack.runtime.life_cycle import LAUNCHED_LOST_S, LAUNCHER_GONE
 from noack.runtime.run_process import RunProcess
@@ -255,9 +256,10 @@ class Recorder:
                 raise PeerError("it was sent with another key")
             first = first_row(header)
             if table == NOTICES and role in LOOP_ROLES:
-                lines = self.store.add_notices(role, first, payload)
-                if self._feed is not None:
-                    for line in lines:
+                for line in self.store.add_notices(role, first, payload):
+                    if line["level"] == CLOCK_NOTICE:
+                        self._progress.warnings.append(str(line["text"]))
+                    if self._feed is not None:
                         self._feed.log(line)
             else:
                 rows, follows = self.store.add_rows(role, table, first, payload)

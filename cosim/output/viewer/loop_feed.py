@@ -37,6 +37,7 @@ from noack.protocol.record_tables import (
     Fate,
     effective,
 )
+from noack.runtime.host_clocks import CLOCK_NOTICE
 from noack.scenario.resolution import loop_of, policy_of, tables_of
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.certified_bounds import (
@@ -62,7 +63,7 @@ SHOWN_TABLES = (
     SENSOR_MEASUREMENT,
 )
 
-_WARNINGS = ("failed", "violation", "watchdog")
+_WARNINGS = ("failed", "violation", "watchdog", CLOCK_NOTICE)
 
 
 def log_level(notice: Mapping[str, object]) -> str:

@@ -88,7 +88,7 @@ def test_the_verdict_of_several_loops_counts_them() -> None:
     )
 
 
-def test_a_run_across_hosts_names_the_firewall_the_network_and_what_to_collect(
+def test_a_run_across_hosts_names_the_firewall_the_network_and_how_to_add_rows(
     outcome: Outcome,
 ) -> None:
     values: dict[str, Any] = {
@@ -105,7 +105,7 @@ def test_a_run_across_hosts_names_the_firewall_the_network_and_what_to_collect(
         return "\n".join(remark.text for remark in remarks(summary))
 
     across, alone = texts(1e-4), texts(None)
-    for named in ("firewalls must pass", "the network between hosts was later", "noack collect"):
+    for named in ("firewalls must pass", "the network between hosts was later", "--add FILE"):
         assert named in across
         assert named not in alone
     assert "lost elsewhere (kernel): 3 on actuation" in alone

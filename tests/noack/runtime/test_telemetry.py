@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from noack.core.errors import MachineError, NoAnswerError
 from noack.protocol.roles import Notice, Record
 from noack.runtime import telemetry
-from noack.runtime.spool import NOTICES, SpoolWriter, kept_run_name, read_batches
-from noack.runtime.telemetry import OwnSpool, ReceivedRows, TelemetryBuffer, deliver_report, first_row
+from noack.runtime.spool import NOTICES, SpoolWriter, read_batches
+from noack.runtime.telemetry import ReceivedRows, TelemetryBuffer, deliver_report, first_row
 
 ROW = np.dtype([("number", "<i8"), ("x", "<f8", (2,))])
 TABLES = {"one": ROW, "two": ROW}
@@ -162,24 +162,6 @@ def test_rows_that_the_recorder_never_takes_are_stored_and_reported(
         assert plane.reports[-1]["stored"].get("one", []) == stored
         assert len(disk) == len(stored) * 3
         assert len(buffer.stored().get("one", ())) == len(stored)
-
-
-def test_what_two_runs_with_one_directory_keep_stays_apart(tmp_path: Path) -> None:
-    """Runs of two recorders that began in one second, with processes on one host."""
-    header = json.dumps({"first": 0}).encode()
-    first, again, other = (
-        OwnSpool(tmp_path / "run", "sensor", writer, remote_run_name)
-        for writer, remote_run_name in [("a", "0001"), ("b", "0001"), ("c", "0002")]
-    )
-    assert not (tmp_path / "run").exists()  # nothing is left of a run that kept nothing
-    for spool in (first, again, other):
-        spool.append("sensor_event", header, b"rows")
-        spool.files.close()
-    assert first.folder == again.folder == tmp_path / "run"
-    assert other.folder == tmp_path / "run-0002"
-    assert [kept_run_name(spool) for spool in (first.folder, other.folder)] == ["0001", "0002"]
-    assert len(list((first.folder / "spool").glob("sensor_event.*"))) == 2
-    assert len(list((other.folder / "spool").glob("sensor_event.*"))) == 1
 
 
 def test_lines_and_rows_that_come_at_once_are_published_in_numbered_batches() -> None:

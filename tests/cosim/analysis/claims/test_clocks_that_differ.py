@@ -19,7 +19,7 @@ from cosim.analysis.summary.summary_model import Claim, ClaimVerdict
 from cosim.record.align import aligned_parts
 from cosim.record.run_record import RunRecord
 from noack.runtime.control_messages import ClockError
-from noack.runtime.host_clocks import CHRONY, RECEIVED, CausalityCheck
+from noack.runtime.host_clocks import CHRONY, CLOCK_NOTICE, RECEIVED, CausalityCheck
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
@@ -167,7 +167,7 @@ def test_a_message_that_came_before_it_was_sent_voids_all_claims(
     table, _ = RECEIVED[receiver]
     notice = check.check(table, record[table])
     assert notice is not None
-    assert notice.level == "violation"
+    assert notice.level == CLOCK_NOTICE
     assert notice.t_ns * 1e-9 == pytest.approx(violation.t_s, abs=1e-9)
     assert check.check(table, record[table]) is None
 
