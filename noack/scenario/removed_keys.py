@@ -16,18 +16,19 @@ REMOVED: Mapping[str, str] = {
 (``table.kind = value``). Numbers of entries in lists are left out: ``network.impairments.kind``."""
 
 
-def plain_way(key: str, value: object) -> str | None:
-    """Return what to do instead of an unknown key, or of an unknown kind; None if it never existed.
+def removed_key(key: str, value: object) -> tuple[str, object, str] | None:
+    """Return what was removed: its key, its value, and what to do instead; None if it never existed.
 
     Args:
-        key: the whole key. It may lie within other tables than in :data:`REMOVED`, as those of an
-            entry of ``[[loops]]``.
+        key: a whole key that is unknown, or of which the value is an unknown kind. It may lie within
+            other tables than in :data:`REMOVED`, as those of an entry of ``[[loops]]``.
         value: its value. If this is a table, the keys in it are looked up, too.
     """
-    name = ".".join(part for part in key.split(".") if not part.isdecimal())
-    inner = value if isinstance(value, Mapping) else ()
-    for candidate in (name, f"{name} = {value}", *(f"{name}.{part}" for part in inner)):
+    inner = value if isinstance(value, Mapping) else {}
+    candidates = [(key, value), *((f"{key}.{part}", inner[part]) for part in inner)]
+    for place, of_place in candidates:
+        name = ".".join(part for part in place.split(".") if not part.isdecimal())
         for removed, instead in REMOVED.items():
-            if f".{candidate}".endswith(f".{removed}"):
-                return f"was removed; {instead}"
+            if f".{name}".endswith(f".{removed}") or f".{name} = {of_place}".endswith(f".{removed}"):
+                return place, of_place, instead
     return None

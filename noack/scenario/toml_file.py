@@ -22,7 +22,7 @@ from pydantic_core import ErrorDetails
 from noack.core.errors import CallerError, did_you_mean, plain_mistake, printable, shortened, why
 from noack.core.extension_points import missing_extension
 from noack.core.file_access import read_regular
-from noack.scenario.removed_keys import plain_way
+from noack.scenario.removed_keys import removed_key
 from noack.settings.section import ReadTable, ScenarioSection, Table
 
 M = TypeVar("M", bound=ScenarioSection)
@@ -270,8 +270,8 @@ def _explain(mistake: ErrorDetails, root: type[ScenarioSection]) -> str:
     if kind == "missing":
         return f"{key}: missing{_purpose(place.section, str(place.path[-1]))}"
     if kind == "extra_forbidden":
-        if instead := plain_way(key, value):
-            return f"{assignment}: {instead}"
+        if line := _removal(key, value):
+            return line
         return f"{assignment}: unknown key; {_nearest(str(place.path[-1]), place.section)}"
     if kind == "value_error":
         return _own_check(key, value, str(mistake["ctx"]["error"]))
@@ -418,13 +418,21 @@ def _choice(key: str, value: object, place: _Place) -> str:
     if not isinstance(value, Mapping) or place.discriminator not in value:
         return f"{key}: missing; one of {choices_text}"
     chosen = value[place.discriminator]
-    if instead := plain_way(key, chosen):
-        return f"{key} = {show_value(chosen)}: {instead}"
+    if line := _removal(key, chosen):
+        return line
     if missing := missing_extension(_GROUPS.get(str(place.path[-1]), ""), str(chosen)):
         return f"{key} = {show_value(chosen)}: {missing}"
     close = difflib.get_close_matches(str(chosen), place.choices, n=1)
     hint = f"; did you mean {close[0]}?" if close else ""
     return f"{key} = {show_value(chosen)}: must be one of {choices_text}{hint}"
+
+
+def _removal(key: str, value: object) -> str | None:
+    """Return the line about a key or kind that was removed, with the plain way; None if there is none."""
+    if (removed := removed_key(key, value)) is None:
+        return None
+    name, of_name, instead = removed
+    return f"{name} = {show_value(of_name)}: was removed; {instead}"
 
 
 def _table_example(value: object, place: _Place) -> str:

@@ -44,5 +44,5 @@ def test_a_file_is_told_the_plain_way_of_a_removed_table(
     monkeypatch.setattr(removed_keys, "REMOVED", {"gone.after_s": "wait"})
     file = tmp_path / "scenario.toml"
     file.write_text(SCENARIO.read_text(encoding="utf-8") + "\n[gone]\nafter_s = 3\n", encoding="utf-8")
-    with pytest.raises(CallerError, match=r'^\S+scenario\.toml: gone = {"after_s": 3}: was removed; wait$'):
+    with pytest.raises(CallerError, match=r"^\S+scenario\.toml: gone\.after_s = 3: was removed; wait$"):
         load(file)
