@@ -60,10 +60,9 @@ def test_an_extension_imports_public_names_alone() -> None:
 
 WALL_CLOCK = {
     "noack/runtime/command_line.py": "lines of the log",
-    "noack/plants/systems/code_cache.py": "ages of files",
     "cosim/record/run_directory.py": "the run's name and its environment",
-    "cosim/live/coordination/coordinator.py": "when a change was requested",
-    "cosim/live/coordination/remote_access.py": "the validity of certificates",
+    "cosim/live/coordination/change_requests.py": "when a change was requested",
+    "cosim/live/coordination/certificate_authority.py": "the validity of a run's certificates",
     "extensions/noack-ros2/noack_ros2/ros2_node.py": "the time stamps of messages of ROS 2",
     "netem/control/command_queue.py": "lines of statistics",
     "native/relay/loop.c": "time stamps of the kernel, compared with the monotonic clock",
