@@ -73,7 +73,7 @@ def test_a_change_received_too_late_is_reported_and_voids_its_claims() -> None:
     resolved = resolve(validate(CONTENT, "here"))
     change = ParameterChange(0, 900 * MS, {"controller.setpoint": [2.0, 0.0]})
     announced_ns = {"sensor": 500 * MS, "netem": 500 * MS, "controller": 1_000 * MS}
-    scheduler = EventScheduler(resolved, (resolved,))
+    scheduler = EventScheduler(resolved)
     for now_ns in scheduler.steps():
         for role in [role for role, at_ns in announced_ns.items() if at_ns <= now_ns]:
             machine: Any = scheduler.machines[role]

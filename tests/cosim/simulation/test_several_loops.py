@@ -125,6 +125,22 @@ def test_a_replay_is_exact_and_finds_a_changed_bit(crowded: Content) -> None:
     assert result.first_difference.column == "head"
 
 
+@pytest.mark.sanitized
+def test_loops_of_different_sizes_replay_each_on_its_own(crowded: Content) -> None:
+    oscillator = {
+        "name": "oscillator",
+        "model": {"A": [[0.0, 1.0, 0.0], [-1.0, -0.1, 0.0], [0.0, 0.0, -1.0]],
+                  "B": [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]],
+                  "gain": [[-1.0, -1.0, 0.0], [0.0, 0.0, -1.0]]},
+        "plant": {"initial_state": [0.1, 0.0, 0.1], "initial_state_halfwidth": [0.0] * 3,
+                  "uncertainty_A": [[0.0] * 3] * 3, "uncertainty_B": [[0.0] * 2] * 3,
+                  "disturbances": []},
+    }  # fmt: skip
+    shared = run(crowded, {"name": "a", "count": 3}, oscillator)
+    assert [record["plant_step"]["x"].shape[1] for record in shared.loops] == [2, 2, 2, 3]
+    assert all(replay(record).bit_exact for record in (shared.network, *shared.loops))
+
+
 def shares_of(level: int) -> tuple[float, float]:
     """Return the shares of the threshold for which an error level stands, by docs/wire.md.
 

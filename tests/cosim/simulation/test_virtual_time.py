@@ -2,39 +2,18 @@
 
 from typing import Any
 
-import numpy as np
 import pytest
 
 from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.record.run_record import RunRecord
-from cosim.simulation.virtual_time import VirtualRun, simulate, simulate_loops
+from cosim.simulation.virtual_time import VirtualRun, simulate
 from noack.core.core_library import core, ffi
-from noack.protocol.record_tables import CONTROLLER_DELIVERY, NETEM_PACKET, OWNER, SENSOR_MEASUREMENT
-from noack.scenario.resolution import resolve, tables_of
-from noack.scenario.scenario import loops_of
+from noack.protocol.record_tables import CONTROLLER_DELIVERY, NETEM_PACKET, SENSOR_MEASUREMENT
+from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
-from tests.cosim.simulation.event_scheduler import EventScheduler, record_of_run
-from tests.helpers.shipped import resolved, shipped
+from tests.cosim.simulation.event_scheduler import record_of_run
+from tests.helpers.shipped import resolved
 from tests.oracles.random_scenarios import POLICIES, random_scenario
-
-IMPAIRMENTS = [
-    {"kind": "duplicate", "probability": 0.3},
-    {"kind": "corrupt", "probability": 0.3},
-    {"kind": "delay", "delay_s": 0.01, "jitter_s": 0.01},
-]
-LOOPS = [
-    {"name": "pendulum", "count": 3},
-    {"name": "periodic", "trigger": {"policy": "periodic", "period_s": 0.1}},
-    {
-        "name": "oscillator",
-        "model": {"A": [[0.0, 1.0, 0.0], [-1.0, -0.1, 0.0], [0.0, 0.0, -1.0]],
-                  "B": [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]],
-                  "gain": [[-1.0, -1.0, 0.0], [0.0, 0.0, -1.0]]},
-        "plant": {"initial_state": [0.1, 0.0, 0.1], "initial_state_halfwidth": [0.0, 0.0, 0.0],
-                  "uncertainty_A": [[0.0] * 3] * 3, "uncertainty_B": [[0.0] * 2] * 3},
-    },
-]  # fmt: skip
-"""Those of the last entry have vectors of other lengths."""
 
 
 def require_equal(record: RunRecord, expected: RunRecord) -> None:
@@ -60,30 +39,6 @@ def test_a_scripted_network_decides_as_in_the_plain_driver() -> None:
         return None if data[16] % 3 == 1 else now_ns % 70_000_000
 
     require_equal(simulate(scenario, decide), record_of_run(scenario, decide))
-
-
-@pytest.mark.sanitized
-def test_loops_of_different_sizes_run_as_by_the_plain_driver() -> None:
-    content = shipped("unstable_pendulum", "horizon_s=1.0").model_dump(mode="json", exclude_none=True)
-    rate = {"kind": "rate", "rate_bps": 50_000, "queue": 6}
-    network = content["network"] | {
-        "impairments": [rate, IMPAIRMENTS[1]], "actuation": {"impairments": IMPAIRMENTS},
-    }  # fmt: skip
-    scenario = validate(content | {"network": network, "loops": LOOPS}, "")
-    scheduler = EventScheduler(scenario, [resolve(loop) for loop in loops_of(scenario)], numbered=True)
-    scheduler.run()
-    simulated = simulate_loops(scenario)
-    for table in ("netem_packet", "netem_release"):
-        rows = np.array(scheduler.rows.get(table, []), simulated.network[table].dtype)
-        assert rows.tobytes() == simulated.network[table].tobytes()
-    for number, record in enumerate(simulated.loops):
-        for table, dtype in tables_of(record.scenario).items():
-            if OWNER[table] != "netem":
-                rows_of_loop = [row[1:] for row in scheduler.rows.get(table, []) if row[0] == number]
-                assert np.array(rows_of_loop, dtype).tobytes() == record[table].tobytes(), table
-        received = record.reports["controller"]["channel"]
-        assert received == scheduler.decoders["controller"][number].report()
-    assert simulated.loops[4]["plant_step"]["x"].shape[1] == 3
 
 
 @pytest.mark.sanitized
