@@ -242,11 +242,14 @@ class RunClaims:
             if certificate is not None and not certificate.exists:
                 claimed = f"a certificate for {certificate.scope}"
                 claims.append(void_claim(claimed, certificate.source, certificate.void or ""))
-            claims += [
-                instance.check.result()
-                for instance in self._checked
-                if instance.certificate is certificate and instance.check.is_claimed
-            ]
+            own = [instance.check for instance in self._checked if instance.certificate is certificate]
+            claimed_checks = [check for check in own if check.is_claimed]
+            if certificate is not None and own and not claimed_checks:
+                why = (
+                    f"settings changed at {self.certified_evidence.until_s:.3f} s, before it could be checked"
+                )
+                claims.append(void_claim(f"a certificate for {certificate.scope}", certificate.source, why))
+            claims += [check.result() for check in claimed_checks]
         return claims
 
     @cached_property

@@ -329,6 +329,14 @@ def test_certificates_speak_of_the_run_until_the_first_change_and_the_identity_o
             assert claim.certified == shorter[key].certified
 
 
+def test_a_change_at_the_start_leaves_nothing_certified() -> None:
+    claims = RunClaims(run_with((0.0, {"trigger.beta": 0.04}))).evaluate()
+    assert {claim.verdict for claim in claims if claim.source == "(I1)"} == {HELD}
+    certified = [claim for claim in claims if claim.is_certified]
+    assert {(claim.verdict, claim.since_s) for claim in certified} == {(VOID, 0.0)}
+    assert {claim.why for claim in certified} == {"settings changed at 0.000 s, before it could be checked"}
+
+
 def test_a_wrong_model_state_after_a_change_violates_the_identity() -> None:
     record = run_with((2.005, {"controller.setpoint": [3.0, 0.0], "trigger.beta": 0.04}))
     steps = record[CONTROLLER_STEP].copy()
