@@ -114,6 +114,7 @@ test: setup-dev ## Lint, types, import rules, and tests (ARGS are pytest's, e.g.
 
 test-system: setup-dev ## Test what needs a browser, root or a system package, and other builds
 	$(BIN)/python -m pytest -m system --numprocesses=2 --dist=loadfile $(ARGS)
+	$(if $(ARGS),,$(BIN)/python -m pytest extensions -m system)
 
 pytest: setup-dev
 	$(BIN)/python -m pytest \
