@@ -19,10 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.clock import NS_PER_S
-from noack.core.errors import MachineError
+from noack.core.errors import MachineError, PeerError
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, PLANT_ACTUATION, SENSOR_MEASUREMENT
 from noack.protocol.roles import Notice
 from noack.runtime.control_messages import ClockError
+from noack.scenario.run_sections import ClocksSection
 
 CLOCK_NOTICE = "clock"
 """Level of the notice about a message that was not sent yet."""
@@ -87,6 +88,15 @@ def clock_error(clock: str, largest_error_us: float) -> ClockError:
     if error_ns is None:
         return ClockError(clock=clock, error_ns=round(largest_error_us * 1000), source=STATED)
     return ClockError(clock=clock, error_ns=error_ns, source=CHRONY)
+
+
+def require_small_error(which: str, clock: ClockError, settings: ClocksSection) -> None:
+    """Raise PeerError if a clock may be off by more than the scenario allows."""
+    if clock.error_ns > settings.largest_error_us * 1000:
+        raise PeerError(
+            f"{which} may be off by {clock.error_ns / 1000:g} µs by {clock.source}, "
+            f"clocks.largest_error_us = {settings.largest_error_us:g} allowed"
+        )
 
 
 def allowed_lead_ns(role: str, clocks: Mapping[str, ClockError]) -> int:

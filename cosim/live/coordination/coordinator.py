@@ -28,10 +28,9 @@ from noack.runtime.control_messages import (
     parse_message,
 )
 from noack.runtime.control_plane import ControlPlane
-from noack.runtime.host_clocks import STATED, realtime_offset_ns
+from noack.runtime.host_clocks import STATED, realtime_offset_ns, require_small_error
 from noack.runtime.life_cycle import HORIZON, LAUNCHED_LOST_S, LOST_AFTER_S, Event, LifeCycle, Side, State
 from noack.runtime.run_descriptor import RunDescriptor
-from noack.scenario.run_sections import ClocksSection
 
 _REPORT_GRACE_S = 0.3
 """A process's last message may arrive this much later than its exit is seen."""
@@ -313,15 +312,6 @@ class Coordinator:
         if self._own_clock is None or all(self._members[role].clock is None for role in LOOP_ROLES):
             return {}
         return {role: self._members[role].clock or self._own_clock for role in LOOP_ROLES}
-
-
-def require_small_error(which: str, clock: ClockError, settings: ClocksSection) -> None:
-    """Raise PeerError if a clock may be off by more than the scenario allows."""
-    if clock.error_ns > settings.largest_error_us * 1000:
-        raise PeerError(
-            f"{which} may be off by {clock.error_ns / 1000:g} µs by {clock.source}, "
-            f"clocks.largest_error_us = {settings.largest_error_us:g} allowed"
-        )
 
 
 def _sender(key_expr: object) -> tuple[str, str]:

@@ -16,14 +16,13 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from cosim.live.coordination.coordinator import require_small_error
 from noack.core.clock import clock_identity
 from noack.core.errors import CallerError, PeerError, why
 from noack.protocol.roles import LOOP_ROLES, RECORDER
 from noack.runtime.address import Address, address_text, parse_address
 from noack.runtime.connections.credentials import CA_FILE, CERTIFICATE_FILE, KEY_FILE, RUN_FILE, own_host
 from noack.runtime.control_messages import ClockError
-from noack.runtime.host_clocks import clock_error
+from noack.runtime.host_clocks import clock_error, require_small_error
 from noack.runtime.run_descriptor import RunDescriptor
 from noack.scenario.run_sections import ClocksSection
 from noack.scenario.scenario import Scenario
