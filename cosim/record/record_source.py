@@ -89,11 +89,6 @@ class RecordSource(ABC):
     def count(self, table: str) -> int:
         """Return the number of rows of a table."""
 
-    def highest_input(self, table: str) -> int:
-        """Return the highest number of an input in a table, or a higher one; −1 without rows."""
-        highest = (rows["input"].max(initial=-1) for rows in self.batches(table, ("input",)))
-        return int(max(highest, default=-1))
-
     def batches(self, table: str, columns: Sequence[str] = ()) -> Iterator[Rows]:
         """Yield the rows of a table in order, with all columns or at least some."""
         if table not in self._whole and self.count(table) > BATCH_ROWS:
@@ -359,10 +354,6 @@ class LoopTables(RecordSource):
             source = self._network.count if is_of_network(table) else self._stored.count_of_loop
             self._counts[table] = source(table, self._number)
         return self._counts[table]
-
-    def highest_input(self, table: str) -> int:
-        """Return the highest number of an input of any loop in a table; −1 without rows."""
-        return self._stored.highest_input(table)
 
     def _read(self, table: str, columns: Sequence[str]) -> Iterator[Rows]:
         if is_of_network(table):

@@ -138,13 +138,6 @@ class StoredTables(RecordSource):
             if group.first <= last and first <= group.last
         }
 
-    @cached_method
-    def highest_input(self, table: str) -> int:
-        """Return the highest number of an input in a table; −1 without rows."""
-        inputs = [group.highest_input for group in self._files[table].groups]
-        known = [number for number in inputs if number is not None]
-        return max(known, default=-1) if len(known) == len(inputs) else super().highest_input(table)
-
 
 class _Group(NamedTuple):
     """A row group of a file."""
@@ -154,8 +147,6 @@ class _Group(NamedTuple):
     """Lowest number of a loop."""
     last: int
     """Highest number of a loop."""
-    highest_input: int | None
-    """Highest number of an input; None if unknown."""
 
 
 class TableFile:
@@ -189,9 +180,10 @@ class TableFile:
                     f"{path}: has {largest:,} rows in one part; at most {_MOST_GROUP_ROWS:,} are read"
                 )
             names = metadata.schema.names
-            column_indices = {name: names.index(name) for name in (LOOP, "input") if name in names}
-            _require_types(file, [*column_indices.values()])
-        self.groups = [_describe_group(group, column_indices) for group in groups]
+            loop_column = names.index(LOOP) if LOOP in names else None
+            if loop_column is not None:
+                _require_type(file, loop_column)
+        self.groups = [_describe_group(group, loop_column) for group in groups]
 
     def batches(self, dtype: RowType | None = None, groups: Iterable[int] | None = None) -> Iterator[Rows]:
         """Yield the rows of each group, or of some, as rows of a type that has fewer columns."""
@@ -264,25 +256,23 @@ class TableFile:
         return rows
 
 
-def _require_types(file: pq.ParquetFile, columns: list[int]) -> None:
-    """Raise ArrowException if a group has other types of these columns than the schema.
+def _require_type(file: pq.ParquetFile, column: int) -> None:
+    """Raise ArrowException if a group has another type of a column than the schema.
 
     The statistics of such a group would end the process: the library throws an error that pyarrow
     does not catch. It does catch that of reading, here of the first row.
     """
     for group in range(file.num_row_groups):
-        next(file.reader.iter_batches(1, row_groups=[group], column_indices=columns, use_threads=False), None)
+        next(
+            file.reader.iter_batches(1, row_groups=[group], column_indices=[column], use_threads=False), None
+        )
 
 
-def _describe_group(group: Any, column_indices: Mapping[str, int]) -> _Group:
-    loops, inputs = (
-        group.column(column_indices[name]).statistics if name in column_indices else None
-        for name in (LOOP, "input")
-    )
-    highest = int(inputs.max) if inputs is not None and inputs.has_min_max else None
+def _describe_group(group: Any, loop_column: int | None) -> _Group:
+    loops = None if loop_column is None else group.column(loop_column).statistics
     if loops is None or not loops.has_min_max:
-        return _Group(group.num_rows, 0, MAX_LOOPS, highest)
-    return _Group(group.num_rows, int(loops.min), int(loops.max), highest)
+        return _Group(group.num_rows, 0, MAX_LOOPS)
+    return _Group(group.num_rows, int(loops.min), int(loops.max))
 
 
 @contextmanager

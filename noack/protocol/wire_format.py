@@ -63,20 +63,6 @@ MAX_DATAGRAM_BYTES = HEADER_BYTES + 8 * MAX_DIMENSION + TAG_BYTES
 _FLOW, _LOOP, _SEQUENCE = slice(3, 4), slice(6, 8), slice(16, 24)  # in the header
 
 
-class Tagger:
-    """Computes the tag of a message of another kind than the loop's; keying is done once."""
-
-    def __init__(self, key: bytes) -> None:
-        require_key(key)
-        self._keyed_hash = hashlib.blake2b(key=key, digest_size=TAG_BYTES)
-
-    def __call__(self, content: bytes) -> bytes:
-        """Return the tag."""
-        state = self._keyed_hash.copy()
-        state.update(content)
-        return state.digest()
-
-
 class EncryptedSeal:
     """Layout version 2: the vector encrypted by ChaCha20-Poly1305 (RFC 8439), with its tag.
 
