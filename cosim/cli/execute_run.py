@@ -38,7 +38,6 @@ def run_processes(
     session: str | None = None,
     server: ForkServer | None = None,
     listening: ListenSettings | None = None,
-    observers: Sequence[RunObserver] = (),
 ) -> int:
     """Run a scenario live; print its verdict and return the exit status.
 
@@ -53,13 +52,12 @@ def run_processes(
         session: name that the processes of the run share.
         server: starts the processes, and ends with the run; by default a new one.
         listening: how processes on other hosts join.
-        observers: follow the run, too.
     """
     require_live_runs()
     with fork_server(server) as server:
         ending = None
         if live:
-            from cosim.output.viewer.rerun_program import require_viewer  # imports rerun
+            from cosim.output.viewer.rerun_program import require_viewer  # imports http.client and TLS
 
             require_viewer()
         warn_of_other_runs()
@@ -71,7 +69,7 @@ def run_processes(
                     spawn=spawn or ROLES,
                     session=session,
                     live=live,
-                    observers=[_TheoryWarnings(loaded), terminal, RunLog(), *observers],
+                    observers=[_TheoryWarnings(loaded), terminal, RunLog()],
                     server=server,
                     listening=listening,
                 )

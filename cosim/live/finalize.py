@@ -436,9 +436,7 @@ def _open(run_dir: Path, loop: str | None, *, view: bool = True) -> tuple[RunSum
 
 
 def import_libraries() -> None:
-    """Import what writing record and recording needs."""
-    import cosim.record.table_files  # imports pyarrow
-
+    """Import what a recording needs, beside the imports of this module."""
     if is_installed():
         import matplotlib.figure  # noqa: F401  # for the map of many loops
         import pyarrow as pa
