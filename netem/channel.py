@@ -273,11 +273,9 @@ def due_settings(
     """Yield the settings that replace the present ones before a datagram that arrives now."""
     for change in schedule.take(now_ns):
         assert change.prepared is not None
-        first = present.first_delivered
-        settings = change.prepared.model_copy(update={"first_delivered": first})
-        if settings != present:
-            present = settings
-            yield settings
+        if change.prepared != present:
+            present = change.prepared
+            yield present
 
 
 def encode_message(message: CData) -> bytes:

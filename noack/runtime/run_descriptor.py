@@ -46,9 +46,6 @@ class RunDescriptor(ScenarioSection):
     """The role that a process on another host has."""
     clock: str
     """The coordinator's monotonic clock, of which the run's epoch is a reading."""
-    time_reference: SocketAddress | None = None
-    """Address at which processes with another clock compare it with the coordinator's, under the run's
-    key."""
     target_losses: Annotated[dict[str, FiniteFloat], AfterValidator(store_probabilities)] = Field({})
     """Probabilities that the check of the scenario needs."""
     scenario: Scenario  # resolved

@@ -75,8 +75,15 @@ def test_a_killed_launcher_leaves_no_process_behind(start: Start) -> None:
     running.process.kill()
     assert running.left_behind() == []
     run_dir = (running.runs / "latest").resolve()
-    assert reopen(run_dir).reason == "the launcher ended early"
-    assert len(load_record(run_dir)["plant_step"]) > 10
+    outcome = reopen(run_dir)
+    assert (outcome.status, outcome.reason) == (1, "the launcher ended early")
+    (loop,) = outcome.summary.loops
+    assert loop.missing_by_table == {}
+    assert loop.replay is not None
+    assert loop.replay.bit_exact
+    steps = load_record(run_dir)["plant_step"]["sequence"]
+    assert len(steps) > 10
+    assert np.array_equal(steps, np.arange(len(steps)))
 
 
 @pytest.mark.usefixtures("no_report", "no_recording")
