@@ -81,6 +81,24 @@ def chart_options(drawn: Drawn) -> Json:
     return options
 
 
+def layout_of(options: Json) -> object:
+    """Return which parts a chart has: panels, kinds of axes, curves."""
+    return (
+        [title["text"] for title in options["title"]],
+        [axis["type"] for axis in options["yAxis"]],
+        [(series["name"], series["yAxisIndex"]) for series in options["series"]],
+    )
+
+
+def values_of(options: Json) -> Json:
+    """Return the curves and the ends of the axes, for a chart that has the same parts."""
+    return {
+        "xAxis": [{"max": axis["max"]} for axis in options["xAxis"]],
+        "yAxis": [{"min": axis.get("min"), "max": axis.get("max")} for axis in options["yAxis"]],
+        "series": [{"data": series["data"]} for series in options["series"]],
+    }
+
+
 def _panels(drawn: Drawn) -> dict[str, list[noack.Curve]]:
     """Return the curves of each panel, in the order of the panels; of the states, one is drawn."""
     run, states = drawn.run, drawn.run.states

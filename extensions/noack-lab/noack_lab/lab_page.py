@@ -13,7 +13,7 @@ from nicegui.events import GenericEventArguments, ValueChangeEventArguments
 
 import noack
 from noack_lab import results
-from noack_lab.chart import Drawn, chart_options, height_px
+from noack_lab.chart import Drawn, chart_options, height_px, layout_of, values_of
 from noack_lab.lab_services import LabServices
 from noack_lab.results import Guarantee, ShownRun, VerdictText
 from noack_lab.scenario_draft import Draft, open_draft
@@ -85,6 +85,8 @@ class _Page:
         self._rest: asyncio.Task[None] | None = None
         self._live_version = -1
         self._margin = self._explored_note = ""
+        self._layout: object = None
+        """Panels and curves of the chart; with the same, only values are sent."""
 
     # What the page has
 
@@ -104,7 +106,9 @@ class _Page:
             ui.button(icon="download", on_click=self._download).props(
                 'flat color=white dense aria-label="save scenario" title="save the scenario as a file"'
             )
-        with ui.left_drawer(bordered=True).props("width=320 breakpoint=900") as self._drawer:
+        with ui.left_drawer(value=False, bordered=True).props(
+            "width=320 breakpoint=900 show-if-above"
+        ) as self._drawer:
             self._controls = ui.column().classes("w-full gap-1")
             with ui.expansion("all settings (TOML)").classes("w-full").props("dense"):
                 self._editor = ui.codemirror(
@@ -308,10 +312,14 @@ class _Page:
         reference = (self._kept or self._before) if exploring and self._compare.value else None
         bounds = self._guarantee.curves if exploring and self._guarantee else ()
         options = chart_options(Drawn(run, self._state, bounds, reference))
-        self._chart.options.clear()
-        self._chart.options.update(options)
-        self._chart.style(f"height: {height_px(options)}px")
-        self._chart.update()
+        if (layout := layout_of(options)) == self._layout:
+            self._chart.run_chart_method("setOption", values_of(options))
+        else:
+            self._layout = layout
+            self._chart.options.clear()
+            self._chart.options.update(options)
+            self._chart.style(f"height: {height_px(options)}px")
+            self._chart.update()
         if self._states.options != run.states:
             state = self._state if self._state in run.states else next(iter(run.states), None)
             self._states.set_options(run.states, value=state)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import noack
+from noack.extend import CallerError
 
 ERRORS, NORM, INTERVALS = "error norms", "norm of the state", "inter-event time"
 """Panels of the curves; see :class:`noack.Curve`."""
@@ -104,7 +105,7 @@ def run_of(scenario: noack.Scenario) -> ShownRun:
         return exact_run_of(scenario)
     except noack.NoackError as error:
         if scenario.loops:
-            raise
+            raise CallerError("a scenario of several loops: run it live") from None
         note = str(error)
     run = noack.simulate(scenario)
     curves = [curve for curve in run.curves() if curve.style.colour != _GREEN]  # bounds come later

@@ -79,10 +79,20 @@ def test_text_is_large_and_has_contrast_and_nothing_is_wider_than_the_page(open_
     assert found == []
     assert page.js(SMALL) == []
     for source in ("explore", "live", "recorded"):
+        page.resize(1280, 844)
         page.click(source)
         for width in (390, 800, 1280):
             page.resize(width, 844)
             page.wait("document.scrollingElement.scrollWidth <= innerWidth")
+
+
+def test_the_settings_open_and_close_beside_the_figure_and_above_it(open_page: OpenPage) -> None:
+    seen = "(r => r.right > 50 && r.left >= 0)(document.querySelector('.q-drawer').getBoundingClientRect())"
+    for size, is_open in (((1280, 900), True), ((390, 844), False)):
+        page = open_page(*size)
+        for shown in (is_open, not is_open, is_open):
+            page.wait(f"{seen} === {json.dumps(shown)}")
+            page.js("document.querySelector('[aria-label=settings]').click()")
 
 
 def test_a_live_run_ends_with_a_verdict_and_is_the_chosen_recorded_run(
