@@ -26,7 +26,7 @@ Part = TypeVar("Part")
 NO_EXTENSIONS = "NOACK_NO_EXTENSIONS"
 """Environment variable: if it is set, installed extensions are ignored."""
 _WARNED_OF = "NOACK_WARNED_OF_EXTENSIONS"
-"""Environment variable: the lines that this process, or one that started it, has printed."""
+"""Environment variable: the packages of which this process, or one that started it, has warned."""
 WITH_CLASSES = frozenset({"noack.plants", "noack.controllers", "noack.triggers"})
 """Groups in which an entry point ``module:Class`` names a user's class, for ``kind = "python"``."""
 KNOWN: Mapping[str, Mapping[str, str]] = {
@@ -41,9 +41,9 @@ KNOWN: Mapping[str, Mapping[str, str]] = {
 def parts(package: str | None, group: str, read: Callable[[ModuleType], Part | None]) -> Iterator[Part]:
     """Yield what ``read`` returns of each module: of a package of noack, then of extensions.
 
-    An extension that cannot be imported, of which ``read`` raises an exception or returns None, is
-    left out with a warning of one line. Of noack's own modules those are left out of which ``read``
-    returns None. Subpackages are not searched.
+    A module of an extension that cannot be imported, or of which ``read`` raises an exception or
+    returns None, is left out, with one line of warning for its package. Of noack's own modules those
+    are left out of which ``read`` returns None. Subpackages are not searched.
 
     Args:
         package: the package of noack; None if noack itself has no such part.
@@ -60,10 +60,10 @@ def parts(package: str | None, group: str, read: Callable[[ModuleType], Part | N
         try:
             part = read(point.load())
         except (Exception, SystemExit) as error:  # an extension's code can raise any error
-            _warn(point, _first_line(error))
+            _warn(_package(point), f"{point.value}: {_first_line(error)}")
             continue
         if part is None:
-            _warn(point, f"it has nothing for the group {group}")
+            _warn(_package(point), f"{point.value}: it has nothing for the group {group}")
         else:
             yield part
 
@@ -88,7 +88,7 @@ def _entry_points() -> tuple[metadata.EntryPoint, ...]:
             if "[noack." in (package.read_text("entry_points.txt") or ""):
                 found.setdefault(package.name, package.entry_points)
         except Exception as error:  # of a damaged installation of any package
-            _print_once(f"a package is ignored: {package}: {_first_line(error)}")
+            _warn(str(package), _first_line(error))
     return tuple(
         point for name in sorted(found) for point in sorted(found[name]) if point.group.startswith("noack.")
     )
@@ -98,18 +98,15 @@ def _package(point: metadata.EntryPoint) -> str:
     return point.dist.name if point.dist else point.value
 
 
-def _warn(point: metadata.EntryPoint, reason: str) -> None:
-    _print_once(f"the extension {_package(point)} is ignored: {point.value}: {reason}")
-
-
 def _first_line(error: BaseException) -> str:
     return f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0]}"
 
 
-def _print_once(line: str) -> None:
-    """Print a warning, unless this process or one that started it has done so."""
-    printed = os.environ.get(_WARNED_OF, "").split("\n")
-    if line not in printed and sys.stderr is not None:
-        os.environ[_WARNED_OF] = "\n".join(filter(None, (*printed, line)))
+def _warn(package: str, reason: str) -> None:
+    """Print a warning of a package, unless this process or one that started it has done so."""
+    warned_of = os.environ.get(_WARNED_OF, "").split("\n")
+    if package not in warned_of and sys.stderr is not None:
+        os.environ[_WARNED_OF] = "\n".join(filter(None, (*warned_of, package)))
         with suppress(OSError, ValueError):  # full or broken pipe; closed
-            print(f"noack: warning: {printable(line)}", file=sys.stderr, flush=True)
+            line = printable(f"a part of the extension {package} is ignored: {reason}")
+            print(f"noack: warning: {line}", file=sys.stderr, flush=True)

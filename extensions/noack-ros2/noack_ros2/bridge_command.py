@@ -1,4 +1,4 @@
-"""The command ``noack bridge``."""
+"""The command ``noack bridge``; it imports within its function, since each command reads this file."""
 
 import json as json_format
 import tomllib
@@ -7,8 +7,6 @@ from typing import Annotated
 
 import typer
 from typer import Argument, Option
-
-from noack_ros2.ros2_messages import DEFAULT_ROUTER
 
 app = typer.Typer()
 
@@ -39,7 +37,7 @@ def bridge(
     ] = None,
     router: Annotated[
         str, Option(metavar="ENDPOINT", help="Where the router of ROS 2 listens, as zenoh writes it.")
-    ] = DEFAULT_ROUTER,
+    ] = "tcp/127.0.0.1:7447",
     listen: Annotated[
         bool, Option("--listen", help="Be the router at this address, to which nodes connect.")
     ] = False,

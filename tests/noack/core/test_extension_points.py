@@ -76,12 +76,15 @@ def test_a_plant_and_an_export_of_a_package_are_parts_of_noack(tmp_path: Path) -
     ],
 )  # fmt: skip
 def test_a_broken_package_costs_one_line(tmp_path: Path, module: str, reason: str) -> None:
-    install(tmp_path, "noack-swing", "[noack.plants]\nswing = swing_plant\n", swing_plant=module)
+    points = "[noack.plants]\nswing = swing_plant\n[noack.triggers]\nswing = not_there\n"
+    install(tmp_path, "noack-swing", points, swing_plant=module)
     again = "import subprocess, sys; subprocess.run([sys.executable, '-c', sys.argv[1]], check=True)"
     output, warnings = run(tmp_path, "-c", f"{KINDS}; {again}", KINDS)
     assert "swing" not in output
     (line,) = warnings  # the program that it starts prints no other
-    assert line.startswith(f"noack: warning: the extension noack-swing is ignored: swing_plant: {reason}")
+    assert line.startswith(
+        f"noack: warning: a part of the extension noack-swing is ignored: swing_plant: {reason}"
+    )
     assert run(tmp_path, "-c", KINDS, **{NO_EXTENSIONS: "1"})[1] == []
 
 
