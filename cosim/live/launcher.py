@@ -179,7 +179,6 @@ class _Run:
         self._by_hand = [role for role in ROLES if role not in children]
         self._missing: tuple[str, ...] = ()
         self._has_started = self._has_ended = False
-        self._joined = 0
         self._last_s = time.monotonic()
         self._limit = WaitLimit(self._start_within_s())
         """How long the launcher still waits: for the start, for the end, or for the stop."""
@@ -229,11 +228,12 @@ class _Run:
             self._limit.wait(self._last_s - last_s, os.getloadavg()[0])
 
     def _follow_phase(self) -> None:
-        """Do what is due once: when the loop starts, when it has ended, when a process joins."""
+        """Do what is due once: when the loop starts, and when it has ended; tell of the progress."""
         if self._coordinator.epoch_ns is not None and not self._has_started:
             self._has_started = True
             # Now, as nothing waits for the launcher: the versions of all packages take 0.02 s.
             write_environment(self._run_dir, "live", run_name(self._run_id))
+            self._write_processes()
             point_to_latest(self._run_dir)
             self._observers.tell(lambda observer: observer.started(self._run_dir))
             self._helpers.prepare(self._run_dir)
@@ -241,9 +241,6 @@ class _Run:
         elif self._has_started and not self._has_ended and not self._is_in_loop():
             self._has_ended = True  # while the processes end: the imports take 0.3 s
             Thread(target=import_module, args=("cosim.live.finalize",), daemon=True).start()
-        if len(self._coordinator.joined) > self._joined:
-            self._joined = len(self._coordinator.joined)
-            self._write_processes()
         self._notify_progress()
 
     def _failure(self) -> EndReason | None:
@@ -267,7 +264,7 @@ class _Run:
 
     def _write_processes(self) -> None:
         """Write which processes joined, for `noack summary --add`; without that the run goes on."""
-        text = json.dumps(self._coordinator.joined, indent=2)
+        text = json.dumps(self._coordinator.instances(), indent=2)
         with contextlib.suppress(MachineError):
             write_whole(self._run_dir / PROCESSES_FILE, text, make_folder=False)
 

@@ -79,8 +79,8 @@ def _require_process(run_dir: Path, head: KeptHead, file: Path) -> None:
     """Raise unless a file's process joined a run, as the one that knows this secret."""
     if head.run != read_object(run_dir / ENVIRONMENT_FILE).get("run_name"):
         raise CallerError(f"{file}: it belongs to another run than {run_dir}")
-    entry = read_object(run_dir / PROCESSES_FILE).get(writer_of(head.secret))
-    if head.process not in LOOP_ROLES or entry != {"process": head.process}:
+    role = read_object(run_dir / PROCESSES_FILE).get(writer_of(head.secret))
+    if head.process not in LOOP_ROLES or role != head.process:
         raise PeerError(f"{file}: it is not of the {head.process} of this run")
 
 

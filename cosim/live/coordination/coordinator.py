@@ -101,8 +101,6 @@ class Coordinator:
         """By role and instance."""
         self._members: dict[str, _Member] = {}
         """The process of each role that has joined."""
-        self.joined: dict[str, dict[str, str]] = {}
-        """The processes that passed the start barrier, by instance: ``process``."""
         self._reported: dict[str, str] = {}
         self._stopped: str | None = None
 
@@ -153,6 +151,10 @@ class Coordinator:
                 self.plane.refuse(member.query, reason)
                 member.query = None
             member.apply(Event.STOP)
+
+    def instances(self) -> dict[str, str]:
+        """The roles of the processes that have joined, by instance."""
+        return {member.instance: role for role, member in self._members.items()}
 
     def missing(self) -> tuple[str, ...]:
         """Roles that are not at the start barrier."""
@@ -291,7 +293,6 @@ class Coordinator:
         """Answer a join request with the start of the run."""
         if member.state is State.AT_BARRIER:
             member.apply(Event.START)
-        self.joined[member.instance] = {"process": member.role}
         members = [self._members[role] for role in LOOP_ROLES]
         addresses = {member.role: member.address for member in members if member.address is not None}
         query, member.query = member.query, None

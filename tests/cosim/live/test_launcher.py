@@ -45,7 +45,6 @@ class FakeCoordinator:
     def __init__(self, now_s: float, exiting: str = "", **failures: str) -> None:
         self._now_s, self._exiting, self._failures = now_s, exiting, failures
         self._running: tuple[str, ...] = ROLES
-        self.joined: dict[str, Any] = {}
         self.notices: list[str] = []
 
     def now_ns(self) -> int:
@@ -53,6 +52,9 @@ class FakeCoordinator:
 
     def failures(self) -> dict[str, str]:
         return self._failures
+
+    def instances(self) -> dict[str, str]:
+        return {}
 
     def is_over(self, role: str) -> bool:
         return role not in self._running

@@ -56,7 +56,7 @@ def run_dir(full_record: RunRecord, tmp_path: Path) -> Path:
     reports = {role: report | {"process": role} for role, report in full_record.reports.items()}
     del reports["controller"]
     (folder / run_directory.REPORTS_FILE).write_text(json.dumps(reports))
-    processes = {WRITER[role]: {"process": role} for role in SECRETS}
+    processes = {WRITER[role]: role for role in SECRETS}
     (folder / run_directory.PROCESSES_FILE).write_text(json.dumps(processes))
     tables = {table: full_record[table] for table in full_record.tables}
     tables[CONTROLLER_STEP] = tables[CONTROLLER_STEP][:100]
