@@ -34,7 +34,7 @@ int64_t noack_controller_handle(
     put_reals(output, n, message->vector);
     put_reals(output, n, x_c_before);
     put_reals(output, n, controller->x_c);
-    put(output, message->sequence - controller->newest - 1);
+    put(output, message->sequence - 1 - controller->newest); /* in this order: newest may be -1 */
     controller->newest = message->sequence;
     if (controller->acknowledges)
         begin_message(output, NOACK_ACKNOWLEDGEMENT, message->sequence, event_ns);

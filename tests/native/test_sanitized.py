@@ -37,4 +37,4 @@ def test_the_tests_of_the_core_run_clean_under_sanitizers() -> None:
     done = run(*PYTEST, *FILES, "-m", "sanitized")
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[:4000]
     (passed,) = re.findall(r"^(\d+) passed", done.stdout, re.MULTILINE)
-    assert int(passed) >= 85
+    assert int(passed) >= 77
