@@ -2,10 +2,11 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -149,6 +150,51 @@ def test_a_host_whose_clock_may_be_off_by_too_much_does_not_join(start: Start, t
     )
     recording.terminate()
     wait_for_end(recording)
+
+
+def _of_another_run(folder: Path, third: Path) -> None:
+    for name in ("certificate.pem", "private_key.pem"):
+        shutil.copy(third / "controller" / name, folder / name)
+
+
+def _none(folder: Path, third: Path) -> None:
+    for name in ("certificate.pem", "private_key.pem"):
+        (folder / name).write_bytes(b"")
+
+
+def _of_another_role(folder: Path, third: Path) -> None:
+    for name in ("certificate.pem", "private_key.pem"):
+        shutil.copy(folder.parent / "credentials" / "sensor" / name, folder / name)
+
+
+@pytest.mark.parametrize(
+    ("take", "reason"),
+    [
+        (_of_another_run, "it did not accept these credentials, or is busy; each run has new ones"),
+        (_none, "it did not accept these credentials, or is busy; each run has new ones"),
+        (_of_another_role, "no answer to 'admit' within 10 s"),
+    ],
+)
+def test_the_certificates_of_a_third_party_admit_nobody(
+    start: Start, tmp_path: Path, take: Callable[[Path, Path], None], reason: str
+) -> None:
+    """It knows the run, by the file `run.json` of the controller, but has no key of the controller."""
+    recording = record(start, tmp_path)
+    third = tmp_path / "third"
+    more = ("--credentials", str(third), "--session", "third")
+    other = start(0, "record", "lane_following", "--listen", f"{LISTEN}:7448", *live.BARE, *more)
+    live.wait_for(lambda: third.exists() or other.poll() is not None)
+    stolen = tmp_path / "stolen"
+    shutil.copytree(tmp_path / "credentials" / "controller", stolen)
+    take(stolen, third)
+    thief = start(1, "controller", "--credentials", str(stolen))
+    _, stderr = wait_for_end(thief)
+    assert thief.returncode == 1
+    assert reason in stderr.splitlines()[-1]
+    assert "Traceback" not in stderr
+    for process in (recording, other):
+        process.terminate()
+        wait_for_end(process)
 
 
 @pytest.mark.usefixtures("hosts")

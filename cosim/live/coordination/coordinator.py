@@ -82,7 +82,7 @@ class Coordinator:
     ) -> None:
         self._launched, self._own_clock = launched, own_clock
         self._clock_settings = descriptor.scenario.clocks
-        self.notices: list[str] = []
+        self.notices = [] if own_clock is None else [_clock_line("the clock of this host", own_clock)]
         """Lines for the person who watches the run, which have not been taken yet."""
         self.plane = ControlPlane(descriptor, COORDINATOR, listen=True)
         session, key = self.plane.session, self.plane.key
@@ -253,11 +253,9 @@ class Coordinator:
         """Return the clock of a process; raise PeerError if it may be off by more than is allowed."""
         if clock is None or self._own_clock is None or self._clock_settings is None:
             return None
-        require_small_error(f"the clock of the {role}'s host", clock, self._clock_settings)
-        bound = f"by at most {clock.error_ns / 1000:g} µs"
-        if clock.source == STATED:
-            bound += f", as {STATED} states: there is no chrony"
-        self.notices.append(f"the clock of the {role}'s host may be off {bound}")
+        which = f"the clock of the {role}'s host"
+        require_small_error(which, clock, self._clock_settings)
+        self.notices.append(_clock_line(which, clock))
         return clock
 
     def _join(self, role: str, query: zenoh.Query) -> None:
@@ -313,6 +311,12 @@ class Coordinator:
         if self._own_clock is None or all(self._members[role].clock is None for role in LOOP_ROLES):
             return {}
         return {role: self._members[role].clock or self._own_clock for role in LOOP_ROLES}
+
+
+def _clock_line(which: str, clock: ClockError) -> str:
+    """Return how far a clock may be off, and whether this was measured."""
+    stated = f", as {STATED} states: there is no chrony" if clock.source == STATED else ""
+    return f"{which} may be off by at most {clock.error_ns / 1000:g} µs{stated}"
 
 
 def _sender(key_expr: object) -> tuple[str, str]:
