@@ -81,7 +81,7 @@ def serve(
     """
     secret, listener = secrets.token_urlsafe(_SECRET_BYTES), _listen(port)
     address = f"http://{HOST}:{listener.getsockname()[1]}/{secret}/"
-    pool = multiprocessing.get_context("spawn").Pool(_WORKERS, os.nice, (_NICE,))
+    pool = multiprocessing.get_context("spawn").Pool(_WORKERS, _yield_to_others)
     with listener, pool, tempfile.TemporaryDirectory(prefix="noack-lab-") as folder:
         services = LabServices(draft, runs, pool)
 
@@ -101,6 +101,11 @@ def serve(
         )
         with suppress(KeyboardInterrupt):  # Ctrl-C is how it ends
             asyncio.run(_LabServer(config, services, on_start).serve(sockets=[listener]))
+
+
+def _yield_to_others() -> None:
+    if hasattr(os, "nice"):  # not on Windows
+        os.nice(_NICE)
 
 
 def lab_application(services: LabServices) -> FastAPI:

@@ -77,9 +77,12 @@ class LiveRun:
         if not self.reports:
             return [VerdictText(self.state)]
         report = self.reports[-1]
+        late_ms = report["late_us"] / 1000
         return [
             VerdictText(f"{self.state}: {report['t_s']:.1f} of {self.horizon_s:g} s"),
-            VerdictText(f"longest loss burst {report['longest_loss_burst']}"),
+            VerdictText(
+                f"longest loss burst {report['longest_loss_burst']}, largest lateness {late_ms:.3g} ms"
+            ),
             VerdictText(f"{report['events']} transmissions, {report['deliveries']} delivered"),
         ]
 

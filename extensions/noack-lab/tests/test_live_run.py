@@ -9,7 +9,14 @@ import pytest
 import noack
 from noack_lab.live_run import LiveRun
 
-PROGRESS = {"t_s": 1.0, "events": 3, "deliveries": 1, "longest_loss_burst": 2, "x_norm": 0.5}
+PROGRESS = {
+    "t_s": 1.0,
+    "events": 3,
+    "deliveries": 1,
+    "longest_loss_burst": 2,
+    "x_norm": 0.5,
+    "late_us": 250.0,
+}
 
 
 def take(run: LiveRun, event: str, **fields: object) -> None:
@@ -26,6 +33,7 @@ def test_what_a_live_run_prints_sets_its_state_and_its_lines() -> None:
     shown = run.shown
     assert shown.values("‖x‖ plant").tolist() == [0.5]
     assert shown.verdict[0].text == "running: 2.0 of 4 s"
+    assert shown.verdict[1].text == "longest loss burst 2, largest lateness 0.25 ms"
     take(run, "end", directory="runs/a", status=0)
     assert run.is_over
     assert run.lines == ["it is run", "it is end"]
