@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from noack.core.errors import CallerError, did_you_mean, shortened
+from noack.core.extension_points import missing_extension
 from noack.core.file_access import shipped_files
 
 KINDS = ("scenarios", "campaigns")
@@ -53,6 +54,8 @@ def find_shipped(name: str, folder: str) -> Path:
     for other in KINDS:
         if name in shipped_names(other):
             raise CallerError(f"{name}: a shipped {other.removesuffix('s')}, not a {kind}")
+    if missing := missing_extension(f"noack.{folder}", name):
+        raise CallerError(f"{name}: {missing}")
     if path.suffix == ".toml":
         names += sorted(map(str, Path().glob("*.toml")))
     hint = did_you_mean(name, names) or _LIST

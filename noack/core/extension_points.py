@@ -34,6 +34,7 @@ KNOWN: Mapping[str, Mapping[str, str]] = {
     "noack.controllers": {"ros2": "noack-ros2"},
     "noack.exports": {"mcap": "noack-ros2"},
     "noack.commands": {"bridge": "noack-ros2", "lab": "noack-lab"},
+    "noack.scenarios": dict.fromkeys(("cart_pole_mujoco", "double_pendulum_mujoco"), "noack-gymnasium"),
 }
 """The extensions that come with noack, by group and name of a part: to say what is to be installed."""
 

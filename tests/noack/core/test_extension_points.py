@@ -7,9 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from noack.core.errors import CallerError
 from noack.core.extension_points import NO_EXTENSIONS
-from tests.helpers.shipped import shipped
+from tests.helpers.command_line import invoke
 
 PLANT = """
 from typing import Literal
@@ -93,7 +92,13 @@ def test_an_entry_point_that_is_a_class_is_for_plants_in_python(tmp_path: Path) 
     assert run(tmp_path, "-c", KINDS)[1] == []
 
 
-@pytest.mark.parametrize("table", ["plant.system"])
-def test_an_unknown_kind_of_a_known_extension_names_its_package(table: str) -> None:
-    with pytest.raises(CallerError, match=rf'{table}.kind = "nosuch": must be one of'):
-        shipped("double_integrator", f'{table}.kind="nosuch"')
+@pytest.mark.parametrize(("words", "package"), [
+    (["check", "double_integrator", "--set", "plant.system.kind=fmu"], "noack-fmi"),
+    (["check", "cart_pole_mujoco"], "noack-gymnasium"),
+    (["linearise", "gymnasium:Pendulum-v1"], "noack-gymnasium"),
+    (["bridge", "lane_following"], "noack-ros2"),
+])  # fmt: skip
+def test_what_an_extension_of_noack_has_is_answered_with_its_package(words: list[str], package: str) -> None:
+    result = invoke(*words)
+    assert (result.exit_code, result.stderr.count("\n")) == (2, 1), result.output
+    assert f"needs an extension that is not installed; pip install {package}" in result.stderr
