@@ -12,14 +12,14 @@ from noack_lab.results import ShownRun
 Json = dict[str, Any]
 
 REFERENCE = "for comparison"
-_GREY = (0, 120, 200)
+_GREY = (60, 60, 60)
 _CROSS = "path://M0 1L1 0L5 4L9 0L10 1L6 5L10 9L9 10L5 6L1 10L0 9L4 5Z"
 _PIXELS_PER_POINT = 4 / 3
 _DECADES = 7
 """Below the largest value on a logarithmic axis: an error is 0 after a reset."""
 _HEAD, _PLOT, _GAP, _FOOT = 48, 120, 12, 40
 """Heights in pixels: title and legend of a panel, its axes, the space below them, the last axis."""
-_LEFT, _RIGHT = 62, 14
+_LEFT, _RIGHT, _TOOLS = 62, 14, 84
 
 
 class Drawn(NamedTuple):
@@ -67,7 +67,8 @@ def chart_options(drawn: Drawn) -> Json:
             {"text": f"{title}{unit}{scale}", "top": top + 2, "left": 4, "textStyle": style}
         )
         names = list(dict.fromkeys(curve.name for curve in curves))
-        legend = {"data": names, "top": top + 24, "left": _LEFT - 6, "type": "scroll"}
+        legend: Json = {"data": names, "top": top + 24, "left": _LEFT - 6, "type": "scroll"}
+        legend["right"] = _RIGHT if number else _TOOLS
         options["legend"].append(legend | {"itemGap": 14, "textStyle": {"fontSize": 13}})
         options["grid"].append({"top": top + _HEAD, "height": _PLOT, "left": _LEFT, "right": _RIGHT})
         axis: Json = {"type": "value", "gridIndex": number, "min": 0, "max": float(f"{end_s:.6g}")}
