@@ -89,7 +89,7 @@ def test_a_run_and_each_loop_can_be_summarised_and_replayed(run_dir: Path) -> No
         assert json.loads(replayed.stdout)["gaps"] == []
     output = invoke("summary", run_dir).stdout
     assert "bottleneck" in output
-    assert "guarantee not checkable in 11 of 11 loops: pendulum-01: no certificate: " in output
+    assert "guarantee not checkable in 1 of 11 loops: periodic: no certificate: " in output
     result = invoke("summary", run_dir, "--loop", "x")
     assert (result.exit_code, result.stderr.count("\n")) == (2, 1)
     assert "--loop x: the run has no such loop; it has pendulum-01, " in result.stderr
