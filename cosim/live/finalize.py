@@ -48,7 +48,7 @@ from cosim.record.run_directory import (
 from cosim.record.run_record import RecordedRun, RunRecord, load_run, scenarios_of
 from cosim.record.spool_conversion import finish_record
 from noack.core.errors import CallerError, ExitStatus, MachineError
-from noack.core.file_access import write_whole
+from noack.core.file_access import remove_file, write_whole
 from noack.core.system_processes import cores
 from noack.runtime.spool import SPOOL
 from noack.scenario.scenario import Scenario
@@ -152,7 +152,7 @@ def _warning_if_not_written(path: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        path.unlink(missing_ok=True)
+        remove_file(path)
         print(f"noack: warning: no {path.name}: {error}", file=sys.stderr)
 
 

@@ -8,7 +8,6 @@ run.
 import contextlib
 import json
 import os
-import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -35,7 +34,7 @@ from cosim.record.run_directory import (
 )
 from cosim.record.run_scenario import write_scenario
 from noack.core.errors import ExitStatus, MachineError, NeverStartedError, NoackError
-from noack.core.file_access import write_whole
+from noack.core.file_access import remove_folder, write_whole
 from noack.protocol.roles import RECORDER, ROLES
 from noack.runtime.active_runs import registered_run, run_name
 from noack.runtime.command_line import Signals, StopRequestError, stop_reason
@@ -133,7 +132,7 @@ def _no_directory_if_refused(run_dir: Path) -> Iterator[None]:
     try:
         yield
     except NoackError:
-        shutil.rmtree(run_dir, ignore_errors=True)
+        remove_folder(run_dir)
         raise
 
 

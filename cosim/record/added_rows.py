@@ -23,6 +23,7 @@ from cosim.record.run_directory import (
 )
 from cosim.record.run_record import RunRecord, load_run
 from noack.core.errors import CallerError, MachineError, NoackError, PeerError, why
+from noack.core.file_access import move, open_folder
 from noack.protocol.record_tables import OWNER
 from noack.protocol.roles import LOOP_ROLES
 from noack.runtime.control_messages import ProcessReport, parse_message
@@ -53,8 +54,9 @@ def add_rows(run_dir: Path, file: Path, complete: Callable[[Path], T]) -> tuple[
         PeerError: the file cannot be of a process of this run.
         MachineError: the record cannot be written.
     """
-    run_dir = run_dir.resolve()
     try:
+        with open_folder(run_dir):  # no link of another user is on the way
+            run_dir = run_dir.resolve()
         with (
             finished_run(run_dir),
             tempfile.TemporaryDirectory(dir=run_dir.parent, prefix=f".{run_dir.name}.") as scratch,
@@ -66,8 +68,8 @@ def add_rows(run_dir: Path, file: Path, complete: Callable[[Path], T]) -> tuple[
             _take(merged, head, parts, file)
             outcome = _complete(complete, merged, run_dir, file)
             _require_consistent(run_dir, merged, file)
-            run_dir.rename(Path(scratch) / "before")
-            merged.rename(run_dir)
+            move(run_dir, Path(scratch) / "before")
+            move(merged, run_dir)
     except OSError as error:
         # Of several files that cannot be copied, each with source and copy: the first one's reason.
         reason = error.args[0][0][2] if isinstance(error, shutil.Error) else why(error)

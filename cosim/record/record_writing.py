@@ -11,7 +11,7 @@ from cosim.record.processes import joint_reports
 from cosim.record.record_source import Rows, with_loop
 from cosim.record.run_directory import RECORD, REPORTS_FILE
 from cosim.record.run_record import NOTICES_FILE, Notice, RecordedRun
-from noack.core.file_access import PARTIAL, new_file, write_whole
+from noack.core.file_access import PARTIAL, create_folder, new_file, remove_file, write_whole
 from noack.core.system_processes import cores
 from noack.protocol.record_tables import LOOP, is_of_network
 from noack.scenario.resolution import resolve, run_tables
@@ -68,9 +68,9 @@ def vector_names(scenario: Scenario) -> dict[str, Sequence[str]]:
 @contextmanager
 def record_folder(folder: Path, notices: Iterable[Notice]) -> Iterator[None]:
     """Have a folder for the tables that are written within the context, and for the run's log."""
-    folder.mkdir(exist_ok=True)
+    create_folder(folder)
     for scratch in folder.glob(f".*{PARTIAL}"):  # of a process that was killed
-        scratch.unlink(missing_ok=True)
+        remove_file(scratch)
     yield
     with new_file(folder / NOTICES_FILE, make_folder=False) as file:
         file.writelines(f"{json.dumps(notice)}\n".encode() for notice in notices)

@@ -21,7 +21,7 @@ from types import TracebackType
 from typing import Any, Literal, Self
 
 from noack.core.errors import CallerError, ExitStatus, MachineError, NoackError, why
-from noack.core.file_access import locked, open_growing, read_regular, write_whole
+from noack.core.file_access import create_folder, locked, open_growing, read_regular, write_link, write_whole
 from noack.core.system_processes import cores
 
 DEFAULT_RUNS = Path("runs")
@@ -53,7 +53,7 @@ def new_run_dir(runs: Path, name: str) -> Path:
     _require_utf8(runs)
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
     try:
-        runs.mkdir(parents=True, exist_ok=True)
+        create_folder(runs)
         free_bytes = shutil.disk_usage(runs).free
         if free_bytes < LEAST_FREE_BYTES:
             raise MachineError(
@@ -63,8 +63,8 @@ def new_run_dir(runs: Path, name: str) -> Path:
         for attempt in range(1000):
             run_dir = runs / (f"{stamp}-{name}" + (f"-{attempt}" if attempt else ""))
             with contextlib.suppress(FileExistsError):
-                run_dir.mkdir()
-                (run_dir / "logs").mkdir()
+                create_folder(run_dir, exist_ok=False)
+                create_folder(run_dir / "logs", exist_ok=False)
                 return run_dir
     except OSError as error:
         raise MachineError(f"{runs}: no run directory can be created: {why(error)}") from None
@@ -98,13 +98,9 @@ def point_to_latest(run_dir: Path) -> None:
     if not _HAS_LINKS:
         return
     latest = run_dir.parent / LATEST
-    scratch = run_dir.parent / f".{LATEST}.{os.urandom(8).hex()}"
     try:  # the link is optional, so its failure does not end the run
-        scratch.symlink_to(run_dir.name)
-        scratch.replace(latest)
+        write_link(latest, run_dir.name)
     except OSError as error:
-        with contextlib.suppress(OSError):
-            scratch.unlink(missing_ok=True)
         print(
             f"noack: warning: {latest} cannot be replaced: {why(error)}; this run is in {run_dir}",
             file=sys.stderr,

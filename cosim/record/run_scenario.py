@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from cosim.record.run_directory import SCENARIO_FILE
-from noack.core.file_access import copy_whole, write_whole
+from noack.core.file_access import copy_whole, create_folder, write_whole
 from noack.scenario.scenario import Scenario, with_loop_tables
 from noack.scenario.scenario_file import dumps
 from noack.settings.user_files import FileSettings, checked_path, file_tables, with_tables
@@ -33,7 +33,7 @@ def write_scenario(scenario: Scenario, run_dir: Path) -> Scenario:
             file = checked_path(table, f"{prefix}{key}")
             name = f"{key.split('.')[0]}/{prefix.replace('.', '_')}{file.name}"
             if not (run_dir / name).is_file():
-                (run_dir / name).parent.mkdir(exist_ok=True)
+                create_folder((run_dir / name).parent)
                 copy_whole(file, run_dir / name)
             copies[key] = table.model_copy(update={"file": f"{folder}{name}"})
         return copies

@@ -29,7 +29,7 @@ from cosim.record.record_writing import record_folder, vector_names
 from cosim.record.run_directory import RECORD
 from cosim.record.run_record import Notice, RecordedRun, load_run, read_notices, scenarios_of
 from noack.core.errors import MachineError, PeerError, why
-from noack.core.file_access import remove_folder
+from noack.core.file_access import create_folder, move, remove_file, remove_folder
 from noack.core.row_operations import firsts_of_equal
 from noack.core.system_processes import be_idle, cores
 from noack.protocol.record_tables import LOOP, is_of_network
@@ -166,7 +166,7 @@ def finish_record(
     try:
         with record_folder(run_dir / RECORD, notices):
             for file in [f"{table}.parquet" for table in ready]:
-                (run_dir / SPOOL / EARLY / file).replace(run_dir / RECORD / file)
+                move(run_dir / SPOOL / EARLY / file, run_dir / RECORD / file)
             for _ in map_tables(partial(convert_table, run_dir), tables):
                 pass  # each table is written as the iteration reaches it
     except OSError as error:
@@ -229,7 +229,7 @@ def remove_spool(run_dir: Path) -> None:
         if spool.is_dir():  # moved in one step, so that an incomplete spool is never read
             spool_to_remove = spool.with_name(f"{SPOOL}.done")
             remove_folder(spool_to_remove)  # of an earlier attempt that was interrupted
-            remove_folder(spool.rename(spool_to_remove))
+            remove_folder(move(spool, spool_to_remove))
     except OSError as error:
         raise _write_error(run_dir, error) from None
 
@@ -275,7 +275,7 @@ def write_early(run_dir: Path) -> Mapping[str, int]:
         with ThreadPoolExecutor(1, initializer=be_idle) as thread:
             tables = thread.submit(_open_tables, run_dir, stack).result()
             thread.submit(_follow, tables, end_file).result()
-        end_file.unlink()
+        remove_file(end_file)
         with ThreadPoolExecutor(cores()) as threads:
             for _ in threads.map(_EarlyTable.finish, tables):
                 pass  # an error of a thread is raised here
@@ -286,7 +286,7 @@ def _open_tables(run_dir: Path, stack: ExitStack) -> "list[_EarlyTable]":
     """Open the tables of the loops, in a new folder."""
     scenario, loops = scenarios_of(run_dir)
     folder, names = run_dir / SPOOL / EARLY, vector_names(scenario)
-    folder.mkdir()
+    create_folder(folder, exist_ok=False)
     tables = []
     for table, dtype in run_tables(scenario).items():
         spool = run_dir / SPOOL / f"{table}.{RECORDER}"

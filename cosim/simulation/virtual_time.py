@@ -7,7 +7,6 @@ of the network couple the loops. :func:`simulate_run` writes the run directory o
 """
 
 import secrets
-import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -31,6 +30,7 @@ from netem.channel import RUN_ID, UserNetwork, channel_of
 from noack.core.clock import NEVER_NS
 from noack.core.core_library import CData, core, ffi
 from noack.core.errors import ExitStatus, MachineError, why
+from noack.core.file_access import remove_folder
 from noack.core.system_processes import require_limits
 from noack.machines.loop_machines import LoopMachines, row_types
 from noack.protocol.record_tables import LOOP, OWNER, is_of_network, network_tables
@@ -316,7 +316,7 @@ def simulate_run(scenario: Scenario, runs: Path, progress: Progress | None = Non
             write_run(run, run_dir)
             ending.store(ExitStatus.OK, HORIZON)
     except BaseException as error:
-        shutil.rmtree(run_dir, ignore_errors=True)
+        remove_folder(run_dir)
         if isinstance(error, OSError):
             raise MachineError(f"{run_dir}: cannot be written: {why(error)}") from None
         raise

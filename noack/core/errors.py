@@ -89,8 +89,10 @@ def one_line(error: BaseException | str) -> str:
 
 def why(error: OSError | ValueError) -> str:
     """Return the operating system's text of an error, without additions by libraries."""
-    number = error.errno if isinstance(error, OSError) else None
-    return os.strerror(number) if number else one_line(error)
+    if not isinstance(error, OSError):
+        return one_line(error)
+    # str() of an error without a number, but with a file, is "[Errno None] None: 'FILE'".
+    return os.strerror(error.errno) if error.errno else one_line(" ".join(map(str, error.args)))
 
 
 def shortened(text: str, longest: int = 80) -> str:

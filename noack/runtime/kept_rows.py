@@ -14,7 +14,7 @@ from typing import IO, Annotated
 from pydantic import Field
 
 from noack.core.errors import CallerError, MachineError, PeerError, why
-from noack.core.file_access import open_append, open_regular
+from noack.core.file_access import create_file, open_append, open_regular
 from noack.runtime.control_messages import ControlMessage, Count, message_json, parse_message
 from noack.runtime.spool import KEPT_REPORT, NOTICES, notices_of
 from noack.runtime.telemetry import first_row
@@ -55,8 +55,7 @@ class KeptFile:
         role = self._head.process
         for path in (self._folder / f"{role}.spool", self._folder / f"{role}-{self._head.run}.spool"):
             try:
-                self._folder.mkdir(parents=True, exist_ok=True)
-                descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+                descriptor = create_file(path, 0o600)
             except FileExistsError:
                 continue
             except OSError as error:

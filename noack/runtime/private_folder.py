@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from noack.core.errors import CallerError, MachineError, why
-from noack.core.file_access import lock
+from noack.core.file_access import lock, open_folder
 
 _SUFFIX = ".json"
 
@@ -107,26 +107,29 @@ def open_private(*inside: str, create: bool = False) -> Iterator[PrivateFolder]:
     if not path.parent.is_dir():
         raise CallerError(f"{path.parent}: no such folder; set XDG_RUNTIME_DIR to a folder of yours")
     with ExitStack() as stack:
-        descriptor: int | None = None
+        try:
+            descriptor = stack.enter_context(open_folder(path.parent)).descriptor
+        except OSError as error:
+            raise CallerError(f"{path.parent}: {why(error)}") from None
         for folder in (path, *(path := path / name for name in inside)):
-            name = folder if descriptor is None else folder.name
-            descriptor = _open_folder(folder, name, descriptor, create=create)
+            descriptor = _open_folder(folder, descriptor, create=create)
             stack.callback(os.close, descriptor)
         assert descriptor is not None
         yield PrivateFolder(path, descriptor)
 
 
-def _open_folder(path: Path, name: Path | str, parent: int | None, *, create: bool) -> int:
+def _open_folder(path: Path, parent: int | None, *, create: bool) -> int:
     if create:
         try:
-            os.mkdir(name, 0o700, dir_fd=parent)
+            os.mkdir(path.name, 0o700, dir_fd=parent)
         except FileExistsError:
             pass
         except OSError as error:
             raise CallerError(f"{path}: cannot be made ({error.strerror})") from None
     wrong = CallerError(f"{path}: must be a folder of yours, no link, closed to others (mode 700)")
+    flags = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
     try:
-        descriptor = os.open(name, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=parent)
+        descriptor = os.open(path.name, flags, dir_fd=parent)
     except FileNotFoundError:
         raise
     except OSError:  # a link, no folder, or one that we may not read

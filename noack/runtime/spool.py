@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import IO, BinaryIO, NamedTuple
 
 from noack.core.errors import MachineError, why
-from noack.core.file_access import open_append
+from noack.core.file_access import create_folder, open_append
 
 SPOOL = "spool"  # the spool's folder in the run directory
 EARLY = "early"
@@ -48,7 +48,7 @@ class SpoolWriter:
         self._writer = writer
         self._files: dict[str, BinaryIO] = {}
         with self._errors_with_path():
-            folder.mkdir(exist_ok=True)
+            create_folder(folder)
 
     def append(self, table: str, first: int, payload: bytes) -> None:
         """Write one batch through to the operating system."""

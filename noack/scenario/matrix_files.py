@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import ValidationError
 
-from noack.core.errors import CallerError
+from noack.core.errors import CallerError, why
 from noack.core.file_access import new_file
 from noack.core.linear_systems import Matrix
 from noack.protocol.wire_format import MAX_DIMENSION
@@ -258,7 +258,7 @@ def save_model(path: str | Path, system: object, gain: ArrayLike | None = None) 
     try:
         write_matrices(Path(path), matrices_of(system, gain))
     except (OSError, ValueError) as error:
-        raise CallerError(f"{path}: cannot be written: {error}") from None
+        raise CallerError(f"{path}: cannot be written: {why(error)}") from None
 
 
 def matrices_of(system: object, gain: ArrayLike | None = None) -> dict[str, Matrix]:

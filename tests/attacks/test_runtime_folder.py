@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
@@ -18,7 +19,15 @@ from cosim.doctor.machine_measures import _runtime_folder_problem
 from cosim.output.viewer.loop_recording import RecordingFile
 from cosim.record.run_directory import ENDING_FILE, RECORD, RECORDING_FILE, EndingFile, finished_run
 from netem.control import control_server as emulator_session
-from noack.core.errors import CallerError, NoackError
+from noack.core.errors import CallerError, MachineError, NoackError
+from noack.core.file_access import (
+    create_file,
+    create_folder,
+    open_growing,
+    remove_file,
+    remove_folder,
+    write_whole,
+)
 from noack.runtime import active_runs
 from noack.runtime.run_descriptor import RunDescriptor, descriptor_file, find_descriptor, new_descriptor
 from noack.runtime.spool import SPOOL, SpoolWriter
@@ -268,6 +277,103 @@ def test_a_folder_that_is_another_users_link_is_not_written_to(common: Path, pri
     assert untouched(private)
     os.chown(common / "tables", os.getuid(), os.getgid(), follow_symlinks=False)
     assert invoke(*words).exit_code == 0
+
+
+OUTPUTS: dict[str, tuple[str, ...]] = {
+    "--tables": ("certify", "double_integrator", "--tables", "{}/tables"),
+    "--out": ("measure", "rural_n8_10kmh", "--out", "{}/m.html"),
+    "--write": ("measure", "rural_n8_10kmh", "--write", "{}/network.toml"),
+    "--runs": ("simulate", "double_integrator", "--set", "horizon_s=0.1", "--runs", "{}"),
+    "--runs with a folder": ("simulate", "double_integrator", "--set", "horizon_s=0.1", "--runs", "{}/runs"),
+    "--out of a campaign": (
+        "campaign",
+        "mb_vs_zoh",
+        "--draws",
+        "1",
+        "--workers",
+        "1",
+        "--out",
+        "{}/campaign",
+    ),
+    "a new scenario": ("new", "{}/mine.toml", "--plant", "double_integrator"),
+}
+
+
+@needs_root
+@pytest.mark.parametrize("above", ["", "sub"], ids=["itself", "above"])
+@pytest.mark.parametrize("option", OUTPUTS)
+def test_no_output_passes_a_link_of_another_user(
+    option: str, above: str, common: Path, private: Path
+) -> None:
+    link = common / "o"
+    (private.parent / "sub").mkdir()
+    before = sorted(private.parent.rglob("*"))
+    link.symlink_to(private.parent)
+    os.chown(link, NOBODY, NOBODY, follow_symlinks=False)
+    words = [word.format(link / above) for word in OUTPUTS[option]]
+    result = invoke(*words)
+    assert result.exit_code != 0
+    assert f"{link} is a symbolic link of another user" in result.stderr
+    assert sorted(private.parent.rglob("*")) == before
+    assert private.read_bytes() == PRIVATE
+
+
+@needs_root
+@pytest.mark.parametrize("make", [create_folder, create_file, remove_file, remove_folder])
+def test_no_folder_or_file_is_made_or_removed_through_a_link_of_another_user(
+    make: Callable[[Path], object], common: Path, private: Path
+) -> None:
+    (private.parent / "sub").mkdir()
+    (link := common / "o").symlink_to(private.parent)
+    os.chown(link, NOBODY, NOBODY, follow_symlinks=False)
+    before = sorted(private.parent.rglob("*"))
+    for path in (link / "new", link / "sub" / "new", link / "sub", link / private.name):
+        with suppress(OSError):
+            make(path)
+    assert sorted(private.parent.rglob("*")) == before
+    assert private.read_bytes() == PRIVATE
+
+
+def test_own_links_on_the_way_are_followed(tmp_path: Path) -> None:
+    (tmp_path / "disk" / "deep").mkdir(parents=True)
+    (tmp_path / "second").symlink_to("disk")
+    (tmp_path / "first").symlink_to(tmp_path / "second" / "deep")
+    write_whole(tmp_path / "first" / "new" / ".." / "new" / "a.txt", "text")
+    assert (tmp_path / "disk" / "deep" / "new" / "a.txt").read_text() == "text"
+    (tmp_path / "stats").symlink_to("first/new/b.txt")
+    for text in (b"first", b"next"):
+        descriptor = open_growing(tmp_path / "stats", follow=True)
+        os.write(descriptor, text)
+        os.close(descriptor)
+        assert (tmp_path / "disk" / "deep" / "new" / "b.txt").read_bytes() == text
+
+
+def test_links_in_a_circle_are_an_error(tmp_path: Path) -> None:
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    with pytest.raises(MachineError, match="Too many levels of symbolic links"):
+        write_whole(tmp_path / "a" / "file", "text")
+    with pytest.raises(OSError, match="Too many levels of symbolic links"):
+        open_growing(tmp_path / "a", follow=True)
+
+
+@needs_root
+def test_statistics_pass_no_link_of_another_user(common: Path, private: Path) -> None:
+    """Behind a link of the user's own, too."""
+    (link := common / "o").symlink_to(private.parent)
+    os.chown(link, NOBODY, NOBODY, follow_symlinks=False)
+    (own := common / "own").symlink_to(link / private.name)
+    for path in (link / private.name, own):
+        with pytest.raises(OSError, match="is a symbolic link of another user"):
+            open_growing(path, follow=True)
+    assert untouched(private)
+
+
+def test_standard_output_can_be_a_growing_file() -> None:
+    code = "import os, pathlib; from noack.core.file_access import open_growing;"
+    code += "os.write(open_growing(pathlib.Path('/dev/stdout'), follow=True), b'text')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
+    assert (done.stdout, done.stderr) == (b"text", b"")
 
 
 @pytest.fixture(scope="module")

@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 from noack.core.clock import clock_identity
 from noack.core.errors import CallerError, PeerError, why
+from noack.core.file_access import move, open_folder
 from noack.protocol.roles import LOOP_ROLES, RECORDER
 from noack.runtime.address import Address, address_text, parse_address
 from noack.runtime.connections.credentials import CA_FILE, CERTIFICATE_FILE, KEY_FILE, RUN_FILE, own_host
@@ -138,12 +139,13 @@ def _replacing(folder: Path) -> Iterator[Path]:
     """
     if folder.is_symlink() or (folder.exists() and not _is_of_credentials(folder)):
         raise CallerError(f"{folder}: exists, and is not a folder of credentials; give another")
-    new = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
+    with open_folder(folder.parent):  # no link of another user is on the way
+        new = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
     try:
         yield new
         if folder.exists():
             shutil.rmtree(folder)
-        new.rename(folder)
+        move(new, folder)
     finally:
         shutil.rmtree(new, ignore_errors=True)
 

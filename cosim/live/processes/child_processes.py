@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import IO, NamedTuple
 
 from cosim.live.processes.fork_server import ENVIRONMENT, ForkedProcess, ForkServer
-from noack.core.errors import ExitStatus, MachineError
+from noack.core.errors import ExitStatus, MachineError, why
 from noack.core.file_access import open_append
 from noack.core.system_processes import python_command
 from noack.protocol.roles import RECORDER
@@ -86,7 +86,7 @@ class ChildProcesses:
             with os.fdopen(open_append(self._run_dir / "logs" / f"{role}.log"), "a") as log:
                 child = self._start_python(role, arguments, log)
         except OSError as error:
-            raise MachineError(f"{role} cannot be started: {error}") from None
+            raise MachineError(f"{role} cannot be started: {why(error)}") from None
         assert child.stdin is not None
         with contextlib.suppress(BrokenPipeError):
             child.stdin.write(self._descriptor.model_dump_json() + "\n")

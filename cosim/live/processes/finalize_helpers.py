@@ -4,6 +4,7 @@ They import libraries and write tables at idle priority: a process of the run th
 core at once. What is not done when the run ends, or is lost with a helper, is done then.
 """
 
+import os
 import time
 from collections import deque
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
@@ -18,6 +19,7 @@ from typing import TYPE_CHECKING, TypeVar, cast
 
 from cosim.live.processes.process_pool import at_idle_priority, call_by_name, process_starts, processes
 from cosim.record.run_directory import RunEnding
+from noack.core.file_access import open_append
 from noack.core.system_processes import cores
 from noack.runtime.spool import EARLY, EARLY_ENDED, SPOOL
 from noack.scenario.scenario import Scenario, loop_names
@@ -92,7 +94,7 @@ class FinalizeHelpers:
         if self._end_file is None:  # no process writes tables, or not yet
             return False
         with suppress(OSError):  # its folder does not exist yet
-            self._end_file.touch()
+            os.close(open_append(self._end_file))
             return True
         return False
 

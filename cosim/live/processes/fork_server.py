@@ -25,7 +25,7 @@ from typing import IO
 
 from pydantic import BaseModel
 
-from noack.core.errors import MachineError
+from noack.core.errors import MachineError, why
 from noack.core.system_processes import QUICK_IMPORTS, python_command, require_limits
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
@@ -217,7 +217,7 @@ def fork_server(server: ForkServer | None = None) -> Iterator[ForkServer | None]
     try:
         server = server or ForkServer()
     except OSError as error:
-        raise MachineError(f"the fork server cannot be started: {error}") from None
+        raise MachineError(f"the fork server cannot be started: {why(error)}") from None
     with closing(server):
         yield server
 

@@ -25,6 +25,7 @@ from cosim.record.run_directory import RECORDING_FILE, active_run
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core
 from noack.core.errors import ExitStatus, MachineError, PeerError
+from noack.core.file_access import remove_file
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
@@ -370,7 +371,7 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
     except MachineError as error:
         print_to_stderr(f"noack recorder: {error}; the numeric record is complete")
     if recorder.view_is_incomplete or unseen:
-        (run_dir / RECORDING_FILE).unlink(missing_ok=True)  # the launcher writes another one
+        remove_file(run_dir / RECORDING_FILE)  # the launcher writes another one
     recorder.report()
     if recorder.lost is not None:
         raise recorder.lost

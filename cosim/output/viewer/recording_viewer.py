@@ -47,7 +47,7 @@ from cosim.output.viewer.rerun_program import (
 )
 from cosim.record.run_directory import RECORDING_FILE, SUMMARY_FILE, loop_of_file, read_object
 from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError, ExitStatus, MachineError, PeerError
+from noack.core.errors import CallerError, ExitStatus, MachineError, PeerError, why
 from noack.core.system_processes import python_command
 
 RECORDING = "recording.rrd"
@@ -105,7 +105,7 @@ class RecordingServer:
         try:
             self._http = _PageServer((HOST, 0), _Handler)
         except OSError as error:
-            raise MachineError(f"cannot serve {path}: {error}") from None
+            raise MachineError(f"cannot serve {path}: {why(error)}") from None
         self._http.recording = self
         self.origin = f"http://{HOST}:{self._http.server_address[1]}"
         self.address = f"{self.origin}/{self._secret}/"

@@ -24,7 +24,7 @@ from cosim.studies.campaign.campaign_file import Campaign
 from cosim.studies.campaign.campaign_grid import Point, row_type
 from cosim.studies.campaign.campaign_workers import Chunk, LostWorkersError, OtherArithmeticError, Runner
 from noack.core.errors import CallerError, ExitStatus, MachineError, NoackError, shortened, why
-from noack.core.file_access import PARTIAL, locked, write_whole
+from noack.core.file_access import PARTIAL, create_folder, locked, remove_file, write_whole
 
 RUNS, MANIFEST = "runs", "campaign.json"
 _LOCK = ".lock"
@@ -147,12 +147,12 @@ def locked_folder(campaign: Campaign, base: Mapping[str, object], store: Store) 
     manifest = json.loads(json.dumps(manifest, default=str))
     with ExitStack() as stack:
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            create_folder(folder)
             if not stack.enter_context(locked(folder / _LOCK)):
                 raise CallerError(f"{folder}: another noack uses this folder")
             made_by = _claim(folder, manifest)
             for scratch in (folder / RUNS).glob(f"*/.*{PARTIAL}"):
-                scratch.unlink(missing_ok=True)
+                remove_file(scratch)
         except OSError as error:
             raise MachineError(f"{folder}: cannot be written: {why(error)}") from None
         deviation = difference(made_by, arithmetic())

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import noack
-from noack.extend import CallerError
+from noack.extend import CallerError, new_file
 from noack_lab import results
 from noack_lab.scenario_draft import Draft, draft_of, open_draft
 
@@ -100,7 +100,8 @@ class Explorer:
 
     def save(self, path: str | Path) -> Path:
         """Write the scenario as TOML, with the comments of the file that it came from."""
-        Path(path).write_text(self.toml, encoding="utf-8")
+        with new_file(Path(path)) as file:
+            file.write(self.toml.encode())
         return Path(path)
 
     def __repr__(self) -> str:
