@@ -19,6 +19,8 @@ from noack.core.errors import why as why
 from noack.core.file_access import new_file as new_file
 from noack.core.linear_systems import Matrix as Matrix
 from noack.core.linear_systems import Vector as Vector
+from noack.core.periods import exact_ns as exact_ns
+from noack.core.periods import nearest_ns as nearest_ns
 from noack.disturbances.disturbance_settings import DisturbanceSettings as DisturbanceSettings
 from noack.disturbances.disturbance_settings import SignalSource as SignalSource
 from noack.plants.plant_settings import EquationSettings as EquationSettings

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from contextlib import suppress
 from copy import deepcopy
+from fractions import Fraction
 from os import PathLike
 from typing import Any, Generic, SupportsFloat, TypeVar
 
@@ -12,7 +13,7 @@ from gymnasium.core import ActType, ObsType
 from gymnasium.spaces.utils import flatdim
 
 from noack import Scenario, VirtualNetwork
-from noack.extend import NS_PER_S, CallerError
+from noack.extend import CallerError, exact_ns, nearest_ns
 from noack_gymnasium.gymnasium_plant import own_step_s
 
 Value = TypeVar("Value")
@@ -44,7 +45,8 @@ class LossyChannel(
     Step k has the time k times the environment's step. The action is sent then, and the environment
     steps with the newest action that has arrived; the next observation is sent at the end of the
     step, and ``step`` returns the newest observation that has arrived. So a packet that is lost or
-    late leaves the one before in force (hold), and a delay takes the next whole number of steps.
+    late leaves the one before in force (hold), and a delay takes the next whole number of steps: at
+    30 steps per second, 0.1 s takes 3.
     Rewards and ends of episodes do not cross the network. ``reset`` returns the first observation
     itself, which is also the first packet.
 
@@ -135,7 +137,7 @@ class LossyChannel(
             applied, network["action"] = self._actions.held, self._info("actuation")
         observation, reward, terminated, truncated, info = self.env.step(deepcopy(applied))
         self._step += 1
-        self._now_ns += self._step_ns
+        self._now_ns = nearest_ns(self._step * self._step_ns)
         self._send("update", observation)
         network["observation"] = self._info("update")
         newest = deepcopy(self._observations.held)
@@ -153,13 +155,14 @@ class LossyChannel(
         return self._receivers[direction].info(self._step, losses)
 
 
-def _step_ns(env: gymnasium.Env[ObsType, ActType], step_s: float | None) -> int:
+def _step_ns(env: gymnasium.Env[ObsType, ActType], step_s: float | None) -> Fraction:
+    """Return the exact time of a step: 10⁹/30 ns, which is no whole number."""
     own_s = own_step_s(env.unwrapped) if step_s is None else step_s
     if own_s is None:
         raise CallerError(f"LossyChannel: {env} has no time of a step; give step_s, in seconds")
     with suppress(TypeError, ValueError):
-        if 1 <= float(own_s) * NS_PER_S < 2**62:
-            return round(float(own_s) * NS_PER_S)
+        if 1e-9 <= float(own_s) < 2**62 * 1e-9:
+            return exact_ns(float(own_s))
     raise CallerError(f"LossyChannel: step_s = {own_s!r}: must be a time in seconds, above 0")
 
 

@@ -93,6 +93,27 @@ def test_a_delay_takes_the_next_whole_number_of_steps(delay_s: float, late: int)
     assert last["action"]["arrived"]
 
 
+@pytest.mark.parametrize("rate_hz", [30, 60, 90, 120, 144, 3, 30000 / 1001, 64000])
+@pytest.mark.parametrize("late", [1, 2, 3, 7])
+def test_a_delay_of_whole_steps_takes_as_many_at_each_rate(rate_hz: float, late: int) -> None:
+    """Also if the step is no whole number of nanoseconds: in the first steps, and in all others."""
+    delayed = {**LOSSLESS, "impairments": [{"kind": "delay", "delay_s": late / rate_hz}]}
+    env = LossyChannel(Clock(), {**delayed, "actuation": delayed}, step_s=1 / rate_hz)
+    observations, infos = episode(env, 200)
+    k = np.arange(201)
+    np.testing.assert_array_equal(observations[:, 0], np.maximum(k - late, 0))
+    np.testing.assert_array_equal(observations[:, 1], np.maximum(k - 2 * late, 0))
+    for info in infos[2 * late :]:
+        assert {info["network"][key]["age_steps"] for key in ("observation", "action")} == {late}
+
+
+@pytest.mark.parametrize(("rate_hz", "late"), [(30, 3), (60, 6), (90, 9), (120, 12), (144, 15)])
+def test_a_tenth_of_a_second_takes_the_steps_of_exact_arithmetic(rate_hz: int, late: int) -> None:
+    delayed = {**LOSSLESS, "impairments": [{"kind": "delay", "delay_s": 0.1}]}
+    observations, _ = episode(LossyChannel(Clock(), delayed, step_s=1 / rate_hz), 100)
+    np.testing.assert_array_equal(observations[:, 0], np.maximum(np.arange(101) - late, 0))
+
+
 @pytest.mark.parametrize("settings", [
     {},
     {"impairments": [{"kind": "delay", "delay_s": 0.03, "jitter_s": 0.03}]},

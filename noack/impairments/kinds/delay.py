@@ -16,6 +16,7 @@ from pydantic import BaseModel, Field, FiniteFloat, model_validator
 
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core, ffi
+from noack.core.periods import exact_ns
 from noack.impairments.clauses import Clause, Part, Word
 from noack.impairments.feature import (
     TC_CORRELATION,
@@ -220,11 +221,16 @@ class Delay(FileFeature, Impairment):
                 high = middle
         return low
 
+    @property
+    def constant_ns(self) -> int:
+        """delay_s in whole nanoseconds, rounded down (:mod:`noack.core.periods`)."""
+        return int(exact_ns(self.delay_s)) if self.delay_s else 0
+
     def stage(self, tables: StageTables) -> Stage:
         self.require_content()
         begin, end = add_numbers(tables.reals, sorted(t_s * NS_PER_S for t_s in self.samples_s or ()))
         numbers = {
-            "constant_ns": round(self.delay_s * NS_PER_S),
+            "constant_ns": self.constant_ns,
             "jitter_ns": self.jitter_s * NS_PER_S,
             "shape": getattr(core, f"NOACK_{self.distribution.upper()}"),
             "begin": begin,

@@ -101,7 +101,7 @@ def update_delay_ns(resolved: Scenario) -> int:
             impairment.jitter_s or impairment.samples_s or impairment.file
         )
         if isinstance(impairment, Delay) and constant:
-            delay_ns += round(impairment.delay_s * NS_PER_S)
+            delay_ns += impairment.constant_ns
         elif impairment.kind not in _WITHOUT_DELAY:
             raise CallerError(
                 f"network.impairments.{number}: {impairment.kind}: this needs a constant "
