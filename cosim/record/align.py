@@ -6,6 +6,8 @@ At each measurement time t:
   measured or estimated by the sensor. With noise or an observer it is not the plant's state
   (:func:`true_states`), and e_c is the controller's error relative to this x;
 * x_c(t) is the controller's last state with a model time t' ≤ t, propagated by e^{H(t−t')};
+* the plant's own state is known at each of its steps, also between measurements
+  (:class:`PlantStates`);
 * :func:`identity_residual` compares x_c − x_s with (I1), and :class:`EventFollower` has what is
   known at the newest event.
 """
@@ -85,8 +87,13 @@ class ControllerTrack(NamedTuple):
 
 def shares_update(scenario: Scenario, aligned: AlignedRun) -> NDArray[np.bool_]:
     """Return where x_c is recorded, and sensor and controller share an update, (k,)."""
-    first = NO_SEQUENCE if scenario.network.initial_sync == "known_state" else 0
-    return np.asarray(all_entries(~np.isnan(aligned.x_c)) & (aligned.received >= first))
+    recorded = all_entries(~np.isnan(aligned.x_c))
+    return np.asarray(recorded & (aligned.received >= _first_shared(scenario)))
+
+
+def _first_shared(scenario: Scenario) -> int:
+    """The first update after which sensor and controller share one; −1 if x(0) is known to both."""
+    return NO_SEQUENCE if scenario.network.initial_sync == "known_state" else 0
 
 
 def initial_track(scenario: Scenario) -> ControllerTrack:
@@ -170,8 +177,7 @@ def _controller_states_at(
     flow: ModelFlow, track: ControllerTrack, t_ns: Times, until_ns: int
 ) -> tuple[Reals, NDArray[np.int64]]:
     """Return x_c, (k, n), and the number of its newest update, (k,), at k times."""
-    index = np.searchsorted(track.model_ns, t_ns, side="right") - 1
-    known = (index >= 0) & (t_ns <= until_ns)
+    index, known = _newest_states(track, t_ns, until_ns)
     received = np.where(known, track.received[index], NO_SEQUENCE)
     x_c = track.x_c.take(index, axis=0)
     x_c[~known] = np.nan
@@ -189,14 +195,37 @@ def _controller_states_at(
     return x_c, received
 
 
+def _newest_states(
+    track: ControllerTrack, t_ns: Times, until_ns: int
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Return the index of the newest state at k times, (k,), and whether it is on record, (k,)."""
+    index = np.searchsorted(track.model_ns, t_ns, side="right") - 1
+    return index, (index >= 0) & (t_ns <= until_ns)
+
+
+class PlantStates(NamedTuple):
+    """The plant's own state at each of j steps of the plant."""
+
+    t_ns: Times
+    """(j,)"""
+    x: Reals
+    """(j, n)"""
+    received: NDArray[np.int64]
+    """(j,) sequence number of the controller's newest update at t, −1 for none."""
+    shared: NDArray[np.bool_]
+    """(j,) where the controller's state is on record, and shares an update with the sensor."""
+
+
 class AlignedPart(NamedTuple):
-    """Consecutive measurements, aligned."""
+    """Consecutive measurements, aligned, and the plant's steps up to the last of them."""
 
     rows: Rows
     """Their rows of ``sensor_measurement``, (k,)."""
     aligned: AlignedRun
     true_x: Reals | None
     """(k, n) the plant's own state, NaN where missing; None if the sensor measures it."""
+    plant: PlantStates
+    """All steps since the part before; in the last part, to the end of the run."""
 
 
 def aligned_parts(record: RunRecord) -> Iterator[AlignedPart]:
@@ -217,28 +246,31 @@ def _align(record: RunRecord) -> Iterator[AlignedPart]:
     track = initial_track(scenario)
     waiting = np.zeros(0, record.tables[SENSOR_MEASUREMENT])
     steps = np.zeros(0, record.tables[PLANT_STEP])
-    reads_steps = not scenario.coverage.knows_state
-    tables = (SENSOR_MEASUREMENT, CONTROLLER_STEP, CONTROLLER_DELIVERY)
+    tables = (SENSOR_MEASUREMENT, CONTROLLER_STEP, CONTROLLER_DELIVERY, PLANT_STEP)
+    first = _first_shared(scenario)
 
-    def part(rows: Rows, until_ns: int) -> AlignedPart:
+    def part(rows: Rows, plant: Rows, until_ns: int) -> AlignedPart:
         aligned = align_measurements(loop, rows, track, until_ns, flow=flow, acknowledged=acknowledged)
-        true_x = true_states(steps, rows["t_ns"]) if reads_steps else None
-        return AlignedPart(rows, aligned, true_x)
+        true_x = None if scenario.coverage.knows_state else true_states(plant, rows["t_ns"])
+        index, known = _newest_states(track, plant["t_ns"], until_ns)
+        received = np.where(known, track.received[index], NO_SEQUENCE)
+        states = PlantStates(plant["t_ns"], plant["x"], received, known & (received >= first))
+        return AlignedPart(rows, aligned, true_x, states)
 
-    for new_rows in record.slices(*tables, *((PLANT_STEP,) if reads_steps else ())):
+    for new_rows in record.slices(*tables):
         # A later state of the controller proves that all states up to a time are there.
         later = waiting["t_ns"] >= track.model_ns[-1]
         ready = int(np.argmax(later)) if later.any() else len(waiting)
         if ready:
-            yield part(waiting[:ready], int(track.model_ns[-1]))
             last_ns = waiting["t_ns"][ready - 1]
+            passed = steps["t_ns"] <= last_ns
+            yield part(waiting[:ready], steps.compress(passed), int(track.model_ns[-1]))
             keep = max(int(np.searchsorted(track.model_ns, last_ns, "right")) - 1, 0)
-            track, steps = track.since(keep), steps.compress(steps["t_ns"] > last_ns)
+            track, steps = track.since(keep), steps.compress(~passed)
         waiting = concatenate_rows([waiting[ready:], new_rows[SENSOR_MEASUREMENT]], waiting.dtype)
         track = controller_track(track, new_rows[CONTROLLER_STEP], new_rows[CONTROLLER_DELIVERY])
-        if reads_steps:
-            steps = concatenate_rows([steps, new_rows[PLANT_STEP]], steps.dtype)
-    yield part(waiting, int(track.model_ns[-1]) + scenario.timing.controller_period_ns)
+        steps = concatenate_rows([steps, new_rows[PLANT_STEP]], steps.dtype)
+    yield part(waiting, steps, int(track.model_ns[-1]) + scenario.timing.controller_period_ns)
 
 
 def align_tables(record: RunRecord) -> AlignedRun:
@@ -325,7 +357,7 @@ NOT_SHARED = 2**62
 
 
 class SinceEvent(NamedTuple):
-    """The newest event t_k at each of some measurements."""
+    """The newest event t_k at each of some times."""
 
     age_s: Reals
     """t − t_k, (k,); NaN before the first event."""
@@ -342,23 +374,28 @@ class EventFollower:
         loop = loop_of(scenario)
         self._scenario = scenario
         self._propagate = Propagator(loop.A + loop.B @ loop.K)
-        self._x = np.full(loop.n, np.nan)
-        self._event_ns = 0
-        self._event = NO_SEQUENCE
+        # The newest event before the part, and those of the part: number, time, and state.
+        self._events, self._event_ns = np.full(1, NO_SEQUENCE), np.zeros(1, np.int64)
+        self._x = np.full((1, loop.n), np.nan)
 
-    @np.errstate(all="ignore")  # a run may diverge
     def take(self, rows: Rows, aligned: AlignedRun) -> SinceEvent:
         """Return what follows from the newest event, at the next measurements."""
         new = np.flatnonzero(rows["event"] != NO_SEQUENCE)
-        events = np.append(self._event, rows["event"][new])
-        event_ns = np.append(self._event_ns, rows["t_ns"][new])
-        x = np.concatenate([self._x[None], rows["x"][new]])
-        newest = np.cumsum(rows["event"] != NO_SEQUENCE)
-        period_ns = self._scenario.timing.measurement_period_ns
-        age_ns = rows["t_ns"] - event_ns[newest]
-        predicted = self._propagate.advance_by_periods(x.take(newest, axis=0), age_ns // period_ns, period_ns)
-        age_s = np.where(events[newest] == NO_SEQUENCE, np.nan, age_ns * 1e-9)
-        shared = shares_update(self._scenario, aligned)
-        missing = np.where(shared, events[newest] - aligned.received, NOT_SHARED)
-        self._event, self._event_ns, self._x = int(events[-1]), int(event_ns[-1]), x[-1]
-        return SinceEvent(age_s, predicted, missing)
+        self._events = np.append(self._events[-1:], rows["event"][new])
+        self._event_ns = np.append(self._event_ns[-1:], rows["t_ns"][new])
+        self._x = np.concatenate([self._x[-1:], rows["x"][new]])
+        return self._since(rows["t_ns"], aligned.received, shares_update(self._scenario, aligned))
+
+    def at_steps(self, plant: PlantStates) -> SinceEvent:
+        """Return the same at the plant's steps up to the last of these measurements."""
+        return self._since(plant.t_ns, plant.received, plant.shared)
+
+    @np.errstate(all="ignore")  # a run may diverge
+    def _since(self, t_ns: Times, received: NDArray[np.int64], shared: NDArray[np.bool_]) -> SinceEvent:
+        newest = np.searchsorted(self._event_ns[1:], t_ns, "right")
+        age_ns, period_ns = t_ns - self._event_ns[newest], self._scenario.timing.plant_period_ns
+        states = self._x.take(newest, axis=0)
+        predicted = self._propagate.advance_by_periods(states, age_ns // period_ns, period_ns)
+        events = self._events[newest]
+        age_s = np.where(events == NO_SEQUENCE, np.nan, age_ns * 1e-9)
+        return SinceEvent(age_s, predicted, np.where(shared, events - received, NOT_SHARED))

@@ -256,14 +256,14 @@ def theorem_2_state(run: RunEvidence, samples: Samples) -> ClaimBound:
     """Theorem 2's bound of ‖x‖."""
     if run.theorem_2 is None:
         return ClaimBound()
-    values = run.theorem_2.state(samples.t_s, run.record.scenario.decaying.alpha_per_s)
-    envelope = Envelope("Theorem 2 (eq:normXt)", "x", samples.t_s, values, "printed")
+    values = run.theorem_2.state(samples.step_s, run.record.scenario.decaying.alpha_per_s)
+    envelope = Envelope("Theorem 2 (eq:normXt)", "x", samples.step_s, values, "printed")
     if not run.record.scenario.coverage.knows_state:
         return ClaimBound(None, envelope)
     slack = ROUNDING * run.offset
-    shares = upper_shares(samples.aligned.x_norm, values + slack)
+    shares = upper_shares(row_norms(samples.plant.x), values + slack)
     formula = "‖x‖ ≤ c x₀ e^(−ᾱt) + g (e^(−αt) − e^(−ᾱt))"
-    return ClaimBound(Bound(formula, samples.t_s, shares, run.paper_violation), envelope)
+    return ClaimBound(Bound(formula, samples.step_s, shares, run.paper_violation), envelope)
 
 
 # What a certificate claims.
@@ -346,15 +346,14 @@ def sensor_error(
 def state(
     run: RunEvidence, samples: Samples, certificate: ScenarioCertificate, constants: Constants
 ) -> ClaimBound:
-    """‖x‖ over time."""
+    """‖x‖ at each step of the plant."""
     formula = envelope_formula("‖x‖", certificate, "state")
-    here, values = samples.with_x, certificate.state(samples.t_s)
-    slack = ROUNDING * run.offset
-    shares = upper_shares(row_norms(samples.true_x.compress(here, axis=0)), values[here] + slack)
+    values, slack = certificate.state(samples.step_s), ROUNDING * run.offset
+    shares = upper_shares(row_norms(samples.plant.x), values + slack)
     void = run.violation_of(certificate)
     return ClaimBound(
-        Bound(formula, samples.t_s[here], shares, void, constants.state),
-        Envelope(f"certified for {certificate.scope}", "x", samples.t_s, values),
+        Bound(formula, samples.step_s, shares, void, constants.state),
+        Envelope(f"certified for {certificate.scope}", "x", samples.step_s, values),
     )
 
 
@@ -365,11 +364,11 @@ def region(
     """The region of a nonlinear plant, coordinate by coordinate."""
     if certificate.region is None:
         return ClaimBound()
-    here, limits = samples.with_x, np.array(certificate.region.x)
-    shares = (np.abs(samples.true_x.compress(here, axis=0)) / limits).max(axis=1)
+    limits = np.array(certificate.region.x)
+    shares = (np.abs(samples.plant.x) / limits).max(axis=1)
     names = run.record.loop.state_names
     formula = ", ".join(f"|{name}| ≤ {at_most(limit)}" for name, limit in zip(names, limits, strict=True))
-    return ClaimBound(Bound(formula, samples.t_s[here], shares, run.violation_of(certificate)))
+    return ClaimBound(Bound(formula, samples.step_s, shares, run.violation_of(certificate)))
 
 
 @certified("the state is bounded from the newest event on")
@@ -377,13 +376,13 @@ def state_from_events(
     run: RunEvidence, samples: Samples, certificate: ScenarioCertificate, constants: Constants
 ) -> ClaimBound:
     """‖x‖ from the newest event on, at which the sensor knows x."""
-    bounds, since, t_s = run.known_state_bounds(certificate), samples.since_event, samples.t_s
+    bounds, since, t_s = run.known_state_bounds(certificate), samples.since_event_at_steps, samples.step_s
     if bounds is None or since is None:
         return ClaimBound()
-    most = bounds.state_deviation(t_s, since.age_s, run.missing_events(samples, since, bounds))
+    most = bounds.state_deviation(t_s, since.age_s, run.missing_events(t_s, since, bounds))
     predicted = row_norms(since.predicted)
-    here = samples.with_x & ~np.isnan(since.age_s)
-    deviation = row_norms((samples.true_x - since.predicted).compress(here, axis=0))
+    here = ~np.isnan(since.age_s)
+    deviation = row_norms((samples.plant.x - since.predicted).compress(here, axis=0))
     shares = upper_shares(deviation, most[here] + run.rounding(predicted[here]))
     formula = "‖x − e^((A+BK)(t−t_k)) x(t_k)‖ ≤ ∫‖e^((A+BK)s) B‖ ‖u − Kx‖ds, since the event t_k"
     values = np.fmin(predicted + most, certificate.state(t_s))

@@ -25,7 +25,15 @@ from cosim.analysis.claims.observed_conditions import (
 from cosim.analysis.claims.run_certificates import certificates_under, scheduled_certificates
 from cosim.analysis.claims.trajectory_delta import trajectory_delta
 from cosim.analysis.summary.signal_statistics import SampleFacts, signal_statistics
-from cosim.record.align import NOT_SHARED, AlignedRun, EventFollower, SinceEvent, aligned_parts, bounded_parts
+from cosim.record.align import (
+    NOT_SHARED,
+    AlignedRun,
+    EventFollower,
+    PlantStates,
+    SinceEvent,
+    aligned_parts,
+    bounded_parts,
+)
 from cosim.record.run_events import changes_of
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NEVER_NS
@@ -51,7 +59,10 @@ _ANY = NetworkConditions(sys.maxsize, _LONG_S, _LONG_S, _LONG_S, _LONG_S, _LONG_
 
 @dataclass(frozen=True)
 class Samples:
-    """Consecutive measurements of a run, (k,), aligned, with bounds of the controller's error."""
+    """Consecutive measurements of a run, (k,), aligned, with bounds of the controller's error.
+
+    And the plant's steps up to the last of them, (j,): claims about x hold at each.
+    """
 
     aligned: AlignedRun
     is_bounded: NDArray[np.bool_]
@@ -61,11 +72,16 @@ class Samples:
     residual: Reals
     """Residual of (I1), (k,)."""
     true_x: Reals
-    """x of the plant, (k, n), where the sensor estimates it, too; NaN where it is not recorded."""
+    """x of the plant at the measurements, (k, n), where the sensor estimates it, too; NaN where it is
+    not recorded."""
+    plant: PlantStates
+    """x of the plant at each of its steps, (j, n)."""
     inter_event_s: tuple[Reals, Reals]
     """Times of the events, without the run's first, and the times since the event before."""
     since_event: SinceEvent | None
-    """None if no certificate has bounds from the newest event."""
+    """At the measurements; None if no certificate has bounds from the newest event."""
+    since_event_at_steps: SinceEvent | None
+    """At the plant's steps."""
 
     @cached_property
     def t_s(self) -> Reals:
@@ -73,8 +89,13 @@ class Samples:
         return np.asarray(self.aligned.t_ns * 1e-9)
 
     @cached_property
+    def step_s(self) -> Reals:
+        """Times of the plant's steps, (j,)."""
+        return np.asarray(self.plant.t_ns * 1e-9)
+
+    @cached_property
     def with_x(self) -> NDArray[np.bool_]:
-        """Where the plant's own state is known, (k,)."""
+        """At which measurements the plant's own state is known, (k,)."""
         if self.true_x is self.aligned.x:
             return np.ones(len(self.true_x), dtype=bool)
         return np.asarray(all_entries(np.isfinite(self.true_x)))
@@ -117,7 +138,8 @@ class RunEvidence:
             last_ns = event_ns[-1:]
             true_x = aligned.x if part.true_x is None else part.true_x
             since = None if follower is None else follower.take(rows, aligned)
-            yield Samples(aligned, bounded, both, residual, true_x, passed, since)
+            at_steps = None if follower is None else follower.at_steps(part.plant)
+            yield Samples(aligned, bounded, both, residual, true_x, part.plant, passed, since, at_steps)
 
     @cached_property
     def lost_in_rounding(self) -> VoidFrom | None:
@@ -287,15 +309,13 @@ class RunEvidence:
             known[id(certificate)] = None if first is None else VoidFrom(first.t_s, first.text)
         return known[id(certificate)]
 
-    def missing_events(
-        self, samples: Samples, since: SinceEvent, bounds: KnownStateBounds
-    ) -> NDArray[np.int64]:
-        """Return how many events are missing in the input since the newest event, (k,).
+    def missing_events(self, t_s: Reals, since: SinceEvent, bounds: KnownStateBounds) -> NDArray[np.int64]:
+        """Return how many events are missing in the input since the newest event, at times t, (k,).
 
         The bounds assume that an update acts within their delay. Where the plant applied its first
         input later than that, the number is unknown until then.
         """
-        event_s = samples.t_s - since.age_s
+        event_s = t_s - since.age_s
         early = event_s + bounds.delay_s < self.started_s - 1e-9
         return np.asarray(np.where(early, NOT_SHARED, since.missing))
 

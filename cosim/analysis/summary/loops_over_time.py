@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from cosim.analysis.summary.quantiles import quantiles_in
 from cosim.record.align import Reals, aligned_parts
 from cosim.record.run_record import RecordedRun, Rows, RunRecord
-from noack.core.row_operations import firsts_of_equal
+from noack.core.row_operations import firsts_of_equal, row_norms
 from noack.protocol.record_tables import NETEM_PACKET
 from noack.scenario.scenario import Scenario, phases_ns
 
@@ -36,7 +36,7 @@ class LoopsOverTime(NamedTuple):
     errors: Reals
     """Largest ‖e_c‖ since the first delivery; NaN where unknown."""
     states: Reals
-    """Largest ‖x‖, measured or estimated by the sensor; NaN where unknown."""
+    """Largest ‖x‖ at the plant's steps; NaN where unknown."""
     link_bytes: Reals
     """Bytes of the loop's updates that left the network."""
 
@@ -76,7 +76,8 @@ def loop_over_time(record: RunRecord, phase_ns: int) -> LoopOverTime:
         aligned = part.aligned
         columns = intervals_of(aligned.t_ns + phase_ns, horizon_ns)
         delivered = aligned.since_delivery(record.scenario)
-        _update_largest(states, columns, aligned.x_norm)
+        steps = intervals_of(part.plant.t_ns + phase_ns, horizon_ns)
+        _update_largest(states, steps, row_norms(part.plant.x))
         _update_largest(errors, columns[delivered], aligned.e_c_norm[delivered])
     return LoopOverTime(errors, states)
 

@@ -14,6 +14,7 @@ from cosim.analysis.claims.claim_catalogue import CertifiedClaim, ClaimDefinitio
 from cosim.analysis.claims.claim_evaluation import RunClaims, definitions, list_violations
 from cosim.analysis.claims.setpoint_deviations import start_error
 from cosim.analysis.summary.loop_summary import summarise_loop
+from cosim.analysis.summary.loops_over_time import loop_over_time
 from cosim.analysis.summary.summary_model import Claim, ClaimVerdict
 from cosim.record.align import aligned_parts
 from cosim.record.run_record import RunRecord
@@ -124,7 +125,7 @@ def test_a_run_of_another_plant_violates_the_certificate(make: Make) -> None:
 @pytest.mark.parametrize(
     ("table", "column", "by", "violated"),
     [
-        (SENSOR_MEASUREMENT, "x", 0.1, CERTIFIED[4]),  # a bound of the whole run still holds
+        (PLANT_STEP, "x", 0.1, CERTIFIED[4]),  # a bound of the whole run still holds
         (SENSOR_MEASUREMENT, "e_s_norm", 5.0, CERTIFIED[0]),
         (CONTROLLER_STEP, "x_c", 1e-3, "x_c − x_s is the sum of the missed jumps"),
     ],
@@ -139,6 +140,48 @@ def test_a_wrong_value_violates_its_claim_from_its_time_on(
     assert claims[violated].verdict is VIOLATED
     assert claims[violated].since_s == pytest.approx(rows["t_ns"][row] * 1e-9, abs=0.011)
     assert claims["the state is bounded"].verdict is HELD
+
+
+BETWEEN = {
+    "name": "between", "horizon_s": 2.0,
+    "model": {"A": [[0.0, 1.0], [0.0, 0.0]], "B": [[0.0], [1.0]], "gain": [[-1.0, -1.7]]},
+    "plant": {"initial_state": [1.0, 3.0], "rate_hz": 50.0, "measure_every": 50},
+    "trigger": {"policy": "periodic", "period_s": 1.0},
+    "network": {"mansd": 0, "loss": {"model": "lossless"}},
+    "controller": {"rate_hz": 50.0},
+}  # fmt: skip
+"""A scenario with three measurements: x is largest between the first two."""
+
+
+@pytest.mark.parametrize("claim", ["the state is bounded", "the state is bounded from the newest event on"])
+def test_claims_about_x_are_compared_at_every_step_of_the_plant(claim: str) -> None:
+    record = simulate(resolve(validate(BETWEEN, "between")))
+    steps = record[PLANT_STEP].copy()
+    assert len(steps) == 101
+    assert len(record[SENSOR_MEASUREMENT]) == 3
+    assert certified(record)[claim].verdict is HELD
+    steps["x"][63] *= 1000.0
+    wrong = certified(changed(record, {PLANT_STEP: steps}))[claim]
+    assert (wrong.verdict, wrong.since_s) == (VIOLATED, pytest.approx(1.26))
+
+
+def test_the_observed_maximum_of_x_is_that_of_the_steps_of_the_plant() -> None:
+    content = BETWEEN | {"plant": BETWEEN["plant"] | {"initial_state": [0.1, 3.0]}, "horizon_s": 2.31}
+    record = simulate(resolve(validate(content, "between")))
+    steps, state = record[PLANT_STEP], certified(record)["the state is bounded"]
+    assert state.certified is not None
+    (certificate,) = RunClaims(record).certified_evidence.certificates
+    t_s = steps["t_ns"] * 1e-9
+    shares = np.linalg.norm(steps["x"], axis=1) / certificate.state(t_s)
+    assert state.ratio == pytest.approx(shares.max())
+    assert int(shares.argmax()) % 50
+
+
+def test_a_loop_over_time_has_the_state_between_measurements() -> None:
+    record = simulate(resolve(validate(BETWEEN, "between")))
+    states = loop_over_time(record, 0).states
+    assert np.nanmax(states) == np.linalg.norm(record[PLANT_STEP]["x"], axis=1).max()
+    assert np.isfinite(states).sum() == 101
 
 
 def test_a_void_claim_is_judged_only_up_to_the_violation(run: RunRecord) -> None:
