@@ -18,6 +18,7 @@ with stoppable_imports():
     from noack.runtime.command_line import Parser, report_failure
     from noack.runtime.join_run import add_options, join_run
     from noack.runtime.run_process import RunProcess
+    from noack.runtime.standard_streams import guard_streams
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -69,4 +70,5 @@ def run_network(run: RunProcess) -> None:
 
 
 if __name__ == "__main__":
+    guard_streams(ignore_broken_pipes=False)  # the emulator ends when its output is closed
     sys.exit(main())

@@ -19,6 +19,7 @@ from noack.impairments.link_settings import LinkSettings
 from noack.impairments.target_loss import expected_loss, with_target_loss
 from noack.impairments.words import percent_text
 from noack.runtime.address import address_text
+from noack.runtime.console import SafeConsole
 
 _MAX_TOML = 4000
 """Longest settings that are printed, in characters."""
@@ -51,7 +52,7 @@ def explain(
         ]
         print(json.dumps({"links": links}, indent=2))
         return
-    console = Console(highlight=False)
+    console = SafeConsole(highlight=False)
     for number, (spec, written_spec) in enumerate(zip(specs, as_written, strict=True)):
         if number:
             console.print()

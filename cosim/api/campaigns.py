@@ -14,7 +14,7 @@ import pyarrow as pa
 from matplotlib.figure import Figure
 
 from cosim.api.scenarios import plain_table
-from cosim.live.monitoring.progress import PipeSafeConsole, runs_bar
+from cosim.live.monitoring.progress import runs_bar
 from cosim.output.figures.figure_drawing import draw
 from cosim.shipped_files import find_shipped
 from cosim.studies.campaign import campaign_figures, campaign_file, campaign_report, campaign_summary
@@ -23,6 +23,7 @@ from cosim.studies.campaign.campaign_workers import local_runner
 from noack.core.errors import CallerError
 from noack.core.number_format import TextRows, as_html, as_text
 from noack.core.system_processes import cores
+from noack.runtime.console import SafeConsole
 from noack.scenario.toml_file import validated
 
 _TABLE = Path("campaign")
@@ -199,7 +200,7 @@ def campaign(
 
 
 def _runs_bar() -> AbstractContextManager[Callable[[int, int], None]]:
-    return runs_bar(PipeSafeConsole(file=sys.stderr))
+    return runs_bar(SafeConsole(file=sys.stderr))
 
 
 def _table(rows: list[dict[str, object]]) -> pa.Table:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from noack.core.errors import NoackError
 from noack.core.system_processes import QUICK_IMPORTS, exhausted_limit
 from noack.runtime.command_line import report_failure, stoppable_imports
+from noack.runtime.standard_streams import guard_streams
 
 if TYPE_CHECKING:
     from cosim.live.processes.fork_server import ForkServer
@@ -26,10 +27,11 @@ def run() -> None:
     try:
         with stoppable_imports(), _fork_server(words) as server:
             from cosim.cli.application import app
-            from cosim.cli.pipe_safe_streams import ignore_broken_pipes
 
-            if words[:1] != ["netem"]:  # the emulator ends when its output is closed
-                ignore_broken_pipes()
+            guard_streams(
+                ignore_broken_pipes=words[:1] != ["netem"],  # the emulator ends when its output is closed
+                escape=not _is_about_the_program(words),
+            )
             app(prog_name="noack", obj=server)  # it handles signals itself
     except Exception as error:
         line = str(error) if isinstance(error, NoackError) else exhausted_limit(error)
@@ -37,6 +39,11 @@ def run() -> None:
             raise
         status = error.exit_status if isinstance(error, NoackError) else NoackError.exit_status
         sys.exit(report_failure(line, status, source="noack", as_json="--json" in words))
+
+
+def _is_about_the_program(words: list[str]) -> bool:
+    """Whether only texts of the program are printed: help, with colours, or a completion."""
+    return not words or "--help" in words or words[0].endswith("-completion")
 
 
 @contextmanager

@@ -8,16 +8,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from cosim.output.result_tables import ResultTable
+    from noack.runtime.console import SafeConsole
 
 
-def console() -> "Console":
+def console() -> "SafeConsole":
     """Return a console on standard output."""
-    from rich.console import Console  # a program that reads JSON waits for no rich
+    from noack.runtime.console import SafeConsole  # a program that reads JSON waits for no rich
 
-    return Console()
+    return SafeConsole()
 
 
 def status(activity: str) -> AbstractContextManager[Callable[[str], None]]:

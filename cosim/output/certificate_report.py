@@ -51,7 +51,7 @@ def print_certificates(console: Console, results: Certificates, chosen: Certific
     for table in tables[1:]:
         console.print(terminal_table(table))
     if (outside := outside_box(results.scenario)) is not None:
-        console.print(f"[yellow]the box certificates do not cover this plant:[/] {outside}")
+        console.print(f"[yellow]the box certificates do not cover this plant:[/] {escape(outside)}")
     console.print("assumptions of the certificates for the schedule:")
     print_assumptions(console, (results.schedule_region or results.schedule).assumptions)
     console.print("assumptions of the paper's theorems:")

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from cosim.analysis.adversary.loop_flows import Measure, Objective, ObjectiveValue, Pattern
@@ -182,7 +183,7 @@ def print_worst(
     if trigger == "sampled" and _is_shaped(certificate):
         console.print("[dim]Scaled: multiplied by bound(0) / bound(t)[/]")
     if certificate.void is not None:
-        console.print(f"[dim]Nothing is certified: {certificate.void}[/]")
+        console.print(f"[dim]Nothing is certified: {escape(certificate.void)}[/]")
     elif trigger == "sampled":
         console.print("[dim]certified: for the scenario's schedule, without lateness[/]")
     console.print("[dim]One letter per event: D delivered, L lost. --json prints their times[/]")

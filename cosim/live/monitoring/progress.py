@@ -17,6 +17,7 @@ from rich.progress import (
 
 from noack.core.clock import NS_PER_S
 from noack.runtime.command_line import print_to_stderr
+from noack.runtime.console import SafeConsole
 
 _LINE_EVERY_S = 10.0
 """Time between two lines about some work, if there is no terminal."""
@@ -24,16 +25,9 @@ _LEAST_SHARE = 0.1
 """Of the work, from which on the remaining time is estimated: the first tries may take longer."""
 
 
-class PipeSafeConsole(Console):
-    """A console that ignores a broken pipe; rich would end the program, and with it the run."""
-
-    def on_broken_pipe(self) -> None:
-        """Ignore it."""
-
-
 def error_console() -> Console:
-    """Return such a console on standard error."""
-    return PipeSafeConsole(stderr=True)
+    """Return a console on standard error."""
+    return SafeConsole(stderr=True)
 
 
 @contextmanager

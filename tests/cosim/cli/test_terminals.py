@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from cosim.cli.pipe_safe_streams import pipe_safe_stream
+from noack.runtime.standard_streams import guarded_stream
 
 NOACK = (sys.executable, "-m", "cosim.cli")
 ROOT = Path(__file__).parents[3]
@@ -50,7 +50,7 @@ def test_a_line_is_written_at_once(line_buffering: bool, write_through: bool) ->
         open(writing, "wb") as raw,  # noqa: PTH123
         io.TextIOWrapper(raw, line_buffering=line_buffering, write_through=write_through) as stream,
     ):
-        patient = pipe_safe_stream(stream)
+        patient = guarded_stream(stream)
         patient.write("waiting\n")
         assert os.read(reading, 100) == b"waiting\n"
     os.close(reading)
