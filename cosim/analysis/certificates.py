@@ -3,6 +3,7 @@
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -43,6 +44,14 @@ MOST_LATE = 1000
 """Most steps of lateness that may be allowed."""
 
 
+class CertificateAnswer(NamedTuple):
+    """Whether a scenario's own plant has a certificate for the scenario's schedule."""
+
+    is_certified: bool
+    text: str
+    """Which plants are certified, or why the scenario's own plant is not."""
+
+
 class Certificates:
     """The certificates of a scenario's plant, and of all plants in its uncertainty box.
 
@@ -79,6 +88,8 @@ class Certificates:
     """Allowed lateness in steps of the plant."""
     nonlinear: str | None = None
     """Why the certificates are for the model as the plant, not for the plant itself; else None."""
+    _no_region: str | None = None
+    """Why a nonlinear plant has no certificate on a region, if that is known from its settings."""
 
     def __init__(
         self,
@@ -103,7 +114,8 @@ class Certificates:
         self._scopes = [scope for scope in scopes if scope is not None]
         if nonlinear is not None:
             self.nonlinear = f'plant.system.kind = "{nonlinear.plant.system.kind}"'
-            if REGION not in void_at_setpoint(nonlinear) and nonlinear.coverage.some_certificate_applies:
+            self._no_region = void_at_setpoint(nonlinear).get(REGION)
+            if self._no_region is None and nonlinear.coverage.some_certificate_applies:
                 self._scopes.append(RegionScope(nonlinear))
         self._certificates = [
             (under, scope.certificate(assumed))
@@ -144,6 +156,41 @@ class Certificates:
     def schedule_region(self) -> ScenarioCertificate | None:
         """Of a nonlinear plant on its region, under the scenario's schedule."""
         return self._covering(REGION, SCHEDULE)
+
+    @property
+    def of_own_plant(self) -> ScenarioCertificate | None:
+        """Of the scenario's own plant under its schedule: linear, or nonlinear on its region.
+
+        None if the plant is not linear, and there is no certificate on a region for its settings.
+        """
+        return self.schedule if self.nonlinear is None else self.schedule_region
+
+    @property
+    def answer(self) -> CertificateAnswer:
+        """Whether the scenario's own plant has a certificate for its schedule.
+
+        What is certified for the model of a nonlinear plant is not certified for the plant.
+        """
+        own = self.of_own_plant
+        certified = [c for c in self._of(SCHEDULE) if c.exists and (c.scope != OWN_PLANT or c is own)]
+        if own is not None and own.exists:
+            plants = " and ".join(certificate.scope for certificate in certified)
+            return CertificateAnswer(True, f"certified: {plants}")
+        void = self._no_region if own is None else own.void
+        reason = f": {void}" if void else ""
+        if self.nonlinear is None:
+            return CertificateAnswer(False, f"no certificate{reason}")
+        model = "; only its model in its place has one" if self.schedule.exists else ""
+        return CertificateAnswer(
+            False, f"no certificate for the plant, which is not linear ({self.nonlinear}){reason}{model}"
+        )
+
+    @property
+    def is_proven_stable(self) -> bool:
+        """Whether ‖x‖ of the scenario's own plant is proven to have a bound under all losses allowed."""
+        if self.answer.is_certified or self.nonlinear is not None:
+            return self.answer.is_certified
+        return self.stability is not None and self.stability.verdict == "stable"
 
     @property
     def error_in_given_norm(self) -> float | None:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cosim.cli.printing import console, print_json, status
+from cosim.cli.printing import console, print_json, status, status_of
 from cosim.live import launcher
 from cosim.live.coordination.remote_access import ListenSettings
 from cosim.live.monitoring.run_observers import RunLog, RunObserver, log_end
@@ -24,6 +24,7 @@ from noack.scenario.scenario import Scenario, loop_names, loop_scenario, loop_se
 
 if TYPE_CHECKING:
     from cosim.analysis.summary.run_summary import Outcome
+    from cosim.output.requirement import Requirement
 
 
 def run_processes(
@@ -34,6 +35,7 @@ def run_processes(
     report: bool = True,
     verbose: bool = False,
     json: bool = False,
+    required: "Sequence[Requirement]" = (),
     spawn: Sequence[str] | None = None,
     session: str | None = None,
     server: ForkServer | None = None,
@@ -48,6 +50,7 @@ def run_processes(
         report: write the report.
         verbose: print all tables.
         json: print the summary as JSON.
+        required: what the run must meet; otherwise the status is 1.
         spawn: roles of the processes to start, all by default; the others join by ``session``.
         session: name that the processes of the run share.
         server: starts the processes, and ends with the run; by default a new one.
@@ -76,7 +79,7 @@ def run_processes(
         except OSError:  # a closed terminal must not end the run
             if ending is None:
                 raise
-    return finalize_run(ending, report=report, verbose=verbose, json=json)
+    return finalize_run(ending, report=report, verbose=verbose, json=json, required=required)
 
 
 class _TheoryWarnings(RunObserver):
@@ -128,11 +131,13 @@ def warn_of_other_runs() -> None:
         )
 
 
-def simulate_continuously(loaded: Scenario, *, json: bool) -> int:
+def simulate_continuously(loaded: Scenario, *, json: bool, required: "Sequence[Requirement]" = ()) -> int:
     """Simulate a scenario in continuous time, print the result, and return the exit status."""
     from cosim.output.continuous_report import print_continuous_run
+    from cosim.output.requirements import refuse_for_exact_runs, unmet_by_exact_run
     from cosim.simulation import continuous
 
+    refuse_for_exact_runs(required)
     resolved = resolve(loaded)
     warn_of_left_out(resolved)
     with status("simulating"):
@@ -143,7 +148,7 @@ def simulate_continuously(loaded: Scenario, *, json: bool) -> int:
     else:
         constraints = [rule.text() for rule in resolved.network.constraints]
         print_continuous_run(console(), run, summary, constraints)
-    return summary.exit_status
+    return status_of(unmet_by_exact_run(summary, required), summary.exit_status)
 
 
 _COMPLETING = "replaying the run, checking its claims, writing its report"
@@ -157,9 +162,17 @@ def reopen_run(run_dir: Path) -> "Outcome":
         return reopen(run_dir)
 
 
-def finalize_run(ending: RunEnding, *, report: bool, verbose: bool, json: bool) -> int:
+def finalize_run(
+    ending: RunEnding,
+    *,
+    report: bool,
+    verbose: bool,
+    json: bool,
+    required: "Sequence[Requirement]" = (),
+) -> int:
     """Finish a run's record, print its verdict, and return its exit status."""
     from cosim.live.finalize import finalize
+    from cosim.output.requirements import unmet_by_run
     from cosim.output.terminal_output import print_outcome
 
     try:
@@ -174,4 +187,4 @@ def finalize_run(ending: RunEnding, *, report: bool, verbose: bool, json: bool) 
         print_json(outcome.summary.to_json())
     else:
         print_outcome(console(), outcome, verbose=verbose)
-    return outcome.status
+    return status_of(unmet_by_run(outcome.summary, required), outcome.status)

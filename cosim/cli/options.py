@@ -14,6 +14,7 @@ import typer
 from typer import Argument, Option
 
 from cosim.output.figures.figure_format import FigureFormat
+from cosim.output.requirement import Requirement
 from cosim.record.run_directory import DEFAULT_RUNS, LATEST, SCENARIO_FILE
 from cosim.shipped_files import find_shipped, shipped_names
 from noack.runtime.command_line import LogFormat, log_format
@@ -217,6 +218,15 @@ InputWeightOption = Annotated[
     Option("--R", help="Weight of the input: rows, or a diagonal; by default the identity."),
 ]
 SeedOption = Annotated[int, Option(help="Seed of the draws.", min=0, max=2**63 - 1)]
+RequireOption = Annotated[
+    list[Requirement] | None,
+    Option(
+        "--require",
+        help="Exit with status 1, and one line that says why, unless: certificate: one covers the "
+        "plant and the whole run; guarantee: it was kept, as the verdict says; stable: ‖x‖ fell to a "
+        "tenth of its largest value. Can be repeated.",
+    ),
+]
 VerboseOption = Annotated[
     bool, Option("--verbose", help="Print all tables: timing, assumptions, each claim.")
 ]

@@ -7,6 +7,9 @@ from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from noack.core.errors import ExitStatus
+from noack.runtime.command_line import print_to_stderr
+
 if TYPE_CHECKING:
     from cosim.output.result_tables import ResultTable
     from noack.runtime.console import SafeConsole
@@ -34,6 +37,17 @@ def write_tables(tables: "Iterable[ResultTable]", folder: Path | None, *, json: 
         paths = save_tables(tables, folder)
         if not json:
             print(*paths, sep="\n")
+
+
+def status_of(unmet: Iterable[str], status: int = ExitStatus.OK) -> int:
+    """Print on standard error the requirements that are not met; return 1 for these, else the status.
+
+    A command that failed has said why.
+    """
+    lines = list(unmet) if status == ExitStatus.OK else []
+    for line in lines:
+        print_to_stderr(f"noack: {line}")
+    return ExitStatus.FAILED if lines else status
 
 
 def print_lines(json: bool, document: object, *lines: object) -> None:

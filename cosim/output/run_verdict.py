@@ -203,6 +203,18 @@ def _if_not_checkable(loop: LoopSummary) -> GuaranteeVerdict:
     return GuaranteeVerdict(Tone.DOUBTFUL, 0.0, why or "no certificate covers this loop")
 
 
+def is_covered(loop: LoopSummary) -> bool:
+    """Whether one of the certificates covers the whole run: each of its claims held to the end."""
+    claims: dict[str, list[Claim]] = {}
+    for claim in loop.claims:
+        if claim.is_certified:
+            claims.setdefault(claim.source, []).append(claim)
+    return any(
+        all(claim.verdict == "held" and claim.until_s is None for claim in of_certificate)
+        for of_certificate in claims.values()
+    )
+
+
 def _void_claims(loop: LoopSummary) -> list[Claim]:
     return [claim for claim in loop.claims if claim.verdict == "void"]
 

@@ -32,6 +32,7 @@ def demo(
     runs: opt.RunsOption = DEFAULT_RUNS,
     live: opt.LiveOption = False,
     log_format: opt.LogFormatOption = LogFormat.TEXT,
+    require: opt.RequireOption = None,
     report: opt.ReportOption = True,
     verbose: opt.VerboseOption = False,
     json: opt.JsonOption = False,
@@ -46,7 +47,7 @@ def demo(
     loaded = opt.load_scenario("lane_following", [*(['mode="zoh"'] if zoh else []), *(settings or ())])
     return run_processes(
         loaded, runs, live=live, report=report, verbose=verbose, json=json,
-        server=context.obj,
+        required=require or (), server=context.obj,
     )  # fmt: skip
 
 
@@ -65,6 +66,7 @@ def run(
     runs: opt.RunsOption = DEFAULT_RUNS,
     live: opt.LiveOption = False,
     log_format: opt.LogFormatOption = LogFormat.TEXT,
+    require: opt.RequireOption = None,
     report: opt.ReportOption = True,
     verbose: opt.VerboseOption = False,
     json: opt.JsonOption = False,
@@ -79,7 +81,7 @@ def run(
     loaded = opt.load_scenario(scenario, settings)
     return run_processes(
         loaded, runs, live=live, report=report, verbose=verbose, json=json,
-        server=context.obj,
+        required=require or (), server=context.obj,
     )  # fmt: skip
 
 
@@ -92,6 +94,7 @@ def run(
             "the paper's loop, exactly, without delays",
         ),
         ("noack simulate reactor_petc --no-report --json", "print the summary as JSON"),
+        ("noack simulate lane_following --require guarantee", "exit status 1 unless it was kept"),
     ),
 )
 def simulate(
@@ -99,6 +102,7 @@ def simulate(
     settings: opt.SetOption = None,
     trigger: opt.TriggerOption = opt.TriggerMode.SAMPLED,
     runs: opt.RunsOption = DEFAULT_RUNS,
+    require: opt.RequireOption = None,
     report: opt.ReportOption = True,
     verbose: opt.VerboseOption = False,
     json: opt.JsonOption = False,
@@ -116,10 +120,10 @@ def simulate(
     loaded = opt.load_scenario(scenario, settings)
     warn_of_violations(loaded)
     if trigger is opt.TriggerMode.CONTINUOUS:
-        return simulate_continuously(loaded, json=json)
+        return simulate_continuously(loaded, json=json, required=require or ())
     with simulation_bar(error_console(), loaded.horizon_s) as bar:
         ending = simulate_run(loaded, runs, bar)
-    return finalize_run(ending, report=report, verbose=verbose, json=json)
+    return finalize_run(ending, report=report, verbose=verbose, json=json, required=require or ())
 
 
 @app.command(

@@ -9,12 +9,21 @@ from typer import Option
 
 from cosim.cli import options as opt
 from cosim.cli.options import THEORY, examples
-from cosim.cli.printing import console, print_json, status, write_tables
+from cosim.cli.printing import console, print_json, status, status_of, write_tables
+from cosim.output.requirement import Requirement
 from cosim.record.run_directory import DEFAULT_RUNS
 from noack.core.errors import CallerError, ExitStatus
 from noack.runtime.command_line import StopRequestError, print_to_stderr
 
 app = typer.Typer()
+
+
+class NormName(StrEnum):
+    """The norm in which ``noack certify`` certifies."""
+
+    GIVEN = "given"
+    IDENTITY = "identity"
+    CHOSEN = "chosen"
 
 
 @app.command(
@@ -23,6 +32,7 @@ app = typer.Typer()
         ("noack certify lane_following", "its plant, and all plants of its uncertainty box"),
         ("noack certify lane_following --weight chosen", "with a norm that certifies more"),
         ("noack certify lane_weighted --late 6 --json", "allow 6 steps of lateness"),
+        ("noack certify lane_following --require certificate", "exit status 1 if there is none"),
     ),
 )
 def certify(
@@ -30,15 +40,24 @@ def certify(
     settings: opt.SetOption = None,
     loop: opt.LoopOption = None,
     weight: Annotated[
-        str,
+        NormName,
         Option(help="Norm of the trigger: `given` in the scenario, `identity`, or `chosen` by noack."),
-    ] = "given",
+    ] = NormName.GIVEN,
     late: Annotated[
         int | None,
         Option(
             min=0,
             max=1000,
             help="Allowed lateness in steps of the plant; certificate.late_periods by default.",
+        ),
+    ] = None,
+    require: Annotated[
+        list[Requirement] | None,
+        Option(
+            "--require",
+            help="Exit with status 1, and one line that says why, unless: certificate: the plant has "
+            "one for the scenario's schedule; guarantee: the network also enforces the limit of the "
+            "losses; stable: ‖x‖ is proven to have a bound. Can be repeated.",
         ),
     ] = None,
     tables: opt.TablesOption = None,
@@ -56,7 +75,8 @@ def certify(
     If there are none for the given norm, those of a norm that noack chooses follow, with the lines
     for the scenario file. If the plant is not linear, the model is certified as the plant.
 
-    Exit status 1: nothing can be certified, not even under the paper's conditions.
+    Exit status 1: nothing can be certified, not even under the paper's conditions; or --require
+    is not met.
 
     Takes two seconds; 10 s for a nonlinear plant; half a minute where events are due after many tests.
     """
@@ -64,14 +84,16 @@ def certify(
     from cosim.live.monitoring.progress import work_bar
     from cosim.output.certificate_report import certificate_tables, print_certificates
     from cosim.output.export.mat_export import save_mat
+    from cosim.output.requirements import uncovered_as_unmet, unmet_by_scenario
 
     loaded, chosen = opt.load_loop(scenario, settings, loop), None
-    if weight == "chosen":
-        with work_bar("choosing the weight") as bar:
-            result = certificates_of(loaded, weight, late, bar, of_model=True)
-    else:
-        result = certificates_of(loaded, weight, late, of_model=True)
-    if weight == "given" and not result.schedule.exists:
+    with uncovered_as_unmet(require or ()):
+        if weight == NormName.CHOSEN:
+            with work_bar("choosing the weight") as bar:
+                result = certificates_of(loaded, weight, late, bar, of_model=True)
+        else:
+            result = certificates_of(loaded, weight, late, of_model=True)
+    if weight == NormName.GIVEN and not result.schedule.exists:
         with work_bar("no certificate in the given norm; choosing another") as bar:
             chosen = in_chosen_norm(loaded, result, bar)
     if json:
@@ -82,6 +104,8 @@ def certify(
     if out is not None:
         save_mat(result.to_json(), out)
     certified = any(certificate.constants for _, certificate in result)
+    if require:
+        return status_of(unmet_by_scenario(result, require))
     return ExitStatus.OK if certified else ExitStatus.FAILED
 
 

@@ -1,0 +1,102 @@
+"""The exit status of ``--require``: 0 only where certificates, or the verdict of a run, say so."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+import noack
+from cosim.output.requirement import Requirement
+from cosim.output.requirements import unmet_by_run
+from tests.helpers.command_line import invoke
+from tests.helpers.summaries import claim, with_values
+
+ALL = ("--require", "certificate", "--require", "guarantee", "--require", "stable")
+UNENFORCED = ("--set", "network.enforce_mansd=false")
+
+
+@pytest.mark.parametrize(
+    ("words", "unmet"),
+    [
+        (("lane_following", *ALL), []),
+        (("lane_following", *UNENFORCED, *ALL), ["guarantee: network.enforce_mansd = false: nothing"]),
+        # Proven stable by its margin, without a bound of ‖x‖ by a certificate.
+        (("lane_periodic", "--require", "stable"), []),
+        (("lane_periodic", "--require", "certificate"), ["certificate: no certificate: the loop gain"]),
+        # Certified under the paper's conditions only: without --require the status is 0.
+        (("lane_following", "--late", "1000", "--require", "certificate"), ["certificate: no certificate: "]),
+        # The model has a certificate, and the plant has none.
+        (("cart_pole", *ALL), [f"{word}: no certificate for the plant, which is not linear"
+                               for word in Requirement]),
+        (("sine_pendulum", "--require", "certificate"), []),
+        (("model_predictive", *ALL), ['certificate: controller.kind = "python": u is not K x_c']),
+        (("lane_acknowledged", *ALL), ['certificate: network.protocol = "ack"']),
+    ],
+)  # fmt: skip
+def test_certify_exits_with_1_unless_what_is_required_is_certified(
+    words: tuple[str, ...], unmet: list[str]
+) -> None:
+    result = invoke("certify", *words)
+    assert result.exit_code == (1 if unmet else 0), result.stderr
+    lines = [line.removeprefix("noack: --require ") for line in result.stderr.splitlines()]
+    assert len(lines) == len(unmet)
+    for line, start in zip(lines, unmet, strict=True):
+        assert line.startswith(start)
+
+
+@pytest.mark.parametrize(
+    ("words", "unmet"),
+    [
+        (("lane_following",), []),
+        (("lane_periodic",), ["certificate: no certificate: ", "guarantee: not checkable: no certificate: "]),
+        (("lane_following", "--set", "horizon_s=1"), ["stable: the loop is bounded"]),
+        (
+            ("model_predictive", "--set", "horizon_s=1"),
+            ["certificate: ", "guarantee: not checkable: ", "stable: "],
+        ),
+        (
+            ("shared_channel", "--set", "horizon_s=2"),
+            ["stable: in 8 of 8 loops: lane-1: the loop is bounded"],
+        ),
+    ],
+)
+def test_a_run_exits_with_1_unless_its_verdict_has_what_is_required(
+    words: tuple[str, ...], unmet: list[str], tmp_path: Path
+) -> None:
+    command = ("simulate", *words, "--no-report", "--runs", tmp_path, "--json")
+    plain, result = invoke(*command), invoke(*command, *ALL)
+    assert plain.exit_code == 0
+    assert result.exit_code == (1 if unmet else 0)
+    assert json.loads(result.stdout)["exit"]["status"] == 0  # of the run, which completed
+    lines = [line for line in result.stderr.splitlines() if line.startswith("noack: --require ")]
+    assert len(lines) == len(unmet)
+    for line, start in zip(lines, unmet, strict=True):
+        assert line.startswith(f"noack: --require {start}")
+
+
+def test_an_exact_run_can_be_required_to_be_stable_and_no_more() -> None:
+    command = ("simulate", "lane_following", "--trigger", "continuous", "--json")
+    assert invoke(*command, "--require", "stable").exit_code == 0
+    assert invoke(*command, "--set", "horizon_s=1", "--require", "stable").exit_code == 1
+    result = invoke(*command, "--require", "guarantee")
+    assert (result.exit_code, result.stdout[:11]) == (2, '{\n  "error"')
+
+
+@pytest.mark.parametrize(
+    ("claims", "unmet"),
+    [
+        ([claim("held"), claim("void", source="box certificate")], []),
+        ([claim("held", source="box certificate"), claim("void")], []),
+        ([claim("held"), claim("void")], ["certificate"]),
+        ([claim("held", source="(I1)")], ["certificate", "guarantee"]),
+        ([claim("held", until_s=1.0)], ["certificate"]),  # the settings changed
+        ([claim("violated")], ["certificate", "guarantee"]),
+        ([], ["certificate", "guarantee"]),
+    ],
+)
+def test_one_certificate_of_the_run_covers_all_of_it(
+    claims: list[dict[str, object]], unmet: list[str]
+) -> None:
+    run = noack.simulate(noack.load("lane_following", {"horizon_s": 0.1})).summary
+    lines = unmet_by_run(with_values(run, claims=claims), [Requirement.CERTIFICATE, Requirement.GUARANTEE])
+    assert [line.split()[1].rstrip(":") for line in lines] == unmet
