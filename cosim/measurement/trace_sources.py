@@ -27,7 +27,8 @@ from noack.impairments.link_settings import LinkSettings
 from noack.protocol.record_tables import CONTROLLER_DELIVERY
 from noack.settings.user_files import NamedFile
 from noack.traces.capture_packets import is_capture
-from noack.traces.capture_trace import CaptureOptions, SequenceField, read_captures
+from noack.traces.capture_trace import CaptureOptions, read_captures
+from noack.traces.numbered_datagrams import SequenceField
 from noack.traces.packet_trace import LOST_NS, PacketTrace, packet_trace, read_trace
 
 if TYPE_CHECKING:
@@ -47,6 +48,8 @@ class SourceOptions:
     the source: only in captures of both ends they were."""
     flow: int = 1
     """Which flow of a capture, by its number of packets; 1 is the largest."""
+    far_flow: int | None = None
+    """Which flow has the far end of the datagrams; None: the nearest one that has them."""
     sequence_at: str | None = None
     """Where the payloads of a capture have sequence numbers: ``OFFSET:BYTES[:little]``."""
     period_ns: int = 20_000_000
@@ -56,10 +59,12 @@ class SourceOptions:
 FILE_OPTIONS = {
     "clocks_differ": "--clocks",
     "flow": "--flow",
+    "far_flow": "--far-flow",
     "sequence_at": "--sequence-at",
     "period_ns": "--rate",
 }
 """Options of the command line, by field of :class:`SourceOptions`."""
+_CAPTURE_OPTIONS = ("clocks_differ", "flow", "far_flow", "sequence_at")
 
 
 def refuse_unused(options: "DataclassInstance", names: Mapping[str, str], source: str, *used: str) -> None:
@@ -89,7 +94,7 @@ def read_source(paths: Sequence[Path], options: SourceOptions | None = None) -> 
         return read_run(first_path)
     heads = [_head(path) for path in paths]
     if all(map(is_capture, heads)) and len(paths) < 3:
-        refuse_unused(options, FILE_OPTIONS, "captures", "clocks_differ", "flow", "sequence_at")
+        refuse_unused(options, FILE_OPTIONS, "captures", *_CAPTURE_OPTIONS)
         return _from_captures(paths, options)
     if len(paths) > 1:
         raise CallerError(
@@ -120,7 +125,8 @@ def _from_captures(paths: Sequence[Path], options: SourceOptions) -> PacketTrace
     try:
         with ExitStack() as stack:
             files = [stack.enter_context(open_regular(path)) for path in paths]
-            return read_captures(files, CaptureOptions(options.flow, field, options.clocks_differ))
+            chosen = CaptureOptions(options.flow, options.far_flow, field, options.clocks_differ)
+            return read_captures(files, chosen)
     except (OSError, ValueError) as error:
         names = ", ".join(map(str, paths))
         raise CallerError(f"{names}: {one_line(error)}") from None

@@ -2,26 +2,27 @@
 
 * Two captures, of the sender's and of the receiver's end: the datagrams are matched by payload. The
   clocks differ, unless the user says otherwise.
-* One capture with both ends, such as the emulator writes: the same, with one clock.
+* One capture with both ends, such as a host that forwards writes: the same, with one clock.
 * One capture of the receiver's end: numbers at a known place of the payload, for a sender with a
   fixed period.
 
-A flow is a pair of addresses at an interface. The largest is taken, unless the user names another.
+A flow is a pair of addresses on a leg: an interface, with the VLAN and the direction. The largest is
+taken, unless the user names another. A datagram that a capture does not show as it was sent (cut, merged,
+or dropped by the capture itself) is not counted as lost: it is matched in another way, or the capture is
+refused.
 """
 
-import hashlib
-import os
-import re
-from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import IO, NamedTuple
+from typing import IO
 
 import numpy as np
-from numpy.typing import NDArray
 
-from noack.core.row_operations import firsts_of_equal
-from noack.traces.capture_packets import CapturedFlow, CutCaptureError, captured_packets, find_udp, is_capture
+from noack.traces.capture_packets import is_capture
+from noack.traces.captured_datagrams import CapturedFlow
+from noack.traces.captured_flows import Capture, Datagrams, matches
+from noack.traces.merged_datagrams import divide_merged
+from noack.traces.numbered_datagrams import NumberedPackets, SequenceField, number_packets
 from noack.traces.packet_trace import (
     MAX_PACKETS,
     Int64s,
@@ -33,117 +34,114 @@ from noack.traces.packet_trace import (
     relative_delays,
 )
 
-_MOST_FLOWS = 1_000_000
-_KEY = os.urandom(16)
-"""Payloads are compared by a keyed hash, so that nobody can make two with the same."""
-_FIELD = re.compile(r"([0-9]{1,5}):([1-8])(:little)?")
-_MOST = 2**62
-"""Upper limit of sequence numbers."""
+MOST_UNKNOWN = 0.01
+"""Largest share of packets that may have been lost by the capture, or that it does not show as sent."""
 
 
-class CapturedDatagram(NamedTuple):
-    """A UDP datagram of a capture."""
+@dataclass(frozen=True)
+class CaptureOptions:
+    """How to read captures."""
 
-    t_ns: int
-    flow: CapturedFlow
-    payload: bytes
-    is_cut: bool  # Whether only its beginning was captured
-    is_outbound: bool
-
-
-class Datagrams(NamedTuple):
-    """The complete datagrams of a capture, sorted by time."""
-
-    t_ns: Int64s
-    hashes: Int64s  # Of the payloads
-    flow: Int64s  # Places of the flows in :attr:`Capture.flows`
-
-    def where(self, flags: NDArray[np.bool_]) -> "Datagrams":
-        """Return those that are flagged."""
-        return Datagrams(*(column[flags] for column in self))
+    flow: int = 1  # Which flow, by its number of datagrams; 1 is the largest
+    far_flow: int | None = None  # The flow at the far end; None: the nearest with the same datagrams
+    sequence_at: SequenceField | None = None
+    clocks_differ: bool | None = None  # None: only if there are two captures
+    most_packets: int = MAX_PACKETS
 
 
-class Capture:
-    """A capture that has been read once: its flows, the largest first, and its datagrams.
+@dataclass(frozen=True, eq=False)
+class _Ends:
+    """The datagrams at two ends."""
+
+    sender: Capture
+    sent: Datagrams
+    receiver: Capture
+    received: Datagrams  # Of one leg, or of all that may be the far end
+    clocks_differ: bool
+
+    def matched(self) -> tuple[Int64s, Int64s]:
+        """Return the places of received datagrams that were sent, and of the latter."""
+        return matches(self.sent, self.received)
+
+
+def read_captures(files: Sequence[IO[bytes]], options: CaptureOptions) -> PacketTrace:
+    """Return the trace in one capture, or in those of the sender's and of the receiver's end.
 
     Raises:
-        ValueError: it is not a capture, or has no UDP datagrams.
+        ValueError: one line; it is not a capture, or does not show what was lost.
     """
-
-    def __init__(self, file: IO[bytes]) -> None:
-        self._file = file
-        self.notes: list[str] = []
-        """Lines about the capture."""
-        counts: dict[CapturedFlow, list[int]] = {}
-        columns = array("q"), array("q"), array("q")
-        for datagram in self.read(self.notes):
-            number_and_count = counts.setdefault(datagram.flow, [len(counts), 0])
-            number_and_count[1] += 1
-            if len(counts) > _MOST_FLOWS:
-                raise ValueError(f"has more than {_MOST_FLOWS} flows; filter the capture first")
-            if not datagram.is_cut:
-                digest = hashlib.blake2b(datagram.payload, digest_size=8, key=_KEY).digest()
-                hashed = int.from_bytes(digest, "little", signed=True)
-                for column, value in zip(columns, (datagram.t_ns, hashed, number_and_count[0]), strict=True):
-                    column.append(value)
-        if not counts:
-            cut = self.notes[0].partition(";")[0] if self.notes else ""
-            raise ValueError(f"has no UDP datagrams{': ' if cut else ''}{cut}")
-        self.flows = sorted(counts, key=lambda flow: -counts[flow][1])
-        self._counts = [counts[flow][1] for flow in self.flows]
-        places = np.argsort([counts[flow][0] for flow in self.flows])
-        order = np.argsort(np.array(columns[0]), kind="stable")
-        t_ns, hashes, flow = (np.array(column)[order] for column in columns)
-        self.complete = Datagrams(t_ns, hashes, places[flow])
-
-    def choose(self, number: int) -> CapturedFlow:
-        """Return the flow of a number; 1 is the largest. Raise ValueError if there is none."""
-        many = len(self.flows)
-        if not 1 <= number <= many:
-            raise ValueError(f"has no flow {number}; its flows are 1 to {many}")
-        flow = self.flows[number - 1]
-        others = f"; --flow chooses another of the {many} flows" if many > 1 else ""
-        self.notes.append(f"flow {number}: {flow}, {self._counts[number - 1]} datagrams{others}")
-        return flow
-
-    def reverse_of(self, flow: CapturedFlow) -> list[int]:
-        """Return the indices of the flows that go the other way."""
-        return [index for index, name in enumerate(self.flows) if name.is_reverse_of(flow)]
-
-    def read(self, notes: list[str] | None = None) -> Iterator[CapturedDatagram]:
-        """Yield the UDP datagrams."""
-        try:
-            for packet in captured_packets(self._file):
-                datagram = find_udp(packet.interface, packet.link_type, packet.data)
-                if datagram is None:
-                    continue
-                flow, payload, is_complete = datagram
-                yield CapturedDatagram(packet.t_ns, flow, payload, not is_complete, packet.is_outbound)
-        except CutCaptureError as error:
-            if notes is not None:
-                notes.append(f"the capture {error}; what is before is used")
+    captures = [Capture(file) for file in files]
+    flow = captures[0].choose(options.flow)
+    try:
+        trace = _trace(captures, flow, options)
+    except TraceRecordError as error:
+        raise ValueError(f"datagram {error.row + 1} of the flow {error}") from None
+    return trace.noted(*(note for capture in captures for note in capture.notes))
 
 
-def two_captures(sender: Capture, flow: CapturedFlow, receiver: Capture) -> tuple[Datagrams, Datagrams]:
+def _trace(captures: list[Capture], flow: CapturedFlow, options: CaptureOptions) -> PacketTrace:
+    field = options.sequence_at
+    if len(captures) > 1:
+        if field is not None:
+            raise ValueError("--sequence-at needs the receiver's capture only")
+        ends: _Ends | None = _two_captures(captures[0], flow, captures[1], options)
+    elif field is not None and options.far_flow == options.flow:
+        ends = None
+    else:
+        ends = _one_capture(captures[0], flow, options, is_numbered=field is not None)
+    if ends is None:
+        assert field is not None
+        return _trace_of_numbers(captures[0], flow, field, options.most_packets)
+    return _trace_of_ends(ends, field, options.most_packets)
+
+
+def _two_captures(sender: Capture, flow: CapturedFlow, receiver: Capture, options: CaptureOptions) -> _Ends:
     """Return the datagrams of a flow at its sender, and all that may be the same at the receiver.
 
     The addresses may differ (NAT, a relay); only the reverse flow of an echo is left out.
     """
-    sent, received = sender.complete, receiver.complete
-    return (
-        sent.where(sent.flow == sender.flows.index(flow)),
-        received.where(~np.isin(received.flow, receiver.reverse_of(flow))),
-    )
+    shown_bytes = min(sender.shown_bytes, receiver.shown_bytes)
+    sender.show(shown_bytes)
+    receiver.show(shown_bytes)
+    sent = sender.datagrams.where(sender.datagrams.flow == sender.flows.index(flow))
+    received = receiver.datagrams
+    if options.far_flow is None:
+        legs = ~np.isin(received.flow, receiver.reverse_of(flow))
+    else:
+        legs = received.flow == receiver.flows.index(receiver.choose(options.far_flow, "--far-flow"))
+    differ = True if options.clocks_differ is None else options.clocks_differ
+    ends = _Ends(sender, sent, receiver, received.where(legs), differ)
+    if options.far_flow is None:
+        counts = np.bincount(ends.received.flow[ends.matched()[0]], minlength=len(receiver.flows))
+        likely = np.flatnonzero((2 * counts > counts.max()) & (counts > 0)).tolist()
+        if len(likely) > 1:
+            receiver.notes.append(
+                "the receiver's capture has these datagrams several times, and the first arrival counts: "
+                f"{receiver.numbered(likely)}; --far-flow N chooses one"
+            )
+    return ends
 
 
-def one_capture(capture: Capture, flow: CapturedFlow) -> tuple[Datagrams, Datagrams] | None:
-    """Return the datagrams at the two ends in one capture; None if it has one end only."""
-    everything, number = capture.complete, capture.flows.index(flow)
+def _one_capture(
+    capture: Capture, flow: CapturedFlow, options: CaptureOptions, *, is_numbered: bool
+) -> _Ends | None:
+    """Return the datagrams at the two ends in one capture; None: it has one end, and numbers."""
+    capture.show(capture.shown_bytes)
+    everything, number = capture.datagrams, capture.flows.index(flow)
     mine = everything.where(everything.flow == number)
     others = everything.where(~np.isin(everything.flow, [number, *capture.reverse_of(flow)]))
-    received, sent = _matches(mine, others)
+    received, sent = matches(mine, others)
+    if flow.leg.outbound and options.far_flow is None:
+        _refuse_senders_end(capture.flows[k] for k in np.unique(others.flow[received]))
     if not len(sent):
-        return None
+        if options.far_flow not in (None, options.flow):
+            raise ValueError(f"--far-flow {options.far_flow}: has no datagram of flow {options.flow}")
+        if is_numbered:
+            return None
+        raise ValueError(
+            "has one end only; give the captures of both ends, or say where the payload has a "
+            "sequence number: --sequence-at OFFSET:BYTES"
+        )
     of_flow = others.flow[received]
     counts = np.bincount(of_flow)
     delays_ns = others.t_ns[received] - mine.t_ns[sent]
@@ -151,35 +149,68 @@ def one_capture(capture: Capture, flow: CapturedFlow) -> tuple[Datagrams, Datagr
     likely = np.flatnonzero(2 * counts > counts.max())
     medians = {int(k): float(np.median(delays_ns[of_flow == k])) for k in likely}
     other = min(medians, key=lambda k: abs(medians[k]))
-    capture.notes.append(f"the other end: {capture.flows[other]}")
+    if options.far_flow is not None:
+        other = capture.flows.index(capture.choose(options.far_flow, "--far-flow"))
+        if not (of_flow == other).any():
+            raise ValueError(f"--far-flow {options.far_flow}: has no datagram of flow {options.flow}")
+        medians[other] = float(np.median(delays_ns[of_flow == other]))
+    else:
+        capture.notes.append(f"the other end: flow {other + 1}: {capture.flows[other]}")
+        further = [k for k in medians if k != other]
+        if further:
+            capture.notes.append(
+                f"more legs of these datagrams: {capture.numbered(further)}; --far-flow N chooses "
+                "the other end"
+            )
     theirs = others.where(others.flow == other)
-    return (mine, theirs) if medians[other] >= 0 else (theirs, mine)
+    if is_numbered:
+        capture.notes.append(
+            "the capture has both ends: sending times are those of the first one, and numbers that are "
+            f"missing there count as lost; --far-flow {options.flow} measures flow {options.flow} alone"
+        )
+    differ = bool(options.clocks_differ)
+    if medians[other] >= 0:
+        return _Ends(capture, mine, capture, theirs, differ)
+    return _Ends(capture, theirs, capture, mine, differ)
 
 
-def matched_trace(
-    sent: Datagrams, received: Datagrams, clocks_differ: bool, most: int, notes: list[str]
-) -> PacketTrace:
+def _refuse_senders_end(other_legs: Iterable[CapturedFlow]) -> None:
+    """Refuse outgoing datagrams that have come in on no other leg."""
+    if all(flow.leg.outbound for flow in other_legs):
+        raise ValueError(
+            "shows the sender's end only (outgoing packets), where nothing is lost yet; capture at the "
+            "receiver, or give the captures of both ends"
+        )
+
+
+def _trace_of_ends(ends: _Ends, field: SequenceField | None, most: int) -> PacketTrace:
     """Return the trace of the sent datagrams.
 
     Raises:
-        ValueError: payloads are repeated, or none has arrived.
+        ValueError: payloads are repeated, none has arrived, or a capture does not show what was lost.
     """
+    ends = _with_merged_divided(ends)
+    sent, received, notes = ends.sent, ends.received, ends.receiver.notes
     repeated = len(sent.hashes) - len(np.unique(sent.hashes))
     if repeated:
+        shown = ends.sender.shown_text()
         raise ValueError(
-            f"{repeated} of {len(sent.hashes)} datagrams have the payload of another one, and "
+            f"{repeated} of {len(sent.hashes)} datagrams have the payload of another one{shown}, and "
             "cannot be matched; if they are numbered, give the receiver's capture with "
             "--sequence-at OFFSET:BYTES"
         )
-    here, there = _matches(sent, received)
+    here, there = ends.matched()
     arrived, first = np.unique(there, return_index=True)
     if not len(arrived):
         raise ValueError(
-            "none of the complete datagrams sent is in the receiver's capture; are both captures "
-            "of whole packets (tcpdump -s 0), and of the same time?"
+            "none of the datagrams sent is in the receiver's capture; are both captures "
+            f"of whole packets (tcpdump -s 0), and of the same time?{ends.receiver.problem()}"
         )
     if len(there) > len(arrived):
         notes.append(f"duplicates at the receiver: {len(there) - len(arrived)}")
+    _check_foreign(ends, here)
+    if not ends.receiver.has_fragments:
+        ends.sender.note_merged(int(sent.flow[0]))
     for where, outside in (("first", arrived[0]), ("last", len(sent.t_ns) - 1 - arrived[-1])):
         if outside:
             notes.append(
@@ -190,170 +221,144 @@ def matched_trace(
     received_ns[arrived] = received.t_ns[here[first]]
     lost = np.ones(len(sent.t_ns), bool)
     lost[arrived] = False
-    trace = packet_trace(sent.t_ns, received_ns, lost, clocks_differ=clocks_differ, most_packets=most)
-    return relative_delays(trace) if clocks_differ else trace
+    sent_ns, numbers = sent.t_ns, None
+    if field is not None:
+        numbered = number_packets(ends.sender, ends.sender.flows[int(sent.flow[0])], field)
+        sent_ns, received_ns, lost, numbers = _numbered_rows(numbered, sent, received_ns, lost)
+    trace = packet_trace(
+        sent_ns, received_ns, lost, numbers, clocks_differ=ends.clocks_differ, most_packets=most
+    )
+    _check_dropped(ends.receiver, received, trace)
+    return relative_delays(trace) if ends.clocks_differ else trace
 
 
-def _matches(sent: Datagrams, received: Datagrams) -> tuple[Int64s, Int64s]:
-    """Return the places of received datagrams with the payload of a sent one, and of the latter."""
-    if not len(sent.hashes):
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    hashes, places = np.unique(sent.hashes, return_index=True)
-    at = np.minimum(np.searchsorted(hashes, received.hashes), len(hashes) - 1)
-    known = np.flatnonzero(hashes[at] == received.hashes)
-    return known, places[at[known]]
+def _numbered_rows(
+    numbered: NumberedPackets, sent: Datagrams, received_ns: Int64s, lost: np.ndarray
+) -> tuple[Int64s, Int64s, np.ndarray, Int64s]:
+    """Return the sent datagrams that have a number, in the order of the numbers, and the numbers."""
+    _, rows, numbers = np.intersect1d(sent.row, numbered.row, return_indices=True)
+    order = np.argsort(numbered.packet[numbers], kind="stable")
+    rows, numbers = rows[order], numbers[order]
+    # The order of sending is that of the numbers.
+    sent_ns = np.maximum.accumulate(sent.t_ns[rows])
+    received_ns = np.maximum(received_ns[rows], np.where(lost[rows], 0, sent_ns))
+    return sent_ns, received_ns, lost[rows], numbered.packet[numbers]
 
 
-class SequenceField(NamedTuple):
-    """Where a payload has its sequence number."""
-
-    offset: int
-    size_bytes: int
-    is_little: bool
-
-    @classmethod
-    def parse(cls, text: str) -> "SequenceField":
-        """Parse ``OFFSET:BYTES`` or ``OFFSET:BYTES:little``; raise ValueError if it is neither."""
-        match = _FIELD.fullmatch(text)
-        if match is None:
-            raise ValueError(
-                f"expected OFFSET:BYTES with 1 to 8 bytes, e.g. 2:2 for RTP, or 8:4:little; found {text!r}"
-            )
-        return cls(int(match[1]), int(match[2]), match[3] is not None)
-
-    def read(self, payload: bytes) -> int | None:
-        """Return the number; None if the payload is too short, or the number too large."""
-        part = payload[self.offset : self.offset + self.size_bytes]
-        if len(part) < self.size_bytes:
-            return None
-        number = int.from_bytes(part, "little" if self.is_little else "big")
-        return number if number < _MOST else None
+def _with_merged_divided(ends: _Ends) -> _Ends:
+    """Return the ends with datagrams that a kernel merged (UDP GRO, GSO) divided again."""
+    sent, received = ends.sent, ends.received
+    here, there = ends.matched()
+    legs = np.unique(received.flow[here]) if len(here) else np.unique(received.flow)
+    unmatched = np.isin(received.flow, legs)
+    unmatched[here] = False
+    received = divide_merged(ends.receiver, received, unmatched, sent, all_known=True)
+    unmatched = np.ones(len(sent.t_ns), bool)
+    unmatched[there] = False
+    sent = divide_merged(ends.sender, sent, unmatched, received, all_known=False)
+    return _Ends(ends.sender, sent, ends.receiver, received, ends.clocks_differ)
 
 
-class _Numbered(NamedTuple):
-    number: Int64s
-    received_ns: Int64s
-
-
-def _numbered(capture: Capture, flow: CapturedFlow, field: SequenceField) -> _Numbered:
-    """Return the numbers and times of arrival of a flow, and check its direction."""
-    numbers, received_ns = array("q"), array("q")
-    outbound = 0
-    for datagram in capture.read():
-        if datagram.flow == flow and (number := field.read(datagram.payload)) is not None:
-            outbound += datagram.is_outbound
-            numbers.append(number)
-            received_ns.append(datagram.t_ns)
-    if numbers and outbound == len(numbers):
+def _check_foreign(ends: _Ends, here: Int64s) -> None:
+    """Refuse captures if the far end has datagrams between the sent ones that were not sent."""
+    received, known_rows = ends.received, ends.sender.datagrams
+    legs = np.bincount(received.flow[here])
+    leg = int(legs.argmax())
+    of_leg = np.flatnonzero(received.flow == leg)
+    inside = of_leg[(of_leg >= here.min()) & (of_leg <= here.max())]
+    known = np.isin(received.hashes[inside], known_rows.hashes) | np.isin(
+        received.hashes[inside], ends.sent.hashes
+    )
+    foreign = inside[~known]
+    if not len(foreign):
+        return
+    count, most = len(foreign), MOST_UNKNOWN * len(ends.sent.t_ns)
+    longest = int(ends.sent.size.max())
+    merged = int(np.count_nonzero(received.size[foreign] > longest))
+    if merged > most:
         raise ValueError(
-            "shows the sender's end only, where nothing is lost yet; capture at the receiver, or "
-            "give the captures of both ends"
+            f"{merged} of {len(inside)} datagrams at the far end are longer than all that were sent: the "
+            "kernel merged them (UDP GRO); switch this off (ethtool -K DEVICE gro off) and capture again"
         )
-    return _Numbered(np.array(numbers), np.array(received_ns))
+    missing = len(ends.sent.t_ns) - len(np.unique(received.hashes[here]))
+    if count > most and count > missing:
+        raise ValueError(
+            f"{count} of {len(inside)} datagrams at the far end are not in the sender's capture, and "
+            f"{missing} are in the sender's only: the captures are in the wrong order (the sender's is the "
+            "first), or the sender's is incomplete"
+        )
+    ends.receiver.notes.append(
+        f"datagrams at the far end that are not in the sender's capture: {count}; they do not count"
+    )
 
 
-def _first_of_each(numbered: _Numbered, notes: list[str]) -> _Numbered:
-    order = np.lexsort((numbered.received_ns, numbered.number))
-    number = numbered.number[order]
-    first = order[firsts_of_equal(number)]
-    if len(first) < len(order):
-        notes.append(f"duplicates: {len(order) - len(first)}; the first counts")
-    return _Numbered(*(column[first] for column in numbered))
+def _check_dropped(capture: Capture, received: Datagrams, trace: PacketTrace) -> None:
+    """Refuse a capture that may itself have lost more than 1 % of the packets."""
+    legs, counts = np.unique(received.flow, return_counts=True)
+    dropped = capture.dropped_at(int(legs[counts.argmax()]))
+    if not dropped:
+        return
+    lost = int(trace.lost.sum())
+    unknown = min(dropped, lost)
+    cause = f"the capture itself dropped {dropped} packets, as its statistics say"
+    if unknown > MOST_UNKNOWN * len(trace):
+        raise ValueError(
+            f"{cause}: up to {unknown} of the {lost} missing packets were not lost in the network; "
+            "capture again with a larger buffer (tcpdump -B 65536)"
+        )
+    capture.notes.append(f"{cause}: up to {unknown} of the {lost} lost packets were not lost in the network")
 
 
-def trace_of_numbers(
+def _trace_of_numbers(
     capture: Capture, flow: CapturedFlow, field: SequenceField, most_packets: int
 ) -> PacketTrace:
     """Return the trace of a sender with a constant period; the payloads have a number each."""
-    numbered = _numbered(capture, flow, field)
-    if len(numbered.number) < 2:
+    if flow.leg.outbound:
+        everything, number = capture.datagrams, capture.flows.index(flow)
+        others = everything.where(everything.flow != number)
+        received, _ = matches(everything.where(everything.flow == number), others)
+        _refuse_senders_end(capture.flows[k] for k in np.unique(others.flow[received]))
+    numbered = number_packets(capture, flow, field)
+    capture.note_merged(capture.flows.index(flow))
+    count = int(numbered.packet.max()) + 1
+    if count > most_packets:
         raise ValueError(
-            f"fewer than two datagrams have a sequence number at {field.offset}:{field.size_bytes}"
+            f"the sequence numbers span {count} packets; at most {most_packets} can be; check --sequence-at"
         )
-    # Numbers that begin again at 0 go on, in the order of the arrivals.
-    order = np.argsort(numbered.received_ns, kind="stable")
-    number = _unwrapped(numbered.number[order], 8 * field.size_bytes)
-    numbered = _first_of_each(_Numbered(number, numbered.received_ns[order]), capture.notes)
-    k = numbered.number - numbered.number[0]
-    received_ns = numbered.received_ns - numbered.received_ns.min()
-    if k[-1] >= most_packets:
-        raise ValueError(
-            f"the sequence numbers span {k[-1] + 1} packets; at most {most_packets} can "
-            "be; check --sequence-at"
-        )
-    # The sending times: those of a constant period, below all arrivals.
-    period_ns = max(envelope_slope(k, received_ns), 0.0)
-    sent_ns = np.rint(period_ns * k).astype(np.int64)
+    order = np.argsort(numbered.packet, kind="stable")
+    packet, part, received_ns = (column[order] for column in numbered[:3])
+    received_ns = received_ns - received_ns.min()
+    periods_ns: list[float] = []
+    sent_ns = np.zeros(len(packet), np.int64)
+    for here in (part == k for k in np.unique(part)):
+        # The sending times: those of a constant period, below all arrivals.
+        number = packet[here] - packet[here][0]
+        period_ns = envelope_slope(number, received_ns[here]) if len(number) > 1 else numbered.period_ns
+        if period_ns <= 0:
+            raise ValueError(
+                "the sender's period is 0 ms by the arrivals: without a period, losses and delays cannot be "
+                "told; check --sequence-at"
+            )
+        planned_ns = np.rint(period_ns * number).astype(np.int64)
+        sent_ns[here] = planned_ns + (received_ns[here] - planned_ns).min()
+        periods_ns.append(period_ns)
+    sent_ns = np.maximum.accumulate(sent_ns)
+    periods = ", ".join(dict.fromkeys(f"{period_ns / 1e6:.6g}" for period_ns in periods_ns))
     capture.notes.append(
         f"the capture has no sending times: the sender's period is assumed to be constant, "
-        f"{period_ns / 1e6:.6g} ms (lower envelope of the arrivals); delays are relative"
+        f"{periods} ms (lower envelope of the arrivals); delays are relative"
     )
-    return packet_trace(
+    trace = packet_trace(
         sent_ns,
-        received_ns,
-        np.zeros(len(k), bool),
-        numbered.number,
+        np.maximum(received_ns, sent_ns),
+        np.zeros(len(packet), bool),
+        packet,
         clocks_differ=True,
         most_packets=most_packets,
     )
-
-
-def _unwrapped(number: Int64s, bits: int) -> NDArray[np.int64]:
-    """Return numbers in the order of arrival without wrap-around; ``bits`` is the field's size."""
-    if bits > 32:
-        return number
-    half = 1 << bits - 1
-    steps = (np.diff(number) + half) % (1 << bits) - half
-    return np.concatenate((number[:1], number[0] + np.cumsum(steps)))
-
-
-@dataclass(frozen=True)
-class CaptureOptions:
-    """How to read captures."""
-
-    flow: int = 1  # Which flow, by its number of datagrams; 1 is the largest
-    sequence_at: SequenceField | None = None
-    clocks_differ: bool | None = None  # None: only if there are two captures
-    most_packets: int = MAX_PACKETS
-
-
-def read_captures(files: Sequence[IO[bytes]], options: CaptureOptions) -> PacketTrace:
-    """Return the trace in one capture, or in those of the sender's and of the receiver's end.
-
-    Raises:
-        ValueError: one line; it is not a capture, or the datagrams cannot be matched.
-    """
-    capture = Capture(files[0])
-    flow = capture.choose(options.flow)
-    try:
-        trace = _trace(capture, flow, files[1:], options)
-    except TraceRecordError as error:
-        raise ValueError(f"datagram {error.row + 1} of the flow {error}") from None
-    return trace.noted(*capture.notes)
-
-
-def _trace(
-    capture: Capture, flow: CapturedFlow, others: Sequence[IO[bytes]], options: CaptureOptions
-) -> PacketTrace:
-    most = options.most_packets
-    if options.sequence_at is not None:
-        if others:
-            raise ValueError("--sequence-at needs the receiver's capture only")
-        return trace_of_numbers(capture, flow, options.sequence_at, most)
-    if others:
-        receiver = Capture(others[0])
-        capture.notes += receiver.notes
-        ends = two_captures(capture, flow, receiver)
-    else:
-        both_ends = one_capture(capture, flow)
-        if both_ends is None:
-            raise ValueError(
-                "has one end only; give the captures of both ends, or say where the payload has a "
-                "sequence number: --sequence-at OFFSET:BYTES"
-            )
-        ends = both_ends
-    differ = bool(others) if options.clocks_differ is None else options.clocks_differ
-    return matched_trace(*ends, differ, most, capture.notes)
+    index = capture.flows.index(flow)
+    _check_dropped(capture, capture.datagrams.where(capture.datagrams.flow == index), trace)
+    return trace
 
 
 def _read(file: IO[bytes], most_packets: int, clocks_differ: bool) -> PacketTrace:

@@ -67,6 +67,10 @@ def measure(
         ),
     ],
     flow: Annotated[int, Option(min=1, help="Flow of a capture; 1 is the largest.")] = 1,
+    far_flow: Annotated[
+        int | None,
+        Option(min=1, help="Flow at the far end; by default the nearest with the same datagrams."),
+    ] = None,
     sequence_at: Annotated[
         str | None,
         Option(
@@ -155,7 +159,7 @@ def measure(
         raise CallerError("--as model: is the form of --write; give its FILE.toml")
     request = OutputRequest(out, requested_files(figure_format, width), write, form.value, scenario)
     differ = None if clocks is None else clocks is ClockRelation.DIFFERENT
-    reading = SourceOptions(differ, flow, sequence_at, _period_ns(rate))
+    reading = SourceOptions(differ, flow, far_flow, sequence_at, _period_ns(rate))
     trace = read_source([*map(find_trace, sources)], reading)
     measurement = NetworkMeasurement(trace, options, " ".join(sources), trace.notes)
     document = report(measurement, request, None if json else console())

@@ -30,7 +30,15 @@ from noack.scenario.toml_file import json_schema
 from noack.settings.user_files import NamedFile
 from tests.fuzz.edits import Choices, Vocabulary, bases, edited, key, quoted, value, vocabulary, write_named
 from tests.fuzz.harness import FOLDER, refusal, workspace
-from tests.oracles.capture_files import ETHERNET, LINKS, Sent, pcap_of, pcapng_of
+from tests.oracles.capture_files import (
+    ETHERNET,
+    LINKS,
+    Sent,
+    fragments_of,
+    pcap_of,
+    pcap_of_packets,
+    pcapng_of,
+)
 
 SCENARIO_KNOWN = vocabulary(json_schema(Scenario), dates=True)
 SCENARIO_SEEDS = [path.read_bytes() for path in sorted((FOLDER.parents[1] / "scenarios").glob("*.toml"))]
@@ -203,6 +211,7 @@ _PERIOD_NS = 20_000_000
 _SENT = [Sent(10**18 + k * _PERIOD_NS, struct.pack(">I", k)) for k in range(6)]
 _ARRIVED = [packet._replace(t_ns=packet.t_ns + 5_000_000, interface=1, source_port=7) for packet in _SENT[1:]]
 _V6 = [packet._replace(source="2001:db8::1", destination="2001:db8::2") for packet in _SENT]
+_LONG = [packet._replace(payload=packet.payload * 9) for packet in _SENT]
 _IRTT = json.dumps({
     "version": {"irtt": "0.9.0"},
     "round_trips": [
@@ -214,7 +223,10 @@ _IRTT = json.dumps({
 }).encode()  # fmt: skip
 _CAPTURES = [
     pcapng_of(*_SENT, *_ARRIVED),
-    pcap_of(*_SENT, link_type=ETHERNET, vlans=1),
+    pcap_of(*(packet._replace(vlans=(7,)) for packet in _SENT), link_type=ETHERNET),
+    pcap_of_packets([(packet.t_ns, part) for packet in _LONG for part in fragments_of(packet, most=16)]),
+    pcap_of(*_LONG, snap_bytes=40),
+    pcapng_of(*_SENT, dropped=1, dropped_before=1),
     pcap_of(*(_SENT[k] for k in (0, 1, 3, 2, 5)), order=">", nano=False),
     pcapng_of(*_V6, order=">", link_type=ETHERNET),
     *(pcap_of(*_SENT, link_type=link) for link in LINKS),
@@ -230,6 +242,7 @@ def captures_input(choices: Choices) -> None:
     options = SourceOptions(
         clocks_differ=choices.choose([None, False, True]),
         flow=choices.choose([1, 2, 3]),
+        far_flow=choices.choose([None, 1, 2]),
         sequence_at=choices.choose(_SEQUENCE_FIELDS),
     )
     path.write_bytes(_damaged(choices, choices.choose(_CAPTURES)))
@@ -237,7 +250,9 @@ def captures_input(choices: Choices) -> None:
     if choices.flag():
         other.write_bytes(pcapng_of(*_ARRIVED) if choices.flag() else path.read_bytes())
         paths.append(other)
-    with refusal((str(path), str(other), "expected one file", "--sequence-at", "--flow", "--clocks")):
+    with refusal(
+        (str(path), str(other), "expected one file", "--sequence-at", "--flow", "--far-flow", "--clocks")
+    ):
         trace = read_source(paths, options)
         received = trace.received_ns[~trace.lost]
         assert (received >= trace.sent_ns[~trace.lost]).all()

@@ -1,10 +1,8 @@
-"""Packet traces from CSV, IRTT and captures; wrong files; relative delays of other clocks."""
+"""Packet traces from CSV and IRTT; wrong files; relative delays of other clocks."""
 
 import gzip
 import io
 import json
-import random
-import struct
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -17,8 +15,6 @@ from scipy.optimize import linprog
 
 from noack.core.errors import CallerError
 from noack.impairments.kinds.replay import Replay
-from noack.traces.capture_packets import CapturedFlow, captured_packets, find_udp
-from noack.traces.capture_trace import CaptureOptions, SequenceField, read_captures
 from noack.traces.irtt_trace import read_irtt
 from noack.traces.packet_trace import (
     MAX_PACKETS,
@@ -29,7 +25,6 @@ from noack.traces.packet_trace import (
     relative_delays,
 )
 from tests.helpers.approved import compare_lines, lines_of_error
-from tests.oracles.capture_files import LINKS, Sent, pcap_of, pcapng_of
 
 
 def test_columns_of_any_unit_and_order_give_the_trace_with_its_lost_packets(tmp_path: Path) -> None:
@@ -209,151 +204,3 @@ def test_a_cut_or_damaged_irtt_file_is_refused(tmp_path: Path) -> None:
         path.write_bytes(wrong)
         with pytest.raises(CallerError, match=r"ends within|cannot be decompressed"):
             read_trace(path)
-
-
-# --- captures -------------------------------------------------------------------------------------
-
-T_NS, CAPTURE_PERIOD_NS = 1_700_000_000 * 10**9, 20_000_000
-AT_SERVER = {"source": "10.0.0.9", "source_port": 7000, "destination": "10.0.0.2", "interface": 1}
-
-
-def trace_of(*files: bytes, **options: object) -> PacketTrace:
-    return read_captures(list(map(io.BytesIO, files)), CaptureOptions(**options))  # type: ignore[arg-type]
-
-
-def network(count: int = 200, seed: int = 1) -> tuple[list[Sent], list[Sent], dict[int, int]]:
-    """Return what is sent and what arrives (lost, reordered, duplicated), and the delays."""
-    rng = random.Random(seed)
-    sent = [Sent(T_NS + k * CAPTURE_PERIOD_NS, struct.pack(">Q", k)) for k in range(count)]
-    delays = {k: rng.randrange(5 * CAPTURE_PERIOD_NS) + 1 for k in range(count) if rng.random() > 0.3}
-    arrived = [sent[k]._replace(t_ns=sent[k].t_ns + delay) for k, delay in delays.items()]
-    arrived += [packet._replace(t_ns=packet.t_ns + 10**9) for packet in arrived[::7]]
-    return sent, sorted(arrived), delays
-
-
-def delays_in(trace: PacketTrace) -> dict[int, int]:
-    return {int(k): int(delay) for k, delay in enumerate(trace.delay_ns) if delay >= 0}
-
-
-@pytest.mark.parametrize("offset_ns", [0, 10**12, -(10**12)])
-def test_two_captures_give_the_losses_and_relative_delays(offset_ns: int) -> None:
-    sent, arrived, delays = network()
-    other = Sent(T_NS, b"other")._replace(destination_port=53)
-    shifted = [packet._replace(t_ns=packet.t_ns + offset_ns, **AT_SERVER) for packet in arrived]
-    trace = trace_of(pcap_of(other, *sent), pcapng_of(*shifted))
-    smallest = min(delays.values())
-    assert delays_in(trace).keys() == delays.keys()
-    # The drift of so short a record is small against its delays, but not exactly 0.
-    for k, delay_ns in delays_in(trace).items():
-        assert abs(delay_ns - (delays[k] - smallest)) < 500e-6 * 200 * CAPTURE_PERIOD_NS + 2
-    assert any("--flow chooses" in line for line in trace.notes)
-    if offset_ns == 0:
-        assert delays_in(trace_of(pcap_of(*sent), pcapng_of(*shifted), clocks_differ=False)) == delays
-
-
-def test_one_capture_of_both_ends_is_matched_in_the_right_direction() -> None:
-    sent, arrived, delays = network()
-    forwarded = [packet._replace(**AT_SERVER) for packet in arrived]
-    # An echo with the same payloads goes back over both interfaces.
-    back = {"source": "198.51.100.7", "source_port": 6000, "destination": "192.0.2.1"}
-    echoes = [packet._replace(t_ns=packet.t_ns + 5, destination_port=5000, **back) for packet in arrived]
-    trace = trace_of(pcapng_of(*sorted([*sent, *forwarded, *echoes])))
-    assert delays_in(trace) == delays
-
-
-def test_numbers_at_a_known_place_may_wrap_around() -> None:
-    period_ns = 20_000_137
-    arrivals = [
-        Sent(
-            T_NS + k * period_ns + (k % 10) * 10**6, b"xx" + struct.pack("<H", (65_500 + k) % 2**16)
-        )
-        for k in range(200) if k % 5
-    ]  # fmt: skip
-    arrivals[3], arrivals[4] = arrivals[4], arrivals[3]
-    trace = trace_of(
-        pcap_of(*arrivals, b_short := Sent(T_NS, b"")),
-        sequence_at=SequenceField.parse("2:2:little"),
-    )
-    assert b_short.payload == b""
-    lost = [k % 5 == 0 for k in range(1, 200)]
-    assert trace.lost.tolist() == lost
-    expected = np.array([(k % 10 - 1) * 10**6 for k in range(1, 200)])
-    assert np.abs(trace.delay_ns - expected)[~trace.lost].max() < 1000
-    assert "20.0001 ms" in " ".join(trace.notes)
-
-
-def test_a_capture_of_the_sender_alone_is_refused() -> None:
-    sent = [Sent(T_NS + k * CAPTURE_PERIOD_NS, struct.pack(">I", k), direction=2) for k in range(9)]
-    with pytest.raises(ValueError, match="sender's end only"):
-        trace_of(pcapng_of(*sent), sequence_at=SequenceField.parse("0:4"))
-
-
-def test_captures_that_do_not_show_what_was_lost_are_refused() -> None:
-    sent, arrived, _ = network()
-    same = [packet._replace(payload=b"same") for packet in sent]
-    for files, message in (
-        ([pcap_of(*same), pcap_of(*arrived)], "199 of 200 datagrams have the payload of another"),
-        ([pcap_of(*sent), pcap_of(*same)], "none of the complete datagrams"),
-        ([pcap_of(*sent, snap_bytes=30)], "has one end only"),
-        ([pcap_of(*sent)], "has one end only"),
-        ([pcap_of()], "has no UDP datagrams"),
-        ([pcap_of(*sent, link_type=101)[:-3]], "has one end only"),
-        ([b"\n\r\r\n\0\0\0\0"], "has no UDP datagrams: the capture is cut off before the end"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            trace_of(*files)
-
-
-families = st.one_of(
-    *(
-        st.builds(
-            Sent,
-            t_ns=st.integers(0, 2**32 * 10**9 - 1),
-            payload=st.binary(max_size=30),
-            source=st.ip_addresses(v=version).map(str),
-            destination=st.ip_addresses(v=version).map(str),
-            source_port=st.integers(0, 65_535),
-            destination_port=st.integers(0, 65_535),
-            interface=st.just(0),
-            direction=st.just(0),
-        )
-        for version in (4, 6)
-    )
-)
-
-
-def read(data: bytes) -> list[tuple[int, CapturedFlow, bytes, bool]]:
-    packets = []
-    for packet in captured_packets(io.BytesIO(data)):
-        datagram = find_udp(packet.interface, packet.link_type, packet.data)
-        assert datagram is not None
-        packets.append((packet.t_ns, *datagram))
-    return packets
-
-
-@given(
-    st.lists(families, max_size=4), st.sampled_from(LINKS), st.sampled_from("<>"),
-    st.integers(0, 2), st.sampled_from(["pcap", "micro", "pcapng"]),
-)  # fmt: skip
-def test_every_datagram_is_found_again(
-    sent: list[Sent], link_type: int, order: str, vlans: int, form: str
-) -> None:
-    if form == "pcapng":
-        data = pcapng_of(*sent, link_type=link_type, order=order, vlans=vlans)
-    else:
-        data = pcap_of(*sent, link_type=link_type, order=order, vlans=vlans, nano=form == "pcap")
-    for expected, (t_ns, flow, payload, is_complete) in zip(sent, read(data), strict=True):
-        assert t_ns == (expected.t_ns // 1000 * 1000 if form == "micro" else expected.t_ns)
-        assert payload == expected.payload
-        assert is_complete
-        source = f"[{expected.source}]" if ":" in expected.source else expected.source
-        destination = f"[{expected.destination}]" if ":" in expected.destination else expected.destination
-        assert str(flow) == (
-            f"{source}:{expected.source_port} → {destination}:{expected.destination_port} on interface 0"
-        )
-
-
-def test_a_block_that_is_too_short_is_named_in_plain_words() -> None:
-    section = bytes.fromhex("0a0d0d0a 1c000000 4d3c2b1a 0100 0000 ffffffffffffffff 1c000000")
-    with pytest.raises(ValueError, match=r"^after packet 0: a block is too short"):
-        list(captured_packets(io.BytesIO(section + bytes.fromhex("06000000 0c000000 0c000000"))))

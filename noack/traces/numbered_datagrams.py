@@ -1,0 +1,254 @@
+"""The packets of a flow whose payloads have a sequence number at a known place."""
+
+import heapq
+import re
+from array import array
+from typing import NamedTuple
+
+import numpy as np
+
+from noack.core.row_operations import firsts_of_equal
+from noack.traces.captured_datagrams import CapturedDatagram, CapturedFlow
+from noack.traces.captured_flows import Capture
+from noack.traces.merged_datagrams import pieces_of
+from noack.traces.packet_trace import Int64s
+from noack.traces.sequence_numbers import find_packets, nearest_steps
+
+_FIELD = re.compile(r"([0-9]{1,5}):([1-8])(:little)?")
+_MOST_UNREADABLE = 0.01
+_LONGEST_LOOKED_AT = 64
+"""The longest datagrams, by which merging is recognised."""
+_CERTAIN_BITS = 40
+"""Bits of consecutive numbers in pieces that are no coincidence."""
+_MOST_LOST_BETWEEN = 64
+"""Largest step between the numbers of two pieces."""
+_LARGE_STEP = 10
+"""Numbers that differ by multiples of this or more may be no sequence numbers."""
+
+
+class SequenceField(NamedTuple):
+    """Where a payload has its sequence number."""
+
+    offset: int
+    size_bytes: int
+    is_little: bool
+
+    @classmethod
+    def parse(cls, text: str) -> "SequenceField":
+        """Parse ``OFFSET:BYTES`` or ``OFFSET:BYTES:little``; raise ValueError if it is neither."""
+        match = _FIELD.fullmatch(text)
+        if match is None:
+            raise ValueError(
+                f"expected OFFSET:BYTES with 1 to 8 bytes, e.g. 2:2 for RTP, or 8:4:little; found {text!r}"
+            )
+        return cls(int(match[1]), int(match[2]), match[3] is not None)
+
+    @property
+    def bits(self) -> int:
+        """The size of the numbers."""
+        return 8 * self.size_bytes
+
+    def read(self, payload: bytes) -> int | None:
+        """Return the number; None if the payload is too short."""
+        part = payload[self.offset : self.offset + self.size_bytes]
+        if len(part) < self.size_bytes:
+            return None
+        return int.from_bytes(part, "little" if self.is_little else "big")
+
+    def numbers_of(self, payload: bytes, size_bytes: int, largest_step: int) -> list[int] | None:
+        """Return the numbers of a payload's pieces; None if they do not ascend in steps up to the largest."""
+        numbers: list[int] = []
+        for piece in pieces_of(payload, size_bytes):
+            number = self.read(piece)
+            if number is None:
+                return None
+            if numbers and not 1 <= (number - numbers[-1]) % (1 << self.bits) <= largest_step:
+                return None
+            numbers.append(number)
+        return numbers
+
+    def __str__(self) -> str:
+        return f"{self.offset}:{self.size_bytes}{':little' if self.is_little else ''}"
+
+
+class NumberedPackets(NamedTuple):
+    """The k packets of a flow that arrived, the first arrival of each, in the order of arrival."""
+
+    packet: Int64s  # (k,) From 0, without wrap-around; parts follow each other without a gap
+    part: Int64s  # (k,) 0, and one more after each restart of the sender
+    received_ns: Int64s
+    row: Int64s  # Numbers of the datagrams in the order of the file
+    period_ns: float
+
+
+class _Numbers(NamedTuple):
+    number: np.ndarray
+    t_ns: Int64s
+    row: Int64s
+
+
+def number_packets(capture: Capture, flow: CapturedFlow, field: SequenceField) -> NumberedPackets:
+    """Return the packets of a flow, and note what is unusual about its numbers.
+
+    Raises:
+        ValueError: there are no sequence numbers, or too many datagrams are cut before them.
+    """
+    numbers = _read_numbers(capture, flow, field)
+    if len(numbers.number) < 2:
+        raise ValueError(f"fewer than two datagrams have a sequence number at {field}")
+    _check_steps(capture, numbers, field)
+    try:
+        found = find_packets(numbers.number, numbers.t_ns, field.bits)
+    except ValueError as error:
+        raise ValueError(
+            f"the numbers at {field} {error}; check --sequence-at, or filter the capture"
+        ) from None
+    notes = capture.notes
+    strays = len(numbers.number) - len(found.index)
+    if strays:
+        notes.append(f"left out: {strays} datagrams whose number does not belong to the sequence")
+    if found.uncertain:
+        notes.append(
+            f"gaps so long that the number of {field.bits}-bit wraps in them is not certain: "
+            f"{len(found.uncertain)}"
+        )
+    packet = found.packet.copy()
+    start = 0
+    for part in range(int(found.part[-1]) + 1):
+        here = found.part == part
+        if part:
+            at_s = (numbers.t_ns[found.index[np.flatnonzero(here)[0]]] - numbers.t_ns[0]) / 1e9
+            notes.append(
+                f"the sender restarted at {at_s:.6g} s: its numbers do not go on; no losses are counted "
+                "between the parts"
+            )
+        packet[here] += start - packet[here].min()
+        start = int(packet[here].max()) + 1
+    numbered = NumberedPackets(
+        packet, found.part, numbers.t_ns[found.index], numbers.row[found.index], found.period_ns
+    )
+    return _first_of_each(capture, numbered)
+
+
+def _first_of_each(capture: Capture, numbered: NumberedPackets) -> NumberedPackets:
+    """Return the first arrival of each packet, and note the others."""
+    order = np.argsort(numbered.packet, kind="stable")
+    places = firsts_of_equal(numbered.packet[order])
+    first = order[places]
+    duplicates = len(order) - len(first)
+    if duplicates:
+        hashes = np.zeros(len(capture.datagrams.row), np.int64)
+        hashes[capture.datagrams.row] = capture.datagrams.hashes
+        of_arrival = hashes[numbered.row[order]]
+        of_first = np.repeat(of_arrival[places], np.diff(places, append=len(order)))
+        others = int(np.count_nonzero(of_arrival != of_first))
+        if duplicates > others:
+            capture.notes.append(f"duplicates: {duplicates - others}; the first counts")
+        if others:
+            capture.notes.append(
+                f"datagrams with the number of an earlier one, but another content: {others}; the flow "
+                "seems to have two counters, or no number there; filter the capture, or check --sequence-at"
+            )
+    first = np.sort(first)
+    return NumberedPackets(*(column[first] for column in numbered[:4]), numbered.period_ns)
+
+
+def _check_steps(capture: Capture, numbers: _Numbers, field: SequenceField) -> None:
+    """Refuse numbers in the wrong byte order, and note those that rise in large steps."""
+    steps = nearest_steps(numbers.number, field.bits)
+    steps = steps[steps != 0]
+    if len(steps) < 2 * _LARGE_STEP:
+        return
+    if field.size_bytes > 1 and float((steps % 256 == 0).mean()) > 0.9:
+        other = str(field._replace(is_little=not field.is_little))
+        raise ValueError(
+            f"the numbers at {field} rise by multiples of 256, as in the wrong byte order; "
+            f"try --sequence-at {other}"
+        )
+    divisor = int(np.gcd.reduce(steps))
+    if divisor >= _LARGE_STEP:
+        capture.notes.append(
+            f"all numbers differ by multiples of {divisor}: if the sender does not lose so many each time, "
+            "they are no sequence numbers (a time, perhaps); check --sequence-at"
+        )
+
+
+def _read_numbers(capture: Capture, flow: CapturedFlow, field: SequenceField) -> _Numbers:
+    """Return the numbers of a flow in the order of arrival, merged datagrams divided."""
+    longest: list[tuple[int, int, bytes]] = []
+    numbers, columns = array("Q"), (array("q"), array("q"))
+    cut = short = 0
+    for row, datagram in enumerate(capture.read()):
+        if datagram.flow != flow:
+            continue
+        number = field.read(datagram.payload)
+        if number is None:
+            cut += datagram.is_cut
+            short += not datagram.is_cut
+            continue
+        numbers.append(number)
+        columns[0].append(datagram.t_ns)
+        columns[1].append(row)
+        if not datagram.is_cut:
+            entry = (len(datagram.payload), -row, datagram.payload)
+            (heapq.heappush if len(longest) < _LONGEST_LOOKED_AT else heapq.heappushpop)(longest, entry)
+    if cut > _MOST_UNREADABLE * (cut + len(numbers)):
+        raise ValueError(
+            f"{cut} of {cut + len(numbers)} datagrams are cut before their sequence number{capture.problem()}"
+        )
+    if cut:
+        capture.notes.append(f"cut before their sequence number, so they seem to be lost: {cut}")
+    if short:
+        capture.notes.append(f"left out: {short} datagrams too short for a sequence number at {field}")
+    read = _Numbers(np.array(numbers, np.uint64), *(np.array(column, np.int64) for column in columns))
+    size_bytes = _merged_size([payload for _, _, payload in longest], field)
+    if size_bytes:
+        read = _divided(capture, flow, field, size_bytes)
+    order = np.argsort(read.t_ns, kind="stable")
+    return _Numbers(*(column[order] for column in read))
+
+
+def _merged_size(longest: list[bytes], field: SequenceField) -> int:
+    """Return the size of the datagrams that were merged into the longest ones; 0: none were."""
+    most = max(map(len, longest), default=0)
+    needed = 0.8 * len(longest)
+    for size_bytes in range(field.offset + field.size_bytes, most):
+        merged = [payload for payload in longest if len(payload) > size_bytes]
+        bits = field.bits * sum(-(-len(payload) // size_bytes) - 1 for payload in merged)
+        if bits < _CERTAIN_BITS or len(merged) < needed / 4:
+            continue
+        wrong, most_wrong = 0, 0.2 * len(merged)
+        for payload in merged:
+            wrong += field.numbers_of(payload, size_bytes, 1) is None
+            if wrong > most_wrong:
+                break
+        else:
+            return size_bytes
+    return 0
+
+
+def _divided(capture: Capture, flow: CapturedFlow, field: SequenceField, size_bytes: int) -> _Numbers:
+    """Return the numbers of a flow with datagrams of more than a size divided."""
+    numbers, columns = array("Q"), (array("q"), array("q"))
+    merged = 0
+    for row, datagram in enumerate(capture.read()):
+        if datagram.flow == flow:
+            parts = _numbers_of(datagram, field, size_bytes)
+            merged += len(parts) > 1
+            for number in parts:
+                numbers.append(number)
+                columns[0].append(datagram.t_ns)
+                columns[1].append(row)
+    capture.notes.append(
+        f"datagrams that the kernel merged (UDP GRO): {merged}, divided into pieces of {size_bytes} bytes"
+    )
+    return _Numbers(np.array(numbers, np.uint64), *(np.array(column, np.int64) for column in columns))
+
+
+def _numbers_of(datagram: CapturedDatagram, field: SequenceField, size_bytes: int) -> list[int]:
+    if not datagram.is_cut and len(datagram.payload) > size_bytes:
+        numbers = field.numbers_of(datagram.payload, size_bytes, _MOST_LOST_BETWEEN)
+        if numbers is not None:
+            return numbers
+    number = field.read(datagram.payload)
+    return [] if number is None else [number]

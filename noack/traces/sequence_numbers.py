@@ -1,0 +1,226 @@
+"""Which packets arrived, by numbers that wrap around, for a sender with a constant period.
+
+A number of b bits says which packet it is up to multiples of R = 2ᵇ. How many times it wrapped around during
+a gap follows from the time: with a period p, the level t/p − u (arrival time t, packet u) is constant up to
+delays, so its lower envelope rises by R for each wrap that was missed. If it changes by something else, and
+the numbers do not go on, the sender was restarted.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter1d
+
+from noack.traces.packet_trace import Int64s, envelope_slope
+
+Reals = NDArray[np.float64]
+_WINDOW = 16
+"""Arrivals over which a rough period is taken, so that packets that arrive in groups do not mislead."""
+_NEIGHBOURS = 256
+"""Arrivals before and after a jump whose lower envelopes are compared."""
+_SPREAD_WINDOW = 64
+_FEWEST_AFTER_RESTART = 8
+"""A restart to smaller numbers is told from late packets by this many arrivals."""
+_CLEAR = 8
+"""A jump forward by no more packets is a loss, whatever the time says."""
+_DELAY_CHANGE_NS = 10**9
+"""A change of the smallest delay by no more is not taken for a restart."""
+_DELAY_CHANGE_SHARE = 0.05
+"""Nor is one by this share of the gap."""
+_MOST_OF_CYCLE = 1 / 8
+"""A change of the level is a number of wraps up to this share of R."""
+_MOST_RESTARTS = 1 / 20
+"""More restarts per arrival are no restarts: the numbers are none."""
+_FAR_AHEAD_NS, _FAR_BEHIND_NS = 5 * 10**9, 60 * 10**9
+"""A single number that is ahead or behind by more than this does not belong to the sequence."""
+_CERTAIN_RESTART = 2**50
+"""A jump by so many packets is a restart."""
+_STEADY = 0.95
+"""Correlation of numbers and times below which the numbers jump at random."""
+_FAR_BACK = 32
+_FAR_BACK_SHARE, _FEWEST_FAR_BACK = 0.1, 8
+"""Two counters in one flow jump back by more than 32 packets at more than this share of the arrivals."""
+
+
+class Arrivals(NamedTuple):
+    """The packets of the k arrivals that belong to the sequence, in their order."""
+
+    index: Int64s  # (k,) Among all arrivals
+    packet: Int64s  # (k,) Number without wrap-around, from any origin in each part
+    part: Int64s  # (k,) 0, and one more after each restart of the sender
+    period_ns: float
+    uncertain: tuple[int, ...]  # Of the k, those after a gap in which the number of wraps is not certain
+
+
+def find_packets(number: NDArray[np.uint64], t_ns: Int64s, bits: int) -> Arrivals:
+    """Return which packets arrived.
+
+    Args:
+        number: Numbers, in the order of arrival.
+        t_ns: Times of arrival, ascending.
+        bits: Size of the numbers.
+
+    Raises:
+        ValueError: what is wrong with the numbers.
+    """
+    steps = nearest_steps(number, bits)
+    if not (steps > 0).any():
+        raise ValueError("do not ascend")
+    index = np.arange(len(number))
+    is_soon = np.diff(t_ns) < _FAR_BACK * int(t_ns[-1] - t_ns[0]) / len(steps)
+    far_back = np.count_nonzero((steps < -_FAR_BACK) & is_soon)
+    if far_back > max(_FAR_BACK_SHARE * len(steps), _FEWEST_FAR_BACK):
+        if _continues(number, bits):
+            raise ValueError("belong to two counters")
+        period_ns = _period_of_all(steps, t_ns)
+    else:
+        period_ns = _rough_period(steps, t_ns, bits)
+    strays = _strays(steps, period_ns)
+    if strays.any():
+        index, t_ns = index[~strays], t_ns[~strays]
+        steps = nearest_steps(number[~strays], bits)
+    arrivals = _with_wraps(index, steps, t_ns, period_ns, 0.01, bits)
+    refined_ns, error = _refined_period(arrivals, t_ns)
+    if refined_ns:
+        arrivals = _with_wraps(index, steps, t_ns, refined_ns, error, bits)
+    if arrivals.part[-1] > 1 + _MOST_RESTARTS * len(number):
+        raise ValueError("jump at random")
+    return arrivals
+
+
+def _strays(steps: Int64s, period_ns: float) -> NDArray[np.bool_]:
+    """Return which numbers are far from those before and after, which are near to each other."""
+    strays = np.zeros(len(steps) + 1, bool)
+    there, back = steps[:-1].astype(float), steps[1:].astype(float)
+    far = (there > _FAR_AHEAD_NS / period_ns) | (there < -_FAR_BEHIND_NS / period_ns)
+    strays[1:-1] = far & (np.abs(there) > _FAR_BACK) & (np.abs(there + back) < np.abs(there) / 8)
+    return strays
+
+
+def nearest_steps(number: NDArray[np.uint64], bits: int) -> Int64s:
+    """Return the steps from each number to the next, from −R/2 to R/2."""
+    steps = np.diff(number).view(np.int64)
+    if bits == 64:
+        return steps
+    half = np.int64(1 << bits - 1)
+    return np.asarray(((steps + half) & np.int64((1 << bits) - 1)) - half)
+
+
+def _continues(number: NDArray[np.uint64], bits: int) -> bool:
+    """Whether most numbers continue one of the four before, as those of two counters do."""
+    known = np.zeros(len(number), bool)
+    mask = np.uint64((1 << bits) - 1)
+    for distance in range(1, 5):
+        ahead = (number[distance:] - number[:-distance]) & mask
+        known[distance:] |= ahead <= 4
+    return float(known.mean()) > 0.3
+
+
+def _rough_period(steps: Int64s, t_ns: Int64s, bits: int) -> float:
+    """Return the median of Δt/Δn over small steps."""
+    small = np.abs(steps.astype(float)) <= max(2.0**bits / 8, 1)
+    elapsed_ns = np.diff(t_ns)
+    for window in (_WINDOW, 1):
+        size = len(steps) // window * window
+        whole = small[:size].reshape(-1, window).all(axis=1)
+        advance = steps[:size].reshape(-1, window).sum(axis=1)
+        time_ns = elapsed_ns[:size].reshape(-1, window).sum(axis=1)
+        useful = whole & (advance > 0)
+        if useful.sum() >= (_WINDOW if window > 1 else 1):
+            period_ns = float(np.median(time_ns[useful] / advance[useful]))
+            if period_ns > 0:
+                return period_ns
+    advance_in_all = int(steps[small].sum())
+    if advance_in_all > 0 and elapsed_ns[small].any():
+        return float(elapsed_ns[small].sum()) / advance_in_all
+    raise ValueError("do not show the sender's period")
+
+
+def _period_of_all(steps: Int64s, t_ns: Int64s) -> float:
+    """Return the period if delays of many periods are usual, and the order of arrival shows little."""
+    packet = np.concatenate(([0.0], np.cumsum(steps.astype(float))))
+    if np.corrcoef(packet, t_ns - t_ns[0])[0, 1] < _STEADY:
+        raise ValueError("jump at random")
+    return float(np.polyfit(packet, (t_ns - t_ns[0]).astype(float), 1)[0])
+
+
+def _refined_period(arrivals: Arrivals, t_ns: Int64s) -> tuple[float, float]:
+    """Return the period in the longest stretch without a gap, and its relative error; 0: too short."""
+    time_ns, advance = np.diff(t_ns), np.diff(arrivals.packet)
+    is_edge = (np.diff(arrivals.part) != 0) | (time_ns > 100 * arrivals.period_ns) | (np.abs(advance) > 100)
+    edges = np.concatenate(([0], np.flatnonzero(is_edge) + 1, [len(t_ns)]))
+    longest = int(np.argmax(np.diff(edges)))
+    here = slice(int(edges[longest]), int(edges[longest + 1]))
+    packet, at_ns = arrivals.packet[here], t_ns[here]
+    if len(packet) < 4 * _WINDOW:
+        return 0.0, 0.0
+    order = np.argsort(packet, kind="stable")
+    packet, at_ns = packet[order] - packet.min(), at_ns[order] - at_ns.min()
+    period_ns = envelope_slope(packet, at_ns)
+    if not 0.5 < period_ns / arrivals.period_ns < 2:
+        return 0.0, 0.0
+    spread = _spread(np.diff(at_ns) / period_ns - np.diff(packet), at_ns / period_ns - packet)
+    return period_ns, (1 + spread) / float(packet[-1])
+
+
+def _spread(excess: Reals, level: Reals) -> float:
+    """Return by how much the level usually varies within 64 arrivals."""
+    windows = len(level) // _SPREAD_WINDOW
+    if windows < 4:
+        return 4 * float(np.median(np.abs(excess)))
+    by_window = level[: windows * _SPREAD_WINDOW].reshape(windows, -1)
+    return float(np.median(np.ptp(by_window, axis=1)))
+
+
+def _with_wraps(
+    index: Int64s, steps: Int64s, t_ns: Int64s, period_ns: float, error: float, bits: int
+) -> Arrivals:
+    """Return the packets for a period that is known up to a relative error."""
+    cycle = 2.0**bits
+    restarts = np.abs(steps.astype(float)) > _CERTAIN_RESTART
+    pauses = np.diff(t_ns) / period_ns
+    steps = np.where(restarts, np.rint(pauses).astype(np.int64), steps)
+    packet = np.concatenate(([0], np.cumsum(steps)))
+    level = (t_ns - t_ns[0]) / period_ns - packet
+    excess = pauses - steps
+    spread = _spread(excess, level)
+    added = np.zeros(len(packet), np.int64)
+    part = np.append(0, restarts.astype(np.int64))
+    uncertain: list[int] = []
+    begin = 0
+    for i in _jumps(excess, steps, level, cycle, spread):
+        step, pause = int(steps[i - 1]), float(pauses[i - 1])
+        # Packets that have waited during a pause arrive together after it: only behind them does the
+        # level show the network's usual delay.
+        following = level[i : i + _NEIGHBOURS + min(int(pause), len(level))]
+        rise = float(following.min() - level[max(begin, i - _NEIGHBOURS) : i].min())
+        wraps = round(rise / cycle)
+        allowed = max(_DELAY_CHANGE_NS / period_ns, _DELAY_CHANGE_SHARE * pause, 6 * spread)
+        allowed = min(allowed, _MOST_OF_CYCLE * cycle)
+        if wraps > 0 and abs(rise - wraps * cycle) <= allowed:
+            added[i] = wraps << bits
+            if pause * error > cycle / 4:
+                uncertain.append(i)
+        elif step < 0:
+            lasts = (t_ns[i + len(following) - 1] - t_ns[i]) / period_ns
+            enough = len(following) >= _FEWEST_AFTER_RESTART and lasts > spread + _FEWEST_AFTER_RESTART / 2
+            if rise <= max(2.0, 1.5 * spread) or not enough:
+                continue
+            part[i] = 1
+        elif step > _CLEAR and abs(rise) > allowed:
+            part[i] = 1
+        else:
+            continue
+        begin = i
+    packet = packet + np.cumsum(added)
+    return Arrivals(index, packet, np.cumsum(part), period_ns, tuple(uncertain))
+
+
+def _jumps(excess: Reals, steps: Int64s, level: Reals, cycle: float, spread: float) -> list[int]:
+    """Return the arrivals at which the level jumps, and may stay where it is then."""
+    after = minimum_filter1d(level, _NEIGHBOURS, origin=-(_NEIGHBOURS // 2), mode="nearest")
+    before = minimum_filter1d(level, _NEIGHBOURS, origin=_NEIGHBOURS // 2 - 1, mode="nearest")
+    jumps = (np.abs(excess) > min(cycle / 4, _CLEAR)) | (steps < 0)
+    stays = np.abs(after[1:] - before[:-1]) > max(1.0, spread / 2)
+    return (np.flatnonzero(jumps & stays) + 1).tolist()

@@ -1,0 +1,420 @@
+"""Packet traces from captures: ends, legs, and what a capture does not show."""
+
+import io
+import random
+import struct
+from collections.abc import Container, Iterator
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from noack.traces.capture_packets import captured_packets
+from noack.traces.capture_trace import CaptureOptions, read_captures
+from noack.traces.captured_datagrams import CapturedDatagram, DatagramReader
+from noack.traces.numbered_datagrams import SequenceField
+from noack.traces.packet_trace import PacketTrace
+from tests.oracles.capture_files import (
+    COOKED,
+    COOKED_2,
+    ETHERNET,
+    LINKS,
+    LOOPBACK,
+    Sent,
+    fragments_of,
+    pcap_of,
+    pcap_of_packets,
+    pcapng_of,
+)
+
+T_NS, CAPTURE_PERIOD_NS = 1_700_000_000 * 10**9, 20_000_000
+AT_SERVER = {"source": "10.0.0.9", "source_port": 7000, "destination": "10.0.0.2", "interface": 1}
+
+
+def trace_of(*files: bytes, **options: object) -> PacketTrace:
+    return read_captures(list(map(io.BytesIO, files)), CaptureOptions(**options))  # type: ignore[arg-type]
+
+
+def network(count: int = 200, seed: int = 1) -> tuple[list[Sent], list[Sent], dict[int, int]]:
+    """Return what is sent and what arrives (lost, reordered, duplicated), and the delays."""
+    rng = random.Random(seed)
+    sent = [Sent(T_NS + k * CAPTURE_PERIOD_NS, struct.pack(">Q", k)) for k in range(count)]
+    delays = {k: rng.randrange(5 * CAPTURE_PERIOD_NS) + 1 for k in range(count) if rng.random() > 0.3}
+    arrived = [sent[k]._replace(t_ns=sent[k].t_ns + delay) for k, delay in delays.items()]
+    arrived += [packet._replace(t_ns=packet.t_ns + 10**9) for packet in arrived[::7]]
+    return sent, sorted(arrived), delays
+
+
+def delays_in(trace: PacketTrace) -> dict[int, int]:
+    return {int(k): int(delay) for k, delay in enumerate(trace.delay_ns) if delay >= 0}
+
+
+@pytest.mark.parametrize("offset_ns", [0, 10**12, -(10**12)])
+def test_two_captures_give_the_losses_and_relative_delays(offset_ns: int) -> None:
+    sent, arrived, delays = network()
+    other = Sent(T_NS, b"other")._replace(destination_port=53)
+    shifted = [packet._replace(t_ns=packet.t_ns + offset_ns, **AT_SERVER) for packet in arrived]
+    trace = trace_of(pcap_of(other, *sent), pcapng_of(*shifted))
+    smallest = min(delays.values())
+    assert delays_in(trace).keys() == delays.keys()
+    # The drift of so short a record is small against its delays, but not exactly 0.
+    for k, delay_ns in delays_in(trace).items():
+        assert abs(delay_ns - (delays[k] - smallest)) < 500e-6 * 200 * CAPTURE_PERIOD_NS + 2
+    assert any("--flow chooses" in line for line in trace.notes)
+    if offset_ns == 0:
+        assert delays_in(trace_of(pcap_of(*sent), pcapng_of(*shifted), clocks_differ=False)) == delays
+
+
+def test_one_capture_of_both_ends_is_matched_in_the_right_direction() -> None:
+    sent, arrived, delays = network()
+    forwarded = [packet._replace(**AT_SERVER) for packet in arrived]
+    # An echo with the same payloads goes back over both interfaces.
+    back = {"source": "198.51.100.7", "source_port": 6000, "destination": "192.0.2.1"}
+    echoes = [packet._replace(t_ns=packet.t_ns + 5, destination_port=5000, **back) for packet in arrived]
+    trace = trace_of(pcapng_of(*sorted([*sent, *forwarded, *echoes])))
+    assert delays_in(trace) == delays
+
+
+def test_numbers_at_a_known_place_may_wrap_around() -> None:
+    period_ns = 20_000_137
+    arrivals = [
+        Sent(
+            T_NS + k * period_ns + (k % 10) * 10**6, b"xx" + struct.pack("<H", (65_500 + k) % 2**16)
+        )
+        for k in range(200) if k % 5
+    ]  # fmt: skip
+    arrivals[3], arrivals[4] = arrivals[4], arrivals[3]
+    trace = trace_of(
+        pcap_of(*arrivals, b_short := Sent(T_NS, b"")),
+        sequence_at=SequenceField.parse("2:2:little"),
+    )
+    assert b_short.payload == b""
+    lost = [k % 5 == 0 for k in range(1, 200)]
+    assert trace.lost.tolist() == lost
+    expected = np.array([(k % 10 - 1) * 10**6 for k in range(1, 200)])
+    assert np.abs(trace.delay_ns - expected)[~trace.lost].max() < 1000
+    assert "20.0001 ms" in " ".join(trace.notes)
+
+
+def test_a_capture_of_the_sender_alone_is_refused() -> None:
+    sent = [Sent(T_NS + k * CAPTURE_PERIOD_NS, struct.pack(">I", k), direction=2) for k in range(9)]
+    with pytest.raises(ValueError, match="sender's end only"):
+        trace_of(pcapng_of(*sent), sequence_at=SequenceField.parse("0:4"))
+
+
+def test_captures_that_do_not_show_what_was_lost_are_refused() -> None:
+    sent, arrived, _ = network()
+    same = [packet._replace(payload=b"same") for packet in sent]
+    for files, message in (
+        ([pcap_of(*same), pcap_of(*arrived)], "199 of 200 datagrams have the payload of another"),
+        ([pcap_of(*sent), pcap_of(*same)], "none of the datagrams"),
+        ([pcap_of(*sent, snap_bytes=30)], "has one end only"),
+        ([pcap_of(*sent)], "has one end only"),
+        ([pcap_of()], "has no UDP datagrams"),
+        ([pcap_of(*sent, link_type=101)[:-3]], "has one end only"),
+        ([b"\n\r\r\n\0\0\0\0"], "has no UDP datagrams: the capture is cut off before the end"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            trace_of(*files)
+
+
+# --- the legs of a host that forwards ---------------------------------------------------------------
+
+COUNT = 300
+LOST = [0, 7, 8, 150, 299]
+
+
+def rtp(k: int, size_bytes: int = 40) -> bytes:
+    """Return a payload with its number in the bytes 2 to 5."""
+    return b"\x80\x01" + struct.pack(">I", k) + random.Random(k).randbytes(size_bytes - 6)
+
+
+def on_leg(delay_ns: int, lost: Container[int] = (), **changes: object) -> list[Sent]:
+    sent = [Sent(T_NS + k * CAPTURE_PERIOD_NS + delay_ns, rtp(k)) for k in range(COUNT) if k not in lost]
+    return [packet._replace(**changes) for packet in sent]  # type: ignore[arg-type]
+
+
+IN_AND_OUT = {
+    "cooked, version 2": (COOKED_2, {"interface": 2, "direction": 1}, {"interface": 3, "direction": 2}),
+    "cooked": (COOKED, {"direction": 1}, {"direction": 2}),
+    "VLAN": (ETHERNET, {"vlans": (7,)}, {"vlans": (8,)}),
+    "VLAN in cooked": (COOKED, {"vlans": (7,)}, {"vlans": (8,)}),
+    "VLAN in cooked, version 2": (COOKED_2, {"vlans": (7, 1)}, {"vlans": (7, 2)}),
+    "one of two has a VLAN": (ETHERNET, {}, {"vlans": (8,)}),
+}
+
+
+@pytest.mark.parametrize("name", IN_AND_OUT)
+@pytest.mark.parametrize("sequence_at", [None, SequenceField(2, 4, False)])
+def test_a_host_that_forwards_shows_both_ends(name: str, sequence_at: SequenceField | None) -> None:
+    link_type, inside, outside = IN_AND_OUT[name]
+    packets = sorted([*on_leg(0, **inside), *on_leg(500_000, LOST, **outside)])
+    for file in (
+        pcap_of(*packets, link_type=link_type),
+        pcapng_of(*packets, link_type=link_type, interfaces=4),
+    ):
+        trace = trace_of(file, sequence_at=sequence_at)
+        assert np.flatnonzero(trace.lost).tolist() == LOST
+        assert set(trace.delay_ns[~trace.lost].tolist()) == {500_000}
+
+
+def test_numbers_that_are_missing_on_the_first_leg_are_lost_too() -> None:
+    packets = [
+        *on_leg(0, [20, 21], interface=2, direction=1),
+        *on_leg(9, [20, 21, 30], interface=3, direction=2),
+    ]
+    file = pcap_of(*sorted(packets), link_type=COOKED_2)
+    field = SequenceField(2, 4, False)
+    assert np.flatnonzero(trace_of(file, sequence_at=field).lost).tolist() == [20, 21, 30]
+    assert np.flatnonzero(trace_of(file, sequence_at=field, far_flow=1).lost).tolist() == [20, 21]
+    alone = trace_of(file, sequence_at=field, flow=2, far_flow=2)
+    assert np.flatnonzero(alone.lost).tolist() == [20, 21, 30]
+
+
+def test_of_three_legs_the_far_end_can_be_chosen() -> None:
+    legs = [
+        on_leg(0, interface=2, direction=1),
+        on_leg(1000, [5], interface=3, direction=2),
+        on_leg(2000, [5, 9], interface=4, direction=2),
+    ]
+    file = pcap_of(*sorted(packet for leg in legs for packet in leg), link_type=COOKED_2)
+    nearest = trace_of(file)
+    assert np.flatnonzero(nearest.lost).tolist() == [5]
+    assert any("flow 3" in line and "--far-flow N" in line for line in nearest.notes)
+    assert np.flatnonzero(trace_of(file, far_flow=3).lost).tolist() == [5, 9]
+    assert np.flatnonzero(trace_of(file, flow=2, far_flow=3).lost).tolist() == [8]  # packet 9 of those left
+    with pytest.raises(ValueError, match=r"has no flow 4; its flows are 1 to 3"):
+        trace_of(file, far_flow=4)
+    sender = pcap_of(*on_leg(0))
+    assert np.flatnonzero(trace_of(sender, file, far_flow=3).lost).tolist() == [5, 9]
+    assert any("several times" in line for line in trace_of(sender, file).notes)
+
+
+@pytest.mark.parametrize("link_type", [COOKED, COOKED_2])
+def test_a_capture_of_outgoing_packets_alone_is_the_senders(link_type: int) -> None:
+    sent = on_leg(0, direction=2)
+    two_legs = sorted([*on_leg(0, interface=2, direction=2), *on_leg(9, interface=3, direction=2)])
+    for file in (pcap_of(*sent, link_type=link_type), pcap_of(*two_legs, link_type=COOKED_2)):
+        with pytest.raises(ValueError, match="sender's end only"):
+            trace_of(file, sequence_at=SequenceField(2, 4, False))
+
+
+def test_captures_in_the_wrong_order_are_refused() -> None:
+    sender, receiver = pcap_of(*on_leg(0)), pcap_of(*on_leg(9, LOST))
+    assert trace_of(sender, receiver).lost.sum() == len(LOST)
+    with pytest.raises(ValueError, match="wrong order"):
+        trace_of(receiver, sender)
+
+
+# --- what a capture does not show -------------------------------------------------------------------
+
+
+def network_of(size_bytes: int, source: str = "192.0.2.1", count: int = COUNT) -> list[Sent]:
+    destination = "2001:db8::7" if ":" in source else "198.51.100.7"
+    return [
+        Sent(T_NS + k * CAPTURE_PERIOD_NS, rtp(k, size_bytes), source, 5000, destination)
+        for k in range(count)
+    ]
+
+
+def parts_of(packets: list[Sent], most: int, link_type: int = ETHERNET) -> list[tuple[int, bytes]]:
+    """Return packets in fragments, with their times."""
+    return [
+        (packet.t_ns + place, part)
+        for k, packet in enumerate(packets)
+        for place, part in enumerate(fragments_of(packet, link_type, k % 2**16, most))
+    ]
+
+
+@pytest.mark.parametrize("source", ["192.0.2.1", "2001:db8::1"])
+@pytest.mark.parametrize("link_type", [ETHERNET, COOKED, LOOPBACK])
+def test_fragments_are_put_together(source: str, link_type: int) -> None:
+    sent = network_of(3000, source)
+    arrived = [packet for k, packet in enumerate(sent) if k not in LOST]
+    parts = parts_of(arrived, 1480, link_type)
+    for k in range(0, len(parts) - 3, 3):
+        parts[k : k + 3] = random.Random(k).sample(parts[k : k + 3], 3)
+    parts += parts[30:36]  # duplicates
+    whole = pcap_of(*sent, link_type=link_type)
+    for sender in (whole, pcap_of_packets(parts_of(sent, 1400, link_type), link_type)):
+        trace = trace_of(sender, pcap_of_packets(parts, link_type))
+        assert np.flatnonzero(trace.lost).tolist() == LOST
+    # A datagram of which a fragment is missing has not arrived.
+    trace = trace_of(whole, pcap_of_packets(parts[:40] + parts[41:], link_type))
+    assert np.flatnonzero(trace.lost).tolist() == sorted([*LOST, 3 + 40 // 3])
+    assert any("fragments are missing: 1" in line for line in trace.notes)
+
+
+@pytest.mark.parametrize("source", ["192.0.2.1", "2001:db8::1"])
+def test_first_fragments_suffice_if_a_filter_has_left_out_the_others(source: str) -> None:
+    sent = network_of(3000, source)
+    arrived = [packet for k, packet in enumerate(sent) if k not in LOST]
+    first = [
+        pcap_of_packets(
+            [(packet.t_ns, fragments_of(packet, ETHERNET, k, 1480)[0]) for k, packet in side], ETHERNET
+        )
+        for side in (enumerate(sent), enumerate(arrived))
+    ]
+    for sender in (first[0], pcap_of(*sent, link_type=ETHERNET)):
+        trace = trace_of(sender, first[1])
+        assert np.flatnonzero(trace.lost).tolist() == LOST
+        assert any("first fragment only" in line for line in trace.notes)
+
+
+@pytest.mark.parametrize("link_type", LINKS)
+@pytest.mark.parametrize("snap_bytes", [80, 200])
+def test_datagrams_that_are_cut_are_compared_as_far_as_they_go(link_type: int, snap_bytes: int) -> None:
+    sent = [
+        packet._replace(payload=packet.payload[: 40 + k % 400]) for k, packet in enumerate(network_of(500))
+    ]
+    arrived = [packet for k, packet in enumerate(sent) if k not in LOST]
+    whole = pcap_of(*sent, link_type=link_type), pcap_of(*arrived, link_type=link_type)
+    cut = [pcap_of(*side, link_type=link_type, snap_bytes=snap_bytes) for side in (sent, arrived)]
+    for files in ((whole[0], cut[1]), (cut[0], cut[1]), (cut[0], whole[1])):
+        trace = trace_of(*files)
+        assert np.flatnonzero(trace.lost).tolist() == LOST
+        assert any("cut by the snap length" in line for line in trace.notes)
+    trace = trace_of(cut[1], sequence_at=SequenceField(2, 4, False))
+    assert np.flatnonzero(trace.lost).tolist() == [k - 1 for k in LOST[1:-1]]
+
+
+def test_datagrams_that_are_cut_too_short_are_refused_with_the_snap_length() -> None:
+    sent, (first, *arrived) = network_of(400), network_of(400)
+    cut = pcap_of(first, *arrived, snap_bytes=30)
+    with pytest.raises(ValueError, match="snap length"):
+        trace_of(pcap_of(*sent), cut)
+    with pytest.raises(ValueError, match="cut before their sequence number: 300 are cut by the snap length"):
+        trace_of(cut, sequence_at=SequenceField(2, 4, False))
+
+
+def merged(packets: list[Sent], groups: int) -> list[Sent]:
+    """Return packets in groups of equal datagrams, as the kernel merges them."""
+    return [
+        packets[k + len(packets[k : k + groups]) - 1]._replace(
+            payload=b"".join(packet.payload for packet in packets[k : k + groups])
+        )
+        for k in range(0, len(packets), groups)
+    ]
+
+
+@pytest.mark.parametrize("groups", [2, 3, 7])
+def test_datagrams_that_the_kernel_merged_are_divided(groups: int) -> None:
+    sent = network_of(400)
+    arrived = [packet for k, packet in enumerate(sent) if k not in LOST]
+    half = arrived[:100] + merged(arrived[100:], groups)
+    for receiver in (half, merged(arrived, groups)):
+        trace = trace_of(pcap_of(*sent), pcap_of(*receiver))
+        assert np.flatnonzero(trace.lost).tolist() == LOST
+        trace = trace_of(pcap_of(*receiver), sequence_at=SequenceField(2, 4, False))
+        assert np.flatnonzero(trace.lost).tolist() == [k - 1 for k in LOST[1:-1]]
+    # A sender that hands many datagrams over at once.
+    trace = trace_of(pcap_of(*merged(sent, groups)), pcap_of(*arrived))
+    assert np.flatnonzero(trace.lost).tolist() == LOST
+
+
+def test_merged_datagrams_that_cannot_be_divided_are_refused() -> None:
+    sent = network_of(400)
+    foreign = [packet._replace(payload=random.Random(k).randbytes(800)) for k, packet in enumerate(sent)]
+    receiver = [foreign[k] if k % 3 == 1 else packet for k, packet in enumerate(sent)]
+    with pytest.raises(ValueError, match="UDP GRO"):
+        trace_of(pcap_of(*sent), pcap_of(*receiver))
+
+
+def test_long_and_short_datagrams_are_not_taken_for_merged_ones() -> None:
+    sent = [
+        packet._replace(payload=packet.payload[: 100 if k % 3 else 200])
+        for k, packet in enumerate(network_of(200))
+    ]
+    arrived = [packet for k, packet in enumerate(sent) if k not in LOST]
+    assert np.flatnonzero(trace_of(pcap_of(*sent), pcap_of(*arrived)).lost).tolist() == LOST
+    trace = trace_of(pcap_of(*arrived), sequence_at=SequenceField(2, 4, False))
+    assert np.flatnonzero(trace.lost).tolist() == [k - 1 for k in LOST[1:-1]]
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_packets_that_the_capture_dropped_are_not_lost_in_the_network(order: str) -> None:
+    sent = on_leg(0)
+    few = pcapng_of(*on_leg(5, [8, 9]), order=order, dropped=2)
+    many = pcapng_of(*on_leg(5, range(10, 20)), order=order, dropped=10)
+    between = pcapng_of(*on_leg(5, range(10, 20)), order=order, dropped_before=1)
+    for files, options in (
+        ((pcap_of(*sent), few), {}),
+        ((few,), {"sequence_at": SequenceField(2, 4, False)}),
+    ):
+        trace = trace_of(*files, **options)
+        assert np.flatnonzero(trace.lost).tolist() == [8, 9]
+        assert any(
+            "up to 2 of the 2 lost packets were not lost in the network" in line for line in trace.notes
+        )
+    for file in (many, between):
+        with pytest.raises(ValueError, match="the capture itself dropped"):
+            trace_of(pcap_of(*sent), file)
+        with pytest.raises(ValueError, match="the capture itself dropped"):
+            trace_of(file, sequence_at=SequenceField(2, 4, False))
+    # Where nothing is missing, it does not matter what was dropped.
+    assert not trace_of(pcap_of(*sent), pcapng_of(*on_leg(5), dropped=50)).lost.any()
+
+
+def test_packets_of_other_links_do_not_hide_the_flow() -> None:
+    data = bytearray(pcapng_of(*on_leg(0), *on_leg(5, LOST, interface=1)))
+    assert trace_of(bytes(data)).lost.sum() == len(LOST)
+    with pytest.raises(ValueError, match="300 packets have link type 189, which is not supported"):
+        trace_of(pcap_of_packets([(T_NS, b"x")] * 300, 189))
+
+
+# --- formats ----------------------------------------------------------------------------------------
+families = st.one_of(
+    *(
+        st.builds(
+            Sent,
+            t_ns=st.integers(0, 2**32 * 10**9 - 1),
+            payload=st.binary(max_size=30),
+            source=st.ip_addresses(v=version).map(str),
+            destination=st.ip_addresses(v=version).map(str),
+            source_port=st.integers(0, 65_535),
+            destination_port=st.integers(0, 65_535),
+            interface=st.just(0),
+            direction=st.just(0),
+        )
+        for version in (4, 6)
+    )
+)
+
+
+def read(data: bytes) -> Iterator[CapturedDatagram]:
+    reader = DatagramReader()
+    yield from reader.read(captured_packets(io.BytesIO(data)))
+    yield from reader.rest()
+
+
+@given(
+    st.lists(families, max_size=4), st.sampled_from(LINKS), st.sampled_from("<>"),
+    st.lists(st.integers(0, 4095), max_size=3), st.sampled_from(["pcap", "micro", "pcapng"]),
+)  # fmt: skip
+def test_every_datagram_is_found_again(
+    sent: list[Sent], link_type: int, order: str, vlans: list[int], form: str
+) -> None:
+    has_vlans = link_type in (ETHERNET, COOKED, COOKED_2)
+    sent = [packet._replace(vlans=tuple(vlans) if has_vlans else ()) for packet in sent]
+    if form == "pcapng":
+        data = pcapng_of(*sent, link_type=link_type, order=order)
+    else:
+        data = pcap_of(*sent, link_type=link_type, order=order, nano=form == "pcap")
+    for expected, datagram in zip(sent, read(data), strict=True):
+        assert datagram.t_ns == (expected.t_ns // 1000 * 1000 if form == "micro" else expected.t_ns)
+        assert datagram.payload == expected.payload
+        assert not datagram.is_cut
+        source = f"[{expected.source}]" if ":" in expected.source else expected.source
+        destination = f"[{expected.destination}]" if ":" in expected.destination else expected.destination
+        leg = "interface 0" + "".join(f", VLAN {vlan}" for vlan in expected.vlans)
+        leg += ", incoming" if link_type in (COOKED, COOKED_2) else ""
+        assert str(datagram.flow) == (
+            f"{source}:{expected.source_port} → {destination}:{expected.destination_port} on {leg}"
+        )
+
+
+def test_a_block_that_is_too_short_is_named_in_plain_words() -> None:
+    section = bytes.fromhex("0a0d0d0a 1c000000 4d3c2b1a 0100 0000 ffffffffffffffff 1c000000")
+    with pytest.raises(ValueError, match=r"^after packet 0: a block is too short"):
+        list(captured_packets(io.BytesIO(section + bytes.fromhex("06000000 0c000000 0c000000"))))

@@ -1,0 +1,197 @@
+"""Numbers that wrap around, senders that restart, and fields that are no sequence numbers."""
+
+import io
+import random
+import struct
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from noack.traces.capture_trace import CaptureOptions, read_captures
+from noack.traces.numbered_datagrams import SequenceField
+from noack.traces.packet_trace import PacketTrace
+from noack.traces.sequence_numbers import find_packets
+from tests.oracles.capture_files import Sent, pcap_of
+
+T_NS, PERIOD_NS = 1_700_000_000 * 10**9, 20_000_000
+ORDERS = ["big", "little"]
+
+
+def capture(
+    packets: Sequence[int],
+    size_bytes: int,
+    *,
+    first: int = 0,
+    order: str = "big",
+    period_ns: int = PERIOD_NS,
+    jitter: float = 0.0,
+) -> bytes:
+    """Return a receiver's capture of packets, by their place among those that are sent."""
+    rng = random.Random(1)
+    sent = []
+    for k in packets:
+        number = (first + k) % (1 << 8 * size_bytes)
+        payload = b"head" + number.to_bytes(size_bytes, order) + rng.randbytes(9)  # type: ignore[arg-type]
+        delay_ns = round((3 + rng.random() * jitter) * period_ns)
+        sent.append(Sent(T_NS + k * period_ns + delay_ns, payload))
+    return pcap_of(*sorted(sent))
+
+
+def trace_of(file: bytes, size_bytes: int, order: str = "big") -> PacketTrace:
+    field = SequenceField(4, size_bytes, order == "little")
+    return read_captures([io.BytesIO(file)], CaptureOptions(sequence_at=field))
+
+
+def lost_of(packets: Sequence[int]) -> list[int]:
+    """Return the places, from the first packet, of those that are missing."""
+    return sorted(
+        {k - min(packets) for k in range(min(packets), max(packets))} - {k - min(packets) for k in packets}
+    )
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("size_bytes", range(1, 9))
+@pytest.mark.parametrize("gap", [1, 100, 127, 128, 200, 255, 256, 300, 1000, 33_000, 70_000])
+def test_a_gap_of_any_length_is_counted_exactly(gap: int, size_bytes: int, order: str) -> None:
+    packets = [k for k in range(600 + gap) if not 300 <= k < 300 + gap]
+    trace = trace_of(capture(packets, size_bytes, order=order, jitter=0.5), size_bytes, order)
+    assert np.flatnonzero(trace.lost).tolist() == lost_of(packets)
+    assert not any(word in line for line in trace.notes for word in ("duplicates", "restarted", "left out"))
+    (line,) = [line for line in trace.notes if "period" in line]
+    assert float(line.split("constant, ")[1].split(" ms")[0]) == pytest.approx(PERIOD_NS / 1e6, rel=1e-3)
+
+
+def test_a_few_datagrams_suffice() -> None:
+    trace = trace_of(capture([0, 1, 130, 131], 1), 1)
+    assert np.flatnonzero(trace.lost).tolist() == list(range(2, 130))
+
+
+@pytest.mark.parametrize("first", [0, 250, 65_530, 2**32 - 5, 2**62 - 7, 2**63 - 9, 2**64 - 11])
+@pytest.mark.parametrize("size_bytes", range(1, 9))
+def test_numbers_may_be_large_and_wrap_around(size_bytes: int, first: int) -> None:
+    packets = [k for k in range(500) if k % 7 != 3]
+    random.Random(3).shuffle(packets)
+    trace = trace_of(capture(packets, size_bytes, first=first, jitter=4), size_bytes)
+    assert np.flatnonzero(trace.lost).tolist() == lost_of(packets)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_any_losses_are_counted_exactly(seed: int) -> None:
+    rng = random.Random(seed)
+    size_bytes, period_ns = rng.choice([1, 1, 2, 3, 4, 8]), rng.choice([10**6, 5 * 10**6, PERIOD_NS, 10**8])
+    packets, k = [], 0
+    for _ in range(rng.randrange(300, 1500)):
+        k += 1 + (rng.random() < 0.2) * rng.randrange(5)
+        k += rng.randrange(5000) if rng.random() < 0.003 else 0
+        packets.append(k)
+    packets += [k for k in packets if rng.random() < 0.02]  # duplicates
+    file = capture(
+        packets, size_bytes, first=rng.randrange(2**63), period_ns=period_ns, jitter=rng.random() * 3
+    )
+    assert np.flatnonzero(trace_of(file, size_bytes).lost).tolist() == lost_of(packets)
+
+
+@pytest.mark.parametrize("bits", [16, 32, 64])
+def test_delays_of_many_periods_are_not_taken_for_anything_else(bits: int) -> None:
+    rng = np.random.default_rng(1)
+    number = np.arange(5000)
+    t_ns = T_NS + number * 10**6 + rng.integers(0, 10**9, 5000)
+    order = np.argsort(t_ns)
+    arrivals = find_packets(number[order].astype(np.uint64), t_ns[order], bits)
+    assert (arrivals.packet - arrivals.packet.min()).tolist() == number[order].tolist()
+    assert not arrivals.part.any()
+
+
+@pytest.mark.parametrize("waited", [30, 200, 1000])
+def test_packets_that_wait_in_a_queue_are_not_taken_for_lost_ones(waited: int) -> None:
+    t_ns = T_NS + np.arange(4000) * PERIOD_NS
+    t_ns[1000 : 1000 + waited] = t_ns[1000 + waited] - np.arange(waited, 0, -1)
+    number = (np.arange(4000) % 256).astype(np.uint64)
+    assert find_packets(number, t_ns, 8).packet.tolist() == list(range(4000))
+
+
+def test_packets_that_arrive_in_groups_show_the_period() -> None:
+    t_ns = T_NS + np.arange(4000) // 10 * 10 * PERIOD_NS
+    keep = (np.arange(4000) < 2000) | (np.arange(4000) >= 2700)
+    arrivals = find_packets((np.arange(4000) % 256).astype(np.uint64)[keep], t_ns[keep], 8)
+    assert arrivals.packet.tolist() == np.flatnonzero(keep).tolist()
+    assert arrivals.period_ns == pytest.approx(PERIOD_NS, rel=0.01)
+
+
+@pytest.mark.parametrize("size_bytes", [2, 3, 4, 8])
+@pytest.mark.parametrize(
+    ("before", "first", "down"), [(500, 0, 0), (500, 0, 400), (40, 0, 5), (20_000, 3, 90)]
+)
+def test_a_sender_that_restarts_is_noticed(size_bytes: int, before: int, first: int, down: int) -> None:
+    start = 0 if before < 10_000 else 2**15
+    parts = [k for k in range(before) if k != 20], [k for k in range(300) if k not in (0, 100, 101)]
+    rng = random.Random(1)
+    sent = [
+        Sent(
+            T_NS + (place + k) * PERIOD_NS + rng.randrange(PERIOD_NS),
+            struct.pack(">Q", number + k)[-size_bytes:],
+        )
+        for part, place, number in ((parts[0], 0, start), (parts[1], before + down, first))
+        for k in part
+    ]
+    trace = read_captures(
+        [io.BytesIO(pcap_of(*sent))], CaptureOptions(sequence_at=SequenceField(0, size_bytes, False))
+    )
+    assert int(trace.lost.sum()) == 3
+    assert len(trace) == before + 299
+    assert not any("duplicates" in line for line in trace.notes)
+    assert sum("the sender restarted at" in line for line in trace.notes) == 1
+
+
+def test_a_sender_that_pauses_loses_nothing() -> None:
+    number = np.arange(1000).astype(np.uint64)
+    t_ns = T_NS + np.arange(1000) * 10**6
+    t_ns[500:] += 40 * 10**9
+    arrivals = find_packets(number, t_ns, 16)
+    assert arrivals.packet.tolist() == list(range(1000))
+    assert not arrivals.part.any()
+
+
+def test_single_numbers_that_are_none_are_left_out() -> None:
+    file = [Sent(T_NS + k * PERIOD_NS, struct.pack(">I", k) + b"x") for k in range(500)]
+    file[200] = file[200]._replace(payload=b"\x9f" * 5)
+    trace = read_captures(
+        [io.BytesIO(pcap_of(*file))], CaptureOptions(sequence_at=SequenceField(0, 4, False))
+    )
+    assert np.flatnonzero(trace.lost).tolist() == [200]
+    assert any("left out: 1 datagrams whose number" in line for line in trace.notes)
+
+
+@pytest.mark.parametrize("second", [0, 3, 1000, 40_000])
+def test_two_counters_in_one_flow_are_noticed(second: int) -> None:
+    payloads = [struct.pack(">HB", k // 2 + (second if k % 2 else 0), k % 2) for k in range(1000)]
+    file = pcap_of(*(Sent(T_NS + k * PERIOD_NS, payload) for k, payload in enumerate(payloads)))
+    options = CaptureOptions(sequence_at=SequenceField(0, 2, False))
+    if second < 1000:
+        trace = read_captures([io.BytesIO(file)], options)
+        assert sum("two counters" in line for line in trace.notes) == 1
+    else:
+        with pytest.raises(ValueError, match="two counters"):
+            read_captures([io.BytesIO(file)], options)
+
+
+def test_fields_that_are_no_sequence_numbers_are_refused() -> None:
+    rng = random.Random(1)
+    for payloads, message in (
+        ([b"\0\5"] * 500, "the numbers at 0:2 do not ascend"),
+        ([rng.randbytes(2) for _ in range(500)], "the numbers at 0:2 jump at random"),
+        (
+            [struct.pack("<H", k % 2**16) for k in range(1000)],
+            "wrong byte order; try --sequence-at 0:2:little",
+        ),
+    ):
+        file = pcap_of(*(Sent(T_NS + k * PERIOD_NS, payload) for k, payload in enumerate(payloads)))
+        with pytest.raises(ValueError, match=message):
+            read_captures([io.BytesIO(file)], CaptureOptions(sequence_at=SequenceField(0, 2, False)))
+    at_once = pcap_of(*(Sent(T_NS, struct.pack(">H", k)) for k in range(50)))
+    with pytest.raises(ValueError, match="period"):
+        read_captures([io.BytesIO(at_once)], CaptureOptions(sequence_at=SequenceField(0, 2, False)))
+    times = pcap_of(*(Sent(T_NS + k * PERIOD_NS, struct.pack(">I", 160 * k)) for k in range(50)))
+    trace = read_captures([io.BytesIO(times)], CaptureOptions(sequence_at=SequenceField(0, 4, False)))
+    assert any("multiples of 160" in line for line in trace.notes)
