@@ -104,7 +104,7 @@ def number_packets(capture: Capture, flow: CapturedFlow, field: SequenceField) -
             f"the numbers at {field} {error}; check --sequence-at, or filter the capture"
         ) from None
     notes = capture.notes
-    strays = len(numbers.number) - len(found.index)
+    strays = len(numbers.number) - len(found.arrival)
     if strays:
         notes.append(f"left out: {strays} datagrams whose number does not belong to the sequence")
     if found.uncertain:
@@ -117,7 +117,7 @@ def number_packets(capture: Capture, flow: CapturedFlow, field: SequenceField) -
     for part in range(int(found.part[-1]) + 1):
         here = found.part == part
         if part:
-            at_s = (numbers.t_ns[found.index[np.flatnonzero(here)[0]]] - numbers.t_ns[0]) / 1e9
+            at_s = (numbers.t_ns[found.arrival[np.flatnonzero(here)[0]]] - numbers.t_ns[0]) / 1e9
             notes.append(
                 f"the sender restarted at {at_s:.6g} s: its numbers do not go on; no losses are counted "
                 "between the parts"
@@ -125,7 +125,7 @@ def number_packets(capture: Capture, flow: CapturedFlow, field: SequenceField) -
         packet[here] += start - packet[here].min()
         start = int(packet[here].max()) + 1
     numbered = NumberedPackets(
-        packet, found.part, numbers.t_ns[found.index], numbers.row[found.index], found.period_ns
+        packet, found.part, numbers.t_ns[found.arrival], numbers.row[found.arrival], found.period_ns
     )
     return _first_of_each(capture, numbered)
 
@@ -150,7 +150,8 @@ def _first_of_each(capture: Capture, numbered: NumberedPackets) -> NumberedPacke
                 "seems to have two counters, or no number there; filter the capture, or check --sequence-at"
             )
     first = np.sort(first)
-    return NumberedPackets(*(column[first] for column in numbered[:4]), numbered.period_ns)
+    packet, part, received_ns, row, period_ns = numbered
+    return NumberedPackets(packet[first], part[first], received_ns[first], row[first], period_ns)
 
 
 def _check_steps(capture: Capture, numbers: _Numbers, field: SequenceField) -> None:

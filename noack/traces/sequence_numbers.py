@@ -46,7 +46,7 @@ _FAR_BACK_SHARE, _FEWEST_FAR_BACK = 0.1, 8
 class Arrivals(NamedTuple):
     """The packets of the k arrivals that belong to the sequence, in their order."""
 
-    index: Int64s  # (k,) Among all arrivals
+    arrival: Int64s  # (k,) Its place among all arrivals
     packet: Int64s  # (k,) Number without wrap-around, from any origin in each part
     part: Int64s  # (k,) 0, and one more after each restart of the sender
     period_ns: float
