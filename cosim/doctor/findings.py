@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from cosim.doctor.machine_measures import EXTRAS, Lateness, MachineFacts, RunRequirements
+from cosim.doctor.machine_measures import MachineFacts, RunRequirements
 from noack.core.number_format import byte_size, duration
 
 LOOP_PROCESSES = 5
@@ -21,8 +21,6 @@ PLENTY_OF_DATAGRAMS = 4096
 """A receive buffer of this size covers a stall of seconds at any rate of the shipped scenarios."""
 LEAST_WRITE_BYTES_PER_S = 20e6
 """A slower disk may not keep up with the record of a run."""
-_SLOW_TIMER_NS = 1_000_000
-"""A timer with this resolution is too coarse for periods of milliseconds."""
 _SETTINGS = {
     "sched_fifo": "SCHED_FIFO",
     "memory_lock": "locked memory",
@@ -136,32 +134,12 @@ def _settings(machine: MachineFacts, required: RunRequirements) -> Iterator[Outc
         yield verdict, f"{name}: {answer}", means, _REMEDIES.get(key, "")
 
 
-@_check("timers")
-def _timer(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
-    slack = machine.timer_slack_ns
-    text = f"resolution {duration(machine.timer_resolution_ns * 1e-9)}"
-    if slack is not None:
-        text += f", default slack {duration(slack * 1e-9)}"
-    if machine.timer_resolution_ns >= _SLOW_TIMER_NS:
-        yield LIMITED, text, "shorter steps cannot be distinguished", "lower plant.rate_hz"
-    else:
-        yield GOOD, text
-
-
-@_check("wake-ups without real-time settings")
-def _plain_wake_ups(machine: MachineFacts, required: RunRequirements) -> Iterator[Outcome]:
-    yield _wake_ups(machine.plain, required, applied=not required.realtime)
-
-
-@_check("wake-ups with the real-time settings applied")
-def _realtime_wake_ups(machine: MachineFacts, required: RunRequirements) -> Iterator[Outcome]:
-    yield _wake_ups(machine.realtime, required, applied=required.realtime)
-
-
-def _wake_ups(lateness: Lateness | str, required: RunRequirements, *, applied: bool) -> Outcome:
+@_check("wake-ups")
+def _wake_ups(machine: MachineFacts, required: RunRequirements) -> Iterator[Outcome]:
     """Compare the lateness of an idle loop with the lateness that the certificates allow."""
-    if isinstance(lateness, str):
-        return LIMITED, lateness, "the lateness of a run cannot be predicted"
+    if isinstance(lateness := machine.lateness, str):
+        yield LIMITED, lateness, "the lateness of a run cannot be predicted"
+        return
     late = (
         f"late by {lateness.p50_us:.3g} µs (median), {duration(lateness.p99_us * 1e-6)} (p99), "
         f"{duration(lateness.max_us * 1e-6)} (max) over {lateness.wakes:,} wake-ups at "
@@ -171,7 +149,8 @@ def _wake_ups(lateness: Lateness | str, required: RunRequirements, *, applied: b
     if not lateness.too_late:
         near = lateness.max_us * 1e3 > required.allowance_ns / 2
         means = f"all within {allowed}" + (", some above half of it" if near else "")
-        return GOOD, late, f"{means}; a longer run may exceed the maximum"
+        yield GOOD, late, f"{means}; a longer run may exceed the maximum"
+        return
     share = 100 * lateness.too_late / lateness.wakes
     first_s = lateness.wakes / lateness.too_late / required.rate_hz
     means = (
@@ -179,27 +158,7 @@ def _wake_ups(lateness: Lateness | str, required: RunRequirements, *, applied: b
         f"{first_s:.2g} s of a run of {required.duration_s:g} s; from the first on, the run needs a "
         "certificate for its actual lateness"
     )
-    if not applied:
-        return GOOD, late, f"{means}. Runs use real-time settings"
-    remedy = "raise certificate.late_periods, or lower speed or rates"
-    return LIMITED, late, means, remedy
-
-
-@_check("UDP on the loopback")
-def _loopback(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
-    if isinstance(trips := machine.round_trips, str):
-        means = "the processes of a run cannot communicate"
-        remedy = "`sudo ip link set lo up`; check the firewall's rules for 127.0.0.1"
-        yield BAD, trips, means, remedy
-        return
-    p50, p99 = duration(trips.p50_us * 1e-6), duration(trips.p99_us * 1e-6)
-    text = f"round trip {p50} (median), {p99} (p99)"
-    if trips.lost:
-        means = "unintended losses break the bound on consecutive losses"
-        lost = f"{text}; {trips.lost} of {trips.sent} lost"
-        yield LIMITED, lost, means, "check the firewall and `tc qdisc show`"
-    else:
-        yield GOOD, text
+    yield LIMITED, late, means, "raise certificate.late_periods, or lower speed or rates"
 
 
 @_check("receive buffer")
@@ -275,28 +234,6 @@ def _viewer(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
         means = "`noack view` and --live open in a browser, not in a window"
         remedy = "from another machine, forward the port: `ssh -L PORT:127.0.0.1:PORT`"
         yield LIMITED, f"{text}, no display", means, remedy
-
-
-@_checks.append
-def _extras(machine: MachineFacts, _: RunRequirements) -> Iterator[MachineFinding]:
-    for name, installed in machine.extras.items():
-        title, (_module, use) = f"extra: {name}", EXTRAS[name]
-        if installed:
-            yield MachineFinding(title, GOOD, f"installed, for {use}")
-        else:
-            remedy = f"`pip install 'noack[{name}]'`"
-            yield MachineFinding(title, LIMITED, "not installed", f"no {use}", remedy)
-
-
-@_check("versions")
-def _versions(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
-    installed = [f"{name} {version}" for name, version in machine.versions.items() if version]
-    missing = [name for name, version in machine.versions.items() if not version]
-    means = f"{', '.join(missing)}: not installed as a package, so runs cannot record the version"
-    if missing:
-        yield LIMITED, ", ".join(installed), means, "`pip install noack`"
-    else:
-        yield GOOD, ", ".join(installed)
 
 
 def document(

@@ -3,19 +3,16 @@
 The measurements stand beside what a scenario requires (:class:`RunRequirements`).
 """
 
-import ctypes
 import json
 import os
 import shutil
 import socket
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TypedDict, TypeVar
 
@@ -29,27 +26,17 @@ from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, MachineError, NoackError, one_line, why
 from noack.core.system_processes import python_command
 from noack.runtime.active_runs import RUNS
-from noack.runtime.address import LOOPBACK
 from noack.runtime.connections.zenoh_session import answer_to, cause_of, open_session
 from noack.runtime.private_folder import open_private
 from noack.runtime.udp_sockets import bind
 from noack.scenario.scenario import Scenario
 
 T = TypeVar("T")
-EXTRAS = {
-    "regions": ("flint", "certificates of nonlinear plants on a region"),
-    "cluster": ("distributed", "`noack campaign --scheduler`"),
-}
-"""Extras of noack by name: one module that each installs, and what it is for."""
 _DATAGRAM = bytes(72)
-_ROUND_TRIPS = 1000
-_TOO_MANY_LOST = 3
-"""Lost datagrams after which no more are sent."""
 _FLOOD_DATAGRAMS = 20_000
 _WRITE_BYTES = 32 * 1024 * 1024
 _PROBE_TIMEOUT_S = 20.0
 _QUERY_TIMEOUT_S = 2.0
-_PR_GET_TIMERSLACK = 30
 
 
 @dataclass(frozen=True)
@@ -103,16 +90,6 @@ class Lateness:
 
 
 @dataclass(frozen=True)
-class RoundTrips:
-    """Round trips of datagrams to another process over UDP on the loopback."""
-
-    sent: int
-    lost: int
-    p50_us: float
-    p99_us: float
-
-
-@dataclass(frozen=True)
 class Buffer:
     """The receive buffer of a run's sockets."""
 
@@ -147,13 +124,8 @@ class MachineFacts:
     """Frequency governor of the first core; None if unknown."""
     settings: Mapping[str, str]
     """For each real-time setting: applied or not permitted, as ``realtime`` reports it."""
-    timer_resolution_ns: int
-    timer_slack_ns: int | None
-    plain: Lateness | str
-    """Without real-time settings."""
-    realtime: Lateness | str
-    """With the real-time settings that are permitted."""
-    round_trips: RoundTrips | str
+    lateness: Lateness | str
+    """Of wake-ups, with the real-time settings if the scenario asks for them."""
     buffer: Buffer | str
     ports_taken: Sequence[str]
     """A line for each port of the scenario that is in use."""
@@ -165,10 +137,6 @@ class MachineFacts:
     display: bool
     viewer: str | None
     """Version of rerun; None if it cannot be imported."""
-    extras: Mapping[str, bool]
-    """Whether each extra of noack is installed."""
-    versions: Mapping[str, str | None]
-    """Versions of Python and of the libraries that a run depends on."""
 
 
 def measure(resolved: Scenario, required: RunRequirements, runs: Path, duration_s: float) -> MachineFacts:
@@ -178,9 +146,9 @@ def measure(resolved: Scenario, required: RunRequirements, runs: Path, duration_
         resolved: the resolved scenario.
         required: its requirements.
         runs: folder of the run directories; it need not exist.
-        duration_s: length of each of the two measurements of wake-ups.
+        duration_s: length of the measurement of wake-ups.
     """
-    plain, realtime, settings = _measure_wake_ups(required, duration_s)
+    late, settings = _measure_wake_ups(required, duration_s)
     recorded = environment("live")
     return MachineFacts(
         cores=recorded["cores"],
@@ -188,11 +156,7 @@ def measure(resolved: Scenario, required: RunRequirements, runs: Path, duration_
         load=os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         governor=_read(Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")),
         settings=settings,
-        timer_resolution_ns=round(time.get_clock_info("monotonic").resolution * NS_PER_S),
-        timer_slack_ns=_timer_slack_ns(),
-        plain=plain,
-        realtime=realtime,
-        round_trips=_result_or_reason(_measure_round_trips),
+        lateness=late,
         buffer=_result_or_reason(_measure_buffer),
         ports_taken=list(_list_taken_ports(required)),
         control=_result_or_reason(_measure_query),
@@ -200,8 +164,6 @@ def measure(resolved: Scenario, required: RunRequirements, runs: Path, duration_
         runtime_folder=_runtime_folder_problem(),
         display=has_display(),
         viewer=recorded["packages"].get("rerun-sdk") if is_installed() else None,
-        extras={name: find_spec(module) is not None for name, (module, _) in EXTRAS.items()},
-        versions={"python": recorded["python"], **recorded["packages"]},
     )
 
 
@@ -216,34 +178,26 @@ def _result_or_reason(measure_it: Callable[[], T]) -> T | str:
         return why(error)
 
 
-def _probe_command(*arguments: object) -> list[str]:
-    return python_command("-m", "cosim.doctor.probe", *arguments)
-
-
 class _WakeUps(TypedDict):
     """What the probe prints: lateness in ns, and whether each setting was applied."""
 
-    plain: list[int]
-    realtime: list[int]
+    late_ns: list[int]
     settings: dict[str, str]
 
 
-def _measure_wake_ups(
-    required: RunRequirements, duration_s: float
-) -> tuple[Lateness | str, Lateness | str, dict[str, str]]:
-    command = _probe_command("wake", required.period_ns, duration_s, required.fifo_priority, required.spin_us)
+def _measure_wake_ups(required: RunRequirements, duration_s: float) -> tuple[Lateness | str, dict[str, str]]:
+    arguments = (
+        required.period_ns, duration_s, required.fifo_priority, required.spin_us, int(required.realtime)
+    )  # fmt: skip
+    command = python_command("-m", "cosim.doctor.probe", *arguments)
     try:
         probe = subprocess.run(
             command, capture_output=True, text=True, check=True, timeout=_PROBE_TIMEOUT_S + 10 * duration_s
         )
     except (OSError, subprocess.SubprocessError) as error:
-        reason = one_line(error)
-        return reason, reason, {}
+        return one_line(error), {}
     printed: _WakeUps = json.loads(probe.stdout)
-    plain, realtime = (
-        lateness(late_ns, required.allowance_ns) for late_ns in (printed["plain"], printed["realtime"])
-    )
-    return plain, realtime, printed["settings"]
+    return lateness(printed["late_ns"], required.allowance_ns), printed["settings"]
 
 
 def lateness(late_ns: Iterable[int], allowance_ns: int) -> Lateness | str:
@@ -254,41 +208,6 @@ def lateness(late_ns: Iterable[int], allowance_ns: int) -> Lateness | str:
     p50, p99 = np.quantile(late, [0.5, 0.99]) / 1e3
     too_late = int((late > allowance_ns).sum())
     return Lateness(len(late), float(p50), float(p99), float(late.max()) / 1e3, too_late)
-
-
-def _round_trips_us(endpoint: socket.socket) -> list[float]:
-    """Return the times of the datagrams that come back; raise MachineError if too many do not."""
-    times_us: list[float] = []
-    for number in range(_ROUND_TRIPS):
-        began_ns = time.perf_counter_ns()
-        with suppress(TimeoutError):
-            endpoint.send(_DATAGRAM)
-            endpoint.recv(len(_DATAGRAM) + 1)
-            times_us.append((time.perf_counter_ns() - began_ns) * 1e-3)
-        if number + 1 - len(times_us) >= _TOO_MANY_LOST:
-            raise MachineError("datagrams on the loopback are lost")
-    return times_us
-
-
-def _measure_round_trips() -> RoundTrips:
-    with (
-        subprocess.Popen(_probe_command("echo"), stdout=subprocess.PIPE, text=True) as process,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint,
-    ):
-        try:
-            assert process.stdout is not None
-            endpoint.settimeout(1.0)
-            port = int(process.stdout.readline() or 0)
-            if not port:
-                raise MachineError("a process that echoes datagrams did not start")
-            endpoint.connect((LOOPBACK, port))
-            times_us = _round_trips_us(endpoint)
-            endpoint.send(b"")
-        except BaseException:
-            process.kill()
-            raise
-    p50, p99 = np.quantile(times_us, [0.5, 0.99])
-    return RoundTrips(_ROUND_TRIPS, _ROUND_TRIPS - len(times_us), float(p50), float(p99))
 
 
 def _measure_buffer() -> Buffer:
@@ -353,13 +272,6 @@ def _runtime_folder_problem() -> str | None:
     except CallerError as error:
         return str(error)
     return None
-
-
-def _timer_slack_ns() -> int | None:
-    if sys.platform != "linux":
-        return None
-    slack_ns: int = ctypes.CDLL(None).prctl(_PR_GET_TIMERSLACK, 0, 0, 0, 0)
-    return slack_ns if slack_ns >= 0 else None
 
 
 def _read(path: Path) -> str | None:

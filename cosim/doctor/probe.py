@@ -1,7 +1,6 @@
-"""Separate processes that measure: ``python -m cosim.doctor.probe wake|echo``."""
+"""A process that measures wake-ups: ``python -m cosim.doctor.probe``."""
 
 import json
-import socket
 import sys
 import time
 from collections.abc import Sequence
@@ -12,7 +11,6 @@ from numpy.typing import NDArray
 from noack.core.clock import NS_PER_S, RunClock
 from noack.protocol.roles import Notice, Record
 from noack.protocol.wire_format import KEY_BYTES, Wire
-from noack.runtime.address import LOOPBACK
 from noack.runtime.drivers.live_driver import LiveDriver
 from noack.runtime.drivers.real_time_loop import RecordSink, run_loop
 from noack.runtime.drivers.realtime_settings import realtime
@@ -22,22 +20,18 @@ from plant_server.plant import plants_of
 
 _WARM_UP = 20
 """Wake-ups before the measurement, to warm up the code."""
-_IDLE_S = 10.0
-"""The echo ends after this time without a datagram."""
 
 
-def wake(period_ns: int, duration_s: float, priority: int, spin_us: float) -> dict[str, object]:
-    """Wake up periodically, as a process of a run does, without and with real-time settings.
+def wake(
+    period_ns: int, duration_s: float, priority: int, spin_us: float, *, is_realtime: bool
+) -> dict[str, object]:
+    """Wake up periodically, as a process of a run does.
 
     Returns:
-        ``plain`` and ``realtime``: lateness in ns; ``settings``: which of them are applied.
+        ``late_ns``: lateness of each wake-up; ``settings``: which real-time settings are applied.
     """
-    measured: dict[str, object] = {}
-    # Timer slack and locked memory cannot be undone in a process: measure without them first.
-    for name, enabled in (("plain", False), ("realtime", True)):
-        with realtime(enabled, priority, place=0) as settings:
-            measured |= {name: idle_lateness_ns(period_ns, duration_s, spin_us), "settings": settings}
-    return measured
+    with realtime(is_realtime, priority, place=0) as settings:
+        return {"late_ns": idle_lateness_ns(period_ns, duration_s, spin_us), "settings": settings}
 
 
 def idle_lateness_ns(period_ns: int, duration_s: float, spin_us: float = 0.0) -> Sequence[int]:
@@ -80,23 +74,7 @@ class _TickRecord:
         pass
 
 
-def echo() -> None:
-    """Print a port and echo datagrams that arrive there; an empty datagram ends it."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint:
-        endpoint.bind((LOOPBACK, 0))
-        endpoint.settimeout(_IDLE_S)
-        print(endpoint.getsockname()[1], flush=True)
-        while True:
-            data, source = endpoint.recvfrom(2048)
-            if not data:
-                return
-            endpoint.sendto(data, source)
-
-
 if __name__ == "__main__":
-    if sys.argv[1] == "echo":
-        echo()
-    else:
-        period_ns, duration_s, priority, spin_us = sys.argv[2:]
-        measured = wake(int(period_ns), float(duration_s), int(priority), float(spin_us))
-        print(json.dumps(measured))
+    period_ns, duration_s, priority, spin_us, is_realtime = sys.argv[1:]
+    numbers = int(period_ns), float(duration_s), int(priority), float(spin_us)
+    print(json.dumps(wake(*numbers, is_realtime=bool(int(is_realtime)))))

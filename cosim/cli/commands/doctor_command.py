@@ -30,20 +30,20 @@ def doctor(
         Option(
             min=0.1,
             max=3600,
-            help="Seconds of each measurement of wake-ups: without and with real-time settings.",
+            help="Seconds of the measurement of wake-ups.",
         ),
     ] = 2.0,
     runs: opt.RunsOption = DEFAULT_RUNS,
     json: opt.JsonOption = False,
 ) -> int:
-    """Check this machine: real-time settings, timers, ports, disk.
+    """Check this machine: real-time settings, lateness, ports, disk.
 
     Each finding is good, limited or bad, with its meaning for a run and a remedy. The scenario
     determines rates, ports and the allowed lateness.
 
     Exit status 1: a finding is bad, so that no run is possible.
 
-    Takes some 10 s.
+    Takes some 5 s.
     """
     opt.require_linux()
     from cosim.doctor import findings
