@@ -21,6 +21,7 @@ from noack.protocol.roles import ROLES
 from noack.runtime.active_runs import active_runs
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario, loop_names, loop_scenario, loop_sections
+from noack.scenario.uneven_periods import uneven_periods
 
 if TYPE_CHECKING:
     from cosim.analysis.summary.run_summary import Outcome
@@ -93,15 +94,19 @@ class _TheoryWarnings(RunObserver):
         warn_of_violations(self._loaded)
 
 
-def warn_of_violations(loaded: Scenario) -> None:
-    """Print the assumptions of Theorem 2 that the scenario violates, on standard error."""
+def warn_of_violations(loaded: Scenario, *, is_sampled: bool = True) -> None:
+    """Print on standard error what Theorem 2 assumes and the scenario violates.
+
+    Of a sampled run also the periods that do not divide each other.
+    """
     from noack.theory.certificates.assumptions import violations_of_theorem_2
 
     shares = len(loop_names(loaded)) > 1
     for section in loop_sections(loaded):
         prefix = f"{section.name}: " if shares else ""
         resolved = resolve(loop_scenario(loaded, section))
-        for line in violations_of_theorem_2(resolved):
+        uneven = uneven_periods(resolved) if is_sampled else ()
+        for line in (*violations_of_theorem_2(resolved), *uneven):
             print(f"noack: warning: {prefix}{line}", file=sys.stderr)
 
 

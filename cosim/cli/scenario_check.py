@@ -14,8 +14,8 @@ from noack.core.clock import NS_PER_S
 from noack.scenario.resolution import policy_of, resolve, resolved_loops
 from noack.scenario.scenario import Scenario, loop_names, phases_ns
 from noack.scenario.scenario_file import dumps
+from noack.scenario.uneven_periods import uneven_periods
 from noack.theory.certificates.assumptions import assumptions
-from noack.trigger_policies.periodic_trigger import PeriodicSettings
 from noack.trigger_policies.trigger_rule import CodedPolicy
 from plant_server.plant import system_of
 
@@ -62,6 +62,8 @@ def _check_loops(loaded: Scenario, *, json: bool) -> None:
     for loop, phase_ns in zip(loops, phases_ns(loaded), strict=True):
         x0 = ", ".join(f"{value:.4g}" for value in loop.plant.initial_state)
         print(f"{_COMMENT}{loop.name}: begins at {phase_ns / NS_PER_S:.6f} s, x(0) = ({x0})")
+        for line in uneven_periods(loop):
+            print(f"{_COMMENT}{loop.name}: {line}")
 
 
 def _print_plant(console: Console, resolved: Scenario) -> None:
@@ -84,11 +86,7 @@ def _dependent_defaults(resolved: Scenario) -> Iterator[str]:
         yield "network.loss: no effect, since network.mansd = 0 lets every update pass"
     if resolved.controller.timeout_input == "hold" and resolved.controller.update_timeout_s is None:
         yield "controller.timeout_input: no effect without controller.update_timeout_s"
-    if isinstance(resolved.trigger, PeriodicSettings):
-        period_s, measured_ns = resolved.trigger.period_s, resolved.timing.measurement_period_ns
-        sent_ns = -(-round(period_s * NS_PER_S) // measured_ns) * measured_ns
-        if sent_ns != round(period_s * NS_PER_S):
-            yield f"trigger.period_s: updates are sent at measurements, every {sent_ns / NS_PER_S:g} s"
+    yield from uneven_periods(resolved)
     watchdog, timeout_s = resolved.plant.watchdog, resolved.timing.actuation_timeout_ns / NS_PER_S
     if watchdog.timeout_s is None:
         yield (f"plant.watchdog: policy {watchdog.policy}, after {timeout_s:g} s without an actuation")

@@ -92,6 +92,7 @@ def run_facts(summary: RunSummary, directory: Path) -> list[tuple[str, str]]:
     mode = f"{len(summary.loops)} loops" if is_shared else mode_words(loop.mode)
     verdicts = Counter(str(claim.verdict) for loop in summary.loops for claim in loop.claims)
     norms = (loop.initial_state_norm, loop.final_state_norm)
+    uneven = [line for each in summary.loops for line in each.uneven_periods]
     of_loop = [
         (
             "events",
@@ -107,6 +108,7 @@ def run_facts(summary: RunSummary, directory: Path) -> list[tuple[str, str]]:
         ("run", f"{summary.scenario}, {mode}, {summary.kind}, {caps_text(summary)}"),
         ("ended", f"at {summary.reached_s:g} s of {summary.horizon_s:g} s: {summary.exit.reason}"),
         *(network_rows(summary)[:_MOST_NETWORK_ROWS] if is_shared else of_loop),
+        *(("periods", line) for line in dict.fromkeys(uneven)),
         ("claims", ", ".join(f"{n} {verdict}" for verdict, n in verdicts.items()) or "none"),
         ("directory", str(directory)),
     ]

@@ -348,6 +348,7 @@ def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
     for part in loop.assumptions:
         if part.verdict == AssumptionStatus.VIOLATED:
             yield f"assumption violated: {part.what} ({part.source}): {part.why}"
+    yield from loop.uneven_periods
     plant = loop.lateness_us.get("plant")
     if plant and plant.late_steps > _MOST_LATE * plant.steps:
         share = 100 * plant.late_steps / plant.steps

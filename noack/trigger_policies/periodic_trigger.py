@@ -1,5 +1,6 @@
 """Time-triggered control: transmit every period, independently of the measurements."""
 
+from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 from noack.trigger_policies.policy_settings import IntervalS, ModelMatrices, WeightedSettings, nanoseconds
@@ -18,6 +19,9 @@ class PeriodicSettings(WeightedSettings):
     def trigger_policy(self, model: ModelMatrices) -> TriggerRule:
         period_ns = nanoseconds(self.period_s)
         return TriggerRule(no_form(len(model.A)), longest_ns=period_ns, weight=self.weight_matrix)
+
+    def intervals(self) -> Mapping[str, tuple[str, float]]:
+        return {"period_s": ("updates are sent at measurements, every", self.period_s)}
 
     @property
     def description(self) -> str:

@@ -8,6 +8,7 @@ field ``policy``, and the behaviour that the settings describe;
 import json
 import warnings
 from abc import abstractmethod
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple, Self, TypeAlias, get_args
 
 import numpy as np
@@ -84,6 +85,13 @@ class PolicySettings(ScenarioSection):
         Raises:
             ValueError: a matrix has another shape, or is not allowed.
         """
+
+    def intervals(self) -> Mapping[str, tuple[str, float]]:
+        """Return the times between events that it names, by key: what they are in words, and seconds.
+
+        Events are at measurements: other times are rounded up to these.
+        """
+        return {}
 
     def check_period(self, measured_ns: int, key: str = "trigger") -> None:
         """Require that the policy's own sampling period fits the time between measurements.
@@ -182,6 +190,10 @@ class CombinedSettings(PolicySettings):
             self.rule.check(n, why)
         except ValueError as error:
             raise ValueError(str(error).replace("trigger.", "trigger.rule.", 1)) from None
+
+    def intervals(self) -> Mapping[str, tuple[str, float]]:
+        of_rule = {f"rule.{key}": interval for key, interval in self.rule.intervals().items()}
+        return {"interval_s": (f"the {self.policy} ends at a measurement, after", self.interval_s), **of_rule}
 
     def check_period(self, measured_ns: int, key: str = "trigger") -> None:
         self.rule.check_period(measured_ns, f"{key}.rule")

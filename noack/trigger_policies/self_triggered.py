@@ -10,6 +10,7 @@ without being tested. (The idea is that of Anta & Tabuada, IEEE TAC 55(9), 2010;
 Gronwall's.)
 """
 
+from collections.abc import Mapping
 from typing import ClassVar, Literal, Self
 
 from pydantic import model_validator
@@ -59,6 +60,12 @@ class SelfTriggeredSettings(WeightedSettings):
         if self.longest_s < self.shortest_s:
             raise ValueError("longest_s: must not be less than shortest_s")
         return self
+
+    def intervals(self) -> Mapping[str, tuple[str, float]]:
+        return {
+            "shortest_s": ("events are at measurements, at the earliest after", self.shortest_s),
+            "longest_s": ("events are at measurements, at the latest after", self.longest_s),
+        }
 
     def trigger_policy(self, model: ModelMatrices) -> TriggerRule:
         forecast = Forecast(

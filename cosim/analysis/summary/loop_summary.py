@@ -37,6 +37,7 @@ from noack.protocol.record_tables import (
 from noack.protocol.roles import FAILED, LOOP_ROLES
 from noack.protocol.wire_format import Flow
 from noack.scenario.runtime_parameters import text_of
+from noack.scenario.uneven_periods import uneven_periods
 from noack.theory.certificates.assumptions import Assumption, assumptions
 
 
@@ -71,6 +72,7 @@ def summarise_loop(
         **signals.for_summary(),
         assumption_violations=reported_violations(record),
         assumptions=_assumptions(record, assumed or assumptions(scenario)),
+        uneven_periods=uneven_periods(scenario),
         changes=change_parts(record),
         missing_samples=sum(missing.values()),
         missing_by_table={table: n for table, n in missing.items() if n},

@@ -346,6 +346,8 @@ class LoopSummary(SummaryPart):
     """Only if they cross the network."""
     assumption_violations: list[ViolationPart]
     assumptions: list[AssumptionPart]
+    uneven_periods: list[Text] = []
+    """What differs from the scenario's periods since they do not divide each other."""
     changes: list[ChangePart]
     missing_samples: Count
     missing_by_table: Counts

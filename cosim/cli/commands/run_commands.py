@@ -118,7 +118,7 @@ def simulate(
     from cosim.simulation.virtual_time import simulate_run
 
     loaded = opt.load_scenario(scenario, settings)
-    warn_of_violations(loaded)
+    warn_of_violations(loaded, is_sampled=trigger is opt.TriggerMode.SAMPLED)
     if trigger is opt.TriggerMode.CONTINUOUS:
         return simulate_continuously(loaded, json=json, required=require or ())
     with simulation_bar(error_console(), loaded.horizon_s) as bar:
