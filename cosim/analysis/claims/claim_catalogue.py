@@ -23,6 +23,8 @@ from noack.theory.certificates.certified_bounds import ScenarioCertificate, enve
 _LEAST_MARGIN, _LARGEST_MARGIN = 1e-9, 1e-6
 """Limits of the relative rounding error that is allowed in (I1)."""
 _EPSILON = float(np.finfo(float).eps)
+_SMALLEST_NORMAL = float(np.finfo(float).tiny)
+"""Smaller numbers have fewer digits: rounding may change them by a multiple."""
 _COMPLETE = "a complete record"
 _CONTINUOUS = "a continuous trigger, a network without delay"
 _CAPPED = "at most M − 1 consecutive losses"
@@ -110,9 +112,12 @@ def norm_text(run: RunEvidence, vector: str) -> str:
 
 
 def upper_shares(observed: Reals, bound: Reals) -> Reals:
-    """Return the share of an upper bound that was reached, (k,); 0 if both values are 0."""
-    shares = np.zeros(len(observed))
-    return np.divide(observed, bound, out=shares, where=(observed != 0) | ~(bound >= 0))
+    """Return the share of an upper bound that was reached, (k,); 0 if both values are 0.
+
+    Numbers below the smallest normal one exceed no bound.
+    """
+    shares, most = np.zeros(len(observed)), bound + _SMALLEST_NORMAL
+    return np.divide(observed, most, out=shares, where=(observed != 0) | ~(bound >= 0))
 
 
 def controller_error_bound(
@@ -182,7 +187,7 @@ def i1_model_difference(run: RunEvidence, samples: Samples) -> ClaimBound:
     here, margin = samples.is_bounded, _margin(run)
     residual = samples.residual[here]
     # Use the larger model state, since a missed update may have moved x_c far from x_s.
-    scale = max(run.facts.largest_state, float(np.finfo(float).tiny))
+    scale = max(run.facts.largest_state, _SMALLEST_NORMAL)
     formula = "x_c − x_s = Σ e^(H(t−t_k)) e_s(t_k), relative residual ≤ {}"
     shares = residual / (margin * scale)
     void = earliest([run.models_apart, run.first_gap])

@@ -37,7 +37,7 @@ _TIMED_RATES = (0.7, 0.4, 0.1)
 """Rates that are tried where events are due, as shares of the decay rate of A + BK: the first that
 has a certificate is used."""
 _OUTSIDE_RANGE = "at its start the input was not known, or not in the range of K, where the bounds have it"
-_LARGEST_START = 1e150
+_SMALLEST_START, _LARGEST_START = 1e-150, 1e150
 """The squares of larger entries of x(0) may overflow."""
 
 
@@ -177,6 +177,7 @@ class CertificateScope:
                 raise NoCertificateError(why)
             if math.isinf(self._start_error):
                 raise NoCertificateError(_OUTSIDE_RANGE)
+            self._require_normal_start()
             phases = self.all_phases(conditions)
         except (NotDecayingError, NoCertificateError) as error:
             void = self._overflow() or error
@@ -221,6 +222,15 @@ class CertificateScope:
             persistent_constants=persistent,
             other=self._with_constants(others, conditions, void) if others else None,
         )
+
+    def _require_normal_start(self) -> None:
+        """Raise NoCertificateError if x(0) is not 0 and its squares are too small for floating point."""
+        largest = float(np.abs(self._loop.x0).max())
+        if 0 < largest < _SMALLEST_START:
+            raise NoCertificateError(
+                "plant.initial_state is too small for floating point: the largest entry of x(0) is "
+                f"{largest:.3g}; bounds are computed from {_SMALLEST_START:g} on, and for 0"
+            )
 
     def _overflow(self) -> NoCertificateError | None:
         """Return the reason for having no certificate if x(0) is too large."""

@@ -251,11 +251,48 @@ def test_no_claim_is_violated_at_a_set_point(name: str, settings: list[str]) -> 
         assert set(certified) == {HELD}
 
 
+SMALL = {
+    "name": "small", "horizon_s": 2.0,
+    "model": {"A": [[0.0, 1.0], [2.0, -0.5]], "B": [[0.0], [1.0]], "gain": [[-6.0, -3.0]]},
+    "network": {"mansd": 1, "loss": {"model": "bernoulli", "probability": 0.5}},
+    "controller": {"rate_hz": 50.0},
+}  # fmt: skip
+
+
 @pytest.mark.parametrize("number", [2839, 4099, 12380])
 def test_no_claim_is_violated_in_runs_that_an_attack_found(number: int) -> None:
     """u_r ≠ 0 before the first input; an event at the time of a change."""
     record = simulate(resolve(validate(random_scenario(number), "random")))
     assert VIOLATED not in {claim.verdict for claim in RunClaims(record).evaluate()}
+
+
+@pytest.mark.parametrize(
+    "trigger",
+    [
+        {"policy": "relative", "sigma": 0.01},
+        {"policy": "periodic", "period_s": 0.1},
+        {"beta": 1e-200, "alpha_per_s": 1.0},
+    ],
+)
+@pytest.mark.parametrize("size", [1e-320, 1e-300, 1e-170, 1e-151])
+def test_the_rounding_of_the_smallest_numbers_violates_no_claim(trigger: dict[str, Any], size: float) -> None:
+    """They have fewer digits, and their squares are 0: bounds from x(0) were 1e-8 of what they had to be."""
+    plant = {"initial_state": [size, 0.0], "rate_hz": 50.0}
+    claims = RunClaims(simulate(resolve(validate(SMALL | {"plant": plant, "trigger": trigger}, "small"))))
+    judged = claims.evaluate()
+    assert {claim.verdict for claim in judged if claim.source == "(I1)"} == {HELD}
+    certificates = [claim for claim in judged if claim.source == "certificate"]
+    assert {claim.verdict for claim in certificates} == {VOID}
+    assert all("too small for floating point" in claim.why for claim in certificates)
+
+
+def test_a_state_that_decays_to_the_smallest_numbers_violates_no_claim() -> None:
+    trigger = {"policy": "relative", "sigma": 0.01}
+    plant = {"initial_state": [1.0, 0.0], "rate_hz": 50.0}
+    content = SMALL | {"plant": plant, "trigger": trigger, "horizon_s": 430.0}
+    record = simulate(resolve(validate(content, "small")))
+    assert 0 <= np.linalg.norm(record[PLANT_STEP]["x"][-1]) < 1e-315
+    assert {claim.verdict for claim in RunClaims(record).evaluate()} == {HELD}
 
 
 # --- claims that cannot be judged -----------------------------------------------------------------
