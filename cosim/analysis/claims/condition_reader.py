@@ -29,7 +29,7 @@ def read_conditions(record: RunRecord) -> ObservedConditions:
     measured = record.columns(SENSOR_MEASUREMENT, "t_ns", "event")
     end_ns = max(0, *(record.last_ns(table) or 0 for table in (PLANT_STEP, SENSOR_MEASUREMENT)))
     is_event = measured["event"] != NO_SEQUENCE
-    losses, delay = _losses_and_delays(
+    losses, delay, first_delay_s = _losses_and_delays(
         measured["event"][is_event].tolist(),
         measured["t_ns"][is_event].tolist(),
         inputs.updates,
@@ -60,6 +60,7 @@ def read_conditions(record: RunRecord) -> ObservedConditions:
         clock_error_s=max((clock.error_ns / NS_PER_S for clock in clocks.values()), default=None),
         reached_s=end_ns * 1e-9,
         early=SampledSeries(*np.array(early).reshape(-1, 2).T),
+        first_delay_s=first_delay_s,
     )
 
 
@@ -99,13 +100,13 @@ def _losses_and_delays(
     passed: dict[int, bool],
     start_s: float,
     end_ns: int,
-) -> tuple[PacketLosses, SampledSeries]:
-    """Return losses and delays of the events, in order.
+) -> tuple[PacketLosses, SampledSeries, float | None]:
+    """Return losses and delays of the events, in order, and the largest delay until the first input.
 
     An update in flight at the end is not lost; it counts as delivered at the end.
     """
     waiting = deque(updates)
-    replaced_after_s, delays = list[float](), list[tuple[int, int]]()
+    replaced_after_s, delays, first_delays_ns = list[float](), list[tuple[int, int]](), list[int]()
     for sequence, t_ns in zip(events, times_ns, strict=True):
         while waiting and waiting[0].sequence < sequence:
             waiting.popleft()
@@ -121,11 +122,14 @@ def _losses_and_delays(
         else:  # it was delivered out of order: a newer update replaced it
             replaced_s = (applied_ns - t_ns) * 1e-9
         replaced_after_s.append(replaced_s)
-        # A delay before the first input is part of the start.
         if acts_ns is not None and acts_ns * 1e-9 > start_s:
             delays.append((t_ns, max(acts_ns - t_ns, 0)))
+        elif acts_ns is not None and np.isfinite(start_s):
+            # A delay until the first input is part of the start, which has a limit of its own.
+            first_delays_ns.append(max(acts_ns - t_ns, 0))
     late = np.array(delays).reshape(-1, 2)
     return (
         PacketLosses(np.array(times_ns) * 1e-9, np.array(replaced_after_s)),
         SampledSeries(late[:, 0] * 1e-9, late[:, 1] * 1e-9),
+        max(first_delays_ns) * 1e-9 if first_delays_ns else None,
     )

@@ -145,7 +145,8 @@ class ObservedConditions(NamedTuple):
     sampling: SampledSeries
     """Time since the measurement before, in seconds, at every measurement."""
     delay: SampledSeries
-    """Time from each event until the plant applied an input computed with its update."""
+    """Time from each event until the plant applied an input computed with its update, after the
+    first input: until then it is part of ``start_s``."""
     hold: SampledSeries
     """Largest difference between the time and the model time of the applied input, per step."""
     start_s: float
@@ -169,6 +170,8 @@ class ObservedConditions(NamedTuple):
     early: SampledSeries = SampledSeries(np.zeros(0), np.zeros(0))
     """Model time at which an update reset x_c, in seconds, by the earlier time at which the plant
     first applied an input computed with it: its step was late, or the controller's clock ahead."""
+    first_delay_s: float | None = None
+    """Largest time from an event to the first input, if that was computed with the event's update."""
 
     def _first_input(self, limit_s: float) -> SampledSeries:
         """The time of the first input, at t = 0; 0 if the run ended before that had to come."""
@@ -236,12 +239,17 @@ class ObservedConditions(NamedTuple):
             start_s=larger(allowed.start_s, self._first_input(allowed.start_s)),
         )
 
+    def _largest_delay_s(self) -> float | None:
+        """The largest time from an event to the plant, that of the first update included."""
+        delays_s = (self.first_delay_s, self.delay.largest())
+        return max((delay_s for delay_s in delays_s if delay_s is not None), default=None)
+
     def summary(self) -> dict[str, float | None]:
         """The largest value of each condition."""
         return {
             DROPOUTS: self.losses.consecutive(0.0).largest(),
             "sampling_s": self.sampling.largest(),
-            "delay_s": self.delay.largest(),
+            "delay_s": self._largest_delay_s(),
             "hold_s": self.hold.largest(),
             "start_s": self.start_s if np.isfinite(self.start_s) else None,
             "clock_error_s": self.clock_error_s,
