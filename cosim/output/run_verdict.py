@@ -366,7 +366,7 @@ def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
         if _has_clocks(loop):
             yield f"{lost} (kernel, or between the hosts; firewalls must pass the ports): {where}"
         else:
-            yield f"{lost} (kernel): {where}"
+            yield f"{lost} (kernel, or a process that did not respond): {where}"
     for role, reasons in loop.rejected_datagrams.items():
         counts = ", ".join(f"{reason.replace('_', ' ')} {n}" for reason, n in reasons.items())
         yield f"{role} rejected datagrams: {counts}"

@@ -6,6 +6,7 @@
 * :func:`reported_violations` of the processes, and the :func:`watchdog_actions` of the plant.
 """
 
+import math
 from collections import Counter
 from collections.abc import Iterator
 
@@ -22,7 +23,7 @@ from cosim.analysis.summary.summary_model import (
 )
 from cosim.record.run_events import ActuationTimes, PacketOutcome, changes_of, packet_outcomes
 from cosim.record.run_record import RunRecord
-from noack.core.clock import NEVER_NS
+from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.guarantee.loss_guarantee import LongestBurst
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -146,67 +147,113 @@ def unintended_losses(record: RunRecord) -> dict[str, int]:
 
     The processes receive for at least 150 ms of wall time beyond the horizon. A datagram that was
     to leave the emulator less than 50 ms before this, or later, is not lost: its receiver may have
-    ended. A datagram that its receiver rejected because an entry is not finite has arrived.
+    ended. A datagram that its receiver rejected because an entry is not finite has arrived. One whose
+    receiver died or stopped responding is lost, and so is one that an emulator held which did.
     """
-    last_ns = record.scenario.timing.horizon_ns + _ARRIVES_AFTER_END_S * record.scenario.speed * 1e9
-    outcomes, events = packet_outcomes(record), record.events()["event"]
+    last_ns = record.scenario.timing.horizon_ns + _arrives_after_ns(record)
+    outcomes, events = packet_outcomes(record), record.events()
     received = record.columns(CONTROLLER_DELIVERY, "sequence")["sequence"]
     every = record.scenario.plant.measure_every
     measured, actuated = _Unmatched(), _Unmatched()
     tables = (PLANT_STEP, SENSOR_MEASUREMENT, CONTROLLER_STEP, PLANT_ACTUATION)
-    for part in record.slices(*tables, columns=("sequence",)):
-        sent = part[PLANT_STEP]["sequence"]
-        measured.take(sent[sent % every == 0] // every, part[SENSOR_MEASUREMENT]["sequence"])
-        actuated.take(part[CONTROLLER_STEP]["sequence"], part[PLANT_ACTUATION]["sequence"])
+    for part in record.slices(*tables, columns=("sequence", "t_ns")):
+        steps, ticks = part[PLANT_STEP], part[CONTROLLER_STEP]
+        steps = steps.compress(steps["sequence"] % every == 0)
+        measured.take(steps["sequence"] // every, steps["t_ns"], part[SENSOR_MEASUREMENT]["sequence"])
+        actuated.take(ticks["sequence"], ticks["t_ns"], part[PLANT_ACTUATION]["sequence"])
+    # An update that the controller has may be missing from the record of an emulator that died.
+    in_netem = np.union1d(outcomes.sequence, received)
     hops = {
         "measurement": measured,
-        "update to netem": _Unmatched().take(events, outcomes.sequence),
-        "update to controller": _Unmatched().take(_forwarded_until(outcomes, last_ns), received),
+        "update to netem": _Unmatched().take(events["event"], events["t_ns"], in_netem),
+        "update to controller": _Unmatched().take(*_forwarded_until(record, outcomes, last_ns), received),
         "actuation": actuated,
     }
     for flow in record.scenario.network.flows[1:]:
         name, answers = flow.name.lower(), packet_outcomes(record, flow)
-        sent, arrived = (record.columns(table, "sequence")["sequence"] for table in _SENT_RECEIVED[flow])
+        sent, arrived = (record.columns(table, "sequence", "now_ns") for table in _SENT_RECEIVED[flow])
         hops.pop(name, None)
-        hops[f"{name} to netem"] = _Unmatched().take(sent, answers.sequence)
+        in_netem = np.union1d(answers.sequence, arrived["sequence"])
+        hops[f"{name} to netem"] = _Unmatched().take(sent["sequence"], sent["now_ns"], in_netem)
         hops[f"{name} to {ENDS[flow].receiver}"] = _Unmatched().take(
-            _forwarded_until(answers, last_ns), arrived
+            *_forwarded_until(record, answers, last_ns), arrived["sequence"]
         )
-    complete = all(record.reports.get(role, {}).get("ended") == HORIZON for role in LOOP_ROLES)
-    counts = {hop: unmatched.count(complete=complete) for hop, unmatched in hops.items()}
+    counts = {hop: unmatched.count(_arrives_ns(record, _receiver(hop))) for hop, unmatched in hops.items()}
     return {hop: max(count - _count_not_finite(record, hop), 0) for hop, count in counts.items()}
+
+
+def _receiver(hop: str) -> str:
+    """Return the process that receives the datagrams of a hop."""
+    return _RECEIVERS.get(hop, hop.rpartition(" ")[2])
+
+
+def _arrives_after_ns(record: RunRecord) -> float:
+    return _ARRIVES_AFTER_END_S * record.scenario.speed * NS_PER_S
+
+
+def _arrives_ns(record: RunRecord, receiver: str) -> float:
+    """Return until when what is sent to a process must arrive; later, it may be in flight at the end.
+
+    Infinite: everything, as the process received beyond the horizon; or it died or stopped responding
+    while others went on, and nothing that has not arrived ever will.
+    """
+    if (report := record.reports.get(receiver)) is not None:
+        if report.get("ended") == HORIZON:
+            return math.inf
+        end_ns = report.get("reached_ns")
+        return -math.inf if end_ns is None else end_ns - _arrives_after_ns(record)
+    if any(role in record.reports for role in LOOP_ROLES):
+        return math.inf
+    return _end_ns(record) - _arrives_after_ns(record)  # all processes were killed at once
+
+
+def _end_ns(record: RunRecord) -> int:
+    """Return the latest time that a process reached, as it reported or as its rows tell."""
+    recorded_ns = (record.last_ns(table) or 0 for table in STEP_TABLES.values())
+    reported_ns = (report.get("reached_ns") or 0 for report in record.reports.values())
+    return max(*recorded_ns, *reported_ns)
 
 
 def _count_not_finite(record: RunRecord, hop: str) -> int:
     """Return the number of datagrams that a hop's receiver rejected because an entry is not finite."""
-    receiver = _RECEIVERS.get(hop, hop.rpartition(" ")[2])
-    channel = record.reports.get(receiver, {}).get("channel") or {}
+    channel = record.reports.get(_receiver(hop), {}).get("channel") or {}
     return int((channel.get("rejected") or {}).get(Rejection.NOT_FINITE, 0))
 
 
-def _forwarded_until(outcomes: PacketOutcome, last_ns: float) -> NDArray[np.int64]:
-    """Return the numbers of the datagrams that were forwarded, and were due until then."""
-    return outcomes.sequence[outcomes.forwarded & (outcomes.due_ns <= last_ns)]
+def _forwarded_until(
+    record: RunRecord, outcomes: PacketOutcome, last_ns: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the numbers of the datagrams that were to be forwarded until then, and when."""
+    passes = outcomes.forwarded
+    if "netem" not in record.reports:  # what it still held is lost
+        passes, last_ns = ~outcomes.lost, min(last_ns, _end_ns(record))
+    passes = passes & (outcomes.due_ns <= last_ns)
+    return outcomes.sequence[passes], outcomes.due_ns[passes]
 
 
 class _Unmatched:
     """Finds the sent numbers that were not received, part by part; both ascend."""
 
     def __init__(self) -> None:
-        self._sent = np.zeros(0, np.int64)
+        self._sent, self._sent_ns = np.zeros((2, 0), np.int64)
         self._newest = -1
 
-    def take(self, sent: NDArray[np.int64], arrived: NDArray[np.int64]) -> "_Unmatched":
+    def take(
+        self, sent: NDArray[np.int64], sent_ns: NDArray[np.int64], arrived: NDArray[np.int64]
+    ) -> "_Unmatched":
         """Add the next numbers; one is received in the same part as it is sent, or later."""
         self._newest = max(self._newest, int(arrived.max(initial=-1)))
-        sent = np.concatenate([self._sent, sent])
-        begins_alike = np.array_equal(sent[: len(arrived)], arrived)
-        self._sent = sent[len(arrived) :] if begins_alike else np.setdiff1d(sent, arrived)
+        sent, sent_ns = np.concatenate([self._sent, sent]), np.concatenate([self._sent_ns, sent_ns])
+        if np.array_equal(sent[: len(arrived)], arrived):
+            missing: NDArray[np.bool_] | slice = slice(len(arrived), None)
+        else:
+            missing = ~np.isin(sent, arrived)
+        self._sent, self._sent_ns = sent[missing], sent_ns[missing]
         return self
 
-    def count(self, *, complete: bool) -> int:
-        """Return how many were lost; in a run that was stopped, one in flight is not lost."""
-        return int((complete | (self._sent <= self._newest)).sum())
+    def count(self, arrives_ns: float) -> int:
+        """Return how many were lost: those before one that arrived, and those sent by ``arrives_ns``."""
+        return int(((self._sent_ns <= arrives_ns) | (self._sent <= self._newest)).sum())
 
 
 def missing_rows(record: RunRecord) -> Counter[str]:

@@ -108,7 +108,7 @@ def test_a_run_across_hosts_names_the_firewall_the_network_and_how_to_add_rows(
     for named in ("firewalls must pass", "the network between hosts was later", "--add FILE"):
         assert named in across
         assert named not in alone
-    assert "lost elsewhere (kernel): 3 on actuation" in alone
+    assert "lost elsewhere (kernel, or a process that did not respond): 3 on actuation" in alone
 
 
 def test_the_longest_burst_is_shown_with_the_limit_of_all_rules(outcome: Outcome) -> None:

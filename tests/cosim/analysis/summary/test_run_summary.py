@@ -5,11 +5,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.analysis.summary.loops_over_time import INTERVALS, intervals_of, loop_over_time
 from cosim.analysis.summary.run_summary import counts_inside, in_flight, worst_loop
 from cosim.analysis.summary.summary_model import LoopSummary
+from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.protocol.record_tables import NETEM_PACKET, network_tables
+from noack.protocol.record_tables import CONTROLLER_DELIVERY, NETEM_PACKET, NETEM_RELEASE, network_tables
+from tests.cosim.record.changed_records import changed
 from tests.helpers.shipped import resolved
 from tests.helpers.summaries import claim, summary_of
 
@@ -83,3 +86,72 @@ def test_the_worst_loop_failed_or_came_nearest_to_a_bound(
     worst = worst_loop(summaries)
     assert worst.number == number
     assert reason in worst.why
+
+
+# --- lost, but by no decision of the emulator -----------------------------------------------------
+
+
+SENDING = ("horizon_s=3", "network.mansd=0", 'trigger={policy="periodic", period_s=0.1}')
+ENDED_EARLY = {"ended": "netem stopped responding", "reached_ns": 3 * S}
+
+
+def stopped_network(stopped_s: float, **reports: Any) -> RunRecord:
+    """A run of 3 s whose emulator did nothing from a time on."""
+    record = simulate(resolved("double_integrator", *SENDING))
+    begins_ns = int(stopped_s * S)
+    rows = {
+        table: record[table][record[table]["now_ns"] < begins_ns]
+        for table in (NETEM_PACKET, NETEM_RELEASE, CONTROLLER_DELIVERY)
+    }
+    left = {role: report for role, report in record.reports.items() if role != "netem"}
+    return changed(record, rows, reports=left | reports)
+
+
+@pytest.mark.parametrize("others", ["went on to the end", "were ended"])
+def test_updates_to_a_network_that_was_stopped_are_lost(others: str) -> None:
+    record = stopped_network(1.0)
+    if others == "were ended":
+        reports = {role: report | ENDED_EARLY for role, report in record.reports.items()}
+        record = changed(record, reports=reports)
+    summary = summarise_loop(record, 1, "netem stopped responding")
+    unaccounted = summary.events - summary.deliveries - summary.drops
+    assert unaccounted > 3
+    assert summary.unintended_losses_by_leg["update to netem"] == unaccounted
+
+
+def test_updates_that_a_stopped_network_held_are_lost() -> None:
+    """It forwarded none that it had delayed by 0.2 s, and did not tell that it had ended."""
+    delay = 'network.impairments=[{kind="delay", delay_s=0.2}]'
+    record = simulate(resolved("double_integrator", *SENDING, delay))
+    packets = record[NETEM_PACKET]
+    packets = packets[packets["now_ns"] < S]
+    rows = {
+        NETEM_PACKET: packets,
+        NETEM_RELEASE: record[NETEM_RELEASE][:0],
+        CONTROLLER_DELIVERY: record[CONTROLLER_DELIVERY][:0],
+    }
+    reports = {role: report for role, report in record.reports.items() if role != "netem"}
+    summary = summarise_loop(changed(record, rows, reports=reports), 1, "netem died")
+    by_hop = summary.unintended_losses_by_leg
+    assert by_hop["update to controller"] == len(packets) > 3
+    assert sum(by_hop.values()) == summary.events
+
+
+def test_what_is_in_flight_when_all_are_stopped_is_not_lost() -> None:
+    """But an update that was sent 0.1 s before the end, or earlier, is not in flight."""
+    record = stopped_network(2.95)
+    reports = {role: report | ENDED_EARLY for role, report in record.reports.items()}
+    sent_ns = record.events()["t_ns"][record.count(CONTROLLER_DELIVERY) :]
+    assert len(sent_ns)
+    for reached_ns, lost in ((sent_ns[0] + S // 20, 0), (sent_ns[0] + S // 10, 1)):
+        of_netem = {"reached_ns": int(reached_ns), "rows": record.row_counts("netem")}
+        reports["netem"] = reports["plant"] | of_netem
+        summary = summarise_loop(changed(record, reports=reports), 130, "stopped by the user")
+        assert summary.unintended_losses_by_leg.get("update to netem", 0) == lost
+
+
+def test_what_is_in_flight_when_all_were_killed_is_not_lost() -> None:
+    record = changed(stopped_network(2.95), reports={})
+    assert summarise_loop(record, 1, "the launcher died").unintended_losses == 0
+    record = changed(stopped_network(1.0), reports={})
+    assert summarise_loop(record, 1, "the launcher died").unintended_losses > 3
