@@ -12,7 +12,7 @@ follows runs. An installed package, an extension, names its modules as entry poi
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import redirect_stdout, suppress
 from functools import cache
 from importlib import import_module, metadata
 from pkgutil import iter_modules
@@ -56,11 +56,16 @@ def parts(package: str | None, group: str, read: Callable[[ModuleType], Part | N
         if not entry.ispkg and (part := read(import_module(entry.name))) is not None:
             yield part
     for point in _entry_points() if group else ():
-        if point.group != group or (point.attr and group in WITH_CLASSES):
+        if point.group != group:
             continue
         try:
-            part = read(point.load())
-        except (Exception, SystemExit) as error:  # an extension's code can raise any error
+            if group in WITH_CLASSES and point.attr:
+                continue
+            with redirect_stdout(sys.stderr):  # what it prints is no part of a command's output
+                part = read(point.load())
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # an extension's code can raise any error
             _warn(_package(point), f"{point.value}: {_first_line(error)}")
             continue
         if part is None:
@@ -89,7 +94,7 @@ def _entry_points() -> tuple[metadata.EntryPoint, ...]:
             if "[noack." in (package.read_text("entry_points.txt") or ""):
                 found.setdefault(package.name, package.entry_points)
         except Exception as error:  # of a damaged installation of any package
-            _warn(str(package), _first_line(error))
+            _warn(_folder(package), _first_line(error))
     return tuple(
         point for name in sorted(found) for point in sorted(found[name]) if point.group.startswith("noack.")
     )
@@ -97,6 +102,11 @@ def _entry_points() -> tuple[metadata.EntryPoint, ...]:
 
 def _package(point: metadata.EntryPoint) -> str:
     return point.dist.name if point.dist else point.value
+
+
+def _folder(package: metadata.Distribution) -> str:
+    """Return where a package is installed, of which the description cannot be read."""
+    return str(getattr(package, "_path", package))  # it may have no name
 
 
 def _first_line(error: BaseException) -> str:

@@ -1,5 +1,6 @@
 """Parts of installed packages, right and wrong ones, in programs of their own."""
 
+import json
 import os
 import subprocess
 import sys
@@ -68,6 +69,7 @@ def test_a_plant_and_an_export_of_a_package_are_parts_of_noack(tmp_path: Path) -
     [
         ("import not_there", "ModuleNotFoundError: No module named 'not_there'"),
         ("raise SystemExit('I end')", "SystemExit: I end"),
+        ("class End(BaseException): ...\nraise End('at once')", "End: at once"),
         ("x = (", "SyntaxError: '(' was never closed (swing_plant.py, line 1)"),
         ("", "it has nothing for the group noack.plants"),
         (PLANT.replace("KIND", "linear"), "ValueError: kind = linear exists already"),
@@ -85,6 +87,21 @@ def test_a_broken_package_costs_one_line(tmp_path: Path, module: str, reason: st
         f"noack: warning: a part of the extension noack-swing is ignored: swing_plant: {reason}"
     )
     assert run(tmp_path, "-c", KINDS, **{NO_EXTENSIONS: "1"})[1] == []
+
+
+def test_an_entry_point_that_names_no_module_costs_one_line(tmp_path: Path) -> None:
+    install(tmp_path, "noack-swing", "[noack.plants]\nswing = not a module !\n")
+    output, (line,) = run(tmp_path, "-c", KINDS)
+    assert "swing" not in output
+    assert line.startswith("noack: warning: a part of the extension noack-swing is ignored: not a module !: ")
+
+
+def test_what_a_module_prints_is_no_part_of_a_document(tmp_path: Path) -> None:
+    module = f"print('hello')\n{PLANT.replace('KIND', 'swing')}"
+    install(tmp_path, "noack-swing", "[noack.plants]\nswing = swing_plant\n", swing_plant=module)
+    schema, lines = run(tmp_path, "-m", "cosim.cli", "schema")
+    assert "SwingSettings" in json.loads(schema)["$defs"]
+    assert lines == ["hello"]
 
 
 def test_an_entry_point_that_is_a_class_is_for_plants_in_python(tmp_path: Path) -> None:
