@@ -14,6 +14,7 @@ from noack.runtime.command_line import stoppable_imports
 with stoppable_imports():
     from netem.run_network import NetworkSockets, RunNetwork
     from noack.core.errors import ExitStatus, NoackError
+    from noack.core.system_processes import exhausted_limit
     from noack.protocol.roles import ENDS
     from noack.runtime.command_line import Parser, report_failure
     from noack.runtime.join_run import add_options, join_run
@@ -47,6 +48,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return run_stand_alone(words)
     except NoackError as error:
         return report_failure(str(error), error.exit_status, source="noack netem", as_json=as_json)
+    except OSError as error:
+        if (limit := exhausted_limit(error)) is None:
+            raise
+        return report_failure(limit, ExitStatus.FAILED, source="noack netem", as_json=as_json)
 
 
 def run_network(run: RunProcess) -> None:

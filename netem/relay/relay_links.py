@@ -3,16 +3,17 @@
 :func:`open_links` binds the listening sockets.
 """
 
+import fcntl
 import os
 import socket
 import struct
 from collections import defaultdict
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from netem.relay.link_sockets import Endpoint, leads_to, listen, one_way_path, socket_name
-from netem.relay.relay_reports import DIRECTIONS, Direction
+from netem.relay.relay_reports import DIRECTIONS, Direction, report_line
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import Address, SocketName, address_of, address_text, unpacked_address
@@ -20,6 +21,8 @@ from noack.runtime.udp_sockets import drops_of
 
 _DROPPED = 11
 """Column of /proc/net/dev with the packets that a full device did not take."""
+_GET_INTERFACE, _REQUEST_BYTES = 0x800454D2, 40
+"""Request of ioctl TUNGETIFF, and the size of what it fills in, which begins with the name."""
 
 
 @dataclass(frozen=True)
@@ -99,11 +102,14 @@ class DeviceLink:
     """The device inside, and the one outside."""
     statistics: tuple[int, int]
     """/proc/net/dev of the two namespaces, whose place in the file system does not matter."""
-    names: tuple[str, str]
     namespace: int
     """The network namespace inside."""
     outside6: str | None
     """The address outside of IPv6, if the system has it."""
+    _drops: list[int] = field(default_factory=lambda: [0, 0])
+    """What the devices have dropped, when last read; the command may delete or rename a device."""
+    _deleted: set[int] = field(default_factory=set)
+    """The devices that were found to be deleted, which is reported."""
 
     discarded = 0
     has_paths = False
@@ -125,10 +131,25 @@ class DeviceLink:
 
     def drops(self, direction: Direction) -> int:
         """Return how many packets a direction lost because a device was full."""
-        device = DIRECTIONS.index(direction)
-        text = os.pread(self.statistics[device], 65536, 0).decode()
-        line = next(line for line in text.splitlines() if f"{self.names[device]}:" in line)
-        return int(line.partition(":")[2].split()[_DROPPED])
+        side = DIRECTIONS.index(direction)
+        name = self.device_name(side)
+        if name is None and side not in self._deleted:
+            self._deleted.add(side)
+            where = ("inside", "outside")[side]
+            report_line(f"the shell's device {where} was deleted: its packets pass no more")
+        for line in _read_whole(self.statistics[side]).splitlines():
+            device, _, counts = line.partition(":")
+            if device.strip() == name:
+                self._drops[side] = int(counts.split()[_DROPPED])
+        return self._drops[side]
+
+    def device_name(self, side: int) -> str | None:
+        """Return the present name of the device inside (0) or outside (1); None if it was deleted."""
+        try:
+            answer = fcntl.ioctl(self.devices[side], _GET_INTERFACE, bytes(_REQUEST_BYTES))
+        except OSError:
+            return None
+        return answer.partition(b"\0")[0].decode()
 
     def client_text(self, flow: bytes) -> str:
         """Return a flow as text: protocol, end inside, end outside."""
@@ -151,6 +172,14 @@ class DeviceLink:
         """Close the devices, which end with that."""
         for descriptor in (*self.devices, *self.statistics, self.namespace):
             os.close(descriptor)
+
+
+def _read_whole(descriptor: int) -> str:
+    """Return the text of a file of the system, of which one call returns some kilobytes."""
+    parts = list[bytes]()
+    while part := os.pread(descriptor, 65536, sum(map(len, parts))):
+        parts.append(part)
+    return b"".join(parts).decode()
 
 
 def open_links(specs: Sequence[LinkSpec]) -> Sequence[OpenLink]:

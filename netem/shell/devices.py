@@ -24,8 +24,8 @@ from typing import NoReturn
 
 from netem.relay.relay_links import DeviceLink, LinkSpec
 from netem.shell import process
-from noack.core.errors import CallerError
-from noack.core.system_processes import python_command
+from noack.core.errors import CallerError, MachineError, why
+from noack.core.system_processes import exhausted_limit, python_command
 
 MTU_BYTES = 1500
 _RANGE = IPv4Network("198.18.0.0/16")
@@ -77,12 +77,11 @@ def open_devices(spec: LinkSpec) -> DeviceLink:
     namespace, inner_counts = _open_namespace(), _open_counts()
     process.call("setns", own_namespace, process.NEW_NETWORK)
     os.close(own_namespace)
-    _configure(name := f"noack{number}", outside_address, network.prefixlen)
+    _configure(f"noack{number}", outside_address, network.prefixlen)
     return DeviceLink(
         replace(spec, listen=(str(inside_address), 0), to=(str(outside_address), 0)),
         (inner, outer),
         (inner_counts, _open_counts()),
-        (_INSIDE, name),
         namespace,
         str(_ipv6_address(outside_address)) if has_ipv6 else None,
     )
@@ -133,6 +132,8 @@ def _open_tun(name: str) -> int:
     try:
         device = os.open(_DEVICE, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError as error:
+        if limit := exhausted_limit(error):
+            raise MachineError(limit) from None
         raise CallerError(
             f"a shell needs {_DEVICE} ({error.strerror}); as root: `modprobe tun` or "
             f"`chmod 666 {_DEVICE}`; for a container: `--device {_DEVICE}`"
@@ -163,8 +164,10 @@ def _ip(*commands: str) -> bool:
     lines = "\n".join(commands).encode()
     try:
         result = subprocess.run(["ip", "-force", "-batch", "-"], input=lines, capture_output=True)
-    except OSError:
+    except FileNotFoundError:
         raise CallerError("a shell needs `ip` (Debian: apt install iproute2)") from None
+    except OSError as error:
+        raise MachineError(f"`ip` cannot be started: {exhausted_limit(error) or why(error)}") from None
     errors = result.stderr.decode(errors="replace").splitlines()
     if f"Command failed -:{len(commands)}" in errors:
         raise CallerError(f"ip {commands[-1]}: {errors[-2]}")

@@ -2,12 +2,13 @@
 
 import json
 import os
+import resource
 import shutil
 import signal
 import socket
 import subprocess
 import sys
-from functools import cache
+from functools import cache, partial
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NoReturn
@@ -197,9 +198,60 @@ def test_the_commands_outside_end_if_the_one_inside_cannot_start(monkeypatch: py
     monkeypatch.setattr(shell, "inside", refuse)
     monkeypatch.setattr(process, "adopt_orphans", lambda: None)  # pytest stays no reaper
     spec = LinkSpec("shell", ("198.18.0.2", 0), ("198.18.0.1", 0), LinkSettings(), LinkSettings())
-    devices = DeviceLink(spec, (-1, -1), (-1, -1), ("", ""), -1, None)
+    devices = DeviceLink(spec, (-1, -1), (-1, -1), -1, None)
     earlier_children = process.children(os.getpid())
     program = shell._Program(devices, ["true"], [["sleep", "1000"]])
     with pytest.raises(OSError, match="no namespace"), program.running(Signals()):
         pass
     assert process.children(os.getpid()) <= earlier_children
+
+
+def test_a_shell_on_a_host_with_many_devices_counts_its_own_drops() -> None:
+    """One call returns some kilobytes of /proc/net/dev: the lines of about 30 devices."""
+    need("unshare")
+    if os.getuid() != 0:
+        pytest.skip("makes network devices on the host: takes root")
+    names = " ".join(f"xd{number}" for number in range(1, 60))
+    make = f"for name in {names}; do ip tuntap add name $name mode tun; done"
+    command = f"{make}; {sys.executable} -m netem shell -- true"
+    done = subprocess.run(
+        ["unshare", "--net", "sh", "-c", command], capture_output=True, text=True, timeout=PATIENCE_S
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [("set noack0 name other", False), ("delete noack0", True), ("set noack0 netns 1", False)],
+)
+def test_the_command_may_change_its_device(change: str, said: bool) -> None:
+    done = run("--", "sh", "-c", f"ip link set noack0 down; ip link {change}; sleep 1.5; exit 7")
+    assert "Traceback" not in done.stderr
+    assert ("the shell's device inside was deleted" in done.stderr) == said
+    assert done.returncode == 7
+
+
+def test_drops_are_those_of_the_device_of_exactly_this_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lines = [f"{name}: 0 0 0 0 0 0 0 0 0 0 0 {drops} 0 0 0 0\n" for name, drops in (
+        ("xnoack0", 5), *((f"d{k}", 9) for k in range(300)), ("  noack0", 7), ("noack01", 3),
+    )]  # fmt: skip
+    (tmp_path / "dev").write_text("Inter-|   Receive\n face |bytes\n" + "".join(lines))
+    spec = LinkSpec("relay", ("", 0), ("", 0), LinkSettings(), LinkSettings())
+    with (tmp_path / "dev").open("rb") as file:
+        link = DeviceLink(spec, (-1, -1), (file.fileno(), file.fileno()), -1, None)
+        monkeypatch.setattr(DeviceLink, "device_name", lambda self, side: ("noack0", "d1")[side])
+        assert (link.drops("forward"), link.drops("reverse")) == (7, 9)
+        monkeypatch.setattr(DeviceLink, "device_name", lambda self, side: None)
+        assert (link.drops("forward"), link.drops("reverse")) == (7, 9)  # the last ones
+
+
+def test_few_open_files_are_the_reason_that_is_given() -> None:
+    for most in range(8, 16):
+        limit = partial(resource.setrlimit, resource.RLIMIT_NOFILE, (most, most))
+        done = run("--", "true", preexec_fn=limit)
+        assert done.returncode in (0, 1)
+        assert done.returncode == 0 or f"too many open files: at most {most} are" in done.stderr
+        assert "Traceback" not in done.stderr
