@@ -1001,7 +1001,7 @@ typedef struct {
     int64_t sends;
     int64_t name_bytes;
     uint8_t name[NOACK_NAME_BYTES];   /* forward: the server's */
-    int64_t full;                     /* forward: 1: further clients are refused */
+    int64_t full;                     /* 1: further clients that begin in it are refused */
     int64_t refused;
     int64_t port_unreachable;         /* forward: ICMP port-unreachable errors */
     int64_t delays[NOACK_BUCKETS];    /* histogram of the time from arrival to departure */
@@ -1071,6 +1071,7 @@ typedef struct {
     int64_t client_rows, table_places, slot_count, block_count, row_count;
     noack_socket *sockets;       /* (2 links + client_rows,) */
     noack_client *clients;
+    uint64_t secret[2];          /* of the hash: a random key of this process */
     /* (table_places, a power of 2) rows of clients by the hash of their key */
     int32_t *table;
     noack_direction *directions; /* (2 links,) forward and reverse direction of each link */
@@ -1118,6 +1119,9 @@ void noack_relay_latest(noack_relay *relay, int64_t direction, int64_t *latest_n
 int64_t noack_client_find(
     const noack_relay *relay, const uint8_t name[NOACK_NAME_BYTES], int64_t link);
 void noack_client_insert(noack_relay *relay, int64_t row);
+
+/* The hash of a client's key with a secret of this process. */
+uint64_t noack_client_hash(const uint64_t secret[2], const int64_t key[5]);
 void noack_client_remove(noack_relay *relay, int64_t row);
 
 /* The bucket of a time in a histogram: 32 for each doubling. */

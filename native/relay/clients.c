@@ -34,14 +34,46 @@ static int is_same(const int64_t key[5], const int64_t other[5]) {
            == 0;
 }
 
+static inline uint64_t rotated(uint64_t word, int bits) { return word << bits | word >> (64 - bits); }
+
+static inline void sip_round(uint64_t v[4]) {
+    v[0] += v[1];
+    v[1] = rotated(v[1], 13) ^ v[0];
+    v[0] = rotated(v[0], 32);
+    v[2] += v[3];
+    v[3] = rotated(v[3], 16) ^ v[2];
+    v[0] += v[3];
+    v[3] = rotated(v[3], 21) ^ v[0];
+    v[2] += v[1];
+    v[1] = rotated(v[1], 17) ^ v[2];
+    v[2] = rotated(v[2], 32);
+}
+
+/* SipHash-1-3 of a client's key: https://www.aumasson.jp/siphash/siphash.pdf. A sender who chose
+   its addresses for a hash without a secret key would let all of them have the same place. */
+uint64_t noack_client_hash(const uint64_t secret[2], const int64_t key[5]) {
+    uint64_t v[4] = {
+        secret[0] ^ UINT64_C(0x736f6d6570736575),
+        secret[1] ^ UINT64_C(0x646f72616e646f6d),
+        secret[0] ^ UINT64_C(0x6c7967656e657261),
+        secret[1] ^ UINT64_C(0x7465646279746573),
+    };
+    for (int i = 0; i <= 5; i++) {
+        uint64_t word = i < 5 ? (uint64_t)key[i] : UINT64_C(40) << 56; /* last: the number of bytes */
+        v[3] ^= word;
+        sip_round(v);
+        v[0] ^= word;
+    }
+    v[2] ^= 0xFF;
+    for (int i = 0; i < 3; i++)
+        sip_round(v);
+    return v[0] ^ v[1] ^ v[2] ^ v[3];
+}
+
 /* The first place in the table for a key: its hash. */
 static int64_t home_of(const noack_relay *relay, const int64_t key[5]) {
-    uint64_t mixed = 0;
-    for (int i = 0; i < 5; i++) {
-        mixed = (mixed ^ (uint64_t)key[i]) * UINT64_C(0x9E3779B97F4A7C15); /* 2^64/phi */
-        mixed ^= mixed >> 29;
-    }
-    return (int64_t)(mixed & (uint64_t)(relay->table_places - 1));
+    uint64_t hash = noack_client_hash(relay->secret, key);
+    return (int64_t)(hash & (uint64_t)(relay->table_places - 1));
 }
 
 int64_t noack_client_find(

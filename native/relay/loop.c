@@ -159,7 +159,7 @@ static int64_t client_of(noack_relay *relay, int64_t direction, int64_t size_byt
     if (!(direction & 1) || relay->devices) {
         noack_direction *forward = &relay->directions[direction & ~INT64_C(1)];
         row = find_sender(relay);
-        if (row < 0 && !forward->full)
+        if (row < 0 && !own->full)
             return NO_CLIENT;
         if (row < 0) {
             forward->refused++;

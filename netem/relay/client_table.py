@@ -45,25 +45,37 @@ class ClientTable:
         self._drops: dict[int, int] = {}
         self.drops = [0] * len(links)
         """(links,) Datagrams dropped by the kernel at the return paths, when last queried."""
+        self._outside_rows: set[int] = set()
+        """Flows through the devices of a shell that began outside."""
         self._not_queried: Iterator[int] = iter(())
         self._idle_ns = np.array([round(link.spec.idle_s * 1e9) for link in links], np.int64)
         self._expired_ns = 0
 
-    def add(self, link: int, name: bytes) -> None:
-        """Add a client by its packed name; if that is impossible, refuse clients until one leaves."""
-        present = self.present_counts[link]
-        if present >= self._links[link].spec.most_clients:
+    def add(self, link: int, name: bytes, *, from_outside: bool = False) -> None:
+        """Add a client by its packed name; if that is impossible, refuse clients until one leaves.
+
+        Half of the flows through the devices of a shell are reserved for those that begin inside:
+        any host may send to the outside of a shell.
+        """
+        present, most = self.present_counts[link], self._links[link].spec.most_clients
+        if from_outside and len(self._outside_rows) >= most // 2:
+            self._warnings[link].report_flood(most // 2)
+            self._set_full(2 * link + 1, True)
+            return
+        if present >= most:
             self._warnings[link].report_full()
-            self._set_full(link, True)
+            self._set_full(2 * link + from_outside, True)
             return
         path, error = None, 0
         if self._links[link].has_paths:
             path, error = return_path(self._links[link].server)
             if error in (errno.EMFILE, errno.ENFILE):
                 self._warnings[link].report_no_descriptor(present)
-                self._set_full(link, True)
+                self._set_full(2 * link, True)
                 return
-        self._accept(link, name, path, error)
+        row = self._accept(link, name, path, error)
+        if from_outside:
+            self._outside_rows.add(row)
 
     def expire(self, now_ns: int) -> None:
         """Remove the clients that have been idle and have no datagram in flight."""
@@ -80,7 +92,7 @@ class ClientTable:
                 self._forget(row)
         for link, present in enumerate(self.present_counts):
             if present == 0:  # full for lack of a file descriptor; no client can make room
-                self._set_full(link, False)
+                self._set_full(2 * link, False)
 
     def reconnect(self) -> None:
         """Open the return paths again that could not be opened before."""
@@ -129,7 +141,8 @@ class ClientTable:
             path.close()
         self._paths.clear()
 
-    def _accept(self, link: int, name: bytes, path: Endpoint | None, error: int) -> None:
+    def _accept(self, link: int, name: bytes, path: Endpoint | None, error: int) -> int:
+        """Add a client; return its row."""
         if not self._free_rows:
             self._grow()
         row = self._free_rows.pop()
@@ -156,6 +169,7 @@ class ClientTable:
         memory.sockets["fd"][self._memory.first_path + row] = -1
         if path is not None:
             self._set_path(row, path)
+        return row
 
     def _set_path(self, row: int, path: Endpoint) -> None:
         memory = self._memory
@@ -179,10 +193,12 @@ class ClientTable:
         self._free_rows.append(row)
         self._free_flow_rows[link].append(int(memory.clients["flow_row"][row]))
         self.present_counts[link] -= 1
-        self._set_full(link, False)
+        self._outside_rows.discard(row)
+        for direction in (2 * link, 2 * link + 1):
+            self._set_full(direction, False)
 
-    def _set_full(self, link: int, full: bool) -> None:
-        self._directions[2 * link].row.full = full
+    def _set_full(self, direction: int, full: bool) -> None:
+        self._directions[direction].row.full = full
 
     def _grow(self) -> None:
         count = len(self._memory.clients)

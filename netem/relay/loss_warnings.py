@@ -31,6 +31,13 @@ class LinkWarnings:
         """Report that the link has its maximum number of clients."""
         self._report(f"no more than {self._spec.most_clients} clients at once are served")
 
+    def report_flood(self, flows: int) -> None:
+        """Report that other hosts, outside a shell, have begun the flows that they may begin."""
+        self._report(
+            f"a flood from outside: other hosts have begun {flows} flows; their further ones are "
+            "refused, those that begin inside pass"
+        )
+
     def report_no_descriptor(self, clients: int) -> None:
         """Report that no file descriptor is left for a client in addition to those present."""
         self._report(

@@ -171,7 +171,9 @@ class Relay:
         while (reason := core.noack_relay_run(relay, until_ns)) != core.NOACK_HOUSEKEEPING:
             if reason == core.NOACK_NEW_CLIENT:
                 name = bytes(ffi.buffer(core.noack_relay_sender(relay), core.NOACK_NAME_BYTES))
-                self._clients.add(core.noack_relay_receiver(relay) % len(self.specs), name)
+                receiver = core.noack_relay_receiver(relay)
+                outside = bool(relay.devices) and receiver > 0
+                self._clients.add(receiver % len(self.specs), name, from_outside=outside)
             elif reason == core.NOACK_STORE_FULL:
                 self._memory.add_room()
 

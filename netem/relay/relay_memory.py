@@ -1,5 +1,6 @@
 """The memory of a relay, which the core uses (native/relay): allocates it, and enlarges it."""
 
+import secrets
 import select
 from collections.abc import Sequence
 from typing import TypeVar
@@ -54,6 +55,7 @@ class RelayMemory:
             "segment_below": 2**16, "records": row_count > 0,
             "directions": self.directions,
             "row_count": row_count, "free_slot": -1, "free_block": -1,
+            "secret": [secrets.randbits(64), secrets.randbits(64)],
         })  # fmt: skip
         """The relay, as the core's functions take it: a ``noack_relay``."""
         self.core.scratch = pointer_to(self._scratch, "void *")

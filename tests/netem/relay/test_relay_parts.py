@@ -1,6 +1,14 @@
 """Parts of a relay: its links, its memory."""
 
-from collections.abc import Sequence
+import ast
+import os
+import socket
+import struct
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -8,13 +16,16 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from netem.relay.link_sockets import socket_name
-from netem.relay.relay_links import LinkSpec, open_links
+from netem.relay.relay import Relay
+from netem.relay.relay_links import DeviceLink, LinkSpec, open_links
 from netem.relay.relay_memory import RelayMemory, name_array
 from netem.tc_words import settings_of
 from noack.core.core_library import core, pointer_to
 from noack.core.errors import CallerError
+from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import packed_name, unpacked_address
 from tests.netem.relay.relays import HOSTS, drain, endpoints, link, name_of, running
 
@@ -133,3 +144,104 @@ def test_the_relay_reuses_memory_of_datagrams_and_clients_that_left(
             assert len(relay._clients._free_rows) == len(memory.clients)
             assert relay._clients._paths == {}
             assert relay._directions[0].rows == 16
+
+
+def hashed(key: NDArray[np.int64], secret: tuple[int, int] = (0, 0)) -> int:
+    secrets = np.array(secret, np.uint64)
+    return int(core.noack_client_hash(pointer_to(secrets, "uint64_t *"), pointer_to(key, "int64_t *")))
+
+
+def test_the_hash_of_clients_is_that_of_python() -> None:
+    """With the seed 0, Python's key of SipHash-1-3 is 0."""
+    if sys.hash_info.algorithm != "siphash13":
+        pytest.skip(f"this Python has {sys.hash_info.algorithm}")
+    keys = np.random.default_rng(1).integers(-(2**63), 2**63 - 1, (20, 5))
+    code = f"print([hash(bytes.fromhex(key)) for key in {[key.tobytes().hex() for key in keys]}])"
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | {"PYTHONHASHSEED": "0"},
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert [value % 2**64 for value in ast.literal_eval(done.stdout)] == [hashed(key) for key in keys]
+    assert hashed(keys[0], (1, 0)) != hashed(keys[0]) != hashed(keys[0], (0, 1))
+
+
+def _of_one_place(count: int, places: int) -> NDArray[np.uint32]:
+    """Return chosen hosts of IPv4 that had one place by the former hash, which had no secret key."""
+    hosts = np.arange(1, 1 + count * places * 2, dtype=np.uint64)
+    mixed = np.zeros(len(hosts), np.uint64)
+    for word in ((hosts << np.uint64(32)) | np.uint64(0x100_0002), *[np.zeros_like(hosts)] * 4):
+        mixed = (mixed ^ word) * np.uint64(0x9E3779B97F4A7C15)
+        mixed ^= mixed >> np.uint64(29)
+    return hosts[mixed % np.uint64(places) == 0][:count].astype(np.uint32)
+
+
+def test_chosen_addresses_do_not_meet_in_the_table_of_clients() -> None:
+    tables = list[NDArray[np.bool_]]()
+    chosen = _of_one_place(60, 256)
+    assert len(chosen) == 60
+    for _ in range(2):
+        memory = RelayMemory(1)
+        table = np.full(256, -1, np.int32)
+        memory.core.table, memory.core.table_places = pointer_to(table, "int32_t *"), 256
+        for row, host in enumerate(chosen):
+            name = struct.pack("<HHI24x", socket.AF_INET, 0x100, host)
+            memory.clients["name"][row, : len(name)] = np.frombuffer(name, np.uint8)
+            core.noack_client_insert(memory.core, row)
+        assert not np.any(np.convolve(table >= 0, np.ones(40), "valid") == 40)  # no run of 40 places
+        tables.append(table >= 0)
+    assert (tables[0] != tables[1]).any()  # each has its own secret
+
+
+def test_a_flood_from_outside_leaves_room_for_flows_that_begin_inside(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    most = 8
+    pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM) for _ in range(2)]
+    monkeypatch.setattr(DeviceLink, "device_name", lambda *_: "lo")
+    for pair in pairs:
+        for end in pair:
+            end.setblocking(False)
+    (inside, inner), (outside, outer) = pairs
+    counts = tuple(os.open("/proc/self/net/dev", os.O_RDONLY) for _ in range(2))
+    spec = LinkSpec("shell", ("198.18.0.2", 0), ("198.18.0.1", 0), LinkSettings(), LinkSettings())
+    spec = replace(spec, most_clients=most)
+    devices = (os.dup(inner.fileno()), os.dup(outer.fileno()))
+    link = DeviceLink(spec, devices, (counts[0], counts[1]), os.open("/dev/null", 0), None)
+
+    def send(end: socket.socket, first: int, ports: int) -> None:
+        for port in range(first, first + ports):
+            ends = (
+                bytes((198, 18, 0, 2, 198, 18, 0, 1))
+                if end is inside
+                else bytes((198, 18, 0, 1, 198, 18, 0, 2))
+            )
+            header = bytes((0x45, 0, 0, 28, 0, 0, 0, 0, 64, 17, 0, 0)) + ends
+            end.send(header + struct.pack("!HHHH", port, 9, 8, 0))
+
+    def received(end: socket.socket) -> int:
+        count = 0
+        with suppress(BlockingIOError):
+            while end.recv(2000):
+                count += 1
+        return count
+
+    passed = list[int]()
+    steps: list[Callable[[], object]] = [
+        lambda: send(outside, 1000, 20),
+        lambda: passed.append(received(inside)),
+        lambda: send(inside, 2000, 3),
+        lambda: send(inside, 2000, 2 * most),
+        lambda: passed.append(received(outside)),
+    ]
+    relay = Relay([spec], devices=link)
+    try:
+        relay.run(lambda: not steps, lambda: steps.pop(0)())
+        assert passed == [most // 2, 3 + most // 2]
+        assert relay.report()[0].refused == 20 - most // 2 + 2 * most - most // 2
+    finally:
+        relay.close()
+        for pair in pairs:
+            for end in pair:
+                end.close()
+    said = capsys.readouterr().err
+    assert "a flood from outside: other hosts have begun 4 flows" in said
