@@ -11,6 +11,7 @@ from netem.links_file import load_links
 from netem.relay.relay_links import LinkSpec
 from netem.tc_words import GRAMMAR, KEYWORDS, parse, require_no_dashes, settings_of
 from noack.core.errors import CallerError
+from noack.impairments.burst_prediction import USUAL_PACKETS, read_within
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.target_loss import read_files
 from noack.impairments.words import OWN_TIME_S
@@ -130,6 +131,12 @@ def command_line_parser() -> Parser:
     links.add_argument(
         "--explain", action="store_true", help="explain the words, or the links of a file, and exit"
     )
+    links.add_argument(
+        "--within",
+        metavar="N|TIME",
+        help=f"with --explain: chance of a long loss burst within N packets ({USUAL_PACKETS}), or a time",
+    )
+    links.add_argument("--period", metavar="TIME", help="with --within TIME: the sender's period")
     return parser
 
 
@@ -231,6 +238,31 @@ def specs_of(options: argparse.Namespace, *, read: bool = True) -> tuple[LinkSpe
             idle_s=_idle_s(options.idle),
         ),
     )
+
+
+def explained_packets(options: argparse.Namespace) -> int:
+    """Return how many packets the explanation's chance of a long loss burst is for.
+
+    Raises:
+        CallerError: the options are wrong.
+    """
+    for name in ("within", "period"):
+        if getattr(options, name) is not None and not options.explain:
+            raise CallerError(f"--{name}: is for --explain")
+    period_s = None
+    if options.period is not None:
+        try:
+            period_s = OWN_TIME_S.read(options.period)
+        except ValueError:
+            raise CallerError(f"--period {options.period}: expected {OWN_TIME_S.expected}") from None
+        if period_s <= 0:
+            raise CallerError(f"--period {options.period}: must be more than 0")
+    if options.within is None:
+        return USUAL_PACKETS
+    try:
+        return read_within(options.within, period_s)
+    except ValueError as error:
+        raise CallerError(f"--within {options.within}: {error}") from None
 
 
 def _require_word(words: Sequence[str]) -> None:

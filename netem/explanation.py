@@ -14,9 +14,11 @@ from rich.text import Text
 from netem.relay.relay_links import LinkSpec
 from netem.tc_words import words_of
 from noack.core.errors import shortened
+from noack.impairments.burst_prediction import BurstPrediction, caps_with, chance_text, predict_bursts
 from noack.impairments.feature import Impairment
 from noack.impairments.link_settings import LinkSettings
-from noack.impairments.target_loss import expected_loss, with_target_loss
+from noack.impairments.markov_chain import NotPredictableError
+from noack.impairments.target_loss import expected_loss, loss_process, with_target_loss
 from noack.impairments.words import percent_text
 from noack.runtime.address import address_text
 from noack.runtime.console import SafeConsole
@@ -28,7 +30,7 @@ _NARROW_WIDTH, _WIDE_WIDTH = 20, 44
 
 
 def explain(
-    specs: Sequence[LinkSpec], as_written: Sequence[LinkSpec], *, as_json: bool, as_file: bool
+    specs: Sequence[LinkSpec], as_written: Sequence[LinkSpec], *, as_json: bool, as_file: bool, packets: int
 ) -> None:
     """Print the effect of links' settings on standard output, as tables or as JSON.
 
@@ -37,6 +39,7 @@ def explain(
         as_written: the same links, with the names of files instead of their content: what tables show.
         as_json: JSON, with the content.
         as_file: tables have the links as a file of links instead of their names.
+        packets: how many packets the chance of a long loss burst is for.
     """
     if as_json:
         links = [
@@ -45,8 +48,8 @@ def explain(
                 "listen": address_text(spec.listen),
                 "to": address_text(spec.to),
                 "seed": spec.seed,
-                "forward": _document(spec.forward),
-                "reverse": _document(spec.reverse) if spec.return_path else None,
+                "forward": _document(spec.forward, packets),
+                "reverse": _document(spec.reverse, packets) if spec.return_path else None,
             }
             for spec in specs
         ]
@@ -60,14 +63,14 @@ def explain(
             seed = f", seed {spec.seed}" if spec.seed else ""
             addresses = f"{address_text(spec.listen)} → {address_text(spec.to)}"
             console.print(Text(f"{spec.name}: {addresses}{seed}", "bold underline"))
-        _print_link(console, spec, written_spec)
+        _print_link(console, spec, written_spec, packets)
         if as_file:
             console.print(Text("\nas a file of links (--links)", "bold"))
             toml = tomli_w.dumps({"link": [_link_table(written_spec)]}).strip()
             console.print(Text(shortened(toml, _MAX_TOML)), soft_wrap=True)  # for copying
 
 
-def _document(settings: LinkSettings) -> dict[str, object]:
+def _document(settings: LinkSettings, packets: int) -> dict[str, object]:
     prediction, tc = expected_loss(settings), tc_command(settings)
     return {
         "words": words_of(settings),
@@ -77,6 +80,7 @@ def _document(settings: LinkSettings) -> dict[str, object]:
         "predicted_loss": prediction.rate,
         "predicted_loss_note": prediction.note,
         "predicted_loss_without_cap": expected_loss(_without_guarantee(settings)).rate,
+        "predicted_bursts_without_cap": _bursts(settings, packets).to_json(),
         "tc": tc.words,
         "tc_lacks": list(tc.lacks),
         "tc_notes": list(tc.notes),
@@ -98,26 +102,30 @@ def settings_meaning(settings: LinkSettings) -> Iterator[tuple[str, str]]:
         yield f"limit {most}", f"at most {most} packets are delayed at once; more are dropped"
 
 
-def _print_link(console: Console, spec: LinkSpec, written: LinkSpec) -> None:
+def _print_link(console: Console, spec: LinkSpec, written: LinkSpec, packets: int) -> None:
     if spec.return_path and spec.forward == spec.reverse:
-        _print_direction(console, "both directions, each by itself", spec.forward, written.forward)
+        _print_direction(console, "both directions, each by itself", spec.forward, written.forward, packets)
         return
-    _print_direction(console, "forward, from clients to the server", spec.forward, written.forward)
+    title = "forward, from clients to the server"
+    _print_direction(console, title, spec.forward, written.forward, packets)
     console.print()
     if spec.return_path:
         title = "reverse, from the server to clients"
-        _print_direction(console, title, spec.reverse, written.reverse)
+        _print_direction(console, title, spec.reverse, written.reverse, packets)
     else:
         console.print(Text("reverse: not relayed; the server's answers are discarded", "bold"))
 
 
-def _print_direction(console: Console, title: str, settings: LinkSettings, written: LinkSettings) -> None:
+def _print_direction(
+    console: Console, title: str, settings: LinkSettings, written: LinkSettings, packets: int
+) -> None:
     if settings == LinkSettings():
         console.print(Text(f"{title}: no impairment", "bold"))
         return
     console.print(Text(f"{title}, in this order", "bold"))
     console.print(_table(settings, written, console.width))
     console.print(Text(f"\nexpected loss rate: {_rate_text(settings)}"))
+    _print_bursts(console, _bursts(settings, packets))
     _print_tc(console, tc_command(settings, written))
 
 
@@ -148,6 +156,32 @@ def _rate_text(settings: LinkSettings) -> str:
     if without is not None and settings.longest_burst is not None:
         text += f" (without the guarantee {100 * without:.4g}%)"
     return f"{text}, {prediction.note}" if prediction.note else text
+
+
+def _bursts(settings: LinkSettings, packets: int) -> BurstPrediction:
+    """Return the loss bursts without the guarantee."""
+    try:
+        process = loss_process(settings)
+    except NotPredictableError as error:
+        return BurstPrediction(packets, None, {}, str(error))
+    return predict_bursts(process, caps_with(settings.longest_burst), packets)
+
+
+def _print_bursts(console: Console, bursts: BurstPrediction) -> None:
+    if not bursts.chance:
+        console.print(Text(f"loss bursts without a cap: not known: {bursts.note}"))
+        return
+    if not any(bursts.chance.values()):
+        return
+    mean = f"{bursts.mean_burst:.3g} packets long on average" if bursts.mean_burst else "endless"
+    console.print(Text(f"loss bursts without a cap: {mean}"))
+    console.print(
+        Text(f"chance that within {bursts.packets} packets one is longer than M − 1, without a cap:")
+    )
+    table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False, show_header=False)
+    table.add_row("  M − 1", *map(str, bursts.chance))
+    table.add_row("  chance", *map(chance_text, bursts.chance.values()))
+    console.print(table)
 
 
 def _without_guarantee(settings: LinkSettings) -> LinkSettings:

@@ -15,7 +15,7 @@ from typing import Protocol
 from netem.control.control_server import starting
 from netem.control.emulator_statistics import Statistics, statistics, unintended_losses
 from netem.control.statistics_text import statistics_lines
-from netem.emulator_options import command_line_parser, parse_options, specs_of
+from netem.emulator_options import command_line_parser, explained_packets, parse_options, specs_of
 from netem.explanation import explain
 from netem.relay.link_sockets import raise_file_limit
 from netem.relay.relay import Relay
@@ -75,9 +75,10 @@ def run_stand_alone(arguments: Sequence[str]) -> ExitStatus:
     add_relay_options(parser)
     options = parse_options(parser, arguments)
     specs = specs_of(options)
+    packets = explained_packets(options)
     if options.explain:
         specs_as_written = specs_of(options, read=False)
-        explain(specs, specs_as_written, as_json=options.json, as_file=options.links is None)
+        explain(specs, specs_as_written, as_json=options.json, as_file=options.links is None, packets=packets)
         return ExitStatus.OK
     with log_format(options.log_format):
         try:

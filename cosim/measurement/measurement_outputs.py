@@ -33,6 +33,7 @@ from cosim.output.result_tables import KEY_VALUE, ResultTable, terminal_table
 from noack.core.errors import CallerError
 from noack.core.file_access import require_suffix, write_whole
 from noack.core.number_format import NONE, duration, number, percent
+from noack.impairments.burst_prediction import chance_text
 from noack.scenario.scenario import Scenario
 
 
@@ -117,6 +118,15 @@ def measurement_tables(
     ]
     heads = ("share", "of the bursts", "with 95 % confidence", "of the packets")
     yield ResultTable("m", f"M: at most M − 1 consecutive losses{suffix}", heads, rows)
+    if prediction := measurement.burst_prediction:
+        chances = [
+            (str(cap), chance_text(chance), str(measurement.longer_bursts(cap)))
+            for cap, chance in prediction.chance.items()
+        ]
+        model = _MODELS[measurement.chosen.fit.model]
+        caption = f"chance of a loss burst longer than M − 1 within {prediction.packets} packets{suffix}"
+        heads = ("M − 1", f"chance, by the preferred model ({model})", "longer bursts in the trace")
+        yield ResultTable("longer", caption, heads, chances)
     if measurement.windows:
         columns = 3 if suffix else 2
         windows = [
@@ -164,6 +174,8 @@ def _numbers(measurement: NetworkMeasurement, suffix: str) -> Iterator[tuple[str
         if len(lengths) > _MOST_LISTED:
             lengths[_MOST_LISTED // 2 : -_MOST_LISTED // 2] = ["…"]
         yield "loss bursts (number × length)", ", ".join(lengths)
+        if measurement.mean_burst is not None:
+            yield f"mean loss burst{suffix}", f"{measurement.mean_burst:.3g} packets"
         yield "longest loss burst", _burst(measurement, int(np.argmax(bursts.length)))
         outages = np.flatnonzero(measurement.is_outage).tolist()
         yield "outages", str(len(outages)) if outages else f"none: {measurement.outage_rule.reason}"

@@ -25,6 +25,15 @@ from cosim.measurement.loss_bursts import (
     quantile_m,
 )
 from cosim.measurement.outages import OutageFit, OutageRule, find_outages, fit_outages, outages_longer_than
+from noack.core.errors import CallerError
+from noack.impairments.burst_prediction import (
+    USUAL_PACKETS,
+    BurstPrediction,
+    caps_with,
+    predict_bursts,
+    read_within,
+)
+from noack.impairments.loss_prediction import LossProcess
 from noack.scenario.scenario import Scenario
 from noack.traces.packet_trace import PacketTrace
 
@@ -123,6 +132,8 @@ class MeasurementOptions:
     """K of the (m, K) table."""
     outage_s: float | None = None
     """Bursts of this duration or more are outages; None: the statistical rule."""
+    within: str = str(USUAL_PACKETS)
+    """Packets, or a time, within which the chance of a long loss burst is given."""
 
 
 class WindowLosses(NamedTuple):
@@ -233,6 +244,37 @@ class NetworkMeasurement:
         """The model that the Bayesian information criterion prefers."""
         return FittedModel(self._fits.chosen, self._fits.test(self._fits.chosen))
 
+    @property
+    def mean_burst(self) -> float | None:
+        """Mean length of the loss bursts, without the outages; None: there are none."""
+        lengths = self.bursts.length[~self.is_outage]
+        return float(lengths.mean()) if len(lengths) else None
+
+    @cached_property
+    def burst_prediction(self) -> BurstPrediction | None:
+        """The chance of a long loss burst, by the preferred model; None without losses.
+
+        Raises:
+            CallerError: the time or the number of packets is wrong.
+        """
+        period_s = self.observed_s / max(len(self.trace) - 1, 1)
+        try:
+            packets = read_within(self.options.within, period_s)
+        except ValueError as error:
+            raise CallerError(f"--within {self.options.within}: {error}") from None
+        if not self.models:
+            return None
+        rates = self.chosen.fit.rates
+        start, delivers, loses = rates.matrices()
+        lost = np.array([rates.loss_in_good, rates.loss_in_bad])
+        process = LossProcess(start, delivers + loses, lost, first_delivered=False)
+        caps = {*caps_with(self.longest_loss_burst), *(quantile.bursts - 1 for quantile in self.quantiles)}
+        return predict_bursts(process, sorted(caps - {0}), packets)
+
+    def longer_bursts(self, cap: int) -> int:
+        """Return the number of loss bursts of more than ``cap`` packets, without the outages."""
+        return int(np.count_nonzero(self.bursts.length[~self.is_outage] > cap))
+
     @cached_property
     def outage_fit(self) -> OutageFit:
         """The model of the outages."""
@@ -281,6 +323,8 @@ class NetworkMeasurement:
             "outages": [*map(self.burst_json, np.flatnonzero(self.is_outage).tolist())],
             "outage_rule": self.outage_rule.reason,
             "M": self.longest_loss_burst + 1,
+            "mean_burst": self.mean_burst,
+            "bursts_by_preferred_model": self.burst_prediction and self.burst_prediction.to_json(),
             "quantiles": [asdict(quantile) for quantile in self.quantiles],
             "fewest_deliveries_between_bursts": self.fewest_deliveries,
             "windows": {

@@ -252,6 +252,13 @@ class LossProcess:
         reachable = np.ix_(reached, reached)
         return OutcomeChain(lost[reachable], delivered[reachable])
 
+    def mean_burst(self) -> float | None:
+        """Return the mean number of consecutive losses; None: losses never begin, or never end."""
+        stationary = _stationary(self.start, self.transitions)
+        lost = float(stationary @ self.lost)
+        begins = float((stationary * (1 - self.lost)) @ (self.transitions @ self.lost))
+        return lost / begins if begins > 0 else None
+
     def keeps(self, guarantee: LossGuarantee, packets: int) -> float:
         """Return the probability that the first packets keep a guarantee by chance.
 

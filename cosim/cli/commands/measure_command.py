@@ -108,6 +108,10 @@ def measure(
             help="Loss bursts of this duration or more are outages; by default a test decides.",
         ),
     ] = None,
+    within: Annotated[
+        str,
+        Option(metavar="N|TIME", help="Chance of a long loss burst within N packets, or within a time."),
+    ] = "1000",
     for_scenario: Annotated[
         str | None,
         Option(
@@ -151,6 +155,7 @@ def measure(
         tuple(map(_share, share or ())) or QUANTILES,
         tuple(sorted(set(window or WINDOWS))),
         _time_s("--outage", outage),
+        within,
     )
     if settings and for_scenario is None:
         raise CallerError("--set: replaces a value of the scenario of --for-scenario; give one")

@@ -92,3 +92,30 @@ def test_a_network_without_losses_is_measured(tmp_path: Path) -> None:
     for words in ((), ("--out", tmp_path / "a.html")):
         document = json.loads(measure(path, "--json", *words).stdout)
         assert (document["lost"], document["M"], document["delay_s"]) == (2, 3, {})
+
+
+def test_the_chance_of_a_long_burst_is_that_of_the_fitted_chain(chain_csv: Path) -> None:
+    document = json.loads(measure(chain_csv, "--within", "500", "--json").stdout)
+    lengths = {int(length): count for length, count in document["histogram"].items()}
+    losses = sum(length * count for length, count in lengths.items())
+    assert document["mean_burst"] == pytest.approx(losses / sum(lengths.values()))
+    predicted = document["bursts_by_preferred_model"]
+    assert predicted["packets"] == 500
+    assert predicted["mean_burst"] == pytest.approx(document["mean_burst"], rel=0.01)
+    # By counting, from the fitted chain: losses are the bad state, which the trace begins in by its share.
+    assert document["chosen_model"] == "gilbert"
+    p, r = (
+        document["models"]["gilbert"]["estimates"][name]["value"] for name in ("good_to_bad", "bad_to_good")
+    )
+    for cap in (2, 5):
+        run = [r / (p + r), p / (p + r)] + [0.0] * (cap - 1)
+        for _ in range(499):
+            run = [run[0] * (1 - p) + sum(run[1:]) * r, run[0] * p, *(mass * (1 - r) for mass in run[1:-1])]
+        assert predicted["chance_of_longer"][str(cap)] == pytest.approx(1 - sum(run), abs=1e-6)
+    # A time is one of packets at the trace's mean rate.
+    period_s = document["observed_s"] / (document["packets"] - 1)
+    of_time = json.loads(measure(chain_csv, "--within", f"{500 * period_s:.6f}s", "--json").stdout)
+    assert of_time["bursts_by_preferred_model"] == predicted
+    text = " ".join(measure(chain_csv, "--within", "500").output.split())
+    assert "chance of a loss burst longer than M − 1 within 500 packets" in text
+    assert "--within x: expected a number of packets, or a time" in measure(chain_csv, "--within", "x").output
