@@ -390,7 +390,8 @@ void noack_exponential(int64_t n, const double *matrix, double *result, double *
    soon as |P z|^2 > max(c e^(-rho (t - t_0)), f)^2 + |N z|^2 + eta. */
 typedef struct {
     double level, rate_per_s, floor; /* c, rho, f */
-    int64_t from_event;              /* 1: t_0 is the last event, and c is |P z| just after it */
+    int64_t since_ns;                /* t_0: 0, or the last change of a rate */
+    int64_t from_event;              /* 1: t_0 is instead the last event, and c is |P z| just after it */
     int64_t integrates;              /* 1: the integral of |P z| since the last event is compared */
     int64_t is_dynamic;              /* 1: eta is Girard's dynamic variable */
     double decay_per_s;              /* of eta */

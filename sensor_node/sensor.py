@@ -37,7 +37,14 @@ from noack.scenario.estimation import assumed_model
 from noack.scenario.parameter_changes import ChangeSchedule
 from noack.scenario.resolution import loop_of, policy_of, setpoint_of
 from noack.scenario.scenario import Scenario
-from noack.trigger_policies.trigger_rule import CodedPolicy, EventTrigger, Policy, fill_rule, rule_rows
+from noack.trigger_policies.trigger_rule import (
+    CodedPolicy,
+    EventTrigger,
+    Policy,
+    TriggerRule,
+    fill_rule,
+    rule_rows,
+)
 
 SENSOR = Role(
     "sensor",
@@ -187,6 +194,8 @@ class Sensor(MachinePart):
                 assert due.prepared is not None
                 setpoint, policy = due.prepared
                 self._set_point(sensor, due.since_ns, setpoint)
+                if isinstance(policy, TriggerRule) and isinstance(self._policy, TriggerRule):
+                    policy = policy.continuing(self._policy, due.since_ns)
                 self._set_policy(sensor, policy)
         elif question == core.NOACK_ASK_ROOM:
             self._make_room(sensor, 2 * sensor.sent_places)
@@ -238,6 +247,7 @@ class Sensor(MachinePart):
 
     def _set_policy(self, sensor: CData, policy: Policy) -> None:
         """Set a policy as if it had been set at the last event."""
+        self._policy = policy
         n, memory = sensor.machine.n, self._memory
         if isinstance(policy, CodedPolicy):
             memory.fill(sensor.rule, {"weight": policy.weight})

@@ -125,7 +125,7 @@ def state_text(
     if word == "stable":
         start, top = f"{first or 0.0:.3g}", f"{largest:.3g}"
         if first is not None and largest > first and top != start:
-            return f"{word}, {norm} rose from {start} to {top}, then fell to {final:.3g}"
+            return f"{word}, {norm} was {start} at the start, at most {top}, at the end {final:.3g}"
         return f"{word}, {norm} fell from {top} to {final:.3g}"
     return f"{word}, {norm} was at most {largest:.3g}, at the end {final:.3g}"
 

@@ -112,7 +112,8 @@ const char *noack_check_rule(const noack_trigger_rule *rule, int64_t most_ns) {
     for (int k = 0; k < 4; k++)
         if (!is_between(0, rows[k], 4 * NOACK_MAX_ENTRIES) || (rows[k] > 0 && matrices[k] == NULL))
             return "a trigger rule has no matrix";
-    if (!is_between(0, rule->grid_ns, most_ns) || !is_between(-most_ns, rule->idle_ns, most_ns)
+    if (!is_between(0, rule->since_ns, most_ns) || !is_between(0, rule->grid_ns, most_ns)
+        || !is_between(-most_ns, rule->idle_ns, most_ns)
         || !is_between(0, rule->shortest_ns, most_ns) || !is_between(0, rule->longest_ns, most_ns))
         return "a trigger rule has times out of range";
     return NULL;

@@ -16,7 +16,8 @@ static void set_z(int64_t n, const double *x, const double *e_s, double *z) {
         z[n + k] = e_s == NULL ? 0.0 : e_s[k];
 }
 
-/* Whether the error may have reached the threshold tau_s after an event at t_s. */
+/* Whether the error may have reached the threshold tau_s after an event at t_s, which counts from
+   t_0. */
 static int is_reached(const noack_trigger_rule *rule, double norm, double t_s, double tau_s) {
     double speed = rule->mismatch_per_s * norm + rule->disturbance_per_s;
     double exponent = rule->growth_per_s * tau_s;
@@ -54,7 +55,7 @@ void noack_trigger_condition(
     const double *x, double *scratch) {
     double *z = scratch, *image = scratch + 2 * n;
     state->level = rule->level;
-    state->since_ns = 0;
+    state->since_ns = rule->since_ns;
     if (rule->from_event) {
         set_z(n, x, NULL, z);
         state->level = image_norm(rule->positive_rows, 2 * n, rule->positive, z, image);
@@ -65,7 +66,8 @@ void noack_trigger_condition(
     if (rule->forecasts) {
         const double *weight = rule->forecast_weight;
         double norm = weight == NULL ? noack_norm(n, x) : image_norm(n, n, weight, x, image);
-        state->latest_ns = t_ns + (int64_t)noack_forecast_ns(rule, norm, (double)t_ns * 1e-9);
+        state->latest_ns = t_ns + (int64_t)noack_forecast_ns(
+                rule, norm, (double)(t_ns - rule->since_ns) * 1e-9);
     }
 }
 

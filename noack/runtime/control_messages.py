@@ -106,6 +106,9 @@ class ChangeReply(ControlMessage):
     """The entries with another value than before the request."""
     warnings: tuple[str, ...] = ()
     """The assumptions of the theory that the change violates."""
+    thresholds: dict[str, tuple[FiniteFloat, FiniteFloat]] = {}
+    """The threshold of ‖e_s‖ at ``from_s`` without and with the change, by entry of [[loops]]; only of
+    the triggers that have one, and that were changed."""
 
 
 class RunStart(ControlMessage):

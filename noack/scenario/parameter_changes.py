@@ -223,6 +223,11 @@ class ChangeSchedule(Generic[Prepared]):
         return len(self._timeline) > 1
 
     @property
+    def all(self) -> Sequence[AppliedParameters[Prepared]]:
+        """The scenarios in the order of their times, the first one from the start on."""
+        return tuple(self._timeline)
+
+    @property
     def last(self) -> Scenario:
         """The scenario with all announced changes."""
         return self._timeline[-1].scenario

@@ -21,7 +21,7 @@ from typing import ClassVar, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.core_library import CData, CoreMemory
+from noack.core.core_library import CData, CoreMemory, core
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 
@@ -58,11 +58,15 @@ class TriggerRule(NamedTuple):
     form: QuadraticForm
     """P and N."""
     level: float = 0.0
-    """c ≥ 0; it decays from t₀ = 0 on."""
+    """c ≥ 0; it decays from t₀ on."""
     rate_per_s: float = 0.0
     """ρ ≥ 0."""
     floor: float = 0.0
     """f ≥ 0."""
+    since_ns: int = 0
+    """t₀: 0, or the last change of the rate."""
+    decayed: float = 0.0
+    """Integral of the rate up to t₀, which c allows for: a change of the rate leaves no jump."""
     from_event: bool = False
     """Instead, t₀ is the event's time, and c is ‖P z‖ just after it."""
     grid_ns: float = 0.0
@@ -128,13 +132,43 @@ class TriggerRule(NamedTuple):
         return max(math.ceil(self.longest_ns / period_ns), 1) * period_ns
 
     def threshold(self, t_ns: float) -> float:
-        """Return max(c e^{−ρt}, f)."""
-        return max(self.level * math.exp(-self.rate_per_s * t_ns * 1e-9), self.floor)
+        """Return max(c e^{−ρ(t−t₀)}, f)."""
+        return max(self.level * math.exp(-self.rate_per_s * (t_ns - self.since_ns) * 1e-9), self.floor)
 
     def thresholds(self, t_ns: NDArray[np.int64]) -> Vector:
         """Return the threshold at k times, (k,)."""
-        decayed = self.level * np.exp(-self.rate_per_s * t_ns * 1e-9)
+        decayed = self.level * np.exp(-self.rate_per_s * (t_ns - self.since_ns) * 1e-9)
         return np.asarray(np.maximum(decayed, self.floor))
+
+    def shown_threshold(self, t_ns: float) -> float | None:
+        """Return the threshold that depends on time only, or the one that is forecast; None without one."""
+        if (forecast := self.forecast) is not None:
+            level, rate_per_s, floor = forecast.beta, forecast.alpha_per_s, forecast.floor
+            return self._replace(level=level, rate_per_s=rate_per_s, floor=floor).threshold(t_ns)
+        is_compared = len(self.form.positive) > 0 and (self.level > 0 or self.floor > 0)
+        return None if self.from_event or not is_compared else self.threshold(t_ns)
+
+    def continuing(self, before: "TriggerRule", t_ns: int) -> "TriggerRule":
+        """Return this rule, as a change at a time puts it in the place of another one.
+
+        The threshold is c e^{−∫ρ dt}: its new rate counts from the change, and c sets its level.
+        """
+        decayed, since_ns, t_ns = before.decayed, before.since_ns, max(t_ns, 0)
+        if self._fading_per_s != before._fading_per_s:
+            decayed += before._fading_per_s * (t_ns - since_ns) * 1e-9
+            since_ns = t_ns
+        if not decayed:
+            return self
+        share, forecast = float(core.noack_exp(-decayed)), self.forecast
+        if forecast is not None:
+            forecast = forecast._replace(beta=forecast.beta * share)
+        level = self.level if self.from_event else self.level * share
+        return self._replace(level=level, forecast=forecast, since_ns=since_ns, decayed=decayed)
+
+    @property
+    def _fading_per_s(self) -> float:
+        """The rate of the threshold that decays from t₀ on, or of the one that is forecast."""
+        return self.fading_per_s if self.forecast is None else self.forecast.alpha_per_s
 
 
 def error_map(n: int, weight: Matrix | None = None) -> Matrix:
@@ -227,7 +261,7 @@ def fill_rule(structure: CData, rule: TriggerRule, n: int, memory: CoreMemory) -
     """
     dynamic, forecast = rule.dynamic_variable, rule.forecast
     memory.fill(structure, {
-        "level": rule.level, "rate_per_s": rule.rate_per_s, "floor": rule.floor,
+        "level": rule.level, "rate_per_s": rule.rate_per_s, "floor": rule.floor, "since_ns": rule.since_ns,
         "from_event": rule.from_event, "integrates": rule.integrates,
         "is_dynamic": dynamic is not None, "initial": rule.initial_dynamic_variable,
         "decay_per_s": 0.0 if dynamic is None else dynamic.decay_per_s,

@@ -235,6 +235,8 @@ class _Draw:
         for begin_s in (0.0, 0.7, 1.3)[self.one_of(0, 1) :]:
             key = _CHANGEABLE[trigger["policy"]]
             new = {f"trigger.{key}": trigger[key] * self.one_of(0.5, 1.5)}
+            if "alpha_per_s" in trigger:
+                new["trigger.alpha_per_s"] = trigger["alpha_per_s"] * {0.0: 3.0, 0.7: 0.5, 1.3: 8.0}[begin_s]
             if self.chance(0.4):
                 new["network.mansd"] = int(self.rng.integers(0, 4))
             if x_r is not None and self.chance(0.6):

@@ -21,13 +21,20 @@ class Trigger:
 
     def __init__(self, rule: Rule, F: Array, BK: Array) -> None:
         self.F, self.BK = F, BK
-        self.use(rule)
+        self.faded, self.faded_until_ns = 0.0, 0  # ∫α dt
+        self.base: Rule = {}
+        self.use(rule, 0)
         self.y = self.base.get("eta_0", 0.0)  # η of "dynamic"; the integral of "send_on_area"
         self.rate = 0.0  # dy/dt at the last measurement
         self.measured_ns = 0
 
-    def use(self, rule: Rule) -> None:
-        """Use a rule, or other numbers of it, as if it had been in force at the last event."""
+    def use(self, rule: Rule, since_ns: int) -> None:
+        """Use a rule, or other numbers of it, as if it had been in force at the last event.
+
+        A threshold that decays keeps what it has decayed by until the change.
+        """
+        self.faded += self.base.get("alpha_per_s", 0.0) * (since_ns - self.faded_until_ns) * 1e-9
+        self.faded_until_ns = since_ns
         self.rule = self.base = rule
         while "rule" in self.base:  # of "deadline" and "dwell"
             self.base = self.base["rule"]
@@ -65,7 +72,7 @@ class Trigger:
         rule, e, z = self.base, float(norm(self.W @ e_s)), np.concatenate([x, e_s])
         match rule["policy"]:
             case "decaying":
-                return e, threshold(rule, t_ns * 1e-9)
+                return e, threshold(rule, (t_ns - self.faded_until_ns) * 1e-9, self.faded)
             case "absolute":
                 return e, rule["delta"]
             case "relative" | "mixed":
@@ -103,7 +110,9 @@ class Trigger:
                 return self.t_k_ns + rule["heartbeat"] * whole_ns(rule["period_s"])
             case "self_triggered":
                 size = float(norm(self.W @ self.x_k))
-                return self.t_k_ns + reach_ns(rule, self.t_k_ns * 1e-9, size)
+                return self.t_k_ns + reach_ns(
+                    rule, (self.t_k_ns - self.faded_until_ns) * 1e-9, size, self.faded
+                )
             case "deadline":
                 return min(inner, self.t_k_ns + whole_ns(rule["interval_s"]))
             case "dwell":
@@ -111,9 +120,9 @@ class Trigger:
         return inner
 
 
-def threshold(rule: Rule, t_s: float) -> float:
-    """max(β e^(−αt), ε)."""
-    return max(rule["beta"] * math.exp(-rule["alpha_per_s"] * t_s), rule["floor"])
+def threshold(rule: Rule, t_s: float, faded: float = 0.0) -> float:
+    """max(β e^(−αt), ε), t after a change up to which ∫α dt was ``faded``."""
+    return max(rule["beta"] * math.exp(-faded - rule["alpha_per_s"] * t_s), rule["floor"])
 
 
 def form_sides(Q: Array, z: Array, level: float) -> tuple[float, float]:
@@ -123,13 +132,13 @@ def form_sides(Q: Array, z: Array, level: float) -> tuple[float, float]:
     return math.sqrt(squares[values > 0].sum()), math.sqrt(level + squares[values < 0].sum())
 
 
-def reach_ns(rule: Rule, t_k_s: float, size: float) -> float:
+def reach_ns(rule: Rule, t_k_s: float, size: float, faded: float) -> float:
     """Return the first τ with (a‖x_k‖ + b)(e^(Lτ) − 1)/L ≥ the threshold, within its limits."""
     growth, speed = rule["growth_per_s"], rule["mismatch_per_s"] * size + rule["disturbance_per_s"]
 
     def reached(tau_s: float) -> bool:
         grown = math.expm1(growth * tau_s) / growth if growth else tau_s
-        return speed * grown >= threshold(rule, t_k_s + tau_s)
+        return speed * grown >= threshold(rule, t_k_s + tau_s, faded)
 
     low_s, high_s = rule["shortest_s"], rule["longest_s"]
     if reached(low_s) or not reached(high_s):

@@ -193,7 +193,8 @@ class Sensor:
     def __init__(self, s: Settings, rows: Rows) -> None:
         self.s, self.rows, self.model = s, rows, Model(s)
         BK = s.B_model @ s.K
-        self.trigger = Trigger(in_force(s.rules, 0), s.A_model + BK, BK)
+        (_, rule), *self.rules_to_come = s.rules
+        self.trigger = Trigger(rule, s.A_model + BK, BK)
         self.observer = None if s.observer is None else Observer(s, s.observer)
         self.started = s.known_state
         self.x_s, self.t_ns = (s.x0 if s.known_state else 0 * s.x0), 0
@@ -207,7 +208,9 @@ class Sensor:
         """Process a measurement y, with the inputs since the last one; return x at an event."""
         trigger, resets = self.trigger, self.s.acknowledgement_timeout_ns is None
         x = y if self.observer is None else self.estimate(number, y, u)
-        trigger.use(in_force(self.s.rules, t_ns))
+        while self.rules_to_come and self.rules_to_come[0][0] <= t_ns:
+            since_ns, rule = self.rules_to_come.pop(0)
+            trigger.use(rule, since_ns)
         first, self.started = not self.started, True
         distance = x - in_force(self.s.setpoints, t_ns)  # with which the trigger compares
         if first:

@@ -176,5 +176,8 @@ def set_(
             print(f"{answer.name}: in force already: {text}")
         else:
             print(f"{answer.name}: {text} from {answer.from_s:.3f} s on{suffix}")
+            for name, (old, new) in answer.thresholds.items():
+                where = "" if len(entries) == 1 else f"{name}: "
+                print(f"{where}threshold at {answer.from_s:.3f} s: {old:.3g} → {new:.3g}")
     else:
         print_parameters(console(), answer)

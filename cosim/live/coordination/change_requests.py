@@ -17,10 +17,11 @@ from noack.scenario.parameter_changes import (
     current_parameters,
     scheduled,
 )
-from noack.scenario.resolution import resolve
+from noack.scenario.resolution import policy_of, resolve
 from noack.scenario.scenario import loop_scenario, loop_sections
 from noack.scenario.scenario_tables import MOST_CHANGES
 from noack.settings.section import ReadTable, Table
+from noack.trigger_policies.trigger_rule import TriggerRule
 
 _CHANGE_DELAY_S = 0.2
 """Wall time from a change's announcement to its effect: processes check every 0.05 s."""
@@ -53,6 +54,7 @@ class ChangeRequests:
         settings = parse_message(ChangeRequest, request).settings
         from_s, now_ns, before = None, clock(), self._parameters()
         warnings: list[str] = []
+        thresholds: dict[str, tuple[float, float]] = {}
         if settings:
             if obstacle is not None:
                 raise CallerError(obstacle)
@@ -60,8 +62,16 @@ class ChangeRequests:
             are_new = [_is_new(settings, schedule, now_ns) for schedule in self._schedules]
             if any(are_new):
                 violated_before = self._violations()
+                rules_before = self._rules(settings)
                 now_ns = clock()
-                from_s = self._announce(settings, now_ns) / NS_PER_S
+                t_ns = self._announce(settings, now_ns)
+                from_s = t_ns / NS_PER_S
+                thresholds = {
+                    name: (old, new)
+                    for name, rule in self._rules(settings).items()
+                    if (old := rules_before[name].shown_threshold(t_ns)) is not None
+                    and (new := rule.shown_threshold(t_ns)) is not None
+                }
                 warnings = [line for line in self._violations() if line not in violated_before]
         loops = self._parameters()
         return ChangeReply(
@@ -73,6 +83,7 @@ class ChangeRequests:
             loops=loops,
             changed_loops=tuple(name for name in loops if loops[name] != before[name]),
             warnings=tuple(warnings),
+            thresholds=thresholds,
         )
 
     def _announce(self, settings: ReadTable, now_ns: int) -> int:
@@ -106,6 +117,13 @@ class ChangeRequests:
             for line, names in violated.items()
         ]
 
+    def _rules(self, settings: ReadTable) -> dict[str, TriggerRule]:
+        """Return the trigger rules after all announced changes, if the settings are of the trigger."""
+        if not any(key.startswith("trigger.") for key in settings):
+            return {}
+        rules = {name: _last_rule(schedule) for name, schedule in self._entries.items()}
+        return {name: rule for name, rule in rules.items() if rule is not None}
+
     @property
     def _schedules(self) -> tuple[ChangeSchedule[None], ...]:
         return (self._schedule, *self._entries.values())
@@ -133,6 +151,17 @@ class ChangeRequests:
         )
         self.announced += (announcement,)
         return announcement
+
+
+def _last_rule(schedule: ChangeSchedule[None]) -> TriggerRule | None:
+    """Return the trigger rule after all changes, each at its time; None if the trigger has none."""
+    rule: TriggerRule | None = None
+    for applied in schedule.all:
+        policy = policy_of(resolve(applied.scenario))
+        if not isinstance(policy, TriggerRule):
+            return None
+        rule = policy if rule is None else policy.continuing(rule, applied.since_ns)
+    return rule
 
 
 def _is_new(settings: ReadTable, schedule: ChangeSchedule[None], now_ns: int) -> bool:

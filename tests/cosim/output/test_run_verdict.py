@@ -46,7 +46,7 @@ def test_the_second_line_states_whether_the_guarantee_was_kept(outcome: Outcome)
     ("first", "largest", "final", "diverged_at_s", "text"),
     [
         (2.0, 2.0, 0.1999, None, "stable, ‖x‖ fell from 2 to 0.2"),
-        (1.0, 2.0, 0.1999, None, "stable, ‖x‖ rose from 1 to 2, then fell to 0.2"),
+        (1.0, 2.0, 0.1999, None, "stable, ‖x‖ was 1 at the start, at most 2, at the end 0.2"),
         (1.0, 1.004, 0.02, None, "stable, ‖x‖ fell from 1 to 0.02"),
         (0.0, 0.0, 0.0, None, "stable, ‖x‖ stayed at 0"),
         (1.0, 2.0, 0.2001, None, "bounded, ‖x‖ was at most 2, at the end 0.2"),

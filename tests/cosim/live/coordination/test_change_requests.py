@@ -1,6 +1,7 @@
 """Requests to change a run."""
 
 import json
+import math
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -53,6 +54,18 @@ def test_a_change_warns_of_the_assumptions_that_it_violates() -> None:
     (warning,) = requested(requests, {"trigger.alpha_per_s": 5.0})["warnings"]
     assert warning.startswith("violated: 0 < α < ᾱ: the threshold decays more slowly than the closed loop")
     assert not requested(requests, {"network.mansd": 2})["warnings"]
+
+
+def test_the_answer_has_the_threshold_without_and_with_the_change() -> None:
+    """β = 0.5 and α = 0.25 /s at first. α changes at 4 s, β at 6 s: the level is βe^(−∫α dt)."""
+    settings = 'trigger={policy="decaying", beta=0.5, alpha_per_s=0.25}'
+    requests = requests_of('{ name = "p" }', settings)
+    slower = requested(requests, {"trigger.alpha_per_s": 0.1}, 3.8)["thresholds"]
+    halved = requested(requests, {"trigger.beta": 0.25}, 5.8)["thresholds"]
+    assert slower == {"p": pytest.approx((0.5 * math.exp(-1.0),) * 2, rel=1e-12)}
+    level = 0.5 * math.exp(-1.0 - 0.1 * 2.0)
+    assert halved == {"p": pytest.approx((level, level / 2), rel=1e-12)}
+    assert requested(requests, {"network.mansd": 2}, 7.0)["thresholds"] == {}
 
 
 def test_a_refused_change_has_no_effect_on_the_next_one() -> None:
