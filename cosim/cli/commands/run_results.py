@@ -42,19 +42,23 @@ def view(
 
     A missing recording, as that of one loop alone, is written first.
     """
-    from cosim.live.finalize import write_recording
-    from cosim.output.viewer.recording_viewer import view_recording
     from cosim.output.viewer.rerun_program import require_viewer
 
     path = chosen_run(recording, runs)
     path = path / file_of_loop(RECORDING_FILE, loop) if path.is_dir() else path
-    if (path.parent / SCENARIO_FILE).is_file() and not path.is_file():
+    is_missing = (path.parent / SCENARIO_FILE).is_file() and not path.is_file()
+    if is_missing or not json:
+        require_viewer()  # before what imports rerun
+    if is_missing:
+        from cosim.live.finalize import write_recording
+
         with status("writing the recording"):
             write_recording(path.parent, loop)
     if json:
         print_json({"recording": str(path), "exists": path.is_file()})
         return ExitStatus.OK if path.is_file() else ExitStatus.CALLER
-    require_viewer()
+    from cosim.output.viewer.recording_viewer import view_recording
+
     view_recording(path, native=False if web else None)
     return ExitStatus.OK
 
