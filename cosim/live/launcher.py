@@ -45,6 +45,9 @@ from noack.scenario.scenario import Scenario
 
 _STOP_TIMEOUT_S = 15.0
 """Wall time that the processes of a stopped run have to end."""
+_STOPPED_S = 15.0
+"""Wall time after which a run ends whose process was stopped, and not continued."""
+_STOPPED = "stopped (state T): by a signal such as SIGSTOP, or by a debugger"
 DEFAULT_START_S = 30.0
 """Wall time within which all processes have to be ready, if the scenario gives none."""
 _POLL_S, _STARTING_POLL_S = 0.01, 0.002
@@ -178,7 +181,9 @@ class _Run:
         self._by_hand = [role for role in ROLES if role not in children]
         self._missing: tuple[str, ...] = ()
         self._has_started = self._has_ended = False
-        self._last_s = time.monotonic()
+        self._last_s = self._next_look_s = time.monotonic()
+        self._stopped_since_s: dict[str, float] = {}
+        """Since when launched processes have been stopped, by role."""
         self._limit = WaitLimit(self._start_within_s())
         """How long the launcher still waits: for the start, for the end, or for the stop."""
 
@@ -212,7 +217,9 @@ class _Run:
         if self._has_started:
             self._observers.tell(lambda observer: observer.stopping(reason))
         self._limit = WaitLimit(_STOP_TIMEOUT_S)
-        while set(self._children.running()) - self._coordinator.failures().keys():
+        while (
+            set(self._children.running()) - self._coordinator.failures().keys() - self._stopped_since_s.keys()
+        ):
             self._advance(waits=True)
             if self._limit.is_reached:
                 return
@@ -225,6 +232,12 @@ class _Run:
         last_s, self._last_s = self._last_s, time.monotonic()
         if waits:
             self._limit.wait(self._last_s - last_s, os.getloadavg()[0])
+        if self._last_s >= self._next_look_s:
+            self._next_look_s = self._last_s + 1.0
+            since_s = self._stopped_since_s
+            self._stopped_since_s = {
+                role: since_s.get(role, self._last_s) for role in self._children.stopped()
+            }
 
     def _follow_phase(self) -> None:
         """Do what is due once: when the loop starts, and when it has ended; tell of the progress."""
@@ -254,6 +267,9 @@ class _Run:
         }
         if RECORDER in running and self._coordinator.now_ns() >= self._scenario.timing.horizon_ns:
             failures.pop(RECORDER, None)  # sorting a long record, it may not respond
+        for role, since_s in self._stopped_since_s.items():
+            if role in failures or self._last_s - since_s > _STOPPED_S:
+                failures[role] = EndReason(ExitStatus.FAILED, f"{role} {_STOPPED}")
         return next(iter((failures | exited).values()), None)
 
     def _is_in_loop(self) -> bool:
@@ -289,6 +305,8 @@ class _Run:
         return given_s
 
     def _overdue(self) -> str:
+        if self._stopped_since_s:
+            return f"{', '.join(self._stopped_since_s)} {_STOPPED}"
         if self._coordinator.epoch_ns is None:
             return f"{', '.join(self._coordinator.missing())} {self._limit.explain_start()}"
         # One that is lost, too: the recorder may not respond while it sorts a long record.

@@ -1,8 +1,9 @@
 """The processes of a shell, as a program of their own, which starts quickly without noack.
 
 ``outside ARGUMENTS``: becomes a user of its own namespaces, in which it may open devices, and
-then the program of the arguments. ``inside PARENT ARGUMENTS``: runs the program, and ends all
-processes that it started when it ends or when the parent does.
+then the program of the arguments. ``inside PARENT NAMESPACE ARGUMENTS``: runs the program, and ends
+all processes that it started when it ends or when the parent does; even if this process and its
+parent are killed, those in the network namespace of this number, if it is not 0.
 """
 
 import ctypes
@@ -99,7 +100,42 @@ def end_children(kept_processes: Collection[int] = ()) -> None:
         time.sleep(_POLL_S)
 
 
-def guard(parent: int, command: list[str]) -> int:
+def in_namespace(namespace: int) -> set[int]:
+    """Return the process ids in the network namespace of this number."""
+    ids = set()
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # it has ended, or is another user's
+            if (process / "ns" / "net").stat().st_ino == namespace:
+                ids.add(int(process.name))
+    return ids
+
+
+def start_warden(namespace: int) -> int:
+    """Start a process that outlives this one, and then kills all that is in a network namespace.
+
+    It sees the end of this process by a pipe, of which no other process has the end.
+    """
+    reading, _ = os.pipe()  # programs that are started do not inherit it
+    warden = os.fork()
+    if warden > 0:
+        os.close(reading)
+        return warden
+    os.setsid()  # what kills the whole group does not kill this process
+    null = os.open(os.devnull, os.O_RDWR)
+    for descriptor in range(256):  # also the end of the pipe
+        if descriptor not in (reading, null):
+            with suppress(OSError):
+                os.close(descriptor)
+    os.read(reading, 1)
+    while others := in_namespace(namespace) - {os.getpid()}:
+        for process in others:
+            with suppress(OSError):
+                os.kill(process, signal.SIGKILL)
+        time.sleep(_POLL_S)
+    os._exit(0)
+
+
+def guard(parent: int, namespace: int, command: list[str]) -> int:
     """Run a command; return its exit status when all processes that it started have ended."""
     # Signals that end the command wait until they are asked for; those of the terminal are its own.
     ending = {signal.SIGTERM, signal.SIGHUP}
@@ -109,6 +145,7 @@ def guard(parent: int, command: list[str]) -> int:
     group = os.getpgrp()
     os.setpgid(0, 0)  # what kills the whole group does not kill this process
     call("prctl", _DEATH_SIGNAL, signal.SIGTERM, 0, 0, 0)
+    wardens = {start_warden(namespace)} if namespace else set()
     # The command, in the terminal's group and with the signals as they were.
     child = os.fork()
     if child == 0:
@@ -134,7 +171,7 @@ def guard(parent: int, command: list[str]) -> int:
             while (reaped := os.waitpid(-1, os.WNOHANG))[0]:
                 if reaped[0] == child:
                     status = os.waitstatus_to_exitcode(reaped[1])
-    end_children()
+    end_children(wardens)
     return 1 if status is None else status if status >= 0 else 128 - status
 
 
@@ -142,7 +179,7 @@ def main() -> None:
     """Run the role that the first argument names."""
     role, *arguments = sys.argv[1:]
     if role == "inside":
-        sys.exit(guard(int(arguments[0]), arguments[1:]))
+        sys.exit(guard(int(arguments[0]), int(arguments[1]), arguments[2:]))
     with suppress(OSError):  # the program will report that it is not permitted
         enter_namespaces()
     os.execv(arguments[0], arguments)

@@ -104,7 +104,8 @@ class _Program:
         try:
             programs.extend(_start(command) for command in self._outside)
             with inside(self.devices):
-                programs.append(_start(self._command, addresses))
+                namespace = os.fstat(self.devices.namespace).st_ino
+                programs.append(_start(self._command, addresses, namespace))
             yield programs[-1]
         finally:
             for program in programs:
@@ -115,6 +116,8 @@ class _Program:
             process.end_children(earlier_children)  # of a guard that was killed
 
 
-def _start(command: Sequence[str], variables: dict[str, str] | None = None) -> subprocess.Popen[bytes]:
-    guard = python_command("-IS", process.__file__, "inside", os.getpid())
+def _start(
+    command: Sequence[str], variables: dict[str, str] | None = None, namespace: int = 0
+) -> subprocess.Popen[bytes]:
+    guard = python_command("-IS", process.__file__, "inside", os.getpid(), namespace)
     return subprocess.Popen([*guard, *command], env=os.environ | (variables or {}))

@@ -56,6 +56,8 @@ class NeverStartedError(NoackError):
         self.exit_status = exit_status
 
 
+TOO_LARGE = "an integer is too large"
+"""In place of Python's text about an integer of more than 4300 digits, which asks for a change of code."""
 _PLAIN = {
     ", unable to parse string as a number": "",
     ", unable to parse string as an integer": "",
@@ -84,7 +86,8 @@ def plain_mistake(message: str) -> str:
 
 def one_line(error: BaseException | str) -> str:
     """Return the message of an error of another library, or another text, as one line."""
-    return " ".join(str(error).split())
+    text = " ".join(str(error).split())
+    return TOO_LARGE if "set_int_max_str_digits" in text else text
 
 
 def why(error: OSError | ValueError) -> str:

@@ -19,7 +19,7 @@ from typing import Annotated, Literal, NamedTuple, TypeAlias, TypeVar, Union, ge
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from noack.core.errors import CallerError, did_you_mean, plain_mistake, printable, shortened, why
+from noack.core.errors import TOO_LARGE, CallerError, did_you_mean, plain_mistake, printable, shortened, why
 from noack.core.extension_points import missing_extension
 from noack.core.file_access import read_regular
 from noack.scenario.removed_keys import removed_key
@@ -48,7 +48,6 @@ _PLACE = re.compile(r" \(at (?:line (\d+), column \d+|end of document)\)$")
 _KEY = re.compile(r"\s*(?:[\w.'\"-]+\s*=|\[+\s*[A-Za-z_'\"])")
 """A line that begins with a key or the head of a table."""
 _TOO_DEEP = f"tables and lists lie within each other more than {MOST_LEVELS} levels deep"
-_TOO_LARGE = "an integer is too large"
 _MOST_LOOKED_AT = 100
 """Files beside a missing one that may be suggested instead."""
 _LONG_KEY = re.compile(rf"(?<![\w-])(?:[\w-]++[ \t]*+\.[ \t]*+){{{MOST_LEVELS}}}")
@@ -115,7 +114,7 @@ def parsed(text: str, source: str) -> Table:
     except tomllib.TOMLDecodeError as error:
         raise CallerError(printable(f"{source}: not valid TOML: {_with_line(text, str(error))}")) from None
     except ValueError:  # an integer has thousands of digits
-        raise CallerError(f"{source}: {_TOO_LARGE}") from None
+        raise CallerError(f"{source}: {TOO_LARGE}") from None
 
 
 def validated(model: type[M], content: ReadTable, source: str) -> M:
@@ -127,7 +126,7 @@ def validated(model: type[M], content: ReadTable, source: str) -> M:
     except TypeError as error:
         raise CallerError(printable(f"{source}: {error}")) from None
     except ValueError:  # an integer has thousands of digits
-        raise CallerError(f"{source}: {_TOO_LARGE}") from None
+        raise CallerError(f"{source}: {TOO_LARGE}") from None
     try:
         # Via JSON, because strict validation accepts an array as a tuple only there.
         return model.model_validate_json(text)

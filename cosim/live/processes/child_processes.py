@@ -80,6 +80,10 @@ class ChildProcesses:
         codes = {role: child.poll() for role, child in self._children.items()}
         return {role: self._failure(role, code, reported) for role, code in codes.items() if code}
 
+    def stopped(self) -> set[str]:
+        """Roles of which the launched process is stopped, by a signal or by a debugger."""
+        return {role for role, child in self._children.items() if _state(child.pid) in ("T", "t")}
+
     def _start(self, role: str, *, live: bool) -> Child:
         arguments = ["--live"] if role == RECORDER and live else []
         try:
@@ -124,6 +128,15 @@ class ChildProcesses:
             return log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
         except OSError:  # the run directory was removed
             return []
+
+
+def _state(pid: int) -> str:
+    """Return the state of a process, a letter as in ``ps``; empty if the system does not tell it."""
+    try:
+        status = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return ""
+    return status.rpartition(")")[2].split()[0]
 
 
 def _end(child: Child) -> None:

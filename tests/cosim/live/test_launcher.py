@@ -1,6 +1,8 @@
 """When the launcher ends a run, and the reason it reports."""
 
 import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,6 +21,7 @@ from noack.runtime.command_line import Signals, StopRequestError
 from noack.runtime.run_descriptor import descriptor_file, new_descriptor
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
+from tests.helpers.waiting import wait_for
 
 LOG = "noack sensor: no room\n"
 
@@ -27,6 +30,7 @@ class Child:
     """A process that has exited with a status, or is running."""
 
     stdin = None
+    pid = 0
 
     def __init__(self, code: int | None = None) -> None:
         self.code = code
@@ -149,6 +153,34 @@ def test_a_run_that_does_not_end_names_the_late_process(
     coordinator._running = running
     reason = case.run(case.children(None), coordinator)._overdue()
     assert reason.startswith(f"the run did not end at its horizon: {late}, too slow or stopped; ")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the state of a process is in /proc")
+@pytest.mark.parametrize("now_s", [0.5, 2.0], ids=["within the run", "after the horizon"])
+def test_a_stopped_process_is_named_with_its_state(
+    case: Case, now_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The load is not blamed; a process that goes on is no failure."""
+    said = "stopped (state T): by a signal such as SIGSTOP, or by a debugger"
+    with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(1000)"]) as process:
+        children = case.children(None)
+        cast(Any, children._children[RECORDER]).pid = process.pid
+        run = case.run(children, FakeCoordinator(now_s))
+        monkeypatch.setattr(FakeCoordinator, "poll", lambda self: None, raising=False)
+        monkeypatch.setattr(run, "_follow_phase", lambda: None)
+        process.send_signal(signal.SIGSTOP)
+        wait_for(lambda: children.stopped() == {RECORDER})
+        run._advance(waits=True)
+        assert run._failure() is None  # not yet
+        assert run._overdue() == f"recorder {said}"
+        monkeypatch.setattr("cosim.live.launcher._STOPPED_S", -1.0)
+        assert run._failure() == (ExitStatus.FAILED, f"recorder {said}")
+        process.send_signal(signal.SIGCONT)
+        wait_for(lambda: children.stopped() == set())
+        run._next_look_s = 0.0
+        run._advance(waits=True)
+        assert run._failure() is None
+        process.kill()
 
 
 class Ending(FakeCoordinator):

@@ -166,7 +166,7 @@ def test_a_system_that_does_not_permit_it_is_one_line_with_the_remedy() -> None:
     assert "`sysctl -w user.max_user_namespaces=10000`" in done.stderr
 
 
-@pytest.mark.parametrize("killed", ["relay", "guard", "group", "all", "terminated"])
+@pytest.mark.parametrize("killed", ["relay", "guard", "both", "group", "all", "terminated"])
 def test_the_shell_leaves_no_process_behind(killed: str) -> None:
     """All of them have the pipe: its end is the end of the last one."""
     script = "(setsid sleep 1000 &) ; sleep 1000 & echo $PPID; wait"
@@ -180,6 +180,10 @@ def test_the_shell_leaves_no_process_behind(killed: str) -> None:
             process.kill()
         elif killed == "guard":
             os.kill(guard, signal.SIGKILL)
+        elif killed == "both":  # neither notices the end of the other
+            for number in (signal.SIGSTOP, signal.SIGKILL):
+                for pid in (guard, process.pid):
+                    os.kill(pid, number)
         elif killed == "all":
             os.killpg(process.pid, signal.SIGKILL)
         elif killed == "group":
@@ -187,7 +191,7 @@ def test_the_shell_leaves_no_process_behind(killed: str) -> None:
         else:
             process.terminate()
         assert process.stdout.read() == ""
-    expected = {"relay": -9, "all": -9, "guard": 128 + 9, "group": 130, "terminated": 143}
+    expected = {"relay": -9, "all": -9, "both": -9, "guard": 128 + 9, "group": 130, "terminated": 143}
     assert process.returncode == expected[killed]
 
 

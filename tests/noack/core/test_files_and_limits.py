@@ -1,6 +1,7 @@
 """Files are written whole, limits of a process and errors give one printable line."""
 
 import errno
+import json
 import os
 import resource
 import stat
@@ -12,8 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from noack.core.errors import CallerError, MachineError, one_line, printable
-from noack.core.file_access import new_file, write_whole
+from noack.core.errors import CallerError, MachineError, one_line, printable, why
+from noack.core.file_access import locked, new_file, write_whole
 from noack.core.system_processes import exhausted_limit
 
 
@@ -96,3 +97,20 @@ def test_control_characters_are_escaped_and_each_mistake_has_a_line() -> None:
 
 def test_an_error_of_another_library_becomes_one_line() -> None:
     assert one_line(ValueError("Couldn't read:\n  no data\n")) == "Couldn't read: no data"
+
+
+def test_an_error_with_a_file_but_without_a_number_is_its_text(tmp_path: Path) -> None:
+    """Python's text is "[Errno None] None: 'FILE'"."""
+    error = OSError("not a regular file")
+    error.filename = str(tmp_path)
+    assert why(error) == "not a regular file"
+    (tmp_path / ".lock").symlink_to("elsewhere")
+    with pytest.raises(OSError, match=r"^not a regular file$"), locked(tmp_path / ".lock"):
+        pass
+
+
+def test_an_integer_of_thousands_of_digits_is_too_large() -> None:
+    """Python's text asks for a change of code."""
+    with pytest.raises(ValueError, match="set_int_max_str_digits") as raised:
+        json.loads("9" * 5000)
+    assert why(raised.value) == one_line(raised.value) == "an integer is too large"
