@@ -17,6 +17,7 @@ from noack.core.linear_systems import Matrix, Vector, discretise, transition
 from noack.core.random_streams import stream
 from noack.observers.observer_settings import unobservable_mode
 from noack.protocol.record_tables import LOOP, RecordShape, entry_names, is_of_network, largest, tables
+from noack.scenario.overload import refuse_overload
 from noack.scenario.scenario import (
     Scenario,
     few_of,
@@ -89,8 +90,12 @@ def resolve_run(scenario: Scenario) -> Scenario:
     become numbers; the draws of its loops follow from the seeds.
 
     Raises:
-        CallerError: as :func:`resolve`.
+        CallerError: as :func:`resolve`, or a link must overflow, in a scenario that no file gives.
     """
+    try:
+        refuse_overload(scenario)
+    except ValueError as error:
+        raise CallerError(f"{scenario.name}: {error}") from None
     resolved = resolved_loops(scenario)
     if not scenario.loops:
         return resolved[0]

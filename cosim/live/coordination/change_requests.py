@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
+from operator import itemgetter
 
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
@@ -10,6 +11,7 @@ from noack.impairments.target_loss import find_probabilities
 from noack.runtime.control_messages import ChangeAnnouncement, ChangeReply, ChangeRequest, parse_message
 from noack.runtime.control_plane import ControlPlane
 from noack.runtime.run_descriptor import RunDescriptor
+from noack.scenario.overload import refuse_overload
 from noack.scenario.parameter_changes import (
     ChangeSchedule,
     ParameterChange,
@@ -18,6 +20,7 @@ from noack.scenario.parameter_changes import (
     scheduled,
 )
 from noack.scenario.resolution import policy_of, resolve
+from noack.scenario.run_sections import ScheduledChange
 from noack.scenario.scenario import loop_scenario, loop_sections
 from noack.scenario.scenario_tables import MOST_CHANGES
 from noack.settings.section import ReadTable, Table
@@ -98,9 +101,22 @@ class ChangeRequests:
         if t_ns >= self._scenario.timing.horizon_ns:
             raise CallerError(f"the run ends at {self._scenario.horizon_s:g} s, before a change could apply")
         change = ParameterChange(len(self.announced), t_ns, settings)
+        self._refuse_overload(change)
         requested_at = datetime.now(UTC).isoformat(timespec="milliseconds")
         self._plane.announce_change(self._add(change, now_ns, requested_at))
         return t_ns
+
+    def _refuse_overload(self, change: ParameterChange) -> None:
+        """Raise CallerError if a link must overflow with a change, or with a later one after it."""
+        timed = [(known.t_ns, known.settings) for known in self.announced] + [(change.t_ns, change.settings)]
+        changes = tuple(
+            ScheduledChange(at_s=t_ns / NS_PER_S, set=dict(settings))
+            for t_ns, settings in sorted(timed, key=itemgetter(0))
+        )
+        try:
+            refuse_overload(self._scenario.model_copy(update={"changes": changes}))
+        except ValueError as error:
+            raise CallerError(f"the change: {error}") from None
 
     def _violations(self) -> list[str]:
         """Return the violated assumptions of Theorem 2, each as a line, with its loops if not all."""

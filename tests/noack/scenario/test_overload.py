@@ -1,6 +1,8 @@
 """A link that must overflow is refused; certificates need a stated delay where a queue is."""
 
 import re
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -129,6 +131,17 @@ def test_every_way_to_load_a_scenario_refuses_overload() -> None:
         noack.with_settings(noack.load("unstable_pendulum"), OVERLOAD)
     with pytest.raises(CallerError, match="the queue would grow without bound"):
         shipped("shared_bottleneck", "network.impairments.0.rate_bps=100")
+
+
+@pytest.mark.parametrize("run", [noack.simulate, noack.run])
+def test_no_run_is_made_of_a_scenario_object_with_overload(
+    run: Callable[..., object], content: dict[str, Any], tmp_path: Path
+) -> None:
+    """One that was loaded from no file, or changed afterwards."""
+    scenario = scenario_of(content, 1000, 5, {"name": "a", "trigger": PERIODIC})
+    with pytest.raises(CallerError, match="the queue would grow without bound"):
+        run(scenario, runs=tmp_path / "runs")
+    assert not list(tmp_path.glob("runs/*"))
 
 
 def test_with_a_queue_a_certificate_needs_a_stated_delay() -> None:

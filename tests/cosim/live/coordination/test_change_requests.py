@@ -82,6 +82,17 @@ def test_a_refused_change_has_no_effect_on_the_next_one() -> None:
     assert [announcement.number for announcement in requests.announced] == [0, 1]
 
 
+def test_a_change_with_which_a_link_must_overflow_is_refused() -> None:
+    """At 20 updates per second of 93 bytes with their headers, one of four passes with M − 1 = 3."""
+    rate = 'network.impairments=[{ kind = "rate", rate_bps = 8000, queue = 5 }]'
+    trigger = 'trigger={policy="periodic", period_s=0.05}'
+    requests = requests_of('{ name = "p" }', rate, trigger)
+    with pytest.raises(CallerError, match=r"the change: network\.impairments\.0: .* the queue would grow"):
+        requested(requests, {"network.mansd": 0})
+    assert requests.announced == ()
+    assert requested(requests, {"network.mansd": 2})["from_s"] > 0
+
+
 def test_a_change_beyond_the_last_one_or_the_end_of_the_run_is_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
