@@ -19,6 +19,7 @@ from noack.impairments.constraints import join_guarantee
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.markov_chain import NotPredictableError
 from noack.impairments.target_loss import loss_process
+from noack.runtime.command_line import StopRequestError
 from noack.scenario.scenario import Scenario
 from noack.theory.margins.joint_spectral_radius import ACCURACY
 from noack.theory.margins.loss_margin import LossMargin, Stability, capped, uncapped
@@ -28,6 +29,9 @@ MOST_M = 16
 """Largest M that is examined by default."""
 _LARGEST_EFFORT = 1e6
 """Largest factor of the work that may be asked for."""
+
+_CAPS, _OTHERS, _PERIOD, _RANDOM = "M", "the other guarantees", "the longest period", "random losses"
+"""What is examined, in this order."""
 
 MarginProgress = Callable[[str], None]
 """Receives what is examined next."""
@@ -212,6 +216,8 @@ class MarginResult:
     """Factor of the limits of the work for a decision."""
     compared: GuaranteeComparison = _NOT_COMPARED
     """The scenario's guarantee and others, if there are others."""
+    missing: tuple[str, ...] = ()
+    """What was not examined, in words, because the search was stopped."""
 
     @property
     def is_periodic(self) -> bool:
@@ -308,6 +314,7 @@ def find_margin(
     guarantees: Sequence[str] = (),
     effort: float = 1.0,
     progress: MarginProgress = lambda text: None,
+    on_stop: Callable[[StopRequestError], None] | None = None,
 ) -> MarginResult:
     """Find the margin of a scenario's loop.
 
@@ -319,9 +326,12 @@ def find_margin(
         guarantees: other guarantees to examine, in words such as ``mansd 4 atmost 3 in 10``.
         effort: factor of the limits of the work for a decision.
         progress: receives what is examined next.
+        on_stop: receives the request to stop, after which the result has what was decided until then;
+            without it, or before a result for M = 1, the request is raised.
 
     Raises:
         CallerError: the loop is not covered, or a number is out of range.
+        StopRequestError: see ``on_stop``.
     """
     _require_in_range(most_m, accuracy, effort)
     margin, network = LossMargin(resolved), resolved.network
@@ -332,17 +342,31 @@ def find_margin(
         progress(name or guarantee.meaning)
         return margin.stability(guarantee, accuracy, effort=effort)
 
-    # M = 1, 2, … up to the first one that is destabilised, or that the other rules imply.
     caps: list[LossCap] = []
-    every_m = False
-    for m in range(1, most_m + 1):
-        caps.append(LossCap(m, examine(capped(other_rules, m - 1), f"M = {m} of at most {most_m}")))
-        every_m = other_rules.longest_burst is not None and other_rules.longest_burst < m
-        if every_m or caps[-1].stability.verdict == "destabilised":
-            break
-    compared = _NOT_COMPARED
-    if others_read:
-        compared = compare_guarantees([network.guarantee, *others_read], examine)
+    every_m, compared = False, _NOT_COMPARED
+    limit: PeriodLimit | None = None
+    growth: MeanSquareGrowth | str = "not examined"
+    missing = [_CAPS, *([_OTHERS] if others_read else []), *([_PERIOD] if with_period else []), _RANDOM]
+    try:
+        # M = 1, 2, … up to the first one that is destabilised, or that the other rules imply.
+        for m in range(1, most_m + 1):
+            caps.append(LossCap(m, examine(capped(other_rules, m - 1), f"M = {m} of at most {most_m}")))
+            every_m = other_rules.longest_burst is not None and other_rules.longest_burst < m
+            if every_m or caps[-1].stability.verdict == "destabilised":
+                break
+        missing.remove(_CAPS)
+        if others_read:
+            compared = compare_guarantees([network.guarantee, *others_read], examine)
+            missing.remove(_OTHERS)
+        if with_period:
+            limit = find_longest_period(resolved, progress)
+            missing.remove(_PERIOD)
+        growth = _without_guarantee(resolved, progress)
+        missing.remove(_RANDOM)
+    except StopRequestError as stop:
+        if on_stop is None or not caps:
+            raise
+        on_stop(stop)
     return MarginResult(
         scenario=resolved.name,
         mode=resolved.mode,
@@ -354,10 +378,11 @@ def find_margin(
         delay_s=margin.loop.times.delay_ns / NS_PER_S,
         caps=_with_implied_bounds(caps),
         every_m=every_m,
-        period=find_longest_period(resolved, progress) if with_period else None,
-        without_guarantee=_without_guarantee(resolved, progress),
+        period=limit,
+        without_guarantee=growth,
         effort=effort,
         compared=compared,
+        missing=tuple(f"M from {len(caps) + 1} on" if what == _CAPS else what for what in missing),
     )
 
 

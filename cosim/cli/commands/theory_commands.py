@@ -262,9 +262,11 @@ def margin(
 
     if play and json:
         raise CallerError("--play: has an output of its own; leave out --json")
+    stops: list[StopRequestError] = []
     with status("examining") as change:
         result = find_margin(
             resolve(opt.load_loop(scenario, settings, loop)),
+            on_stop=stops.append,
             most_m=most,
             accuracy=accuracy,
             with_period=period,
@@ -277,6 +279,9 @@ def margin(
     else:
         print_margin(console(), result)
     write_tables(margin_tables(result), tables, json=json)
+    if stops:  # the results so far are shown
+        print_to_stderr(f"noack: {stops[0]}; missing: {', '.join(result.missing)}")
+        return stops[0].exit_status
     if not play:
         return ExitStatus.OK if result.stable_m else ExitStatus.FAILED
     if (pattern := result.destabilised) is None:

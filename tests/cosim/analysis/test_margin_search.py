@@ -1,11 +1,14 @@
 """The margin of a scenario: the search, the command, the library."""
 
 import json
+import signal
+from typing import Any
 
 import numpy as np
 import pytest
 
 import noack
+from cosim.analysis import margin_search
 from cosim.analysis.margin_search import find_longest_period, find_margin, undecided_text
 from cosim.cli.options import load_scenario
 from noack.core.linear_systems import discretise
@@ -174,3 +177,50 @@ def test_an_undecided_m_states_the_gap_and_the_effort() -> None:
     assert "--effort 30 is estimated to prove it, in about 60 s" in text
     never = bounds._replace(needed_effort=np.inf)
     assert "no effort up to 1e+06" in undecided_text(never, effort=1.0)
+
+
+@pytest.mark.usefixtures("usual_signals")
+@pytest.mark.parametrize("json_output", [False, True])
+def test_ctrl_c_leaves_what_was_decided(monkeypatch: pytest.MonkeyPatch, json_output: bool) -> None:
+    decide, decided = LossMargin.stability, 0
+
+    def interrupted(self: LossMargin, *arguments: Any, **more: Any) -> Stability:
+        nonlocal decided
+        decided += 1
+        if decided == 3:
+            signal.raise_signal(signal.SIGINT)
+        return decide(self, *arguments, **more)
+
+    monkeypatch.setattr(LossMargin, "stability", interrupted)
+    result = invoke("margin", "lane_periodic", *(["--json"] if json_output else []))
+    line = "noack: stopped by the user (SIGINT); missing: M from 3 on, the longest period, random losses"
+    assert (result.exit_code, result.stderr.splitlines()[-1]) == (130, line)
+    if json_output:
+        document = json.loads(result.stdout)
+        assert [cap["m"] for cap in document["caps"]] == [1, 2]
+        assert document["stable_m"] == 2
+        assert document["missing"] == ["M from 3 on", "the longest period", "random losses"]
+        assert document["period"] is None
+    else:
+        assert "proven stable for every loss pattern with M ≤ 2" in result.stdout
+
+
+@pytest.mark.usefixtures("usual_signals")
+def test_ctrl_c_in_the_search_of_a_period_leaves_every_m(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        margin_search, "find_longest_period", lambda *arguments: signal.raise_signal(signal.SIGINT)
+    )
+    result = invoke("margin", "lane_periodic", "--most", "2")
+    line = "noack: stopped by the user (SIGINT); missing: the longest period, random losses"
+    assert (result.exit_code, result.stderr.splitlines()[-1]) == (130, line)
+    assert "M ≤ 2" in result.stdout
+
+
+@pytest.mark.usefixtures("usual_signals")
+def test_ctrl_c_before_the_first_decision_prints_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        LossMargin, "stability", lambda *arguments, **more: signal.raise_signal(signal.SIGINT)
+    )
+    result = invoke("margin", "lane_periodic")
+    assert (result.exit_code, result.stdout) == (130, "")
+    assert result.stderr.splitlines()[-1] == "noack: stopped by the user (SIGINT)"
