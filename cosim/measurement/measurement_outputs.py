@@ -30,8 +30,9 @@ from cosim.output.figures.figure_description import (
 )
 from cosim.output.figures.figure_format import FigureFiles
 from cosim.output.result_tables import KEY_VALUE, ResultTable, terminal_table
+from cosim.record.run_directory import write_output
 from noack.core.errors import CallerError
-from noack.core.file_access import require_suffix, write_whole
+from noack.core.file_access import require_suffix
 from noack.core.number_format import NONE, duration, number, percent
 from noack.impairments.burst_prediction import chance_text
 from noack.scenario.scenario import Scenario
@@ -275,7 +276,7 @@ def write_page(
         tables=list(measurement_tables(measurement, void)),
         figures=figures,
     )
-    return [write_whole(path, html), *save_figures(figures, path, figure_files)]
+    return [write_output(path, html), *save_figures(figures, path, figure_files)]
 
 
 _BURSTS, _OUTAGES, _DELAYS = palette.SENSOR, palette.CONTROLLER, palette.PLANT

@@ -8,8 +8,9 @@ import numpy as np
 
 from cosim.measurement.chain_fits import ChainFit
 from cosim.measurement.network_measurement import NetworkMeasurement
+from cosim.record.run_directory import write_output
 from noack.core.errors import printable
-from noack.core.file_access import require_suffix, write_whole
+from noack.core.file_access import require_suffix
 from noack.impairments.target_loss import read_files
 from noack.scenario import toml_file
 from noack.scenario.scenario_file import toml_text
@@ -34,7 +35,7 @@ def write_network(measurement: NetworkMeasurement, path: Path, form: Form) -> li
     paths = [path]
     if form == "trace":
         trace_path = path.with_suffix(".csv")
-        write_whole(trace_path, trace_csv(measurement.trace))
+        write_output(trace_path, trace_csv(measurement.trace))
         section, paths = _trace_section(measurement, trace_path.name), [trace_path, path]
     else:
         section = _model_section(measurement)
@@ -45,7 +46,7 @@ def write_network(measurement: NetworkMeasurement, path: Path, form: Form) -> li
     assert isinstance(content, dict)
     settings = toml_file.validated(NetworkSection, content, source)
     read_files(settings.link, path.parent, source)
-    write_whole(path, text)
+    write_output(path, text)
     return paths
 
 

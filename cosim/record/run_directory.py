@@ -37,6 +37,12 @@ SUMMARY_FILE = "summary.json"
 REPORT_FILE = "report.html"
 RECORD = "record"
 LATEST = "latest"
+CAMPAIGN_FILE, CAMPAIGN_PAGE = "campaign.json", "campaign.html"
+_KEPT = frozenset({
+    SCENARIO_FILE, ENVIRONMENT_FILE, REPORTS_FILE, RECORDING_FILE, PROCESSES_FILE, ENDING_FILE,
+    SUMMARY_FILE, REPORT_FILE, CAMPAIGN_FILE, CAMPAIGN_PAGE,
+})  # fmt: skip
+"""Files of the folders of runs and campaigns, which no other output replaces."""
 _LOCK = ".lock"
 _HAS_LINKS = hasattr(os, "geteuid")  # not on Windows
 _MOST_JSON_BYTES = 256 * 2**20
@@ -47,10 +53,12 @@ def new_run_dir(runs: Path, name: str) -> Path:
     """Create a fresh run directory below ``runs``.
 
     Raises:
-        CallerError: the path is not UTF-8.
+        CallerError: the path is not UTF-8, or has another kind of results.
         MachineError: the directory cannot be created.
     """
     _require_utf8(runs)
+    if (holder := holder_of(runs)) is not None:
+        raise CallerError(f"{runs}: {holder}, not a folder of run directories; give another --runs")
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
     try:
         create_folder(runs)
@@ -69,6 +77,27 @@ def new_run_dir(runs: Path, name: str) -> Path:
     except OSError as error:
         raise MachineError(f"{runs}: no run directory can be created: {why(error)}") from None
     raise MachineError(f"{runs}: too many runs named {stamp}-{name}")
+
+
+def holder_of(folder: Path) -> str | None:
+    """Return what a folder is that holds the results of a run or a campaign, in words; None: neither."""
+    if (folder / CAMPAIGN_FILE).is_file():
+        return "the folder of a campaign"
+    if (folder / SCENARIO_FILE).is_file() and (folder / ENVIRONMENT_FILE).is_file():
+        return "the directory of a run"
+    return None
+
+
+def write_output(path: Path, content: str | bytes) -> Path:
+    """Write a file that a user named, or replace it; return its path.
+
+    Raises:
+        CallerError: it is one of the files of a run or a campaign.
+        MachineError: it cannot be written.
+    """
+    if path.name in _KEPT and (holder := holder_of(path.parent)) is not None:
+        raise CallerError(f"{path}: is a file of {holder}; give another name")
+    return write_whole(path, content)
 
 
 def _require_utf8(path: Path) -> None:
@@ -152,7 +181,7 @@ def require_run_directory(path: Path) -> None:
     if not path.exists():
         raise CallerError(f"{path}: no such run directory")
     if path.is_dir():
-        raise CallerError(f"{path}: not a run directory (no {SCENARIO_FILE})")
+        raise CallerError(f"{path}: not a run directory ({holder_of(path) or f'no {SCENARIO_FILE}'})")
     hint = ""
     for folder in path.parents:
         if not hint and (folder / SCENARIO_FILE).is_file() and (folder / RECORD).is_dir():

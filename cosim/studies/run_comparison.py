@@ -29,11 +29,10 @@ from cosim.output.figures.figure_description import (
 from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.output.run_tables import caps_text
 from cosim.record.align import Reals, Times, align_tables
-from cosim.record.run_directory import chosen_run
+from cosim.record.run_directory import chosen_run, write_output
 from cosim.record.run_record import RunRecord, load_record
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, shortened
-from noack.core.file_access import write_whole
 from noack.core.number_format import as_text
 from noack.core.row_operations import row_norms
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, NO_SEQUENCE, PLANT_STEP, SENSOR_MEASUREMENT
@@ -151,7 +150,7 @@ class RunComparison:
         if width is not None:
             raise CallerError(f"{path}: a page has its own width; --width is that of a figure")
         template = templates(Path(__file__).parent).get_template("overlay.html.jinja")
-        write_whole(path, template.render(comparison=self, figure=overlay_figure(self.runs)))
+        write_output(path, template.render(comparison=self, figure=overlay_figure(self.runs)))
 
     def to_json(self) -> dict[str, object]:
         """Return the comparison without the figure, for programs."""

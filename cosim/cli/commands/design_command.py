@@ -157,11 +157,11 @@ def design(
     from cosim.cli.cost_weights import cost_weights
     from cosim.cli.execute_run import warn_of_left_out
     from cosim.live.monitoring.progress import work_bar
+    from cosim.record.run_directory import write_output
     from cosim.studies.design import design_page, design_search
     from cosim.studies.design.design_outcome import design_for_network
     from cosim.studies.design.design_space import families_of
     from cosim.studies.design.network_search import DesignRequest
-    from noack.core.file_access import write_whole
     from noack.scenario.scenario_file import dumps
 
     figure_files = requested_files(figure_format, width)
@@ -185,7 +185,7 @@ def design(
         page = page or DEFAULT_RUNS / "design" / f"{loaded.name}-network.html"
         written = design_page.write_outcome(outcome, page, figure_files)
         if out is not None and outcome.is_certified:
-            written.append(write_whole(out, outcome.scenario_toml()))
+            written.append(write_output(out, outcome.scenario_toml()))
         if json:
             print_json(outcome.to_json() | {"files": [str(file) for file in written]})
         else:
@@ -219,7 +219,7 @@ def design(
     page = page or DEFAULT_RUNS / "design" / f"{loaded.name}.html"
     written = design_page.write_page(result, page, figure_files)
     if out is not None and result.feasible:
-        written.append(write_whole(out, dumps(result.scenario)))
+        written.append(write_output(out, dumps(result.scenario)))
     if json:
         print_json(result.to_json() | {"files": [str(file) for file in written]})
     else:

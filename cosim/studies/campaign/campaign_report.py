@@ -16,7 +16,7 @@ from cosim.output.figures.figure_files import save_figures
 from cosim.output.figures.figure_format import FigureFiles
 from cosim.output.page_kit import templates
 from cosim.output.result_tables import ResultTable
-from cosim.record.run_directory import read_object
+from cosim.record.run_directory import CAMPAIGN_PAGE, SUMMARY_FILE, read_object
 from cosim.studies.campaign.campaign_figures import figures
 from cosim.studies.campaign.campaign_file import Campaign
 from cosim.studies.campaign.campaign_grid import base_of, grid
@@ -28,7 +28,7 @@ from noack.core.file_access import write_whole
 from noack.core.number_format import plus_minus
 from noack.runtime.command_line import stop_requests_raised
 
-PAGE, SUMMARY = "campaign.html", "summary.json"
+PAGE, SUMMARY = CAMPAIGN_PAGE, SUMMARY_FILE
 _NONE = "–"
 _MOST_ROWS = 40
 """Rows of a table in the terminal."""

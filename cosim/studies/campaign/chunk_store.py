@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from cosim.record.run_directory import SCENARIO_FILE, SUMMARY_FILE
+from cosim.record.run_directory import CAMPAIGN_FILE, LATEST, SCENARIO_FILE, SUMMARY_FILE
 from cosim.studies.campaign.arithmetic import arithmetic, difference
 from cosim.studies.campaign.campaign_file import Campaign
 from cosim.studies.campaign.campaign_grid import Point, row_type
@@ -26,7 +26,7 @@ from cosim.studies.campaign.campaign_workers import Chunk, LostWorkersError, Oth
 from noack.core.errors import CallerError, ExitStatus, MachineError, NoackError, shortened, why
 from noack.core.file_access import PARTIAL, create_folder, locked, remove_file, write_whole
 
-RUNS, MANIFEST = "runs", "campaign.json"
+RUNS = "runs"
 _LOCK = ".lock"
 _FORMAT = 1
 """Version of the files; those of another one are not read."""
@@ -146,6 +146,7 @@ def locked_folder(campaign: Campaign, base: Mapping[str, object], store: Store) 
     }
     manifest = json.loads(json.dumps(manifest, default=str))
     with ExitStack() as stack:
+        _refuse_runs(folder)
         try:
             create_folder(folder)
             if not stack.enter_context(locked(folder / _LOCK)):
@@ -164,14 +165,22 @@ def locked_folder(campaign: Campaign, base: Mapping[str, object], store: Store) 
         yield
 
 
+def _refuse_runs(folder: Path) -> None:
+    """Raise CallerError for a folder with results that are no campaign's; nothing is written there."""
+    if (folder / CAMPAIGN_FILE).exists():
+        return
+    if any((folder / name).exists() for name in (RUNS, SUMMARY_FILE, SCENARIO_FILE)):
+        raise CallerError(f"{folder}: holds results, but no {CAMPAIGN_FILE}; give another --out")
+    if (folder / LATEST).is_symlink() or any(folder.glob(f"*/{SCENARIO_FILE}")):
+        raise CallerError(f"{folder}: a folder of run directories; give another --out")
+
+
 def _claim(folder: Path, manifest: Mapping[str, object]) -> Mapping[str, str]:
     """Write or check the folder's manifest; return the code and libraries of its runs."""
-    path = folder / MANIFEST
+    path = folder / CAMPAIGN_FILE
     try:
         stored_manifest = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        if any((folder / name).exists() for name in (RUNS, SUMMARY_FILE, SCENARIO_FILE)):
-            raise CallerError(f"{folder}: holds results, but no {MANIFEST}; give another --out") from None
         write_whole(path, json.dumps(manifest, indent=1))
         stored_manifest = dict(manifest)
     except ValueError:

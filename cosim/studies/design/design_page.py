@@ -27,9 +27,9 @@ from cosim.output.figures.figure_files import save_figures
 from cosim.output.figures.figure_format import FigureFiles
 from cosim.output.page_kit import templates
 from cosim.output.result_tables import ResultTable, terminal_table
+from cosim.record.run_directory import write_output
 from cosim.studies.design.design_outcome import HEIGHT_IN, DesignOutcome
 from cosim.studies.design.design_search import WORDS, DesignResult, certified
-from noack.core.file_access import write_whole
 from noack.core.number_format import plus_minus
 from noack.scenario.scenario_file import dumps
 
@@ -49,7 +49,7 @@ def _write(
 ) -> list[Path]:
     template = templates(Path(__file__).parent).get_template("design.html.jinja")
     html = template.render(figure=figure, **content)
-    return [write_whole(path, html), *save_figures([figure], path, figure_files)]
+    return [write_output(path, html), *save_figures([figure], path, figure_files)]
 
 
 def write_page(result: DesignResult, path: Path, figure_files: FigureFiles | None = None) -> list[Path]:

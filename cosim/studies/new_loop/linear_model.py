@@ -10,9 +10,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cosim.record.run_directory import write_output
 from cosim.studies.new_loop.plant_reference import PlantReference, plant_reference
 from noack.core.errors import CallerError
-from noack.core.file_access import write_whole
 from noack.core.linear_systems import Matrix, Vector, norm
 from noack.core.number_format import TextRows, as_text, to_digits
 from noack.plants.systems.linearisation import LinearMotion, largest_errors
@@ -428,7 +428,7 @@ def write_document(result: LinearModel | LoopGain, path: Path) -> None:
     document = result.to_json()
     if path.exists() and (other_plant := read_document(path)["plant"]) != document["plant"]:
         raise CallerError(f"--out {path}: has the model of {other_plant}; give another name")
-    write_whole(path, json.dumps(document, indent=2))
+    write_output(path, json.dumps(document, indent=2))
 
 
 def model_or_gain(plant: str, settings: ReadTable) -> LinearModel | LoopGain:

@@ -16,6 +16,8 @@ import pytest
 from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.api.runs import open_run
 from cosim.record.run_directory import (
+    CAMPAIGN_FILE,
+    ENVIRONMENT_FILE,
     LATEST,
     RECORD,
     REPORTS_FILE,
@@ -26,6 +28,8 @@ from cosim.record.run_directory import (
     loop_of_file,
     new_run_dir,
     point_to_latest,
+    require_run_directory,
+    write_output,
 )
 from cosim.record.run_record import load_record
 from cosim.record.spool_conversion import finish_record
@@ -187,3 +191,41 @@ def test_the_docs_describe_the_common_columns() -> None:
 def test_the_docs_describe_every_table(table: Table) -> None:
     described = f"`{table.name}` ({table.owner}): one row per {table.row}. "
     assert described + markdown(table.columns) in TEXT
+
+
+# --- folders of another kind ----------------------------------------------------------------------
+
+
+@pytest.fixture(params=["campaign", "run"])
+def held(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Path, str]:
+    """A folder with results, and what it is in words."""
+    folder = tmp_path / "held"
+    folder.mkdir()
+    files_of = {"campaign": [CAMPAIGN_FILE], "run": [SCENARIO_FILE, ENVIRONMENT_FILE]}
+    for name in (*files_of[request.param], "summary.json"):
+        (folder / name).write_text("its own")
+    holders = {"campaign": "the folder of a campaign", "run": "the directory of a run"}
+    return folder, holders[request.param]
+
+
+def test_no_run_is_made_in_the_folder_of_other_results(held: tuple[Path, str]) -> None:
+    folder, holder = held
+    with pytest.raises(CallerError, match=f"held: {holder}, not a folder of run directories"):
+        new_run_dir(folder, "a")
+    assert all(entry.read_text() == "its own" for entry in folder.iterdir())
+
+
+@pytest.mark.parametrize("name", ["summary.json", "scenario.toml", "report.html", "campaign.html"])
+def test_no_output_replaces_a_file_of_a_run_or_a_campaign(held: tuple[Path, str], name: str) -> None:
+    folder, holder = held
+    with pytest.raises(CallerError, match=f"{name}: is a file of {holder}; give another name"):
+        write_output(folder / name, "a page")
+    assert not (folder / name).exists() or (folder / name).read_text() == "its own"
+    write_output(folder / "overlay.html", "a page")
+    write_output(folder.parent / name, "a page")
+
+
+def test_a_campaigns_folder_is_no_run_directory(tmp_path: Path) -> None:
+    (tmp_path / CAMPAIGN_FILE).write_text("{}")
+    with pytest.raises(CallerError, match=r"not a run directory \(the folder of a campaign\)"):
+        require_run_directory(tmp_path)

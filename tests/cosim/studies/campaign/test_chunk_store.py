@@ -167,6 +167,11 @@ def test_a_folder_in_use_or_of_other_content_is_refused(
     for folder in ("mine", "run"):
         with pytest.raises(CallerError, match="holds results"):
             use(path, tmp_path / folder)
+    assert [entry.name for entry in (tmp_path / "run").iterdir()] == ["summary.json"]
+    (tmp_path / "of runs" / "20260101-000000-a").mkdir(parents=True)
+    (tmp_path / "of runs" / "20260101-000000-a" / "scenario.toml").write_text("")
+    with pytest.raises(CallerError, match="of runs: a folder of run directories; give another --out"):
+        use(path, tmp_path / "of runs")
     for text in ("nonsense", '{"arithmetic": 3}'):
         (tmp_path / "mine" / "campaign.json").write_text(text)
         with pytest.raises(CallerError, match=r"campaign\.json: not a manifest of a campaign; "):
