@@ -70,11 +70,16 @@ def shipped_names(folder: str) -> list[str]:
 def all_shipped(folder: str) -> list[ShippedFile]:
     """Return the scenarios or campaigns that come with noack, by name."""
     paths = [_path_of(name, folder) for name in shipped_names(folder)]
-    contents = [tomllib.loads(path.read_text(encoding="utf-8")) for path in paths]
-    return [
-        ShippedFile(path.stem, content["description"], path)
-        for path, content in zip(paths, contents, strict=True)
-    ]
+    return [ShippedFile(path.stem, _description_in(path), path) for path in paths]
+
+
+def _description_in(path: Path) -> str:
+    """Return the description in a file, which an extension's may lack: also if it is not TOML."""
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        return f"not a TOML file: {error}"
+    return str(content.get("description", ""))
 
 
 def text_of(name: str) -> str:
