@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from noack.protocol.wire_format import HEADER_BYTES, TAG_BYTES, Encoder, Flow, Message
-from tests.oracles.capture_files import Sent, pcapng_of
+from tests.oracles.capture_files import Sent, pcap_of
 
 Tshark = Callable[..., str]
 
@@ -26,10 +26,7 @@ def tshark(tmp_path: Path) -> Tshark:
 
     def run(capture: Path, *arguments: str) -> str:
         done = subprocess.run(
-            [
-                program, "-n", "-r", str(capture),
-                "-o", "udp.check_checksum:TRUE", "-o", "ip.check_checksum:TRUE", *arguments,
-            ],
+            [program, "-n", "-r", str(capture), *arguments],
             env={"HOME": str(tmp_path), "LC_ALL": "C.UTF-8", "PATH": "/usr/bin:/bin"},
             capture_output=True, text=True, check=False, timeout=60,
         )  # fmt: skip
@@ -49,8 +46,8 @@ Fields = dict[str, list[dict[str, str]]]
 
 
 def capture_of(folder: Path, *payloads: bytes) -> Path:
-    path = folder / "capture.pcapng"
-    path.write_bytes(pcapng_of(*(Sent(T_NS, payload, destination_port=PORT) for payload in payloads)))
+    path = folder / "capture.pcap"
+    path.write_bytes(pcap_of(*(Sent(T_NS, payload, destination_port=PORT) for payload in payloads)))
     return path
 
 
