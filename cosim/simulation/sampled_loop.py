@@ -72,6 +72,15 @@ class Runs(NamedTuple):
     state_at: Numbers
 
 
+def _without_model(resolved: Scenario) -> Scenario:
+    """Return the scenario with a watchdog that needs no model in the actuations.
+
+    Its policy makes no difference: nothing is late, so the watchdog never acts.
+    """
+    watchdog = resolved.plant.watchdog.model_copy(update={"policy": "hold"})
+    return resolved.model_copy(update={"plant": resolved.plant.model_copy(update={"watchdog": watchdog})})
+
+
 class SampledLoop:
     """The loop of a resolved scenario; every delivered update takes the longest certified delay.
 
@@ -102,7 +111,7 @@ class SampledLoop:
         self._C, self._gains = assumed.C, np.zeros((0, n, len(assumed.C)))
         if resolved.observer is not None:
             self._gains = _dense(np.array([*islice(resolved.observer.gains(assumed), measurements)]))
-        loops = (resolved,)
+        loops = (_without_model(resolved),)
         self._machines = (plants_of(loops), sensors_of(loops), controllers_of(loops))
         self._set_disturbances(state_increments(resolved), noise_of(resolved))
 

@@ -15,8 +15,9 @@ from pydantic import (
     model_validator,
 )
 
-from noack.core.errors import ExitStatus
+from noack.core.errors import CallerError, ExitStatus
 from noack.core.number_format import at_least, at_most
+from noack.scenario.scenario import few_of
 
 
 def _or_none(value: object) -> object:
@@ -470,14 +471,17 @@ class RunSummary(SummaryPart):
         """Return the summary with one loop only; it ended as this loop did.
 
         Raises:
-            KeyError: there is no loop of this name.
+            CallerError: there is no loop of this name, as in the summary of another run.
         """
         for loop in self.loops:
             if loop.name == name:
                 only = {"loops": [loop], "exit": loop.exit, "changes": loop.changes}
                 scenario = self.scenario if len(self.loops) == 1 else name
                 return self.model_copy(update=only | {"scenario": scenario, "reached_s": loop.reached_s})
-        raise KeyError(name)
+        raise CallerError(
+            f"summary.json: has no loop {name}, but {few_of([loop.name for loop in self.loops])}; if it is "
+            "of another run, remove it: `noack summary RUN` computes it again"
+        )
 
     def to_json(self) -> dict[str, object]:
         """The content of ``summary.json``."""

@@ -162,9 +162,10 @@ def _exported_run(run_dir: Path, loop: str | None) -> ExportedRun:
         summary = read_summary(content)
         loop_summary = summary.of_loop(record.scenario.name).to_json() if summary else content
         return ExportedRun(run_dir, record, loop_summary)
-    parts = dict(zip(run.names, content.get("loops", []), strict=False))
+    parts = content.get("loops")
+    by_name = dict(zip(run.names, parts if isinstance(parts, list) else [], strict=False))
     loops = [
-        ExportedRun(run_dir, record, parts.get(name, {}), (), name, phase_ns)
+        ExportedRun(run_dir, record, by_name.get(name, {}), (), name, phase_ns)
         for name, record, phase_ns in zip(run.names, run.loops, run.phases_ns, strict=True)
     ]
     return ExportedRun(run_dir, run.network, content, loops)

@@ -67,3 +67,17 @@ def test_ctrl_c_leaves_the_finished_objectives(monkeypatch: pytest.MonkeyPatch) 
     line = "noack: stopped by the user (SIGINT); missing: cost, inter-event"
     assert (result.exit_code, result.stderr.splitlines()[-1]) == (130, line)
     assert "state: " in invoke("adversary", "double_integrator", *arguments).stdout
+
+
+def test_the_policy_of_the_watchdog_makes_no_difference() -> None:
+    """Nothing is late in a search, so it never acts; "model" needs x_c in the actuations otherwise."""
+    arguments = ["--horizon", "0.5", "--nodes", "100", "--json", "--set"]
+    results = [
+        invoke("adversary", "double_integrator", *arguments, f'plant.watchdog={{policy="{policy}"}}')
+        for policy in ("hold", "model")
+    ]
+    assert [result.exit_code for result in results] == [ExitStatus.OK] * 2, results[1].output
+    held, modelled = (json.loads(result.stdout)["worst"] for result in results)
+    for objective, worst in held.items():
+        for key in ("value", "pattern", "tightness"):
+            assert modelled[objective].get(key) == worst.get(key)
