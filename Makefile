@@ -8,6 +8,8 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11; 
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes
+# Says what is being done, and every 8 s that it goes on; with --late only then.
+SAY := $(BIN)/python tools/with_progress.py
 EDITABLE := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 
 SCENARIO ?= scenarios/lane_following.toml
@@ -136,8 +138,8 @@ soak: setup-dev ## Soak test: one hour, then a simulated day at speed 48; MINUTE
 check: setup-dev ## Lint, format, strict types, import rules; the core in C without a warning
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
-	$(BIN)/lint-imports
+	$(SAY) --late "checking types" $(BIN)/mypy
+	$(SAY) --late "checking imports" $(BIN)/lint-imports
 	$(BIN)/clang-format --dry-run --Werror $(C_FILES)
 	$(BIN)/python native/build.py --check
 
@@ -160,30 +162,32 @@ schema: setup ## Write the JSON Schemas of scenario, campaign and links files to
 	$(BIN)/noack schema --netem > docs/netem.schema.json
 
 docs: setup-dev ## Build the documentation site into site/; a warning is an error
-	$(BIN)/sphinx-build -b html -E -W --keep-going --jobs auto --quiet docs site
+	$(SAY) "building the site" $(BIN)/sphinx-build -b html -E -W --keep-going --jobs auto --quiet docs site
 	@echo site/index.html
 
 docs-serve: docs ## Build the site and serve it on http://127.0.0.1:8000
 	$(BIN)/python -m http.server --bind 127.0.0.1 --directory site 8000
 
 lock: setup-dev ## Update the pinned dependencies
-	$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
+	$(SAY) "resolving dependencies" $(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 		--no-header pyproject.toml --extra viewer --group build -o requirements.lock
 	$(BIN)/python tools/extension_requirements.py | \
-		$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
+		$(SAY) "resolving dependencies" $(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 		--no-header pyproject.toml - --extra viewer --group build --group dev --group docs -c requirements.lock -o requirements-dev.lock
 	$(BIN)/python tools/extension_requirements.py noack-lab | \
-		$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
+		$(SAY) "resolving dependencies" $(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 		--no-header pyproject.toml - --extra viewer -c requirements-dev.lock -o requirements-lab.lock
-	$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
+	$(SAY) "resolving dependencies" $(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 		--no-header --group compiler -o requirements-compiler.lock
 
 dist: setup-dev ## Build the sdist, and from it the wheels for Linux, macOS and Windows, into dist/
 	@rm -rf dist
-	$(PIP) -r requirements-compiler.lock
-	$(BIN)/uv build --quiet --sdist --no-build-isolation --out-dir dist .
-	@for platform in $$($(BIN)/python native/build.py --platforms); do \
-		NOACK_PLATFORM=$$platform $(BIN)/uv build --quiet --wheel --no-build-isolation --out-dir dist \
+	@$(SAY) "installing the compiler for all platforms" $(PIP) -r requirements-compiler.lock
+	@$(SAY) "building the sdist" $(BIN)/uv build --quiet --sdist --no-build-isolation --out-dir dist .
+	@set -- $$($(BIN)/python native/build.py --platforms); number=0; \
+	for platform; do number=$$((number + 1)); \
+		NOACK_PLATFORM=$$platform $(SAY) "building wheel $$number of $$#, for $$platform" \
+			$(BIN)/uv build --quiet --wheel --no-build-isolation --out-dir dist \
 			dist/noack-*.tar.gz || exit; done
 	@ls -s --block-size=K dist/*
 
@@ -193,42 +197,38 @@ clean: ## Remove the environment and caches, not runs/
 
 $(VENV)/bin/python:
 	@test -n "$(PYTHON)" || { echo "noack needs Python >= 3.11; none found (set PYTHON=...)" >&2; exit 2; }
-	@echo "making $(VENV) with $(PYTHON) ..."
-	@$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
+	@$(PYTHON) tools/with_progress.py "making $(VENV) with $(PYTHON)" $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
 		echo "noack needs Python's venv module (Debian: apt-get install python3-venv)" >&2; exit 2; }
 
 $(VENV)/.dependencies: requirements.lock | $(VENV)/bin/python
-	@echo "installing pinned dependencies ..."
 	@# On another core meanwhile the library in C; the target core reports what fails of it.
 	@$(BIN)/python native/build.py --library > /dev/null 2>&1 & \
-		$(PIP) --no-compile -r requirements.lock; status=$$?; wait; exit $$status
+		$(SAY) "installing pinned dependencies" $(PIP) --no-compile -r requirements.lock; status=$$?; wait; exit $$status
 	@# pip would do it on one core.
-	@$(BIN)/python -m compileall -q -q -j 0 $(VENV)/lib || true
+	@$(SAY) "compiling their modules" $(BIN)/python -m compileall -q -q -j 0 $(VENV)/lib || true
 	@touch $@
 
 # It builds if a source has changed, else it does nothing. Exit status 3: there is no C compiler.
 .PHONY: core
 core: $(VENV)/.dependencies
-	@$(BIN)/python native/build.py 2> $(VENV)/build.log || { status=$$?; \
+	@$(SAY) --late "building the core" $(BIN)/python native/build.py 2> $(VENV)/build.log || { status=$$?; \
 		[ $$status = 3 ] || { cat $(VENV)/build.log >&2; exit $$status; }; \
-		echo "no C compiler here: installing ziglang, which has one ..."; \
-		$(PIP) -r requirements-compiler.lock && $(BIN)/python native/build.py; }
+		$(SAY) "no C compiler here: installing ziglang, which has one" $(PIP) -r requirements-compiler.lock && \
+		$(SAY) --late "building the core" $(BIN)/python native/build.py; }
 
 $(VENV)/.installed: $(VENV)/.dependencies pyproject.toml | core
-	@$(EDITABLE)
+	@$(SAY) --late "installing noack" $(EDITABLE)
 	@# Else each process compiles its modules anew where PYTHONDONTWRITEBYTECODE is set.
-	@$(BIN)/python -m compileall -q -j 0 noack netem cosim plant_server sensor_node controller_node
+	@$(SAY) --late "compiling modules" $(BIN)/python -m compileall -q -j 0 noack netem cosim plant_server sensor_node controller_node
 	@touch $@
 
 $(VENV)/.installed-lab: requirements-lab.lock $(VENV)/.installed
-	@echo "installing the lab page ..."
-	@$(PIP) -r requirements-lab.lock
-	@$(EDITABLE) -e extensions/noack-lab
+	@$(SAY) "installing the lab page" $(PIP) -r requirements-lab.lock
+	@$(SAY) --late "installing the lab page" $(EDITABLE) -e extensions/noack-lab
 	@touch $@
 
 $(VENV)/.installed-dev: requirements-dev.lock $(EXTENSIONS:=/pyproject.toml) $(VENV)/.installed
-	@echo "installing development tools ..."
 	@# A tool's modules are compiled when it first runs: most never are.
-	@$(PIP) --no-compile -r requirements-dev.lock
-	@$(EDITABLE) $(addprefix -e ,$(EXTENSIONS))
+	@$(SAY) "installing development tools" $(PIP) --no-compile -r requirements-dev.lock
+	@$(SAY) "installing the extensions" $(EDITABLE) $(addprefix -e ,$(EXTENSIONS))
 	@touch $@
