@@ -193,8 +193,10 @@ def _with_wraps(
         step, pause = int(steps[i - 1]), float(pauses[i - 1])
         # Packets that have waited during a pause arrive together after it: only behind them does the
         # level show the network's usual delay.
-        following = level[i : i + _NEIGHBOURS + min(int(pause), len(level))]
-        rise = float(following.min() - level[max(begin, i - _NEIGHBOURS) : i].min())
+        before = float(level[max(begin, i - _NEIGHBOURS) : i].min())
+        waiting = min(max(pause, float(level[i]) - before, 0.0), len(level))
+        following = level[i : i + _NEIGHBOURS + int(waiting)]
+        rise = float(following.min()) - before
         wraps = round(rise / cycle)
         allowed = max(_DELAY_CHANGE_NS / period_ns, _DELAY_CHANGE_SHARE * pause, 6 * spread)
         allowed = min(allowed, _MOST_OF_CYCLE * cycle)
@@ -209,6 +211,10 @@ def _with_wraps(
                 continue
             part[i] = 1
         elif step > _CLEAR and abs(rise) > allowed:
+            # While a queue empties, the level falls to where it was before; only a restart is below.
+            lowest = float(level[begin:i].min()) - allowed - error * (i - begin)
+            if rise < 0 and following.min() > lowest:
+                continue
             part[i] = 1
         else:
             continue

@@ -111,6 +111,18 @@ def test_packets_that_wait_in_a_queue_are_not_taken_for_lost_ones(waited: int) -
     assert find_packets(number, t_ns, 8).packet.tolist() == list(range(4000))
 
 
+@pytest.mark.parametrize("bits", [8, 16, 32])
+def test_losses_while_a_queue_empties_are_no_restart(bits: int) -> None:
+    number = np.arange(6000)
+    t_ns = T_NS + number * 5 * 10**6
+    t_ns[3000:3900] = t_ns[3900] - np.arange(900, 0, -1)  # 4.5 s of packets arrive at once
+    keep = np.ones(6000, bool)
+    keep[3200:3212] = keep[3600:3611] = False
+    arrivals = find_packets((number % 2**bits).astype(np.uint64)[keep], t_ns[keep], bits)
+    assert arrivals.packet.tolist() == number[keep].tolist()
+    assert not arrivals.part.any()
+
+
 def test_packets_that_arrive_in_groups_show_the_period() -> None:
     t_ns = T_NS + np.arange(4000) // 10 * 10 * PERIOD_NS
     keep = (np.arange(4000) < 2000) | (np.arange(4000) >= 2700)
