@@ -127,6 +127,8 @@ def state_text(
         if first is not None and largest > first and top != start:
             return f"{word}, {norm} was {start} at the start, at most {top}, at the end {final:.3g}"
         return f"{word}, {norm} fell from {top} to {final:.3g}"
+    if first is not None and final > _MOST_GROWTH * first > 0:
+        return f"{norm} grew from {first:.3g} to {final:.3g}, it was at most {largest:.3g}"
     return f"{word}, {norm} was at most {largest:.3g}, at the end {final:.3g}"
 
 
@@ -235,7 +237,9 @@ def _reason(loop: LoopSummary) -> GuaranteeVerdict:
     claim = min(candidates, key=lambda claim: (claim.since_s or 0.0, _why(claim)))
     reason, late = _why(claim), _lateness(loop)
     if late and late[0] == reason and not loop.missing_samples:
-        reason = f"at worst {reason}; no certificate covers that"
+        covered = any(other.is_certified and other.verdict == "held" for other in loop.claims)
+        missing = f"the {claim.source} does not cover that" if covered else "no certificate covers that"
+        reason = f"{reason}; {missing}"
     return GuaranteeVerdict(Tone.DOUBTFUL, claim.since_s or 0.0, reason, claim.lacks_loop_gain)
 
 
@@ -325,10 +329,10 @@ def remarks(summary: RunSummary) -> Iterator[Remark]:
         if violation.what not in reason and not (violation.cause in SCHEDULE and _covers_lateness(loop))
     ]
     for violation in violations[:_MOST_VIOLATIONS]:
-        where = f"t = {violation.t_s:.3f} s (reported by {violation.process})"
+        where = f"from t = {violation.t_s:.3f} s on (reported by {violation.process})"
         what = violation.what + worst_time(violation.t_s, violation.worst_at_s)
         severe = violation.cause not in CAUSES  # the guarantee, or a change
-        yield Remark(f"assumption violated at {where}: {what}", severe=severe)
+        yield Remark(f"assumption violated {where}: {what}", severe=severe)
     if (more := len(violations) - _MOST_VIOLATIONS) > 0:
         plural = "s" if more > 1 else ""
         yield Remark(f"{more} more violation{plural} of an assumption", severe=True)

@@ -331,7 +331,12 @@ class TheoryCoverage:
     @property
     def some_certificate_applies(self) -> bool:
         """Whether certificates apply: those of linear plants, or that of a plant on a region."""
-        return (self._beyond_any_certificate or self.scenario.trigger.beyond_exact) is None
+        return self.beyond_certificates is None
+
+    @property
+    def beyond_certificates(self) -> str | None:
+        """The first setting that no certificate covers, also none on a region; None if one may."""
+        return self._beyond_any_certificate or self.scenario.trigger.beyond_exact
 
     @property
     def is_undisturbed(self) -> bool:

@@ -32,7 +32,7 @@ from noack.core.number_format import at_least, at_most
 from noack.scenario.resolution import setpoint_of
 from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.conditions import BOX, void_at_setpoint
+from noack.theory.certificates.conditions import BOX, OWN_PLANT, void_at_setpoint
 from noack.theory.certificates.scenario_certificates import outside_box
 
 _IDEAL_LOOP = "assumes a continuous trigger, and a network and input without delay, which no sampled loop has"
@@ -238,6 +238,8 @@ class RunClaims:
         if self.record.scenario.protocol.acknowledges:
             return [void_claim("x_c − x_s is the sum of the missed jumps", "(I1)", _ACKNOWLEDGED)]
         claims: list[Claim] = []
+        if (uncovered := self.record.scenario.coverage.beyond_certificates) is not None:
+            claims.append(void_claim(f"a certificate for {OWN_PLANT}", "certificate", uncovered))
         for certificate in (None, *self.certified_evidence.certificates):
             if certificate is not None and not certificate.exists:
                 claimed = f"a certificate for {certificate.scope}"

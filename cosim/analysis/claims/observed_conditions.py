@@ -34,11 +34,12 @@ def clock_cause(role: str) -> str:
 CLOCK_CAUSES = tuple(clock_cause(role) for role in RECEIVED)
 """The assumptions about clocks, on which all claims depend; see ``docs/derivations.md``."""
 CAUSES = {
-    "sampling": "no measurement for {:.4g} s, {:.4g} s allowed",
-    "delay": "an update took effect after {:.4g} s, {:.4g} s allowed",
-    "hold": "an input was {:.4g} s old, {:.4g} s allowed",
-    "start": "the plant applied no input until {:.4g} s, {:.4g} s allowed",
-    "watchdog": "the watchdog replaced the input: the newest actuation was {:.4g} s old, {:.4g} s allowed",
+    "sampling": "no measurement for up to {:.4g} s, {:.4g} s allowed",
+    "delay": "an update took effect up to {:.4g} s after its event, {:.4g} s allowed",
+    "hold": "the applied input was up to {:.4g} s old, {:.4g} s allowed",
+    "start": "the plant applied its first input at {:.4g} s, {:.4g} s allowed",
+    "watchdog": "the watchdog replaced the input: the newest actuation was up to {:.4g} s old, {:.4g} s "
+    "allowed",
     "safe input": "the controller had no state and sent its safe input, largest entry {:.4g}",
     **{clock_cause(role): causality_text(role) for role in RECEIVED},
 }
@@ -53,6 +54,8 @@ A certificate holds for every run that meets its conditions, however they were c
 was later than its scenario allows has the certificate for the times that it took, if there is one.
 """
 DROPOUTS = LongestBurst(0).name
+_NOT_WITHIN = "an update had not taken effect {:.4g} s after its event, when the run ended; {:.4g} s allowed"
+"""In place of the delay of an update that never took effect."""
 _NO_INPUT = "the plant applied no input at all, the first within {1:.4g} s required"
 """In place of a time until the first input, which is the only condition without an upper limit."""
 
@@ -132,9 +135,9 @@ class AssumptionViolation(NamedTuple):
 
 
 def worst_time(t_s: float, worst_at_s: float | None) -> str:
-    """Return how long after a violation its largest excess was, in words; empty if it was the first."""
-    later_s = 0.0 if worst_at_s is None else worst_at_s - t_s
-    return f" (worst {later_s:.3f} s later)" if later_s > 0 else ""
+    """Return in words when the largest excess of a violation was; empty if it was the first."""
+    later = worst_at_s is not None and worst_at_s > t_s
+    return f" (the worst value at t = {worst_at_s:.3f} s)" if later else ""
 
 
 class ObservedConditions(NamedTuple):
@@ -209,6 +212,8 @@ class ObservedConditions(NamedTuple):
                 continue
             if (excess := series.excess(limit)) is not None:
                 message = _NO_INPUT if excess.worst == np.inf else CAUSES[cause]
+                if cause == "delay" and excess.worst_at_s + excess.worst >= self.reached_s - _TOLERANCE_S:
+                    message = _NOT_WITHIN
                 text = message.format(excess.worst, limit)
                 violations.append(
                     AssumptionViolation(excess.first_s, cause, excess.worst, text, excess.worst_at_s)

@@ -254,6 +254,9 @@ def margin(
     The verdict holds for all times of events that the policy allows. Exit status 1: the loop is not
     proven stable for any M.
 
+    --play takes the scenario's horizon, or a longer one, up to 10 minutes, at which the growth of
+    ‖x‖ shows, and prints what to expect.
+
     Takes some seconds; minutes where the times of events vary, as with a deadline.
     """
     from cosim.analysis.margin_search import find_margin
@@ -287,9 +290,12 @@ def margin(
     if (pattern := result.destabilised) is None:
         raise CallerError(f"--play: no destabilising pattern was found for M up to {most}")
     from cosim.cli.execute_run import run_processes
+    from cosim.cli.played_pattern import until_it_shows
 
-    played = opt.load_loop(scenario, [*(settings or ()), *pattern.settings], loop)
-    return run_processes(played, runs, server=context.obj)
+    with status("trying how long the pattern must be played until its growth shows"):
+        played = until_it_shows(opt.load_loop(scenario, [*(settings or ()), *pattern.settings], loop))
+    print(played.expected, flush=True)
+    return run_processes(played.scenario, runs, server=context.obj)
 
 
 @app.command(

@@ -125,12 +125,13 @@ def exact_run_of(scenario: noack.Scenario) -> ShownRun:
 def guarantee_of(scenario: noack.Scenario) -> Guarantee:
     """Return what is certified; that nothing is, is no error."""
     try:
-        certificate = noack.certify(scenario).schedule
+        certificates = noack.certify(scenario)
     except noack.NoackError as error:
         return Guarantee(VerdictText(f"no certificate: {error}", "doubt"), [], [])
-    constants = certificate.constants
-    if constants is None:
-        return Guarantee(VerdictText(f"no certificate: {certificate.void}", "doubt"), [], [])
+    certificate, answer = certificates.of_own_plant, certificates.answer
+    constants = None if certificate is None else certificate.constants
+    if certificate is None or constants is None:
+        return Guarantee(VerdictText(answer.text, "doubt"), [], [])
     t_s = np.linspace(0.0, scenario.horizon_s, _POINTS)
     style = noack.CurveStyle(_GREEN, 1.6, _DASHED)
     with np.errstate(all="ignore"):
@@ -147,7 +148,7 @@ def guarantee_of(scenario: noack.Scenario) -> Guarantee:
     ]
     decay = f"all errors decay at {_number(constants.rate_per_s)} /s" if constants.rate_per_s > 0 else ""
     words = decay or "all errors stay bounded"
-    line = VerdictText(f"certified: {words}, for every loss pattern that the guarantee allows", "good")
+    line = VerdictText(f"{answer.text}: {words}, for every loss pattern that the guarantee allows", "good")
     curves = [noack.Curve(panel, "certified bound", "", t_s, values, style) for panel, values in bounds]
     return Guarantee(line, curves, facts)
 

@@ -21,7 +21,7 @@ def test_results_are_those_of_the_library() -> None:
     certificate = noack.certify(scenario).schedule
     bound = explorer.certificate.curves[0]
     np.testing.assert_array_equal(bound.values, certificate.controller_error(bound.t_s))
-    assert explorer.certificate.line.text.startswith("certified: all errors decay at 0.25 /s")
+    assert explorer.certificate.line.text.startswith("certified: the scenario's plant")
     assert "longest time" in explorer.margin  # an event trigger has none
 
 

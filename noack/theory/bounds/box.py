@@ -178,7 +178,7 @@ class BoxGains(PlantGains):
         from_w = np.array([peaks.from_w for peaks in self._coordinates])
         loop = self._halfwidths @ from_w
         if len(loop) and np.abs(np.linalg.eigvals(loop)).max() >= 1:
-            raise NotDecayingError("the uncertainty box is too large for the loop's gains")
+            raise NotDecayingError("the plants differ too much from the model for the loop's gains")
         known = (coordinates @ self._halfwidths.T)[..., None]
         return np.asarray(np.linalg.solve(np.eye(len(loop)) - loop, known)[..., 0])
 

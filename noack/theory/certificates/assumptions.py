@@ -287,7 +287,9 @@ def certificate_assumptions(
     if constants is None:
         is_unchecked = isinstance(void, CertificateNotCheckedError)
         status = AssumptionStatus.NOT_CHECKED if is_unchecked else AssumptionStatus.VIOLATED
-        checked.append(Assumption("there is a certificate", "certificate", status, str(void)))
+        is_gain = str(void).startswith("the loop gain")
+        condition = "small-gain condition" if is_gain else "condition of the certificate"
+        checked.append(Assumption(condition, "certificate", status, str(void)))
     else:
         why = f"the loop gain of the errors is {apart_from(1, loop_gain)}, below 1"
         checked.append(_checked("small-gain condition", "certificate", True, why))

@@ -198,7 +198,7 @@ class ConstantsSearch:
             rate = share * alpha_per_s
             with contextlib.suppress(NotDecayingError):
                 return self._solve(conditions, rate, self._trigger.beta, None)
-        raise NotDecayingError("the uncertainty box is too large for the loop's gains")
+        raise NotDecayingError("the plants differ too much from the model for the loop's gains")
 
     def _solve(
         self,

@@ -67,7 +67,7 @@ def test_a_broken_guarantee_is_shown_as_an_error(outcome: Outcome) -> None:
     lost = {"t_s": 2.5, "process": "controller", "cause": "dropouts", "what": "MANSD violated: 6 lost"}
     later_violations = [lost | {"what": f"MANSD violated: {n} lost"} for n in range(7, 13)]
     text = printed(outcome, assumption_violations=[lost, *later_violations])
-    assert text.count("assumption violated at t = 2.500 s (reported by controller): MANSD") == 5
+    assert text.count("assumption violated from t = 2.500 s on (reported by controller): MANSD") == 5
     assert "1 more violation of an assumption" in text
     assert RED in text
 

@@ -510,7 +510,7 @@ def test_the_summary_lists_every_violated_assumption() -> None:
     assert reported == []  # no process detects that an input is old
     (violation,) = list_violations(reported, RunClaims(outage).violations())
     assert (violation.cause, violation.t_s, violation.process) == ("hold", pytest.approx(0.506), "recorder")
-    assert violation.what == "an input was 0.203 s old, 0.007 s allowed"
+    assert violation.what == "the applied input was up to 0.203 s old, 0.007 s allowed"
     assert violation.worst_at_s == pytest.approx(0.7)
 
 

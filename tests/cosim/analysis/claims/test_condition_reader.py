@@ -144,7 +144,7 @@ def safe_input(make: Make) -> RunRecord:
         (deaf("netem", 10, 14), 12, "4 consecutive updates lost, 2 allowed"),
         (losing(10, 12, 14, constraint=IN_WINDOW), 14, "3 of 6 consecutive updates lost"),
         (losing(10, 12, 19, constraint=RECOVERY), 12, "only 1 delivered between two bursts"),
-        (deaf("sensor", 100, 103), 0.99, "no measurement for 0.04 s, 0.01 s allowed"),
+        (deaf("sensor", 100, 103), 0.99, "no measurement for up to 0.04 s, 0.01 s allowed"),
         (watchdog("zero"), 2.02, "the watchdog replaced the input: the newest actuation was "),
         (watchdog("model"), 2.02, "the watchdog replaced the input: the newest actuation was "),
         (safe_input, 0.01, "the controller had no state and sent its safe input, largest entry "),
@@ -205,8 +205,8 @@ def test_a_late_run_has_the_certificate_of_its_lateness(
 @pytest.mark.parametrize(
     ("violate", "why"),
     [
-        (lambda make: with_outage(make(), 2.0, 2.3), "an input was 0.315 s old, "),
-        (delayed(lambda n: 500), "the plant applied no input until 0.51 s, 0.01 s allowed"),
+        (lambda make: with_outage(make(), 2.0, 2.3), "the applied input was up to 0.315 s old, "),
+        (delayed(lambda n: 500), "the plant applied its first input at 0.51 s, 0.01 s allowed"),
     ],
 )  # fmt: skip
 def test_a_run_that_is_later_than_any_certificate_covers_is_void_from_then_on(

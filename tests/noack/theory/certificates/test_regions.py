@@ -184,5 +184,5 @@ def test_without_its_package_a_certificate_is_not_checked(monkeypatch: pytest.Mo
     monkeypatch.setattr(jacobian_enclosure, "find_spec", lambda name: None)
     certificate = certificate_of(CASES["pendulum"].resolved(), CASES["pendulum"].semi_axes)
     assert "noack[regions]" in (certificate.void or "")
-    (assumption,) = (a for a in certificate.assumptions if a.what == "there is a certificate")
+    (assumption,) = (a for a in certificate.assumptions if a.what == "condition of the certificate")
     assert assumption.verdict == AssumptionStatus.NOT_CHECKED

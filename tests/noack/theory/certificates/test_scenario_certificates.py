@@ -109,7 +109,7 @@ def test_a_void_certificate_gives_the_reason_and_no_bounds() -> None:
     for envelope in (certificate.sensor_error, certificate.controller_error, certificate.state):
         assert np.isnan(envelope(np.linspace(0, 9, 4))).all()
     assert (certificate.assumptions[-2].what, certificate.assumptions[-2].verdict) == (
-        "there is a certificate", AssumptionStatus.VIOLATED,
+        "condition of the certificate", AssumptionStatus.VIOLATED,
     )  # fmt: skip
     assert "not below 1" in str(certify(shipped(), NetworkConditions(4, 0.5, 0.5)).void)
     enormous = shipped("lane_following", "trigger.beta=1e308")

@@ -1,0 +1,64 @@
+"""certify, margin and the verdict of a run give the same answer about a scenario."""
+
+from pathlib import Path
+
+import pytest
+
+import noack
+from cosim.cli.options import load_scenario
+from cosim.cli.played_pattern import GROWN, until_it_shows
+from cosim.output.run_verdict import Tone
+from tests.helpers.command_line import invoke
+
+
+def guarantee_line(scenario: str, **settings: object) -> str:
+    line = noack.simulate(noack.load(scenario, {"horizon_s": 1.0, **settings})).verdict[1]
+    assert line.tone == Tone.DOUBTFUL
+    return line.text
+
+
+@pytest.mark.parametrize("name", ["model_predictive", "lane_python_trigger"])
+def test_a_run_that_no_certificate_covers_says_why_as_certify_does(name: str) -> None:
+    refused = invoke("certify", name)
+    assert refused.exit_code == 2
+    reason = refused.stderr.removeprefix("noack: ").removesuffix("; no certificate covers this\n")
+    assert guarantee_line(name) == f"guarantee not checkable: no certificate: {reason}"
+
+
+@pytest.mark.parametrize(
+    ("name", "is_certified"), [("lane_following", True), ("cart_pole", False), ("kinematic_car", True)]
+)
+def test_the_answer_of_certify_is_that_of_the_run(name: str, is_certified: bool) -> None:
+    answer = noack.certify(name).answer
+    assert answer.is_certified == is_certified
+    line = noack.simulate(noack.load(name, {"horizon_s": 1.0})).verdict[1]
+    assert line.tone == (Tone.GOOD if is_certified else Tone.DOUBTFUL)
+    if not is_certified:
+        reason = line.text.removeprefix("guarantee not checkable: no certificate: ")
+        assert answer.text.endswith(f": {reason}; only its model in its place has one")
+
+
+def test_what_is_violated_without_a_certificate_is_its_condition() -> None:
+    shown = " ".join(invoke("certify", "lane_periodic").stdout.split())
+    assert "violated small-gain condition (certificate): the loop gain of the errors is 1e+04" in shown
+    shown = " ".join(invoke("certify", "cart_pole").stdout.split())
+    assert "violated condition of the certificate (certificate): on the region" in shown
+    assert "there is a certificate" not in shown
+    assert "box is too large" not in shown
+
+
+def test_a_played_pattern_is_long_enough_to_show_its_growth(tmp_path: Path) -> None:
+    margin = noack.margin("lane_periodic", most_m=7, period=False)
+    assert margin.destabilised is not None
+    words = [word for setting in margin.destabilised.settings for word in ("--set", setting)]
+    short = invoke("simulate", "lane_periodic", "--no-report", "--runs", tmp_path, *words)
+    assert "stable, ‖x‖ fell from" in short.stdout  # 20 s show the decay of the other modes only
+    played = until_it_shows(load_scenario("lane_periodic", margin.destabilised.settings))
+    run = noack.simulate(played.scenario)
+    (loop,) = run.summary.loops
+    assert loop.initial_state_norm is not None
+    assert loop.final_state_norm is not None
+    assert loop.final_state_norm >= GROWN * loop.initial_state_norm
+    assert "‖x‖ grew from" in run.verdict[0].text
+    expected = f"in {played.scenario.horizon_s:g} s ‖x‖ goes from 3.04 to {loop.final_state_norm:.3g}"
+    assert played.expected == f"expected, as in virtual time: {expected}"
