@@ -57,10 +57,11 @@ async def show_page(services: LabServices) -> None:
     """Build the page for one visitor, and draw for the first time."""
     ui.add_css(_CSS)
     ui.colors(primary="#1f5f99", negative="#b3261e", warning="#8a5300", positive="#1b6e3c")
-    page = _Page(services)
+    page, client = _Page(services), ui.context.client
     page.build()
-    await ui.context.client.connected()
-    await page.open(services.draft)
+    await client.connected()
+    if not client.is_deleted:  # what asks for the page only, as a preview of links, never connects
+        await page.open(services.draft)
 
 
 class _Page:
@@ -218,7 +219,8 @@ class _Page:
         self._base = draft
         self._run = self._before = self._guarantee = None
         await self._change(lambda _: draft, "")
-        self._build_controls()
+        if not self._client.is_deleted:
+            self._build_controls()
 
     async def _change(self, change: Callable[[Draft], Draft], key: str) -> None:
         """Change the draft; of several changes during a redraw only the newest is drawn."""
@@ -254,11 +256,13 @@ class _Page:
             except noack.NoackError:
                 self._run = await self._services.compute(results.run_of, scenario)
             note, self._guarantee, self._margin = self._run.note, None, ""
+            is_wrong = False
         except noack.NoackError as error:
             note = f"{error}\nThe figure shows the settings before." if self._run else str(error)
-            self._chart.classes("lab-stale")
-        else:
-            self._chart.classes(remove="lab-stale")
+            is_wrong = True
+        if self._client.is_deleted:  # the visitor has left meanwhile
+            return
+        self._chart.classes(add="lab-stale" if is_wrong else None, remove=None if is_wrong else "lab-stale")
         self._explored_note = note
         self._note.set_text(note)
         self._draw()
@@ -266,6 +270,8 @@ class _Page:
     async def _compute_rest(self, draft: Draft) -> None:
         """Compute what takes longer, once the settings have rested for a moment."""
         await asyncio.sleep(_QUIET_S)
+        if self._client.is_deleted:
+            return
         if self._editor.value != draft.text:
             self._editor.set_value(draft.text)
         try:
@@ -297,7 +303,9 @@ class _Page:
         return self._run if self._source == EXPLORE else self._recorded
 
     def _draw(self) -> None:
-        """Show the chosen source: figure, verdict, key numbers."""
+        """Show the chosen source: figure, verdict, key numbers; nothing to a visitor who has left."""
+        if self._client.is_deleted:
+            return
         self._show_parts()
         run = self._shown()
         self._chart.set_visibility(run is not None)
@@ -433,10 +441,11 @@ class _Page:
         try:
             record = await self._services.compute(results.recorded_run, self._services.runs / name, loop)
         except noack.NoackError as error:
-            self._note.set_text(str(error))
+            if not self._client.is_deleted:
+                self._note.set_text(str(error))
             return
-        if name != self._runs.value:
-            return  # another one was chosen meanwhile
+        if name != self._runs.value or self._client.is_deleted:
+            return  # another one was chosen meanwhile, or the visitor has left
         self._recorded = record
         self._note.set_text("")
         self._report.props["href"] = f"report/{name}"
@@ -451,7 +460,8 @@ class _Page:
                 answer = await self._services.compute(results.replay, self._services.runs / name)
             except noack.NoackError as error:
                 answer = str(error)
-            self._note.set_text(answer)
+            if not self._client.is_deleted:
+                self._note.set_text(answer)
 
     def _notify(self, text: str, kind: Literal["negative", "warning"]) -> None:
         with self._client:

@@ -4,10 +4,12 @@ import asyncio
 import stat
 from collections.abc import MutableMapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from noack_lab import lab_page
 from noack_lab.lab_server import AddressGuard, opening_page
 
 SECRET = "s" * 43
@@ -71,3 +73,25 @@ def test_the_browser_is_given_a_file_that_only_this_user_reads(tmp_path: Path) -
     path = opening_page(tmp_path, "http://127.0.0.1:1/secret/")
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     assert "url=http://127.0.0.1:1/secret/" in path.read_text()
+
+
+@pytest.mark.parametrize("has_left", [False, True])
+def test_nothing_is_computed_for_a_visitor_who_never_connects(
+    has_left: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A program that only asks for the page: the page's client is deleted while it waits."""
+    opened: list[Any] = []
+
+    async def connected() -> None:
+        client.is_deleted = has_left
+
+    async def show(draft: Any) -> None:
+        opened.append(draft)
+
+    client = SimpleNamespace(connected=connected, is_deleted=False)
+    context = SimpleNamespace(client=client)
+    ignored: Any = lambda *_, **__: None  # noqa: E731
+    monkeypatch.setattr(lab_page, "ui", SimpleNamespace(add_css=ignored, colors=ignored, context=context))
+    monkeypatch.setattr(lab_page, "_Page", lambda _: SimpleNamespace(build=ignored, open=show))
+    asyncio.run(lab_page.show_page(SimpleNamespace(draft="draft")))  # type: ignore[arg-type]
+    assert opened == ([] if has_left else ["draft"])
