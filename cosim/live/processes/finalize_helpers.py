@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from threading import Thread, current_thread
-from typing import TYPE_CHECKING, TypeVar, cast
+from typing import TypeVar, cast
 
 from cosim.live.processes.process_pool import at_idle_priority, call_by_name, process_starts, processes
 from cosim.record.run_directory import RunEnding
@@ -23,9 +23,6 @@ from noack.core.file_access import open_append
 from noack.core.system_processes import cores
 from noack.runtime.spool import EARLY, EARLY_ENDED, SPOOL
 from noack.scenario.scenario import Scenario, loop_names
-
-if TYPE_CHECKING:
-    pass
 
 Result = TypeVar("Result")
 Item = TypeVar("Item", bound=Hashable)
