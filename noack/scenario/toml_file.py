@@ -268,9 +268,9 @@ def _explain(mistake: ErrorDetails, root: type[ScenarioSection]) -> str:
     assignment = f"{key} = {show_value(value)}"
     if kind == "missing":
         return f"{key}: missing{_purpose(place.section, str(place.path[-1]))}"
+    if kind in ("extra_forbidden", "literal_error") and (line := _removal(key, value)):
+        return line
     if kind == "extra_forbidden":
-        if line := _removal(key, value):
-            return line
         return f"{assignment}: unknown key; {_nearest(str(place.path[-1]), place.section)}"
     if kind == "value_error":
         return _own_check(key, value, str(mistake["ctx"]["error"]))

@@ -13,7 +13,7 @@ SCENARIO = Path(__file__).parents[3] / "scenarios" / "lane_following.toml"
 
 @pytest.fixture(autouse=True)
 def _two_removals(monkeypatch: pytest.MonkeyPatch) -> None:
-    rows = {"network.gone": "do it yourself", "impairments.kind = teleport": "walk"}
+    rows = {"network.gone": "do it yourself", "impairments.kind = teleport": "walk", "mode = guess": "know"}
     monkeypatch.setattr(removed_keys, "REMOVED", rows)
 
 
@@ -31,6 +31,7 @@ def message(*settings: str) -> str:
         ("network.impairments=[{kind='teleport'}]", 'impairments.0.kind = "teleport": was removed; walk'),
         ("network.impairments=[{kind='gone'}]", 'network.impairments.0.kind = "gone": must be one of '),
         ("gone=3", "gone = 3: unknown key; "),
+        ("mode=guess", 'mode = "guess": was removed; know'),
     ],
 )
 def test_only_a_removed_name_is_told_the_plain_way(setting: str, line: str) -> None:
