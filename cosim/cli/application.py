@@ -18,6 +18,7 @@ from typer.core import TyperGroup
 from typer.main import get_group
 
 from cosim.cli.options import PANELS, examples
+from cosim.cli.removed_words import removal
 from noack.core.errors import CallerError, ExitStatus, NoackError, plain_mistake, printable, why
 from noack.core.extension_points import missing_extension, parts
 from noack.core.system_processes import exhausted_limit
@@ -99,6 +100,8 @@ class Program(TyperGroup):
         message = _with_value(message.removeprefix("invalid value: "), self._words)
         if self._words and (missing := missing_extension("noack.commands", self._words[0])):
             return f"{NAME} {self._words[0]}: {missing}"
+        if self._words and (removed := removal(self._words[0], getattr(error, "option_name", None))):
+            return f"{NAME} {removed}"
         name = next((word for word in self._words if word in self.commands), None)
         where, command = (f"{name}: ", f"{NAME} {name}") if name else ("", NAME)
         if option := getattr(error, "option_name", None):

@@ -1,0 +1,34 @@
+"""Commands and options that earlier builds had: who uses one is told the plain way instead."""
+
+from collections.abc import Mapping
+
+REMOVED: Mapping[str, str] = {
+    "archive": "zip the run directory",
+    "capacity": "`noack campaign loops_on_a_link` varies the number of loops on a link",
+    "collect": "copy the file that the process on the other host names, and `noack summary RUN --add FILE`",
+    "fidelity": "`noack summary RUN` has the difference to the ideal loop",
+    "helics": "send the federates' messages through `noack netem`, or use noack.VirtualNetwork",
+    "paper": "`noack campaign paper` has the draws of Section V",
+    "reproduce": "`noack simulate RUN` repeats a run, `noack replay RUN` compares its outputs",
+    "design --holds": "compare the modes by a campaign",
+    "design --share": "compare event-triggered loops by a campaign",
+    "design --window": "compare event-triggered loops by a campaign",
+    "measure --listen": "`irtt client -o FILE`, then `noack measure FILE`",
+    "record --invitation": "the folder of credentials of `noack record --listen`",
+    "record --invite": "the folder of credentials of `noack record --listen`",
+    "record --metrics": "--log-format jsonl has the progress of a run",
+    "record --valid-minutes": "the folder of credentials of `noack record --listen` is valid for its run",
+    "run --hosts": "`noack record --listen`, and start each process on its host",
+    "run --metrics": "--log-format jsonl has the progress of a run",
+    **{
+        f"{role} --invitation": f"`noack {role} --credentials FOLDER`"
+        for role in ("plant", "sensor", "controller")
+    },
+}
+"""The plain way by the words: a command, or a command and its option."""
+
+
+def removal(command: str, option: str | None = None) -> str | None:
+    """Return that a command or an option was removed, with the plain way; None if it never existed."""
+    words = command if option is None else f"{command} {option}"
+    return f"{words}: was removed; {REMOVED[words]}" if words in REMOVED else None
