@@ -23,9 +23,12 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from enum import StrEnum
 from types import FrameType
-from typing import NoReturn, TextIO
+from typing import TYPE_CHECKING, NoReturn, TextIO
 
 from noack.core.errors import CallerError, ExitStatus, printable
+
+if TYPE_CHECKING:
+    from _typeshed import SupportsWrite
 
 _LINE = re.compile(r"(?P<source>noack(?: [a-z]+)?): (?P<warning>warning: )?(?P<message>.*)")
 _COLOURS = re.compile(r"\x1b\[[0-9;]*m")
@@ -137,6 +140,12 @@ class Parser(argparse.ArgumentParser):
         """Raise CallerError."""
         mistake = message.removeprefix("argument ")
         raise CallerError(f"{mistake}; see `{self.prog} --help`")
+
+    def print_help(self, file: "SupportsWrite[str] | None" = None) -> None:
+        """Print the help; unlike that of the base class, it raises OSError on a full disk."""
+        print(self.format_help(), end="", file=file)
+        if file is None:
+            sys.stdout.flush()
 
 
 def report_failure(message: str, status: ExitStatus, *, source: str, as_json: bool) -> ExitStatus:

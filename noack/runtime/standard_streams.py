@@ -37,9 +37,10 @@ def guarded_stream(stream: TextIO, *, ignore_broken_pipes: bool = True, escape: 
     """Return a standard stream as :func:`guard_streams` says."""
     if not isinstance(stream, io.TextIOWrapper):  # the shell closed it by >&-
         return stream
-    kind = _PipeSafeFile if ignore_broken_pipes else io.FileIO
+    file = _OneErrorFile(stream.fileno(), "w", closefd=False)
+    file.ignores_broken_pipes = ignore_broken_pipes
     return (SafeStream if escape else io.TextIOWrapper)(
-        io.BufferedWriter(kind(stream.fileno(), "w", closefd=False)),
+        io.BufferedWriter(file),
         encoding=stream.encoding,
         errors="replace",  # a terminal that cannot show ‖x‖ gets ?x?
         # PYTHONUNBUFFERED requests more than lines; readers wait for lines.
@@ -72,16 +73,18 @@ class SafeStream(io.TextIOWrapper):
         return super().write(text)
 
 
-class _PipeSafeFile(io.FileIO):
-    """Raises one error if the disk is full; the rest, written at the end, is discarded."""
+class _OneErrorFile(io.FileIO):
+    """Raises one error if the disk is full or the reader has gone; what is written later is discarded."""
 
-    _full = False
+    ignores_broken_pipes = True
+    _has_raised = False
 
     def write(self, data: "ReadableBuffer", /) -> int:
         try:
             return super().write(data)
         except OSError as error:
-            if not self._full and not isinstance(error, BrokenPipeError):
-                self._full = True
+            is_ignored = self.ignores_broken_pipes and isinstance(error, BrokenPipeError)
+            if not self._has_raised and not is_ignored:
+                self._has_raised = True
                 raise
             return memoryview(data).nbytes

@@ -57,10 +57,13 @@ def test_a_line_is_written_at_once(line_buffering: bool, write_through: bool) ->
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
-def test_a_full_disk_gives_one_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "words", [["scenarios"], ["netem", "--help"], ["netem", "--explain", "loss", "5%"]], ids="-".join
+)
+def test_a_full_disk_gives_one_line(tmp_path: Path, words: list[str]) -> None:
     with Path("/dev/full").open("w") as full:
         process = subprocess.run(
-            [*NOACK, "scenarios"], cwd=tmp_path, env=environment(),
+            [*NOACK, *words], cwd=tmp_path, env=environment(),
             stdout=full, stderr=subprocess.PIPE, text=True, check=False,
         )  # fmt: skip
     assert process.returncode == 1
