@@ -33,8 +33,16 @@ from cosim.output.run_tables import (
     timing_table,
 )
 from cosim.output.run_verdict import Tone, remarks, verdict
-from cosim.record.run_directory import ENVIRONMENT_FILE, REPORT_FILE, SCENARIO_FILE, file_of_loop, read_object
+from cosim.record.run_directory import (
+    ENVIRONMENT_FILE,
+    REPORT_FILE,
+    SCENARIO_FILE,
+    SUMMARY_FILE,
+    file_of_loop,
+    read_object,
+)
 from cosim.record.run_record import RecordedRun
+from noack.core.errors import CallerError
 from noack.core.file_access import write_whole
 from noack.core.number_format import seconds
 from noack.scenario.scenario import Scenario
@@ -114,10 +122,16 @@ def write_report(
         The report's path.
 
     Raises:
+        CallerError: the summary is of another run.
         MachineError: the report cannot be written.
     """
     shown = summary if loop is None else summary.of_loop(loop)
     worst = worst_loop(shown.loops)
+    if worst.number >= len(run.loops):
+        raise CallerError(
+            f"{run_dir / SUMMARY_FILE}: has loop {worst.number}, and the run has {len(run.loops)}; if it is "
+            "of another run, remove it: `noack summary RUN` computes it again"
+        )
     record = run.loops[worst.number]
     described = run_figures(record, envelopes(record), timed=shown.kind == "live")
     report = Report(

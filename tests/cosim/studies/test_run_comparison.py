@@ -134,3 +134,14 @@ def test_a_summary_of_another_run_costs_one_line(runs: list[Path], tmp_path: Pat
     assert result.exit_code == 2
     (line,) = result.stderr.splitlines()
     assert "summary.json: has no loop lane_following, but of_another_run; if it is of another run" in line
+
+
+def test_a_report_from_a_summary_of_more_loops_costs_one_line(runs: list[Path], tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(runs[0], other)
+    summary = json.loads((other / "summary.json").read_text())
+    summary["loops"][0]["number"] = 7
+    (other / "summary.json").write_text(json.dumps(summary))
+    result = invoke("report", other)
+    assert result.exit_code == 2
+    assert "summary.json: has loop 7, and the run has 1; if it is of another run" in result.stderr
