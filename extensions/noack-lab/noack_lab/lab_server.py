@@ -31,6 +31,7 @@ from starlette.websockets import WebSocketClose
 
 import noack
 from noack.extend import MachineError
+from noack_lab.connections import Strangers, limited_protocol
 from noack_lab.lab_page import show_page
 from noack_lab.lab_services import LabServices
 from noack_lab.results import report_page
@@ -91,8 +92,10 @@ def serve(
                 webbrowser.open(opening_page(Path(folder), address).as_uri())
 
         application = lab_application(services)
+        strangers = Strangers()
         config = uvicorn.Config(
-            AddressGuard(application, secret),
+            AddressGuard(application, secret, strangers),
+            http=limited_protocol(strangers),
             log_level="warning",
             access_log=False,
             ws_per_message_deflate=False,
@@ -185,8 +188,9 @@ def _listen(port: int) -> socket.socket:
 class AddressGuard:
     """An ASGI application in front of another one, which sees the secret as its root path."""
 
-    def __init__(self, application: ASGIApp, secret: str) -> None:
+    def __init__(self, application: ASGIApp, secret: str, strangers: Strangers) -> None:
         self._application, self._root = application, f"/{secret}"
+        self._strangers = strangers
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass an admitted request on; refuse another one."""
@@ -194,6 +198,8 @@ class AddressGuard:
         if answer is not None:
             await answer(scope, receive, send)
             return
+        if peer := scope.get("client"):
+            self._strangers.forget((peer[0], peer[1]))
 
         async def protected(message: Message) -> None:
             if message["type"] == "http.response.start":

@@ -5,11 +5,13 @@ import stat
 from collections.abc import MutableMapping
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
+import uvicorn
 
 from noack_lab import lab_page
+from noack_lab.connections import MOST_STRANGERS, Strangers, limited_protocol
 from noack_lab.lab_server import AddressGuard, opening_page
 
 SECRET = "s" * 43
@@ -31,7 +33,7 @@ def answer(kind: str, path: str, **headers: str) -> MutableMapping[str, Any]:
 
     encoded_headers = [(name.encode(), value.encode()) for name, value in headers.items()]
     scope = {"type": kind, "path": path, "headers": encoded_headers, "query_string": b""}
-    asyncio.run(AddressGuard(inner, SECRET)(scope, receive, send))
+    asyncio.run(AddressGuard(inner, SECRET, Strangers())(scope, receive, send))
     return sent[0]
 
 
@@ -95,3 +97,69 @@ def test_nothing_is_computed_for_a_visitor_who_never_connects(
     monkeypatch.setattr(lab_page, "_Page", lambda _: SimpleNamespace(build=ignored, open=show))
     asyncio.run(lab_page.show_page(SimpleNamespace(draft="draft")))  # type: ignore[arg-type]
     assert opened == ([] if has_left else ["draft"])
+
+
+async def _page(scope: Any, receive: Any, send: Any) -> None:
+    headers = [(b"content-length", b"4")]
+    await send({"type": "http.response.start", "status": 200, "headers": headers})
+    await send({"type": "http.response.body", "body": b"page"})
+
+
+async def flooded(idle_connections: int) -> tuple[list[bytes], int, int]:
+    """Serve a page while connections of strangers are idle; return answers, strangers, open ones."""
+    strangers = Strangers()
+    config = uvicorn.Config(
+        AddressGuard(_page, SECRET, strangers), http=limited_protocol(strangers), lifespan="off", port=0,
+        log_level="warning",
+    )  # fmt: skip
+    server = uvicorn.Server(config)
+    serving = asyncio.create_task(server.serve())
+    while not server.started:
+        await asyncio.sleep(0.01)
+    port = server.servers[0].sockets[0].getsockname()[1]
+    request = f"GET {OWN} HTTP/1.1\r\nhost: 127.0.0.1:{port}\r\n\r\n".encode()
+    reader, writer = await asyncio.open_connection("127.0.0.1", port)  # the page's, kept open
+    answers = list[bytes]()
+    writer.write(request)
+    answers.append(await reader.readuntil(b"page"))
+    idle = [await asyncio.open_connection("127.0.0.1", port) for _ in range(idle_connections)]
+    while len(server.server_state.connections) > MOST_STRANGERS + 1:
+        await asyncio.sleep(0.01)
+    writer.write(request)
+    answers.append(await reader.readuntil(b"page"))
+    counts = len(strangers), len(server.server_state.connections)
+    for _, other in [*idle, (reader, writer)]:
+        other.close()
+    server.should_exit = True
+    await serving
+    return answers, *counts
+
+
+def test_idle_connections_of_others_take_a_bounded_number_of_descriptors(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    answers, strangers, connections = asyncio.run(flooded(200))
+    assert [text[:15] for text in answers] == [b"HTTP/1.1 200 OK"] * 2
+    assert strangers <= MOST_STRANGERS
+    assert connections <= MOST_STRANGERS + 1
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_a_connection_without_a_request_has_some_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("noack_lab.connections.ADMITTED_WITHIN_S", 0.05)
+    aborted = list[bool]()
+
+    class Transport:
+        def abort(self) -> None:
+            aborted.append(True)
+
+    async def wait() -> None:
+        strangers = Strangers()
+        strangers.came(("127.0.0.1", 1), cast(Any, Transport()))
+        strangers.came(("127.0.0.1", 2), cast(Any, Transport()))
+        strangers.forget(("127.0.0.1", 2))  # admitted
+        while len(strangers):
+            await asyncio.sleep(0.01)
+
+    asyncio.run(wait())
+    assert aborted == [True]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.extend import CONTROLLER_DELIVERY, NS_PER_S, PLANT_STEP, SENSOR_MEASUREMENT
+from noack.extend import CONTROLLER_DELIVERY, NS_PER_S, PLANT_STEP, SENSOR_MEASUREMENT, one_line
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Msg, Typestore
@@ -103,8 +103,9 @@ def read_joint_state(data: bytes) -> Entries:
 
     try:
         message: _JointState = _store().deserialize_cdr(data, JOINT_STATE)  # type: ignore[assignment]
-    except (SerdeError, AssertionError, IndexError) as error:
-        raise ValueError(f"not a {JOINT_STATE}: {error}") from None
+    except Exception as error:  # the library raises many kinds for bytes that are no message
+        text = str(error) if isinstance(error, SerdeError) else "its bytes end early, or are damaged"
+        raise ValueError(one_line(f"not a {JOINT_STATE}: {text}")) from None
     stamp = message.header.stamp
     values = np.array(message.position, dtype=np.float64)
     return Entries(stamp.sec * NS_PER_S + stamp.nanosec, tuple(message.name), values)

@@ -10,7 +10,9 @@ import hashlib
 import json
 import re
 import struct
+import sys
 import time
+from collections import Counter
 from typing import Self
 
 import zenoh
@@ -28,6 +30,8 @@ _OPEN_MS, _LEASE_MS = 3000, 2000
 """Longest wait for a connection with the router, and longest silence of it."""
 _WAITING = 256
 """Messages that wait until they are read; later ones replace the oldest."""
+_MOST_CAUSES = 4
+"""Causes for which messages are skipped that are told apart."""
 _POLL_S = 0.0002
 """Time between two looks for an answer."""
 
@@ -160,8 +164,18 @@ class Node:
         self._tokens.append(self._session.liveliness().declare_token(token))
 
 
+def _identity(sample: zenoh.Sample) -> bytes:
+    """Return the identity of the sender in a message's attachment; empty if it has none."""
+    attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+    is_whole = len(attachment) == _ATTACHMENT.size + _GID_BYTES
+    return attachment[_ATTACHMENT.size :] if is_whole else b""
+
+
 class TopicExchange:
     """Asks a node: a message on one topic, the answer with the same stamp on another.
+
+    Other nodes may send on the topic of the answers, too. Answers count that come from the sender
+    of the first one, and are whole; others are skipped, counted, and named once on standard error.
 
     Args:
         node: this side.
@@ -173,6 +187,9 @@ class TopicExchange:
     def __init__(self, node: Node, ask: str, answer: str, frame: str) -> None:
         self._answers, self._questions = node.subscription(answer), node.publisher(ask)
         self._topics, self._frame = (ask, answer), frame
+        self._sender: bytes | None = None
+        self.skipped: Counter[str] = Counter()
+        """Messages that were skipped, by cause."""
 
     def ask(self, entries: Entries, count: int, timeout_s: float, *, again_s: float | None = None) -> Entries:
         """Send a question and wait for the answer, which has ``count`` values.
@@ -184,8 +201,7 @@ class TopicExchange:
             again_s: send it again after this time: a node may not be connected yet.
 
         Raises:
-            TimeoutError: there is no answer in time.
-            ValueError: an answer with this stamp is not valid.
+            TimeoutError: there is no valid answer in time.
         """
         began_s = sent_s = time.monotonic()
         self._questions.publish(entries, self._frame, urgent=True)
@@ -196,13 +212,29 @@ class TopicExchange:
                     self._questions.publish(entries, self._frame, urgent=True)
                 time.sleep(_POLL_S)
                 continue
-            answer = ros2.read_joint_state(sample.payload.to_bytes())
+            sender = _identity(sample)
+            if self._sender is not None and sender != self._sender:
+                self._skip("of another sender than the first answer")
+                continue
+            try:
+                answer = ros2.read_joint_state(sample.payload.to_bytes())
+            except ValueError as error:
+                self._skip(str(error))
+                continue
             if answer.stamp_ns != entries.stamp_ns:
                 continue  # the answer to a question that was sent again
             if len(answer.values) != count:
-                raise ValueError(
-                    f"{self._topics[1]}: {len(answer.values)} values in `position`; {count} needed"
-                )
+                self._skip(f"{len(answer.values)} values in `position`; {count} needed")
+                continue
+            self._sender = sender
             return answer
         ask, reply = self._topics
-        raise TimeoutError(f"no answer on {reply} to {ask} within {timeout_s:g} s")
+        causes = "".join(f"; skipped {n} messages: {cause}" for cause, n in self.skipped.items())
+        raise TimeoutError(f"no answer on {reply} to {ask} within {timeout_s:g} s{causes}")
+
+    def _skip(self, cause: str) -> None:
+        if len(self.skipped) >= _MOST_CAUSES and cause not in self.skipped:
+            cause = "others"
+        if not self.skipped[cause]:
+            print(f"noack: warning: {self._topics[1]}: skipped a message: {cause}", file=sys.stderr)
+        self.skipped[cause] += 1
