@@ -51,7 +51,7 @@ def limited_protocol(strangers: Strangers) -> type[asyncio.Protocol]:
     class LimitedProtocol(AutoHTTPProtocol):  # type: ignore[misc, valid-type]  # one of two classes
         """A connection, which is a stranger's at first."""
 
-        def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        def connection_made(self, transport: asyncio.Transport) -> None:
             """Begin."""
             super().connection_made(transport)
             self._peer: Peer = transport.get_extra_info("peername") or ("", 0)

@@ -14,6 +14,7 @@ import multiprocessing
 import os
 import re
 import secrets
+import signal
 import socket
 import tempfile
 import webbrowser
@@ -107,6 +108,7 @@ def serve(
 
 
 def _yield_to_others() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C in a terminal is for all; the server ends them
     if hasattr(os, "nice"):  # not on Windows
         os.nice(_NICE)
 
