@@ -24,6 +24,7 @@ from noack.settings.section import Seed, Table
 T = TypeVar("T")
 _REFUSED = {
     "slot": "this emulator does not gather packets into slots; it has rate and blackout",
+    "jitter": "is no word; the jitter is the second time of delay, e.g. delay 10ms 2ms",
     "ecn": "this emulator cannot mark packets: it sees payloads, not IP headers",
 }
 _KINDS: Sequence[type[Feature]] = (*IMPAIRMENTS, *CONSTRAINTS)

@@ -206,7 +206,9 @@ def _evaluate_run(
         return helpers.call(_evaluate_stored_loops, own, block)
 
     with (
-        work_bar(f"claims of {loops} loops", lines=True) as show,
+        work_bar(
+            "checking claims" if loops == 1 else f"checking claims of {loops} loops", lines=True
+        ) as show,
         helpers.share(_blocks(run), evaluate_in_helper, show) as evaluate,
     ):
         if run.kind == "live" and loops > 1:

@@ -207,7 +207,7 @@ def _burst(measurement: NetworkMeasurement, index: int) -> str:
 
 def _model_rows(measurement: NetworkMeasurement) -> Iterator[tuple[str, str, str]]:
     for name, model in measurement.models.items():
-        mark = " (preferred)" if name == measurement.chosen.fit.model else ""
+        mark = " (closest)" if name == measurement.chosen.fit.model else ""
         yield f"{_MODELS[name]}{mark}", "", ""
         for parameter, estimate in model.fit.estimates.items():
             yield f"  {_PARAMETERS[parameter]}", *_estimate(estimate)
