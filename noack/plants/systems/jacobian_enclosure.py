@@ -145,6 +145,10 @@ class Enclosed:
     def __bool__(self) -> bool:
         return not self == 0  # noqa: SIM201 # __ne__ would be another comparison
 
+    def __float__(self) -> float:
+        """Refuse to become a float, as the functions of ``math`` ask."""
+        raise TypeError("a certificate on a region needs numpy's functions: np.sin, not math.sin")
+
     def sin(self) -> "Enclosed":
         """See :func:`numpy.sin`."""
         return self._mapped(self.value.sin(), self.value.cos())
