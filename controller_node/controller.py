@@ -16,6 +16,7 @@ from noack.controllers.linear_feedback import LinearFeedback
 from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.core_library import CData, CoreMemory, core, reals_at
 from noack.core.linear_systems import Matrix, Vector
+from noack.core.periods import Period
 from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee, LossHistory, LossRule
 from noack.machines.loop_machines import LoopMachines, MachinePart, Role, parts_of, set_machine, take_changes
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_SETTING, CONTROLLER_STEP, RecordShape
@@ -144,7 +145,7 @@ class Controller(MachinePart):
         H: what the model integrates between updates, shape (n, n), per second.
         law: the control law.
         inputs: m.
-        period_ns: time between two control inputs.
+        period: time between two control inputs.
         first_ns: time of the first.
         horizon_ns: no tick is due after this time.
         guarantee: losses that it does not allow violate the assumption.
@@ -163,7 +164,7 @@ class Controller(MachinePart):
     H: Matrix
     law: ControlLaw
     inputs: int
-    period_ns: int
+    period: Period
     first_ns: int
     horizon_ns: int
     guarantee: LossGuarantee
@@ -202,7 +203,7 @@ class Controller(MachinePart):
 
     def fill(self, controller: CData, memory: CoreMemory) -> None:
         """Fill a ``noack_controller`` at its start."""
-        n, m, period_ns = len(self.H), self.inputs, self.period_ns
+        n, m, period = len(self.H), self.inputs, self.period
         self._memory = memory
         set_machine(
             controller.machine,
@@ -210,11 +211,12 @@ class Controller(MachinePart):
             m=m,
             entries=n,
             flow=Flow.UPDATE,
-            period_ns=period_ns,
+            period=period,
             horizon_ns=self.horizon_ns,
         )
         controller.machine.first_ns = self.first_ns
-        steps_ns = (period_ns, self.first_ns, period_ns - self.first_ns)
+        rests_ns = (length_ns - self.first_ns for length_ns in period.lengths_ns)
+        steps_ns = (*period.lengths_ns, self.first_ns, *rests_ns)
         transitions = memory.transitions(self.H, steps_ns)
         memory.set_model(controller.model, transitions, (), self._points)
         K = self.law.K if isinstance(self.law, LinearFeedback) else None
@@ -334,7 +336,7 @@ def _part(resolved: Scenario) -> Controller:
         loop.H,
         law_of(resolved),
         inputs=loop.m,
-        period_ns=resolved.timing.controller_period_ns,
+        period=resolved.timing.controller_period,
         first_ns=resolved.timing.controller_phase_ns,
         horizon_ns=resolved.timing.horizon_ns,
         guarantee=resolved.network.guarantee,

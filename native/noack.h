@@ -498,13 +498,19 @@ typedef struct {
     double *points;     /* (changes + 1, n) */
 } noack_model;
 
+/* A period of ns + part / parts nanoseconds. */
+typedef struct {
+    int64_t ns, part, parts; /* 0 <= part < parts */
+} noack_period;
+
 /* What the machines of all roles have, first in each. */
 typedef struct {
     int64_t n, m;
     /* time of the run at which the loop begins; other times are the loop's own */
     int64_t phase_ns;
     int64_t step;                /* number of the next tick */
-    int64_t first_ns, period_ns; /* tick k is due at first_ns + k period_ns; 0: no ticks */
+    int64_t first_ns;            /* tick k is due at first_ns + the nearest whole ns to k T */
+    noack_period period;         /* T; 0: no ticks */
     int64_t horizon_ns;          /* no tick is later */
     int64_t inputs;              /* number of the next input */
     /* time up to which the present settings have been used; -1: none */
@@ -536,7 +542,9 @@ typedef struct {
     int64_t internal;                       /* entries of z, the user's system's own state */
     int64_t system;                         /* enum noack_system */
     int64_t sources;                        /* columns of Bd: m, or m + n if x is disturbed */
-    double *Ad, *Bd;                        /* over a period, (n, n) and (n, sources) */
+    /* over a step of period.ns, (n, n) and (n, sources); behind each, if a part remains, those of
+       a step that is 1 ns longer */
+    double *Ad, *Bd;
     double *C;                              /* (p, n); NULL: the identity */
     int64_t p;
     noack_signal at_input, at_state, noise; /* d of each step, w of each step, v by measurement */
@@ -545,7 +553,7 @@ typedef struct {
     int64_t reports_inputs;
     int64_t predictions;                    /* N, inputs of an actuation */
     int64_t carries_model;                  /* 1: an actuation has x_c, too */
-    int64_t input_period_ns;                /* of the controller */
+    noack_period input_period;              /* of the controller */
     int64_t watchdog, timeout_ns, notice_ns;
     double *K;                              /* (m, n); used by NOACK_PREDICT only */
     noack_model fallback;                   /* dx/dt = H x; used by NOACK_PREDICT only */
@@ -591,7 +599,7 @@ typedef struct {
     int64_t acknowledged;  /* 1: only an acknowledged update resets x_s */
     int64_t timeout_ns;    /* of an acknowledgement */
     int64_t reports_error; /* 1: updates have an error level, by which the network chooses */
-    int64_t plant_period_ns;
+    noack_period plant_period;
     noack_observer observer;
 
     /* State */

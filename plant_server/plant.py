@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.core_library import CData, CoreMemory, core, reals_at
 from noack.core.linear_systems import Matrix, Vector, discretise
+from noack.core.periods import ANY_PERIOD, Period
 from noack.core.random_streams import normals, uniforms
 from noack.disturbances.disturbance_settings import Place, SignalSource
 from noack.machines.loop_machines import LoopMachines, MachinePart, Role, parts_of, set_machine
@@ -112,7 +113,7 @@ class Watchdog:
         """Whether actuations carry the controller's model state."""
         return self.policy == "model"
 
-    def fill(self, plant: CData, memory: CoreMemory, period_ns: int) -> None:
+    def fill(self, plant: CData, memory: CoreMemory, period: Period) -> None:
         """Fill the watchdog of a ``noack_plant`` with this step."""
         memory.fill(
             plant,
@@ -125,7 +126,7 @@ class Watchdog:
             },
         )
         if self.H is not None:
-            memory.set_model(plant.fallback, memory.transitions(self.H, (period_ns,)))
+            memory.set_model(plant.fallback, memory.transitions(self.H, period.lengths_ns))
 
 
 def too_old(t_ns: NDArray[np.int64], newest_ns: NDArray[np.int64], timeout_ns: int) -> NDArray[np.bool_]:
@@ -156,11 +157,11 @@ class Plant(MachinePart):
         system: the system to advance, at x(0).
         inputs: m.
         watchdog: what is applied if the newest actuation is too old.
-        period_ns: step h.
+        period: step h.
         horizon_ns: no step is due after this time.
         measure_every: number of steps per measurement.
         predictions: number of inputs of an actuation.
-        input_period_ns: time between them, the period of the controller.
+        input_period: time between them, the period of the controller.
         disturbance: is added to u and to ẋ; None if there is none.
         measurement: the measurement model; None if y = x.
         reports_inputs: whether a measurement also carries the inputs of the steps since the last
@@ -170,12 +171,12 @@ class Plant(MachinePart):
 
     system: PlantSystem
     inputs: int
-    period_ns: int
+    period: Period
     horizon_ns: int
     watchdog: Watchdog = field(default_factory=Watchdog)
     measure_every: int = 1
     predictions: int = 1
-    input_period_ns: int = 1
+    input_period: Period = ANY_PERIOD
     disturbance: Disturbance | None = None
     measurement: MeasurementModel | None = None
     reports_inputs: bool = False
@@ -211,7 +212,7 @@ class Plant(MachinePart):
             m=m,
             flow=Flow.ACTUATION,
             entries=m * self.predictions + n * self.watchdog.carries_model,
-            period_ns=self.period_ns,
+            period=self.period,
             horizon_ns=self.horizon_ns,
         )
         # Its settings and its memory.
@@ -221,7 +222,7 @@ class Plant(MachinePart):
             "internal": shape.internal, "system": core.NOACK_USER, "sources": sources,
             "C": C, "p": n if C is None else len(C),
             "measure_every": self.measure_every, "reports_inputs": self.reports_inputs,
-            "predictions": self.predictions, "input_period_ns": self.input_period_ns,
+            "predictions": self.predictions, "input_period": self.input_period.core,
             "newest_sequence": NO_SEQUENCE, "fallback_sequence": NO_SEQUENCE, "missing_ns": -1,
             "x": np.zeros(n), "z": np.zeros(shape.internal), "u": np.zeros(m),
             "applied": np.zeros(sources), "recent_inputs": np.zeros((reported, m)),
@@ -229,10 +230,11 @@ class Plant(MachinePart):
             "x_fallback": np.zeros(n), "scratch": np.zeros(2 * n + 2 * m),
         })  # fmt: skip
         if isinstance(self.system, LinearSystem):
-            matrices = {"Ad": np.zeros((n, n)), "Bd": np.zeros((n, sources))}
+            lengths = len(self.period.lengths_ns)
+            matrices = {"Ad": np.zeros((lengths, n, n)), "Bd": np.zeros((lengths, n, sources))}
             memory.fill(plant, {"system": core.NOACK_LINEAR, **matrices})
         self.set_drawn_values(plant, memory)
-        self.watchdog.fill(plant, memory, self.period_ns)
+        self.watchdog.fill(plant, memory, self.period)
         # Disturbances and noise, of which no block has been drawn yet.
         widths = (0, 0) if self.disturbance is None else self.disturbance.widths
         noisy = self.measurement is not None and self.measurement.is_noisy
@@ -250,8 +252,11 @@ class Plant(MachinePart):
         n, system = plant.machine.n, self.system
         reals_at(plant.x, n)[:], reals_at(plant.z, plant.internal)[:] = system.x, system.z
         if isinstance(system, LinearSystem):
-            Ad, Bd = discretise(system.A, system.B, self.period_ns)
-            reals_at(plant.Ad, n, n)[:], reals_at(plant.Bd, n, plant.sources)[:] = Ad, Bd
+            lengths_ns = self.period.lengths_ns
+            Ad = reals_at(plant.Ad, len(lengths_ns), n, n)
+            Bd = reals_at(plant.Bd, len(lengths_ns), n, plant.sources)
+            for place, length_ns in enumerate(lengths_ns):
+                Ad[place], Bd[place] = discretise(system.A, system.B, length_ns)
 
     def answer(self, question: int, plant: CData) -> Sequence[Notice]:
         """Compute the disturbances and the noise of the next steps, or advance the system."""
@@ -260,12 +265,11 @@ class Plant(MachinePart):
             return ()
         assert question == core.NOACK_ASK_STATE
         plant.machine.answered = 1
-        period_ns = self.period_ns
-        t_ns = plant.machine.step * period_ns
+        last_ns, t_ns = map(self.period.time_ns, (plant.machine.step - 1, plant.machine.step))
         x, z = reals_at(plant.x, plant.machine.n), reals_at(plant.z, plant.internal)
         applied = reals_at(plant.applied, plant.sources).copy()
         try:
-            self.system.advance(applied, t_ns - period_ns, period_ns)
+            self.system.advance(applied, last_ns, t_ns - last_ns)
         except SystemFailedError as error:
             plant.system = core.NOACK_FAILED
             x[:], z[:] = np.nan, np.nan
@@ -302,12 +306,12 @@ def _part(resolved: Scenario) -> Plant:
     return Plant(
         system_of(resolved),
         resolved.model.dimensions[1],
-        period_ns=resolved.timing.plant_period_ns,
+        period=resolved.timing.plant_period,
         horizon_ns=resolved.timing.horizon_ns,
         watchdog=watchdog_of(resolved),
         measure_every=resolved.plant.measure_every,
         predictions=resolved.controller.predictions,
-        input_period_ns=resolved.timing.controller_period_ns,
+        input_period=resolved.timing.controller_period,
         disturbance=disturbance_of(resolved),
         measurement=measurement_model_of(resolved),
         reports_inputs=resolved.observer is not None,
@@ -353,7 +357,7 @@ def disturbance_of(resolved: Scenario) -> Disturbance | None:
     signals: dict[Place, list[DisturbanceSignal]] = {"input": [], "state": []}
     for number, disturbance in enumerate(resolved.plant.disturbances):
         name = ("plant", "disturbance", str(number))
-        source = SignalSource(resolved.timing.plant_period_ns, resolved.seeds.disturbance, name)
+        source = SignalSource(resolved.timing.plant_period, resolved.seeds.disturbance, name)
         signals[disturbance.at].append(partial(disturbance.signal, source=source))
     n, m = resolved.model.dimensions
     widths = m * bool(signals["input"]), n * bool(signals["state"])

@@ -23,6 +23,7 @@ import numpy as np
 
 from noack.core.core_library import CData, CoreMemory, core, ffi, reals_at
 from noack.core.linear_systems import Matrix, Vector
+from noack.core.periods import Period
 from noack.machines.loop_machines import LoopMachines, MachinePart, Role, parts_of, set_machine, take_changes
 from noack.observers.observer_settings import EstimationModel, ObserverSettings
 from noack.protocol.record_tables import (
@@ -68,7 +69,7 @@ class Observer:
         model: the model with the covariances that it assumes.
         x: x̂ before the first measurement, (n,).
         reported: entries of a measurement that are inputs.
-        period_ns: the plant's step.
+        period: the plant's step.
         starts_from_x0: True: x̂ is the estimate at time 0; False: at the first measurement.
     """
 
@@ -76,7 +77,7 @@ class Observer:
     model: EstimationModel
     x: Vector
     reported: int
-    period_ns: int
+    period: Period
     starts_from_x0: bool
 
     @property
@@ -88,7 +89,7 @@ class Observer:
         """Fill the ``noack_observer`` of a sensor."""
         self.settings.fill(sensor.observer, self.model, self.x, memory)
         sensor.observer.t_ns = 0 if self.starts_from_x0 else -1
-        sensor.plant_period_ns = self.period_ns
+        sensor.plant_period = self.period.core
 
 
 @dataclass
@@ -104,7 +105,7 @@ class Sensor(MachinePart):
         x0: x(0), if sensor and controller start from it; else None, and the first measurement is an
             event. With acknowledgements x_s is then 0, as x_c is, until an update is acknowledged.
         inputs: m.
-        period_ns: expected time between measurements, for precomputed matrices; others are
+        period: expected time between measurements, for precomputed matrices; others are
             possible.
         setpoint: x_r, shape (n,); None is 0.
         schedule: the announced changes of its settings; None if they cannot change.
@@ -118,7 +119,7 @@ class Sensor(MachinePart):
     policy: Policy
     x0: Vector | None = None
     inputs: int = 1
-    period_ns: int | None = None
+    period: Period | None = None
     setpoint: Vector | None = None
     schedule: ChangeSchedule[tuple[Vector | None, Policy]] | None = None
     timeout_ns: int | None = None
@@ -150,7 +151,7 @@ class Sensor(MachinePart):
 
     def fill(self, sensor: CData, memory: CoreMemory) -> None:
         """Fill a ``noack_sensor`` at its start."""
-        n, observer, steps_ns = len(self.H), self.observer, (self.period_ns or 0,)
+        n, observer, period = len(self.H), self.observer, self.period
         self._memory = memory
         set_machine(
             sensor.machine,
@@ -160,6 +161,7 @@ class Sensor(MachinePart):
             entries=n if observer is None else observer.p + observer.reported,
             horizon_ns=self.horizon_ns,
         )
+        steps_ns = () if period is None else period.lengths_ns
         memory.set_model(sensor.model, memory.transitions(self.H, steps_ns), (), self._points)
         start = np.zeros(n) if self.x0 is None else self.x0
         memory.fill(sensor, {
@@ -304,7 +306,7 @@ def _part(resolved: Scenario) -> Sensor:
         policy_of(resolved),
         loop.x0 if starts_from_x0 else None,
         inputs=loop.m,
-        period_ns=resolved.timing.measurement_period_ns,
+        period=resolved.timing.measurement_period,
         setpoint=None if acknowledges else loop.setpoint,
         schedule=None if acknowledges else ChangeSchedule(resolved, _prepared),
         timeout_ns=resolved.timing.acknowledgement_timeout_ns if acknowledges else None,
@@ -345,6 +347,6 @@ def observer_of(resolved: Scenario) -> Observer | None:
         assumed_model(resolved),
         x,
         resolved.message_sizes.inputs_reported,
-        resolved.timing.plant_period_ns,
+        resolved.timing.plant_period,
         starts_from_x0,
     )

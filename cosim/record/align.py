@@ -306,8 +306,8 @@ def _short_bounds(record: RunRecord) -> Sequence[BoundedPart]:
 
 def _add_bounds(record: RunRecord) -> Iterator[BoundedPart]:
     scenario = record.scenario
-    period_ns = scenario.timing.measurement_period_ns
-    monitor = ErrorMonitor(record.loop.H, policy_of(scenario), period_ns)
+    shortest_ns = scenario.timing.measurement_period.lengths_ns[0]
+    monitor = ErrorMonitor(record.loop.H, policy_of(scenario), shortest_ns)
     for part in aligned_parts(record):
         rows, aligned = part.rows, part.aligned
         e_s = rows["x_s"] - rows["x"]
@@ -393,9 +393,9 @@ class EventFollower:
     @np.errstate(all="ignore")  # a run may diverge
     def _since(self, t_ns: Times, received: NDArray[np.int64], shared: NDArray[np.bool_]) -> SinceEvent:
         newest = np.searchsorted(self._event_ns[1:], t_ns, "right")
-        age_ns, period_ns = t_ns - self._event_ns[newest], self._scenario.timing.plant_period_ns
+        age_ns, period = t_ns - self._event_ns[newest], self._scenario.timing.plant_period
         states = self._x.take(newest, axis=0)
-        predicted = self._propagate.advance_by_periods(states, age_ns // period_ns, period_ns)
+        predicted = self._propagate.advance_by(states, age_ns, period.lengths_ns[0])
         events = self._events[newest]
         age_s = np.where(events == NO_SEQUENCE, np.nan, age_ns * 1e-9)
         return SinceEvent(age_s, predicted, np.where(shared, events - received, NOT_SHARED))

@@ -100,8 +100,8 @@ class SampledLoop:
             )
         self.matrices, n = loop_of(resolved), resolved.model.dimensions[0]
         self.resolved = resolved
-        self.last = timing.horizon_ns // timing.plant_period_ns
-        self.step_s = timing.plant_period_ns * 1e-9
+        self.last = timing.last_step
+        self.step_s = float(timing.plant_period.exact) * 1e-9
         self.steps_per_measurement = resolved.plant.measure_every
         self.weight = np.eye(n) if self.matrices.weight is None else self.matrices.weight
         self.delay_ns = network_delay_ns(resolved, 0)
@@ -120,14 +120,16 @@ class SampledLoop:
         matrices, (n, m) = self.matrices, self.resolved.model.dimensions
         self._increments, self._noise = increments, noise
         plant = ffi.new("noack_plant *", self._machines[0].machines[0])
-        B = discretise(matrices.A, matrices.B, self.resolved.timing.plant_period_ns)[1]
-        sources, at_state = B, np.zeros((self.last + 1, n))
+        lengths_ns = self.resolved.timing.plant_period.lengths_ns
+        sources = np.array([discretise(matrices.A, matrices.B, length)[1] for length in lengths_ns])
+        at_state = np.zeros((self.last + 1, n))
         if len(increments):
-            sources, at_state[: len(increments)] = np.hstack([B, np.eye(n)]), increments
+            at_state[: len(increments)] = increments
+            sources = np.array([np.hstack([B, np.eye(n)]) for B in sources])
         arrays = {"Bd": _dense(sources), "applied": np.zeros(m + n)}
         for name, array in arrays.items():
             setattr(plant, name, pointer_to(array, "double *"))
-        plant.sources, plant.at_input.width = sources.shape[1], 0
+        plant.sources, plant.at_input.width = sources.shape[2], 0
         noises = _dense(noise)
         for signal, values, count in (
             (plant.at_state, at_state, len(increments)),
@@ -244,9 +246,13 @@ class SampledLoop:
 
 def disturbance_effect(resolved: Scenario) -> Matrix:
     """Return the effect of disturbances of u and of ẋ, held over a step, on x, (n, m + n)."""
-    matrices, period_ns = loop_of(resolved), resolved.timing.plant_period_ns
+    return _effect_over(resolved, resolved.timing.plant_period_ns)
+
+
+def _effect_over(resolved: Scenario, length_ns: int) -> Matrix:
+    matrices = loop_of(resolved)
     sources = np.hstack([matrices.B, np.eye(matrices.n)])
-    return discretise(matrices.A, sources, period_ns)[1]
+    return discretise(matrices.A, sources, length_ns)[1]
 
 
 def state_increments(resolved: Scenario) -> Matrix:
@@ -254,12 +260,14 @@ def state_increments(resolved: Scenario) -> Matrix:
     disturbance, (n, m) = disturbance_of(resolved), resolved.model.dimensions
     if disturbance is None:
         return np.zeros((0, n))
-    effect = disturbance_effect(resolved)
-    increments = np.zeros((resolved.timing.horizon_ns // resolved.timing.plant_period_ns, n))
-    d, w = disturbance.values(range(len(increments)))
-    for part, matrix in ((d, effect[:, :m]), (w, effect[:, m:])):
-        if part.shape[1]:
-            increments += part @ matrix.T
+    period, last = resolved.timing.plant_period, resolved.timing.last_step
+    steps_ns, increments = np.diff(period.times_ns(np.arange(last + 1))), np.zeros((last, n))
+    d, w = disturbance.values(range(last))
+    for length_ns in period.lengths_ns:
+        effect, has_length = _effect_over(resolved, length_ns), steps_ns == length_ns
+        for part, matrix in ((d, effect[:, :m]), (w, effect[:, m:])):
+            if part.shape[1]:
+                increments[has_length] += part[has_length] @ matrix.T
     return increments
 
 
@@ -268,8 +276,7 @@ def noise_of(resolved: Scenario) -> Matrix:
     model = measurement_model_of(resolved)
     if model is None or not model.is_noisy:
         return np.zeros((0, resolved.message_sizes.outputs))
-    steps = resolved.timing.horizon_ns // resolved.timing.plant_period_ns
-    return model.noise(0, steps // resolved.plant.measure_every + 1)
+    return model.noise(0, resolved.timing.last_step // resolved.plant.measure_every + 1)
 
 
 def _dense(matrix: Matrix | Numbers) -> Matrix:

@@ -40,8 +40,12 @@ const char *noack_segments_check(const noack_segments *segments) {
 
 /* The first tick of a machine that is not before a time. */
 static int64_t first_tick(const noack_machine *machine, int64_t t_ns) {
-    int64_t late_ns = t_ns - machine->first_ns;
-    return late_ns <= 0 ? 0 : (late_ns + machine->period_ns - 1) / machine->period_ns;
+    int64_t k = periods_within(&machine->period, max_of(t_ns - machine->first_ns, 0));
+    while (k > 0 && time_of_tick_ns(machine, k - 1) >= t_ns)
+        k--;
+    while (time_of_tick_ns(machine, k) < t_ns)
+        k++;
+    return k;
 }
 
 /* Load the state of a run into the machines. */
@@ -51,7 +55,7 @@ static void load(noack_segments *segments, int64_t run) {
     noack_controller *controller = segments->controller;
     int64_t n = plant->machine.n, m = plant->machine.m, step = segments->step[run];
     int64_t measure_every = plant->measure_every, first_step = max_of(step, 0);
-    int64_t t_ns = first_step * plant->machine.period_ns;
+    int64_t t_ns = time_of_tick_ns(&plant->machine, first_step);
     copy(n, segments->x + run * n, plant->x);
     copy(m, segments->u + run * m, plant->u);
     copy(m, segments->u_next + run * m, plant->inputs);
@@ -70,7 +74,7 @@ static void load(noack_segments *segments, int64_t run) {
     if (segments->gains != NULL) {
         copy(n, segments->y + run * n, sensor->observer.x);
         sensor->observer.t_ns =
-            step < 0 ? -1 : t_ns - step % measure_every * plant->machine.period_ns;
+            step < 0 ? -1 : time_of_tick_ns(&plant->machine, step - step % measure_every);
     }
     copy(n, segments->x_c + run * n, controller->x_c);
     controller->model_ns = t_ns;
@@ -84,7 +88,7 @@ static void advance_controller(noack_segments *segments, int64_t step, double *x
     const noack_controller *controller = segments->controller;
     noack_model_advance(
         &controller->model, controller->x_c, controller->model_ns,
-        step * segments->plant->machine.period_ns, x_c);
+        time_of_tick_ns(&segments->plant->machine, step), x_c);
 }
 
 /* Take the state of a run out of the machines, at the end of a step and before its updates. */
@@ -97,7 +101,7 @@ static void store(noack_segments *segments, int64_t run, int64_t step) {
     copy(m, plant->u, segments->u + run * m);
     copy(m, plant->inputs, segments->u_next + run * m);
     noack_model_advance(
-        &sensor->model, sensor->x_s, sensor->model_ns, step * plant->machine.period_ns,
+        &sensor->model, sensor->x_s, sensor->model_ns, time_of_tick_ns(&plant->machine, step),
         segments->x_s + run * n);
     advance_controller(segments, step, segments->x_c + run * n);
     segments->auxiliary[run] = sensor->trigger.auxiliary;
@@ -110,7 +114,7 @@ static void receive(noack_segments *segments, int64_t run, int64_t until_ns, noa
     double *sent = segments->sent + run * places, *updates = segments->updates + run * places * n;
     noack_message message;
     while (sent[0] >= 0.0) {
-        message.t_ns = (int64_t)sent[0] * segments->plant->machine.period_ns;
+        message.t_ns = time_of_tick_ns(&segments->plant->machine, (int64_t)sent[0]);
         if (message.t_ns + segments->delay_ns > until_ns)
             return;
         message.flow = NOACK_UPDATE;
@@ -127,9 +131,10 @@ static void receive(noack_segments *segments, int64_t run, int64_t until_ns, noa
 /* What the controller does between a step of the plant and the next one. */
 static void control(noack_segments *segments, int64_t run, int64_t step, noack_output *output) {
     noack_controller *controller = segments->controller;
-    int64_t period_ns = segments->plant->machine.period_ns, t_ns = step * period_ns, due_ns;
-    receive(segments, run, t_ns, output);
-    while ((due_ns = tick_ns(&controller->machine)) < t_ns + period_ns) {
+    const noack_machine *plant = &segments->plant->machine;
+    int64_t next_ns = time_of_tick_ns(plant, step + 1), due_ns;
+    receive(segments, run, time_of_tick_ns(plant, step), output);
+    while ((due_ns = tick_ns(&controller->machine)) < next_ns) {
         receive(segments, run, due_ns, output);
         noack_controller_tick(controller, due_ns, output);
         noack_plant_handle(segments->plant, &output->message, due_ns, output);
@@ -169,7 +174,6 @@ static void follow_one(
     noack_segments *segments, int64_t run, int64_t last, int64_t tests, noack_output *output) {
     noack_plant *plant = segments->plant;
     int64_t n = plant->machine.n, step = segments->step[run];
-    double h_s = (double)plant->machine.period_ns * 1e-9;
     noack_note note;
     segments->is_event[run] = 0;
     segments->error[run] = segments->state[run] = segments->cost[run] = 0.0;
@@ -178,7 +182,8 @@ static void follow_one(
         control(segments, run, step, output);
     while (step < last) {
         step++;
-        noack_plant_tick(plant, step * plant->machine.period_ns, output, &note);
+        double h_s = step > 0 ? (double)last_period_ns(&plant->machine) * 1e-9 : 0.0;
+        noack_plant_tick(plant, time_of_tick_ns(&plant->machine, step), output, &note);
         double size = noack_norm(n, plant->x);
         if (!(size < DIVERGED_NORM)) {
             segments->error[run] = segments->state[run] = segments->cost[run] = INFINITY;

@@ -73,13 +73,14 @@ static void choose_input(noack_controller *controller, int64_t t_ns, const doubl
 /* Append the inputs for the times one period, two periods ... after the model's time. */
 static void append_predictions(noack_controller *controller, noack_output *output) {
     const noack_machine *machine = &controller->machine;
-    int64_t n = machine->n, m = machine->m, t_ns = controller->model_ns;
+    int64_t n = machine->n, m = machine->m, t_ns = controller->model_ns, from_ns = t_ns;
     double *x = controller->scratch + 2 * n, *u = controller->scratch + 3 * n;
     copy(n, controller->x_c, x);
     copy(m, output->message.vector, u);
     for (int64_t k = 1; k < controller->predictions; k++) {
         if (controller->has_state) {
-            int64_t next_ns = min_of(t_ns + machine->period_ns, MESSAGE_TIMES_NS);
+            int64_t next_ns =
+                min_of(from_ns + whole_periods_ns(&machine->period, k), MESSAGE_TIMES_NS);
             noack_model_advance(&controller->model, x, t_ns, next_ns, x);
             t_ns = next_ns;
             choose_input(controller, t_ns, x, u);
@@ -91,7 +92,7 @@ static void append_predictions(noack_controller *controller, noack_output *outpu
 int64_t noack_controller_tick(noack_controller *controller, int64_t now_ns, noack_output *output) {
     noack_machine *machine = &controller->machine;
     int64_t n = machine->n, m = machine->m;
-    int64_t t_ns = machine->first_ns + machine->step * machine->period_ns;
+    int64_t t_ns = time_of_tick_ns(machine, machine->step);
     int64_t model_ns = max_of(t_ns, controller->model_ns);
     if (model_ns >= machine->change_ns)
         return NOACK_ASK_CHANGE;

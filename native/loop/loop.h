@@ -50,11 +50,42 @@ static inline void append(noack_output *output, int64_t count, const double *val
     output->message.entries += count;
 }
 
-/* The time of tick k of a machine; NO_TICK: there is none. */
+/* The nearest whole number of nanoseconds to k periods, halves up; k >= 0. */
+static inline int64_t periods_ns(const noack_period *period, int64_t k) {
+    return k * period->ns + (2 * k * period->part + period->parts) / (2 * period->parts);
+}
+
+/* The same, rounded down: a time that is not before is reached at the tick k after any tick. */
+static inline int64_t whole_periods_ns(const noack_period *period, int64_t k) {
+    return k * period->ns + k * period->part / period->parts;
+}
+
+/* The largest k of which whole_periods_ns is at most an age, which is not negative. */
+static inline int64_t periods_within(const noack_period *period, int64_t age_ns) {
+    int64_t k = age_ns / period->ns;
+    if (period->part == 0)
+        return k;
+    k = max_of(k - k / period->ns - 1, 0); /* each period is less than 1 ns longer */
+    while (whole_periods_ns(period, k + 1) <= age_ns)
+        k++;
+    return k;
+}
+
+/* The time of tick k of a machine. */
+static inline int64_t time_of_tick_ns(const noack_machine *machine, int64_t k) {
+    return machine->first_ns + periods_ns(&machine->period, k);
+}
+
+/* The time between the last tick of a machine and its next one, which is not the first. */
+static inline int64_t last_period_ns(const noack_machine *machine) {
+    return time_of_tick_ns(machine, machine->step) - time_of_tick_ns(machine, machine->step - 1);
+}
+
+/* The time of the next tick of a machine; NO_TICK: there is none. */
 static inline int64_t tick_ns(const noack_machine *machine) {
-    if (machine->period_ns == 0)
+    if (machine->period.ns == 0)
         return NO_TICK;
-    int64_t t_ns = machine->first_ns + machine->step * machine->period_ns;
+    int64_t t_ns = time_of_tick_ns(machine, machine->step);
     return t_ns <= machine->horizon_ns ? t_ns : NO_TICK;
 }
 
@@ -83,6 +114,6 @@ void noack_disturb(noack_plant *plant, int64_t step);
 /* observer.c: advance x-hat to a measurement [y; u of the plant's steps since the last one]. */
 void noack_observe(
     noack_observer *observer, const noack_message *message, int64_t n, int64_t m,
-    int64_t plant_period_ns);
+    const noack_period *plant_period);
 
 #endif

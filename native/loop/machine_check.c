@@ -3,7 +3,7 @@
 
 #include "loop.h"
 
-enum { MOST_PLACES = 1 << 20, MOST_EVERY = 1 << 20, MOST_ROWS = 1 << 16 };
+enum { MOST_PLACES = 1 << 20, MOST_EVERY = 1 << 20, MOST_ROWS = 1 << 16, MOST_PARTS = 100000 };
 static const int64_t MOST_LENGTH = INT64_C(1) << 32;
 
 /* Times and numbers of which a few sums, with the time of a message, fit into an int64_t. */
@@ -12,16 +12,24 @@ static const int64_t MOST_NS = INT64_C(1) << 60, MOST_NUMBER = INT64_MAX / 2;
 /* A time up to which a machine has come: that of a message at most. */
 static int is_model_time(int64_t t_ns) { return is_between(0, t_ns, MESSAGE_TIMES_NS); }
 
+/* Whether a period has at least some whole nanoseconds; its multiples do not overflow. */
+static int is_period(const noack_period *period, int64_t least_ns) {
+    return is_between(least_ns, period->ns, MOST_NS) && is_between(1, period->parts, MOST_PARTS)
+           && is_between(0, period->part, period->parts - 1)
+           && (period->part == 0 || period->parts <= period->ns);
+}
+
 static const char *check_machine(const noack_machine *machine) {
     if (!is_between(1, machine->n, NOACK_MAX_ENTRIES)
         || !is_between(1, machine->m, NOACK_MAX_ENTRIES))
         return "a machine needs 1 to 64 states and 1 to 64 inputs";
     if (!is_between(0, machine->phase_ns, MOST_NS) || !is_between(0, machine->horizon_ns, MOST_NS)
-        || !is_between(0, machine->first_ns, MOST_NS)
-        || !is_between(0, machine->period_ns, MOST_NS))
+        || !is_between(0, machine->first_ns, MOST_NS) || !is_period(&machine->period, 0))
         return "a machine has a phase, a horizon or a period out of range";
     if (!is_between(0, machine->step, MOST_NUMBER) || !is_between(0, machine->inputs, MOST_NUMBER)
-        || (machine->period_ns > 0 && machine->step > MOST_NS / machine->period_ns))
+        || (machine->period.ns > 0
+            && machine->step
+                   > MOST_NS / max_of(machine->period.ns + 1, 2 * machine->period.parts)))
         return "a machine's step or count of inputs is out of range";
     if (!is_between(0, machine->received.entries, NOACK_MAX_ENTRIES)
         || machine->acknowledgements.entries != 0)
@@ -63,7 +71,7 @@ static const char *check_signal(const noack_signal *signal, int64_t width) {
 static const char *check_plant(const noack_plant *plant) {
     const noack_machine *machine = &plant->machine;
     int64_t n = machine->n, m = machine->m;
-    if (machine->period_ns < 1 || plant->input_period_ns < 1)
+    if (machine->period.ns < 1 || !is_period(&plant->input_period, 1))
         return "a plant has no period";
     if (!is_between(1, plant->measure_every, MOST_EVERY)
         || !is_between(1, plant->p, NOACK_MAX_ENTRIES))
@@ -145,10 +153,10 @@ static const char *check_sensor(const noack_sensor *sensor) {
         || (wrong = noack_check_rule(&sensor->rule, MOST_NS)) != NULL
         || (wrong = check_observer(&sensor->observer, machine)) != NULL)
         return wrong;
-    if (machine->period_ns != 0)
+    if (machine->period.ns != 0)
         return "a sensor must not have ticks";
     if (sensor->observer.kind == NOACK_NO_OBSERVER ? machine->received.entries != machine->n
-                                                   : sensor->plant_period_ns < 1)
+                                                   : !is_period(&sensor->plant_period, 1))
         return "a sensor receives measurements of the wrong size";
     if (sensor->x_s == NULL || sensor->event_x == NULL || sensor->x == NULL || sensor->e_s == NULL
         || sensor->scratch == NULL)
@@ -169,7 +177,7 @@ static const char *check_sensor(const noack_sensor *sensor) {
 static const char *check_controller(const noack_controller *controller) {
     const noack_machine *machine = &controller->machine;
     int64_t n = machine->n, m = machine->m;
-    if (machine->period_ns < 1 || machine->received.entries != n)
+    if (machine->period.ns < 1 || machine->received.entries != n)
         return "a controller has no period, or receives updates of the wrong size";
     if (!is_between(1, controller->predictions, NOACK_MAX_ENTRIES)
         || controller->predictions * m + (controller->carries_model ? n : 0) > NOACK_MAX_ENTRIES)

@@ -111,9 +111,11 @@ void noack_observer_correct(noack_observer *observer, int64_t n, const double *y
    input is used. */
 void noack_observe(
     noack_observer *observer, const noack_message *message, int64_t n, int64_t m,
-    int64_t plant_period_ns) {
+    const noack_period *plant_period) {
     int64_t t_ns = message->t_ns, known = (message->entries - observer->p) / m;
-    int64_t steps = observer->t_ns < 0 ? 0 : floor_div(t_ns - observer->t_ns, plant_period_ns);
+    /* Times are rounded to whole nanoseconds, so the difference may be 1 ns too short. */
+    int64_t age_ns = t_ns - observer->t_ns + (plant_period->part > 0);
+    int64_t steps = observer->t_ns < 0 || age_ns < 0 ? 0 : periods_within(plant_period, age_ns);
     const double *inputs = message->vector + observer->p;
     for (int64_t before = steps; before > 0; before--)
         noack_observer_predict(observer, n, m, inputs + m * max_of(known - before, 0));

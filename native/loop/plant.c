@@ -2,7 +2,8 @@
 
    At grid time t_k = k h the plant advances its system to t_k under the input held since t_(k-1).
    Then it measures, and latches the newest actuation received; the input that is due of it is held
-   until t_(k+1). A late step has the same length h, and the plant catches up.
+   until t_(k+1). A late step has the same length h, and the plant catches up. If h is no whole number
+   of nanoseconds, t_k is rounded, and steps differ by 1 ns.
 
    An actuation for the model time t carries N inputs, for t, t + h_c, ..., t + (N - 1) h_c, where
    h_c is the period of the controller. Input j is applied from t + j h_c on, the last one until a
@@ -50,9 +51,11 @@ static void advance(noack_plant *plant) {
         append_recent_input(plant);
     if (plant->system != NOACK_LINEAR)
         return;
+    int64_t longer = last_period_ns(&plant->machine) - plant->machine.period.ns; /* 0 or 1 */
     double *free_part = plant->scratch, *forced_part = free_part + n;
-    noack_product(n, n, plant->Ad, plant->x, free_part);
-    noack_product(n, plant->sources, plant->Bd, plant->applied, forced_part);
+    noack_product(n, n, plant->Ad + longer * n * n, plant->x, free_part);
+    noack_product(
+        n, plant->sources, plant->Bd + longer * n * plant->sources, plant->applied, forced_part);
     for (int64_t k = 0; k < n; k++)
         plant->x[k] = free_part[k] + forced_part[k];
 }
@@ -83,8 +86,8 @@ static void predict(noack_plant *plant, int64_t t_ns) {
 static int64_t choose_input(noack_plant *plant, int64_t t_ns) {
     int64_t m = plant->machine.m, last = plant->predictions - 1;
     if (t_ns - plant->newest_ns <= plant->timeout_ns) {
-        int64_t age = floor_div(t_ns - plant->newest_ns, plant->input_period_ns);
-        int64_t entry = min_of(max_of(age, 0), last);
+        int64_t age_ns = max_of(t_ns - plant->newest_ns, 0);
+        int64_t entry = min_of(periods_within(&plant->input_period, age_ns), last);
         copy(m, plant->inputs + entry * m, plant->u);
         return entry;
     }
@@ -161,7 +164,7 @@ static void put_step(
 int64_t noack_plant_tick(
     noack_plant *plant, int64_t now_ns, noack_output *output, noack_note *note) {
     noack_machine *machine = &plant->machine;
-    int64_t step = machine->step, t_ns = machine->first_ns + step * machine->period_ns;
+    int64_t step = machine->step, t_ns = time_of_tick_ns(machine, step);
     int measures = step % plant->measure_every == 0;
     if (!has(&plant->at_input, step) || !has(&plant->at_state, step)
         || (measures && !has(&plant->noise, plant->measurements)))

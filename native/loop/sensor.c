@@ -201,7 +201,7 @@ int64_t noack_sensor_handle(
             copy(machine->n, message->vector, sensor->x);
         } else if (!machine->observed) {
             noack_observe(
-                &sensor->observer, message, machine->n, machine->m, sensor->plant_period_ns);
+                &sensor->observer, message, machine->n, machine->m, &sensor->plant_period);
             copy(machine->n, sensor->observer.x, sensor->x);
             machine->observed = 1;
         }

@@ -56,12 +56,12 @@ def matrix_of(key: MatrixKey) -> Matrix:
     return np.frombuffer(data).reshape(shape)
 
 
-def transition(generator: Matrix, dt_ns: int) -> Matrix:
+def transition(generator: Matrix, dt_ns: float) -> Matrix:
     """Return the transition matrix e^{G dt}, shape (n, n), of ``dz/dt = G z`` over ``dt_ns``."""
     return exponential(generator * (dt_ns * 1e-9))
 
 
-def discretise(A: Matrix, B: Matrix, dt_ns: int) -> tuple[Matrix, Matrix]:
+def discretise(A: Matrix, B: Matrix, dt_ns: float) -> tuple[Matrix, Matrix]:
     """Return the exact discretisation of ``dx/dt = A x + B u`` with u held over ``dt_ns``.
 
     Both blocks come from one exponential, e^{[[A, B], [0, 0]] dt} (Van Loan, 1978), so A may be
@@ -111,12 +111,13 @@ class Propagator:
             return states
         return np.asarray(states @ self.transition(dt_ns).T)
 
-    def advance_by_periods(self, states: Matrix, counts: NDArray[np.int64], period_ns: int) -> Matrix:
-        """Return e^{G j dt} of each of k states, (k, n), after its own number j of periods, (k,).
+    def advance_by(self, states: Matrix, ages_ns: NDArray[np.int64], period_ns: int) -> Matrix:
+        """Return e^{G t} of each of k states, (k, n), after its own time t, (k,): whole periods and a rest.
 
         A number of periods is followed bit by bit, so that a row does not depend on the others.
+        Rests should be few: ages are near to multiples of the period.
         """
-        advanced = np.array(states, np.float64, order="C")
+        advanced, (counts, rests_ns) = np.array(states, np.float64, order="C"), divmod(ages_ns, period_ns)
         bits = int(counts.max(initial=0)).bit_length()
         if bits and not self._static:
             powers = np.array([self.transition(period_ns << bit) for bit in range(bits)])
@@ -130,6 +131,8 @@ class Propagator:
                 _reals(advanced),
                 _reals(scratch),
             )
+        for rest_ns in np.unique(rests_ns[rests_ns > 0]).tolist():
+            advanced[rests_ns == rest_ns] = self.rows(advanced[rests_ns == rest_ns], rest_ns)
         return advanced
 
 

@@ -12,6 +12,7 @@ from typing import ClassVar, Literal, NamedTuple
 import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector
+from noack.core.periods import Period
 from noack.settings.section import Row, ScenarioSection, Table
 
 Place = Literal["input", "state"]
@@ -20,7 +21,7 @@ Place = Literal["input", "state"]
 class SignalSource(NamedTuple):
     """The data, besides its settings, from which a signal is computed."""
 
-    period_ns: int  # Step of the plant
+    period: Period  # Step of the plant
     seed: int
     stream: tuple[str, ...]  # Name of the disturbance's own random stream
 

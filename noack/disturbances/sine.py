@@ -29,5 +29,5 @@ class SineDisturbance(DisturbanceSettings):
 
     def signal(self, steps: range, source: SignalSource) -> Matrix:
         """The value at the beginning of each step."""
-        t_s = np.array(steps) * source.period_ns * 1e-9
+        t_s = source.period.times_ns(np.array(steps)) * 1e-9
         return np.outer(np.sin(2 * np.pi * self.hz * t_s + self.phase_rad), self.amplitude)

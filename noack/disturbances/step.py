@@ -41,7 +41,7 @@ class StepDisturbance(DisturbanceSettings):
 
     def signal(self, steps: range, source: SignalSource) -> Matrix:
         """The constant in steps that begin in [from_s, until_s), else 0."""
-        t_ns = np.array(steps) * source.period_ns
+        t_ns = source.period.times_ns(np.array(steps))
         active = t_ns >= round(self.from_s * NS_PER_S)
         if self.until_s is not None:
             active &= t_ns < round(self.until_s * NS_PER_S)

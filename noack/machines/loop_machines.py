@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from noack.core.clock import NEVER_NS
 from noack.core.core_library import CData, CoreMemory, StructRows, core, dtype_of, ffi, pointer_to
 from noack.core.errors import CallerError
+from noack.core.periods import NO_PERIOD, Period
 from noack.protocol.record_tables import LOOP, RecordShape, largest, tables
 from noack.protocol.roles import External, Notice, Record
 from noack.protocol.wire_format import Flow
@@ -123,12 +124,12 @@ def set_machine(
     m: int,
     entries: int,
     flow: Flow,
-    period_ns: int = 0,
+    period: Period | None = None,
     horizon_ns: int,
 ) -> None:
     """Fill a new ``noack_machine``; its ticks begin at time 0."""
     machine.n, machine.m = n, m
-    machine.period_ns, machine.horizon_ns = period_ns, horizon_ns
+    machine.period, machine.horizon_ns = NO_PERIOD if period is None else period.core, horizon_ns
     machine.reached_ns, machine.change_ns = -1, NEVER_NS
     machine.received.flow, machine.received.entries = flow, entries
     machine.acknowledgements.flow = Flow.ACKNOWLEDGEMENT

@@ -66,7 +66,7 @@ class LuenbergerSettings(ObserverSettings):
                 poles.append(complex(pole))
         return tuple(poles)
 
-    def resolved(self, A: Matrix, C: Matrix, period_ns: int) -> Self:
+    def resolved(self, A: Matrix, C: Matrix, period_ns: float) -> Self:
         if self.poles_per_s is None:
             return self
         try:

@@ -76,7 +76,7 @@ class ObserverSettings(ScenarioSection):
         """
         require_length(self.initial_estimate, "observer.initial_estimate", n, "one per state")
 
-    def resolved(self, A: Matrix, C: Matrix, period_ns: int) -> Self:
+    def resolved(self, A: Matrix, C: Matrix, period_ns: float) -> Self:
         """Return settings with an explicit gain, in place of data from which the gain is computed.
 
         A is Â^(T) between two measurements, T the period.

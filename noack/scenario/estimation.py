@@ -26,8 +26,8 @@ def true_model(resolved: Scenario) -> EstimationModel:
     """The model with the covariances of the scenario's disturbances and noise."""
     loop, plant = loop_of(resolved), resolved.plant
     noise = plant.noise_variances(loop.n, loop.m)
-    Ad, Bd = discretise(loop.A_model, loop.B_model, resolved.timing.plant_period_ns)
-    _, Gd = discretise(loop.A_model, np.eye(loop.n), resolved.timing.plant_period_ns)
+    Ad, Bd = discretise(loop.A_model, loop.B_model, float(resolved.timing.plant_period.exact))
+    _, Gd = discretise(loop.A_model, np.eye(loop.n), float(resolved.timing.plant_period.exact))
     C = plant.measurement.matrix(loop.n)
     model = EstimationModel(Ad, Bd, Gd, C, np.zeros_like(Ad), np.diag(noise.output), plant.measure_every)
     return model._replace(Q=model.process_covariance(noise.at_state, noise.at_input))

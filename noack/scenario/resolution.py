@@ -207,7 +207,7 @@ def _observer(scenario: Scenario, model: ModelSection) -> AnyObserver | None:
         return None
     A = np.array(model.A)
     C = scenario.plant.measurement.matrix(len(A))
-    period_ns = scenario.timing.measurement_period_ns
+    period_ns = float(scenario.timing.measurement_period.exact)
     with np.errstate(all="ignore"):
         step = transition(A, period_ns)
     if not np.isfinite(step).all():

@@ -86,7 +86,7 @@ def check_target_loss(scenario: ScenarioTables) -> None:
 def check_trigger(scenario: ScenarioTables) -> None:
     """Raise ValueError unless the trigger fits the model's dimensions and measurement period."""
     scenario.trigger.check(scenario.model.dimensions[0], _dimensions(scenario))
-    scenario.trigger.check_period(scenario.timing.measurement_period_ns)
+    scenario.trigger.check_period(scenario.timing.measurement_period)
 
 
 def check_setpoint(scenario: ScenarioTables) -> None:

@@ -13,6 +13,7 @@ from noack.controllers.linear_feedback import LinearFeedbackSettings
 from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.number_format import as_html, as_text
+from noack.core.periods import Period, period_of
 from noack.plants.linear import LinearSettings
 from noack.protocol.roles import PROTOCOLS, LoopProtocol
 from noack.protocol.wire_format import Flow
@@ -34,7 +35,7 @@ from noack.scenario.sections import (
     NetworkSection,
     PlantSection,
 )
-from noack.settings.section import ScenarioSection, period_ns
+from noack.settings.section import ScenarioSection
 from noack.trigger_policies.decaying import DecayingSettings
 
 MOST_CHANGES = 256  # largest number of scheduled changes in a run
@@ -175,19 +176,44 @@ class Timing:
         return round(self.scenario.horizon_s * NS_PER_S)
 
     @property
-    def plant_period_ns(self) -> int:
+    def plant_period(self) -> Period:
         """Period of the plant's steps."""
-        return period_ns(self.scenario.plant.rate_hz)
+        return period_of(self.scenario.plant.rate_hz)
+
+    @property
+    def measurement_period(self) -> Period:
+        """Time between measurements."""
+        return self.plant_period.times(self.scenario.plant.measure_every)
+
+    @property
+    def controller_period(self) -> Period:
+        """Period of the controller's ticks."""
+        return period_of(self.scenario.controller.rate_hz)
+
+    @property
+    def has_whole_periods(self) -> bool:
+        """Whether all periods are whole numbers of nanoseconds: if not, steps differ by 1 ns."""
+        return self.plant_period.is_whole and self.controller_period.is_whole
+
+    @property
+    def plant_period_ns(self) -> int:
+        """Longest time between two steps of the plant."""
+        return self.plant_period.longest_ns
 
     @property
     def measurement_period_ns(self) -> int:
-        """Time between measurements."""
-        return self.plant_period_ns * self.scenario.plant.measure_every
+        """Longest time between two measurements."""
+        return self.measurement_period.longest_ns
 
     @property
     def controller_period_ns(self) -> int:
-        """Period of the controller's ticks."""
-        return period_ns(self.scenario.controller.rate_hz)
+        """Longest time between two ticks of the controller."""
+        return self.controller_period.longest_ns
+
+    @property
+    def last_step(self) -> int:
+        """The number of the plant's last step."""
+        return self.plant_period.last_until(self.horizon_ns)
 
     @property
     def controller_phase_ns(self) -> int:
@@ -226,7 +252,7 @@ class Timing:
     @property
     def predicted_ns(self) -> int:
         """Time for which an actuation has inputs."""
-        return self.scenario.controller.predictions * self.controller_period_ns
+        return math.floor(self.scenario.controller.predictions * self.controller_period.exact)
 
     @property
     def missing_actuation_ns(self) -> int:

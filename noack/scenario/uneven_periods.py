@@ -4,8 +4,6 @@ Measurements are at steps of the plant, events at measurements, and inputs take 
 ``noack check`` says these lines, and so does every run.
 """
 
-from fractions import Fraction
-
 from noack.core.clock import NS_PER_S
 from noack.core.periods import exact_ns
 from noack.scenario.scenario import Scenario
@@ -18,7 +16,7 @@ def uneven_periods(resolved: Scenario) -> list[str]:
 
 def _at_measurements(resolved: Scenario) -> list[str]:
     """Return the times of the trigger that are no multiples of that between measurements."""
-    period_ns = Fraction(resolved.timing.measurement_period_ns)
+    period_ns = resolved.timing.measurement_period.exact
     lines = []
     for key, (what, time_s) in resolved.trigger.intervals().items():
         periods = exact_ns(time_s) / period_ns
@@ -31,7 +29,7 @@ def _at_measurements(resolved: Scenario) -> list[str]:
 def _at_steps(resolved: Scenario) -> list[str]:
     """Return how long inputs wait for a step of the plant if these times differ."""
     timing = resolved.timing
-    step_ns, tick_ns = Fraction(timing.plant_period_ns), Fraction(timing.controller_period_ns)
+    step_ns, tick_ns = timing.plant_period.exact, timing.controller_period.exact
     if 1 in ((tick_ns / step_ns).denominator, (step_ns / tick_ns).denominator):
         return []
     what = "predicted inputs, too, " if resolved.controller.predictions > 1 else ""

@@ -10,6 +10,7 @@ import json
 import math
 import sys
 from collections.abc import Iterable, Mapping
+from fractions import Fraction
 from functools import cache, reduce
 from itertools import pairwise
 from operator import or_
@@ -31,6 +32,7 @@ from pydantic_core import CoreSchema
 from noack.core import extension_points
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
+from noack.core.periods import RATE_ROUNDING, period_of
 from noack.protocol.wire_format import MAX_DIMENSION
 
 Table = dict[str, object]
@@ -113,23 +115,17 @@ def _docstrings(module: str) -> dict[str, dict[str, str]]:
     return docstrings
 
 
-def period_ns(rate_hz: float) -> int:
-    """Return the period of a validated rate, a whole number of nanoseconds."""
-    return round(NS_PER_S / rate_hz)
-
-
-def _with_whole_period(rate_hz: float) -> float:
-    """Raise ValueError unless the rate's period is a whole number of nanoseconds."""
-    whole_ns = period_ns(rate_hz)
-    if whole_ns < 1 or abs(NS_PER_S / whole_ns - rate_hz) > 1e-12 * rate_hz:
+def _with_period(rate_hz: float) -> float:
+    """Raise ValueError if steps at this rate would drift from their times."""
+    if abs(1 - (exact := period_of(rate_hz).exact * Fraction(rate_hz) / NS_PER_S)) > RATE_ROUNDING:
         raise ValueError(
-            "the period must be a whole number of nanoseconds; "
-            f"the nearest such rate is {NS_PER_S / max(whole_ns, 1)!r}"
+            "the period is too near to a whole number of nanoseconds; "
+            f"the nearest such rate is {float(rate_hz / exact)!r}"
         )
     return rate_hz
 
 
-RateHz = Annotated[FiniteFloat, Field(ge=1e-6, le=100_000), AfterValidator(_with_whole_period)]
+RateHz = Annotated[FiniteFloat, Field(ge=1e-6, le=100_000), AfterValidator(_with_period)]
 """A run has at most 1e7 s: the times of its steps fit into 64 bits."""
 Row = Annotated[tuple[FiniteFloat, ...], Field(min_length=1, max_length=MAX_DIMENSION)]
 """A vector."""

@@ -87,8 +87,8 @@ class MissedJumps(NamedTuple):
     """(p,) place of the measurement."""
     event_ns: NDArray[np.int64]
     """(p,) t_k."""
-    periods: NDArray[np.int64]
-    """(p,) t − t_k, in periods."""
+    ages_ns: NDArray[np.int64]
+    """(p,) t − t_k."""
     jumps: Matrix
     """(p, n) e^{H(t−t_k)} e_s(t_k⁻)."""
 
@@ -99,7 +99,7 @@ class MissedJumps(NamedTuple):
 
 
 class MissedEvents:
-    """Follows the missed events along a run; all measurements lie on a grid of ``period_ns``."""
+    """Follows the missed events along a run; times between measurements are near multiples of a period."""
 
     def __init__(self, H: Matrix, period_ns: int) -> None:
         self._propagate, self._period_ns = Propagator(H), period_ns
@@ -138,9 +138,9 @@ class MissedEvents:
             last = max(int(np.searchsorted(totals, earlier + batch, "right")), begin + 1)
             event = np.repeat(np.arange(begin, last), lengths[begin:last])
             measurement = np.arange(len(event)) - (totals - lengths)[event] + earlier + begins[event]
-            periods = (t_ns[measurement] - times_ns[event]) // self._period_ns
-            jumps = self._propagate.advance_by_periods(errors.take(event, axis=0), periods, self._period_ns)
-            yield MissedJumps(measurement, times_ns[event], periods, jumps)
+            ages_ns = t_ns[measurement] - times_ns[event]
+            jumps = self._propagate.advance_by(errors.take(event, axis=0), ages_ns, self._period_ns)
+            yield MissedJumps(measurement, times_ns[event], ages_ns, jumps)
             begin = last
 
 
@@ -156,7 +156,7 @@ class ErrorBounds(NamedTuple):
 
 
 class ErrorMonitor:
-    """Computes the bounds along a run; its measurements lie on a grid of ``period_ns``.
+    """Computes the bounds along a run; times between its measurements are near multiples of a period.
 
     H is the matrix of both models between updates. The cost is that of a few array operations for
     each pair of a measurement and an event that is missing there.
@@ -166,7 +166,7 @@ class ErrorMonitor:
         self._trigger = trigger
         self._missed = MissedEvents(H, period_ns)
         self._weight = np.eye(len(H)) if trigger.weight is None else trigger.weight
-        self._growths = _growths(matrix_key(H), matrix_key(self._weight), period_ns)
+        self._growths = _growths(matrix_key(H), matrix_key(self._weight))
 
     def take(
         self, t_ns: NDArray[np.int64], e_s: Matrix, events: NDArray[np.int64], received: NDArray[np.int64]
@@ -181,7 +181,7 @@ class ErrorMonitor:
             identity += np.bincount(pairs.at, row_norms(jumps), count)
             missed += pairs.sums(count)
             if isinstance(self._trigger, TriggerRule) and self._trigger.is_decaying:
-                grown = self._growths.at(pairs.periods) * self._thresholds(pairs.event_ns)
+                grown = self._growths.at(pairs.ages_ns) * self._thresholds(pairs.event_ns)
                 printed += np.bincount(pairs.at, grown, count)
         return ErrorBounds(identity, printed, missed)
 
@@ -192,27 +192,26 @@ class ErrorMonitor:
 
 
 class _Growths:
-    """‖e^{Hτ}‖_W at the multiples of a period."""
+    """‖e^{Hτ}‖_W at the ages that events have."""
 
-    def __init__(self, H: Matrix, weight: Matrix, period_ns: int) -> None:
-        self._H, self._weight, self._period_ns = H, weight, period_ns
+    def __init__(self, H: Matrix, weight: Matrix) -> None:
+        self._H, self._weight = H, weight
         self._inverse = np.linalg.inv(weight)
-        self._known = np.ones(1)
+        self._known = {0: 1.0}
 
-    def at(self, periods: NDArray[np.int64]) -> Vector:
-        """Return the values at k multiples, (k,)."""
-        known, oldest = len(self._known), int(periods.max(initial=0))
-        if oldest >= known:
-            ages_ns = (i * self._period_ns for i in range(known, oldest + 1))
-            moved = self._weight @ [transition(self._H, ns) for ns in ages_ns] @ self._inverse
-            self._known = np.append(self._known, np.linalg.norm(moved, 2, axis=(1, 2)))
-        return np.asarray(self._known[periods])
+    def at(self, ages_ns: NDArray[np.int64]) -> Vector:
+        """Return the values at k ages, (k,)."""
+        different, places = np.unique(ages_ns, return_inverse=True)
+        if new := [age_ns for age_ns in different.tolist() if age_ns not in self._known]:
+            moved = self._weight @ [transition(self._H, ns) for ns in new] @ self._inverse
+            self._known |= zip(new, np.linalg.norm(moved, 2, axis=(1, 2)).tolist(), strict=True)
+        return np.array([self._known[age_ns] for age_ns in different.tolist()])[places]
 
 
 @lru_cache(maxsize=16)
-def _growths(H: MatrixKey, weight: MatrixKey, period_ns: int) -> _Growths:
+def _growths(H: MatrixKey, weight: MatrixKey) -> _Growths:
     """Return the growths of some models; loops with equal models share them."""
-    return _Growths(matrix_of(H), matrix_of(weight), period_ns)
+    return _Growths(matrix_of(H), matrix_of(weight))
 
 
 class Theorem2(NamedTuple):

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple, Self, TypeAli
 import numpy as np
 from pydantic import Field, FiniteFloat, field_validator
 
-from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, spectral_abscissa
+from noack.core.periods import Period, exact_ns
 from noack.settings.section import MatrixRows, ReadTable, ScenarioSection, require_shape
 from noack.trigger_policies.trigger_rule import Policy, TriggerRule, require_rule
 
@@ -93,7 +93,7 @@ class PolicySettings(ScenarioSection):
         """
         return {}
 
-    def check_period(self, measured_ns: int, key: str = "trigger") -> None:
+    def check_period(self, measured: Period, key: str = "trigger") -> None:
         """Require that the policy's own sampling period fits the time between measurements.
 
         Raises:
@@ -195,10 +195,10 @@ class CombinedSettings(PolicySettings):
         of_rule = {f"rule.{key}": interval for key, interval in self.rule.intervals().items()}
         return {"interval_s": (f"the {self.policy} ends at a measurement, after", self.interval_s), **of_rule}
 
-    def check_period(self, measured_ns: int, key: str = "trigger") -> None:
-        self.rule.check_period(measured_ns, f"{key}.rule")
+    def check_period(self, measured: Period, key: str = "trigger") -> None:
+        self.rule.check_period(measured, f"{key}.rule")
 
 
 def nanoseconds(seconds: float) -> int:
-    """Return a time in whole nanoseconds."""
-    return round(seconds * NS_PER_S)
+    """Return a time in whole nanoseconds, rounded down: whole steps then take as many."""
+    return int(exact_ns(seconds))

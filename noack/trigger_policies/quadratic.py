@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from noack.core.clock import NS_PER_S
+from noack.core.periods import Period, exact_ns
 from noack.settings.section import MatrixRows, NonNegative, require_shape
 from noack.trigger_policies.policy_settings import IntervalS, ModelMatrices, WeightedSettings, nanoseconds
 from noack.trigger_policies.trigger_rule import TriggerRule, quadratic_form
@@ -57,9 +58,12 @@ class QuadraticSettings(WeightedSettings):
         if not np.allclose(Q, Q.T, rtol=1e-12, atol=0.0):
             raise ValueError("trigger.Q: must be symmetric")
 
-    def check_period(self, measured_ns: int, key: str = "trigger") -> None:
-        if nanoseconds(self.period_s) % measured_ns:
+    def check_period(self, measured: Period, key: str = "trigger") -> None:
+        period_ns = exact_ns(self.period_s)
+        if period_ns % measured.exact:
             raise ValueError(
-                f"{key}.period_s: must be a whole number of the {measured_ns / NS_PER_S} s "
+                f"{key}.period_s: must be a whole number of the {measured.longest_ns / NS_PER_S} s "
                 "between measurements"
             )
+        if period_ns.denominator > 1:
+            raise ValueError(f"{key}.period_s: must be a whole number of nanoseconds")

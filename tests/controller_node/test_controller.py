@@ -17,6 +17,7 @@ from scipy.linalg import expm
 
 from controller_node.controller import Controller, LossCheck
 from noack.controllers.linear_feedback import LinearFeedback
+from noack.core.periods import Period
 from noack.guarantee.loss_guarantee import (
     DeliveriesBetweenBursts,
     LongestBurst,
@@ -39,7 +40,7 @@ PERIOD_MS = 2
 
 def new_controller(**more: Any) -> OneLoop:
     controller = Controller(
-        H, LinearFeedback(K), inputs=len(K), period_ns=PERIOD_MS * MS, first_ns=0, horizon_ns=10**9,
+        H, LinearFeedback(K), inputs=len(K), period=Period(PERIOD_MS * MS), first_ns=0, horizon_ns=10**9,
         guarantee=LossGuarantee((LongestBurst(2),)), safe_input=SAFE, **more,
     )  # fmt: skip
     return machine(controller)

@@ -31,12 +31,13 @@ WHOLE = (0, 1, -1, 7, MS, 2**40, 2**60, 2**61, 2**62 - 1, 2**62, 2**63 - 1, -(2*
 
 _MACHINE = tuple(
     f"machine.{name}"
-    for name in ("phase_ns", "first_ns", "period_ns", "horizon_ns", "step", "inputs",
-                 "reached_ns", "change_ns")
+    for name in ("phase_ns", "first_ns", "period.ns", "period.part", "period.parts", "horizon_ns",
+                 "step", "inputs", "reached_ns", "change_ns")
 )  # fmt: skip
 NUMBERS_OF = {
     "plant": (
-        *_MACHINE, "input_period_ns", "timeout_ns", "notice_ns", "newest_ns", "newest_sequence",
+        *_MACHINE, "input_period.ns", "input_period.part", "input_period.parts", "timeout_ns",
+        "notice_ns", "newest_ns", "newest_sequence",
         "fallback_ns", "fallback_sequence", "missing_ns", "measurements", "watchdog",
     ),
     "sensor": (

@@ -1,6 +1,7 @@
 """The reference loop of a scenario: its settings, and what happened by chance in a recorded run."""
 
 from collections.abc import Callable, Mapping, Sequence
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,13 @@ def why_not(scenario: Scenario) -> str | None:
     return "a user's trigger" if scenario.trigger.policy == "python" else None
 
 
+def _period_ns(rate_hz: float) -> Fraction:
+    """Return a period that is a whole number of nanoseconds, or that of a rate with few digits."""
+    whole_ns = round(1e9 / rate_hz)
+    is_whole = abs(1e9 / whole_ns - rate_hz) <= 1e-12 * rate_hz
+    return Fraction(whole_ns) if is_whole else 10**9 / Fraction(rate_hz).limit_denominator(2000)
+
+
 def settings_of(scenario: Scenario) -> Settings:
     """Return the settings of a resolved scenario."""
     loop, timing = loop_of(scenario), scenario.timing
@@ -39,8 +47,8 @@ def settings_of(scenario: Scenario) -> Settings:
         H=loop.A_model + loop.B_model @ loop.K if scenario.mode == "model" else 0 * loop.A,
         C=np.eye(loop.n) if C is None else np.array(C),
         x0=np.array(scenario.plant.initial_state), known_state=known,
-        plant_period_ns=timing.plant_period_ns, measure_every=scenario.plant.measure_every,
-        controller_period_ns=timing.controller_period_ns,
+        plant_period_ns=_period_ns(scenario.plant.rate_hz), measure_every=scenario.plant.measure_every,
+        controller_period_ns=_period_ns(scenario.controller.rate_hz),
         controller_phase_ns=timing.controller_phase_ns, horizon_ns=timing.horizon_ns,
         rules=[(t_ns, rule_of(scenario_then)) for t_ns, scenario_then in in_force],
         setpoints=[(t_ns, _x_r(scenario_then)) for t_ns, scenario_then in in_force],
@@ -91,7 +99,7 @@ def observer_of(scenario: Scenario) -> Mapping[str, Array]:
     noise = np.square(plant.measurement.noise_std or 0.0)
     noise = noise + np.square(plant.measurement.noise_bound or 0.0) / 3
     A, B = (np.array(matrix) for matrix in scenario.model.matrices)
-    _, both = held_input(A, np.hstack([np.eye(n), B]), scenario.timing.plant_period_ns)
+    _, both = held_input(A, np.hstack([np.eye(n), B]), _period_ns(scenario.plant.rate_hz))
     process = np.concatenate([
         variances[at] if std is None else np.square(std)
         for at, std in (("state", observer.process_std), ("input", observer.input_std))
@@ -109,11 +117,11 @@ def chance_of(scenario: Scenario, packets: Any) -> Chance:
     ``packets`` has the columns of the table netem_packet.
     """
     n, m = scenario.model.dimensions
-    steps = range(scenario.timing.horizon_ns // scenario.timing.plant_period_ns + 1)
+    steps = range(scenario.timing.last_step + 1)
     pushes = {"state": np.zeros((len(steps), n)), "input": np.zeros((len(steps), m))}
     for number, disturbance in enumerate(scenario.plant.disturbances):
         name = ("plant", "disturbance", str(number))
-        source = SignalSource(scenario.timing.plant_period_ns, scenario.seeds.disturbance, name)
+        source = SignalSource(scenario.timing.plant_period, scenario.seeds.disturbance, name)
         pushes[disturbance.at] += disturbance.signal(steps, source)
     v = _noise(scenario, steps)
     return Chance(

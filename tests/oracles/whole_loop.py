@@ -14,9 +14,11 @@ chance is given: disturbances, noise, and the fate of each packet on the network
 
 import heapq
 import itertools
+import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import lru_cache
 from typing import Any
 
@@ -43,9 +45,9 @@ class Settings:
     C: Array  # measured outputs, (p, n)
     x0: Array  # x(0)
     known_state: bool  # sensor and controller start from x(0); else from the first update
-    plant_period_ns: int  # h
+    plant_period_ns: Fraction  # h
     measure_every: int  # steps of the plant per measurement
-    controller_period_ns: int
+    controller_period_ns: Fraction
     controller_phase_ns: int  # time of the first tick
     horizon_ns: int  # neither a step nor a tick is later
     rules: Sequence[tuple[int, Rule]]  # from when on which trigger rule is in force
@@ -77,10 +79,15 @@ def in_force(changes: Sequence[tuple[int, Any]], t_ns: int) -> Any:
     return [what for since_ns, what in changes if since_ns <= t_ns][-1]
 
 
-def held_input(A: Array, B: Array, dt_ns: int) -> tuple[Array, Array]:
+def step_ns(k: int, period_ns: Fraction) -> int:
+    """Return the time of step k: the nearest whole number of nanoseconds, halves up."""
+    return math.floor(k * period_ns + Fraction(1, 2))
+
+
+def held_input(A: Array, B: Array, dt_ns: int | Fraction) -> tuple[Array, Array]:
     """Return Ad and Bd with x(t + dt) = Ad x(t) + Bd u, for a held input."""
     n, m = B.shape
-    both = expm(np.block([[A, B], [np.zeros((m, n + m))]]) * (dt_ns * 1e-9))
+    both = expm(np.block([[A, B], [np.zeros((m, n + m))]]) * (float(dt_ns) * 1e-9))
     return both[:n, :n], both[:n, n:]
 
 
@@ -139,8 +146,8 @@ class Plant:
     def __init__(self, s: Settings, chance: Chance, rows: Rows) -> None:
         self.s, self.chance, self.rows = s, chance, rows
         n, m = s.B.shape
-        self.Ad, B_and_G = held_input(s.A, np.hstack([s.B, np.eye(n)]), s.plant_period_ns)
-        self.Bd, self.Gd = B_and_G[:, :m], B_and_G[:, m:]
+        sources = np.hstack([s.B, np.eye(n)])
+        self.over = lru_cache(None)(lambda dt_ns: held_input(s.A, sources, dt_ns))
         self.x, self.u = s.x0, np.zeros(m)
         self.recent = [self.u] * s.measure_every  # inputs since the last measurement
         self.newest = (NONE, 0, np.zeros((s.predictions, m)), np.zeros(n))  # actuation
@@ -149,10 +156,12 @@ class Plant:
     def step(self, k: int) -> tuple[Array, Array] | None:
         """Advance to k h; return a measurement y with the recent inputs, if one is due."""
         if k > 0:
-            pushed = self.Bd @ (self.u + self.chance.d(k - 1)) + self.Gd @ self.chance.w(k - 1)
-            self.x = self.Ad @ self.x + pushed
+            before_ns, after_ns = (step_ns(j, self.s.plant_period_ns) for j in (k - 1, k))
+            (Ad, B_and_G), m = self.over(after_ns - before_ns), len(self.u)
+            pushed = B_and_G[:, :m] @ (self.u + self.chance.d(k - 1)) + B_and_G[:, m:] @ self.chance.w(k - 1)
+            self.x = Ad @ self.x + pushed
             self.recent = [*self.recent[1:], self.u]
-        t_ns = k * self.s.plant_period_ns
+        t_ns = step_ns(k, self.s.plant_period_ns)
         self.u, entry = self.input(t_ns)
         self.rows["plant_step"].append({
             "sequence": k, "t_ns": t_ns, "x": self.x, "u": self.u, "actuation": self.newest[0],
@@ -168,7 +177,9 @@ class Plant:
         _, model_ns, inputs, x_c = self.newest
         age_ns = t_ns - model_ns
         if age_ns <= self.s.watchdog_timeout_ns:
-            entry = min(max(age_ns // self.s.controller_period_ns, 0), len(inputs) - 1)
+            # Input j is for j periods later, rounded down.
+            entries = [j for j in range(len(inputs)) if int(j * self.s.controller_period_ns) <= age_ns]
+            entry = max(entries, default=0)
             return inputs[entry], entry
         match self.s.watchdog:
             case "hold":
@@ -285,13 +296,14 @@ class Controller:
         self.x_c, self.t_ns = self.model.flow(self.x_c, self.t_ns, t_ns), t_ns
         x_r, x, inputs = in_force(self.s.setpoints, t_ns), self.x_c, [self.u]
         for k in range(self.s.predictions):
-            age_ns = t_ns + k * self.s.controller_period_ns - self.update_ns
+            now_ns, next_ns = (t_ns + int(j * self.s.controller_period_ns) for j in (k, k + 1))
+            age_ns = now_ns - self.update_ns
             if self.has_state and age_ns < self.s.update_timeout_ns:
                 inputs.append(self.model.input(x_r, x))
             else:
                 holds = self.has_state and self.s.timeout_input == "hold"
                 inputs.append(inputs[-1] if holds else self.s.safe_input)
-            x = self.model.towards(x_r, x, self.s.controller_period_ns)
+            x = self.model.towards(x_r, x, next_ns - now_ns)
         inputs = inputs[1:]
         self.u = inputs[0]
         self.rows["controller_step"].append({
@@ -338,8 +350,8 @@ def run(s: Settings, chance: Chance) -> Rows:
     def plant_steps(t_ns: int, k: int) -> None:
         if (measurement := plant.step(k)) is not None:
             at(t_ns, DATAGRAM, deliver, sensor_receives, k // s.measure_every, *measurement)
-        if t_ns + s.plant_period_ns <= s.horizon_ns:
-            at(t_ns + s.plant_period_ns, PLANT, plant_steps, k + 1)
+        if (next_ns := step_ns(k + 1, s.plant_period_ns)) <= s.horizon_ns:
+            at(next_ns, PLANT, plant_steps, k + 1)
 
     def sensor_receives(t_ns: int, number: int, y: Array, u: Array) -> None:
         event = sensor.events
@@ -357,8 +369,9 @@ def run(s: Settings, chance: Chance) -> Rows:
     def controller_ticks(t_ns: int, k: int) -> None:
         route = (cross, 1) if s.actuations_cross else (deliver,)
         at(t_ns, DATAGRAM, *route, plant_receives, k, *controller.tick(k, t_ns))
-        if t_ns + s.controller_period_ns <= s.horizon_ns:
-            at(t_ns + s.controller_period_ns, TICK, controller_ticks, k + 1)
+        next_ns = s.controller_phase_ns + step_ns(k + 1, s.controller_period_ns)
+        if next_ns <= s.horizon_ns:
+            at(next_ns, TICK, controller_ticks, k + 1)
 
     def plant_receives(t_ns: int, number: int, *actuation: Any) -> None:
         plant.receive(number, *actuation)

@@ -98,7 +98,7 @@ def _steps(record: RunRecord) -> tuple[Times, Times, NDArray[np.float64], Times]
     names = record.tables[PLANT_STEP].names or ()
     columns = ("t_ns", "actuation", "u", *(["entry"] if "entry" in names else []))
     times, newest, sizes, ahead = [], [], [], []
-    tick_ns = record.scenario.timing.controller_period_ns
+    whole_ns, part, parts = record.scenario.timing.controller_period.core
     for rows in record.source.batches(PLANT_STEP, columns):
         times.append(rows["t_ns"])
         newest.append(rows["actuation"])
@@ -106,7 +106,7 @@ def _steps(record: RunRecord) -> tuple[Times, Times, NDArray[np.float64], Times]
             sizes.append(largest_sizes(rows["u"]))
         # The age of an input that was predicted counts from the time that it is for.
         predicted = np.maximum(rows["entry"], 0) if "entry" in names else np.zeros(len(rows), np.int64)
-        ahead.append(predicted * tick_ns)
+        ahead.append(predicted * whole_ns + predicted * part // parts)
     no_times, no_sizes = np.zeros(0, np.int64), np.zeros(0)
     integers = (np.concatenate([no_times, *part]) for part in (times, newest, ahead))
     t_ns, numbers, ahead_ns = integers

@@ -280,15 +280,16 @@ def _steps_without(record: RunRecord, role: str) -> int:
     Of the network, whose datagrams have no period, 0.
     """
     timing = record.scenario.timing
-    period_ns = {
-        "plant": timing.plant_period_ns,
-        "sensor": timing.measurement_period_ns,
-        "controller": timing.controller_period_ns,
+    period = {
+        "plant": timing.plant_period,
+        "sensor": timing.measurement_period,
+        "controller": timing.controller_period,
     }.get(role)
     reached_ns = max((report.get("reached_ns") or 0 for report in record.reports.values()), default=0)
     newest_ns = record.last_ns(STEP_TABLES[role]) or 0
     missing_ns = max(min(reached_ns, timing.horizon_ns) - newest_ns, 0)
-    return 0 if period_ns is None else missing_ns // period_ns
+    # Times of steps are rounded: the difference of two may be 1 ns too short.
+    return 0 if period is None else (missing_ns + (not period.is_whole)) // period.exact
 
 
 def reported_violations(record: RunRecord) -> list[ViolationPart]:

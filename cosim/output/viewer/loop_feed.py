@@ -100,7 +100,8 @@ class LoopFeed:
         self._track: ControllerTrack = initial_track(scenario)
         self._undrawn: list[Rows] = []
         self._forced: set[int] = set()
-        self._monitor = ErrorMonitor(self._loop.H, policy_of(scenario), scenario.timing.measurement_period_ns)
+        shortest_ns = scenario.timing.measurement_period.lengths_ns[0]
+        self._monitor = ErrorMonitor(self._loop.H, policy_of(scenario), shortest_ns)
         self._follower = EventFollower(scenario)
         # Plant steps whose x or z is shown with the measurements at their times.
         self._steps = np.zeros(0, self._types[PLANT_STEP])

@@ -17,7 +17,8 @@ class NetworkConditions(NamedTuple):
     sampling_s: float = 0.0
     """h, the longest time between two tests of the trigger; 0 is a continuous trigger."""
     spacing_s: float = 0.0
-    """The shortest time between two tests; all other times between tests are multiples of it."""
+    """The shortest time between two tests; all other times between tests are multiples of it. 0: tests
+    are at any times, at least ``apart_s`` apart."""
     delay_s: float = 0.0
     """d, the longest time from an event until a delivered update affects the plant's input."""
     hold_s: float = 0.0
@@ -26,6 +27,8 @@ class NetworkConditions(NamedTuple):
     """Time from which the plant applies the controller's input; before, its input is 0."""
     constraints: tuple[LossRule, ...] = ()
     """Further rules of the guarantee."""
+    apart_s: float = 0.0
+    """The shortest time between two tests that are on no grid."""
 
     @property
     def guarantee(self) -> LossGuarantee:

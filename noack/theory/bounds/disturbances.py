@@ -77,7 +77,7 @@ def normal_bounds(resolved: Scenario) -> NormalBounds | None:
     if not values and not noisy:
         return None
     # At each step the values, their sum in x, and the estimation error.
-    steps = timing.horizon_ns // timing.plant_period_ns + 1
+    steps = timing.last_step + 1
     return NormalBounds(resolved.certificate.exceedance_probability / (steps * (values + 2)))
 
 

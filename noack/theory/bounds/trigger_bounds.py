@@ -301,7 +301,7 @@ class TriggerBounds:
         rule = self.rule
         step_s = conditions.spacing_s
         return InterEventTimes(
-            shortest_s=_rounded_up(rule.earliest_ns / NS_PER_S, step_s),
+            shortest_s=max(_rounded_up(rule.earliest_ns / NS_PER_S, step_s), conditions.apart_s),
             longest_s=self._longest_until_test(rule.longest_ns, conditions),
             earliest_due_s=_rounded_up(rule.longest_ns / NS_PER_S, step_s),
         )

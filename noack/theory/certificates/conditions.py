@@ -7,12 +7,14 @@ is a constant disturbance of the loop in these coordinates.
 
 import math
 from collections.abc import Mapping
+from fractions import Fraction
 
 import numpy as np
 
 from noack.core.cached_method import cached_method
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Vector
+from noack.core.periods import exact_ns, nearest_ns
 from noack.disturbances.step import StepDisturbance
 from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee
 from noack.impairments.markov_chain import NotPredictableError
@@ -26,6 +28,8 @@ OWN_PLANT = "the scenario's plant"
 BOX = "every plant of the uncertainty box"
 REGION = "the nonlinear plant on its region"
 """The plants that a certificate covers, by name."""
+_ROUNDED_NS = 2
+"""More than two times of steps differ from exact ones, together."""
 _AT_REST = 1e-9
 """The plant rests if |A x_r + B u_r| is at most this share of its larger term."""
 
@@ -42,31 +46,54 @@ def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> NetworkCond
     their losses have no bound, an input may be as old as the run. Of predicted inputs, the plant
     applies the one whose time has come.
     """
-    step_ns, tick_ns = resolved.timing.plant_period_ns, resolved.timing.controller_period_ns
-    phase_ns, sample_ns = resolved.timing.controller_phase_ns, step_ns * resolved.plant.measure_every
+    timing = resolved.timing
+    step_ns, tick_ns = timing.plant_period.exact, timing.controller_period.exact
+    phase_ns, sample_ns = timing.controller_phase_ns, timing.measurement_period.exact
+    rounded_ns = _rounded_ns(resolved)
     # Age of the newest tick at a step: 0 < age ≤ tick and age ≡ −phase modulo the gcd; all these
     # values occur. Time from a measurement to the next tick: 0 ≤ wait < tick.
-    newest_ns = tick_ns - phase_ns % math.gcd(step_ns, tick_ns)
-    common_ns = math.gcd(sample_ns, tick_ns)
+    newest_ns = tick_ns - phase_ns % _gcd(step_ns, tick_ns) + rounded_ns
+    common_ns = _gcd(sample_ns, tick_ns)
     wait_ns = tick_ns - common_ns + phase_ns % common_ns
-    late_ns = late_periods * step_ns
+    late_ns = late_periods * timing.plant_period_ns
     in_flight_ns = network_delay_ns(resolved, late_periods)
     if in_flight_ns > 0:  # an update in flight for up to this time may just miss a tick
         wait_ns = in_flight_ns + tick_ns - 1
+        if rounded_ns:  # of the possible times, the largest one below
+            rest_ns = phase_ns % common_ns
+            wait_ns = (math.ceil((wait_ns + 1 - rest_ns) / common_ns) - 1) * common_ns + rest_ns
     gap_ns = _actuation_gap_ns(resolved)
-    delay_ns, first_ns = (((t_ns + gap_ns) // step_ns + 1) * step_ns for t_ns in (wait_ns, phase_ns))
+    delay_ns, first_ns = (_next_step_ns(resolved, t_ns + gap_ns) for t_ns in (wait_ns, phase_ns))
     # With a delay, the newest actuation that has arrived may just be one tick older than that.
-    oldest_ns = gap_ns + (newest_ns if gap_ns % tick_ns == 0 else tick_ns)
-    predicted_ns = resolved.timing.predicted_ns - tick_ns
-    age_ns = max(min(oldest_ns, tick_ns), oldest_ns - predicted_ns)
+    oldest_ns = gap_ns + (newest_ns if gap_ns % tick_ns == 0 else tick_ns + rounded_ns)
+    predicted_ns = timing.predicted_ns - tick_ns
+    age_ns = math.ceil(max(min(oldest_ns, tick_ns + rounded_ns), oldest_ns - predicted_ns))
     start_ns = first_ns if in_flight_ns == 0 else max(first_ns + late_ns, delay_ns)
     return ideal_conditions(resolved)._replace(
-        sampling_s=sample_ns / NS_PER_S,
-        spacing_s=sample_ns / NS_PER_S,
+        sampling_s=timing.measurement_period_ns / NS_PER_S,
+        spacing_s=0.0 if rounded_ns else timing.measurement_period_ns / NS_PER_S,
+        apart_s=timing.measurement_period.lengths_ns[0] / NS_PER_S if rounded_ns else 0.0,
         delay_s=delay_ns / NS_PER_S,
-        hold_s=(age_ns + step_ns + late_ns) / NS_PER_S,
+        hold_s=(age_ns + timing.plant_period_ns + late_ns) / NS_PER_S,
         start_s=start_ns / NS_PER_S,
     )
+
+
+def _rounded_ns(resolved: Scenario) -> int:
+    """Return by how much times of steps, together, differ from exact ones; their order may, too."""
+    return 0 if resolved.timing.has_whole_periods else _ROUNDED_NS
+
+
+def _next_step_ns(resolved: Scenario, t_ns: Fraction | int) -> int:
+    """Return a time up to which the plant's next step after a time has come."""
+    step_ns, rounded_ns = resolved.timing.plant_period.exact, _rounded_ns(resolved)
+    return math.ceil(((t_ns + rounded_ns) // step_ns + 1) * step_ns) + rounded_ns
+
+
+def _gcd(first: Fraction, second: Fraction) -> Fraction:
+    """Return the largest time of which both are multiples."""
+    unit = first.denominator * second.denominator
+    return Fraction(math.gcd(int(first * unit), int(second * unit)), unit)
 
 
 def _actuation_gap_ns(resolved: Scenario) -> int:
@@ -83,8 +110,7 @@ def void_by_safe_input(resolved: Scenario, conditions: NetworkConditions) -> str
     if not any(resolved.controller.safe_input or ()) or resolved.network.initial_sync == "known_state":
         return None
     timing = resolved.timing
-    first_ns = timing.controller_phase_ns + _actuation_gap_ns(resolved)
-    first_ns += timing.plant_period_ns - first_ns % timing.plant_period_ns
+    first_ns = _next_step_ns(resolved, timing.controller_phase_ns + _actuation_gap_ns(resolved))
     if conditions.start_s <= first_ns / NS_PER_S:
         return None
     return "controller.safe_input: it may be the input before the first update, where bounds assume 0"
@@ -104,8 +130,25 @@ def void_without_delay(resolved: Scenario, conditions: NetworkConditions) -> str
     )
 
 
+def void_by_uneven_steps(resolved: Scenario) -> str | None:
+    """Return why there is no certificate if the plant's steps differ by 1 ns.
+
+    An observer's steps are then not those of the plant, and sums of normal values not those of equal steps.
+    """
+    rate_hz, is_estimated = resolved.plant.rate_hz, resolved.observer is not None
+    is_normal = excluded_probability(resolved) > 0
+    if resolved.timing.plant_period.is_whole or not (is_estimated or is_normal):
+        return None
+    what = "an observer" if is_estimated else "normally distributed disturbances or noise"
+    nearest_hz = NS_PER_S / nearest_ns(resolved.timing.plant_period.exact)
+    return (
+        f"plant.rate_hz = {rate_hz:g}: bounds with {what} need a period of whole nanoseconds; "
+        f"the nearest such rate is {nearest_hz!r}"
+    )
+
+
 def void_beforehand(resolved: Scenario, conditions: NetworkConditions) -> str | None:
-    """Return why there is no certificate before a run; see the two functions above."""
+    """Return why there is no certificate before a run; see these two functions."""
     return void_without_delay(resolved, conditions) or void_by_safe_input(resolved, conditions)
 
 
@@ -136,8 +179,10 @@ def network_delay_text(resolved: Scenario) -> str:
 
 def network_delay_ns(resolved: Scenario, late_periods: int) -> int:
     """Return the longest time for which the network may delay an update under these conditions."""
-    late_ns = late_periods * resolved.timing.plant_period_ns
-    return late_ns + math.ceil(certified_delay_s(resolved) * NS_PER_S)
+    timing, delay_s = resolved.timing, certified_delay_s(resolved)
+    if not timing.has_whole_periods:  # whole steps take as many: see noack.core.periods
+        return math.floor(late_periods * timing.plant_period.exact) + int(exact_ns(delay_s) if delay_s else 0)
+    return late_periods * timing.plant_period_ns + math.ceil(delay_s * NS_PER_S)
 
 
 def allowed_conditions(resolved: Scenario) -> NetworkConditions:

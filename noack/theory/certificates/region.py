@@ -42,7 +42,7 @@ from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.certificates.assumptions import Assumption, AssumptionStatus
 from noack.theory.certificates.certified_bounds import Region, ScenarioCertificate
-from noack.theory.certificates.conditions import REGION, void_by_safe_input
+from noack.theory.certificates.conditions import REGION, void_by_safe_input, void_by_uneven_steps
 from noack.theory.certificates.constants_search import Phases
 from noack.theory.certificates.scenario_certificates import CertificateScope, box_scope, own_plant_scope
 
@@ -151,7 +151,7 @@ class RegionScope(_Box):
     @np.errstate(all="ignore")
     def loop_gain(self, conditions: NetworkConditions) -> float:
         """Return the loop gain on the region; at least 1, perhaps infinite, if there is none."""
-        if void_by_safe_input(self._resolved, conditions) is not None:
+        if void_by_safe_input(self._resolved, conditions) or void_by_uneven_steps(self._resolved):
             return math.inf
         try:
             phases = self.all_phases(conditions, longest=False, near=True)

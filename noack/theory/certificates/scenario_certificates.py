@@ -28,6 +28,7 @@ from noack.theory.certificates.conditions import (
     kept_probability,
     void_beforehand,
     void_by_safe_input,
+    void_by_uneven_steps,
 )
 from noack.theory.certificates.constants_search import ConstantsSearch, Phases, is_within
 from noack.theory.certificates.deliveries.due_deliveries import Deliveries
@@ -172,6 +173,7 @@ class CertificateScope:
         # The constants, or the reason for having none.
         void: NotDecayingError | NoCertificateError | None = None
         phases: Sequence[tuple[Constants | None, ...]] = [(None, None, None)]
+        why = why or void_by_uneven_steps(self._resolved)
         try:
             if why is not None:
                 raise NoCertificateError(why)
@@ -245,7 +247,7 @@ class CertificateScope:
     @np.errstate(all="ignore")
     def loop_gain(self, conditions: NetworkConditions) -> float:
         """Return the loop gain of a certificate; at least 1, perhaps infinite, if there is none."""
-        if void_by_safe_input(self._resolved, conditions) is not None:
+        if void_by_safe_input(self._resolved, conditions) or void_by_uneven_steps(self._resolved):
             return math.inf
         # Whether the first inputs at a set-point are covered depends on the constants.
         try:

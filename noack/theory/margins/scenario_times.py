@@ -10,6 +10,7 @@ import numpy as np
 
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
+from noack.core.periods import nearest_ns
 from noack.impairments.kinds.delay import Delay
 from noack.scenario.resolution import rule_of, setpoint_of
 from noack.scenario.scenario import Scenario
@@ -51,12 +52,25 @@ def require_idle_watchdog(resolved: Scenario) -> None:
         )
 
 
+def require_whole_periods(resolved: Scenario) -> None:
+    """Raise CallerError if steps differ by 1 ns: an exact loop repeats the same ones."""
+    timing = resolved.timing
+    for key, period in (("plant", timing.plant_period), ("controller", timing.controller_period)):
+        if not period.is_whole:
+            nearest_hz = NS_PER_S / nearest_ns(period.exact)
+            raise CallerError(
+                f"{key}.rate_hz: this needs a period of whole nanoseconds; "
+                f"the nearest such rate is {nearest_hz!r}"
+            )
+
+
 def intervals_ns(resolved: Scenario) -> tuple[int, int]:
     """Return the shortest and the longest time between two transmissions, as measurements allow.
 
     Raises:
         CallerError: there is no longest time.
     """
+    require_whole_periods(resolved)
     rule, step_ns = rule_of(resolved), resolved.timing.measurement_period_ns
     if rule.longest_ns == math.inf:
         raise CallerError(
@@ -74,6 +88,7 @@ def loop_times(resolved: Scenario, unit_ns: int) -> LoopTimes:
     Raises:
         CallerError: the delay of the updates is longer.
     """
+    require_whole_periods(resolved)
     timing, delay_ns = resolved.timing, update_delay_ns(resolved)
     if delay_ns >= unit_ns:
         is_every = unit_ns != timing.measurement_period_ns

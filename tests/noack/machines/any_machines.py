@@ -14,6 +14,7 @@ from noack.controllers.linear_feedback import LinearFeedback
 from noack.core.clock import NEVER_NS
 from noack.core.core_library import core, ffi
 from noack.core.linear_systems import Matrix, Vector, norm, product
+from noack.core.periods import Period
 from noack.guarantee.loss_guarantee import (
     DeliveriesBetweenBursts,
     LongestBurst,
@@ -167,12 +168,12 @@ def plant(seed: int, of: Sizes, scale: float = 1.0, period_ns: int = 10 * MS) ->
     return Plant(
         system,
         m,
-        period_ns=period_ns,
+        period=Period(period_ns),
         horizon_ns=10**12,
         watchdog=watchdog,
         measure_every=of.measure_every,
         predictions=of.predictions,
-        input_period_ns=int(rng.integers(1, 20)) * MS,
+        input_period=Period(int(rng.integers(1, 20)) * MS),
         disturbance=Disturbance(*waves, widths=(m * d, n * w)) if d or w else None,
         measurement=MeasurementModel(C, *(chance(rng) * np.ones((2, outputs))), seed=seed),
         reports_inputs=of.outputs > 0,
@@ -195,7 +196,7 @@ def sensor(seed: int, of: Sizes, form: int, scale: float = 1.0) -> Sensor:
         every[form % len(every)],
         x0=matrix(rng, scale, n) if chance(rng) else None,
         inputs=m,
-        period_ns=10 * MS,
+        period=Period(10 * MS),
         setpoint=matrix(rng, scale, n) if chance(rng) else None,
         timeout_ns=int(rng.integers(0, 50)) * MS if of.acknowledged else None,
         observer=observer(rng, of.outputs, n, m, steps, scale) if of.outputs else None,
@@ -217,7 +218,7 @@ def observer(rng: Rng, p: int, n: int, m: int, steps: int, scale: float) -> Obse
         model,
         x=matrix(rng, scale, n),
         reported=steps * m,
-        period_ns=10 * MS,
+        period=Period(10 * MS),
         starts_from_x0=chance(rng),
     )
 
@@ -236,7 +237,7 @@ def controller(
         matrix(rng, scale, n, n) * chance(rng),
         laws[rng.integers(0, 3)],
         m,
-        period_ns=period_ns,
+        period=Period(period_ns),
         first_ns=int(rng.integers(0, 10)) * MS if first_ns is None else first_ns,
         horizon_ns=10**12,
         guarantee=LossGuarantee(tuple(chosen)),

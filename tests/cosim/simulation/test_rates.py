@@ -1,0 +1,143 @@
+"""Rates whose periods are no whole number of nanoseconds: 30, 60, 90, 120, 144 Hz, 1/3 s."""
+
+import math
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import pytest
+
+import noack
+from cosim.analysis.replay import replay
+from cosim.simulation.virtual_time import simulate
+from noack.core.core_library import core
+from noack.core.periods import MOST_PARTS, period_of
+from noack.scenario.resolution import resolve, resolved_loops
+from noack.scenario.scenario_file import validate
+from noack.trigger_policies.quadratic import QuadraticSettings
+from plant_server.plant import plants_of
+from tests.helpers.command_line import invoke
+from tests.oracles.comparison import Comparison
+from tests.oracles.random_scenarios import random_scenario
+
+RATES = (3.0, 30.0, 60.0, 90.0, 120.0, 144.0, 30_000 / 1001)
+LONGEST_S = 10**7
+
+
+def at_rate(name: str, plant_hz: float, controller_hz: float, **settings: Any) -> noack.Scenario:
+    rates = {"plant.rate_hz": plant_hz, "controller.rate_hz": controller_hz}
+    return noack.load(name, {"horizon_s": 4.0, **rates, **settings})
+
+
+def exact_times(rate_hz: float, count: int, first: int = 0) -> np.ndarray:
+    rate = Fraction(rate_hz).limit_denominator(2000)
+    return np.array([math.floor(k * 10**9 / rate + Fraction(1, 2)) for k in range(first, first + count)])
+
+
+@pytest.mark.parametrize("rate_hz", RATES)
+def test_no_step_drifts_within_the_longest_run(rate_hz: float) -> None:
+    """In Python and in the core."""
+    period = period_of(rate_hz)
+    (loop,) = resolved_loops(at_rate("lane_following", rate_hz, rate_hz))
+    machines = plants_of([loop])
+    machine = machines.machines[0].machine
+    machine.horizon_ns = LONGEST_S * 10**9
+    rng, last = np.random.default_rng(1), int(LONGEST_S * rate_hz)
+    steps = [0, 1, 2, 3, last - 1, last, *rng.integers(0, last, 200).tolist()]
+    np.testing.assert_array_equal(
+        period.times_ns(np.array(steps)), [int(exact_times(rate_hz, 1, k)[0]) for k in steps]
+    )
+    for k in steps:
+        expected = int(exact_times(rate_hz, 1, k)[0])
+        machine.step = k
+        core.noack_process_begin(machines.core)
+        assert period.time_ns(k) == machines.core.heap[0].due_ns == expected
+        assert period.last_until(expected) == k
+        assert period.last_until(expected - 1) == k - 1 if k else True
+
+
+def test_a_rate_with_many_digits_is_met_within_its_rounding() -> None:
+    for rate_hz in np.random.default_rng(2).uniform(1, 10_000, 500).tolist():
+        period = period_of(rate_hz)
+        assert period.exact.denominator <= MOST_PARTS
+        assert float(10**9 / period.exact) == pytest.approx(rate_hz, rel=1e-12)
+
+
+def test_a_whole_period_stays_whole() -> None:
+    for rate_hz in (500.0, 100.0, 64.0, 30.000000300000004, 59.99999880000002, 1e9 / 7_654_321, 1e-6):
+        assert period_of(rate_hz).is_whole
+        assert period_of(rate_hz).longest_ns == round(1e9 / rate_hz)
+
+
+@pytest.mark.parametrize(
+    "name", ["lane_following", "lane_actuation_loss", "pendulum_observed", "lane_crosswind"]
+)
+@pytest.mark.parametrize(("plant_hz", "controller_hz"), [
+    (30.0, 30.0), (60.0, 30.0), (144.0, 48.0), (90.0, 120.0), (30_000 / 1001, 500.0),
+])  # fmt: skip
+def test_a_run_is_that_of_the_reference_loop(name: str, plant_hz: float, controller_hz: float) -> None:
+    scenario = resolve(at_rate(name, plant_hz, controller_hz))
+    record = simulate(scenario)
+    assert Comparison(record).tie_ns is None
+    steps = record["plant_step"]["t_ns"]
+    np.testing.assert_array_equal(steps, exact_times(plant_hz, len(steps)))
+    assert steps[-1] <= scenario.timing.horizon_ns < exact_times(plant_hz, 1, len(steps))[0]
+    assert replay(record).bit_exact
+
+
+@pytest.mark.parametrize("number", range(24))
+def test_random_scenarios_run_as_the_reference_loop(number: int) -> None:
+    content = random_scenario(number)
+    rng = np.random.default_rng(number)
+    for table in ("plant", "controller"):
+        content[table]["rate_hz"] = float(rng.choice([300, 600, 700, 900, 1200, 1440]))
+    if content["trigger"]["policy"] == "quadratic":
+        content["plant"]["measure_every"], content["trigger"]["period_s"] = 1, 0.01
+    record = simulate(resolve(validate(content, "random")))
+    Comparison(record)
+    assert replay(record).bit_exact
+
+
+def test_a_period_of_whole_steps_is_kept_at_each_rate() -> None:
+    for rate_hz, steps in ((30.0, 3), (60.0, 6), (90.0, 9), (120.0, 12), (30.0, 2), (90.0, 7)):
+        trigger = {"policy": "periodic", "period_s": steps / rate_hz}
+        record = simulate(resolve(at_rate("lane_following", rate_hz, rate_hz, trigger=trigger)))
+        events = record.events()["t_ns"]
+        np.testing.assert_array_equal(events, exact_times(rate_hz, len(events) * steps)[::steps])
+
+
+def test_a_grid_that_is_no_whole_number_of_nanoseconds_is_refused() -> None:
+    trigger = {**QuadraticSettings.example(4).content(), "period_s": 1 / 30}
+    with pytest.raises(noack.NoackError, match=r"trigger.period_s.*: must be a whole number of nanoseconds"):
+        at_rate("lane_following", 30.0, 30.0, trigger=trigger)
+
+
+@pytest.mark.parametrize("rate_hz", [30.0, 60.0, 90.0, 120.0, 144.0])
+def test_claims_and_identity_hold(rate_hz: float) -> None:
+    run = noack.simulate(at_rate("lane_following", rate_hz, rate_hz, horizon_s=8.0))
+    (loop,) = run.summary.loops
+    assert run.ok
+    assert loop.identity_residual_max < 1e-12
+    assert "violated" not in [claim.verdict for claim in loop.claims]
+    assert loop.missing_samples == 0
+    assert loop.uneven_periods == []
+    if rate_hz > 100:
+        assert loop.certified_for is None
+        assert sum(claim.is_certified and claim.verdict == "held" for claim in loop.claims) > 4
+
+
+def test_usual_rates_need_no_warning() -> None:
+    rates = ("--set", "plant.rate_hz=30", "--set", "controller.rate_hz=30")
+    checked = invoke("check", "lane_following", *rates)
+    assert (checked.exit_code, checked.stderr) == (0, "")
+    assert "rate_hz = 30" in checked.stdout
+
+
+def test_what_needs_equal_steps_says_so() -> None:
+    scenario = at_rate("lane_periodic", 30.0, 30.0)
+    with pytest.raises(noack.NoackError, match=r"plant.rate_hz: this needs a period of whole nanoseconds"):
+        noack.margin(scenario)
+    run = noack.simulate(at_rate("pendulum_observed", 90.0, 90.0))
+    reasons = [claim.why for claim in run.summary.loops[0].claims if claim.is_certified]
+    assert reasons
+    assert all("a period of whole nanoseconds" in why for why in reasons)
