@@ -146,6 +146,11 @@ def _wake_ups(machine: MachineFacts, required: RunRequirements) -> Iterator[Outc
         f"{required.rate_hz:g} Hz"
     )
     allowed = f"the {duration(required.allowance_ns * 1e-9)} that {required.name}'s certificates allow"
+    if not lateness.too_late and lateness.p99_us * 1e3 > required.period_ns:
+        period = duration(required.period_ns * 1e-9)
+        means = f"all within {allowed}, but 1 % are later than a step of the plant, {period}"
+        yield LIMITED, late, means, "use a less busy machine, or lower speed or rates"
+        return
     if not lateness.too_late:
         near = lateness.max_us * 1e3 > required.allowance_ns / 2
         means = f"all within {allowed}" + (", some above half of it" if near else "")
