@@ -134,6 +134,7 @@ class Sensor(MachinePart):
         if isinstance(self.policy, CodedPolicy):
             self._trigger = self.policy.new_trigger()
         self._points, self._since_ns = [self.setpoint], list[int]()
+        self._policy = self.policy  # also of a copy of another loop, which is not filled
 
     @property
     def shape(self) -> RecordShape:
