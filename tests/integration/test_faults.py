@@ -99,7 +99,8 @@ def test_a_process_that_is_not_ready_in_time_is_named(start: Start) -> None:
     assert sensor is not None
     error = running.finish_unstarted()
     # On a busy machine, other processes may not be ready, either.
-    reason = re.search(r"sensor\b.* not ready in time: waited \d+ s.* cores", error)
+    # On a slow one, the time to be ready is longer than that after which a stopped process is named.
+    reason = re.search(r"sensor (stopped \(state T\)|.*not ready in time: waited \d+ s.* cores)", error)
     assert reason is not None, error
     assert not sensor.is_running()
     outcome = reopen(max(running.runs.glob("*-lane_following")))
