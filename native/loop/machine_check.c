@@ -28,8 +28,7 @@ static const char *check_machine(const noack_machine *machine) {
         return "a machine has a phase, a horizon or a period out of range";
     if (!is_between(0, machine->step, MOST_NUMBER) || !is_between(0, machine->inputs, MOST_NUMBER)
         || (machine->period.ns > 0
-            && machine->step
-                   > MOST_NS / max_of(machine->period.ns + 1, 2 * machine->period.parts)))
+            && machine->step > MOST_NS / max_of(machine->period.ns + 1, 2 * machine->period.parts)))
         return "a machine's step or count of inputs is out of range";
     if (!is_between(0, machine->received.entries, NOACK_MAX_ENTRIES)
         || machine->acknowledgements.entries != 0)

@@ -2,8 +2,8 @@
 
    At grid time t_k = k h the plant advances its system to t_k under the input held since t_(k-1).
    Then it measures, and latches the newest actuation received; the input that is due of it is held
-   until t_(k+1). A late step has the same length h, and the plant catches up. If h is no whole number
-   of nanoseconds, t_k is rounded, and steps differ by 1 ns.
+   until t_(k+1). A late step has the same length h, and the plant catches up. If h is no whole
+   number of nanoseconds, t_k is rounded, and steps differ by 1 ns.
 
    An actuation for the model time t carries N inputs, for t, t + h_c, ..., t + (N - 1) h_c, where
    h_c is the period of the controller. Input j is applied from t + j h_c on, the last one until a

@@ -66,8 +66,8 @@ void noack_trigger_condition(
     if (rule->forecasts) {
         const double *weight = rule->forecast_weight;
         double norm = weight == NULL ? noack_norm(n, x) : image_norm(n, n, weight, x, image);
-        state->latest_ns = t_ns + (int64_t)noack_forecast_ns(
-                rule, norm, (double)(t_ns - rule->since_ns) * 1e-9);
+        state->latest_ns =
+            t_ns + (int64_t)noack_forecast_ns(rule, norm, (double)(t_ns - rule->since_ns) * 1e-9);
     }
 }
 

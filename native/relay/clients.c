@@ -34,7 +34,9 @@ static int is_same(const int64_t key[5], const int64_t other[5]) {
            == 0;
 }
 
-static inline uint64_t rotated(uint64_t word, int bits) { return word << bits | word >> (64 - bits); }
+static inline uint64_t rotated(uint64_t word, int bits) {
+    return word << bits | word >> (64 - bits);
+}
 
 static inline void sip_round(uint64_t v[4]) {
     v[0] += v[1];
@@ -59,7 +61,8 @@ uint64_t noack_client_hash(const uint64_t secret[2], const int64_t key[5]) {
         secret[1] ^ UINT64_C(0x7465646279746573),
     };
     for (int i = 0; i <= 5; i++) {
-        uint64_t word = i < 5 ? (uint64_t)key[i] : UINT64_C(40) << 56; /* last: the number of bytes */
+        uint64_t word =
+            i < 5 ? (uint64_t)key[i] : UINT64_C(40) << 56; /* last: the number of bytes */
         v[3] ^= word;
         sip_round(v);
         v[0] ^= word;
