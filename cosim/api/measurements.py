@@ -5,10 +5,13 @@ from os import PathLike
 from pathlib import Path
 from typing import Literal
 
+from cosim.measurement.loss_bursts import WINDOWS
 from cosim.measurement.measurement_outputs import write_page
 from cosim.measurement.network_measurement import QUANTILES, MeasurementOptions, NetworkMeasurement
 from cosim.measurement.network_section import write_network
-from cosim.measurement.trace_sources import read_source
+from cosim.measurement.trace_sources import USUAL_PERIOD_NS, SourceOptions, read_source
+from noack.core.errors import CallerError
+from noack.impairments.burst_prediction import USUAL_PACKETS
 from noack.traces.packet_trace import find_trace
 
 
@@ -37,6 +40,13 @@ def measure(
     deadline_s: float | None = None,
     outage_s: float | None = None,
     shares: Sequence[float] | None = None,
+    windows: Sequence[int] | None = None,
+    within: str | int | None = None,
+    flow: int = 1,
+    far_flow: int | None = None,
+    sequence_at: str | None = None,
+    clocks: Literal["same", "different"] | None = None,
+    period_s: float | None = None,
 ) -> Measurement:
     """Measure a network from a packet trace, as ``noack measure`` does.
 
@@ -50,12 +60,29 @@ def measure(
         deadline_s: a packet that takes longer counts as lost.
         outage_s: loss bursts of this duration or more are outages; by default a test decides.
         shares: shares of loss bursts and packets for which M is given.
+        windows: K of the (m, K) table.
+        within: packets, or a time such as ``"600s"``, for the chance of a long loss burst.
+        flow: which flow of a capture; 1 is the largest.
+        far_flow: which flow of a capture has the far end of the datagrams.
+        sequence_at: where the payloads of a capture have sequence numbers, ``OFFSET:BYTES[:little]``.
+        clocks: whether sending and receiving times were read on the same clock.
+        period_s: period of the simulated probe through delivery opportunities.
 
     Raises:
-        NoackError: a file cannot be read, or is not a trace.
+        NoackError: a file cannot be read, or is not a trace; an option is wrong, or has no effect.
     """
-    trace = read_source([find_trace(str(source)) for source in sources])
-    quantiles = QUANTILES if shares is None else tuple(shares)
-    options = MeasurementOptions(deadline_s, quantiles, outage_s=outage_s)
+    if clocks not in (None, "same", "different"):
+        raise CallerError(f"clocks: expected 'same' or 'different'; found {clocks!r}")
+    differ = None if clocks is None else clocks == "different"
+    period_ns = USUAL_PERIOD_NS if period_s is None else round(period_s * 1e9)
+    reading = SourceOptions(differ, flow, far_flow, sequence_at, period_ns)
+    trace = read_source([find_trace(str(source)) for source in sources], reading)
+    options = MeasurementOptions(
+        deadline_s,
+        QUANTILES if shares is None else tuple(shares),
+        WINDOWS if windows is None else tuple(sorted(set(windows))),
+        outage_s,
+        str(USUAL_PACKETS if within is None else within),
+    )
     name = " ".join(str(Path(source)) for source in sources)
     return Measurement(trace, options, name, trace.notes)

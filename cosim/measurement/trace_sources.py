@@ -20,22 +20,32 @@ from cosim.record.run_record import RunRecord, load_record
 from netem.link_state import LinkState
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core
-from noack.core.errors import CallerError, one_line, why
+from noack.core.errors import CallerError, one_line
 from noack.core.file_access import open_regular
 from noack.impairments.kinds.opportunities import OPPORTUNITY_BYTES, Opportunities
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.record_tables import CONTROLLER_DELIVERY
 from noack.settings.user_files import NamedFile
 from noack.traces.capture_packets import is_capture
-from noack.traces.capture_trace import CaptureOptions, read_captures
+from noack.traces.capture_trace import CaptureFileError, CaptureOptions, read_captures
 from noack.traces.numbered_datagrams import SequenceField
-from noack.traces.packet_trace import LOST_NS, PacketTrace, packet_trace, read_trace
+from noack.traces.packet_trace import (
+    FILE_ERRORS,
+    LOST_NS,
+    PacketTrace,
+    decompressed,
+    file_problem,
+    is_compressed,
+    packet_trace,
+    read_trace,
+)
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 _HEAD_BYTES = 64
 """Bytes by which a file is recognised."""
+USUAL_PERIOD_NS = 20_000_000
 _OTHER_SOURCES = ("run directories", "delivery opportunities")
 
 
@@ -52,7 +62,7 @@ class SourceOptions:
     """Which flow has the far end of the datagrams; None: the nearest one that has them."""
     sequence_at: str | None = None
     """Where the payloads of a capture have sequence numbers: ``OFFSET:BYTES[:little]``."""
-    period_ns: int = 20_000_000
+    period_ns: int = USUAL_PERIOD_NS
     """Period of the simulated probe through delivery opportunities."""
 
 
@@ -102,6 +112,10 @@ def read_source(paths: Sequence[Path], options: SourceOptions | None = None) -> 
             "that of the receiver's"
         )
     if is_opportunity_file(heads[0]):
+        if is_compressed(first_path):
+            raise CallerError(
+                f"{first_path}: delivery opportunities are not read compressed; gunzip it first"
+            )
         refuse_unused(options, FILE_OPTIONS, "delivery opportunities", "period_ns")
         return read_opportunities(first_path, options.period_ns)
     refuse_unused(options, FILE_OPTIONS, "a packet trace", "clocks_differ")
@@ -109,12 +123,15 @@ def read_source(paths: Sequence[Path], options: SourceOptions | None = None) -> 
 
 
 def _head(path: Path) -> bytes:
+    """Return how a file begins, decompressed if necessary."""
     try:
         with open_regular(path) as file:
-            return file.read(_HEAD_BYTES)
-    except (OSError, ValueError) as error:
-        reason = f"cannot be read: {why(error)}" if isinstance(error, OSError) else str(error)
-        raise CallerError(f"{path}: {reason}") from None
+            head = decompressed(file)[0][:_HEAD_BYTES]
+    except FILE_ERRORS as error:
+        raise CallerError(f"{path}: {file_problem(error)}") from None
+    if not head:
+        raise CallerError(f"{path}: is empty")
+    return head
 
 
 def _from_captures(paths: Sequence[Path], options: SourceOptions) -> PacketTrace:
@@ -124,12 +141,13 @@ def _from_captures(paths: Sequence[Path], options: SourceOptions) -> PacketTrace
         raise CallerError(f"--sequence-at: {error}") from None
     try:
         with ExitStack() as stack:
-            files = [stack.enter_context(open_regular(path)) for path in paths]
+            files = [decompressed(stack.enter_context(open_regular(path)))[1] for path in paths]
             chosen = CaptureOptions(options.flow, options.far_flow, field, options.clocks_differ)
             return read_captures(files, chosen)
-    except (OSError, ValueError) as error:
-        names = ", ".join(map(str, paths))
-        raise CallerError(f"{names}: {one_line(error)}") from None
+    except CaptureFileError as error:
+        raise CallerError(f"{paths[error.place]}: {one_line(error)}") from None
+    except FILE_ERRORS as error:
+        raise CallerError(f"{', '.join(map(str, paths))}: {file_problem(error)}") from None
 
 
 def read_run(run_dir: Path) -> PacketTrace:

@@ -24,18 +24,28 @@ from noack.traces.captured_flows import Capture, Datagrams, matches
 from noack.traces.merged_datagrams import divide_merged
 from noack.traces.numbered_datagrams import NumberedPackets, SequenceField, number_packets
 from noack.traces.packet_trace import (
+    FILE_ERRORS,
     MAX_PACKETS,
     Int64s,
     PacketTrace,
     TraceFormat,
     TraceRecordError,
     envelope_slope,
+    file_problem,
     packet_trace,
     relative_delays,
 )
 
 MOST_UNKNOWN = 0.01
 """Largest share of packets that may have been lost by the capture, or that it does not show as sent."""
+
+
+class CaptureFileError(ValueError):
+    """One of the files cannot be used; ``place`` is its place among them, from 0."""
+
+    def __init__(self, place: int, message: str) -> None:
+        super().__init__(message)
+        self.place = place
 
 
 @dataclass(frozen=True)
@@ -68,9 +78,15 @@ def read_captures(files: Sequence[IO[bytes]], options: CaptureOptions) -> Packet
     """Return the trace in one capture, or in those of the sender's and of the receiver's end.
 
     Raises:
-        ValueError: one line; it is not a capture, or does not show what was lost.
+        CaptureFileError: one line; a file is not a capture, or has no datagrams.
+        ValueError: one line; the captures do not show what was lost.
     """
-    captures = [Capture(file) for file in files]
+    captures = []
+    for place, file in enumerate(files):
+        try:
+            captures.append(Capture(file))
+        except FILE_ERRORS as error:
+            raise CaptureFileError(place, file_problem(error)) from None
     flow = captures[0].choose(options.flow)
     try:
         trace = _trace(captures, flow, options)
@@ -91,6 +107,8 @@ def _trace(captures: list[Capture], flow: CapturedFlow, options: CaptureOptions)
         ends = _one_capture(captures[0], flow, options, is_numbered=field is not None)
     if ends is None:
         assert field is not None
+        if options.clocks_differ is not None:
+            raise ValueError("--clocks: has no effect on one end, whose capture has no sending times")
         return _trace_of_numbers(captures[0], flow, field, options.most_packets)
     return _trace_of_ends(ends, field, options.most_packets)
 
@@ -191,15 +209,17 @@ def _trace_of_ends(ends: _Ends, field: SequenceField | None, most: int) -> Packe
     """
     ends = _with_merged_divided(ends)
     sent, received, notes = ends.sent, ends.received, ends.receiver.notes
+    here, there = ends.matched()
+    if len(here):
+        _check_foreign(ends, here)
     repeated = len(sent.hashes) - len(np.unique(sent.hashes))
     if repeated:
         shown = ends.sender.shown_text()
         raise ValueError(
             f"{repeated} of {len(sent.hashes)} datagrams have the payload of another one{shown}, and "
-            "cannot be matched; if they are numbered, give the receiver's capture with "
-            "--sequence-at OFFSET:BYTES"
+            f"cannot be matched{_order_hint(ends, repeated)}; if they are numbered, give the receiver's "
+            "capture with --sequence-at OFFSET:BYTES"
         )
-    here, there = ends.matched()
     arrived, first = np.unique(there, return_index=True)
     if not len(arrived):
         raise ValueError(
@@ -208,7 +228,6 @@ def _trace_of_ends(ends: _Ends, field: SequenceField | None, most: int) -> Packe
         )
     if len(there) > len(arrived):
         notes.append(f"duplicates at the receiver: {len(there) - len(arrived)}")
-    _check_foreign(ends, here)
     if not ends.receiver.has_fragments:
         ends.sender.note_merged(int(sent.flow[0]))
     for where, outside in (("first", arrived[0]), ("last", len(sent.t_ns) - 1 - arrived[-1])):
@@ -259,6 +278,16 @@ def _with_merged_divided(ends: _Ends) -> _Ends:
     return _Ends(ends.sender, sent, ends.receiver, received, ends.clocks_differ)
 
 
+def _order_hint(ends: _Ends, repeated: int) -> str:
+    """Return a hint for a line if repeated datagrams are in the first of two captures only."""
+    if ends.sender is ends.receiver:
+        return ""
+    repeated_there = len(ends.received.hashes) - len(np.unique(ends.received.hashes))
+    return " (unless the captures are in the wrong order: the sender's is the first)" * (
+        repeated_there < repeated
+    )
+
+
 def _check_foreign(ends: _Ends, here: Int64s) -> None:
     """Refuse captures if the far end has datagrams between the sent ones that were not sent."""
     received, known_rows = ends.received, ends.sender.datagrams
@@ -272,7 +301,7 @@ def _check_foreign(ends: _Ends, here: Int64s) -> None:
     foreign = inside[~known]
     if not len(foreign):
         return
-    count, most = len(foreign), MOST_UNKNOWN * len(ends.sent.t_ns)
+    count, most = len(np.unique(received.hashes[foreign])), MOST_UNKNOWN * len(ends.sent.t_ns)
     longest = int(ends.sent.size.max())
     merged = int(np.count_nonzero(received.size[foreign] > longest))
     if merged > most:
@@ -280,7 +309,7 @@ def _check_foreign(ends: _Ends, here: Int64s) -> None:
             f"{merged} of {len(inside)} datagrams at the far end are longer than all that were sent: the "
             "kernel merged them (UDP GRO); switch this off (ethtool -K DEVICE gro off) and capture again"
         )
-    missing = len(ends.sent.t_ns) - len(np.unique(received.hashes[here]))
+    missing = len(np.unique(ends.sent.hashes)) - len(np.unique(received.hashes[here]))
     if count > most and count > missing:
         raise ValueError(
             f"{count} of {len(inside)} datagrams at the far end are not in the sender's capture, and "
@@ -289,6 +318,7 @@ def _check_foreign(ends: _Ends, here: Int64s) -> None:
         )
     ends.receiver.notes.append(
         f"datagrams at the far end that are not in the sender's capture: {count}; they do not count"
+        f"{'' if missing else '. If the captures are in the wrong order, they were lost'}"
     )
 
 

@@ -22,8 +22,8 @@ _CERTAIN_BITS = 40
 """Bits of consecutive numbers in pieces that are no coincidence."""
 _MOST_LOST_BETWEEN = 64
 """Largest step between the numbers of two pieces."""
-_LARGE_STEP = 10
-"""Numbers that differ by multiples of this or more may be no sequence numbers."""
+_FEWEST_STEPS = 20
+"""With fewer steps nothing is said about their size."""
 
 
 class SequenceField(NamedTuple):
@@ -155,10 +155,10 @@ def _first_of_each(capture: Capture, numbered: NumberedPackets) -> NumberedPacke
 
 
 def _check_steps(capture: Capture, numbers: _Numbers, field: SequenceField) -> None:
-    """Refuse numbers in the wrong byte order, and note those that rise in large steps."""
+    """Refuse numbers in the wrong byte order, and note those that rise in equal steps above 1."""
     steps = nearest_steps(numbers.number, field.bits)
     steps = steps[steps != 0]
-    if len(steps) < 2 * _LARGE_STEP:
+    if len(steps) < _FEWEST_STEPS:
         return
     if field.size_bytes > 1 and float((steps % 256 == 0).mean()) > 0.9:
         other = str(field._replace(is_little=not field.is_little))
@@ -167,10 +167,10 @@ def _check_steps(capture: Capture, numbers: _Numbers, field: SequenceField) -> N
             f"try --sequence-at {other}"
         )
     divisor = int(np.gcd.reduce(steps))
-    if divisor >= _LARGE_STEP:
+    if divisor > 1:
         capture.notes.append(
-            f"all numbers differ by multiples of {divisor}: if the sender does not lose so many each time, "
-            "they are no sequence numbers (a time, perhaps); check --sequence-at"
+            f"all numbers differ by multiples of {divisor}: the numbers between them count as lost, which is "
+            f"wrong if the sender counts in steps of {divisor}, or if they are times; check --sequence-at"
         )
 
 

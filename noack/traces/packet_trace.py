@@ -325,7 +325,9 @@ def read_trace(
     known = _formats()
     try:
         with open_regular(path) as file:
-            head, file = _decompressed(file)
+            head, file = decompressed(file)
+            if not head:
+                raise ValueError("is empty")
             known_format = next((candidate for candidate in known if candidate.recognises(head)), None)
             if known_format is None:
                 names = ", ".join(sorted(candidate.name for candidate in known))
@@ -335,14 +337,11 @@ def read_trace(
                     "begins with a header, e.g. sequence,sent_ms,received_ms"
                 )
             return known_format.read(file, most_packets, clocks_differ)
-    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-        raise CallerError(f"{place or path}: cannot be decompressed: {one_line(error)}") from None
-    except (OSError, ValueError) as error:
-        reason = f"cannot be read: {why(error)}" if isinstance(error, OSError) else one_line(error)
-        raise CallerError(f"{place or path}: {reason}") from None
+    except FILE_ERRORS as error:
+        raise CallerError(f"{place or path}: {file_problem(error)}") from None
 
 
-def _decompressed(file: IO[bytes]) -> tuple[bytes, IO[bytes]]:
+def decompressed(file: IO[bytes]) -> tuple[bytes, IO[bytes]]:
     """Return how a file begins, and the file from its beginning, decompressed if necessary."""
     head = file.read(_HEAD_BYTES)
     file.seek(0)
@@ -352,6 +351,23 @@ def _decompressed(file: IO[bytes]) -> tuple[bytes, IO[bytes]]:
     head = content.read(_HEAD_BYTES)
     content.seek(0)
     return head, content
+
+
+def is_compressed(path: Path) -> bool:
+    """Return whether a file is compressed by gzip."""
+    with open_regular(path) as file:
+        return file.read(len(_GZIP)) == _GZIP
+
+
+FILE_ERRORS = (OSError, ValueError, EOFError, zlib.error)
+"""What reading a file raises, compressed or not."""
+
+
+def file_problem(error: Exception) -> str:
+    """Return in one line what is wrong with a file."""
+    if isinstance(error, EOFError | zlib.error | gzip.BadGzipFile):
+        return f"cannot be decompressed: {one_line(error)}"
+    return f"cannot be read: {why(error)}" if isinstance(error, OSError) else one_line(error)
 
 
 def find_trace(name: str, folder: Path = Path(), named: str = "") -> Path:

@@ -9,6 +9,7 @@ from click.testing import Result
 import noack
 from cosim.measurement.chain_fits import ChainRates
 from cosim.measurement.network_section import trace_csv
+from noack.core.errors import CallerError
 from noack.scenario import toml_file
 from noack.scenario.sections import NetworkSection
 from tests.cosim.measurement.chains import chain_losses, trace_of
@@ -119,3 +120,8 @@ def test_the_chance_of_a_long_burst_is_that_of_the_fitted_chain(chain_csv: Path)
     text = " ".join(measure(chain_csv, "--within", "500").output.split())
     assert "chance of a loss burst longer than M − 1 within 500 packets" in text
     assert "--within x: expected a number of packets, or a time" in measure(chain_csv, "--within", "x").output
+    found = noack.measure(chain_csv, within=500, windows=[20, 7])
+    assert json.loads(json.dumps(found.to_json()))["bursts_by_preferred_model"] == predicted
+    assert list(found.windows) == [7, 20]
+    with pytest.raises(CallerError, match="clocks: expected 'same' or 'different'"):
+        noack.measure(chain_csv, clocks="equal")  # type: ignore[arg-type]

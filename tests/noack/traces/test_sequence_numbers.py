@@ -207,3 +207,6 @@ def test_fields_that_are_no_sequence_numbers_are_refused() -> None:
     times = pcap_of(*(Sent(T_NS + k * PERIOD_NS, struct.pack(">I", 160 * k)) for k in range(50)))
     trace = read_captures([io.BytesIO(times)], CaptureOptions(sequence_at=SequenceField(0, 4, False)))
     assert any("multiples of 160" in line for line in trace.notes)
+    by_two = pcap_of(*(Sent(T_NS + k * PERIOD_NS, struct.pack(">I", 2 * k)) for k in range(50)))
+    trace = read_captures([io.BytesIO(by_two)], CaptureOptions(sequence_at=SequenceField(0, 4, False)))
+    assert any("multiples of 2:" in line for line in trace.notes)
