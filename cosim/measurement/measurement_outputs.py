@@ -189,6 +189,8 @@ def _numbers(measurement: NetworkMeasurement, suffix: str) -> Iterator[tuple[str
     if (fewest := measurement.fewest_deliveries) is not None:
         yield "fewest deliveries between two bursts", str(fewest)
     delays = measurement.delays
+    if measurement.trace.delays_unknown:
+        yield "delay", "not known (see below)"
     if delays.received:
         values = (duration(delays.quantiles_s[share]) for share in _SHOWN_DELAYS)
         yield f"delay {' / '.join(_SHOWN_DELAYS.values())}", " / ".join(values)
@@ -342,7 +344,8 @@ def _histogram(measurement: NetworkMeasurement) -> Panel:
 def _delays(measurement: NetworkMeasurement) -> Panel:
     trace = measurement.trace
     sent_s, lost = np.asarray(trace.sent_ns * 1e-9), trace.lost
-    values = np.asarray(np.where(lost, np.nan, np.maximum(trace.delay_ns, 1)) * 1e-9)
+    unknown = lost | (trace.delays_unknown != "")
+    values = np.asarray(np.where(unknown, np.nan, np.maximum(trace.delay_ns, 1)) * 1e-9)
     begin_s, duration_s = measurement.bursts.subset(measurement.is_outage).times_s(trace)
     items: list[Item] = [
         Line(x=sent_s, y=values, colour=_DELAYS, width=0.8, marker=".", size=2.5),
@@ -363,7 +366,7 @@ def _delays(measurement: NetworkMeasurement) -> Panel:
         title="Delay over time",
         items=items,
         x=time_axis(sent_s, label="sending time [s]"),
-        y=Axis(label="delay [s]", logarithmic=bool((~lost).any())),
+        y=Axis(label="delay [s]", logarithmic=bool((~unknown).any())),
     )
 
 

@@ -66,7 +66,7 @@ class Correlation(NamedTuple):
 
 @dataclass(frozen=True)
 class DelayStatistics:
-    """Delays in seconds; empty if no packet was received."""
+    """Delays in seconds; empty if no packet was received, or delays are not known."""
 
     received: int
     quantiles_s: dict[float, float]
@@ -79,7 +79,7 @@ class DelayStatistics:
 
 def delay_statistics(trace: PacketTrace) -> DelayStatistics:
     """Return the statistics of the packets that were received, in order or not."""
-    arrived = ~trace.lost
+    arrived = ~trace.lost & (trace.delays_unknown == "")
     delays_ns = trace.delay_ns[arrived]
     if not len(delays_ns):
         return DelayStatistics(0, {}, Correlation((), ()), 0.0)
@@ -170,6 +170,18 @@ class NetworkMeasurement:
     name: str = "trace"
     notes: Sequence[str] = ()
     """How the trace was obtained."""
+
+    def __post_init__(self) -> None:
+        """Refuse a deadline without delays."""
+        if self.options.deadline_s is not None:
+            self.require_delays("a deadline (--deadline)")
+
+    def require_delays(self, what: str) -> None:
+        """Raise CallerError if the delays of the trace are not known, naming what needs them."""
+        if self.trace.delays_unknown:
+            raise CallerError(
+                f"{self.name}: {what} needs delays; they are not known: {self.trace.delays_unknown}"
+            )
 
     @cached_property
     def outcomes(self) -> Outcomes:
@@ -282,7 +294,12 @@ class NetworkMeasurement:
         return fit_outages(durations_s, self.bursts.complete[self.is_outage], self.observed_s)
 
     def certificate_time(self, scenario: Scenario) -> CertificateTime:
-        """Return for which share of the time a scenario's certificates would have been void."""
+        """Return for which share of the time a scenario's certificates would have been void.
+
+        Raises:
+            CallerError: the delays are not known.
+        """
+        self.require_delays("a scenario's certificate (--for-scenario)")
         return certificate_time(self.trace, scenario)
 
     @cached_property

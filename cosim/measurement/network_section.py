@@ -28,10 +28,12 @@ def write_network(measurement: NetworkMeasurement, path: Path, form: Form) -> li
     """Write the section, and the trace that it names; return the written files.
 
     Raises:
-        CallerError: the name does not end in .toml, or the emulator cannot reproduce the network.
+        CallerError: the name does not end in .toml, the delays are not known, or the emulator cannot
+            reproduce the network.
         MachineError: a file cannot be written.
     """
     require_suffix(path, "--write", ".toml")
+    measurement.require_delays("a network for a scenario (--write)")
     paths = [path]
     if form == "trace":
         trace_path = path.with_suffix(".csv")

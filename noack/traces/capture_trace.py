@@ -13,7 +13,7 @@ refused.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import IO
 
 import numpy as np
@@ -30,11 +30,11 @@ from noack.traces.packet_trace import (
     PacketTrace,
     TraceFormat,
     TraceRecordError,
-    envelope_slope,
     file_problem,
     packet_trace,
     relative_delays,
 )
+from noack.traces.sending_plan import plan_sending
 
 MOST_UNKNOWN = 0.01
 """Largest share of packets that may have been lost by the capture, or that it does not show as sent."""
@@ -358,26 +358,7 @@ def _trace_of_numbers(
     order = np.argsort(numbered.packet, kind="stable")
     packet, part, received_ns = (column[order] for column in numbered[:3])
     received_ns = received_ns - received_ns.min()
-    periods_ns: list[float] = []
-    sent_ns = np.zeros(len(packet), np.int64)
-    for here in (part == k for k in np.unique(part)):
-        # The sending times: those of a constant period, below all arrivals.
-        number = packet[here] - packet[here][0]
-        period_ns = envelope_slope(number, received_ns[here]) if len(number) > 1 else numbered.period_ns
-        if period_ns <= 0:
-            raise ValueError(
-                "the sender's period is 0 ms by the arrivals: without a period, losses and delays cannot be "
-                "told; check --sequence-at"
-            )
-        planned_ns = np.rint(period_ns * number).astype(np.int64)
-        sent_ns[here] = planned_ns + (received_ns[here] - planned_ns).min()
-        periods_ns.append(period_ns)
-    sent_ns = np.maximum.accumulate(sent_ns)
-    periods = ", ".join(dict.fromkeys(f"{period_ns / 1e6:.6g}" for period_ns in periods_ns))
-    capture.notes.append(
-        f"the capture has no sending times: the sender's period is assumed to be constant, "
-        f"{periods} ms (lower envelope of the arrivals); delays are relative"
-    )
+    sent_ns, unknown = _planned_times(capture, packet, part, received_ns)
     trace = packet_trace(
         sent_ns,
         np.maximum(received_ns, sent_ns),
@@ -388,7 +369,34 @@ def _trace_of_numbers(
     )
     index = capture.flows.index(flow)
     _check_dropped(capture, capture.datagrams.where(capture.datagrams.flow == index), trace)
-    return trace
+    return replace(trace, delays_unknown=unknown)
+
+
+def _planned_times(capture: Capture, packet: Int64s, part: Int64s, received_ns: Int64s) -> tuple[Int64s, str]:
+    """Return the sending times by a constant period, below all arrivals, and why delays are not known.
+
+    If they are not, the sending times are those of the arrivals.
+    """
+    periods_ns: list[float] = []
+    sent_ns = np.zeros(len(packet), np.int64)
+    unknown = ""
+    for here in (part == k for k in np.unique(part)):
+        number = packet[here] - packet[here][0]
+        planned = plan_sending(number, received_ns[here])
+        sent_ns[here] = planned.sent_ns
+        periods_ns.append(planned.period_ns)
+        unknown = unknown or planned.unknown
+        if planned.note:
+            capture.notes.append(planned.note)
+    if unknown:
+        capture.notes.append(f"the capture has no sending times, and delays are not known: {unknown}")
+        return np.minimum.accumulate(received_ns[::-1])[::-1], unknown
+    periods = ", ".join(dict.fromkeys(f"{period_ns / 1e6:.6g}" for period_ns in periods_ns))
+    capture.notes.append(
+        "the capture has no sending times: by the arrivals, the sender's period is constant, "
+        f"{periods} ms; the smallest delay is shown as 0, and a deadline applies to these relative delays"
+    )
+    return np.maximum.accumulate(sent_ns), ""
 
 
 def _read(file: IO[bytes], most_packets: int, clocks_differ: bool) -> PacketTrace:

@@ -3,19 +3,21 @@
 import hashlib
 import os
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import IO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.traces.capture_packets import CutCaptureError, captured_packets
+from noack.traces.capture_packets import CapturedPacket, CutCaptureError, captured_packets
 from noack.traces.captured_datagrams import CapturedDatagram, CapturedFlow, DatagramReader
 from noack.traces.packet_trace import Int64s
 
 _MOST_FLOWS = 1_000_000
 _KEY = os.urandom(16)
 """Payloads are compared by a keyed hash, so that nobody can make two with the same."""
+_MOST_BEHIND_NS = 10_000_000
+"""Packets of one interface are in the order of their times, up to some ms between processors."""
 _WHOLE = 2**62
 """Bytes of a payload of which nothing is cut."""
 
@@ -163,7 +165,7 @@ class Capture:
         dropped: dict[int, int] = {}
         cut_off = ""
         try:
-            yield from reader.read(captured_packets(self._file, dropped))
+            yield from reader.read(_ascending(captured_packets(self._file, dropped)))
         except CutCaptureError as error:
             cut_off = f"the capture {error}; what is before is used"
         yield from reader.rest()
@@ -180,6 +182,22 @@ class Capture:
             )
         if reader.incomplete:
             notes.append(f"datagrams that did not arrive because fragments are missing: {reader.incomplete}")
+
+
+def _ascending(packets: Iterable[CapturedPacket]) -> Iterator[CapturedPacket]:
+    """Yield packets; refuse them if the clock was set back while an interface was captured."""
+    latest_ns: dict[int, int] = {}
+    for count, packet in enumerate(packets, 1):
+        behind_ns = latest_ns.setdefault(packet.interface, packet.t_ns) - packet.t_ns
+        if behind_ns > _MOST_BEHIND_NS:
+            raise ValueError(
+                f"packet {count} is {behind_ns / 1e9:.6g} s older than one before it: the clock was set "
+                "back, and the order and times are not known; measure the parts "
+                f"(editcap -r FILE PART 1-{count - 1}), "
+                "or sort the file if it was joined in the wrong order (reordercap)"
+            )
+        latest_ns[packet.interface] = max(latest_ns[packet.interface], packet.t_ns)
+        yield packet
 
 
 def matches(sent: Datagrams, received: Datagrams) -> tuple[Int64s, Int64s]:

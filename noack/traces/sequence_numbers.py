@@ -30,6 +30,8 @@ _DELAY_CHANGE_SHARE = 0.05
 """Nor is one by this share of the gap."""
 _MOST_OF_CYCLE = 1 / 8
 """A change of the level is a number of wraps up to this share of R."""
+_CERTAIN_SHARE = 1 / 64
+"""A change of the level by this share of R is no restart."""
 _MOST_RESTARTS = 1 / 20
 """More restarts per arrival are no restarts: the numbers are none."""
 _FAR_AHEAD_NS, _FAR_BEHIND_NS = 5 * 10**9, 60 * 10**9
@@ -199,7 +201,9 @@ def _with_wraps(
         rise = float(following.min()) - before
         wraps = round(rise / cycle)
         allowed = max(_DELAY_CHANGE_NS / period_ns, _DELAY_CHANGE_SHARE * pause, 6 * spread)
-        allowed = min(allowed, _MOST_OF_CYCLE * cycle)
+        # Small numbers come round so soon that a restart is told from wraps by little.
+        certain = max(_CERTAIN_SHARE * cycle, 2 * spread + error * pause)
+        allowed = min(allowed, certain, _MOST_OF_CYCLE * cycle)
         if wraps > 0 and abs(rise - wraps * cycle) <= allowed:
             added[i] = wraps << bits
             if pause * error > cycle / 4:

@@ -10,6 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cosim.measurement.network_measurement import MeasurementOptions, NetworkMeasurement
+from noack.core.errors import CallerError
 from noack.traces.capture_packets import captured_packets
 from noack.traces.capture_trace import CaptureOptions, read_captures
 from noack.traces.captured_datagrams import CapturedDatagram, DatagramReader
@@ -84,9 +86,8 @@ def test_numbers_at_a_known_place_may_wrap_around() -> None:
         )
         for k in range(200) if k % 5
     ]  # fmt: skip
-    arrivals[3], arrivals[4] = arrivals[4], arrivals[3]
     trace = trace_of(
-        pcap_of(*arrivals, b_short := Sent(T_NS, b"")),
+        pcap_of(b_short := Sent(T_NS, b""), *arrivals),
         sequence_at=SequenceField.parse("2:2:little"),
     )
     assert b_short.payload == b""
@@ -95,6 +96,39 @@ def test_numbers_at_a_known_place_may_wrap_around() -> None:
     expected = np.array([(k % 10 - 1) * 10**6 for k in range(1, 200)])
     assert np.abs(trace.delay_ns - expected)[~trace.lost].max() < 1000
     assert "20.0001 ms" in " ".join(trace.notes)
+
+
+@pytest.mark.parametrize("back_ns", [45_000_000, 2_000_000_000])
+def test_a_capture_whose_clock_was_set_back_is_refused(back_ns: int) -> None:
+    sent, arrived = on_leg(0), on_leg(5_000_000, LOST)
+    late = [packet._replace(t_ns=packet.t_ns - back_ns * (k >= 150)) for k, packet in enumerate(arrived)]
+    for files, options in (
+        ([pcap_of(*sent), pcap_of(*late)], {}),
+        ([pcap_of(*late)], {"sequence_at": SequenceField(2, 4, False)}),
+    ):
+        with pytest.raises(ValueError, match=r"packet 151 is .* the clock was set back"):
+            trace_of(*files, **options)
+
+
+@pytest.mark.parametrize("at", [30, 150, 280])
+@pytest.mark.parametrize("step_ns", [200_000_000, 3_600_000_000_000])
+def test_without_a_steady_clock_delays_are_not_known(at: int, step_ns: int) -> None:
+    sent, arrived = on_leg(0), on_leg(5_000_000)
+    ahead = [packet._replace(t_ns=packet.t_ns + step_ns * (k >= at)) for k, packet in enumerate(arrived)]
+    lost = [packet for k, packet in enumerate(ahead) if k not in LOST]
+    for files, options in (
+        ([pcap_of(*sent), pcap_of(*lost)], {}),
+        ([pcap_of(*lost)], {"sequence_at": SequenceField(2, 4, False)}),
+    ):
+        trace = trace_of(*files, **options)
+        assert f"changes by {step_ns / 1e6:+.1f} ms" in trace.delays_unknown
+        assert trace.lost.sum() in (len(LOST), len(LOST) - 2)
+        measured = NetworkMeasurement(trace)
+        assert measured.bursts.losses == trace.lost.sum()
+        assert measured.delays.received == 0
+        with pytest.raises(CallerError, match=r"deadline .* needs delays"):
+            NetworkMeasurement(trace, MeasurementOptions(deadline_s=0.1))
+    assert not trace_of(pcap_of(*sent), pcap_of(*lost), clocks_differ=False).delays_unknown
 
 
 def test_a_capture_of_the_sender_alone_is_refused() -> None:
@@ -245,13 +279,13 @@ def test_fragments_are_put_together(source: str, link_type: int) -> None:
     parts = parts_of(arrived, 1480, link_type)
     for k in range(0, len(parts) - 3, 3):
         parts[k : k + 3] = random.Random(k).sample(parts[k : k + 3], 3)
-    parts += parts[30:36]  # duplicates
+    parts[36:36] = [(parts[35][0], part) for _, part in parts[30:36]]  # duplicates
     whole = pcap_of(*sent, link_type=link_type)
     for sender in (whole, pcap_of_packets(parts_of(sent, 1400, link_type), link_type)):
         trace = trace_of(sender, pcap_of_packets(parts, link_type))
         assert np.flatnonzero(trace.lost).tolist() == LOST
     # A datagram of which a fragment is missing has not arrived.
-    trace = trace_of(whole, pcap_of_packets(parts[:40] + parts[41:], link_type))
+    trace = trace_of(whole, pcap_of_packets(parts[:46] + parts[47:], link_type))
     assert np.flatnonzero(trace.lost).tolist() == sorted([*LOST, 3 + 40 // 3])
     assert any("fragments are missing: 1" in line for line in trace.notes)
 

@@ -156,6 +156,24 @@ def test_a_sender_that_restarts_is_noticed(size_bytes: int, before: int, first: 
     assert sum("the sender restarted at" in line for line in trace.notes) == 1
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_a_restart_of_eight_bits_is_told_from_wraps(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    before = 256 * 4 + int(rng.integers(8, 248))  # where no number of wraps explains the restart
+    down = int(rng.integers(0, 3))
+    number = np.concatenate((np.arange(before), np.arange(700)))
+    sent_ns = np.concatenate((np.arange(before), before + down + np.arange(700))) * PERIOD_NS
+    keep = rng.random(len(number)) > 0.03
+    keep[[0, before - 1, before, -1]] = True
+    t_ns = T_NS + sent_ns + rng.integers(0, 2_000_000, len(number))
+    arrivals = find_packets((number % 256).astype(np.uint64)[keep], t_ns[keep], 8)
+    assert int(arrivals.part[-1]) == 1
+    lost = sum(
+        int(np.ptp(arrivals.packet[arrivals.part == k])) + 1 - int((arrivals.part == k).sum()) for k in (0, 1)
+    )
+    assert lost == int((~keep).sum())
+
+
 def test_a_sender_that_pauses_loses_nothing() -> None:
     number = np.arange(1000).astype(np.uint64)
     t_ns = T_NS + np.arange(1000) * 10**6
