@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 
-from noack.traces.packet_trace import Int64s, envelope_slope
+from noack.traces.smallest_delays import Int64s, envelope_slope
 
 Reals = NDArray[np.float64]
 _WINDOW = 16
