@@ -83,7 +83,9 @@ def _traffic_text(side: DirectionStatistics, key: str) -> str:
 def _loss_text(side: DirectionStatistics) -> str:
     lost, realised = side["loss"]["lost"], side["loss"]["realised"]
     stale = f", with stale {percent_text(realised)}" if realised != lost else ""
-    return percent_text(lost) + stale
+    new = f"{side['received'] - side['received_before']:,}"
+    base = f" of the {new} since the last change" if side["received_before"] else ""
+    return percent_text(lost) + stale + base
 
 
 def _drawn_text(side: DirectionStatistics) -> str:

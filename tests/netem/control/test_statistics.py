@@ -80,6 +80,7 @@ def test_loss_is_counted_since_the_settings_came_into_force(relay: FakeRelay) ->
     direction = forward(statistics(before))
     assert direction["loss"]["realised"] == direction["loss"]["lost"] == pytest.approx(0.75)
     assert (direction["received_before"], direction["received"]) == (100, 300)
+    assert "loss 75.0 % of the 200 since the last change  drawn" in next(statistics_lines(statistics(before)))
     relay.counters["up", "forward"] = Counters(
         received=301, delivered=151, dropped=150, delivered_out_of_order=5
     )
