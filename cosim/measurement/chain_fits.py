@@ -14,7 +14,7 @@ profile-likelihood intervals.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, NamedTuple
 
@@ -155,6 +155,8 @@ class FitTest:
     degrees: int
     p_value: float | None
     """None: too few data for the test."""
+    name: str = "lengths"
+    """What is tested: the ``lengths`` of bursts and deliveries, or whether losses are in ``bursts``."""
 
     @property
     def verdict(self) -> str:
@@ -165,10 +167,10 @@ class FitTest:
 
     @property
     def numbers_text(self) -> str:
-        """Statistic, degrees of freedom, and p."""
+        """Name, statistic, degrees of freedom, and p."""
         if self.p_value is None:
             return ""
-        return f"χ² = {self.statistic:.4g}, {self.degrees} d.f., p = {self.p_value:.2g}"
+        return f"{self.name}: χ² = {self.statistic:.4g}, {self.degrees} d.f., p = {self.p_value:.2g}"
 
 
 def length_test(bursts: LossBursts, left_out: Flags, rates: ChainRates, parameters: int) -> FitTest:
@@ -334,8 +336,22 @@ class ChainFits:
         return ChainFit("gilbert_elliott", rates, estimates, -best.value, 4)
 
     def test(self, fit: ChainFit) -> FitTest:
-        """Return the test of the lengths of bursts and deliveries."""
-        return length_test(self._bursts, self._left_out, fit.rates, fit.parameters)
+        """Return the test of the lengths of bursts and deliveries.
+
+        Independent losses are tested against Gilbert's chain, too, by the likelihood ratio: it finds bursts
+        in traces that are too short for the test of lengths. Of the two, the test with the smaller p is
+        returned, with p doubled (Bonferroni).
+        """
+        lengths = length_test(self._bursts, self._left_out, fit.rates, fit.parameters)
+        if fit.model != "bernoulli" or self.lost < FEWEST_EXPECTED:
+            return lengths
+        ratio = max(2 * (self.gilbert.log_likelihood - fit.log_likelihood), 0.0)
+        p_value = float(stats.chi2.sf(ratio, 1))
+        bursts = FitTest(ratio, 1, p_value, "bursts")
+        if lengths.p_value is None:
+            return bursts
+        clearest = bursts if p_value < lengths.p_value else lengths
+        return replace(clearest, p_value=min(2 * p_value, 2 * lengths.p_value, 1.0))
 
     def all(self) -> list[ChainFit]:
         """Return the three fits; none without losses."""

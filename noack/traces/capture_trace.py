@@ -36,6 +36,8 @@ from noack.traces.packet_trace import (
 )
 from noack.traces.sending_plan import plan_sending
 
+_NEAR_END = 100
+"""Arrivals by whose delays it is decided what the receiver's capture would show."""
 MOST_UNKNOWN = 0.01
 """Largest share of packets that may have been lost by the capture, or that it does not show as sent."""
 
@@ -151,6 +153,8 @@ def _one_capture(
     received, sent = matches(mine, others)
     if flow.leg.outbound and options.far_flow is None:
         _refuse_senders_end(capture.flows[k] for k in np.unique(others.flow[received]))
+    if options.far_flow is None:
+        received, sent = _without_copies(capture, flow, others, received, sent, is_numbered=is_numbered)
     if not len(sent):
         if options.far_flow not in (None, options.flow):
             raise ValueError(f"--far-flow {options.far_flow}: has no datagram of flow {options.flow}")
@@ -173,23 +177,52 @@ def _one_capture(
             raise ValueError(f"--far-flow {options.far_flow}: has no datagram of flow {options.flow}")
         medians[other] = float(np.median(delays_ns[of_flow == other]))
     else:
-        capture.notes.append(f"the other end: flow {other + 1}: {capture.flows[other]}")
         further = [k for k in medians if k != other]
         if further:
             capture.notes.append(
-                f"more legs of these datagrams: {capture.numbered(further)}; --far-flow N chooses "
-                "the other end"
+                f"these datagrams are also in {capture.numbered(further)}; --far-flow N compares with flow N"
             )
+    capture.notes.append(
+        f"compared with flow {other + 1}: {capture.flows[other]}. One host has captured both: losses and "
+        "delays are those between these two legs, not those before or after them"
+    )
+    if flow.is_copy_of(capture.flows[other]):
+        capture.notes.append("both legs have the same direction: between them is no network, only this host")
     theirs = others.where(others.flow == other)
     if is_numbered:
         capture.notes.append(
             "the capture has both ends: sending times are those of the first one, and numbers that are "
-            f"missing there count as lost; --far-flow {options.flow} measures flow {options.flow} alone"
+            "missing there count as lost; to measure one flow alone by its numbers, give its number as "
+            "--flow and as --far-flow"
         )
     differ = bool(options.clocks_differ)
     if medians[other] >= 0:
         return _Ends(capture, mine, capture, theirs, differ)
     return _Ends(capture, theirs, capture, mine, differ)
+
+
+def _without_copies(
+    capture: Capture,
+    flow: CapturedFlow,
+    others: Datagrams,
+    received: Int64s,
+    sent: Int64s,
+    *,
+    is_numbered: bool,
+) -> tuple[Int64s, Int64s]:
+    """Return matches without those on legs of the same direction, between which is no network."""
+    copies = [k for k in np.unique(others.flow[received]).tolist() if capture.flows[k].is_copy_of(flow)]
+    if not copies:
+        return received, sent
+    text = f"the same datagrams come in twice on this host (a bridge?): {capture.numbered(copies)}"
+    is_other = ~np.isin(others.flow[received], copies)
+    if not is_other.any() and not is_numbered:
+        raise ValueError(
+            f"has the receiver's end only: {text}; give the captures of both ends, or say where the payload "
+            "has a sequence number: --sequence-at OFFSET:BYTES"
+        )
+    capture.notes.append(f"{text}; it is not the other end")
+    return received[is_other], sent[is_other]
 
 
 def _refuse_senders_end(other_legs: Iterable[CapturedFlow]) -> None:
@@ -226,18 +259,16 @@ def _trace_of_ends(ends: _Ends, field: SequenceField | None, most: int) -> Packe
             "none of the datagrams sent is in the receiver's capture; are both captures "
             f"of whole packets (tcpdump -s 0), and of the same time?{ends.receiver.problem()}"
         )
-    if len(there) > len(arrived):
-        notes.append(f"duplicates at the receiver: {len(there) - len(arrived)}")
+    of_leg = there[received.flow[here] == np.bincount(received.flow[here]).argmax()]
+    if duplicates := len(of_leg) - len(np.unique(of_leg)):
+        notes.append(f"duplicates at the receiver: {duplicates}")
     if not ends.receiver.has_fragments:
         ends.sender.note_merged(int(sent.flow[0]))
-    for where, outside in (("first", arrived[0]), ("last", len(sent.t_ns) - 1 - arrived[-1])):
-        if outside:
-            notes.append(
-                f"the {where} {outside} sent datagrams did not arrive; if the receiver's capture "
-                "did not run then, they are no losses"
-            )
+    arrived_ns = received.t_ns[here[first]]
+    begin, end = _common_time(ends, arrived, arrived_ns)
+    sent, arrived = sent.where(slice(begin, end)), arrived - begin
     received_ns = np.zeros(len(sent.t_ns), np.int64)
-    received_ns[arrived] = received.t_ns[here[first]]
+    received_ns[arrived] = arrived_ns
     lost = np.ones(len(sent.t_ns), bool)
     lost[arrived] = False
     sent_ns, numbers = sent.t_ns, None
@@ -249,6 +280,31 @@ def _trace_of_ends(ends: _Ends, field: SequenceField | None, most: int) -> Packe
     )
     _check_dropped(ends.receiver, received, trace)
     return relative_delays(trace) if ends.clocks_differ else trace
+
+
+def _common_time(ends: _Ends, arrived: Int64s, arrived_ns: Int64s) -> tuple[int, int]:
+    """Return the range of sent datagrams that the receiver's capture would show, had they arrived.
+
+    Args:
+        ends: the two ends.
+        arrived: (k,) Places of the sent datagrams that arrived, ascending.
+        arrived_ns: (k,) When they arrived.
+    """
+    sent_ns, span, notes = ends.sent.t_ns, ends.receiver.span, ends.receiver.notes
+    lag_ns = arrived_ns - sent_ns[arrived]
+    soonest_ns = lag_ns[:_NEAR_END].min()
+    usually_ns = int(np.quantile(lag_ns[-_NEAR_END:], 0.99))
+    begin = min(int(np.searchsorted(sent_ns, span.begin_ns - soonest_ns)), int(arrived[0]))
+    end = max(int(np.searchsorted(sent_ns, span.end_ns - usually_ns, side="right")), int(arrived[-1]) + 1)
+    if begin:
+        notes.append(f"left out: {begin} datagrams sent before the receiver's capture begins")
+    if after := len(sent_ns) - end:
+        last_s = (sent_ns[-1] - sent_ns[end]) / 1e9
+        notes.append(
+            f"left out: {after} datagrams, of {last_s:.3g} s, that would arrive after the receiver's capture "
+            "ends; if it ran on without a packet, they were lost"
+        )
+    return begin, end
 
 
 def _numbered_rows(
@@ -272,9 +328,10 @@ def _with_merged_divided(ends: _Ends) -> _Ends:
     unmatched = np.isin(received.flow, legs)
     unmatched[here] = False
     received = divide_merged(ends.receiver, received, unmatched, sent, all_known=True)
+    far = received.where(np.isin(received.flow, legs))
     unmatched = np.ones(len(sent.t_ns), bool)
     unmatched[there] = False
-    sent = divide_merged(ends.sender, sent, unmatched, received, all_known=False)
+    sent = divide_merged(ends.sender, sent, unmatched, far, all_known=False)
     return _Ends(ends.sender, sent, ends.receiver, received, ends.clocks_differ)
 
 

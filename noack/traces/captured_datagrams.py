@@ -5,6 +5,7 @@ RFC 8200, RFC 768, IEEE 802.1Q. The library dpkt has no fragments, no VLAN tags 
 packets that are cut.
 """
 
+import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from ipaddress import ip_address
@@ -22,6 +23,8 @@ _MOST_EXTENSIONS = 8
 """Extension headers of IPv6 that are followed."""
 _OUTGOING = 4
 """The type of an outgoing packet in Linux's cooked headers."""
+_LOOPBACK = 772
+"""The loopback interface in Linux's cooked headers (ARPHRD_LOOPBACK)."""
 _LONGEST_REASSEMBLY_NS = 30 * 10**9
 """Linux waits this long for missing fragments."""
 _MOST_REASSEMBLIES = 4096
@@ -56,6 +59,13 @@ class CapturedFlow(NamedTuple):
             for host, port in ends
         )
         return f"{' → '.join(texts)} on {self.leg}"
+
+    def is_copy_of(self, other: "CapturedFlow") -> bool:
+        """Whether a host has the same datagrams twice in one direction, as with a bridge."""
+        mine, theirs = self.leg, other.leg
+        are_two_vlans = mine.vlans and theirs.vlans and mine.vlans != theirs.vlans
+        is_known = mine.outbound is not None and mine.outbound == theirs.outbound
+        return self[1:] == other[1:] and is_known and not are_two_vlans
 
     def is_reverse_of(self, other: "CapturedFlow") -> bool:
         """Whether its datagrams go the other way."""
@@ -141,6 +151,8 @@ class DatagramReader:
     def read(self, packets: Iterable[CapturedPacket]) -> Iterator[CapturedDatagram]:
         """Yield the datagrams; those with fragments when the last one arrives."""
         for packet in packets:
+            if _is_sent_on_loopback(packet):
+                continue
             located = _locate_ip(packet)
             if located is None:
                 self.unsupported[packet.link_type] = self.unsupported.get(packet.link_type, 0) + 1
@@ -196,6 +208,14 @@ class DatagramReader:
         if datagram is not None:
             self.first_fragments += 1
             yield datagram
+
+
+def _is_sent_on_loopback(packet: CapturedPacket) -> bool:
+    """Whether a cooked packet goes out on the loopback interface, where it comes in at once."""
+    data = packet.data
+    if packet.link_type == 113:
+        return data[:4] == struct.pack(">HH", _OUTGOING, _LOOPBACK)
+    return packet.link_type == 276 and data[8:11] == struct.pack(">HB", _LOOPBACK, _OUTGOING)
 
 
 def _locate_ip(packet: CapturedPacket) -> tuple[int, Leg] | None:

@@ -4,6 +4,7 @@ import hashlib
 import os
 from array import array
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import IO, NamedTuple
 
 import numpy as np
@@ -37,9 +38,15 @@ class Datagrams(NamedTuple):
     size: Int64s  # Of the payloads, in bytes
     row: Int64s  # Numbers of the datagrams in the order of the file
 
-    def where(self, which: NDArray[np.bool_] | Int64s) -> "Datagrams":
+    def where(self, which: NDArray[np.bool_] | Int64s | slice) -> "Datagrams":
         """Return those that are flagged, or those at some places."""
         return Datagrams(*(column[which] for column in self))
+
+
+@dataclass
+class _Span:
+    begin_ns: int = 2**63 - 1
+    end_ns: int = 0
 
 
 class Capture:
@@ -59,6 +66,8 @@ class Capture:
         """Datagrams of which only the beginning was captured."""
         self.has_fragments = False
         """Whether datagrams arrived in fragments."""
+        self.span = _Span()
+        """The times of the first and of the last packet, also of those without datagrams."""
         self._dropped: dict[int, int] = {}
         self._first_fragments = 0
         self._hashed_bytes = _WHOLE
@@ -165,7 +174,7 @@ class Capture:
         dropped: dict[int, int] = {}
         cut_off = ""
         try:
-            yield from reader.read(_ascending(captured_packets(self._file, dropped)))
+            yield from reader.read(_ascending(captured_packets(self._file, dropped), self.span))
         except CutCaptureError as error:
             cut_off = f"the capture {error}; what is before is used"
         yield from reader.rest()
@@ -184,8 +193,8 @@ class Capture:
             notes.append(f"datagrams that did not arrive because fragments are missing: {reader.incomplete}")
 
 
-def _ascending(packets: Iterable[CapturedPacket]) -> Iterator[CapturedPacket]:
-    """Yield packets; refuse them if the clock was set back while an interface was captured."""
+def _ascending(packets: Iterable[CapturedPacket], span: _Span) -> Iterator[CapturedPacket]:
+    """Yield packets, and note their times; refuse them if the clock was set back on an interface."""
     latest_ns: dict[int, int] = {}
     for count, packet in enumerate(packets, 1):
         behind_ns = latest_ns.setdefault(packet.interface, packet.t_ns) - packet.t_ns
@@ -197,6 +206,8 @@ def _ascending(packets: Iterable[CapturedPacket]) -> Iterator[CapturedPacket]:
                 "or sort the file if it was joined in the wrong order (reordercap)"
             )
         latest_ns[packet.interface] = max(latest_ns[packet.interface], packet.t_ns)
+        span.begin_ns = min(span.begin_ns, packet.t_ns)
+        span.end_ns = max(span.end_ns, packet.t_ns)
         yield packet
 
 

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from noack.traces.captured_flows import Capture, Datagrams, payload_hash
 
+_SMALLEST = 8
+"""Smaller datagrams are in longer ones by chance."""
 _MOST_SIZES = 64
 """Sizes of datagrams, the most frequent ones, that are tried."""
 
@@ -43,7 +45,7 @@ def divide_merged(
     suspect = unmatched & (datagrams.size > max(int(single.size.min()), 1))
     if not suspect.any():
         return datagrams
-    sizes = [size for size, _ in Counter(single.size.tolist()).most_common(_MOST_SIZES) if size > 0]
+    sizes = [size for size, _ in Counter(single.size.tolist()).most_common(_MOST_SIZES) if size >= _SMALLEST]
     known = set(single.hashes.tolist())
     rows = set(datagrams.row[suspect].tolist())
     divided: dict[int, list[tuple[int, int]]] = {}

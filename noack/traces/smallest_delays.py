@@ -61,7 +61,7 @@ def _lowest_of_each_bucket(t: Int64s, y: Int64s) -> Int64s:
     return np.sort(order[firsts_of_equal(bucket[order])])
 
 
-class Step(NamedTuple):
+class DelayStep(NamedTuple):
     """A change of the smallest delay that lasts."""
 
     place: int  # Of the first packet after it
@@ -90,7 +90,7 @@ def steady_slope(planned_ns: Reals, delay_ns: Reals) -> tuple[float, float]:
     return slope, 1.5 * float(np.median(np.abs(slopes - slope))) / len(slopes) ** 0.5
 
 
-def steps_text(steps: Sequence[Step], at_ns: Int64s) -> str:
+def steps_text(steps: Sequence[DelayStep], at_ns: Int64s) -> str:
     """Return the largest of some steps, and how many more there are, for a line.
 
     Args:
@@ -103,7 +103,7 @@ def steps_text(steps: Sequence[Step], at_ns: Int64s) -> str:
     return f"the smallest delay changes by {largest.size_ns / 1e6:+.1f} ms at {at_s:.6g} s{more}"
 
 
-def find_steps(planned_ns: Reals, delay_ns: Reals, smallest_ns: float = 0.0) -> list[Step]:
+def find_steps(planned_ns: Reals, delay_ns: Reals, smallest_ns: float = 0.0) -> list[DelayStep]:
     """Return the steps of the smallest delay, in their order; at most 20.
 
     Args:
@@ -121,7 +121,7 @@ def find_steps(planned_ns: Reals, delay_ns: Reals, smallest_ns: float = 0.0) -> 
     usual_ns, most_ns = spreads(level)
     least_ns = max(SMALLEST_STEP_NS, smallest_ns, 6 * float(np.median(np.abs(change))), usual_ns)
     is_sharp = (np.abs(change) > least_ns) & (change * near > change**2 / 2)
-    steps: list[Step] = []
+    steps: list[DelayStep] = []
     for place in (np.flatnonzero(is_sharp) + _FEW).tolist():
         # The first of the places from which a step shows is the nearest to it, up to a few packets.
         if steps and place < steps[-1].place + window // 2:
@@ -133,7 +133,7 @@ def find_steps(planned_ns: Reals, delay_ns: Reals, smallest_ns: float = 0.0) -> 
         gap_ns = planned_ns[sharpest] - planned_ns[sharpest - 1]
         by_slope_ns = 4 * slope_error * gap_ns
         if abs(size_ns) > (max(least_ns, most_ns) if is_at_end else least_ns) + by_slope_ns:
-            steps.append(Step(sharpest, size_ns))
+            steps.append(DelayStep(sharpest, size_ns))
             if len(steps) == _MOST_STEPS:
                 break
     return steps

@@ -22,6 +22,8 @@ class Sent(NamedTuple):
     direction: int = 0
     """1 inbound, 2 outbound."""
     vlans: tuple[int, ...] = ()
+    hardware: int = 1
+    """ARPHRD type of the interface, in cooked packets."""
 
 
 def packet_of(sent: Sent, link_type: int = RAW) -> bytes:
@@ -61,8 +63,10 @@ def _on_link(sent: Sent, link_type: int, version: int) -> bytes:
         ETHERNET: bytes(12) + kinds,
         LOOPBACK: struct.pack("=I", 2 if version == 4 else 10),
         RAW: b"",
-        COOKED: struct.pack(">HHH8s", packet_type, 1, 6, b"") + kinds,
-        COOKED_2: kinds[:2] + struct.pack(">HIHBB8s", 0, sent.interface, 1, packet_type, 6, b"") + kinds[2:],
+        COOKED: struct.pack(">HHH8s", packet_type, sent.hardware, 6, b"") + kinds,
+        COOKED_2: kinds[:2]
+        + struct.pack(">HIHBB8s", 0, sent.interface, sent.hardware, packet_type, 6, b"")
+        + kinds[2:],
     }[link_type]
 
 

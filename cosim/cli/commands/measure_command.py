@@ -69,7 +69,10 @@ def measure(
     flow: Annotated[int, Option(min=1, help="Flow of a capture; 1 is the largest.")] = 1,
     far_flow: Annotated[
         int | None,
-        Option(min=1, help="Flow at the far end; by default the nearest with the same datagrams."),
+        Option(
+            min=1,
+            help="Flow to compare with; by default the one in which the datagrams are seen soonest.",
+        ),
     ] = None,
     sequence_at: Annotated[
         str | None,
@@ -80,7 +83,7 @@ def measure(
     ] = None,
     clocks: Annotated[
         ClockRelation | None,
-        Option(help="Whether both times of a file were read on the same clock."),
+        Option(help="Whether sending and receiving times were read on the same clock."),
     ] = None,
     rate: Annotated[
         str,

@@ -16,14 +16,8 @@ from scipy.optimize import linprog
 from noack.core.errors import CallerError
 from noack.impairments.kinds.replay import Replay
 from noack.traces.irtt_trace import read_irtt
-from noack.traces.packet_trace import (
-    MAX_PACKETS,
-    PacketTrace,
-    envelope_slope,
-    packet_trace,
-    read_trace,
-    relative_delays,
-)
+from noack.traces.packet_trace import MAX_PACKETS, PacketTrace, packet_trace, read_trace, relative_delays
+from noack.traces.smallest_delays import envelope_slope
 from tests.helpers.approved import compare_lines, lines_of_error
 
 
