@@ -26,6 +26,7 @@ UNKNOWN := $(foreach v,$(filter-out $(SETTABLE) SHELL MAKE% -%,$(.VARIABLES)),$(
 $(if $(strip $(UNKNOWN)),$(error no such variable: $(strip $(UNKNOWN)); there are $(SETTABLE)))
 C_FILES := $(wildcard native/*.[ch] native/*/*.[ch] extensions/*/*/*.c)
 EXTENSIONS := $(patsubst %/pyproject.toml,%,$(wildcard extensions/*/pyproject.toml))
+GIVEN_DRAWS := $(strip $(if $(filter file,$(origin N)),,--number $(N)) $(if $(filter file,$(origin MINUTES)),,--minutes $(MINUTES)))
 override FLAGS := $(if $(filter-out 0 no,$(LIVE)),--live) $(ARGS)
 
 .PHONY: help
@@ -126,8 +127,10 @@ pytest-extensions: setup-dev
 	$(BIN)/python -m pytest extensions \
 		$(or $(ARGS),-m "not system" --numprocesses=3 --dist=loadfile --no-loadscope-reorder)
 
-fuzz: setup-dev ## A thousand new inputs for every parser (ARGS are pytest's, e.g. ARGS="-k scenario")
-	$(BIN)/python -m pytest tests/fuzz --hypothesis-profile search --numprocesses=2 $(ARGS)
+# With ARGS only the parsers, with N or MINUTES only whole scenarios.
+fuzz: setup-dev ## New inputs for every parser, and random whole scenarios: N=2000 of them, or for MINUTES=60
+	$(if $(GIVEN_DRAWS),,$(BIN)/python -m pytest tests/fuzz --hypothesis-profile search --numprocesses=2 $(ARGS))
+	$(if $(ARGS),,$(BIN)/python -m tests.fuzz.scenarios --seed $$(date +%s) $(GIVEN_DRAWS))
 
 attack: setup-dev ## Send N=1000000 hostile datagrams to each port of a run (5 minutes)
 	$(BIN)/python -m tests.attacks --number $(N) $(ARGS)

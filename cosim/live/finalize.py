@@ -211,7 +211,7 @@ def _evaluate_run(
         ) as show,
         helpers.share(_blocks(run), evaluate_in_helper, show) as evaluate,
     ):
-        if run.kind == "live" and loops > 1:
+        if run.kind == "live" and run.has_own_network:
             replayed = _replay(run.network)
         blocks = evaluate(evaluate_here)
     results = [loop for block in sorted(blocks, key=min) for loop in blocks[block]]

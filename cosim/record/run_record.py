@@ -74,9 +74,13 @@ _COLUMNS = 6_000
 NETWORK_ROLES = ("netem",)
 
 
-def loop_roles(loops: int) -> Sequence[str]:
-    """Return the processes whose inputs are in the record of a loop, in a run of some loops."""
-    return LOOP_ROLES if loops == 1 else [role for role in LOOP_ROLES if role not in NETWORK_ROLES]
+def loop_roles(phases_ns: Sequence[int]) -> Sequence[str]:
+    """Return the processes whose inputs are in the record of a loop, in a run of loops with these phases.
+
+    The emulator uses the time of the run: its inputs are in the record of a loop that is the only one,
+    and begins with the run.
+    """
+    return LOOP_ROLES if tuple(phases_ns) == (0,) else [r for r in LOOP_ROLES if r not in NETWORK_ROLES]
 
 
 class _Notice(LogLine):
@@ -94,7 +98,7 @@ class RunRecord:
         kind: live or simulated.
         number: the number of the loop; 0 for the network.
         roles: the processes whose inputs are all in the record: those of a loop, with the emulator
-            if it serves no other loop; the emulator alone for the network.
+            if it serves no other loop (:func:`loop_roles`); the emulator alone for the network.
     """
 
     def __init__(
@@ -295,6 +299,11 @@ class RecordedRun:
         """When each loop begins, in the time of the run."""
         return phases_ns(self.scenario)
 
+    @property
+    def has_own_network(self) -> bool:
+        """Whether the network is replayed for itself, and not with the only loop; see `loop_roles`."""
+        return loop_roles(self.phases_ns) != LOOP_ROLES
+
     @cached_property
     def names(self) -> list[str]:
         """The names of the loops."""
@@ -395,7 +404,7 @@ class StoredLoops(Sequence[RunRecord]):
             for notice in self._notices
             if notice.get(LOOP, number) == number
         ]
-        roles = loop_roles(len(self))
+        roles = loop_roles(self._phases_ns)
         return RunRecord(loop, source, notices, reports, self._kind, number, roles)
 
     @cached_property

@@ -347,7 +347,7 @@ def _simulate(
         own_counts = {table: numbers[table][number] for table in rows.types}
         reports = _reports(run, own_counts, scenario, number)
         notices = run.record.notices(number)
-        roles = loop_roles(len(loops))
+        roles = loop_roles(run.phases_ns)
         records.append(RunRecord(loop, rows, notices, reports, "simulated", number, roles))
     of_all = {table: len(rows) for table, rows in of_network.items()}
     reports = {"netem": _report(of_all, "netem", {"rejected": {}})}

@@ -338,9 +338,10 @@ def replay(record: RunRecord, shared: SharedMachines | None = None) -> ReplayRes
 
     ``shared`` has the machines of several loops, if they are replayed in turn.
 
-    In a run of several loops, the network is replayed once, for all of them: ``record`` is that of
-    the network, or that of a loop, whose network is not replayed. The record is read part by part,
-    so that memory does not grow with the length of the run.
+    In a run of several loops, or of one that begins later than the run, the network is replayed
+    once, in the time of the run: ``record`` is that of the network, or that of a loop, whose
+    network is not replayed. The record is read part by part, so that memory does not grow with the
+    length of the run.
     """
     shared = shared or SharedMachines(())
     machines = {role: MachineReplay(role, record, shared) for role in record.roles}
@@ -361,7 +362,7 @@ def replay_run(run: RecordedRun, loop: str | None = None) -> ReplayResult:
     Raises:
         CallerError: there is no such loop.
     """
-    if loop is not None or len(run.loops) == 1:
+    if loop is not None or not run.has_own_network:
         return replay(run.loop(loop))
     replays = [replay(run.network), *map(replay, run.loops)]
     processes = _by_name((result.process, result) for replayed in replays for result in replayed.processes)

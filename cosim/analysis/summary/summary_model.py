@@ -375,7 +375,7 @@ class LoopSummary(SummaryPart):
     disturbances: list[DisturbancePart]
     diverged_at_s: Real
     replay: ReplayPart | None = None
-    """Of its processes; with the network, if no other loop shares it."""
+    """Of its processes; with the network, unless others share it or the loop begins later than the run."""
     linearisation: LinearisationPart | NoLinearisationPart | None = None
     ideal_loop: IdealLoopPart | NoIdealLoopPart | None = None
     conditions: ConditionsPart | None = None
@@ -426,7 +426,7 @@ class NetworkPart(SummaryPart):
     overhead; with a duplication before the bottleneck, their copies, too."""
     in_flight: InFlightPart
     replay: ReplayPart | None = None
-    """Only if several loops share the network."""
+    """Unless it is replayed with the only loop."""
 
 
 class DeadlinesPart(SummaryPart):

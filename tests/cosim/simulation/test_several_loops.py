@@ -7,6 +7,7 @@ import pytest
 
 from cosim.analysis.replay import replay
 from cosim.analysis.replay.machine_replay import SharedMachines
+from cosim.analysis.replay.run_replay import replay_run
 from cosim.record.run_record import RecordedRun, RunRecord
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, SENSOR_MEASUREMENT, Fate
@@ -98,6 +99,16 @@ def test_the_guarantee_holds_per_loop_when_the_shared_queue_overflows(crowded: C
     assert gaps_ns.min() >= gap_ns
     # The link is loaded above its rate: it is hardly ever idle.
     assert (gaps_ns <= gap_ns + 1).mean() > 0.95
+
+
+def test_a_single_loop_with_a_phase_replays_with_the_network_in_the_time_of_the_run(short: Content) -> None:
+    """The slots of a schedule are those of the run; the loop's own time begins at its phase."""
+    short["network"]["impairments"] = [{"kind": "schedule", "order": [0, -1], "slot_s": 0.0029}]
+    only = run(short, {"name": "only", "phase": 0.3})
+    result = replay_run(only)
+    assert (result.bit_exact, result.gaps) == (True, [])
+    assert {process.process for process in result.processes} == {"plant", "sensor", "netem", "controller"}
+    assert (only.loops[0][NETEM_PACKET]["release_ns"] % 5_800_000 != 0).all()
 
 
 @pytest.mark.sanitized

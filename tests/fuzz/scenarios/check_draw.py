@@ -1,0 +1,210 @@
+"""What is checked of a drawn scenario, from reading it to its worst losses.
+
+A mistake of noack is a *contradiction*: a traceback, a message of several lines, a replay that
+differs, a claim or bound that is violated, or a step that takes too long. A draw may be refused, with
+one line.
+"""
+
+import contextlib
+import io
+import json
+import signal
+import traceback
+import warnings
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import FrameType
+from typing import NamedTuple
+
+import numpy as np
+
+from cosim.analysis.adversary import Objective, conditions_of, find_worst
+from cosim.analysis.certificates import certificates_of
+from cosim.analysis.replay.run_replay import replay_run
+from cosim.cli.scenario_check import check_scenario
+from cosim.live.finalize import finalize
+from cosim.record.run_record import load_run
+from cosim.simulation.virtual_time import simulate_run
+from noack.core.errors import NoackError
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario, loops_by_entry
+from noack.scenario.scenario_file import load
+from noack.theory.certificates.scenario_certificates import certify
+from tests.fuzz.scenarios.draws import Draw, draw, drawn_keys
+
+LIMIT_S = 60.0
+"""Largest CPU time of a step."""
+_NODES, _BEAM = 400, 8
+"""Effort of the adversary, for each objective."""
+_MOST_ENTRIES = 2
+"""Entries of [[loops]] whose loop is certified and attacked."""
+_MOST_LETTERS = 400
+"""Longest message of a refusal."""
+
+
+class Contradiction(NamedTuple):
+    """Something that must not be."""
+
+    seed: int
+    number: int
+    step: str
+    what: str
+    detail: str = ""
+
+
+class Checked(NamedTuple):
+    """What became of a draw."""
+
+    seed: int
+    number: int
+    is_refused: bool
+    contradictions: list[Contradiction]
+    keys: set[str]
+    """The keys that it sets; none if it is refused."""
+    counts: Counter[str]
+    """How often each thing was done, such as "certified"."""
+    refusals: Counter[str]
+    """The messages of refusals, each after its step."""
+
+
+class TooLongError(Exception):
+    """A step has taken more CPU time than its limit."""
+
+
+class _Checks:
+    """The steps of one draw."""
+
+    def __init__(self, drawn: Draw, folder: Path, limit_s: float) -> None:
+        self.drawn, self.folder, self.limit_s = drawn, folder, limit_s
+        self.contradictions: list[Contradiction] = []
+        self.counts, self.refusals = Counter[str](), Counter[str]()
+
+    def add(self, step: str, what: str, detail: str = "") -> None:
+        self.contradictions.append(Contradiction(self.drawn.seed, self.drawn.number, step, what, detail))
+
+    @contextlib.contextmanager
+    def step(self, name: str, *, may_refuse: bool = True) -> Iterator[None]:
+        """Do a step, with a limit of its CPU time; any exception but a refusal is a contradiction."""
+        try:
+            with _limited(self.limit_s), warnings.catch_warnings(action="error"):
+                warnings.filterwarnings("default", category=DeprecationWarning)
+                yield
+            self.counts[name] += 1
+        except NoackError as error:
+            self.counts[f"{name}: refused"] += 1
+            self.refusals[f"{name}: {str(error).replace(f'{self.folder}/', '')}"] += 1
+            if not may_refuse:
+                self.add(name, f"refused: {error}")
+            elif fault := fault_of_message(str(error)):
+                self.add(name, f"{fault}: {error}")
+        except TooLongError:
+            self.add(name, f"more than {self.limit_s:g} s of CPU time", traceback.format_exc(limit=-6))
+        except Exception as error:
+            self.add(name, f"{type(error).__name__}: {error}", traceback.format_exc(limit=-6))
+
+    def read(self, path: Path) -> Scenario | None:
+        """Return the scenario; None if it is refused."""
+        with self.step("check"):
+            scenario = load(path)
+            with contextlib.redirect_stdout(io.StringIO()):
+                check_scenario(scenario, json=False)
+            return scenario
+        return None
+
+    def simulate(self, scenario: Scenario) -> None:
+        """Simulate the run, replay it, and evaluate its claims."""
+        run_dir = None
+        with self.step("simulate"):
+            ending = simulate_run(scenario, self.folder / "runs")
+            run_dir = ending.run_dir
+        if run_dir is None:
+            return
+        warned = io.StringIO()
+        with self.step("finalize", may_refuse=False), contextlib.redirect_stderr(warned):
+            summary = finalize(ending, report=False, view=False).summary
+            if warned.getvalue():
+                self.add("finalize", warned.getvalue())
+            for loop in summary.loops:
+                if loop.unintended_losses:
+                    self.add("simulate", f"{loop.name}: {loop.unintended_losses} unintended losses")
+                for claim in loop.claims:
+                    self.counts[f"claim {claim.verdict}"] += 1
+                    if claim.verdict == "violated":
+                        values = f"observed {claim.observed}, certified {claim.certified}"
+                        self.add("claims", f"{loop.name}: {claim.what} {claim.bound}: {values}", claim.source)
+
+        with self.step("replay", may_refuse=False):
+            result = replay_run(load_run(run_dir))
+            if not result.bit_exact:
+                self.add("replay", str(result.first_difference), str(result))
+
+    def certify(self, loop: Scenario) -> None:
+        """Certify a loop under both conditions."""
+        with self.step("certify"):
+            results = certificates_of(loop, of_model=True)
+            json.dumps([certificate.to_json() for _, certificate in results], allow_nan=False)
+            self.counts["certified"] += results.answer.is_certified
+
+    def attack(self, loop: Scenario) -> None:
+        """Search for losses that exceed a certified bound."""
+        resolved, certificate = resolve(loop), None
+        with self.step("certificate to attack"):
+            certificate = certify(resolved, conditions_of(resolved, continuous=False))
+        for objective in (Objective.ERROR, Objective.STATE, Objective.INTER_EVENT):
+            if certificate is None:
+                return
+            with self.step("attack"):
+                worst = find_worst(
+                    resolved, objective, most_nodes=_NODES, beam=_BEAM, certificate=certificate
+                )
+                self.counts["attacked with a bound"] += worst.certified is not None
+                if worst.breaches:
+                    self.add("attack", f"{loop.name}: {objective.value}: found {worst.value}, certified "
+                                       f"{worst.certified}", worst.text)  # fmt: skip
+
+
+def check_draw(seed: int, number: int, limit_s: float = LIMIT_S) -> Checked:
+    """Draw a scenario, and check all that is done with it."""
+    drawn = draw(seed, number)
+    with TemporaryDirectory(prefix="noack-fuzz-") as folder:
+        checks = _Checks(drawn, Path(folder), limit_s)
+        scenario = checks.read(drawn.write(Path(folder)))
+        if scenario is not None:
+            with np.errstate(all="ignore"):
+                checks.simulate(scenario)
+            for loops in loops_by_entry(scenario)[:_MOST_ENTRIES]:
+                checks.certify(loops[0])
+                checks.attack(loops[0])
+    keys = set[str]() if scenario is None else drawn_keys(drawn.content)
+    return Checked(
+        seed, number, scenario is None, checks.contradictions, keys, checks.counts, checks.refusals
+    )
+
+
+def fault_of_message(message: str) -> str | None:
+    """Return what is wrong with the message of a refusal; None if it is one clear line."""
+    if len(message.splitlines()) != 1:
+        return "not one line"
+    if len(message) > _MOST_LETTERS:
+        return f"{len(message)} letters"
+    if any(word in message for word in ("Traceback", "<class", " object at 0x")):
+        return "not for a user"
+    return None
+
+
+@contextlib.contextmanager
+def _limited(limit_s: float) -> Iterator[None]:
+    """Raise TooLongError in a body that takes more CPU time than the limit."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise TooLongError
+
+    before = signal.signal(signal.SIGPROF, stop)
+    signal.setitimer(signal.ITIMER_PROF, limit_s)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, before)
