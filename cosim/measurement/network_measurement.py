@@ -348,6 +348,7 @@ class NetworkMeasurement:
                 str(window): {"most_losses": losses.in_all, "without_outages": losses.without_outages}
                 for window, losses in self.windows.items()
             },
+            "delays_unknown": self.trace.delays_unknown or None,
             "delay_s": {str(share): value for share, value in self.delays.quantiles_s.items()},
             "delay_correlation": dict(
                 zip(map(str, self.delays.correlation.lags), self.delays.correlation.at_lags, strict=True)

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from noack.core.errors import CallerError, one_line, shortened, why
 from noack.core.file_access import open_regular
-from noack.traces.smallest_delays import envelope_slope, find_steps, steps_text
+from noack.traces.smallest_delays import FEWEST, envelope_slope, find_steps, steps_text
 
 Int64s = NDArray[np.int64]
 Times = NDArray[np.float64]
@@ -191,6 +191,8 @@ def relative_delays(trace: PacketTrace) -> PacketTrace:
             "measure the parts (editcap -A, -B), or give --clocks same if the clocks were synchronised"
         )
         return replace(trace, delays_unknown=reason).noted(f"delays are not known: {reason}")
+    if len(here) < FEWEST:
+        trace = trace.noted(f"fewer than {FEWEST} arrivals do not show whether a clock was set between them")
     slope = 0.0 if len(here) < _FEWEST else envelope_slope(sent_ns, delay_ns)
     is_plausible = 0 < abs(slope) <= MOST_DRIFT_PPM * 1e-6
     if is_plausible:

@@ -66,13 +66,15 @@ def plan_sending(number: Int64s, received_ns: Int64s) -> SendingPlan:
     delay_ns = received_ns - planned_ns
     sent_ns = planned_ns + delay_ns.min()
     if len(number) < FEWEST:
-        return SendingPlan(sent_ns, period_ns, "", "")
+        return SendingPlan(
+            sent_ns, period_ns, f"fewer than {FEWEST} datagrams do not show a constant period; {_BOTH}", ""
+        )
     steps = find_steps(planned_ns.astype(float), delay_ns.astype(float), period_ns / 4)
     if steps:
         unknown = (
-            f"{steps_text(steps, received_ns)}: the sender paused while its numbers went on, the receiver's "
-            "clock was set, the route changed, or a queue stays full; measure the parts (editcap -A, -B), or "
-            f"{_BOTH}"
+            f"{steps_text(steps, received_ns)}: the sender paused or became slower while its numbers went "
+            "on, the receiver's clock was set, the route changed, or a queue stays full; measure the parts "
+            f"(editcap -A, -B), or {_BOTH}"
         )
         return SendingPlan(sent_ns, period_ns, unknown, "")
     unknown, note = why_not_straight(number, period_ns, (received_ns - sent_ns).astype(float))

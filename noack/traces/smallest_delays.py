@@ -20,7 +20,7 @@ Reals = NDArray[np.float64]
 _BUCKETS = 4096
 """Parts of the time, of which each has its smallest delay."""
 FEWEST = 64
-"""With fewer packets nothing is said about steps."""
+"""With fewer packets steps cannot be told."""
 _MOST_BLOCKS, SMALLEST_BLOCK = 50, 16
 _FEW = 8
 """A step shows within so many packets; so many must be before it, and after it."""
@@ -130,6 +130,8 @@ def find_steps(planned_ns: Reals, delay_ns: Reals, smallest_ns: float = 0.0) -> 
         sharpest = int(np.abs(near[here.start - _FEW : here.stop - _FEW]).argmax()) + here.start
         size_ns = _lasting(planned_ns, level, sharpest, window)
         is_at_end = min(sharpest, count - sharpest) < window
+        if size_ns < 0 and sharpest < window:
+            continue  # a queue that empties when the trace begins
         gap_ns = planned_ns[sharpest] - planned_ns[sharpest - 1]
         by_slope_ns = 4 * slope_error * gap_ns
         if abs(size_ns) > (max(least_ns, most_ns) if is_at_end else least_ns) + by_slope_ns:

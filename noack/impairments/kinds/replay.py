@@ -206,6 +206,8 @@ class Replay(FileFeature, Impairment):
 
     def with_trace(self, trace: PacketTrace, file: NamedFile) -> Self:
         """Return the settings with a trace, which was in a file."""
+        if trace.delays_unknown:
+            file.wrong(f"cannot be replayed: delays are not known: {trace.delays_unknown}")
         if (trace.delay_ns > LONGEST_DELAY_NS).any():
             file.wrong("has a delay of more than an hour; a replay can have none")
         update = {

@@ -44,6 +44,20 @@ def test_a_constant_period_gives_the_delays(count: int, seed: int) -> None:
         assert np.abs(error_ns).max() < max(np.quantile(delay_ns, 0.2), 1e6), name
 
 
+def test_a_trace_that_begins_and_ends_in_stalls_has_known_delays() -> None:
+    count = 3000
+    delay_ns = delays_of(count, 1)["small"]
+    for begin in (0, 1500):
+        delay_ns[begin : begin + 80] += np.arange(80, 0, -1) * PERIOD_NS
+    plan, error_ns = plan_of(np.arange(count) * PERIOD_NS, delay_ns)
+    assert not plan.unknown
+    assert np.abs(error_ns).max() < 1e6
+
+
+def test_few_packets_do_not_show_the_period() -> None:
+    assert "fewer than 64" in plan_of(np.arange(50) * PERIOD_NS, np.zeros(50))[0].unknown
+
+
 @pytest.mark.parametrize("count", [300, 3000, 30_000])
 @pytest.mark.parametrize("seed", range(4))
 def test_a_sender_without_a_constant_period_has_no_known_delays(count: int, seed: int) -> None:
