@@ -11,7 +11,6 @@ from itertools import combinations, permutations
 from typing import NamedTuple
 
 from netem.tc_words import guarantee_words, settings_of
-from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.number_format import at_least, at_most, duration
 from noack.guarantee.loss_guarantee import LossGuarantee, OutcomePattern, find_counterexample, outcome_letters
@@ -373,9 +372,9 @@ def find_margin(
         between_updates=resolved.between_updates,
         mansd=network.mansd,
         guarantee=network.guarantee.meaning,
-        shortest_s=margin.shortest_ns / NS_PER_S,
-        period_s=margin.longest_ns / NS_PER_S,
-        delay_s=margin.loop.times.delay_ns / NS_PER_S,
+        shortest_s=margin.seconds(margin.shortest),
+        period_s=margin.seconds(margin.longest),
+        delay_s=margin.loop.times.seconds(margin.loop.times.delay),
         caps=_with_implied_bounds(caps),
         every_m=every_m,
         period=limit,
@@ -424,27 +423,27 @@ def find_longest_period(resolved: Scenario, progress: MarginProgress = lambda te
     then the interval between them is bisected. Stability need not be monotonic in the period, so
     nothing is said about periods that were not examined.
     """
-    step_ns = resolved.timing.measurement_period_ns
     examined: dict[int, Stability] = {}
 
     def is_stable(steps: int) -> bool:
-        progress(f"the longest period: {steps * step_ns / NS_PER_S:g} s")
-        examined[steps] = LossMargin(resolved, steps * step_ns).coarse_bounds()
+        progress(f"the longest period: {own_margin.seconds(steps):g} s")
+        examined[steps] = LossMargin(resolved, steps).coarse_bounds()
         return examined[steps].verdict == "stable"
 
     own_margin = LossMargin(resolved)
-    is_longest = own_margin.shortest_ns < own_margin.longest_ns
-    longest = max(resolved.timing.horizon_ns, own_margin.longest_ns) // step_ns
-    shortest = own_margin.loop.times.delay_ns // step_ns + 1
+    is_longest = own_margin.shortest < own_margin.longest
+    times, measurement_ns = own_margin.loop.times, resolved.timing.measurement_period.exact
+    longest = max(int(resolved.timing.horizon_ns / measurement_ns), own_margin.longest)
+    shortest = int(times.delay / (times.parts * measurement_ns)) + 1
     if is_longest:  # below the policy's least time, all times between updates would be equal
-        shortest = max(shortest, own_margin.shortest_ns // step_ns)
+        shortest = max(shortest, own_margin.shortest)
     stable, unstable = 0, 0
-    steps = own_margin.longest_ns // step_ns
+    steps = own_margin.longest
     while not stable or not unstable:
         if is_stable(steps):
             stable = steps
             if steps == longest:
-                return PeriodLimit(steps * step_ns / NS_PER_S, None, is_longest, None)
+                return PeriodLimit(own_margin.seconds(steps), None, is_longest, None)
             next_steps = min(2 * steps, longest)
         else:
             unstable = steps
@@ -456,8 +455,8 @@ def find_longest_period(resolved: Scenario, progress: MarginProgress = lambda te
         steps = (stable + unstable) // 2
         stable, unstable = (steps, unstable) if is_stable(steps) else (stable, steps)
     return PeriodLimit(
-        stable * step_ns / NS_PER_S if stable else None,
-        unstable * step_ns / NS_PER_S,
+        own_margin.seconds(stable) if stable else None,
+        own_margin.seconds(unstable),
         is_longest,
         examined[unstable],
     )

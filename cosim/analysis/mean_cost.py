@@ -141,7 +141,7 @@ def find_mean_cost(resolved: Scenario, Q: Matrix | None = None, R: Matrix | None
     return MeanCost(
         scenario=resolved.name,
         mode=resolved.mode,
-        period_s=periods.times.period_ns / NS_PER_S,
+        period_s=periods.times.seconds(periods.times.period),
         horizon_s=resolved.timing.horizon_ns / NS_PER_S,
         state_names=loop.state_names or tuple(f"x_{i + 1}" for i in range(n)),
         input_names=loop.input_names or tuple(f"u_{j + 1}" for j in range(loop.m)),
@@ -170,8 +170,9 @@ def _cost_under(resolved: Scenario, periods: LoopPeriods, guarantee: LossGuarant
 
     rms = _roots(map(over_time, range(n + m)))
     horizon_cost: float | None = None
+    horizon = resolved.timing.horizon_ns * periods.times.parts
     with suppress(NotPredictableError):  # there are too many periods
-        horizon_cost = float(moments.until(start, resolved.timing.horizon_ns)[1][whole_cost])
+        horizon_cost = float(moments.until(start, horizon)[1][whole_cost])
     transient = moments.of_cost(whole_cost).transient(start)
     return CostUnder(
         guarantee.meaning,

@@ -66,6 +66,11 @@ class Period:
         return whole_ns, part, self.exact.denominator
 
     @property
+    def seconds(self) -> float:
+        """T in seconds, rounded."""
+        return float(self.exact / NS_PER_S)
+
+    @property
     def is_whole(self) -> bool:
         """Whether it is a whole number of nanoseconds."""
         return self.exact.denominator == 1

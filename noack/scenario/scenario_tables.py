@@ -13,7 +13,7 @@ from noack.controllers.linear_feedback import LinearFeedbackSettings
 from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.number_format import as_html, as_text
-from noack.core.periods import Period, period_of
+from noack.core.periods import Period, exact_ns, period_of, simplest_fraction
 from noack.plants.linear import LinearSettings
 from noack.protocol.roles import PROTOCOLS, LoopProtocol
 from noack.protocol.wire_format import Flow
@@ -217,15 +217,18 @@ class Timing:
 
     @property
     def controller_phase_ns(self) -> int:
-        """Time of the controller's first tick."""
-        return round(self.scenario.controller.phase * self.controller_period_ns)
+        """Time of the controller's first tick; rounded up, so that it is not before a step at its time."""
+        phase, period = self.scenario.controller.phase, self.controller_period
+        if period.is_whole:
+            return round(phase * period.longest_ns)
+        return math.ceil(simplest_fraction(phase) * period.exact)
 
     @property
     def actuation_timeout_ns(self) -> int:
         """Age of the newest actuation at which the plant's watchdog acts."""
         timeout_s = self.scenario.plant.watchdog.timeout_s
         if timeout_s is not None:
-            return round(timeout_s * NS_PER_S)
+            return math.ceil(exact_ns(timeout_s))  # of that age, it is not yet too old
         usual_ns = _WATCHDOG_PERIODS * self.controller_period_ns
         actuation = self.scenario.network.actuation
         if actuation is None:
@@ -237,7 +240,7 @@ class Timing:
     def update_timeout_ns(self) -> int:
         """Age of the newest update from which on the controller does not use it."""
         timeout_s = self.scenario.controller.update_timeout_s
-        return NEVER_NS if timeout_s is None else round(timeout_s * NS_PER_S)
+        return NEVER_NS if timeout_s is None else int(exact_ns(timeout_s))
 
     @property
     def actuation_gap_ns(self) -> int | None:

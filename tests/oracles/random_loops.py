@@ -79,8 +79,8 @@ def random_loop(seed: int) -> RandomLoop:
     scale = wanted / _fastest(margin, guarantee)
     original = margin.maps
 
-    def scaled(slot: int, usable_ns: int, losses: int) -> IntervalMatrix:
-        matrix = original(slot, usable_ns, losses)
+    def scaled(slot: int, usable: int, losses: int) -> IntervalMatrix:
+        matrix = original(slot, usable, losses)
         return matrix @ exactly(np.eye(len(matrix.middle[0])) * scale ** (losses + 1))
 
     margin.maps = scaled

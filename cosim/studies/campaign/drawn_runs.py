@@ -135,7 +135,7 @@ class SampledWork:
         drift = np.zeros((size, size))
         drift[:n, :n], drift[:n, n:] = loop.A, through
         block = np.block([[-drift.T, weight], [np.zeros((size, size)), drift]])
-        block = expm(block * (record.scenario.timing.plant_period_ns / NS_PER_S))
+        block = expm(block * (record.scenario.timing.plant_period.seconds))
         over_a_step = block[size:, size:].T @ block[:size, size:]
         z = np.hstack([steps[name] for name in ("x", *inputs)])[:-1]
         return float(np.einsum("kj,kj->", z @ over_a_step, z))
@@ -143,7 +143,7 @@ class SampledWork:
     def _trapezoid(self, record: RunRecord) -> float:
         x, u = record[PLANT_STEP]["x"], record[PLANT_STEP]["u"][:-1]
         Q, R = self._weights(record.loop.n, record.loop.m)
-        step_s = record.scenario.timing.plant_period_ns / NS_PER_S
+        step_s = record.scenario.timing.plant_period.seconds
         of_x = np.trapezoid(np.einsum("ki,ij,kj->k", x, Q, x))
         return float(step_s * (of_x + np.einsum("ki,ij,kj->", u, R, u)))
 

@@ -121,7 +121,7 @@ def network_outcome(search: NetworkSearch, given: CertifiedLoop, best: Certified
 
 
 def _loop_result(search: NetworkSearch, loop: CertifiedLoop) -> LoopResult:
-    proven, share = loop.stability, search.scenario.timing.measurement_period_ns / search.period_ns
+    proven, share = loop.stability, 1 / search.measurements
     reach = f"M = {loop.m}{', the most examined' * (loop.m == search.most)}" if loop.m else "nothing proven"
     growth = (
         f"{at_least(proven.lower, decimals=5)} to {at_most(proven.upper, decimals=5)}" if proven else NONE
@@ -153,8 +153,8 @@ def _notes(search: NetworkSearch) -> Iterator[str]:
         f"the best of {search.tried:,} loops tried, with a cost of at most {limit}; what it "
         "tolerates is proven, that it is the best is not"
     )
-    wanted_s, period_s = search.request.period_s, search.period_ns / NS_PER_S
-    if wanted_s is not None and round(wanted_s * NS_PER_S) != search.period_ns:
+    wanted_s, period_s = search.request.period_s, search.period_s
+    if wanted_s is not None and abs(wanted_s - period_s) > 1 / NS_PER_S:
         yield f"--period {wanted_s:g}: updates are sent at measurements, every {period_s:g} s"
 
 

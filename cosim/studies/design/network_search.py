@@ -115,8 +115,10 @@ class NetworkSearch:
         self.request, self.scenario = request, time_triggered(scenario, request.period_s)
         resolved = resolve(self.scenario)
         self.plant, margin = loop_of(resolved), LossMargin(resolved)
-        self.period_ns, self._times = margin.longest_ns, margin.loop.times
-        if margin.shortest_ns < margin.longest_ns:
+        self.measurements, self._times = margin.longest, margin.loop.times
+        """From an update to the next one."""
+        self.period_s = margin.seconds(margin.longest)
+        if margin.shortest < margin.longest:
             raise CallerError(
                 f'trigger.policy = "{scenario.trigger.policy}": the search is for periodic '
                 "updates; give their --period"

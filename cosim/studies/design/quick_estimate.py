@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import expm, solve_discrete_lyapunov
 
-from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.bounds.stacked_norms import Stack
 from noack.theory.margins.loss_margin import Burst
@@ -63,31 +62,31 @@ class QuickLoop:
         occurrences = [(x, x_c, w, w), (x, x_c, u, K @ x_c), (x, x_c, u, without_update)]
         steps = (_Map(np.vstack(rows), np.zeros((size, size))) for rows in occurrences)
         self._between = Timeline(times, self._exponential, *steps).between
-        self._x_c, self._arrived = slice(n, 2 * n), expm(H * (times.delay_ns / NS_PER_S)) @ x
+        self._x_c, self._arrived = slice(n, 2 * n), expm(H * times.seconds(times.delay)) @ x
         self._lost, self._delivered = cache(self._lost_period), cache(self._delivered_period)
         self._z = np.eye(size), np.eye(size)
-        if not times.delay_ns:  # just after a delivery x_c = x and w = u
+        if not times.delay:  # just after a delivery x_c = x and w = u
             self._z = np.vstack([x, u]), np.vstack([x, x, u, u]) @ np.vstack([x, u]).T
 
-    def _exponential(self, dt_ns: int) -> _Map:
+    def _exponential(self, dt: int) -> _Map:
         """Return the flow over dt (Van Loan, IEEE Trans. Autom. Control 23(3), 1978)."""
         G, n = self._generator, len(self._generator)
         block = np.block([[-G.T, self._weight], [np.zeros((n, n)), G]])
-        exponential = expm(block * (dt_ns / NS_PER_S))
+        exponential = expm(block * self.times.seconds(dt))
         M = exponential[n:, n:]
         return _Map(M, M.T @ exponential[:n, n:])
 
-    def _lost_period(self, slot: int, usable_ns: int) -> _Map:
+    def _lost_period(self, slot: int, usable: int) -> _Map:
         """Return the map of a period whose update is lost; x_c is used for some time."""
-        from_ns = slot * self.times.period_ns
-        return self._between(from_ns, from_ns + self.times.period_ns, from_ns + usable_ns)
+        begin = slot * self.times.period
+        return self._between(begin, begin + self.times.period, begin + usable)
 
-    def _delivered_period(self, slot: int, usable_ns: int) -> _Map:
+    def _delivered_period(self, slot: int, usable: int) -> _Map:
         """Return the map of a period whose update is delivered; x_c before it is used for some time."""
-        from_ns = slot * self.times.period_ns
-        until_ns, arrival_ns = from_ns + self.times.period_ns, from_ns + self.times.delay_ns
-        first = self._between(from_ns, arrival_ns, from_ns + usable_ns)
-        second = self._between(arrival_ns, until_ns, from_ns + self.times.timeout_ns)
+        begin = slot * self.times.period
+        end, arrival = begin + self.times.period, begin + self.times.delay
+        first = self._between(begin, arrival, begin + usable)
+        second = self._between(arrival, end, begin + self.times.timeout)
         M = first.M.copy()
         M[self._x_c] = self._arrived
         return _Map(M, first.C).then(second)
@@ -97,10 +96,10 @@ class QuickLoop:
 
         The controller knows x(0), and the input is 0 until its first tick.
         """
-        usable_ns = self.times.usable_ns(1, self.times.delay_ns)
-        round_map = self._delivered(0, usable_ns)
+        usable = self.times.usable(1, self.times.delay)
+        round_map = self._delivered(0, usable)
         for slot in range(1, self.times.slots):
-            round_map = round_map.then(self._delivered(slot, usable_ns))
+            round_map = round_map.then(self._delivered(slot, usable))
         if not np.isfinite([round_map.M, round_map.C]).all() or not spectral_radii(round_map.M) < 1 - 1e-9:
             return np.inf
         z0 = np.concatenate([x0, x0, np.zeros(2 * self._m)])
@@ -110,10 +109,10 @@ class QuickLoop:
         """Return the maps of bursts between two deliveries, (k, d, d)."""
         (rows, start), times, maps = self._z, self.times, []
         for burst in bursts:
-            M = self._delivered(burst.slot, burst.usable_ns).M @ start
+            M = self._delivered(burst.slot, burst.usable).M @ start
             for number in range(1, burst.losses + 1):
-                usable_ns = times.usable_ns(number, times.period_ns)
-                M = self._lost((burst.slot + number) % times.slots, usable_ns).M @ M
+                usable = times.usable(number, times.period)
+                M = self._lost((burst.slot + number) % times.slots, usable).M @ M
             maps.append(rows @ M)
         return np.array(maps)
 

@@ -151,19 +151,24 @@ def stacked(*parts: FixedPointMatrix) -> FixedPointMatrix:
     return FixedPointMatrix(entries, np.concatenate([part.errors for part in parts]))
 
 
-def exponential(generator: Matrix, dt_ns: int) -> FixedPointMatrix:
+def exponential(generator: Matrix, dt: int, parts: int = 1) -> FixedPointMatrix:
     """Return e^{G dt}, with G per second, by Taylor's series and repeated squaring.
+
+    Args:
+        generator: G, (n, n).
+        dt: in parts of a nanosecond.
+        parts: their number in a nanosecond.
 
     Raises:
         OverflowError: an entry, or its error, is beyond double precision.
     """
-    whole = fixed(generator)
-    scaled = [value * dt_ns // NS_PER_S for value in whole.entries.ravel()]
+    whole, per_s = fixed(generator), parts * NS_PER_S
+    scaled = [value * dt // per_s for value in whole.entries.ravel()]
     norm = sum(abs(value) for value in scaled) or 1
     halvings = max(norm.bit_length() - _DIGITS + 4, 0)
     entries = np.empty(generator.shape, dtype=object)
     entries.ravel()[:] = [value >> halvings for value in scaled]
-    step = FixedPointMatrix(entries, np.full_like(entries, dt_ns // NS_PER_S + 3))
+    step = FixedPointMatrix(entries, np.full_like(entries, dt // per_s + 3))
     total = term = fixed(np.eye(len(generator)))
     for order in range(1, _TAYLOR_TERMS):
         term = term @ step

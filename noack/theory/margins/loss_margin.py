@@ -16,14 +16,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.guarantee.loss_guarantee import LongestBurst, LossAutomaton, LossGuarantee, outcome_letters
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.margins.exact_matrices import IntervalMatrix
 from noack.theory.margins.joint_spectral_radius import ACCURACY, MOST_VERTICES, joint_spectral_radius
-from noack.theory.margins.scenario_times import intervals_ns, loop_times, require_covered
+from noack.theory.margins.scenario_times import intervals, loop_times, require_covered
 from noack.theory.margins.switched_system import Edge
 from noack.theory.margins.time_triggered_loop import LoopTimes, TimeTriggeredLoop
 
@@ -51,7 +50,7 @@ class Burst(NamedTuple):
     target: int
     slot: int
     """Number of the step of the first delivered update, modulo the number of slots."""
-    usable_ns: int
+    usable: int
     """How long the update before the first one is used after the first one's transmission."""
     losses: int
     steps: int
@@ -81,7 +80,7 @@ def list_bursts(
     """
     automaton = LossAutomaton(guarantee)
     first = int(automaton.after_delivery(np.zeros(1, int))[0])
-    begin = first, 0, loop.usable_ns(1, loop.delay_ns)
+    begin = first, 0, loop.usable(1, loop.delay)
     numbers, pending = {begin: 0}, [begin]
     bursts: dict[tuple[int, int, int], Burst] = {}
     while pending:
@@ -91,7 +90,7 @@ def list_bursts(
             after = int(automaton.after_delivery(np.array([state]))[0])
             sent = losses + 1
             for steps in range(sent * times.shortest, sent * times.longest + 1):
-                target = after, (slot + steps) % loop.slots, loop.usable_ns(steps, loop.delay_ns)
+                target = after, (slot + steps) % loop.slots, loop.usable(steps, loop.delay)
                 if target not in numbers:
                     numbers[target] = len(numbers)
                     pending.append(target)
@@ -208,26 +207,26 @@ class LossMargin:
 
     Args:
         resolved: the resolved scenario.
-        longest_ns: longest time between two transmissions, a multiple of the time between
-            measurements; by default the scenario's.
+        longest: longest time between two transmissions, in measurements; by default the scenario's.
 
     Raises:
         CallerError: the loop is not covered; the message names the setting.
     """
 
-    def __init__(self, resolved: Scenario, longest_ns: int | None = None) -> None:
+    def __init__(self, resolved: Scenario, longest: int | None = None) -> None:
         require_covered(resolved)
         loop = loop_of(resolved)
         self.guarantee = resolved.network.guarantee
-        self.shortest_ns, self.longest_ns = intervals_ns(resolved)
-        if longest_ns is not None:
-            is_regular = self.shortest_ns == self.longest_ns
-            self.shortest_ns = longest_ns if is_regular else min(self.shortest_ns, longest_ns)
-            self.longest_ns = longest_ns
-        is_periodic = self.shortest_ns == self.longest_ns
-        self._unit_ns = unit_ns = self.longest_ns if is_periodic else resolved.timing.measurement_period_ns
-        self._times = EventTimes(self.shortest_ns // unit_ns, self.longest_ns // unit_ns)
-        times = loop_times(resolved, unit_ns)
+        self.shortest, self.longest = intervals(resolved)
+        if longest is not None:
+            is_regular = self.shortest == self.longest
+            self.shortest = longest if is_regular else min(self.shortest, longest)
+            self.longest = longest
+        is_periodic = self.shortest == self.longest
+        self._unit = unit = self.longest if is_periodic else 1
+        self._measurement = resolved.timing.measurement_period
+        self._times = EventTimes(self.shortest // unit, self.longest // unit)
+        times = loop_times(resolved, unit)
         self.loop = TimeTriggeredLoop(loop.A, loop.B, loop.K, loop.H, times)
         # A controller that knows x(0) gets its first update after a period.
         knows_start = resolved.network.initial_sync == "known_state"
@@ -235,13 +234,17 @@ class LossMargin:
         self.maps: Callable[[int, int, int], IntervalMatrix] = cache(self.loop.map)
         """The loop's maps by slot, use of the update before, and number of lost updates."""
 
+    def seconds(self, measurements: int) -> float:
+        """Return the time of a number of measurements."""
+        return self._measurement.times(measurements).seconds
+
     def bursts(self, guarantee: LossGuarantee) -> list[Burst]:
         """Return the graph of a guarantee; raise CallerError if it has too many edges."""
         return list_bursts(guarantee, self.loop.times, self._times)
 
     def edges(self, bursts: list[Burst]) -> list[Edge]:
         """Return a graph with the loop's maps."""
-        maps = [self.maps(burst.slot, burst.usable_ns, burst.steps - 1) for burst in bursts]
+        maps = [self.maps(burst.slot, burst.usable, burst.steps - 1) for burst in bursts]
         return [
             Edge(burst.source, burst.target, matrix, burst.steps)
             for burst, matrix in zip(bursts, maps, strict=True)
@@ -298,7 +301,7 @@ class LossMargin:
             begin = (self._first_slot - path[0].slot) % self.loop.times.slots
             pattern = pattern[begin:] + pattern[:begin]
         intervals_s = (
-            steps * self._unit_ns / NS_PER_S for burst in path for steps in burst.intervals(self._times)
+            self.seconds(steps * self._unit) for burst in path for steps in burst.intervals(self._times)
         )
         return Stability(
             radius.lower**self._times.longest,

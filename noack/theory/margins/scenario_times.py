@@ -5,16 +5,17 @@ delay, and a watchdog that does not act.
 """
 
 import math
+from fractions import Fraction
 
 import numpy as np
 
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
-from noack.core.periods import nearest_ns
+from noack.core.periods import exact_ns, simplest_fraction
 from noack.impairments.kinds.delay import Delay
 from noack.scenario.resolution import rule_of, setpoint_of
 from noack.scenario.scenario import Scenario
-from noack.theory.margins.time_triggered_loop import LoopTimes
+from noack.theory.margins.time_triggered_loop import NEVER, LoopTimes
 
 _WITHOUT_DELAY = ("loss", "corrupt", "blackout", "duplicate")
 """Kinds of impairments that do not change the delay of a packet."""
@@ -52,71 +53,81 @@ def require_idle_watchdog(resolved: Scenario) -> None:
         )
 
 
-def require_whole_periods(resolved: Scenario) -> None:
-    """Raise CallerError if steps differ by 1 ns: an exact loop repeats the same ones."""
-    timing = resolved.timing
-    for key, period in (("plant", timing.plant_period), ("controller", timing.controller_period)):
-        if not period.is_whole:
-            nearest_hz = NS_PER_S / nearest_ns(period.exact)
-            raise CallerError(
-                f"{key}.rate_hz: this needs a period of whole nanoseconds; "
-                f"the nearest such rate is {nearest_hz!r}"
-            )
-
-
-def intervals_ns(resolved: Scenario) -> tuple[int, int]:
-    """Return the shortest and the longest time between two transmissions, as measurements allow.
+def intervals(resolved: Scenario) -> tuple[int, int]:
+    """Return the shortest and the longest time between two transmissions, in measurements.
 
     Raises:
         CallerError: there is no longest time.
     """
-    require_whole_periods(resolved)
-    rule, step_ns = rule_of(resolved), resolved.timing.measurement_period_ns
+    rule, measurement = rule_of(resolved), resolved.timing.measurement_period
     if rule.longest_ns == math.inf:
         raise CallerError(
             f'trigger.policy = "{resolved.trigger.policy}": this needs a longest time '
             "between two events, as periodic and deadline have; use e.g. "
             "--set 'trigger={policy=\"periodic\", period_s=0.5}'"
         )
-    shortest_ns = max(math.ceil(rule.earliest_ns / step_ns), 1) * step_ns
-    return shortest_ns, int(rule.latest_ns(step_ns))
+    # An event that is due between two measurements happens at the later one.
+    shortest, longest = (
+        max(math.ceil(Fraction(time_ns) / measurement.exact), 1)
+        for time_ns in (rule.earliest_ns, rule.longest_ns)
+    )
+    return shortest, longest
 
 
-def loop_times(resolved: Scenario, unit_ns: int) -> LoopTimes:
-    """Return the times of a loop with an update every ``unit_ns``, or at multiples of it.
+def loop_times(resolved: Scenario, measurements: int) -> LoopTimes:
+    """Return the times of a loop with an update after so many measurements, or at multiples of it.
+
+    Runs round times to nanoseconds, down or up so that what is at one time stays in its order
+    (:mod:`noack.core.periods`). Here nothing is rounded.
 
     Raises:
         CallerError: the delay of the updates is longer.
     """
-    require_whole_periods(resolved)
-    timing, delay_ns = resolved.timing, update_delay_ns(resolved)
-    if delay_ns >= unit_ns:
-        is_every = unit_ns != timing.measurement_period_ns
-        pair = "two updates" if is_every else "two measurements"
+    timing = resolved.timing
+    periods = timing.plant_period, timing.controller_period, timing.measurement_period.times(measurements)
+    step, tick, unit = (period.exact for period in periods)
+    delay, phase = update_delay_ns(resolved), Fraction(timing.controller_phase_ns)
+    timeout_s, timeout = resolved.controller.update_timeout_s, Fraction(0)
+    if timeout_s is not None:
+        timeout = Fraction(timing.update_timeout_ns) if timing.has_whole_periods else exact_ns(timeout_s)
+    if not timing.has_whole_periods:
+        phase = simplest_fraction(resolved.controller.phase) * tick
+    if delay >= unit:
+        pair = "two measurements" if measurements == 1 else "two updates"
         raise CallerError(
-            f"network.impairments: a delay of {delay_ns / NS_PER_S:g} s; expected less "
-            f"than the period between {pair}, {unit_ns / NS_PER_S:g} s"
+            f"network.impairments: a delay of {float(delay / NS_PER_S):g} s; expected less "
+            f"than the period between {pair}, {periods[-1].seconds:g} s"
         )
+    parts = math.lcm(*(time.denominator for time in (step, tick, unit, phase, delay, timeout)))
+
+    def whole(time_ns: Fraction) -> int:
+        return int(time_ns * parts)
+
     return LoopTimes(
-        timing.plant_period_ns,
-        timing.controller_period_ns,
-        timing.controller_phase_ns,
-        unit_ns,
-        delay_ns,
-        timing.update_timeout_ns,
+        whole(step),
+        whole(tick),
+        whole(phase),
+        whole(unit),
+        whole(delay),
+        NEVER if timeout_s is None else whole(timeout),
         resolved.controller.timeout_input == "hold",
+        parts,
     )
 
 
-def update_delay_ns(resolved: Scenario) -> int:
-    """Return the constant delay of the updates; raise CallerError if it may vary."""
-    delay_ns = 0
+def update_delay_ns(resolved: Scenario) -> Fraction:
+    """Return the constant delay of the updates; raise CallerError if it may vary.
+
+    In a loop whose periods are whole nanoseconds, each delay is one, too.
+    """
+    delay_ns = Fraction(0)
     for number, impairment in enumerate(resolved.network.impairments):
         constant = isinstance(impairment, Delay) and not (
             impairment.jitter_s or impairment.samples_s or impairment.file
         )
         if isinstance(impairment, Delay) and constant:
-            delay_ns += impairment.constant_ns
+            is_whole = resolved.timing.has_whole_periods or not impairment.delay_s
+            delay_ns += impairment.constant_ns if is_whole else exact_ns(impairment.delay_s)
         elif impairment.kind not in _WITHOUT_DELAY:
             raise CallerError(
                 f"network.impairments.{number}: {impairment.kind}: this needs a constant "

@@ -23,52 +23,61 @@ from typing import Generic, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 
-from noack.core.clock import NEVER_NS
+from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, balancing_exponents
 from noack.theory.margins.exact_matrices import FixedPointMatrix, IntervalMatrix, exponential, fixed, stacked
 
+NEVER = 10**60
+"""Later than all times, in any unit."""
+
 
 class LoopTimes(NamedTuple):
-    """The times of a time-triggered loop, in nanoseconds."""
+    """The times of a time-triggered loop, in parts of a nanosecond: no period is rounded."""
 
-    step_ns: int
+    step: int
     """h, of the plant."""
-    tick_ns: int
+    tick: int
     """τ, of the controller."""
-    phase_ns: int
+    phase: int
     """φ, of its first tick; below τ."""
-    period_ns: int
+    period: int
     """T, between two transmissions; a multiple of h."""
-    delay_ns: int
+    delay: int
     """d, of an update; below T."""
-    timeout_ns: int = NEVER_NS
+    timeout: int = NEVER
     """Θ, from the time of the newest update on."""
     holds_input: bool = False
     """Whether w is then sent once more; else it is 0."""
+    parts: int = 1
+    """Number of parts of a nanosecond."""
 
-    def usable_ns(self, periods: int, most_ns: int) -> int:
+    def seconds(self, duration: int) -> float:
+        """Return a time in seconds."""
+        return duration / (self.parts * NS_PER_S)
+
+    def usable(self, periods: int, most: int) -> int:
         """Return how much longer, up to some time, an update is used that is some periods old."""
-        return min(max(self.timeout_ns - periods * self.period_ns, 0), most_ns)
+        return min(max(self.timeout - periods * self.period, 0), most)
 
     @property
     def slots(self) -> int:
         """Number of transmissions after which their times repeat, relative to the ticks."""
-        cycle_ns = math.lcm(self.step_ns, self.tick_ns)
-        return cycle_ns // math.gcd(cycle_ns, self.period_ns)
+        cycle = math.lcm(self.step, self.tick)
+        return cycle // math.gcd(cycle, self.period)
 
-    def since_tick_ns(self, t_ns: int) -> int:
-        """Time from the last tick before ``t_ns`` to ``t_ns``, above 0."""
-        return (t_ns - self.phase_ns - 1) % self.tick_ns + 1
+    def since_tick(self, t: int) -> int:
+        """Time from the last tick before ``t`` to ``t``, above 0."""
+        return (t - self.phase - 1) % self.tick + 1
 
-    def occurrences(self, from_ns: int, until_ns: int) -> list[tuple[int, bool]]:
+    def occurrences(self, begin: int, end: int) -> list[tuple[int, bool]]:
         """Return the times of ticks (True) and of the plant's steps (False) in their order.
 
         A tick at the end and a step at the start are excluded.
         """
-        first = -(-(from_ns - self.phase_ns) // self.tick_ns)
-        ticks = range(first * self.tick_ns + self.phase_ns, until_ns, self.tick_ns)
-        steps = range((from_ns // self.step_ns + 1) * self.step_ns, until_ns + 1, self.step_ns)
-        return sorted([(t_ns, False) for t_ns in steps] + [(t_ns, True) for t_ns in ticks])
+        first = -(-(begin - self.phase) // self.tick)
+        ticks = range(first * self.tick + self.phase, end, self.tick)
+        steps = range((begin // self.step + 1) * self.step, end + 1, self.step)
+        return sorted([(t, False) for t in steps] + [(t, True) for t in ticks])
 
 
 class TimedMap(Protocol):
@@ -96,7 +105,7 @@ class Timeline(Generic[_Map]):
 
     Args:
         times: times of the loop.
-        flow: the map over some nanoseconds between steps and ticks.
+        flow: the map over a time between steps and ticks.
         latch: the map of a step of the plant.
         tick: the map of a tick of the controller.
         late_tick: the map of a tick when no update is new enough.
@@ -107,33 +116,33 @@ class Timeline(Generic[_Map]):
     ) -> None:
         self._times, self._flow, self._latch = times, cache(flow), latch
         self._ticks = tick, late_tick
-        self._cycle_ns = math.lcm(times.step_ns, times.tick_ns)
+        self._cycle = math.lcm(times.step, times.tick)
         self._advance = cache(self._advance_from_cycle)
 
-    def between(self, from_ns: int, until_ns: int, timeout_ns: int = NEVER_NS) -> _Map:
+    def between(self, begin: int, end: int, timeout: int = NEVER) -> _Map:
         """Return the map between two times; a tick at the end is excluded, and a step at the start.
 
-        From ``timeout_ns`` on the ticks are late.
+        From ``timeout`` on the ticks are late.
         """
-        split_ns = min(max(timeout_ns, from_ns), until_ns)
-        in_time = self._advance(from_ns % self._cycle_ns, split_ns - from_ns, False)
-        if split_ns == until_ns:
+        split = min(max(timeout, begin), end)
+        in_time = self._advance(begin % self._cycle, split - begin, False)
+        if split == end:
             return in_time
-        return in_time.then(self._advance(split_ns % self._cycle_ns, until_ns - split_ns, True))
+        return in_time.then(self._advance(split % self._cycle, end - split, True))
 
-    def _advance_from_cycle(self, from_ns: int, duration_ns: int, is_late: bool) -> _Map:
-        cycles, rest_ns = divmod(duration_ns, self._cycle_ns)
-        last_part = self._occurrences(from_ns, from_ns + rest_ns, is_late)
+    def _advance_from_cycle(self, begin: int, duration: int, is_late: bool) -> _Map:
+        cycles, rest = divmod(duration, self._cycle)
+        last_part = self._occurrences(begin, begin + rest, is_late)
         if not cycles:
             return last_part
-        return repeated(self._occurrences(from_ns, from_ns + self._cycle_ns, is_late), cycles).then(last_part)
+        return repeated(self._occurrences(begin, begin + self._cycle, is_late), cycles).then(last_part)
 
-    def _occurrences(self, from_ns: int, until_ns: int, is_late: bool) -> _Map:
-        parts, now_ns = list[_Map](), from_ns
-        for t_ns, is_tick in self._times.occurrences(from_ns, until_ns):
-            parts += [self._flow(t_ns - now_ns), self._ticks[is_late] if is_tick else self._latch]
-            now_ns = t_ns
-        return reduce(lambda first, later: first.then(later), [*parts, self._flow(until_ns - now_ns)])
+    def _occurrences(self, begin: int, end: int, is_late: bool) -> _Map:
+        parts, now = list[_Map](), begin
+        for t, is_tick in self._times.occurrences(begin, end):
+            parts += [self._flow(t - now), self._ticks[is_late] if is_tick else self._latch]
+            now = t
+        return reduce(lambda first, later: first.then(later), [*parts, self._flow(end - now)])
 
 
 class TimeTriggeredLoop:
@@ -160,13 +169,15 @@ class TimeTriggeredLoop:
         occurrences = [(x, x_c, w, w), (x, x_c, u, K @ x_c), (x, x_c, u, without_update)]
         self._start = fixed(np.eye(size))
         self._between = Timeline(
-            times, lambda dt_ns: exponential(generator, dt_ns), *(fixed(np.vstack(o)) for o in occurrences)
+            times,
+            lambda dt: exponential(generator, dt, times.parts),
+            *(fixed(np.vstack(rows)) for rows in occurrences),
         ).between
         self._states: dict[tuple[int, int], list[FixedPointMatrix]] = {}
         """States by slot and use of x_c: (x, x_c, u, w) after 1, 2, … periods, as functions of z."""
-        since_ns = [times.since_tick_ns(k * times.period_ns) for k in range(times.slots)]
-        follows = max(since_ns) <= times.period_ns - times.delay_ns and times.timeout_ns == NEVER_NS
-        if times.delay_ns == 0:
+        since = [times.since_tick(k * times.period) for k in range(times.slots)]
+        follows = max(since) <= times.period - times.delay and times.timeout == NEVER
+        if times.delay == 0:
             self._kept = [*range(n), *range(2 * n, 2 * n + m)]  # x, u
         else:
             self._kept = [*range(2 * n if follows else 2 * n + m)]  # x, x_c and perhaps u
@@ -174,17 +185,15 @@ class TimeTriggeredLoop:
         rows = np.vstack([of_x, of_x, of_u, of_u])[self._kept]
         self._given_units = rows.T - rows
 
-    def map(self, slot: int, usable_ns: int, losses: int) -> IntervalMatrix:
+    def map(self, slot: int, usable: int, losses: int) -> IntervalMatrix:
         """Return the map of z from a delivered update to the next one.
 
         Args:
             slot: number of the first update, modulo the number of slots.
-            usable_ns: how long the update before it is used after its transmission, up to d.
+            usable: how long the update before it is used after its transmission, up to d.
             losses: number of lost updates between the two.
         """
-        return (
-            self._state_after(slot, usable_ns, losses).rows(self._kept).interval().scaled(self._given_units)
-        )
+        return self._state_after(slot, usable, losses).rows(self._kept).interval().scaled(self._given_units)
 
     def period(self, slot: int, is_delivered: bool) -> IntervalMatrix:
         """Return the map of (x, x_c, u, w), in units of its own, from one transmission to the next.
@@ -198,43 +207,44 @@ class TimeTriggeredLoop:
         Raises:
             OverflowError: an entry is beyond double precision.
         """
-        from_ns = slot * self.times.period_ns
+        begin = slot * self.times.period
         if is_delivered:
-            return self._updated(self._start, from_ns, NEVER_NS, NEVER_NS).interval()
-        return self._between(from_ns, from_ns + self.times.period_ns).interval()
+            return self._updated(self._start, begin, NEVER, NEVER).interval()
+        return self._between(begin, begin + self.times.period).interval()
 
-    def _state_after(self, slot: int, usable_ns: int, losses: int) -> FixedPointMatrix:
-        period_ns = self.times.period_ns
-        timeout_ns = slot * period_ns + self.times.timeout_ns
-        states = self._states.setdefault((slot, usable_ns), [])
+    def _state_after(self, slot: int, usable: int, losses: int) -> FixedPointMatrix:
+        period = self.times.period
+        timeout = slot * period + self.times.timeout
+        states = self._states.setdefault((slot, usable), [])
         while len(states) <= losses:
-            from_ns = (slot + len(states)) * period_ns
+            begin = (slot + len(states)) * period
             if states:
-                states.append(self._between(from_ns, from_ns + period_ns, timeout_ns) @ states[-1])
+                states.append(self._between(begin, begin + period, timeout) @ states[-1])
             else:
-                state = self._state(from_ns)
-                states.append(self._updated(state, from_ns, from_ns + usable_ns, timeout_ns))
+                state = self._state(begin)
+                states.append(self._updated(state, begin, begin + usable, timeout))
         return states[losses]
 
     def _updated(
-        self, state: FixedPointMatrix, from_ns: int, old_timeout_ns: int, timeout_ns: int
+        self, state: FixedPointMatrix, begin: int, old_timeout: int, timeout: int
     ) -> FixedPointMatrix:
         """Return the state a period after the transmission of a delivered update."""
-        until_ns = from_ns + self.times.period_ns
+        end = begin + self.times.period
         # Until the update arrives, x_c is that of older ones.
-        sent, arrival_ns = state.rows(self._x), from_ns + self.times.delay_ns
-        state = self._between(from_ns, arrival_ns, old_timeout_ns) @ state
-        updated = exponential(self._H, self.times.delay_ns) @ sent
+        sent, arrival = state.rows(self._x), begin + self.times.delay
+        state = self._between(begin, arrival, old_timeout) @ state
+        updated = exponential(self._H, self.times.delay, self.times.parts) @ sent
         state = stacked(state.rows(self._x), updated, state.rows(self._inputs))
-        return self._between(arrival_ns, until_ns, timeout_ns) @ state
+        return self._between(arrival, end, timeout) @ state
 
-    def _state(self, t_ns: int) -> FixedPointMatrix:
+    def _state(self, t: int) -> FixedPointMatrix:
         """Return (x, x_c, u, w) as a function of z at a transmission."""
         z, n = fixed(np.eye(self.dimension)), self._x.stop
-        if self.times.delay_ns == 0:
+        if self.times.delay == 0:
             x, u = z.rows(slice(n)), z.rows(slice(n, None))
             return stacked(x, x, u, u)
         if self.dimension > 2 * n:
             return stacked(z, z.rows(slice(2 * n, None)))
-        u = self._K @ exponential(-self._H, self.times.since_tick_ns(t_ns)) @ z.rows(self._x_c)
+        since = self.times.since_tick(t)
+        u = self._K @ exponential(-self._H, since, self.times.parts) @ z.rows(self._x_c)
         return stacked(z, u, u)

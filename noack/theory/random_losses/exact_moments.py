@@ -31,7 +31,6 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.cached_method import cached_method
-from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, balancing_exponents, exponential
 from noack.impairments.loss_prediction import OutcomeChain
@@ -40,7 +39,7 @@ from noack.scenario.resolution import LoopMatrices, loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.stacked_norms import Stack
 from noack.theory.margins.exact_matrices import exactly
-from noack.theory.margins.scenario_times import intervals_ns, loop_times, require_idle_watchdog
+from noack.theory.margins.scenario_times import intervals, loop_times, require_idle_watchdog
 from noack.theory.margins.time_triggered_loop import LoopTimes, Timeline, repeated
 from noack.theory.random_losses.mean_square_growth import (
     from_triangles,
@@ -155,28 +154,29 @@ class LoopPeriods:
         latch = jump(np.vstack([x, x_c, w, w, nothing, s]), count, fresh)
         tick = jump(np.vstack([x, x_c, u, loop.K @ x_c, d, s]), count)
 
-        def flow_of(dt_ns: int) -> MomentStep:
-            return propagation(generator, 0 * generator, forms, dt_ns / NS_PER_S)
+        def flow_of(dt: int) -> MomentStep:
+            return propagation(generator, 0 * generator, forms, times.seconds(dt))
 
         self._between = Timeline(times, flow_of, latch, tick, tick).between
         self._send = jump(np.vstack([x, x_c, u, w, d, x]), count, s.T @ noise @ s)
-        during_delay = propagation(loop.H, 0 * loop.H, np.zeros((0, n, n)), times.delay_ns / NS_PER_S).matrix
+        delay_s = times.seconds(times.delay)
+        during_delay = propagation(loop.H, 0 * loop.H, np.zeros((0, n, n)), delay_s).matrix
         self._receive = jump(np.vstack([x, during_delay @ s, u, w, d, s]), count)
 
-    def step(self, slot: int, delivered: bool, duration_ns: int | None = None) -> MomentStep:
+    def step(self, slot: int, delivered: bool, duration: int | None = None) -> MomentStep:
         """Return a period, or its first part, from just before its transmission.
 
         Args:
             slot: number of the transmission, modulo the number of slots.
             delivered: whether its update arrives.
-            duration_ns: length of this part; by default the period.
+            duration: length of this part; by default the period.
         """
-        from_ns, duration = slot * self.times.period_ns, duration_ns or self.times.period_ns
-        until_ns, arrival_ns = from_ns + duration, from_ns + self.times.delay_ns
-        if not delivered or arrival_ns > until_ns:
-            return self._fresh.then(self._between(from_ns, until_ns)).of_states(range(self.size))
-        sent = self._fresh.then(self._send).then(self._between(from_ns, arrival_ns))
-        received = sent.then(self._receive).then(self._between(arrival_ns, until_ns))
+        begin, duration = slot * self.times.period, duration or self.times.period
+        end, arrival = begin + duration, begin + self.times.delay
+        if not delivered or arrival > end:
+            return self._fresh.then(self._between(begin, end)).of_states(range(self.size))
+        sent = self._fresh.then(self._send).then(self._between(begin, arrival))
+        received = sent.then(self._receive).then(self._between(arrival, end))
         return received.of_states(range(self.size))
 
 
@@ -206,8 +206,8 @@ class LoopMoments:
         self.growth = mean_square_growth(maps, outcomes)
         """Of √E‖z‖² per period."""
 
-    def _step(self, slot: int, *, delivered: bool, duration_ns: int | None = None) -> MomentStep:
-        return self._periods.step(slot, delivered, duration_ns).of_states(self.states)
+    def _step(self, slot: int, *, delivered: bool, duration: int | None = None) -> MomentStep:
+        return self._periods.step(slot, delivered, duration).of_states(self.states)
 
     @cached_method
     def of_cost(self, number: int) -> "LoopMoments":
@@ -251,8 +251,8 @@ class LoopMoments:
         added, _ = self._cycle(SecondMoments(np.zeros((len(shares), size, size)), shares))
         entries = self._sum(triangles(added.moments))
         start = SecondMoments(from_triangles(entries, size), shares)
-        cycle_s = len(self._slots) * self._periods.times.period_ns / NS_PER_S
-        return start, self._cycle(start)[1] / cycle_s
+        times = self._periods.times
+        return start, self._cycle(start)[1] / times.seconds(len(self._slots) * times.period)
 
     def transient(self, start: SecondMoments) -> Vector | None:
         """Return the costs of all periods from a start of z without noise; None: infinite."""
@@ -263,13 +263,13 @@ class LoopMoments:
         all_cycles = from_triangles(self._sum(triangles(moments)), len(self.states))
         return self._cycle(SecondMoments(all_cycles, 0 * start.shares))[1]
 
-    def until(self, start: SecondMoments, horizon_ns: int) -> tuple[SecondMoments, Vector]:
-        """Return the moments at a time, and the mean costs until then.
+    def until(self, start: SecondMoments, duration: int) -> tuple[SecondMoments, Vector]:
+        """Return the moments after a time, in the unit of the loop's, and the mean costs until then.
 
         Raises:
             NotPredictableError: there are too many periods.
         """
-        number, rest_ns = divmod(horizon_ns, self._periods.times.period_ns)
+        number, rest = divmod(duration, self._periods.times.period)
         if number > _MOST_PERIODS:
             raise NotPredictableError("there are too many periods until the horizon")
         current, costs = start, np.zeros_like(self._slots[0][0].constants)
@@ -282,11 +282,10 @@ class LoopMoments:
         for k in range(single_periods):
             current, added = self._advance(current, self._slots[k % len(self._slots)])
             costs = costs + added
-        if rest_ns:
+        if rest:
             slot = number % len(self._slots)
             last = tuple(
-                self._step(slot, delivered=is_delivered, duration_ns=rest_ns)
-                for is_delivered in (True, False)
+                self._step(slot, delivered=is_delivered, duration=rest) for is_delivered in (True, False)
             )
             current, added = self._advance(current, last)
             costs = costs + added
@@ -312,7 +311,7 @@ class LoopMoments:
         return SecondMoments(from_triangles(moments, size), shares), costs
 
     def _cycle(self, current: SecondMoments) -> tuple[SecondMoments, Vector]:
-        return self.until(current, len(self._slots) * self._periods.times.period_ns)
+        return self.until(current, len(self._slots) * self._periods.times.period)
 
     def _advance(self, current: SecondMoments, slot: tuple[MomentStep, ...]) -> tuple[SecondMoments, Vector]:
         """Return the moments after a period, and its mean costs."""
@@ -346,8 +345,8 @@ def require_predictable(resolved: Scenario) -> None:
     if any(resolved.controller.safe_input or ()):
         raise CallerError("controller.safe_input: the mean cost needs the input 0 at the start")
     require_idle_watchdog(resolved)
-    shortest_ns, longest_ns = intervals_ns(resolved)
-    if shortest_ns != longest_ns:
+    shortest, longest = intervals(resolved)
+    if shortest != longest:
         raise CallerError(
             f'trigger.policy = "{resolved.trigger.policy}": the mean cost needs a time-triggered '
             "sensor: --set 'trigger={policy=\"periodic\", period_s=0.5}'"
@@ -363,7 +362,7 @@ def periods_of(resolved: Scenario, forms: Stack) -> LoopPeriods:
     require_predictable(resolved)
     loop, noise = loop_of(resolved), resolved.plant.noise_variances(*resolved.model.dimensions)
     disturbance = np.diag(noise.at_state) + loop.B @ np.diag(noise.at_input) @ loop.B.T
-    times = loop_times(resolved, intervals_ns(resolved)[0])
+    times = loop_times(resolved, intervals(resolved)[0])
     return LoopPeriods(loop, times, disturbance, np.diag(noise.output), forms)
 
 

@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from noack.core.clock import NEVER_NS
 from noack.core.linear_systems import Matrix, Vector, balancing_exponents
 from noack.guarantee.loss_guarantee import LossGuarantee
 from noack.impairments.loss_prediction import LossProcess, OutcomeChain
@@ -30,9 +29,9 @@ from noack.scenario.scenario import Scenario
 from noack.theory.bounds.contraction import EPSILON
 from noack.theory.bounds.stacked_norms import Stack
 from noack.theory.margins.exact_matrices import IntervalMatrix, exactly, inverse
-from noack.theory.margins.scenario_times import intervals_ns, loop_times
+from noack.theory.margins.scenario_times import intervals, loop_times
 from noack.theory.margins.switched_system import Graph
-from noack.theory.margins.time_triggered_loop import LoopTimes, TimeTriggeredLoop
+from noack.theory.margins.time_triggered_loop import NEVER, LoopTimes, TimeTriggeredLoop
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array  # slow to import
@@ -74,11 +73,11 @@ def growth_without_guarantee(resolved: Scenario, losses: LossProcess) -> MeanSqu
         NotPredictableError: loop and losses have too many states, or the sensor is not
             time-triggered.
     """
-    shortest_ns, longest_ns = intervals_ns(resolved)
-    if shortest_ns != longest_ns:
+    shortest, longest = intervals(resolved)
+    if shortest != longest:
         raise NotPredictableError("the times between updates are not known")
-    loop, times = loop_of(resolved), loop_times(resolved, longest_ns)
-    if times.timeout_ns < NEVER_NS:
+    loop, times = loop_of(resolved), loop_times(resolved, longest)
+    if times.timeout < NEVER:
         raise NotPredictableError("controller.update_timeout_s: the input depends on the update's age")
     require_few_slots(times)
     exact = TimeTriggeredLoop(loop.A, loop.B, loop.K, loop.H, times)

@@ -133,10 +133,53 @@ def test_usual_rates_need_no_warning() -> None:
     assert "rate_hz = 30" in checked.stdout
 
 
+@pytest.mark.parametrize("rate_hz", RATES)
+@pytest.mark.parametrize("count", [1, 2, 5, 7])
+def test_timeouts_and_phases_of_whole_steps_act_at_the_same_step_always(rate_hz: float, count: int) -> None:
+    """An update of that age is too old, an actuation not yet; a first tick is not before its step."""
+    times = exact_times(rate_hz, 1000)
+    ages = times[count:] - times[:-count]
+    rate = Fraction(rate_hz).limit_denominator(2000)
+    seconds, phase = float(count / rate), {"controller.phase": 0.5}
+    settings = {"controller.update_timeout_s": seconds, "plant.watchdog.timeout_s": seconds}
+    timing = at_rate("lane_following", rate_hz, rate_hz, **settings).timing
+    assert ages.max() - 1 <= timing.update_timeout_ns <= ages.min()
+    assert ages.max() <= timing.actuation_timeout_ns <= ages.min() + 1
+    slower = at_rate("lane_following", rate_hz, float(rate / (2 * count)), **phase).timing
+    ticks = slower.controller_phase_ns + np.array([slower.controller_period.time_ns(k) for k in range(100)])
+    steps = exact_times(rate_hz, 201 * count)[count :: 2 * count]
+    assert set(ticks - steps) <= {0, 1}
+
+
+NEARBY = {30.0: 30.000000300000004, 60.0: 59.99999880000002, 90.0: 89.99999991, 144.0: 1e9 / 6_944_444}
+
+
+@pytest.mark.parametrize("rate_hz", NEARBY)
+def test_margin_and_cost_are_nearly_those_of_a_rate_with_whole_nanoseconds(rate_hz: float) -> None:
+    def results(rate_hz: float) -> tuple[Any, Any]:
+        trigger = {"policy": "periodic", "period_s": 6 / rate_hz}
+        noise = {"plant.disturbances": [{"kind": "gaussian", "std": [0.1, 0.1]}]}
+        quiet, noisy = (at_rate("lane_periodic", rate_hz, rate_hz, trigger=trigger, **s) for s in ({}, noise))
+        return noack.margin(quiet, most_m=4), noack.cost(noisy)
+
+    (margin, cost), (near_margin, near_cost) = results(rate_hz), results(NEARBY[rate_hz])
+    assert margin.period_s == cost.period_s == 6 / rate_hz
+    for cap, near_cap in zip(margin.caps, near_margin.caps, strict=True):
+        assert cap.stability.lower == pytest.approx(near_cap.stability.lower, rel=1e-6)
+        assert cap.stability.verdict == near_cap.stability.verdict
+    assert margin.period is not None
+    assert margin.period.stable_s == pytest.approx(near_margin.period.stable_s, rel=1e-7)
+    assert margin.without_guarantee.per_period == pytest.approx(
+        near_margin.without_guarantee.per_period, rel=2e-6
+    )
+    for name in ("horizon_cost", "transient_cost", "growth"):
+        wanted = getattr(near_cost.with_guarantee, name)
+        assert getattr(cost.with_guarantee, name) == pytest.approx(wanted, rel=1e-5), name
+    wanted = near_cost.with_guarantee.stationary.cost_per_s
+    assert cost.with_guarantee.stationary.cost_per_s == pytest.approx(wanted, rel=1e-6)
+
+
 def test_what_needs_equal_steps_says_so() -> None:
-    scenario = at_rate("lane_periodic", 30.0, 30.0)
-    with pytest.raises(noack.NoackError, match=r"plant.rate_hz: this needs a period of whole nanoseconds"):
-        noack.margin(scenario)
     run = noack.simulate(at_rate("pendulum_observed", 90.0, 90.0))
     reasons = [claim.why for claim in run.summary.loops[0].claims if claim.is_certified]
     assert reasons

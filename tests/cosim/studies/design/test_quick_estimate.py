@@ -23,7 +23,7 @@ def test_quick_bounds_are_those_of_the_exact_maps() -> None:
         exact = LossMargin(resolve(search.scenario))
         bursts = exact.bursts(search.guarantee(5))
         quick = search.quick_loop(search.given_gain).maps(bursts)
-        maps = np.array([exact.maps(burst.slot, burst.usable_ns, burst.losses).middle for burst in bursts])
+        maps = np.array([exact.maps(burst.slot, burst.usable, burst.losses).middle for burst in bursts])
         if not more or more == timeouts[0]:
             np.testing.assert_allclose(quick, maps, rtol=0, atol=1e-11 * np.abs(maps).max())
         stability = exact.coarse_bounds(search.guarantee(5))

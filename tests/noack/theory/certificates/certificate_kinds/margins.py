@@ -18,7 +18,7 @@ from noack.scenario.scenario import Scenario
 from noack.theory.margins import loss_margin
 from noack.theory.margins.joint_spectral_radius import JointSpectralRadius
 from noack.theory.margins.loss_margin import LossMargin, Stability, capped
-from noack.theory.margins.scenario_times import intervals_ns, without_timeout
+from noack.theory.margins.scenario_times import intervals, without_timeout
 from noack.theory.margins.switched_system import Edge, SwitchedSystem, find_cycle
 from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificates.certificate_kinds.policies import scenario_of
@@ -105,10 +105,10 @@ def _used_forever(loop: LoopMaps) -> Stability:
 
 
 def _soon(loop: LoopMaps) -> Stability:
-    shortest_ns, longest_ns = intervals_ns(loop.resolved)
-    with patch.object(loss_margin, "intervals_ns", lambda resolved: (shortest_ns, shortest_ns)):
+    shortest, longest = intervals(loop.resolved)
+    with patch.object(loss_margin, "intervals", lambda resolved: (shortest, shortest)):
         stability = bounded(loop.resolved)
-    return stability._replace(upper=stability.upper ** (longest_ns / shortest_ns), pattern=())
+    return stability._replace(upper=stability.upper ** (longest / shortest), pattern=())
 
 
 def _late_pattern(loop: LoopMaps) -> Stability:
