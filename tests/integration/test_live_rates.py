@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from cosim.analysis.replay import replay
-from cosim.record.run_record import load_record
+from cosim.record.run_record import load_record, load_run
 from tests.helpers.live_runs import run_scenario, settings
 
 
-@pytest.mark.parametrize("rate_hz", [30, 144])
+@pytest.mark.parametrize("rate_hz", [30, 60, 90, 120, 144])
 def test_a_live_run_keeps_the_rate_and_is_replayed_bit_for_bit(tmp_path: Path, rate_hz: int) -> None:
     finished = run_scenario(
         tmp_path, *settings(horizon_s=2.0, plant__rate_hz=rate_hz, controller__rate_hz=rate_hz)
@@ -22,3 +22,21 @@ def test_a_live_run_keeps_the_rate_and_is_replayed_bit_for_bit(tmp_path: Path, r
     expected = [math.floor(k * Fraction(10**9, rate_hz) + Fraction(1, 2)) for k in range(2 * rate_hz + 1)]
     np.testing.assert_array_equal(steps["t_ns"], expected[: len(steps)])
     assert replay(record).bit_exact
+
+
+def test_loops_of_different_odd_rates_are_replayed_bit_for_bit(tmp_path: Path) -> None:
+    rates = {"film": 30_000 / 1001, "display": 144.0, "camera": 90.0}
+    loops = ", ".join(
+        f'{{name="{name}", plant={{rate_hz={rate_hz!r}}}, controller={{rate_hz={rate_hz / (1 + number)!r}}}}}'
+        for number, (name, rate_hz) in enumerate(rates.items())
+    )
+    finished = run_scenario(tmp_path, *settings(horizon_s=2.0), "--set", f"loops=[{loops}]")
+    run = load_run(finished.run_dir)
+    assert [*run.names] == [*rates]
+    for record, rate_hz in zip(run.loops, rates.values(), strict=True):
+        t_ns = record["plant_step"]["t_ns"]
+        rate = Fraction(rate_hz).limit_denominator(2000)
+        expected = [math.floor(k * 10**9 / rate + Fraction(1, 2)) for k in range(len(t_ns))]
+        assert len(t_ns) > rate_hz
+        np.testing.assert_array_equal(t_ns, expected)
+        assert replay(record).bit_exact

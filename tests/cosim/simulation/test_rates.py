@@ -179,6 +179,28 @@ def test_margin_and_cost_are_nearly_those_of_a_rate_with_whole_nanoseconds(rate_
     assert cost.with_guarantee.stationary.cost_per_s == pytest.approx(wanted, rel=1e-6)
 
 
+@pytest.mark.parametrize("time", ["continuous", "sampled"])
+def test_a_campaign_has_nearly_the_results_of_a_rate_with_whole_nanoseconds(time: str) -> None:
+    def estimates(rate_hz: float) -> dict[tuple[str, str], float]:
+        rates = {"plant.rate_hz": rate_hz, "controller.rate_hz": rate_hz, "horizon_s": 3.99}
+        variants = {
+            "decaying": {"mode": "model"},
+            "periodic": {"trigger": {"policy": "periodic", "period_s": 3 / rate_hz}},
+        }
+        plan = {
+            "name": "rates", "scenario": "lane_following", "draws": 10, "seed": 3, "time": time,
+            "settings": rates, "axes": [{"name": "policy", "variants": variants}],
+        }  # fmt: skip
+        rows = noack.campaign(plan, workers=1).estimates().to_pylist()
+        return {(row["policy"], row["metric"]): row["mean"] for row in rows}
+
+    exact, near = estimates(90.0), estimates(NEARBY[90.0])
+    assert exact["periodic", "transmissions"] == near["periodic", "transmissions"] == 120
+    for metric in ("transmissions", "cost", "final_norm", "sup_e_c_scaled"):
+        for policy in ("decaying", "periodic"):
+            assert exact[policy, metric] == pytest.approx(near[policy, metric], rel=1e-5)
+
+
 def test_what_needs_equal_steps_says_so() -> None:
     run = noack.simulate(at_rate("pendulum_observed", 90.0, 90.0))
     reasons = [claim.why for claim in run.summary.loops[0].claims if claim.is_certified]
