@@ -16,6 +16,7 @@ from noack.scenario.scenario import Scenario, loop_names, phases_ns
 from noack.scenario.scenario_file import dumps
 from noack.scenario.uneven_periods import uneven_periods
 from noack.theory.certificates.assumptions import assumptions
+from noack.theory.certificates.conditions import void_by_uneven_steps
 from noack.trigger_policies.trigger_rule import CodedPolicy
 from plant_server.plant import system_of
 
@@ -62,8 +63,16 @@ def _check_loops(loaded: Scenario, *, json: bool) -> None:
     for loop, phase_ns in zip(loops, phases_ns(loaded), strict=True):
         x0 = ", ".join(f"{value:.4g}" for value in loop.plant.initial_state)
         print(f"{_COMMENT}{loop.name}: begins at {phase_ns / NS_PER_S:.6f} s, x(0) = ({x0})")
-        for line in uneven_periods(loop):
+        for line in _period_lines(loop):
             print(f"{_COMMENT}{loop.name}: {line}")
+
+
+def _period_lines(resolved: Scenario) -> Iterator[str]:
+    """Yield the periods that do not divide each other, and why they allow no certificate."""
+    yield from uneven_periods(resolved)
+    why = void_by_uneven_steps(resolved)
+    if why is not None and resolved.coverage.uncertified_setting is None:
+        yield f"no certificate: {why}"
 
 
 def _print_plant(console: Console, resolved: Scenario) -> None:
@@ -86,7 +95,7 @@ def _dependent_defaults(resolved: Scenario) -> Iterator[str]:
         yield "network.loss: no effect, since network.mansd = 0 lets every update pass"
     if resolved.controller.timeout_input == "hold" and resolved.controller.update_timeout_s is None:
         yield "controller.timeout_input: no effect without controller.update_timeout_s"
-    yield from uneven_periods(resolved)
+    yield from _period_lines(resolved)
     watchdog, timeout_s = resolved.plant.watchdog, resolved.timing.actuation_timeout_ns / NS_PER_S
     if watchdog.timeout_s is None:
         yield (f"plant.watchdog: policy {watchdog.policy}, after {timeout_s:g} s without an actuation")

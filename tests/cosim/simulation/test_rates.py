@@ -131,6 +131,21 @@ def test_usual_rates_need_no_warning() -> None:
     checked = invoke("check", "lane_following", *rates)
     assert (checked.exit_code, checked.stderr) == (0, "")
     assert "rate_hz = 30" in checked.stdout
+    assert "no certificate" not in checked.stdout
+
+
+@pytest.mark.parametrize("settings", [
+    ("pendulum_observed",),
+    ("lane_crosswind", "--set", 'plant.disturbances=[{kind="gaussian",std=[0.1,0.1]}]'),
+    ("pendulum_observed", "--set", 'loops=[{name="one"},{name="two"}]'),
+])  # fmt: skip
+def test_check_says_which_periods_allow_no_certificate(settings: tuple[str, ...]) -> None:
+    def lines(rate_hz: float) -> str:
+        rates = ("--set", f"plant.rate_hz={rate_hz}", "--set", f"controller.rate_hz={rate_hz}")
+        return " ".join(invoke("check", *settings, *rates).stdout.replace("#", "").split())
+
+    assert "no certificate: plant.rate_hz = 90: bounds with" in lines(90.0)
+    assert "no certificate" not in lines(100.0)
 
 
 @pytest.mark.parametrize("rate_hz", RATES)
