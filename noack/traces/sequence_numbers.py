@@ -19,6 +19,8 @@ _WINDOW = 16
 """Arrivals over which a rough period is taken, so that packets that arrive in groups do not mislead."""
 _NEIGHBOURS = 256
 """Arrivals before and after a jump whose lower envelopes are compared."""
+_MOST_REORDERED, _LOOKED_AT = 4096, 64
+"""Arrivals before and after a jump, and numbers of them, by which a restart is told from another order."""
 _SPREAD_WINDOW = 64
 _FEWEST_AFTER_RESTART = 8
 """A restart to smaller numbers is told from late packets by this many arrivals."""
@@ -41,6 +43,8 @@ _CERTAIN_RESTART = 2**50
 _STEADY = 0.95
 """Correlation of numbers and times below which the numbers jump at random."""
 _FAR_BACK = 32
+_WIDE_SHARE = 0.01
+"""Share of the arrivals that may jump back by more than a quarter of R."""
 _FAR_BACK_SHARE, _FEWEST_FAR_BACK = 0.1, 8
 """Two counters in one flow jump back by more than 32 packets at more than this share of the arrivals."""
 
@@ -75,6 +79,9 @@ def find_packets(number: NDArray[np.uint64], t_ns: Int64s, bits: int) -> Arrival
     if far_back > max(_FAR_BACK_SHARE * len(steps), _FEWEST_FAR_BACK):
         if _continues(number, bits):
             raise ValueError("belong to two counters")
+        is_wide = (steps < -max(2.0**bits / 4, _FAR_BACK)) & is_soon
+        if np.count_nonzero(is_wide) > max(_WIDE_SHARE * len(steps), _FEWEST_FAR_BACK):
+            raise ValueError(f"jump at random, or packets overtake more others than {bits} bits can tell")
         period_ns = _period_of_all(steps, t_ns)
     else:
         period_ns = _rough_period(steps, t_ns, bits)
@@ -211,13 +218,13 @@ def _with_wraps(
         elif step < 0:
             lasts = (t_ns[i + len(following) - 1] - t_ns[i]) / period_ns
             enough = len(following) >= _FEWEST_AFTER_RESTART and lasts > spread + _FEWEST_AFTER_RESTART / 2
-            if rise <= max(2.0, 1.5 * spread) or not enough:
+            if rise <= max(2.0, 1.5 * spread) or not enough or _is_reordered(packet, begin, i):
                 continue
             part[i] = 1
         elif step > _CLEAR and abs(rise) > allowed:
             # While a queue empties, the level falls to where it was before; only a restart is below.
             lowest = float(level[begin:i].min()) - allowed - error * (i - begin)
-            if rise < 0 and following.min() > lowest:
+            if (rise < 0 and following.min() > lowest) or _is_reordered(packet, begin, i):
                 continue
             part[i] = 1
         else:
@@ -225,6 +232,28 @@ def _with_wraps(
         begin = i
     packet = packet + np.cumsum(added)
     return Arrivals(index, packet, np.cumsum(part), period_ns, tuple(uncertain))
+
+
+def _is_reordered(packet: Int64s, begin: int, i: int) -> bool:
+    """Return whether the numbers at a jump are those of one sequence in another order.
+
+    Args:
+        packet: numbers without wraps.
+        begin: the first arrival of this part.
+        i: the first arrival after the jump.
+    """
+    before = packet[max(begin, i - _MOST_REORDERED) : i]
+    after = packet[i : i + _MOST_REORDERED]
+    if packet[i] > packet[i - 1]:
+        # The numbers that were skipped arrive, too.
+        skipped = np.arange(max(packet[i - 1] + 1, packet[i] - _LOOKED_AT), packet[i])
+        arrive = np.isin(skipped, after) | np.isin(skipped, before)
+        return 2 * int(arrive.sum()) > len(skipped)
+    # The numbers behind are missing ones; a sender that restarts repeats some, or goes below all.
+    behind = after[:_LOOKED_AT]
+    behind = behind[behind < before.max()]
+    missing = (behind > before.min()) & ~np.isin(behind, before)
+    return 2 * int(missing.sum()) > len(behind)
 
 
 def _jumps(excess: Reals, steps: Int64s, level: Reals, cycle: float, spread: float) -> list[int]:

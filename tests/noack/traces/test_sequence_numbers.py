@@ -123,6 +123,29 @@ def test_losses_while_a_queue_empties_are_no_restart(bits: int) -> None:
     assert not arrivals.part.any()
 
 
+@pytest.mark.parametrize("bits", [8, 16, 32])
+@pytest.mark.parametrize(
+    ("largest", "jitter_ns"), [(40, 0), (40, 900_000), (9, 20_000_000), (4, 3_000_000), (200, 1_000_000)]
+)
+def test_groups_in_any_order_are_no_restart(largest: int, jitter_ns: int, bits: int) -> None:
+    """Video frames of many packets each, which overtake each other."""
+    rng = np.random.default_rng(1)
+    sizes = rng.integers(largest // 7 + 1, largest, 900)
+    sent_ns = np.repeat(33_300_000 * np.arange(900), sizes)
+    sent_ns += 12_000 * (np.arange(len(sent_ns)) - np.repeat(np.cumsum(sizes) - sizes, sizes))
+    t_ns = T_NS + sent_ns + rng.integers(0, jitter_ns + 1, len(sent_ns))
+    kept = np.flatnonzero(rng.random(len(sent_ns)) > 0.02)
+    number = kept[np.argsort(t_ns[kept], kind="stable")]
+    t_ns = t_ns[number]
+    if largest == 200 and bits == 8:
+        with pytest.raises(ValueError, match="overtake more others than 8 bits can tell"):
+            find_packets((number % 256).astype(np.uint64), t_ns, bits)
+        return
+    arrivals = find_packets((number % 2**bits).astype(np.uint64), t_ns, bits)
+    assert (arrivals.packet - arrivals.packet.min()).tolist() == (number - number.min()).tolist()
+    assert not arrivals.part.any()
+
+
 def test_packets_that_arrive_in_groups_show_the_period() -> None:
     t_ns = T_NS + np.arange(4000) // 10 * 10 * PERIOD_NS
     keep = (np.arange(4000) < 2000) | (np.arange(4000) >= 2700)
