@@ -161,8 +161,9 @@ def _one_capture(
         if is_numbered:
             return None
         raise ValueError(
-            "has one end only; give the captures of both ends, or say where the payload has a "
-            "sequence number: --sequence-at OFFSET:BYTES"
+            f"has one end only of flow {options.flow} ({flow}); give the captures of both ends, choose "
+            "another flow (--flow), or say where the payload has a sequence number: --sequence-at "
+            "OFFSET:BYTES"
         )
     of_flow = others.flow[received]
     counts = np.bincount(of_flow)
@@ -295,7 +296,10 @@ def _common_time(ends: _Ends, arrived: Int64s, arrived_ns: Int64s) -> tuple[int,
     soonest_ns = lag_ns[:_NEAR_END].min()
     usually_ns = int(np.quantile(lag_ns[-_NEAR_END:], 0.99))
     begin = min(int(np.searchsorted(sent_ns, span.begin_ns - soonest_ns)), int(arrived[0]))
-    end = max(int(np.searchsorted(sent_ns, span.end_ns - usually_ns, side="right")), int(arrived[-1]) + 1)
+    end_ns = span.end_ns
+    if ends.sender is ends.receiver and 4 * usually_ns < (period_ns := int(np.median(np.diff(sent_ns)))):
+        end_ns += period_ns // 4  # hardly a datagram is on its way
+    end = max(int(np.searchsorted(sent_ns, end_ns - usually_ns, side="right")), int(arrived[-1]) + 1)
     if begin:
         notes.append(f"left out: {begin} datagrams sent before the receiver's capture begins")
     if after := len(sent_ns) - end:

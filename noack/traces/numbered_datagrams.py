@@ -22,6 +22,8 @@ _CERTAIN_BITS = 40
 """Bits of consecutive numbers in pieces that are no coincidence."""
 _MOST_LOST_BETWEEN = 64
 """Largest step between the numbers of two pieces."""
+_MOST_OF_OTHER_CONTENT = 0.6
+"""Two counters have equal numbers in half of the datagrams; with more, it is no number."""
 _FEWEST_STEPS = 20
 """With fewer steps nothing is said about their size."""
 
@@ -142,6 +144,11 @@ def _first_of_each(capture: Capture, numbered: NumberedPackets) -> NumberedPacke
         of_arrival = hashes[numbered.row[order]]
         of_first = np.repeat(of_arrival[places], np.diff(places, append=len(order)))
         others = int(np.count_nonzero(of_arrival != of_first))
+        if others > _MOST_OF_OTHER_CONTENT * len(order):
+            raise ValueError(
+                f"{others} of {len(order)} datagrams have the number of an earlier one, but another content: "
+                "they have no sequence number there; check --sequence-at"
+            )
         if duplicates > others:
             capture.notes.append(f"duplicates: {duplicates - others}; the first counts")
         if others:

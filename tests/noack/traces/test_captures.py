@@ -246,13 +246,14 @@ IN_AND_OUT = {
 @pytest.mark.parametrize("sequence_at", [None, SequenceField(2, 4, False)])
 def test_a_host_that_forwards_shows_both_ends(name: str, sequence_at: SequenceField | None) -> None:
     link_type, inside, outside = IN_AND_OUT[name]
-    packets = sorted([*on_leg(0, **inside), *on_leg(500_000, LOST, **outside)])
+    lost = [*LOST, COUNT - 1]
+    packets = sorted([*on_leg(0, **inside), *on_leg(500_000, lost, **outside)])
     for file in (
         pcap_of(*packets, link_type=link_type),
         pcapng_of(*packets, link_type=link_type, interfaces=4),
     ):
         trace = trace_of(file, sequence_at=sequence_at)
-        assert np.flatnonzero(trace.lost).tolist() == LOST
+        assert np.flatnonzero(trace.lost).tolist() == lost
         assert set(trace.delay_ns[~trace.lost].tolist()) == {500_000}
 
 

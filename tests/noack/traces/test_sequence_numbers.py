@@ -235,6 +235,10 @@ def test_fields_that_are_no_sequence_numbers_are_refused() -> None:
         ([b"\0\5"] * 500, "the numbers at 0:2 do not ascend"),
         ([rng.randbytes(2) for _ in range(500)], "the numbers at 0:2 jump at random"),
         (
+            [struct.pack(">HI", k % 2, k) for k in range(500)],
+            "of 500 datagrams have the number of an earlier one",
+        ),
+        (
             [struct.pack("<H", k % 2**16) for k in range(1000)],
             "wrong byte order; try --sequence-at 0:2:little",
         ),
