@@ -960,7 +960,7 @@ enum {
     NOACK_HEAD_BYTES = 32,     /* of a payload, that a record has */
     NOACK_BLOCK_BYTES = 512,   /* payloads of delayed datagrams are kept in chained blocks */
     NOACK_CHUNK_BLOCKS = 4096, /* number of blocks per allocation */
-    NOACK_BUCKETS = 1280       /* of a histogram of times */
+    NOACK_BUCKETS = 1280       /* of a histogram of times; the last one also has all from 4.8 hours on */
 };
 
 /* Why the relay returned; the last two occur within it only. */

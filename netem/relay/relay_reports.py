@@ -10,7 +10,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.core_library import core
 from noack.impairments.link_settings import Counters, LinkSettings
 from noack.runtime.address import Address
 from noack.runtime.command_line import print_to_stderr
@@ -25,8 +24,6 @@ _STEPS = 1 << _STEP_BITS
 """Buckets for each doubling of the time; times below this number of ns have a bucket each."""
 _JOINED = 8
 """Buckets that are one bucket of a coarse histogram."""
-BUCKETS: int = core.NOACK_BUCKETS
-"""Number of buckets. The last one also counts all longer times: 4.8 hours and more."""
 
 
 def report_line(line: str) -> None:

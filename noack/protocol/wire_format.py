@@ -40,8 +40,6 @@ MAX_DIMENSION = 64
 """Most entries of a vector in a datagram."""
 MAX_LOOPS = 65_535
 """Maximum number of loops of a run; they are numbered from 0."""
-TIMES_NS = 2**62
-"""Upper limit of times: sums of two fit the record's columns."""
 HEADER_ROW = np.dtype(
     [
         ("magic", "S2"),

@@ -22,7 +22,7 @@ class Decoder:
         run_id: int,
         key: bytes,
         *,
-        not_after_ns: int = wire_format.TIMES_NS - 1,
+        not_after_ns: int = 2**62 - 1,
         loop: int = 0,
         encrypted: bool = False,
     ) -> None:

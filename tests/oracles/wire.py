@@ -9,11 +9,13 @@ from typing import Any
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
-from noack.protocol.wire_format import TIMES_NS, Flow, Message, Rejection
+from noack.protocol.wire_format import Flow, Message, Rejection
 from tests.helpers.wire_decoder import Decoder
 
 KEY = bytes(range(32))
 """The key of all published datagrams."""
+TIMES_NS = 2**62
+"""Times are below."""
 RUN = 0x0123_4567_89AB_CDEF
 ACCEPTED = "accepted"
 

@@ -41,8 +41,6 @@ _LONGEST_S = 1e9
 """The equations are enclosed for all times from 0 to this."""
 _AT_REST = 1e-9
 """The plant rests if |f(0, 0)| is at most this share of the largest entry of A and B in its row."""
-_WIDENINGS = 8
-"""Regions that are tried for the steps that begin in another."""
 _UNDECIDED = "its equations distinguish cases, and the region contains more than one of them"
 _NOT_INSTALLED = "its equations cannot be enclosed without python-flint: pip install 'noack[regions]'"
 

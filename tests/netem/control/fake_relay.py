@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from netem.control.command_queue import CommandQueue
 from netem.relay.relay import Relay
 from netem.relay.relay_links import LinkSpec
-from netem.relay.relay_reports import BUCKETS, DIRECTIONS, Direction, DirectionReport, FlowReport, LinkReport
+from netem.relay.relay_reports import DIRECTIONS, Direction, DirectionReport, FlowReport, LinkReport
 from netem.relay_watch import add_watching_options, check_watching_options
 from netem.tc_words import settings_of
 from noack.core.core_library import core
@@ -30,7 +30,7 @@ def spec_of(name: str) -> LinkSpec:
 
 def times(*t_ns: int) -> NDArray[np.int64]:
     buckets = [core.noack_bucket_of(one_ns) for one_ns in t_ns]
-    return np.bincount(np.array(buckets, np.int64), minlength=BUCKETS)
+    return np.bincount(np.array(buckets, np.int64), minlength=core.NOACK_BUCKETS)
 
 
 class FakeRelay(Relay):

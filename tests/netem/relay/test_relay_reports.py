@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem.relay.relay_reports import BUCKETS, bucket_start_ns, coarse_histogram, quantile_ns
+from netem.relay.relay_reports import bucket_start_ns, coarse_histogram, quantile_ns
 from noack.core.core_library import core
 
 
@@ -15,12 +15,12 @@ def test_a_bucket_holds_its_times_to_three_percent(t_ns: int) -> None:
     assert bucket_start_ns(bucket) <= t_ns < bucket_start_ns(bucket + 1)
     assert bucket_start_ns(bucket + 1) - bucket_start_ns(bucket) <= max(1, bucket_start_ns(bucket) / 32)
     assert core.noack_bucket_of(-1 - t_ns) == 0
-    assert core.noack_bucket_of(2**60) == BUCKETS - 1
+    assert core.noack_bucket_of(2**60) == core.NOACK_BUCKETS - 1
 
 
 @given(st.lists(st.integers(0, 2**43), min_size=1, max_size=200))
 def test_quantiles_and_the_coarse_histogram_are_those_of_the_times(times_ns: list[int]) -> None:
-    counts = np.bincount([core.noack_bucket_of(t_ns) for t_ns in times_ns], minlength=BUCKETS)
+    counts = np.bincount([core.noack_bucket_of(t_ns) for t_ns in times_ns], minlength=core.NOACK_BUCKETS)
     for share in (0.5, 0.99, 1.0):
         exact = float(np.quantile(times_ns, share, method="inverted_cdf"))
         assert quantile_ns(counts, share) == pytest.approx(exact, rel=1 / 32, abs=1)
