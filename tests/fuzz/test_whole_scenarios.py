@@ -37,7 +37,7 @@ def test_a_draw_is_a_function_of_seed_and_number() -> None:
     [
         ("a.toml: trigger.beta: expected more than 0", None),
         ("a.toml: plant.A: wrong\na.toml: plant.B: wrong", "not one line"),
-        ("x" * 500, "500 letters"),
+        ("x" * 800, "800 letters"),
         ("a.toml: <class 'float'> is wrong", "not for a user"),
     ],
 )

@@ -16,6 +16,8 @@ import pytest
 import rerun.chunk
 
 from cosim.analysis.claims.claim_evaluation import RunClaims
+from cosim.analysis.explained_run.explain import explains
+from cosim.analysis.explained_run.findings import SCHEDULE
 from cosim.analysis.replay import replay
 from cosim.output.viewer import blueprint
 from cosim.record.run_events import changes_of
@@ -101,6 +103,12 @@ def test_the_run_is_replayed_bit_for_bit(record: RunRecord, finished: Finished) 
     assert all(hop.compared == hop.received > 0 for hop in result.messages)
     assert finished.loop["replay"] == result.verdict().model_dump()
     assert finished.summary["kind"] == record.kind == "live"
+
+
+def test_the_model_explains_the_run(record: RunRecord) -> None:
+    """All but the times of the schedule, which a late machine exceeds."""
+    findings = [finding for finding in explains(record) if finding.part != SCHEDULE]
+    assert not findings, "\n".join(map(str, findings[:5]))
 
 
 def test_the_recording_shows_the_record(finished: Finished, record: RunRecord) -> None:

@@ -22,6 +22,7 @@ import numpy as np
 
 from cosim.analysis.adversary import Objective, conditions_of, find_worst
 from cosim.analysis.certificates import certificates_of
+from cosim.analysis.explained_run.explain import explains
 from cosim.analysis.replay.run_replay import replay_run
 from cosim.cli.scenario_check import check_scenario
 from cosim.live.finalize import finalize
@@ -38,9 +39,11 @@ LIMIT_S = 60.0
 """Largest CPU time of a step."""
 _NODES, _BEAM = 400, 8
 """Effort of the adversary, for each objective."""
+_MOST_FINDINGS = 5
+"""Findings of a run that the model does not explain that are listed."""
 _MOST_ENTRIES = 2
 """Entries of [[loops]] whose loop is certified and attacked."""
-_MOST_LETTERS = 400
+_MOST_LETTERS = 700
 """Longest message of a refusal."""
 
 
@@ -139,6 +142,11 @@ class _Checks:
             result = replay_run(load_run(run_dir))
             if not result.bit_exact:
                 self.add("replay", str(result.first_difference), str(result))
+        with self.step("explain", may_refuse=False):
+            for record in load_run(run_dir).loops:
+                if findings := explains(record):
+                    lines = "\n".join(map(str, findings[:_MOST_FINDINGS]))
+                    self.add("explain", f"{record.scenario.name}: {len(findings)} findings", lines)
 
     def certify(self, loop: Scenario) -> None:
         """Certify a loop under both conditions."""

@@ -1,0 +1,94 @@
+"""What the model does not explain in a run, and what all checks use: exact flows and tolerances."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.record.record_source import Rows
+from cosim.record.run_events import changes_of
+from cosim.record.run_record import RunRecord
+from noack.core.clock import NEVER_NS, NS_PER_S
+from noack.core.linear_systems import Matrix, Vector
+from noack.scenario.resolution import loop_of
+from noack.scenario.scenario import Scenario
+
+ROUNDING = 1e-9
+"""Largest relative difference that is taken as rounding."""
+_LARGEST = 1e100
+"""A run that diverges is explained up to the first larger number."""
+SCHEDULE = "schedule"
+"""The part of findings about times that a late process exceeds, in a live run."""
+
+
+class Unexplained(NamedTuple):
+    """Something in a record that no run of the model has."""
+
+    t_s: float
+    part: str
+    """What it concerns, such as "plant"; `SCHEDULE` for lateness."""
+    what: str
+
+    def __str__(self) -> str:
+        """The finding in one line."""
+        return f"t = {self.t_s:.6f} s, {self.part}: {self.what}"
+
+
+class ExplainedLoop:
+    """The record of a loop up to the first change that the model depends on.
+
+    Args:
+        record: the record of the loop.
+    """
+
+    def __init__(self, record: RunRecord) -> None:
+        self.record, self.scenario = record, record.scenario
+        self.loop = loop_of(record.scenario)
+        changes = [change.first_ns for change in changes_of(record) if change.touches_claims]
+        self.until_ns = min(changes, default=NEVER_NS)
+        self.findings: list[Unexplained] = []
+        self._flows: dict[int, Matrix] = {}
+
+    def rows(self, table: str, *, time: str = "t_ns") -> Rows:
+        """Return the rows of a table before the first change, in the order of inputs."""
+        rows = self.record[table]
+        return rows[rows[time] < self.until_ns]
+
+    def add(self, t_ns: float, part: str, what: str) -> None:
+        """Add a finding; of each part only the first ones are of use."""
+        self.findings.append(Unexplained(t_ns / NS_PER_S, part, what))
+
+    def flow(self, x: Vector, dt_ns: int) -> Vector:
+        """Return where the models bring a state x in a time: about the set-point, by e^{Hτ}."""
+        if dt_ns not in self._flows:
+            self._flows[dt_ns] = exponential(self.loop.H * (dt_ns * 1e-9))
+        point = self.loop.setpoint
+        about = np.zeros(len(x)) if point is None else point
+        return np.asarray(about + self._flows[dt_ns] @ (x - about))
+
+    def is_near(self, found: Vector, expected: Vector, *scales: Vector) -> bool:
+        """Whether two vectors differ by no more than rounding errors of numbers as large as the scales."""
+        largest = max(float(np.abs(v).max(initial=0.0)) for v in (found, expected, *scales))
+        return bool(np.abs(found - expected).max(initial=0.0) <= ROUNDING * largest + 1e-300)
+
+
+def exponential(M: Matrix) -> Matrix:
+    """Return e^M by scipy, which is independent of the core's."""
+    from scipy.linalg import expm
+
+    return np.asarray(expm(M))
+
+
+def is_moderate(*vectors: NDArray[np.float64]) -> bool:
+    """Whether all entries are finite, and not as large as those of a diverging run."""
+    return all(bool((np.abs(v) < _LARGEST).all()) for v in vectors)
+
+
+def bound_at(scenario: Scenario, place: str, entries: int) -> Vector:
+    """Return the largest sizes of the disturbances at a place, (entries,); infinite if they have none."""
+    bound = np.zeros(entries)
+    for disturbance in scenario.plant.disturbances:
+        if disturbance.at == place:
+            bound += np.abs(disturbance.extent()).sum(axis=1)
+            bound[np.abs(disturbance.deviations()).sum(axis=1) > 0] = np.inf
+    return bound
