@@ -1,0 +1,67 @@
+"""What a statement about a loop depends on, as numbers: plant, model, gain, trigger's rule, times, losses."""
+
+from typing import NamedTuple
+
+from flint import arb, arb_mat, fmpq
+
+
+class Rule(NamedTuple):
+    """The trigger's rule: with z = (x, e_s), an event needs ‖P z‖² > max(c e^{−ρt}, f)² + ‖N z‖².
+
+    With ``period`` above 0 nothing is compared; an event is due at each period. ``always`` says that
+    events may also come without the comparison, as after a deadline.
+    """
+
+    positive: arb_mat  # P, (p, 2n)
+    negative: arb_mat  # N, (q, 2n)
+    level: arb  # c
+    rate: arb  # ρ, 1/s
+    floor: arb  # f
+    period: arb  # s
+    always: bool = False
+
+
+class Times(NamedTuple):
+    """The times of a loop, in s, exactly. All are 0 under ideal conditions."""
+
+    sampling: fmpq
+    """The rule is tested at least this often."""
+    least_sampling: fmpq
+    """Two tests are at least this far apart."""
+    delay: fmpq
+    """The first input that is computed from an update acts within this time after its event, if at all."""
+    age: fmpq
+    """The input that acts at t is K e^{−Hs} x_c(t) for an s of at most this."""
+    start: fmpq
+    """The first input acts within this time; until then the input is 0."""
+
+
+class Loop(NamedTuple):
+    """A loop with n states and m inputs, in coordinates in which its set-point is 0."""
+
+    A: arb_mat  # (n, n)
+    B: arb_mat  # (n, m)
+    half_A: arb_mat  # the plant's entries are within ± these of A and B
+    half_B: arb_mat
+    model_A: arb_mat
+    model_B: arb_mat
+    gain: arb_mat  # K, (m, n)
+    weight: arb_mat  # W of ‖·‖_W, (n, n)
+    holds: bool  # the models hold the last update: H = 0
+    start: arb_mat  # x(0), (n, 1)
+    rule: Rule
+    pushes: arb_mat  # columns D of disturbances, (n, k)
+    sizes: tuple[arb, ...]  # |d_i| ≤ sizes[i]
+    losses: int  # most consecutive losses, M − 1
+    times: Times
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return int(self.A.nrows())
+
+    @property
+    def H(self) -> arb_mat:
+        """What the models integrate."""
+        closed = self.model_A + self.model_B * self.gain
+        return closed * 0 if self.holds else closed

@@ -1,0 +1,467 @@
+"""The loop as a hybrid system: locations with flows, and edges between them.
+
+The state is z = (x, e, w, f₁, f₂): the plant's state x; e = x_s − x, the sensor's error; w = x_c − x_s,
+where x_c is what the acting input was computed from; f₁ = e^{−rt} and f₂ = 1, the units of decaying and
+of constant bounds. With the input u = K e^{−Hs} x_c of age s,
+
+    ẋ = Ax + Bu + Dd,   ė = H(x + e) − ẋ,   ẇ = Hw,   ḟ₁ = −r f₁,   ḟ₂ = 0.
+
+An event sets e := 0 at once, since the sensor's model is reset whether or not the update arrives. The
+controller's error w grows by e, and becomes 0 when the first input acts that was computed from an
+update of the newest event. So a location says how many updates were lost since, and whether one is
+on its way. ``assumed`` in :class:`Model` says that no event happens while one is: :mod:`.events` proves
+this from bounds of the same loop, by induction over the events.
+
+An *inequality* of :meth:`Model.inequalities` is a symmetric matrix that depends linearly on the
+numbers of a witness (matrices, multipliers, levels) and has to be positive semidefinite. Together they
+prove the statement:
+
+* V(z) = zᵀPz, with P of the location and the time θ since the last test (affine between nodes of θ).
+  V ≤ 0 is invariant: along flows dV/dt ≤ −νV, over edges V does not grow, and V ≤ 0 at the start.
+* Where V ≤ 0, each output obeys |Cz|² ≤ D₁² f₁² + D₂² f₂².
+* Quadratic facts q(z) ≤ 0 that hold where an inequality is used (the rule's comparison, a bound of w)
+  enter with multipliers m ≥ 0, and unknown signals p with |p|² ≤ |Rz|² with multipliers, too.
+
+Flows are affine in the input's matrix K e^{−Hs}, so its hull's corners suffice; inequalities are affine
+in θ between two nodes, so both ends suffice.
+"""
+
+from collections.abc import Iterator
+from math import comb
+from typing import NamedTuple
+
+from flint import arb, arb_mat
+
+from noack_check.balls import (
+    around_zero,
+    beside,
+    columns_of,
+    identity,
+    rows_of,
+    square,
+    stack,
+    transpose,
+    upto,
+    zeros,
+)
+from noack_check.loop import Loop
+
+DEGREE, SMALL = 8, 1e-12
+"""The degree of Taylor polynomials in the age of inputs, and a remainder that needs no smaller parts."""
+
+
+class Unknown(NamedTuple):
+    """An unknown signal p in ż = Fz + ``column`` p with |p| ≤ |``rows`` z|."""
+
+    column: arb_mat
+    rows: arb_mat
+
+
+class Flow(NamedTuple):
+    """ż = ``matrix`` z + Σ column p."""
+
+    matrix: arb_mat
+    unknowns: tuple[Unknown, ...]
+
+
+class Location(NamedTuple):
+    """Where z flows until an edge is taken."""
+
+    name: str
+    coordinates: tuple[int, ...]
+    """The entries of z that may differ from 0."""
+    nodes: tuple[arb, ...]
+    """Times θ since it was entered, or since the last test."""
+    flows: tuple[Flow, ...]
+    facts: tuple[arb_mat, ...]
+    """Symmetric Q with zᵀQz ≤ 0."""
+    is_tested: bool
+
+
+class Edge(NamedTuple):
+    """A jump z := ``jump`` z, possible where ``facts`` are ≤ 0."""
+
+    name: str
+    source: int
+    nodes: tuple[int, ...]
+    jump: arb_mat
+    facts: tuple[arb_mat, ...]
+    target: int
+    target_nodes: tuple[int, ...]
+
+
+class Part(NamedTuple):
+    """LᵀVR + RᵀVL of a symmetric matrix V of the witness."""
+
+    name: str
+    left: arb_mat
+    right: arb_mat
+
+
+class Inequality(NamedTuple):
+    """Σ parts + Σ number · matrix + constant ⪰ 0."""
+
+    name: str
+    location: int
+    signals: int
+    """The last rows and columns are those of so many unknown signals, the others those of a location."""
+    parts: tuple[Part, ...]
+    scalars: tuple[tuple[str, arb_mat], ...]
+    constant: arb_mat
+
+
+class Form(NamedTuple):
+    """P of a location at a node: Σ SᵀVS + Σ number · matrix, with named V and numbers."""
+
+    parts: tuple[tuple[str, arb_mat], ...]
+    scalars: tuple[tuple[str, arb_mat], ...]
+
+
+class Model:
+    """The hybrid system of a loop.
+
+    Args:
+        loop: the loop.
+        rate: r ≥ 0 in f₁ = e^{−rt}, in 1/s.
+        decay: ν in dV/dt ≤ −νV, in 1/s.
+        chain: κ with ‖W w‖ ≤ κ·(number of missing updates)·threshold, if that is known; else None.
+        is_exact: with False a coarse approximation of K e^{−Hs} replaces its hull, for a search.
+    """
+
+    def __init__(
+        self, loop: Loop, rate: arb, decay: arb, chain: arb | None = None, *, is_exact: bool = True
+    ) -> None:
+        self.loop, self.rate, self.decay, self.chain = loop, rate, decay, chain
+        self.is_exact = is_exact
+        n = loop.n
+        self.size = 3 * n + 2
+        every = identity(self.size)
+        self.x, self.e, self.w = (rows_of(every, range(i * n, i * n + n)) for i in range(3))
+        self.f1, self.f2 = (rows_of(every, [3 * n + i]) for i in range(2))
+        rule = loop.rule
+        self._has_f1 = bool(rate > 0) or not self._needs_constant
+        self.silent = self._comparison(rule.level, rule.floor)
+        self.locations = self._locations()
+        self.edges = self._edges()
+
+    @property
+    def _needs_constant(self) -> bool:
+        return bool(self.loop.rule.floor > 0) or bool(self.loop.sizes)
+
+    # The system.
+
+    def _comparison(self, level: arb, floor: arb) -> arb_mat:
+        """Return ‖P z‖² − ‖N z‖² − c² f₁² − f² f₂²."""
+        pair = stack([self.x, self.e])
+        rule = self.loop.rule
+        form = square(rule.positive * pair) if rule.positive.nrows() else zeros(self.size, self.size)
+        if rule.negative.nrows():
+            form = form - square(rule.negative * pair)
+        return form - level**2 * square(self.f1) - floor**2 * square(self.f2)
+
+    def threshold_squared(self) -> arb_mat:
+        """Return c² f₁² + f² f₂², at least the square of the threshold."""
+        rule = self.loop.rule
+        return rule.level**2 * square(self.f1) + rule.floor**2 * square(self.f2)
+
+    def _locations(self) -> list[Location]:
+        n, losses, times = self.loop.n, self.loop.losses, self.loop.times
+        units = ([3 * n] if self._has_f1 else []) + ([3 * n + 1] if self._needs_constant else [])
+        without_w, all_of_z = (*range(2 * n), *units), (*range(3 * n), *units)
+        flows = self._flows(self._gains())
+        nodes = (arb(0), arb(times.sampling)) if times.sampling > 0 else (arb(0),)
+        compared = () if times.sampling > 0 else (self.silent,)
+        found = []
+        for lost in range(losses + 1):
+            facts = compared + (self._chain(lost) if lost else ())
+            found.append(Location(f"{lost} lost", all_of_z if lost else without_w, nodes, flows, facts, True))
+        if times.delay > 0:
+            waiting = (arb(0), arb(times.delay))
+            facts = self._chain(losses + 1)
+            found.append(Location("on its way", all_of_z, waiting, flows, facts, False))
+        if times.start > 0:
+            waiting, no_input = (arb(0), arb(times.start)), self._flows([0 * self.loop.gain])
+            found.append(Location("start", without_w, waiting, no_input, (), False))
+        return found
+
+    def _chain(self, missing: int) -> tuple[arb_mat, ...]:
+        """Return ‖W w‖² − (κ·missing)² (c² f₁² + f² f₂²), if κ is known."""
+        if self.chain is None:
+            return ()
+        bound = (self.chain * missing) ** 2 * self.threshold_squared()
+        return (square(self.loop.weight * self.w) - bound,)
+
+    def _gains(self) -> list[arb_mat]:
+        """Return matrices in whose hull K e^{−Hs} is, for all ages s.
+
+        On each part [a, a + q] it is a Taylor polynomial of degree d, up to q^{d+1}/(d+1)! ·
+        sup|K H^{d+1} e^{−Hs}|, and the polynomial is in the hull of its Bézier points
+        b_i = Σ_{k ≤ i} C(i, k)/C(d, k) q^k t_k, with t_k its coefficients.
+        """
+        K, H, age = self.loop.gain, self.loop.H, arb(self.loop.times.age)
+        if self.loop.holds or not age > 0:
+            return [K]
+        if not self.is_exact:
+            return _corners(K, H, age, degree=2)[0]
+        for parts in (1, 2, 4, 8):
+            q = age / parts
+            found = [_corners(K * (-part * q * H).exp(), H, q, DEGREE) for part in range(parts)]
+            if max(float(rest.abs_upper()) for _, rests in found for rest in rests.entries()) < SMALL:
+                break
+        return [point + rests for points, rests in found for point in points]
+
+    def _flows(self, gains: list[arb_mat]) -> tuple[Flow, ...]:
+        loop, H = self.loop, self.loop.H
+        found = []
+        for gain in gains:
+            u = gain * (self.x + self.e + self.w)
+            velocity = loop.A * self.x + loop.B * u
+            error = H * (self.x + self.e) - velocity
+            matrix = stack([velocity, error, H * self.w, -self.rate * self.f1, 0 * self.f2])
+            found.append(Flow(matrix, tuple(self._unknowns(u))))
+        return tuple(found)
+
+    def _unknowns(self, u: arb_mat) -> Iterator[Unknown]:
+        """Yield what moves x in an unknown way: entries of A and B, and disturbances."""
+        loop, n = self.loop, self.loop.n
+        for half, signal in ((loop.half_A, self.x), (loop.half_B, u)):
+            for i in range(half.nrows()):
+                for k in range(half.ncols()):
+                    if half[i, k] != 0:
+                        root = half[i, k].sqrt()
+                        row = rows_of(signal, [k])
+                        yield Unknown(self._push(columns_of(root * identity(n), [i])), root * row)
+        for index, size in enumerate(loop.sizes):
+            root = size.sqrt()
+            yield Unknown(self._push(root * columns_of(loop.pushes, [index])), root * self.f2)
+
+    def _push(self, column: arb_mat) -> arb_mat:
+        """Return the column of ż for one of ẋ."""
+        return transpose(self.x) * column - transpose(self.e) * column
+
+    def _edges(self) -> list[Edge]:
+        losses, times, rule = self.loop.losses, self.loop.times, self.loop.rule
+        Z = zeros(self.loop.n, self.size)
+        units = [self.f1, self.f2]
+        lost, delivered = stack([self.x, Z, self.w + self.e, *units]), stack([self.x, Z, Z, *units])
+        arrival = stack([self.x, self.e, Z, *units])
+        event: tuple[arb_mat, ...] = ()
+        if not rule.always and rule.positive.nrows():
+            event = (-1 * self._comparison(arb(0), rule.floor),)
+            if bool(self.rate == rule.rate) and rule.level > 0:
+                event = (*event, -1 * self._comparison(rule.level, arb(0)))
+        nodes = tuple(range(len(self.locations[0].nodes)))
+        waits = losses + 1
+        found = []
+        for j in range(losses + 1):
+            if times.delay > 0:
+                found.append(Edge(f"{j} sent", j, nodes, lost, event, waits, (0,)))
+            else:
+                found.append(Edge(f"{j} delivered", j, nodes, delivered, event, 0, (0,)))
+            if j < losses:
+                found.append(Edge(f"{j} lost", j, nodes, lost, event, j + 1, (0,)))
+        if times.delay > 0:
+            found.append(Edge("arrival", waits, (0, 1), arrival, (), 0, nodes))
+        if times.start > 0:
+            first = len(self.locations) - 1
+            found.append(Edge("first input", first, (0, 1), arrival, (), 0, nodes))
+        return found
+
+    # The quadratic forms.
+
+    def form(self, location: int, node: int) -> Form:
+        """Return P of a location at a node, in the location's coordinates.
+
+        P is that of xᵀXx + (e, w)ᵀQ(e, w) − c₁ f₁² − c₂ f₂² − a θ·(comparison), with X common to all
+        locations: then x drops out of the edges, and a silent test at θ leaves V as it is where the
+        comparison is ≤ 0, since a ≥ 0. Waiting locations have Q, c₁ and c₂ for each node.
+        """
+        place = self.locations[location]
+        n = self.loop.n
+        E = columns_of(identity(self.size), place.coordinates)
+        errors = stack([self.e, self.w]) if 2 * n in place.coordinates else self.e
+        own = f"{place.name}" if place.is_tested else f"{place.name}, {node}"
+        X = f"X/{own}" if place.name == "start" else "X"
+        parts = ((X, self.x * E), (f"Q/{own}", errors * E))
+        units = [(name, f) for name, f in (("c1", self.f1), ("c2", self.f2)) if not is_zero(f * E)]
+        scalars = [(f"{name}/{own}", -1 * square(f * E)) for name, f in units]
+        if place.is_tested and node and self.loop.rule.positive.nrows():
+            scalars.append((f"a/{own}", -1 * place.nodes[node] * transpose(E) * self.silent * E))
+        return Form(parts, tuple(scalars))
+
+    # The inequalities.
+
+    def inequalities(self, output: str, *, starts: bool) -> Iterator[Inequality]:
+        """Yield the inequalities that prove a bound of an output: see :meth:`output`.
+
+        ``starts``: from the loop's start on; else in the limit t → ∞.
+        """
+        for index, place in enumerate(self.locations):
+            yield from self._flow_inequalities(index)
+            if place.name != "start" or output != "drift":
+                yield from self._output_inequalities(index, output)
+        for edge in self.edges:
+            yield from self._edge_inequalities(edge)
+        if starts:
+            yield self._start_inequality()
+
+    def _flow_inequalities(self, index: int) -> Iterator[Inequality]:
+        """dV/dt + νV ≤ Σ m q + Σ τ (|p|² − |Rz|²), at both ends of each piece of θ."""
+        place = self.locations[index]
+        E0 = columns_of(identity(self.size), place.coordinates)
+        last = len(place.nodes) - 1
+        for piece in range(max(last, 1)):
+            for end in (piece, piece + 1) if last else (0,):
+                for corner, flow in enumerate(place.flows):
+                    k = len(flow.unknowns)
+                    E = beside(identity(E0.ncols()), zeros(E0.ncols(), k))
+                    motion = flow.matrix * E0
+                    for unknown in flow.unknowns:
+                        motion = beside(motion, unknown.column)
+                    F = rows_of(motion, place.coordinates)
+                    terms = _Terms(E.ncols())
+                    terms.add(self.form(index, end), E, F, arb(-1))
+                    terms.add(self.form(index, end), E, E, -self.decay / 2)
+                    if last:
+                        length = place.nodes[piece + 1] - place.nodes[piece]
+                        terms.add(self.form(index, piece + 1), E, E, -1 / length / 2)
+                        terms.add(self.form(index, piece), E, E, 1 / length / 2)
+                    name = f"flow/{place.name}/{end}"
+                    for number_, fact in enumerate(place.facts):
+                        terms.scalar(f"m/{name}/{number_}", transpose(E0 * E) * fact * (E0 * E))
+                    self._add_signals(terms, f"m/{name}", flow.unknowns, E0 * E)
+                    yield terms.inequality(f"{name}/{corner}", index, k)
+
+    def output(self, name: str, place: Location) -> list[tuple[arb_mat, Flow | None]]:
+        """Return C of an output in a location, for each flow if the output depends on the flow.
+
+        "x" is x, "x[i]" one of its entries, "e_s" and "e_c" are W e_s and W e_c, "u" is the input, and
+        "drift" is W (ẋ − H x), by which the sensor's error grows: ė = He − (ẋ − Hx). The bound of the
+        drift is one from the first input on.
+        """
+        loop = self.loop
+        if name == "x":
+            return [(self.x, None)]
+        if name == "e_s":
+            return [(loop.weight * self.e, None)]
+        if name == "e_c":
+            return [(loop.weight * (self.e + self.w), None)]
+        if name == "drift":
+            return [(self._drift(flow.matrix) - loop.weight * loop.H * self.x, flow) for flow in place.flows]
+        index = int(name.removeprefix("x[").removesuffix("]"))
+        return [(rows_of(self.x, [index]), None)]
+
+    def _drift(self, motion: arb_mat) -> arb_mat:
+        return self.loop.weight * rows_of(motion, range(self.loop.n))
+
+    def _output_inequalities(self, index: int, output: str) -> Iterator[Inequality]:
+        """|Cz + Σ C p|² ≤ D₁² f₁² + D₂² f₂² + V + Σ m q + Σ τ (|Rz|² − |p|²)."""
+        place = self.locations[index]
+        E0 = columns_of(identity(self.size), place.coordinates)
+        for node in range(len(place.nodes)):
+            for corner, (C, flow) in enumerate(self.output(output, place)):
+                unknowns = flow.unknowns if flow is not None else ()
+                E = beside(identity(E0.ncols()), zeros(E0.ncols(), len(unknowns)))
+                terms = _Terms(E.ncols())
+                terms.add(self.form(index, node), E, E, arb(1) / 2)
+                for level, f in (("level 1", self.f1), ("level 2", self.f2)):
+                    if not is_zero(f * E0):
+                        terms.scalar(level, square(f * E0 * E))
+                name = f"output/{place.name}/{node}"
+                for number_, fact in enumerate(place.facts):
+                    terms.scalar(f"m/{name}/{number_}", transpose(E0 * E) * fact * (E0 * E))
+                whole = C * E0
+                for unknown in unknowns:
+                    whole = beside(whole, self._drift(unknown.column))
+                self._add_signals(terms, f"m/{name}", unknowns, E0 * E)
+                terms.constant = -1 * square(whole)
+                yield terms.inequality(f"{name}/{corner}", index, len(unknowns))
+
+    def _add_signals(self, terms: "_Terms", name: str, unknowns: tuple[Unknown, ...], E: arb_mat) -> None:
+        """Add Σ τ (|p|² − |Rz|²) of the last coordinates, p."""
+        size = E.ncols()
+        for signal, unknown in enumerate(unknowns):
+            one = zeros(1, size)
+            one[0, size - len(unknowns) + signal] = 1
+            terms.scalar(f"{name}/signal {signal}", square(one) - square(unknown.rows * E))
+
+    def _edge_inequalities(self, edge: Edge) -> Iterator[Inequality]:
+        """V_target(jump z) ≤ V_source(z) + Σ m q."""
+        source, target = self.locations[edge.source], self.locations[edge.target]
+        E = columns_of(identity(self.size), source.coordinates)
+        jump = rows_of(edge.jump * E, target.coordinates)
+        for node in edge.nodes:
+            for target_node in edge.target_nodes:
+                terms = _Terms(E.ncols())
+                one = identity(E.ncols())
+                terms.add(self.form(edge.source, node), one, one, arb(1) / 2)
+                terms.add(self.form(edge.target, target_node), jump, jump, arb(-1) / 2)
+                name = f"edge/{edge.name}/{node} {target_node}"
+                for number_, fact in enumerate(edge.facts + source.facts):
+                    terms.scalar(f"m/{name}/{number_}", transpose(E) * fact * E)
+                yield terms.inequality(name, edge.source, 0)
+
+    def _start_inequality(self) -> Inequality:
+        """V(z(0)) ≤ 0."""
+        index = len(self.locations) - 1 if self.loop.times.start > 0 else 0
+        z = transpose(self.x) * self.loop.start + transpose(self.f1) + transpose(self.f2)
+        z = rows_of(z, self.locations[index].coordinates)
+        terms = _Terms(1)
+        terms.add(self.form(index, 0), z, z, arb(-1) / 2)
+        return terms.inequality("start", index, -1)
+
+
+def _corners(K: arb_mat, H: arb_mat, q: arb, degree: int) -> tuple[list[arb_mat], arb_mat]:
+    """Return the Bézier points of the Taylor polynomial of K e^{−Hs} on [0, q], and balls of the rest."""
+    terms = [K]
+    for k in range(degree + 1):
+        terms.append(terms[-1] * H * (-q / (k + 1)))
+    last = terms.pop() * (-1 * upto(q) * H).exp()
+    rest = arb_mat(K.nrows(), K.ncols(), [around_zero(v) for v in last.entries()])
+    points = []
+    for i in range(degree + 1):
+        shares = [arb(comb(i, k)) / comb(degree, k) for k in range(i + 1)]
+        points.append(sum((share * term for share, term in zip(shares, terms, strict=False)), 0 * K))
+    return points, rest
+
+
+def is_zero(M: arb_mat) -> bool:
+    """Return whether all entries are exactly 0."""
+    return all(entry == 0 for entry in M.entries())
+
+
+def is_same(part: Part, other: Part) -> bool:
+    """Return whether two parts are exactly equal."""
+    return part.name == other.name and part.left == other.left and part.right == other.right
+
+
+class _Terms:
+    """Collects an inequality of some size."""
+
+    def __init__(self, size: int) -> None:
+        self.parts: list[Part] = []
+        self.scalars: dict[str, arb_mat] = {}
+        self.constant = zeros(size, size)
+
+    def add(self, form: Form, left: arb_mat, right: arb_mat, factor: arb) -> None:
+        """Add factor · (leftᵀ P right + rightᵀ P left)."""
+        for name, S in form.parts:
+            part = Part(name, factor * (S * left), S * right)
+            opposite = Part(name, -1 * part.left, part.right)
+            if any(is_same(opposite, other) for other in self.parts):  # they cancel
+                self.parts = [other for other in self.parts if not is_same(opposite, other)]
+            else:
+                self.parts.append(part)
+        for name, M in form.scalars:
+            product = factor * (transpose(left) * M * right)
+            self.scalar(name, product + transpose(product))
+
+    def scalar(self, name: str, M: arb_mat) -> None:
+        """Add number · M."""
+        self.scalars[name] = self.scalars[name] + M if name in self.scalars else M
+
+    def inequality(self, name: str, location: int, signals: int) -> Inequality:
+        """Return what was collected."""
+        return Inequality(
+            name, location, signals, tuple(self.parts), tuple(self.scalars.items()), self.constant
+        )

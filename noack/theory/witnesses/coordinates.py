@@ -1,0 +1,144 @@
+"""Coordinates in which the solver succeeds: second moments of random runs of the hybrid system.
+
+The runs are rough: steps of one test, inputs of some age, random losses and delays, disturbances that
+change their signs. They only have to show how large the states are where they are.
+"""
+
+from collections import defaultdict
+from collections.abc import Mapping
+
+import numpy as np
+from flint import arb, arb_mat, fmpq
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from noack.core.linear_systems import Matrix, Vector
+from noack_check.model import Model
+
+Frames = Mapping[str, Matrix]
+"""By the name of a witness's matrix V: T with V = T⁻ᵀ V̂ T⁻¹, V̂ of order 1."""
+_RUNS, _MOST_STEPS = 120, 3000
+_LOSS_RATES = (0.0, 0.3, 0.6, 0.9, 1.0)
+_WAITING = "on its way"
+
+
+def floats(M: arb_mat) -> Matrix:
+    """Return the midpoints."""
+    return np.array([[float(v.mid()) for v in row] for row in M.tolist()]).reshape(M.nrows(), M.ncols())
+
+
+def simulated_frames(model: Model) -> Frames:
+    """Return coordinates for the matrices of a model's forms, in units of the threshold."""
+    runs = _Runs(model)
+    runs.advance()
+    frames: dict[str, Matrix] = {}
+    for index, place in enumerate(model.locations):
+        own = runs.moments(place.name)
+        for node in range(len(place.nodes)):
+            for name, S in model.form(index, node).parts:
+                where = [place.coordinates[int(np.flatnonzero(row)[0])] for row in floats(S)]
+                block = (runs.moments("") if name.startswith("X") else own)[np.ix_(where, where)]
+                block = block + 1e-3 * np.diag(np.diag(block)) + 1e-9 * np.trace(block) * np.eye(len(where))
+                frames[name] = 2 * np.linalg.cholesky(block)
+    return frames
+
+
+class _Runs:
+    """Random runs of a model, of which the second moments by location are kept."""
+
+    def __init__(self, model: Model) -> None:
+        self._loop, n, N = model.loop, model.loop.n, model.size
+        self._rng = np.random.default_rng(0)
+        flows = [floats(flow.matrix) for flow in model.locations[0].flows]
+        fastest = max(float(np.abs(np.linalg.eigvals(flow)).max()) for flow in flows)
+        slowest = max(-float(np.linalg.eigvals(flows[0][:n, :n]).real.max()), 1e-3)
+        self._h = _seconds(self._loop.times.sampling) or 0.1 / fastest
+        self._steps = int(min(max(6.0 / slowest / self._h, 200), _MOST_STEPS))
+        self._sway = self._h * slowest * np.array([0.3, 1.0, 3.0])
+        self._exact = [expm(flow * self._h) for flow in flows]
+        self._corner = self._rng.integers(0, len(flows), _RUNS)
+        self._unknowns = [
+            (floats(u.column)[:, 0], floats(u.rows)) for u in model.locations[0].flows[0].unknowns
+        ]
+        self._silent, self._unit = floats(model.silent), floats(model.threshold_squared())
+        self._lost, self._arrived = np.eye(N), np.eye(N)
+        self._lost[n : 2 * n, n : 2 * n] = 0
+        self._lost[2 * n : 3 * n, n : 2 * n] = np.eye(n)
+        self._arrived[2 * n : 3 * n] = 0
+        self._z = np.ones((_RUNS, N))
+        self._z[:, n : 3 * n] = 0
+        self._z[:, :n] = floats(self._loop.start)[:, 0]
+        spread = float(np.linalg.norm(floats(self._loop.start))) or 1.0
+        half = _RUNS // 2
+        self._z[half:, :n] = spread * self._rng.standard_normal((_RUNS - half, n)) / np.sqrt(n)
+        self._missing, self._waiting = np.zeros(_RUNS, int), np.zeros(_RUNS, bool)
+        self._loss_rate = self._rng.choice(_LOSS_RATES, _RUNS)
+        self._sums: dict[str, Matrix] = defaultdict(lambda: np.zeros((N, N)))
+        self._counts: dict[str, int] = defaultdict(int)
+
+    def advance(self) -> None:
+        """Simulate all steps."""
+        for step in range(self._steps):
+            self._flow(step)
+            self._jump(self._events(step))
+            self._observe()
+
+    def moments(self, location: str) -> Matrix:
+        """Return the second moments in a location, mixed with those of all; of all for ""."""
+        total = np.sum(list(self._sums.values()), axis=0) / sum(self._counts.values())
+        if location not in self._sums:
+            return np.asarray(total)
+        return np.asarray(0.7 * self._sums[location] / self._counts[location] + 0.3 * total)
+
+    def _flow(self, step: int) -> None:
+        moved = np.empty_like(self._z)
+        for index, E in enumerate(self._exact):
+            moved[self._corner == index] = self._z[self._corner == index] @ E.T
+        for column, rows in self._unknowns:
+            sign = np.sign(np.sin(step * self._rng.choice(self._sway) + np.arange(_RUNS)))
+            moved += self._h * (sign * np.linalg.norm(self._z @ rows.T, axis=1))[:, None] * column
+        self._z = moved
+
+    def _events(self, step: int) -> NDArray[np.bool_]:
+        if period := float(self._loop.rule.period):
+            return np.full(_RUNS, (step + 1) % max(round(period / self._h), 1) == 0) & ~self._waiting
+        return (self._quadratic(self._silent) > 0) & ~self._waiting
+
+    def _jump(self, event: NDArray[np.bool_]) -> None:
+        z, delay_s = self._z, _seconds(self._loop.times.delay)
+        arrives = self._waiting & (self._rng.random(_RUNS) < 2.0 * self._h / max(delay_s, self._h))
+        z[arrives] = z[arrives] @ self._arrived.T
+        self._waiting &= ~arrives
+        self._missing[arrives] = 0
+        z[event] = z[event] @ self._lost.T
+        drops = event & (self._rng.random(_RUNS) < self._loss_rate) & (self._missing < self._loop.losses)
+        self._missing[drops] += 1
+        passes = event & ~drops
+        if delay_s:
+            self._waiting |= passes
+        else:
+            z[passes] = z[passes] @ self._arrived.T
+            self._missing[passes] = 0
+
+    def _observe(self) -> None:
+        """Add to the moments, in units of the present threshold; without one, of the decay."""
+        size = self._quadratic(self._unit)
+        decay = self._z[:, -2] ** 2
+        unit = float(self._unit.sum()) or 1.0
+        ratio = np.maximum(size / unit if size.any() else decay, 1e-300)
+        scaled = self._z / np.sqrt(ratio)[:, None]
+        for missing in range(self._loop.losses + 1):
+            self._add(f"{missing} lost", scaled[(self._missing == missing) & ~self._waiting])
+        self._add(_WAITING, scaled[self._waiting])
+
+    def _add(self, location: str, z: Matrix) -> None:
+        if len(z):
+            self._sums[location] += z.T @ z
+            self._counts[location] += len(z)
+
+    def _quadratic(self, M: Matrix) -> Vector:
+        return np.asarray(np.einsum("ri,ij,rj->r", self._z, M, self._z))
+
+
+def _seconds(time: fmpq) -> float:
+    return float(arb(time).mid())

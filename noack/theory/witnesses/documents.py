@@ -1,0 +1,215 @@
+"""The search for a whole witness: a document that :mod:`noack_check.proof` accepts."""
+
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import expm, solve_continuous_lyapunov
+
+from noack.core.linear_systems import Matrix
+from noack.theory.witnesses.coordinates import Frames, floats, simulated_frames
+from noack.theory.witnesses.search import Found, Search, refined
+from noack_check.balls import matrix, number
+from noack_check.check import RejectedError
+from noack_check.loop import Loop
+from noack_check.model import Model
+from noack_check.norms import growth
+from noack_check.proof import Proof, prove, prove_bound
+
+_MARGINS = (1e-5, 1e-4, 1e-3)
+"""Margins of the inequalities, in the coordinates of the search, until the checker accepts."""
+_SHARES = (0.25, 0.45, 0.65)
+"""ν between 2r and twice the loop's rate of decay, as shares; three, then one more by interpolation."""
+_ROOM = 1 + 1e-6
+_MOST_LOSSES = 24
+
+
+class NoWitnessError(ArithmeticError):
+    """No witness was found; the message says what fails first."""
+
+
+class Witness(NamedTuple):
+    """A document, and what the checker found it to prove."""
+
+    document: Mapping[str, object]
+    proof: Proof
+
+
+def find_witness(loop: Loop, outputs: Sequence[str] = ("x", "e_c")) -> Witness:
+    """Return a witness for bounds of some outputs, of the drift, and of the time between events.
+
+    Raises:
+        NoWitnessError: none was found.
+    """
+    if loop.losses > _MOST_LOSSES:
+        raise NoWitnessError(f"M − 1 = {loop.losses} consecutive losses: at most {_MOST_LOSSES} are searched")
+    rates = _Rates(loop)
+    if rates.slowest <= 0:
+        raise NoWitnessError("the loop does not decay without losses")
+    document: dict[str, object] = {"rate": rates.rate}
+    chain = _chain(loop, rates.rate)
+    if chain is not None:
+        document["chain"] = chain
+    search = _OutputSearch(loop, rates)
+    drift = search.bound("drift")
+    document["bounds"] = [*search.bounds(outputs), drift]
+    document["inter_event_s"] = _inter_event_s(loop, rates.rate, drift)
+    try:
+        return Witness(document, prove(loop, document))
+    except RejectedError as error:
+        raise NoWitnessError(str(error)) from None
+
+
+class _Rates:
+    """The rates of decay of a loop: that of the bounds, r, and the largest that ν may have, halved."""
+
+    def __init__(self, loop: Loop) -> None:
+        closed = floats(loop.A + loop.B * loop.gain)
+        own = [closed] if loop.holds else [closed, floats(loop.H)]
+        self.slowest = min(-float(np.linalg.eigvals(M).real.max()) for M in own)
+        threshold, level = float(loop.rule.rate), float(loop.rule.level)
+        wanted = threshold if level else 0.3 * self.slowest
+        if loop.holds or (level and not threshold):
+            self.rate = 0.0
+        else:
+            self.rate = wanted if wanted < 0.95 * self.slowest else 0.8 * self.slowest
+
+    def decay(self, share: float) -> float:
+        """Return ν at a share of what is possible."""
+        return 2 * self.rate + 2 * (self.slowest - self.rate) * share
+
+
+class _OutputSearch:
+    """The search for the bounds of one loop; ν of the first output is kept for the others."""
+
+    def __init__(self, loop: Loop, rates: _Rates) -> None:
+        self._loop, self._rates = loop, rates
+        self._frames = simulated_frames(self._model(rates.decay(_SHARES[0])))
+        self._decay: float | None = None
+
+    def _model(self, decay: float) -> Model:
+        return Model(self._loop, number(self._rates.rate), number(decay), is_exact=False)
+
+    def bounds(self, outputs: Sequence[str]) -> list[dict[str, object]]:
+        """Return the entries of those outputs for which there is one."""
+        found = []
+        for output in outputs:
+            with contextlib.suppress(NoWitnessError):
+                found.append(self.bound(output))
+        return found
+
+    def bound(self, output: str) -> dict[str, object]:
+        """Return the entry of a document for an output."""
+        if self._decay is None:
+            self._decay = self._best_decay(output)
+        why = f"{output}: the solver finds no quadratic forms"
+        for margin in _MARGINS:
+            found = self._solve(output, self._decay, margin, self._frames)
+            if found is None:
+                continue
+            again = self._solve(output, self._decay, margin, refined(self._frames, found))
+            for candidate in sorted(filter(None, (found, again)), key=_size):
+                entry = _entry(output, self._decay, candidate)
+                try:
+                    prove_bound(self._loop, number(self._rates.rate), entry, None, None)
+                except RejectedError as error:
+                    why = str(error)
+                else:
+                    return entry
+        raise NoWitnessError(why)
+
+    def _best_decay(self, output: str) -> float:
+        sizes = {}
+        for share in _SHARES:
+            found = self._solve(output, self._rates.decay(share), _MARGINS[0], self._frames)
+            if found is not None:
+                sizes[share] = _size(found)
+        if not sizes:
+            raise NoWitnessError(f"{output}: the solver finds no quadratic forms at any rate of decay")
+        best = min(sizes, key=sizes.__getitem__)
+        if len(sizes) == len(_SHARES):
+            fit = np.polyfit(list(sizes), list(np.log(list(sizes.values()))), 2)
+            lowest = -fit[1] / (2 * fit[0]) if fit[0] > 0 else best
+            lowest = min(max(lowest, 0.08), 0.9)
+            if abs(lowest - best) > 0.03:
+                found = self._solve(output, self._rates.decay(lowest), _MARGINS[0], self._frames)
+                if found is not None and _size(found) < sizes[best]:
+                    best = lowest
+        return self._rates.decay(best)
+
+    def _solve(self, output: str, decay: float, margin: float, frames: Frames) -> Found | None:
+        found = Search(self._model(decay), frames).solve(output, starts=True, margin=margin)
+        return found if found.status in {"Solved", "AlmostSolved"} else None
+
+
+def _size(found: Found) -> float:
+    return float(np.hypot(*found.levels))
+
+
+def _entry(output: str, decay: float, found: Found) -> dict[str, object]:
+    """Return the entry of a document: symmetric matrices, multipliers that are not negative."""
+    numbers = {
+        name: value
+        if name.startswith("c")
+        else max(value, 0.0) * (_ROOM if name.startswith("level") else 1.0)
+        for name, value in found.numbers.items()
+    }
+    matrices = {name: ((V + V.T) / 2).tolist() for name, V in found.matrices.items()}
+    return {
+        "output": output, "decay": decay, "from_start": True, "matrices": matrices, "numbers": numbers,
+    }  # fmt: skip
+
+
+def _chain(loop: Loop, rate: float) -> dict[str, object] | None:
+    """Return the gain of the paper's chain with the witness of its tail; None: the model does not decay."""
+    W = floats(loop.weight)
+    G = W @ floats(loop.H) @ np.linalg.inv(W) + rate * np.eye(loop.n)
+    if not G.any():
+        return {"gain": 1.0, "tail": np.eye(loop.n).tolist()}
+    if np.linalg.eigvals(G).real.max() >= 0:
+        return None
+    tail = solve_continuous_lyapunov(G.T, -np.eye(loop.n))
+    gain = max(_sups(G)) * (1 + 3e-4) + 1e-9
+    return {"gain": gain, "tail": ((tail + tail.T) / 2).tolist()}
+
+
+def _sups(G: Matrix) -> Iterator[float]:
+    """Yield ‖e^{Gτ}‖ on a grid until it has decayed."""
+    slowest = -float(np.linalg.eigvals(G).real.max())
+    step = 0.02 / max(float(np.linalg.norm(G, 2)), slowest)
+    E, power = expm(G * step), np.eye(len(G))
+    for _ in range(100_000):
+        size = float(np.linalg.norm(power, 2))
+        yield size
+        if size < 1e-2:
+            return
+        power = E @ power
+
+
+def _inter_event_s(loop: Loop, rate: float, drift: Mapping[str, object]) -> float:
+    """Return a time that :mod:`noack_check.proof` accepts between two events; 0 without one."""
+    numbers = drift["numbers"]
+    assert isinstance(numbers, dict)
+    D1, D2 = numbers.get("level 1", 0.0), numbers.get("level 2", 0.0)
+    level, floor = float(loop.rule.level), float(loop.rule.floor)
+    if rate != float(loop.rule.rate):
+        level = 0.0
+    if loop.rule.always or loop.rule.negative.nrows() or not (level or floor):
+        return 0.0
+    shares = [(max(level**2 * v, floor**2), D1 * v + D2) for v in _kinks(level, floor)]
+    most = min((threshold / size) ** 0.5 for threshold, size in shares if size)
+    W = floats(loop.weight)
+    G = W @ floats(loop.H) @ np.linalg.inv(W) + rate * np.eye(loop.n)
+    low, high = 0.0, most
+    for _ in range(30):
+        middle = (low + high) / 2
+        total = float(growth(matrix(G.tolist()), number(middle))[1].mid())
+        low, high = (middle, high) if total * (1 + 1e-9) < most else (low, middle)
+    return low
+
+
+def _kinks(level: float, floor: float) -> list[float]:
+    if not level:
+        return [0.0, 1.0]
+    return [1.0, *([0.0, min((floor / level) ** 2, 1.0)] if floor else [])]

@@ -1,0 +1,144 @@
+"""Witnesses that the search finds are accepted; changed ones are not."""
+
+import copy
+import math
+
+import numpy as np
+import pytest
+from flint import arb, fmpq
+
+from noack.theory.witnesses.documents import NoWitnessError, Witness, find_witness
+from noack_check.balls import matrix, number, zeros
+from noack_check.check import RejectedError
+from noack_check.loop import Loop, Rule, Times
+from noack_check.proof import prove
+
+IDEAL = Times(fmpq(0), fmpq(0), fmpq(0), fmpq(0), fmpq(0))
+SCHEDULE = Times(fmpq(1, 100), fmpq(1, 100), fmpq(1, 50), fmpq(3, 100), fmpq(1, 50))
+
+
+def double_integrator(
+    times: Times = SCHEDULE, *, level: float = 0.05, floor: float = 0.0, losses: int = 2
+) -> Loop:
+    A, B, K = [[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], [[-1.0, -1.4]]
+    rule = Rule(
+        matrix([[0, 0, 1, 0], [0, 0, 0, 1]]), zeros(0, 4), number(level), number(0.3), number(floor), arb(0)
+    )
+    return Loop(
+        A=matrix([[0.0, 1.0], [0.0, 0.0]]),
+        B=matrix([[0.0], [0.9]]),
+        half_A=zeros(2, 2),
+        half_B=zeros(2, 1),
+        model_A=matrix(A),
+        model_B=matrix(B),
+        gain=matrix(K),
+        weight=matrix([[1, 0], [0, 1]]),
+        holds=False,
+        start=matrix([[1.0], [0.0]]),
+        rule=rule,
+        pushes=zeros(2, 0),
+        sizes=(),
+        losses=2,
+        times=times,
+    )
+
+
+@pytest.fixture(scope="module")
+def witness() -> Witness:
+    return find_witness(double_integrator())
+
+
+def bounds_of(witness: Witness) -> dict[str, float]:
+    sizes: dict[str, float] = {}
+    for bound in witness.proof.bounds:
+        size = math.hypot(float(bound.decaying.mid()), float(bound.constant.mid()))
+        sizes[bound.output] = min(size, sizes.get(bound.output, math.inf))
+    return sizes
+
+
+def test_bounds_are_near_what_is_simulated(witness: Witness) -> None:
+    sizes = bounds_of(witness)
+    assert 1.0 <= sizes["x"] < 1.5  # it begins at 1
+    assert 0.05 <= sizes["e_s"] < 0.06  # the threshold is 0.05
+    assert sizes["e_s"] < sizes["e_c"] < 0.4
+    assert witness.proof.inter_event is not None
+    assert 0.02 <= witness.proof.inter_event < 0.2
+
+
+@pytest.mark.parametrize("floor", [0.0, 0.01])
+def test_ideal_conditions_give_smaller_bounds(witness: Witness, floor: float) -> None:
+    ideal = bounds_of(find_witness(double_integrator(IDEAL, floor=floor)))
+    assert ideal["e_s"] == pytest.approx(math.hypot(0.05, floor))
+    assert ideal["x"] < bounds_of(witness)["x"] + floor
+
+
+CHANGES = {
+    "one loss more": lambda loop: loop._replace(losses=loop.losses + 1),
+    "another plant": lambda loop: loop._replace(B=loop.B * 1.02),
+    "a plant that may be another": lambda loop: loop._replace(half_B=matrix([[0.0], [0.02]])),
+    "another gain": lambda loop: loop._replace(gain=loop.gain * 1.05),
+    "another model": lambda loop: loop._replace(model_B=loop.model_B * 1.05),
+    "larger start": lambda loop: loop._replace(start=loop.start * 1.01),
+    "rarer tests": lambda loop: loop._replace(times=loop.times._replace(sampling=fmpq(1, 50))),
+    "longer delays": lambda loop: loop._replace(times=loop.times._replace(delay=fmpq(1, 10))),
+    "older inputs": lambda loop: loop._replace(times=loop.times._replace(age=fmpq(1, 20))),
+    "later start": lambda loop: loop._replace(times=loop.times._replace(start=fmpq(1, 10))),
+    "larger threshold": lambda loop: loop._replace(rule=loop.rule._replace(level=loop.rule.level * 1.05)),
+    "slower threshold": lambda loop: loop._replace(rule=loop.rule._replace(rate=arb(0.2))),
+    "a floor": lambda loop: loop._replace(rule=loop.rule._replace(floor=arb(0.001))),
+    "a disturbance": lambda loop: loop._replace(pushes=matrix([[0.0], [1.0]]), sizes=(arb(0.01),)),
+    "events at any time": lambda loop: loop._replace(rule=loop.rule._replace(always=True)),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_witness_proves_nothing_about_another_loop(witness: Witness, change: str) -> None:
+    with pytest.raises(RejectedError):
+        prove(CHANGES[change](double_integrator()), witness.document)
+
+
+def test_no_number_of_a_witness_may_be_missing_or_negative(witness: Witness) -> None:
+    for index, entry in enumerate(witness.document["bounds"]):  # type: ignore[arg-type, var-annotated]
+        for table in ("numbers", "matrices"):
+            for name in entry[table]:
+                changed = copy.deepcopy(dict(witness.document))
+                del changed["bounds"][index][table][name]  # type: ignore[index]
+                with pytest.raises(RejectedError, match="missing"):
+                    prove(double_integrator(), changed)
+
+
+def test_a_loop_that_does_not_decay_has_no_witness() -> None:
+    loop = double_integrator()
+    with pytest.raises(NoWitnessError, match="does not decay"):
+        find_witness(loop._replace(gain=loop.gain * -1))
+
+
+def test_random_runs_stay_below_the_bounds(witness: Witness) -> None:
+    """Runs of the loop at its tests, with exact steps, random losses, delays and ages."""
+    rng = np.random.default_rng(1)
+    sizes = bounds_of(witness)
+    largest = max(_run(rng) for _ in range(20))
+    assert largest <= sizes["x"]
+
+
+def _run(rng: np.random.Generator) -> float:
+    A, B, K = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [0.9]]), np.array([[-1.0, -1.4]])
+    H = A + np.array([[0.0], [1.0]]) @ K
+    dt, x = 0.001, np.array([1.0, 0.0])
+    xs, xc, u, arriving, lost, largest = x.copy(), None, np.zeros(1), None, 0, 1.0
+    for step in range(8000):
+        if step % 10 == 0 and (step == 0 or np.linalg.norm(xs - x) > 0.05 * math.exp(-0.3 * step * dt)):
+            xs = x.copy()
+            drop = step > 0 and lost < 2 and rng.random() < 0.7
+            lost = lost + 1 if drop else 0
+            if not drop:
+                arriving = (step + int(rng.integers(0, 11)), x.copy())
+        if arriving is not None and step >= arriving[0]:
+            xc, arriving = arriving[1], None  # without its propagation: older, at most by 10 ms
+        if step % 10 == 0 and xc is not None:
+            u = K @ xc
+        x = x + dt * (A @ x + B @ u)
+        xs = xs + dt * (H @ xs)
+        xc = None if xc is None else xc + dt * (H @ xc)
+        largest = max(largest, float(np.linalg.norm(x)))
+    return largest
