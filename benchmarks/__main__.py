@@ -22,7 +22,8 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 from benchmarks import cases
 from benchmarks.machine_load import MachineLoad
 from benchmarks.report import BENCHMARKS, Benchmark, MeasurementError, Row, print_table
-from noack.core.errors import NoackError
+from noack.core.errors import NoackError, why
+from noack.core.file_access import write_whole
 
 GOALS = (
     "latency", "startup", "simulation", "long_run", "many_loops", "batch", "relays", "relay_delay",
@@ -75,7 +76,7 @@ def run(benchmarks: Mapping[str, Benchmark], arguments: Sequence[str] | None = N
         failures += failed
     if options.json is not None:
         content = [row.to_json() | {"benchmark": name} for name in rows for row in rows[name]]
-        options.json.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        write_whole(options.json, json.dumps(content, indent=2, allow_nan=False) + "\n")
     if "goals" in requested:
         print_table("The goals", rows_of_goals(rows))
     if options.docs is not None:
@@ -116,7 +117,7 @@ def write_docs(page: Path, goals: Iterable[Row]) -> None:
         cells = (name, "not measured" if row.value is None else value, alternative, ratio, goal)
         lines.append(f"| {' | '.join((*cells, holds))} |")
     table = "\n".join(lines)
-    page.write_text(f"{before}{begin}\n{table}\n{end}{after}", encoding="utf-8")
+    write_whole(page, f"{before}{begin}\n{table}\n{end}{after}")
 
 
 if __name__ == "__main__":
@@ -124,4 +125,11 @@ if __name__ == "__main__":
         found = all_benchmarks()
     except ModuleNotFoundError as error:  # the tests' helpers need it
         sys.exit(f"{error}; `make setup-dev` installs what the benchmarks need")
-    sys.exit(run(found))
+    try:
+        status = run(found)
+        sys.stdout.flush()
+    except NoackError as error:
+        sys.exit(str(error))
+    except OSError as error:
+        sys.exit(f"cannot write: {why(error)}")
+    sys.exit(status)

@@ -16,7 +16,7 @@ with stoppable_imports():
     from noack.core.errors import ExitStatus, NoackError
     from noack.core.system_processes import exhausted_limit
     from noack.protocol.roles import ENDS
-    from noack.runtime.command_line import Parser, report_failure
+    from noack.runtime.command_line import Parser, report_failure, why_not_written
     from noack.runtime.join_run import add_options, join_run
     from noack.runtime.run_process import RunProcess
     from noack.runtime.standard_streams import guard_streams
@@ -45,13 +45,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return ExitStatus.OK
         from netem.stand_alone import run_stand_alone  # a run's emulator starts without it
 
-        return run_stand_alone(words)
+        status = run_stand_alone(words)
+        if sys.stdout is not None:  # closed by the shell: >&-
+            sys.stdout.flush()
+        return status
     except NoackError as error:
         return report_failure(str(error), error.exit_status, source="noack netem", as_json=as_json)
     except OSError as error:
-        if (limit := exhausted_limit(error)) is None:
-            raise
-        return report_failure(limit, ExitStatus.FAILED, source="noack netem", as_json=as_json)
+        reason = exhausted_limit(error) or why_not_written(error) or str(error)
+        return report_failure(reason, ExitStatus.FAILED, source="noack netem", as_json=as_json)
 
 
 def run_network(run: RunProcess) -> None:

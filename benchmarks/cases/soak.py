@@ -20,6 +20,7 @@ from benchmarks.programs import set_options
 from benchmarks.report import ZERO, Goal, MeasurementError, Row, benchmark
 from cosim.record.run_directory import RECORD
 from cosim.record.run_record import load_record
+from noack.core.file_access import create_folder, write_whole
 from noack.protocol.record_tables import NETEM_RELEASE
 from noack.protocol.roles import LOOP_ROLES, RECORDER
 from noack.runtime.spool import SPOOL
@@ -185,7 +186,7 @@ def soaked(settings: Sequence[str], runs: Path) -> list[Row]:
     """Run the soak's scenario with changed settings; write ``soak.json`` into its run directory."""
     scenario = load(_SCENARIO, settings)
     length_s = scenario.horizon_s / scenario.speed
-    runs.mkdir(parents=True, exist_ok=True)
+    create_folder(runs)
     folder = Path(tempfile.mkdtemp(prefix="soak-", dir=runs))
     pause_s = min(length_s / _LEAST_SAMPLES, _LONGEST_PAUSE_S)
     run = observed_run([str(_SCENARIO), "--report", *set_options(*settings)], folder, length_s, pause_s)
@@ -194,7 +195,7 @@ def soaked(settings: Sequence[str], runs: Path) -> list[Row]:
         "rows": [row.to_json() for row in rows],
         "samples": {role: [sample._asdict() for sample in run.in_loops(role)] for role in ROLES},
     }
-    (run.run_dir / "soak.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    write_whole(run.run_dir / "soak.json", json.dumps(content, indent=2) + "\n")
     return rows
 
 

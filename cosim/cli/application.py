@@ -8,7 +8,6 @@ import sys
 from collections.abc import Sequence
 from importlib import metadata
 from itertools import pairwise
-from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,7 +21,7 @@ from cosim.cli.removed_words import removal
 from noack.core.errors import CallerError, ExitStatus, NoackError, plain_mistake, printable, why
 from noack.core.extension_points import missing_extension, parts
 from noack.core.system_processes import exhausted_limit
-from noack.runtime.command_line import StopRequestError, report_failure, stop_requests_raised
+from noack.runtime.command_line import StopRequestError, report_failure, stop_requests_raised, why_not_written
 
 if TYPE_CHECKING:
     from typer._click.core import Command, Context
@@ -83,7 +82,7 @@ class Program(TyperGroup):
         except NoackError as error:
             return self._report(str(error), error.exit_status)
         except Exception as error:
-            reason = exhausted_limit(error) or _why_not_written(error)
+            reason = exhausted_limit(error) or why_not_written(error)
             if reason is None:
                 raise
             return self._report(reason, ExitStatus.FAILED)
@@ -154,17 +153,6 @@ def _refuse_empty(words: Sequence[str]) -> None:
             raise typer.BadParameter("an argument is empty")
         if option.startswith("--") and "=" in word and not value:
             raise typer.BadParameter(f"the value of {option} is empty")
-
-
-def _why_not_written(error: Exception) -> str | None:
-    """Return why standard output cannot be written; None if this is another error."""
-    if not isinstance(error, OSError):
-        return None
-    try:
-        folder_exists = Path.cwd().is_dir()
-    except OSError:
-        folder_exists = False
-    return f"cannot write: {why(error)}" if folder_exists else "the current folder was deleted"
 
 
 def examples_of(command: "Command") -> list[str]:

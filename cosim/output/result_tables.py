@@ -15,7 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from noack.core.file_access import write_whole
+from cosim.record.run_directory import write_output
 from noack.core.number_format import NONE
 
 KEY_VALUE = ("quantity", "value")
@@ -74,7 +74,7 @@ def save_tables(tables: Iterable[ResultTable], folder: Path) -> list[Path]:
     Raises:
         MachineError: a file cannot be written.
     """
-    return [write_whole(folder / f"{table.name}.csv", as_csv(table)) for table in tables]
+    return [write_output(folder / f"{table.name}.csv", as_csv(table)) for table in tables]
 
 
 def as_csv(table: ResultTable) -> str:

@@ -23,6 +23,7 @@ from typing import Any, Literal, Self
 from noack.core.errors import CallerError, ExitStatus, MachineError, NoackError, why
 from noack.core.file_access import create_folder, locked, open_growing, read_regular, write_link, write_whole
 from noack.core.system_processes import cores
+from noack.runtime.spool import SPOOL
 
 DEFAULT_RUNS = Path("runs")
 """Folder for run directories, relative to the current folder."""
@@ -43,6 +44,13 @@ _KEPT = frozenset({
     SUMMARY_FILE, REPORT_FILE, CAMPAIGN_FILE, CAMPAIGN_PAGE,
 })  # fmt: skip
 """Files of the folders of runs and campaigns, which no other output replaces."""
+_RESULT_FOLDERS = {
+    RECORD: ENVIRONMENT_FILE,
+    SPOOL: ENVIRONMENT_FILE,
+    "logs": ENVIRONMENT_FILE,
+    "runs": CAMPAIGN_FILE,
+}
+"""Folders of results by name, in which no other output is written, each with a file beside it."""
 _LOCK = ".lock"
 _HAS_LINKS = hasattr(os, "geteuid")  # not on Windows
 _MOST_JSON_BYTES = 256 * 2**20
@@ -95,9 +103,25 @@ def write_output(path: Path, content: str | bytes) -> Path:
         CallerError: it is one of the files of a run or a campaign.
         MachineError: it cannot be written.
     """
+    refuse_results(path)
+    return write_whole(path, content)
+
+
+def refuse_results(path: Path) -> None:
+    """Raise CallerError if an output would replace, or be among, the results of a run or a campaign.
+
+    Args:
+        path: of the file or the folder that a user named.
+    """
+    for folder in (path, *path.parents[:2]):
+        holder = holder_of(folder.parent)
+        beside = _RESULT_FOLDERS.get(folder.name)
+        if beside and holder and (folder.parent / beside).is_file():
+            raise CallerError(f"{path}: lies in {holder}, among its results; give another name")
+    if (holder := holder_of(path)) is not None:
+        raise CallerError(f"{path}: {holder}; give another name")
     if path.name in _KEPT and (holder := holder_of(path.parent)) is not None:
         raise CallerError(f"{path}: is a file of {holder}; give another name")
-    return write_whole(path, content)
 
 
 def _require_utf8(path: Path) -> None:

@@ -20,7 +20,7 @@ from netem.control.emulator_statistics import Statistics
 from netem.control.statistics_text import statistics_lines
 from netem.relay.relay_reports import DIRECTIONS
 from netem.tc_words import guarantee_words, require_no_dashes, settings_of
-from noack.core.errors import CallerError, ExitStatus, NoackError, PeerError
+from noack.core.errors import CallerError, ExitStatus, NoackError, PeerError, why
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.target_loss import read_files
 from noack.runtime.command_line import Parser, Signals, discard_output, report_failure
@@ -102,6 +102,11 @@ def main(arguments: Sequence[str]) -> ExitStatus:
     except BrokenPipeError:  # the reader has closed the pipe
         discard_output(sys.stdout.fileno())
         return ExitStatus.OK
+    except OSError as error:
+        reason = f"cannot write: {why(error)}"
+        return report_failure(
+            reason, ExitStatus.FAILED, source=f"noack netem {command}", as_json="--json" in options
+        )
 
 
 def _parser(

@@ -22,10 +22,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from enum import StrEnum
+from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, NoReturn, TextIO
 
-from noack.core.errors import CallerError, ExitStatus, printable
+from noack.core.errors import CallerError, ExitStatus, MachineError, printable, why
 
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
@@ -142,10 +143,15 @@ class Parser(argparse.ArgumentParser):
         raise CallerError(f"{mistake}; see `{self.prog} --help`")
 
     def print_help(self, file: "SupportsWrite[str] | None" = None) -> None:
-        """Print the help; unlike that of the base class, it raises OSError on a full disk."""
-        print(self.format_help(), end="", file=file)
-        if file is None:
-            sys.stdout.flush()
+        """Print the help; unlike that of the base class, it raises MachineError on a full disk."""
+        try:
+            print(self.format_help(), end="", file=file)
+            if file is None:
+                sys.stdout.flush()
+        except BrokenPipeError:  # its reader has seen enough
+            discard_output(sys.stdout.fileno())
+        except OSError as error:
+            raise MachineError(f"cannot write: {why(error)}") from None
 
 
 def report_failure(message: str, status: ExitStatus, *, source: str, as_json: bool) -> ExitStatus:
@@ -162,6 +168,17 @@ def report_failure(message: str, status: ExitStatus, *, source: str, as_json: bo
         if not log_event("error", source, line):
             print_to_stderr(f"{source}: {line}")
     return status
+
+
+def why_not_written(error: Exception) -> str | None:
+    """Return why standard output cannot be written; None if this is another error."""
+    if not isinstance(error, OSError):
+        return None
+    try:
+        folder_exists = Path.cwd().is_dir()
+    except OSError:
+        folder_exists = False
+    return f"cannot write: {why(error)}" if folder_exists else "the current folder was deleted"
 
 
 def discard_output(descriptor: int) -> None:

@@ -9,8 +9,8 @@ from pyarrow import csv
 
 from cosim.output.export.export_formats import ExportedRun
 from cosim.record.data_frames import events, samples, with_seconds
+from cosim.record.run_directory import write_output
 from cosim.record.table_files import arrow_table
-from noack.core.file_access import write_whole
 
 SUFFIX = ""
 
@@ -25,7 +25,7 @@ def write(run: ExportedRun, folder: Path, *, certificates: bool = True) -> list[
     for name, table in _tables(run):
         buffer = io.BytesIO()
         csv.write_csv(_with_hex(table), buffer)
-        written.append(write_whole(folder / f"{name}.csv", buffer.getvalue()))
+        written.append(write_output(folder / f"{name}.csv", buffer.getvalue()))
     for loop in run.loops:
         written += write(loop, folder / loop.name)
     return written

@@ -13,8 +13,8 @@ from cosim.analysis.certificates import certificates_of
 from cosim.output.export.export_formats import ExportedRun
 from cosim.record.data_frames import events, samples
 from cosim.record.record_source import Rows
+from cosim.record.run_directory import write_output
 from noack.core.errors import CallerError, MachineError
-from noack.core.file_access import write_whole
 from noack.scenario.scenario import Scenario
 
 SUFFIX = ".mat"
@@ -46,7 +46,7 @@ def save_mat(content: Mapping[str, object], path: Path) -> list[Path]:
     except (ValueError, OverflowError, TypeError) as error:
         raise MachineError(f"{path}: not possible as a .mat file of version 5: {error}") from None
     header = b"MATLAB 5.0 MAT-file, written by noack".ljust(116)  # without a date
-    return [write_whole(path, header + buffer.getvalue()[len(header) :])]
+    return [write_output(path, header + buffer.getvalue()[len(header) :])]
 
 
 def _content(run: ExportedRun, *, certificates: bool) -> dict[str, object]:

@@ -13,8 +13,8 @@ from cosim.output.figures.figure_description import FigureDescription
 from cosim.output.figures.figure_drawing import draw
 from cosim.output.figures.figure_format import FigureFiles, FigureFormat, figure_width_in
 from cosim.output.figures.figure_layout import GRID, INK, PAPER, matplotlib_settings, use_figure_width
+from cosim.record.run_directory import write_output
 from noack.core.errors import CallerError
-from noack.core.file_access import write_whole
 
 _WITHOUT_DATE: dict[FigureFormat, dict[str, str | None]] = {
     FigureFormat.SVG: {"Date": None, "Creator": None, "Format": None, "Type": None},
@@ -46,7 +46,7 @@ def save_figure(figure: FigureDescription, path: Path, width: str | float | None
     if path.suffix not in FIGURE_SUFFIXES:
         raise CallerError(f"{path}: a figure is saved as {', '.join(FIGURE_SUFFIXES)}")
     kind = FigureFormat(path.suffix.removeprefix("."))
-    write_whole(path, file_content(figure, kind, figure_width_in(kind, width)))
+    write_output(path, file_content(figure, kind, figure_width_in(kind, width)))
 
 
 def save_figures(figures: Iterable[FigureDescription], page: Path, files: FigureFiles | None) -> list[Path]:

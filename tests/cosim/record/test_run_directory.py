@@ -15,6 +15,9 @@ import pytest
 
 from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.api.runs import open_run
+from cosim.output.export.export_formats import export_run
+from cosim.output.export.mat_export import save_mat
+from cosim.output.result_tables import ResultTable, save_tables
 from cosim.record.run_directory import (
     CAMPAIGN_FILE,
     ENVIRONMENT_FILE,
@@ -28,6 +31,7 @@ from cosim.record.run_directory import (
     loop_of_file,
     new_run_dir,
     point_to_latest,
+    refuse_results,
     require_run_directory,
     write_output,
 )
@@ -223,6 +227,38 @@ def test_no_output_replaces_a_file_of_a_run_or_a_campaign(held: tuple[Path, str]
     assert not (folder / name).exists() or (folder / name).read_text() == "its own"
     write_output(folder / "overlay.html", "a page")
     write_output(folder.parent / name, "a page")
+
+
+@pytest.mark.parametrize("name", ["record", "logs", "runs"])
+def test_no_output_is_written_among_the_results(held: tuple[Path, str], name: str) -> None:
+    folder, holder = held
+    if (name == "runs") != ("campaign" in holder):
+        return
+    (folder / name).mkdir()
+    for path in (folder / name, folder / name / "plant.csv", folder / name / "inner" / "plant.csv"):
+        with pytest.raises(CallerError, match=f"lies in {holder}, among its results; give another name"):
+            refuse_results(path)
+
+
+def test_no_output_replaces_the_folder_of_results(held: tuple[Path, str]) -> None:
+    folder, holder = held
+    with pytest.raises(CallerError, match=f"held: {holder}; give another name"):
+        refuse_results(folder)
+
+
+def test_tables_figures_and_exports_replace_no_results(
+    held: tuple[Path, str],
+) -> None:
+    folder, holder = held
+    table = ResultTable("summary", "", ("a",), [("1",)])
+    tables = folder / ("runs" if "campaign" in holder else "record")
+    with pytest.raises(CallerError, match="among its results"):
+        save_tables([table], tables)
+    with pytest.raises(CallerError, match="among its results"):
+        save_mat({"a": 1.0}, tables / "a.mat")
+    with pytest.raises(CallerError, match="give another name"):
+        export_run(folder, folder, "csv")
+    assert not tables.exists()
 
 
 def test_a_campaigns_folder_is_no_run_directory(tmp_path: Path) -> None:
