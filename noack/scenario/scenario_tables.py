@@ -233,7 +233,9 @@ class Timing:
         actuation = self.scenario.network.actuation
         if actuation is None:
             return max(usual_ns, self.predicted_ns)
-        last_ns = self.predicted_ns + round(actuation.link.longest_delay_s * NS_PER_S)
+        # Of the age of its last input, it is not yet too old.
+        predicted_ns = math.ceil(self.scenario.controller.predictions * self.controller_period.exact)
+        last_ns = predicted_ns + round(actuation.link.longest_delay_s * NS_PER_S)
         return max(usual_ns, last_ns) if self.scenario.plant.watchdog.policy == "hold" else last_ns
 
     @property
@@ -272,9 +274,9 @@ class Timing:
         """The time that the sensor waits for an acknowledgement before it transmits again."""
         network = self.scenario.network
         if network.reverse.timeout_s is not None:
-            return round(network.reverse.timeout_s * NS_PER_S)
+            return int(exact_ns(network.reverse.timeout_s))
         round_trip_s = network.link.longest_delay_s + network.reverse.link.longest_delay_s
-        return _TIMEOUT_PERIODS * self.measurement_period_ns + round(round_trip_s * NS_PER_S)
+        return int(_TIMEOUT_PERIODS * self.measurement_period.exact) + round(round_trip_s * NS_PER_S)
 
 
 @dataclass(frozen=True)

@@ -166,6 +166,37 @@ def test_timeouts_and_phases_of_whole_steps_act_at_the_same_step_always(rate_hz:
     assert set(ticks - steps) <= {0, 1}
 
 
+@pytest.mark.parametrize("rate_hz", [30.0, 60.0, 144.0])
+@pytest.mark.parametrize("predictions", [1, 2, 4])
+def test_a_lost_actuation_is_used_for_as_many_steps_at_each_rate(rate_hz: float, predictions: int) -> None:
+    """The watchdog's input is 0; with whole nanoseconds it is in use at the same steps."""
+
+    def is_zero(rate_hz: float) -> list[bool]:
+        settings = {
+            "controller.predictions": predictions, "controller.phase": 0.0, "plant.watchdog.policy": "zero",
+            "network.actuation.loss.probability": 0.6,
+        }  # fmt: skip
+        record = simulate(resolve(at_rate("lane_actuation_loss", rate_hz, rate_hz, **settings)))
+        zeros: list[bool] = (record["plant_step"]["u"] == 0).all(axis=1).tolist()
+        return zeros[:110]
+
+    zeros = is_zero(rate_hz)
+    assert zeros == is_zero(NEARBY[rate_hz])
+    assert predictions > 3 or any(zeros[20:])
+
+
+def test_an_acknowledgement_is_waited_for_as_many_steps_at_each_rate() -> None:
+    def events(rate_hz: float, **settings: Any) -> list[int]:
+        record = simulate(resolve(at_rate("lane_acknowledged", rate_hz, rate_hz, **settings)))
+        t_s = record.events()["t_ns"] * 1e-9
+        return np.rint(t_s[t_s < 3.9] * rate_hz).astype(int).tolist()
+
+    for rate_hz, near_hz in NEARBY.items():
+        waits = [events(hz, **{"network.acknowledgements.timeout_s": 2 / hz}) for hz in (rate_hz, near_hz)]
+        assert waits[0] == waits[1]
+        assert 2 in np.diff(waits[0])
+
+
 NEARBY = {30.0: 30.000000300000004, 60.0: 59.99999880000002, 90.0: 89.99999991, 144.0: 1e9 / 6_944_444}
 
 
