@@ -111,8 +111,8 @@ def number_packets(capture: Capture, flow: CapturedFlow, field: SequenceField) -
         notes.append(f"left out: {strays} datagrams whose number does not belong to the sequence")
     if found.uncertain:
         notes.append(
-            f"gaps so long that the number of {field.bits}-bit wraps in them is not certain: "
-            f"{len(found.uncertain)}"
+            f"gaps in which the numbers of {field.bits} bits wrapped around: {len(found.uncertain)}; how "
+            "often is not certain, and a sender that paused or began again may look the same"
         )
     packet = found.packet.copy()
     start = 0

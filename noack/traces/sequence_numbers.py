@@ -34,6 +34,8 @@ _MOST_OF_CYCLE = 1 / 8
 """A change of the level is a number of wraps up to this share of R."""
 _CERTAIN_SHARE = 1 / 64
 """A change of the level by this share of R is no restart."""
+_COINCIDENCE = 0.01
+"""Chance above which a restart that looks like wraps is no rare coincidence."""
 _MOST_RESTARTS = 1 / 20
 """More restarts per arrival are no restarts: the numbers are none."""
 _FAR_AHEAD_NS, _FAR_BEHIND_NS = 5 * 10**9, 60 * 10**9
@@ -104,6 +106,12 @@ def _strays(steps: Int64s, period_ns: float) -> NDArray[np.bool_]:
     there, back = steps[:-1].astype(float), steps[1:].astype(float)
     far = (there > _FAR_AHEAD_NS / period_ns) | (there < -_FAR_BEHIND_NS / period_ns)
     strays[1:-1] = far & (np.abs(there) > _FAR_BACK) & (np.abs(there + back) < np.abs(there) / 8)
+    packet = np.concatenate(([0], np.cumsum(steps)))
+    for i in np.flatnonzero(strays).tolist():
+        # A number between those of its neighbours is one of a packet that was overtaken.
+        here = slice(max(i - _NEIGHBOURS, 0), i + _NEIGHBOURS)
+        others = packet[here][~strays[here]]
+        strays[i] = not others.min() <= packet[i] <= others.max()
     return strays
 
 
@@ -131,10 +139,10 @@ def _rough_period(steps: Int64s, t_ns: Int64s, bits: int) -> float:
     small = np.abs(steps.astype(float)) <= max(2.0**bits / 8, 1)
     elapsed_ns = np.diff(t_ns)
     for window in (_WINDOW, 1):
-        size = len(steps) // window * window
-        whole = small[:size].reshape(-1, window).all(axis=1)
-        advance = steps[:size].reshape(-1, window).sum(axis=1)
-        time_ns = elapsed_ns[:size].reshape(-1, window).sum(axis=1)
+        if len(steps) < window:
+            continue
+        whole = _sums(small.astype(np.int64), window) == window
+        advance, time_ns = _sums(steps, window), _sums(elapsed_ns, window)
         useful = whole & (advance > 0)
         if useful.sum() >= (_WINDOW if window > 1 else 1):
             period_ns = float(np.median(time_ns[useful] / advance[useful]))
@@ -144,6 +152,12 @@ def _rough_period(steps: Int64s, t_ns: Int64s, bits: int) -> float:
     if advance_in_all > 0 and elapsed_ns[small].any():
         return float(elapsed_ns[small].sum()) / advance_in_all
     raise ValueError("do not show the sender's period")
+
+
+def _sums(values: Int64s, window: int) -> Int64s:
+    """Return the sums of so many successive values."""
+    total = np.concatenate(([0], np.cumsum(values)))
+    return np.asarray(total[window:] - total[:-window])
 
 
 def _period_of_all(steps: Int64s, t_ns: Int64s) -> float:
@@ -182,6 +196,13 @@ def _spread(excess: Reals, level: Reals) -> float:
     return float(np.median(np.ptp(by_window, axis=1)))
 
 
+def _noise(level: Reals) -> float:
+    """Return by how much the smallest level usually differs between neighbours."""
+    starts = np.arange(0, len(level), _NEIGHBOURS)
+    lowest = np.minimum.reduceat(level, starts)
+    return float(np.median(np.abs(np.diff(lowest)))) if len(lowest) > 4 else 0.0
+
+
 def _with_wraps(
     index: Int64s, steps: Int64s, t_ns: Int64s, period_ns: float, error: float, bits: int
 ) -> Arrivals:
@@ -193,7 +214,7 @@ def _with_wraps(
     packet = np.concatenate(([0], np.cumsum(steps)))
     level = (t_ns - t_ns[0]) / period_ns - packet
     excess = pauses - steps
-    spread = _spread(excess, level)
+    spread, noise = _spread(excess, level), _noise(level)
     added = np.zeros(len(packet), np.int64)
     part = np.append(0, restarts.astype(np.int64))
     uncertain: list[int] = []
@@ -209,11 +230,11 @@ def _with_wraps(
         wraps = round(rise / cycle)
         allowed = max(_DELAY_CHANGE_NS / period_ns, _DELAY_CHANGE_SHARE * pause, 6 * spread)
         # Small numbers come round so soon that a restart is told from wraps by little.
-        certain = max(_CERTAIN_SHARE * cycle, 2 * spread + error * pause)
+        certain = max(_CERTAIN_SHARE * cycle, 4 * noise + error * pause)
         allowed = min(allowed, certain, _MOST_OF_CYCLE * cycle)
         if wraps > 0 and abs(rise - wraps * cycle) <= allowed:
             added[i] = wraps << bits
-            if pause * error > cycle / 4:
+            if pause * error > cycle / 4 or 2 * allowed > _COINCIDENCE * cycle:
                 uncertain.append(i)
         elif step < 0:
             lasts = (t_ns[i + len(following) - 1] - t_ns[i]) / period_ns
@@ -244,6 +265,9 @@ def _is_reordered(packet: Int64s, begin: int, i: int) -> bool:
     """
     before = packet[max(begin, i - _MOST_REORDERED) : i]
     after = packet[i : i + _MOST_REORDERED]
+    next_ones = after[1 : 1 + _FEWEST_AFTER_RESTART]
+    if len(next_ones) and abs(np.median(next_ones) - packet[i]) >= abs(packet[i] - packet[i - 1]):
+        return True  # not this one begins something else, but perhaps the next
     if packet[i] > packet[i - 1]:
         # The numbers that were skipped arrive, too.
         skipped = np.arange(max(packet[i - 1] + 1, packet[i] - _LOOKED_AT), packet[i])
