@@ -157,6 +157,8 @@ class FitTest:
     """None: too few data for the test."""
     name: str = "lengths"
     """What is tested: the ``lengths`` of bursts and deliveries, or whether losses are in ``bursts``."""
+    tests: int = 1
+    """Of how many tests this is the one with the smallest p, which is multiplied by their number."""
 
     @property
     def verdict(self) -> str:
@@ -170,7 +172,10 @@ class FitTest:
         """Name, statistic, degrees of freedom, and p."""
         if self.p_value is None:
             return ""
-        return f"{self.name}: χ² = {self.statistic:.4g}, {self.degrees} d.f., p = {self.p_value:.2g}"
+        of_tests = f" (of {self.tests} tests)" if self.tests > 1 else ""
+        return (
+            f"{self.name}: χ² = {self.statistic:.4g}, {self.degrees} d.f., p = {self.p_value:.2g}{of_tests}"
+        )
 
 
 def length_test(bursts: LossBursts, left_out: Flags, rates: ChainRates, parameters: int) -> FitTest:
@@ -351,7 +356,7 @@ class ChainFits:
         if lengths.p_value is None:
             return bursts
         clearest = bursts if p_value < lengths.p_value else lengths
-        return replace(clearest, p_value=min(2 * p_value, 2 * lengths.p_value, 1.0))
+        return replace(clearest, p_value=min(2 * p_value, 2 * lengths.p_value, 1.0), tests=2)
 
     def all(self) -> list[ChainFit]:
         """Return the three fits; none without losses."""

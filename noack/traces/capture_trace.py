@@ -301,12 +301,12 @@ def _common_time(ends: _Ends, arrived: Int64s, arrived_ns: Int64s) -> tuple[int,
         end_ns += period_ns // 4  # hardly a datagram is on its way
     end = max(int(np.searchsorted(sent_ns, end_ns - usually_ns, side="right")), int(arrived[-1]) + 1)
     if begin:
-        notes.append(f"left out: {begin} datagrams sent before the receiver's capture begins")
+        notes.append(f"datagrams left out because the receiver's capture begins after them: {begin}")
     if after := len(sent_ns) - end:
         last_s = (sent_ns[-1] - sent_ns[end]) / 1e9
         notes.append(
-            f"left out: {after} datagrams, of {last_s:.3g} s, that would arrive after the receiver's capture "
-            "ends; if it ran on without a packet, they were lost"
+            f"datagrams left out because the receiver's capture ends before they would arrive: {after}, of "
+            f"{last_s:.3g} s; if it ran on without a packet, they were lost"
         )
     return begin, end
 

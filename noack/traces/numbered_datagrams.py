@@ -108,7 +108,7 @@ def number_packets(capture: Capture, flow: CapturedFlow, field: SequenceField) -
     notes = capture.notes
     strays = len(numbers.number) - len(found.arrival)
     if strays:
-        notes.append(f"left out: {strays} datagrams whose number does not belong to the sequence")
+        notes.append(f"datagrams left out because their number does not belong to the sequence: {strays}")
     if found.uncertain:
         notes.append(
             f"gaps in which the numbers of {field.bits} bits wrapped around: {len(found.uncertain)}; how "
@@ -121,8 +121,8 @@ def number_packets(capture: Capture, flow: CapturedFlow, field: SequenceField) -
         if part:
             at_s = (numbers.t_ns[found.arrival[np.flatnonzero(here)[0]]] - numbers.t_ns[0]) / 1e9
             notes.append(
-                f"the sender restarted at {at_s:.6g} s: its numbers do not go on; no losses are counted "
-                "between the parts"
+                f"the sender restarted at {at_s:.6g} s: its numbers do not go on there, and no losses are "
+                "counted at this place"
             )
         packet[here] += start - packet[here].min()
         start = int(packet[here].max()) + 1
@@ -207,7 +207,9 @@ def _read_numbers(capture: Capture, flow: CapturedFlow, field: SequenceField) ->
     if cut:
         capture.notes.append(f"cut before their sequence number, so they seem to be lost: {cut}")
     if short:
-        capture.notes.append(f"left out: {short} datagrams too short for a sequence number at {field}")
+        capture.notes.append(
+            f"datagrams left out because they are too short for a number at {field}: {short}"
+        )
     read = _Numbers(np.array(numbers, np.uint64), *(np.array(column, np.int64) for column in columns))
     size_bytes = _merged_size([payload for _, _, payload in longest], field)
     if size_bytes:
