@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from noack.core.errors import NoackError
 from noack.core.system_processes import QUICK_IMPORTS, exhausted_limit
-from noack.runtime.command_line import report_failure, stoppable_imports
+from noack.runtime.command_line import report_failure, stoppable_until_exit
 from noack.runtime.standard_streams import guard_streams
 
 if TYPE_CHECKING:
@@ -24,8 +24,9 @@ def run() -> None:
     """Run the command of the command line."""
     gc.set_threshold(_NEW_OBJECTS)
     words = sys.argv[1:]
+    stoppable_until_exit()
     try:
-        with stoppable_imports(), _fork_server(words) as server:
+        with _fork_server(words) as server:
             from cosim.cli.application import app
 
             guard_streams(

@@ -1,6 +1,7 @@
 """Errors by cause: the caller, a peer process, or the computer that the process runs on."""
 
 import os
+import re
 from collections.abc import Iterable
 from enum import IntEnum
 from pathlib import Path
@@ -59,6 +60,7 @@ class NeverStartedError(NoackError):
 TOO_LARGE = "an integer is too large"
 """In place of Python's text about an integer of more than 4300 digits, which asks for a change of code."""
 _PLAIN = {
+    "Unable to parse input string as an integer, exceeded maximum size": TOO_LARGE,
     ", unable to parse string as a number": "",
     ", unable to parse string as an integer": "",
     "Input should have": "needs",
@@ -101,6 +103,15 @@ def why(error: OSError | ValueError) -> str:
 def shortened(text: str, longest: int = 80) -> str:
     """Return a text, or its beginning and ``...`` if it has more than ``longest`` characters."""
     return text if len(text) <= longest else f"{text[: longest - 3]}..."
+
+
+def with_short_words(text: str) -> str:
+    """Return a message in which the quoted words of more than 500 characters are cut off."""
+
+    def cut_off(word: re.Match[str]) -> str:
+        return f"{shortened(word[0])} ({len(word[0]):,} characters)"
+
+    return re.sub(r"[^\s:;,'\"]{501,}", cut_off, text)
 
 
 def did_you_mean(name: str, files: Iterable[str]) -> str:

@@ -10,6 +10,7 @@ it cleans up. During the imports an error would be printed from within them, or 
 """
 
 import argparse
+import atexit
 import io
 import json
 import os
@@ -26,7 +27,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, NoReturn, TextIO
 
-from noack.core.errors import CallerError, ExitStatus, MachineError, printable, why
+from noack.core.errors import CallerError, ExitStatus, MachineError, printable, why, with_short_words
 
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
@@ -158,8 +159,9 @@ def report_failure(message: str, status: ExitStatus, *, source: str, as_json: bo
     """Print why a command failed, one line per mistake, and return its exit status.
 
     Each line begins with ``source``, such as ``noack netem``. With ``as_json`` a JSON document is
-    also printed to standard output.
+    also printed to standard output. Very long words, which the message quotes, are cut off.
     """
+    message = with_short_words(message)
     with suppress(OSError):  # standard output may be closed or full
         if as_json and sys.stdout is not None:
             reason = {"status": int(status), "reason": message}
@@ -178,6 +180,8 @@ def why_not_written(error: Exception) -> str | None:
         folder_exists = Path.cwd().is_dir()
     except OSError:
         folder_exists = False
+    if error.filename is not None:  # not of standard output
+        return f"{error.filename}: {why(error)}"
     return f"cannot write: {why(error)}" if folder_exists else "the current folder was deleted"
 
 
@@ -265,6 +269,23 @@ def stoppable_imports() -> Iterator[None]:
     """End the process with one line and its exit status on a signal, while the context lasts."""
     with _default_replaced(_end_at_once):
         yield
+
+
+def stoppable_until_exit() -> None:
+    """End the process with one line and its exit status on a signal, until it has done everything.
+
+    In its last moments, when Python cleans up, it ignores signals: its exit status is decided.
+    """
+    if threading.current_thread() is threading.main_thread():
+        atexit.register(_ignore_signals)
+        for number in _ENDING:
+            if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
+                signal.signal(number, _end_at_once)
+
+
+def _ignore_signals() -> None:
+    for number in _ENDING:
+        signal.signal(number, signal.SIG_IGN)
 
 
 def _end_at_once(number: int, _frame: FrameType | None) -> None:

@@ -81,3 +81,20 @@ def test_a_full_disk_gives_one_line(tmp_path: Path, words: list[str]) -> None:
     assert process.returncode == 1
     assert re.match("noack[ a-z]*: cannot write: ", process.stderr)
     assert process.stderr.count("\n") == 1
+
+
+def test_a_signal_in_the_last_moments_does_not_change_the_exit_status(tmp_path: Path) -> None:
+    code = """
+import atexit, os, signal, sys
+for number in (signal.SIGINT, signal.SIGTERM):
+    atexit.register(os.kill, os.getpid(), number)  # as from outside, when Python cleans up
+sys.argv = ["noack", "scenarios"]
+from cosim.cli.entry_point import run
+run()
+"""
+    process = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=environment(),
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (process.returncode, process.stderr) == (0, "")
+    assert "lane_following" in process.stdout
