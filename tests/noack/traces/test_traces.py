@@ -125,6 +125,13 @@ def test_a_step_of_a_clock_is_found(step_ns: int) -> None:
     assert not any("ppm" in line for line in trace.notes)
 
 
+def test_a_replay_needs_known_delays(tmp_path: Path) -> None:
+    rows = "".join(f"{20 * k},{20 * k + 5 + 200 * (k > 150)}\n" for k in range(300))
+    (tmp_path / "trace.csv").write_text(f"sent_ms,received_other_clock_ms\n{rows}")
+    with pytest.raises(CallerError, match="cannot be replayed: delays are not known"):
+        Replay(file="trace.csv").without_files(tmp_path, "")
+
+
 def test_an_unknown_name_of_a_trace_gets_the_known_ones(tmp_path: Path) -> None:
     with pytest.raises(CallerError, match="rural: no such file, nor a shipped trace; there are"):
         Replay(file="rural").without_files(tmp_path, "")
