@@ -16,7 +16,7 @@ from noack.scenario.scenario import Scenario, loop_names, phases_ns
 from noack.scenario.scenario_file import dumps
 from noack.scenario.uneven_periods import uneven_periods
 from noack.theory.certificates.assumptions import assumptions
-from noack.theory.certificates.conditions import void_by_uneven_steps
+from noack.theory.certificates.conditions import void_by_uneven_steps, with_stated_times
 from noack.trigger_policies.trigger_rule import CodedPolicy
 from plant_server.plant import system_of
 
@@ -42,6 +42,15 @@ def check_scenario(loaded: Scenario, *, json: bool) -> None:
     print(dumps(resolved))
     for line in captured.get().splitlines():
         print(f"{_COMMENT}{line}".rstrip())
+
+
+def print_resolved(loaded: Scenario, *, json: bool) -> None:
+    """Print a scenario of one loop with numbers only: what a statement about it depends on."""
+    stated = with_stated_times(resolve(loaded))
+    if json:
+        print_json(stated.model_dump(mode="json"))
+    else:
+        print(dumps(stated), end="")
 
 
 def _make_trigger(resolved: Scenario) -> None:

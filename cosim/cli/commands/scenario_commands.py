@@ -70,10 +70,17 @@ def _print_shipped(files: Sequence[ShippedFile]) -> None:
     epilog=examples(
         ("noack check lane_following", "print the scenario and its assumptions"),
         ("noack check lane_following --set mode=zoh --json", "as JSON"),
+        ("noack check shared_channel --resolved --loop lane-1", "one loop, in numbers only"),
     ),
 )
 def check(
-    scenario: opt.ScenarioArgument, settings: opt.SetOption = None, json: opt.JsonOption = False
+    scenario: opt.ScenarioArgument,
+    settings: opt.SetOption = None,
+    resolved: Annotated[
+        bool, Option("--resolved", help="Print one loop with numbers only, also for times that have none.")
+    ] = False,
+    loop: opt.LoopOption = None,
+    json: opt.JsonOption = False,
 ) -> None:
     """Check a scenario and print it with all defaults and random draws filled in.
 
@@ -81,9 +88,10 @@ def check(
 
     A nonlinear plant is also started and linearised. For a plant in Python this runs its code.
     """
-    from cosim.cli.scenario_check import check_scenario
+    from cosim.cli.scenario_check import check_scenario, print_resolved
 
-    check_scenario(opt.load_scenario(scenario, settings), json=json)
+    loaded = opt.load_loop(scenario, settings, loop)
+    print_resolved(loaded, json=json) if resolved else check_scenario(loaded, json=json)
 
 
 @app.command(

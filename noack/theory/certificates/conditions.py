@@ -21,6 +21,7 @@ from noack.impairments.markov_chain import NotPredictableError
 from noack.impairments.target_loss import loss_process
 from noack.scenario.resolution import loop_of, setpoint_of
 from noack.scenario.scenario import Scenario
+from noack.settings.section import Table
 from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.bounds.disturbances import excluded_probability
 
@@ -160,6 +161,22 @@ def certified_delay_s(resolved: Scenario) -> float:
     """
     given_s = resolved.certificate.network_delay_s
     return resolved.network.link.longest_delay_s if given_s is None else given_s
+
+
+def with_stated_times(resolved: Scenario) -> Scenario:
+    """Return a resolved scenario with numbers in place of the times that follow from other keys.
+
+    These are the network delay that certificates allow for, and the watchdog's timeout; their effect
+    stays the same. The delay in a queue is not known: if it is not stated, it stays so.
+    """
+    update: Table = {}
+    if not resolved.network.link.queues:
+        stated = {"network_delay_s": float(certified_delay_s(resolved))}
+        update["certificate"] = resolved.certificate.model_copy(update=stated)
+    timeout_s = resolved.timing.actuation_timeout_ns / NS_PER_S
+    watchdog = resolved.plant.watchdog.model_copy(update={"timeout_s": timeout_s})
+    update["plant"] = resolved.plant.model_copy(update={"watchdog": watchdog})
+    return resolved.model_copy(update=update)
 
 
 def network_delay_text(resolved: Scenario) -> str:
