@@ -74,7 +74,9 @@ def _without_numbers(line: str) -> str:
     return re.sub(r"-?[0-9][0-9.e-]*", "#", line)[:130]
 
 
-def checked_draws(seed: int, numbers: Iterator[int], processes: int, limit_s: float) -> Iterator[Checked]:
+def checked_draws(
+    seed: int, numbers: Iterator[int], processes: int, limit_s: float, *, theory: bool
+) -> Iterator[Checked]:
     """Check draws in some processes; yield the results as they come.
 
     If a process dies, the draws that were under way are contradictions, and the search ends.
@@ -84,7 +86,7 @@ def checked_draws(seed: int, numbers: Iterator[int], processes: int, limit_s: fl
         pending: dict[Future[Checked], int] = {}
         while True:
             for number in islice(numbers, processes + 1 - len(pending)):
-                pending[pool.submit(check_draw, seed, number, limit_s)] = number
+                pending[pool.submit(check_draw, seed, number, limit_s, theory=theory)] = number
             if not pending:
                 return
             done, _ = wait(pending, return_when=FIRST_COMPLETED)
@@ -127,11 +129,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--failures", type=Path, default=Path("fuzz-failures"), help="folder for failing draws"
     )
+    parser.add_argument("--runs-only", action="store_true", help="no claims, certificates and adversary")
     options = parser.parse_args(arguments)
     totals, began_s = Totals(), time.monotonic()
     said_s = began_s
     processes = min(options.processes, len(options.only)) if options.only else options.processes
-    for checked in checked_draws(options.seed, _numbers(options), processes, options.limit):
+    numbers, theory = _numbers(options), not options.runs_only
+    for checked in checked_draws(options.seed, numbers, processes, options.limit, theory=theory):
         totals.add(checked, options.failures)
         if time.monotonic() - said_s > _EVERY_S:
             said_s = time.monotonic()

@@ -19,6 +19,8 @@ class Chances:
 
     def __init__(self, seed: int, number: int) -> None:
         self.generator = np.random.default_rng([seed, number])
+        self.gentle = self.chance(0.5)
+        """Whether the draw is easy to control, so that more draws have a certificate."""
         self.files: dict[str, str | bytes] = {}
         """The content of the files that the scenario names, by their names."""
 

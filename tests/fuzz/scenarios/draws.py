@@ -59,7 +59,8 @@ def draw(seed: int, number: int) -> Draw:
     content["network"] = network(of, count, horizon_s, acknowledged=acknowledged)
     of.put(content, 0.3, "certificate", lambda: _certificate(of))
     if not acknowledged:
-        of.put(content, 0.25, "changes", lambda: _changes(of, content, model, horizon_s))
+        often = 0.1 if of.gentle else 0.25
+        of.put(content, often, "changes", lambda: _changes(of, content, model, horizon_s))
     if entries:
         content["loops"] = entries
     seeds = ("plant", "initial_state", "loss", "disturbance", "noise")

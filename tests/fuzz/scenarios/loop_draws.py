@@ -160,7 +160,7 @@ def _random_model(of: Chances) -> Model:
     """Return a random model with the gain of a linear-quadratic regulator."""
     while True:
         n, m = of.integer(1, 4), of.integer(1, 2)
-        growth = of.one_of(0.3, 1.0, 3.0)
+        growth = 0.3 if of.gentle else of.one_of(0.3, 1.0, 3.0)
         A = np.array([of.row(n, growth) for _ in range(n)])
         B = np.array([of.row(m) for _ in range(n)])
         weight = of.size(0.1, 10.0)
@@ -187,8 +187,8 @@ def _plant(of: Chances, model: Model) -> Table:
     of.put(plant, 0.2, "system", lambda: {"kind": "linear"})
     _draw(of, model, plant)
     of.put(plant, 0.2, "initial_state_halfwidth", lambda: of.positives(n, 0.5))
-    of.put(plant, 0.9, "rate_hz", lambda: of.one_of(*_RATES_HZ))
-    of.put(plant, 0.3, "measure_every", lambda: of.integer(1, 4))
+    of.put(plant, 0.9, "rate_hz", lambda: of.one_of(*_RATES_HZ[3 if of.gentle else 0 :]))
+    of.put(plant, 0.1 if of.gentle else 0.3, "measure_every", lambda: of.integer(1, 4))
     of.put(plant, 0.35, "disturbances", lambda: [_disturbance(of, n, m) for _ in range(of.integer(1, 2))])
     of.put(plant, 0.2, "watchdog", lambda: _watchdog(of))
     return plant
@@ -201,7 +201,7 @@ def _draw(of: Chances, model: Model, plant: Table) -> None:
         of.put(plant, 0.3, "draw", lambda: kind)
         return
     plant["draw"] = kind
-    share = of.size(0.001, 0.05)
+    share = of.size(0.001, 0.01 if of.gentle else 0.05)
     if kind == "given":
         near_A, near_B = (M * (1 + share * of.generator.uniform(-1, 1, M.shape)) for M in model[:2])
         if of.chance(0.3):
@@ -290,7 +290,8 @@ def controller(of: Chances, model: Model, plant: Table, *, acknowledged: bool) -
     """Return a controller of the model."""
     table: Table = {}
     rate_hz = plant.get("rate_hz", 500.0)
-    table["rate_hz"] = rate_hz if of.chance(0.6) else of.one_of(*(rate for rate in _RATES_HZ if rate >= 50))
+    rates_hz = _RATES_HZ[3 if of.gentle else 1 :]
+    table["rate_hz"] = rate_hz if of.chance(0.6) else of.one_of(*rates_hz)
     of.put(table, 0.4, "phase", lambda: of.between(0.0, 0.99))
     of.put(table, 0.15, "safe_input", lambda: of.row(model.m, 0.1))
     carries_model = plant.get("watchdog", {}).get("policy") == "model"
@@ -300,7 +301,7 @@ def controller(of: Chances, model: Model, plant: Table, *, acknowledged: bool) -
         code = of.file("controller", ".py", CONTROLLER_CODE)
         return table | {"kind": "python", "file": code, "name": "Gain", "parameters": {"K": model.K.tolist()}}
     of.put(table, 0.3, "kind", lambda: "linear")
-    of.put(table, 0.15, "update_timeout_s", lambda: of.size(0.1, 1.0))
+    of.put(table, 0.05 if of.gentle else 0.15, "update_timeout_s", lambda: of.size(0.1, 1.0))
     of.put(table, 0.15, "timeout_input", lambda: of.one_of("safe", "hold"))
     if not acknowledged and not carries_model:
         of.put(table, 0.15, "setpoint", lambda: setpoint(of, model))

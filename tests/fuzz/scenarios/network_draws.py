@@ -6,7 +6,7 @@ from tests.fuzz.scenarios.chances import Chances, Table
 def network(of: Chances, loops: int, horizon_s: float, *, acknowledged: bool) -> Table:
     """Return a network for some loops."""
     table = direction(of, loops, horizon_s, forward=True)
-    table["mansd"] = of.integer(0, 5)
+    table["mansd"] = of.integer(0, 2 if of.gentle else 5)
     table.setdefault("loss", {"model": "lossless"})
     of.put(table, 0.07, "enforce_mansd", of.flag)
     of.put(table, 0.3, "initial_sync", lambda: of.one_of("first_packet", "known_state"))
@@ -18,7 +18,8 @@ def network(of: Chances, loops: int, horizon_s: float, *, acknowledged: bool) ->
         of.put(table, 0.6, "acknowledgements", lambda: back)
     else:
         of.put(table, 0.1, "protocol", lambda: "none")
-        of.put(table, 0.2, "actuation", lambda: direction(of, loops, horizon_s, forward=False))
+        often = 0.1 if of.gentle else 0.2
+        of.put(table, often, "actuation", lambda: direction(of, loops, horizon_s, forward=False))
     return table
 
 
@@ -29,7 +30,8 @@ def direction(of: Chances, loops: int, horizon_s: float, *, forward: bool) -> Ta
     of.put(table, 0.85, "mansd", lambda: of.integer(0, 4))
     if "mansd" in table or forward:
         of.put(table, 0.25, "constraints", lambda: constraints(of))
-    of.put(table, 0.4, "impairments", lambda: impairments(of, loops, horizon_s, forward=forward))
+    often = 0.15 if of.gentle else 0.4
+    of.put(table, often, "impairments", lambda: impairments(of, loops, horizon_s, forward=forward))
     of.put(table, 0.15, "limit", lambda: of.one_of(1, 2, 3, 8, 100))
     return table
 
