@@ -70,19 +70,29 @@ class _TargetLoss(NamedTuple):
     loss: BernoulliLoss
 
 
-def with_target_loss(settings: LinkSettings, *, known: ProbabilityCache = PROBABILITIES) -> LinkSettings:
-    """Return settings with the probability that gives the asked loss rate; it is kept in ``known``.
-
-    Raises:
-        ValueError: there is none; one line.
-    """
-    target_losses = [
+def _target_losses(settings: LinkSettings) -> list[_TargetLoss]:
+    """Return the losses of which the rate is given; valid settings have at most one."""
+    return [
         _TargetLoss(number, impairment, impairment.loss)
         for number, impairment in enumerate(settings.impairments)
         if isinstance(impairment, LossOf)
         and isinstance(impairment.loss, BernoulliLoss)
         and impairment.loss.keep
     ]
+
+
+def number_of_target_loss(settings: LinkSettings) -> int:
+    """Return the number of the impairment with the first of them; 0 if there is none."""
+    return next((target.number for target in _target_losses(settings)), 0)
+
+
+def with_target_loss(settings: LinkSettings, *, known: ProbabilityCache = PROBABILITIES) -> LinkSettings:
+    """Return settings with the probability that gives the asked loss rate; it is kept in ``known``.
+
+    Raises:
+        ValueError: there is none; one line.
+    """
+    target_losses = _target_losses(settings)
     if not target_losses:
         return settings
     target_loss = target_losses[0]

@@ -49,9 +49,6 @@ def steady_state(resolved: Scenario) -> SteadyState:
     R are the scenario's own, even if the observer assumes others. Without an observer x̂ = y, L =
     I.
     """
-    # Imported here: a sensor without an observer does not need this large module.
-    from scipy.linalg import solve_discrete_lyapunov
-
     true, observer = true_model(resolved), resolved.observer
     A, Q = true.between_measurements()
     n, C = len(A), true.C
@@ -63,5 +60,23 @@ def steady_state(resolved: Scenario) -> SteadyState:
     if radius >= 1:
         return SteadyState(L, radius, np.full((n, n), np.inf))
     added = update_factor @ Q @ update_factor.T + L @ true.R @ L.T
-    covariance = np.asarray(solve_discrete_lyapunov(update_factor @ A, added), dtype=np.float64)
-    return SteadyState(L, radius, covariance)
+    return SteadyState(L, radius, _stationary_covariance(update_factor @ A, added))
+
+
+_MOST_DOUBLINGS = 64
+
+
+def _stationary_covariance(F: Matrix, Q: Matrix) -> Matrix:
+    """Return Σ F^k Q (F^k)ᵀ over all k ≥ 0, (n, n), of an F whose spectral radius is below 1.
+
+    It is P of P = F P Fᵀ + Q. Sums of twice as many terms follow from each other. Unlike the linear
+    equations of P, they are exact to rounding if the gain of an observer is large.
+    """
+    P = Q
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(_MOST_DOUBLINGS):
+            longer = P + F @ P @ F.T
+            if np.array_equal(longer, P):
+                return P
+            P, F = longer, F @ F
+    return P if np.isfinite(P).all() else np.full_like(Q, np.inf)

@@ -21,7 +21,7 @@ from noack.impairments.constraints import require_consistent
 from noack.impairments.link_settings import Constraints, Mansd, require_scores
 from noack.impairments.loss_models import Loss
 from noack.impairments.loss_models.trace import TraceLoss
-from noack.impairments.target_loss import with_target_loss
+from noack.impairments.target_loss import number_of_target_loss, with_target_loss
 from noack.protocol.wire_format import MAX_DIMENSION
 from noack.scenario.runtime_parameters import LOSS, put_settings, require_runtime_parameters
 from noack.scenario.scenario_tables import ScenarioTables
@@ -80,7 +80,9 @@ def check_target_loss(scenario: ScenarioTables) -> None:
         try:
             with_target_loss(section.link)
         except ValueError as error:
-            raise ValueError(f"{key}.loss: {error}") from None
+            number = number_of_target_loss(section.link)  # the first one is that of the table itself
+            place = f"{key}.impairments.{number - 1}" if number else key
+            raise ValueError(f"{place}.loss: {error}") from None
 
 
 def check_trigger(scenario: ScenarioTables) -> None:

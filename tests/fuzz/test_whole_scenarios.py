@@ -1,13 +1,17 @@
 """Random whole scenarios, from reading to the worst losses; thousands of them are ``make fuzz``."""
 
+from pathlib import Path
+
 import pytest
 
+from noack.core.errors import CallerError
+from noack.scenario.scenario_file import load
 from tests.fuzz.scenarios.check_draw import check_draw, fault_of_message
 from tests.fuzz.scenarios.draws import NEVER_DRAWN, draw, drawn_keys, schema_keys
 
 SEED = 71
-DRAWS = [number for number in range(32) if number not in (18, 20, 26, 28)]
-"""Draws that are checked; one of the others is refused, their certificates take long."""
+DRAWS = [number for number in range(31) if number not in (18, 20, 26, 27)]
+"""Draws that are checked; the certificates of the others take long."""
 MANY = 2000
 """Draws that together set every key."""
 
@@ -17,7 +21,16 @@ def test_a_draw_has_no_contradiction(number: int) -> None:
     checked = check_draw(SEED, number)
     found = [f"{step}: {what}\n{detail}" for *_, step, what, detail in checked.contradictions]
     assert not found, "\n".join(found)
-    assert not checked.is_refused
+
+
+def test_few_draws_are_refused(tmp_path: Path) -> None:
+    refused = []
+    for number in range(MANY // 20):
+        try:
+            load(draw(SEED, number).write(tmp_path / str(number)))
+        except CallerError as error:
+            refused.append(str(error))
+    assert len(refused) < MANY // 20 // 10, "\n".join(refused)
 
 
 def test_every_key_is_drawn_or_listed_with_a_reason() -> None:

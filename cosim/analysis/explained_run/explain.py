@@ -15,7 +15,7 @@ from cosim.analysis.explained_run.plant_flow import check_measurements, check_ob
 from cosim.analysis.explained_run.sensor_events import check_events
 from cosim.record.run_record import RunRecord
 from noack.scenario.scenario import Scenario
-from noack.theory.certificates.conditions import allowed_conditions
+from noack.theory.certificates.conditions import nominal_conditions
 
 _CHECKS = (
     check_plant, check_measurements, check_observer, check_events, check_updates, check_controller,
@@ -26,27 +26,27 @@ _CHECKS = (
 def explains(record: RunRecord) -> list[Unexplained]:
     """Return what the model does not explain in the record of a loop, in the order of time.
 
-    An empty list: the run is a run of the model. A live run may exceed the times of the schedule, if
-    the machine was late: such findings have the part `.findings.SCHEDULE`.
+    An empty list: the run is a run of the model. In virtual time nothing is late. A live run
+    may exceed the times of the schedule if the machine was late: such findings have the part
+    `.findings.SCHEDULE`.
     """
     run = ExplainedLoop(record)
     for check in _CHECKS:
         check(run)
     if states_schedule(record.scenario):
-        check_schedule(run, allowed_conditions(record.scenario))
+        late = 0 if record.kind == "simulated" else record.scenario.certificate.late_periods
+        check_schedule(run, nominal_conditions(record.scenario, late))
     return sorted(run.findings, key=lambda finding: finding.t_s)
 
 
 def states_schedule(resolved: Scenario) -> bool:
     """Whether the times of a loop's updates and inputs have bounds that do not depend on the machine."""
-    network, controller = resolved.network, resolved.controller
+    network = resolved.network
     directions = [network.link] + ([] if network.actuation is None else [network.actuation.link])
     stated_s = resolved.certificate.network_delay_s
     return (
-        not resolved.protocol.acknowledges
+        resolved.coverage.some_certificate_applies
         and network.enforce_mansd
-        and controller.update_timeout_s is None
         and all(link.delay_is_bounded for link in directions)
         and (stated_s is None or stated_s >= network.link.longest_delay_s)
-        and (network.actuation is None or network.actuation.link.longest_burst is not None)
     )

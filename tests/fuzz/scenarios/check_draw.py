@@ -28,10 +28,11 @@ from cosim.record.run_directory import RunEnding
 from cosim.record.run_record import load_run
 from cosim.simulation.virtual_time import simulate_run
 from noack.core.errors import NoackError
-from noack.scenario.resolution import resolve
+from noack.scenario.resolution import resolve, resolve_run, resolved_loops
 from noack.scenario.scenario import Scenario, loops_by_entry
-from noack.scenario.scenario_file import load
+from noack.scenario.scenario_file import dumps, load
 from noack.theory.certificates.scenario_certificates import certify
+from noack.trigger_policies.decaying import DecayingSettings
 from tests.fuzz.scenarios.draws import Draw, draw, drawn_keys
 
 LIMIT_S = 60.0
@@ -115,6 +116,16 @@ class _Checks:
             return scenario
         return None
 
+    def read_again(self, scenario: Scenario) -> None:
+        """Check that what ``noack check`` prints is the same scenario, and that its run is the same."""
+        with self.step("read again", may_refuse=False):
+            printed = resolve_run(scenario)
+            path = self.folder / "printed.toml"
+            path.write_text(dumps(printed))
+            again = load(path)
+            if resolved_loops(again) != resolved_loops(printed):
+                self.add("read again", "the scenario that noack check prints is another one")
+
     def simulate(self, scenario: Scenario) -> RunEnding | None:
         """Simulate the run, replay it, and explain it; return how it ended, None if it is refused."""
         ending = None
@@ -157,21 +168,30 @@ class _Checks:
             self.counts["certified"] += results.answer.is_certified
 
     def attack(self, loop: Scenario) -> None:
-        """Search for losses that exceed a certified bound."""
-        resolved, certificate = resolve(loop), None
+        """Search for losses that exceed a certified bound; also of the paper's loop if it has its rule."""
+        resolved = resolve(loop)
+        self._attack(resolved, continuous=False)
+        if isinstance(resolved.trigger, DecayingSettings) and resolved.coverage.is_undisturbed:
+            self._attack(resolved, continuous=True)
+
+    def _attack(self, resolved: Scenario, *, continuous: bool) -> None:
+        certificate = None
         with self.step("certificate to attack"):
-            certificate = certify(resolved, conditions_of(resolved, continuous=False))
+            certificate = certify(resolved, conditions_of(resolved, continuous=continuous))
         for objective in (Objective.ERROR, Objective.STATE, Objective.INTER_EVENT):
             if certificate is None:
                 return
             with self.step("attack"):
                 worst = find_worst(
-                    resolved, objective, most_nodes=_NODES, beam=_BEAM, certificate=certificate
-                )
+                    resolved, objective, continuous=continuous, most_nodes=_NODES, beam=_BEAM,
+                    certificate=certificate,
+                )  # fmt: skip
                 self.counts["attacked with a bound"] += worst.certified is not None
                 if worst.breaches:
-                    self.add("attack", f"{loop.name}: {objective.value}: found {worst.value}, certified "
-                                       f"{worst.certified}", worst.text)  # fmt: skip
+                    loop = "the paper's loop" if continuous else "the loop"
+                    values = f"found {worst.value}, certified {worst.certified}"
+                    what = f"{resolved.name}, {loop}: {objective.value}: {values}"
+                    self.add("attack", what, worst.text)
 
 
 def check_draw(seed: int, number: int, limit_s: float = LIMIT_S, *, theory: bool = True) -> Checked:
@@ -181,6 +201,7 @@ def check_draw(seed: int, number: int, limit_s: float = LIMIT_S, *, theory: bool
         checks = _Checks(drawn, Path(folder), limit_s)
         scenario = checks.read(drawn.write(Path(folder)))
         if scenario is not None:
+            checks.read_again(scenario)
             ending = checks.simulate(scenario)
             if theory and ending is not None:
                 checks.evaluate(ending)

@@ -16,7 +16,6 @@ FILE = "scenario.toml"
 _LOOP_SEEDS = ("plant", "initial_state", "disturbance", "noise")
 
 NEVER_DRAWN: Mapping[str, str] = {
-    "LoopSection.scenario": "another file's loop is the same tables: drawn as entries of [[loops]]",
     "PythonControllerSettings.sha256": "the user's own copy in a run directory",
     "PythonPlantSettings.sha256": "the user's own copy in a run directory",
     "PythonTriggerSettings.sha256": "the user's own copy in a run directory",
@@ -114,16 +113,10 @@ def _loops(of: Chances, tables: Table, model: Model, *, acknowledged: bool) -> l
         of.put(entry, 0.3, "count", lambda: of.integer(1, 3))
         of.put(entry, 0.3, "phase", lambda: of.between(0.0, 0.99))
         of.put(entry, 0.2, "mode", lambda: of.one_of("model", "zoh"))
-        if of.chance(0.25) and "observer" not in tables:
-            other, _ = loop(of, acknowledged=acknowledged)
-            entry |= {key: value for key, value in other.items() if key != "mode"}
-            entry.setdefault("controller", {"kind": "linear"})
-            if "kind" not in entry["controller"]:
-                entry["controller"] = {"kind": "linear", **entry["controller"]}
-            plant = tables["plant"]
-            entry["plant"] = {"rate_hz": 500.0, **entry["plant"]}
-            if any(key not in entry["plant"] for key in plant):
-                entry = {key: value for key, value in entry.items() if key in ("name", "count", "phase")}
+        if of.chance(0.4):
+            entry["scenario"] = _loop_file(of, acknowledged=acknowledged)
+        elif of.chance(0.3) and "observer" not in tables:
+            entry |= _other_tables(of, tables, acknowledged=acknowledged)
         elif of.chance(0.3):
             plant = tables["plant"]
             measured_s = plant.get("measure_every", 1) / plant.get("rate_hz", 500.0)
@@ -132,6 +125,22 @@ def _loops(of: Chances, tables: Table, model: Model, *, acknowledged: bool) -> l
         of.put(entry, 0.2, "seeds", lambda: _some(of, {key: of.integer(0, 1000) for key in _LOOP_SEEDS}))
         entries.append(entry)
     return entries
+
+
+def _loop_file(of: Chances, *, acknowledged: bool) -> str:
+    """Add the file of another loop; return its name."""
+    tables, _ = loop(of, acknowledged=acknowledged)
+    network = {"mansd": 0, "loss": {"model": "lossless"}}
+    content = {"name": "other", "horizon_s": 1.0, "network": network, **tables}
+    return of.file("loop", ".toml", tomli_w.dumps(content))
+
+
+def _other_tables(of: Chances, tables: Table, *, acknowledged: bool) -> Table:
+    """Return the tables of another loop, none if it would keep keys of a plant of another size."""
+    other, _ = loop(of, acknowledged=acknowledged)
+    other["controller"] = {"kind": "linear", **other.get("controller", {})}
+    other["plant"] = {"rate_hz": 500.0, **other["plant"]}
+    return other if tables["plant"].keys() <= other["plant"].keys() else {}
 
 
 def _without_effect(of: Chances, content: Table) -> None:

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.linalg import expm
+from scipy.linalg import expm, solve_discrete_lyapunov
 from scipy.stats import chi2
 
 from cosim.analysis.claims.claim_evaluation import RunClaims
@@ -65,6 +65,26 @@ def test_the_estimation_error_agrees_with_the_filters_covariance(observed: dict[
     assert low < distance < high
     # so an error that is 30 % off would be detected
     assert 2 * N / 1.3**2 < low < high < 2 * N * 1.3**2
+
+
+@pytest.mark.parametrize("coupling", [1.0, 1e-3, 1e-6])
+def test_the_covariance_is_that_of_its_equation_also_with_a_large_gain(
+    observed: dict[str, Any], coupling: float
+) -> None:
+    """A state that hardly appears in the output needs one; P is then far from well conditioned."""
+    observed["model"] = {"A": [[0.0, coupling], [0.0, 0.0]], "B": [[0.0], [1.0]],
+                         "gain": [[-1.0 / coupling, -1.5]]}  # fmt: skip
+    observed["observer"] = {"kind": "luenberger", "poles_per_s": [-5.0, -8.0]}
+    scenario = resolved(observed)
+    state, model = steady_state(scenario), true_model(scenario)
+    A, Q = model.between_measurements()
+    correction = np.eye(2) - state.gain @ model.C
+    F, added = correction @ A, correction @ Q @ correction.T + state.gain @ model.R @ state.gain.T
+    P = state.covariance
+    scale = np.abs(F) @ np.abs(P) @ np.abs(F).T + np.abs(added)
+    assert (np.abs(F @ P @ F.T + added - P) <= 1e-9 * scale).all()
+    if coupling == 1.0:
+        np.testing.assert_allclose(P, solve_discrete_lyapunov(F, added), rtol=1e-9)
 
 
 def test_measurements_that_are_lost_are_bridged_and_replayed(observed: dict[str, Any]) -> None:
