@@ -99,7 +99,8 @@ def settings_meaning(settings: LinkSettings) -> Iterator[tuple[str, str]]:
         yield "first", f"{meaning}; the cap for later packets is mansd"
     if any(impairment.delays for impairment in settings.impairments):
         most = settings.limit
-        yield f"limit {most}", f"at most {most} packets are delayed at once; more are dropped"
+        delayed = f"{most} packet is" if most == 1 else f"{most} packets are"
+        yield f"limit {most}", f"at most {delayed} delayed at once; more are dropped"
 
 
 def _print_link(console: Console, spec: LinkSpec, written: LinkSpec, packets: int) -> None:

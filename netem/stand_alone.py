@@ -23,6 +23,7 @@ from netem.relay.relay_links import DeviceLink, LinkSpec
 from netem.relay.relay_reports import report_line
 from netem.relay_watch import add_watching_options, check_watching_options, watch_relay
 from noack.core.errors import CallerError, ExitStatus, MachineError, NoackError, why
+from noack.core.number_format import counted
 from noack.runtime.address import address_text
 from noack.runtime.command_line import Signals, log_event, log_format, report_failure
 from noack.runtime.drivers.realtime_settings import realtime
@@ -99,7 +100,7 @@ def report_totals(totals: Statistics, options: argparse.Namespace) -> None:
             print(line, file=sys.stderr)
         if lost := unintended_losses(totals):
             status = ExitStatus.UNINTENDED_LOSSES
-            text = f"{lost:,} datagrams; the guarantee does not hold (exit status {status})"
+            text = f"{counted(lost, 'datagram')}; the guarantee does not hold (exit status {status})"
             print(f"unintended losses: {text}", file=sys.stderr)
 
 

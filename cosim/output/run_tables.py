@@ -24,7 +24,7 @@ from cosim.analysis.summary.summary_model import (
 from cosim.output.result_tables import KEY_VALUE, ResultTable
 from netem.tc_words import settings_of
 from noack.core.errors import ExitStatus
-from noack.core.number_format import NONE, duration, duration_at_least, number, ratio, seconds, whole
+from noack.core.number_format import NONE, counted, duration, duration_at_least, number, ratio, seconds, whole
 from noack.scenario.runtime_parameters import MANSD
 
 Numbers = tuple[tuple[str, str], ...]
@@ -382,7 +382,7 @@ def network_rows(summary: RunSummary) -> list[tuple[str, str]]:
         burst = max(flow.longest_loss_burst for flow in flows)
         rows.append(("  lost, longest loss burst", f"{lost} ({ratio(lost, sent)}), {burst}"))
     if trips := [loop.watchdog.trips for loop in loops if loop.watchdog.trips]:
-        rows.append(("watchdog acted", f"{sum(trips)} times, in {len(trips)} loops"))
+        rows.append(("watchdog acted", f"{counted(sum(trips), 'time')}, in {counted(len(trips), 'loop')}"))
     if deadlines := summary.deadlines:
         rows.append(("deadlines missed", _missed_deadlines(deadlines)))
         worst = max(deadlines, key=lambda role: deadlines[role].max_us or 0.0)

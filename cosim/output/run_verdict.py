@@ -14,7 +14,7 @@ from cosim.analysis.summary.summary_model import Claim, ExitPart, IdealLoopPart,
 from cosim.output.run_tables import changes_in, shares_network, state_norm
 from cosim.simulation.continuous import ContinuousSummary
 from noack.core.errors import ExitStatus
-from noack.core.number_format import duration_at_least
+from noack.core.number_format import counted, duration_at_least
 from noack.runtime.life_cycle import HORIZON
 from noack.theory.certificates.assumptions import AssumptionStatus
 
@@ -363,10 +363,12 @@ def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
         yield f"{state_norm(loop)} grew from {first:.3g} to {last:.3g} during the run"
     if loop.missing_samples:
         where = ", ".join(f"{n} of {t}" for t, n in loop.missing_by_table.items())
-        yield f"{loop.missing_samples} samples are missing from the record: {where}"
+        count = loop.missing_samples
+        yield f"{counted(count, 'sample')} {'is' if count == 1 else 'are'} missing from the record: {where}"
     if loop.unintended_losses:
         where = ", ".join(f"{n} on {leg}" for leg, n in loop.unintended_losses_by_leg.items())
-        lost = f"{loop.unintended_losses} datagrams were lost elsewhere"
+        count = loop.unintended_losses
+        lost = f"{counted(count, 'datagram')} {'was' if count == 1 else 'were'} lost elsewhere"
         if _has_clocks(loop):
             yield f"{lost} (kernel, or between the hosts; firewalls must pass the ports): {where}"
         else:

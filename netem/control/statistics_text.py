@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 from netem.control.emulator_statistics import DirectionStatistics, LinkStatistics, Statistics
 from netem.relay.relay_reports import DIRECTIONS
-from noack.core.number_format import with_unit
+from noack.core.number_format import counted, with_unit
 
 _NONE = "–"
 _BIT_RATES = ("Gbit/s", "Mbit/s", "kbit/s", "bit/s")
@@ -64,11 +64,11 @@ def _direction_parts(side: DirectionStatistics) -> Iterator[str]:
 
 def _client_problems(link: LinkStatistics) -> Iterator[str]:
     if link["refused"]:
-        yield f"{link['refused']:,} datagrams of further clients refused"
+        yield f"{counted(link['refused'], 'datagram')} of further clients refused"
     if link["port_unreachable"]:
-        yield f"port unreachable {link['port_unreachable']:,} times"
+        yield f"port unreachable {counted(link['port_unreachable'], 'time')}"
     if link["discarded"]:
-        yield f"{link['discarded']:,} answers discarded"
+        yield f"{counted(link['discarded'], 'answer')} discarded"
 
 
 def _traffic_text(side: DirectionStatistics, key: str) -> str:

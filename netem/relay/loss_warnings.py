@@ -10,6 +10,7 @@ from collections.abc import Mapping
 
 from netem.relay.relay_links import LinkSpec
 from netem.relay.relay_reports import Direction, report_line
+from noack.core.number_format import counted
 from noack.runtime.address import address_text
 
 KERNEL = "lost_in_kernel"
@@ -29,7 +30,7 @@ class LinkWarnings:
 
     def report_full(self) -> None:
         """Report that the link has its maximum number of clients."""
-        self._report(f"no more than {self._spec.most_clients} clients at once are served")
+        self._report(f"at most {counted(self._spec.most_clients, 'client')} can be served at once")
 
     def report_flood(self, flows: int) -> None:
         """Report that other hosts, outside a shell, have begun the flows that they may begin."""
@@ -41,7 +42,8 @@ class LinkWarnings:
     def report_no_descriptor(self, clients: int) -> None:
         """Report that no file descriptor is left for a client in addition to those present."""
         self._report(
-            f"no file descriptors are left for more than {clients} clients; raise the limit (ulimit -n)"
+            f"no file descriptors are left for more than {counted(clients, 'client')}; "
+            "raise the limit (ulimit -n)"
         )
 
     def set_port_unreachable(self, answers: int) -> None:
@@ -87,7 +89,7 @@ class UnintendedLosses:
             if datagrams > self._reported[cause]:
                 self._reported[cause] = datagrams
                 text = _CAUSES.get(cause, f"could not be sent ({cause})")
-                report_line(f"{self._where}: {datagrams} datagrams {text}; the guarantee is void")
+                report_line(f"{self._where}: {counted(datagrams, 'datagram')} {text}; the guarantee is void")
 
     def _set(self, cause: str, datagrams: int) -> None:
         if datagrams > 0:

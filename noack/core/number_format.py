@@ -27,6 +27,11 @@ _CELL = 'style="text-align: left; vertical-align: top; line-height: 1.4"'
 """At the cells, since the style sheets of notebooks align the text of each cell."""
 
 
+def counted(count: int, noun: str) -> str:
+    """Write a number of things: ``1 datagram``, ``2,000 datagrams``."""
+    return f"{count:,} {noun}" if count == 1 else f"{count:,} {noun}s"
+
+
 def number(value: float | None, digits: int = 3) -> str:
     """Write a number with ``digits`` significant digits."""
     return NONE if value is None or math.isnan(value) else f"{value:.{digits}g}"

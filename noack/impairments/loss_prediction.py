@@ -93,7 +93,10 @@ def order_and_notes(settings: LinkSettings) -> tuple[PacketOrder, list[str]]:
         order = impairment.order_after(order)
         notes.append(impairment.prediction_note)
     if order.delayed and settings.limit < USUAL_LIMIT:
-        notes.append(f"as long as no more than {settings.limit} packets are delayed at once")
+        notes.append(
+            f"as long as no more than {settings.limit} "
+            f"{'packet is' if settings.limit == 1 else 'packets are'} delayed at once"
+        )
     return order, [note for note in dict.fromkeys(notes) if note]
 
 

@@ -19,6 +19,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 
 from noack.core.errors import CallerError, PeerError
+from noack.core.number_format import counted
 from noack.protocol.roles import Notice
 from noack.protocol.wire_format import MAX_DATAGRAM_BYTES
 from noack.runtime.address import LOOPBACK, Address, SocketName, address_text, family_of
@@ -316,7 +317,7 @@ class FloodWatch:
         self.is_flood = False
         self._needed_calm_intervals = min(2 * self._needed_calm_intervals, _MOST_CALM_INTERVALS)
         drops = self._dropped - self._drops_at_start
-        return f"the flood is over: the kernel dropped {drops} datagrams from unknown sources"
+        return f"the flood is over: the kernel dropped {counted(drops, 'datagram')} from unknown sources"
 
 
 class SourceCount:

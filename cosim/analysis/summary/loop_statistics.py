@@ -313,7 +313,8 @@ def reported_violations(record: RunRecord) -> list[ViolationPart]:
     mansd = _largest_mansd(record, int(outcomes.event_ns[first - 1]) if first else 0)
     dropped = len(outcomes.lost) - first
     if dropped > mansd:
-        text = f"MANSD violated: the last {dropped} updates were lost, at most {mansd} assumed"
+        last = "the last update was lost" if dropped == 1 else f"the last {dropped} updates were lost"
+        text = f"MANSD violated: {last}, at most {mansd} assumed"
         at_s = float(outcomes.event_ns[first + mansd]) * 1e-9
         violations.append(ViolationPart(t_s=at_s, process="netem", cause=_DROPOUTS, what=text))
     return violations

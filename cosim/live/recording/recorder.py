@@ -26,6 +26,7 @@ from noack.core.clock import NS_PER_S
 from noack.core.core_library import core
 from noack.core.errors import ExitStatus, MachineError, PeerError
 from noack.core.file_access import remove_file
+from noack.core.number_format import counted
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
@@ -297,7 +298,7 @@ class Recorder:
             self._plane.refuse(query, str(error))
             return
         if stored := self.store.add_stored(role, report):
-            text = f"{role}: {stored} rows were written to disk by itself: the recorder was slow"
+            text = f"{role} wrote {counted(stored, 'row')} to disk itself, because the recorder was slow"
             self.store.add_own_notice(Notice(report.reached_ns or 0, "info", text))
         # Telemetry has a lower priority: batches that were sent earlier may still be in flight.
         deadline_s = time.monotonic() + _ROWS_IN_FLIGHT_S

@@ -144,3 +144,13 @@ def test_a_run_that_ends_before_its_first_input_is_due_keeps_its_guarantee() -> 
     for horizon_s, held in ((0.01, 8), (0.2, 11)):  # nothing is compared for the other claims
         summary = noack.simulate(noack.load("lane_weighted", {"horizon_s": horizon_s, **delay})).summary
         assert verdict(summary)[1].text == f"guarantee kept: {held} claims held, none violated"
+
+
+def test_one_missing_sample_and_one_lost_datagram_have_no_plural(outcome: Outcome) -> None:
+    summary = with_values(
+        outcome.summary, missing_samples=1, missing_by_table={"plant_step": 1},
+        unintended_losses=1, unintended_losses_by_leg={"actuation": 1},
+    )  # fmt: skip
+    texts = "\n".join(remark.text for remark in remarks(summary))
+    assert "1 sample is missing from the record: 1 of plant_step" in texts
+    assert "1 datagram was lost elsewhere" in texts

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from noack.core.core_library import CoreMemory, reals_at
-from noack.core.number_format import apart_from, at_least, at_most, duration_at_least, plus_minus
+from noack.core.number_format import apart_from, at_least, at_most, counted, duration_at_least, plus_minus
 from noack.core.random_streams import stream, stream_key, stream_keys, uniforms, words
 
 
@@ -124,3 +124,11 @@ def test_a_bound_with_decimals_and_a_time() -> None:
 )
 def test_a_number_is_told_from_its_limit(value: float, text: str) -> None:
     assert apart_from(1.0, value) == text
+
+
+def test_one_thing_has_no_plural() -> None:
+    assert [counted(count, "datagram") for count in (0, 1, 2000)] == [
+        "0 datagrams",
+        "1 datagram",
+        "2,000 datagrams",
+    ]

@@ -234,7 +234,7 @@ def test_a_kept_rate_is_that_of_the_losses_under_the_guarantee() -> None:
 def test_losses_are_not_predicted_if_few_packets_may_be_delayed_at_once() -> None:
     """A copy that finds no place is dropped: without the limit a quarter of the packets is lost."""
     settings = settings_of("duplicate 100% corrupt 50% delay 10ms").model_copy(update={"limit": 1})
-    note = "as long as no more than 1 packets are delayed at once"
+    note = "as long as no more than 1 packet is delayed at once"
     assert predict(settings) == LossPrediction(0.25, note)
     with pytest.raises(NotPredictableError, match=note):
         loss_process(settings)

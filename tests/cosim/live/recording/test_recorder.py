@@ -125,7 +125,7 @@ def test_rows_that_a_process_has_stored_are_not_requested_and_are_logged(run: Ru
     stored = {PLANT_STEP: [[3, 7], [8, 10]]}
     assert run.report("plant", stored=stored, **{PLANT_STEP: 10}) == {PLANT_STEP: [[7, 8]]}
     ((_, line),) = read_batches(run.run_dir / SPOOL, f"{NOTICES}_{RECORDER}")
-    assert "plant: 4 rows were written to disk by itself" in line.decode()
+    assert "plant wrote 4 rows to disk itself, because the recorder was slow" in line.decode()
 
 
 def test_a_process_that_left_the_start_barrier_is_gone_once_the_one_in_its_place_has_reported(
