@@ -1,0 +1,361 @@
+"""From a resolved scenario, as ``noack check --resolved`` prints it, to the loop that statements are about.
+
+Floats are the exact binary values that noack runs with. A scenario with a key that :mod:`.keys`
+refuses has no loop. What is moved to 0 is the set-point x_r: with Âx_r = 0 the models rest at it without
+an input, and what is left of the plant is a constant disturbance A x_r.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from fractions import Fraction
+from typing import NamedTuple
+
+from flint import arb, arb_mat, fmpq
+
+from noack_check.balls import beside, identity, matrix, number, rows_of, stack, zeros
+from noack_check.keys import RefusedError, Table, refusals
+from noack_check.loop import Loop, Rule, Times
+from noack_check.times import NS_PER_S, Schedule, nanoseconds
+
+Rows = Sequence[Sequence[float]]
+
+
+class _Plants(NamedTuple):
+    """The plants of a statement: entries of A and B are within half-widths of these."""
+
+    A: Rows
+    B: Rows
+    half_A: Rows
+    half_B: Rows
+
+
+def read_loop(resolved: Table, *, box: bool, ideal: bool) -> Loop:
+    """Return the loop of a resolved scenario of one loop.
+
+    Args:
+        resolved: the scenario's tables, as tomllib returns them.
+        box: all plants within the uncertainty around the model; else the plant itself.
+        ideal: the paper's conditions: no delay, inputs of age 0, tests at all times (at those of its
+            grid for a rule that has one).
+
+    Raises:
+        RefusedError: a key is not covered, is missing or has a wrong value.
+    """
+    for refusal in refusals(resolved):
+        raise RefusedError(refusal)
+    model, plant, trigger = (_table(resolved, key) for key in ("model", "plant", "trigger"))
+    A, B = _matrix(model, "model.A"), _matrix(model, "model.B")
+    n, m = len(A), len(B[0])
+    _require_shapes(model, plant, n, m)
+    own = _Plants(_matrix(plant, "plant.A"), _matrix(plant, "plant.B"), [[0] * n] * n, [[0] * m] * n)
+    plants = _box(plant, A, B, own) if box else own
+    x_r = _setpoint(resolved, A, plants)
+    pushes = [*_disturbances(plant, plants), *_at_rest(plants.A, x_r)]
+    weight = _weight(trigger, n)
+    rule = _rule(trigger, weight)
+    return Loop(
+        A=matrix(plants.A),
+        B=matrix(plants.B),
+        half_A=matrix(plants.half_A),
+        half_B=matrix(plants.half_B),
+        model_A=matrix(A),
+        model_B=matrix(B),
+        gain=matrix(_matrix(model, "model.gain")),
+        weight=weight,
+        holds=_choice(resolved, "mode", ("model", "zoh")) == "zoh",
+        start=matrix([[value] for value in _row(plant, "plant.initial_state")]) - matrix([[v] for v in x_r]),
+        rule=rule,
+        pushes=arb_mat(n, len(pushes), [column[i] for i in range(n) for column in pushes]),
+        sizes=(arb(1),) * len(pushes),
+        losses=_losses(_table(resolved, "network")),
+        times=_times(resolved, trigger, ideal=ideal),
+    )
+
+
+def _box(plant: Table, A: Rows, B: Rows, own: _Plants) -> _Plants:
+    """Return the plants within the uncertainty around the model."""
+    half_A = _matrix(plant, "plant.uncertainty_A") if "uncertainty_A" in plant else own.half_A
+    half_B = _matrix(plant, "plant.uncertainty_B") if "uncertainty_B" in plant else own.half_B
+    return _Plants(A, B, half_A, half_B)
+
+
+def _require_shapes(model: Table, plant: Table, n: int, m: int) -> None:
+    shapes = {"model.A": (n, n), "model.B": (n, m), "model.gain": (m, n), "plant.A": (n, n)}
+    shapes |= {"plant.B": (n, m), "plant.uncertainty_A": (n, n), "plant.uncertainty_B": (n, m)}
+    for name, (height, width) in shapes.items():
+        table = model if name.startswith("model.") else plant
+        if name.startswith("plant.uncertainty") and name.partition(".")[2] not in table:
+            continue
+        rows = _matrix(table, name)
+        if len(rows) != height or len(rows[0]) != width:
+            raise RefusedError(f"{name}: not {height} x {width}")
+        if name.startswith("plant.uncertainty") and any(half < 0 for row in rows for half in row):
+            raise RefusedError(f"{name}: below 0")
+    if len(_row(plant, "plant.initial_state")) != n:
+        raise RefusedError(f"plant.initial_state: not {n} numbers")
+    measured = _optional_table(plant, "measurement").get("C")
+    if measured is not None and measured != [[int(i == j) for j in range(n)] for i in range(n)]:
+        raise RefusedError("plant.measurement.C: the sensor does not measure the state")
+
+
+def _losses(network: Table) -> int:
+    """Return the most consecutive losses that the guarantee allows."""
+    most = _whole(network, "network.mansd")
+    for entry in _tables(network, "network.constraints"):
+        if entry.get("kind") == "at_most":
+            limit = _whole(entry, "network.constraints.losses")
+            if limit < _whole(entry, "network.constraints.window"):
+                most = min(most, limit)
+    return most
+
+
+def _times(resolved: Table, trigger: Table, *, ideal: bool) -> Times:
+    """Return the times; a rule with a grid is tested at its points, and otherwise at measurements."""
+    plant, controller, certificate = (_table(resolved, key) for key in ("plant", "controller", "certificate"))
+    zero = fmpq(0)
+    times = Times(zero, zero, zero, zero, zero)
+    if not ideal:
+        schedule = Schedule(
+            _rate(plant, "plant.rate_hz"),
+            max(_whole(plant, "plant.measure_every"), 1),
+            _rate(controller, "controller.rate_hz"),
+            _real(controller, "controller.phase"),
+            _whole(certificate, "certificate.late_periods"),
+            _real(certificate, "certificate.network_delay_s") if "network_delay_s" in certificate else 0.0,
+        )
+        times = schedule.times
+        _require_watchdog(_optional_table(plant, "watchdog"), times)
+    inner = trigger
+    while inner.get("policy") == "deadline":
+        inner = _table(inner, "rule")
+    if inner.get("policy") == "quadratic":
+        grid = fmpq(nanoseconds(_real(inner, "trigger.period_s")), NS_PER_S)
+        # With a deadline an event may come between two points of the grid.
+        least = grid if inner is trigger else times.least_sampling
+        times = times._replace(sampling=grid, least_sampling=least)
+    return times
+
+
+def _require_watchdog(watchdog: Table, times: Times) -> None:
+    """Require that the plant's watchdog does not replace inputs as old as they may be."""
+    if watchdog.get("policy", "hold") == "hold":
+        return
+    timeout_s = _real(watchdog, "plant.watchdog.timeout_s")
+    if fmpq(nanoseconds(timeout_s), NS_PER_S) < times.age:
+        raise RefusedError(
+            f"plant.watchdog.timeout_s = {timeout_s:g}: the watchdog may replace an input, "
+            f"which may be {float(times.age.p) / float(times.age.q):g} s old"
+        )
+
+
+# The trigger.
+
+
+def _weight(trigger: Table, n: int) -> arb_mat:
+    """Return W; that of a rule with a deadline is that of the rule."""
+    if trigger.get("policy") == "deadline":
+        return _weight(_table(trigger, "rule"), n)
+    if "weight" not in trigger:
+        return identity(n)
+    rows = _matrix(trigger, "trigger.weight")
+    if len(rows) != n or len(rows[0]) != n:
+        raise RefusedError(f"trigger.weight: not {n} x {n}")
+    return matrix(rows)
+
+
+def _rule(trigger: Table, weight: arb_mat) -> Rule:
+    """Return the rule of a trigger, in which W e_s is compared."""
+    n, policy = weight.nrows(), trigger.get("policy")
+    errors, nothing = beside(zeros(n, n), weight), zeros(0, 2 * n)
+    rule = Rule(errors, nothing, arb(0), arb(0), arb(0), arb(0))
+    if policy == "decaying":
+        names = ("trigger.beta", "trigger.alpha_per_s", "trigger.floor")
+        level, rate, floor = (number(_real(trigger, name)) for name in names)
+        return rule._replace(level=level, rate=rate, floor=floor)
+    if policy == "absolute":
+        return rule._replace(floor=number(_real(trigger, "trigger.delta")))
+    if policy in ("relative", "mixed"):
+        floor = number(_real(trigger, "trigger.epsilon")) if policy == "mixed" else arb(0)
+        states = beside(number(_real(trigger, "trigger.sigma")) * weight, zeros(n, n))
+        return rule._replace(negative=states, floor=floor)
+    if policy == "quadratic":
+        positive, negative = _squares(_matrix(trigger, "trigger.Q"), 2 * n)
+        floor = number(_real(trigger, "trigger.epsilon")).sqrt()
+        return rule._replace(
+            positive=positive,
+            negative=negative,
+            floor=floor,
+            always=_whole(trigger, "trigger.heartbeat") > 0,
+        )
+    if policy == "periodic":
+        due = fmpq(nanoseconds(_real(trigger, "trigger.period_s")), NS_PER_S)
+        return rule._replace(positive=nothing, period=arb(due))
+    if policy == "deadline":
+        rule = _rule(_table(trigger, "rule"), weight)
+        due = fmpq(nanoseconds(_real(trigger, "trigger.interval_s")), NS_PER_S)
+        if rule.period > 0:
+            return rule._replace(period=rule.period.min(arb(due)))
+        return rule._replace(always=True)
+    raise RefusedError(f"trigger.policy = {policy!r}: not covered")
+
+
+def _squares(Q: Rows, size: int) -> tuple[arb_mat, arb_mat]:
+    """Return P and N with ‖Pz‖² − ‖Nz‖² = zᵀQz: 2ab is ((a + b)² − (a − b)²)/2.
+
+    noack reads the lower triangle of Q.
+    """
+    if len(Q) != size or len(Q[0]) != size:
+        raise RefusedError(f"trigger.Q: not {size} x {size}")
+    P, N = [zeros(0, size)], [zeros(0, size)]
+    for i in range(size):
+        for j in range(i + 1):
+            value = number(Q[i][j])
+            own, others = (P, N) if value > 0 else (N, P)
+            first, second = (rows_of(identity(size), [k]) for k in (i, j))
+            if i == j and value != 0:
+                own.append(abs(value).sqrt() * first)
+            elif value != 0:
+                root = (abs(value) / 2).sqrt()
+                own.append(root * (first + second))
+                others.append(root * (first - second))
+    return _stacked(P), _stacked(N)
+
+
+def _stacked(blocks: Sequence[arb_mat]) -> arb_mat:
+    return stack(blocks) if len(blocks) > 1 else blocks[0]
+
+
+# Disturbances and set-points.
+
+
+def _disturbances(plant: Table, plants: _Plants) -> Iterator[list[arb]]:
+    """Yield columns: bounded disturbances add their multiples with factors from −1 to 1 to ẋ."""
+    n, m = len(plants.A), len(plants.B[0])
+    for entry in _tables(plant, "plant.disturbances"):
+        at_input = _choice(entry, "plant.disturbances.at", ("input", "state")) == "input"
+        each_alone = entry.get("kind") == "uniform"
+        values = _row(entry, f"plant.disturbances.{'bound' if each_alone else 'amplitude'}")
+        if len(values) != (m if at_input else n):
+            raise RefusedError("plant.disturbances: not one number per input or state")
+        signals = [[0.0] * k + [v] + [0.0] * (len(values) - k - 1) for k, v in enumerate(values)]
+        for signal in signals if each_alone else [values]:
+            yield from _nonzero(_product(plants.B, signal) if at_input else [number(v) for v in signal])
+            if at_input:
+                sizes = _product(plants.half_B, [abs(v) for v in signal])
+                for i, size in enumerate(sizes):  # B of the plants is not known
+                    yield from _nonzero([size if k == i else arb(0) for k in range(n)])
+
+
+def _setpoint(resolved: Table, A: Rows, plants: _Plants) -> Sequence[float]:
+    """Return x_r, at which the model rests without an input."""
+    controller = _table(resolved, "controller")
+    n = len(A)
+    x_r = _row(controller, "controller.setpoint") if "setpoint" in controller else [0.0] * n
+    if len(x_r) != n:
+        raise RefusedError(f"controller.setpoint: not {n} numbers")
+    if any(sum(Fraction(a) * Fraction(v) for a, v in zip(row, x_r, strict=True)) for row in A):
+        raise RefusedError("controller.setpoint: it needs an input, which is 0 until the first one arrives")
+    if any(h and v for row in plants.half_A for h, v in zip(row, x_r, strict=True)):
+        raise RefusedError("controller.setpoint: not every plant within the uncertainty rests there")
+    return x_r
+
+
+def _at_rest(A: Rows, x_r: Sequence[float]) -> Iterator[list[arb]]:
+    """Yield A x_r, the constant disturbance of a plant that does not rest at the set-point."""
+    yield from _nonzero(
+        [
+            number(sum((Fraction(a) * Fraction(v) for a, v in zip(row, x_r, strict=True)), Fraction(0)))
+            for row in A
+        ]
+    )
+
+
+def _product(M: Rows, v: Sequence[float]) -> list[arb]:
+    return [sum((number(a) * number(b) for a, b in zip(row, v, strict=True)), arb(0)) for row in M]
+
+
+def _nonzero(column: list[arb]) -> Iterator[list[arb]]:
+    if any(entry != 0 for entry in column):
+        yield column
+
+
+# Reading tables. A name has the key's place in the scenario: ``plant.rate_hz``.
+
+
+def _table(table: Table, key: str) -> Table:
+    value = table.get(key)
+    if not isinstance(value, Mapping):
+        raise RefusedError(f"{key}: the table is missing")
+    return value
+
+
+def _optional_table(table: Table, key: str) -> Table:
+    return _table(table, key) if key in table else {}
+
+
+def _value(table: Table, name: str) -> object:
+    key = name.rpartition(".")[2]
+    if key not in table:
+        raise RefusedError(f"{name}: missing")
+    return table[key]
+
+
+def _choice(table: Table, name: str, choices: Sequence[str]) -> str:
+    value = _value(table, name)
+    if value not in choices:
+        raise RefusedError(f"{name}: not one of {', '.join(choices)}")
+    return str(value)
+
+
+def _tables(table: Table, name: str) -> Sequence[Table]:
+    value = table.get(name.rpartition(".")[2], [])
+    if not isinstance(value, list) or not all(isinstance(entry, Mapping) for entry in value):
+        raise RefusedError(f"{name}: not a list of tables")
+    return value
+
+
+def _checked(value: object, name: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise RefusedError(f"{name}: not a number")
+    if not math.isfinite(value):
+        raise RefusedError(f"{name}: not finite")
+    return value
+
+
+def _real(table: Table, name: str) -> float:
+    """Return a number that is at least 0."""
+    value = _checked(_value(table, name), name)
+    if value < 0:
+        raise RefusedError(f"{name}: below 0")
+    return value
+
+
+def _rate(table: Table, name: str) -> float:
+    value = _real(table, name)
+    if not 1e-6 <= value <= 1e5:
+        raise RefusedError(f"{name}: not from 1e-6 to 1e5")
+    return value
+
+
+def _whole(table: Table, name: str) -> int:
+    value = _real(table, name)
+    if not isinstance(value, int):
+        raise RefusedError(f"{name}: not a whole number")
+    return value
+
+
+def _row(table: Table, name: str) -> Sequence[float]:
+    value = _value(table, name)
+    if not isinstance(value, list) or not value:
+        raise RefusedError(f"{name}: not a list of numbers")
+    return [_checked(entry, name) for entry in value]
+
+
+def _matrix(table: Table, name: str) -> Rows:
+    value = _value(table, name)
+    if not isinstance(value, list) or not value:
+        raise RefusedError(f"{name}: not a matrix")
+    rows = [_row({name.rpartition(".")[2]: row}, name) for row in value]
+    if any(len(row) != len(rows[0]) for row in rows):
+        raise RefusedError(f"{name}: rows of different lengths")
+    return rows

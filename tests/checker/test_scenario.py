@@ -1,0 +1,292 @@
+"""The checker reads a resolved scenario as noack does."""
+
+import random
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from flint import arb_mat, fmpq
+
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Matrix
+from noack.scenario.resolution import loop_of, rule_of
+from noack.scenario.scenario import Scenario
+from noack.theory.certificates.conditions import (
+    about_setpoint,
+    allowed_conditions,
+    ideal_conditions,
+    void_at_setpoint,
+)
+from noack_check.keys import RefusedError, refusals, rows
+from noack_check.loop import Loop
+from noack_check.scenario import read_loop
+from tests.helpers.resolved_tables import first_loop, resolved_tables, tables_of
+
+SCENARIOS = Path(__file__).parents[2] / "scenarios"
+NAMES = sorted(file.stem for file in SCENARIOS.glob("*.toml"))
+REFUSED = {
+    "cart_pole", "dc_motor", "four_tank", "kinematic_car", "lane_acknowledged", "lane_actuation_loss",
+    "lane_python_trigger", "model_predictive", "pendulum_observed", "quadrotor_hover", "saturated_lqr",
+    "selivanov_switching", "sine_pendulum", "tabuada_dynamic",
+}  # fmt: skip
+
+
+def floats(M: arb_mat) -> Matrix:
+    return np.array([[float(M[i, j].mid()) for j in range(M.ncols())] for i in range(M.nrows())]).reshape(
+        M.nrows(), M.ncols()
+    )
+
+
+def square(M: Matrix) -> Matrix:
+    return np.asarray(M.T @ M)
+
+
+def times_ns(loop: Loop) -> list[fmpq]:
+    return [time * 10**9 for time in loop.times]
+
+
+def conditions_ns(resolved: Scenario) -> list[int]:
+    """Return the times of noack's conditions."""
+    conditions, rule = allowed_conditions(resolved), rule_of(resolved)
+    sampling_s, least_s = conditions.sampling_s, conditions.spacing_s or conditions.apart_s
+    if rule.grid_ns:
+        sampling_s = rule.grid_ns * 1e-9
+        least_s = least_s if rule.longest_ns % rule.grid_ns and rule.longest_ns < np.inf else sampling_s
+    times_s = (sampling_s, least_s, conditions.delay_s, conditions.hold_s, conditions.start_s)
+    return [round(time_s * 1e9) for time_s in times_s]
+
+
+def require_same(loop: Loop, resolved: Scenario) -> None:
+    """Compare what does not depend on the plants of the statement."""
+    matrices, rule, n = loop_of(resolved), rule_of(resolved), loop.n
+    np.testing.assert_array_equal(floats(loop.model_A), matrices.A_model)
+    np.testing.assert_array_equal(floats(loop.model_B), matrices.B_model)
+    np.testing.assert_array_equal(floats(loop.gain), matrices.K)
+    np.testing.assert_array_equal(
+        floats(loop.weight), np.eye(n) if matrices.weight is None else matrices.weight
+    )
+    assert loop.holds is (resolved.mode == "zoh")
+    x_0 = loop_of(about_setpoint(resolved)).x0
+    np.testing.assert_allclose(floats(loop.start)[:, 0], x_0, rtol=1e-15)
+    assert loop.losses == ideal_conditions(resolved).dropouts
+    P, N = rule.form
+    form = square(floats(loop.rule.positive)) - square(floats(loop.rule.negative))
+    np.testing.assert_allclose(form, square(P) - square(N), atol=1e-12 * max(np.abs(form).max(), 1.0))
+    assert float(loop.rule.level) == rule.level
+    assert float(loop.rule.rate) == rule.rate_per_s
+    assert float(loop.rule.floor) == pytest.approx(rule.floor, rel=1e-15)
+    is_compared = len(rule.form.positive) > 0
+    assert loop.rule.always is (is_compared and rule.longest_ns < np.inf)
+    assert float(loop.rule.period) == (0.0 if is_compared else rule.longest_ns * 1e-9)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_shipped_scenarios_are_read_as_noack_reads_them(name: str) -> None:
+    try:
+        resolved = first_loop(name)
+    except CallerError as error:
+        pytest.skip(str(error))
+    tables = tables_of(resolved)
+    if name in REFUSED:
+        with pytest.raises(RefusedError, match=refusals(tables)[0].partition(" ")[0]):
+            read_loop(tables, box=False, ideal=False)
+        return
+    own = read_loop(tables, box=False, ideal=False)
+    require_same(own, resolved)
+    assert times_ns(own) == conditions_ns(resolved)
+    np.testing.assert_array_equal(floats(own.A), loop_of(resolved).A)
+    np.testing.assert_array_equal(floats(own.B), loop_of(resolved).B)
+    assert not floats(own.half_A).any()
+    ideal = read_loop(tables, box=False, ideal=True)
+    assert list(ideal.times) == [fmpq(round(rule_of(resolved).grid_ns), 10**9)] * 2 + [fmpq(0)] * 3
+    box, plant = read_loop(tables, box=True, ideal=False), resolved.plant
+    require_same(box, resolved)
+    np.testing.assert_array_equal(floats(box.A), loop_of(resolved).A_model)
+    for half, given in ((box.half_A, plant.uncertainty_A), (box.half_B, plant.uncertainty_B)):
+        assert floats(half).any() == (given is not None and np.any(given))
+        assert given is None or (floats(half) == np.array(given)).all()
+
+
+RATES = (500.0, 1000.0, 100.0, 50.0, 40.0, 25.0, 30.0, 60.0, 90.0, 120.0, 144.0, 59.94, 333.0, 7.0, 0.3)
+
+
+def test_times_are_those_of_noack() -> None:
+    """200 draws, of which most have a period that is no whole number of nanoseconds."""
+    draw, base = random.Random(5), first_loop("double_integrator")
+    uneven = 0
+    for number in range(200):
+        plant = {"rate_hz": draw.choice(RATES), "measure_every": draw.choice((1, 1, 2, 5, 7))}
+        controller = {
+            "rate_hz": draw.choice((plant["rate_hz"], draw.choice(RATES))),
+            "phase": draw.choice((0.0, 0.5, 0.25, 1 / 3, 0.999, draw.random())),
+        }
+        certificate = {
+            "late_periods": draw.choice((0, 0, 1, 2, 9)),
+            "network_delay_s": draw.choice((None, 0.0, 0.001, 0.02, 1 / 30, draw.uniform(0, 0.3))),
+        }
+        resolved = base.model_copy(
+            update={
+                "plant": base.plant.model_copy(update=plant),
+                "controller": base.controller.model_copy(update=controller),
+                "certificate": base.certificate.model_copy(update=certificate),
+            }
+        )
+        uneven += not resolved.timing.has_whole_periods
+        found = times_ns(read_loop(tables_of(resolved), box=False, ideal=False))
+        assert found == conditions_ns(resolved), (number, plant, controller, certificate)
+    assert 50 < uneven < 190
+
+
+Q = "[[-0.04, 0.01, 0, 0], [0.01, -0.02, 0, 0.3], [0, 0, 1, -0.2], [0, 0.3, -0.2, 2]]"
+INNER = f'{{policy="quadratic", Q={Q}, epsilon=0.01, period_s=0.01, heartbeat=0}}'
+TRIGGERS = (
+    'policy="absolute", delta=0.1, weight=[[2.0, 1.0], [0.0, 1.0]]',
+    'policy="relative", sigma=0.2, weight=[[2.0, 1.0], [0.0, 1.0]]',
+    'policy="mixed", sigma=0.2, epsilon=0.03',
+    f'policy="quadratic", Q={Q}, epsilon=0.01, period_s=0.01, heartbeat=7',
+    'policy="periodic", period_s=0.1',
+    'policy="deadline", interval_s=0.5, rule={policy="decaying", beta=0.1, alpha_per_s=0.2, floor=0.001}',
+    'policy="deadline", interval_s=0.5, rule={policy="periodic", period_s=0.8}',
+    f'policy="deadline", interval_s=0.505, rule={INNER}',
+    f'policy="deadline", interval_s=0.5, rule={{policy="deadline", interval_s=0.7, rule={INNER}}}',
+)
+
+
+@pytest.mark.parametrize("trigger", TRIGGERS)
+def test_rules_are_those_of_noack(trigger: str) -> None:
+    resolved = first_loop("double_integrator", f"trigger={{{trigger}}}")
+    loop = read_loop(tables_of(resolved), box=False, ideal=False)
+    require_same(loop, resolved)
+    assert times_ns(loop)[2:] == conditions_ns(resolved)[2:]
+    assert times_ns(loop)[0] == conditions_ns(resolved)[0]
+    assert times_ns(loop)[1] <= conditions_ns(resolved)[1]
+
+
+def test_constraints_can_lower_the_most_losses() -> None:
+    settings = 'network.constraints=[{kind="at_most", losses=2, window=10}, {kind="recovery", deliveries=3}]'
+    resolved = first_loop("double_integrator", settings, "network.mansd=4")
+    assert read_loop(tables_of(resolved), box=False, ideal=False).losses == 2
+    require_same(read_loop(tables_of(resolved), box=False, ideal=True), resolved)
+
+
+DISTURBANCES = (
+    'plant.disturbances=[{kind="uniform", bound=[0.3]}, {kind="sine", at="state", amplitude=[0.5, -1.0], '
+    'hz=3.0}, {kind="uniform", at="state", bound=[0.0, 0.2]}, {kind="step", amplitude=[1.5]}]'
+)
+
+
+def test_disturbances_are_columns_of_what_they_add() -> None:
+    resolved = first_loop("double_integrator", DISTURBANCES)
+    loop = read_loop(tables_of(resolved), box=False, ideal=False)
+    B = loop_of(resolved).B
+    expected = np.hstack([0.3 * B, [[0.5], [-1.0]], [[0.0], [0.2]], 1.5 * B])
+    np.testing.assert_allclose(floats(loop.pushes), expected, rtol=1e-15)
+    assert [float(size) for size in loop.sizes] == [1.0] * 4
+
+
+def test_a_disturbance_of_the_input_acts_through_each_B_of_the_box() -> None:
+    settings = ("plant.uncertainty_B=[[0.0], [0.25]]", 'plant.disturbances=[{kind="step", amplitude=[-2.0]}]')
+    resolved = first_loop("double_integrator", *settings)
+    loop = read_loop(tables_of(resolved), box=True, ideal=False)
+    model_B = loop_of(resolved).B_model
+    np.testing.assert_allclose(floats(loop.pushes), np.hstack([-2.0 * model_B, [[0.0], [0.5]]]))
+
+
+def test_the_setpoint_is_moved_to_0() -> None:
+    resolved = first_loop("double_integrator", "controller.setpoint=[2.0, 0.0]")
+    loop = read_loop(tables_of(resolved), box=False, ideal=False)
+    moved = about_setpoint(resolved)
+    np.testing.assert_allclose(floats(loop.start)[:, 0], moved.plant.initial_state)
+    extents = [entry.extent() for entry in moved.plant.disturbances]
+    expected = np.hstack(extents) if extents else np.zeros((2, 0))
+    np.testing.assert_allclose(floats(loop.pushes), expected, rtol=1e-12)
+
+
+def test_setpoints_that_noack_does_not_cover_are_refused() -> None:
+    uncertain = ("controller.setpoint=[2.0, 0.0]", "plant.uncertainty_A=[[0.1, 0.0], [0.0, 0.0]]")
+    resolved = first_loop("double_integrator", *uncertain)
+    assert list(void_at_setpoint(resolved)) == ["every plant of the uncertainty box"]
+    with pytest.raises(RefusedError, match=r"controller.setpoint: not every plant"):
+        read_loop(tables_of(resolved), box=True, ideal=False)
+    pendulum = first_loop("unstable_pendulum", "controller.setpoint=[0.1, 0.0]")
+    assert len(void_at_setpoint(pendulum)) == 2
+    with pytest.raises(RefusedError, match=r"controller.setpoint: it needs an input"):
+        read_loop(tables_of(pendulum), box=False, ideal=False)
+
+
+def test_a_watchdog_that_may_act_is_refused() -> None:
+    settings = ("plant.watchdog.policy=zero", "plant.watchdog.timeout_s=0.004")
+    with pytest.raises(RefusedError, match=r"plant.watchdog.timeout_s = 0.004"):
+        read_loop(resolved_tables("double_integrator", *settings), box=False, ideal=False)
+    read_loop(resolved_tables("double_integrator", settings[0]), box=False, ideal=False)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "message"),
+    [
+        (("plant", "rate_hz"), 0.0, "plant.rate_hz: not from 1e-6 to 1e5"),
+        (("plant", "rate_hz"), "fast", "plant.rate_hz: not a number"),
+        (("plant", "A"), [[0.0, 1.0], [0.0]], "plant.A: rows of different lengths"),
+        (("plant", "A"), [[0.0, 1.0]], "plant.A: not 2 x 2"),
+        (("plant", "initial_state"), [1.0], "plant.initial_state: not 2 numbers"),
+        (("model", "gain"), [[float("inf"), 1.0]], "model.gain: not finite"),
+        (("plant", "uncertainty_B"), [[0.0], [-0.1]], "plant.uncertainty_B: below 0"),
+        (("network", "mansd"), 1.5, "network.mansd: not a whole number"),
+        (("trigger", "beta"), -1.0, "trigger.beta: below 0"),
+        (("trigger", "weight"), [[1.0]], "trigger.weight: not 2 x 2"),
+        (("certificate", "late_periods"), True, "certificate.late_periods: not a number"),
+    ],
+)
+def test_wrong_values_are_said_in_a_line(place: tuple[str, str], value: object, message: str) -> None:
+    tables = resolved_tables("double_integrator")
+    tables[place[0]][place[1]] = value
+    with pytest.raises(RefusedError) as caught:
+        read_loop(tables, box=False, ideal=False)
+    assert str(caught.value) == message
+
+
+class Recorded(dict[str, Any]):
+    """A table that records which of its keys are read."""
+
+    def __init__(self, table: dict[str, Any], read: set[str], prefix: str = "") -> None:
+        super().__init__()
+        self.read, self.prefix = read, prefix
+        for key, value in table.items():
+            self[key] = self._recorded(key, value)
+
+    def _recorded(self, key: str, value: object) -> object:
+        prefix = "trigger." if f"{self.prefix}{key}" == "trigger.rule" else f"{self.prefix}{key}."
+        if isinstance(value, dict):
+            return Recorded(value, self.read, prefix)
+        if isinstance(value, list):
+            return [
+                Recorded(entry, self.read, prefix) if isinstance(entry, dict) else entry for entry in value
+            ]
+        return value
+
+    def __getitem__(self, key: str) -> Any:
+        self.read.add(f"{self.prefix}{key}")
+        return super().__getitem__(key)
+
+    def get(self, key: str, default: Any = None) -> Any:
+        self.read.add(f"{self.prefix}{key}")
+        return super().get(key, default)
+
+
+def test_the_keys_that_the_table_calls_used_are_those_that_are_read() -> None:
+    read: set[str] = set()
+    constraint = 'network.constraints=[{kind="at_most", losses=2, window=10}]'
+    identity = "plant.measurement.C=[[1.0, 0.0], [0.0, 1.0]]"
+    box = ("plant.uncertainty_A=[[0.1, 0.0], [0.0, 0.0]]", "plant.uncertainty_B=[[0.0], [0.25]]")
+    for trigger in (*TRIGGERS, 'policy="decaying", beta=0.1, alpha_per_s=0.2'):
+        settings = (f"trigger={{{trigger}}}", constraint, identity, DISTURBANCES, *box)
+        tables = resolved_tables("double_integrator", *settings, "plant.watchdog.policy=zero")
+        read_loop(Recorded(tables, read), box=True, ideal=False)
+    tables = resolved_tables("double_integrator", "controller.setpoint=[2.0, 0.0]")
+    read_loop(Recorded(tables, read), box=False, ideal=False)
+    used = {key for key, row in rows().items() if row.use == "used"}
+    assert used <= read | {"network.initial_sync"}
+    refused = {key for key, row in rows().items() if row.use == "refused"}
+    inner = {key.removesuffix(".*") for key in rows()}
+    assert {key for key in read if key in inner} - refused - used <= {"network.impairments"}
