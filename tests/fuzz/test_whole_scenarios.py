@@ -1,12 +1,14 @@
 """Random whole scenarios, from reading to the worst losses; thousands of them are ``make fuzz``."""
 
+from collections import Counter
 from pathlib import Path
 
 import pytest
 
 from noack.core.errors import CallerError
 from noack.scenario.scenario_file import load
-from tests.fuzz.scenarios.check_draw import check_draw, fault_of_message
+from tests.fuzz.scenarios import __main__ as command
+from tests.fuzz.scenarios.check_draw import Checked, Checks, Contradiction, check_draw, fault_of_message
 from tests.fuzz.scenarios.draws import NEVER_DRAWN, draw, drawn_keys, schema_keys
 
 SEED = 71
@@ -43,6 +45,38 @@ def test_every_key_is_drawn_or_listed_with_a_reason() -> None:
 def test_a_draw_is_a_function_of_seed_and_number() -> None:
     assert draw(SEED, 3) == draw(SEED, 3)
     assert draw(SEED, 3).content != draw(SEED, 4).content
+
+
+@pytest.mark.parametrize("status", [0, 1])
+def test_the_command_prints_a_contradiction_with_its_file(
+    status: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = [Contradiction(SEED, 3, "claims", "a bound is exceeded", "by 2 %")] * status
+    checked = Checked(SEED, 3, False, found, set(), Counter(), Counter())
+    monkeypatch.setattr(command, "checked_draws", lambda *_, **__: iter([checked]))
+    assert command.main(["--failures", str(tmp_path)]) == status
+    output = capsys.readouterr().out
+    path = tmp_path / f"{SEED}-3" / "scenario.toml"
+    assert (f"draw 3 of seed {SEED} ({path}): claims: a bound is exceeded\n    by 2 %" in output) == bool(
+        status
+    )
+    assert path.exists() == bool(status)
+    assert f"{status} with a contradiction" in output
+
+
+def test_a_step_that_raises_or_takes_too_long_is_a_contradiction(tmp_path: Path) -> None:
+    checks = Checks(draw(SEED, 0), tmp_path, 0.05)
+    with checks.step("raises"):
+        raise ZeroDivisionError
+    with checks.step("is slow"):
+        while True:
+            pass
+    with checks.step("is refused"):
+        raise CallerError("a.toml: trigger.beta: expected more than 0")
+    assert [(c.step, c.what.partition(":")[0]) for c in checks.contradictions] == [
+        ("raises", "ZeroDivisionError"),
+        ("is slow", "more than 0.05 s of CPU time"),
+    ]
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from cosim.analysis.explained_run.plant_flow import check_measurements, check_ob
 from cosim.analysis.explained_run.sensor_events import check_events
 from cosim.record.run_record import RunRecord
 from noack.scenario.scenario import Scenario
+from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.certificates.conditions import nominal_conditions
 
 _CHECKS = (
@@ -23,19 +24,26 @@ _CHECKS = (
 )  # fmt: skip
 
 
-def explains(record: RunRecord) -> list[Unexplained]:
+def explains(record: RunRecord, conditions: NetworkConditions | None = None) -> list[Unexplained]:
     """Return what the model does not explain in the record of a loop, in the order of time.
 
     An empty list: the run is a run of the model. In virtual time nothing is late. A live run
     may exceed the times of the schedule if the machine was late: such findings have the part
     `.findings.SCHEDULE`.
+
+    Args:
+        record: the record of the loop.
+        conditions: the times that the model allows; by default those of the loop's certificates, if
+            they do not depend on the machine.
     """
     run = ExplainedLoop(record)
     for check in _CHECKS:
         check(run)
-    if states_schedule(record.scenario):
+    if conditions is None and states_schedule(record.scenario):
         late = 0 if record.kind == "simulated" else record.scenario.certificate.late_periods
-        check_schedule(run, nominal_conditions(record.scenario, late))
+        conditions = nominal_conditions(record.scenario, late)
+    if conditions is not None:
+        check_schedule(run, conditions)
     return sorted(run.findings, key=lambda finding: finding.t_s)
 
 

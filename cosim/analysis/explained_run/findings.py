@@ -55,7 +55,7 @@ class ExplainedLoop:
         return rows[rows[time] < self.until_ns]
 
     def add(self, t_ns: float, part: str, what: str) -> None:
-        """Add a finding; of each part only the first ones are of use."""
+        """Add a finding."""
         self.findings.append(Unexplained(t_ns / NS_PER_S, part, what))
 
     def flow(self, x: Vector, dt_ns: int) -> Vector:

@@ -14,6 +14,7 @@ from cosim.shipped_files import shipped_names
 from cosim.simulation.virtual_time import simulate_loops
 from noack.protocol.record_tables import NO_SEQUENCE, Fate
 from noack.scenario.resolution import resolve_run
+from noack.theory.certificates.conditions import ideal_conditions
 from tests.cosim.record.changed_records import changed, copied
 from tests.helpers.shipped import resolved, shipped
 
@@ -138,6 +139,7 @@ def test_times_beyond_the_schedule_are_told_apart() -> None:
     findings = explains(changed(record, scenario=resolved("lane_following", *settings)))
     assert findings
     assert {finding.part for finding in findings} == {SCHEDULE}
+    assert explains(record, ideal_conditions(record.scenario))
 
 
 @pytest.mark.parametrize(

@@ -76,7 +76,7 @@ class TooLongError(Exception):
     """A step has taken more CPU time than its limit."""
 
 
-class _Checks:
+class Checks:
     """The steps of one draw."""
 
     def __init__(self, drawn: Draw, folder: Path, limit_s: float) -> None:
@@ -198,7 +198,7 @@ def check_draw(seed: int, number: int, limit_s: float = LIMIT_S, *, theory: bool
     """Draw a scenario, and check all that is done with it; without theory only its run."""
     drawn = draw(seed, number)
     with TemporaryDirectory(prefix="noack-fuzz-") as folder:
-        checks = _Checks(drawn, Path(folder), limit_s)
+        checks = Checks(drawn, Path(folder), limit_s)
         scenario = checks.read(drawn.write(Path(folder)))
         if scenario is not None:
             checks.read_again(scenario)
