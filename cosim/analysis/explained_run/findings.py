@@ -10,6 +10,7 @@ from cosim.record.run_events import changes_of
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.linear_systems import Matrix, Vector
+from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 
@@ -35,7 +36,7 @@ class Unexplained(NamedTuple):
 
 
 class ExplainedLoop:
-    """The record of a loop up to the first change that the model depends on.
+    """The record of a loop up to the first change that the model depends on, or until it diverges.
 
     Args:
         record: the record of the loop.
@@ -45,7 +46,7 @@ class ExplainedLoop:
         self.record, self.scenario = record, record.scenario
         self.loop = loop_of(record.scenario)
         changes = [change.first_ns for change in changes_of(record) if change.touches_claims]
-        self.until_ns = min(changes, default=NEVER_NS)
+        self.until_ns = min([*changes, _diverges_ns(record[PLANT_STEP])])
         self.findings: list[Unexplained] = []
         self._flows: dict[int, Matrix] = {}
 
@@ -70,6 +71,12 @@ class ExplainedLoop:
         """Whether two vectors differ by no more than rounding errors of numbers as large as the scales."""
         largest = max(float(np.abs(v).max(initial=0.0)) for v in (found, expected, *scales))
         return bool(np.abs(found - expected).max(initial=0.0) <= ROUNDING * largest + 1e-300)
+
+
+def _diverges_ns(steps: Rows) -> int:
+    """Return the time of the plant's first extreme state."""
+    extreme = ~(np.abs(steps["x"]) < _LARGEST).all(axis=1)
+    return int(steps["t_ns"][np.argmax(extreme)]) if extreme.any() else NEVER_NS
 
 
 def exponential(M: Matrix) -> Matrix:

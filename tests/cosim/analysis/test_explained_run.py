@@ -195,6 +195,18 @@ def test_it_covers_the_run_up_to_the_first_change() -> None:
     assert not explains(changed(record, late))
 
 
+def test_a_run_that_diverges_is_explained_up_to_its_first_extreme_number() -> None:
+    """Numbers that overflow are not sent: inputs and updates then stay away."""
+    gain = "model.gain=[[200.0,100.0]]"
+    scenario = shipped("double_integrator", "horizon_s=12", gain, "model.allow_unstable=true")
+    record = simulate_loops(resolve_run(scenario)).loops[0]
+    assert not np.isfinite(record["plant_step"]["x"][-1]).all()
+    assert explains(record) == []
+    tables = copied(record)
+    tables["plant_step"]["x"][20] += 1e-3
+    assert explains(changed(record, tables))
+
+
 @pytest.mark.parametrize("name", shipped_names("scenarios"))
 def test_runs_of_shipped_scenarios_are_explained(name: str) -> None:
     run = simulate_loops(resolve_run(shipped(name, "horizon_s=1.5")))
