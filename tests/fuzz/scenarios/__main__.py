@@ -9,6 +9,7 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"  # before numpy is imported
 os.environ["NOACK_NO_EXTENSIONS"] = "1"
 
 import argparse
+import contextlib
 import multiprocessing
 import re
 import sys
@@ -135,12 +136,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     said_s = began_s
     processes = min(options.processes, len(options.only)) if options.only else options.processes
     numbers, theory = _numbers(options), not options.runs_only
-    for checked in checked_draws(options.seed, numbers, processes, options.limit, theory=theory):
-        totals.add(checked, options.failures)
-        if time.monotonic() - said_s > _EVERY_S:
-            said_s = time.monotonic()
-            print(f"{totals.draws} draws, {len(totals.contradictory)} with a contradiction, "
-                  f"{said_s - began_s:.0f} s", file=sys.stderr)  # fmt: skip
+    with contextlib.suppress(KeyboardInterrupt):  # the results so far are shown
+        for checked in checked_draws(options.seed, numbers, processes, options.limit, theory=theory):
+            totals.add(checked, options.failures)
+            if time.monotonic() - said_s > _EVERY_S:
+                said_s = time.monotonic()
+                print(f"{totals.draws} draws, {len(totals.contradictory)} with a contradiction, "
+                      f"{said_s - began_s:.0f} s", file=sys.stderr)  # fmt: skip
     totals.print_summary(time.monotonic() - began_s)
     return 1 if totals.contradictory else 0
 
