@@ -201,8 +201,9 @@ class Model:
         K, H, age = self.loop.gain, self.loop.H, arb(self.loop.times.age)
         if self.loop.holds or not age > 0:
             return [K]
-        if not self.is_exact:
-            return _corners(K, H, age, degree=2)[0]
+        if not self.is_exact:  # a parabola through three points
+            middle, end = K * (-age / 2 * H).exp(), K * (-age * H).exp()
+            return [K, 2 * middle - (K + end) / 2, end]
         for parts in (1, 2, 4, 8):
             q = age / parts
             found = [_corners(K * (-part * q * H).exp(), H, q, DEGREE) for part in range(parts)]

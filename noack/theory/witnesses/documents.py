@@ -17,9 +17,9 @@ from noack_check.model import Model
 from noack_check.norms import growth
 from noack_check.proof import Proof, prove, prove_bound
 
-_MARGINS = (1e-5, 1e-4, 1e-3)
+_MARGINS = (1e-6, 1e-5, 1e-4, 1e-3)
 """Margins of the inequalities, in the coordinates of the search, until the checker accepts."""
-_SHARES = (0.25, 0.45, 0.65)
+_SHARES = (0.2, 0.42, 0.64)
 """ν between 2r and twice the loop's rate of decay, as shares; three, then one more by interpolation."""
 _ROOM = 1 + 1e-6
 _MOST_LOSSES = 24
@@ -52,8 +52,9 @@ def find_witness(loop: Loop, outputs: Sequence[str] = ("x", "e_c")) -> Witness:
     if chain is not None:
         document["chain"] = chain
     search = _OutputSearch(loop, rates)
+    bounds = search.bounds(outputs)
     drift = search.bound("drift")
-    document["bounds"] = [*search.bounds(outputs), drift]
+    document["bounds"] = [*bounds, drift]
     document["inter_event_s"] = _inter_event_s(loop, rates.rate, drift)
     try:
         return Witness(document, prove(loop, document))
@@ -81,12 +82,12 @@ class _Rates:
 
 
 class _OutputSearch:
-    """The search for the bounds of one loop; ν of the first output is kept for the others."""
+    """The search for the bounds of one loop; ν of the first output is the first guess for the others."""
 
     def __init__(self, loop: Loop, rates: _Rates) -> None:
         self._loop, self._rates = loop, rates
         self._frames = simulated_frames(self._model(rates.decay(_SHARES[0])))
-        self._decay: float | None = None
+        self._share: float | None = None
 
     def _model(self, decay: float) -> Model:
         return Model(self._loop, number(self._rates.rate), number(decay), is_exact=False)
@@ -100,46 +101,60 @@ class _OutputSearch:
         return found
 
     def bound(self, output: str) -> dict[str, object]:
-        """Return the entry of a document for an output."""
-        if self._decay is None:
-            self._decay = self._best_decay(output)
-        why = f"{output}: the solver finds no quadratic forms"
+        """Return the entry of a document for an output.
+
+        ν is found by coarse solutions. The best of them gives the coordinates for an accurate one.
+        """
+        decay, found = self._best_decay(output)
+        frames, why = self._frames, f"{output}: the solver finds no quadratic forms"
         for margin in _MARGINS:
-            found = self._solve(output, self._decay, margin, self._frames)
-            if found is None:
+            frames = refined(frames, found)
+            again = self._solve(output, decay, frames, margin=margin)
+            if again is None:
                 continue
-            again = self._solve(output, self._decay, margin, refined(self._frames, found))
-            for candidate in sorted(filter(None, (found, again)), key=_size):
-                entry = _entry(output, self._decay, candidate)
-                try:
-                    prove_bound(self._loop, number(self._rates.rate), entry, None, None)
-                except RejectedError as error:
-                    why = str(error)
-                else:
-                    return entry
+            found = again
+            entry = _entry(output, decay, found)
+            try:
+                prove_bound(self._loop, number(self._rates.rate), entry, None, None)
+            except RejectedError as error:
+                why = str(error)
+            else:
+                return entry
         raise NoWitnessError(why)
 
-    def _best_decay(self, output: str) -> float:
-        sizes = {}
-        for share in _SHARES:
-            found = self._solve(output, self._rates.decay(share), _MARGINS[0], self._frames)
-            if found is not None:
-                sizes[share] = _size(found)
-        if not sizes:
+    def _best_decay(self, output: str) -> tuple[float, Found]:
+        """Return ν with its coarse solution; the first output tries all shares, the others its neighbours."""
+        found: dict[float, Found] = {}
+        first = self._share
+        self._try(output, _SHARES if first is None else (first, min(1.5 * first, 0.9)), found)
+        if first is not None and min(found, key=lambda share: _size(found[share]), default=first) == first:
+            self._try(output, [0.65 * first], found)
+        if not found:
             raise NoWitnessError(f"{output}: the solver finds no quadratic forms at any rate of decay")
-        best = min(sizes, key=sizes.__getitem__)
-        if len(sizes) == len(_SHARES):
-            fit = np.polyfit(list(sizes), list(np.log(list(sizes.values()))), 2)
-            lowest = -fit[1] / (2 * fit[0]) if fit[0] > 0 else best
-            lowest = min(max(lowest, 0.08), 0.9)
-            if abs(lowest - best) > 0.03:
-                found = self._solve(output, self._rates.decay(lowest), _MARGINS[0], self._frames)
-                if found is not None and _size(found) < sizes[best]:
-                    best = lowest
-        return self._rates.decay(best)
+        if len(found) == 3:
+            # the lowest point of a parabola
+            sizes = [np.log(_size(each)) for each in found.values()]
+            fit = np.polyfit(list(found), sizes, 2)
+            if fit[0] > 0:
+                lowest = float(np.clip(-fit[1] / (2 * fit[0]), 0.08, 0.9))
+                if min(abs(lowest - share) for share in found) > 0.03:
+                    self._try(output, [lowest], found)
+        best = min(found, key=lambda share: _size(found[share]))
+        self._share = self._share or best
+        return self._rates.decay(best), found[best]
 
-    def _solve(self, output: str, decay: float, margin: float, frames: Frames) -> Found | None:
-        found = Search(self._model(decay), frames).solve(output, starts=True, margin=margin)
+    def _try(self, output: str, shares: Sequence[float], found: dict[float, Found]) -> None:
+        for share in shares:
+            decay = self._rates.decay(share)
+            solution = self._solve(output, decay, self._frames, margin=_MARGINS[0], tolerance=1e-3)
+            if solution is not None:
+                found[share] = solution
+
+    def _solve(
+        self, output: str, decay: float, frames: Frames, *, margin: float, tolerance: float = 1e-8
+    ) -> Found | None:
+        search = Search(self._model(decay), frames)
+        found = search.solve(output, starts=True, margin=margin, tolerance=tolerance)
         return found if found.status in {"Solved", "AlmostSolved"} else None
 
 
@@ -175,16 +190,17 @@ def _chain(loop: Loop, rate: float) -> dict[str, object] | None:
 
 
 def _sups(G: Matrix) -> Iterator[float]:
-    """Yield ‖e^{Gτ}‖ on a grid until it has decayed."""
+    """Yield the largest of ‖e^{Gτ}‖ on grids of 256 times until it has decayed."""
     slowest = -float(np.linalg.eigvals(G).real.max())
     step = 0.02 / max(float(np.linalg.norm(G, 2)), slowest)
-    E, power = expm(G * step), np.eye(len(G))
-    for _ in range(100_000):
-        size = float(np.linalg.norm(power, 2))
-        yield size
-        if size < 1e-2:
+    cells = np.array([expm(G * step * k) for k in range(256)])
+    power, following = np.eye(len(G)), expm(G * step * 256)
+    for _ in range(400):
+        sizes = np.linalg.norm(cells @ power, 2, axis=(1, 2))
+        yield float(sizes.max())
+        if sizes[-1] < 1e-2:
             return
-        power = E @ power
+        power = following @ power
 
 
 def _inter_event_s(loop: Loop, rate: float, drift: Mapping[str, object]) -> float:

@@ -37,7 +37,9 @@ class Search:
         level, floor = float(model.loop.rule.level), float(model.loop.rule.floor)
         self._f_units = (1.0, level / floor if level and floor else 1.0)
 
-    def solve(self, output: str, *, starts: bool, weight: float = 1.0, margin: float = 1e-7) -> Found:
+    def solve(
+        self, output: str, *, starts: bool, weight: float = 1.0, margin: float = 1e-7, tolerance: float = 1e-8
+    ) -> Found:
         """Return the smallest bound D₁² + weight · D₂² of an output, for this model's ν."""
         model = self.model
         size = self._output_size(output)
@@ -53,7 +55,7 @@ class Search:
         largest = max(objective.values())
         objective = {name: w / largest for name, w in objective.items()}
         free = {name for name in units if name.startswith("c")}
-        solution = minimise(objective, problem, free=free, margin=margin)
+        solution = minimise(objective, problem, free=free, margin=margin, tolerance=tolerance)
         return self._unscaled(solution, size, units)
 
     def _output_size(self, output: str) -> float:
@@ -107,8 +109,9 @@ def refined(frames: Frames, found: Found) -> Frames:
     scale = max(*found.levels, 1e-150)
     better = dict(frames)
     for name, V in found.matrices.items():
-        values, vectors = np.linalg.eigh(V)
-        better[name] = scale * vectors / np.sqrt(np.maximum(values, 1e-9 * values[-1]))
+        T = frames[name]
+        values, vectors = np.linalg.eigh(T.T @ V @ T)
+        better[name] = scale * T @ vectors / np.sqrt(np.maximum(values, 1e-6 * values[-1]))
     return better
 
 

@@ -56,6 +56,7 @@ def minimise(
     *,
     free: Iterable[str] = (),
     margin: float = 0.0,
+    tolerance: float = 1e-8,
 ) -> Solution:
     """Return numbers and matrices that obey all inequalities with a margin.
 
@@ -64,11 +65,12 @@ def minimise(
         inequalities: all of them.
         free: numbers that may be negative.
         margin: each inequality is solved as (·) ⪰ margin · 1.
+        tolerance: relative error of the objective.
     """
     problem = _Problem()
     for inequality in inequalities:
         problem.add(inequality, margin)
-    return problem.solve(objective, set(free))
+    return problem.solve(objective, set(free), tolerance)
 
 
 class _Problem:
@@ -118,7 +120,7 @@ class _Problem:
         self._columns.append(columns[which])
         self._values.append(-entries[which, where])
 
-    def solve(self, objective: Mapping[str, float], free: set[str]) -> Solution:
+    def solve(self, objective: Mapping[str, float], free: set[str], tolerance: float) -> Solution:
         signed = [self._first[name] for name, size in self._sizes.items() if not size and name not in free]
         rows = np.concatenate([*self._rows, self._height + np.arange(len(signed))])
         columns = np.concatenate([*self._columns, np.array(signed, dtype=int)])
@@ -132,6 +134,8 @@ class _Problem:
             cost[self._first[name]] = weight
         settings = clarabel.DefaultSettings()
         settings.verbose, settings.max_threads = False, 1
+        settings.direct_solve_method = "faer"  # large blocks need a third of the time that QDLDL needs
+        settings.tol_gap_rel = settings.tol_gap_abs = settings.tol_feas = tolerance
         quadratic = sp.csc_matrix((self._count, self._count))
         cones = [*self._cones, clarabel.NonnegativeConeT(len(signed))]
         answer = clarabel.DefaultSolver(quadratic, cost, A, b, cones, settings).solve()
