@@ -66,6 +66,11 @@ def square(M: arb_mat) -> arb_mat:
     return transpose(M) * M
 
 
+def is_zero(M: arb_mat) -> bool:
+    """Return whether all entries are exactly 0."""
+    return all(entry == 0 for entry in M.entries())
+
+
 def around_zero(radius: arb) -> arb:
     """Return the ball of all numbers of at most this size."""
     return arb(0, radius.abs_upper())

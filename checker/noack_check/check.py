@@ -8,11 +8,15 @@ from flint import arb, arb_mat
 from noack_check.balls import is_positive, transpose
 from noack_check.model import Inequality, Model
 
+_LONGEST_MESSAGE = 300
 _Value = TypeVar("_Value", arb, arb_mat)
 
 
 class RejectedError(ValueError):
-    """A witness does not prove its statement; the message names the first inequality that fails."""
+    """A witness does not prove its statement; one line names the first inequality that fails."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(" ".join(message[:_LONGEST_MESSAGE].split()))
 
 
 def verify(

@@ -4,6 +4,8 @@ from typing import NamedTuple
 
 from flint import arb, arb_mat, fmpq
 
+from noack_check.balls import identity, is_zero, stack, zeros
+
 
 class Rule(NamedTuple):
     """The trigger's rule: with z = (x, e_s), an event needs ‖P z‖² > max(c e^{−ρt}, f)² + ‖N z‖².
@@ -65,3 +67,37 @@ class Loop(NamedTuple):
         """What the models integrate."""
         closed = self.model_A + self.model_B * self.gain
         return closed * 0 if self.holds else closed
+
+    def fault(self) -> str:
+        """Return what is wrong with the numbers, or an empty text."""
+        n, rule, times = self.n, self.rule, self.times
+        m, k = self.B.ncols(), self.pushes.ncols()
+        shapes = {
+            "A": (n, n), "B": (n, m), "half_A": (n, n), "half_B": (n, m), "model_A": (n, n),
+            "model_B": (n, m), "gain": (m, n), "weight": (n, n), "start": (n, 1), "pushes": (n, k),
+        }  # fmt: skip
+        matrices = {name: getattr(self, name) for name in shapes} | {
+            "rule.positive": rule.positive, "rule.negative": rule.negative,
+        }  # fmt: skip
+        shapes |= {name: (matrices[name].nrows(), 2 * n) for name in ("rule.positive", "rule.negative")}
+        for name, M in matrices.items():
+            if (M.nrows(), M.ncols()) != shapes[name]:
+                return f"{name}: not {' x '.join(map(str, shapes[name]))}"
+            if not all(entry.is_finite() for entry in M.entries()):
+                return f"{name}: not finite"
+        sizes = {"rule.level": rule.level, "rule.floor": rule.floor, "rule.period": rule.period}
+        sizes |= {f"sizes[{i}]": size for i, size in enumerate(self.sizes)}
+        halves = (*self.half_A.entries(), *self.half_B.entries())
+        sizes |= {f"half-width {i}": half for i, half in enumerate(halves)}
+        for name, size in sizes.items():
+            if not (size.is_finite() and size >= 0):
+                return f"{name}: not a number of at least 0"
+        if n == 0 or len(self.sizes) != k or self.losses < 0:
+            return "no states, not one size for each disturbance, or losses below 0"
+        if not all(time >= 0 for time in times) or times.least_sampling > times.sampling:
+            return "times: below 0, or tests further apart than they may be"
+        if rule.period > 0 and rule.positive.nrows():
+            return "rule: compares and is periodic"
+        if times.sampling == 0 and not is_zero(rule.positive * stack([identity(n), zeros(n, n)])):
+            return "rule: tested at all times, it may hold at once after an event"
+        return ""

@@ -37,6 +37,7 @@ from noack_check.balls import (
     beside,
     columns_of,
     identity,
+    is_zero,
     rows_of,
     square,
     stack,
@@ -139,14 +140,16 @@ class Model:
         self.x, self.e, self.w = (rows_of(every, range(i * n, i * n + n)) for i in range(3))
         self.f1, self.f2 = (rows_of(every, [3 * n + i]) for i in range(2))
         rule = loop.rule
-        self._has_f1 = bool(rate > 0) or not self._needs_constant
+        # Without a level, f₁ = 1 is not needed beside f₂.
+        self._has_f1 = not (rate == 0 and rule.level == 0 and self._needs_constant)
         self.silent = self._comparison(rule.level, rule.floor)
         self.locations = self._locations()
         self.edges = self._edges()
 
     @property
     def _needs_constant(self) -> bool:
-        return bool(self.loop.rule.floor > 0) or bool(self.loop.sizes)
+        is_needless = self.loop.rule.floor == 0 and not self.loop.sizes  # false for a ball around 0
+        return not is_needless
 
     # The system.
 
@@ -228,10 +231,11 @@ class Model:
         for half, signal in ((loop.half_A, self.x), (loop.half_B, u)):
             for i in range(half.nrows()):
                 for k in range(half.ncols()):
-                    if half[i, k] != 0:
-                        root = half[i, k].sqrt()
-                        row = rows_of(signal, [k])
-                        yield Unknown(self._push(columns_of(root * identity(n), [i])), root * row)
+                    if half[i, k] == 0:  # false for a ball around 0
+                        continue
+                    root = half[i, k].sqrt()
+                    row = rows_of(signal, [k])
+                    yield Unknown(self._push(columns_of(root * identity(n), [i])), root * row)
         for index, size in enumerate(loop.sizes):
             root = size.sqrt()
             yield Unknown(self._push(root * columns_of(loop.pushes, [index])), root * self.f2)
@@ -336,7 +340,7 @@ class Model:
     def output(self, name: str, place: Location) -> list[tuple[arb_mat, Flow | None]]:
         """Return C of an output in a location, for each flow if the output depends on the flow.
 
-        "x" is x, "x[i]" one of its entries, "e_s" and "e_c" are W e_s and W e_c, "u" is the input, and
+        "x" is x, "x[i]" one of its entries, "e_s" and "e_c" are W e_s and W e_c, and
         "drift" is W (ẋ − H x), by which the sensor's error grows: ė = He − (ẋ − Hx). The bound of the
         drift is one from the first input on.
         """
@@ -356,7 +360,7 @@ class Model:
         return self.loop.weight * rows_of(motion, range(self.loop.n))
 
     def _output_inequalities(self, index: int, output: str) -> Iterator[Inequality]:
-        """|Cz + Σ C p|² ≤ D₁² f₁² + D₂² f₂² + V + Σ m q + Σ τ (|Rz|² − |p|²)."""
+        """|Cz + Σ C p|² ≤ D₁² f₁² + D₂² f₂² + V + Σ m q + Σ τ (|p|² − |Rz|²)."""
         place = self.locations[index]
         E0 = columns_of(identity(self.size), place.coordinates)
         for node in range(len(place.nodes)):
@@ -424,11 +428,6 @@ def _corners(K: arb_mat, H: arb_mat, q: arb, degree: int) -> tuple[list[arb_mat]
         shares = [arb(comb(i, k)) / comb(degree, k) for k in range(i + 1)]
         points.append(sum((share * term for share, term in zip(shares, terms, strict=False)), 0 * K))
     return points, rest
-
-
-def is_zero(M: arb_mat) -> bool:
-    """Return whether all entries are exactly 0."""
-    return all(entry == 0 for entry in M.entries())
 
 
 def is_same(part: Part, other: Part) -> bool:

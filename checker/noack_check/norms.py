@@ -41,7 +41,10 @@ def decays_below(G: arb_mat, bound: arb, tail: arb_mat) -> bool:
     n = G.nrows()
     if not (is_positive(tail) and is_positive(-1 * (transpose(G) * tail + tail * G))):
         return False
-    high, low = spectral_norm(tail), 1 / spectral_norm(tail.inv())
+    try:
+        high, low = spectral_norm(tail), 1 / spectral_norm(tail.inv())
+    except ZeroDivisionError:
+        return False
     constant = arb((high / low).sqrt().abs_upper())
     edge, time, step = identity(n), arb(0), arb(1) / (4 * spectral_norm(G) + arb(2) ** -40)
     for _ in range(_MOST_CELLS):

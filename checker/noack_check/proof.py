@@ -15,10 +15,10 @@ from typing import NamedTuple
 
 from flint import arb, arb_mat, fmpq
 
-from noack_check.balls import around_zero, frobenius, identity, number, upto
+from noack_check.balls import around_zero, frobenius, identity, is_zero, number, upto
 from noack_check.check import RejectedError, verify
 from noack_check.loop import Loop, Times
-from noack_check.model import Model, is_zero
+from noack_check.model import Model
 from noack_check.norms import decays_below, growth
 
 _MOST_TESTS = 1_000_000
@@ -40,7 +40,10 @@ class Proof(NamedTuple):
 
     rate: arb  # r, 1/s
     bounds: tuple[Bound, ...]
-    inter_event: arb | None  # two events are at least this far apart, s; None: nothing is known
+    inter_event: arb | None
+    """Two events after the one at t = 0 are at least this far apart, s; None: nothing is known."""
+    first_event: arb | None
+    """No event follows the one at t = 0 before this time, s."""
 
 
 def prove(loop: Loop, document: Mapping[str, object]) -> Proof:
@@ -49,23 +52,32 @@ def prove(loop: Loop, document: Mapping[str, object]) -> Proof:
     Raises:
         RejectedError: the first inequality that fails, or what is wrong with the document.
     """
+    if not isinstance(document, Mapping):
+        raise RejectedError("not a table")
+    if fault := loop.fault():
+        raise RejectedError(f"loop: {fault}")
     rate = _number(document, "rate")
-    if not rate >= 0 or (loop.rule.level > 0 and not rate <= loop.rule.rate):
+    if not rate >= 0 or not (loop.rule.level == 0 or rate <= loop.rule.rate):
         raise RejectedError("rate: not between 0 and that of the threshold")
     chain_gain = _chain_gain(loop, rate, document)
     overshoot = _number(document, "overshoot") if "overshoot" in document else None
-    bounds = [prove_bound(loop, rate, entry, chain_gain, overshoot) for entry in _entries(document, "bounds")]
+    entries = _entries(document, "bounds")
+    if len({(str(e.get("output")), bool(e.get("from_start", True))) for e in entries}) < len(entries):
+        raise RejectedError("bounds: an output occurs twice")
+    bounds = [prove_bound(loop, rate, entry, chain_gain, overshoot) for entry in entries]
     drift = next((b for b in bounds if b.output == "drift" and b.from_start), None)
     if drift is None:
         if loop.times.delay > 0 or loop.times.start > 0 or overshoot is not None:
             raise RejectedError("bounds: that of the drift from the start on is missing")
-        return Proof(rate, tuple(bounds), None)
-    apart = _number(document, "inter_event_s")
+        return Proof(rate, tuple(bounds), None, None)
+    apart = first = _number(document, "inter_event_s")
     _prove_inter_event(loop, rate, drift, apart)
     if loop.times.delay > 0 and not _next_test(loop, apart) >= arb(loop.times.delay):
         raise RejectedError("inter_event_s: an event may happen while an update is on its way")
     if loop.times.start > 0:
-        _prove_quiet_start(loop, rate)
+        _prove_quiet_start(loop)
+        first = _number(document, "first_event_s") if "first_event_s" in document else arb(0)
+        prove_first_event(loop, drift, first, loop.times.start)
     sensor = _sensor_error(loop, rate, drift)
     if overshoot is not None:
         _prove_overshoot(loop, sensor, overshoot)
@@ -74,7 +86,9 @@ def prove(loop: Loop, document: Mapping[str, object]) -> Proof:
         missing = loop.losses + (1 if loop.times.delay > 0 else 0)
         factor = 1 + missing * chain_gain
         bounds.append(Bound("e_c", factor * sensor.decaying, factor * sensor.constant, True))
-    return Proof(rate, tuple(bounds), apart)
+    if not all(size.is_finite() for bound in bounds for size in (bound.decaying, bound.constant)):
+        raise RejectedError("bounds: not finite")
+    return Proof(rate, tuple(bounds), apart, first)
 
 
 def _next_test(loop: Loop, apart: arb) -> arb:
@@ -91,35 +105,59 @@ def _next_test(loop: Loop, apart: arb) -> arb:
     return apart.max(arb((quiet + 1) * times.least_sampling))
 
 
-def _prove_quiet_start(loop: Loop, rate: arb) -> None:
-    """Prove that no event happens after the one at t = 0 until the first input acts.
+def _prove_quiet_start(loop: Loop) -> None:
+    """Prove that no event happens after the one at t = 0 until the first input acts."""
+    times, rule = loop.times, loop.rule
+    last = times.start if not times.sampling > 0 else _last_test_before(times, times.start)
+    if last == 0:
+        return
+    if rule.always or not rule.positive.nrows():
+        raise RejectedError("times: an event without a comparison may happen before the first input acts")
+    if not error_without_input(loop, last) < (rule.level * (-rule.rate * last).exp()).max(rule.floor):
+        raise RejectedError("times: an event may happen before the first input acts")
+
+
+def error_without_input(loop: Loop, until: fmpq) -> arb:
+    """Return a bound of ‖W e_s‖ until a time, if no input acts and no event happens after t = 0.
 
     Without an input x(t) = e^{At} x(0), and the disturbances add at most t · sup‖e^{As}‖ · ‖D d‖.
     """
-    until = loop.times.start
-    last = until if not loop.times.sampling > 0 else _last_test_before(loop.times, until)
-    quiet = arb(last)
-    if last == 0:
-        return
     A = loop.A + arb_mat(loop.n, loop.n, [around_zero(h) for h in loop.half_A.entries()])
     pushes = arb_mat(loop.n, 1)
     if loop.sizes:
         pushes = loop.pushes * arb_mat(len(loop.sizes), 1, [around_zero(size) for size in loop.sizes])
-    largest, _ = growth(_weighted(loop, arb(0)), quiet)
-    step, x, reached = quiet / _CELLS, loop.start, arb(0)
+    largest, _ = growth(_weighted(loop, arb(0)), arb(until))
+    step, x, reached = arb(until) / _CELLS, loop.start, arb(0)
     within, forward = (upto(step) * A).exp(), (step * A).exp()
     for _ in range(_CELLS):
         during = within * x + upto(step) * (within * pushes)
         drift = loop.weight * ((A - loop.H) * during + pushes)
         reached += step * largest * frobenius(drift)
         x = forward * x + step * (within * pushes)
+    return reached
+
+
+def prove_first_event(loop: Loop, drift: Bound, first: arb, until: fmpq) -> None:
+    """Prove that no event follows the one at t = 0 for a time, where inputs may act from 0 to ``until`` on.
+
+    Until the first input e_s grows as without one, and after it as the bound of the drift says.
+    """
     rule = loop.rule
-    if not reached < (rule.level * (-rule.rate * quiet).exp()).max(rule.floor):
-        raise RejectedError("times: an event may happen before the first input acts")
+    if first == 0:
+        return
+    if rule.always or not _compares_error(loop) or rule.negative.nrows() or not first > 0:
+        raise RejectedError("first_event_s: not proven for this rule; 0 is")
+    largest, total = growth(_weighted(loop, arb(0)), first)
+    added = total * (drift.decaying**2 + drift.constant**2).sqrt()
+    threshold = (rule.level * (-rule.rate * first).exp()).max(rule.floor)
+    if not largest * error_without_input(loop, until) + added < threshold:
+        raise RejectedError("first_event_s: an event may come earlier")
 
 
 def _last_test_before(times: Times, until: fmpq) -> fmpq:
     """Return the time of the last test before a time; one at this time comes after it."""
+    if times.least_sampling == 0:
+        return until
     tests = (until / times.least_sampling).ceil() - 1
     return min(tests * times.sampling, until)
 
@@ -141,7 +179,10 @@ def _chain_gain(loop: Loop, rate: arb, document: Mapping[str, object]) -> arb | 
 
 def _weighted(loop: Loop, rate: arb) -> arb_mat:
     """Return W (H + r) W⁻¹."""
-    H = loop.weight * loop.H * loop.weight.inv()
+    try:
+        H = loop.weight * loop.H * loop.weight.inv()
+    except ZeroDivisionError:
+        raise RejectedError("weight: not proven to have an inverse") from None
     return H if is_zero(H) and rate == 0 else H + rate * identity(loop.n)
 
 
@@ -156,7 +197,7 @@ def prove_bound(
     model = Model(loop, rate, _number(entry, "decay"), kappa)
     output, starts = str(entry.get("output")), bool(entry.get("from_start", True))
     if output not in {"x", "e_s", "e_c", "drift", *(f"x[{i}]" for i in range(loop.n))}:
-        raise RejectedError(f"output: {output!r} is none of the loop's")
+        raise RejectedError(f"output: {output[:50]!r} is none of the loop's")
     matrices, numbers = entry.get("matrices"), entry.get("numbers")
     if not isinstance(matrices, Mapping) or not isinstance(numbers, Mapping):
         raise RejectedError(f"{output}: matrices or numbers are missing")
@@ -164,7 +205,7 @@ def prove_bound(
         verify(
             model,
             output,
-            {name: _matrix(matrices, name) for name in matrices},
+            {name: _matrix(matrices, name, most=2 * loop.n) for name in matrices},
             {name: _number(numbers, name) for name in numbers},
             starts=starts,
         )
@@ -216,12 +257,25 @@ def _sensor_error(loop: Loop, rate: arb, drift: Bound) -> Bound:
     rule = loop.rule
     if not _compares_error(loop) or rule.negative.nrows():
         raise RejectedError("drift: bounds e_s only for a rule that compares ‖W e_s‖")
-    largest, total = growth(_weighted(loop, rate), arb(loop.times.sampling))
     if loop.times.sampling == 0:
         return Bound("e_s", rule.level, rule.floor, True)
+    largest, total = growth(_weighted(loop, rate), arb(loop.times.sampling))
+    most = largest * _at_first_input(loop, rate)
     parts = zip((rule.level, rule.floor), (drift.decaying, drift.constant), strict=True)
-    decaying, constant = (largest * at_test + total * added for at_test, added in parts)
+    decaying, constant = (most * at_test + total * added for at_test, added in parts)
     return Bound("e_s", decaying, constant, True)
+
+
+def _at_first_input(loop: Loop, rate: arb) -> arb:
+    """Return the largest ‖W e_s‖ up to the first input in multiples of the threshold, or 1.
+
+    No test is needed between the first input and the last one before it: the drift has no bound there.
+    """
+    until, rule = loop.times.start, loop.rule
+    if until == 0:
+        return arb(1)
+    threshold = ((rule.level * (-rate * until).exp()) ** 2 + rule.floor**2).sqrt()
+    return arb((error_without_input(loop, until) / threshold).max(arb(1)).abs_upper())
 
 
 def _prove_overshoot(loop: Loop, sensor: Bound, overshoot: arb) -> None:
@@ -262,12 +316,15 @@ def _number(table: Mapping[str, object], key: str) -> arb:
     return found
 
 
-def _matrix(table: Mapping[str, object], key: str, size: int | None = None) -> arb_mat:
+def _matrix(
+    table: Mapping[str, object], key: str, size: int | None = None, *, most: int | None = None
+) -> arb_mat:
     rows = table.get(key)
     if not isinstance(rows, list) or not rows or not all(isinstance(row, Sequence) for row in rows):
         raise RejectedError(f"{key}: not a matrix")
     n = len(rows)
-    if (size is not None and n != size) or any(len(row) != n for row in rows):
+    wrong = (size is not None and n != size) or (most is not None and n > most)
+    if wrong or any(len(row) != n for row in rows):
         raise RejectedError(f"{key}: not a square matrix of the right size")
     found = arb_mat([[_number({key: value}, key) for value in row] for row in rows])
     if any(found[i, j] != found[j, i] for i in range(n) for j in range(i)):

@@ -15,7 +15,7 @@ from noack_check.check import RejectedError
 from noack_check.loop import Loop
 from noack_check.model import Model
 from noack_check.norms import growth
-from noack_check.proof import Proof, prove, prove_bound
+from noack_check.proof import Bound, Proof, prove, prove_bound, prove_first_event
 
 _MARGINS = (1e-6, 1e-5, 1e-4, 1e-3)
 """Margins of the inequalities, in the coordinates of the search, until the checker accepts."""
@@ -55,7 +55,8 @@ def find_witness(loop: Loop, outputs: Sequence[str] = ("x", "e_c")) -> Witness:
     bounds = search.bounds(outputs)
     drift = search.bound("drift")
     document["bounds"] = [*bounds, drift]
-    document["inter_event_s"] = _inter_event_s(loop, rates.rate, drift)
+    document["inter_event_s"] = apart = _inter_event_s(loop, rates.rate, drift)
+    document["first_event_s"] = _first_event_s(loop, drift, apart)
     try:
         return Witness(document, prove(loop, document))
     except RejectedError as error:
@@ -223,6 +224,19 @@ def _inter_event_s(loop: Loop, rate: float, drift: Mapping[str, object]) -> floa
         total = float(growth(matrix(G.tolist()), number(middle))[1].mid())
         low, high = (middle, high) if total * (1 + 1e-9) < most else (low, middle)
     return low
+
+
+def _first_event_s(loop: Loop, drift: Mapping[str, object], most: float) -> float:
+    """Return a share of ``most`` before which no event follows the one at t = 0; 0 without one."""
+    numbers = drift["numbers"]
+    assert isinstance(numbers, dict)
+    decaying, constant = (number(numbers.get(name, 0.0)).sqrt() for name in ("level 1", "level 2"))
+    bound = Bound("drift", decaying, constant, True)
+    for share in (1.0, 0.9, 0.75, 0.5, 0.25):
+        with contextlib.suppress(RejectedError):
+            prove_first_event(loop, bound, number(share * most), loop.times.start)
+            return share * most
+    return 0.0
 
 
 def _kinks(level: float, floor: float) -> list[float]:

@@ -1,0 +1,288 @@
+"""Documents that prove something false, or loops that are none: each violates one condition of the proof."""
+
+import copy
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import pytest
+from flint import arb, fmpq
+
+from noack.theory.witnesses.documents import NoWitnessError, Witness, find_witness
+from noack_check.balls import identity, is_positive, matrix, number, zeros
+from noack_check.check import RejectedError, _value
+from noack_check.loop import Loop
+from noack_check.model import Model
+from noack_check.norms import decays_below
+from noack_check.proof import _prove_quiet_start, prove
+from tests.checker.test_witnesses import IDEAL, SCHEDULE, double_integrator
+
+DEFAULT = double_integrator()
+
+
+@pytest.fixture(scope="module")
+def witness() -> Witness:
+    return find_witness(double_integrator())
+
+
+def rejects(loop: Loop, document: object, match: str = ".") -> None:
+    with pytest.raises(RejectedError, match=match) as caught:
+        prove(loop, document)  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) <= 300
+
+
+# Loops whose numbers are balls or contradict each other.
+
+
+def test_a_level_counts_beside_a_floor_at_rate_0() -> None:
+    """With a rate of 0, f₁ = f₂ = 1, but c² f₁² + f² f₂² is not f² f₂²: x is driven by errors up to c."""
+    sizes = []
+    for floor in (0.01, 0.0):
+        loop = double_integrator(IDEAL, level=0.05, floor=floor)
+        found = find_witness(loop._replace(rule=loop.rule._replace(rate=arb(0))))
+        assert found.document["rate"] == 0
+        drift = next(bound for bound in found.proof.bounds if bound.output == "drift")
+        sizes.append(math.hypot(float(drift.decaying.mid()), float(drift.constant.mid())))
+    assert sizes[0] > 0.9 * sizes[1]
+
+
+@pytest.mark.parametrize("field", ["half_A", "half_B"])
+def test_a_half_width_that_is_a_ball_around_0_is_not_left_out(field: str) -> None:
+    ball = identity(2) * arb(0, 0.3) if field == "half_A" else matrix([[1.0], [1.0]]) * arb(0, 0.3)
+    loop = double_integrator(IDEAL)
+    document = find_witness(loop).document
+    rejects(loop._replace(**{field: ball}), document, "loop: half-width")
+
+
+WRONG: dict[str, Callable[[Loop], Loop]] = {
+    "negative floor": lambda loop: loop._replace(rule=loop.rule._replace(floor=arb(-5))),
+    "ball as level": lambda loop: loop._replace(rule=loop.rule._replace(level=arb(0, 1))),
+    "ball as floor": lambda loop: loop._replace(rule=loop.rule._replace(floor=arb(0, 1))),
+    "infinite gain": lambda loop: loop._replace(gain=loop.gain * arb("inf")),
+    "not a number": lambda loop: loop._replace(start=loop.start * arb("nan")),
+    "a disturbance without size": lambda loop: loop._replace(pushes=matrix([[0.0], [1.0]])),
+    "a negative size": lambda loop: loop._replace(pushes=matrix([[0.0], [1.0]]), sizes=(arb(-1),)),
+    "less than no losses": lambda loop: loop._replace(losses=-1),
+    "two comparisons at once": lambda loop: loop._replace(rule=loop.rule._replace(period=arb(1))),
+    "rare and frequent tests": lambda loop: loop._replace(times=loop.times._replace(least_sampling=fmpq(1))),
+    "negative delay": lambda loop: loop._replace(times=loop.times._replace(delay=fmpq(-1))),
+    "another shape": lambda loop: loop._replace(half_B=zeros(1, 1)),
+    "no states": lambda loop: loop._replace(A=zeros(0, 0)),
+}
+
+
+@pytest.mark.parametrize("change", WRONG)
+def test_a_loop_that_is_none_is_rejected(witness: Witness, change: str) -> None:
+    rejects(WRONG[change](DEFAULT), witness.document, "^loop: ")
+
+
+def test_a_rule_that_holds_at_once_after_an_event_needs_tests_at_intervals() -> None:
+    """Its event sets e := 0, but not x: that the rule is silent between events would be false."""
+    loop = double_integrator(IDEAL)
+    rule = loop.rule._replace(positive=matrix([[1, 0, 1, 0], [0, 0, 0, 1]]))
+    rejects(loop._replace(rule=rule), find_witness(loop).document, "at once after an event")
+
+
+def test_a_weight_without_inverse_is_rejected(witness: Witness) -> None:
+    rejects(DEFAULT._replace(weight=matrix([[1, 0], [0, 0]])), witness.document, "inverse")
+
+
+# The time before the first input.
+
+
+def early(level: float) -> Loop:
+    """Return a loop whose first input acts before the first test, at which e_s may be above the threshold."""
+    times = SCHEDULE._replace(delay=fmpq(1, 100), age=fmpq(1, 50), start=fmpq(1, 100))
+    return double_integrator(times, level=level)
+
+
+def test_the_sensor_error_before_the_first_input_is_bounded() -> None:
+    """Without an input ‖e_s‖ = ‖∫ e^{Hs} BKx‖ is near 0.01 at 0.01 s."""
+    proof = find_witness(early(0.005)).proof
+    sensor = next(bound for bound in proof.bounds if bound.output == "e_s")
+    assert float(sensor.decaying.mid()) > 0.0099
+
+
+def test_the_first_event_may_come_earlier_than_others_do() -> None:
+    found = find_witness(early(0.05))
+    assert found.proof.first_event is not None
+    assert found.proof.inter_event is not None
+    assert found.proof.first_event < found.proof.inter_event
+    changed = {**found.document, "first_event_s": found.document["inter_event_s"]}
+    rejects(early(0.05), changed, "first_event_s")
+
+
+def test_events_without_a_comparison_may_come_before_the_first_input() -> None:
+    loop = double_integrator(SCHEDULE._replace(start=fmpq(1, 20)))
+    _prove_quiet_start(loop)
+    with pytest.raises(RejectedError, match="without a comparison"):
+        _prove_quiet_start(loop._replace(rule=loop.rule._replace(always=True)))
+
+
+def test_a_start_in_which_an_event_may_come_is_rejected(witness: Witness) -> None:
+    rejects(DEFAULT._replace(times=SCHEDULE._replace(start=fmpq(1, 2))), witness.document)
+
+
+# Conditions without which the statements would be false.
+
+
+def entry_of(document: dict, output: str) -> dict:  # type: ignore[type-arg]
+    return next(entry for entry in document["bounds"] if entry["output"] == output)
+
+
+def changed(witness: Witness) -> dict:  # type: ignore[type-arg]
+    return copy.deepcopy(dict(witness.document))
+
+
+def test_the_chain_has_one_more_update_where_updates_take_time(witness: Witness) -> None:
+    bounds = {bound.output: float(bound.decaying.mid()) for bound in witness.proof.bounds}
+    gain = witness.document["chain"]["gain"]  # type: ignore[index]
+    assert bounds["e_c"] == pytest.approx((1 + 3 * gain) * bounds["e_s"])
+
+
+def test_no_event_may_come_while_an_update_is_on_its_way() -> None:
+    loop = double_integrator(SCHEDULE._replace(delay=fmpq(1, 100)))
+    found = find_witness(loop)
+    longer = loop._replace(times=loop.times._replace(delay=fmpq(3, 10)))
+    with pytest.raises(NoWitnessError):
+        find_witness(longer)
+    rejects(loop, {**found.document, "inter_event_s": 0.3}, "inter_event_s")
+
+
+@pytest.mark.parametrize("overshoot", [0.0, 0.5, 1.0, -2.0])
+def test_the_overshoot_has_to_reproduce_itself(witness: Witness, overshoot: float) -> None:
+    rejects(DEFAULT, {**witness.document, "overshoot": overshoot})
+
+
+def test_the_overshoot_needs_the_chain(witness: Witness) -> None:
+    document = {key: value for key, value in witness.document.items() if key != "chain"}
+    rejects(DEFAULT, {**document, "overshoot": 2.0}, "needs the chain")
+
+
+@pytest.mark.parametrize("factor", [0.0, 0.9, 0.999, -1.0])
+def test_the_gain_of_the_chain_is_proven(witness: Witness, factor: float) -> None:
+    document = changed(witness)
+    document["chain"]["gain"] *= factor
+    rejects(DEFAULT, document, "chain")
+
+
+def test_a_tail_that_is_zero_proves_no_decay() -> None:
+    assert not decays_below(matrix([[-1.0, 0.0], [0.0, -1.0]]), arb(2), zeros(2, 2))
+
+
+@pytest.mark.parametrize("decay", [0.0, -1.0, 0.6, math.inf, math.nan, True, "1", None])
+def test_forms_decay_faster_than_the_threshold(witness: Witness, decay: object) -> None:
+    document = changed(witness)
+    entry_of(document, "x")["decay"] = decay
+    rejects(DEFAULT, document)
+
+
+@pytest.mark.parametrize("rate", [-0.1, 0.31, 1e300, 5e-324])
+def test_the_rate_is_at_most_that_of_the_threshold(witness: Witness, rate: float) -> None:
+    rejects(DEFAULT, {**witness.document, "rate": rate})
+
+
+def failing(loop: Loop, entry: Mapping[str, Any], rate: float) -> set[str]:
+    """Return the names of all inequalities that fail."""
+    model = Model(loop, number(rate), number(entry["decay"]))
+    matrices = {name: matrix(rows) for name, rows in entry["matrices"].items()}
+    numbers = {name: number(value) for name, value in entry["numbers"].items()}
+    every = model.inequalities(entry["output"], starts=True)
+    return {item.name for item in every if not is_positive(_value(item, matrices, numbers))}
+
+
+@pytest.mark.parametrize(
+    ("name", "by", "fails"),
+    [
+        ("c1/on its way, 1", 1.0, "edge/arrival/1 0"),
+        ("c1/on its way, 1", 1.0, "edge/arrival/1 1"),
+        ("c1/start, 1", 1.0, "edge/first input/1 0"),
+        ("c1/start, 0", 1.0, "edge/first input/0 0"),
+        ("c1/start, 0", -1.0, "start"),
+        ("c1/on its way, 0", -1.0, "edge/0 sent/1 0"),
+        ("c1/on its way, 0", 1.0, "edge/arrival/0 0"),
+        ("c1/1 lost", -1.0, "edge/0 lost/0 0"),
+        ("c1/2 lost", -1.0, "edge/1 lost/1 0"),
+        ("c1/2 lost", 1.0, "edge/2 sent/1 0"),
+        ("c1/0 lost", -1.0, "edge/arrival/1 1"),
+        ("level 1", -0.1, "output/0 lost/0/0"),
+    ],
+)
+def test_edges_hold_at_each_node(witness: Witness, name: str, by: float, fails: str) -> None:
+    """V is changed at one node: the edges into it or out of it fail."""
+    document = changed(witness)
+    entry = entry_of(document, "x")
+    assert not failing(DEFAULT, entry, 0.3)
+    entry["numbers"][name] += by * abs(entry["numbers"][name])
+    assert fails in failing(DEFAULT, entry, 0.3)
+    rejects(DEFAULT, document, "x: ")
+
+
+def test_a_constant_disturbance_needs_constant_bounds() -> None:
+    loop = double_integrator(IDEAL)
+    document = find_witness(loop).document
+    with_push = loop._replace(pushes=matrix([[0.0], [1.0]]), sizes=(arb(1e-6),))
+    rejects(with_push, document, "missing")
+
+
+# Hostile documents.
+
+DEEP: list[object] = []
+for _ in range(500):
+    DEEP = [DEEP]
+HOSTILE: dict[str, object] = {
+    "a list": [],
+    "a text": "bounds",
+    "nothing": {},
+    "no bounds": {"rate": 0.3, "bounds": []},
+    "bounds is a table": {"rate": 0.3, "bounds": {}},
+    "a bound is a text": {"rate": 0.3, "bounds": ["x"]},
+    "a bound is empty": {"rate": 0.3, "bounds": [{}]},
+    "a rate that is a bool": {"rate": True, "bounds": []},
+    "a rate that is a text": {"rate": "0.3", "bounds": []},
+    "a rate of 1000 digits": {"rate": 10**1000, "bounds": []},
+    "an unknown output": {"rate": 0.3, "bounds": [{"output": "\n" * 10**6, "decay": 1}]},
+    "a deep output": {"rate": 0.3, "bounds": [{"output": DEEP, "decay": 1}]},
+    "deep matrices": {
+        "rate": 0.3, "bounds": [{"output": "x", "decay": 1, "matrices": {"X": DEEP}, "numbers": {}}],
+    },
+    "a large matrix": {
+        "rate": 0.3,
+        "bounds": [{"output": "x", "decay": 1, "matrices": {"X": [[0.0] * 2000] * 2000}, "numbers": {}}],
+    },
+    "a long name": {
+        "rate": 0.3,
+        "bounds": [{"output": "x", "decay": 1, "matrices": {}, "numbers": {"m/" + "\n" * 10**6: -1}}],
+    },
+    "a chain that is a number": {"rate": 0.3, "chain": 1, "bounds": []},
+    "a chain of zeros": {"rate": 0.3, "chain": {"gain": 9.0, "tail": [[0, 0], [0, 0]]}, "bounds": []},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_documents_are_one_line(name: str) -> None:
+    rejects(DEFAULT, HOSTILE[name])
+
+
+def test_an_output_occurs_once(witness: Witness) -> None:
+    document = changed(witness)
+    document["bounds"] *= 1000
+    rejects(DEFAULT, document, "occurs twice")
+
+
+@pytest.mark.parametrize("value", [True, "1", None, math.nan, math.inf, [1], 2**70, -1.0])
+def test_a_multiplier_is_a_number_of_at_least_0(witness: Witness, value: object) -> None:
+    document = changed(witness)
+    numbers = entry_of(document, "x")["numbers"]
+    numbers[next(name for name in numbers if name.startswith("m/"))] = value
+    rejects(DEFAULT, document, "x: |not ")
+
+
+@pytest.mark.parametrize(
+    "value", [[], [[]], [[1]], [[1, 2]], [[1, 2], [3, 4]], [["1", 0], [0, 1]], "ab", [1, 2]]
+)
+def test_a_matrix_is_square_symmetric_and_of_the_right_size(witness: Witness, value: object) -> None:
+    document = changed(witness)
+    entry_of(document, "x")["matrices"]["X"] = value
+    rejects(DEFAULT, document, "X")
