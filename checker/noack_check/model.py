@@ -26,7 +26,7 @@ Flows are affine in the input's matrix K e^{−Hs}, so its hull's corners suffic
 in θ between two nodes, so both ends suffice.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from math import comb
 from typing import NamedTuple
 
@@ -118,6 +118,25 @@ class Form(NamedTuple):
     scalars: tuple[tuple[str, arb_mat], ...]
 
 
+def _needs_constant(loop: Loop) -> bool:
+    is_needless = loop.rule.floor == 0 and not loop.sizes  # false for a ball around 0
+    return not is_needless
+
+
+def has_decaying_unit(loop: Loop, rate: arb) -> bool:
+    """Return whether f₁ is a state; with r = 0 it equals f₂, and one of both is enough."""
+    return not (rate == 0 and _needs_constant(loop))
+
+
+def thresholds(loop: Loop, rate: arb) -> tuple[arb, arb]:
+    """Return c and f with c² f₁² + f² f₂² at least the square of the threshold.
+
+    Without f₁ the threshold is at most the constant max(c, f).
+    """
+    rule = loop.rule
+    return (rule.level, rule.floor) if has_decaying_unit(loop, rate) else (arb(0), rule.level.max(rule.floor))
+
+
 class Model:
     """The hybrid system of a loop.
 
@@ -139,19 +158,30 @@ class Model:
         every = identity(self.size)
         self.x, self.e, self.w = (rows_of(every, range(i * n, i * n + n)) for i in range(3))
         self.f1, self.f2 = (rows_of(every, [3 * n + i]) for i in range(2))
-        rule = loop.rule
-        # Without a level, f₁ = 1 is not needed beside f₂.
-        self._has_f1 = not (rate == 0 and rule.level == 0 and self._needs_constant)
-        self.silent = self._comparison(rule.level, rule.floor)
+        self._has_f1 = has_decaying_unit(loop, rate)
+        self.level, self.floor = thresholds(loop, rate)
+        self.silent = self._comparison(self.level, self.floor)
+        self._guards = self._event_guards()
         self.locations = self._locations()
         self.edges = self._edges()
 
-    @property
-    def _needs_constant(self) -> bool:
-        is_needless = self.loop.rule.floor == 0 and not self.loop.sizes  # false for a ball around 0
-        return not is_needless
-
     # The system.
+
+    def _event_guards(self) -> Mapping[str, arb_mat]:
+        """Return by unit what is ≤ 0 at events: that the rule's comparison exceeds the unit's threshold.
+
+        Only with the guard of a unit does an edge leave room for a constant c of this unit that differs
+        between locations. Where it is missing, all locations have the same c, and edges use no facts.
+        """
+        rule, found = self.loop.rule, {}
+        if not rule.always and rule.positive.nrows():
+            if bool(self.rate == rule.rate) and rule.level > 0 and self._has_f1:
+                found["c1"] = -1 * self._comparison(rule.level, arb(0))
+            if rule.floor > 0 and bool(self.floor == rule.floor):
+                found["c2"] = -1 * self._comparison(arb(0), rule.floor)
+            if not found:
+                found[""] = -1 * self._comparison(arb(0), rule.floor)
+        return found
 
     def _comparison(self, level: arb, floor: arb) -> arb_mat:
         """Return ‖P z‖² − ‖N z‖² − c² f₁² − f² f₂²."""
@@ -164,12 +194,11 @@ class Model:
 
     def threshold_squared(self) -> arb_mat:
         """Return c² f₁² + f² f₂², at least the square of the threshold."""
-        rule = self.loop.rule
-        return rule.level**2 * square(self.f1) + rule.floor**2 * square(self.f2)
+        return self.level**2 * square(self.f1) + self.floor**2 * square(self.f2)
 
     def _locations(self) -> list[Location]:
         n, losses, times = self.loop.n, self.loop.losses, self.loop.times
-        units = ([3 * n] if self._has_f1 else []) + ([3 * n + 1] if self._needs_constant else [])
+        units = ([3 * n] if self._has_f1 else []) + ([3 * n + 1] if _needs_constant(self.loop) else [])
         without_w, all_of_z = (*range(2 * n), *units), (*range(3 * n), *units)
         flows = self._flows(self._gains())
         nodes = (arb(0), arb(times.sampling)) if times.sampling > 0 else (arb(0),)
@@ -245,16 +274,12 @@ class Model:
         return transpose(self.x) * column - transpose(self.e) * column
 
     def _edges(self) -> list[Edge]:
-        losses, times, rule = self.loop.losses, self.loop.times, self.loop.rule
+        losses, times = self.loop.losses, self.loop.times
         Z = zeros(self.loop.n, self.size)
         units = [self.f1, self.f2]
         lost, delivered = stack([self.x, Z, self.w + self.e, *units]), stack([self.x, Z, Z, *units])
         arrival = stack([self.x, self.e, Z, *units])
-        event: tuple[arb_mat, ...] = ()
-        if not rule.always and rule.positive.nrows():
-            event = (-1 * self._comparison(arb(0), rule.floor),)
-            if bool(self.rate == rule.rate) and rule.level > 0:
-                event = (*event, -1 * self._comparison(rule.level, arb(0)))
+        event = tuple(self._guards.values())
         nodes = tuple(range(len(self.locations[0].nodes)))
         waits = losses + 1
         found = []
@@ -280,6 +305,7 @@ class Model:
         P is that of xᵀXx + (e, w)ᵀQ(e, w) − c₁ f₁² − c₂ f₂² − a θ·(comparison), with X common to all
         locations: then x drops out of the edges, and a silent test at θ leaves V as it is where the
         comparison is ≤ 0, since a ≥ 0. Waiting locations have Q, c₁ and c₂ for each node.
+        Where an event's guard contains x, each location has a form of x, e and w of its own.
         """
         place = self.locations[location]
         n = self.loop.n
@@ -287,9 +313,14 @@ class Model:
         errors = stack([self.e, self.w]) if 2 * n in place.coordinates else self.e
         own = f"{place.name}" if place.is_tested else f"{place.name}, {node}"
         X = f"X/{own}" if place.name == "start" else "X"
-        parts = ((X, self.x * E), (f"Q/{own}", errors * E))
+        parts: tuple[tuple[str, arb_mat], ...] = ((X, self.x * E), (f"Q/{own}", errors * E))
+        if self.loop.rule.negative.nrows():
+            parts = ((f"P/{own}", stack([self.x, errors]) * E),)
         units = [(name, f) for name, f in (("c1", self.f1), ("c2", self.f2)) if not is_zero(f * E)]
-        scalars = [(f"{name}/{own}", -1 * square(f * E)) for name, f in units]
+        scalars = []
+        for name, f in units:
+            is_common = name not in self._guards and place.name != "start"
+            scalars.append((name if is_common else f"{name}/{own}", -1 * square(f * E)))
         if place.is_tested and node and self.loop.rule.positive.nrows():
             scalars.append((f"a/{own}", -1 * place.nodes[node] * transpose(E) * self.silent * E))
         return Form(parts, tuple(scalars))
@@ -395,6 +426,8 @@ class Model:
         source, target = self.locations[edge.source], self.locations[edge.target]
         E = columns_of(identity(self.size), source.coordinates)
         jump = rows_of(edge.jump * E, target.coordinates)
+        units = {name for name, f in (("c1", self.f1), ("c2", self.f2)) if not is_zero(f * E)}
+        facts = edge.facts + (source.facts if units <= set(self._guards) else ())
         for node in edge.nodes:
             for target_node in edge.target_nodes:
                 terms = _Terms(E.ncols())
@@ -402,7 +435,7 @@ class Model:
                 terms.add(self.form(edge.source, node), one, one, arb(1) / 2)
                 terms.add(self.form(edge.target, target_node), jump, jump, arb(-1) / 2)
                 name = f"edge/{edge.name}/{node} {target_node}"
-                for number_, fact in enumerate(edge.facts + source.facts):
+                for number_, fact in enumerate(facts):
                     terms.scalar(f"m/{name}/{number_}", transpose(E) * fact * E)
                 yield terms.inequality(name, edge.source, 0)
 

@@ -8,6 +8,9 @@ each output the numbers that :mod:`.check` verifies. From the bound of the drift
 * that no event happens while an update is on its way, which the model assumes: by induction over the
   events, since all bounds hold up to the next one;
 * the controller's error, e_c = e_s + Σ e^{H(t−t_i)} e_s(t_i⁻) over the missing updates: the paper's chain.
+
+Rules that do not compare ‖W e_s‖ with a threshold have no such bound of the drift. Without it, events
+are as far apart as tests: no update may be on its way for longer.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,7 +21,7 @@ from flint import arb, arb_mat, fmpq
 from noack_check.balls import around_zero, frobenius, identity, is_zero, number, upto
 from noack_check.check import RejectedError, verify
 from noack_check.loop import Loop, Times
-from noack_check.model import Model
+from noack_check.model import Model, thresholds
 from noack_check.norms import decays_below, growth
 
 _MOST_TESTS = 1_000_000
@@ -67,12 +70,12 @@ def prove(loop: Loop, document: Mapping[str, object]) -> Proof:
     bounds = [prove_bound(loop, rate, entry, chain_gain, overshoot) for entry in entries]
     drift = next((b for b in bounds if b.output == "drift" and b.from_start), None)
     if drift is None:
-        if loop.times.delay > 0 or loop.times.start > 0 or overshoot is not None:
+        if overshoot is not None or loop.times.least_sampling < max(loop.times.delay, loop.times.start):
             raise RejectedError("bounds: that of the drift from the start on is missing")
         return Proof(rate, tuple(bounds), None, None)
     apart = first = _number(document, "inter_event_s")
     _prove_inter_event(loop, rate, drift, apart)
-    if loop.times.delay > 0 and not _next_test(loop, apart) >= arb(loop.times.delay):
+    if not _is_quiet(loop, apart, loop.times.delay):
         raise RejectedError("inter_event_s: an event may happen while an update is on its way")
     if loop.times.start > 0:
         _prove_quiet_start(loop)
@@ -80,7 +83,7 @@ def prove(loop: Loop, document: Mapping[str, object]) -> Proof:
         prove_first_event(loop, drift, first, loop.times.start)
     sensor = _sensor_error(loop, rate, drift)
     if overshoot is not None:
-        _prove_overshoot(loop, sensor, overshoot)
+        _prove_overshoot(loop, rate, sensor, overshoot)
     bounds.append(sensor)
     if chain_gain is not None:
         missing = loop.losses + (1 if loop.times.delay > 0 else 0)
@@ -91,18 +94,19 @@ def prove(loop: Loop, document: Mapping[str, object]) -> Proof:
     return Proof(rate, tuple(bounds), apart, first)
 
 
-def _next_test(loop: Loop, apart: arb) -> arb:
-    """Return a time before which no event follows another, if e_s needs longer than ``apart``.
+def _is_quiet(loop: Loop, apart: arb, time: fmpq) -> bool:
+    """Return whether no event comes sooner than ``time`` after another, if e_s needs longer than ``apart``.
 
     Tests are the only times of events, and the k-th comes between k times the least and the largest
-    time between two tests. An event at the time at which an input begins to act comes after it.
+    time between two tests. An event at the time at which an input begins to act may come before or
+    after it: w is the same.
     """
     times, quiet = loop.times, 0
-    if not times.sampling > 0:
-        return apart
-    while quiet < _MOST_TESTS and arb((quiet + 1) * times.sampling) <= apart:
+    if time == 0 or apart >= arb(time):
+        return True
+    while times.sampling > 0 and quiet < _MOST_TESTS and arb((quiet + 1) * times.sampling) <= apart:
         quiet += 1
-    return apart.max(arb((quiet + 1) * times.least_sampling))
+    return (quiet + 1) * times.least_sampling >= time
 
 
 def _prove_quiet_start(loop: Loop) -> None:
@@ -145,7 +149,7 @@ def prove_first_event(loop: Loop, drift: Bound, first: arb, until: fmpq) -> None
     rule = loop.rule
     if first == 0:
         return
-    if rule.always or not _compares_error(loop) or rule.negative.nrows() or not first > 0:
+    if rule.always or not compares_error(loop) or not first > 0:
         raise RejectedError("first_event_s: not proven for this rule; 0 is")
     largest, total = growth(_weighted(loop, arb(0)), first)
     added = total * (drift.decaying**2 + drift.constant**2).sqrt()
@@ -205,7 +209,7 @@ def prove_bound(
         verify(
             model,
             output,
-            {name: _matrix(matrices, name, most=2 * loop.n) for name in matrices},
+            {name: _matrix(matrices, name, most=3 * loop.n) for name in matrices},
             {name: _number(numbers, name) for name in numbers},
             starts=starts,
         )
@@ -225,7 +229,7 @@ def _prove_inter_event(loop: Loop, rate: arb, drift: Bound, apart: arb) -> None:
     if apart == 0:
         return
     rule = loop.rule
-    if rule.always or not _compares_error(loop) or rule.negative.nrows() or not apart > 0:
+    if rule.always or not compares_error(loop) or not apart > 0:
         raise RejectedError("inter_event_s: not proven for this rule; 0 is")
     _, total = growth(_weighted(loop, rate), apart)
     level = rule.level if bool(rate == rule.rate) else arb(0)
@@ -241,10 +245,10 @@ def _prove_inter_event(loop: Loop, rate: arb, drift: Bound, apart: arb) -> None:
             raise RejectedError("inter_event_s: an event may come earlier")
 
 
-def _compares_error(loop: Loop) -> bool:
-    """Return whether the rule compares ‖W e_s‖."""
+def compares_error(loop: Loop) -> bool:
+    """Return whether the rule compares ‖W e_s‖ with a threshold."""
     n, positive = loop.n, loop.rule.positive
-    if positive.nrows() != n:
+    if positive.nrows() != n or loop.rule.negative.nrows():
         return False
     entries = (
         (positive[i, j], loop.weight[i, j - n] if j >= n else 0) for i in range(n) for j in range(2 * n)
@@ -254,14 +258,14 @@ def _compares_error(loop: Loop) -> bool:
 
 def _sensor_error(loop: Loop, rate: arb, drift: Bound) -> Bound:
     """Return the bound of W e_s: the threshold at the last test, grown, plus what the drift adds."""
-    rule = loop.rule
-    if not _compares_error(loop) or rule.negative.nrows():
+    if not compares_error(loop):
         raise RejectedError("drift: bounds e_s only for a rule that compares ‖W e_s‖")
+    level, floor = thresholds(loop, rate)
     if loop.times.sampling == 0:
-        return Bound("e_s", rule.level, rule.floor, True)
+        return Bound("e_s", level, floor, True)
     largest, total = growth(_weighted(loop, rate), arb(loop.times.sampling))
     most = largest * _at_first_input(loop, rate)
-    parts = zip((rule.level, rule.floor), (drift.decaying, drift.constant), strict=True)
+    parts = zip((level, floor), (drift.decaying, drift.constant), strict=True)
     decaying, constant = (most * at_test + total * added for at_test, added in parts)
     return Bound("e_s", decaying, constant, True)
 
@@ -278,18 +282,17 @@ def _at_first_input(loop: Loop, rate: arb) -> arb:
     return arb((error_without_input(loop, until) / threshold).max(arb(1)).abs_upper())
 
 
-def _prove_overshoot(loop: Loop, sensor: Bound, overshoot: arb) -> None:
-    """Prove ‖W e_s‖ ≤ overshoot · (c² f₁² + f²)^½, strictly: then the facts that used it hold on.
+def _prove_overshoot(loop: Loop, rate: arb, sensor: Bound, overshoot: arb) -> None:
+    """Prove ‖W e_s‖ ≤ overshoot · (c² f₁² + f² f₂²)^½, strictly: then the facts that used it hold on.
 
     Up to some time they hold; so do all bounds, and ‖W e_s‖ is below what the facts allow, also a
     little later, since e_s is continuous but for its jumps to 0.
     """
-    rule = loop.rule
     if loop.times.sampling == 0:
         if not overshoot >= 1:
             raise RejectedError("overshoot: below 1")
         return
-    for proven, unit in ((sensor.decaying, rule.level), (sensor.constant, rule.floor)):
+    for proven, unit in zip((sensor.decaying, sensor.constant), thresholds(loop, rate), strict=True):
         if not (proven < overshoot * unit or (proven == 0 and unit == 0)):
             raise RejectedError("overshoot: the sensor's error may exceed it")
 

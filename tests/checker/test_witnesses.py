@@ -142,3 +142,58 @@ def _run(rng: np.random.Generator) -> float:
         xc = None if xc is None else xc + dt * (H @ xc)
         largest = max(largest, float(np.linalg.norm(x)))
     return largest
+
+
+def holding(level: float = 0.0, floor: float = 0.02) -> Loop:
+    return double_integrator(IDEAL, level=level, floor=floor)._replace(holds=True)
+
+
+def test_a_loop_that_holds_updates_has_bounds_by_the_chain() -> None:
+    sizes = bounds_of(find_witness(holding(level=0.05)))
+    assert 1.0 <= sizes["x"] < 1.2
+    assert sizes["e_c"] == pytest.approx(3 * 0.05)
+
+
+def test_at_rate_0_the_bounds_are_those_of_the_largest_threshold() -> None:
+    witness = find_witness(holding())
+    assert not witness.proof.rate > 0
+    prove(holding(), witness.document)
+    with pytest.raises(RejectedError):
+        prove(holding(level=0.05), witness.document)
+
+
+def relative(sigma: float) -> Loop:
+    """The rule ‖e_s‖ > σ‖x‖."""
+    loop = double_integrator(IDEAL, level=0.0)
+    return loop._replace(rule=loop.rule._replace(negative=matrix([[sigma, 0, 0, 0], [0, sigma, 0, 0]])))
+
+
+@pytest.mark.parametrize("sigma", [0.02, 0.2])
+def test_a_relative_rule_has_decaying_bounds(sigma: float) -> None:
+    witness = find_witness(relative(sigma))
+    sizes = bounds_of(witness)
+    assert witness.proof.rate > 0
+    assert 1.0 <= sizes["x"] < 1.25
+    assert sizes["e_s"] < 1.25 * sigma
+    assert sizes["e_c"] < 6 * sigma
+    with pytest.raises(RejectedError):
+        prove(relative(1.05 * sigma), witness.document)
+
+
+def test_without_a_bound_of_the_drift_no_update_may_be_on_its_way_longer_than_a_test_takes() -> None:
+    tests = IDEAL._replace(sampling=fmpq(1, 100), least_sampling=fmpq(1, 100), delay=fmpq(1, 100))
+    witness = find_witness(relative(0.1)._replace(times=tests))
+    later = relative(0.1)._replace(times=tests._replace(least_sampling=fmpq(1, 200)))
+    with pytest.raises(RejectedError, match="drift"):
+        prove(later, witness.document)
+
+
+def test_in_the_limit_bounds_are_those_of_disturbances_and_the_floor() -> None:
+    push = matrix([[0.0], [0.1]])
+    loop = double_integrator(floor=0.05)._replace(pushes=push, sizes=(arb(1),))
+    witness = find_witness(loop, ("x",), ultimate=("x", "x[1]"))
+    whole, ultimate, rate, *_ = witness.proof.bounds
+    assert (whole.from_start, ultimate.from_start, rate.from_start) == (True, False, False)
+    assert 0.1 < float(ultimate.constant.mid()) < 0.7
+    assert ultimate.constant <= whole.constant
+    assert rate.constant < ultimate.constant

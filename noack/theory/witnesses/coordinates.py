@@ -50,9 +50,10 @@ class _Runs:
         self._loop, n, N = model.loop, model.loop.n, model.size
         self._rng = np.random.default_rng(0)
         flows = [floats(flow.matrix) for flow in model.locations[0].flows]
-        fastest = max(float(np.abs(np.linalg.eigvals(flow)).max()) for flow in flows)
-        slowest = max(-float(np.linalg.eigvals(flows[0][:n, :n]).real.max()), 1e-3)
-        self._h = _seconds(self._loop.times.sampling) or 0.1 / fastest
+        closed = flows[0][:n, :n]
+        fastest = max(float(np.abs(np.linalg.eigvals(M)).max()) for M in (*flows, closed))
+        slowest = max(-float(np.linalg.eigvals(closed).real.max()), 1e-3)
+        self._h = _seconds(self._loop.times.sampling) or (0.02 if self._loop.holds else 0.1) / fastest
         self._steps = int(min(max(6.0 / slowest / self._h, 200), _MOST_STEPS))
         self._sway = self._h * slowest * np.array([0.3, 1.0, 3.0])
         self._exact = [expm(flow * self._h) for flow in flows]

@@ -21,6 +21,8 @@ class Found(NamedTuple):
     matrices: Mapping[str, Matrix]
     numbers: Mapping[str, float]
     status: str
+    size: float
+    """What was minimised: (D₁² + D₂²)^½ from the start on, D₂ in the limit."""
 
     @property
     def levels(self) -> tuple[float, float]:
@@ -37,10 +39,8 @@ class Search:
         level, floor = float(model.loop.rule.level), float(model.loop.rule.floor)
         self._f_units = (1.0, level / floor if level and floor else 1.0)
 
-    def solve(
-        self, output: str, *, starts: bool, weight: float = 1.0, margin: float = 1e-7, tolerance: float = 1e-8
-    ) -> Found:
-        """Return the smallest bound D₁² + weight · D₂² of an output, for this model's ν."""
+    def solve(self, output: str, *, starts: bool, margin: float = 1e-7, tolerance: float = 1e-8) -> Found:
+        """Return the smallest bound of an output for this model's ν: from the start on, or in the limit."""
         model = self.model
         size = self._output_size(output)
         problem = [self._scaled(item, size) for item in model.inequalities(output, starts=starts)]
@@ -50,13 +50,16 @@ class Search:
             for item in problem
         ]
         objective = {
-            name: w * units[name] for name, w in (("level 1", 1.0), ("level 2", weight)) if name in units
+            name: weight * units[name]
+            for name, weight in (("level 1", 1.0 if starts else 1e-6), ("level 2", 1.0))
+            if name in units
         }
         largest = max(objective.values())
         objective = {name: w / largest for name, w in objective.items()}
         free = {name for name in units if name.startswith("c")}
         solution = minimise(objective, problem, free=free, margin=margin, tolerance=tolerance)
-        return self._unscaled(solution, size, units)
+        found = self._unscaled(solution, size, units)
+        return found._replace(size=float(np.hypot(*found.levels)) if starts else found.levels[1])
 
     def _output_size(self, output: str) -> float:
         place = self.model.locations[min(1, len(self.model.locations) - 1)]
@@ -101,12 +104,12 @@ class Search:
             inverse = np.linalg.inv(self.frames[name])
             matrices[name] = size**2 * inverse.T @ V @ inverse
         numbers = {name: size**2 * units[name] * value for name, value in solution.numbers.items()}
-        return Found(matrices, numbers, solution.status)
+        return Found(matrices, numbers, solution.status, 0.0)
 
 
 def refined(frames: Frames, found: Found) -> Frames:
     """Return the coordinates in which the matrices of a solution are of order 1."""
-    scale = max(*found.levels, 1e-150)
+    scale = max(found.size, 1e-150)
     better = dict(frames)
     for name, V in found.matrices.items():
         T = frames[name]
