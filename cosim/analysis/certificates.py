@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cosim.analysis.witnesses import Witnesses, find_witnesses
 from noack.core.errors import CallerError, one_line
 from noack.core.linear_systems import Matrix
 from noack.core.number_format import NONE, TextRows, as_html, as_text, at_least, at_most
@@ -233,6 +234,17 @@ class Certificates:
         with contextlib.suppress(CallerError):
             return LossMargin(self.scenario).first_bounds()
         return None
+
+    def witnesses(self, progress: Callable[[float], None] = lambda share: None) -> Witnesses:
+        """Search for bounds that the checker proves, for the same plants and conditions.
+
+        Raises:
+            CallerError: the plant is not linear.
+        """
+        scenario, late_periods, *_ = self._arguments
+        if self.nonlinear is not None:
+            raise CallerError(f"no witness: the plant is not linear ({self.nonlinear})")
+        return find_witnesses(scenario, late_periods, progress)
 
     def to_json(self) -> dict[str, object]:
         """Return all certificates as one document, as ``noack certify --json`` prints it."""

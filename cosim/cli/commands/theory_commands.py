@@ -32,6 +32,7 @@ class NormName(StrEnum):
         ("noack certify lane_following", "its plant, and all plants of its uncertainty box"),
         ("noack certify lane_following --weight chosen", "with a norm that certifies more"),
         ("noack certify lane_weighted --late 6 --json", "allow 6 steps of lateness"),
+        ("noack certify lane_following --witness lane.json", "bounds that noack-check proves"),
         ("noack certify lane_following --require certificate", "exit status 1 if there is none"),
     ),
 )
@@ -68,6 +69,14 @@ def certify(
             help="Write the certificates for MATLAB and Octave (.mat).",
         ),
     ] = None,
+    witness: Annotated[
+        Path | None,
+        Option(
+            callback=opt.usable_path,
+            help="Also search for bounds that the program noack-check proves, and write their witnesses "
+            "to this file (.json). Takes some seconds to minutes.",
+        ),
+    ] = None,
     json: opt.JsonOption = False,
 ) -> int:
     """Compute the bounds that are guaranteed for a scenario, and their conditions.
@@ -85,6 +94,8 @@ def certify(
     from cosim.output.certificate_report import certificate_tables, print_certificates
     from cosim.output.export.mat_export import save_mat
     from cosim.output.requirements import uncovered_as_unmet, unmet_by_scenario
+    from cosim.output.witness_report import print_witnesses
+    from cosim.record.run_directory import write_output
 
     loaded, chosen = opt.load_loop(scenario, settings, loop), None
     with uncovered_as_unmet(require or ()):
@@ -96,10 +107,18 @@ def certify(
     if weight == NormName.GIVEN and not result.schedule.exists:
         with work_bar("no certificate in the given norm; choosing another") as bar:
             chosen = in_chosen_norm(loaded, result, bar)
+    witnesses = None
+    if witness is not None:
+        with work_bar("searching for witnesses", lines=True) as bar:
+            witnesses = result.witnesses(bar)
+        write_output(witness, witnesses.file_text())
     if json:
-        print_json(result.to_json() | {"in_chosen_norm": chosen and chosen.to_json()})
+        proven = {} if witnesses is None else {"witnesses": [s.to_json() for s in witnesses.statements]}
+        print_json(result.to_json() | {"in_chosen_norm": chosen and chosen.to_json()} | proven)
     else:
         print_certificates(console(), result, chosen)
+        if witnesses is not None:
+            print_witnesses(console(), witnesses)
     write_tables(certificate_tables(result), tables, json=json)
     if out is not None:
         save_mat(result.to_json(), out)

@@ -11,7 +11,7 @@ import numpy as np
 
 from noack.core.linear_systems import Matrix
 from noack.theory.witnesses.coordinates import Frames, floats
-from noack.theory.witnesses.semidefinite import MatrixInequality, Solution, minimise
+from noack.theory.witnesses.semidefinite import MatrixInequality, SolverAnswer, minimise
 from noack_check.model import Inequality, Model
 
 
@@ -98,7 +98,7 @@ class Search:
         whole[: len(frame), : len(frame)] = frame
         return result.within(whole[:, _occurring(result, whole)])
 
-    def _unscaled(self, solution: Solution, size: float, units: Mapping[str, float]) -> Found:
+    def _unscaled(self, solution: SolverAnswer, size: float, units: Mapping[str, float]) -> Found:
         matrices = {}
         for name, V in solution.matrices.items():
             inverse = np.linalg.inv(self.frames[name])

@@ -37,7 +37,7 @@ class MatrixInequality(NamedTuple):
         )
 
 
-class Solution(NamedTuple):
+class SolverAnswer(NamedTuple):
     """What the solver found; ``status`` is its own word."""
 
     status: str
@@ -57,7 +57,7 @@ def minimise(
     free: Iterable[str] = (),
     margin: float = 0.0,
     tolerance: float = 1e-8,
-) -> Solution:
+) -> SolverAnswer:
     """Return numbers and matrices that obey all inequalities with a margin.
 
     Args:
@@ -120,7 +120,7 @@ class _Problem:
         self._columns.append(columns[which])
         self._values.append(-entries[which, where])
 
-    def solve(self, objective: Mapping[str, float], free: set[str], tolerance: float) -> Solution:
+    def solve(self, objective: Mapping[str, float], free: set[str], tolerance: float) -> SolverAnswer:
         signed = [self._first[name] for name, size in self._sizes.items() if not size and name not in free]
         rows = np.concatenate([*self._rows, self._height + np.arange(len(signed))])
         columns = np.concatenate([*self._columns, np.array(signed, dtype=int)])
@@ -141,7 +141,7 @@ class _Problem:
         answer = clarabel.DefaultSolver(quadratic, cost, A, b, cones, settings).solve()
         return self._solution(str(answer.status), np.array(answer.x))
 
-    def _solution(self, status: str, x: Vector) -> Solution:
+    def _solution(self, status: str, x: Vector) -> SolverAnswer:
         matrices, numbers = {}, {}
         for name, first in self._first.items():
             n = self._sizes[name]
@@ -152,4 +152,4 @@ class _Problem:
             V = np.zeros((n, n))
             V[a, b] = V[b, a] = x[first : first + len(a)]
             matrices[name] = V
-        return Solution(status, matrices, numbers)
+        return SolverAnswer(status, matrices, numbers)

@@ -1,0 +1,93 @@
+"""``noack-check witness.json [--scenario resolved.toml]``: verifies a file of witnesses.
+
+Prints PROVED and what was proven, for each statement of the file, or REJECTED and the first inequality
+that fails. Exit status: 0 if all are proven, 1 if one is not, 2 for a file that cannot be read.
+
+The loop is derived from the scenario, as ``noack check NAME --resolved`` prints it; without it, from the
+copy in the witness's file. A copy that differs from the scenario is a rejection.
+"""
+
+import argparse
+import json
+import os
+import sys
+import tomllib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from noack_check.check import RejectedError
+from noack_check.keys import RefusedError
+from noack_check.proof import prove
+from noack_check.scenario import Table, read_loop
+from noack_check.sentences import sentences
+
+MOST_BYTES = 64 * 1024**2
+
+
+def main() -> None:
+    """Run the command."""
+    parser = argparse.ArgumentParser("noack-check", description="Verify the witnesses of bounds of a loop.")
+    parser.add_argument(
+        "witness", type=Path, help="file that `noack certify NAME --witness FILE` has written"
+    )
+    parser.add_argument("--scenario", type=Path, help="the scenario, by `noack check NAME --resolved`")
+    arguments = parser.parse_args()
+    try:
+        file = _read(arguments.witness, json.loads)
+        given = None if arguments.scenario is None else _read(arguments.scenario, tomllib.loads)
+    except (OSError, ValueError, RecursionError) as error:
+        print(f"noack-check: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(2)
+    try:
+        for line in check_file(file, given):
+            print(line)
+        sys.stdout.flush()
+    except (RejectedError, RefusedError) as error:
+        print(f"REJECTED {error}")
+        sys.exit(1)
+    except BrokenPipeError:  # nobody reads on
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+
+
+def check_file(file: Table, given: Table | None) -> Iterator[str]:
+    """Yield a line for each bound that a file of witnesses proves.
+
+    Args:
+        file: its content.
+        given: the resolved scenario; None: the file's copy is used.
+
+    Raises:
+        RejectedError: a statement is not proven, or the copy differs from the scenario.
+        RefusedError: a key of the scenario is not covered.
+    """
+    scenario, statements = file.get("scenario"), file.get("statements")
+    if not isinstance(scenario, Mapping) or not isinstance(statements, list) or not statements:
+        raise RejectedError("the file has no scenario, or no statements")
+    if given is not None and given != scenario:
+        different = [key for key in {*given, *scenario} if given.get(key) != scenario.get(key)]
+        raise RejectedError(f"the witness is of another scenario: {', '.join(sorted(different))} differ")
+    for document in statements:
+        if not isinstance(document, Mapping):
+            raise RejectedError("a statement is no table")
+        plants, conditions = document.get("plants"), document.get("conditions")
+        if plants not in ("own", "box") or conditions not in ("ideal", "schedule"):
+            raise RejectedError("a statement has no plants or conditions")
+        loop = read_loop(scenario, box=plants == "box", ideal=conditions == "ideal")
+        for sentence in sentences(prove(loop, document)):
+            yield f"PROVED {scenario.get('name')}, {plants} plant, {conditions}: {sentence}"
+
+
+def _read(path: Path, parse: object) -> Table:
+    with path.open("rb") as file:
+        content = file.read(MOST_BYTES + 1)
+    if len(content) > MOST_BYTES:
+        raise ValueError(f"{path}: larger than {MOST_BYTES // 1024**2} MiB")
+    found = parse(content.decode())  # type: ignore[operator]
+    if not isinstance(found, dict):
+        raise ValueError(f"{path}: not a table")
+    return found
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,63 @@
+"""What was proven, in words; decimals are rounded so that the sentences stay true."""
+
+from collections.abc import Iterator
+from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
+
+from flint import arb
+
+from noack_check.proof import Bound, Proof
+
+_SHORT = 7
+_NAMES = {"x": "‖x‖", "e_s": "‖W e_s‖", "e_c": "‖W e_c‖", "drift": "‖W(ẋ − Hx)‖"}
+
+
+def sentences(proof: Proof) -> Iterator[str]:
+    """Yield each bound of a proof; of two bounds of the same output the smaller one."""
+    for bound in smallest_bounds(proof):
+        yield f"{_NAMES.get(bound.output, f'|{bound.output}|')} ≤ {formula(bound, proof.rate)}"
+    if proof.inter_event is not None and proof.inter_event > 0:
+        yield f"two events are at least {at_least(proof.inter_event)} s apart"
+
+
+def smallest_bounds(proof: Proof) -> list[Bound]:
+    """Return the bounds of a proof; of two bounds of the same output the smaller one."""
+    smallest: dict[tuple[str, bool], Bound] = {}
+    for bound in proof.bounds:
+        key = (bound.output, bound.from_start)
+        if key not in smallest or size(bound) < size(smallest[key]):
+            smallest[key] = bound
+    return list(smallest.values())
+
+
+def size(bound: Bound) -> float:
+    """Return the bound at t = 0, or in the limit."""
+    return float((bound.decaying**2 + bound.constant**2).sqrt().mid())
+
+
+def formula(bound: Bound, rate: arb) -> str:
+    """Return a bound of D₁ e^{−rt} + D₂, which is at least (D₁² e^{−2rt} + D₂²)^½."""
+    if not bound.from_start:
+        return f"{at_most(bound.constant)} in the limit"
+    decay = f" e^(−{at_least(rate)} t)" if rate > 0 else ""
+    parts = [f"{at_most(bound.decaying)}{decay}"] if bound.decaying != 0 else []
+    if bound.constant != 0:
+        parts.append(at_most(bound.constant))
+    return " + ".join(parts) or "0"
+
+
+def at_most(value: arb) -> str:
+    """Return four digits of a number that is at least the value."""
+    return _rounded(value.upper() if value.rad() != 0 else value, ROUND_CEILING)
+
+
+def at_least(value: arb) -> str:
+    """Return four digits of a number that is at most the value."""
+    return _rounded(value.lower() if value.rad() != 0 else value, ROUND_FLOOR)
+
+
+def _rounded(value: arb, rounding: str) -> str:
+    if value == arb(float(value)) and len(text := repr(float(value))) <= _SHORT:
+        return text  # which stands for exactly this number
+    exact = value.mid().fmpq()
+    context = Context(prec=4, rounding=rounding)
+    return f"{context.divide(Decimal(int(exact.p)), Decimal(int(exact.q))):g}"

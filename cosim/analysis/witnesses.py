@@ -1,0 +1,90 @@
+"""Bounds of a scenario that the checker has proven, with their witnesses.
+
+The search takes some seconds to minutes; what it finds is verified by :mod:`noack_check`, which derives
+the loop from the resolved scenario itself.
+"""
+
+import json
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from noack.scenario.scenario import Scenario
+from noack.theory.certificates.conditions import with_stated_times
+from noack.theory.witnesses.documents import NoWitnessError, find_witness
+from noack_check.keys import RefusedError
+from noack_check.proof import Proof
+from noack_check.scenario import read_loop
+from noack_check.sentences import sentences
+
+
+class WitnessedStatement(NamedTuple):
+    """What is proven for some plants under some conditions, or why nothing is."""
+
+    plants: str
+    """"own" or "box"."""
+    conditions: str
+    """"ideal" or "schedule"."""
+    document: dict[str, object] | None
+    proof: Proof | None
+    reason: str = ""
+    """Why there is no witness."""
+
+    def to_json(self) -> dict[str, object]:
+        """Return what is proven, without the witness."""
+        proven = [] if self.proof is None else list(sentences(self.proof))
+        return {"plants": self.plants, "conditions": self.conditions, "proven": proven, "reason": self.reason}
+
+
+class Witnesses(NamedTuple):
+    """All statements of a scenario, and the scenario that they are about."""
+
+    scenario: dict[str, object]
+    """As `noack check --resolved` prints it."""
+    statements: Sequence[WitnessedStatement]
+
+    def file_text(self) -> str:
+        """Return the file that ``noack-check`` reads."""
+        documents = [s.document for s in self.statements if s.document is not None]
+        return json.dumps({"scenario": self.scenario, "statements": documents}, allow_nan=False)
+
+
+def find_witnesses(
+    resolved: Scenario, late_periods: int, progress: Callable[[float], None] = lambda share: None
+) -> Witnesses:
+    """Search for witnesses of a resolved scenario's bounds, for its plant and its uncertainty box.
+
+    Args:
+        resolved: the scenario.
+        late_periods: allowed lateness in steps of the plant.
+        progress: called with the completed share.
+    """
+    content = resolved_content(resolved, late_periods)
+    has_box = resolved.plant.uncertainty_A is not None or resolved.plant.uncertainty_B is not None
+    wanted = [
+        (plants, under)
+        for under in ("ideal", "schedule")
+        for plants in ("own", *(["box"] if has_box else []))
+    ]
+    found = []
+    for index, (plants, under) in enumerate(wanted):
+        progress(index / len(wanted))
+        found.append(_statement(content, plants, under))
+    progress(1.0)
+    return Witnesses(content, found)
+
+
+def resolved_content(resolved: Scenario, late_periods: int) -> dict[str, object]:
+    """Return the tables of a resolved scenario, as `noack check --resolved` prints them."""
+    certificate = resolved.certificate.model_copy(update={"late_periods": late_periods})
+    stated = with_stated_times(resolved.model_copy(update={"certificate": certificate}))
+    return dict(stated.content())
+
+
+def _statement(content: dict[str, object], plants: str, conditions: str) -> WitnessedStatement:
+    try:
+        loop = read_loop(content, box=plants == "box", ideal=conditions == "ideal")
+        witness = find_witness(loop)
+    except (RefusedError, NoWitnessError) as error:
+        return WitnessedStatement(plants, conditions, None, None, str(error))
+    document = {"plants": plants, "conditions": conditions, **witness.document}
+    return WitnessedStatement(plants, conditions, document, witness.proof)

@@ -1,0 +1,98 @@
+"""``noack certify NAME --witness FILE`` and ``noack-check FILE``, from the command line."""
+
+import json
+from pathlib import Path
+
+import pytest
+import tomli_w
+from typer.testing import CliRunner
+
+from cosim.cli.application import app
+from noack.core.errors import ExitStatus
+from noack_check.__main__ import check_file, main
+from noack_check.check import RejectedError
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("witness") / "pendulum.json"
+    words = ["certify", "unstable_pendulum", "--witness", str(path), "--json"]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == ExitStatus.OK
+    witnesses = json.loads(result.stdout)["witnesses"]
+    assert [(w["plants"], w["conditions"]) for w in witnesses] == [
+        ("own", "ideal"), ("box", "ideal"), ("own", "schedule"), ("box", "schedule"),
+    ]  # fmt: skip
+    assert all(witness["proven"] for witness in witnesses)
+    return path
+
+
+def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *words: str) -> tuple[int, str]:
+    monkeypatch.setattr("sys.argv", ["noack-check", *words])
+    try:
+        main()
+    except SystemExit as stop:
+        captured = capsys.readouterr()
+        return int(stop.code or 0), captured.out + captured.err
+    return 0, capsys.readouterr().out
+
+
+def test_the_program_prints_what_is_proven(
+    file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    status, text = run(capsys, monkeypatch, str(file))
+    assert status == 0
+    assert all(line.startswith("PROVED unstable_pendulum, ") for line in text.splitlines())
+    assert "own plant, schedule: ‖x‖ ≤ 0.4" in text  # 0.285 is the largest that was found
+
+
+def test_another_scenario_is_told_apart(
+    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenario = json.loads(file.read_text())["scenario"]
+    given = tmp_path / "resolved.toml"
+    given.write_text(tomli_w.dumps(scenario))
+    assert run(capsys, monkeypatch, str(file), "--scenario", str(given))[0] == 0
+    scenario["network"]["mansd"] += 1
+    given.write_text(tomli_w.dumps(scenario))
+    status, text = run(capsys, monkeypatch, str(file), "--scenario", str(given))
+    assert (status, text) == (1, "REJECTED the witness is of another scenario: network differ\n")
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value", "why"),
+    [
+        ("network", "mansd", 4, "edge|missing"),
+        ("trigger", "beta", 0.03, "inter_event_s|start|flow|output"),
+        ("plant", "initial_state", [0.3, 0.0], "start"),
+        ("plant", "rate_hz", 250.0, "flow|inter_event_s|times"),
+        ("network", "protocol", "ack", "network.protocol = ack"),
+        ("controller", "predictions", 3, "controller.predictions = 3"),
+        ("controller", "safe_input", [1.0], "controller.safe_input"),
+        ("trigger", "new_key", 1, "trigger.new_key: not in the table of keys"),
+    ],
+)
+def test_a_changed_scenario_is_not_proven(
+    file: Path, section: str, key: str, value: object, why: str
+) -> None:
+    content = json.loads(file.read_text())
+    content["scenario"][section][key] = value
+    content["statements"] = content["statements"][2:3]
+    with pytest.raises(ValueError, match=why):
+        list(check_file(content, None))
+
+
+@pytest.mark.parametrize("text", ["", "[1]", "{", '{"scenario": {}}', "[" * 100_000])
+def test_files_that_are_no_witness_are_one_line(
+    text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "w.json"
+    path.write_text(text)
+    status, printed = run(capsys, monkeypatch, str(path))
+    assert status in (1, 2)
+    assert len(printed.splitlines()) == 1
+
+
+def test_a_file_without_statements_proves_nothing() -> None:
+    with pytest.raises(RejectedError, match="no statements"):
+        list(check_file({"scenario": {}, "statements": []}, None))
