@@ -16,9 +16,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from noack_check.check import RejectedError
-from noack_check.keys import RefusedError
+from noack_check.keys import RefusedError, Table
 from noack_check.proof import prove
-from noack_check.scenario import Table, read_loop
+from noack_check.scenario import read_loop
 from noack_check.sentences import sentences
 
 MOST_BYTES = 64 * 1024**2

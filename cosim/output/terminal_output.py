@@ -41,7 +41,6 @@ _ASSUMPTION_STYLES: dict[str, str] = {
     AssumptionStatus.VIOLATED: "bold yellow",
     AssumptionStatus.IDEALISED: "dim",
     AssumptionStatus.NOT_NEEDED: "dim",
-    AssumptionStatus.NOT_CHECKED: "yellow",
     AssumptionStatus.ASSUMED: "cyan",
 }
 _MOST_LOOPS, _MOST_REASONS = 12, 3

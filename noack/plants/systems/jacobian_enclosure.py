@@ -20,7 +20,6 @@ import operator
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
@@ -42,15 +41,10 @@ _LONGEST_S = 1e9
 _AT_REST = 1e-9
 """The plant rests if |f(0, 0)| is at most this share of the largest entry of A and B in its row."""
 _UNDECIDED = "its equations distinguish cases, and the region contains more than one of them"
-_NOT_INSTALLED = "its equations cannot be enclosed without python-flint: pip install 'noack[regions]'"
 
 
 class NotEnclosedError(NoackError):
     """The derivatives have no enclosure over the region; the message is the reason."""
-
-
-class NotInstalledError(NotEnclosedError):
-    """The package that encloses derivatives is not installed."""
 
 
 class Inclusion(NamedTuple):
@@ -204,7 +198,7 @@ def _is_array(value: object) -> bool:
 
 
 def _ball(middle: float, radius: float = 0.0) -> "arb":
-    from flint import arb  # an extra of noack
+    from flint import arb
 
     return arb(middle, radius)
 
@@ -234,7 +228,6 @@ class EnclosedMotion:
 
     Raises:
         NotEnclosedError: it has no equations that can be enclosed.
-        NotInstalledError: the package that encloses them is missing.
     """
 
     system: PlantSystem
@@ -244,8 +237,6 @@ class EnclosedMotion:
     def __post_init__(self) -> None:
         if not hasattr(self.system, "expressions"):
             raise NotEnclosedError("it has no equations that can be enclosed: it moves by itself")
-        if find_spec("flint") is None:
-            raise NotInstalledError(_NOT_INSTALLED)
 
     def over(self, halfwidths: Vector) -> Inclusion:
         """Enclose the equations over the region |(x, u)_j| ≤ ``halfwidths``, (n + m,).

@@ -77,10 +77,6 @@ class NoCertificateError(ArithmeticError):
         self.loop_gain = loop_gain
 
 
-class CertificateNotCheckedError(NoCertificateError):
-    """An optional package that the search for a certificate needs is not installed."""
-
-
 class EstimationBound(NamedTuple):
     """Bound of the estimation error at every measurement, where the trigger tests x̂ instead of x.
 

@@ -18,7 +18,7 @@ from noack.scenario.estimation import SteadyState, steady_state
 from noack.scenario.resolution import LoopMatrices, loop_of, policy_of
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_tables import UNCERTIFIED_ACKNOWLEDGEMENTS
-from noack.theory.bounds.certificate_terms import CertificateNotCheckedError, Constants, NetworkConditions
+from noack.theory.bounds.certificate_terms import Constants, NetworkConditions
 from noack.theory.bounds.disturbances import normal_bounds
 from noack.theory.certificates.conditions import network_delay_text
 
@@ -35,8 +35,6 @@ class AssumptionStatus(StrEnum):
     """No sampled loop meets it; certificates allow for the difference."""
     NOT_NEEDED = "not needed"
     """It does not hold, or is not checked; no computed bound depends on it."""
-    NOT_CHECKED = "not checked"
-    """An optional package that the check needs is not installed."""
     ASSUMED = "assumed"
     """It is not proven; what depends on the run is checked in each run."""
 
@@ -285,11 +283,9 @@ def certificate_assumptions(
     checked += _bounded_disturbances(resolved)
     # Of the certificate itself.
     if constants is None:
-        is_unchecked = isinstance(void, CertificateNotCheckedError)
-        status = AssumptionStatus.NOT_CHECKED if is_unchecked else AssumptionStatus.VIOLATED
         is_gain = str(void).startswith("the loop gain")
         condition = "small-gain condition" if is_gain else "condition of the certificate"
-        checked.append(Assumption(condition, "certificate", status, str(void)))
+        checked.append(_violated(condition, "certificate", str(void)))
     else:
         why = f"the loop gain of the errors is {apart_from(1, loop_gain)}, below 1"
         checked.append(_checked("small-gain condition", "certificate", True, why))

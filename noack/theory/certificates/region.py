@@ -24,20 +24,11 @@ import numpy as np
 from noack.core.errors import NoackError
 from noack.core.linear_systems import Matrix, Vector
 from noack.plants.plant_settings import PlantStart, SystemFailedError
-from noack.plants.systems.jacobian_enclosure import (
-    EnclosedMotion,
-    Inclusion,
-    NotEnclosedError,
-    NotInstalledError,
-)
+from noack.plants.systems.jacobian_enclosure import EnclosedMotion, Inclusion, NotEnclosedError
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.box import BoxGains
-from noack.theory.bounds.certificate_terms import (
-    CertificateNotCheckedError,
-    NetworkConditions,
-    NoCertificateError,
-)
+from noack.theory.bounds.certificate_terms import NetworkConditions, NoCertificateError
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.certificates.assumptions import Assumption, AssumptionStatus
@@ -179,8 +170,6 @@ class RegionScope(_Box):
                 plants = _Box(self._resolved, inclusion, self._other_start)
                 phases, reached = plants.bounded(conditions)
             except (NotEnclosedError, SystemFailedError) as error:  # also from a user's class
-                if isinstance(error, NotInstalledError):
-                    raise CertificateNotCheckedError(str(error)) from None
                 why = f"{where}: {error}" if widths.any() else str(error)
                 raise NoCertificateError(why) from None
             except NoCertificateError as error:

@@ -11,12 +11,10 @@ from cosim.analysis.summary.summary_model import ClaimVerdict
 from cosim.simulation.virtual_time import simulate
 from noack.core.linear_systems import Vector
 from noack.plants.plant_settings import PlantStart
-from noack.plants.systems import jacobian_enclosure
 from noack.plants.systems.jacobian_enclosure import Enclosed, EnclosedMotion, Inclusion
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
-from noack.theory.certificates.assumptions import AssumptionStatus
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import nominal_conditions
 from noack.theory.certificates.network_limits import network_limit
@@ -144,14 +142,6 @@ def test_what_the_bounds_leave_out_is_named(tmp_path: Path, rest: float, status:
     assert (f"at most {rest:.2g} there" in rests.why) == (rest > 0)
 
 
-def test_without_the_library_one_line_says_how_to_get_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(jacobian_enclosure, "find_spec", lambda name: None)
-    void = certificate_of(own_plant(tmp_path, STEEP), (0.1, 0.1)).void
-    assert "pip install 'noack[regions]'" in str(void)
-
-
 def test_a_run_is_held_against_its_region() -> None:
     for name, verdict in (("sine_pendulum", ClaimVerdict.HELD), ("cart_pole", ClaimVerdict.VOID)):
         record = simulate(resolve(load(SCENARIOS / f"{name}.toml", ["horizon_s=1.0"])))
@@ -181,11 +171,3 @@ def test_what_persists_is_bounded_on_a_region(setting: str) -> None:
         claim for claim in RunClaims(simulate(resolved)).evaluate() if claim.source == "region certificate"
     ]
     assert {claim.verdict for claim in claims} == {ClaimVerdict.HELD}
-
-
-def test_without_its_package_a_certificate_is_not_checked(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(jacobian_enclosure, "find_spec", lambda name: None)
-    certificate = certificate_of(CASES["pendulum"].resolved(), CASES["pendulum"].semi_axes)
-    assert "noack[regions]" in (certificate.void or "")
-    (assumption,) = (a for a in certificate.assumptions if a.what == "condition of the certificate")
-    assert assumption.verdict == AssumptionStatus.NOT_CHECKED
