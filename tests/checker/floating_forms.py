@@ -1,0 +1,174 @@
+"""The inequalities of a witness in floating point, written anew from the statement, not from the checker.
+
+V = xᵀXx + (e, w)ᵀQ(e, w) − c₁ f₁² − c₂ f₂² − a θ (‖W e‖² − c² f₁² − f² f₂²), for a rule that compares
+W e_s, under a schedule. The inputs K e^{−Hs} x_c are those of random ages, not corners of a hull.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from noack_check.loop import Loop
+from tests.checker.runs import floats
+
+Array = NDArray[np.float64]
+_TOLERANCE = 1e-7
+
+
+class Forms:
+    """The forms V of one bound of a loop."""
+
+    def __init__(self, loop: Loop, rate: float, entry: Mapping[str, Any]) -> None:
+        self.loop, self.rate, self.numbers, self.matrices = loop, rate, entry["numbers"], entry["matrices"]
+        self.decay, self.n = entry["decay"], loop.n
+        n = self.n
+        every = np.eye(3 * n + 2)
+        self.x, self.e, self.w = every[:n], every[n : 2 * n], every[2 * n : 3 * n]
+        self.f1, self.f2 = every[3 * n : 3 * n + 1], every[3 * n + 1 :]
+        self.W, self.H = floats(loop.weight), floats(loop.H)
+        self.times = [float(t.p) / float(t.q) for t in loop.times]
+        level, floor = float(loop.rule.level.mid()), float(loop.rule.floor.mid())
+        self.threshold = level**2 * self.f1.T @ self.f1 + floor**2 * self.f2.T @ self.f2
+        self.compared = self.e.T @ self.W.T @ self.W @ self.e - self.threshold
+        self.floor_only = floor**2 * self.f2.T @ self.f2
+        self.level_only = level**2 * self.f1.T @ self.f1
+        self.exact_level = level > 0 and rate == float(loop.rule.rate.mid())
+
+    def form(self, place: str, node: int) -> Array:
+        """Return P of a location, at the start or the end of its time."""
+        tested = place.endswith("lost")
+        own = place if tested else f"{place}, {node}"
+        X = np.array(self.matrices["X" if place != "start" else f"X/{own}"])
+        Q = np.array(self.matrices[f"Q/{own}"])
+        errors = np.vstack([self.e, self.w])[: len(Q)]
+        P: Array = self.x.T @ X @ self.x + errors.T @ Q @ errors
+        for name, f in (("c1", self.f1), ("c2", self.f2)):
+            P = P - self.numbers.get(f"{name}/{own}", 0.0) * f.T @ f
+        return P - self.numbers[f"a/{own}"] * self.times[0] * self.compared if tested and node else P
+
+    def flow(self, place: str, age: float) -> tuple[Array, list[tuple[Array, Array]]]:
+        """Return F and unknown signals (column, rows) of ż = Fz + column p, |p| ≤ |rows z|."""
+        K = floats(self.loop.gain) @ expm(-self.H * age) * (place != "start")
+        u = K @ (self.x + self.e + self.w)
+        moved = floats(self.loop.A) @ self.x + floats(self.loop.B) @ u
+        F = np.vstack(
+            [moved, self.H @ (self.x + self.e) - moved, self.H @ self.w, -self.rate * self.f1, 0 * self.f2]
+        )
+        unknowns = []
+        for half, signal in ((floats(self.loop.half_A), self.x), (floats(self.loop.half_B), u)):
+            for i, k in zip(*np.nonzero(half), strict=True):
+                root = np.sqrt(half[i, k])
+                unknowns.append((root * (self.x - self.e)[[i]].T, root * signal[[k]]))
+        pushes = floats(self.loop.pushes)
+        for k, size in enumerate(self.loop.sizes):
+            root = np.sqrt(float(size.mid()))
+            unknowns.append((root * (self.x - self.e).T @ pushes[:, [k]], root * self.f2))
+        return F, unknowns
+
+    def holds(self, output: str, rng: np.random.Generator) -> bool:
+        """Return whether flows, outputs, edges and the start obey their inequalities."""
+        if (
+            any(v < 0 for name, v in self.numbers.items() if not name.startswith("c"))
+            or self.decay <= 2 * self.rate
+        ):
+            return False
+        losses, (_, _, delay, age, start) = self.loop.losses, self.times
+        waits = [("on its way", delay)] if delay else []
+        begins = [("start", start)] if start else []
+        places = [(f"{j} lost", self.times[0]) for j in range(losses + 1)] + waits + begins
+        ages = [0.0, age, *(age * rng.random(3))]
+        return (
+            all(self._flow_holds(*place, node, s) for place in places for node in (0, 1) for s in ages)
+            and all(
+                self._output_holds(output, name, node, s)
+                for name, _ in places
+                for node in (0, 1)
+                for s in ages
+            )
+            and self._edges_hold(losses, bool(waits), bool(begins))
+            and self._starts("start" if begins else "0 lost")
+        )
+
+    def _flow_holds(self, place: str, length: float, node: int, age: float) -> bool:
+        P, (F, unknowns) = self.form(place, node), self.flow(place, age)
+        slope = (self.form(place, 1) - self.form(place, 0)) / length
+        M = -(P @ F + F.T @ P + self.decay * P + slope)
+        return self._positive(place, M, [-P @ c for c, _ in unknowns], unknowns, f"m/flow/{place}/{node}")
+
+    def _output_holds(self, output: str, place: str, node: int, age: float) -> bool:
+        if output == "drift" and place == "start":
+            return True
+        F, unknowns = self.flow(place, age)
+        outputs = {"x": self.x, "e_s": self.W @ self.e, "e_c": self.W @ (self.e + self.w)}
+        C = outputs.get(output, self.W @ (F[: self.n] - self.H @ self.x))
+        columns = [self.W @ c[: self.n] for c, _ in unknowns] if output == "drift" else []
+        levels = [self.numbers.get(f"level {k}", 0.0) for k in (1, 2)]
+        M = (
+            self.form(place, node)
+            - C.T @ C
+            + levels[0] * self.f1.T @ self.f1
+            + levels[1] * self.f2.T @ self.f2
+        )
+        used = unknowns if output == "drift" else []
+        mixed = np.hstack(columns).T @ np.hstack(columns) if columns else np.zeros((0, 0))
+        return self._positive(place, M, [-C.T @ c for c in columns], used, f"m/output/{place}/{node}", -mixed)
+
+    def _positive(
+        self,
+        place: str,
+        M: Array,
+        sides: list[Array],
+        unknowns: list[tuple[Array, Array]],
+        name: str,
+        corner: Array | None = None,
+    ) -> bool:
+        """Return whether M with the blocks of unknown signals is positive semidefinite."""
+        k = len(unknowns)
+        tau = [self.numbers[f"{name}/signal {i}"] for i in range(k)]
+        for t, (_, rows) in zip(tau, unknowns, strict=True):
+            M = M - t * rows.T @ rows
+        side = np.hstack(sides) if sides else np.zeros((len(M), 0))
+        below = np.diag(tau) + (corner if corner is not None else 0) if k else np.zeros((0, 0))
+        return self._is_psd(place, np.block([[M, side], [side.T, below]]))
+
+    def _is_psd(self, place: str, M: Array) -> bool:
+        n = self.n
+        has_w = place not in ("0 lost", "start")
+        kept = [i for i in range(len(M)) if (has_w or not 2 * n <= i < 3 * n) and M[i].any()]
+        M = M[np.ix_(kept, kept)]
+        scale = 1 / np.sqrt(np.maximum(np.abs(np.diag(M)), 1e-300))
+        return len(M) == 0 or bool(np.linalg.eigvalsh(scale[:, None] * M * scale).min() > -_TOLERANCE)
+
+    def _edges_hold(self, losses: int, waits: bool, begins: bool) -> bool:
+        arrival, lost = np.eye(3 * self.n + 2), np.eye(3 * self.n + 2)
+        arrival[2 * self.n : 3 * self.n] = 0
+        lost[2 * self.n : 3 * self.n] = self.w + self.e
+        lost[self.n : 2 * self.n] = 0
+        found = []
+        for j in range(losses + 1):
+            sent = (
+                ("on its way", f"{j} sent", lost) if waits else ("0 lost", f"{j} delivered", arrival @ lost)
+            )
+            following = [sent] + ([(f"{j + 1} lost", f"{j} lost", lost)] if j < losses else [])
+            found += [(f"{j} lost", *each, node, 0, True) for each in following for node in (0, 1)]
+        for place, name in [("on its way", "arrival")] * waits + [("start", "first input")] * begins:
+            found += [(place, "0 lost", name, arrival, i, j, False) for i in (0, 1) for j in (0, 1)]
+        return all(self._edge_holds(*each) for each in found)
+
+    def _edge_holds(
+        self, source: str, target: str, name: str, jump: Array, node: int, other: int, event: bool
+    ) -> bool:
+        M = self.form(source, node) - jump.T @ self.form(target, other) @ jump
+        if event and not self.loop.rule.always:
+            compared = self.compared + self.threshold
+            facts = [self.floor_only - compared] + [self.level_only - compared] * self.exact_level
+            for i, fact in enumerate(facts):
+                M = M + self.numbers[f"m/edge/{name}/{node} {other}/{i}"] * fact
+        return self._is_psd(source, M)
+
+    def _starts(self, place: str) -> bool:
+        z = np.concatenate([floats(self.loop.start)[:, 0], np.zeros(2 * self.n), [1.0, 1.0]])
+        return bool(z @ self.form(place, 0) @ z <= _TOLERANCE)

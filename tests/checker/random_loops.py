@@ -1,0 +1,48 @@
+"""Random small loops under a schedule, for which there may be a witness."""
+
+import numpy as np
+from flint import arb, fmpq
+from scipy.linalg import solve_continuous_are
+
+from noack_check.balls import beside, identity, matrix, number, zeros
+from noack_check.loop import Loop, Rule, Times
+
+
+def random_loop(rng: np.random.Generator) -> Loop:
+    """Return a loop with at most three states and three consecutive losses."""
+    n, m = int(rng.integers(1, 4)), 1
+    A, B = np.round(rng.normal(size=(n, n)), 3), np.round(rng.normal(size=(n, m)) + 0.5, 3)
+    gain = np.round(-B.T @ solve_continuous_are(A, B, np.eye(n), np.eye(m)), 3)
+    speed = np.linalg.norm(A + B @ gain, 2)
+    error = 0.02 * rng.integers(0, 2)
+    sampling = fmpq(int(rng.integers(2, 20)), int(1000 * speed) + 1)
+    parts = rng.integers(0, 5, 3)
+    least = sampling * fmpq(int(rng.integers(1, 3)), 2)
+    delay, age, start = (sampling * fmpq(int(k), 2) for k in parts)
+    rate = 0.3 * -np.linalg.eigvals(A + B @ gain).real.max()
+    W = identity(n) if rng.random() < 0.5 else matrix(np.round(np.diag(rng.uniform(0.3, 3, n)), 3).tolist())
+    has_push = rng.random() < 0.4
+    return Loop(
+        A=matrix((A * (1 + error * rng.choice([-1, 0, 1], A.shape))).tolist()),
+        B=matrix((B * (1 + error)).tolist()),
+        half_A=matrix((0.01 * np.abs(A) * rng.integers(0, 2)).tolist()),
+        half_B=matrix((0.01 * np.abs(B) * rng.integers(0, 2)).tolist()),
+        model_A=matrix(A.tolist()),
+        model_B=matrix(B.tolist()),
+        gain=matrix(gain.tolist()),
+        weight=W,
+        holds=False,
+        start=matrix(np.round(rng.normal(size=(n, 1)), 2).tolist()),
+        rule=Rule(
+            beside(zeros(n, n), W),
+            zeros(0, 2 * n),
+            number(rng.choice([0.0, 0.1, 0.3])),
+            number(round(rate, 4)),
+            number(rng.choice([0.02, 0.1])),
+            arb(0),
+        ),
+        pushes=matrix(np.round(rng.normal(size=(n, 1)), 2).tolist()) if has_push else zeros(n, 0),
+        sizes=(arb(0.02),) if has_push else (),
+        losses=int(rng.integers(0, 4)),
+        times=Times(sampling, least, delay, age, start),
+    )

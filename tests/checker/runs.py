@@ -1,0 +1,144 @@
+"""Runs of a loop with exact steps, random or worst losses, delays, ages and disturbances, beside a proof.
+
+Nothing of the checker's model is used: x, x_s and x_c are integrated, not the errors.
+"""
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from noack_check.loop import Loop
+from noack_check.proof import Proof
+
+Array = NDArray[np.float64]
+_ROUNDING = 1e-9
+
+
+def floats(M: object) -> Array:
+    """Return a matrix of balls as floats."""
+    return np.array([[float(v.mid()) for v in row] for row in M.tolist()]).reshape(M.nrows(), M.ncols())  # type: ignore[attr-defined]
+
+
+class Exceeded(NamedTuple):
+    """A bound that a run exceeded."""
+
+    output: str
+    time: float
+    value: float
+    bound: float
+
+
+class _Plant:
+    """One plant of the box; steps under an input K e^{−Hs} x_c of some age and a disturbance."""
+
+    def __init__(self, loop: Loop, rng: np.random.Generator) -> None:
+        self.n, self.H, self.gain = loop.n, floats(loop.H), floats(loop.gain)
+        signs = [rng.choice([-1.0, 0.0, 1.0], floats(M).shape) for M in (loop.half_A, loop.half_B)]
+        self.A = floats(loop.A) + signs[0] * floats(loop.half_A)
+        self.B = floats(loop.B) + signs[1] * floats(loop.half_B)
+        self.pushes = floats(loop.pushes) * np.array([float(size.mid()) for size in loop.sizes])
+        self.step = functools.lru_cache(4096)(self._step)
+        self.input_matrix = functools.lru_cache(16)(self._input_matrix)
+
+    def _input_matrix(self, age: float | None) -> Array:
+        return 0 * self.gain if age is None else self.gain @ expm(-self.H * age)
+
+    def _step(self, age: float | None, signs: tuple[float, ...], dt: float) -> Array:
+        """Return the exact step of (x, x_s, x_c, 1)."""
+        n = self.n
+        F = np.zeros((3 * n + 1, 3 * n + 1))
+        F[:n, :n], F[:n, 2 * n : 3 * n] = self.A, self.B @ self.input_matrix(age)
+        F[:n, -1] = self.pushes @ np.array(signs)
+        F[n : 2 * n, n : 2 * n] = F[2 * n : 3 * n, 2 * n : 3 * n] = self.H
+        return np.asarray(expm(F * dt))
+
+
+def exceeded(loop: Loop, proof: Proof, rng: np.random.Generator, until: float) -> list[Exceeded]:
+    """Return where a random run exceeds what is proven."""
+    plant, times, rule = _Plant(loop, rng), [float(t.p) / float(t.q) for t in loop.times], loop.rule
+    sampling, least, delay, age, start = times
+    W, n = floats(loop.weight), loop.n
+    level, rate, floor = (float(v.mid()) for v in (rule.level, rule.rate, rule.floor))
+    x = floats(loop.start)[:, 0]
+    z = np.concatenate([x, x, x, [1.0]])
+    first_input = start * rng.choice([0.0, 1.0, rng.random()])
+    style = rng.integers(3)
+    ages = [0.0, age, age / 2]
+    t, arriving, lost, events = 0.0, None, 0, [0.0]
+    next_test, found = sampling, list[Exceeded]()
+    current = ages[rng.integers(3)]
+    signs = tuple(rng.choice([-1.0, 1.0], len(loop.sizes)))
+    bounds = [
+        (b.output, float(b.decaying.mid()), float(b.constant.mid())) for b in proof.bounds if b.from_start
+    ]
+    r = float(proof.rate.mid())
+    while t < until:
+        stop = min(v for v in (next_test, arriving or np.inf) if v > t)
+        if t < first_input < stop:
+            stop = first_input
+        acting = current if t >= first_input else None
+        step = plant.step(acting, signs, round((stop - t) / 2, 12))
+        for half in (1, 2):
+            z = step @ z
+            _compare(found, plant, z, W, t + half * (stop - t) / 2, bounds, r, acting, signs)
+        t = stop
+        if arriving and t >= arriving:
+            z[2 * n : 3 * n], arriving = z[n : 2 * n], None
+        if t >= next_test:
+            e = W @ (z[n : 2 * n] - z[:n])
+            threshold = max(level * np.exp(-rate * t), floor)
+            fires = np.linalg.norm(e) > threshold or (rule.always and rng.random() < 0.2)
+            if fires:
+                if arriving:
+                    found.append(Exceeded("an event while an update is on its way", t, 0.0, 0.0))
+                if t < first_input:
+                    found.append(Exceeded("an event before the first input", t, 0.0, first_input))
+                _apart(found, proof, events, t)
+                z[n : 2 * n] = z[:n]
+                loses = lost < loop.losses and (style == 0 or (style == 1 and rng.random() < 0.7))
+                lost = lost + 1 if loses else 0
+                if not loses and delay:
+                    late = delay * rng.choice([1.0, 1.0, 0.5, 0.0])
+                    arriving = t + max(round(late, 9), 1e-9)
+                elif not loses:
+                    z[2 * n : 3 * n] = z[n : 2 * n]
+            next_test = t + (round(rng.choice([least, sampling]), 9))
+            current = ages[rng.integers(3)] if rng.random() < 0.3 else current
+            if rng.random() < 0.05:
+                signs = tuple(rng.choice([-1.0, 1.0], len(loop.sizes)))
+    return found
+
+
+def _apart(found: list[Exceeded], proof: Proof, events: list[float], t: float) -> None:
+    least = proof.first_event if len(events) == 1 else proof.inter_event
+    if least is not None and t - events[-1] < float(least.mid()) - 1e-9:
+        found.append(Exceeded("inter-event time", t, t - events[-1], float(least.mid())))
+    events.append(t)
+
+
+def _compare(
+    found: list[Exceeded],
+    plant: _Plant,
+    z: Array,
+    W: Array,
+    t: float,
+    bounds: list[tuple[str, float, float]],
+    rate: float,
+    age: float | None,
+    signs: tuple[float, ...],
+) -> None:
+    n = plant.n
+    x, xs, xc = z[:n], z[n : 2 * n], z[2 * n : 3 * n]
+    u = plant.input_matrix(age) @ xc if age is not None else np.zeros(len(plant.gain))
+    motion = plant.A @ x + plant.B @ u + plant.pushes @ np.array(signs)
+    values = {"x": x, "e_s": W @ (xs - x), "e_c": W @ (xc - x), "drift": W @ (motion - plant.H @ x)}
+    for output, decaying, constant in bounds:
+        if output == "drift" and age is None:
+            continue
+        value = values[output] if output in values else np.array([x[int(output[2:-1])]])
+        size, bound = float(np.linalg.norm(value)), float(np.hypot(decaying * np.exp(-rate * t), constant))
+        if size > bound * (1 + _ROUNDING):
+            found.append(Exceeded(output, t, size, bound))

@@ -1,0 +1,316 @@
+"""Changed documents and changed loops: the checker rejects them, or what it accepts is true.
+
+What is accepted has to pass the inequalities in floating point, in :mod:`tests.checker.floating_forms`, which
+has nothing of the checker's model, and random runs of the loop have to stay within what was proven.
+"""
+
+import copy
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from flint import arb
+
+from noack.theory.witnesses.documents import find_witness
+from noack_check.balls import matrix, number
+from noack_check.check import RejectedError
+from noack_check.loop import Loop
+from noack_check.model import Model
+from noack_check.proof import prove
+from tests.checker.floating_forms import Forms
+from tests.checker.runs import exceeded
+from tests.checker.test_witnesses import double_integrator
+
+Document = dict[str, Any]
+Rng = np.random.Generator
+_OUTPUTS = ("x", "x[1]", "e_s", "e_c")
+
+
+def pushed() -> Loop:
+    """Return a loop with a floor, a box of plants, and a disturbance."""
+    loop = double_integrator(floor=0.02)
+    return loop._replace(
+        half_A=matrix([[0.0, 0.0], [0.01, 0.0]]),
+        half_B=matrix([[0.0], [0.01]]),
+        pushes=matrix([[0.0], [1.0]]),
+        sizes=(arb(0.01),),
+        losses=1,
+    )
+
+
+@functools.cache
+def base(name: str) -> tuple[Loop, Document]:
+    """Return a loop and a document that is accepted; "overshoot" uses facts about w."""
+    loop = pushed() if name == "pushed" else double_integrator()
+    document = dict(find_witness(loop, _OUTPUTS).document)
+    return loop, with_overshoot(loop, document) if name == "overshoot" else document
+
+
+def with_overshoot(loop: Loop, document: Document) -> Document:
+    """Return a document in which the facts about w are used, with multipliers of 0."""
+    proof = prove(loop, document)
+    sensor = [bound for bound in proof.bounds if bound.output == "e_s"][-1]
+    found = {**copy.deepcopy(document), "overshoot": float((sensor.decaying / loop.rule.level).mid()) * 1.001}
+    for entry in found["bounds"]:
+        model = Model(loop, number(found["rate"]), number(entry["decay"]), arb(1))
+        for item in model.inequalities(entry["output"], starts=True):
+            for name, _ in item.scalars:
+                entry["numbers"].setdefault(name, 0.0)
+    prove(loop, found)
+    return found
+
+
+# Changes of documents.
+
+
+def _entry(document: Document, rng: Rng) -> Document:
+    return document["bounds"][rng.integers(len(document["bounds"]))]  # type: ignore[no-any-return]
+
+
+def _number_of(document: Document, rng: Rng, start: str = "") -> tuple[Document, str]:
+    numbers = _entry(document, rng)["numbers"]
+    names = [name for name in numbers if name.startswith(start)] or list(numbers)
+    return numbers, names[rng.integers(len(names))]
+
+
+def _scaled_number(document: Document, rng: Rng, start: str, factor: float) -> None:
+    numbers, name = _number_of(document, rng, start)
+    numbers[name] *= factor
+
+
+def _other_digit(document: Document, rng: Rng) -> None:
+    numbers, name = _number_of(document, rng)
+    text = f"{numbers[name]:.6e}"
+    place = rng.choice([i for i, c in enumerate(text) if c.isdigit()])
+    numbers[name] = float(text[:place] + str(rng.integers(10)) + text[place + 1 :])
+
+
+def _changed_matrix(document: Document, rng: Rng, change: Callable[[Any], Any]) -> None:
+    matrices = _entry(document, rng)["matrices"]
+    name = rng.choice(list(matrices))
+    M = change(np.array(matrices[name]))
+    matrices[name] = ((M + M.T) / 2).tolist()
+
+
+def _one_entry(document: Document, rng: Rng) -> None:
+    def change(M: Any) -> Any:
+        i, j = rng.integers(len(M), size=2)
+        M[i, j] = M[j, i] = M[i, j] * rng.choice([0.99, 1.01])
+        return M
+
+    _changed_matrix(document, rng, change)
+
+
+def _swapped_numbers(document: Document, rng: Rng) -> None:
+    start = rng.choice(["c", "a/", "m/flow", "m/edge", "m/output"])
+    numbers, first = _number_of(document, rng, start)
+    second = rng.choice([name for name in numbers if name.startswith(start)])
+    numbers[first], numbers[second] = numbers[second], numbers[first]
+
+
+def _swapped_locations(document: Document, rng: Rng) -> None:
+    entry = _entry(document, rng)
+    names = [n for n in entry["matrices"] if n.startswith("Q/") and np.shape(entry["matrices"][n]) == (4, 4)]
+    for first, second in [rng.choice(names, 2, replace=False)]:
+        M = entry["matrices"]
+        M[first], M[second] = M[second], M[first]
+
+
+def _another_label(document: Document, rng: Rng) -> None:
+    first, second = rng.choice(len(document["bounds"]), 2, replace=False)
+    entries = document["bounds"]
+    entries[first]["output"], entries[second]["output"] = entries[second]["output"], entries[first]["output"]
+
+
+def _scaled_entry(document: Document, rng: Rng) -> None:
+    """Change all forms by one factor, but not the levels."""
+    entry, factor = _entry(document, rng), rng.choice([0.9, 1.1])
+    entry["matrices"] = {name: (factor * np.array(M)).tolist() for name, M in entry["matrices"].items()}
+    for name in entry["numbers"]:
+        if not name.startswith("level"):
+            entry["numbers"][name] *= factor
+
+
+def _scaled(key: str, factor: float) -> Callable[[Document, Rng], None]:
+    def change(document: Document, rng: Rng) -> None:
+        table = (
+            document if key in document else _entry(document, rng) if key == "decay" else document["chain"]
+        )
+        table[key] = table.get(key, 1.0) * factor
+
+    return change
+
+
+DOCUMENTS: dict[str, Callable[[Document, Rng], object]] = {
+    "multiplier 0": lambda d, rng: _scaled_number(d, rng, "m/", 0.0),
+    "multiplier of an edge 0": lambda d, rng: _scaled_number(d, rng, "m/edge", 0.0),
+    "multiplier of a comparison 0": lambda d, rng: _scaled_number(d, rng, "a/", 0.0),
+    "multiplier of the other sign": lambda d, rng: _scaled_number(d, rng, "m/", -1.0),
+    "multiplier doubled": lambda d, rng: _scaled_number(d, rng, "m/", 2.0),
+    "level 1 % smaller": lambda d, rng: _scaled_number(d, rng, "level", 0.99),
+    "level 1 % larger": lambda d, rng: _scaled_number(d, rng, "level", 1.01),
+    "another c": lambda d, rng: _scaled_number(d, rng, "c", rng.choice([-1.0, 0.98, 1.02])),
+    "another digit": _other_digit,
+    "one entry": _one_entry,
+    "a matrix of the other sign": lambda d, rng: _changed_matrix(d, rng, lambda M: -M),
+    "a scaled matrix": lambda d, rng: _changed_matrix(d, rng, lambda M: M * rng.choice([0.97, 1.03])),
+    "scaled forms": _scaled_entry,
+    "numbers swapped": _swapped_numbers,
+    "locations swapped": _swapped_locations,
+    "outputs swapped": _another_label,
+    "rate + 5 %": _scaled("rate", 1.05),
+    "rate - 5 %": _scaled("rate", 0.95),
+    "decay + 5 %": _scaled("decay", 1.05),
+    "decay - 5 %": _scaled("decay", 0.95),
+    "inter-event time + 5 %": _scaled("inter_event_s", 1.05),
+    "inter-event time x 2": _scaled("inter_event_s", 2.0),
+    "inter-event time - 5 %": _scaled("inter_event_s", 0.95),
+    "first event x 2": _scaled("first_event_s", 2.0),
+    "gain of the chain - 1 %": _scaled("gain", 0.99),
+    "gain of the chain + 1 %": _scaled("gain", 1.01),
+    "overshoot - 5 %": _scaled("overshoot", 0.95),
+    "overshoot + 5 %": _scaled("overshoot", 1.05),
+}
+
+# Changes of loops.
+
+
+def _one_of(field: str, factors: tuple[float, ...] = (0.98, 1.02)) -> Callable[[Loop, Rng], Loop]:
+    def change(loop: Loop, rng: Rng) -> Loop:
+        M = getattr(loop, field) * 1
+        found = [(i, j) for i in range(M.nrows()) for j in range(M.ncols()) if M[i, j] != 0]
+        for i, j in found[rng.integers(len(found)) :][:1] if found else []:
+            M[i, j] = M[i, j] * number(rng.choice(factors))
+        return loop._replace(**{field: M})
+
+    return change
+
+
+def _time(field: str, factor: int) -> Callable[[Loop, Rng], Loop]:
+    def change(loop: Loop, rng: Rng) -> Loop:
+        times = loop.times._replace(**{field: getattr(loop.times, field) * factor})
+        return loop._replace(times=times)
+
+    return change
+
+
+def _rule(field: str, factor: float) -> Callable[[Loop, Rng], Loop]:
+    def change(loop: Loop, rng: Rng) -> Loop:
+        return loop._replace(rule=loop.rule._replace(**{field: getattr(loop.rule, field) * number(factor)}))
+
+    return change
+
+
+LOOPS: dict[str, Callable[[Loop, Rng], Loop]] = {
+    "one loss more": lambda loop, rng: loop._replace(losses=loop.losses + 1),
+    "one loss less": lambda loop, rng: loop._replace(losses=loop.losses - 1),
+    "two losses more": lambda loop, rng: loop._replace(losses=loop.losses + 2),
+    "A": _one_of("A"),
+    "B": _one_of("B"),
+    "model A": _one_of("model_A"),
+    "model B": _one_of("model_B"),
+    "K": _one_of("gain"),
+    "K of the other sign": _one_of("gain", (-1.0,)),
+    "W": _one_of("weight"),
+    "box + 2 %": _one_of("half_B", (1.02,)),
+    "box - 2 %": _one_of("half_A", (0.98,)),
+    "a state 1 % off": _one_of("start", (1.01,)),
+    "a smaller start": _one_of("start", (0.99,)),
+    "start of the other sign": lambda loop, rng: loop._replace(start=loop.start * -1),
+    "another push": _one_of("pushes"),
+    "larger disturbance": lambda loop, rng: loop._replace(sizes=tuple(s * number(1.1) for s in loop.sizes)),
+    "level + 5 %": _rule("level", 1.05),
+    "level - 5 %": _rule("level", 0.95),
+    "floor + 5 %": _rule("floor", 1.05),
+    "floor - 5 %": _rule("floor", 0.95),
+    "rate + 5 %": _rule("rate", 1.05),
+    "rate - 5 %": _rule("rate", 0.95),
+    "another rule": lambda loop, rng: loop._replace(rule=loop.rule._replace(positive=loop.rule.positive * 2)),
+    "holds": lambda loop, rng: loop._replace(holds=True),
+    "sampling x 2": _time("sampling", 2),
+    "delay x 2": _time("delay", 2),
+    "delay x 4": _time("delay", 4),
+    "age x 2": _time("age", 2),
+    "start x 2": _time("start", 2),
+    "start x 4": _time("start", 4),
+    "no delay": _time("delay", 0),
+    "no age": _time("age", 0),
+    "no start": _time("start", 0),
+}
+
+
+def is_true_or_rejected(loop: Loop, document: Document, seed: int) -> bool:
+    """Return whether a document was rejected; what is accepted has to be true."""
+    try:
+        proof = prove(loop, document)
+    except RejectedError:
+        return True
+    rng = np.random.default_rng(seed)
+    if "overshoot" not in document:
+        for entry in document["bounds"]:
+            assert entry["output"] == "x[1]" or Forms(loop, document["rate"], entry).holds(
+                entry["output"], rng
+            )
+    for _ in range(3):
+        assert exceeded(loop, proof, rng, 6.0) == []
+    return False
+
+
+def mutated_document(name: str, change: str, seed: int) -> bool:
+    loop, document = base(name)
+    other = copy.deepcopy(document)
+    DOCUMENTS[change](other, np.random.default_rng(seed))
+    return is_true_or_rejected(loop, other, seed)
+
+
+def mutated_loop(name: str, change: str, seed: int) -> bool:
+    loop, document = base(name)
+    return is_true_or_rejected(LOOPS[change](loop, np.random.default_rng(seed)), document, seed)
+
+
+@pytest.mark.parametrize("name", ["plain", "pushed", "overshoot"])
+def test_the_documents_are_true(name: str) -> None:
+    loop, document = base(name)
+    assert not is_true_or_rejected(loop, document, 0)
+
+
+SOME_DOCUMENTS = (
+    "multiplier of the other sign", "level 1 % smaller", "a matrix of the other sign", "outputs swapped",
+    "inter-event time x 2", "gain of the chain - 1 %", "rate + 5 %",
+)  # fmt: skip
+SOME_LOOPS = (
+    "one loss more",
+    "K of the other sign",
+    "box + 2 %",
+    "a state 1 % off",
+    "delay x 4",
+    "start x 4",
+)
+
+
+@pytest.mark.parametrize("change", SOME_DOCUMENTS)
+def test_some_changed_documents_are_rejected(change: str) -> None:
+    assert mutated_document("pushed", change, 1)
+
+
+@pytest.mark.parametrize("change", SOME_LOOPS)
+def test_some_changed_loops_are_rejected(change: str) -> None:
+    assert mutated_loop("pushed", change, 1)
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("name", ["plain", "pushed", "overshoot"])
+@pytest.mark.parametrize("change", DOCUMENTS)
+def test_changed_documents_prove_nothing_false(name: str, change: str) -> None:
+    for seed in range(4):
+        mutated_document(name, change, seed)
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("name", ["plain", "pushed", "overshoot"])
+@pytest.mark.parametrize("change", LOOPS)
+def test_changed_loops_make_nothing_false_proven(name: str, change: str) -> None:
+    for seed in range(2):
+        mutated_loop(name, change, seed)

@@ -1,0 +1,53 @@
+"""What a witness proves of random loops is never exceeded in runs of them."""
+
+import numpy as np
+import pytest
+
+from noack.theory.witnesses.documents import NoWitnessError, find_witness
+from noack_check.balls import number
+from tests.checker.random_loops import random_loop
+from tests.checker.runs import exceeded
+from tests.checker.test_witnesses import double_integrator
+
+_RUNS = 6
+
+
+def _found_for(seed: int) -> bool:
+    """Return whether there is a witness, after runs of the loop."""
+    rng = np.random.default_rng(seed)
+    loop = random_loop(rng)
+    try:
+        proof = find_witness(loop).proof
+    except NoWitnessError:
+        return False
+    until = 600 * float(loop.times.sampling.p) / float(loop.times.sampling.q)
+    for _ in range(_RUNS):
+        assert exceeded(loop, proof, rng, until) == []
+    return True
+
+
+def test_bounds_of_a_few_random_loops_are_not_exceeded() -> None:
+    found = [_found_for(seed) for seed in (105, 108)]  # with one state: fast
+    assert any(found)
+
+
+def test_runs_come_near_the_bounds() -> None:
+    """Runs that could not exceed a bound that is too small would show nothing."""
+    rng = np.random.default_rng(1)
+    loop = double_integrator()
+    proof = find_witness(loop).proof
+    smaller = [
+        bound._replace(decaying=bound.decaying * share)
+        for bound in proof.bounds
+        for share in [number({"x": 0.9, "e_s": 0.8, "e_c": 0.2, "drift": 0.1}[bound.output])]
+    ]
+    changed = proof._replace(bounds=tuple(smaller))
+    found = {each.output for _ in range(3) for each in exceeded(loop, changed, rng, 6.0)}
+    assert found >= {"x", "e_s", "e_c", "drift"}
+
+
+@pytest.mark.system
+@pytest.mark.timeout(1200)
+def test_bounds_of_random_loops_are_not_exceeded() -> None:
+    seeds = range(100, 150)
+    assert sum(_found_for(seed) for seed in seeds) >= len(seeds) // 4
