@@ -67,6 +67,7 @@ def check_file(file: Table, given: Table | None) -> Iterator[str]:
     if given is not None and given != scenario:
         different = [key for key in {*given, *scenario} if given.get(key) != scenario.get(key)]
         raise RejectedError(f"the witness is of another scenario: {', '.join(sorted(different))} differ")
+    scenario = scenario if given is None else given
     for document in statements:
         if not isinstance(document, Mapping):
             raise RejectedError("a statement is no table")

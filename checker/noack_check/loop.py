@@ -6,6 +6,9 @@ from flint import arb, arb_mat, fmpq
 
 from noack_check.balls import identity, is_zero, stack, zeros
 
+_MOST_STATES, _MOST_LOSSES = 40, 1000
+"""A proof of a larger loop would take hours."""
+
 
 class Rule(NamedTuple):
     """The trigger's rule: with z = (x, e_s), an event needs ‖P z‖² > max(c e^{−ρt}, f)² + ‖N z‖².
@@ -72,6 +75,8 @@ class Loop(NamedTuple):
         """Return what is wrong with the numbers, or an empty text."""
         n, rule, times = self.n, self.rule, self.times
         m, k = self.B.ncols(), self.pushes.ncols()
+        if not 0 < max(n, m, k) <= _MOST_STATES or not 0 <= self.losses <= _MOST_LOSSES:
+            return f"not from 1 to {_MOST_STATES} states, or not from 0 to {_MOST_LOSSES} losses"
         shapes = {
             "A": (n, n), "B": (n, m), "half_A": (n, n), "half_B": (n, m), "model_A": (n, n),
             "model_B": (n, m), "gain": (m, n), "weight": (n, n), "start": (n, 1), "pushes": (n, k),
@@ -92,8 +97,8 @@ class Loop(NamedTuple):
         for name, size in sizes.items():
             if not (size.is_finite() and size >= 0):
                 return f"{name}: not a number of at least 0"
-        if n == 0 or len(self.sizes) != k or self.losses < 0:
-            return "no states, not one size for each disturbance, or losses below 0"
+        if n == 0 or len(self.sizes) != k:
+            return "no states, or not one size for each disturbance"
         if not all(time >= 0 for time in times) or times.least_sampling > times.sampling:
             return "times: below 0, or tests further apart than they may be"
         if rule.period > 0 and rule.positive.nrows():

@@ -275,10 +275,10 @@ def _at_first_input(loop: Loop, rate: arb) -> arb:
 
     No test is needed between the first input and the last one before it: the drift has no bound there.
     """
-    until, rule = loop.times.start, loop.rule
+    until, (level, floor) = loop.times.start, thresholds(loop, rate)
     if until == 0:
         return arb(1)
-    threshold = ((rule.level * (-rate * until).exp()) ** 2 + rule.floor**2).sqrt()
+    threshold = ((level * (-rate * until).exp()) ** 2 + floor**2).sqrt()
     return arb((error_without_input(loop, until) / threshold).max(arb(1)).abs_upper())
 
 

@@ -317,6 +317,8 @@ def _tables(table: Table, name: str) -> Sequence[Table]:
 def _checked(value: object, name: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise RefusedError(f"{name}: not a number")
+    if isinstance(value, int) and abs(value) > 2**63:
+        raise RefusedError(f"{name}: too large")
     if not math.isfinite(value):
         raise RefusedError(f"{name}: not finite")
     return value

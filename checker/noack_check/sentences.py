@@ -16,7 +16,15 @@ def sentences(proof: Proof) -> Iterator[str]:
     for bound in smallest_bounds(proof):
         yield f"{_NAMES.get(bound.output, f'|{bound.output}|')} ≤ {formula(bound, proof.rate)}"
     if proof.inter_event is not None and proof.inter_event > 0:
-        yield f"two events are at least {at_least(proof.inter_event)} s apart"
+        yield f"two events are at least {at_least(proof.inter_event)} s apart{_exception(proof)}"
+
+
+def _exception(proof: Proof) -> str:
+    """Return what is proven of the first event, if it is less."""
+    first = proof.first_event
+    if first is None or proof.inter_event is None or first >= proof.inter_event:
+        return ""
+    return f", but the second event may come {at_least(first)} s after the first, at t = 0"
 
 
 def smallest_bounds(proof: Proof) -> list[Bound]:
@@ -37,7 +45,8 @@ def size(bound: Bound) -> float:
 def formula(bound: Bound, rate: arb) -> str:
     """Return a bound of D₁ e^{−rt} + D₂, which is at least (D₁² e^{−2rt} + D₂²)^½."""
     if not bound.from_start:
-        return f"{at_most(bound.constant)} in the limit"
+        last = bound.constant if rate > 0 else (bound.decaying**2 + bound.constant**2).sqrt()
+        return f"{at_most(last)} in the limit"
     decay = f" e^(−{at_least(rate)} t)" if rate > 0 else ""
     parts = [f"{at_most(bound.decaying)}{decay}"] if bound.decaying != 0 else []
     if bound.constant != 0:

@@ -11,10 +11,13 @@ from flint import arb, fmpq
 from noack.theory.witnesses.documents import NoWitnessError, Witness, find_witness
 from noack_check.balls import identity, is_positive, matrix, number, zeros
 from noack_check.check import RejectedError, _value
+from noack_check.keys import RefusedError
 from noack_check.loop import Loop
-from noack_check.model import Model
+from noack_check.model import Model, thresholds
 from noack_check.norms import decays_below
-from noack_check.proof import _prove_quiet_start, prove
+from noack_check.proof import Bound, Proof, _at_first_input, _prove_quiet_start, error_without_input, prove
+from noack_check.scenario import _checked
+from noack_check.sentences import formula, sentences
 from tests.checker.test_witnesses import IDEAL, SCHEDULE, double_integrator
 
 DEFAULT = double_integrator()
@@ -63,6 +66,7 @@ WRONG: dict[str, Callable[[Loop], Loop]] = {
     "not a number": lambda loop: loop._replace(start=loop.start * arb("nan")),
     "a disturbance without size": lambda loop: loop._replace(pushes=matrix([[0.0], [1.0]])),
     "a negative size": lambda loop: loop._replace(pushes=matrix([[0.0], [1.0]]), sizes=(arb(-1),)),
+    "a billion losses": lambda loop: loop._replace(losses=10**9),
     "less than no losses": lambda loop: loop._replace(losses=-1),
     "two comparisons at once": lambda loop: loop._replace(rule=loop.rule._replace(period=arb(1))),
     "rare and frequent tests": lambda loop: loop._replace(times=loop.times._replace(least_sampling=fmpq(1))),
@@ -122,6 +126,27 @@ def test_events_without_a_comparison_may_come_before_the_first_input() -> None:
 
 def test_a_start_in_which_an_event_may_come_is_rejected(witness: Witness) -> None:
     rejects(DEFAULT._replace(times=SCHEDULE._replace(start=fmpq(1, 2))), witness.document)
+
+
+def test_the_threshold_at_the_first_input_is_one_constant_at_rate_0() -> None:
+    loop = early(0.0045)
+    loop = loop._replace(rule=loop.rule._replace(floor=arb(0.004), rate=arb(0)))
+    level, floor = thresholds(loop, arb(0))
+    reached = error_without_input(loop, loop.times.start)
+    assert level == 0
+    assert _at_first_input(loop, arb(0)) * floor >= reached > floor
+
+
+def test_the_second_event_has_a_sentence_of_its_own() -> None:
+    apart, first = arb(0.25), arb(0.125)
+    assert list(sentences(Proof(arb(1), (), apart, apart))) == ["two events are at least 0.25 s apart"]
+    assert "0.125" in next(iter(sentences(Proof(arb(1), (), apart, first))))
+
+
+def test_what_does_not_decay_counts_in_the_limit() -> None:
+    bound = Bound("x", arb(3), arb(4), False)
+    assert formula(bound, arb(0)) == "5.0 in the limit"
+    assert formula(bound, arb(1)) == "4.0 in the limit"
 
 
 # Conditions without which the statements would be false.
@@ -286,3 +311,8 @@ def test_a_matrix_is_square_symmetric_and_of_the_right_size(witness: Witness, va
     document = changed(witness)
     entry_of(document, "x")["matrices"]["X"] = value
     rejects(DEFAULT, document, "X")
+
+
+def test_a_number_of_a_scenario_may_have_any_number_of_digits() -> None:
+    with pytest.raises(RefusedError, match="gain: too large"):
+        _checked(10**400, "gain")
