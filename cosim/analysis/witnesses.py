@@ -73,6 +73,11 @@ def find_witnesses(
     return Witnesses(content, found)
 
 
+def find_statement(resolved: Scenario, *, plants: str, conditions: str) -> WitnessedStatement:
+    """Search for the witness of one statement: of "own" or "box" plants, "ideal" or "schedule"."""
+    return _statement(resolved_content(resolved, resolved.certificate.late_periods), plants, conditions)
+
+
 def resolved_content(resolved: Scenario, late_periods: int) -> dict[str, object]:
     """Return the tables of a resolved scenario, as `noack check --resolved` prints them."""
     certificate = resolved.certificate.model_copy(update={"late_periods": late_periods})

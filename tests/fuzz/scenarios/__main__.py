@@ -76,7 +76,7 @@ def _without_numbers(line: str) -> str:
 
 
 def checked_draws(
-    seed: int, numbers: Iterator[int], processes: int, limit_s: float, *, theory: bool
+    seed: int, numbers: Iterator[int], processes: int, limit_s: float, *, theory: bool, witnesses: bool
 ) -> Iterator[Checked]:
     """Check draws in some processes; yield the results as they come.
 
@@ -87,7 +87,8 @@ def checked_draws(
         pending: dict[Future[Checked], int] = {}
         while True:
             for number in islice(numbers, processes + 1 - len(pending)):
-                pending[pool.submit(check_draw, seed, number, limit_s, theory=theory)] = number
+                future = pool.submit(check_draw, seed, number, limit_s, theory=theory, witnesses=witnesses)
+                pending[future] = number
             if not pending:
                 return
             done, _ = wait(pending, return_when=FIRST_COMPLETED)
@@ -131,13 +132,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--failures", type=Path, default=Path("fuzz-failures"), help="folder for failing draws"
     )
     parser.add_argument("--runs-only", action="store_true", help="no claims, certificates and adversary")
+    parser.add_argument("--witnesses", action="store_true", help="also search for witnesses")
     options = parser.parse_args(arguments)
     totals, began_s = Totals(), time.monotonic()
     said_s = began_s
     processes = min(options.processes, len(options.only)) if options.only else options.processes
     numbers, theory = _numbers(options), not options.runs_only
     with contextlib.suppress(KeyboardInterrupt):  # the results so far are shown
-        for checked in checked_draws(options.seed, numbers, processes, options.limit, theory=theory):
+        for checked in checked_draws(
+            options.seed, numbers, processes, options.limit, theory=theory, witnesses=options.witnesses
+        ):
             totals.add(checked, options.failures)
             if time.monotonic() - said_s > _EVERY_S:
                 said_s = time.monotonic()

@@ -18,10 +18,13 @@ from tempfile import TemporaryDirectory
 from types import FrameType
 from typing import NamedTuple
 
+import numpy as np
+
 from cosim.analysis.adversary import Objective, conditions_of, find_worst
 from cosim.analysis.certificates import certificates_of
 from cosim.analysis.explained_run.explain import explains
 from cosim.analysis.replay.run_replay import replay_run
+from cosim.analysis.witnesses import find_statement
 from cosim.cli.scenario_check import check_scenario
 from cosim.live.finalize import finalize
 from cosim.record.run_directory import RunEnding
@@ -31,9 +34,12 @@ from noack.core.errors import NoackError
 from noack.scenario.resolution import resolve, resolve_run, resolved_loops
 from noack.scenario.scenario import Scenario, loops_by_entry
 from noack.scenario.scenario_file import dumps, load
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.scenario_certificates import certify
 from noack.trigger_policies.decaying import DecayingSettings
+from noack_check.proof import Proof
 from tests.fuzz.scenarios.draws import Draw, draw, drawn_keys
+from tests.fuzz.scenarios.proven_bounds import proven_limit, sizes_of, with_proven_bounds
 
 LIMIT_S = 60.0
 """Largest CPU time of a step."""
@@ -174,10 +180,12 @@ class Checks:
         if isinstance(resolved.trigger, DecayingSettings) and resolved.coverage.is_undisturbed:
             self._attack(resolved, continuous=True)
 
-    def _attack(self, resolved: Scenario, *, continuous: bool) -> None:
-        certificate = None
-        with self.step("certificate to attack"):
-            certificate = certify(resolved, conditions_of(resolved, continuous=continuous))
+    def _attack(
+        self, resolved: Scenario, *, continuous: bool, certificate: ScenarioCertificate | None = None
+    ) -> None:
+        if certificate is None:
+            with self.step("certificate to attack"):
+                certificate = certify(resolved, conditions_of(resolved, continuous=continuous))
         for objective in (Objective.ERROR, Objective.STATE, Objective.INTER_EVENT):
             if certificate is None:
                 return
@@ -193,8 +201,44 @@ class Checks:
                     what = f"{resolved.name}, {loop}: {objective.value}: {values}"
                     self.add("attack", what, worst.text)
 
+    def prove(self, loop: Scenario, ending: RunEnding | None) -> None:
+        """Search for a witness of a loop, and for runs and losses that exceed what it proves."""
+        resolved = resolve(loop)
+        for conditions in ("schedule", "ideal"):
+            proof = None
+            with self.step(f"prove, {conditions}"):
+                statement = find_statement(resolved, plants="own", conditions=conditions)
+                proof = statement.proof
+                self.refusals[f"prove: {statement.reason}"] += proof is None
+            if proof is None:
+                continue
+            self.counts[f"proven, {conditions}"] += 1
+            is_ideal = conditions == "ideal"
+            if not is_ideal and ending is not None:
+                self._compare(ending, proof)
+            is_attacked = isinstance(resolved.trigger, DecayingSettings) and resolved.coverage.is_undisturbed
+            if not is_ideal or is_attacked:
+                certificate = with_proven_bounds(
+                    certify(resolved, conditions_of(resolved, continuous=is_ideal)), proof, resolved
+                )
+                self._attack(resolved, continuous=is_ideal, certificate=certificate)
 
-def check_draw(seed: int, number: int, limit_s: float = LIMIT_S, *, theory: bool = True) -> Checked:
+    def _compare(self, ending: RunEnding, proof: Proof) -> None:
+        """Compare the states and errors of a run of one loop with what is proven."""
+        records = load_run(ending.run_dir).loops
+        if len(records) > 1 or records[0].scenario.changes:
+            return
+        for output, t_s, sizes in sizes_of(records[0]):
+            limit = proven_limit(proof, output, t_s)
+            if len(over := np.flatnonzero(sizes > limit * (1 + 1e-9) + 1e-12)):
+                at = over[0]
+                what = f"‖{output}‖ = {sizes[at]:.6g} at {t_s[at]:.4f} s, proven {limit[at]:.6g}"
+                self.add("prove", what)
+
+
+def check_draw(
+    seed: int, number: int, limit_s: float = LIMIT_S, *, theory: bool = True, witnesses: bool = False
+) -> Checked:
     """Draw a scenario, and check all that is done with it; without theory only its run."""
     drawn = draw(seed, number)
     with TemporaryDirectory(prefix="noack-fuzz-") as folder:
@@ -208,6 +252,8 @@ def check_draw(seed: int, number: int, limit_s: float = LIMIT_S, *, theory: bool
             for loops in loops_by_entry(scenario)[: _MOST_ENTRIES if theory else 0]:
                 checks.certify(loops[0])
                 checks.attack(loops[0])
+                if witnesses:
+                    checks.prove(loops[0], ending)
     keys = set[str]() if scenario is None else drawn_keys(drawn.content)
     return Checked(
         seed, number, scenario is None, checks.contradictions, keys, checks.counts, checks.refusals
