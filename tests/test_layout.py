@@ -20,7 +20,7 @@ EXTENSIONS = sorted(str(path.relative_to(ROOT)) for path in ROOT.glob("extension
 def test_names_of_classes_are_unique() -> None:
     names = Counter(
         node.name
-        for folder in (*PACKAGES, "benchmarks", *EXTENSIONS)
+        for folder in (*PACKAGES, "checker", "benchmarks", *EXTENSIONS)
         for path in (ROOT / folder).rglob("*.py")
         if path.name != HEADER
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
@@ -75,7 +75,7 @@ def test_no_time_of_a_run_is_read_from_the_wall_clock() -> None:
     reads = re.compile(r"\btime\.time(_ns)?\(|CLOCK_REALTIME\)|datetime\.(now|today)\(|utcnow")
     readers = {
         str(path.relative_to(ROOT))
-        for folder in (*PACKAGES, "native", *EXTENSIONS)
+        for folder in (*PACKAGES, "checker", "native", *EXTENSIONS)
         for path in (ROOT / folder).rglob("*.[pc]*")
         if path.suffix in (".py", ".c") and reads.search(path.read_text())
     }

@@ -19,8 +19,10 @@ from noack_check.check import RejectedError
 from noack_check.keys import RefusedError, Table
 from noack_check.proof import prove
 from noack_check.scenario import read_loop
-from noack_check.sentences import sentences
+from noack_check.sentences import assumptions, sentences
 
+_PLANTS = {"own": "its plant", "box": "all plants of its uncertainty box"}
+_CONDITIONS = {"ideal": "ideal conditions", "schedule": "its schedule"}
 MOST_BYTES = 64 * 1024**2
 
 
@@ -72,11 +74,13 @@ def check_file(file: Table, given: Table | None) -> Iterator[str]:
         if not isinstance(document, Mapping):
             raise RejectedError("a statement is no table")
         plants, conditions = document.get("plants"), document.get("conditions")
-        if plants not in ("own", "box") or conditions not in ("ideal", "schedule"):
+        if plants not in _PLANTS or conditions not in _CONDITIONS:
             raise RejectedError("a statement has no plants or conditions")
         loop = read_loop(scenario, box=plants == "box", ideal=conditions == "ideal")
+        of = f"{scenario.get('name')}, {_PLANTS[plants]}, {_CONDITIONS[conditions]}"
         for sentence in sentences(prove(loop, document)):
-            yield f"PROVED {scenario.get('name')}, {plants} plant, {conditions}: {sentence}"
+            yield f"PROVED {of}: {sentence}"
+        yield f"       if there are {assumptions(scenario, loop)}"
 
 
 def _read(path: Path, parse: object) -> Table:

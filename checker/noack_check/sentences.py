@@ -1,14 +1,34 @@
 """What was proven, in words; decimals are rounded so that the sentences stay true."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 
 from flint import arb
 
+from noack_check.loop import Loop
 from noack_check.proof import Bound, Proof
 
 _SHORT = 7
 _NAMES = {"x": "‖x‖", "e_s": "‖W e_s‖", "e_c": "‖W e_c‖", "drift": "‖W(ẋ − Hx)‖"}
+
+
+def assumptions(scenario: Mapping[str, object], loop: Loop) -> str:
+    """Return what a statement assumes of a run, in words."""
+    times = loop.times
+    network = scenario.get("network")
+    enforced = not isinstance(network, Mapping) or network.get("enforce_mansd", True)
+    parts = [f"at most {loop.losses} consecutive losses{'' if enforced else ', which nothing enforces'}"]
+    if times.sampling > 0:
+        ms = {name: f"{float(1000 * arb(getattr(times, name)).mid()):.6g} ms" for name in times._fields}
+        parts += [
+            f"tests every {ms['sampling']}",
+            f"updates act within {ms['delay']}",
+            f"inputs at most {ms['age']} old",
+            f"the first within {ms['start']}",
+        ]
+    if scenario.get("changes"):
+        parts.append("until the first change of settings")
+    return ", ".join(parts)
 
 
 def sentences(proof: Proof) -> Iterator[str]:

@@ -41,8 +41,21 @@ def test_the_program_prints_what_is_proven(
 ) -> None:
     status, text = run(capsys, monkeypatch, str(file))
     assert status == 0
-    assert all(line.startswith("PROVED unstable_pendulum, ") for line in text.splitlines())
-    assert "own plant, schedule: ‖x‖ ≤ 0.4" in text  # 0.285 is the largest that was found
+    lines = text.splitlines()
+    proven = [line for line in lines if line.startswith("PROVED unstable_pendulum, ")]
+    assumed = [line for line in lines if line.startswith("       if there are at most 3 consecutive losses")]
+    assert (len(lines), len(assumed)) == (len(proven) + 4, 4)
+    assert "its plant, its schedule: ‖x‖ ≤ 0.4" in text  # 0.285 is the largest that was found
+    assert "losses, tests every 2 ms, updates act within 6 ms, inputs at most 7 ms old, the first" in text
+
+
+def test_what_a_statement_assumes_is_printed(file: Path) -> None:
+    content = json.loads(file.read_text())
+    content["statements"] = content["statements"][:1]
+    content["scenario"]["network"]["enforce_mansd"] = False
+    content["scenario"]["changes"] = [{"at_s": 1.0, "key": "trigger.beta", "value": 0.1}]
+    text = "\n".join(check_file(content, None))
+    assert "losses, which nothing enforces, until the first change of settings" in text
 
 
 def test_another_scenario_is_told_apart(

@@ -38,9 +38,16 @@ def simulated_frames(model: Model) -> Frames:
             for name, S in model.form(index, node).parts:
                 where = [place.coordinates[int(np.flatnonzero(row)[0])] for row in floats(S)]
                 block = (runs.moments("") if name.startswith("X") else own)[np.ix_(where, where)]
-                block = block + 1e-3 * np.diag(np.diag(block)) + 1e-9 * np.trace(block) * np.eye(len(where))
-                frames[name] = 2 * np.linalg.cholesky(block)
+                frames[name] = 2 * _root(block + 1e-3 * np.diag(np.diag(block)))
     return frames
+
+
+def _root(M: Matrix) -> Matrix:
+    """Return an invertible T with TTᵀ near M, also where M is singular, 0 or no number."""
+    if not np.isfinite(M).all() or not M.any():
+        return np.eye(len(M))
+    values, vectors = np.linalg.eigh((M + M.T) / 2)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 1e-9 * values[-1])))
 
 
 class _Runs:
