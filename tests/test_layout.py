@@ -20,7 +20,7 @@ EXTENSIONS = sorted(str(path.relative_to(ROOT)) for path in ROOT.glob("extension
 def test_names_of_classes_are_unique() -> None:
     names = Counter(
         node.name
-        for folder in (*PACKAGES, "checker", "benchmarks", *EXTENSIONS)
+        for folder in (*PACKAGES, "benchmarks", *EXTENSIONS)
         for path in (ROOT / folder).rglob("*.py")
         if path.name != HEADER
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
