@@ -46,7 +46,7 @@ class Forms:
         errors = np.vstack([self.e, self.w])[: len(Q)]
         P: Array = self.x.T @ X @ self.x + errors.T @ Q @ errors
         for name, f in (("c1", self.f1), ("c2", self.f2)):
-            P = P - self.numbers.get(f"{name}/{own}", 0.0) * f.T @ f
+            P = P - self.numbers.get(f"{name}/{own}", self.numbers.get(name, 0.0)) * f.T @ f
         return P - self.numbers[f"a/{own}"] * self.times[0] * self.compared if tested and node else P
 
     def flow(self, place: str, age: float) -> tuple[Array, list[tuple[Array, Array]]]:
@@ -164,7 +164,10 @@ class Forms:
         M = self.form(source, node) - jump.T @ self.form(target, other) @ jump
         if event and not self.loop.rule.always:
             compared = self.compared + self.threshold
-            facts = [self.floor_only - compared] + [self.level_only - compared] * self.exact_level
+            above_floor = float(self.loop.rule.floor.mid()) > 0 or not self.exact_level
+            facts = [self.level_only - compared] * self.exact_level + [
+                self.floor_only - compared
+            ] * above_floor
             for i, fact in enumerate(facts):
                 M = M + self.numbers[f"m/edge/{name}/{node} {other}/{i}"] * fact
         return self._is_psd(source, M)

@@ -106,7 +106,7 @@ def _one_entry(document: Document, rng: Rng) -> None:
 def _swapped_numbers(document: Document, rng: Rng) -> None:
     start = rng.choice(["c", "a/", "m/flow", "m/edge", "m/output"])
     numbers, first = _number_of(document, rng, start)
-    second = rng.choice([name for name in numbers if name.startswith(start)])
+    second = rng.choice([name for name in numbers if name.startswith(start)] or list(numbers))
     numbers[first], numbers[second] = numbers[second], numbers[first]
 
 
