@@ -9,8 +9,8 @@ of constant bounds. With the input u = K e^{−Hs} x_c of age s,
 An event sets e := 0 at once, since the sensor's model is reset whether or not the update arrives. The
 controller's error w grows by e, and becomes 0 when the first input acts that was computed from an
 update of the newest event. So a location says how many updates were lost since, and whether one is
-on its way. ``assumed`` in :class:`Model` says that no event happens while one is: :mod:`.events` proves
-this from bounds of the same loop, by induction over the events.
+on its way. The model assumes that no event happens while one is: :mod:`.proof` shows this from bounds of
+the same loop, by induction over the events.
 
 An *inequality* of :meth:`Model.inequalities` is a symmetric matrix that depends linearly on the
 numbers of a witness (matrices, multipliers, levels) and has to be positive semidefinite. Together they
