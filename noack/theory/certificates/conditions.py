@@ -148,9 +148,31 @@ def void_by_uneven_steps(resolved: Scenario) -> str | None:
     )
 
 
+def void_by_watchdog(resolved: Scenario, conditions: NetworkConditions) -> str | None:
+    """Return why there is no certificate if the watchdog may replace an input that is not too old.
+
+    At a step, an input is at most as old as ``conditions.hold_s``, less the step until the next one.
+    Where actuations cross the network, the settings are checked with their losses.
+    """
+    watchdog, timing = resolved.plant.watchdog, resolved.timing
+    if watchdog.policy == "hold" or resolved.network.actuation is not None:
+        return None
+    oldest_s = conditions.hold_s - timing.plant_period_ns / NS_PER_S
+    if timing.actuation_timeout_ns / NS_PER_S >= oldest_s * (1 - 1e-12):
+        return None
+    return (
+        f"plant.watchdog.timeout_s: the watchdog may replace an input, which may be {1e3 * oldest_s:g} ms old "
+        "at a step; set it to at least that"
+    )
+
+
 def void_beforehand(resolved: Scenario, conditions: NetworkConditions) -> str | None:
-    """Return why there is no certificate before a run; see these two functions."""
-    return void_without_delay(resolved, conditions) or void_by_safe_input(resolved, conditions)
+    """Return why there is no certificate before a run; see these three functions."""
+    return (
+        void_without_delay(resolved, conditions)
+        or void_by_safe_input(resolved, conditions)
+        or void_by_watchdog(resolved, conditions)
+    )
 
 
 def certified_delay_s(resolved: Scenario) -> float:

@@ -29,6 +29,7 @@ from noack.theory.certificates.conditions import (
     void_beforehand,
     void_by_safe_input,
     void_by_uneven_steps,
+    void_by_watchdog,
 )
 from noack.theory.certificates.constants_search import ConstantsSearch, Phases, is_within
 from noack.theory.certificates.deliveries.due_deliveries import Deliveries
@@ -247,7 +248,10 @@ class CertificateScope:
     @np.errstate(all="ignore")
     def loop_gain(self, conditions: NetworkConditions) -> float:
         """Return the loop gain of a certificate; at least 1, perhaps infinite, if there is none."""
-        if void_by_safe_input(self._resolved, conditions) or void_by_uneven_steps(self._resolved):
+        resolved = self._resolved
+        if void_by_safe_input(resolved, conditions) or void_by_watchdog(resolved, conditions):
+            return math.inf
+        if void_by_uneven_steps(resolved):
             return math.inf
         # Whether the first inputs at a set-point are covered depends on the constants.
         try:

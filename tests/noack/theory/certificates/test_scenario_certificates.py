@@ -159,6 +159,25 @@ def test_no_safe_input_may_come_before_the_first_update(overrides: tuple[str, ..
     assert exists or "controller.safe_input" in str(certificate.void)
 
 
+@pytest.mark.parametrize(
+    ("watchdog", "exists"),
+    [
+        ('{policy="hold", timeout_s=0.002}', True),
+        ('{policy="zero"}', True),
+        ('{policy="zero", timeout_s=0.002}', False),  # an input may be 5 ms old at a step
+        ('{policy="model", timeout_s=0.0049}', False),
+        ('{policy="zero", timeout_s=0.005}', True),
+    ],
+)
+def test_no_watchdog_may_replace_an_input_that_is_not_too_old(watchdog: str, exists: bool) -> None:
+    loop = shipped("double_integrator", f"plant.watchdog={watchdog}", "certificate.late_periods=2")
+    conditions = nominal_conditions(loop, 2)
+    assert conditions.hold_s == pytest.approx(0.007)
+    certificate = certify(loop, conditions)
+    assert certificate.exists is exists
+    assert exists or "plant.watchdog.timeout_s" in str(certificate.void)
+
+
 def test_events_that_are_due_may_come_as_soon_as_they_are_due() -> None:
     """Where measurements may be missing, the longest time between two events is longer."""
     trigger = 'trigger={policy="deadline", interval_s=0.04, rule={policy="absolute", delta=5.0}}'
