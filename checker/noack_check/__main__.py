@@ -1,7 +1,7 @@
 """``noack-check witness.json [--scenario resolved.toml]``: verifies a file of witnesses.
 
 Prints PROVED and what was proven, for each statement of the file, or REJECTED and the first inequality
-that fails. Exit status: 0 if all are proven, 1 if one is not, 2 for a file that cannot be read.
+that fails. Exit status: 0 if all are proven, 1 if one is not, 2 for a file that cannot be read or written.
 
 The loop is derived from the scenario, as ``noack check NAME --resolved`` prints it; without it, from the
 copy in the witness's file. A copy that differs from the scenario is a rejection.
@@ -12,7 +12,7 @@ import json
 import os
 import sys
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from noack_check.check import RejectedError
@@ -23,6 +23,7 @@ from noack_check.sentences import assumptions, sentences
 
 _PLANTS = {"own": "its plant", "box": "all plants of its uncertainty box"}
 _CONDITIONS = {"ideal": "ideal conditions", "schedule": "its schedule"}
+_LONGEST_NAME, _MOST_KEYS = 200, 5
 MOST_BYTES = 64 * 1024**2
 
 
@@ -35,10 +36,10 @@ def main() -> None:
     parser.add_argument("--scenario", type=Path, help="the scenario, by `noack check NAME --resolved`")
     arguments = parser.parse_args()
     try:
-        file = _read(arguments.witness, json.loads)
-        given = None if arguments.scenario is None else _read(arguments.scenario, tomllib.loads)
-    except (OSError, ValueError, RecursionError) as error:
-        print(f"noack-check: {' '.join(str(error).split())}", file=sys.stderr)
+        file = _read(arguments.witness, "JSON", json.loads)
+        given = None if arguments.scenario is None else _read(arguments.scenario, "TOML", tomllib.loads)
+    except UnreadableError as error:
+        print(f"noack-check: {error}", file=sys.stderr)
         sys.exit(2)
     try:
         for line in check_file(file, given):
@@ -47,9 +48,11 @@ def main() -> None:
     except (RejectedError, RefusedError) as error:
         print(f"REJECTED {error}")
         sys.exit(1)
-    except BrokenPipeError:  # nobody reads on
+    except OSError as error:  # the output cannot be written
+        if not isinstance(error, BrokenPipeError):
+            print(f"noack-check: standard output: {error.strerror}", file=sys.stderr)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(1)
+        sys.exit(2)
 
 
 def check_file(file: Table, given: Table | None) -> Iterator[str]:
@@ -67,30 +70,50 @@ def check_file(file: Table, given: Table | None) -> Iterator[str]:
     if not isinstance(scenario, Mapping) or not isinstance(statements, list) or not statements:
         raise RejectedError("the file has no scenario, or no statements")
     if given is not None and given != scenario:
-        different = [key for key in {*given, *scenario} if given.get(key) != scenario.get(key)]
-        raise RejectedError(f"the witness is of another scenario: {', '.join(sorted(different))} differ")
+        different = sorted(key for key in {*given, *scenario} if given.get(key) != scenario.get(key))
+        raise RejectedError(f"the witness is of another scenario, by its {', '.join(different[:_MOST_KEYS])}")
     scenario = scenario if given is None else given
+    name = scenario.get("name")
+    if not isinstance(name, str) or not name.isprintable() or len(name) > _LONGEST_NAME:
+        raise RejectedError("name: not a printable name of a scenario")
     for document in statements:
         if not isinstance(document, Mapping):
             raise RejectedError("a statement is no table")
         plants, conditions = document.get("plants"), document.get("conditions")
+        if not isinstance(plants, str) or not isinstance(conditions, str):
+            raise RejectedError("a statement has no plants or conditions")
         if plants not in _PLANTS or conditions not in _CONDITIONS:
             raise RejectedError("a statement has no plants or conditions")
         loop = read_loop(scenario, box=plants == "box", ideal=conditions == "ideal")
-        of = f"{scenario.get('name')}, {_PLANTS[plants]}, {_CONDITIONS[conditions]}"
+        of = f"{name}, {_PLANTS[plants]}, {_CONDITIONS[conditions]}"
         for sentence in sentences(prove(loop, document)):
             yield f"PROVED {of}: {sentence}"
         yield f"       if there are {assumptions(scenario, loop)}"
 
 
-def _read(path: Path, parse: object) -> Table:
-    with path.open("rb") as file:
-        content = file.read(MOST_BYTES + 1)
+class UnreadableError(ValueError):
+    """A file cannot be read; the message names it."""
+
+
+def _read(path: Path, kind: str, parse: Callable[[str], object]) -> Table:
+    """Return the table in a file of a kind, which ``parse`` reads.
+
+    Raises:
+        UnreadableError: there is none.
+    """
+    try:
+        with path.open("rb") as file:
+            content = file.read(MOST_BYTES + 1)
+    except OSError as error:
+        raise UnreadableError(f"{path}: {error.strerror}") from None
     if len(content) > MOST_BYTES:
-        raise ValueError(f"{path}: larger than {MOST_BYTES // 1024**2} MiB")
-    found = parse(content.decode())  # type: ignore[operator]
+        raise UnreadableError(f"{path}: larger than {MOST_BYTES // 1024**2} MiB")
+    try:
+        found = parse(content.decode())
+    except (ValueError, RecursionError):
+        raise UnreadableError(f"{path}: not a {kind} file") from None
     if not isinstance(found, dict):
-        raise ValueError(f"{path}: not a table")
+        raise UnreadableError(f"{path}: not a table")
     return found
 
 

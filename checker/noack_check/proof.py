@@ -65,6 +65,8 @@ def prove(loop: Loop, document: Mapping[str, object]) -> Proof:
     chain_gain = _chain_gain(loop, rate, document)
     overshoot = _number(document, "overshoot") if "overshoot" in document else None
     entries = _entries(document, "bounds")
+    if not entries:
+        raise RejectedError("bounds: there is none")
     if len({(str(e.get("output")), bool(e.get("from_start", True))) for e in entries}) < len(entries):
         raise RejectedError("bounds: an output occurs twice")
     bounds = [prove_bound(loop, rate, entry, chain_gain, overshoot) for entry in entries]

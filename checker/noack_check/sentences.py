@@ -44,7 +44,9 @@ def _exception(proof: Proof) -> str:
     first = proof.first_event
     if first is None or proof.inter_event is None or first >= proof.inter_event:
         return ""
-    return f", but the second event may come {at_least(first)} s after the first, at t = 0"
+    if not first > 0:
+        return ", from the second one on"
+    return f"; the second one at least {at_least(first)} s after the first, which is at t = 0"
 
 
 def smallest_bounds(proof: Proof) -> list[Bound]:

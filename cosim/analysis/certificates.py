@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.analysis.witnesses import Witnesses, find_witnesses
+from cosim.analysis.witnesses import Witnesses, find_witnesses, no_witnesses
 from noack.core.errors import CallerError, one_line
 from noack.core.linear_systems import Matrix
 from noack.core.number_format import NONE, TextRows, as_html, as_text, at_least, at_most
@@ -236,14 +236,10 @@ class Certificates:
         return None
 
     def witnesses(self, progress: Callable[[float], None] = lambda share: None) -> Witnesses:
-        """Search for bounds that the checker proves, for the same plants and conditions.
-
-        Raises:
-            CallerError: the plant is not linear.
-        """
+        """Search for bounds that the checker proves, for the same plants and conditions."""
         scenario, late_periods, *_ = self._arguments
         if self.nonlinear is not None:
-            raise CallerError(f"no witness: the plant is not linear ({self.nonlinear})")
+            return no_witnesses(scenario, f"the plant is not linear ({self.nonlinear})")
         return find_witnesses(scenario, late_periods, progress)
 
     def to_json(self) -> dict[str, object]:

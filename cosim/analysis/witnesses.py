@@ -42,6 +42,11 @@ class Witnesses(NamedTuple):
     """As `noack check --resolved` prints it."""
     statements: Sequence[WitnessedStatement]
 
+    @property
+    def are_any(self) -> bool:
+        """Whether something is proven."""
+        return any(statement.proof is not None for statement in self.statements)
+
     def file_text(self) -> str:
         """Return the file that ``noack-check`` reads."""
         documents = [s.document for s in self.statements if s.document is not None]
@@ -71,6 +76,12 @@ def find_witnesses(
         found.append(_statement(content, plants, under))
     progress(1.0)
     return Witnesses(content, found)
+
+
+def no_witnesses(resolved: Scenario, reason: str) -> Witnesses:
+    """Return that nothing is proven of a scenario."""
+    content: dict[str, object] = {"name": resolved.name}
+    return Witnesses(content, [WitnessedStatement("own", "schedule", None, None, reason)])
 
 
 def find_statement(resolved: Scenario, *, plants: str, conditions: str) -> WitnessedStatement:

@@ -67,7 +67,7 @@ def test_another_scenario_is_told_apart(
     assert run(capsys, monkeypatch, str(file), "--scenario", str(given))[0] == 0
     given.write_text(resolved.replace("mansd = 3", "mansd = 4"))
     status, text = run(capsys, monkeypatch, str(file), "--scenario", str(given))
-    assert (status, text) == (1, "REJECTED the witness is of another scenario: network differ\n")
+    assert (status, text) == (1, "REJECTED the witness is of another scenario, by its network\n")
 
 
 @pytest.mark.parametrize(
@@ -102,6 +102,28 @@ def test_files_that_are_no_witness_are_one_line(
     status, printed = run(capsys, monkeypatch, str(path))
     assert status in (1, 2)
     assert len(printed.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "why"),
+    [
+        (("scenario", "name"), "a\nPROVED b", "name"),
+        (("scenario", "name"), None, "name"),
+        (("statements", 0, "bounds"), [], "bounds: there is none"),
+        (("statements", 0, "plants"), [], "no plants"),
+        (("statements", 0, "conditions"), {}, "no plants or conditions"),
+    ],
+)
+def test_hostile_entries_are_rejected(
+    file: Path, place: tuple[str | int, ...], value: object, why: str
+) -> None:
+    content = json.loads(file.read_text())
+    inner = content
+    for key in place[:-1]:
+        inner = inner[key]
+    inner[place[-1]] = value
+    with pytest.raises(ValueError, match=why):
+        list(check_file(content, None))
 
 
 def test_a_file_without_statements_proves_nothing() -> None:

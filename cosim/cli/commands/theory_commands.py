@@ -1,5 +1,6 @@
 """``noack certify``, ``margin``, ``adversary``, ``cost``: all losses, bad ones, random ones."""
 
+import os
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -87,7 +88,8 @@ def certify(
     Exit status 1: nothing can be certified, not even under the paper's conditions; or --require
     is not met.
 
-    Takes two seconds; 10 s for a nonlinear plant; half a minute where events are due after many tests.
+    Takes two seconds; 10 s for a nonlinear plant; half a minute where events are due after many tests;
+    with --witness some seconds to minutes more.
     """
     from cosim.analysis.certificates import certificates_of, in_chosen_norm
     from cosim.live.monitoring.progress import work_bar
@@ -95,8 +97,12 @@ def certify(
     from cosim.output.export.mat_export import save_mat
     from cosim.output.requirements import uncovered_as_unmet, unmet_by_scenario
     from cosim.output.witness_report import print_witnesses
-    from cosim.record.run_directory import write_output
+    from cosim.record.run_directory import refuse_results, write_output
 
+    if witness is not None:
+        refuse_results(witness)
+        if not os.access(witness.parent, os.W_OK) or witness.is_dir():
+            raise CallerError(f"--witness {witness}: no file can be written there")
     loaded, chosen = opt.load_loop(scenario, settings, loop), None
     with uncovered_as_unmet(require or ()):
         if weight == NormName.CHOSEN:
@@ -111,7 +117,8 @@ def certify(
     if witness is not None:
         with work_bar("searching for witnesses", lines=True) as bar:
             witnesses = result.witnesses(bar)
-        write_output(witness, witnesses.file_text())
+        if witnesses.are_any:
+            write_output(witness, witnesses.file_text())
     if json:
         proven = {} if witnesses is None else {"witnesses": [s.to_json() for s in witnesses.statements]}
         print_json(result.to_json() | {"in_chosen_norm": chosen and chosen.to_json()} | proven)
@@ -123,6 +130,9 @@ def certify(
     if out is not None:
         save_mat(result.to_json(), out)
     certified = any(certificate.constants for _, certificate in result)
+    if witnesses is not None and not witnesses.are_any:
+        status("no witness was found; no file is written")
+        return ExitStatus.FAILED
     if require:
         return status_of(unmet_by_scenario(result, require))
     return ExitStatus.OK if certified else ExitStatus.FAILED

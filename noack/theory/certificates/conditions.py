@@ -161,8 +161,8 @@ def void_by_watchdog(resolved: Scenario, conditions: NetworkConditions) -> str |
     if timing.actuation_timeout_ns / NS_PER_S >= oldest_s * (1 - 1e-12):
         return None
     return (
-        f"plant.watchdog.timeout_s: the watchdog may replace an input, which may be {1e3 * oldest_s:g} ms old "
-        "at a step; set it to at least that"
+        "plant.watchdog.timeout_s: the watchdog may replace an input, which may be "
+        f"{1e3 * oldest_s:g} ms old at a step; set it to at least that"
     )
 
 
