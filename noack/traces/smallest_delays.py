@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import minimum_filter1d
 
 from noack.core.row_operations import firsts_of_equal
 
@@ -143,6 +142,8 @@ def find_steps(planned_ns: Reals, delay_ns: Reals, smallest_ns: float = 0.0) -> 
 
 def _changes(level: Reals, window: int) -> Reals:
     """Return min(after) − min(before) at the places from 8 to n − 8."""
+    from scipy.ndimage import minimum_filter1d  # a slow import
+
     size = min(window, len(level) // 2)
     after = minimum_filter1d(level, size, origin=-(size // 2), mode="nearest")
     before = minimum_filter1d(level, size, origin=(size - 1) // 2, mode="nearest")

@@ -192,7 +192,7 @@ def test_more_clients_than_allowed_are_refused_and_counted(
             clients[0].sendto(b"x", emulator.address())
             emulator.until(lambda: emulator.report().refused == 3)
     error = capfd.readouterr().err
-    assert error.count("no more than 2 clients at once") == 1
+    assert error.count("at most 2 clients can be served at once") == 1
     assert error.count("no file descriptors are left") == 1
 
 
