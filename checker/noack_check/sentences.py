@@ -9,6 +9,7 @@ from noack_check.loop import Loop
 from noack_check.proof import Bound, Proof
 
 _SHORT = 7
+"""Longest decimal number that is printed as it is, if it stands for exactly that number."""
 _NAMES = {"x": "‖x‖", "e_s": "‖W e_s‖", "e_c": "‖W e_c‖", "drift": "‖W(ẋ − Hx)‖"}
 
 

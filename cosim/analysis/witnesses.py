@@ -73,7 +73,7 @@ def find_witnesses(
     found = []
     for index, (plants, under) in enumerate(wanted):
         progress(index / len(wanted))
-        found.append(_statement(content, plants, under))
+        found.append(find_statement(content, plants, under))
     progress(1.0)
     return Witnesses(content, found)
 
@@ -84,11 +84,6 @@ def no_witnesses(resolved: Scenario, reason: str) -> Witnesses:
     return Witnesses(content, [WitnessedStatement("own", "schedule", None, None, reason)])
 
 
-def find_statement(resolved: Scenario, *, plants: str, conditions: str) -> WitnessedStatement:
-    """Search for the witness of one statement: of "own" or "box" plants, "ideal" or "schedule"."""
-    return _statement(resolved_content(resolved, resolved.certificate.late_periods), plants, conditions)
-
-
 def resolved_content(resolved: Scenario, late_periods: int) -> dict[str, object]:
     """Return the tables of a resolved scenario, as `noack check --resolved` prints them."""
     certificate = resolved.certificate.model_copy(update={"late_periods": late_periods})
@@ -96,7 +91,8 @@ def resolved_content(resolved: Scenario, late_periods: int) -> dict[str, object]
     return dict(stated.content())
 
 
-def _statement(content: dict[str, object], plants: str, conditions: str) -> WitnessedStatement:
+def find_statement(content: dict[str, object], plants: str, conditions: str) -> WitnessedStatement:
+    """Search for the witness of one statement of a resolved scenario: its plants and conditions."""
     try:
         loop = read_loop(content, box=plants == "box", ideal=conditions == "ideal")
         witness = find_witness(loop)

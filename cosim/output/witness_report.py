@@ -1,5 +1,6 @@
 """What the checker has proven of a scenario, as a table."""
 
+from flint import arb
 from rich.console import Console
 from rich.markup import escape
 
@@ -39,9 +40,14 @@ def witness_table(witnesses: Witnesses) -> ResultTable | None:
         rows.append([f"bound of {norm}", *(NONE if b is None else at_most(b.decaying) for b in bounds)])
         if any(b is not None and b.constant != 0 for b in bounds):
             rows.append(["+ without decay", *(NONE if b is None else at_most(b.constant) for b in bounds)])
-    times = (proof.inter_event for _, proof in proven)
-    rows.append(["inter-event time, s", *(at_least(t) if t is not None and t > 0 else NONE for t in times)])
+    rows.append(["inter-event time, s", *(_time(proof.inter_event) for _, proof in proven)])
+    if any(proof.first_event != proof.inter_event for _, proof in proven):
+        rows.append(["the first one, s", *(_time(proof.first_event) for _, proof in proven)])
     return ResultTable("proven", f"{witnesses.scenario['name']}: proven bounds", headings, rows)
+
+
+def _time(least: arb | None) -> str:
+    return at_least(least) if least is not None and least > 0 else NONE
 
 
 def _bound(proof: Proof, output: str) -> Bound | None:

@@ -24,7 +24,7 @@ from cosim.analysis.adversary import Objective, conditions_of, find_worst
 from cosim.analysis.certificates import certificates_of
 from cosim.analysis.explained_run.explain import explains
 from cosim.analysis.replay.run_replay import replay_run
-from cosim.analysis.witnesses import find_statement
+from cosim.analysis.witnesses import find_statement, resolved_content
 from cosim.cli.scenario_check import check_scenario
 from cosim.live.finalize import finalize
 from cosim.record.run_directory import RunEnding
@@ -207,7 +207,8 @@ class Checks:
         for conditions in ("schedule", "ideal"):
             proof = None
             with self.step(f"prove, {conditions}"):
-                statement = find_statement(resolved, plants="own", conditions=conditions)
+                content = resolved_content(resolved, resolved.certificate.late_periods)
+                statement = find_statement(content, "own", conditions)
                 proof = statement.proof
                 self.refusals[f"prove: {statement.reason}"] += proof is None
             if proof is None:
