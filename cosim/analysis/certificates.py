@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.analysis.witnesses import Witnesses, find_witnesses, no_witnesses
+from cosim.analysis.witnesses import Witnesses, find_witnesses, needs_matrices, no_witnesses
 from noack.core.errors import CallerError, one_line
 from noack.core.linear_systems import Matrix
 from noack.core.number_format import NONE, TextRows, as_html, as_text, at_least, at_most
@@ -28,6 +28,7 @@ from noack.theory.certificates.conditions import (
     void_at_setpoint,
 )
 from noack.theory.certificates.network_limits import NetworkLimits, network_limits
+from noack.theory.certificates.plant_equations import LinearEquations, linear_plant
 from noack.theory.certificates.region import RegionScope
 from noack.theory.certificates.scenario_certificates import box_scope, own_plant_scope
 from noack.theory.certificates.trigger_weight import choose_weight
@@ -71,6 +72,7 @@ class Certificates:
         weight: W, if noack chose it.
         given: W of the scenario, if it has one and noack chose another.
         nonlinear: the same scenario with its nonlinear plant, certified on a region as well.
+        equations: the same scenario with its plant as equations, which are linear: those of ``scenario``.
 
     Raises:
         CallerError: its updates are acknowledged, its plant or controller is nonlinear, or its
@@ -99,8 +101,9 @@ class Certificates:
         weight: Matrix | None = None,
         given: Matrix | None = None,
         nonlinear: Scenario | None = None,
+        equations: Scenario | None = None,
     ) -> None:
-        self._arguments = (scenario, late_periods, weight, given, nonlinear)
+        self._arguments = (scenario, late_periods, weight, given, nonlinear, equations)
         scenario.coverage.require_constant()
         scenario.coverage.require_certifiable()
         self.setpoint, void = scenario.controller.setpoint, void_at_setpoint(scenario)
@@ -111,7 +114,8 @@ class Certificates:
         self.scheduled = nominal_conditions(scenario, late_periods)
         """The times of the schedule, with its permitted lateness."""
         conditions = {IDEAL: ideal_conditions(scenario), SCHEDULE: self.scheduled}
-        scopes = (own_plant_scope(scenario), None if BOX in void else box_scope(scenario))
+        own = own_plant_scope(scenario) if equations is None else LinearEquations(equations, scenario)
+        scopes = (own, None if BOX in void else box_scope(scenario))
         self._scopes = [scope for scope in scopes if scope is not None]
         if nonlinear is not None:
             self.nonlinear = f'plant.system.kind = "{nonlinear.plant.system.kind}"'
@@ -237,9 +241,9 @@ class Certificates:
 
     def witnesses(self, progress: Callable[[float], None] = lambda share: None) -> Witnesses:
         """Search for bounds that the checker proves, for the same plants and conditions."""
-        scenario, late_periods, *_ = self._arguments
-        if self.nonlinear is not None:
-            return no_witnesses(scenario, f"the plant is not linear ({self.nonlinear})")
+        scenario, late_periods, *_, nonlinear, equations = self._arguments
+        if (other := nonlinear or equations) is not None:
+            return no_witnesses(scenario, needs_matrices(other))
         return find_witnesses(scenario, late_periods, progress)
 
     def to_json(self) -> dict[str, object]:
@@ -370,16 +374,18 @@ def certificates_of(
         CallerError: the choice is unknown, or no certificate covers this scenario.
     """
     original = resolve(scenario)
-    is_model = of_model and not original.coverage.is_linear
-    resolved = with_linear_plant(original) if is_model else original
+    linear = linear_plant(original)
+    is_model = of_model and not original.coverage.is_linear and linear is None
+    resolved = with_linear_plant(original) if is_model else linear or original
     late = resolved.certificate.late_periods if late_periods is None else late_periods
     if not 0 <= late <= MOST_LATE:
         raise CallerError(f"late: {late} steps; give 0 to {MOST_LATE}")
     weighted, W = with_weight(resolved, weight, late, progress)
     rows = getattr(resolved.trigger, "weight", None)
     given = None if rows is None else np.array(rows)
-    nonlinear = weighted.model_copy(update={"plant": original.plant}) if is_model else None
-    return Certificates(weighted, late, W, given, nonlinear)
+    as_given = weighted.model_copy(update={"plant": original.plant})
+    nonlinear, equations = (as_given if is_kind else None for is_kind in (is_model, linear is not None))
+    return Certificates(weighted, late, W, given, nonlinear, equations)
 
 
 def in_chosen_norm(

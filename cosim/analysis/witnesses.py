@@ -8,6 +8,7 @@ import json
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+from noack.core.errors import CallerError
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.conditions import with_stated_times
 from noack.theory.witnesses.documents import NoWitnessError, find_witness
@@ -76,6 +77,27 @@ def find_witnesses(
         found.append(find_statement(content, plants, under))
     progress(1.0)
     return Witnesses(content, found)
+
+
+def needs_matrices(resolved: Scenario) -> str:
+    """Return why a plant that is not linear by its settings has no witness."""
+    kind = resolved.plant.system.kind
+    return f'plant.system.kind = "{kind}": witnesses are for a plant with A and B in the scenario'
+
+
+def require_covered(resolved: Scenario, late_periods: int) -> None:
+    """Raise CallerError if the checker's model covers a scenario under no conditions."""
+    if not resolved.coverage.is_linear:
+        raise CallerError(f"--witness: {needs_matrices(resolved)}")
+    content = resolved_content(resolved, late_periods)
+    for ideal in (False, True):
+        try:
+            read_loop(content, box=False, ideal=ideal)
+        except RefusedError as error:
+            if ideal:
+                raise CallerError(f"--witness: {error}") from None
+        else:
+            return
 
 
 def no_witnesses(resolved: Scenario, reason: str) -> Witnesses:

@@ -186,7 +186,8 @@ def _failure_text(settings: ClassSettings, place: str, error: BaseException) -> 
     """Return one line about an error in the user's code: the class, the error, the source line."""
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not _is_ours(frame)]
     source_place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
-    return f'{place}.name = "{settings.name}": {type(error).__name__}: {one_line(error)}{source_place}'
+    kind = "" if isinstance(error, NoackError) else f"{type(error).__name__}: "
+    return f'{place}.name = "{settings.name}": {kind}{one_line(error)}{source_place}'
 
 
 def read_only(values: Vector) -> Vector:

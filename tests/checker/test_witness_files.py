@@ -26,6 +26,18 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.parametrize("name", ["sine_pendulum", "lane_acknowledged"])
+def test_what_has_no_witness_is_refused_before_anything_is_certified(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def certificates_of(*_: object, **__: object) -> None:
+        raise AssertionError("a certificate is computed")
+
+    monkeypatch.setattr("cosim.analysis.certificates.certificates_of", certificates_of)
+    result = CliRunner().invoke(app, ["certify", name, "--witness", str(tmp_path / "w.json")])
+    assert (result.exit_code, not any(tmp_path.iterdir())) == (ExitStatus.CALLER, True)
+
+
 def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *words: str) -> tuple[int, str]:
     monkeypatch.setattr("sys.argv", ["noack-check", *words])
     try:

@@ -92,18 +92,23 @@ def certify(
     with --witness some seconds to minutes more.
     """
     from cosim.analysis.certificates import certificates_of, in_chosen_norm
+    from cosim.analysis.witnesses import require_covered
     from cosim.live.monitoring.progress import work_bar
     from cosim.output.certificate_report import certificate_tables, print_certificates
     from cosim.output.export.mat_export import save_mat
     from cosim.output.requirements import uncovered_as_unmet, unmet_by_scenario
     from cosim.output.witness_report import print_witnesses
     from cosim.record.run_directory import refuse_results, write_output
+    from noack.scenario.resolution import resolve
 
     if witness is not None:
         refuse_results(witness)
         if not os.access(witness.parent, os.W_OK) or witness.is_dir():
             raise CallerError(f"--witness {witness}: no file can be written there")
     loaded, chosen = opt.load_loop(scenario, settings, loop), None
+    if witness is not None:
+        resolved = resolve(loaded)
+        require_covered(resolved, resolved.certificate.late_periods if late is None else late)
     with uncovered_as_unmet(require or ()):
         if weight == NormName.CHOSEN:
             with work_bar("choosing the weight") as bar:

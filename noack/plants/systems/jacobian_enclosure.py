@@ -41,6 +41,7 @@ _LONGEST_S = 1e9
 _AT_REST = 1e-9
 """The plant rests if |f(0, 0)| is at most this share of the largest entry of A and B in its row."""
 _UNDECIDED = "its equations distinguish cases, and the region contains more than one of them"
+_KNOWN_FUNCTIONS = "sin, cos, tan, arctan, tanh, sinh, cosh, exp, log, sqrt and abs"
 
 
 class NotEnclosedError(NoackError):
@@ -113,7 +114,12 @@ class Enclosed:
         return self._mapped(_power(self.value, power), power * _power(self.value, power - 1))
 
     def __abs__(self) -> "Enclosed":
-        return self if self >= 0 else -self
+        """Return |x|: where x may be 0, its slope is any from −1 to 1, as that of the chords of |x|."""
+        if self.value >= 0:
+            return self
+        if self.value <= 0:
+            return -self
+        return self._mapped(_at_sizes(self.value, lambda x: x), _ball(0.0, 1.0))
 
     def __lt__(self, other: Operand) -> bool:
         return self._decided(operator.lt, operator.ge, other)
@@ -141,6 +147,16 @@ class Enclosed:
         """Refuse to become a float, as the functions of ``math`` ask."""
         raise TypeError("a certificate on a region needs numpy's functions: np.sin, not math.sin")
 
+    def __getattr__(self, name: str) -> Callable[..., "Enclosed"]:
+        """Refuse a function of numpy that has no method here, by its name."""
+        if name.startswith("_"):  # numpy also asks for protocols
+            raise AttributeError(name)
+
+        def refuse(*_: object) -> "Enclosed":
+            raise NotEnclosedError(f"np.{name} has no enclosure; {_KNOWN_FUNCTIONS} have one")
+
+        return refuse
+
     def sin(self) -> "Enclosed":
         """See :func:`numpy.sin`."""
         return self._mapped(self.value.sin(), self.value.cos())
@@ -158,13 +174,23 @@ class Enclosed:
         return self._mapped(self.value.atan(), 1 / (1 + _power(self.value, 2)))
 
     def tanh(self) -> "Enclosed":
-        """See :func:`numpy.tanh`."""
-        value = self.value.tanh()
-        return self._mapped(value, 1 - _power(value, 2))
+        """See :func:`numpy.tanh`; its slope 1/cosh² falls with |x|."""
+        slope = _at_sizes(self.value, lambda x: x.sech() ** 2)
+        return self._mapped(_at_ends(self.value, lambda x: x.tanh()), slope)
+
+    def sinh(self) -> "Enclosed":
+        """See :func:`numpy.sinh`."""
+        slope = _at_sizes(self.value, lambda x: x.cosh())
+        return self._mapped(_at_ends(self.value, lambda x: x.sinh()), slope)
+
+    def cosh(self) -> "Enclosed":
+        """See :func:`numpy.cosh`."""
+        slope = _at_ends(self.value, lambda x: x.sinh())
+        return self._mapped(_at_sizes(self.value, lambda x: x.cosh()), slope)
 
     def exp(self) -> "Enclosed":
         """See :func:`numpy.exp`."""
-        value = self.value.exp()
+        value = _at_ends(self.value, lambda x: x.exp())
         return self._mapped(value, value)
 
     def log(self) -> "Enclosed":
@@ -204,14 +230,21 @@ def _ball(middle: float, radius: float = 0.0) -> "arb":
 
 
 def _power(value: "arb", power: float) -> "arb":
-    """Enclose xᵖ: by the ends of the interval, between which it is monotonic, or those of |x|."""
+    """Enclose xᵖ: it is monotonic, or a monotonic function of |x|."""
     if power < 0:
         return 1 / _power(value, -power)
-    ends = value.lower(), value.upper()
-    if power % 2 == 0:
-        ends = value.abs_lower(), value.abs_upper()
-    low, high = (_power_of_number(end, power) for end in ends)
-    return low.union(high)
+    at = _at_sizes if power % 2 == 0 else _at_ends
+    return at(value, lambda x: _power_of_number(x, power))
+
+
+def _at_ends(value: "arb", function: "Callable[[arb], arb]") -> "arb":
+    """Enclose a monotonic function of x: between its values at the ends of the interval."""
+    return function(value.lower()).union(function(value.upper()))
+
+
+def _at_sizes(value: "arb", function: "Callable[[arb], arb]") -> "arb":
+    """Enclose a monotonic function of |x|."""
+    return function(value.abs_lower()).union(function(value.abs_upper()))
 
 
 def _power_of_number(value: "arb", power: float) -> "arb":
@@ -267,6 +300,22 @@ class EnclosedMotion:
                 f"it does not rest at x = 0, u = 0: an entry of ẋ is {self.at_rest.max():.3g} there"
             )
         return Inclusion(centre[:, :n], centre[:, n:], halves[:, :n], halves[:, n:])
+
+    def linear_within(self, largest: float) -> tuple[Matrix, Matrix] | None:
+        """Return A and B if all derivatives are the same for |x_j|, |u_i| ≤ ``largest``, to rounding.
+
+        None: they are not, or the plant does not rest at x = 0, u = 0.
+
+        Raises:
+            NotEnclosedError: there is no enclosure.
+        """
+        size = self.n + self.m
+        rates = self._values(np.full(size, largest), range(size))
+        centre, half = _box([[rate.slopes[j] for rate in rates] for j in range(size)])
+        row_sizes = np.abs(centre).max(axis=1, keepdims=True)
+        if (half > _NARROW * row_sizes).any() or self.at_rest.any():
+            return None
+        return centre[:, : self.n], centre[:, self.n :]
 
     @cached_property
     def at_rest(self) -> Vector:

@@ -46,6 +46,8 @@ from noack.theory.bounds.enclosure import (
 from noack.theory.bounds.stacked_norms import ROUNDING, spectral_norm
 
 Counts = NDArray[np.int64]
+_AT_ONCE = 64
+"""Missing events whose responses are computed at once."""
 
 
 class NormalForcing(NamedTuple):
@@ -218,11 +220,11 @@ class ErrorGains:
     @cached_method
     def _all_missing_until(self, events: int, due_s: float) -> Mapping[Output, float]:
         totals = dict.fromkeys(self.outputs, 0.0)
-        for number in range(events):
-            until_s = (number + 1) * due_s
+        for first in range(0, events, _AT_ONCE):
+            until_s = due_s * np.arange(first + 1, min(first + _AT_ONCE, events) + 1)
             responses = response_until(self.scaled_H, self.inverse_weight, until_s)
             for output, kernel in responses.through_each(self.stacked).items():
-                totals[output] += float(kernel.sup_on_grid())
+                totals[output] += float(kernel.sup_on_grid().sum())
         return totals
 
     @cached_property

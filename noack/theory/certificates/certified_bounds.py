@@ -33,7 +33,7 @@ from noack.theory.bounds.disturbances import bound_forcing
 from noack.theory.bounds.enclosure import KernelBounds, response
 from noack.theory.bounds.gains import Counts, Output, PlantGains, error_gains
 from noack.theory.certificates.assumptions import Assumption
-from noack.theory.certificates.conditions import BOX, OWN_PLANT
+from noack.theory.certificates.conditions import BOX, LINEAR_EQUATIONS, OWN_PLANT
 
 
 class Region(NamedTuple):
@@ -94,7 +94,7 @@ class ScenarioCertificate:
     @property
     def source(self) -> str:
         """Name of the certificate as the source of a claim."""
-        kinds = {OWN_PLANT: "certificate", BOX: "box certificate"}
+        kinds = {OWN_PLANT: "certificate", LINEAR_EQUATIONS: "certificate", BOX: "box certificate"}
         return kinds.get(self.scope, "region certificate")
 
     @property

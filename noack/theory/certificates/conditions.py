@@ -28,6 +28,7 @@ from noack.theory.bounds.disturbances import excluded_probability
 OWN_PLANT = "the scenario's plant"
 BOX = "every plant of the uncertainty box"
 REGION = "the nonlinear plant on its region"
+LINEAR_EQUATIONS = "the scenario's plant (linear equations)"
 """The plants that a certificate covers, by name."""
 _ROUNDED_NS = 2
 """More than two times of steps differ from exact ones, together."""

@@ -49,6 +49,8 @@ from noack.theory.certificates.error_rows import (
     signal_row,
 )
 
+MOST_MISSING = 1000
+"""No bounds are computed for more missing events at once: the work grows with their number."""
 _EPSILON = float(np.finfo(float).eps)
 """The relative distance of two neighbouring doubles: twice the error of an operation."""
 
@@ -147,6 +149,13 @@ class LoopConstants(NamedTuple):
         return Constants(rate_per_s=rate_per_s, inter_event_s=inter_event_s, **fields)
 
 
+def _without_bounds(events: Counts) -> LoopConstants:
+    """Return that loops have no certificate, because their missing events are too many."""
+    infinite = np.full(len(events), np.inf)
+    names = [name for name in LoopConstants._fields if name not in ("missing_events", "exists")]
+    return LoopConstants(missing_events=events, exists=infinite < 0, **dict.fromkeys(names, infinite))
+
+
 class ErrorInequalities:
     """The inequalities of one part, and their solution for assumed inter-event times.
 
@@ -187,8 +196,10 @@ class ErrorInequalities:
         is_spaced = inter_event_s > 0
         if conditions.delay_s > 0:  # of arbitrarily close events, any number of updates may be in flight
             events[is_spaced] += np.ceil(conditions.delay_s / inter_event_s[is_spaced]).astype(np.int64)
-        is_counted = is_spaced | (conditions.delay_s == 0)
-        solved = self._solutions(method, events, inter_event_s)
+        is_counted = (is_spaced | (conditions.delay_s == 0)) & (events <= MOST_MISSING)
+        if not is_counted.any():
+            return _without_bounds(events)
+        solved = self._solutions(method, np.where(is_counted, events, conditions.dropouts), inter_event_s)
         smallest = np.min([bound for _, _, bound in solved], axis=0)
         gain = np.where(is_counted, np.min([gain for _, gain, _ in solved], axis=0), np.inf)
         by_bound = []

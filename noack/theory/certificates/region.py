@@ -21,9 +21,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.core.errors import NoackError
 from noack.core.linear_systems import Matrix, Vector
-from noack.plants.plant_settings import PlantStart, SystemFailedError
+from noack.plants.plant_settings import SystemFailedError
 from noack.plants.systems.jacobian_enclosure import EnclosedMotion, Inclusion, NotEnclosedError
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
@@ -35,6 +34,7 @@ from noack.theory.certificates.assumptions import Assumption, AssumptionStatus
 from noack.theory.certificates.certified_bounds import Region, ScenarioCertificate
 from noack.theory.certificates.conditions import REGION, void_by_safe_input, void_by_uneven_steps
 from noack.theory.certificates.constants_search import Phases
+from noack.theory.certificates.plant_equations import LinearEquations, enclosed_motion, linear_plant
 from noack.theory.certificates.scenario_certificates import CertificateScope, box_scope, own_plant_scope
 
 _WIDER = 1.02
@@ -43,6 +43,12 @@ _LEAST = 1e-9
 """Least width of a region in each direction, as a share of its largest."""
 _ATTEMPTS = 40
 """Regions that are tried."""
+_LEAST_SHARE, _BISECTIONS = 1e-3, 5
+"""Where a region has no bounds: the least share of it that is tried, and the steps to the largest one."""
+_NO_BOUNDS = (NotEnclosedError, SystemFailedError, NoCertificateError, NotDecayingError)
+"""Why a region has no bounds."""
+_FROM_EQUATIONS = (NotEnclosedError, SystemFailedError)
+"""Those of them that come from the equations, also from a user's class."""
 _MOST_NAMES = 8
 """Maximum number of bounds of a region that a reason names."""
 _TIMES = ("sampling_s", "spacing_s", "delay_s", "hold_s", "start_s")
@@ -52,12 +58,22 @@ _TIMES = ("sampling_s", "spacing_s", "delay_s", "hold_s", "start_s")
 def scopes(resolved: Scenario, start_error: float | None = None) -> list[CertificateScope]:
     """Return the plants of a resolved scenario for which certificates can exist.
 
-    These are its own plant and the box around it, if it is linear; otherwise its plant on a region.
+    These are its own plant and the box around it, if it is linear by its settings; otherwise its
+    plant, on a region if its equations are not linear.
     """
     if resolved.coverage.linear_certificates_apply:
         linear = own_plant_scope(resolved, start_error), box_scope(resolved, start_error)
         return [scope for scope in linear if scope is not None]
-    return [RegionScope(resolved)] if resolved.coverage.some_certificate_applies else []
+    return [nonlinear_scope(resolved)] if resolved.coverage.some_certificate_applies else []
+
+
+def nonlinear_scope(resolved: Scenario, start: Matrix | None = None) -> CertificateScope:
+    """Return the scope of a plant that is not linear by its settings: on a region, if it is not linear.
+
+    ``start``: as of :class:`CertificateScope`.
+    """
+    linear = linear_plant(resolved)
+    return RegionScope(resolved, start) if linear is None else LinearEquations(resolved, linear, start)
 
 
 class _Box(CertificateScope):
@@ -163,19 +179,16 @@ class RegionScope(_Box):
         Raises: as :meth:`CertificateScope.all_phases`.
         """
         widths = self._widths_within(conditions) if near else np.zeros(self._loop.n + self._loop.m)
-        where, step = "near 0", 0.0
+        step = 0.0
         for _ in range(_ATTEMPTS):
             try:
-                inclusion = self._motion.over(widths)
-                plants = _Box(self._resolved, inclusion, self._other_start)
-                phases, reached = plants.bounded(conditions)
-            except (NotEnclosedError, SystemFailedError) as error:  # also from a user's class
-                why = f"{where}: {error}" if widths.any() else str(error)
-                raise NoCertificateError(why) from None
-            except NoCertificateError as error:
-                raise NoCertificateError(f"{where}: {error}", error.loop_gain) from None
-            except NotDecayingError as error:
-                raise NotDecayingError(f"{where}: {error}") from None
+                inclusion, plants, phases, reached = self._bounded(widths, conditions)
+            except _NO_BOUNDS as error:
+                why = str(error) if near else self._reason(error, widths, conditions)
+                if isinstance(error, NotDecayingError):
+                    raise NotDecayingError(why) from None
+                gain = error.loop_gain if isinstance(error, NoCertificateError) else math.inf
+                raise NoCertificateError(why, gain) from None
             if (reached < widths).all():
                 region = Region.of(widths, inclusion)
                 self._proven[conditions] = _ProvenRegion(region, plants.decay_per_s)
@@ -188,8 +201,77 @@ class RegionScope(_Box):
             grown, step = step, float(np.linalg.norm(wider - widths))
             if near and 0 < grown < step:
                 break
-            widths, where = wider, f"on the region {self._described(wider)}"
-        raise NoCertificateError(f"{where}: the bounds are not within it")
+            widths = wider
+        raise NoCertificateError(
+            f"on the region {self._described(widths)}: the bounds are not within it, as on the smaller ones"
+        )
+
+    def _bounded(
+        self, widths: Vector, conditions: NetworkConditions
+    ) -> tuple[Inclusion, _Box, list[Phases], Vector]:
+        """Return the box over a region, as matrices and as plants, and :meth:`_Box.bounded` of it.
+
+        Raises: one of ``_NO_BOUNDS``.
+        """
+        inclusion = self._motion.over(widths)
+        plants = _Box(self._resolved, inclusion, self._other_start)
+        return inclusion, plants, *plants.bounded(conditions)
+
+    def _reason(self, error: Exception, widths: Vector, conditions: NetworkConditions) -> str:
+        """Return why there is no certificate: the error on a region, and where there is none."""
+        if not widths.any():
+            return str(error) if isinstance(error, _FROM_EQUATIONS) else f"near 0: {error}"
+        share = self._largest_share(error, widths, conditions)
+        needed = f"the bounds from x(0) need the region {self._described(widths)}, and there "
+        needed += f"{error}{self._steepest(widths)}"
+        if share == 0:
+            return f"{needed}; so it is on one of {_LEAST_SHARE:g} of this size"
+        largest = share * widths
+        start = np.abs(self._start).max(axis=1)
+        outside = int((start / largest[: self._loop.n]).argmax())
+        why = f"{needed}; it is not so on {self._described(largest)}"
+        if start[outside] <= largest[outside]:
+            return why
+        limit = f"{largest[outside]:.3g}, and it starts at {start[outside]:.3g}"
+        return f"{why}, which does not contain the start: |{self._loop.state_names[outside]}| ≤ {limit}"
+
+    def _largest_share(self, error: Exception, widths: Vector, conditions: NetworkConditions) -> float:
+        """Return a share of a region without such an error, nearly the largest one; 0 if none is found."""
+
+        def has_bounds(share: float) -> bool:
+            try:
+                if isinstance(error, _FROM_EQUATIONS):
+                    self._motion.over(share * widths)
+                else:
+                    self._bounded(share * widths, conditions)
+            except _NO_BOUNDS:
+                return False
+            return True
+
+        if not has_bounds(_LEAST_SHARE):
+            return 0.0
+        low, high = _LEAST_SHARE, 1.0
+        for _ in range(_BISECTIONS):
+            middle = math.sqrt(low * high)
+            low, high = (middle, high) if has_bounds(middle) else (low, middle)
+        return low
+
+    def _steepest(self, widths: Vector) -> str:
+        """Return, as text, the slope of the equations over a region that varies most; empty if none does."""
+        try:
+            A, B, half_A, half_B = self._motion.over(widths)
+        except _FROM_EQUATIONS:
+            return ""
+        centre, half = np.hstack([A, B]), np.hstack([half_A, half_B])
+        sizes = ((np.abs(centre) + half) * widths).sum(axis=1, keepdims=True)
+        shares = half * widths / np.where(sizes > 0, sizes, 1.0)
+        i, j = np.unravel_index(int(shares.argmax()), shares.shape)
+        if not shares[i, j]:
+            return ""
+        states, inputs = self._loop.state_names, self._loop.input_names
+        low, high = centre[i, j] - half[i, j], centre[i, j] + half[i, j]
+        name = (*states, *inputs)[j]
+        return f" (the slope of d{states[i]}/dt by {name} is from {low:.3g} to {high:.3g} there)"
 
     def _widths_within(self, conditions: NetworkConditions) -> Vector:
         """Return the newest region of shorter times, where a search ends sooner than from 0.
@@ -211,20 +293,3 @@ class RegionScope(_Box):
     @cached_property
     def _motion(self) -> EnclosedMotion:
         return enclosed_motion(self._resolved)
-
-
-def enclosed_motion(resolved: Scenario) -> EnclosedMotion:
-    """Return the equations of a resolved scenario's plant, to be enclosed.
-
-    Raises:
-        NotEnclosedError: it has no equations that can be enclosed, or does not accept x = 0.
-    """
-    loop, plant = loop_of(resolved), resolved.plant.system
-    if not plant.has_equations:
-        raise NotEnclosedError(f'a plant of kind "{plant.kind}" has no equations to enclose')
-    start = PlantStart(np.zeros(loop.n), loop.A_model, loop.B_model, resolved.timing.plant_period_ns)
-    try:
-        system = plant.system(start)
-    except NoackError as error:  # a user's class that does not accept x = 0, for example
-        raise NotEnclosedError(str(error)) from None
-    return EnclosedMotion(system, loop.n, loop.m)

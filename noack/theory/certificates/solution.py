@@ -30,7 +30,7 @@ from noack.theory.bounds.error_growth import LONGEST_S
 from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.certificates.deliveries.sharpened_constants import can_be_sharpened, sharpened_constants
 from noack.theory.certificates.error_rows import BoundMethod
-from noack.theory.certificates.inequalities import ErrorInequalities, LoopConstants
+from noack.theory.certificates.inequalities import MOST_MISSING, ErrorInequalities, LoopConstants
 
 _INTER_EVENT_SETTLED = 1e-3
 """Relative change of δ at which the search for it ends."""
@@ -186,6 +186,11 @@ class _SmallestConstants(NamedTuple):
         gain = float(self.loop_gain[loop])
         if math.isinf(gain) and not self.is_spaced[loop]:
             raise NoCertificateError("events may be arbitrarily close, so that any number may be in flight")
+        if (missing := int(self.parts[0].missing_events[loop])) > MOST_MISSING:
+            raise NoCertificateError(
+                f"up to {missing:,} updates may be missing at once, lost or in flight; bounds are computed "
+                f"for at most {MOST_MISSING:,}"
+            )
         if gain < 1:
             raise NoCertificateError("its bounds are too large for floating point")
         raise NoCertificateError(f"the loop gain of the errors is {apart_from(1, gain)}, not below 1", gain)

@@ -42,7 +42,9 @@ def test_what_is_violated_without_a_certificate_is_its_condition() -> None:
     shown = " ".join(invoke("certify", "lane_periodic").stdout.split())
     assert "violated small-gain condition (certificate): the loop gain of the errors is 1e+04" in shown
     shown = " ".join(invoke("certify", "cart_pole").stdout.split())
-    assert "violated condition of the certificate (certificate): on the region" in shown
+    assert (
+        "violated condition of the certificate (certificate): the bounds from x(0) need the region" in shown
+    )
     assert "there is a certificate" not in shown
     assert "box is too large" not in shown
 

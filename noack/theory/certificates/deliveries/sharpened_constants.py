@@ -35,6 +35,8 @@ _MOST_ROUNDS, _SETTLED = 20, 0.99
 """Limit of the rounds; they end when no bound of x or e_c falls below this share of the last one."""
 _MOST_INSERTIONS, _INSERTIONS_SETTLED = 60, 0.9999
 """The same of the insertions in a round."""
+_MOST_MISSING = 100
+"""With more missing events at once the constants are not sharpened: each is followed in every round."""
 _SHORTEST_S = 1e-9
 """Shortest inter-event time with which lost events are followed: events are resolved to 1 ns."""
 _LEAST_SHARE = 1e-6
@@ -63,7 +65,7 @@ def sharpened_constants(
 ) -> Constants:
     """Return the constants with the bounds from the flow between updates."""
     inter_event_s = constants.inter_event_s or conditions.spacing_s
-    if inter_event_s == 0 and conditions.delay_s > 0:
+    if (inter_event_s == 0 and conditions.delay_s > 0) or constants.missing_events > _MOST_MISSING:
         return constants
     sharpening = SharpenedBounds(part, conditions, inter_event_s)
     bounds = sharpening.bounds

@@ -1,5 +1,6 @@
 """Certificates of nonlinear plants on regions: enclosures, attacks on the shipped ones, reasons."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -7,9 +8,12 @@ import numpy as np
 import pytest
 
 from cosim.analysis.claims.claim_evaluation import RunClaims
+from cosim.analysis.claims.run_certificates import scheduled_certificates
 from cosim.analysis.summary.summary_model import ClaimVerdict
 from cosim.simulation.virtual_time import simulate
 from noack.core.linear_systems import Vector
+from noack.observers.luenberger import LuenbergerSettings
+from noack.plants.linear import LinearSettings
 from noack.plants.plant_settings import PlantStart
 from noack.plants.systems.jacobian_enclosure import Enclosed, EnclosedMotion, Inclusion
 from noack.scenario.resolution import loop_of, resolve
@@ -18,7 +22,7 @@ from noack.scenario.scenario_file import load
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import nominal_conditions
 from noack.theory.certificates.network_limits import network_limit
-from noack.theory.certificates.region import RegionScope
+from noack.theory.certificates.region import RegionScope, nonlinear_scope
 from tests.oracles.attacked_regions import CASES, SCENARIOS, attacked, certificate_of, inclusion_share
 
 arb = pytest.importorskip("flint").arb
@@ -28,6 +32,7 @@ REGIONS = {
     "cart-pole": [1.0, 2.0, 0.5, 3.0, 20.0],
     "four tanks": [4.0, 4.0, 1.2, 0.9, 2.0, 2.0],
 }
+LUENBERGER = LuenbergerSettings(kind="luenberger", gain=((0.2, 0.0), (0.0, 0.2)))
 STEEP = """class Steep:
     def derivative(self, t_s, z, u):
         return [z[1], z[0] + z[0] ** 7 + u[0]]
@@ -61,7 +66,7 @@ def test_a_sine_is_enclosed_almost_tightly() -> None:
 @pytest.mark.parametrize(
     "of",
     [
-        np.sin, np.cos, np.tan, np.arctan, np.tanh, np.exp, np.log, np.sqrt,
+        np.sin, np.cos, np.tan, np.arctan, np.tanh, np.sinh, np.cosh, np.exp, np.log, np.sqrt,
         lambda x: x**3 - 2 / x + x**-1.5, lambda x: (1 - x * x) / (x + np.cos(x)),
         lambda x: np.abs(-x) + max(x, 0.0), lambda x: np.array([x, 2 * x]) @ np.array([3.0, x]),
     ],
@@ -73,6 +78,20 @@ def test_numbers_carry_enclosed_derivatives(of: Callable[[Enclosed | float], Enc
         slope = (of(x + h) - of(x - h)) / (2 * h)
         assert abs(enclosed.value - arb(float(of(x)))).abs_lower() < 1e-12
         assert abs(enclosed.slopes[0] - arb(float(slope))).abs_lower() < 1e-8
+
+
+@pytest.mark.parametrize(
+    ("of", "slopes"), [(np.tanh, (0, 1)), (np.abs, (-1, 1)), (np.exp, (0, np.exp(40))), (np.arctan, (0, 1))]
+)
+def test_wide_intervals_have_enclosures(
+    of: Callable[[Enclosed | float], Enclosed], slopes: tuple[float, float]
+) -> None:
+    """Of an interval that is much wider than the range in which the function bends."""
+    enclosed = of(Enclosed(arb(0, 40), [arb(1.0)]))
+    for x in (-40.0, -3.0, 0.0, 0.01, 40.0):
+        assert enclosed.value.contains(arb(float(of(x)))) or abs(enclosed.value - of(x)).abs_lower() < 1e-12
+    assert arb(enclosed.slopes[0]).abs_upper() <= 1.001 * slopes[1]
+    assert enclosed.slopes[0].lower() > slopes[0] - 0.01 * slopes[1]
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -124,12 +143,72 @@ def own_plant(folder: Path, code: str) -> Scenario:
         ("return [z[1], z[0] + u[0] + (t_s > 1)]", "distinguish cases"),
         ("return [z[1], z[0] + u[0] + 0.1]", "does not rest"),
         ("return [z[1], np.sqrt(z[0]) + u[0]]", "not defined and smooth"),
+        ("return [z[1], np.hypot(z[0], 1.0) - 1 + u[0]]", "np.hypot has no enclosure; sin, cos"),
     ],
 )
 def test_without_a_certificate_the_reason_is_given(tmp_path: Path, body: str, reason: str) -> None:
     code = "class Own:\n    def derivative(self, t_s, z, u):\n        import math, numpy as np\n"
     code += f"        {body}\n"
     assert reason in (certificate_of(own_plant(tmp_path, code), (0.1, 0.1)).void or "")
+
+
+FRICTION = """class Rubbing:
+    def derivative(self, t_s, z, u):
+        import numpy as np
+        return [z[1], z[0] + u[0] - 0.01 * {term}]
+"""
+
+
+@pytest.mark.parametrize("term", ["np.tanh(z[1] / 0.05)", "np.arctan(z[1] / 0.05)", "10 * z[1] * abs(z[1])"])
+def test_friction_is_certified_far_from_its_bend(tmp_path: Path, term: str) -> None:
+    assert certificate_of(own_plant(tmp_path, FRICTION.format(term=term)), (1.0, 0.1)).void is None
+
+
+@pytest.mark.parametrize(
+    ("term", "reason"),
+    [
+        ("-3000 * z[0] ** 3", "the slope of dx_2/dt by x_1 is from"),
+        ("(z[1] if abs(z[0]) < 0.5 else 0.0)", "distinguish cases"),
+    ],
+)
+def test_a_start_too_far_away_is_named(tmp_path: Path, term: str, reason: str) -> None:
+    """With the region that the bounds need, and the one on which the equations are near enough to linear."""
+    void = certificate_of(own_plant(tmp_path, FRICTION.format(term=term)), (1.0, 0.1)).void
+    assert void is not None
+    assert reason in void
+    found = re.search(
+        r"it is not so on \|x_1\| ≤ ([\d.]+), .* does not contain the start: \|x_1\| ≤ \1", void
+    )
+    assert found
+    nearer = certificate_of(own_plant(tmp_path, FRICTION.format(term=term)), (0.01, 0.01))
+    assert nearer.void is None
+
+
+def test_linear_equations_have_the_certificates_of_a_linear_plant(tmp_path: Path) -> None:
+    """From any x(0), also with an observer, and without a region."""
+    code = """class Linear:
+    def derivative(self, t_s, z, u):
+        return [z[1], 1.5 * z[0] - 0.1 * z[1] + u[0]]
+"""
+    for start, settings in ((1.0, {}), (1e6, {}), (1.0, {"observer": LUENBERGER})):
+        own = own_plant(tmp_path, code)
+        moved = own.plant.model_copy(update={"initial_state": (start, 0.0)})
+        own = own.model_copy(update={"plant": moved, **settings})
+        matrices = {"A": ((0.0, 1.0), (1.5, -0.1)), "B": ((0.0,), (1.0,)), "system": LinearSettings()}
+        linear = own.model_copy(update={"plant": moved.model_copy(update=matrices)})
+        [certificate] = scheduled_certificates(own)
+        [expected] = scheduled_certificates(linear)
+        assert certificate.constants is not None
+        assert certificate.constants == expected.constants
+        assert certificate.persistent_constants == expected.persistent_constants
+        assert certificate.region is None
+        assert "the plant is ẋ = Ax + Bu" in {assumption.what for assumption in certificate.assumptions}
+
+
+def test_equations_that_are_linear_near_0_only_are_not_linear(tmp_path: Path) -> None:
+    for term in ("max(z[1] - 1e3, 0.0)", "1e-9 * z[1] ** 2", "np.sin(1e-6 * z[1])"):
+        own = own_plant(tmp_path, FRICTION.format(term=term))
+        assert isinstance(nonlinear_scope(own), RegionScope)
 
 
 @pytest.mark.parametrize(("rest", "status"), [(0.0, "holds"), (1e-10, "assumed")])

@@ -4,6 +4,7 @@ tests/cosim/analysis/claims compares ``nominal_conditions`` with the machines.
 """
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,27 @@ def certified(system: System, floor: float = 0.0) -> tuple[ScenarioCertificate, 
 
 def run(system: System, seed: int, floor: float = 0.0) -> Trace:
     return simulate(system, *networks(seed, system), floor=floor)
+
+
+@pytest.mark.parametrize("mansd", [5000, 1_000_000])
+def test_what_would_take_minutes_is_refused_with_its_reason(
+    mansd: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is computed that grows with the number of missing updates."""
+    monkeypatch.setattr("noack.theory.certificates.error_rows.sum_of_sups", None)
+    resolved = shipped("double_integrator", f"network.mansd={mansd}")
+    void = certify(resolved, nominal_conditions(resolved)).void
+    assert void is not None
+    assert re.match(r"up to [\d,]+ updates may be missing at once, .* for at most 1,000", void)
+
+
+def test_constants_with_many_missing_updates_are_not_sharpened(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The sharpening would follow each of them in every round."""
+    monkeypatch.setattr(
+        "noack.theory.certificates.deliveries.sharpened_constants.SharpenedBounds", None
+    )  # fmt: skip
+    resolved = shipped("double_integrator", "network.mansd=300")
+    assert certify(resolved, ideal_conditions(resolved)).constants is not None
 
 
 LATE_INPUT = systems(hold_steps=4, lag_steps=2, step_share=0.03, beta=0.01)
