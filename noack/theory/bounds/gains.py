@@ -221,7 +221,7 @@ class ErrorGains:
     def _all_missing_until(self, events: int, due_s: float) -> Mapping[Output, float]:
         totals = dict.fromkeys(self.outputs, 0.0)
         for first in range(0, events, _AT_ONCE):
-            until_s = due_s * np.arange(first + 1, min(first + _AT_ONCE, events) + 1)
+            until_s = np.asarray(due_s * np.arange(first + 1.0, min(first + _AT_ONCE, events) + 1.0))
             responses = response_until(self.scaled_H, self.inverse_weight, until_s)
             for output, kernel in responses.through_each(self.stacked).items():
                 totals[output] += float(kernel.sup_on_grid().sum())
