@@ -14,6 +14,7 @@ from noack.core.number_format import NONE, TextRows, as_html, as_text, at_least,
 from noack.plants.linear import LinearSettings
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_tables import NOT_COVERED
 from noack.theory.bounds.enclosure import NotDecayingError, norm_bounds, response
 from noack.theory.bounds.gains import error_gains, sum_of_sups
 from noack.theory.certificates.assumptions import assumptions
@@ -386,6 +387,14 @@ def certificates_of(
     as_given = weighted.model_copy(update={"plant": original.plant})
     nonlinear, equations = (as_given if is_kind else None for is_kind in (is_model, linear is not None))
     return Certificates(weighted, late, W, given, nonlinear, equations)
+
+
+def answer_for(scenario: Scenario) -> CertificateAnswer:
+    """Whether a scenario's own plant has a certificate for its schedule, also where none covers it."""
+    try:
+        return certificates_of(scenario, of_model=True).answer
+    except CallerError as error:
+        return CertificateAnswer(False, f"no certificate: {str(error).removesuffix(NOT_COVERED)}")
 
 
 def in_chosen_norm(

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from itertools import combinations, permutations
 from typing import NamedTuple
 
+from cosim.analysis.certificates import CertificateAnswer, answer_for
 from netem.tc_words import guarantee_words, settings_of
 from noack.core.errors import CallerError
 from noack.core.number_format import at_least, at_most, duration
@@ -30,6 +31,7 @@ _LARGEST_EFFORT = 1e6
 """Largest factor of the work that may be asked for."""
 
 _CAPS, _OTHERS, _PERIOD, _RANDOM = "M", "the other guarantees", "the longest period", "random losses"
+_CERTIFICATE = "the certificate"
 """What is examined, in this order."""
 
 MarginProgress = Callable[[str], None]
@@ -211,6 +213,8 @@ class MarginResult:
     """None if it was not searched for."""
     without_guarantee: MeanSquareGrowth | str
     """The growth under the scenario's losses if nothing limits them, or why it is not known."""
+    certificate: CertificateAnswer | None = None
+    """Whether the scenario has a certificate; None if this was not examined."""
     effort: float = 1.0
     """Factor of the limits of the work for a decision."""
     compared: GuaranteeComparison = _NOT_COMPARED
@@ -264,7 +268,7 @@ class MarginResult:
         """Return the verdicts."""
         period = [self.period.text] if self.period else []
         relations = self.compared.relations
-        return "\n".join([self.verdict, *relations, *period, self.random_text])
+        return "\n".join([self.verdict, *relations, *period, self.random_text, *self.certificate_texts])
 
     @property
     def random_text(self) -> str:
@@ -272,6 +276,13 @@ class MarginResult:
         growth = self.without_guarantee
         text = growth if isinstance(growth, str) else growth.text
         return f"if losses were only random, without the guarantee: {text}"
+
+    @property
+    def certificate_texts(self) -> tuple[str, ...]:
+        """The answer of ``noack certify``, as a line; none if it was not examined."""
+        if self.certificate is None:
+            return ()
+        return (f"noack certify, for {self.guarantee}: {self.certificate.text}",)
 
     def to_json(self) -> dict[str, object]:
         """Return all fields and the verdicts for JSON."""
@@ -292,6 +303,7 @@ class MarginResult:
             "relations": self.compared.relations,
             "period": period,
             "without_guarantee": growth if isinstance(growth, str) else growth._asdict(),
+            "certificate": None if self.certificate is None else self.certificate._asdict(),
         }
 
 
@@ -345,7 +357,9 @@ def find_margin(
     every_m, compared = False, _NOT_COMPARED
     limit: PeriodLimit | None = None
     growth: MeanSquareGrowth | str = "not examined"
-    missing = [_CAPS, *([_OTHERS] if others_read else []), *([_PERIOD] if with_period else []), _RANDOM]
+    certificate: CertificateAnswer | None = None
+    missing = [_CAPS, *([_OTHERS] if others_read else []), *([_PERIOD] if with_period else [])]
+    missing += [_RANDOM, _CERTIFICATE]
     try:
         # M = 1, 2, … up to the first one that is destabilised, or that the other rules imply.
         for m in range(1, most_m + 1):
@@ -362,6 +376,9 @@ def find_margin(
             missing.remove(_PERIOD)
         growth = _without_guarantee(resolved, progress)
         missing.remove(_RANDOM)
+        progress(_CERTIFICATE)
+        certificate = answer_for(resolved)
+        missing.remove(_CERTIFICATE)
     except StopRequestError as stop:
         if on_stop is None or not caps:
             raise
@@ -379,6 +396,7 @@ def find_margin(
         every_m=every_m,
         period=limit,
         without_guarantee=growth,
+        certificate=certificate,
         effort=effort,
         compared=compared,
         missing=tuple(f"M from {len(caps) + 1} on" if what == _CAPS else what for what in missing),

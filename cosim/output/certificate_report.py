@@ -294,10 +294,13 @@ def print_margin(console: Console, margin: MarginResult) -> None:
     if margin.period is not None:
         text = f"for {margin.guarantee}: {margin.period.text}"
         console.print(text, soft_wrap=True, highlight=False)
-    console.print(margin.random_text, soft_wrap=True, highlight=False, markup=False)
+    for text in (margin.random_text, *margin.certificate_texts):
+        console.print(text, soft_wrap=True, highlight=False, markup=False)
     note = "D delivered, L lost, repeated. Below 1: every pattern is stable."
     if not margin.is_periodic:
         note += " In brackets: the time to the next update."
+    if margin.certificate is not None and not margin.certificate.is_certified:
+        note += " A loop without a certificate may be stable."
     console.print(f"[dim]{note}[/]")
 
 

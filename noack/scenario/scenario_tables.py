@@ -326,6 +326,8 @@ class MessageSizes:
         }[flow]
 
 
+NOT_COVERED = "; no certificate covers this"
+"""End of the message about a setting that no certificate covers."""
 UNCERTIFIED_ACKNOWLEDGEMENTS = (
     "x_s is reset only when an acknowledgement returns, so ‖e_s‖ exceeds the threshold while the "
     "sensor waits, and (I1), on which every bound rests, does not hold"
@@ -459,7 +461,7 @@ class TheoryCoverage:
     def require_certifiable(self) -> None:
         """Raise CallerError if no certificate covers the scenario."""
         if (reason := self.uncertified_setting) is not None:
-            raise CallerError(f"{reason}; no certificate covers this")
+            raise CallerError(f"{reason}{NOT_COVERED}")
 
     def require_exact(self) -> None:
         """Raise CallerError if exact simulation does not cover the scenario."""

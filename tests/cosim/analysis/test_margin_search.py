@@ -193,13 +193,14 @@ def test_ctrl_c_leaves_what_was_decided(monkeypatch: pytest.MonkeyPatch, json_ou
 
     monkeypatch.setattr(LossMargin, "stability", interrupted)
     result = invoke("margin", "lane_periodic", *(["--json"] if json_output else []))
-    line = "noack: stopped by the user (SIGINT); missing: M from 3 on, the longest period, random losses"
+    missing = ["M from 3 on", "the longest period", "random losses", "the certificate"]
+    line = f"noack: stopped by the user (SIGINT); missing: {', '.join(missing)}"
     assert (result.exit_code, result.stderr.splitlines()[-1]) == (130, line)
     if json_output:
         document = json.loads(result.stdout)
         assert [cap["m"] for cap in document["caps"]] == [1, 2]
         assert document["stable_m"] == 2
-        assert document["missing"] == ["M from 3 on", "the longest period", "random losses"]
+        assert document["missing"] == missing
         assert document["period"] is None
     else:
         assert "proven stable for every loss pattern with M ≤ 2" in result.stdout
@@ -211,7 +212,8 @@ def test_ctrl_c_in_the_search_of_a_period_leaves_every_m(monkeypatch: pytest.Mon
         margin_search, "find_longest_period", lambda *arguments: signal.raise_signal(signal.SIGINT)
     )
     result = invoke("margin", "lane_periodic", "--most", "2")
-    line = "noack: stopped by the user (SIGINT); missing: the longest period, random losses"
+    missing = "the longest period, random losses, the certificate"
+    line = f"noack: stopped by the user (SIGINT); missing: {missing}"
     assert (result.exit_code, result.stderr.splitlines()[-1]) == (130, line)
     assert "M ≤ 2" in result.stdout
 

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 import noack
+from cosim.analysis.certificates import answer_for
 from cosim.cli.options import load_scenario
 from cosim.cli.played_pattern import GROWN, until_it_shows
 from cosim.output.run_verdict import Tone
@@ -36,6 +37,26 @@ def test_the_answer_of_certify_is_that_of_the_run(name: str, is_certified: bool)
     if not is_certified:
         reason = line.text.removeprefix("guarantee not checkable: no certificate: ")
         assert answer.text.endswith(f": {reason}; only its model in its place has one")
+
+
+@pytest.mark.parametrize("losses", [0, 4])
+def test_the_answer_of_certify_is_that_of_margin(losses: int) -> None:
+    """margin said of the first only that every pattern is stable."""
+    scenario = noack.load("lane_periodic", {"network.mansd": losses})
+    answer = noack.certify(scenario).answer
+    assert answer.is_certified == (losses == 0)
+    margin = noack.margin(scenario, most_m=1, period=False)
+    assert margin.certificate == answer
+    assert str(margin).splitlines()[-1] == (
+        f"noack certify, for at most M − 1 = {losses} consecutive losses: {answer.text}"
+    )
+
+
+def test_a_setting_that_no_certificate_covers_is_the_reason_once() -> None:
+    answer = answer_for(noack.load("lane_python_trigger"))
+    assert not answer.is_certified
+    assert answer.text.startswith("no certificate: trigger.")
+    assert "covers this" not in answer.text
 
 
 def test_what_is_violated_without_a_certificate_is_its_condition() -> None:
