@@ -5,7 +5,7 @@ The terminal (:mod:`cosim.output.terminal_output`) and the report show them; :at
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -15,7 +15,10 @@ from cosim.output.run_tables import changes_in, shares_network, state_norm
 from cosim.simulation.continuous import ContinuousSummary
 from noack.core.errors import ExitStatus
 from noack.core.number_format import counted, duration_at_least
+from noack.protocol.roles import RECORDER
+from noack.protocol.wire_format import Rejection
 from noack.runtime.life_cycle import HORIZON
+from noack.runtime.udp_sockets import DROPPED_IN_FLOOD
 from noack.theory.certificates.assumptions import AssumptionStatus
 
 _MOST_NAMED = 3
@@ -34,6 +37,22 @@ _TIMES = {
     "start_s": "a first input after up to {}",
 }
 """The times of a certificate, in words."""
+
+
+_REJECTIONS: Mapping[str, str] = {
+    Rejection.LENGTH: "wrong length",
+    Rejection.VERSION: "another version",
+    Rejection.RUN: "of another run",
+    Rejection.FLOW: "of another flow",
+    Rejection.LOOP: "of no loop of the run",
+    Rejection.TAG: "not authentic",
+    Rejection.SOURCE: "unknown source",
+    Rejection.RANGE: "a number out of range",
+    Rejection.STALE: "not newer than one before",
+    Rejection.NOT_FINITE: "a number that is not finite",
+    DROPPED_IN_FLOOD: "dropped in a flood",
+}
+"""Why a process rejected datagrams, in words."""
 
 
 class Tone(StrEnum):
@@ -236,11 +255,22 @@ def _reason(loop: LoopSummary) -> GuaranteeVerdict:
     candidates = [claim for claim in uncovered if claim.has_bound] or uncovered or _void_claims(loop)
     claim = min(candidates, key=lambda claim: (claim.since_s or 0.0, _why(claim)))
     reason, late = _why(claim), _lateness(loop)
-    if late and late[0] == reason and not loop.missing_samples:
-        covered = any(other.is_certified and other.verdict == "held" for other in loop.claims)
-        missing = f"the {claim.source} does not cover that" if covered else "no certificate covers that"
-        reason = f"{reason}; {missing}"
+    if late and late[0] == reason:
+        reason = f"{reason}; {_what_does_not_cover(loop, claim)}"
     return GuaranteeVerdict(Tone.DOUBTFUL, claim.since_s or 0.0, reason, claim.lacks_loop_gain)
+
+
+def _what_does_not_cover(loop: LoopSummary, claim: Claim) -> str:
+    """Return which certificates do not cover the lateness of a loop, of which a claim is void."""
+    if _is_incomplete(loop):
+        return "no certificate was computed for that, because the record is incomplete"
+    covered = any(other.is_certified and other.verdict == "held" for other in loop.claims)
+    return f"the {claim.source} does not cover that" if covered else "no certificate covers that"
+
+
+def _is_incomplete(loop: LoopSummary) -> bool:
+    """Whether rows are missing from the record, or may be: a process has written no report."""
+    return bool(loop.missing_samples) or (loop.replay is not None and not loop.replay.complete)
 
 
 def _why(claim: Claim) -> str:
@@ -329,7 +359,9 @@ def remarks(summary: RunSummary) -> Iterator[Remark]:
         if violation.what not in reason and not (violation.cause in SCHEDULE and _covers_lateness(loop))
     ]
     for violation in violations[:_MOST_VIOLATIONS]:
-        where = f"from t = {violation.t_s:.3f} s on (reported by {violation.process})"
+        is_reported = violation.process != RECORDER
+        source = f"reported by {violation.process}" if is_reported else "found in the record"
+        where = f"from t = {violation.t_s:.3f} s on ({source})"
         what = violation.what + worst_time(violation.t_s, violation.worst_at_s)
         severe = violation.cause not in CAUSES  # the guarantee, or a change
         yield Remark(f"assumption violated {where}: {what}", severe=severe)
@@ -356,17 +388,17 @@ def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
     plant = loop.lateness_us.get("plant")
     if plant and plant.late_steps > _MOST_LATE * plant.steps:
         share = 100 * plant.late_steps / plant.steps
-        yield f"the plant missed {share:.0f} % of its deadlines: lower speed or plant.rate_hz"
+        yield f"the plant missed {share:.0f} % of its deadlines: reduce speed or plant.rate_hz"
     first, last = loop.initial_state_norm, loop.final_state_norm
     grew = first is not None and last is not None and last > _MOST_GROWTH * first > 0
     if grew and loop.diverged_at_s is None:  # else it is the reason why the run ended
         yield f"{state_norm(loop)} grew from {first:.3g} to {last:.3g} during the run"
     if loop.missing_samples:
-        where = ", ".join(f"{n} of {t}" for t, n in loop.missing_by_table.items())
+        where = ", ".join(f"{n:,} of {t}" for t, n in loop.missing_by_table.items())
         count = loop.missing_samples
         yield f"{counted(count, 'sample')} {'is' if count == 1 else 'are'} missing from the record: {where}"
     if loop.unintended_losses:
-        where = ", ".join(f"{n} on {leg}" for leg, n in loop.unintended_losses_by_leg.items())
+        where = ", ".join(f"{n:,} on {leg}" for leg, n in loop.unintended_losses_by_leg.items())
         count = loop.unintended_losses
         lost = f"{counted(count, 'datagram')} {'was' if count == 1 else 'were'} lost elsewhere"
         if _has_clocks(loop):
@@ -374,19 +406,22 @@ def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
         else:
             yield f"{lost} (kernel, or a process that did not respond): {where}"
     for role, reasons in loop.rejected_datagrams.items():
-        counts = ", ".join(f"{reason.replace('_', ' ')} {n}" for reason, n in reasons.items())
+        counts = ", ".join(f"{n:,} ({_REJECTIONS.get(reason, reason)})" for reason, n in reasons.items())
         yield f"{role} rejected datagrams: {counts}"
     if guarantee_of(loop).lacks_loop_gain:
         yield (
             "no bound of ‖x‖ is certified: noack certify shows what would have to change; "
-            "noack margin, whether a time-triggered loop is proven stable"
+            "noack margin shows whether a time-triggered loop is proven stable"
         )
-    unchecked = any(_is_late(loop, claim) for claim in _void_claims(loop))
-    ended_well = summary.exit.status != ExitStatus.FAILED and not loop.missing_samples
-    if unchecked and ended_well and summary.kind == "live":
+    late = [claim for claim in _void_claims(loop) if _is_late(loop, claim)]
+    ended_well = summary.exit.status != ExitStatus.FAILED and not _is_incomplete(loop)
+    if late and ended_well and summary.kind == "live":
         culprit = "A host or the network between hosts" if _has_clocks(loop) else "This machine"
+        covered = any(claim.is_certified and claim.verdict == "held" for claim in loop.claims)
+        sources = " and the ".join(dict.fromkeys(claim.source for claim in late))
+        certificate = f"the {sources}" if covered else "any certificate"
         yield (
-            f"{culprit} was later than any certificate of this loop allows, so some claims were not "
+            f"{culprit} was later than {certificate} of this loop allows, so some claims were not "
             "checked to the end: use a less busy machine, or a lower speed"
         )
     if _has_clocks(loop) and loop.replay is not None and not loop.replay.complete:

@@ -31,6 +31,7 @@ from cosim.output.run_tables import (
 )
 from cosim.output.run_verdict import Tone, VerdictLine, remarks, verdict
 from cosim.record.run_directory import RECORDING_FILE, REPORT_FILE, file_of_loop
+from noack.core.number_format import counted
 from noack.theory.certificates.assumptions import Assumption, AssumptionStatus
 
 _GOOD, _DOUBTFUL, _BAD = "green", "yellow", "bold red"
@@ -116,7 +117,7 @@ def _print_loops(console: Console, summary: RunSummary, *, verbose: bool) -> Non
     console.print(terminal_table(loops_table(loops, title), dense=True))
     console.print(LOOPS_CAPTION, style="table.caption")
     if more := len(summary.loops) - len(loops):
-        console.print(f"and {more} more loops: --verbose shows all")
+        console.print(f"and {counted(more, 'more loop')}: --verbose shows all")
 
 
 def _void_lines(loops: Sequence[LoopSummary]) -> list[str]:

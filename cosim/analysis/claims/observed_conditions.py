@@ -54,9 +54,11 @@ A certificate holds for every run that meets its conditions, however they were c
 was later than its scenario allows has the certificate for the times that it took, if there is one.
 """
 DROPOUTS = LongestBurst(0).name
-_NOT_WITHIN = "an update had not taken effect {:.4g} s after its event, when the run ended; {:.4g} s allowed"
+_NOT_WITHIN = (
+    "an update had not taken effect by the end of the run, {:.4g} s after its event; {:.4g} s allowed"
+)
 """In place of the delay of an update that never took effect."""
-_NO_INPUT = "the plant applied no input at all, the first within {1:.4g} s required"
+_NO_INPUT = "the plant applied no input at all; the first was required within {1:.4g} s"
 """In place of a time until the first input, which is the only condition without an upper limit."""
 
 

@@ -105,6 +105,9 @@ def test_the_chance_of_a_long_burst_is_that_of_the_fitted_chain(chain_csv: Path)
     assert predicted["mean_burst"] == pytest.approx(document["mean_burst"], rel=0.01)
     # By counting, from the fitted chain: losses are the bad state, which the trace begins in by its share.
     assert document["chosen_model"] == "gilbert"
+    table = measure(chain_csv, "--within", "500").stdout
+    (marked,) = [line for line in table.splitlines() if "(closest)" in line]
+    assert "Gilbert (closest)" in marked
     p, r = (
         document["models"]["gilbert"]["estimates"][name]["value"] for name in ("good_to_bad", "bad_to_good")
     )

@@ -11,11 +11,14 @@ import noack
 from cosim.analysis.summary.run_summary import Outcome
 from cosim.analysis.summary.summary_model import Claim
 from cosim.live.finalize import finalize
+from cosim.output import run_verdict
 from cosim.output.page_kit import TERMS
 from cosim.output.run_tables import run_title, short_numbers
 from cosim.output.run_verdict import SETTLED_SHARE, Tone, remarks, state_text, verdict
 from cosim.record.divergence import GROWTH
 from cosim.simulation.virtual_time import simulate_run
+from noack.protocol.wire_format import Rejection
+from noack.runtime.udp_sockets import DROPPED_IN_FLOOD
 from tests.helpers.approved import compare_lines
 from tests.helpers.shipped import shipped
 from tests.helpers.summaries import claim, with_values
@@ -94,20 +97,31 @@ def test_a_run_across_hosts_names_the_firewall_the_network_and_how_to_add_rows(
     values: dict[str, Any] = {
         "kind": "live", "unintended_losses": 3, "unintended_losses_by_leg": {"actuation": 3},
         "assumption_violations": [LATE],
-        "claims": [claim("void", why=LATE["what"])], "replay": {"complete": False, "bit_exact": None},
+        "claims": [claim("void", why=LATE["what"])],
     }  # fmt: skip
 
-    def texts(clock_error_s: float | None) -> str:
+    def texts(clock_error_s: float | None, *, complete: bool) -> str:
         conditions = dict.fromkeys(("dropouts", "sampling_s", "delay_s", "hold_s", "start_s"))
         summary = with_values(
-            outcome.summary, conditions=conditions | {"clock_error_s": clock_error_s}, **values
+            outcome.summary,
+            conditions=conditions | {"clock_error_s": clock_error_s},
+            replay={"complete": complete, "bit_exact": None},
+            **values,
         )
         return "\n".join(remark.text for remark in remarks(summary))
 
-    across, alone = texts(1e-4), texts(None)
-    for named in ("firewalls must pass", "the network between hosts was later", "--add FILE"):
-        assert named in across
-        assert named not in alone
+    across, alone = ([texts(error_s, complete=whole) for whole in (True, False)] for error_s in (1e-4, None))
+    for named, whole in (
+        ("firewalls must pass", True),
+        ("the network between hosts was later than any certificate of this loop allows", True),
+        ("--add FILE", False),
+    ):
+        assert named in across[not whole]
+        assert named not in "".join(alone)
+    # What is missing from the record may be later: no certificate was computed for it.
+    assert "was later than" in alone[0]
+    assert "was later than" not in across[1] + alone[1]
+    alone = alone[0]
     assert "lost elsewhere (kernel, or a process that did not respond): 3 on actuation" in alone
 
 
@@ -154,3 +168,53 @@ def test_one_missing_sample_and_one_lost_datagram_have_no_plural(outcome: Outcom
     texts = "\n".join(remark.text for remark in remarks(summary))
     assert "1 sample is missing from the record: 1 of plant_step" in texts
     assert "1 datagram was lost elsewhere" in texts
+
+
+def test_where_the_plant_is_certified_only_the_box_is_said_to_be_uncovered(outcome: Outcome) -> None:
+    """It said that the machine was later than any certificate allows."""
+    claims = [claim("held"), claim("void", source="box certificate", why=LATE["what"])]
+    late = with_values(outcome.summary, kind="live", claims=claims, assumption_violations=[LATE])
+    texts = "\n".join(remark.text for remark in remarks(late))
+    assert "This machine was later than the box certificate of this loop allows, so some claims" in texts
+    assert (
+        "assumption violated from t = 1.000 s on (found in the record)" not in texts
+    )  # it is in the verdict
+    unseen = LATE | {"what": "no measurement for up to 1 s", "cause": "sampling"}
+    other = with_values(outcome.summary, claims=claims, assumption_violations=[LATE, unseen])
+    text = "\n".join(remark.text for remark in remarks(other))
+    assert "assumption violated from t = 1.000 s on (found in the record): no measurement" in text
+
+
+@pytest.mark.parametrize(
+    ("delay_s", "end"),
+    [
+        (0.3, "held, none violated; 4 claims not checkable: {}; the box certificate does not cover that"),
+        (0.4, "guarantee not checkable: {}; no certificate covers that"),
+    ],
+)
+def test_a_late_run_says_which_certificate_does_not_cover_it(delay_s: float, end: str) -> None:
+    """The plant has a certificate for 390 ms, every plant of the box one for 265 ms."""
+    delay = {"kind": "delay", "delay_s": delay_s}
+    changes = {"horizon_s": 5.0, "network.impairments": [delay], "certificate.network_delay_s": 0.001}
+    line = noack.simulate(noack.load("lane_following", changes)).verdict[1].text
+    why = f"the plant applied its first input at {delay_s + 0.002:.4g} s, 0.008 s allowed"
+    assert line.endswith(end.format(why))
+
+
+def test_the_numbers_and_reasons_of_datagrams_are_written_out(outcome: Outcome) -> None:
+    summary = with_values(
+        outcome.summary, missing_samples=2000, missing_by_table={"plant_step": 2000},
+        unintended_losses=1500, unintended_losses_by_leg={"actuation": 1500},
+        rejected_datagrams={"plant": {"length": 3, "shed": 4685}, "netem": {"source": 1}},
+    )  # fmt: skip
+    texts = "\n".join(remark.text for remark in remarks(summary))
+    assert "2,000 samples are missing from the record: 2,000 of plant_step" in texts
+    assert (
+        "1,500 datagrams were lost elsewhere (kernel, or a process that did not respond): 1,500 on" in texts
+    )
+    assert "plant rejected datagrams: 3 (wrong length), 4,685 (dropped in a flood)" in texts
+    assert "netem rejected datagrams: 1 (unknown source)" in texts
+
+
+def test_every_reason_for_a_rejection_has_words() -> None:
+    assert {*Rejection, DROPPED_IN_FLOOD} == {*run_verdict._REJECTIONS}

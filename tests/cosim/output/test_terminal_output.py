@@ -63,6 +63,13 @@ def test_reasons_of_several_loops_that_differ_only_in_numbers_are_one_line(tmp_p
     ]
 
 
+def test_one_more_loop_has_no_plural(outcome: Outcome) -> None:
+    loops = [outcome.summary.loops[0].model_copy(update={"name": f"loop-{i}"}) for i in range(13)]
+    summary = outcome.summary.model_copy(update={"loops": loops})
+    print_outcome(Console(file=(file := io.StringIO())), replace(outcome, summary=summary))
+    assert "and 1 more loop: --verbose shows all" in file.getvalue()
+
+
 def test_a_broken_guarantee_is_shown_as_an_error(outcome: Outcome) -> None:
     lost = {"t_s": 2.5, "process": "controller", "cause": "dropouts", "what": "MANSD violated: 6 lost"}
     later_violations = [lost | {"what": f"MANSD violated: {n} lost"} for n in range(7, 13)]
