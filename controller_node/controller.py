@@ -90,7 +90,8 @@ class LossCheck:
         newest_ns, self._newest_ns = self._newest_ns, event_ns
         violation = self._check_burst(sequence, losses, newest_ns, max(now_ns, event_ns))
         if not violation and newest == -1 and losses > 0 and not self._known_start:
-            violation = f"no delivered t_0: {losses} updates were lost before the first delivery"
+            lost = "1 update was lost" if losses == 1 else f"{losses} updates were lost"
+            violation = f"no delivered t_0: {lost} before the first delivery"
         texts = [violation] if violation else []
         if newest_ns >= self._since_ns:
             texts += self._check_further_rules(sequence, losses)
@@ -104,9 +105,8 @@ class LossCheck:
             allowed = max(_longest_burst(scenario.network.guarantee) for scenario in scenarios)
         if losses <= allowed:
             return ""
-        return (
-            f"MANSD violated: {losses} consecutive losses before update {sequence}, at most {allowed} assumed"
-        )
+        lost = "1 loss" if losses == 1 else f"{losses} consecutive losses"
+        return f"MANSD violated: {lost} before update {sequence}, at most {allowed} assumed"
 
     def _check_further_rules(self, sequence: int, losses: int) -> list[str]:
         """Return the largest violation of each further rule."""

@@ -10,7 +10,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
 from threading import Thread
@@ -47,7 +47,6 @@ _STOP_TIMEOUT_S = 15.0
 """Wall time that the processes of a stopped run have to end."""
 _STOPPED_S = 15.0
 """Wall time after which a run ends whose process was stopped, and not continued."""
-_STOPPED = "stopped (state T): by a signal such as SIGSTOP, or by a debugger"
 DEFAULT_START_S = 30.0
 """Wall time within which all processes have to be ready, if the scenario gives none."""
 _POLL_S, _STARTING_POLL_S = 0.01, 0.002
@@ -269,7 +268,7 @@ class _Run:
             failures.pop(RECORDER, None)  # sorting a long record, it may not respond
         for role, since_s in self._stopped_since_s.items():
             if role in failures or self._last_s - since_s > _STOPPED_S:
-                failures[role] = EndReason(ExitStatus.FAILED, f"{role} {_STOPPED}")
+                failures[role] = EndReason(ExitStatus.FAILED, _stopped_text([role]))
         return next(iter((failures | exited).values()), None)
 
     def _is_in_loop(self) -> bool:
@@ -306,17 +305,33 @@ class _Run:
 
     def _overdue(self) -> str:
         if self._stopped_since_s:
-            return f"{', '.join(self._stopped_since_s)} {_STOPPED}"
+            return _stopped_text(self._stopped_since_s)
         if self._coordinator.epoch_ns is None:
-            return f"{', '.join(self._coordinator.missing())} {self._limit.explain_start()}"
+            return self._not_ready()
         # One that is lost, too: the recorder may not respond while it sorts a long record.
         silent = [role for role in ROLES if not self._coordinator.has_ended(role)]
         # The recorder waits for the others.
         silent = [role for role in silent if role != RECORDER] or silent
-        failure = f"no report from {', '.join(silent)}"
+        failure = f"there is no report from {', '.join(silent)}"
         if not silent:
             failure = f"{', '.join(self._children.running())} reported the end, but did not exit"
-        return f"the run did not end at its horizon: {failure}, {self._limit.explain_end()}"
+        return f"the run did not end at its horizon: {failure}; {self._limit.explain_end()}"
+
+    def _not_ready(self) -> str:
+        """Why the run did not start in time."""
+        missing = self._coordinator.missing()
+        by_hand = [role for role in missing if role in self._by_hand]
+        # Those may wait for a person: neither the load nor a limit is the reason.
+        reasons = [self._limit.explain_missing(by_hand)] if by_hand else []
+        launched = [role for role in missing if role not in by_hand]
+        reasons += [self._limit.explain_start(launched)] if launched else []
+        return "; ".join(reasons)
+
+
+def _stopped_text(roles: Collection[str]) -> str:
+    """Return that processes are stopped, and by what."""
+    are = "is" if len(roles) == 1 else "are"
+    return f"{', '.join(roles)} {are} stopped (state T), by a signal such as SIGSTOP or by a debugger"
 
 
 def _signalled(signals: Signals) -> EndReason | None:

@@ -1,5 +1,6 @@
 """How long a launcher waits for its processes: longer on a loaded machine."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from noack.core.system_processes import cores as usable_cores
@@ -48,9 +49,10 @@ class WaitLimit:
         """Whether the load extended the limit, so that it is the likely cause."""
         return self.waited_s > _OVERLOADED * self.counted_s
 
-    def explain_start(self) -> str:
+    def explain_start(self, roles: Sequence[str]) -> str:
         """Why processes were not ready within the limit, and what would help."""
-        waited = f"not ready in time: waited {self.waited_s:.0f} s"
+        were = "was" if len(roles) == 1 else "were"
+        waited = f"{', '.join(roles)} {were} not ready in time: waited {self.waited_s:.0f} s"
         if self.is_loaded:
             return (
                 f"{waited}; likely cause: {self.load_text}; start fewer runs at once, or set "
@@ -58,8 +60,16 @@ class WaitLimit:
             )
         return f"{waited} (start_within_s); {self.load_text} is not the likely cause"
 
+    def explain_missing(self, roles: Sequence[str]) -> str:
+        """Which processes that people start did not join within the limit, and how to start them."""
+        commands = ", ".join(f"`noack {role}`" for role in roles)
+        return (
+            f"{', '.join(roles)} did not join in time: waited {self.waited_s:.0f} s (start_within_s); "
+            f"start with {commands}"
+        )
+
     def explain_end(self) -> str:
         """Why a run did not end within the limit after its horizon, and what would help."""
         if self.is_loaded:
             return f"likely cause: {self.load_text}; start fewer runs at once"
-        return "too slow or stopped; reduce the speed or the rates"
+        return "likely cause: too slow, or stopped; reduce the speed or the rates"

@@ -134,7 +134,7 @@ def _require_utf8(path: Path) -> None:
 
 def how_to_complete(run_dir: Path) -> str:
     """Return what to do about a run whose end was interrupted."""
-    return f"its record is incomplete: `noack summary {run_dir}` completes it"
+    return f"the run's record is incomplete: `noack summary {run_dir}` completes it"
 
 
 def read_object(path: Path) -> dict[str, Any]:

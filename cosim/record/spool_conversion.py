@@ -237,7 +237,7 @@ def remove_spool(run_dir: Path) -> None:
 def _write_error(run_dir: Path, error: OSError) -> MachineError:
     return MachineError(
         f"{run_dir / RECORD}: the record cannot be written: {why(error)}; what was recorded is "
-        f"kept in {run_dir / SPOOL}, and `noack summary {run_dir}` finishes it"
+        f"kept in {run_dir / SPOOL}; later, `noack summary {run_dir}` completes the record"
     )
 
 

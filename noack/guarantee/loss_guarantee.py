@@ -75,7 +75,8 @@ class LongestBurst(LossRule):
         return count, count
 
     def violation(self, value: float) -> str:
-        return f"{value:.0f} consecutive updates lost, {self.limit} allowed"
+        lost = "1 update" if value == 1 else f"{value:.0f} consecutive updates"
+        return f"{lost} lost, {self.limit} allowed"
 
 
 @dataclass(frozen=True)

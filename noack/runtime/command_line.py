@@ -44,6 +44,8 @@ _ENDING: dict[int, tuple[ExitStatus, str]] = {  # exit status and reason after a
 }
 if _HANGUP:
     _ENDING[_HANGUP] = ExitStatus.TERMINATED, "stopped because the terminal was closed"
+END_SIGNALS = tuple(signal.Signals(number).name for number in _ENDING)
+"""Names of the signals that end a program."""
 
 
 class LogFormat(StrEnum):

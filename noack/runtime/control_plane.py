@@ -224,7 +224,7 @@ class ControlPlane:
             if reply is not None and reply.err is not None:
                 raise PeerError(reply.err.payload.to_bytes().decode(errors="replace"))
             time.sleep(0.02)
-        raise NoAnswerError(f"no answer to {queryable!r} within {timeout_s:g} s")
+        raise NoAnswerError(f"the run did not answer the request {queryable!r} within {timeout_s:g} s")
 
 
 class ParameterUpdates:

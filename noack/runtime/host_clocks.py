@@ -94,8 +94,8 @@ def require_small_error(which: str, clock: ClockError, settings: ClocksSection) 
     """Raise PeerError if a clock may be off by more than the scenario allows."""
     if clock.error_ns > settings.largest_error_us * 1000:
         raise PeerError(
-            f"{which} may be off by {clock.error_ns / 1000:g} µs by {clock.source}, "
-            f"clocks.largest_error_us = {settings.largest_error_us:g} allowed"
+            f"{which} may be off by {clock.error_ns / 1000:g} µs, as `{clock.source}` says; "
+            f"clocks.largest_error_us = {settings.largest_error_us:g} allows less"
         )
 
 

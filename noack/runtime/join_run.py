@@ -96,8 +96,10 @@ def join_run(role: str, arguments: Sequence[str] | None = None) -> Iterator[RunP
         if options.json:
             print(json.dumps(process.report, indent=2))
         if signals.received is None and not descriptor.launched:
-            print(f"noack {role}: ended: {process.ended}", file=sys.stderr)
-            if process.ended != HORIZON:
+            is_complete = process.ended == HORIZON
+            end = "the run reached its horizon" if is_complete else f"ended early: {process.ended}"
+            print(f"noack {role}: {end}", file=sys.stderr)
+            if not is_complete:
                 sys.exit(ExitStatus.FAILED)
 
 
@@ -126,12 +128,12 @@ def _find_descriptor(role: str, session: str, signals: Signals) -> RunDescriptor
     descriptor = _wait_for(
         lambda: find_descriptor(session),
         signals,
-        f"noack {role}: waiting for `noack record SCENARIO` on this host (session {session!r}); of "
-        "a run on another host, give its --credentials; Ctrl-C ends",
+        f"noack {role}: waiting for `noack record SCENARIO` on this host (session {session!r}); to join "
+        "a run on another host, use --credentials; Ctrl-C ends the wait",
     )
     if descriptor is None:
         raise PeerError(f"no run to join in session {session!r}: start `noack record SCENARIO` first")
-    print(f"noack {role}: joining run of {descriptor.scenario.name!r}", file=sys.stderr)
+    print(f"noack {role}: joining the run of {descriptor.scenario.name!r}", file=sys.stderr)
     return descriptor
 
 
@@ -140,13 +142,13 @@ def _wait_for_credentials(role: str, folder: Path, runs: Path, signals: Signals)
 
     Raise CallerError or PeerError without one.
     """
-    waiting = f"noack {role}: waiting for {folder}; Ctrl-C ends"
+    waiting = f"noack {role}: waiting for {folder}; Ctrl-C ends the wait"
     if not _wait_for(folder.exists, signals, waiting):
-        raise PeerError("no credentials")
+        raise PeerError(f"{folder}: there is no such folder")
     descriptor = read_credentials(folder, role, runs)
     assert descriptor.remote is not None  # else read_credentials refuses it
     host_port = address_text(descriptor.remote)
-    print(f"noack {role}: joining run of {descriptor.scenario.name!r} at {host_port}", file=sys.stderr)
+    print(f"noack {role}: joining the run of {descriptor.scenario.name!r} at {host_port}", file=sys.stderr)
     return descriptor
 
 

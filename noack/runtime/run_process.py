@@ -307,7 +307,7 @@ class RunProcess:
         # only: on a busy machine the coordinator may only seem to be gone.
         waiting = self.life.state in (State.REQUESTED, State.AT_BARRIER)
         if waiting and self.plane.coordinator_gone(for_s=LOST_AFTER_S):
-            return "lost the connection to the run's coordinator"
+            return "the connection to `noack record` is lost"
         return None
 
     def _take_inputs(self, machine: Reconfigurable, now_ns: int, most: int | None) -> list[Record | Notice]:
@@ -332,8 +332,8 @@ class RunProcess:
         if isinstance(self._spool, KeptFile) and (not delivered or any(telemetry.stored().values())):
             reason = "the recorder was too slow" if delivered else "cannot reach the recorder"
             print_to_stderr(
-                f"noack {self.role}: {reason}; rows are kept in {self._spool.path}; copy it to the "
-                f"recorder's host, and there: noack summary RUN --add {self._spool.path.name}"
+                f"noack {self.role}: {reason}; rows are kept in {self._spool.path}; copy this file to the "
+                f"recorder's host, and add it there: noack summary RUN --add {self._spool.path.name}"
             )
 
 

@@ -130,8 +130,8 @@ def test_further_constraints_are_checked_over_all_updates_so_far(delivered: list
     ("known", "lost", "expected"),
     [
         (False, 0, None),
-        (False, 1, "no delivered t_0: 1 "),
-        (False, 2, "no delivered t_0: 2 "),
+        (False, 1, "no delivered t_0: 1 update was lost before"),
+        (False, 2, "no delivered t_0: 2 updates were lost before"),
         (False, 3, "MANSD violated: 3 consecutive losses"),
         (True, 0, None),
         (True, 2, None),

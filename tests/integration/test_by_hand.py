@@ -46,7 +46,7 @@ def test_a_wait_for_a_missing_process_can_be_interrupted(
         why = stderr.splitlines()[-1].removeprefix(f"noack {role}: ")
         assert why in (
             "stopped by the user (SIGINT)",
-            "lost the connection to the run's coordinator",
+            "the connection to `noack record` is lost",
         ), stderr
     assert psutil.wait_procs(children, timeout=live.PATIENCE_S)[1] == []
     assert live.private_files(tmp_path) == []
@@ -65,7 +65,7 @@ def test_the_loop_outlives_the_coordinator(start: Start, by_hand: ByHand) -> Non
     for role, process in processes.items():
         stdout, stderr = live.wait_for_end(process)
         assert process.returncode == 0, stderr
-        assert stderr.splitlines()[-1] == f"noack {role}: ended: horizon"
+        assert stderr.splitlines()[-1] == f"noack {role}: the run reached its horizon"
         assert json.loads(stdout)["ended"] == "horizon"
     assert recording.left_behind() == []
     outcome = reopen(run_dir)

@@ -34,7 +34,7 @@ def test_a_frozen_recorder_is_named_and_no_row_is_lost(start: Start) -> None:
     assert finished.status == 1
     assert (
         finished.summary["exit"]["reason"]
-        == "recorder stopped (state T): by a signal such as SIGSTOP, or by a debugger"
+        == "recorder is stopped (state T), by a signal such as SIGSTOP or by a debugger"
     )
     live.assert_complete(finished.loop)
     steps = load_record(finished.run_dir)["plant_step"]
@@ -100,7 +100,7 @@ def test_a_process_that_is_not_ready_in_time_is_named(start: Start) -> None:
     error = running.finish_unstarted()
     # On a busy machine, other processes may not be ready, either.
     # On a slow one, the time to be ready is longer than that after which a stopped process is named.
-    reason = re.search(r"sensor (stopped \(state T\)|.*not ready in time: waited \d+ s.* cores)", error)
+    reason = re.search(r"sensor (is stopped \(state T\)|.*not ready in time: waited \d+ s.* cores)", error)
     assert reason is not None, error
     assert not sensor.is_running()
     outcome = reopen(max(running.runs.glob("*-lane_following")))

@@ -145,8 +145,8 @@ def test_a_host_whose_clock_may_be_off_by_too_much_does_not_join(start: Start, t
     _, stderr = wait_for_end(away)
     assert away.returncode == 1
     assert stderr.splitlines()[-1] == (
-        "noack sensor: cannot join: the clock of the sensor's host may be off by 1100 µs by chronyc "
-        "tracking, clocks.largest_error_us = 1000 allowed"
+        "noack sensor: cannot join: the clock of the sensor's host may be off by 1100 µs, as `chronyc "
+        "tracking` says; clocks.largest_error_us = 1000 allows less"
     )
     recording.terminate()
     wait_for_end(recording)
@@ -170,9 +170,9 @@ def _of_another_role(folder: Path, third: Path) -> None:
 @pytest.mark.parametrize(
     ("take", "reason"),
     [
-        (_of_another_run, "it did not accept these credentials, or is busy; each run has new ones"),
-        (_none, "it did not accept these credentials, or is busy; each run has new ones"),
-        (_of_another_role, "no answer to 'admit' within 10 s"),
+        (_of_another_run, "it is busy, or did not accept these credentials; each run has new ones"),
+        (_none, "it is busy, or did not accept these credentials; each run has new ones"),
+        (_of_another_role, "the run did not answer the request 'admit' within 10 s"),
     ],
 )
 def test_the_certificates_of_a_third_party_admit_nobody(

@@ -75,8 +75,8 @@ class RunTerminal(RunObserver):
             self._print(text)
 
     def stopping(self, why: str) -> None:
-        """Say why the run ends early: the completion of its record may take minutes."""
-        self._print(f"{why}; the run ends, and its record is completed")
+        """Say why the run ends early."""
+        self._print(f"{why}; the run ends")
 
     def notice(self, line: str) -> None:
         """Show a line about the run."""

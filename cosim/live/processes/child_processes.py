@@ -114,7 +114,9 @@ class ChildProcesses:
         if code < 0:
             return EndReason(ExitStatus.FAILED, f"{role} died: killed by {signal_name(-code)}")
         if code in (ExitStatus.INTERRUPTED, ExitStatus.TERMINATED):
-            return EndReason(ExitStatus.FAILED, f"{role} ended early: {signal_name(code - 128)}")
+            # SIGHUP has the exit status of SIGTERM.
+            by = reported(role) or signal_name(code - 128)
+            return EndReason(ExitStatus.FAILED, f"{role} ended early: {by}")
         known = code in (ExitStatus.FAILED, ExitStatus.CALLER)
         lines, own = self._log_lines(role), f"noack {role}: "
         # Libraries write to the log, too; and on a full disk the log may be empty.

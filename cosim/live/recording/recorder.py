@@ -37,7 +37,7 @@ from noack.protocol.record_tables import (
     effective,
 )
 from noack.protocol.roles import LOOP_ROLES, RECORDER, Notice
-from noack.runtime.command_line import print_to_stderr
+from noack.runtime.command_line import END_SIGNALS, print_to_stderr
 from noack.runtime.connections.zenoh_session import header_of
 from noack.runtime.control_messages import ChangeAnnouncement, ProcessReport, RunProgress, message_json
 from noack.runtime.control_plane import ControlPlane
@@ -363,7 +363,7 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
     while recorder.poll():
         pass
     if silent := recorder.without_report:
-        print_to_stderr(f"noack recorder: no report from {', '.join(silent)}")
+        print_to_stderr(f"noack recorder: there is no report from {', '.join(silent)}")
     recorder.show()
     recorder.finish()
     try:
@@ -409,7 +409,7 @@ def _poll_to_the_end(process: RunProcess, recorder: Recorder) -> bool:
             if process.ended == LAUNCHER_GONE:
                 return False
             stop_s = stop_s or now_s
-            if process.ended in ("SIGINT", "SIGTERM") or now_s - stop_s > _STOP_TIMEOUT_S:
+            if process.ended in END_SIGNALS or now_s - stop_s > _STOP_TIMEOUT_S:
                 return True
         if not more:
             time.sleep(_POLL_S)

@@ -102,6 +102,8 @@ def read_credentials(folder: Path, role: str, runs: Path) -> RunDescriptor:
     CallerError if a file is missing or other users can read it, or the folder is another role's; or
     ``runs`` cannot be written; PeerError if there is no route to the recording host.
     """
+    if not (folder / RUN_FILE).exists() and (folder / role).is_dir():
+        raise CallerError(f"{folder}: has the credentials of all roles; give {folder / role}")
     files = (RUN_FILE, CA_FILE, CERTIFICATE_FILE, KEY_FILE)
     content, *_ = [_private_content(folder / file) for file in files]
     try:
@@ -109,8 +111,8 @@ def read_credentials(folder: Path, role: str, runs: Path) -> RunDescriptor:
     except (CallerError, UnicodeDecodeError) as error:
         raise CallerError(f"{folder / RUN_FILE}: not of `noack record --listen`: {error}") from None
     if descriptor.remote is None or descriptor.credentials_for != role:
-        owner = descriptor.credentials_for or "no role"
-        raise CallerError(f"{folder}: the credentials of {owner}, not of {role}")
+        owner = f"of {descriptor.credentials_for}" if descriptor.credentials_for else "of no role"
+        raise CallerError(f"{folder}: these credentials are {owner}, not of {role}")
     name = Path(descriptor.run_dir).name
     if name in ("", "..") or "\0" in name:
         raise CallerError(f"{folder / RUN_FILE}: its run directory has no name")
@@ -170,8 +172,8 @@ def no_connection(address: Address) -> NoAnswerError:
     try:
         with socket.create_connection(address, _LOOK_S):
             reason = (
-                "it did not accept these credentials, or is busy; each run has new ones: copy those of "
-                "the open run"
+                "a program listens there, but it is busy, or did not accept these credentials; each run "
+                "has new ones: copy those of the open run"
             )
     except TimeoutError:
         reason = "no answer; is it the recording host's address? Do firewalls pass TCP to this port?"

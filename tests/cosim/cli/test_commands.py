@@ -80,7 +80,7 @@ def test_a_signal_while_a_run_is_finalised_names_the_command_that_completes_it(
     assert result.exit_code == status
     (run_dir,) = (path for path in tmp_path.iterdir() if not path.is_symlink())
     assert result.stderr.splitlines()[-1] == (
-        f"noack: {reason}; its record is incomplete: `noack summary {run_dir}` completes it"
+        f"noack: {reason}; the run's record is incomplete: `noack summary {run_dir}` completes it"
     )
     assert not (run_dir / SUMMARY_FILE).exists()
     assert invoke("summary", run_dir).exit_code == 0

@@ -120,7 +120,6 @@ def case(content: dict[str, Any], tmp_path: Path) -> Case:
     [
         (None, 0.5, LOG, None),
         (-9, 0.5, LOG, (ExitStatus.FAILED, "sensor died: killed by SIGKILL")),
-        (143, 0.5, LOG, (ExitStatus.FAILED, "sensor ended early: SIGTERM")),
         (1, 0.5, LOG, (ExitStatus.FAILED, "sensor: no room")),
         (2, 0.5, f"{LOG}ERROR of a library\n", (ExitStatus.CALLER, "sensor: no room")),
         (1, 0.5, "ERROR of a library\n", (ExitStatus.FAILED, "sensor: the disk is full")),
@@ -141,8 +140,8 @@ def test_a_process_that_fails_ends_the_run_with_its_reason(
 @pytest.mark.parametrize(
     ("running", "lost", "late"),
     [
-        (("plant", RECORDER), (), "no report from plant"),
-        ((), (RECORDER,), "no report from recorder"),  # it sorts a long record
+        (("plant", RECORDER), (), "there is no report from plant"),
+        ((), (RECORDER,), "there is no report from recorder"),  # it sorts a long record
         ((), (), f"{', '.join(ROLES)} reported the end, but did not exit"),
     ],
 )
@@ -152,7 +151,43 @@ def test_a_run_that_does_not_end_names_the_late_process(
     coordinator = FakeCoordinator(2.0, **dict.fromkeys(lost, "stopped responding"))
     coordinator._running = running
     reason = case.run(case.children(None), coordinator)._overdue()
-    assert reason.startswith(f"the run did not end at its horizon: {late}, too slow or stopped; ")
+    assert reason == (
+        f"the run did not end at its horizon: {late}; likely cause: too slow, or stopped; reduce the "
+        "speed or the rates"
+    )
+
+
+@pytest.mark.parametrize(
+    ("missing", "reason"),
+    [
+        (("plant",), "plant did not join in time: waited 90 s (start_within_s); start with `noack plant`"),
+        (
+            ("plant", "netem"),
+            "plant, netem did not join in time: waited 90 s (start_within_s); start with `noack plant`, "
+            "`noack netem`",
+        ),
+        ((RECORDER,), "recorder was not ready in time: waited 90 s; likely cause: a load of "),
+    ],
+)
+def test_of_a_process_that_nobody_starts_the_load_is_not_the_cause(
+    case: Case, missing: tuple[str, ...], reason: str
+) -> None:
+    """On a loaded machine, `noack record` said that the load was the likely cause."""
+    coordinator = FakeCoordinator(0.0)
+    vars(coordinator).update(epoch_ns=None, missing=lambda: missing)
+    children = case.children(None)
+    children._children = {RECORDER: children._children[RECORDER]}
+    run = case.run(children, coordinator)
+    run._limit.wait(90.0, 1e3)
+    assert run._overdue().startswith(reason)
+
+
+def test_the_reason_for_an_end_by_sighup_is_not_another_signal(case: Case) -> None:
+    """Its exit status is that of SIGTERM."""
+    failures = case.children(143).failures(lambda role: "SIGHUP")
+    assert failures == {"sensor": (ExitStatus.FAILED, "sensor ended early: SIGHUP")}
+    failures = case.children(143).failures(lambda role: None)
+    assert failures == {"sensor": (ExitStatus.FAILED, "sensor ended early: SIGTERM")}
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the state of a process is in /proc")
@@ -161,7 +196,7 @@ def test_a_stopped_process_is_named_with_its_state(
     case: Case, now_s: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The load is not blamed; a process that goes on is no failure."""
-    said = "stopped (state T): by a signal such as SIGSTOP, or by a debugger"
+    said = "is stopped (state T), by a signal such as SIGSTOP or by a debugger"
     with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(1000)"]) as process:
         children = case.children(None)
         cast(Any, children._children[RECORDER]).pid = process.pid
@@ -173,6 +208,9 @@ def test_a_stopped_process_is_named_with_its_state(
         run._advance(waits=True)
         assert run._failure() is None  # not yet
         assert run._overdue() == f"recorder {said}"
+        run._stopped_since_s["plant"] = run._last_s
+        assert run._overdue() == f"recorder, plant {said}".replace(" is ", " are ")
+        del run._stopped_since_s["plant"]
         monkeypatch.setattr("cosim.live.launcher._STOPPED_S", -1.0)
         assert run._failure() == (ExitStatus.FAILED, f"recorder {said}")
         process.send_signal(signal.SIGCONT)
@@ -243,6 +281,6 @@ def test_after_a_second_signal_the_record_is_incomplete_and_can_be_completed(
             observers=[Calls(started=interrupt, stopping=interrupt)],
         )
     (run_dir,) = (path for path in tmp_path.iterdir() if not path.is_symlink())
-    how = f"its record is incomplete: `noack summary {run_dir}` completes it"
+    how = f"the run's record is incomplete: `noack summary {run_dir}` completes it"
     assert (stopped.value.exit_status, stopped.value.__notes__) == (ExitStatus.INTERRUPTED, [how])
     assert reopen(run_dir, view=False).status == ExitStatus.INTERRUPTED

@@ -152,7 +152,7 @@ def test_a_request_is_sent_again_when_its_answer_was_lost_and_its_answer_arrives
         assert received.epoch_ns == 7
         assert received.addresses == answer["addresses"]
         # The message must not read ``noack plant: plant: no answer``.
-        with pytest.raises(PeerError, match=r"^no answer to 'nothing'"):
+        with pytest.raises(PeerError, match=r"^the run did not answer the request 'nothing'"):
             plant.request("nothing", {}, timeout_s=0.05)
     unanswered.clear()
 

@@ -130,8 +130,8 @@ def test_a_host_whose_clock_may_be_off_by_too_much_is_refused(
     answer = ask(plane, barrier, "admit", role="sensor", clock=other.fields())
     if refused:
         assert answer.error == (
-            "cannot join: the clock of the sensor's host may be off by 1001 µs by chronyc tracking, "
-            "clocks.largest_error_us = 1000 allowed"
+            "cannot join: the clock of the sensor's host may be off by 1001 µs, as `chronyc tracking` says; "
+            "clocks.largest_error_us = 1000 allows less"
         )
         return
     assert answer.error is None

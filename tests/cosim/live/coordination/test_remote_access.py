@@ -54,7 +54,9 @@ def test_a_run_on_several_hosts_says_how_far_their_clocks_may_be_off(
     chronyc = tmp_path / "chronyc"
     chronyc.write_text("#!/bin/sh\necho 0,,1,0,0.000006,0,0,0,0,0,0,0,8,Normal\n")
     chronyc.chmod(0o755)
-    with pytest.raises(PeerError, match=r"the clock of this host may be off by 6 µs by chronyc tracking, "):
+    with pytest.raises(
+        PeerError, match=r"the clock of this host may be off by 6 µs, as `chronyc tracking` says; "
+    ):
         remote_access.own_clock(strict)
     chronyc.write_text("#!/bin/sh\necho 0,,1,0,0.000006,0,0,0,0,0,0,0,8,Not synchronised\n")
     with pytest.raises(MachineError, match="chrony has not synchronised"):
@@ -173,7 +175,7 @@ def test_the_certificate_of_another_role_permits_nothing_of_this_role(
     received: list[str] = []
     every = f"noack/{run_name(RUN_DESCRIPTOR.run_id)}/**"
     coordinator.session.declare_subscriber(every, lambda sample: received.append(str(sample.key_expr)))
-    with pytest.raises(CallerError, match="the credentials of sensor, not of controller"):
+    with pytest.raises(CallerError, match="these credentials are of sensor, not of controller"):
         read_credentials(folder / "sensor", "controller", tmp_path)
     stolen = remote(folder, "sensor", tmp_path)
     with ControlPlane(stolen, "controller") as thief:
@@ -215,7 +217,10 @@ def test_a_process_refuses_a_run_with_other_certificates(
     """Who listens in the place of the recording host is not believed."""
     with (
         credentials(settings._replace(folder=tmp_path / "third"), RUN_DESCRIPTOR),
-        pytest.raises(NoAnswerError, match="it did not accept these credentials"),
+        pytest.raises(
+            NoAnswerError,
+            match="a program listens there, but it is busy, or did not accept these credentials",
+        ),
     ):
         ControlPlane(remote(tmp_path / "third", "sensor", tmp_path), "sensor")
 

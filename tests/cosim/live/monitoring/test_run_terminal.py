@@ -26,3 +26,10 @@ def test_the_terminal_reports_each_cause_once(terminal: bool) -> None:
             terminal_line.progress(RunProgress(**report, warnings=void))
     assert output.getvalue().count("one [cause]") == 1
     assert output.getvalue().count("another") == 1
+
+
+def test_no_completed_record_is_promised_when_a_run_ends_early() -> None:
+    """On a full disk, the record of the run cannot be completed."""
+    output = io.StringIO()
+    RunTerminal(resolved("lane_following"), Console(file=output)).stopping("recorder: the disk is full")
+    assert output.getvalue() == "recorder: the disk is full; the run ends\n"

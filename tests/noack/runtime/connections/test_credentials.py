@@ -1,6 +1,7 @@
 """A folder of credentials as another host reads it: one line for each mistake."""
 
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -61,7 +62,7 @@ def _fifo(path: Path) -> None:
         ),
         (
             "run.json", lambda path: path.write_text(RUN_DESCRIPTOR.model_dump_json()),
-            "the credentials of no role, not of sensor",
+            "these credentials are of no role, not of sensor",
         ),
     ],
 )  # fmt: skip
@@ -74,6 +75,15 @@ def test_a_spoiled_file_is_refused_in_one_line(
     assert str(caught.value).startswith(str(folder))
     assert "\n" not in str(caught.value)
     assert "0" * 32 not in str(caught.value)  # the key
+
+
+def test_the_folder_of_all_roles_is_answered_with_that_of_the_role(folder: Path, tmp_path: Path) -> None:
+    """It said: run.json cannot be read; copy the whole folder."""
+    whole = tmp_path / "whole"
+    shutil.copytree(folder, whole / "sensor")
+    with pytest.raises(CallerError) as caught:
+        read_credentials(whole, "sensor", folder)
+    assert str(caught.value) == f"{whole}: has the credentials of all roles; give {whole / 'sensor'}"
 
 
 def test_the_own_address_is_that_of_the_route() -> None:
