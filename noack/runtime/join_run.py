@@ -97,7 +97,7 @@ def join_run(role: str, arguments: Sequence[str] | None = None) -> Iterator[RunP
             print(json.dumps(process.report, indent=2))
         if signals.received is None and not descriptor.launched:
             is_complete = process.ended == HORIZON
-            end = "the run reached its horizon" if is_complete else f"ended early: {process.ended}"
+            end = "the run reached its horizon" if is_complete else f"the run ended early: {process.ended}"
             print(f"noack {role}: {end}", file=sys.stderr)
             if not is_complete:
                 sys.exit(ExitStatus.FAILED)

@@ -43,6 +43,7 @@ from noack.runtime.host_clocks import RECEIVED, CausalityCheck, clock_error, rea
 from noack.runtime.kept_rows import KeptFile, KeptHead
 from noack.runtime.life_cycle import HORIZON, LAUNCHER_GONE, LOST_AFTER_S, Event, LifeCycle, Side, State
 from noack.runtime.run_descriptor import RunDescriptor
+from noack.runtime.spool import SPOOL
 from noack.runtime.telemetry import OwnSpool, TelemetryBuffer, deliver_report, persisted_rows
 from noack.runtime.udp_sockets import CountingSockets, bind, enlarge_buffer
 from noack.scenario.parameter_changes import ParameterChange
@@ -329,11 +330,21 @@ class RunProcess:
         if not delivered:
             telemetry.store_all()
             self._spool.keep_report(self.report)
+            self._say_how_to_complete()
         if isinstance(self._spool, KeptFile) and (not delivered or any(telemetry.stored().values())):
             reason = "the recorder was too slow" if delivered else "cannot reach the recorder"
             print_to_stderr(
                 f"noack {self.role}: {reason}; rows are kept in {self._spool.path}; copy this file to the "
                 f"recorder's host, and add it there: noack summary RUN --add {self._spool.path.name}"
+            )
+
+    def _say_how_to_complete(self) -> None:
+        """Say where the rows are, and what completes the record, if `noack record` cannot say it."""
+        run_dir = self.descriptor.run_dir
+        if self.descriptor.remote is None and not self.descriptor.launched and self.plane.coordinator_gone():
+            print_to_stderr(
+                f"noack {self.role}: cannot reach `noack record`; rows are kept in {run_dir}/{SPOOL}; "
+                f"`noack summary {run_dir}` completes the record"
             )
 
 
