@@ -20,14 +20,15 @@ from cosim.studies.new_loop import (
 from noack.core.errors import CallerError
 from noack.core.linear_systems import spectral_abscissa
 from noack.core.number_format import to_digits
-from noack.scenario import toml_file
 from noack.scenario.matrix_files import matrices_of, model_of
 from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_file import completed, put, remove
+from noack.scenario.scenario_file import completed_with, load_with
 from noack.settings.section import ReadTable, Table
 
 Source = Scenario | str | PathLike[str] | ReadTable
 """A scenario; or the name of a shipped one, a file, or a table with a scenario file's content."""
+_NAMED = "settings: "
+"""What stands before a key in a message about a setting."""
 
 
 def load(source: Source, settings: ReadTable | None = None) -> Scenario:
@@ -40,8 +41,9 @@ def load(source: Source, settings: ReadTable | None = None) -> Scenario:
 
     Args:
         source: the name of a shipped scenario (``"lane_following"``); or the path of a scenario
-            file; or its content as a table, ``{"name": ..., "model": {...}, ...}``. Relative file
-            names in a table are relative to the working directory. A scenario is returned as it is.
+            file or of a run directory; or its content as a table, ``{"name": ..., "model": {...},
+            ...}``. Relative file names in a table are relative to the working directory. A scenario
+            is returned as it is.
         settings: values that replace the source's, as in :func:`with_settings`.
 
     Raises:
@@ -50,9 +52,8 @@ def load(source: Source, settings: ReadTable | None = None) -> Scenario:
     if isinstance(source, Scenario):
         return with_settings(source, settings) if settings else source
     if isinstance(source, Mapping):
-        return _complete(plain_table(source), settings, Path("scenario"))
-    path = find_shipped(str(source), "scenarios")
-    return _complete(toml_file.read(path, Scenario), settings, path)
+        return completed_with(plain_table(source), _values(settings), Path("scenario"), _NAMED)
+    return load_with(find_shipped(str(source), "scenarios"), _values(settings), _NAMED)
 
 
 def scenarios() -> dict[str, str]:
@@ -79,7 +80,7 @@ def with_settings(scenario: Scenario, settings: ReadTable) -> Scenario:
         NoackError: one line per mistake, each with key, value and remedy.
     """
     content = scenario.model_dump(mode="json", exclude_none=True)
-    return _complete(content, settings, Path("settings"))
+    return completed_with(content, _values(settings), Path(scenario.name), _NAMED)
 
 
 def from_system(
@@ -141,24 +142,20 @@ def from_system(
             "loss": {"model": "bernoulli", "probability": DEFAULT_LOSS_PROBABILITY},
         },
     }
-    return _complete(content, settings, Path("from_system"))
+    return completed_with(content, _values(settings), Path("from_system"), _NAMED)
 
 
-def _complete(content: Table, settings: ReadTable | None, path: Path) -> Scenario:
-    """Apply settings, validate, and read the named files, relative to ``path``."""
+def _values(settings: ReadTable | None) -> list[tuple[str, object]]:
+    """Return keys and plain values; raise CallerError if it is not a table."""
     if not isinstance(settings, Mapping | None):
         raise CallerError(
             f"settings: {settings!r} is not a table; give values by key, "
             'e.g. {"network.loss.probability": 0.8}'
         )
-    for key, value in (settings or {}).items():
+    for key in settings or {}:
         if not isinstance(key, str):
             raise CallerError(f'settings: {key!r} is not a key; a key is a text such as "trigger.beta"')
-        if value is None:
-            remove(content, key)
-        else:
-            put(content, key, plain(value), f"settings: {key}")
-    return completed(content, path)
+    return [(key, plain(value)) for key, value in (settings or {}).items()]
 
 
 def plain_table(table: ReadTable) -> Table:

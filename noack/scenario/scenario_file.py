@@ -47,18 +47,48 @@ def load(path: Path, overrides: Iterable[str] = (), most_bytes: int = toml_file.
     Raises:
         CallerError: one line per mistake, each with file (or ``--set``), key, value and remedy.
     """
+    return load_with(path, [setting_of(override) for override in overrides], "--set ", most_bytes)
+
+
+def load_with(
+    path: Path,
+    settings: Sequence[tuple[str, object]],
+    named: str,
+    most_bytes: int = toml_file.MOST_BYTES,
+) -> Scenario:
+    """Read a scenario file, or that of a run directory, as :func:`load` does; for ``settings`` see below."""
     if (recorded := path / "scenario.toml").is_file():
         path, most_bytes = recorded, MOST_RECORDED_BYTES
-    content = toml_file.read(path, Scenario, most_bytes)
-    assignments = [*overrides]
-    keys = [_apply(content, override) for override in assignments]
+    return completed_with(toml_file.read(path, Scenario, most_bytes), settings, path, named)
+
+
+def completed_with(
+    content: Table, settings: Sequence[tuple[str, object]], path: Path, named: str
+) -> Scenario:
+    """Validate parsed content, as :func:`completed` does, after values in it are replaced.
+
+    Args:
+        content: as parsed; it is changed.
+        settings: keys, which may be short, and their values; None removes a key.
+        path: the scenario file.
+        named: what stands before a key in a message about a setting: ``--set`` or ``settings:``.
+
+    Raises:
+        CallerError: one line per mistake, each with file or ``named``, key, value and remedy.
+    """
+    given = copy.deepcopy(content) if settings else content
+    for key, value in settings:
+        if value is None:
+            remove(content, key)
+        else:
+            put(content, key, value, f"{named}{key}")
     try:
         return completed(content, path)
     except CallerError as error:
-        lines = str(error)
-        for key, override in zip(keys, assignments, strict=True):
-            lines = _explain_kind(lines, path, key, override.partition("=")[2])
-        raise CallerError(_attributed(lines, path, keys) if keys else lines) from None
+        lines, keys = str(error), [full_key(key) for key, _ in settings]
+        for key, (_, value) in zip(keys, settings, strict=True):
+            lines = _explain_kind(lines, path, key, value, named)
+        raise CallerError(_attributed(lines, path, keys, given, named) if keys else lines) from None
 
 
 def completed(content: ReadTable, path: Path, source: str | None = None) -> Scenario:
@@ -181,10 +211,10 @@ def toml_text(content: ReadTable) -> str:
     return _ROW.sub(lambda row: f"[{', '.join(re.findall(_ENTRY, row[1]))}]", text)
 
 
-def _explain_kind(lines: str, path: Path, key: str, value: str) -> str:
+def _explain_kind(lines: str, path: Path, key: str, value: object, named: str) -> str:
     """Make one line of all mistakes that arise because only the kind of a table was set."""
     table, _, kind = key.rpartition(".")
-    value, start = value.strip().strip("\"'"), re.escape(printable(f"{path}: {table}."))
+    start = re.escape(printable(f"{path}: {table}."))
     unknown = re.findall(rf"^{start}(\w+) = .*: unknown key; .*", lines, re.MULTILINE)
     if kind not in ("kind", "model", "policy") or not unknown:
         return lines
@@ -192,17 +222,17 @@ def _explain_kind(lines: str, path: Path, key: str, value: str) -> str:
     other_lines = re.sub(rf"^{start}\w+(: missing| = .*: unknown key; ).*\n?", "", lines, flags=re.MULTILINE)
     assignments = "".join(f", {name}=..." for name in missing)
     line = (
-        f"--set {table}.{kind} = {value}: the file has {', '.join(unknown)} of another {kind}; "
-        f"set the table: --set '{table}={{{kind}=\"{value}\"{assignments}}}'"
+        f"{named}{table}.{kind} = {value}: the file has {', '.join(unknown)} of another {kind}; "
+        f"set the table: {named}'{table}={{{kind}=\"{value}\"{assignments}}}'"
     )
     return "\n".join([line, *other_lines.splitlines()])
 
 
-def _attributed(lines: str, path: Path, keys: Sequence[str]) -> str:
-    """Name ``--set`` if a key that was set is wrong, or if the file without it is valid."""
+def _attributed(lines: str, path: Path, keys: Sequence[str], given: ReadTable, named: str) -> str:
+    """Name the settings if a key that was set is wrong, or if the content without them is valid."""
     is_valid_alone = False
     with suppress(CallerError):
-        completed(toml_file.read(path), path)
+        completed(given, path)
         is_valid_alone = True
     names = [shortened(key) for key in keys]
 
@@ -214,26 +244,19 @@ def _attributed(lines: str, path: Path, keys: Sequence[str]) -> str:
                 nearest_name = nearest_key(name, (*SHORT, *known_keys(Scenario)))
                 if nearest_name and section not in toml_file.SYMBOLS:
                     hint = f"did you mean {nearest_name}?"
-                return f"--set {name if dot else assignment}: unknown key; {hint}"
+                return f"{named}{name if dot else assignment}: unknown key; {hint}"
         if any(re.match(rf"{re.escape(name)}[.:=\s]", line["rest"]) for name in names):
-            return f"--set {line['rest']}"
+            return f"{named}{line['rest']}"
         if not is_valid_alone:
             return line[0]
         place = re.split(r"[:\s]", line["rest"], maxsplit=1)[0].split(".")
         # The number of equal parts at the beginning of two keys.
         shared = [len(commonprefix([place, key.split(".")])) for key in keys]  # noqa: RUF071
         nearest = [name for name, parts in zip(names, shared, strict=True) if parts == max(shared)]
-        return f"{line['file']} with --set {', '.join(nearest)}: {line['rest']}"
+        return f"{line['file']} with {named}{', '.join(nearest)}: {line['rest']}"
 
     file = re.escape(printable(str(path)))
     return re.sub(rf"^(?P<file>{file}): (?P<rest>.*)", attributed, lines, flags=re.MULTILINE)
-
-
-def _apply(content: Table, override: str) -> str:
-    key, value = setting_of(override)
-    name = full_key(key)
-    put(content, name, value, f"--set {override}")
-    return name
 
 
 def setting_of(override: str, example: str = "trigger.beta=0.3") -> tuple[str, object]:
