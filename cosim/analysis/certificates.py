@@ -10,6 +10,7 @@ import numpy as np
 from cosim.analysis.witnesses import Witnesses, find_witnesses, needs_matrices, no_witnesses
 from noack.core.errors import CallerError, one_line
 from noack.core.linear_systems import Matrix
+from noack.core.number_checks import one_of, whole_number
 from noack.core.number_format import NONE, TextRows, as_html, as_text, at_least, at_most
 from noack.plants.linear import LinearSettings
 from noack.scenario.resolution import loop_of, resolve
@@ -321,10 +322,9 @@ def with_weight(
         CallerError: the choice is unknown, or no weight can be chosen for this scenario.
     """
     weight: Matrix | None = None
+    one_of("weight", norm_name, ("given", "identity", "chosen"))
     if norm_name == "given":
         return resolved, None
-    if norm_name not in ("identity", "chosen"):
-        raise CallerError(f'weight: given, identity or chosen, not "{norm_name}"')
     trigger = resolved.trigger
     if not isinstance(trigger, DecayingSettings):
         raise CallerError(
@@ -378,9 +378,9 @@ def certificates_of(
     linear = linear_plant(original)
     is_model = of_model and not original.coverage.is_linear and linear is None
     resolved = with_linear_plant(original) if is_model else linear or original
-    late = resolved.certificate.late_periods if late_periods is None else late_periods
-    if not 0 <= late <= MOST_LATE:
-        raise CallerError(f"late: {late} steps; give 0 to {MOST_LATE}")
+    late = resolved.certificate.late_periods
+    if late_periods is not None:
+        late = whole_number("late", late_periods, 0, MOST_LATE)
     weighted, W = with_weight(resolved, weight, late, progress)
     rows = getattr(resolved.trigger, "weight", None)
     given = None if rows is None else np.array(rows)

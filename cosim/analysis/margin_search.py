@@ -13,6 +13,7 @@ from typing import NamedTuple
 from cosim.analysis.certificates import CertificateAnswer, answer_for
 from netem.tc_words import guarantee_words, settings_of
 from noack.core.errors import CallerError
+from noack.core.number_checks import real_number, whole_number
 from noack.core.number_format import at_least, at_most, duration
 from noack.guarantee.loss_guarantee import LossGuarantee, OutcomePattern, find_counterexample, outcome_letters
 from noack.impairments.constraints import join_guarantee
@@ -27,6 +28,8 @@ from noack.theory.random_losses.mean_square_growth import MeanSquareGrowth, grow
 
 MOST_M = 16
 """Largest M that is examined by default."""
+_LARGEST_M = 1000
+"""Largest M that may be examined."""
 _LARGEST_EFFORT = 1e6
 """Largest factor of the work that may be asked for."""
 
@@ -60,7 +63,7 @@ def read_guarantee(words: str) -> LossGuarantee:
     Raises:
         CallerError: the words are wrong, have other parts, or do not limit consecutive losses.
     """
-    settings = settings_of(words, ("mansd", "atmost", "recover"))
+    settings = settings_of(str(words), ("mansd", "atmost", "recover"))
     if settings != LinkSettings(mansd=settings.mansd, constraints=settings.constraints):
         raise CallerError(
             f'guarantee "{words}": expected only mansd, atmost and recover, e.g. '
@@ -344,10 +347,12 @@ def find_margin(
         CallerError: the loop is not covered, or a number is out of range.
         StopRequestError: see ``on_stop``.
     """
-    _require_in_range(most_m, accuracy, effort)
+    most_m = whole_number("most", most_m, 1, _LARGEST_M)
+    _require_in_range(accuracy, effort)
     margin, network = LossMargin(resolved), resolved.network
     other_rules = uncapped(network.guarantee)
-    others_read = [read_guarantee(words) for words in guarantees]
+    words_of_others = [guarantees] if isinstance(guarantees, str) else guarantees
+    others_read = [read_guarantee(words) for words in words_of_others]
 
     def examine(guarantee: LossGuarantee, name: str = "") -> Stability:
         progress(name or guarantee.meaning)
@@ -417,12 +422,10 @@ def _with_implied_bounds(caps: Sequence[LossCap]) -> tuple[LossCap, ...]:
     return tuple(cap._replace(stability=stability) for cap, stability in zip(caps, bounds, strict=True))
 
 
-def _require_in_range(most_m: int, accuracy: float, effort: float) -> None:
-    if most_m < 1:
-        raise CallerError(f"most_m {most_m}: expected the largest M to examine, 1 or more")
-    if not 1e-8 <= accuracy < 1:
+def _require_in_range(accuracy: float, effort: float) -> None:
+    if not 1e-8 <= real_number("accuracy", accuracy) < 1:
         raise CallerError(f"accuracy {accuracy:g}: expected a number from 1e-8 to 1, e.g. 1e-4")
-    if not 0 < effort <= _LARGEST_EFFORT:
+    if not 0 < real_number("effort", effort) <= _LARGEST_EFFORT:
         raise CallerError(f"effort {effort:g}: expected a factor of the work up to 1e6, e.g. 10")
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError
+from noack.core.errors import CallerError, one_line, shortened
 from noack.core.linear_systems import Matrix
 from noack.core.number_format import number
 from noack.guarantee.loss_guarantee import LossGuarantee
@@ -95,6 +95,25 @@ class MeanCost:
         return text
 
 
+def weight_matrix(name: str, given: object, size: int) -> Matrix:
+    """Return a weight, (size, size), that is given by its rows or its diagonal; None: the identity.
+
+    Raise CallerError if it has another shape, or entries that are no finite numbers.
+    """
+    try:
+        value = np.eye(size) if given is None else np.array(given, dtype=np.float64)
+    except (ValueError, TypeError):
+        value = np.empty(0)
+    if value.ndim == 1:
+        value = np.diag(value)
+    if value.shape != (size, size) or not np.isfinite(value).all():
+        raise CallerError(
+            f"{name} {shortened(one_line(str(given)))}: expected {size} x {size} numbers by rows, or {size} "
+            f"for the diagonal, e.g. '{[1] * size}'"
+        )
+    return value
+
+
 def require_weight(name: str, weight: Matrix, *, definite: bool = False) -> None:
     """Raise CallerError unless a weight of a cost is symmetric and positive (semi)definite, (k, k)."""
     if not np.allclose(weight, weight.T, rtol=1e-12, atol=0.0):
@@ -106,13 +125,13 @@ def require_weight(name: str, weight: Matrix, *, definite: bool = False) -> None
 
 
 @np.errstate(over="ignore", invalid="ignore")  # what overflows is not known
-def find_mean_cost(resolved: Scenario, Q: Matrix | None = None, R: Matrix | None = None) -> MeanCost:
+def find_mean_cost(resolved: Scenario, Q: object = None, R: object = None) -> MeanCost:
     """Return the mean of the cost ∫ xᵀQx + uᵀRu dt.
 
     Args:
         resolved: the resolved scenario, with a time-triggered sensor.
-        Q: weight of the state, (n, n), positive semidefinite; None: the identity.
-        R: weight of the input, (m, m), positive semidefinite; None: the identity.
+        Q: weight of the state, (n, n), positive semidefinite, or its diagonal, (n,); None: the identity.
+        R: weight of the input, (m, m) or (m,), likewise.
 
     Raises:
         CallerError: a weight is wrong, or the loop is not covered; the message names the setting.
@@ -122,14 +141,12 @@ def find_mean_cost(resolved: Scenario, Q: Matrix | None = None, R: Matrix | None
     forms = np.zeros((size + 1, size, size))
     entries = np.arange(size)
     forms[entries, entries, entries] = 1.0  # one form for each entry's square
-    Q, R = np.eye(n) if Q is None else Q, np.eye(loop.m) if R is None else R
-    for name, weight, width in (("Q", Q, n), ("R", R, loop.m)):
-        if weight.shape != (width, width):
-            raise CallerError(f"{name}: expected {width} x {width} numbers")
-        require_weight(name, weight)
-    if not (Q.any() or R.any()):
+    state_weight, input_weight = weight_matrix("Q", Q, n), weight_matrix("R", R, loop.m)
+    require_weight("Q", state_weight)
+    require_weight("R", input_weight)
+    if not (state_weight.any() or input_weight.any()):
         raise CallerError("Q, R: all weights are 0")
-    forms[size, :n, :n], forms[size, n:, n:] = Q, R
+    forms[size, :n, :n], forms[size, n:, n:] = state_weight, input_weight
     periods = periods_of(resolved, forms)
 
     def attempt(guarantee: LossGuarantee) -> CostUnder | str:

@@ -2,8 +2,6 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from cosim.analysis.certificates import Certificates, certificates_of
 from cosim.analysis.margin_search import MOST_M, MarginResult, find_margin
 from cosim.analysis.mean_cost import MeanCost, find_mean_cost
@@ -89,13 +87,11 @@ def cost(
     Args:
         scenario: a scenario with a time-triggered sensor (policy ``periodic``), or a source that
             :func:`noack.load` accepts.
-        Q: weight of the state, (n, n); None: the identity.
-        R: weight of the input, (m, m); None: the identity.
+        Q: weight of the state, (n, n), or its diagonal, (n,); None: the identity.
+        R: weight of the input, (m, m) or (m,); None: the identity.
 
     Raises:
         NoackError: the scenario is wrong, or its loop is not covered; the message names the
             setting.
     """
-    resolved = resolve(load(scenario))
-    weights = (None if weight is None else np.array(weight, np.float64) for weight in (Q, R))
-    return find_mean_cost(resolved, *weights)
+    return find_mean_cost(resolve(load(scenario)), Q, R)

@@ -48,9 +48,7 @@ def certify(
     late: Annotated[
         int | None,
         Option(
-            min=0,
-            max=1000,
-            help="Allowed lateness in steps of the plant; certificate.late_periods by default.",
+            help="Allowed lateness in steps of the plant, 0 to 1000; certificate.late_periods by default.",
         ),
     ] = None,
     require: Annotated[
@@ -262,7 +260,7 @@ def margin(
     scenario: opt.ScenarioArgument,
     settings: opt.SetOption = None,
     loop: opt.LoopOption = None,
-    most: Annotated[int, Option(min=1, max=1000, help="Largest M to examine.")] = 16,
+    most: Annotated[int, Option(help="Largest M to examine, 1 to 1000.")] = 16,
     accuracy: Annotated[
         float, Option(help="Wanted ratio of the bounds, minus 1; finer where they include 1.")
     ] = 2e-4,
@@ -359,12 +357,12 @@ def cost(
     Takes a second.
     """
     from cosim.analysis.mean_cost import find_mean_cost
-    from cosim.cli.cost_weights import cost_weights
+    from cosim.cli.cost_weights import given_weight
     from cosim.output.certificate_report import mean_cost_tables, print_mean_cost
     from noack.scenario.resolution import resolve
 
     resolved = resolve(opt.load_loop(scenario, settings, loop))
-    costs = find_mean_cost(resolved, *cost_weights(resolved, Q, R))
+    costs = find_mean_cost(resolved, given_weight(Q), given_weight(R))
     if json:
         print_json(costs.to_json())
     else:

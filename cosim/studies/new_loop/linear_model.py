@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +14,7 @@ from cosim.record.run_directory import write_output
 from cosim.studies.new_loop.plant_reference import PlantReference, plant_reference
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, norm
+from noack.core.number_checks import real_number
 from noack.core.number_format import TextRows, as_text, to_digits
 from noack.plants.systems.linearisation import LinearMotion, largest_errors
 from noack.plants.systems.linearisation import linearise as linear_motion
@@ -236,8 +237,8 @@ def linearise(
             settings=document["settings"] | dict(settings or {}),
             within=within,
         )
-    if not (np.isfinite(within) and within > 0):
-        raise CallerError(f"within: {within:g}; give a positive number")
+    if not np.isfinite(real_number("within", within, above=0.0)):
+        raise CallerError(f"within {within:g}: expected a finite number")
     at, input = ([values] if isinstance(values, float | int) else values for values in (at, input))  # noqa: A001
     sizes = (None if at is None else len(at), None if input is None else len(input))
     reference = plant_reference(plant, settings or {}, sizes)
@@ -296,7 +297,7 @@ def gain(
     elif q is not None or r is not None:
         raise CallerError("poles: give either these or the weights q and r")
     else:
-        pole_values = np.array(poles, dtype=np.complex128)
+        pole_values = np.atleast_1d(_numbers("poles", poles, np.complex128))
         K, method = _place_poles(model, pole_values), f"poles {eigenvalue_text(pole_values)} /s"
     K = np.array([[to_digits(value, _GAIN_DIGITS) for value in row] for row in K])
     if (reason := instability(model.A, model.B, K)) is not None:
@@ -334,7 +335,7 @@ def _place_poles(model: LinearModel, poles: Complex) -> Matrix:
 
 def _weight_matrix(key: str, weights: ArrayLike | None, matrix: Matrix) -> Matrix:
     """Return a diagonal weight with an entry for each row of ``matrix``."""
-    size, values = len(matrix), np.atleast_1d(np.array(1.0 if weights is None else weights, np.float64))
+    size, values = len(matrix), np.atleast_1d(_numbers(key, 1.0 if weights is None else weights))
     if values.shape not in ((1,), (size,)):
         raise CallerError(f"{key}: {values.size} numbers; give 1 or {size}")
     if not (np.isfinite(values).all() and (values >= 0).all() and (key == "q" or values.all())):
@@ -385,12 +386,17 @@ def eigenvalue_text(values: Complex) -> str:
     return ", ".join(texts)
 
 
-def parse_vector(key: str, entries: object, size: int, meaning: str) -> Vector:
-    """Return a given vector, (size,); None is 0. Raise CallerError if it is not one."""
+def _numbers(key: str, entries: object, kind: type = np.float64) -> NDArray[Any]:
+    """Return a number or a list of them as an array; raise CallerError if they are none."""
     try:
-        values = np.zeros(size) if entries is None else np.array(entries, dtype=np.float64)
+        return np.array(entries, dtype=kind)
     except (TypeError, ValueError):
         raise CallerError(f"{key}: {entries!r} is not a list of numbers") from None
+
+
+def parse_vector(key: str, entries: object, size: int, meaning: str) -> Vector:
+    """Return a given vector, (size,); None is 0. Raise CallerError if it is not one."""
+    values = np.zeros(size) if entries is None else _numbers(key, entries)
     if values.shape != (size,):
         raise CallerError(f"{key}: {values.size} numbers; the plant has {size} {meaning}")
     if not np.isfinite(values).all():

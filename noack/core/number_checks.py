@@ -1,0 +1,68 @@
+"""Checks of the numbers that a user gives, by an option of a command or an argument of the library.
+
+The option and the argument have the same name, and so the same line: ``late -1: expected at least 0``.
+"""
+
+from collections.abc import Iterable
+from math import isnan
+from numbers import Integral, Real
+
+from noack.core.errors import CallerError, one_line, shortened
+
+
+def whole_number(name: str, value: object, least: int, most: int | None = None) -> int:
+    """Return a whole number, also one of NumPy.
+
+    Args:
+        name: of the option and the argument, for the message.
+        value: what the user gave.
+        least: smallest number allowed.
+        most: largest number allowed.
+
+    Raises:
+        CallerError: it is none, or is out of range.
+    """
+    if not isinstance(value, Integral) or isinstance(value, bool):
+        raise _wrong(name, value, "a whole number")
+    _require_range(name, value, int(value), least, most)
+    return int(value)
+
+
+def real_number(
+    name: str,
+    value: object,
+    *,
+    above: float | None = None,
+    least: float | None = None,
+    most: float | None = None,
+) -> float:
+    """Return a number, also one of NumPy, as :func:`whole_number` does; it must be more than ``above``."""
+    if not isinstance(value, Real) or isinstance(value, bool) or isnan(value):
+        raise _wrong(name, value, "a number")
+    if above is not None and not value > above:
+        raise _wrong(name, value, f"more than {above:g}")
+    _require_range(name, value, float(value), least, most)
+    return float(value)
+
+
+def one_of(name: str, value: object, choices: Iterable[str]) -> None:
+    """Raise CallerError unless a value is one of some texts."""
+    known = tuple(choices)
+    if value not in known:
+        quoted = ", ".join(f"'{choice}'" for choice in known)
+        raise CallerError(f"{name} {_text(value)}: '{_text(value)}' is not one of {quoted}")
+
+
+def _require_range(name: str, value: object, number: float, least: float | None, most: float | None) -> None:
+    if least is not None and number < least:
+        raise _wrong(name, value, f"at least {least:,.15g}")
+    if most is not None and number > most:
+        raise _wrong(name, value, f"at most {most:,.15g}")
+
+
+def _wrong(name: str, value: object, expected: str) -> CallerError:
+    return CallerError(f"{name} {_text(value)}: expected {expected}")
+
+
+def _text(value: object) -> str:
+    return shortened(f"{value:g}" if isinstance(value, float) else one_line(str(value)))
