@@ -19,10 +19,9 @@ from cosim.output.figures.figure_drawing import draw
 from cosim.shipped_files import find_shipped
 from cosim.studies.campaign import campaign_figures, campaign_file, campaign_report, campaign_summary
 from cosim.studies.campaign.campaign_report import FinishedCampaign
-from cosim.studies.campaign.campaign_workers import local_runner
+from cosim.studies.campaign.campaign_workers import local_runner, worker_count
 from noack.core.errors import CallerError
 from noack.core.number_format import TextRows, as_html, as_text
-from noack.core.system_processes import cores
 from noack.runtime.console import SafeConsole
 from noack.scenario.toml_file import validated
 
@@ -172,8 +171,9 @@ def campaign(
         draws: draws at each grid point; by default the campaign's.
         folder: where the runs are kept; an interrupted campaign in it is continued. Without it,
             a temporary folder, which exists as long as the result.
-        workers: processes; by default one per core. With 1, this process computes. Others import
-            the main program anew: a script needs ``if __name__ == "__main__":``.
+        workers: processes, at most four per core; by default one per core. With 1, this process
+            computes. Others import the main program anew: a script needs
+            ``if __name__ == "__main__":``.
         progress: show a progress line on standard error.
 
     Raises:
@@ -185,8 +185,8 @@ def campaign(
     else:
         path = find_shipped(str(source), "campaigns")
         plan = campaign_file.load(path)
+    start = partial(local_runner, worker_count(workers))
     temporary = None if folder is not None else Path(tempfile.mkdtemp(prefix="noack-"))
-    start = partial(local_runner, workers or cores())
     try:
         bar, runs_folder = _runs_bar() if progress else None, Path(folder or temporary or "")
         finished = campaign_report.finish_campaign(

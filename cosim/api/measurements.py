@@ -1,22 +1,37 @@
 """Measurements of a network from packet traces."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
+from cosim.api.scenarios import Source, load
+from cosim.measurement.certificate_time import CertificateTime
 from cosim.measurement.loss_bursts import WINDOWS
 from cosim.measurement.measurement_outputs import write_page
 from cosim.measurement.network_measurement import QUANTILES, MeasurementOptions, NetworkMeasurement
 from cosim.measurement.network_section import write_network
-from cosim.measurement.trace_sources import USUAL_PERIOD_NS, SourceOptions, read_source
-from noack.core.errors import CallerError
+from cosim.measurement.trace_sources import USUAL_PERIOD_NS, SourceOptions, probe_period_ns, read_source
+from noack.core.number_checks import one_of
 from noack.impairments.burst_prediction import USUAL_PACKETS
 from noack.traces.packet_trace import find_trace
+
+Number = TypeVar("Number", int, float)
 
 
 class Measurement(NetworkMeasurement):
     """The measurement of a network, which writes its page and a network that reproduces it."""
+
+    def certificate_time(self, scenario: Source) -> CertificateTime:
+        """Return for which share of the time a scenario's certificates would have been void.
+
+        Args:
+            scenario: a scenario, or a source that :func:`noack.load` accepts.
+
+        Raises:
+            NoackError: the scenario is wrong, has several loops, or the delays are not known.
+        """
+        return super().certificate_time(load(scenario))
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the page of tables and figures (``.html``).
@@ -71,18 +86,23 @@ def measure(
     Raises:
         NoackError: a file cannot be read, or is not a trace; an option is wrong, or has no effect.
     """
-    if clocks not in (None, "same", "different"):
-        raise CallerError(f"clocks: expected 'same' or 'different'; found {clocks!r}")
+    if clocks is not None:
+        one_of("clocks", clocks, ("same", "different"))
     differ = None if clocks is None else clocks == "different"
-    period_ns = USUAL_PERIOD_NS if period_s is None else round(period_s * 1e9)
+    period_ns = USUAL_PERIOD_NS if period_s is None else probe_period_ns(period_s)
     reading = SourceOptions(differ, flow, far_flow, sequence_at, period_ns)
     trace = read_source([find_trace(str(source)) for source in sources], reading)
     options = MeasurementOptions(
         deadline_s,
-        QUANTILES if shares is None else tuple(shares),
-        WINDOWS if windows is None else tuple(sorted(set(windows))),
+        QUANTILES if shares is None else _several(shares),
+        WINDOWS if windows is None else _several(windows),
         outage_s,
         str(USUAL_PACKETS if within is None else within),
     )
     name = " ".join(str(Path(source)) for source in sources)
     return Measurement(trace, options, name, trace.notes)
+
+
+def _several(values: Number | Sequence[Number]) -> tuple[Number, ...]:
+    """Return numbers as a tuple, also a single one."""
+    return tuple(values) if isinstance(values, Iterable) else (values,)

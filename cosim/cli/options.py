@@ -3,7 +3,6 @@
 A command imports what is large within its function. So help and completion need none of it.
 """
 
-import os
 from collections.abc import Sequence
 from contextlib import ExitStack
 from enum import StrEnum
@@ -15,7 +14,7 @@ from typer import Argument, Option
 
 from cosim.output.figures.figure_format import FigureFormat
 from cosim.output.requirement import Requirement
-from cosim.record.run_directory import DEFAULT_RUNS, LATEST, SCENARIO_FILE
+from cosim.record.run_directory import DEFAULT_RUNS, LATEST, SCENARIO_FILE, require_folder, require_output
 from cosim.shipped_files import find_shipped, shipped_names
 from noack.runtime.command_line import LogFormat, log_format
 
@@ -77,20 +76,17 @@ def _matching(incomplete: str, words: list[str]) -> list[str]:
     return [word for word in words if word.startswith(incomplete)]
 
 
-def _usable_folder(folder: Path | None) -> Path | None:
+def usable_folder(folder: Path | None) -> Path | None:
     """Refuse a folder in which nothing can be written, before anything is computed."""
     if folder is not None:
-        existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-        if not (existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)):
-            reason = "may not be written to" if existing.is_dir() else "is not a folder"
-            raise typer.BadParameter(f"{existing} {reason}")
+        require_folder(folder)
     return folder
 
 
 def usable_path(path: Path | None) -> Path | None:
-    """Refuse a file or folder that cannot be written, before anything is computed."""
+    """Refuse a file that cannot be written, before anything is computed."""
     if path is not None:
-        _usable_folder(path if path.is_dir() else path.parent)
+        require_output(path)
     return path
 
 
@@ -204,7 +200,7 @@ TablesOption = Annotated[
     Path | None,
     Option(
         "--tables",
-        callback=_usable_folder,
+        callback=usable_folder,
         metavar="FOLDER",
         help="Write the tables into this folder, as CSV.",
     ),

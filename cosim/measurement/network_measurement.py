@@ -26,6 +26,7 @@ from cosim.measurement.loss_bursts import (
 )
 from cosim.measurement.outages import OutageFit, OutageRule, find_outages, fit_outages, outages_longer_than
 from noack.core.errors import CallerError
+from noack.core.number_checks import real_number, whole_number
 from noack.impairments.burst_prediction import (
     USUAL_PACKETS,
     BurstPrediction,
@@ -48,6 +49,8 @@ _FEWEST_PAIRS = 30
 """Pairs of packets below which no correlation is given."""
 _FEW_BURSTS = 20
 """Fewer bursts than these are called few."""
+_LONGEST_S, _LONGEST_WINDOW = 1e8, 100_000_000
+"""Largest deadline and duration of an outage, and largest K of the (m, K) table."""
 _MOST_RANKED = 1_000_000
 """Number of packets, the first ones, of which correlations are computed."""
 
@@ -135,6 +138,16 @@ class MeasurementOptions:
     within: str = str(USUAL_PACKETS)
     """Packets, or a time, within which the chance of a long loss burst is given."""
 
+    def __post_init__(self) -> None:
+        """Raise CallerError for a number that is out of range."""
+        for name, time_s in (("deadline", self.deadline_s), ("outage", self.outage_s)):
+            if time_s is not None:
+                real_number(name, time_s, above=0.0, most=_LONGEST_S)
+        for share in self.quantiles:
+            real_number("share", share, above=0.0, most=1.0)
+        for window in self.windows:
+            whole_number("window", window, 1, _LONGEST_WINDOW)
+
 
 class WindowLosses(NamedTuple):
     """The most losses in windows of a length."""
@@ -172,7 +185,8 @@ class NetworkMeasurement:
     """How the trace was obtained."""
 
     def __post_init__(self) -> None:
-        """Refuse a deadline without delays."""
+        """Refuse a deadline without delays, and a wrong time or number of packets."""
+        _ = self._predicted_packets
         if self.options.deadline_s is not None:
             self.require_delays("a deadline (--deadline)")
 
@@ -227,8 +241,9 @@ class NetworkMeasurement:
     @cached_property
     def windows(self) -> dict[int, WindowLosses]:
         """By K: the most losses in K consecutive packets."""
-        in_all = most_losses(self.bursts, self.options.windows)
-        without_outages = most_losses(self.bursts, self.options.windows, self.is_outage)
+        lengths = sorted({int(window) for window in self.options.windows})
+        in_all = most_losses(self.bursts, lengths)
+        without_outages = most_losses(self.bursts, lengths, self.is_outage)
         return {window: WindowLosses(most, without_outages.get(window)) for window, most in in_all.items()}
 
     @cached_property
@@ -264,16 +279,7 @@ class NetworkMeasurement:
 
     @cached_property
     def burst_prediction(self) -> BurstPrediction | None:
-        """The chance of a long loss burst, by the preferred model; None without losses.
-
-        Raises:
-            CallerError: the time or the number of packets is wrong.
-        """
-        period_s = self.observed_s / max(len(self.trace) - 1, 1)
-        try:
-            packets = read_within(self.options.within, period_s)
-        except ValueError as error:
-            raise CallerError(f"--within {self.options.within}: {error}") from None
+        """The chance of a long loss burst, by the preferred model; None without losses."""
         if not self.models:
             return None
         rates = self.chosen.fit.rates
@@ -281,7 +287,16 @@ class NetworkMeasurement:
         lost = np.array([rates.loss_in_good, rates.loss_in_bad])
         process = LossProcess(start, delivers + loses, lost, first_delivered=False)
         caps = {*caps_with(self.longest_loss_burst), *(quantile.bursts - 1 for quantile in self.quantiles)}
-        return predict_bursts(process, sorted(caps - {0}), packets)
+        return predict_bursts(process, sorted(caps - {0}), self._predicted_packets)
+
+    @cached_property
+    def _predicted_packets(self) -> int:
+        """Packets within which the chance of a long loss burst is given."""
+        period_s = self.observed_s / max(len(self.trace) - 1, 1)
+        try:
+            return read_within(self.options.within, period_s)
+        except ValueError as error:
+            raise CallerError(f"--within {self.options.within}: {error}") from None
 
     def longer_bursts(self, cap: int) -> int:
         """Return the number of loss bursts of more than ``cap`` packets, without the outages."""

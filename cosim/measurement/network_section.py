@@ -2,15 +2,16 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
 from cosim.measurement.chain_fits import ChainFit
 from cosim.measurement.network_measurement import NetworkMeasurement
-from cosim.record.run_directory import write_output
+from cosim.record.run_directory import require_output, write_output
 from noack.core.errors import printable
 from noack.core.file_access import require_suffix
+from noack.core.number_checks import one_of
 from noack.impairments.target_loss import read_files
 from noack.scenario import toml_file
 from noack.scenario.scenario_file import toml_text
@@ -33,6 +34,8 @@ def write_network(measurement: NetworkMeasurement, path: Path, form: Form) -> li
         MachineError: a file cannot be written.
     """
     require_suffix(path, "--write", ".toml")
+    require_output(path)
+    one_of("form", form, get_args(Form))
     measurement.require_delays("a network for a scenario (--write)")
     paths = [path]
     if form == "trace":

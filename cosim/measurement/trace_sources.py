@@ -22,6 +22,7 @@ from noack.core.clock import NS_PER_S
 from noack.core.core_library import core
 from noack.core.errors import CallerError, one_line
 from noack.core.file_access import open_regular
+from noack.core.number_checks import real_number, whole_number
 from noack.impairments.kinds.opportunities import OPPORTUNITY_BYTES, Opportunities
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.record_tables import CONTROLLER_DELIVERY
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
 _HEAD_BYTES = 64
 """Bytes by which a file is recognised."""
 USUAL_PERIOD_NS = 20_000_000
+_SHORTEST_PERIOD_S, _LONGEST_PERIOD_S = 50e-6, 3600.0
 _OTHER_SOURCES = ("run directories", "delivery opportunities")
 
 
@@ -64,6 +66,22 @@ class SourceOptions:
     """Where the payloads of a capture have sequence numbers: ``OFFSET:BYTES[:little]``."""
     period_ns: int = USUAL_PERIOD_NS
     """Period of the simulated probe through delivery opportunities."""
+
+    def __post_init__(self) -> None:
+        """Raise CallerError for the number of a flow that there cannot be."""
+        whole_number("flow", self.flow, 1)
+        if self.far_flow is not None:
+            whole_number("far-flow", self.far_flow, 1)
+
+
+def probe_period_ns(period_s: float) -> int:
+    """Return the period of the simulated probe; raise CallerError if it is too short or too long."""
+    if not _SHORTEST_PERIOD_S <= real_number("period", period_s) <= _LONGEST_PERIOD_S:
+        raise CallerError(
+            f"a probe every {period_s:g} s: expected one every {_SHORTEST_PERIOD_S:g} to "
+            f"{_LONGEST_PERIOD_S:g} s"
+        )
+    return round(period_s * NS_PER_S)
 
 
 FILE_OPTIONS = {
@@ -98,6 +116,8 @@ def read_source(paths: Sequence[Path], options: SourceOptions | None = None) -> 
     Raises:
         NoackError: one line; it cannot be read, or is not a trace.
     """
+    if not paths:
+        raise CallerError("no file is given; give a packet trace, or the name of a shipped one")
     options, first_path = options or SourceOptions(), paths[0]
     if len(paths) == 1 and first_path.is_dir():
         refuse_unused(options, FILE_OPTIONS, "a run directory")

@@ -15,7 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from cosim.record.run_directory import write_output
+from cosim.record.run_directory import require_folder, write_output
 from noack.core.number_format import NONE
 
 KEY_VALUE = ("quantity", "value")
@@ -74,6 +74,7 @@ def save_tables(tables: Iterable[ResultTable], folder: Path) -> list[Path]:
     Raises:
         MachineError: a file cannot be written.
     """
+    require_folder(folder)
     return [write_output(folder / f"{table.name}.csv", as_csv(table)) for table in tables]
 
 

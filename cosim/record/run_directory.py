@@ -67,6 +67,7 @@ def new_run_dir(runs: Path, name: str) -> Path:
     _require_utf8(runs)
     if (holder := holder_of(runs)) is not None:
         raise CallerError(f"{runs}: {holder}, not a folder of run directories; give another --runs")
+    refuse_among_results(runs)
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
     try:
         create_folder(runs)
@@ -100,11 +101,30 @@ def write_output(path: Path, content: str | bytes) -> Path:
     """Write a file that a user named, or replace it; return its path.
 
     Raises:
-        CallerError: it is one of the files of a run or a campaign.
+        CallerError: as :func:`require_output`.
         MachineError: it cannot be written.
     """
-    refuse_results(path)
+    require_output(path)
     return write_whole(path, content)
+
+
+def require_output(path: Path, *, is_folder: bool = False) -> None:
+    """Raise CallerError if a file or folder that a user named for an output cannot be written there."""
+    refuse_results(path)
+    if not is_folder and path.is_dir():
+        raise CallerError(f"{path}: is a folder; give the name of a file")
+    require_folder(path if is_folder else path.parent, path)
+
+
+def require_folder(folder: Path, output: Path | None = None) -> None:
+    """Raise CallerError, which names ``output``, if nothing can be written in a folder.
+
+    A folder that does not exist can be written in if it can be made.
+    """
+    existing = next((path for path in (folder, *folder.parents) if path.exists()), folder)
+    if not (existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)):
+        named = f"{output or folder}: " + (f"{existing} " if existing != (output or folder) else "")
+        raise CallerError(named + ("may not be written to" if existing.is_dir() else "is not a folder"))
 
 
 def refuse_results(path: Path) -> None:
@@ -113,15 +133,20 @@ def refuse_results(path: Path) -> None:
     Args:
         path: of the file or the folder that a user named.
     """
+    refuse_among_results(path)
+    if (holder := holder_of(path)) is not None:
+        raise CallerError(f"{path}: {holder}; give another name")
+    if path.name in _KEPT and (holder := holder_of(path.parent)) is not None:
+        raise CallerError(f"{path}: is a file of {holder}; give another name")
+
+
+def refuse_among_results(path: Path) -> None:
+    """Raise CallerError if a file or folder would be among the results of a run or a campaign."""
     for folder in (path, *path.parents[:2]):
         holder = holder_of(folder.parent)
         beside = _RESULT_FOLDERS.get(folder.name)
         if beside and holder and (folder.parent / beside).is_file():
             raise CallerError(f"{path}: lies in {holder}, among its results; give another name")
-    if (holder := holder_of(path)) is not None:
-        raise CallerError(f"{path}: {holder}; give another name")
-    if path.name in _KEPT and (holder := holder_of(path.parent)) is not None:
-        raise CallerError(f"{path}: is a file of {holder}; give another name")
 
 
 def _require_utf8(path: Path) -> None:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -127,7 +128,7 @@ class RunComparison:
 
         return draw(overlay_figure(self.runs))
 
-    def save(self, path: Path, width: str | float | None = None) -> None:
+    def save(self, path: str | PathLike[str], width: str | float | None = None) -> None:
         """Write the overlay as a page (``.html``), or the figure alone (``.svg``, ``.pdf``, …).
 
         Args:
@@ -141,6 +142,7 @@ class RunComparison:
         from cosim.output.figures.figure_files import FIGURE_SUFFIXES, save_figure  # they import matplotlib
         from cosim.output.page_kit import templates
 
+        path = Path(path)
         if path.suffix in FIGURE_SUFFIXES:
             save_figure(overlay_figure(self.runs), path, width)
             return

@@ -22,10 +22,11 @@ def whole_number(name: str, value: object, least: int, most: int | None = None) 
     Raises:
         CallerError: it is none, or is out of range.
     """
-    if not isinstance(value, Integral) or isinstance(value, bool):
+    if isinstance(value, bool) or not isinstance(value, Integral):
         raise _wrong(name, value, "a whole number")
-    _require_range(name, value, int(value), least, most)
-    return int(value)
+    number = int(value)
+    _require_range(name, value, number, least, most)
+    return number
 
 
 def real_number(
@@ -37,12 +38,13 @@ def real_number(
     most: float | None = None,
 ) -> float:
     """Return a number, also one of NumPy, as :func:`whole_number` does; it must be more than ``above``."""
-    if not isinstance(value, Real) or isinstance(value, bool) or isnan(value):
+    if isinstance(value, bool) or not isinstance(value, Real) or isnan(value):
         raise _wrong(name, value, "a number")
-    if above is not None and not value > above:
+    number = float(value)
+    if above is not None and not number > above:
         raise _wrong(name, value, f"more than {above:g}")
-    _require_range(name, value, float(value), least, most)
-    return float(value)
+    _require_range(name, value, number, least, most)
+    return number
 
 
 def one_of(name: str, value: object, choices: Iterable[str]) -> None:

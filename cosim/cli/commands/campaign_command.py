@@ -13,12 +13,8 @@ from cosim.cli.printing import console, print_json, write_tables
 from cosim.output.figures.figure_format import requested_files
 from cosim.record.run_directory import DEFAULT_RUNS
 from noack.core.errors import CallerError, ExitStatus
-from noack.core.system_processes import cores
 
 app = typer.Typer()
-
-_PER_CORE = 4
-"""Maximum worker processes per core; more gain nothing, and use memory."""
 
 
 @app.command(
@@ -39,16 +35,18 @@ def campaign(
     ],
     draws: Annotated[
         int | None,
-        Option(min=1, help="Runs at each grid point; the campaign file's number by default."),
+        Option(help="Runs at each grid point; the campaign file's number by default."),
     ] = None,
-    workers: Annotated[int | None, Option(min=1, help="Worker processes; one per core by default.")] = None,
+    workers: Annotated[
+        int | None, Option(help="Worker processes, at most four per core; one per core by default.")
+    ] = None,
     scheduler: Annotated[
         str | None,
         Option(metavar="tcp://HOST:PORT", help="Run on the Dask cluster of this scheduler."),
     ] = None,
     out: Annotated[
         Path | None,
-        Option(callback=opt.usable_path, help="Folder of the campaign; runs/campaigns/NAME by default."),
+        Option(callback=opt.usable_folder, help="Folder of the campaign; runs/campaigns/NAME by default."),
     ] = None,
     figure_format: opt.FigureFormatOption = None,
     width: opt.WidthOption = None,
@@ -66,13 +64,11 @@ def campaign(
     from cosim.live.monitoring import progress
     from cosim.shipped_files import find_shipped
     from cosim.studies.campaign import campaign_file, campaign_report
-    from cosim.studies.campaign.campaign_workers import Runner, cluster_runner, local_runner
+    from cosim.studies.campaign.campaign_workers import Runner, cluster_runner, local_runner, worker_count
 
     if scheduler is not None and workers is not None:
         raise CallerError("--workers: with --scheduler the cluster's workers are used")
-    number = workers or cores()
-    if number > (limit := _PER_CORE * cores()):
-        raise CallerError(f"--workers {number}: on this machine at most {limit}")
+    number = worker_count(workers)
     figure_files = requested_files(figure_format, width)
     path = find_shipped(file, "campaigns")
     plan = campaign_file.load(path)
@@ -87,7 +83,7 @@ def campaign(
     def start() -> AbstractContextManager[Runner]:
         return local_runner(number) if scheduler is None else cluster_runner(scheduler, print_line)
 
-    shown = draws or plan.draws
+    shown = plan.draws if draws is None else draws
     has_fewer = campaign_report.had_more_draws(folder, shown)
     finished = campaign_report.finish_campaign(
         plan,

@@ -145,13 +145,9 @@ def new(
     Takes some 10 s.
     """
     from cosim.studies.new_loop.new_scenario import new as new_scenario
+    from cosim.studies.new_loop.new_scenario import require_new_file
 
-    if file.suffix != ".toml":
-        raise CallerError(f"{file}: the name of a scenario file ends in .toml")
-    if file.exists():
-        raise CallerError(f"{file}: exists; give another name, or remove it first")
-    if not file.parent.is_dir():
-        raise CallerError(f"{file}: there is no folder {file.parent}")
+    require_new_file(file)
     with status("linearising") as change:
         result = new_scenario(
             plant,

@@ -272,7 +272,7 @@ def export(
     loop: opt.LoopOption = None,
     out: Annotated[
         Path | None,
-        Option(callback=opt.usable_path, help="File, or folder of CSV; RUN.mat and so on by default."),
+        Option(help="File, or folder of CSV; RUN.mat and so on by default."),
     ] = None,
     certificates: Annotated[
         bool,

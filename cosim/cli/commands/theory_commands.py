@@ -1,6 +1,5 @@
 """``noack certify``, ``margin``, ``adversary``, ``cost``: all losses, bad ones, random ones."""
 
-import os
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -96,13 +95,12 @@ def certify(
     from cosim.output.export.mat_export import save_mat
     from cosim.output.requirements import uncovered_as_unmet, unmet_by_scenario
     from cosim.output.witness_report import print_witnesses
-    from cosim.record.run_directory import refuse_results, write_output
+    from cosim.record.run_directory import write_output
+    from noack.core.file_access import require_suffix
     from noack.scenario.resolution import resolve
 
-    if witness is not None:
-        refuse_results(witness)
-        if not os.access(witness.parent, os.W_OK) or witness.is_dir():
-            raise CallerError(f"--witness {witness}: no file can be written there")
+    if out is not None:
+        require_suffix(out, "--out", ".mat")
     loaded, chosen = opt.load_loop(scenario, settings, loop), None
     if witness is not None:
         resolved = resolve(loaded)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cosim.analysis.summary.summary_model import read_summary
 from cosim.record import data_frames
-from cosim.record.run_directory import ENVIRONMENT_FILE, SUMMARY_FILE, read_object, refuse_results
+from cosim.record.run_directory import ENVIRONMENT_FILE, SUMMARY_FILE, read_object, require_output
 from cosim.record.run_record import Notice, RunRecord, load_run
 from noack.core.errors import CallerError
 from noack.core.extension_points import missing_extension, parts
@@ -121,7 +121,7 @@ def export_run(
         expected = f"{', '.join(first)} or {last}" if file_format is None else suffixes[file_format]
         missing = missing_extension("noack.exports", path.suffix.removeprefix("."))
         raise CallerError(f"{path}: {missing or f'an export is written to {expected}'}")
-    refuse_results(path)
+    require_output(path, is_folder=not suffixes[chosen])
     return formats()[chosen].write(_exported_run(run_dir, loop), path, certificates=certificates)
 
 

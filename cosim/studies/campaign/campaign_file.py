@@ -21,6 +21,7 @@ from noack.settings.section import MatrixRows, ScenarioSection, Seed
 
 MOST_POINTS = 10_000
 MOST_SERIES = 12
+MOST_DRAWS = 100_000_000
 """Largest number of curves in a figure."""
 
 Identifier = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
@@ -248,7 +249,7 @@ class Campaign(ScenarioSection):
     """continuous: continuous trigger, network without delay; exact and compiled. sampled: the
     machines of a live run in virtual time, with the schedule's sampling, delays and
     acknowledgements; about a thousand times slower."""
-    draws: Annotated[int, Field(ge=1, le=100_000_000)]
+    draws: Annotated[int, Field(ge=1, le=MOST_DRAWS)]
     """Runs at each grid point, with different plants from the box, initial states and losses."""
     seed: Seed = 0
     """Seed of the draws. Draw i has the same plant, x(0) and losses at every grid point."""

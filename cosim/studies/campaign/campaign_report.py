@@ -18,13 +18,14 @@ from cosim.output.page_kit import templates
 from cosim.output.result_tables import ResultTable
 from cosim.record.run_directory import CAMPAIGN_PAGE, SUMMARY_FILE, read_object
 from cosim.studies.campaign.campaign_figures import figures
-from cosim.studies.campaign.campaign_file import Campaign
+from cosim.studies.campaign.campaign_file import MOST_DRAWS, Campaign
 from cosim.studies.campaign.campaign_grid import base_of, grid
 from cosim.studies.campaign.campaign_summary import CampaignSummary, summarise
 from cosim.studies.campaign.campaign_workers import Runner
 from cosim.studies.campaign.chunk_store import RUNS, Progress, Store, locked_folder, run_campaign
 from cosim.studies.campaign.metrics import METRICS, Estimate, Metric, to_shown_unit
 from noack.core.file_access import write_whole
+from noack.core.number_checks import whole_number
 from noack.core.number_format import plus_minus
 from noack.runtime.command_line import stop_requests_raised
 
@@ -307,10 +308,11 @@ def finish_campaign(
         CallerError: the campaign does not fit its scenario, or another one is in the folder.
         MachineError: the results cannot be written.
     """
+    draws = plan.draws if draws is None else whole_number("draws", draws, 1, MOST_DRAWS)
     with show("preparing the grid"):
         points = grid(plan, path)
     _, base = base_of(plan, path)
-    store = Store(folder, points, int(draws or plan.draws), plan.chunk)  # also a number of NumPy
+    store = Store(folder, points, draws, plan.chunk)
     with stop_requests_raised(), locked_folder(plan, base, store):
         with workers() as runner, bar or nullcontext() as progress:
             new_runs = run_campaign(store, runner, progress)

@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 from cosim.live.processes.process_pool import process_starts, processes
 from cosim.studies.campaign.arithmetic import arithmetic, difference
 from noack.core.errors import CallerError, PeerError
+from noack.core.number_checks import whole_number
+from noack.core.system_processes import cores
 
 
 class Work(Protocol):
@@ -43,6 +45,15 @@ class Chunk(NamedTuple):
     def draws(self) -> range:
         """Numbers of the draws."""
         return range(self.start, self.stop)
+
+
+_PER_CORE = 4
+"""Most worker processes per core; more gain nothing, and use memory."""
+
+
+def worker_count(workers: int | None) -> int:
+    """Return the number of worker processes, by default one per core; raise CallerError if it is wrong."""
+    return cores() if workers is None else whole_number("workers", workers, 1, _PER_CORE * cores())
 
 
 FinishedChunk = tuple[Chunk, NDArray[np.void]]

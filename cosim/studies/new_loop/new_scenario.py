@@ -19,6 +19,7 @@ import numpy as np
 
 from cosim.analysis.certificates import with_linear_plant, with_weight
 from cosim.output.run_verdict import SETTLED_SHARE
+from cosim.record.run_directory import refuse_among_results
 from cosim.simulation.virtual_time import simulate_loops
 from cosim.studies.new_loop import (
     ALPHA_SHARE,
@@ -87,9 +88,8 @@ class NewScenario:
     notes: tuple[str, ...]
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the file; raise NoackError if it exists, or cannot be written."""
-        if Path(path).exists():
-            raise CallerError(f"{path}: exists; give another name, or remove it first")
+        """Write the file, which ends in .toml; raise NoackError if it exists, or cannot be written."""
+        require_new_file(Path(path))
         try:
             with new_file(Path(path), make_folder=False) as file:
                 file.write(self.text.encode())
@@ -103,6 +103,17 @@ class NewScenario:
 
     def __repr__(self) -> str:
         return self.text
+
+
+def require_new_file(path: Path) -> None:
+    """Raise CallerError unless a new scenario can be written to a file of this name."""
+    if path.suffix != ".toml":
+        raise CallerError(f"{path}: the name of a scenario file ends in .toml")
+    if path.exists():
+        raise CallerError(f"{path}: exists; give another name, or remove it first")
+    if not path.parent.is_dir():
+        raise CallerError(f"{path}: there is no folder {path.parent}")
+    refuse_among_results(path)
 
 
 @dataclass(frozen=True)

@@ -126,5 +126,5 @@ def test_the_chance_of_a_long_burst_is_that_of_the_fitted_chain(chain_csv: Path)
     found = noack.measure(chain_csv, within=500, windows=[20, 7])
     assert json.loads(json.dumps(found.to_json()))["bursts_by_preferred_model"] == predicted
     assert list(found.windows) == [7, 20]
-    with pytest.raises(CallerError, match="clocks: expected 'same' or 'different'"):
+    with pytest.raises(CallerError, match="'equal' is not one of 'same', 'different'"):
         noack.measure(chain_csv, clocks="equal")  # type: ignore[arg-type]

@@ -178,7 +178,7 @@ def test_a_folder_in_use_or_of_other_content_is_refused(
             use(path, tmp_path / "mine")
     with pytest.raises(CallerError, match=r"would be 100,000,000 files; .* or a larger chunk"):
         Store(tmp_path, points[:1], 100_000_000, 1)
-    with pytest.raises(MachineError, match="cannot be written"):
+    with pytest.raises(CallerError, match=r"few\.toml: is not a folder"):
         use(path, path)  # a file, not a folder
 
 
