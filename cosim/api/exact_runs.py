@@ -10,9 +10,8 @@ from cosim.output import curves
 from cosim.output.curves import Curve
 from cosim.output.run_verdict import VerdictLine, verdict_of_exact_run
 from cosim.simulation import continuous
-from cosim.simulation.exact_simulation import left_out
-from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
+from noack.core.number_checks import whole_number
 from noack.scenario.resolution import policy_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.trigger_policies.trigger_rule import TriggerRule
@@ -21,6 +20,8 @@ _POINTS = 400
 """Number of evenly spaced times; each event adds the times just before and after it."""
 _MOST_EVENT_POINTS = 600
 """With more events, only the evenly spaced times are in the curves."""
+_MOST_EVENTS = 10_000_000
+"""Most transmissions that may be asked for."""
 
 
 class ExactRun:
@@ -119,12 +120,6 @@ def simulate_exactly(scenario: Source, *, most_events: int = 100_000) -> ExactRu
         NoackError: the scenario is wrong; the exact simulation does not cover it, since the plant is
             nonlinear, or has noise, or the network delays; or there are too many transmissions.
     """
-    loaded = load(scenario)
-    if loaded.loops:
-        raise CallerError("loops: one loop is simulated exactly; noack.simulate takes several")
-    if kinds := left_out(loaded.network.link):
-        raise CallerError(f"network.impairments: {kinds}: the exact simulation has no delay")
-    resolved = resolve(loaded)
-    resolved.coverage.require_unchanging()
-    resolved.coverage.require_exact()
+    resolved = resolve(load(scenario))
+    most_events = whole_number("most_events", most_events, 1, _MOST_EVENTS)
     return ExactRun(resolved, continuous.run_continuous(resolved, most_events))

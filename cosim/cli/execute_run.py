@@ -144,7 +144,6 @@ def simulate_continuously(loaded: Scenario, *, json: bool, required: "Sequence[R
 
     refuse_for_exact_runs(required)
     resolved = resolve(loaded)
-    warn_of_left_out(resolved)
     with status("simulating"):
         run = continuous.run_continuous(resolved)
     summary = continuous.summary(run, resolved)

@@ -38,7 +38,6 @@ def print_continuous_run(
         ),
         ("‖x‖ at the start", number(summary.initial_state_norm)),
         ("‖x‖ at the end", number(summary.final_state_norm)),
-        *([("left out of the network", summary.left_out)] if summary.left_out else ()),
     )
     cap = f"M − 1 = {summary.mansd}"
     title = title_of(summary.scenario, summary.mode, cap, constraints, "continuous")

@@ -168,7 +168,7 @@ def continuous_loop_of(resolved: Scenario) -> ContinuousLoop:
         resolved.coverage.require_unchanging()
         resolved.coverage.require_exact()
     except CallerError as error:
-        raise CallerError(f"with a continuous trigger (--trigger continuous): {error}") from None
+        raise CallerError(f"in continuous time: {error}") from None
     return ContinuousLoop(loop_of(resolved), rule_of(resolved))
 
 
@@ -364,8 +364,14 @@ def run_continuous(resolved: Scenario, max_events: int = MAX_EVENTS) -> Continuo
 
     Raises:
         TooManyEventsError: more than ``max_events`` events, or two at the same time.
-        CallerError: the threshold becomes too small to compute with.
+        CallerError: the scenario is not covered, since its plant is not linear or its network delays;
+            or the threshold becomes too small to compute with.
     """
+    if kinds := left_out(resolved.network.link):
+        raise CallerError(
+            f"in continuous time: network.impairments: {kinds}: the network has no delay there; "
+            "leave it out: network.impairments=[]"
+        )
     return simulate_continuous(
         continuous_loop_of(resolved),
         horizon_s=resolved.horizon_s,
@@ -422,8 +428,6 @@ class ContinuousSummary(NamedTuple):
     final_state_norm: float
     sup_state_norm: float
     diverged_at_s: float | None
-    left_out: str
-    """The kinds of the network's impairments that do not exist in continuous time; empty if none."""
     exit_status: ExitStatus
     reason: str
 
@@ -457,7 +461,6 @@ def summary(run: ContinuousRun, resolved: Scenario) -> ContinuousSummary:
         final_state_norm=float(np.linalg.norm(samples.x[-1])),
         sup_state_norm=float(np.linalg.norm(samples.x, axis=1).max()),
         diverged_at_s=None if divergence is None else divergence.at_s,
-        left_out=left_out(resolved.network.link),
         exit_status=ExitStatus.OK if divergence is None else ExitStatus.FAILED,
         reason="horizon" if divergence is None else divergence.text,
     )

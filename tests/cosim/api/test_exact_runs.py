@@ -41,7 +41,7 @@ def test_the_controller_has_no_state_before_its_first_update() -> None:
 
 
 @pytest.mark.parametrize(("scenario", "reason"), [
-    ("shared_channel", "one loop"),
+    ("shared_channel", "this is for one"),
     ("lane_5g_urban", "has no delay"),
     ("dc_motor", "the plant is not linear"),
 ])  # fmt: skip

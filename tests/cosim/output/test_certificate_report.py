@@ -166,7 +166,7 @@ def test_a_start_that_overflows_is_named() -> None:
 def test_no_weight_improves_a_hold_and_identity_removes_the_weight() -> None:
     with pytest.raises(CallerError, match=r"weight chosen: α = 0\.25 /s is not below"):
         with_weight(resolved("lane_following", 'mode="zoh"'), "chosen")
-    with pytest.raises(CallerError, match='given, identity or chosen, not "best"'):
+    with pytest.raises(CallerError, match="'best' is not one of 'given', 'identity', 'chosen'"):
         with_weight(resolved("lane_following"), "best")
     plain, W = with_weight(resolved("lane_weighted"), "identity")
     assert W is None
