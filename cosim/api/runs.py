@@ -31,7 +31,7 @@ from cosim.output.figures.run_figures import BOUNDED, run_curves
 from cosim.output.run_verdict import VerdictLine
 from cosim.record import data_frames
 from cosim.record.run_directory import RECORD, REPORT_FILE, chosen_run, file_of_loop, require_run_directory
-from cosim.record.run_record import RecordedRun, RunRecord, load_run
+from cosim.record.run_record import RecordedRun, RunRecord, load_run, no_such_loop
 from cosim.record.table_files import TableFile, arrow_table
 from cosim.simulation.virtual_time import simulate_run
 from cosim.studies.run_comparison import RunComparison, compare_runs
@@ -108,8 +108,9 @@ class Run:
         """The loops of the run, each as a run, by name; their times are their own.
 
         ``samples`` and ``events`` are of one loop: the only one of the run, or one of these.
+        Another name is a NoackError.
         """
-        return {name: self._of(name) for name in self._run.names if self._loop in (None, name)}
+        return _Loops((name, self._of(name)) for name in self._run.names if self._loop in (None, name))
 
     def _of(self, loop: str) -> "Run":
         return Run(self.directory, lambda: outcome_of_loop(self._outcome, loop), loop=loop)
@@ -307,6 +308,13 @@ class Run:
         return as_html(self._facts())
 
 
+class _Loops(dict[str, Run]):
+    """Loops by name; another name is a mistake of the caller, as for ``--loop``."""
+
+    def __missing__(self, name: str) -> Run:
+        raise no_such_loop(name, [*self])
+
+
 def simulate(scenario: Source, *, runs: PathLike | None = None) -> Run:
     """Run a scenario in virtual time: the same machines and losses, no sockets, never late.
 
@@ -383,7 +391,9 @@ def open_run(directory: PathLike = "runs/latest") -> Run:
     path = chosen_run(Path(directory), Path(directory).parent)
     require_run_directory(path)
     outcome = run_end.reopen(path.resolve())
-    return Run(outcome.run_dir, lambda: outcome)
+    opened = Run(outcome.run_dir, lambda: outcome)
+    _ = opened._run  # an error if a table is missing or damaged
+    return opened
 
 
 def compare(*runs: Run | PathLike) -> RunComparison:

@@ -343,7 +343,7 @@ def no_such_loop(name: str | None, names: Sequence[str]) -> CallerError:
             f"the run has {len(names)} loops, and this is for one: use --loop NAME, RUN:NAME in noack "
             f"compare, run.loops[NAME] in Python; they are {few}"
         )
-    return CallerError(f"--loop {name}: the run has no such loop; it has {few}")
+    return CallerError(f"{name}: the run has no such loop; it has {few}")
 
 
 class StoredLoops(Sequence[RunRecord]):

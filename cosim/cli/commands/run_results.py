@@ -42,7 +42,7 @@ def view(
 
     A missing recording, as that of one loop alone, is written first.
     """
-    from cosim.output.viewer.rerun_program import require_viewer
+    from cosim.output.viewer.rerun_program import require_recording, require_viewer
 
     path = chosen_run(recording, runs)
     path = path / file_of_loop(RECORDING_FILE, loop) if path.is_dir() else path
@@ -54,9 +54,10 @@ def view(
 
         with status("writing the recording"):
             write_recording(path.parent, loop)
+    require_recording(path)
     if json:
-        print_json({"recording": str(path), "exists": path.is_file()})
-        return ExitStatus.OK if path.is_file() else ExitStatus.CALLER
+        print_json({"recording": str(path), "exists": True})
+        return ExitStatus.OK
     from cosim.output.viewer.recording_viewer import view_recording
 
     view_recording(path, native=False if web else None)

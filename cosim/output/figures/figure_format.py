@@ -4,6 +4,7 @@ from enum import StrEnum
 from typing import NamedTuple
 
 from noack.core.errors import CallerError
+from noack.core.number_checks import one_of
 
 SCREEN_IN = 10.0
 """Width of a figure on a page of noack, in inches."""
@@ -37,8 +38,7 @@ def requested_files(kind: str | None, width: str | float | None = None) -> Figur
         if width is not None:
             raise CallerError("--width: is the width of the figures of --format; give one")
         return None
-    if kind not in [*FigureFormat]:
-        raise CallerError(f'"{kind}": a figure is saved as {", ".join(FigureFormat)}')
+    one_of("format", kind, FigureFormat)
     return FigureFiles(FigureFormat(kind), figure_width_in(FigureFormat(kind), width))
 
 

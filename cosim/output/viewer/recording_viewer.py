@@ -42,18 +42,17 @@ from cosim.output.viewer.rerun_program import (
     has_display,
     move_window_to,
     peer_user,
+    require_recording,
     script_to_open_at,
     start_rerun,
 )
 from cosim.record.run_directory import RECORDING_FILE, SUMMARY_FILE, loop_of_file, read_object
 from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError, ExitStatus, MachineError, PeerError, why
+from noack.core.errors import ExitStatus, MachineError, PeerError, why
 from noack.core.system_processes import python_command
 
 RECORDING = "recording.rrd"
 """Last part of the address of a recording."""
-_MAGIC = b"RRF"
-"""First bytes of a recording."""
 _BLOCK_BYTES = 1 << 18
 _POLL_S = 0.1
 _START_S = 10.0
@@ -368,11 +367,7 @@ def view_recording(path: Path, *, native: bool | None = None) -> None:
         MachineError: the viewer cannot be started.
         SystemExit: on SIGTERM or SIGHUP.
     """
-    if not path.is_file():
-        raise CallerError(f"{path}: no such recording")
-    with path.open("rb") as file:
-        if not file.read(len(_MAGIC)).startswith(_MAGIC):
-            raise CallerError(f"{path}: not a rerun recording, or empty; give a run directory")
+    require_recording(path)
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, _exit)
     with contextlib.suppress(KeyboardInterrupt), RecordingServer(path, follow=False) as server:

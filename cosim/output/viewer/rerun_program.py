@@ -32,6 +32,8 @@ from noack.core.errors import CallerError, MachineError, PeerError
 NOT_INSTALLED = "the viewer's package is not installed: pip install 'noack[viewer]'"
 _PR_SET_PDEATHSIG = 1
 _POLL_S = 0.02
+_MAGIC = b"RRF"
+"""First bytes of a recording."""
 HOST = "127.0.0.1"
 OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?")
 """The host in a request's header; another name would be that of a foreign page (DNS rebinding)."""
@@ -61,6 +63,15 @@ _SCRIPT = """<script>
 def is_installed() -> bool:
     """Whether recordings can be written and shown."""
     return importlib.util.find_spec("rerun") is not None
+
+
+def require_recording(path: Path) -> None:
+    """Raise CallerError if a file does not exist, or is not a recording."""
+    if not path.is_file():
+        raise CallerError(f"{path}: no such recording")
+    with path.open("rb") as file:
+        if not file.read(len(_MAGIC)).startswith(_MAGIC):
+            raise CallerError(f"{path}: not a rerun recording, or empty; give a run directory")
 
 
 def require_viewer() -> None:

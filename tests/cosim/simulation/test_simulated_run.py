@@ -92,7 +92,7 @@ def test_a_run_and_each_loop_can_be_summarised_and_replayed(run_dir: Path) -> No
     assert "guarantee not checkable in 1 of 11 loops: periodic: no certificate: " in output
     result = invoke("summary", run_dir, "--loop", "x")
     assert (result.exit_code, result.stderr.count("\n")) == (2, 1)
-    assert "--loop x: the run has no such loop; it has pendulum-01, " in result.stderr
+    assert "noack: x: the run has no such loop; it has pendulum-01, " in result.stderr
 
 
 def test_a_run_that_is_simulated_again_has_the_same_bits(run_dir: Path, tmp_path: Path) -> None:
