@@ -11,6 +11,7 @@ from netem.links_file import load_links
 from netem.relay.relay_links import LinkSpec
 from netem.tc_words import GRAMMAR, KEYWORDS, parse, require_no_dashes, settings_of
 from noack.core.errors import CallerError
+from noack.core.number_checks import whole_number
 from noack.impairments.burst_prediction import USUAL_PACKETS, read_within
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.target_loss import read_files
@@ -18,6 +19,7 @@ from noack.impairments.words import OWN_TIME_S
 from noack.runtime.address import parse_address, parse_destination
 from noack.runtime.command_line import Parser
 from noack.runtime.join_run import add_options
+from noack.settings.section import LARGEST_SEED
 
 LINK_NAME = "relay"
 """Name of the link that the command line describes."""
@@ -309,6 +311,4 @@ def _directions(options: argparse.Namespace) -> tuple[LinkSettings, LinkSettings
     if seed is not None and options.seed is not None:
         raise CallerError(f"--seed {options.seed}: the words have seed {seed} already")
     seed = options.seed if seed is None else seed
-    if seed is not None and not 0 <= seed < 2**64:
-        raise CallerError(f"--seed {seed}: must be 0 or more, below 2^64")
-    return forward, forward if options.both else reverse, seed or 0
+    return forward, forward if options.both else reverse, whole_number("seed", seed or 0, 0, LARGEST_SEED)

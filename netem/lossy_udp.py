@@ -19,9 +19,11 @@ from netem.relay.relay_links import LinkSpec
 from netem.relay.relay_reports import DIRECTIONS, Direction
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError, why
+from noack.core.number_checks import whole_number
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.target_loss import read_files
 from noack.runtime.address import Address, address_text, parse_address, parse_destination
+from noack.settings.section import LARGEST_SEED
 
 
 class LossyUdp:
@@ -61,8 +63,7 @@ class LossyUdp:
         listen: str | Sequence[str | int] = "127.0.0.1:0",
         name: str = "relay",
     ) -> None:
-        if not isinstance(seed, int) or not 0 <= seed < 2**64:
-            raise CallerError(f"seed {seed}: must be a whole number, 0 or more, below 2^64")
+        seed = whole_number("seed", seed, 0, LARGEST_SEED)
         listen_at = parse_address(_text(listen, "listen"), "listen")
         server = parse_destination(_text(to, "to"), "to", listen_at)
         forward_settings, reverse_settings = _settings(words, "words"), _settings(reverse, "reverse")

@@ -13,7 +13,6 @@ from pathlib import Path
 import pyarrow as pa
 from matplotlib.figure import Figure
 
-from cosim.api.scenarios import plain_table
 from cosim.live.monitoring.progress import runs_bar
 from cosim.output.figures.figure_drawing import draw
 from cosim.shipped_files import find_shipped
@@ -23,6 +22,7 @@ from cosim.studies.campaign.campaign_workers import local_runner, worker_count
 from noack.core.errors import CallerError
 from noack.core.number_format import TextRows, as_html, as_text
 from noack.runtime.console import SafeConsole
+from noack.scenario.given_settings import plain_table
 from noack.scenario.toml_file import validated
 
 _TABLE = Path("campaign")

@@ -17,9 +17,9 @@ from cosim.studies.new_loop import (
     DEFAULT_MANSD,
     HORIZON_DECAY,
 )
-from noack.core.errors import CallerError
 from noack.core.linear_systems import spectral_abscissa
 from noack.core.number_format import to_digits
+from noack.scenario.given_settings import given_settings, plain, plain_table
 from noack.scenario.matrix_files import matrices_of, model_of
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import completed_with, load_with
@@ -52,8 +52,8 @@ def load(source: Source, settings: ReadTable | None = None) -> Scenario:
     if isinstance(source, Scenario):
         return with_settings(source, settings) if settings else source
     if isinstance(source, Mapping):
-        return completed_with(plain_table(source), _values(settings), Path("scenario"), _NAMED)
-    return load_with(find_shipped(str(source), "scenarios"), _values(settings), _NAMED)
+        return completed_with(plain_table(source), given_settings(settings), Path("scenario"), _NAMED)
+    return load_with(find_shipped(str(source), "scenarios"), given_settings(settings), _NAMED)
 
 
 def scenarios() -> dict[str, str]:
@@ -80,7 +80,7 @@ def with_settings(scenario: Scenario, settings: ReadTable) -> Scenario:
         NoackError: one line per mistake, each with key, value and remedy.
     """
     content = scenario.model_dump(mode="json", exclude_none=True)
-    return completed_with(content, _values(settings), Path(scenario.name), _NAMED)
+    return completed_with(content, given_settings(settings), Path(scenario.name), _NAMED)
 
 
 def from_system(
@@ -142,36 +142,7 @@ def from_system(
             "loss": {"model": "bernoulli", "probability": DEFAULT_LOSS_PROBABILITY},
         },
     }
-    return completed_with(content, _values(settings), Path("from_system"), _NAMED)
-
-
-def _values(settings: ReadTable | None) -> list[tuple[str, object]]:
-    """Return keys and plain values; raise CallerError if it is not a table."""
-    if not isinstance(settings, Mapping | None):
-        raise CallerError(
-            f"settings: {settings!r} is not a table; give values by key, "
-            'e.g. {"network.loss.probability": 0.8}'
-        )
-    for key in settings or {}:
-        if not isinstance(key, str):
-            raise CallerError(f'settings: {key!r} is not a key; a key is a text such as "trigger.beta"')
-    return [(key, plain(value)) for key, value in (settings or {}).items()]
-
-
-def plain_table(table: ReadTable) -> Table:
-    """Return a table as from a TOML parser: NumPy arrays and numbers become lists and numbers."""
-    return {str(key): plain(entry) for key, entry in table.items()}
-
-
-def plain(value: object) -> object:
-    """Return a value as from a TOML parser, as :func:`plain_table` does."""
-    if isinstance(value, Mapping):
-        return plain_table(value)
-    if isinstance(value, list | tuple):
-        return [plain(entry) for entry in value]
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    return value
+    return completed_with(content, given_settings(settings), Path("from_system"), _NAMED)
 
 
 def _is_vector(value: object) -> TypeGuard[list[float]]:

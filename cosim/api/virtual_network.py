@@ -13,14 +13,17 @@ from cosim.shipped_files import find_shipped
 from netem.channel import Channel, Departure, link_name, require_stand_alone
 from netem.link_state import LinkState
 from noack.core.errors import CallerError
+from noack.core.number_checks import one_of, whole_number
 from noack.protocol.record_tables import NETEM_PACKET
 from noack.protocol.wire_format import Flow, datagram_bytes
 from noack.scenario import toml_file
 from noack.scenario.scenario import Scenario
-from noack.settings.section import ReadTable
+from noack.settings.section import LARGEST_SEED, ReadTable
 
 Content = TypeVar("Content")
 
+_MOST_EPISODES, _MOST_ENTRIES, _LAST_NS = 2**31, 2**20, 2**62
+"""Most episodes, most numbers of a packet, and the last time."""
 _DIRECTIONS = {Flow.UPDATE: "update", Flow.ACTUATION: "actuation"}
 
 
@@ -59,16 +62,18 @@ class VirtualNetwork(Generic[Content]):
 
     def __init__(self, network: Source | ReadTable, *, seed: int | None = None, episode: int = 0) -> None:
         scenario = require_stand_alone(_load_network(network))
-        self.seed = scenario.seeds.loss if seed is None else seed
+        self.seed = scenario.seeds.loss if seed is None else whole_number("seed", seed, 0, LARGEST_SEED)
         """The seed of the losses."""
         flows = scenario.network.flows
         self.directions = tuple(_DIRECTIONS[flow] for flow in flows)
         """``("update",)``, or ``("update", "actuation")`` if actuations cross the network, too."""
         links = [LinkState(scenario.network.link_of(flow), self.seed, link_name(flow)) for flow in flows]
+        episode = whole_number("episode", episode, 0, _MOST_EPISODES)
         self._channel = Channel(links)
         for direction, link in enumerate(links):
             link.start_flow(0, len(links) * episode + direction)
         self._sent, self._losses = [0] * len(links), [0] * len(links)
+        self._now_ns = 0
         self._on_their_way: list[dict[int, Content]] = [{} for _ in links]
 
     def send(
@@ -81,8 +86,12 @@ class VirtualNetwork(Generic[Content]):
             content: what arrives with the packet.
             entries: how many numbers the packet has, for its size.
             now_ns: the time.
+
+        Raises:
+            NoackError: there is no such direction, the size is wrong, or time goes back.
         """
-        flow = self.directions.index(direction)
+        flow, entries = self._flow(direction), whole_number("entries", entries, 0, _MOST_ENTRIES)
+        now_ns = self._advanced_to(now_ns)
         number, self._sent[flow] = self._sent[flow], self._sent[flow] + 1
         self._on_their_way[flow][number] = content
         arrived = self.receive(now_ns)
@@ -96,12 +105,21 @@ class VirtualNetwork(Generic[Content]):
         return arrived
 
     def receive(self, now_ns: int) -> list[PacketArrival[Content]]:
-        """Return what has arrived up to now, in order."""
-        return self._arrivals(self._channel.release(now_ns))
+        """Return what has arrived up to now, in order; raise NoackError if time goes back."""
+        return self._arrivals(self._channel.release(self._advanced_to(now_ns)))
 
     def consecutive_losses(self, direction: str) -> int:
         """Return how many of the packets that were sent last are lost."""
-        return self._losses[self.directions.index(direction)]
+        return self._losses[self._flow(direction)]
+
+    def _flow(self, direction: str) -> int:
+        one_of("direction", direction, self.directions)
+        return self.directions.index(direction)
+
+    def _advanced_to(self, now_ns: int) -> int:
+        """Return a time that is not before the last one."""
+        self._now_ns = whole_number("now_ns", now_ns, self._now_ns, _LAST_NS)
+        return self._now_ns
 
     def _arrivals(self, leaving: Iterable[Departure]) -> list[PacketArrival[Content]]:
         arrivals: list[PacketArrival[Content]] = []

@@ -57,9 +57,13 @@ def one_of(name: str, value: object, choices: Iterable[str]) -> None:
 
 def _require_range(name: str, value: object, number: float, least: float | None, most: float | None) -> None:
     if least is not None and number < least:
-        raise _wrong(name, value, f"at least {least:,.15g}")
+        raise _wrong(name, value, f"at least {_limit(least)}")
     if most is not None and number > most:
-        raise _wrong(name, value, f"at most {most:,.15g}")
+        raise _wrong(name, value, f"at most {_limit(most)}")
+
+
+def _limit(value: float) -> str:
+    return f"{value:,}" if isinstance(value, int) else f"{value:g}"
 
 
 def _wrong(name: str, value: object, expected: str) -> CallerError:

@@ -43,6 +43,7 @@ Positive = Annotated[FiniteFloat, Field(gt=0)]
 NonNegative = Annotated[FiniteFloat, Field(ge=0)]
 Probability = Annotated[FiniteFloat, Field(ge=0, le=1)]
 Correlation = Annotated[FiniteFloat, Field(ge=0, lt=1)]
+LARGEST_SEED = 2**64 - 1
 Seed = Annotated[int, Field(ge=0, lt=2**64)]
 
 

@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from os import PathLike
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -18,6 +19,7 @@ from noack.core.number_checks import real_number
 from noack.core.number_format import TextRows, as_text, to_digits
 from noack.plants.systems.linearisation import LinearMotion, largest_errors
 from noack.plants.systems.linearisation import linearise as linear_motion
+from noack.scenario.given_settings import given_settings
 from noack.scenario.sections import instability
 from noack.settings.section import ReadTable, Table
 from noack.settings.user_files import UserCode
@@ -203,7 +205,7 @@ class LoopGain:
 
 
 def linearise(
-    plant: str,
+    plant: str | PathLike[str],
     *,
     at: Sequence[float] | float | None = None,
     input: Sequence[float] | float | None = None,  # noqa: A002 # the option of the command
@@ -228,20 +230,21 @@ def linearise(
     Raises:
         NoackError: there is no such plant, it has no linear model there, or a value is wrong.
     """
+    plant, settings = str(plant), dict(given_settings(settings))
     if plant.endswith(".json"):
         document = read_document(Path(plant))
         return linearise(
             document["plant"],
             at=document["at"] if at is None else at,
             input=document["input"] if input is None else input,
-            settings=document["settings"] | dict(settings or {}),
+            settings=document["settings"] | settings,
             within=within,
         )
     if not np.isfinite(real_number("within", within, above=0.0)):
         raise CallerError(f"within {within:g}: expected a finite number")
     at, input = ([values] if isinstance(values, float | int) else values for values in (at, input))  # noqa: A001
     sizes = (None if at is None else len(at), None if input is None else len(input))
-    reference = plant_reference(plant, settings or {}, sizes)
+    reference = plant_reference(plant, settings, sizes)
     x, u = parse_vector("at", at, reference.n, "states"), parse_vector("input", input, reference.m, "inputs")
     point = {"x0": x, "u0": u, "step_ns": reference.step_ns}
     with np.errstate(all="ignore"):
@@ -262,7 +265,7 @@ def linearise(
 
 
 def gain(
-    plant: str | LinearModel,
+    plant: str | PathLike[str] | LinearModel,
     *,
     q: ArrayLike | None = None,
     r: ArrayLike | None = None,
@@ -437,9 +440,9 @@ def write_document(result: LinearModel | LoopGain, path: Path) -> None:
     write_output(path, json.dumps(document, indent=2))
 
 
-def model_or_gain(plant: str, settings: ReadTable) -> LinearModel | LoopGain:
+def model_or_gain(plant: str | PathLike[str], settings: ReadTable | None) -> LinearModel | LoopGain:
     """Return the model of a plant, or of a file, and its gain if the file has one."""
-    model = linearise(plant, settings=settings)
+    plant, model = str(plant), linearise(plant, settings=settings)
     if not plant.endswith(".json") or "gain" not in (document := read_document(Path(plant))):
         return model
     gain_rows = document["gain"]

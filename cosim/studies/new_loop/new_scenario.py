@@ -41,6 +41,7 @@ from noack.core.file_access import new_file
 from noack.core.linear_systems import Matrix, Vector, norm
 from noack.core.number_format import at_most, to_digits
 from noack.plants.linear import LinearSettings
+from noack.scenario.given_settings import given_settings
 from noack.scenario.resolution import resolve, resolve_run
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import completed, put, toml_text
@@ -129,7 +130,7 @@ class _Trial:
 
 
 def new(
-    plant: str | LinearModel | LoopGain,
+    plant: str | PathLike[str] | LinearModel | LoopGain,
     path: str | PathLike[str] = "new.toml",
     *,
     initial_state: Sequence[float] | None = None,
@@ -148,8 +149,9 @@ def new(
     Raises:
         NoackError: the plant does not rest at x = 0, u = 0, or a value is wrong.
     """
-    plant_model = model_or_gain(plant, settings or {}) if isinstance(plant, str) else plant
-    fixed = {key: value for key, value in (settings or {}).items() if not key.startswith("plant.system")}
+    values = dict(given_settings(settings))
+    plant_model = plant if isinstance(plant, LinearModel | LoopGain) else model_or_gain(plant, values)
+    fixed = {key: value for key, value in values.items() if not key.startswith("plant.system")}
     fixed_state = fixed.pop("plant.initial_state", initial_state)
     model = plant_model.model if isinstance(plant_model, LoopGain) else plant_model
     _require_rest(model)

@@ -181,7 +181,7 @@ def test_the_figures_of_a_report_are_written_as_wide_as_a_paper_wants(tmp_path: 
     assert [path.name for path in run.save_figures("png", figure="losses")] == ["losses.png"]
     with pytest.raises(CallerError, match='"loss": no such figure of this run; it has states, '):
         run.save_figures("png", figure="loss")
-    with pytest.raises(CallerError, match='"eps": a figure is saved as svg, png, pdf'):
+    with pytest.raises(CallerError, match="format eps: 'eps' is not one of 'svg', 'png', 'pdf'"):
         run.save_figures("eps")
     with pytest.raises(CallerError, match=r"figure\.eps: a figure is saved as \.svg"):
         save_figure(norms(line(T_S, T_S)), tmp_path / "figure.eps")
