@@ -109,35 +109,32 @@ def write_output(path: Path, content: str | bytes) -> Path:
 
 
 def require_output(path: Path, *, is_folder: bool = False) -> None:
-    """Raise CallerError if a file or folder that a user named for an output cannot be written there."""
-    refuse_results(path)
-    if not is_folder and path.is_dir():
-        raise CallerError(f"{path}: is a folder; give the name of a file")
-    require_folder(path if is_folder else path.parent, path)
-
-
-def require_folder(folder: Path, output: Path | None = None) -> None:
-    """Raise CallerError, which names ``output``, if nothing can be written in a folder.
-
-    A folder that does not exist can be written in if it can be made.
-    """
-    existing = next((path for path in (folder, *folder.parents) if path.exists()), folder)
-    if not (existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)):
-        named = f"{output or folder}: " + (f"{existing} " if existing != (output or folder) else "")
-        raise CallerError(named + ("may not be written to" if existing.is_dir() else "is not a folder"))
-
-
-def refuse_results(path: Path) -> None:
-    """Raise CallerError if an output would replace, or be among, the results of a run or a campaign.
+    """Raise CallerError if an output may not or cannot be written to a file or folder that a user named.
 
     Args:
-        path: of the file or the folder that a user named.
+        path: of the file or the folder. It may not replace, or be among, the results of a run or a campaign.
+        is_folder: it is a folder.
     """
-    refuse_among_results(path)
     if (holder := holder_of(path)) is not None:
         raise CallerError(f"{path}: {holder}; give another name")
     if path.name in _KEPT and (holder := holder_of(path.parent)) is not None:
         raise CallerError(f"{path}: is a file of {holder}; give another name")
+    require_folder(path if is_folder else path.parent, path)
+    if not is_folder and path.is_dir():
+        raise CallerError(f"{path}: is a folder; give the name of a file")
+
+
+def require_folder(folder: Path, output: Path | None = None) -> None:
+    """Raise CallerError, which names ``output``, if nothing may be written in a folder.
+
+    A folder that does not exist can be written in if it can be made. The folders of the results of a
+    run or a campaign are refused.
+    """
+    refuse_among_results(output or folder)
+    existing = next((path for path in (folder, *folder.parents) if path.exists()), folder)
+    if not (existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)):
+        named = f"{output or folder}: " + (f"{existing} " if existing != (output or folder) else "")
+        raise CallerError(named + ("may not be written to" if existing.is_dir() else "is not a folder"))
 
 
 def refuse_among_results(path: Path) -> None:

@@ -18,14 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from cosim.record.run_directory import (
-    CAMPAIGN_FILE,
-    LATEST,
-    SCENARIO_FILE,
-    SUMMARY_FILE,
-    refuse_among_results,
-    require_folder,
-)
+from cosim.record.run_directory import CAMPAIGN_FILE, LATEST, SCENARIO_FILE, SUMMARY_FILE, require_folder
 from cosim.studies.campaign.arithmetic import arithmetic, difference
 from cosim.studies.campaign.campaign_file import Campaign
 from cosim.studies.campaign.campaign_grid import Point, row_type
@@ -174,7 +167,6 @@ def locked_folder(campaign: Campaign, base: Mapping[str, object], store: Store) 
 
 def _refuse_runs(folder: Path) -> None:
     """Raise CallerError for a folder with results that are no campaign's; nothing is written there."""
-    refuse_among_results(folder)
     require_folder(folder)
     if (folder / CAMPAIGN_FILE).exists():
         return

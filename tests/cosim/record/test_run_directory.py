@@ -31,7 +31,7 @@ from cosim.record.run_directory import (
     loop_of_file,
     new_run_dir,
     point_to_latest,
-    refuse_results,
+    require_output,
     require_run_directory,
     write_output,
 )
@@ -237,13 +237,13 @@ def test_no_output_is_written_among_the_results(held: tuple[Path, str], name: st
     (folder / name).mkdir()
     for path in (folder / name, folder / name / "plant.csv", folder / name / "inner" / "plant.csv"):
         with pytest.raises(CallerError, match=f"lies in {holder}, among its results; give another name"):
-            refuse_results(path)
+            require_output(path)
 
 
 def test_no_output_replaces_the_folder_of_results(held: tuple[Path, str]) -> None:
     folder, holder = held
     with pytest.raises(CallerError, match=f"held: {holder}; give another name"):
-        refuse_results(folder)
+        require_output(folder)
 
 
 def test_tables_figures_and_exports_replace_no_results(
