@@ -63,7 +63,7 @@ def _require_range(name: str, value: object, number: float, least: float | None,
 
 
 def _limit(value: float) -> str:
-    return f"{value:,}" if isinstance(value, int) else f"{value:g}"
+    return f"{value}" if isinstance(value, int) else f"{value:g}"
 
 
 def _wrong(name: str, value: object, expected: str) -> CallerError:
