@@ -98,7 +98,7 @@ def test_constraints_that_limit_the_losses_alone_make_every_m_stable() -> None:
     assert margin.stable_m == 2
     assert "every M ≥ 2" in margin.verdict
     assert margin.to_json()["period"] is None
-    with pytest.raises(noack.NoackError, match="most_m 0: expected"):
+    with pytest.raises(noack.NoackError, match="most 0: expected at least 1"):
         noack.margin("lane_periodic", most_m=0)
 
 

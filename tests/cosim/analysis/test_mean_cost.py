@@ -134,7 +134,7 @@ def test_costs_that_do_not_depend_on_what_grows_are_those_of_the_loop_without_it
         (["lane_periodic", "--set", "network.mansd=20"], 1, "∞"),
         (["lane_periodic", "--set", "horizon_s=1e6"], 0, "not known"),
         (["lane_periodic", "--Q", "[0, 0, 0, 0]", "--R", "[0, 0]"], 2, "Q, R: all weights are 0"),
-        (["lane_periodic", "--Q", "[1, 1]"], 2, "--Q [1, 1]: expected 4 x 4 numbers"),
+        (["lane_periodic", "--Q", "[1, 1]"], 2, "Q [1, 1]: expected 4 x 4 numbers"),
         (["lane_periodic", "--Q", "[1, 1, 1, -1]"], 2, "Q: must be positive semidefinite"),
         (["lane_periodic", "--R", "[[1, 1], [0, 1]]"], 2, "R: must be symmetric"),
         (["lane_periodic", "--R", "[1e308, 1e308]"], 0, "0.862511"),
