@@ -22,7 +22,7 @@ from noack.settings.section import LARGEST_SEED, ReadTable
 
 Content = TypeVar("Content")
 
-_MOST_EPISODES, _MOST_ENTRIES, _LAST_NS = 2**31, 2**20, 2**62
+_MOST_EPISODES, _MOST_ENTRIES, _LAST_NS = 2**31, 10**8, 2**62
 """Most episodes, most numbers of a packet, and the last time."""
 _DIRECTIONS = {Flow.UPDATE: "update", Flow.ACTUATION: "actuation"}
 

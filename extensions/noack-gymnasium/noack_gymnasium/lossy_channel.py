@@ -91,9 +91,7 @@ class LossyChannel(
             self, network=network, step_s=step_s, first_action=first_action, seed=seed
         )
         super().__init__(env)
-        if seed is not None and (not isinstance(seed, int | np.integer) or seed < 0):
-            raise CallerError(f"LossyChannel: seed = {seed!r}: must be a whole number, 0 or more")
-        lossy = VirtualNetwork[Any](network, seed=None if seed is None else int(seed))
+        lossy = VirtualNetwork[Any](network, seed=seed)
         self._network, self._seed, self._crossed = network, lossy.seed, len(lossy.directions) > 1
         self._step_ns = _step_ns(env, step_s)
         self._episode, self._step, self._now_ns = -1, 0, 0

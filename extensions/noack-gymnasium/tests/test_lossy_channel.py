@@ -184,8 +184,8 @@ class NoStep(Clock):
     (Clock, HALF, {"step_s": 0.0}, "step_s = 0.0: must be a time in seconds, above 0"),
     (Clock, HALF, {"step_s": "x"}, "step_s = 'x': must be a time in seconds"),
     (Clock, HALF, {"step_s": float("nan")}, "step_s = nan: must be a time in seconds"),
-    (Clock, HALF, {"seed": 1.5}, "seed = 1.5: must be a whole number"),
-    (Clock, HALF, {"seed": np.int64(-1)}, "must be a whole number, 0 or more"),
+    (Clock, HALF, {"seed": 1.5}, "seed 1.5: expected a whole number"),
+    (Clock, HALF, {"seed": np.int64(-1)}, "seed -1: expected at least 0"),
 ])  # fmt: skip
 def test_a_mistake_is_one_line(env: Any, network: Any, given: Any, reason: str) -> None:
     with pytest.raises(CallerError, match=reason) as error:

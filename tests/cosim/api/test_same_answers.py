@@ -363,3 +363,14 @@ def test_command_and_library_refuse_with_the_same_line(
     if not command.startswith("summary HERE"):  # shows the summary of a run whose record is damaged
         assert result.stdout == ""
     assert sorted(folder.rglob("*")) == before
+
+
+def test_the_library_takes_what_the_commands_take(folder: Path, tmp_path: Path) -> None:
+    """The directory of a run as a scenario, the diagonal of a weight, paths as text or as ``Path``."""
+    assert noack.load(folder / "run").name == "double_integrator"
+    by_diagonal = noack.cost("lane_periodic", Q=[1, 2, 3, 4])
+    by_rows = noack.cost("lane_periodic", Q=[[1, 0, 0, 0], [0, 2, 0, 0], [0, 0, 3, 0], [0, 0, 0, 4]])
+    assert by_diagonal == by_rows
+    noack.compare(folder / "run", folder / "run").save(str(tmp_path / "overlay.svg"))
+    noack.new(noack.linearise("cart_pole")).save(str(tmp_path / "new.toml"))
+    assert {path.name for path in tmp_path.iterdir()} == {"overlay.svg", "new.toml"}
