@@ -72,4 +72,4 @@ class WaitLimit:
         """Why a run did not end within the limit after its horizon, and what would help."""
         if self.is_loaded:
             return f"likely cause: {self.load_text}; start fewer runs at once"
-        return "likely cause: too slow, or stopped; reduce the speed or the rates"
+        return "likely cause: too slow, stopped, or hung in code of yours; reduce the speed or the rates"

@@ -74,10 +74,11 @@ def bind_to(endpoint: socket.socket, name: SocketName, title: str, remedy: str) 
         endpoint.bind(name)
     except OSError as error:
         endpoint.close()
+        if error.errno == errno.EADDRNOTAVAIL:  # another port does not help
+            raise CallerError(f"{title}: {name[0]} is no address of this machine; see `ip address`") from None
         reason = {
             errno.EADDRINUSE: "is already taken by another program",
             errno.EACCES: "needs privileges that this user does not have",
-            errno.EADDRNOTAVAIL: "is no address of this machine",
         }.get(error.errno or 0, f"cannot be bound ({error.strerror})")
         raise CallerError(f"{title} {reason}; {remedy}") from None
 

@@ -173,7 +173,7 @@ def set_(
         suffix = "" if len(entries) == 1 else f"; changed: {', '.join(loops) or 'no loop'}"
         text = text_of(changes)
         if answer.from_s is None:
-            print(f"{answer.name}: in force already: {text}")
+            print(f"{answer.name}: unchanged, already in force: {text}")
         else:
             print(f"{answer.name}: {text} from {answer.from_s:.3f} s on{suffix}")
             for name, (old, new) in answer.thresholds.items():

@@ -121,8 +121,9 @@ class ChildProcesses:
         lines, own = self._log_lines(role), f"noack {role}: "
         # Libraries write to the log, too; and on a full disk the log may be empty.
         logged = next((line.removeprefix(own) for line in lines[::-1] if line.startswith(own)), None)
-        why = logged or reported(role) or "".join(lines[-1:]) or f"exit status {code}"
-        return EndReason(ExitStatus(code) if known else ExitStatus.FAILED, f"{role}: {why}")
+        why = logged or reported(role) or "".join(lines[-1:])
+        text = f"{role}: {why}" if why else f"{role} ended with exit status {code}"
+        return EndReason(ExitStatus(code) if known else ExitStatus.FAILED, text)
 
     def _log_lines(self, role: str) -> list[str]:
         log = self._run_dir / "logs" / f"{role}.log"

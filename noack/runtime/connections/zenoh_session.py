@@ -167,5 +167,8 @@ def next_payload(subscriber: "zenoh.Subscriber[Handler[zenoh.Sample]]") -> bytes
 
 
 def cause_of(error: zenoh.ZError) -> str:
-    """Return zenoh's message without the place in its own source."""
-    return str(error).partition(" at /")[0]
+    """Return zenoh's message without the place in its own source; in plain words if nobody answered."""
+    cause = str(error).partition(" at /")[0]
+    if cause.startswith("Unable to connect to any of"):
+        return f"no connection within {_CONNECT_MS / 1000:g} s; the process is stopped, busy or has ended"
+    return cause

@@ -78,7 +78,7 @@ def assumptions(resolved: Scenario) -> list[Assumption]:
 def violations_of_theorem_2(resolved: Scenario) -> list[str]:
     """Return the assumptions of Theorem 2 that a resolved scenario violates, each as a line."""
     return [
-        f"violated: {assumption.what}: {assumption.why}"
+        f"an assumption of Theorem 2 is violated: {assumption.what}: {assumption.why}"
         for assumption in assumptions(resolved)
         if assumption.verdict == AssumptionStatus.VIOLATED and assumption.source == "Theorem 2"
     ]

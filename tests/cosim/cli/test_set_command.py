@@ -14,6 +14,8 @@ from cosim.cli.live_settings import parse_settings
 from cosim.live.coordination.coordinator import Coordinator
 from noack.core.errors import CallerError
 from noack.runtime import active_runs
+from noack.runtime.active_runs import OpenRun
+from noack.runtime.control_messages import ChangeReply
 from noack.runtime.run_descriptor import RunDescriptor, new_descriptor
 from noack.scenario.parameter_changes import changed
 from noack.scenario.resolution import resolve
@@ -118,3 +120,14 @@ def test_only_active_runs_can_be_changed(coordinator: Coordinator) -> None:
     runtime_parameters = json.loads(question.replies[0])["runtime_parameters"]
     assert runtime_parameters["network.mansd"] == 2
     assert runtime_parameters["controller.setpoint"] == [0.0, 0.0]
+
+
+def test_settings_that_are_in_force_already_are_unchanged(monkeypatch: pytest.MonkeyPatch) -> None:
+    reply = ChangeReply(
+        name="lane", run_dir="runs/one", t_s=1.0, from_s=None, runtime_parameters={}, loops={"lane": {}},
+        changed_loops=(), warnings=(), thresholds={},
+    )  # fmt: skip
+    monkeypatch.setattr(active_runs, "find_run", lambda *of: OpenRun("1", "runs/one", None))
+    monkeypatch.setattr(active_runs, "request_change", lambda run, changes: reply)
+    result = invoke("set", "mansd", "2")
+    assert result.stdout == "lane: unchanged, already in force: network.mansd = 2\n"

@@ -152,8 +152,8 @@ def test_a_run_that_does_not_end_names_the_late_process(
     coordinator._running = running
     reason = case.run(case.children(None), coordinator)._overdue()
     assert reason == (
-        f"the run did not end at its horizon: {late}; likely cause: too slow, or stopped; reduce the "
-        "speed or the rates"
+        f"the run did not end at its horizon: {late}; likely cause: too slow, stopped, or hung in code of "
+        "yours; reduce the speed or the rates"
     )
 
 
@@ -186,6 +186,9 @@ def test_the_reason_for_an_end_by_sighup_is_not_another_signal(case: Case) -> No
     """Its exit status is that of SIGTERM."""
     failures = case.children(143).failures(lambda role: "SIGHUP")
     assert failures == {"sensor": (ExitStatus.FAILED, "sensor ended early: SIGHUP")}
+    case.log.unlink()
+    failures = case.children(3).failures(lambda role: None)
+    assert failures == {"sensor": (ExitStatus.FAILED, "sensor ended with exit status 3")}
     failures = case.children(143).failures(lambda role: None)
     assert failures == {"sensor": (ExitStatus.FAILED, "sensor ended early: SIGTERM")}
 

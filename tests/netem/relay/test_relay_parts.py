@@ -79,7 +79,10 @@ def test_a_link_whose_address_cannot_be_used_is_refused() -> None:
     with endpoints(HOSTS[4]) as (other,):
         for specs, message in (
             ([link(there, listen=("localhost", 0))], "not an address of IPv4 or IPv6"),
-            ([link(there, listen=("192.0.2.1", 0))], "is no address of this machine"),
+            (
+                [link(there, listen=("192.0.2.1", 0))],
+                ":0: 192.0.2.1 is no address of this machine; see `ip address`$",
+            ),
             ([link(("127.0.0.1", 0))], "^link test: to 127.0.0.1:0: port 0 is not a destination"),
             ([link(there, listen=name_of(other))], "already taken"),
             ([link(there)] * 2, "two links have this name"),

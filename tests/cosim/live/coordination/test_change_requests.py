@@ -52,7 +52,7 @@ def test_a_value_that_is_in_force_is_no_change_unless_another_one_is_to_come() -
 def test_a_change_warns_of_the_assumptions_that_it_violates() -> None:
     requests = requests_of('{ name = "p" }')
     (warning,) = requested(requests, {"trigger.alpha_per_s": 5.0})["warnings"]
-    assert warning.startswith("violated: 0 < α < ᾱ: the threshold decays more slowly than the closed loop")
+    assert warning.startswith("an assumption of Theorem 2 is violated: 0 < α < ᾱ: the threshold decays ")
     assert not requested(requests, {"network.mansd": 2})["warnings"]
 
 
