@@ -10,7 +10,7 @@ from noack.runtime.connections.zenoh_session import cause_of
     ("message", "cause"),
     [
         (
-            "Unable to connect to any of [Single(unixsock-stream//proc/self/fd/6/x.sock)]. Timeout! at /b.rs:1.",
+            "Unable to connect to any of [Single(unixsock-stream//proc/self/fd/6/x)]. Timeout! at /b.rs:1.",
             "no connection within 5 s; the process is stopped, busy or has ended",
         ),
         ("Can not create a new Unix listener at /a/b.rs:1.", "Can not create a new Unix listener"),
