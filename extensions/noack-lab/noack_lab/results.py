@@ -127,7 +127,8 @@ def guarantee_of(scenario: noack.Scenario) -> Guarantee:
     try:
         certificates = noack.certify(scenario)
     except noack.NoackError as error:
-        return Guarantee(VerdictText(f"no certificate: {error}", "doubt"), [], [])
+        reason = str(error).removesuffix("; no certificate covers this")
+        return Guarantee(VerdictText(f"no certificate: {reason}", "doubt"), [], [])
     certificate, answer = certificates.of_own_plant, certificates.answer
     constants = None if certificate is None else certificate.constants
     if certificate is None or constants is None:

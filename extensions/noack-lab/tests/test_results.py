@@ -11,3 +11,8 @@ def test_the_lab_gives_the_answer_of_certify() -> None:
         answer, line = noack.certify(scenario).answer, guarantee_of(scenario).line
         assert line.text.startswith(answer.text)
         assert line.tone == ("good" if answer.is_certified else "doubt")
+
+
+def test_a_setting_without_a_certificate_is_the_reason_once() -> None:
+    text = guarantee_of(noack.load("model_predictive")).line.text
+    assert text == 'no certificate: controller.kind = "python": u is not K x_c'
