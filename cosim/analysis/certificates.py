@@ -1,12 +1,13 @@
 """All certificates of a scenario: as one object, as JSON, and as rows of a table."""
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
+from cosim.analysis.tried_settings import Tried, helpful_box, helpful_settings, largest_settings
 from cosim.analysis.witnesses import Witnesses, find_witnesses, needs_matrices, no_witnesses
 from noack.core.errors import CallerError, one_line
 from noack.core.linear_systems import Matrix
@@ -28,6 +29,7 @@ from noack.theory.certificates.conditions import (
     ideal_conditions,
     nominal_conditions,
     void_at_setpoint,
+    void_by_setting,
 )
 from noack.theory.certificates.network_limits import NetworkLimits, network_limits
 from noack.theory.certificates.plant_equations import LinearEquations, linear_plant
@@ -216,18 +218,52 @@ class Certificates:
         missing = sum_of_sups(kernel, constants.missing_events, constants.inter_event_s or 0.0)
         return min(present_gain * constants.delta, (present_gain + float(missing)) * constants.overshoot)
 
-    @property
-    def limits(self) -> NetworkLimits:
-        """Limits of the schedule's times for the scenario's plant, each varied alone, in s."""
-        return next(iter(self.limits_by_scope.values()))
-
     @cached_property
     def limits_by_scope(self) -> dict[str, NetworkLimits]:
-        """The limits for the scenario's plant and for the box, by the name of the scope.
+        """The limits for the plants that have a certificate for the schedule, by the name of the scope.
 
         They are computed at the first access, from dozens of certificates.
         """
-        return {scope.name: network_limits(scope, self.scheduled) for scope in self._scopes}
+        certified = {certificate.scope for certificate in self._of(SCHEDULE) if certificate.exists}
+        return {
+            scope.name: network_limits(scope, self.scheduled)
+            for scope in self._scopes
+            if scope.name in certified
+        }
+
+    @cached_property
+    def largest_settings(self) -> list[Tried]:
+        """Settings with which the scenario's own plant has a certificate, at their largest, each alone."""
+        own = self.of_own_plant
+        if own is None or not own.exists:
+            return []
+        limits = self.limits_by_scope[own.scope]
+        return [*largest_settings(self._own_scenario, self.late_periods, limits.delay_s, limits.sampling_s)]
+
+    @cached_property
+    def helpful_settings(self) -> list[Tried]:
+        """Settings, each of which alone gives the scenario's own plant its missing certificate."""
+        own, scenario = self.of_own_plant, self._own_scenario
+        if own is None or own.exists or own.void == void_by_setting(scenario, self.scheduled):
+            return []
+        [scope] = [scope for scope in self._scopes if scope.name == own.scope]
+        if scope.decay_per_s["A + BK"] <= 0:  # it is unstable without losses
+            return []
+        return [*helpful_settings(scenario, self.late_periods)]
+
+    @cached_property
+    def helpful_box(self) -> Tried | None:
+        """A smaller uncertainty box with its missing certificate, while the plant has one."""
+        box = self.schedule_box
+        if box is None or box.exists or not self.schedule.exists:
+            return None
+        return helpful_box(self._own_scenario, self.late_periods)
+
+    @property
+    def _own_scenario(self) -> Scenario:
+        """The resolved scenario with its own plant."""
+        scenario, _, _, _, nonlinear, _ = self._arguments
+        return nonlinear or scenario
 
     @cached_property
     def stability(self) -> Stability | None:
@@ -266,6 +302,7 @@ class Certificates:
                 f"{name}_s": getattr(self.scheduled, f"{name}_s") for name in ("sampling", "delay", "hold")
             },
             "limits": {scope: limits._asdict() for scope, limits in self.limits_by_scope.items()},
+            "largest_settings": [dict(tried.values) for tried in self.largest_settings],
         }
 
     def _covering(self, plants: str, conditions: str) -> ScenarioCertificate | None:
@@ -286,17 +323,6 @@ class Certificates:
 
     def _repr_html_(self) -> str:
         return as_html(self._rows())
-
-
-def is_certified_with(results: Certificates, changes: Mapping[str, float]) -> bool:
-    """Whether the plant has a certificate for the schedule with settings such as network.mansd."""
-    scenario = results.scenario
-    for name, value in changes.items():
-        section, _, key = name.partition(".")
-        changed = getattr(scenario, section).model_copy(update={key: value})
-        scenario = scenario.model_copy(update={section: changed})
-    conditions = nominal_conditions(scenario, results.late_periods)
-    return own_plant_scope(scenario).loop_gain(conditions) < 1
 
 
 def _theorem_2(scenario: Scenario, certificate: ScenarioCertificate) -> Theorem2 | None:

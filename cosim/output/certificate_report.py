@@ -5,21 +5,15 @@ losses are not limited, what holds for random ones; :func:`print_margin` prints 
 time-triggered loop, :func:`print_mean_cost` its mean cost under random losses.
 """
 
-from collections.abc import Iterable, Iterator
-from functools import partial
+from collections.abc import Iterable, Iterator, Sequence
 
 from rich.console import Console
 from rich.markup import escape
 
-from cosim.analysis.certificates import (
-    SCHEDULE,
-    Certificates,
-    constant_rows,
-    covered_plants,
-    is_certified_with,
-)
+from cosim.analysis.certificates import SCHEDULE, Certificates, constant_rows, covered_plants
 from cosim.analysis.margin_search import MarginResult
 from cosim.analysis.mean_cost import CostUnder, MeanCost
+from cosim.analysis.tried_settings import Tried
 from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.output.terminal_output import print_assumptions
 from noack.core.linear_systems import Matrix
@@ -27,7 +21,7 @@ from noack.core.number_format import NONE, at_least, at_most, duration, duration
 from noack.scenario.resolution import loop_of, policy_of
 from noack.theory.certificates.assumptions import assumptions
 from noack.theory.certificates.certified_bounds import envelope_formula
-from noack.theory.certificates.conditions import BOX, REGION, nominal_conditions
+from noack.theory.certificates.conditions import BOX, REGION
 from noack.theory.certificates.network_limits import MOST_S
 from noack.theory.certificates.scenario_certificates import outside_box
 from noack.theory.margins.loss_margin import Stability
@@ -50,6 +44,8 @@ def print_certificates(console: Console, results: Certificates, chosen: Certific
         )
     for table in tables[1:]:
         console.print(terminal_table(table))
+    if largest := _listed("as settings, the certificate is kept", results.largest_settings):
+        console.print(largest, markup=False, highlight=False)
     if (outside := outside_box(results.scenario)) is not None:
         console.print(f"[yellow]the box certificates do not cover this plant:[/] {escape(outside)}")
     console.print("assumptions of the certificates for the schedule:")
@@ -58,10 +54,9 @@ def print_certificates(console: Console, results: Certificates, chosen: Certific
     print_assumptions(console, assumptions(results.scenario))
     for sentence in (*_in_words(results), *_stability_in_words(results)):
         console.print(sentence, markup=False, highlight=False)
-    exists = results.schedule.constants is not None
-    if results.weight is not None and exists:
+    if results.weight is not None and results.schedule.exists:
         _print_weight(console, results, results.weight)
-    if not exists and chosen is None:
+    if not (chosen or results).answer.is_certified:
         _print_advice(console, results)
     if chosen is not None and chosen.weight is not None:
         console.print("[bold]With another norm, also in the trigger, there are certificates:[/]")
@@ -84,48 +79,19 @@ def _print_nonlinear(console: Console, results: Certificates, why_nonlinear: str
 
 
 def _print_advice(console: Console, results: Certificates) -> None:
-    """Print that there is no certificate, and what gives one; settings that are named were tried."""
-    advice = ""
-    if (results.schedule.void or "").startswith("the loop gain"):
-        changes = list(_helpful_changes(results))
-        advice = "; no higher rates and no smaller network.mansd that were tried alone give one"
-        if changes:
-            advice = f"; there is one with {', or with '.join(changes)}"
+    """Print that there is no certificate, and settings with which there is one."""
+    advice = _listed("; there is one", results.helpful_settings)
     console.print(
-        f"[yellow]no certificate for the schedule[/], so no bound of ‖x‖{advice}; noack adversary "
+        f"[yellow]no certificate for the schedule[/], so no bound of ‖x‖{escape(advice)}; noack adversary "
         "shows what losses can do to it"
     )
 
 
-def _helpful_changes(results: Certificates) -> Iterator[str]:
-    """Yield, in words, changes of which each gives a certificate for the plant."""
-    times = {
-        "sampling": "a sampling period of at most {}",
-        "delay": "a total delay of updates of at most {}, waits for clocks included",
-        "hold": "inputs that are at most {} old",
-    }
-    scenario = results.scenario
-    prompt_network = scenario.network.model_copy(update={"impairments": ()})
-    # The clocks alone delay updates, whatever the network does.
-    prompt = nominal_conditions(scenario.model_copy(update={"network": prompt_network}))
-    least_s = {"sampling": 0.0, "delay": prompt.delay_s, "hold": prompt.hold_s}
-    for name, text in times.items():
-        limit_s = getattr(results.limits, f"{name}_s")
-        scheduled_s = getattr(results.scheduled, f"{name}_s")
-        if limit_s is not None and 0 < limit_s < scheduled_s and least_s[name] <= limit_s:
-            yield text.format(_limit(limit_s))
-    rates = {"plant.rate_hz": scenario.plant.rate_hz, "controller.rate_hz": scenario.controller.rate_hz}
-    # An observer's gain belongs to its period.
-    faster = (2, 5, 10) if scenario.observer is None else ()
-    sigma = getattr(scenario.trigger, "sigma", 0.0)
-    candidates: tuple[list[dict[str, float]], ...] = (
-        [{name: factor * rate for name, rate in rates.items()} for factor in faster],
-        [{"network.mansd": most} for most in range(scenario.network.mansd - 1, -1, -1)],
-        [{"trigger.sigma": sigma / 2**k} for k in range(1, 10) if sigma],
-    )
-    for changes in candidates:
-        if (helpful := next(filter(partial(is_certified_with, results), changes), None)) is not None:
-            yield " and ".join(f"{name} = {value:g}" for name, value in helpful.items())
+def _listed(what: str, tried: Sequence[Tried]) -> str:
+    """Return settings that were tried as one text; empty if there are none."""
+    if not tried:
+        return ""
+    return f"{what} with {', or with '.join(settings.text for settings in tried)}; each was tried alone"
 
 
 def _print_weight(console: Console, chosen: Certificates, weight: Matrix) -> None:
@@ -254,6 +220,8 @@ def _print_notes(console: Console, results: Certificates) -> None:
             reasons.setdefault((certificate.scope, certificate.void), []).append(under)
     for (scope, why), conditions in reasons.items():
         console.print(f"[yellow]no certificate[/] ({' and '.join(conditions)}, {scope}): {escape(why)}")
+    if (box := results.helpful_box) is not None:
+        console.print(f"the box has one{escape(_listed('', [box]))}", highlight=False)
     for under, certificate in results:
         if certificate.region is not None:
             loop, region = loop_of(results.scenario), certificate.region

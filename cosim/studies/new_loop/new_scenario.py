@@ -344,8 +344,8 @@ def _notes(trial: _Trial, certificate: ScenarioCertificate, returns: bool, is_li
     plant = "the plant" if is_linear else "the linear plant ẋ = Âx + B̂u"
     if certificate.constants is None:
         yield (
-            f"No certificate was found for {plant}: {certificate.void}. A faster rate, a slower "
-            "gain (a larger --r of noack gain) or a smaller network.mansd may have one."
+            f"No certificate was found for {plant}: {certificate.void}. Rates, gains and M were "
+            "tried; noack certify tries other settings, and names those with a certificate."
         )
     else:
         bound = envelope_formula("‖x‖", certificate, "state").format(at_most(certificate.constants.state))
@@ -356,8 +356,9 @@ def _notes(trial: _Trial, certificate: ScenarioCertificate, returns: bool, is_li
             f"{of_states.max():.2g} within ±{within:g}" for within, of_states in trial.gain.model.errors
         )
         yield (
-            "The plant itself is not linear. If its equations are known, noack certify searches a "
-            "certificate on a region that it does not leave; without one, a run checks only what "
+            "This is not about the plant itself. If its equations are known, noack certify searches a "
+            "certificate of them: on a region that the plant does not leave, or from any x(0) if the "
+            "equations are linear; without one, a run checks only what "
             "holds for every plant; with --set 'plant.system={kind=\"linear\"}' a run has the "
             "linear plant, and is checked against its certificate. Largest relative error of the "
             f"linear model, sampled: {errors}."

@@ -167,6 +167,15 @@ def void_by_watchdog(resolved: Scenario, conditions: NetworkConditions) -> str |
     )
 
 
+def void_by_setting(resolved: Scenario, conditions: NetworkConditions) -> str | None:
+    """Return why there is no certificate whatever the others are; the reason names the setting."""
+    return (
+        void_by_safe_input(resolved, conditions)
+        or void_by_watchdog(resolved, conditions)
+        or void_by_uneven_steps(resolved)
+    )
+
+
 def void_beforehand(resolved: Scenario, conditions: NetworkConditions) -> str | None:
     """Return why there is no certificate before a run; see these three functions."""
     return (

@@ -63,6 +63,9 @@ class Solution(NamedTuple):
     If it is not below 1: at least the largest entry of the diagonal."""
     bound: Vector
     """(…, k) upper bound of v; infinite where ρ(F) < 1 was not confirmed."""
+    failing: Counts
+    """(…) The first signal with which no bound follows from those before it: that of the first
+    leading principal minor not above 0. Of no use where ρ(F) < 1."""
 
 
 def solve_inequalities(F: Matrix, g: Vector) -> Solution:
@@ -77,11 +80,12 @@ def solve_inequalities(F: Matrix, g: Vector) -> Solution:
     remainder = np.eye(size) - F
     minor, x, w = _eliminate(remainder, g, right)
     loop_gain = np.asarray(1 - minor)
-    is_small = loop_gain < 1
+    is_small, failing = loop_gain < 1, np.zeros(minor.shape, dtype=np.int64)
     if not is_small.all():  # the elimination ends too early there
         large = ~is_small
         with np.errstate(invalid="ignore"):
             minors = [np.linalg.det(remainder[large][..., :k, :k]) for k in range(1, size + 1)]
+        failing[large] = (np.stack(minors, axis=-1) <= 0).argmax(axis=-1)
         diagonal = np.diagonal(F[large], axis1=-2, axis2=-1)
         gains = np.concatenate([1 - np.min(minors, axis=0)[..., None], diagonal], axis=-1)
         is_finite = np.isfinite(gains).all(axis=-1)
@@ -94,7 +98,7 @@ def solve_inequalities(F: Matrix, g: Vector) -> Solution:
     largest = np.maximum((shortfall / slack).max(axis=-1, keepdims=True), 0.0)
     bound = np.where(F.any(axis=-1), x + w * largest * (1 + rounding), g)
     confirmed = is_small & (w > 0).all(axis=-1) & (slack > 0).all(axis=-1)
-    return Solution(loop_gain, np.where(confirmed[..., None], bound, np.inf))
+    return Solution(loop_gain, np.where(confirmed[..., None], bound, np.inf), failing)
 
 
 def _apply(F: Matrix, v: Vector) -> Vector:
@@ -138,13 +142,15 @@ class LoopConstants(NamedTuple):
     received_input_error: Vector
     earlier_input_error: Vector
     """The part of the input error that does not come from the present e_s."""
+    failing: Counts
+    """The first signal without a bound, where there is no certificate: see :class:`Solution`."""
     exists: NDArray[np.bool_]
-    """Where there is a certificate; of the others only ``loop_gain`` is of use."""
+    """Where there is a certificate; of the others only ``loop_gain`` and ``failing`` are of use."""
 
     def of_loop(self, loop: int, rate_per_s: float, inter_event_s: float | None) -> Constants:
         """Return the constants of one loop."""
         fields = {name: values[loop].item() for name, values in self._asdict().items()}
-        del fields["exists"], fields["earlier_input_error"]
+        del fields["exists"], fields["failing"], fields["earlier_input_error"]
         fields["present_input_error"] = fields["received_input_error"]
         return Constants(rate_per_s=rate_per_s, inter_event_s=inter_event_s, **fields)
 
@@ -152,8 +158,9 @@ class LoopConstants(NamedTuple):
 def _without_bounds(events: Counts) -> LoopConstants:
     """Return that loops have no certificate, because their missing events are too many."""
     infinite = np.full(len(events), np.inf)
-    names = [name for name in LoopConstants._fields if name not in ("missing_events", "exists")]
-    return LoopConstants(missing_events=events, exists=infinite < 0, **dict.fromkeys(names, infinite))
+    names = [name for name in LoopConstants._fields if name not in ("missing_events", "failing", "exists")]
+    others = dict.fromkeys(names, infinite)
+    return LoopConstants(missing_events=events, failing=0 * events, exists=infinite < 0, **others)
 
 
 class ErrorInequalities:
@@ -200,26 +207,31 @@ class ErrorInequalities:
         if not is_counted.any():
             return _without_bounds(events)
         solved = self._solutions(method, np.where(is_counted, events, conditions.dropouts), inter_event_s)
-        smallest = np.min([bound for _, _, bound in solved], axis=0)
-        gain = np.where(is_counted, np.min([gain for _, gain, _ in solved], axis=0), np.inf)
+        smallest = np.min([solution.bound for _, solution in solved], axis=0)
+        gains = np.array([solution.loop_gain for _, solution in solved])
+        gain = np.where(is_counted, gains.min(axis=0), np.inf)
+        failing = _taken([solution.failing for _, solution in solved], gains.argmin(axis=0))
         by_bound = []
-        for signals, _, bound in solved:  # b differs from bound to bound
-            bound = np.where(UNIT_ROWS[Signal.AFTER_TEST] == 1, bound, smallest)
-            by_bound.append(self._implied_bounds(signals, events, gain, bound, is_counted))
+        for signals, solution in solved:  # b differs from bound to bound
+            bound = np.where(UNIT_ROWS[Signal.AFTER_TEST] == 1, solution.bound, smallest)
+            implied = self._implied_bounds(signals, events, gain, bound, is_counted)
+            by_bound.append(implied._replace(failing=failing))
         exists = np.any([constants.exists for constants in by_bound], axis=0)
         return LoopConstants(*map(np.fmin.reduce, zip(*by_bound, strict=True)))._replace(exists=exists)
 
     def _solutions(
         self, method: BoundMethod, events: Counts, inter_event_s: Vector
-    ) -> list[tuple[SignalRows, Vector, Matrix]]:
-        """Return the signals, the loop gains and the bounds of all signals for each bound of e_s."""
+    ) -> list[tuple[SignalRows, Solution]]:
+        """Return the signals, and what bounds them all, for each bound of e_s."""
         solved = []
         for growths in self._growths:  # all bounds of e_s hold; of each, one growth applies
             own_growth = growths[0] if len(growths) == 1 and self._error.decays else None
             signals = self._error_rows.signals(method, events, inter_event_s, own_growth)
             solutions = [self._solve_for_growth(signals, growth, own_growth) for growth in growths]
-            gain = np.max([solution.loop_gain for solution in solutions], axis=0)
-            solved.append((signals, gain, np.max([solution.bound for solution in solutions], axis=0)))
+            gains = np.array([solution.loop_gain for solution in solutions])
+            failing = _taken([solution.failing for solution in solutions], gains.argmax(axis=0))
+            bound = np.max([solution.bound for solution in solutions], axis=0)
+            solved.append((signals, Solution(gains.max(axis=0), bound, failing)))
         return solved
 
     def _implied_bounds(
@@ -247,6 +259,7 @@ class ErrorInequalities:
             estimation_error=estimation,
             received_input_error=_product(signals.received, solved) + age_input,
             earlier_input_error=_product(signals.earlier, solved) + age_input,
+            failing=0 * events,
             exists=np.isfinite(solved).all(axis=-1) & is_counted,
         )
         return LoopConstants._make(np.broadcast_to(values, events.shape) for values in constants)
@@ -341,6 +354,11 @@ class ErrorInequalities:
         if (grid_s := self._conditions.spacing_s) == 0:
             return np.asarray(next_event_s)
         return np.asarray(grid_s * np.maximum(np.ceil(next_event_s / grid_s - 1e-9), 1.0))
+
+
+def _taken(values: Sequence[Counts], index: Counts) -> Counts:
+    """Return of several values of each loop, (loops,) each, that of an index, (loops,)."""
+    return np.asarray(np.take_along_axis(np.stack(values), index[None], axis=0)[0])
 
 
 def _product(row: Vector, column: Vector) -> Vector:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from typing import NamedTuple
 
+from noack.core.number_format import at_least
 from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.certificates.scenario_certificates import CertificateScope
 
@@ -21,6 +22,8 @@ _USUAL_S = 1e-3
 """Tried first, if the schedule's time is 0."""
 _RESOLUTION = 1e-3
 """Relative accuracy of a limit."""
+_DIGITS, _SHORTER = 3, (0.0, 0.01, 0.02, 0.05)
+"""Digits of a limit that is printed; by which shares smaller times are tried in its place."""
 _WIDER, _NEXT = 4.0, 1.2
 """Factors from a time to the next one until the limit is enclosed: without a guess, and at least."""
 _BISECTION_EVERY = 6
@@ -41,11 +44,16 @@ class NetworkLimits(NamedTuple):
 
 
 def network_limits(scope: CertificateScope, scheduled: NetworkConditions) -> NetworkLimits:
-    """Return the limits for some plants; 0 means that there is no certificate at any time."""
-    sampling_s = None if scope.has_observer else network_limit(scope, scheduled, "sampling")
-    return NetworkLimits(
-        sampling_s, network_limit(scope, scheduled, "delay"), network_limit(scope, scheduled, "hold")
-    )
+    """Return the limits for some plants, of three digits; 0: there is no certificate at any time.
+
+    Each was tried as it is returned.
+    """
+
+    def tried_s(quantity: str) -> float:
+        return network_limit(scope, scheduled, quantity, is_short=True)
+
+    sampling_s = None if scope.has_observer else tried_s("sampling")
+    return NetworkLimits(sampling_s, tried_s("delay"), tried_s("hold"))
 
 
 _CHANGES: dict[str, Callable[[NetworkConditions, float], NetworkConditions]] = {
@@ -56,9 +64,12 @@ _CHANGES: dict[str, Callable[[NetworkConditions, float], NetworkConditions]] = {
 }
 
 
-def network_limit(scope: CertificateScope, scheduled: NetworkConditions, quantity: str) -> float:
+def network_limit(
+    scope: CertificateScope, scheduled: NetworkConditions, quantity: str, *, is_short: bool = False
+) -> float:
     """Return the limit of one of the times ``sampling``, ``delay``, ``hold`` and ``start``, in s.
 
+    ``is_short``: one of three digits that was tried, that of the schedule if there is no larger one.
     0 means that there is no certificate at any time. With an observer, a sampling period other than
     its own needs another gain, about which this says nothing.
     """
@@ -75,7 +86,12 @@ def network_limit(scope: CertificateScope, scheduled: NetworkConditions, quantit
         shorter_s = _with_late_tests_s(value_s, scope.test_times_s)
         return max(map(gain_at, (value_s, *(t_s for t_s in shorter_s if t_s > usual_s))))
 
-    return largest_stable_time_s(gain_up_to, usual_s)
+    limit_s = largest_stable_time_s(gain_up_to, usual_s)
+    if not is_short or limit_s in (0.0, MOST_S):
+        return limit_s
+    # The gain need not grow with the time to the last digit.
+    shorter_s = (float(at_least((1 - share) * limit_s, _DIGITS)) for share in _SHORTER)
+    return next((time_s for time_s in shorter_s if time_s >= usual_s and gain_up_to(time_s) < 1), usual_s)
 
 
 def _with_late_tests_s(period_s: float, times_s: Sequence[float]) -> Iterator[float]:

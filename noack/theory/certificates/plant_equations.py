@@ -59,7 +59,8 @@ def linear_plant(resolved: Scenario) -> Scenario | None:
     if matrices is None:
         return None
     A, B = (tuple(map(tuple, matrix.tolist())) for matrix in matrices)
-    update = {"system": LinearSettings(), "A": A, "B": B, "uncertainty_A": None, "uncertainty_B": None}
+    update = {"system": LinearSettings(), "draw": "given", "A": A, "B": B}
+    update |= {"uncertainty_A": None, "uncertainty_B": None}
     return resolved.model_copy(update={"plant": plant.model_copy(update=update)})
 
 

@@ -27,11 +27,20 @@ from noack.theory.bounds.certificate_terms import (
 )
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.error_growth import LONGEST_S
-from noack.theory.bounds.gains import ErrorGains, PlantGains
+from noack.theory.bounds.gains import Counts, ErrorGains, PlantGains
 from noack.theory.certificates.deliveries.sharpened_constants import can_be_sharpened, sharpened_constants
-from noack.theory.certificates.error_rows import BoundMethod
+from noack.theory.certificates.error_rows import BoundMethod, Signal
 from noack.theory.certificates.inequalities import MOST_MISSING, ErrorInequalities, LoopConstants
 
+_FIRST_WITHOUT_BOUND = {
+    Signal.AGE_INPUT: "already the part of u − Kx from the age of the input reproduces itself",
+    Signal.AFTER_TEST: "already ‖e_s‖ at the tests reproduces itself",
+    Signal.ESTIMATION_ERROR: "already the error of the estimate reproduces itself",
+    Signal.INPUT_ERROR: "‖u − Kx‖ reproduces itself through updates that are lost, late or held",
+    Signal.MISMATCH: "‖u − Kx‖ reproduces itself through the difference of plant and model",
+    Signal.ONE: "no bound is confirmed",
+}
+"""What is said of the first signal that has no bound."""
 _INTER_EVENT_SETTLED = 1e-3
 """Relative change of δ at which the search for it ends."""
 _MOST_ROUNDS = 200
@@ -173,6 +182,8 @@ class _SmallestConstants(NamedTuple):
     """(loops,) that of the first part that has no certificate; the smaller one of both methods."""
     is_spaced: NDArray[np.bool_]
     """Where the assumed inter-event time is above 0, (loops,)."""
+    failing: Counts
+    """(loops,) of the part and the method of this loop gain: the first signal without a bound."""
 
     def of_loop(
         self, loop: int, rates_per_s: Sequence[float], inter_event_s: float | None
@@ -193,7 +204,11 @@ class _SmallestConstants(NamedTuple):
             )
         if gain < 1:
             raise NoCertificateError("its bounds are too large for floating point")
-        raise NoCertificateError(f"the loop gain of the errors is {apart_from(1, gain)}, not below 1", gain)
+        raise NoCertificateError(
+            f"the loop gain of the errors is {apart_from(1, gain)}, not below 1: "
+            f"{_FIRST_WITHOUT_BOUND[Signal(int(self.failing[loop]))]}",
+            gain,
+        )
 
 
 def _smallest_constants(
@@ -201,14 +216,18 @@ def _smallest_constants(
 ) -> _SmallestConstants:
     """Return the constants of all parts with the first method for e_c that has a certificate."""
     infinite = np.full(len(inter_event_s), np.inf)
-    best = _SmallestConstants((), infinite > 0, infinite < 0, infinite, inter_event_s > 0)
+    none = np.zeros(len(inter_event_s), dtype=np.int64)
+    best = _SmallestConstants((), infinite > 0, infinite < 0, infinite, inter_event_s > 0, none)
     for method in inequalities[0].methods:
         if not all(method in part.methods for part in inequalities):
             continue
         parts = [part.constants(inter_event_s, method) for part in inequalities]
-        exists, gain = np.ones(len(infinite), dtype=bool), infinite
+        exists, gain, failing = np.ones(len(infinite), dtype=bool), infinite, none
         for part in parts:
-            gain = np.where(exists & ~part.exists, part.loop_gain, gain)
+            is_first = exists & ~part.exists
+            gain, failing = (
+                np.where(is_first, new, old) for new, old in ((part.loop_gain, gain), (part.failing, failing))
+            )
             exists = exists & part.exists
         is_new = exists & ~best.exists
         drifts = np.where(is_new, method is BoundMethod.DRIFTING, best.drifts)
@@ -217,8 +236,15 @@ def _smallest_constants(
                 LoopConstants(*(np.where(is_new, *pair) for pair in zip(new, old, strict=True)))
                 for new, old in zip(parts, best.parts, strict=True)
             ]
-        gain = np.where(is_new | best.exists, best.loop_gain, np.minimum(gain, best.loop_gain))
-        best = best._replace(parts=parts, drifts=drifts, exists=best.exists | exists, loop_gain=gain)
+        is_smaller = ~(is_new | best.exists) & (gain < best.loop_gain)
+        best = _SmallestConstants(
+            parts,
+            drifts,
+            best.exists | exists,
+            np.where(is_smaller, gain, best.loop_gain),
+            best.is_spaced,
+            np.where(is_smaller, failing, best.failing),
+        )
         if best.exists.all():
             break
     return best

@@ -1,6 +1,9 @@
 """``noack certify``: its text and JSON output, and the figures quoted in the documentation."""
 
+import json
+import math
 import re
+from collections.abc import Sequence
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -18,8 +21,8 @@ from noack.core.errors import CallerError
 from noack.scenario.resolution import loop_of
 from noack.theory.bounds.certificate_terms import Constants
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.conditions import most_events
-from noack.theory.certificates.scenario_certificates import outside_box
+from noack.theory.certificates.conditions import OWN_PLANT, most_events
+from noack.theory.certificates.scenario_certificates import CertificateScope, outside_box
 from tests.helpers.command_line import invoke
 from tests.helpers.shipped import resolved, shipped
 
@@ -66,14 +69,23 @@ def test_the_documentation_quotes_computed_figures(lane: Certificates, weighted:
     least_ms = 1e3 * live.inter_event_s
     message = f"Δ = {live.delta:.3g}, X = {live.state:.3g} and δ = {least_ms:.0f} ms"
     assert message in " ".join(text.split())
-    sampling_s = weighted.limits.sampling_s
-    assert sampling_s is not None
-    assert f"sampling periods up to {1e3 * sampling_s:.3g} ms" in text
+    limits, plain = (certificates.limits_by_scope[OWN_PLANT] for certificates in (weighted, lane))
+    assert limits.sampling_s is not None
+    assert plain.sampling_s is not None
+    delay_s = weighted.largest_settings[0].values["certificate.network_delay_s"]
+    assert isinstance(delay_s, float)
+    for quoted in (
+        f"a certificate exists for sampling periods up to {1e3 * plain.sampling_s:.3g} ms",
+        f"it exists for sampling periods up to {1e3 * limits.sampling_s:.3g} ms",
+        f"for updates up to {1e3 * limits.delay_s:.3g} ms late",
+        f"with a network that delays them by {1e3 * delay_s:.3g} ms",
+    ):
+        assert quoted in " ".join(text.split())
 
 
 def test_an_observer_has_no_limit_of_the_sampling_period() -> None:
     gain = 'observer={kind="luenberger", gain=[[1.0], [100.0]]}'
-    limits = Certificates(resolved("pendulum_observed", gain), 2).limits
+    limits = Certificates(resolved("pendulum_observed", gain), 2).limits_by_scope[OWN_PLANT]
     assert limits.sampling_s is None
     assert limits.delay_s > 0.1
     # At 32 ms the observer is unstable, although e_s grows by less than with 65 ms between two tests.
@@ -141,7 +153,7 @@ def test_advice_names_only_what_helps() -> None:
     settings += ['network.impairments=[{kind="delay", delay_s=1.0}]']
     result = invoke("certify", "double_integrator", *(word for s in settings for word in ("--set", s)))
     _, _, last = " ".join(result.stdout.split()).rpartition("no certificate for the schedule, ")
-    assert "there is one with a total delay of updates of at most " in last
+    assert "there is one with certificate.network_delay_s = 0.5 " in last
     assert "rate_hz =" not in last
     assert "mansd" not in last
 
@@ -150,8 +162,111 @@ def test_advice_with_an_observer_leaves_its_period_alone() -> None:
     delay = 'network.impairments=[{kind="delay", delay_s=1.0}]'
     result = invoke("certify", "pendulum_observed", "--set", delay)
     _, _, last = " ".join(result.stdout.split()).rpartition("no certificate for the schedule, ")
-    assert "there is one with a total delay of updates of at most " in last
+    assert "there is one with certificate.network_delay_s = 0.1 " in last
     assert "rate_hz" not in last
+
+
+STICK = (
+    "model={A=[[0,1],[19.6,0]], B=[[0],[1]], gain=[[-40,-9]]}",
+    'plant={draw="given", A=[[0,1],[20.4,0]], B=[[0],[1]], initial_state=[0.1,0]}',
+    "trigger={beta=0.05, alpha_per_s=0.5}",
+    "network.mansd=3",
+)
+"""The loop of the tutorial."""
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [STICK, ("trigger={beta=0.02, alpha_per_s=0.3}",), ('trigger={policy="absolute", delta=0.1}',)],
+)
+def test_the_largest_settings_are_certified_and_the_next_ones_are_not(settings: Sequence[str]) -> None:
+    """Waits for clocks, and whole numbers of steps, come between a time of the schedule and a setting."""
+    certificates = certificates_of(shipped("unstable_pendulum", *settings))
+    keys = set()
+    for tried in certificates.largest_settings:
+        [(key, value)] = tried.values.items()
+        assert isinstance(value, float | int)
+        keys.add(key)
+        step = 1 if isinstance(value, int) else 10.0 ** (math.floor(math.log10(value)) - 2)
+        certified = [
+            certificates_of(shipped("unstable_pendulum", *settings, f"{key}={other:.12g}")).schedule.exists
+            for other in (value, value + 2 * step)
+        ]
+        assert certified == [True, False], (key, value)
+    assert keys == {"certificate.network_delay_s", "plant.measure_every"}
+
+
+def test_the_tutorial_names_the_largest_settings() -> None:
+    [delay, period] = certificates_of(shipped("unstable_pendulum", *STICK)).largest_settings
+    text = " ".join((ROOT / "docs/tutorial.md").read_text().split())
+    assert delay.text in text
+    assert period.text in text
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("unstable_pendulum", 'network.impairments=[{kind="delay",delay_s=0.3}]'),
+        ("lane_following", "plant.measure_every=100"),
+        ("double_integrator", 'trigger={policy="relative",sigma=0.9}'),
+        ("lane_periodic",),
+        ("sine_pendulum", "network.mansd=12"),
+        ("unstable_pendulum", 'network.impairments=[{kind="rate",rate_bps=400000,queue=100}]'),
+    ],
+)
+def test_advised_settings_have_a_certificate(words: Sequence[str]) -> None:
+    name, *settings = words
+    results = certificates_of(shipped(name, *settings), of_model=True)
+    assert not results.answer.is_certified
+    assert results.helpful_settings
+    for tried in results.helpful_settings:
+        changed = [f"{key}={json.dumps(value)}" for key, value in tried.values.items()]
+        again = certificates_of(shipped(name, *settings, *changed), of_model=True)
+        assert again.answer.is_certified, tried.text
+
+
+def test_an_advised_box_has_a_certificate() -> None:
+    results = certificates_of(shipped("double_integrator", "plant.uncertainty_B=[[0.0],[0.9]]"))
+    tried = results.helpful_box
+    assert tried is not None
+    assert tried.text == "plant.uncertainty_B times 0.2, entry by entry"
+    changed = [f"{key}={json.dumps(value)}" for key, value in tried.values.items()]
+    box = certificates_of(shipped("double_integrator", *changed)).schedule_box
+    assert box is not None
+    assert box.exists
+
+
+def test_a_limited_number_of_settings_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    results = Certificates(resolved("lane_periodic"), 2)
+    tried: list[float] = []
+    monkeypatch.setattr(CertificateScope, "loop_gain", lambda *_: tried.append(1) or 2.0)
+    assert not results.helpful_settings
+    assert len(tried) <= 24
+
+
+def test_where_no_delay_is_known_no_limit_is_searched(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A full queue is an hour long, and a search takes minutes."""
+    monkeypatch.setattr("cosim.analysis.certificates.network_limits", None)
+    queue = 'network.impairments=[{kind="rate",rate_bps=24000,queue=1000}]'
+    results = Certificates(resolved("double_integrator", queue), 2)
+    assert not results.schedule.exists
+    assert results.limits_by_scope == {}
+
+
+@pytest.mark.parametrize(
+    ("settings", "reason"),
+    [
+        (("plant.rate_hz=2", "controller.rate_hz=2"), "already the part of u − Kx from the age of the input"),
+        (('trigger={policy="relative",sigma=0.9}',), "already ‖e_s‖ at the tests reproduces itself"),
+        (
+            ("certificate.network_delay_s=1.8", "trigger.beta=0.5"),
+            "‖u − Kx‖ reproduces itself through updates that are lost, late",
+        ),
+    ],
+)
+def test_the_first_inequality_without_a_bound_is_named(settings: Sequence[str], reason: str) -> None:
+    void = Certificates(resolved("double_integrator", *settings), 2).schedule.void
+    assert reason in (void or "")
 
 
 def test_a_start_that_overflows_is_named() -> None:

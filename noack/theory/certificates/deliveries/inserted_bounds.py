@@ -255,7 +255,9 @@ class InsertedInequalities(ErrorInequalities):
         """Return the bounds of one loop; infinite without a certificate."""
         times_s, events = np.array([inter_event_s]), np.array([self._missing_events(inter_event_s)])
         solved = [
-            bound[0] for method in self.methods for _, _, bound in self._solutions(method, events, times_s)
+            solution.bound[0]
+            for method in self.methods
+            for _, solution in self._solutions(method, events, times_s)
         ]
         infinite = dict.fromkeys(self._states, math.inf), dict.fromkeys(self._error.outputs, math.inf)
         return KnownBounds(np.min(solved, axis=0), *infinite)

@@ -2,12 +2,19 @@
 
 import math
 from collections.abc import Callable
+from typing import cast
 
 import pytest
 
+from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.certificates.conditions import nominal_conditions
-from noack.theory.certificates.network_limits import MOST_S, largest_stable_time_s, network_limit
-from noack.theory.certificates.scenario_certificates import own_plant_scope
+from noack.theory.certificates.network_limits import (
+    MOST_S,
+    largest_stable_time_s,
+    network_limit,
+    network_limits,
+)
+from noack.theory.certificates.scenario_certificates import CertificateScope, own_plant_scope
 from tests.helpers.shipped import resolved
 
 GAINS: dict[str, Callable[[float], float]] = {
@@ -32,6 +39,27 @@ def test_the_limit_is_found_to_its_resolution(name: str, limit_s: float, usual_s
 
     assert (1 - 1.1e-3) * limit_s <= largest_stable_time_s(gain, usual_s) < limit_s
     assert len(tried) < 40
+
+
+class Bumpy:
+    """A scope whose loop gain is not below 1 at one time below its limit."""
+
+    has_observer, test_times_s = False, ()
+
+    def loop_gain(self, conditions: NetworkConditions) -> float:
+        longest_s = max(conditions.sampling_s, conditions.delay_s, conditions.hold_s)
+        return 1.1 if longest_s == 0.123 else longest_s / 0.1234
+
+
+def test_a_printed_limit_was_tried_as_it_is_printed() -> None:
+    scheduled = NetworkConditions(3, sampling_s=0.002, spacing_s=0.002, delay_s=0.006, hold_s=0.007)
+    scope = cast(CertificateScope, Bumpy())
+    for limit_s in network_limits(scope, scheduled):
+        assert limit_s is not None
+        assert limit_s == float(f"{limit_s:.3g}")
+        changed = scheduled._replace(sampling_s=limit_s)
+        assert scope.loop_gain(changed) < 1
+        assert 0.12 <= limit_s < 0.123
 
 
 def test_all_times_or_none_may_have_a_certificate() -> None:
