@@ -23,6 +23,7 @@ from noack.theory.certificates.conditions import (
     nominal_conditions,
     void_beforehand,
 )
+from noack.theory.certificates.network_limits import MOST_S
 from noack.theory.certificates.region import scopes
 from noack.theory.certificates.scenario_certificates import CertificateScope, box_scope
 
@@ -61,7 +62,7 @@ class Tried(NamedTuple):
         return f"{text} (the network must then delay no update by more)" if is_delay else text
 
 
-class _Trial(NamedTuple):
+class _ChangedScope(NamedTuple):
     """The plants and conditions of a scenario with other settings."""
 
     scope: CertificateScope
@@ -112,7 +113,7 @@ class SettingTrials:
         None if there is none. ``low`` has a certificate, and ``high`` has perhaps none.
         """
         step = 10.0 ** (math.floor(math.log10(high)) - 2)
-        found = list[tuple[float, _Trial]]()
+        found = list[tuple[float, _ChangedScope]]()
         while high - low > 1.5 * step and self.left > 0:
             value = to_digits((low + high) / 2)
             trial = self._trial({key: value})
@@ -124,7 +125,7 @@ class SettingTrials:
         largest = (value for value, trial in reversed(found[-2:]) if trial.is_certified)
         return next((Tried({key: value}) for value in largest), None)
 
-    def _trial(self, values: Values, *, box: bool = False) -> "_Trial | None":
+    def _trial(self, values: Values, *, box: bool = False) -> "_ChangedScope | None":
         """Return what is tried with some values; None if they are not legal, or cannot have a certificate."""
         try:
             changed = resolve(self._with(values))
@@ -137,7 +138,7 @@ class SettingTrials:
         if scope is None or void_beforehand(changed, conditions) is not None:
             return None
         self.left -= 1
-        return _Trial(scope, conditions)
+        return _ChangedScope(scope, conditions)
 
     def _with(self, values: Values) -> Scenario:
         content = self._content
@@ -186,13 +187,16 @@ def largest_settings(
     Args:
         resolved: the scenario, which has a certificate.
         late_periods: allowed lateness in steps of the plant.
-        delay_s: the largest certified delay of updates, with all waits.
-        sampling_s: the largest certified sampling period; None: another one needs another observer.
+        delay_s: the largest certified delay of updates, with all waits; ``MOST_S`` is any.
+        sampling_s: the largest certified sampling period, as well; None: another one needs another observer.
     """
     trials, present_s = SettingTrials(resolved, late_periods), float(certified_delay_s(resolved))
-    if delay_s > present_s and (tried := trials.largest("certificate.network_delay_s", present_s, delay_s)):
+    if present_s < delay_s < MOST_S and (
+        tried := trials.largest("certificate.network_delay_s", present_s, delay_s)
+    ):
         yield tried
-    most = math.floor((sampling_s or 0.0) * NS_PER_S / resolved.timing.plant_period_ns)
+    longest_s = 0.0 if sampling_s is None or sampling_s >= MOST_S else sampling_s
+    most = math.floor(longest_s * NS_PER_S / resolved.timing.plant_period_ns)
     fewer = range(most, max(most - 4, resolved.plant.measure_every), -1)
     if (tried := trials.first({"plant.measure_every": count} for count in fewer)) is not None:
         yield tried
