@@ -82,7 +82,7 @@ def finalize(ending: RunEnding, *, report: bool = True, view: bool = True, again
         if prepared is not None:
             stack.enter_context(closing(prepared))
         if not (scenario_file := run_dir / SCENARIO_FILE).exists():
-            raise MachineError(f"{scenario_file}: no such file")  # the run directory was replaced
+            raise MachineError(f"{scenario_file}: no such file; the run directory was deleted or replaced")
         is_complete = not (run_dir / SPOOL).is_dir() and (run_dir / RECORD).is_dir()
         # A recorder that completed its recording writes the reports afterwards.
         is_recorded = is_complete or (run_dir / REPORTS_FILE).is_file()

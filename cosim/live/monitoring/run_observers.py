@@ -56,7 +56,7 @@ class RunObservers:
             except Exception as error:  # the run is worth more than who follows it
                 self._observers.remove(observer)
                 name = type(observer).__name__
-                print_to_stderr(f"noack: warning: {name} follows the run no more: {one_line(error)}")
+                print_to_stderr(f"noack: warning: {name} no longer follows the run: {one_line(error)}")
 
 
 def observers_of_extensions(scenario: Scenario) -> list[RunObserver]:

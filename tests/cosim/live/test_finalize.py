@@ -150,7 +150,10 @@ def test_a_run_that_cannot_be_replayed_or_whose_directory_is_deleted_fails(
         finalize(ended_well(run_dir), report=False)
     assert not run_dir.exists()
     run_dir.mkdir()  # it was replaced
-    with pytest.raises(MachineError, match=r"^the run failed: it was moved\n.*: no such file$"):
+    with pytest.raises(
+        MachineError,
+        match=r"^the run failed: it was moved\n.*: no such file; the run directory was deleted or replaced$",
+    ):
         finalize(RunEnding(run_dir, 1, ExitStatus.FAILED, "it was moved", None))
 
 

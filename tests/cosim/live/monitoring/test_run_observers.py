@@ -46,7 +46,7 @@ def test_an_observer_that_fails_is_told_no_more_and_does_not_stop_the_others(
         observers.tell(lambda observer, report=report: observer.progress(report))
     assert (closed.times_s, wrong.times_s, well.times_s) == ([1.0], [1.0], [1.0, 2.0])
     # Of a closed output nobody reads a warning.
-    assert capsys.readouterr().err == "noack: warning: Follower follows the run no more: no number\n"
+    assert capsys.readouterr().err == "noack: warning: Follower no longer follows the run: no number\n"
 
 
 def test_an_installed_extension_follows_each_run(monkeypatch: pytest.MonkeyPatch) -> None:
