@@ -21,6 +21,7 @@ import numpy as np
 
 from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector
+from noack.core.number_format import apart_from
 from noack.theory.bounds.contraction import logarithmic_norm
 from noack.theory.bounds.enclosure import NotDecayingError, Outputs, ResponseBounds, response
 from noack.theory.bounds.gains import Coefficients, Columns, Output, PlantGains
@@ -177,8 +178,12 @@ class BoxGains(PlantGains):
         """Return sup|w|, (…, rows), from bounds of |(x, K x)| that were computed without w."""
         from_w = np.array([peaks.from_w for peaks in self._coordinates])
         loop = self._halfwidths @ from_w
-        if len(loop) and np.abs(np.linalg.eigvals(loop)).max() >= 1:
-            raise NotDecayingError("the plants differ too much from the model for the loop's gains")
+        gain = float(np.abs(np.linalg.eigvals(loop)).max(initial=0.0))
+        if not gain < 1:
+            raise NotDecayingError(
+                "the plants differ too much from the model: the loop gain of what differs is "
+                f"{apart_from(1, gain)}, not below 1"
+            )
         known = (coordinates @ self._halfwidths.T)[..., None]
         return np.asarray(np.linalg.solve(np.eye(len(loop)) - loop, known)[..., 0])
 

@@ -194,11 +194,11 @@ class ConstantsSearch:
         Raises:
             NotDecayingError: there are no such bounds.
         """
-        for share in _SHARES_OF_ALPHA:
+        for share in _SHARES_OF_ALPHA[:-1]:
             rate = share * alpha_per_s
             with contextlib.suppress(NotDecayingError):
                 return self._solve(conditions, rate, self._trigger.beta, None)
-        raise NotDecayingError("the plants differ too much from the model for the loop's gains")
+        return self._solve(conditions, _SHARES_OF_ALPHA[-1] * alpha_per_s, self._trigger.beta, None)
 
     def _solve(
         self,

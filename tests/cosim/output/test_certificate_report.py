@@ -269,6 +269,24 @@ def test_the_first_inequality_without_a_bound_is_named(settings: Sequence[str], 
     assert reason in (void or "")
 
 
+def test_linear_equations_are_certified_as_the_plant(tmp_path: Path) -> None:
+    """From any x(0), with the same bounds and the same advice as A and B in the scenario."""
+    (tmp_path / "own.py").write_text(
+        "class Own:\n    def derivative(self, t_s, z, u):\n        return [z[1], 20.4 * z[0] + u[0]]\n"
+    )
+    start = "plant.initial_state=[30.0,0.0]"
+    as_matrices = certificates_of(shipped("unstable_pendulum", *STICK, start))
+    system = f'{{kind="python", file="{tmp_path}/own.py", name="Own"}}'
+    own = f'plant={{draw="nominal", system={system}, initial_state=[30.0,0.0]}}'
+    certificates = certificates_of(shipped("unstable_pendulum", STICK[0], own, *STICK[2:]), of_model=True)
+    assert certificates.nonlinear is None
+    assert certificates.answer.is_certified
+    assert certificates.schedule.constants == as_matrices.schedule.constants
+    assert certificates.largest_settings == as_matrices.largest_settings
+    [statement] = certificates.witnesses().statements
+    assert 'plant.system.kind = "python": witnesses are for' in statement.reason
+
+
 def test_a_start_that_overflows_is_named() -> None:
     certificates = certificates_of(shipped("double_integrator", "plant.initial_state=[1e200, 0]"))
     reasons = {certificate.void for _, certificate in certificates}
