@@ -85,7 +85,7 @@ def certify(
     Exit status 1: nothing can be certified, not even under the paper's conditions; or --require
     is not met.
 
-    Takes two seconds; 10 s for a nonlinear plant; half a minute where events are due after many tests;
+    Takes two seconds; some 10 s for a nonlinear plant, or where events are due after many tests;
     with --witness some seconds to minutes more.
     """
     from cosim.analysis.certificates import certificates_of, in_chosen_norm
