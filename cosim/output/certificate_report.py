@@ -242,7 +242,7 @@ def _limit(value_s: float | None) -> str:
         return NONE
     if value_s <= 0:
         return "none"
-    return "any" if value_s >= MOST_S else duration_at_least(value_s)
+    return f"≥ {MOST_S:g} s" if value_s >= MOST_S else duration_at_least(value_s)
 
 
 _MARGIN_STYLES = {"stable": "green", "destabilised": "red", "undecided": "yellow"}

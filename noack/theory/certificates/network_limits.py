@@ -22,7 +22,7 @@ _USUAL_S = 1e-3
 """Tried first, if the schedule's time is 0."""
 _RESOLUTION = 1e-3
 """Relative accuracy of a limit."""
-_DIGITS, _SHORTER = 3, (0.0, 0.01, 0.02, 0.05)
+_DIGITS, _SHORTER = 3, (0.0, 0.02, 0.1)
 """Digits of a limit that is printed; by which shares smaller times are tried in its place."""
 _WIDER, _NEXT = 4.0, 1.2
 """Factors from a time to the next one until the limit is enclosed: without a guess, and at least."""
@@ -87,11 +87,15 @@ def network_limit(
         return max(map(gain_at, (value_s, *(t_s for t_s in shorter_s if t_s > usual_s))))
 
     limit_s = largest_stable_time_s(gain_up_to, usual_s)
-    if not is_short or limit_s in (0.0, MOST_S):
+    if not is_short or limit_s == 0:
         return limit_s
-    # The gain need not grow with the time to the last digit.
+
+    def is_certified(value_s: float) -> bool:
+        return gain_up_to(value_s) < 1 and scope.certificate(change(scheduled, value_s)).exists
+
+    # The gain need not grow with the time to the last digit, and other inequalities may fail first.
     shorter_s = (float(at_least((1 - share) * limit_s, _DIGITS)) for share in _SHORTER)
-    return next((time_s for time_s in shorter_s if time_s >= usual_s and gain_up_to(time_s) < 1), usual_s)
+    return next((time_s for time_s in shorter_s if time_s >= usual_s and is_certified(time_s)), usual_s)
 
 
 def _with_late_tests_s(period_s: float, times_s: Sequence[float]) -> Iterator[float]:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import cast
 
 import pytest
@@ -42,23 +43,31 @@ def test_the_limit_is_found_to_its_resolution(name: str, limit_s: float, usual_s
 
 
 class Bumpy:
-    """A scope whose loop gain is not below 1 at one time below its limit."""
+    """A scope without a certificate at 0.123 s, for its loop gain or ``other_reason``."""
 
     has_observer, test_times_s = False, ()
 
+    def __init__(self, *, other_reason: bool) -> None:
+        self.other_reason = other_reason
+
     def loop_gain(self, conditions: NetworkConditions) -> float:
         longest_s = max(conditions.sampling_s, conditions.delay_s, conditions.hold_s)
-        return 1.1 if longest_s == 0.123 else longest_s / 0.1234
+        return 1.1 if longest_s == 0.123 and not self.other_reason else longest_s / 0.1234
+
+    def certificate(self, conditions: NetworkConditions) -> SimpleNamespace:
+        return SimpleNamespace(exists=0.123 not in conditions)
 
 
-def test_a_printed_limit_was_tried_as_it_is_printed() -> None:
+@pytest.mark.parametrize("other_reason", [False, True])
+def test_a_printed_limit_was_certified_as_it_is_printed(other_reason: bool) -> None:
     scheduled = NetworkConditions(3, sampling_s=0.002, spacing_s=0.002, delay_s=0.006, hold_s=0.007)
-    scope = cast(CertificateScope, Bumpy())
+    scope = cast(CertificateScope, Bumpy(other_reason=other_reason))
     for limit_s in network_limits(scope, scheduled):
         assert limit_s is not None
         assert limit_s == float(f"{limit_s:.3g}")
         changed = scheduled._replace(sampling_s=limit_s)
         assert scope.loop_gain(changed) < 1
+        assert scope.certificate(changed).exists
         assert 0.12 <= limit_s < 0.123
 
 
