@@ -5,7 +5,7 @@
 
 import json
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -20,77 +20,83 @@ class RefusedError(ValueError):
 
 
 class Row(NamedTuple):
-    """A row of the table of keys."""
+    """A row of a table of keys."""
 
     use: str  # "used", "irrelevant" or "refused"
     reason: str
     unless: tuple[object, ...]
     """Values with which a refused key changes nothing; of a list, each entry is one of them."""
+    of: tuple[str, ...]
+    """The statements in which the key is refused; in all others it is used. Empty: in all."""
+
+
+class KeyTable:
+    """A table of keys, from a TOML file: by key, or by ``table.*`` for all keys of a table."""
+
+    def __init__(self, path: Path) -> None:
+        self.rows: dict[str, list[Row]] = {}
+        for use, groups in tomllib.loads(path.read_text(encoding="utf-8")).items():
+            for group in groups:
+                unless, of = tuple(group.get("unless", ())), tuple(group.get("of", ()))
+                for key in group["keys"]:
+                    self.rows.setdefault(key, []).append(Row(use, group.get("reason", ""), unless, of))
+
+    def rows_of(self, key: str) -> Sequence[Row]:
+        """Return the rows of a key such as ``trigger.beta``; empty: there is none.
+
+        A rule that another one contains has the keys of a trigger: ``trigger.rule.beta`` is ``trigger.beta``.
+        """
+        while key.startswith("trigger.rule."):
+            key = "trigger." + key.removeprefix("trigger.rule.")
+        parts = key.split(".")
+        names = [key, *(".".join(parts[:count]) + ".*" for count in range(1, len(parts) + 1))]
+        return next((self.rows[name] for name in names if name in self.rows), [])
+
+    def refusals(self, resolved: Table, of: Container[str] = ()) -> Iterator[tuple[str, str]]:
+        """Yield the keys of a resolved scenario that some statements do not cover, each with a line."""
+        for key, value in self._entries(resolved):
+            rows = self.rows_of(key)
+            if not rows:
+                yield key, f"{key}: no statement covers this key"
+            for row in rows:
+                is_asked = not row.of or any(statement in of for statement in row.of)
+                if row.use == "refused" and is_asked and not _is_harmless(value, row.unless):
+                    yield key, f"{key} = {_shown(value)}: {row.reason}"
+
+    def _entries(self, table: Table, prefix: str = "") -> Iterator[tuple[str, object]]:
+        """Yield the keys of all tables with their values; those of a list of tables without numbers."""
+        for key, value in table.items():
+            name = f"{prefix}{key}"
+            entries = value if isinstance(value, list) else [value]
+            tables = [entry for entry in entries if isinstance(entry, Mapping)]
+            if not value and isinstance(value, Mapping | list):
+                if not self._has_keys(name):
+                    yield name, value
+            elif len(tables) == len(entries):
+                for entry in tables:
+                    yield from self._entries(entry, f"{name}.")
+            else:
+                yield name, value
+
+    def _has_keys(self, name: str) -> bool:
+        """Return whether the table has a key of this name, or within it."""
+        return bool(self.rows_of(name)) or any(key.startswith(f"{name}.") for key in self.rows)
 
 
 @cache
-def rows() -> Mapping[str, Row]:
-    """Return the table: by key, or by ``table.*`` for all keys of a table."""
-    content = tomllib.loads(Path(__file__).with_name("keys.toml").read_text(encoding="utf-8"))
-    found: dict[str, Row] = {}
-    for use, groups in content.items():
-        for group in groups:
-            row = Row(use, group.get("reason", ""), tuple(group.get("unless", ())))
-            for key in group["keys"]:
-                if key in found:
-                    raise ValueError(f"keys.toml: {key} is there twice")
-                found[key] = row
-    return found
-
-
-def row_of(key: str) -> Row | None:
-    """Return the row of a key such as ``trigger.beta``; None: there is none.
-
-    A rule that another one contains has the keys of a trigger: ``trigger.rule.beta`` is ``trigger.beta``.
-    """
-    while key.startswith("trigger.rule."):
-        key = "trigger." + key.removeprefix("trigger.rule.")
-    parts = key.split(".")
-    names = [key, *(".".join(parts[:count]) + ".*" for count in range(1, len(parts) + 1))]
-    return next((rows()[name] for name in names if name in rows()), None)
+def key_table() -> KeyTable:
+    """Return the table of the statements of witnesses."""
+    return KeyTable(Path(__file__).with_name("keys.toml"))
 
 
 def refusals(resolved: Table) -> list[str]:
-    """Return a line for each key of a resolved scenario that no statement covers."""
+    """Return a line for each key of a resolved scenario that no statement of a witness covers."""
     knows_state = _get(resolved, "network", "initial_sync") == "known_state"
-    found = []
-    for key, value in _entries(resolved):
-        row = row_of(key)
-        if row is None:
-            found.append(f"{key}: unknown to the checker")
-        elif key == "controller.safe_input" and knows_state:
-            continue  # it is never applied
-        elif row.use == "refused" and not _is_harmless(value, row.unless):
-            found.append(f"{key} = {_shown(value)}: {row.reason}")
+    harmless = ["controller.safe_input"] if knows_state else []  # it is never applied
+    found = [line for key, line in key_table().refusals(resolved) if key not in harmless]
     if _get(resolved, "network", "impairments") and _get(resolved, "certificate", "network_delay_s") is None:
         found.append("certificate.network_delay_s: state the largest delay of updates in the network")
     return found
-
-
-def _entries(table: Table, prefix: str = "") -> Iterator[tuple[str, object]]:
-    """Yield the keys of all tables with their values; those of a list of tables without numbers."""
-    for key, value in table.items():
-        name = f"{prefix}{key}"
-        entries = value if isinstance(value, list) else [value]
-        tables = [entry for entry in entries if isinstance(entry, Mapping)]
-        if not value and isinstance(value, Mapping | list):
-            if not _has_keys(name):
-                yield name, value
-        elif len(tables) == len(entries):
-            for entry in tables:
-                yield from _entries(entry, f"{name}.")
-        else:
-            yield name, value
-
-
-def _has_keys(name: str) -> bool:
-    """Return whether the table of keys has a key of this name, or within it."""
-    return row_of(name) is not None or any(key.startswith(f"{name}.") for key in rows())
 
 
 def _is_harmless(value: object, unless: tuple[object, ...]) -> bool:

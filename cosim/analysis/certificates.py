@@ -16,7 +16,6 @@ from noack.core.number_format import NONE, TextRows, as_html, as_text, at_least,
 from noack.plants.linear import LinearSettings
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_tables import NOT_COVERED
 from noack.theory.bounds.enclosure import NotDecayingError, norm_bounds, response
 from noack.theory.bounds.gains import error_gains, sum_of_sups
 from noack.theory.certificates.assumptions import assumptions
@@ -28,14 +27,14 @@ from noack.theory.certificates.conditions import (
     about_setpoint,
     ideal_conditions,
     nominal_conditions,
-    void_at_setpoint,
-    void_by_setting,
 )
 from noack.theory.certificates.network_limits import NetworkLimits, network_limits
 from noack.theory.certificates.plant_equations import LinearEquations, linear_plant
+from noack.theory.certificates.refusals import refusal_under, refusals_at_setpoint
 from noack.theory.certificates.region import RegionScope
 from noack.theory.certificates.scenario_certificates import box_scope, own_plant_scope
 from noack.theory.certificates.trigger_weight import choose_weight
+from noack.theory.coverage import NOT_COVERED, refusals, require_certifiable
 from noack.theory.margins.loss_margin import LossMargin, Stability
 from noack.theory.paper import Theorem2, theorem_2
 from noack.trigger_policies.decaying import DecayingSettings
@@ -108,11 +107,10 @@ class Certificates:
         equations: Scenario | None = None,
     ) -> None:
         self._arguments = (scenario, late_periods, weight, given, nonlinear, equations)
-        scenario.coverage.require_constant()
-        scenario.coverage.require_certifiable()
-        self.setpoint, void = scenario.controller.setpoint, void_at_setpoint(scenario)
+        require_certifiable(scenario, "linear", "whole run")
+        self.setpoint, void = scenario.controller.setpoint, refusals_at_setpoint(scenario)
         if OWN_PLANT in void:
-            raise CallerError(f"controller.setpoint: {void[OWN_PLANT]}")
+            raise CallerError(void[OWN_PLANT])
         scenario = about_setpoint(scenario)
         self.scenario, self.weight, self.late_periods = scenario, weight, late_periods
         self.scheduled = nominal_conditions(scenario, late_periods)
@@ -123,8 +121,8 @@ class Certificates:
         self._scopes = [scope for scope in scopes if scope is not None]
         if nonlinear is not None:
             self.nonlinear = f'plant.system.kind = "{nonlinear.plant.system.kind}"'
-            self._no_region = void_at_setpoint(nonlinear).get(REGION)
-            if self._no_region is None and nonlinear.coverage.some_certificate_applies:
+            self._no_region = refusals_at_setpoint(nonlinear).get(REGION)
+            if self._no_region is None and not refusals(nonlinear):
                 self._scopes.append(RegionScope(nonlinear))
         self._certificates = [
             (under, scope.certificate(assumed))
@@ -244,8 +242,10 @@ class Certificates:
     def helpful_settings(self) -> list[Tried]:
         """Settings, each of which alone gives the scenario's own plant its missing certificate."""
         own, scenario = self.of_own_plant, self._own_scenario
-        if own is None or own.exists or own.void == void_by_setting(scenario, self.scheduled):
+        if own is None or own.exists:
             return []
+        if own.void == refusal_under(self.scheduled, scenario, own.scope, knows_delay=True):
+            return []  # whatever the others are
         [scope] = [scope for scope in self._scopes if scope.name == own.scope]
         if scope.decay_per_s["A + BK"] <= 0:  # it is unstable without losses
             return []

@@ -20,6 +20,7 @@ from cosim.simulation.continuous import (
 from noack.core.errors import NoackError
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, PLANT_STEP
 from noack.scenario.scenario import Scenario
+from noack.theory.coverage import require_exact
 
 _MORE_EVENTS = 10_000
 """The ideal loop has at most twice the events of the run, and these; an unstable one has any number."""
@@ -69,7 +70,7 @@ def compare_with_ideal(record: RunRecord, summary: LoopSummary) -> IdealLoopPart
 def _require(scenario: Scenario, summary: LoopSummary, *, complete: bool) -> None:
     """Raise an error unless the run is one of a loop with an exact simulation."""
     scenario.coverage.require_unchanging()
-    scenario.coverage.require_exact()
+    require_exact(scenario)
     watchdog, safe_input = summary.watchdog, scenario.controller.safe_input
     reasons = {
         "settings were changed during the run": bool(summary.changes),

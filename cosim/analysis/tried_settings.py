@@ -17,13 +17,9 @@ from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from noack.settings.section import Table
 from noack.theory.bounds.certificate_terms import NetworkConditions
-from noack.theory.certificates.conditions import (
-    about_setpoint,
-    certified_delay_s,
-    nominal_conditions,
-    void_beforehand,
-)
+from noack.theory.certificates.conditions import about_setpoint, certified_delay_s, nominal_conditions
 from noack.theory.certificates.network_limits import MOST_S
+from noack.theory.certificates.refusals import refusal_under
 from noack.theory.certificates.region import scopes
 from noack.theory.certificates.scenario_certificates import CertificateScope, box_scope
 
@@ -135,7 +131,7 @@ class SettingTrials:
         except (NoackError, ValueError):  # not a legal value, or a link that must overflow
             return None
         conditions = nominal_conditions(changed, self._late_periods)
-        if scope is None or void_beforehand(changed, conditions) is not None:
+        if scope is None or refusal_under(conditions, changed, scope.name) is not None:
             return None
         self.left -= 1
         return _ChangedScope(scope, conditions)

@@ -16,7 +16,9 @@ from noack.scenario.scenario import Scenario, loop_names, phases_ns
 from noack.scenario.scenario_file import dumps
 from noack.scenario.uneven_periods import uneven_periods
 from noack.theory.certificates.assumptions import assumptions
-from noack.theory.certificates.conditions import void_by_uneven_steps, with_stated_times
+from noack.theory.certificates.conditions import with_stated_times
+from noack.theory.certificates.refusals import refusal_of_steps
+from noack.theory.coverage import refusals
 from noack.trigger_policies.trigger_rule import CodedPolicy
 from plant_server.plant import system_of
 
@@ -79,8 +81,8 @@ def _check_loops(loaded: Scenario, *, json: bool) -> None:
 def _period_lines(resolved: Scenario) -> Iterator[str]:
     """Yield the periods that do not divide each other, and why they allow no certificate."""
     yield from uneven_periods(resolved)
-    why = void_by_uneven_steps(resolved)
-    if why is not None and resolved.coverage.uncertified_setting is None:
+    why = refusal_of_steps(resolved)
+    if why is not None and not refusals(resolved, "linear"):
         yield f"no certificate: {why}"
 
 

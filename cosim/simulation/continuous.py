@@ -44,6 +44,7 @@ from noack.core.linear_systems import Matrix, Vector
 from noack.protocol.record_tables import Fate
 from noack.scenario.resolution import LoopMatrices, loop_of, rule_of
 from noack.scenario.scenario import Scenario
+from noack.theory.coverage import require_exact
 from noack.trigger_policies.trigger_rule import TriggerRule
 
 
@@ -166,7 +167,7 @@ def continuous_loop_of(resolved: Scenario) -> ContinuousLoop:
     """
     try:
         resolved.coverage.require_unchanging()
-        resolved.coverage.require_exact()
+        require_exact(resolved)
     except CallerError as error:
         raise CallerError(f"in continuous time: {error}") from None
     return ContinuousLoop(loop_of(resolved), rule_of(resolved))

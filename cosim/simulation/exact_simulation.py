@@ -25,6 +25,7 @@ from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
 from noack.scenario.resolution import loop_of, rule_of
 from noack.scenario.scenario import Scenario
+from noack.theory.coverage import require_exact
 from noack.trigger_policies.trigger_rule import TriggerRule, fill_rule
 
 ROW = dtype_of("noack_exact_row")
@@ -310,7 +311,7 @@ def setting_of(resolved: Scenario) -> Setting:
         CallerError: exact simulation does not support the scenario.
     """
     resolved.coverage.require_unchanging()
-    resolved.coverage.require_exact()
+    require_exact(resolved)
     loop = loop_of(resolved)
     return Setting(
         H=loop.H,

@@ -128,7 +128,7 @@ class ScenarioTables(ScenarioSection):
 
     @property
     def coverage(self) -> "TheoryCoverage":
-        """The parts of the theory that apply to it."""
+        """What theory and simulation ask of it."""
         return TheoryCoverage(self)
 
     @property
@@ -326,18 +326,9 @@ class MessageSizes:
         }[flow]
 
 
-NOT_COVERED = "; no certificate covers this"
-"""End of the message about a setting that no certificate covers."""
-UNCERTIFIED_ACKNOWLEDGEMENTS = (
-    "x_s is reset only when an acknowledgement returns, so ‖e_s‖ exceeds the threshold while the "
-    "sensor waits, and (I1), on which every bound rests, does not hold"
-)
-"""The reason why the baseline with acknowledgements has no certificate."""
-
-
 @dataclass(frozen=True)
 class TheoryCoverage:
-    """The theorems of the paper, certificates and exact simulation that cover a scenario."""
+    """What theory and simulation ask of a scenario; noack/theory/coverage.py has what they cover."""
 
     scenario: ScenarioTables
 
@@ -357,84 +348,9 @@ class TheoryCoverage:
         return self.scenario.observer is None and not self.scenario.plant.measurement.is_noisy
 
     @property
-    def linear_certificates_apply(self) -> bool:
-        """Whether certificates of linear plants apply; the paper's theorems need its trigger as well."""
-        return self.uncertified_setting is None
-
-    @property
-    def some_certificate_applies(self) -> bool:
-        """Whether certificates apply: those of linear plants, or that of a plant on a region."""
-        return self.beyond_certificates is None
-
-    @property
-    def beyond_certificates(self) -> str | None:
-        """The first setting that no certificate covers, also none on a region; None if one may."""
-        return self._beyond_any_certificate or self.scenario.trigger.beyond_exact
-
-    @property
     def is_undisturbed(self) -> bool:
         """Whether nothing disturbs the plant, and the sensor measures x."""
         return self.knows_state and not self.scenario.plant.disturbances
-
-    @property
-    def uncertified_setting(self) -> str | None:
-        """The first setting that certificates of linear plants do not cover; None if all are covered."""
-        return self._beyond_certificates or self.scenario.trigger.beyond_exact
-
-    @property
-    def _beyond_certificates(self) -> str | None:
-        """The first setting besides the trigger that certificates of linear plants do not cover."""
-        if not self.is_linear and not self.scenario.protocol.acknowledges:
-            kind = self.scenario.plant.system.kind
-            return f'plant.system.kind = "{kind}": the plant is not linear'
-        return self._beyond_any_certificate
-
-    @property
-    def _beyond_any_certificate(self) -> str | None:
-        """The first setting besides plant and trigger that no certificate covers."""
-        scenario = self.scenario
-        if scenario.protocol.acknowledges:
-            return f'network.protocol = "ack": {UNCERTIFIED_ACKNOWLEDGEMENTS}'
-        if not scenario.controller.is_linear:
-            return f'controller.kind = "{scenario.controller.kind}": u is not K x_c'
-        if scenario.controller.update_timeout_s is not None:
-            return "controller.update_timeout_s: without a recent update, u is not K x_c"
-        return self._beyond_actuation
-
-    @property
-    def _beyond_actuation(self) -> str | None:
-        """The reason why the age of the applied input has no bound, or the watchdog replaces the input."""
-        timing, policy = self.scenario.timing, self.scenario.plant.watchdog.policy
-        if (gap_ns := timing.actuation_gap_ns) is None:
-            return (
-                "network.actuation: without mansd or constraints, the age of the applied input has no bound"
-            )
-        oldest_ns = timing.controller_period_ns + gap_ns
-        if gap_ns and policy != "hold" and timing.actuation_timeout_ns < oldest_ns:
-            return (
-                f'plant.watchdog.policy = "{policy}": it replaces the input after '
-                f"{timing.actuation_timeout_ns / NS_PER_S:g} s, and an actuation may be "
-                f"{oldest_ns / NS_PER_S:g} s old; use more controller.predictions, or a longer "
-                "plant.watchdog.timeout_s"
-            )
-        return None
-
-    @property
-    def _beyond_linear(self) -> str | None:
-        """The first setting besides the trigger with which the loop is not ẋ = A x + B K x_c."""
-        scenario = self.scenario
-        if (reason := self._beyond_certificates) is not None:
-            return reason
-        if scenario.network.actuation is not None:
-            return "network.actuation: actuations may be lost or late"
-        if scenario.plant.disturbances:
-            kinds = ", ".join(disturbance.kind for disturbance in scenario.plant.disturbances)
-            return f"plant.disturbances ({kinds}): the plant is disturbed"
-        if scenario.observer is not None:
-            return f'observer.kind = "{scenario.observer.kind}": the state is estimated'
-        if scenario.plant.measurement.is_noisy:
-            return "plant.measurement: the state is measured with noise"
-        return None
 
     def require_constant(self) -> None:
         """Raise CallerError if the settings change."""
@@ -457,18 +373,3 @@ class TheoryCoverage:
             return
         key = "controller.predictions" if direct else "network.actuation"
         raise CallerError(f"{key}: needs actuations that reach the plant at once and carry one input")
-
-    def require_certifiable(self) -> None:
-        """Raise CallerError if no certificate covers the scenario."""
-        if (reason := self.uncertified_setting) is not None:
-            raise CallerError(f"{reason}{NOT_COVERED}")
-
-    def require_exact(self) -> None:
-        """Raise CallerError if exact simulation does not cover the scenario."""
-        if (reason := self._beyond_linear) is not None:
-            raise CallerError(
-                f"{reason}; this needs a linear plant with u = K x_c, without acknowledgements, "
-                "lost actuations, disturbances, noise and observer"
-            )
-        if (reason := self.scenario.trigger.beyond_exact) is not None:
-            raise CallerError(reason)

@@ -11,6 +11,8 @@
    signals.
 5. ``random_losses``: what holds if nothing limits the number of consecutive losses.
 
+``coverage.py`` and ``keys.toml`` say which settings of a scenario all this covers.
+
 The docstring of each part has its chain of arguments. Labels such as eq:LossEv3 are those of the
 paper's source. docs/theory.md states the results, docs/derivations.md has the proofs and a table of
 the files. Modules are imported in the order bounds, paper, certificates and margins,

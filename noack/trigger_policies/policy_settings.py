@@ -43,6 +43,8 @@ class PolicySettings(ScenarioSection):
     """Keys of the example, which :meth:`example` returns."""
     at_start_only: ClassVar[tuple[str, ...]] = ()
     """Keys that describe the start of a run and cannot change later."""
+    is_rule: ClassVar[bool] = True
+    """Whether the policy is a trigger rule; else it is code."""
 
     policy: str
 
@@ -73,11 +75,6 @@ class PolicySettings(ScenarioSection):
     @abstractmethod
     def description(self) -> str:
         """The condition under which the sensor transmits, in one line."""
-
-    @property
-    def beyond_exact(self) -> str | None:
-        """Why exact simulation cannot apply the policy; None if it can."""
-        return None
 
     def check(self, n: int, why: str) -> None:
         """Require matrices of the right shapes for n states.
@@ -169,7 +166,7 @@ class CombinedSettings(PolicySettings):
     @field_validator("rule")
     @classmethod
     def _check_rule(cls, rule: PolicySettings) -> PolicySettings:
-        if rule.beyond_exact is not None:
+        if not rule.is_rule:
             raise ValueError(f'"{rule.policy}" cannot be combined; let the class test the interval')
         return rule
 

@@ -16,7 +16,7 @@ from noack.settings.user_files import ClassSettings, UserCode, new_instance, rea
 from noack.trigger_policies.policy_settings import ModelMatrices, WeightedSettings
 from noack.trigger_policies.trigger_rule import CodedPolicy, TriggerDecision
 
-_BEYOND_EXACT = (
+_NO_RULE = (
     'trigger.policy: needs a policy that is a rule; this scenario has "python", a class that '
     "decides at measurements only"
 )
@@ -29,20 +29,17 @@ class PythonTriggerSettings(ClassSettings, WeightedSettings):
     """
 
     group: ClassVar = "noack.triggers"
+    is_rule: ClassVar = False
 
     policy: Literal["python"]
 
     def trigger_policy(self, model: ModelMatrices) -> CodedPolicy:
-        return CodedPolicy(self.weight_matrix, partial(PythonTrigger, self), _BEYOND_EXACT)
+        return CodedPolicy(self.weight_matrix, partial(PythonTrigger, self), _NO_RULE)
 
     @property
     def description(self) -> str:
         file = "" if self.file is None else f" of {Path(self.file).name}"
         return f"the class {self.name}{file} decides"
-
-    @property
-    def beyond_exact(self) -> str:
-        return _BEYOND_EXACT
 
 
 class PythonTrigger:

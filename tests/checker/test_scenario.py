@@ -12,13 +12,9 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.scenario.resolution import loop_of, rule_of
 from noack.scenario.scenario import Scenario
-from noack.theory.certificates.conditions import (
-    about_setpoint,
-    allowed_conditions,
-    ideal_conditions,
-    void_at_setpoint,
-)
-from noack_check.keys import RefusedError, refusals, rows
+from noack.theory.certificates.conditions import about_setpoint, allowed_conditions, ideal_conditions
+from noack.theory.certificates.refusals import refusals_at_setpoint
+from noack_check.keys import RefusedError, key_table, refusals
 from noack_check.loop import Loop
 from noack_check.scenario import read_loop
 from tests.helpers.resolved_tables import first_loop, resolved_tables, tables_of
@@ -206,11 +202,11 @@ def test_the_setpoint_is_moved_to_0() -> None:
 def test_setpoints_that_noack_does_not_cover_are_refused() -> None:
     uncertain = ("controller.setpoint=[2.0, 0.0]", "plant.uncertainty_A=[[0.1, 0.0], [0.0, 0.0]]")
     resolved = first_loop("double_integrator", *uncertain)
-    assert list(void_at_setpoint(resolved)) == ["every plant of the uncertainty box"]
+    assert list(refusals_at_setpoint(resolved)) == ["every plant of the uncertainty box"]
     with pytest.raises(RefusedError, match=r"controller.setpoint: not every plant"):
         read_loop(tables_of(resolved), box=True, ideal=False)
     pendulum = first_loop("unstable_pendulum", "controller.setpoint=[0.1, 0.0]")
-    assert len(void_at_setpoint(pendulum)) == 2
+    assert len(refusals_at_setpoint(pendulum)) == 2
     with pytest.raises(RefusedError, match=r"controller.setpoint: it needs an input"):
         read_loop(tables_of(pendulum), box=False, ideal=False)
 
@@ -285,8 +281,8 @@ def test_the_keys_that_the_table_calls_used_are_those_that_are_read() -> None:
         read_loop(Recorded(tables, read), box=True, ideal=False)
     tables = resolved_tables("double_integrator", "controller.setpoint=[2.0, 0.0]")
     read_loop(Recorded(tables, read), box=False, ideal=False)
-    used = {key for key, row in rows().items() if row.use == "used"}
+    used = {key for key, (row, *_) in key_table().rows.items() if row.use == "used"}
     assert used <= read | {"network.initial_sync"}
-    refused = {key for key, row in rows().items() if row.use == "refused"}
-    inner = {key.removesuffix(".*") for key in rows()}
+    refused = {key for key, (row, *_) in key_table().rows.items() if row.use == "refused"}
+    inner = {key.removesuffix(".*") for key in key_table().rows}
     assert {key for key in read if key in inner} - refused - used <= {"network.impairments"}

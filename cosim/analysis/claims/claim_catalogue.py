@@ -19,6 +19,7 @@ from noack.core.number_format import at_most
 from noack.core.row_operations import row_norms
 from noack.theory.bounds.certificate_terms import Constants
 from noack.theory.certificates.certified_bounds import ScenarioCertificate, envelope_formula
+from noack.theory.coverage import refusals
 
 _LEAST_MARGIN, _LARGEST_MARGIN = 1e-9, 1e-6
 """Limits of the relative rounding error that is allowed in (I1)."""
@@ -231,7 +232,7 @@ def theorem_1_controller_error(run: RunEvidence, samples: Samples) -> ClaimBound
     """Theorem 1 with the Δ of the trajectory."""
     scenario = run.record.scenario
     coverage = scenario.coverage
-    is_covered = coverage.linear_certificates_apply and coverage.is_undisturbed and coverage.is_decaying
+    is_covered = not refusals(scenario, "linear") and coverage.is_undisturbed and coverage.is_decaying
     if not is_covered or scenario.decaying.floor > 0 or (delta := run.trajectory_delta) is None:
         return ClaimBound()
     level = scenario.decaying.beta * np.exp(-scenario.decaying.alpha_per_s * samples.t_s)

@@ -32,8 +32,10 @@ from noack.core.number_format import at_least, at_most
 from noack.scenario.resolution import setpoint_of
 from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.conditions import BOX, OWN_PLANT, void_at_setpoint
+from noack.theory.certificates.conditions import BOX, OWN_PLANT
+from noack.theory.certificates.refusals import refusals_at_setpoint
 from noack.theory.certificates.scenario_certificates import outside_box
+from noack.theory.coverage import refusal, refusals
 
 _IDEAL_LOOP = "assumes a continuous trigger, and a network and input without delay, which no sampled loop has"
 _ACKNOWLEDGED = (
@@ -204,7 +206,7 @@ class RunClaims:
     ) -> RunEvidence:
         changes = [change.first_ns for change in changes_of(self._checked_record) if change.touches_claims]
         until_s = changes[0] * 1e-9 if changes else math.inf  # as the times of samples are computed
-        void = void_at_setpoint(self.record.scenario, knows_start=True)
+        void = refusals_at_setpoint(self.record.scenario, knows_inputs=True)
         return RunEvidence(record, self.record, until_s, error, void, certificates, offset)
 
     @property
@@ -220,7 +222,7 @@ class RunClaims:
     @property
     def allowed(self) -> NetworkConditions | None:
         """The conditions of the scenario's certificates; None if it can have none."""
-        return self.evidence.allowed if self.record.scenario.coverage.some_certificate_applies else None
+        return None if refusals(self.record.scenario) else self.evidence.allowed
 
     @property
     def certified_for(self) -> NetworkConditions | None:
@@ -238,7 +240,7 @@ class RunClaims:
         if self.record.scenario.protocol.acknowledges:
             return [void_claim("x_c − x_s is the sum of the missed jumps", "(I1)", _ACKNOWLEDGED)]
         claims: list[Claim] = []
-        if (uncovered := self.record.scenario.coverage.beyond_certificates) is not None:
+        if (uncovered := refusal(self.record.scenario)) is not None:
             claims.append(void_claim(f"a certificate for {OWN_PLANT}", "certificate", uncovered))
         for certificate in (None, *self.certified_evidence.certificates):
             if certificate is not None and not certificate.exists:

@@ -12,6 +12,7 @@ from noack.runtime.host_clocks import RECEIVED, causality_text
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.certificates.conditions import ideal_conditions
+from noack.theory.coverage import refusals
 
 _TOLERANCE_S = 1e-9
 """Times in seconds have rounding errors below this."""
@@ -276,7 +277,7 @@ def causes_of(scenario: Scenario) -> Collection[str]:
     """
     if scenario.protocol.acknowledges:
         return ()
-    if not scenario.coverage.some_certificate_applies:
+    if refusals(scenario):
         return ("sampling", *CLOCK_CAUSES)
     return (*guarantee_causes(scenario), *CAUSES)
 

@@ -49,6 +49,7 @@ from noack.theory.certificates.certified_bounds import (
 )
 from noack.theory.certificates.conditions import allowed_conditions, ideal_conditions, nominal_conditions
 from noack.theory.certificates.scenario_certificates import certify
+from noack.theory.coverage import refusals
 from noack.theory.paper import Theorem2, theorem_2
 
 ROUNDING = 1e-9
@@ -343,7 +344,7 @@ class RunEvidence:
         """Theorem 2 with (I1)'s uniform Δ under the paper's conditions; None if there is no Δ."""
         scenario, loop = self.record.scenario, self.record.loop
         if (
-            not scenario.coverage.linear_certificates_apply
+            refusals(scenario, "linear")
             or not scenario.coverage.is_undisturbed
             or not scenario.coverage.is_decaying
             or loop.weight is not None

@@ -17,6 +17,7 @@ from cosim.record.run_record import RunRecord
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.certificates.conditions import nominal_conditions
+from noack.theory.coverage import refusals
 
 _CHECKS = (
     check_plant, check_measurements, check_observer, check_events, check_updates, check_controller,
@@ -53,7 +54,7 @@ def states_schedule(resolved: Scenario) -> bool:
     directions = [network.link] + ([] if network.actuation is None else [network.actuation.link])
     stated_s = resolved.certificate.network_delay_s
     return (
-        resolved.coverage.some_certificate_applies
+        not refusals(resolved)
         and network.enforce_mansd
         and all(link.delay_is_bounded for link in directions)
         and (stated_s is None or stated_s >= network.link.longest_delay_s)

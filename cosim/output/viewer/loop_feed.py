@@ -47,6 +47,7 @@ from noack.theory.certificates.certified_bounds import (
 )
 from noack.theory.certificates.conditions import allowed_conditions
 from noack.theory.certificates.scenario_certificates import certify
+from noack.theory.coverage import refusals
 from noack.theory.paper import ErrorMonitor
 
 LAG_S = 0.2
@@ -90,7 +91,7 @@ class LoopFeed:
         certified: bool = True,
     ) -> None:
         self._columns = columns
-        self._is_certified = certified and scenario.coverage.some_certificate_applies
+        self._is_certified = certified and not refusals(scenario)
         self._scenario = scenario
         self._loop = loop_of(scenario)
         self._view = view

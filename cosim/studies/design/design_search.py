@@ -24,6 +24,7 @@ from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.conditions import ideal_conditions, nominal_conditions
 from noack.theory.certificates.scenario_certificates import certify, certify_box, outside_box
+from noack.theory.coverage import require_exact
 
 BoundedQuantity = Literal["state", "error"]
 Bounds = Mapping[BoundedQuantity, float]
@@ -399,7 +400,7 @@ def design(
         CallerError: the limits or the scenario do not permit a design.
     """
     first = next(iter(families.values()))
-    first.coverage.require_exact()
+    require_exact(first)
     if limits.settling_s > first.horizon_s:
         raise CallerError(f"--settling: {limits.settling_s:g} s lie beyond horizon_s = {first.horizon_s:g}")
     require_draws(draws, limits.quantile)

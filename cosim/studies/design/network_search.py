@@ -27,6 +27,7 @@ from noack.guarantee.loss_guarantee import LossGuarantee
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.settings.section import MatrixRows, rows_of
+from noack.theory.coverage import require_exact
 from noack.theory.margins.loss_margin import LossMargin, Stability, capped, list_bursts, uncapped
 from noack.theory.margins.scenario_times import without_timeout
 from noack.trigger_policies.periodic_trigger import PeriodicSettings
@@ -101,7 +102,7 @@ def _require_possible(scenario: Scenario, request: DesignRequest) -> None:
             f'plant.system.kind = "{scenario.plant.system.kind}": the plant is not linear; '
             "--set 'plant.system={kind=\"linear\"}' designs for its model"
         )
-    without_timeout(scenario).coverage.require_exact()
+    require_exact(without_timeout(scenario))
     scenario.coverage.require_unchanging()
     if not request.cost >= 1:
         raise CallerError(f"--cost: 1 or more times that of the given loop, not {request.cost:g}")

@@ -49,6 +49,7 @@ from noack.settings.section import ReadTable, Table
 from noack.theory.certificates.certified_bounds import ScenarioCertificate, envelope_formula
 from noack.theory.certificates.conditions import nominal_conditions
 from noack.theory.certificates.scenario_certificates import own_plant_scope
+from noack.theory.coverage import require_certifiable
 
 _FLOOR_SHARE = 0.05
 """The floor of the threshold, as a share of beta."""
@@ -292,7 +293,7 @@ class _TrialScenarios:
         """Return the certificate of a trial's linear plant, perhaps void, and its loop gain."""
         resolved = with_linear_plant(resolve(self.scenario(trial)))
         resolved.coverage.require_unchanging()
-        resolved.coverage.require_certifiable()
+        require_certifiable(resolved, "linear")
         conditions = nominal_conditions(resolved, resolved.certificate.late_periods)
         certificate = own_plant_scope(resolved).certificate(conditions)
         if certificate.constants is not None:

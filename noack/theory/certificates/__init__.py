@@ -28,7 +28,8 @@ loop"):
    event on, at which the sensor knows x (docs/theory.md, "From the newest event").
 
 What a certificate assumes: ``conditions.py`` derives h, d, σ and the losses from a scenario, and
-moves a set-point to 0; ``assumptions.py`` lists every assumption of the paper and of the
+moves a set-point to 0; ``refusals.py`` says for which settings and times together there is none;
+``assumptions.py`` lists every assumption of the paper and of the
 certificate, with a verdict. A run that violates a condition voids the claims from that time on.
 
 ``trigger_weight.py`` chooses W of the trigger's norm such that a certificate is tight.

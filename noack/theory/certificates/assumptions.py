@@ -17,10 +17,10 @@ from noack.core.number_format import apart_from, at_least
 from noack.scenario.estimation import SteadyState, steady_state
 from noack.scenario.resolution import LoopMatrices, loop_of, policy_of
 from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_tables import UNCERTIFIED_ACKNOWLEDGEMENTS
 from noack.theory.bounds.certificate_terms import Constants, NetworkConditions
 from noack.theory.bounds.disturbances import normal_bounds
 from noack.theory.certificates.conditions import network_delay_text
+from noack.theory.coverage import key_table
 
 _NOT_COVERED = "not covered by the theorems and the certificates"
 _NOT_BY_THEOREMS = "not covered by the theorems"
@@ -63,7 +63,8 @@ def assumptions(resolved: Scenario) -> list[Assumption]:
         checked.append(_violated("the input is u = K x_c", "eq:ModCont", why))
     if resolved.protocol.acknowledges:
         assumed = "the sensor resets x_s at every event; nothing is acknowledged"
-        checked.append(_violated(assumed, "Section II", f'protocol = "ack": {UNCERTIFIED_ACKNOWLEDGEMENTS}'))
+        (row,) = key_table().rows_of("network.protocol")
+        checked.append(_violated(assumed, "Section II", f'network.protocol = "ack": {row.reason}'))
     if linear:
         checked.append(_unstable_and_distinct(loop.A))
     checked += [_mansd(resolved), _continuous_time(resolved)]

@@ -6,7 +6,6 @@ is a constant disturbance of the loop in these coordinates.
 """
 
 import math
-from collections.abc import Mapping
 from fractions import Fraction
 
 import numpy as np
@@ -14,7 +13,7 @@ import numpy as np
 from noack.core.cached_method import cached_method
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Vector
-from noack.core.periods import exact_ns, nearest_ns
+from noack.core.periods import exact_ns
 from noack.disturbances.step import StepDisturbance
 from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee
 from noack.impairments.markov_chain import NotPredictableError
@@ -104,85 +103,9 @@ def _actuation_gap_ns(resolved: Scenario) -> int:
     return horizon_ns if gap_ns is None else gap_ns
 
 
-def void_by_safe_input(resolved: Scenario, conditions: NetworkConditions) -> str | None:
-    """Return why there is no certificate if a safe input other than 0 may come before the first update.
-
-    If the input of the first tick is in time for ``conditions.start_s``, none comes.
-    """
-    if not any(resolved.controller.safe_input or ()) or resolved.network.initial_sync == "known_state":
-        return None
-    timing = resolved.timing
-    first_ns = _next_step_ns(resolved, timing.controller_phase_ns + _actuation_gap_ns(resolved))
-    if conditions.start_s <= first_ns / NS_PER_S:
-        return None
-    return "controller.safe_input: it may be the input before the first update, where bounds assume 0"
-
-
-def void_without_delay(resolved: Scenario, conditions: NetworkConditions) -> str | None:
-    """Return why there is no certificate if a queue delays updates and no largest delay is stated."""
-    network = resolved.network
-    if not conditions.delay_s or resolved.certificate.network_delay_s is not None:
-        return None
-    queues = [index for index, impairment in enumerate(network.impairments) if impairment.queues]
-    if not queues:
-        return None
-    return (
-        "certificate.network_delay_s: state the largest delay of updates, which the run checks; that in "
-        f"the queue of network.impairments.{queues[0]} is not known before"
-    )
-
-
-def void_by_uneven_steps(resolved: Scenario) -> str | None:
-    """Return why there is no certificate if the plant's steps differ by 1 ns.
-
-    An observer's steps are then not those of the plant, and sums of normal values not those of equal steps.
-    """
-    rate_hz, is_estimated = resolved.plant.rate_hz, resolved.observer is not None
-    is_normal = excluded_probability(resolved) > 0
-    if resolved.timing.plant_period.is_whole or not (is_estimated or is_normal):
-        return None
-    what = "an observer" if is_estimated else "normally distributed disturbances or noise"
-    nearest_hz = NS_PER_S / nearest_ns(resolved.timing.plant_period.exact)
-    return (
-        f"plant.rate_hz = {rate_hz:g}: bounds with {what} need a period of whole nanoseconds; "
-        f"the nearest such rate is {nearest_hz!r}"
-    )
-
-
-def void_by_watchdog(resolved: Scenario, conditions: NetworkConditions) -> str | None:
-    """Return why there is no certificate if the watchdog may replace an input that is not too old.
-
-    At a step, an input is at most as old as ``conditions.hold_s``, less the step until the next one.
-    Where actuations cross the network, the settings are checked with their losses.
-    """
-    watchdog, timing = resolved.plant.watchdog, resolved.timing
-    if watchdog.policy == "hold" or resolved.network.actuation is not None:
-        return None
-    oldest_s = conditions.hold_s - timing.plant_period_ns / NS_PER_S
-    if timing.actuation_timeout_ns / NS_PER_S >= oldest_s * (1 - 1e-12):
-        return None
-    return (
-        "plant.watchdog.timeout_s: the watchdog may replace an input, which may be "
-        f"{1e3 * oldest_s:g} ms old at a step; set it to at least that"
-    )
-
-
-def void_by_setting(resolved: Scenario, conditions: NetworkConditions) -> str | None:
-    """Return why there is no certificate whatever the others are; the reason names the setting."""
-    return (
-        void_by_safe_input(resolved, conditions)
-        or void_by_watchdog(resolved, conditions)
-        or void_by_uneven_steps(resolved)
-    )
-
-
-def void_beforehand(resolved: Scenario, conditions: NetworkConditions) -> str | None:
-    """Return why there is no certificate before a run; see these three functions."""
-    return (
-        void_without_delay(resolved, conditions)
-        or void_by_safe_input(resolved, conditions)
-        or void_by_watchdog(resolved, conditions)
-    )
+def first_input_ns(resolved: Scenario) -> int:
+    """Return the time by which the plant applies the input of the controller's first tick."""
+    return _next_step_ns(resolved, resolved.timing.controller_phase_ns + _actuation_gap_ns(resolved))
 
 
 def certified_delay_s(resolved: Scenario) -> float:
@@ -305,29 +228,3 @@ def constant_disturbance(resolved: Scenario) -> Vector:
     largest = max(float(np.abs(drift).max()), float(np.abs(loop.A).max() * np.abs(x_r).max()))
     w = drift + push
     return w if float(np.abs(w).max()) > _AT_REST * largest else np.zeros(loop.n)
-
-
-def void_at_setpoint(resolved: Scenario, *, knows_start: bool = False) -> Mapping[str, str]:
-    """Return by scope why there is no certificate at the set-point.
-
-    Until the first input arrives, the input is 0, and not u_r; ``knows_start``: the certificate is
-    for an error of that size (``start_error``), which a run shows.
-    """
-    setpoint = setpoint_of(resolved)
-    if setpoint is None:
-        return {}
-    if not resolved.coverage.is_linear:
-        return {REGION: "the region of a nonlinear plant is one about 0, and not about a set-point"}
-    if resolved.observer is not None:
-        why = "at a set-point the error of the observer's first estimate is not known"
-        return {OWN_PLANT: why, BOX: why}
-    x_r, u_r = setpoint
-    if u_r.any() and not knows_start:
-        why = "the input is 0 until the first one arrives, and not the set-point's u_r ≠ 0"
-        return {OWN_PLANT: why, BOX: why}
-    half_A, half_B = resolved.plant.uncertainty_A, resolved.plant.uncertainty_B
-    moved = np.zeros(len(x_r)) if half_A is None else np.array(half_A) @ np.abs(x_r)
-    moved = moved + (0.0 if half_B is None else np.array(half_B) @ np.abs(u_r))
-    if moved.any():
-        return {BOX: "not every plant of the box rests at the set-point, A x_r + B u_r ≠ 0"}
-    return {}

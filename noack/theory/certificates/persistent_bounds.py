@@ -75,13 +75,9 @@ class DisturbedCertificate:
         for the tightest bounds and the longest δ; otherwise any suffice.
 
         Raises:
-            NoCertificateError: the loop gain is not below 1, or the estimation error is not known.
+            NoCertificateError: the loop gain is not below 1.
             NotDecayingError: a mode of the loop or of the observer does not decay.
         """
-        if self.resolved.observer is not None and (
-            self.start_error or loop_of(self.resolved).setpoint is not None
-        ):
-            raise NoCertificateError("after a change or at a set-point the estimation error is not known")
         conditions = self.trigger.conditions_of_tests(conditions)
         structured = self.start_error == 0.0
         # A part that decays as the threshold does, if there is one.
@@ -223,16 +219,11 @@ class DisturbedCertificate:
 
     @cached_property
     def _estimation(self) -> EstimationError:
-        """The estimation error of the plant.
-
-        Raises:
-            NoCertificateError: the plant is not known.
-        """
+        """The estimation error of the plant."""
         loop = loop_of(self.resolved)
         models = error_gains(loop, 0.0)
         plant = self.plant_at(models, loop.x0[:, None], 0.0)
-        if self.resolved.observer is not None and not plant.is_one_plant:
-            raise NoCertificateError("an observer's error is bounded for one plant only, not for a box")
+        assert plant.is_one_plant or self.resolved.observer is None  # others are refused
         return EstimationError(self.resolved, plant.A, plant.B, self._forcing(plant))
 
 

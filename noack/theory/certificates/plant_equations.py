@@ -89,7 +89,9 @@ class LinearEquations(CertificateScope):
         closed_loop = loop.A + loop.B @ loop.K
         super().__init__(LINEAR_EQUATIONS, linear, closed_loop, plant_at, start=start)
 
-    def certificate_unless(self, why: str | None, conditions: NetworkConditions) -> ScenarioCertificate:
+    def certificate(
+        self, conditions: NetworkConditions, *, knows_delay: bool = False, knows_inputs: bool = False
+    ) -> ScenarioCertificate:
         """Return the certificate under some conditions; it rests on the equations' being linear."""
-        certificate = super().certificate_unless(why, conditions)
+        certificate = super().certificate(conditions, knows_delay=knows_delay, knows_inputs=knows_inputs)
         return replace(certificate, assumptions=(*certificate.assumptions, self._linearity))

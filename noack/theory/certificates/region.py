@@ -32,10 +32,12 @@ from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.certificates.assumptions import Assumption, AssumptionStatus
 from noack.theory.certificates.certified_bounds import Region, ScenarioCertificate
-from noack.theory.certificates.conditions import REGION, void_by_safe_input, void_by_uneven_steps
+from noack.theory.certificates.conditions import REGION
 from noack.theory.certificates.constants_search import Phases
 from noack.theory.certificates.plant_equations import LinearEquations, enclosed_motion, linear_plant
+from noack.theory.certificates.refusals import refusal_under
 from noack.theory.certificates.scenario_certificates import CertificateScope, box_scope, own_plant_scope
+from noack.theory.coverage import refusals
 
 _WIDER = 1.02
 """The next region is larger than the bounds by this factor."""
@@ -61,10 +63,10 @@ def scopes(resolved: Scenario, start_error: float | None = None) -> list[Certifi
     These are its own plant and the box around it, if it is linear by its settings; otherwise its
     plant, on a region if its equations are not linear.
     """
-    if resolved.coverage.linear_certificates_apply:
+    if not refusals(resolved, "linear"):
         linear = own_plant_scope(resolved, start_error), box_scope(resolved, start_error)
         return [scope for scope in linear if scope is not None]
-    return [nonlinear_scope(resolved)] if resolved.coverage.some_certificate_applies else []
+    return [] if refusals(resolved) else [nonlinear_scope(resolved)]
 
 
 def nonlinear_scope(resolved: Scenario, start: Matrix | None = None) -> CertificateScope:
@@ -131,9 +133,11 @@ class RegionScope(_Box):
         super().__init__(resolved, model, start)
 
     @np.errstate(all="ignore")
-    def certificate_unless(self, why: str | None, conditions: NetworkConditions) -> ScenarioCertificate:
+    def certificate(
+        self, conditions: NetworkConditions, *, knows_delay: bool = False, knows_inputs: bool = False
+    ) -> ScenarioCertificate:
         """Return the certificate under some conditions, and its region."""
-        certificate = super().certificate_unless(why, conditions)
+        certificate = super().certificate(conditions, knows_delay=knows_delay, knows_inputs=knows_inputs)
         if certificate.constants is None:
             return certificate
         region = self._proven[conditions].region
@@ -158,7 +162,7 @@ class RegionScope(_Box):
     @np.errstate(all="ignore")
     def loop_gain(self, conditions: NetworkConditions) -> float:
         """Return the loop gain on the region; at least 1, perhaps infinite, if there is none."""
-        if void_by_safe_input(self._resolved, conditions) or void_by_uneven_steps(self._resolved):
+        if refusal_under(conditions, self._resolved, self.name, knows_delay=True) is not None:
             return math.inf
         try:
             phases = self.all_phases(conditions, longest=False, near=True)

@@ -22,23 +22,15 @@ from noack.theory.bounds.gains import ErrorGains, PlantGains, error_gains
 from noack.theory.bounds.trigger_bounds import TriggerBounds
 from noack.theory.certificates.assumptions import certificate_assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.conditions import (
-    BOX,
-    OWN_PLANT,
-    kept_probability,
-    void_beforehand,
-    void_by_safe_input,
-    void_by_uneven_steps,
-    void_by_watchdog,
-)
+from noack.theory.certificates.conditions import BOX, OWN_PLANT, kept_probability
 from noack.theory.certificates.constants_search import ConstantsSearch, Phases, is_within
 from noack.theory.certificates.deliveries.due_deliveries import Deliveries
 from noack.theory.certificates.persistent_bounds import PlantAt
+from noack.theory.certificates.refusals import refusal_under
 
 _TIMED_RATES = (0.7, 0.4, 0.1)
 """Rates that are tried where events are due, as shares of the decay rate of A + BK: the first that
 has a certificate is used."""
-_OUTSIDE_RANGE = "at its start the input was not known, or not in the range of K, where the bounds have it"
 _SMALLEST_START, _LARGEST_START = 1e-150, 1e150
 """The squares of larger entries of x(0) may overflow."""
 
@@ -164,22 +156,28 @@ class CertificateScope:
         times_ns = (rule.grid_ns, rule.idle_ns, rule.longest_ns)
         return [t_ns / NS_PER_S for t_ns in times_ns if 0 < t_ns < math.inf]
 
-    def certificate(self, conditions: NetworkConditions) -> ScenarioCertificate:
-        """Return the certificate under some conditions; a void certificate has the reason."""
-        return self.certificate_unless(void_beforehand(self._resolved, conditions), conditions)
-
     @np.errstate(all="ignore")
-    def certificate_unless(self, why: str | None, conditions: NetworkConditions) -> ScenarioCertificate:
-        """Return the certificate under some conditions; ``why`` there is none, if that is known."""
+    def certificate(
+        self, conditions: NetworkConditions, *, knows_delay: bool = False, knows_inputs: bool = False
+    ) -> ScenarioCertificate:
+        """Return the certificate under some conditions; a void certificate has the reason.
+
+        ``knows_delay``, ``knows_inputs``: as for :func:`refusal_under`.
+        """
         # The constants, or the reason for having none.
         void: NotDecayingError | NoCertificateError | None = None
         phases: Sequence[tuple[Constants | None, ...]] = [(None, None, None)]
-        why = why or void_by_uneven_steps(self._resolved)
+        why = refusal_under(
+            conditions,
+            self._resolved,
+            self.name,
+            knows_delay=knows_delay,
+            knows_inputs=knows_inputs,
+            start_error=self._start_error,
+        )
         try:
             if why is not None:
                 raise NoCertificateError(why)
-            if math.isinf(self._start_error):
-                raise NoCertificateError(_OUTSIDE_RANGE)
             self._require_normal_start()
             phases = self.all_phases(conditions)
         except (NotDecayingError, NoCertificateError) as error:
@@ -248,10 +246,7 @@ class CertificateScope:
     @np.errstate(all="ignore")
     def loop_gain(self, conditions: NetworkConditions) -> float:
         """Return the loop gain of a certificate; at least 1, perhaps infinite, if there is none."""
-        resolved = self._resolved
-        if void_by_safe_input(resolved, conditions) or void_by_watchdog(resolved, conditions):
-            return math.inf
-        if void_by_uneven_steps(resolved):
+        if refusal_under(conditions, self._resolved, self.name, knows_delay=True) is not None:
             return math.inf
         # Whether the first inputs at a set-point are covered depends on the constants.
         try:

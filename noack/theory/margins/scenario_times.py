@@ -15,6 +15,7 @@ from noack.core.periods import exact_ns, simplest_fraction
 from noack.impairments.kinds.delay import Delay
 from noack.scenario.resolution import rule_of, setpoint_of
 from noack.scenario.scenario import Scenario
+from noack.theory.coverage import require_exact
 from noack.theory.margins.time_triggered_loop import NEVER, LoopTimes
 
 _WITHOUT_DELAY = ("loss", "corrupt", "blackout", "duplicate")
@@ -24,7 +25,7 @@ _WITHOUT_DELAY = ("loss", "corrupt", "blackout", "duplicate")
 def require_covered(resolved: Scenario) -> None:
     """Raise CallerError unless the loop is linear, transmits in time, and the watchdog is idle."""
     resolved.coverage.require_direct_inputs()
-    without_timeout(resolved).coverage.require_exact()
+    require_exact(without_timeout(resolved))
     resolved.coverage.require_constant()
     require_idle_watchdog(resolved)
     if resolved.controller.update_timeout_s is None or resolved.controller.timeout_input == "hold":

@@ -38,6 +38,7 @@ from noack.impairments.markov_chain import NotPredictableError
 from noack.scenario.resolution import LoopMatrices, loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.stacked_norms import Stack
+from noack.theory.coverage import refusal
 from noack.theory.margins.exact_matrices import exactly
 from noack.theory.margins.scenario_times import intervals, loop_times, require_idle_watchdog
 from noack.theory.margins.time_triggered_loop import LoopTimes, Timeline, repeated
@@ -332,7 +333,7 @@ def require_predictable(resolved: Scenario) -> None:
     """Raise CallerError unless the loop's second moments follow linear equations."""
     resolved.coverage.require_direct_inputs()
     resolved.coverage.require_unchanging()
-    if (why := resolved.coverage.uncertified_setting) is not None:
+    if (why := refusal(resolved, "linear")) is not None:
         raise CallerError(f"{why}; the mean cost needs a linear plant with u = K x_c")
     if resolved.observer is not None:
         raise CallerError(f'observer.kind = "{resolved.observer.kind}": the mean cost needs none')

@@ -19,6 +19,7 @@ from noack.core.errors import CallerError, ExitStatus
 from noack.protocol.record_tables import CONTROLLER_STEP
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
+from noack.theory.coverage import require_exact
 from tests.helpers.approved import compare_lines, lines_of_error
 from tests.helpers.shipped import resolved
 
@@ -87,7 +88,7 @@ def test_mistakes_in_the_settings_give_the_approved_lines() -> None:
         lambda setting: lines_of_error(lambda: simulate(resolve(load(path, [setting]))), FILE=path),
     )
     with pytest.raises(CallerError, match=r"^controller\.kind = .*: u is not K x_c; this needs"):
-        resolve(load(path)).coverage.require_exact()
+        require_exact(resolve(load(path)))
 
 
 CODE = """

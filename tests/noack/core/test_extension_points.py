@@ -23,6 +23,29 @@ class SwingSettings(EquationSettings):
     def equations(self):
         return PlantEquations(lambda t, z, v: (z[1], -9.81 / self.length_m * z[0] + v[0]))
 """
+GUST = """
+from typing import ClassVar, Literal
+import numpy as np
+from noack.extend import DisturbanceSettings, Row
+
+class GustSettings(DisturbanceSettings):
+    "A constant wind; nothing but its signal says how strong it is."
+    entries_key: ClassVar = "amplitude"
+    kind: Literal["gust"]
+    amplitude: Row
+
+    def signal(self, steps, source):
+        return np.tile(self.amplitude, (len(steps), 1))
+"""
+POLICY = """
+from typing import Literal
+from noack.trigger_policies.absolute import AbsoluteSettings
+
+class ImpatientSettings(AbsoluteSettings):
+    "A threshold."
+    policy: Literal["impatient"]
+    patience_s: float = 1.0
+"""
 EXPORT = 'SUFFIX = ".txt"\n\ndef write(run, path, *, certificates=True):\n    return [path]\n'
 KINDS = "from noack.scenario.sections import PLANTS; print(*[kind for kind in PLANTS if 's' in kind])"
 
@@ -62,6 +85,25 @@ def test_a_plant_and_an_export_of_a_package_are_parts_of_noack(tmp_path: Path) -
     assert "SwingSettings" not in schema
     formats = "from cosim.output.export.export_formats import formats; print('swing' in formats())"
     assert run(tmp_path, "-c", formats) == ("True", [])
+
+
+def test_certificates_cover_no_disturbance_and_no_policy_of_a_package(tmp_path: Path) -> None:
+    groups = "[noack.disturbances]\ngust = gust\n[noack.triggers]\nimpatient = impatient\n"
+    install(tmp_path, "noack-gust", groups, gust=GUST, impatient=POLICY)
+    gust = 'plant.disturbances=[{kind="gust", amplitude=[1.0]}]'
+    policy = 'trigger={policy="impatient", delta=0.1}'
+    program = (
+        "import sys; from noack.theory.coverage import refusals; from tests.helpers.shipped import resolved; "
+        "print(*refusals(resolved('double_integrator', *sys.argv[1:])), sep='\\n')"
+    )
+    output, warnings = run(tmp_path, "-c", program, gust, policy)
+    assert warnings == []
+    assert output.splitlines() == [
+        'plant.disturbances.kind = "gust": no bound of this kind of disturbance is known',
+        'trigger.policy = "impatient": it is none of noack\'s rules; a class of your own '
+        "decides at measurements only",
+        "trigger.patience_s: no statement covers this key",
+    ]
 
 
 @pytest.mark.parametrize(

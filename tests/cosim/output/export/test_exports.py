@@ -50,7 +50,7 @@ def test_a_mat_file_has_the_record(run: noack.Run, tmp_path: Path) -> None:
     assert list(np.atleast_1d(stored["events"]["fate"])) == run.events()["fate"].to_pylist()
     assert stored["summary"]["loops"]["events"] == run.summary.loops[0].events
     assert stored["loop"]["A"].shape == (4, 4)
-    assert stored["certificates"]["none"].startswith("changes: needs settings that stay the same")
+    assert stored["certificates"]["none"].startswith("changes.at_s = 0.5: settings must stay the same")
     assert run.export(path)[0].read_bytes() == path.read_bytes()
 
 
