@@ -141,7 +141,8 @@ def _with_value(message: str, words: Sequence[str]) -> str:
     option = match[1]
     joined = [word for word in words if word.startswith(f"{option}=")]
     following = [f"{option} {word}" for before, word in pairwise(words) if before == option]
-    return f"{(joined + following or [option])[0]}: {message[match.end() :]}"
+    given = {*joined, *following}
+    return f"{given.pop() if len(given) == 1 else option}: {message[match.end() :]}"
 
 
 def _refuse_empty(words: Sequence[str]) -> None:

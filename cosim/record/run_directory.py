@@ -220,14 +220,21 @@ def chosen_run(run_dir: Path | None, runs: Path) -> Path:
     return run_dir
 
 
+def is_run_directory(path: Path) -> bool:
+    """Whether a folder has a scenario and something of its run, however early this was cut short."""
+    of_run = (ENVIRONMENT_FILE, ENDING_FILE, RECORD, SPOOL)
+    return (path / SCENARIO_FILE).is_file() and any((path / name).exists() for name in of_run)
+
+
 def require_run_directory(path: Path) -> None:
     """Raise CallerError, which says what the path is instead, if it is no run directory."""
-    if (path / SCENARIO_FILE).is_file():
+    if is_run_directory(path):
         return
     if not path.exists():
         raise CallerError(f"{path}: no such run directory")
     if path.is_dir():
-        raise CallerError(f"{path}: not a run directory ({holder_of(path) or f'no {SCENARIO_FILE}'})")
+        lacks = "only a scenario" if (path / SCENARIO_FILE).is_file() else f"no {SCENARIO_FILE}"
+        raise CallerError(f"{path}: not a run directory ({holder_of(path) or lacks})")
     hint = ""
     for folder in path.parents:
         if not hint and (folder / SCENARIO_FILE).is_file() and (folder / RECORD).is_dir():

@@ -205,8 +205,8 @@ def compare_runs(directories: Sequence[Path]) -> RunComparison:
 
 def _open_run(label: str, named_path: Path) -> ComparedRun:
     """Open a run of one loop, or a loop of a run: ``RUN:NAME``."""
-    folder, colon, name = named_path.name.partition(":")
-    loop = name if colon and not named_path.exists() else None
+    folder, _, name = named_path.name.partition(":")
+    loop = name if folder and name and not named_path.exists() else None
     path = named_path if loop is None else named_path.with_name(folder)
     path = chosen_run(path, path.parent)
     outcome, record = reopen(path), load_record(path, loop)

@@ -162,9 +162,13 @@ def design(
     from cosim.studies.design.design_outcome import design_for_network
     from cosim.studies.design.design_space import families_of
     from cosim.studies.design.network_search import DesignRequest
+    from noack.core.file_access import require_suffix
     from noack.scenario.scenario_file import dumps
 
     figure_files = requested_files(figure_format, width)
+    for option, path, suffix in (("--out", out, ".toml"), ("--page", page, ".html")):
+        if path is not None:
+            require_suffix(path, option, suffix)
     loaded = opt.load_loop(scenario, settings, loop)
     _require_writable(out)
     if aim is DesignAim.NETWORK:

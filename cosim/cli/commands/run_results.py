@@ -11,7 +11,13 @@ from cosim.cli import options as opt
 from cosim.cli.options import RUNS, examples
 from cosim.cli.printing import console, print_json, print_lines, status, write_tables
 from cosim.output.figures.figure_format import requested_files
-from cosim.record.run_directory import DEFAULT_RUNS, RECORDING_FILE, SCENARIO_FILE, chosen_run, file_of_loop
+from cosim.record.run_directory import (
+    DEFAULT_RUNS,
+    RECORDING_FILE,
+    chosen_run,
+    file_of_loop,
+    is_run_directory,
+)
 from noack.core.errors import CallerError, ExitStatus, NoackError
 from noack.runtime.command_line import print_to_stderr
 
@@ -46,7 +52,7 @@ def view(
 
     path = chosen_run(recording, runs)
     path = path / file_of_loop(RECORDING_FILE, loop) if path.is_dir() else path
-    is_missing = (path.parent / SCENARIO_FILE).is_file() and not path.is_file()
+    is_missing = is_run_directory(path.parent) and not path.is_file()
     if is_missing or not json:
         require_viewer()  # before what imports rerun
     if is_missing:

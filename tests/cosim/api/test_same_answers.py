@@ -174,6 +174,9 @@ RESULTS: dict[str, Call] = {
     "summary several --loop nobody": lambda: noack.open_run("several").loops["nobody"].summary,
     "summary run --tables empty": lambda: noack.open_run("run").save_tables("empty"),
     "summary run --tables run/record": lambda: noack.open_run("run").save_tables("run/record"),
+    "summary only_scenario": lambda: noack.open_run("only_scenario").summary,
+    "replay only_scenario": lambda: noack.open_run("only_scenario").replay(),
+    "report only_scenario": lambda: noack.open_run("only_scenario").report(),
     "replay nothing": lambda: noack.open_run("nothing").replay(),
     "replay campaign.toml": lambda: noack.open_run("campaign.toml").replay(),
     "replay HERE/damaged": lambda: noack.open_run("damaged").replay(),
@@ -202,6 +205,8 @@ RESULTS: dict[str, Call] = {
     f"compare {'run ' * 8}": lambda: noack.compare(*["run"] * 8),
     "compare run nothing": lambda: noack.compare("run", "nothing"),
     "compare run folder": lambda: noack.compare("run", "folder"),
+    "compare run ':x'": lambda: noack.compare("run", ":x"),
+    "compare run only_scenario": lambda: noack.compare("run", "only_scenario"),
     "compare run empty": lambda: noack.compare("run", "empty"),
     "compare run damaged": lambda: noack.compare("run", "damaged"),
     "compare run several": lambda: noack.compare("run", "several"),
@@ -313,7 +318,7 @@ MISTAKES = SCENARIOS | THEORY | RUNS | RESULTS | STUDIES | PLANTS
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run, one of several loops, one with a damaged record, one without; files of other kinds."""
+    """A run, one of several loops, one with a damaged record, one without; other folders and files."""
     here = tmp_path_factory.mktemp("files")
     for name, scenario in (("run", "double_integrator"), ("several", "priority_channel")):
         made = noack.simulate(noack.load(scenario, {"horizon_s": 0.3}), runs=here / "runs").directory
@@ -324,6 +329,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(here / "run", here / "no_record")
     shutil.rmtree(here / "no_record/record")
     (here / "folder").mkdir()
+    (here / "only_scenario").mkdir()
+    shutil.copy(here / "run/scenario.toml", here / "only_scenario")
     (here / "empty").touch()
     (here / "run/x.html").touch()
     (here / "links.toml").write_text('[[link]]\nname = "a"\nlisten = ":0"\nto = ":9"\n')
