@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -92,6 +93,25 @@ def test_wide_intervals_have_enclosures(
         assert enclosed.value.contains(arb(float(of(x)))) or abs(enclosed.value - of(x)).abs_lower() < 1e-12
     assert arb(enclosed.slopes[0]).abs_upper() <= 1.001 * slopes[1]
     assert enclosed.slopes[0].lower() > slopes[0] - 0.01 * slopes[1]
+
+
+KINKS = """class Kinks:
+    def derivative(self, t_s, z, u):
+        push = abs(z[0] - 0.3) - 0.3 + abs(u[0] + 2 * z[1]) * z[1]
+        return [z[1] * abs(z[1]) - abs(z[0]), push + abs(abs(z[0]) - abs(u[0])) / 2]
+"""
+
+
+def test_equations_with_kinks_lie_in_their_enclosure(tmp_path: Path) -> None:
+    own, namespace = own_plant(tmp_path, KINKS), dict[str, Any]()
+    exec(KINKS, namespace)
+    plant = namespace["Kinks"]()
+
+    def field(x: Vector, u: Vector) -> Vector:
+        return np.array(plant.derivative(0.0, x, u))
+
+    for widths in ([0.5, 0.4, 2.0], [0.2, 3.0, 0.1], [5.0, 0.01, 0.3]):
+        assert 0.2 < inclusion_share(over(own, np.array(widths)), field, np.array(widths)) <= 1
 
 
 @pytest.mark.parametrize("name", CASES)
