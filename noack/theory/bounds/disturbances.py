@@ -17,6 +17,7 @@ those of a Kalman filter are computed until they have settled. The sum over all 
 """
 
 import math
+import warnings
 from functools import cached_property
 from itertools import islice
 from typing import NamedTuple
@@ -30,7 +31,7 @@ from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import EstimationBound
 from noack.theory.bounds.enclosure import NotDecayingError, factors
-from noack.theory.bounds.gains import Forcing, NormalForcing
+from noack.theory.bounds.gains import Forcing, NormalForcing, stationary_covariance
 from noack.theory.bounds.stacked_norms import (
     Stack,
     product_along_last,
@@ -212,11 +213,9 @@ class EstimationError:
 
     @cached_property
     def _settled_covariance(self) -> Matrix:
-        from scipy.linalg import solve_discrete_lyapunov  # slow to import
-
         F, added = self._covariances[-1]
         _contraction(F)
-        return np.asarray(solve_discrete_lyapunov(F, added))
+        return stationary_covariance(F, added)
 
     def _excess_deviation(self, alpha_per_s: float) -> float:
         """Return sup_k of the root of ‖W (P_k − P_∞) Wᵀ‖, scaled."""
@@ -390,7 +389,8 @@ def _contraction(step: Matrix) -> tuple[Matrix, float]:
     if not np.abs(np.linalg.eigvals(step)).max() < 1:
         raise NotDecayingError(reason)
     try:
-        P = solve_discrete_lyapunov(step.T, np.eye(len(step)))
+        with warnings.catch_warnings(action="ignore"):  # of an inaccurate P, which is checked
+            P = solve_discrete_lyapunov(step.T, np.eye(len(step)))
         factor = np.linalg.cholesky(0.5 * (P + P.T)).T
     except (np.linalg.LinAlgError, ValueError):
         raise NotDecayingError(reason) from None

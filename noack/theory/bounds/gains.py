@@ -12,6 +12,7 @@ interest are the weighted norm W, the state itself, E x, and K H x (the error ra
 depend on the models alone; :class:`PlantGains` those of one known plant.
 """
 
+import warnings
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
@@ -35,6 +36,7 @@ from noack.core.linear_systems import (
 from noack.scenario.resolution import LoopMatrices
 from noack.theory.bounds.enclosure import (
     KernelBounds,
+    NotDecayingError,
     Outputs,
     ResponseBounds,
     constant_kernel,
@@ -433,13 +435,11 @@ class PlantGains:
     @cached_property
     def _deviations(self) -> Matrix:
         """S with S Sᵀ the stationary covariance of x under the normal disturbances."""
-        from scipy.linalg import solve_discrete_lyapunov  # slow to import
-
         normal = self._forcing.normal
         assert normal is not None
         period_ns = round(normal.period_s * NS_PER_S)
         step, increments = discretise(self.closed_loop, normal.columns, period_ns)
-        return deviations(np.asarray(solve_discrete_lyapunov(step, increments @ increments.T)))
+        return deviations(stationary_covariance(step, increments @ increments.T))
 
     @cached_property
     def _disturbed(self) -> list[ResponseBounds]:
@@ -522,3 +522,18 @@ def deviations(covariance: Matrix) -> Matrix:
     """Return S with S Sᵀ = the covariance, (n, n)."""
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def stationary_covariance(step: Matrix, added: Matrix) -> Matrix:
+    """Return P = F P Fᵀ + Q for the step F, whose spectral radius is below 1, and Q, (n, n) each.
+
+    Raises:
+        NotDecayingError: F decays so slowly that P is not known within rounding.
+    """
+    from scipy.linalg import LinAlgWarning, solve_discrete_lyapunov  # slow to import
+
+    try:
+        with warnings.catch_warnings(action="error", category=LinAlgWarning):
+            return np.asarray(solve_discrete_lyapunov(step, added))
+    except (LinAlgWarning, np.linalg.LinAlgError, ValueError):
+        raise NotDecayingError("a covariance is not known within rounding") from None

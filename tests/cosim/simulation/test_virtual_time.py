@@ -82,7 +82,8 @@ def test_the_controller_reports_a_violated_assumption(busy_content: dict[str, An
     for violation, gap in zip(violations, long_gaps, strict=True):
         assert violation["t_s"] == pytest.approx(gap["t_ns"] * 1e-9)
         assert violation["process"] == "controller"
-        assert f"{gap['dropouts']} consecutive losses" in violation["what"]
+        lost = "1 loss" if gap["dropouts"] == 1 else f"{gap['dropouts']} consecutive losses"
+        assert f"MANSD violated: {lost} before" in violation["what"]
 
 
 def test_a_violation_without_a_later_delivery_is_reported(busy_content: dict[str, Any]) -> None:

@@ -150,7 +150,7 @@ def test_exact_simulation_is_refused_in_one_line(
     del observed["plant"]["disturbances"]
     observed["observer"] = KALMAN | {"input_std": [0.5]}
     for take in (continuous_loop_of, setting_of):
-        for scenario, key in ((disturbed, r"plant\.disturbances"), (resolved(observed), "observer")):
+        for scenario, key in ((disturbed, r"plant\.measurement\.noise_std"), (resolved(observed), "observer")):
             with pytest.raises(CallerError, match=key) as refusal:
                 take(scenario)
             assert "\n" not in str(refusal.value)

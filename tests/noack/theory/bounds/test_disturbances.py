@@ -10,6 +10,8 @@ import noack
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.disturbances import EstimationError, bound_forcing, normal_bounds
+from noack.theory.bounds.enclosure import NotDecayingError
+from noack.theory.bounds.gains import stationary_covariance
 
 GAUSSIAN = {"kind": "gaussian", "std": [0.5]}
 UNIFORM = {"kind": "uniform", "bound": [0.2, 0.4], "at": "state"}
@@ -55,3 +57,10 @@ def test_without_an_observer_the_estimation_error_is_the_noise_in_the_triggers_n
     W = np.eye(2) if loop.weight is None else loop.weight
     expected = bounds.radius(2) * 0.05 * np.linalg.norm(W, 2)
     assert EstimationError(resolved, loop.A, loop.B, None).persistent().fixed == pytest.approx(expected)
+
+
+def test_a_covariance_that_rounding_hides_is_not_returned() -> None:
+    np.testing.assert_allclose(stationary_covariance(np.diag([0.5, 0.0]), np.eye(2)), np.diag([4 / 3, 1.0]))
+    slow = np.array([[np.nextafter(1.0, 0.0), 100.0], [0.0, 0.5]])
+    with pytest.raises(NotDecayingError, match="within rounding"):
+        stationary_covariance(slow, np.eye(2))
