@@ -195,6 +195,7 @@ def test_every_run_gets_a_report(case: str) -> None:
 def dead_run(content: dict[str, Any], tmp_path: Path) -> Path:
     """The directory of a run in which all processes died before they recorded anything."""
     (tmp_path / "scenario.toml").write_text(scenario_toml(scenario_of(content)), encoding="utf-8")
+    (tmp_path / "ending.json").touch()
     return tmp_path
 
 
