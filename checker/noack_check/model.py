@@ -6,11 +6,22 @@ of constant bounds. With the input u = K e^{−Hs} x_c of age s,
 
     ẋ = Ax + Bu + Dd,   ė = H(x + e) − ẋ,   ẇ = Hw,   ḟ₁ = −r f₁,   ḟ₂ = 0.
 
-An event sets e := 0 at once, since the sensor's model is reset whether or not the update arrives. The
-controller's error w grows by e, and becomes 0 when the first input acts that was computed from an
-update of the newest event. So a location says how many updates were lost since, and whether one is
-on its way. The model assumes that no event happens while one is: :mod:`.proof` shows this from bounds of
-the same loop, by induction over the events.
+An event sets e := 0 at once, since the sensor's model is reset whether or not the update arrives, and w
+grows by e. A location says what becomes of the updates that were sent since the one that the acting input
+was computed from:
+
+* "j lost": j updates, which never act. At an event the next one is lost, too, or is on its way.
+* "k later": one is on its way that will act, k events happened after its own, and a clock shows the time
+  since that. It acts before the clock shows d. Then w becomes
+
+      Σ e^{H(t − t_i)} e(t_i⁻)  over the k later events t_i:
+
+  0 for k = 0, else some vector below k·sup‖W e^{(H + r)s} W⁻¹‖·‖W e‖, where the last is a bound that is
+  assumed of this loop (:class:`Errors`). Of the k later updates one acts next, or all are lost.
+
+At most M − 1 consecutive updates are lost, and at most ``later`` events are assumed to happen within d
+after an event. :mod:`.proof` shows both assumptions from bounds of the same loop, by induction over the
+events.
 
 An *inequality* of :meth:`Model.inequalities` is a symmetric matrix that depends linearly on the
 numbers of a witness (matrices, multipliers, levels) and has to be positive semidefinite. Together they
@@ -80,15 +91,26 @@ class Location(NamedTuple):
 
 
 class Edge(NamedTuple):
-    """A jump z := ``jump`` z, possible where ``facts`` are ≤ 0."""
+    """A jump z := ``jump`` (z, p), p unknown, possible where ``facts`` of (z, p) are ≤ 0."""
 
     name: str
     source: int
-    nodes: tuple[int, ...]
+    target: int
+    pairs: tuple[tuple[int, int], ...]
+    """Nodes of the source and of the target; between two pairs both times are affine."""
     jump: arb_mat
     facts: tuple[arb_mat, ...]
-    target: int
-    target_nodes: tuple[int, ...]
+
+
+class Errors(NamedTuple):
+    """What is assumed of e_s at all times: ‖W e_s‖² ≤ ``decaying``² f₁² + ``constant``² f₂²."""
+
+    decaying: arb
+    constant: arb
+    fresh: arb
+    """At least sup ‖W e^{(H + r)s} W⁻¹‖ while an update may be on its way."""
+    gain: arb | None
+    """At least sup ‖W e^{(H + r)s} W⁻¹‖ over all s ≥ 0, if that is known."""
 
 
 class Part(NamedTuple):
@@ -118,14 +140,15 @@ class Form(NamedTuple):
     scalars: tuple[tuple[str, arb_mat], ...]
 
 
-def _needs_constant(loop: Loop) -> bool:
+def needs_constant(loop: Loop) -> bool:
+    """Return whether f₂ is a state."""
     is_needless = loop.rule.floor == 0 and not loop.sizes  # false for a ball around 0
     return not is_needless
 
 
 def has_decaying_unit(loop: Loop, rate: arb) -> bool:
     """Return whether f₁ is a state; with r = 0 it equals f₂, and one of both is enough."""
-    return not (rate == 0 and _needs_constant(loop))
+    return not (rate == 0 and needs_constant(loop))
 
 
 def thresholds(loop: Loop, rate: arb) -> tuple[arb, arb]:
@@ -144,15 +167,26 @@ class Model:
         loop: the loop.
         rate: r ≥ 0 in f₁ = e^{−rt}, in 1/s.
         decay: ν in dV/dt ≤ −νV, in 1/s.
-        chain: κ with ‖W w‖ ≤ κ·(number of missing updates)·threshold, if that is known; else None.
+        errors: what is assumed of the errors, if it is used.
+        later: most events within d after an event; above 0 only with ``errors``.
+        later_at_start: most events after the one at t = 0 before the first input acts, likewise.
         is_exact: with False a coarse approximation of K e^{−Hs} replaces its hull, for a search.
     """
 
     def __init__(
-        self, loop: Loop, rate: arb, decay: arb, chain: arb | None = None, *, is_exact: bool = True
+        self,
+        loop: Loop,
+        rate: arb,
+        decay: arb,
+        errors: Errors | None = None,
+        *,
+        later: int = 0,
+        later_at_start: int = 0,
+        is_exact: bool = True,
     ) -> None:
-        self.loop, self.rate, self.decay, self.chain = loop, rate, decay, chain
-        self.is_exact = is_exact
+        self.loop, self.rate, self.decay, self.errors = loop, rate, decay, errors
+        self.later, self.is_exact = later, is_exact
+        self.later_at_start = later_at_start
         n = loop.n
         self.size = 3 * n + 2
         every = identity(self.size)
@@ -198,30 +232,37 @@ class Model:
 
     def _locations(self) -> list[Location]:
         n, losses, times = self.loop.n, self.loop.losses, self.loop.times
-        units = ([3 * n] if self._has_f1 else []) + ([3 * n + 1] if _needs_constant(self.loop) else [])
+        units = ([3 * n] if self._has_f1 else []) + ([3 * n + 1] if needs_constant(self.loop) else [])
         without_w, all_of_z = (*range(2 * n), *units), (*range(3 * n), *units)
         flows = self._flows(self._gains())
-        nodes = (arb(0), arb(times.sampling)) if times.sampling > 0 else (arb(0),)
+        tested = (arb(0), arb(times.sampling)) if times.sampling > 0 else (arb(0),)
+        waiting = (arb(0), arb(times.delay))
         compared = () if times.sampling > 0 else (self.silent,)
         found = []
         for lost in range(losses + 1):
             facts = compared + (self._chain(lost) if lost else ())
-            found.append(Location(f"{lost} lost", all_of_z if lost else without_w, nodes, flows, facts, True))
-        if times.delay > 0:
-            waiting = (arb(0), arb(times.delay))
-            facts = self._chain(losses + 1)
-            found.append(Location("on its way", all_of_z, waiting, flows, facts, False))
+            found.append(
+                Location(f"{lost} lost", all_of_z if lost else without_w, tested, flows, facts, True)
+            )
+        for later in range(self._waiting):
+            facts = self._chain(losses + 1 + later)
+            found.append(Location(f"{later} later", all_of_z, waiting, flows, facts, False))
         if times.start > 0:
-            waiting, no_input = (arb(0), arb(times.start)), self._flows([0 * self.loop.gain])
-            found.append(Location("start", without_w, waiting, no_input, (), False))
+            nodes, no_input = (arb(0), arb(times.start)), self._flows([0 * self.loop.gain])
+            found.append(Location("start", without_w, nodes, no_input, (), False))
         return found
 
     def _chain(self, missing: int) -> tuple[arb_mat, ...]:
-        """Return ‖W w‖² − (κ·missing)² (c² f₁² + f² f₂²), if κ is known."""
-        if self.chain is None:
+        """Return ‖W w‖² minus its bound by the paper's chain, if that is known."""
+        if self.errors is None or self.errors.gain is None:
             return ()
-        bound = (self.chain * missing) ** 2 * self.threshold_squared()
+        bound = (self.errors.gain * missing) ** 2 * self._errors_squared()
         return (square(self.loop.weight * self.w) - bound,)
+
+    def _errors_squared(self) -> arb_mat:
+        """Return the assumed bound of ‖W e_s‖²."""
+        assert self.errors is not None
+        return self.errors.decaying**2 * square(self.f1) + self.errors.constant**2 * square(self.f2)
 
     def _gains(self) -> list[arb_mat]:
         """Return matrices in whose hull K e^{−Hs} is, for all ages s.
@@ -273,29 +314,66 @@ class Model:
         """Return the column of ż for one of ẋ."""
         return transpose(self.x) * column - transpose(self.e) * column
 
+    @property
+    def _waiting(self) -> int:
+        """The number of locations with an update on its way."""
+        return self.later + 1 if self.loop.times.delay > 0 else 0
+
     def _edges(self) -> list[Edge]:
-        losses, times = self.loop.losses, self.loop.times
+        losses = self.loop.losses
         Z = zeros(self.loop.n, self.size)
         units = [self.f1, self.f2]
-        lost, delivered = stack([self.x, Z, self.w + self.e, *units]), stack([self.x, Z, Z, *units])
-        arrival = stack([self.x, self.e, Z, *units])
         event = tuple(self._guards.values())
-        nodes = tuple(range(len(self.locations[0].nodes)))
-        waits = losses + 1
+        sent, delivered = stack([self.x, Z, self.w + self.e, *units]), stack([self.x, Z, Z, *units])
+        tests = tuple((node, 0) for node in range(len(self.locations[0].nodes)))
         found = []
         for j in range(losses + 1):
-            if times.delay > 0:
-                found.append(Edge(f"{j} sent", j, nodes, lost, event, waits, (0,)))
+            if self._waiting:
+                found.append(Edge(f"{j} lost, sent", j, losses + 1, tests, sent, event))
             else:
-                found.append(Edge(f"{j} delivered", j, nodes, delivered, event, 0, (0,)))
+                found.append(Edge(f"{j} lost, delivered", j, 0, tests, delivered, event))
             if j < losses:
-                found.append(Edge(f"{j} lost", j, nodes, lost, event, j + 1, (0,)))
-        if times.delay > 0:
-            found.append(Edge("arrival", waits, (0, 1), arrival, (), 0, nodes))
-        if times.start > 0:
+                found.append(Edge(f"{j} lost, lost", j, j + 1, tests, sent, event))
+        both = ((0, 0), (1, 1))
+        for k in range(self._waiting):
+            source = losses + 1 + k
+            if k < self.later:
+                found.append(Edge(f"{k} later, event", source, source + 1, both, sent, event))
+            found += self._arrivals(f"{k} later", source, k)
+        if self.loop.times.start > 0:
             first = len(self.locations) - 1
-            found.append(Edge("first input", first, (0, 1), arrival, (), 0, nodes))
+            for k in range(self.later_at_start + 1):
+                found += self._arrivals(f"start, {k} later", first, k)
+            if self.later_at_start:
+                found.append(Edge("start, event", first, first, both, delivered, event))
         return found
+
+    def _arrivals(self, name: str, source: int, later: int) -> Iterator[Edge]:
+        """Yield the edges of the first input with an update that has so many later ones."""
+        losses = self.loop.losses
+        if later <= losses:
+            yield self._arrival(f"{name}, all lost", source, later, later)
+        for next_later in range(min(later, self._waiting)):
+            yield self._arrival(f"{name}, {next_later} later", source, losses + 1 + next_later, later)
+
+    def _arrival(self, name: str, source: int, target: int, missing: int) -> Edge:
+        """Return an edge to a location, with so many updates missing. All times are open."""
+        n = self.loop.n
+        pairs = tuple(
+            (node, target_node)
+            for node in range(len(self.locations[source].nodes))
+            for target_node in range(len(self.locations[target].nodes))
+        )
+        same = stack([self.x, self.e, zeros(n, self.size), self.f1, self.f2])
+        if not missing:
+            return Edge(name, source, target, pairs, same, ())
+        assert self.errors is not None
+        size = self.errors.decaying.max(self.errors.constant)
+        w = self.errors.fresh * missing * size * self.loop.weight.inv()
+        fact = _with_signals(self._errors_squared() * (-1 / size**2), n)
+        for k in range(self.size, self.size + n):
+            fact[k, k] = 1
+        return Edge(name, source, target, pairs, beside(same, transpose(self.w) * w), (fact,))
 
     # The quadratic forms.
 
@@ -422,22 +500,27 @@ class Model:
             terms.scalar(f"{name}/signal {signal}", square(one) - square(unknown.rows * E))
 
     def _edge_inequalities(self, edge: Edge) -> Iterator[Inequality]:
-        """V_target(jump z) ≤ V_source(z) + Σ m q."""
+        """V_target(jump (z, p)) ≤ V_source(z) + Σ m q(z, p)."""
         source, target = self.locations[edge.source], self.locations[edge.target]
         E = columns_of(identity(self.size), source.coordinates)
-        jump = rows_of(edge.jump * E, target.coordinates)
+        signals = edge.jump.ncols() - self.size
+        own = beside(identity(E.ncols()), zeros(E.ncols(), signals))
+        pair = _with_signals(E, signals)
+        for k in range(signals):
+            pair[self.size + k, E.ncols() + k] = 1
+        jump = rows_of(edge.jump * pair, target.coordinates)
         units = {name for name, f in (("c1", self.f1), ("c2", self.f2)) if not is_zero(f * E)}
-        facts = edge.facts + (source.facts if units <= set(self._guards) else ())
-        for node in edge.nodes:
-            for target_node in edge.target_nodes:
-                terms = _Terms(E.ncols())
-                one = identity(E.ncols())
-                terms.add(self.form(edge.source, node), one, one, arb(1) / 2)
-                terms.add(self.form(edge.target, target_node), jump, jump, arb(-1) / 2)
-                name = f"edge/{edge.name}/{node} {target_node}"
-                for number_, fact in enumerate(facts):
-                    terms.scalar(f"m/{name}/{number_}", transpose(E) * fact * E)
-                yield terms.inequality(name, edge.source, 0)
+        facts = edge.facts
+        if units <= set(self._guards):
+            facts += tuple(_with_signals(fact, signals) for fact in source.facts)
+        for node, target_node in edge.pairs:
+            terms = _Terms(pair.ncols())
+            terms.add(self.form(edge.source, node), own, own, arb(1) / 2)
+            terms.add(self.form(edge.target, target_node), jump, jump, arb(-1) / 2)
+            name = f"edge/{edge.name}/{node} {target_node}"
+            for number_, fact in enumerate(facts):
+                terms.scalar(f"m/{name}/{number_}", transpose(pair) * fact * pair)
+            yield terms.inequality(name, edge.source, signals)
 
     def _start_inequality(self) -> Inequality:
         """V(z(0)) ≤ 0."""
@@ -447,6 +530,12 @@ class Model:
         terms = _Terms(1)
         terms.add(self.form(index, 0), z, z, arb(-1) / 2)
         return terms.inequality("start", index, -1)
+
+
+def _with_signals(M: arb_mat, signals: int) -> arb_mat:
+    """Return a matrix with so many rows and columns of zeros more."""
+    wide = beside(M, zeros(M.nrows(), signals))
+    return stack([wide, zeros(signals, wide.ncols())])
 
 
 def _corners(K: arb_mat, H: arb_mat, q: arb, degree: int) -> tuple[list[arb_mat], arb_mat]:

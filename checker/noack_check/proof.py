@@ -4,13 +4,15 @@ A document names the plants ("own" or "box") and the conditions ("schedule" or "
 each output the numbers that :mod:`.check` verifies. From the bound of the drift W(ẋ − Hx) follow
 
 * the sensor's error between two tests: e^{Hs} times its value at the test, plus what the drift adds;
-* the least time between events, since e_s begins at 0 and has to reach the threshold;
-* that no event happens while an update is on its way, which the model assumes: by induction over the
-  events, since all bounds hold up to the next one;
+* the least time between events, since e_s begins at 0 and has to reach the threshold.
+
+Rules that do not compare ‖W e_s‖ with a threshold have a bound of e_s by quadratic forms, and their
+events are as far apart as tests. From a bound of e_s follows
+
 * the controller's error, e_c = e_s + Σ e^{H(t−t_i)} e_s(t_i⁻) over the missing updates: the paper's chain.
 
-Rules that do not compare ‖W e_s‖ with a threshold have no such bound of the drift. Without it, events
-are as far apart as tests: no update may be on its way for longer.
+The model assumes a bound of e_s ("errors") and a number of events while an update is on its way ("later").
+Both are proven from bounds of this model, by induction over the events: all bounds hold up to the next one.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,9 +23,11 @@ from flint import arb, arb_mat, fmpq
 from noack_check.balls import around_zero, frobenius, identity, is_zero, number, upto
 from noack_check.check import RejectedError, verify
 from noack_check.loop import Loop, Times
-from noack_check.model import Model, thresholds
+from noack_check.model import Errors, Model, has_decaying_unit, needs_constant, thresholds
 from noack_check.norms import decays_below, growth
 
+MOST_LATER = 100
+"""Most events within the time that an update may be on its way."""
 _MOST_TESTS = 1_000_000
 _CELLS = 32
 """Parts of the time before the first input."""
@@ -47,6 +51,8 @@ class Proof(NamedTuple):
     """Two events after the one at t = 0 are at least this far apart, s; None: nothing is known."""
     first_event: arb | None
     """No event follows the one at t = 0 before this time, s."""
+    is_quiet: bool
+    """No event follows the one at t = 0 before the first input acts; else the other times hold from it on."""
 
 
 def prove(loop: Loop, document: Mapping[str, object]) -> Proof:
@@ -62,53 +68,101 @@ def prove(loop: Loop, document: Mapping[str, object]) -> Proof:
     rate = _number(document, "rate")
     if not rate >= 0 or not (loop.rule.level == 0 or rate <= loop.rule.rate):
         raise RejectedError("rate: not between 0 and that of the threshold")
-    chain_gain = _chain_gain(loop, rate, document)
-    overshoot = _number(document, "overshoot") if "overshoot" in document else None
+    assumed = read_assumptions(loop, rate, document)
     entries = _entries(document, "bounds")
     if not entries:
         raise RejectedError("bounds: there is none")
     if len({(str(e.get("output")), bool(e.get("from_start", True))) for e in entries}) < len(entries):
         raise RejectedError("bounds: an output occurs twice")
-    bounds = [prove_bound(loop, rate, entry, chain_gain, overshoot) for entry in entries]
-    drift = next((b for b in bounds if b.output == "drift" and b.from_start), None)
-    if drift is None:
-        if overshoot is not None or loop.times.least_sampling < max(loop.times.delay, loop.times.start):
-            raise RejectedError("bounds: that of the drift from the start on is missing")
-        return Proof(rate, tuple(bounds), None, None)
-    apart = first = _number(document, "inter_event_s")
-    _prove_inter_event(loop, rate, drift, apart)
-    if not _is_quiet(loop, apart, loop.times.delay):
-        raise RejectedError("inter_event_s: an event may happen while an update is on its way")
-    if loop.times.start > 0:
-        _prove_quiet_start(loop)
-        first = _number(document, "first_event_s") if "first_event_s" in document else arb(0)
-        prove_first_event(loop, drift, first, loop.times.start)
-    sensor = _sensor_error(loop, rate, drift)
-    if overshoot is not None:
-        _prove_overshoot(loop, rate, sensor, overshoot)
-    bounds.append(sensor)
-    if chain_gain is not None:
-        missing = loop.losses + (1 if loop.times.delay > 0 else 0)
-        factor = 1 + missing * chain_gain
+    bounds = [prove_bound(loop, rate, entry, assumed) for entry in entries]
+    proven = {bound.output: bound for bound in bounds if bound.from_start}
+    apart = first = None
+    if "drift" in proven:
+        apart, first = _times_between_events(loop, rate, proven["drift"], assumed, document)
+        bounds.append(sensor_error(loop, rate, proven["drift"]))
+    sensor = bounds[-1] if "drift" in proven else proven.get("e_s")
+    is_quiet = require_few_at_start(loop, assumed)
+    require_few_later(loop, assumed, apart if is_quiet else None)
+    if assumed.errors is not None:
+        _require_errors(loop, rate, sensor, assumed.errors)
+    if assumed.chain_gain is not None and sensor is not None:
+        missing = loop.losses + (1 + assumed.later if loop.times.delay > 0 else 0)
+        factor = 1 + missing * assumed.chain_gain
         bounds.append(Bound("e_c", factor * sensor.decaying, factor * sensor.constant, True))
     if not all(size.is_finite() for bound in bounds for size in (bound.decaying, bound.constant)):
         raise RejectedError("bounds: not finite")
-    return Proof(rate, tuple(bounds), apart, first)
+    return Proof(rate, tuple(bounds), apart, first, is_quiet)
 
 
-def _is_quiet(loop: Loop, apart: arb, time: fmpq) -> bool:
-    """Return whether no event comes sooner than ``time`` after another, if e_s needs longer than ``apart``.
+class Assumptions(NamedTuple):
+    """What the model assumes, and the growth of the model's error, which is proven."""
 
-    Tests are the only times of events, and the k-th comes between k times the least and the largest
-    time between two tests. An event at the time at which an input begins to act may come before or
-    after it: w is the same.
+    errors: Errors | None
+    later: int
+    later_at_start: int
+    chain_gain: arb | None
+
+
+def read_assumptions(loop: Loop, rate: arb, document: Mapping[str, object]) -> Assumptions:
+    """Return what a document assumes of a loop.
+
+    Raises:
+        RejectedError: it has no meaning, or the chain's gain is not proven.
     """
-    times, quiet = loop.times, 0
-    if time == 0 or apart >= arb(time):
-        return True
-    while times.sampling > 0 and quiet < _MOST_TESTS and arb((quiet + 1) * times.sampling) <= apart:
-        quiet += 1
-    return (quiet + 1) * times.least_sampling >= time
+    gain = _chain_gain(loop, rate, document)
+    later, at_start = (_count(document, key) for key in ("later", "later_at_start"))
+    if "errors" not in document:
+        if later or at_start:
+            raise RejectedError("errors: missing, and events may happen while an update is on its way")
+        return Assumptions(None, later, at_start, gain)
+    table = document["errors"]
+    if not isinstance(table, Mapping):
+        raise RejectedError("errors: not a table")
+    sizes = _number(table, "decaying"), _number(table, "constant")
+    units = has_decaying_unit(loop, rate), needs_constant(loop)
+    if not all(size == 0 or (size > 0 and is_unit) for size, is_unit in zip(sizes, units, strict=True)):
+        raise RejectedError("errors: below 0, or in a unit that the loop does not have")
+    longest = arb(max(loop.times.delay, loop.times.start))
+    fresh, _ = growth(weighted(loop, rate), longest)
+    return Assumptions(Errors(*sizes, fresh, gain), later, at_start, gain)
+
+
+def require_few_at_start(loop: Loop, assumed: Assumptions) -> bool:
+    """Prove that no more events than assumed precede the first input; return whether there is none."""
+    if (assumed.later_at_start + 1) * loop.times.least_sampling < loop.times.start:
+        if assumed.later_at_start:
+            raise RejectedError("later_at_start: more events may happen before the first input acts")
+        _prove_quiet_start(loop)
+    return assumed.later_at_start == 0
+
+
+def require_few_later(loop: Loop, assumed: Assumptions, apart: arb | None) -> None:
+    """Prove that no more events than assumed happen while an update is on its way.
+
+    Tests are the only times of events. If e_s needs longer than ``apart`` to reach the threshold, as
+    many tests as surely happen within it are silent. An event at the time at which an input begins to
+    act may come before or after it: w is the same.
+    """
+    times, silent = loop.times, 0
+    if apart is not None:
+        if apart * (assumed.later + 1) >= arb(times.delay):
+            return
+        while times.sampling > 0 and silent < _MOST_TESTS and arb((silent + 1) * times.sampling) <= apart:
+            silent += 1
+    if not (silent + 1) * times.least_sampling * (assumed.later + 1) >= times.delay:
+        raise RejectedError("later: more events may happen while an update is on its way")
+
+
+def _times_between_events(
+    loop: Loop, rate: arb, drift: Bound, assumed: Assumptions, document: Mapping[str, object]
+) -> tuple[arb, arb]:
+    """Return least times between two events, and of the first event after t = 0, as proven."""
+    apart = first = _number(document, "inter_event_s")
+    _prove_inter_event(loop, rate, drift, apart)
+    if loop.times.start > 0:
+        first = _number(document, "first_event_s") if "first_event_s" in document else arb(0)
+        prove_first_event(loop, drift, first, loop.times.start)
+    return apart, first
 
 
 def _prove_quiet_start(loop: Loop) -> None:
@@ -132,7 +186,7 @@ def error_without_input(loop: Loop, until: fmpq) -> arb:
     pushes = arb_mat(loop.n, 1)
     if loop.sizes:
         pushes = loop.pushes * arb_mat(len(loop.sizes), 1, [around_zero(size) for size in loop.sizes])
-    largest, _ = growth(_weighted(loop, arb(0)), arb(until))
+    largest, _ = growth(weighted(loop, arb(0)), arb(until))
     step, x, reached = arb(until) / _CELLS, loop.start, arb(0)
     within, forward = (upto(step) * A).exp(), (step * A).exp()
     for _ in range(_CELLS):
@@ -153,7 +207,7 @@ def prove_first_event(loop: Loop, drift: Bound, first: arb, until: fmpq) -> None
         return
     if rule.always or not compares_error(loop) or not first > 0:
         raise RejectedError("first_event_s: not proven for this rule; 0 is")
-    largest, total = growth(_weighted(loop, arb(0)), first)
+    largest, total = growth(weighted(loop, arb(0)), first)
     added = total * (drift.decaying**2 + drift.constant**2).sqrt()
     threshold = (rule.level * (-rule.rate * first).exp()).max(rule.floor)
     if not largest * error_without_input(loop, until) + added < threshold:
@@ -175,7 +229,7 @@ def _chain_gain(loop: Loop, rate: arb, document: Mapping[str, object]) -> arb | 
     chain = document["chain"]
     if not isinstance(chain, Mapping):
         raise RejectedError("chain: not a table")
-    gain, G = _number(chain, "gain"), _weighted(loop, rate)
+    gain, G = _number(chain, "gain"), weighted(loop, rate)
     tail = _matrix(chain, "tail", loop.n)
     proven = gain >= 1 if is_zero(G) else decays_below(G, gain, tail)
     if not proven:
@@ -183,7 +237,7 @@ def _chain_gain(loop: Loop, rate: arb, document: Mapping[str, object]) -> arb | 
     return gain
 
 
-def _weighted(loop: Loop, rate: arb) -> arb_mat:
+def weighted(loop: Loop, rate: arb) -> arb_mat:
     """Return W (H + r) W⁻¹."""
     try:
         H = loop.weight * loop.H * loop.weight.inv()
@@ -192,15 +246,16 @@ def _weighted(loop: Loop, rate: arb) -> arb_mat:
     return H if is_zero(H) and rate == 0 else H + rate * identity(loop.n)
 
 
-def prove_bound(
-    loop: Loop, rate: arb, entry: Mapping[str, object], chain_gain: arb | None, overshoot: arb | None
-) -> Bound:
+def prove_bound(loop: Loop, rate: arb, entry: Mapping[str, object], assumed: Assumptions) -> Bound:
     """Return the bound of one output, after verifying its inequalities."""
-    uses_chain = overshoot is not None
-    if uses_chain and chain_gain is None:
-        raise RejectedError("overshoot: needs the chain")
-    kappa = chain_gain * overshoot if uses_chain else None  # type: ignore[operator]
-    model = Model(loop, rate, _number(entry, "decay"), kappa)
+    model = Model(
+        loop,
+        rate,
+        _number(entry, "decay"),
+        assumed.errors,
+        later=assumed.later,
+        later_at_start=assumed.later_at_start,
+    )
     output, starts = str(entry.get("output")), bool(entry.get("from_start", True))
     if output not in {"x", "e_s", "e_c", "drift", *(f"x[{i}]" for i in range(loop.n))}:
         raise RejectedError(f"output: {output[:50]!r} is none of the loop's")
@@ -233,7 +288,7 @@ def _prove_inter_event(loop: Loop, rate: arb, drift: Bound, apart: arb) -> None:
     rule = loop.rule
     if rule.always or not compares_error(loop) or not apart > 0:
         raise RejectedError("inter_event_s: not proven for this rule; 0 is")
-    _, total = growth(_weighted(loop, rate), apart)
+    _, total = growth(weighted(loop, rate), apart)
     level = rule.level if bool(rate == rule.rate) else arb(0)
     kinks = [arb(0), arb(1)]
     if level > 0 and rule.floor > 0:
@@ -258,14 +313,14 @@ def compares_error(loop: Loop) -> bool:
     return all(entry == expected for entry, expected in entries)
 
 
-def _sensor_error(loop: Loop, rate: arb, drift: Bound) -> Bound:
+def sensor_error(loop: Loop, rate: arb, drift: Bound) -> Bound:
     """Return the bound of W e_s: the threshold at the last test, grown, plus what the drift adds."""
     if not compares_error(loop):
         raise RejectedError("drift: bounds e_s only for a rule that compares ‖W e_s‖")
     level, floor = thresholds(loop, rate)
     if loop.times.sampling == 0:
         return Bound("e_s", level, floor, True)
-    largest, total = growth(_weighted(loop, rate), arb(loop.times.sampling))
+    largest, total = growth(weighted(loop, rate), arb(loop.times.sampling))
     most = largest * _at_first_input(loop, rate)
     parts = zip((level, floor), (drift.decaying, drift.constant), strict=True)
     decaying, constant = (most * at_test + total * added for at_test, added in parts)
@@ -284,19 +339,20 @@ def _at_first_input(loop: Loop, rate: arb) -> arb:
     return arb((error_without_input(loop, until) / threshold).max(arb(1)).abs_upper())
 
 
-def _prove_overshoot(loop: Loop, rate: arb, sensor: Bound, overshoot: arb) -> None:
-    """Prove ‖W e_s‖ ≤ overshoot · (c² f₁² + f² f₂²)^½, strictly: then the facts that used it hold on.
+def _require_errors(loop: Loop, rate: arb, sensor: Bound | None, errors: Errors) -> None:
+    """Prove that ‖W e_s‖ is below what is assumed of it, strictly: then what used it holds on.
 
-    Up to some time they hold; so do all bounds, and ‖W e_s‖ is below what the facts allow, also a
-    little later, since e_s is continuous but for its jumps to 0.
+    Up to some time the assumption holds; so do all bounds, and ‖W e_s‖ is below what is assumed, also a
+    little later, since e_s is continuous but for its jumps to 0. A rule that is tested at all times keeps
+    ‖W e_s‖ at its threshold or below: there nothing is assumed.
     """
-    if loop.times.sampling == 0:
-        if not overshoot >= 1:
-            raise RejectedError("overshoot: below 1")
-        return
-    for proven, unit in zip((sensor.decaying, sensor.constant), thresholds(loop, rate), strict=True):
-        if not (proven < overshoot * unit or (proven == 0 and unit == 0)):
-            raise RejectedError("overshoot: the sensor's error may exceed it")
+    if sensor is None:
+        raise RejectedError("errors: no bound of e_s, or of the drift, from the start on")
+    exact = loop.times.sampling == 0 and compares_error(loop)
+    pairs = zip((sensor.decaying, sensor.constant), (errors.decaying, errors.constant), strict=True)
+    for proven, assumed in pairs:
+        if not (proven < assumed or (proven == 0 and assumed == 0) or (exact and proven <= assumed)):
+            raise RejectedError("errors: the sensor's error may exceed them")
 
 
 # Reading a document.
@@ -307,6 +363,13 @@ def _entries(document: Mapping[str, object], key: str) -> list[Mapping[str, obje
     if not isinstance(entries, list) or not all(isinstance(entry, Mapping) for entry in entries):
         raise RejectedError(f"{key}: not a list of tables")
     return entries
+
+
+def _count(table: Mapping[str, object], key: str) -> int:
+    value = table.get(key, 0)
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MOST_LATER:
+        raise RejectedError(f"{key}: not a whole number from 0 to {MOST_LATER}")
+    return value
 
 
 def _number(table: Mapping[str, object], key: str) -> arb:

@@ -37,7 +37,9 @@ def sentences(proof: Proof) -> Iterator[str]:
     for bound in smallest_bounds(proof):
         yield f"{_NAMES.get(bound.output, f'|{bound.output}|')} ≤ {formula(bound, proof.rate)}"
     if proof.inter_event is not None and proof.inter_event > 0:
-        yield f"two events are at least {at_least(proof.inter_event)} s apart{_exception(proof)}"
+        which = "" if proof.is_quiet else " after the first input"
+        exception = _exception(proof) if proof.is_quiet else ""
+        yield f"two events{which} are at least {at_least(proof.inter_event)} s apart{exception}"
 
 
 def _exception(proof: Proof) -> str:

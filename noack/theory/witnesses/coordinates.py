@@ -19,7 +19,6 @@ Frames = Mapping[str, Matrix]
 """By the name of a witness's matrix V: T with V = T⁻ᵀ V̂ T⁻¹, V̂ of order 1."""
 _RUNS, _MOST_STEPS = 120, 3000
 _LOSS_RATES = (0.0, 0.3, 0.6, 0.9, 1.0)
-_WAITING = "on its way"
 
 
 def floats(M: arb_mat) -> Matrix:
@@ -79,7 +78,9 @@ class _Runs:
         spread = float(np.linalg.norm(floats(self._loop.start))) or 1.0
         half = _RUNS // 2
         self._z[half:, :n] = spread * self._rng.standard_normal((_RUNS - half, n)) / np.sqrt(n)
-        self._missing, self._waiting = np.zeros(_RUNS, int), np.zeros(_RUNS, bool)
+        self._missing = np.zeros(_RUNS, int)
+        self._later, self._most = np.zeros(_RUNS, int), model.later
+        self._waiting = np.zeros(_RUNS, bool)
         self._loss_rate = self._rng.choice(_LOSS_RATES, _RUNS)
         self._sums: dict[str, Matrix] = defaultdict(lambda: np.zeros((N, N)))
         self._counts: dict[str, int] = defaultdict(int)
@@ -109,24 +110,27 @@ class _Runs:
 
     def _events(self, step: int) -> NDArray[np.bool_]:
         if period := float(self._loop.rule.period):
-            return np.full(_RUNS, (step + 1) % max(round(period / self._h), 1) == 0) & ~self._waiting
-        return (self._quadratic(self._silent) > 0) & ~self._waiting
+            return np.full(_RUNS, (step + 1) % max(round(period / self._h), 1) == 0)
+        return self._quadratic(self._silent) > 0
 
     def _jump(self, event: NDArray[np.bool_]) -> None:
         z, delay_s = self._z, _seconds(self._loop.times.delay)
         arrives = self._waiting & (self._rng.random(_RUNS) < 2.0 * self._h / max(delay_s, self._h))
-        z[arrives] = z[arrives] @ self._arrived.T
-        self._waiting &= ~arrives
-        self._missing[arrives] = 0
+        self._arrive(arrives | self._waiting & event & (self._later >= self._most))
         z[event] = z[event] @ self._lost.T
         drops = event & (self._rng.random(_RUNS) < self._loss_rate) & (self._missing < self._loop.losses)
-        self._missing[drops] += 1
+        self._later[event & self._waiting] += 1
+        self._missing[drops & ~self._waiting] += 1
         passes = event & ~drops
         if delay_s:
             self._waiting |= passes
         else:
-            z[passes] = z[passes] @ self._arrived.T
-            self._missing[passes] = 0
+            self._arrive(passes)
+
+    def _arrive(self, which: NDArray[np.bool_]) -> None:
+        self._z[which] = self._z[which] @ self._arrived.T
+        self._waiting &= ~which
+        self._missing[which] = self._later[which] = 0
 
     def _observe(self) -> None:
         """Add to the moments, in units of the present threshold; without one, of the decay."""
@@ -135,9 +139,10 @@ class _Runs:
         unit = float(self._unit.sum()) or 1.0
         ratio = np.maximum(size / unit if size.any() else decay, 1e-300)
         scaled = self._z / np.sqrt(ratio)[:, None]
-        for missing in range(self._loop.losses + 1):
-            self._add(f"{missing} lost", scaled[(self._missing == missing) & ~self._waiting])
-        self._add(_WAITING, scaled[self._waiting])
+        for lost in range(self._loop.losses + 1):
+            self._add(f"{lost} lost", scaled[(self._missing == lost) & ~self._waiting])
+        for later in range(self._most + 1):
+            self._add(f"{later} later", scaled[(self._later == later) & self._waiting])
 
     def _add(self, location: str, z: Matrix) -> None:
         if len(z):

@@ -1,22 +1,26 @@
 """The search for a whole witness: a document that :mod:`noack_check.proof` accepts."""
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from flint import arb
-from scipy.linalg import expm, solve_continuous_lyapunov
 
-from noack.core.linear_systems import Matrix
+from noack.theory.witnesses.assumptions import (
+    are_below,
+    first_assumptions,
+    first_event_s,
+    inter_event_s,
+    next_assumptions,
+    with_errors,
+)
 from noack.theory.witnesses.coordinates import Frames, floats, simulated_frames
 from noack.theory.witnesses.search import Found, Search, refined
-from noack_check.balls import matrix, number
+from noack_check.balls import number
 from noack_check.check import RejectedError
 from noack_check.loop import Loop
-from noack_check.model import Model, thresholds
-from noack_check.norms import growth
-from noack_check.proof import Bound, Proof, compares_error, prove, prove_bound, prove_first_event
+from noack_check.model import Model
+from noack_check.proof import Proof, compares_error, prove, prove_bound, read_assumptions
 
 _MARGINS = (1e-6, 1e-5, 1e-4, 1e-3)
 """Margins of the inequalities, in the coordinates of the search, until the checker accepts."""
@@ -56,28 +60,65 @@ def find_witness(
     rates = _Rates(loop)
     if rates.slowest <= 0:
         raise NoWitnessError("the loop does not decay without losses")
-    document: dict[str, object] = {"rate": rates.rate}
-    chain = _chain(loop, rates.rate)
-    if chain is not None and compares_error(loop):
-        document["chain"] = chain
-    search = _OutputSearch(loop, rates)
-    if not compares_error(loop):
-        bounds = search.bounds([*outputs, "e_s"], ultimate)
-        if not bounds:  # at a smaller rate of decay, perhaps
-            rates = _Rates(loop, slow=True)
-            document["rate"] = rates.rate
-            bounds = _OutputSearch(loop, rates).bounds([*outputs, "e_s"], ultimate)
-        if not bounds:
-            raise NoWitnessError("the solver finds no quadratic forms at any rate of decay")
-        document["bounds"] = bounds
+    if compares_error(loop):
+        return _by_threshold(loop, rates, outputs, ultimate)
+    with contextlib.suppress(NoWitnessError):
+        return _by_quadratic_forms(loop, rates, outputs, ultimate)
+    return _by_quadratic_forms(loop, _Rates(loop, slow=True), outputs, ultimate)
+
+
+def _by_threshold(loop: Loop, rates: "_Rates", outputs: Sequence[str], ultimate: Sequence[str]) -> Witness:
+    """Return a witness for a rule that compares ‖W e_s‖: the drift bounds e_s and the times between events."""
+    document = first_assumptions(loop, rates.rate)
+    for _ in range(_MOST_GUESSES):
+        search = _OutputSearch(loop, rates, document)
+        drift = search.best_decay("drift", starts=True)[1].levels
+        following = next_assumptions(loop, document, drift)
+        if following is None:
+            break
+        document = following
     else:
-        if loop.holds:
-            document["overshoot"] = search.overshoot()
-        bounds = search.bounds(outputs, ultimate)
-        drift = search.bound("drift")
-        document["bounds"] = [*bounds, drift]
-        document["inter_event_s"] = apart = _inter_event_s(loop, rates.rate, drift)
-        document["first_event_s"] = _first_event_s(loop, drift, apart)
+        raise NoWitnessError("errors: the sensor's error may be larger than each guess of it")
+    bounds = search.bounds(outputs, ultimate)
+    entry = search.bound("drift")
+    document["bounds"] = [*bounds, entry]
+    numbers = entry["numbers"]
+    assert isinstance(numbers, dict)
+    drift = tuple(float(np.sqrt(numbers.get(f"level {i}", 0.0))) for i in (1, 2))
+    document["inter_event_s"] = apart = inter_event_s(loop, rates.rate, drift)
+    document["first_event_s"] = first_event_s(loop, drift, apart)
+    return _proven(loop, document)
+
+
+def _by_quadratic_forms(
+    loop: Loop, rates: "_Rates", outputs: Sequence[str], ultimate: Sequence[str]
+) -> Witness:
+    """Return a witness for another rule: e_s has quadratic forms as other outputs have."""
+    document = first_assumptions(loop, rates.rate)
+    if "errors" in document:
+        document = _with_errors(loop, rates, document)
+    search = _OutputSearch(loop, rates, document)
+    bounds = search.bounds([*outputs, "e_s"], ultimate)
+    if not bounds:
+        raise NoWitnessError("the solver finds no quadratic forms at any rate of decay")
+    document["bounds"] = bounds
+    return _proven(loop, document)
+
+
+def _with_errors(loop: Loop, rates: "_Rates", document: dict[str, object]) -> dict[str, object]:
+    """Return a document whose bound of e_s follows from itself; the first guess is that without any."""
+    alone = {key: document[key] for key in ("rate", "chain") if key in document}
+    search = _OutputSearch(loop, rates, alone)
+    for _ in range(_MOST_GUESSES):
+        levels = search.best_decay("e_s", starts=True)[1].levels
+        if search.document is not alone and are_below(levels, document):
+            return document
+        document = with_errors(document, [1.3 * level for level in levels])
+        search = _OutputSearch(loop, rates, document)
+    raise NoWitnessError("errors: the sensor's error may be larger than each guess of it")
+
+
+def _proven(loop: Loop, document: Mapping[str, object]) -> Witness:
     try:
         return Witness(document, prove(loop, document))
     except RejectedError as error:
@@ -105,40 +146,31 @@ class _Rates:
 
 
 class _OutputSearch:
-    """The search for the bounds of one loop; ν of the first output is the first guess for the others."""
+    """The search for the bounds of one loop; ν of the first output is the first guess for the others.
 
-    def __init__(self, loop: Loop, rates: _Rates) -> None:
-        self._loop, self._rates = loop, rates
-        self._overshoot: arb | None = None
+    Args:
+        loop: the loop.
+        rates: its rates of decay.
+        document: a witness's document with its assumptions.
+    """
+
+    def __init__(self, loop: Loop, rates: _Rates, document: Mapping[str, object]) -> None:
+        self._loop, self._rates, self.document = loop, rates, document
+        self._rate = number(rates.rate)
+        self._assumed = read_assumptions(loop, self._rate, document)
         self._frames = simulated_frames(self._model(rates.decay(rates.shares[0])))
         self._share: float | None = None
 
     def _model(self, decay: float) -> Model:
-        rate, chain = number(self._rates.rate), self._overshoot
-        return Model(self._loop, rate, number(decay), chain, is_exact=False)
-
-    def overshoot(self) -> float:
-        """Return a largest ‖W e_s‖ between tests, in thresholds, that the facts about w may use.
-
-        These facts lead to a bound of the drift, and it to the next guess.
-
-        Raises:
-            NoWitnessError: no guess is confirmed.
-        """
-        sampling = float(arb(self._loop.times.sampling).mid())
-        units = [float(each) for each in thresholds(self._loop, number(self._rates.rate))]
-        guess = 1.0 if not sampling else 1.1
-        for _ in range(_MOST_GUESSES):
-            self._overshoot = number(guess)
-            if not sampling:
-                return guess
-            levels = self._best_decay("drift", starts=True)[1].levels
-            needed = 1 + sampling * max(D / unit for D, unit in zip(levels, units, strict=True) if unit)
-            if needed < guess:
-                return guess
-            guess = 1 + (needed - 1) * 1.3
-        raise NoWitnessError(
-            f"overshoot: the sensor's error may grow to {guess:.3g} thresholds between tests"
+        assumed = self._assumed
+        return Model(
+            self._loop,
+            self._rate,
+            number(decay),
+            assumed.errors,
+            later=assumed.later,
+            later_at_start=assumed.later_at_start,
+            is_exact=False,
         )
 
     def bounds(self, outputs: Sequence[str], ultimate: Sequence[str]) -> list[dict[str, object]]:
@@ -156,7 +188,7 @@ class _OutputSearch:
         ν is found by coarse solutions. The best of them gives the coordinates for accurate ones, of
         which the first that is accepted and not much larger than the coarse one is taken.
         """
-        decay, coarse = self._best_decay(output, starts=starts)
+        decay, coarse = self.best_decay(output, starts=starts)
         frames, why = refined(self._frames, coarse), f"{output}: the solver finds no quadratic forms"
         accepted: list[tuple[float, dict[str, object]]] = []
         for margin in _MARGINS:
@@ -166,7 +198,7 @@ class _OutputSearch:
                     continue
                 entry = _entry(output, decay, found, starts=starts)
                 try:
-                    prove_bound(self._loop, number(self._rates.rate), entry, arb(1), self._overshoot)
+                    prove_bound(self._loop, self._rate, entry, self._assumed)
                 except RejectedError as error:
                     why = str(error)
                     frames = refined(coordinates, found)
@@ -178,7 +210,7 @@ class _OutputSearch:
                 return min(accepted, key=lambda pair: pair[0])[1]
         raise NoWitnessError(why)
 
-    def _best_decay(self, output: str, *, starts: bool) -> tuple[float, Found]:
+    def best_decay(self, output: str, *, starts: bool) -> tuple[float, Found]:
         """Return ν with its coarse solution; the first output tries all shares, the others its neighbours."""
         found: dict[float, Found] = {}
         first = self._share
@@ -237,71 +269,3 @@ def _entry(output: str, decay: float, found: Found, *, starts: bool) -> dict[str
     return {
         "output": output, "decay": decay, "from_start": starts, "matrices": matrices, "numbers": numbers,
     }  # fmt: skip
-
-
-def _chain(loop: Loop, rate: float) -> dict[str, object] | None:
-    """Return the gain of the paper's chain with the witness of its tail; None: the model does not decay."""
-    W = floats(loop.weight)
-    G = W @ floats(loop.H) @ np.linalg.inv(W) + rate * np.eye(loop.n)
-    if not G.any():
-        return {"gain": 1.0, "tail": np.eye(loop.n).tolist()}
-    if np.linalg.eigvals(G).real.max() >= 0:
-        return None
-    tail = solve_continuous_lyapunov(G.T, -np.eye(loop.n))
-    gain = max(_sups(G)) * (1 + 3e-4) + 1e-9
-    return {"gain": gain, "tail": ((tail + tail.T) / 2).tolist()}
-
-
-def _sups(G: Matrix) -> Iterator[float]:
-    """Yield the largest of ‖e^{Gτ}‖ on grids of 256 times until it has decayed."""
-    slowest = -float(np.linalg.eigvals(G).real.max())
-    step = 0.02 / max(float(np.linalg.norm(G, 2)), slowest)
-    cells = np.array([expm(G * step * k) for k in range(256)])
-    power, following = np.eye(len(G)), expm(G * step * 256)
-    for _ in range(400):
-        sizes = np.linalg.norm(cells @ power, 2, axis=(1, 2))
-        yield float(sizes.max())
-        if sizes[-1] < 1e-2:
-            return
-        power = following @ power
-
-
-def _inter_event_s(loop: Loop, rate: float, drift: Mapping[str, object]) -> float:
-    """Return a time that :mod:`noack_check.proof` accepts between two events; 0 without one."""
-    numbers = drift["numbers"]
-    assert isinstance(numbers, dict)
-    D1, D2 = numbers.get("level 1", 0.0), numbers.get("level 2", 0.0)
-    level, floor = float(loop.rule.level), float(loop.rule.floor)
-    if rate != float(loop.rule.rate):
-        level = 0.0
-    if loop.rule.always or loop.rule.negative.nrows() or not (level or floor):
-        return 0.0
-    shares = [(max(level**2 * v, floor**2), D1 * v + D2) for v in _kinks(level, floor)]
-    most = min((threshold / size) ** 0.5 for threshold, size in shares if size)
-    W = floats(loop.weight)
-    G = W @ floats(loop.H) @ np.linalg.inv(W) + rate * np.eye(loop.n)
-    low, high = 0.0, most
-    for _ in range(30):
-        middle = (low + high) / 2
-        total = float(growth(matrix(G.tolist()), number(middle))[1].mid())
-        low, high = (middle, high) if total * (1 + 1e-9) < most else (low, middle)
-    return low
-
-
-def _first_event_s(loop: Loop, drift: Mapping[str, object], most: float) -> float:
-    """Return a share of ``most`` before which no event follows the one at t = 0; 0 without one."""
-    numbers = drift["numbers"]
-    assert isinstance(numbers, dict)
-    decaying, constant = (number(numbers.get(name, 0.0)).sqrt() for name in ("level 1", "level 2"))
-    bound = Bound("drift", decaying, constant, True)
-    for share in (1.0, 0.9, 0.75, 0.5, 0.25):
-        with contextlib.suppress(RejectedError):
-            prove_first_event(loop, bound, number(share * most), loop.times.start)
-            return share * most
-    return 0.0
-
-
-def _kinks(level: float, floor: float) -> list[float]:
-    if not level:
-        return [0.0, 1.0]
-    return [1.0, *([0.0, min((floor / level) ** 2, 1.0)] if floor else [])]

@@ -1,0 +1,173 @@
+"""What a witness's model assumes: the size of the sensor's error, and events while an update is on its way.
+
+Each guess leads to a bound of the drift or of the error, and this to the next guess, until one confirms
+itself. Nothing here has to be right: :mod:`noack_check.proof` proves what is assumed.
+"""
+
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+from flint import fmpq
+from scipy.linalg import expm, solve_continuous_lyapunov
+
+from noack.core.linear_systems import Matrix
+from noack.theory.witnesses.coordinates import floats
+from noack_check.balls import matrix, number
+from noack_check.check import RejectedError
+from noack_check.loop import Loop
+from noack_check.model import thresholds
+from noack_check.norms import growth
+from noack_check.proof import (
+    Assumptions,
+    Bound,
+    compares_error,
+    prove_first_event,
+    require_few_at_start,
+    require_few_later,
+    sensor_error,
+)
+
+_ROOM = 1.01
+"""A guess is confirmed if what follows from it is smaller by this factor."""
+_FURTHER = 1.3
+"""The next guess exceeds what followed from the last one by this factor."""
+
+
+def first_assumptions(loop: Loop, rate: float) -> dict[str, object]:
+    """Return a document without bounds: its rate, its chain, and what is assumed at first.
+
+    A rule that compares ‖W e_s‖ may have no event while an update is on its way; of others each test may
+    be one.
+    """
+    document: dict[str, object] = {"rate": rate}
+    if (chain := _chain(loop, rate)) is not None:
+        document["chain"] = chain
+    later, at_start = 0, 0
+    try:
+        require_few_at_start(loop, Assumptions(None, 0, 0, None))
+    except RejectedError:
+        at_start = _most_between(loop, loop.times.start)
+    if at_start or not compares_error(loop):
+        later = _most_between(loop, loop.times.delay)
+    document |= {"later": later, "later_at_start": at_start}
+    if loop.holds or later or at_start:
+        share = 1.1 if loop.times.sampling > 0 else 1.0
+        document = with_errors(document, [share * float(each) for each in thresholds(loop, number(rate))])
+    return document
+
+
+def with_errors(document: Mapping[str, object], sizes: Sequence[float]) -> dict[str, object]:
+    """Return a document that assumes other errors."""
+    decaying, constant = sizes
+    return {**document, "errors": {"decaying": decaying, "constant": constant}}
+
+
+def are_below(sizes: Sequence[float], document: Mapping[str, object]) -> bool:
+    """Return whether errors are below what a document assumes."""
+    errors = document.get("errors")
+    if not isinstance(errors, Mapping):
+        return True
+    most = errors["decaying"], errors["constant"]
+    return all(_ROOM * size < limit or size == 0 for size, limit in zip(sizes, most, strict=True))
+
+
+def next_assumptions(
+    loop: Loop, document: Mapping[str, object], drift: Sequence[float]
+) -> dict[str, object] | None:
+    """Return the next document, or None if a bound of the drift confirms what the present one assumes."""
+    rate = document["rate"]
+    assert isinstance(rate, float)
+    units = [float(each) for each in thresholds(loop, number(rate))]
+    sensor = sensor_error(loop, number(rate), _bound(drift))
+    needed = [float(sensor.decaying), float(sensor.constant)]
+    later = _needed_later(loop, document, inter_event_s(loop, rate, drift) / _ROOM)
+    is_exact = not loop.times.sampling > 0
+    if later == document["later"] and (is_exact or are_below(needed, document)):
+        return None
+    grown = [unit + _FURTHER * (size - unit) for size, unit in zip(needed, units, strict=True)]
+    return with_errors({**document, "later": later}, grown)
+
+
+def _needed_later(loop: Loop, document: Mapping[str, object], apart_s: float) -> int:
+    """Return the most events while an update is on its way, if two are so far apart."""
+    later, at_start = document["later"], document["later_at_start"]
+    assert isinstance(later, int)
+    while later < _most_between(loop, loop.times.delay):
+        with contextlib.suppress(RejectedError):
+            require_few_later(loop, Assumptions(None, later, 0, None), None if at_start else number(apart_s))
+            break
+        later += 1
+    return later
+
+
+def _most_between(loop: Loop, time: fmpq) -> int:
+    """Return the most events within a time after an event, if each test may be one."""
+    least = loop.times.least_sampling
+    return max(int((time / least).ceil()) - 1, 0) if least > 0 else 0
+
+
+def _bound(drift: Sequence[float]) -> Bound:
+    return Bound("drift", *(number(level) for level in drift), True)
+
+
+def _chain(loop: Loop, rate: float) -> dict[str, object] | None:
+    """Return the gain of the paper's chain with the witness of its tail; None: the model does not decay."""
+    W = floats(loop.weight)
+    G = W @ floats(loop.H) @ np.linalg.inv(W) + rate * np.eye(loop.n)
+    if not G.any():
+        return {"gain": 1.0, "tail": np.eye(loop.n).tolist()}
+    if np.linalg.eigvals(G).real.max() >= 0:
+        return None
+    tail = solve_continuous_lyapunov(G.T, -np.eye(loop.n))
+    gain = max(_sups(G)) * (1 + 3e-4) + 1e-9
+    return {"gain": gain, "tail": ((tail + tail.T) / 2).tolist()}
+
+
+def _sups(G: Matrix) -> Iterator[float]:
+    """Yield the largest of ‖e^{Gτ}‖ on grids of 256 times until it has decayed."""
+    slowest = -float(np.linalg.eigvals(G).real.max())
+    step = 0.02 / max(float(np.linalg.norm(G, 2)), slowest)
+    cells = np.array([expm(G * step * k) for k in range(256)])
+    power, following = np.eye(len(G)), expm(G * step * 256)
+    for _ in range(400):
+        sizes = np.linalg.norm(cells @ power, 2, axis=(1, 2))
+        yield float(sizes.max())
+        if sizes[-1] < 1e-2:
+            return
+        power = following @ power
+
+
+def inter_event_s(loop: Loop, rate: float, drift: Sequence[float]) -> float:
+    """Return a time that :mod:`noack_check.proof` accepts between two events; 0 without one."""
+    D1, D2 = (level**2 for level in drift)
+    level, floor = float(loop.rule.level), float(loop.rule.floor)
+    if rate != float(loop.rule.rate):
+        level = 0.0
+    if loop.rule.always or loop.rule.negative.nrows() or not (level or floor):
+        return 0.0
+    shares = [(max(level**2 * v, floor**2), D1 * v + D2) for v in _kinks(level, floor)]
+    most = min((threshold / size) ** 0.5 * (1 - 1e-9) for threshold, size in shares if size)
+    W = floats(loop.weight)
+    G = W @ floats(loop.H) @ np.linalg.inv(W) + rate * np.eye(loop.n)
+    low, high = 0.0, most
+    for _ in range(30):
+        middle = (low + high) / 2
+        total = float(growth(matrix(G.tolist()), number(middle))[1].mid())
+        low, high = (middle, high) if total * (1 + 1e-9) < most else (low, middle)
+    return low
+
+
+def first_event_s(loop: Loop, drift: Sequence[float], most: float) -> float:
+    """Return a share of ``most`` before which no event follows the one at t = 0; 0 without one."""
+    for share in (1.0, 0.9, 0.75, 0.5, 0.25):
+        with contextlib.suppress(RejectedError):
+            prove_first_event(loop, _bound(drift), number(share * most), loop.times.start)
+            return share * most
+    return 0.0
+
+
+def _kinks(level: float, floor: float) -> list[float]:
+    if not level:
+        return [0.0, 1.0]
+    return [1.0, *([0.0, min((floor / level) ** 2, 1.0)] if floor else [])]
