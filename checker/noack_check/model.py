@@ -12,12 +12,10 @@ was computed from:
 
 * "j lost": j updates, which never act. At an event the next one is lost, too, or is on its way.
 * "k later": one is on its way that will act, k events happened after its own, and a clock shows the time
-  since that. It acts before the clock shows d. Then w becomes
+  since that. It acts before the clock shows d. Of the k later updates one acts next, or all are lost.
 
-      Σ e^{H(t − t_i)} e(t_i⁻)  over the k later events t_i:
-
-  0 for k = 0, else some vector below k·sup‖W e^{(H + r)s} W⁻¹‖·‖W e‖, where the last is a bound that is
-  assumed of this loop (:class:`Errors`). Of the k later updates one acts next, or all are lost.
+In "k later" z has k vectors more: v₁, …, v_k with v̇ᵢ = Hvᵢ, what w will be when the updates act that
+have k, …, 1 later ones. An event adds e to all of them, since it changes x_s by −e and no prediction.
 
 At most M − 1 consecutive updates are lost, and at most ``later`` events are assumed to happen within d
 after an event. :mod:`.proof` shows both assumptions from bounds of the same loop, by induction over the
@@ -37,7 +35,7 @@ Flows are affine in the input's matrix K e^{−Hs}, so its hull's corners suffic
 in θ between two nodes, so both ends suffice.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from math import comb
 from typing import NamedTuple
 
@@ -91,7 +89,7 @@ class Location(NamedTuple):
 
 
 class Edge(NamedTuple):
-    """A jump z := ``jump`` (z, p), p unknown, possible where ``facts`` of (z, p) are ≤ 0."""
+    """A jump z := ``jump`` z, possible where ``facts`` are ≤ 0."""
 
     name: str
     source: int
@@ -107,10 +105,8 @@ class Errors(NamedTuple):
 
     decaying: arb
     constant: arb
-    fresh: arb
-    """At least sup ‖W e^{(H + r)s} W⁻¹‖ while an update may be on its way."""
-    gain: arb | None
-    """At least sup ‖W e^{(H + r)s} W⁻¹‖ over all s ≥ 0, if that is known."""
+    gain: arb
+    """At least sup ‖W e^{(H + r)s} W⁻¹‖ over all s ≥ 0."""
 
 
 class Part(NamedTuple):
@@ -167,9 +163,9 @@ class Model:
         loop: the loop.
         rate: r ≥ 0 in f₁ = e^{−rt}, in 1/s.
         decay: ν in dV/dt ≤ −νV, in 1/s.
-        errors: what is assumed of the errors, if it is used.
-        later: most events within d after an event; above 0 only with ``errors``.
-        later_at_start: most events after the one at t = 0 before the first input acts, likewise.
+        errors: what is assumed of e_s, if it is used: then w is bounded by the paper's chain.
+        later: most events within d after an event.
+        later_at_start: most events after the one at t = 0 before the first input acts.
         is_exact: with False a coarse approximation of K e^{−Hs} replaces its hull, for a search.
     """
 
@@ -187,11 +183,12 @@ class Model:
         self.loop, self.rate, self.decay, self.errors = loop, rate, decay, errors
         self.later, self.is_exact = later, is_exact
         self.later_at_start = later_at_start
-        n = loop.n
-        self.size = 3 * n + 2
+        n, copies = loop.n, max(later, later_at_start)
+        self.size = (3 + copies) * n + 2
         every = identity(self.size)
-        self.x, self.e, self.w = (rows_of(every, range(i * n, i * n + n)) for i in range(3))
-        self.f1, self.f2 = (rows_of(every, [3 * n + i]) for i in range(2))
+        vectors = [rows_of(every, range(i, i + n)) for i in range(0, self.size - 2, n)]
+        self.x, self.e, self.w, *self.v = vectors
+        self.f1, self.f2 = (rows_of(every, [self.size - 2 + i]) for i in range(2))
         self._has_f1 = has_decaying_unit(loop, rate)
         self.level, self.floor = thresholds(loop, rate)
         self.silent = self._comparison(self.level, self.floor)
@@ -231,38 +228,39 @@ class Model:
         return self.level**2 * square(self.f1) + self.floor**2 * square(self.f2)
 
     def _locations(self) -> list[Location]:
-        n, losses, times = self.loop.n, self.loop.losses, self.loop.times
-        units = ([3 * n] if self._has_f1 else []) + ([3 * n + 1] if needs_constant(self.loop) else [])
-        without_w, all_of_z = (*range(2 * n), *units), (*range(3 * n), *units)
+        losses, times = self.loop.losses, self.loop.times
         flows = self._flows(self._gains())
         tested = (arb(0), arb(times.sampling)) if times.sampling > 0 else (arb(0),)
-        waiting = (arb(0), arb(times.delay))
         compared = () if times.sampling > 0 else (self.silent,)
         found = []
         for lost in range(losses + 1):
             facts = compared + (self._chain(lost) if lost else ())
-            found.append(
-                Location(f"{lost} lost", all_of_z if lost else without_w, tested, flows, facts, True)
-            )
+            found.append(Location(f"{lost} lost", self._coordinates(lost > 0, 0), tested, flows, facts, True))
         for later in range(self._waiting):
-            facts = self._chain(losses + 1 + later)
-            found.append(Location(f"{later} later", all_of_z, waiting, flows, facts, False))
+            facts, nodes = self._chain(losses + 1 + later), (arb(0), arb(times.delay))
+            name, coordinates = f"{later} later", self._coordinates(True, later)
+            found.append(Location(name, coordinates, nodes, flows, facts, False))
         if times.start > 0:
-            nodes, no_input = (arb(0), arb(times.start)), self._flows([0 * self.loop.gain])
-            found.append(Location("start", without_w, nodes, no_input, (), False))
+            no_input, nodes = self._flows([0 * self.loop.gain]), (arb(0), arb(times.start))
+            for later in range(self.later_at_start + 1):
+                name, coordinates = f"start, {later} later", self._coordinates(False, later)
+                found.append(Location(name, coordinates, nodes, no_input, (), False))
         return found
+
+    def _coordinates(self, has_w: bool, copies: int) -> tuple[int, ...]:
+        """Return those of x, e, w, some v and the units."""
+        n, first = self.loop.n, self.size - 2
+        units = ([first] if self._has_f1 else []) + ([first + 1] if needs_constant(self.loop) else [])
+        w = range(2 * n, 3 * n) if has_w else range(0)
+        return (*range(2 * n), *w, *range(3 * n, (3 + copies) * n), *units)
 
     def _chain(self, missing: int) -> tuple[arb_mat, ...]:
         """Return ‖W w‖² minus its bound by the paper's chain, if that is known."""
-        if self.errors is None or self.errors.gain is None:
+        if self.errors is None:
             return ()
-        bound = (self.errors.gain * missing) ** 2 * self._errors_squared()
-        return (square(self.loop.weight * self.w) - bound,)
-
-    def _errors_squared(self) -> arb_mat:
-        """Return the assumed bound of ‖W e_s‖²."""
-        assert self.errors is not None
-        return self.errors.decaying**2 * square(self.f1) + self.errors.constant**2 * square(self.f2)
+        decaying, constant, gain = self.errors
+        assumed = decaying**2 * square(self.f1) + constant**2 * square(self.f2)
+        return (square(self.loop.weight * self.w) - (gain * missing) ** 2 * assumed,)
 
     def _gains(self) -> list[arb_mat]:
         """Return matrices in whose hull K e^{−Hs} is, for all ages s.
@@ -291,7 +289,8 @@ class Model:
             u = gain * (self.x + self.e + self.w)
             velocity = loop.A * self.x + loop.B * u
             error = H * (self.x + self.e) - velocity
-            matrix = stack([velocity, error, H * self.w, -self.rate * self.f1, 0 * self.f2])
+            copies = (H * v for v in self.v)
+            matrix = stack([velocity, error, H * self.w, *copies, -self.rate * self.f1, 0 * self.f2])
             found.append(Flow(matrix, tuple(self._unknowns(u))))
         return tuple(found)
 
@@ -321,59 +320,54 @@ class Model:
 
     def _edges(self) -> list[Edge]:
         losses = self.loop.losses
-        Z = zeros(self.loop.n, self.size)
-        units = [self.f1, self.f2]
         event = tuple(self._guards.values())
-        sent, delivered = stack([self.x, Z, self.w + self.e, *units]), stack([self.x, Z, Z, *units])
+        delivered = self.jump(0 * self.e, 0 * self.w, ())
+        lost = self.jump(0 * self.e, self.w + self.e, ())
         tests = tuple((node, 0) for node in range(len(self.locations[0].nodes)))
         found = []
         for j in range(losses + 1):
             if self._waiting:
-                found.append(Edge(f"{j} lost, sent", j, losses + 1, tests, sent, event))
+                found.append(Edge(f"{j} lost, sent", j, losses + 1, tests, lost, event))
             else:
                 found.append(Edge(f"{j} lost, delivered", j, 0, tests, delivered, event))
             if j < losses:
-                found.append(Edge(f"{j} lost, lost", j, j + 1, tests, sent, event))
-        both = ((0, 0), (1, 1))
-        for k in range(self._waiting):
-            source = losses + 1 + k
-            if k < self.later:
-                found.append(Edge(f"{k} later, event", source, source + 1, both, sent, event))
-            found += self._arrivals(f"{k} later", source, k)
+                found.append(Edge(f"{j} lost, lost", j, j + 1, tests, lost, event))
+        for later in range(self._waiting):
+            found += self._on_its_way(losses + 1 + later, later, self.later)
         if self.loop.times.start > 0:
-            first = len(self.locations) - 1
-            for k in range(self.later_at_start + 1):
-                found += self._arrivals(f"start, {k} later", first, k)
-            if self.later_at_start:
-                found.append(Edge("start, event", first, first, both, delivered, event))
+            first = losses + 1 + self._waiting
+            for later in range(self.later_at_start + 1):
+                found += self._on_its_way(first + later, later, self.later_at_start)
+            for later in range(self.later_at_start):
+                name = f"start, {later} later, event"
+                found.append(Edge(name, first + later, first, ((0, 0), (1, 1)), delivered, event))
         return found
 
-    def _arrivals(self, name: str, source: int, later: int) -> Iterator[Edge]:
-        """Yield the edges of the first input with an update that has so many later ones."""
-        losses = self.loop.losses
+    def _on_its_way(self, source: int, later: int, most: int) -> Iterator[Edge]:
+        """Yield the edges of a location in which an update is on its way that has so many later ones."""
+        losses, name = self.loop.losses, self.locations[source].name
+        event = tuple(self._guards.values())
+        if later < most:
+            copies = [v + self.e for v in self.v[:later]] + [self.e]
+            jump = self.jump(0 * self.e, self.w + self.e, copies)
+            yield Edge(f"{name}, event", source, source + 1, ((0, 0), (1, 1)), jump, event)
+        w, others = (self.v[0], self.v[1:later]) if later else (0 * self.w, [])
         if later <= losses:
-            yield self._arrival(f"{name}, all lost", source, later, later)
-        for next_later in range(min(later, self._waiting)):
-            yield self._arrival(f"{name}, {next_later} later", source, losses + 1 + next_later, later)
+            yield self._arrival(f"{name}, all lost", source, later, self.jump(self.e, w, ()))
+        for following in range(min(later, self._waiting)):
+            jump = self.jump(self.e, w, others[len(others) - following :])
+            yield self._arrival(f"{name}, {following} later", source, losses + 1 + following, jump)
 
-    def _arrival(self, name: str, source: int, target: int, missing: int) -> Edge:
-        """Return an edge to a location, with so many updates missing. All times are open."""
-        n = self.loop.n
-        pairs = tuple(
-            (node, target_node)
-            for node in range(len(self.locations[source].nodes))
-            for target_node in range(len(self.locations[target].nodes))
-        )
-        same = stack([self.x, self.e, zeros(n, self.size), self.f1, self.f2])
-        if not missing:
-            return Edge(name, source, target, pairs, same, ())
-        assert self.errors is not None
-        size = self.errors.decaying.max(self.errors.constant)
-        w = self.errors.fresh * missing * size * self.loop.weight.inv()
-        fact = _with_signals(self._errors_squared() * (-1 / size**2), n)
-        for k in range(self.size, self.size + n):
-            fact[k, k] = 1
-        return Edge(name, source, target, pairs, beside(same, transpose(self.w) * w), (fact,))
+    def _arrival(self, name: str, source: int, target: int, jump: arb_mat) -> Edge:
+        """Return the edge of the first input with an update. All times are open."""
+        nodes, target_nodes = (range(len(self.locations[index].nodes)) for index in (source, target))
+        pairs = tuple((node, target_node) for node in nodes for target_node in target_nodes)
+        return Edge(name, source, target, pairs, jump, ())
+
+    def jump(self, e: arb_mat, w: arb_mat, v: Sequence[arb_mat]) -> arb_mat:
+        """Return z after a jump; other vectors than these become 0."""
+        rest = [0 * self.w] * (len(self.v) - len(v))
+        return stack([self.x, e, w, *v, *rest, self.f1, self.f2])
 
     # The quadratic forms.
 
@@ -386,18 +380,18 @@ class Model:
         Where an event's guard contains x, each location has a form of x, e and w of its own.
         """
         place = self.locations[location]
-        n = self.loop.n
         E = columns_of(identity(self.size), place.coordinates)
-        errors = stack([self.e, self.w]) if 2 * n in place.coordinates else self.e
+        errors = stack([f for f in (self.e, self.w, *self.v) if not is_zero(f * E)])
         own = f"{place.name}" if place.is_tested else f"{place.name}, {node}"
-        X = f"X/{own}" if place.name == "start" else "X"
+        starts = place.name.startswith("start")
+        X = f"X/{own}" if starts else "X"
         parts: tuple[tuple[str, arb_mat], ...] = ((X, self.x * E), (f"Q/{own}", errors * E))
         if self.loop.rule.negative.nrows():
             parts = ((f"P/{own}", stack([self.x, errors]) * E),)
         units = [(name, f) for name, f in (("c1", self.f1), ("c2", self.f2)) if not is_zero(f * E)]
         scalars = []
         for name, f in units:
-            is_common = name not in self._guards and place.name != "start"
+            is_common = name not in self._guards and not starts
             scalars.append((name if is_common else f"{name}/{own}", -1 * square(f * E)))
         if place.is_tested and node and self.loop.rule.positive.nrows():
             scalars.append((f"a/{own}", -1 * place.nodes[node] * transpose(E) * self.silent * E))
@@ -412,7 +406,7 @@ class Model:
         """
         for index, place in enumerate(self.locations):
             yield from self._flow_inequalities(index)
-            if place.name != "start" or output != "drift":
+            if not place.name.startswith("start") or output != "drift":
                 yield from self._output_inequalities(index, output)
         for edge in self.edges:
             yield from self._edge_inequalities(edge)
@@ -500,42 +494,30 @@ class Model:
             terms.scalar(f"{name}/signal {signal}", square(one) - square(unknown.rows * E))
 
     def _edge_inequalities(self, edge: Edge) -> Iterator[Inequality]:
-        """V_target(jump (z, p)) ≤ V_source(z) + Σ m q(z, p)."""
+        """V_target(jump z) ≤ V_source(z) + Σ m q."""
         source, target = self.locations[edge.source], self.locations[edge.target]
         E = columns_of(identity(self.size), source.coordinates)
-        signals = edge.jump.ncols() - self.size
-        own = beside(identity(E.ncols()), zeros(E.ncols(), signals))
-        pair = _with_signals(E, signals)
-        for k in range(signals):
-            pair[self.size + k, E.ncols() + k] = 1
-        jump = rows_of(edge.jump * pair, target.coordinates)
+        jump = rows_of(edge.jump * E, target.coordinates)
         units = {name for name, f in (("c1", self.f1), ("c2", self.f2)) if not is_zero(f * E)}
-        facts = edge.facts
-        if units <= set(self._guards):
-            facts += tuple(_with_signals(fact, signals) for fact in source.facts)
+        facts = edge.facts + (source.facts if units <= set(self._guards) else ())
         for node, target_node in edge.pairs:
-            terms = _Terms(pair.ncols())
-            terms.add(self.form(edge.source, node), own, own, arb(1) / 2)
+            terms = _Terms(E.ncols())
+            one = identity(E.ncols())
+            terms.add(self.form(edge.source, node), one, one, arb(1) / 2)
             terms.add(self.form(edge.target, target_node), jump, jump, arb(-1) / 2)
             name = f"edge/{edge.name}/{node} {target_node}"
             for number_, fact in enumerate(facts):
-                terms.scalar(f"m/{name}/{number_}", transpose(pair) * fact * pair)
-            yield terms.inequality(name, edge.source, signals)
+                terms.scalar(f"m/{name}/{number_}", transpose(E) * fact * E)
+            yield terms.inequality(name, edge.source, 0)
 
     def _start_inequality(self) -> Inequality:
         """V(z(0)) ≤ 0."""
-        index = len(self.locations) - 1 if self.loop.times.start > 0 else 0
+        index = self.loop.losses + 1 + self._waiting if self.loop.times.start > 0 else 0
         z = transpose(self.x) * self.loop.start + transpose(self.f1) + transpose(self.f2)
         z = rows_of(z, self.locations[index].coordinates)
         terms = _Terms(1)
         terms.add(self.form(index, 0), z, z, arb(-1) / 2)
         return terms.inequality("start", index, -1)
-
-
-def _with_signals(M: arb_mat, signals: int) -> arb_mat:
-    """Return a matrix with so many rows and columns of zeros more."""
-    wide = beside(M, zeros(M.nrows(), signals))
-    return stack([wide, zeros(signals, wide.ncols())])
 
 
 def _corners(K: arb_mat, H: arb_mat, q: arb, degree: int) -> tuple[list[arb_mat], arb_mat]:

@@ -26,7 +26,7 @@ from noack_check.loop import Loop, Times
 from noack_check.model import Errors, Model, has_decaying_unit, needs_constant, thresholds
 from noack_check.norms import decays_below, growth
 
-MOST_LATER = 100
+MOST_LATER = 30
 """Most events within the time that an update may be on its way."""
 _MOST_TESTS = 1_000_000
 _CELLS = 32
@@ -112,19 +112,17 @@ def read_assumptions(loop: Loop, rate: arb, document: Mapping[str, object]) -> A
     gain = _chain_gain(loop, rate, document)
     later, at_start = (_count(document, key) for key in ("later", "later_at_start"))
     if "errors" not in document:
-        if later or at_start:
-            raise RejectedError("errors: missing, and events may happen while an update is on its way")
         return Assumptions(None, later, at_start, gain)
     table = document["errors"]
     if not isinstance(table, Mapping):
         raise RejectedError("errors: not a table")
+    if gain is None:
+        raise RejectedError("errors: need the chain")
     sizes = _number(table, "decaying"), _number(table, "constant")
     units = has_decaying_unit(loop, rate), needs_constant(loop)
     if not all(size == 0 or (size > 0 and is_unit) for size, is_unit in zip(sizes, units, strict=True)):
         raise RejectedError("errors: below 0, or in a unit that the loop does not have")
-    longest = arb(max(loop.times.delay, loop.times.start))
-    fresh, _ = growth(weighted(loop, rate), longest)
-    return Assumptions(Errors(*sizes, fresh, gain), later, at_start, gain)
+    return Assumptions(Errors(*sizes, gain), later, at_start, gain)
 
 
 def require_few_at_start(loop: Loop, assumed: Assumptions) -> bool:

@@ -51,7 +51,7 @@ def first_assumptions(loop: Loop, rate: float) -> dict[str, object]:
     if at_start or not compares_error(loop):
         later = _most_between(loop, loop.times.delay)
     document |= {"later": later, "later_at_start": at_start}
-    if loop.holds or later or at_start:
+    if loop.holds and compares_error(loop) and "chain" in document:
         share = 1.1 if loop.times.sampling > 0 else 1.0
         document = with_errors(document, [share * float(each) for each in thresholds(loop, number(rate))])
     return document
@@ -86,7 +86,8 @@ def next_assumptions(
     if later == document["later"] and (is_exact or are_below(needed, document)):
         return None
     grown = [unit + _FURTHER * (size - unit) for size, unit in zip(needed, units, strict=True)]
-    return with_errors({**document, "later": later}, grown)
+    following = {**document, "later": later}
+    return with_errors(following, grown) if "errors" in document else following
 
 
 def _needed_later(loop: Loop, document: Mapping[str, object], apart_s: float) -> int:
@@ -108,7 +109,8 @@ def _most_between(loop: Loop, time: fmpq) -> int:
 
 
 def _bound(drift: Sequence[float]) -> Bound:
-    return Bound("drift", *(number(level) for level in drift), True)
+    decaying, constant = (number(level) for level in drift)
+    return Bound("drift", decaying, constant, True)
 
 
 def _chain(loop: Loop, rate: float) -> dict[str, object] | None:

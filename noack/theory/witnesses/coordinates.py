@@ -37,7 +37,7 @@ def simulated_frames(model: Model) -> Frames:
             for name, S in model.form(index, node).parts:
                 where = [place.coordinates[int(np.flatnonzero(row)[0])] for row in floats(S)]
                 block = (runs.moments("") if name.startswith("X") else own)[np.ix_(where, where)]
-                frames[name] = 2 * _root(block + 1e-3 * np.diag(np.diag(block)))
+                frames[name] = 2 * _root(block + 0.3 * np.diag(np.diag(block)))
     return frames
 
 
@@ -46,7 +46,7 @@ def _root(M: Matrix) -> Matrix:
     if not np.isfinite(M).all() or not M.any():
         return np.eye(len(M))
     values, vectors = np.linalg.eigh((M + M.T) / 2)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 1e-9 * values[-1])))
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 1e-4 * values[-1])))
 
 
 class _Runs:
@@ -68,12 +68,10 @@ class _Runs:
             (floats(u.column)[:, 0], floats(u.rows)) for u in model.locations[0].flows[0].unknowns
         ]
         self._silent, self._unit = floats(model.silent), floats(model.threshold_squared())
-        self._lost, self._arrived = np.eye(N), np.eye(N)
-        self._lost[n : 2 * n, n : 2 * n] = 0
-        self._lost[2 * n : 3 * n, n : 2 * n] = np.eye(n)
-        self._arrived[2 * n : 3 * n] = 0
+        self._sent = [self._jump_matrix(model, later, arrives=False) for later in range(model.later + 1)]
+        self._used = [self._jump_matrix(model, later, arrives=True) for later in range(model.later + 1)]
         self._z = np.ones((_RUNS, N))
-        self._z[:, n : 3 * n] = 0
+        self._z[:, n : N - 2] = 0
         self._z[:, :n] = floats(self._loop.start)[:, 0]
         spread = float(np.linalg.norm(floats(self._loop.start))) or 1.0
         half = _RUNS // 2
@@ -84,6 +82,14 @@ class _Runs:
         self._loss_rate = self._rng.choice(_LOSS_RATES, _RUNS)
         self._sums: dict[str, Matrix] = defaultdict(lambda: np.zeros((N, N)))
         self._counts: dict[str, int] = defaultdict(int)
+
+    @staticmethod
+    def _jump_matrix(model: Model, later: int, *, arrives: bool) -> Matrix:
+        """Return the jump of an event, or of an input, if an update with so many later ones is on its way."""
+        if arrives:
+            return floats(model.jump(model.e, model.v[0] if later else 0 * model.w, ()))
+        copies = [*(v + model.e for v in model.v[:later]), model.e][: len(model.v)]
+        return floats(model.jump(0 * model.e, model.w + model.e, copies))
 
     def advance(self) -> None:
         """Simulate all steps."""
@@ -117,7 +123,9 @@ class _Runs:
         z, delay_s = self._z, _seconds(self._loop.times.delay)
         arrives = self._waiting & (self._rng.random(_RUNS) < 2.0 * self._h / max(delay_s, self._h))
         self._arrive(arrives | self._waiting & event & (self._later >= self._most))
-        z[event] = z[event] @ self._lost.T
+        for later, matrix in enumerate(self._sent):
+            these = event & (self._later == later)
+            z[these] = z[these] @ matrix.T
         drops = event & (self._rng.random(_RUNS) < self._loss_rate) & (self._missing < self._loop.losses)
         self._later[event & self._waiting] += 1
         self._missing[drops & ~self._waiting] += 1
@@ -128,7 +136,9 @@ class _Runs:
             self._arrive(passes)
 
     def _arrive(self, which: NDArray[np.bool_]) -> None:
-        self._z[which] = self._z[which] @ self._arrived.T
+        for later, matrix in enumerate(self._used):
+            these = which & (self._later == later)
+            self._z[these] = self._z[these] @ matrix.T
         self._waiting &= ~which
         self._missing[which] = self._later[which] = 0
 

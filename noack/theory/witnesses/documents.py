@@ -7,12 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.theory.witnesses.assumptions import (
-    are_below,
     first_assumptions,
     first_event_s,
     inter_event_s,
     next_assumptions,
-    with_errors,
 )
 from noack.theory.witnesses.coordinates import Frames, floats, simulated_frames
 from noack.theory.witnesses.search import Found, Search, refined
@@ -68,12 +66,12 @@ def find_witness(
 
 
 def _by_threshold(loop: Loop, rates: "_Rates", outputs: Sequence[str], ultimate: Sequence[str]) -> Witness:
-    """Return a witness for a rule that compares ‖W e_s‖: the drift bounds e_s and the times between events."""
+    """Return a witness for a rule that compares ‖W e_s‖: its drift bounds e_s and times between events."""
     document = first_assumptions(loop, rates.rate)
     for _ in range(_MOST_GUESSES):
         search = _OutputSearch(loop, rates, document)
-        drift = search.best_decay("drift", starts=True)[1].levels
-        following = next_assumptions(loop, document, drift)
+        levels = search.best_decay("drift", starts=True)[1].levels
+        following = next_assumptions(loop, document, levels)
         if following is None:
             break
         document = following
@@ -84,7 +82,7 @@ def _by_threshold(loop: Loop, rates: "_Rates", outputs: Sequence[str], ultimate:
     document["bounds"] = [*bounds, entry]
     numbers = entry["numbers"]
     assert isinstance(numbers, dict)
-    drift = tuple(float(np.sqrt(numbers.get(f"level {i}", 0.0))) for i in (1, 2))
+    drift = tuple(float(np.sqrt(numbers.get(name, 0.0))) for name in ("level 1", "level 2"))
     document["inter_event_s"] = apart = inter_event_s(loop, rates.rate, drift)
     document["first_event_s"] = first_event_s(loop, drift, apart)
     return _proven(loop, document)
@@ -95,27 +93,10 @@ def _by_quadratic_forms(
 ) -> Witness:
     """Return a witness for another rule: e_s has quadratic forms as other outputs have."""
     document = first_assumptions(loop, rates.rate)
-    if "errors" in document:
-        document = _with_errors(loop, rates, document)
-    search = _OutputSearch(loop, rates, document)
-    bounds = search.bounds([*outputs, "e_s"], ultimate)
+    bounds = _OutputSearch(loop, rates, document).bounds([*outputs, "e_s"], ultimate)
     if not bounds:
         raise NoWitnessError("the solver finds no quadratic forms at any rate of decay")
-    document["bounds"] = bounds
-    return _proven(loop, document)
-
-
-def _with_errors(loop: Loop, rates: "_Rates", document: dict[str, object]) -> dict[str, object]:
-    """Return a document whose bound of e_s follows from itself; the first guess is that without any."""
-    alone = {key: document[key] for key in ("rate", "chain") if key in document}
-    search = _OutputSearch(loop, rates, alone)
-    for _ in range(_MOST_GUESSES):
-        levels = search.best_decay("e_s", starts=True)[1].levels
-        if search.document is not alone and are_below(levels, document):
-            return document
-        document = with_errors(document, [1.3 * level for level in levels])
-        search = _OutputSearch(loop, rates, document)
-    raise NoWitnessError("errors: the sensor's error may be larger than each guess of it")
+    return _proven(loop, {**document, "bounds": bounds})
 
 
 def _proven(loop: Loop, document: Mapping[str, object]) -> Witness:

@@ -73,7 +73,7 @@ class Search:
         N = len(place.coordinates)
         frame = np.eye(N)
         for f in (0, 1):
-            row = 3 * self.model.loop.n + f
+            row = self.model.size - 2 + f
             if row in place.coordinates:
                 at = place.coordinates.index(row)
                 frame[at, at] = self._f_units[f]
