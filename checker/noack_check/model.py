@@ -391,8 +391,8 @@ class Model:
         units = [(name, f) for name, f in (("c1", self.f1), ("c2", self.f2)) if not is_zero(f * E)]
         scalars = []
         for name, f in units:
-            is_common = name not in self._guards and not starts
-            scalars.append((name if is_common else f"{name}/{own}", -1 * square(f * E)))
+            common = f"{name}/start, {node}" if starts else name
+            scalars.append((f"{name}/{own}" if name in self._guards else common, -1 * square(f * E)))
         if place.is_tested and node and self.loop.rule.positive.nrows():
             scalars.append((f"a/{own}", -1 * place.nodes[node] * transpose(E) * self.silent * E))
         return Form(parts, tuple(scalars))
