@@ -26,7 +26,7 @@ from noack_check.loop import Loop, Times
 from noack_check.model import Errors, Model, has_decaying_unit, needs_constant, thresholds
 from noack_check.norms import decays_below, growth
 
-MOST_LATER = 30
+MOST_LATER = 8
 """Most events within the time that an update may be on its way."""
 _MOST_TESTS = 1_000_000
 _CELLS = 32
@@ -264,7 +264,7 @@ def prove_bound(loop: Loop, rate: arb, entry: Mapping[str, object], assumed: Ass
         verify(
             model,
             output,
-            {name: _matrix(matrices, name, most=3 * loop.n) for name in matrices},
+            {name: _matrix(matrices, name, most=model.size - 2) for name in matrices},
             {name: _number(numbers, name) for name in numbers},
             starts=starts,
         )
