@@ -384,7 +384,7 @@ class Model:
         errors = stack([f for f in (self.e, self.w, *self.v) if not is_zero(f * E)])
         own = f"{place.name}" if place.is_tested else f"{place.name}, {node}"
         starts = place.name.startswith("start")
-        X = f"X/{own}" if starts else "X"
+        X = f"X/start, {node}" if starts else "X"
         parts: tuple[tuple[str, arb_mat], ...] = ((X, self.x * E), (f"Q/{own}", errors * E))
         if self.loop.rule.negative.nrows():
             parts = ((f"P/{own}", stack([self.x, errors]) * E),)

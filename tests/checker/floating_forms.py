@@ -41,7 +41,7 @@ class Forms:
         """Return P of a location, at the start or the end of its time."""
         tested = place.endswith("lost")
         own = place if tested else f"{place}, {node}"
-        X = np.array(self.matrices["X" if place != "start" else f"X/{own}"])
+        X = np.array(self.matrices["X" if place != "start, 0 later" else f"X/start, {node}"])
         Q = np.array(self.matrices[f"Q/{own}"])
         errors = np.vstack([self.e, self.w])[: len(Q)]
         P: Array = self.x.T @ X @ self.x + errors.T @ Q @ errors
@@ -51,7 +51,7 @@ class Forms:
 
     def flow(self, place: str, age: float) -> tuple[Array, list[tuple[Array, Array]]]:
         """Return F and unknown signals (column, rows) of ż = Fz + column p, |p| ≤ |rows z|."""
-        K = floats(self.loop.gain) @ expm(-self.H * age) * (place != "start")
+        K = floats(self.loop.gain) @ expm(-self.H * age) * (place != "start, 0 later")
         u = K @ (self.x + self.e + self.w)
         moved = floats(self.loop.A) @ self.x + floats(self.loop.B) @ u
         F = np.vstack(
@@ -76,8 +76,8 @@ class Forms:
         ):
             return False
         losses, (_, _, delay, age, start) = self.loop.losses, self.times
-        waits = [("on its way", delay)] if delay else []
-        begins = [("start", start)] if start else []
+        waits = [("0 later", delay)] if delay else []
+        begins = [("start, 0 later", start)] if start else []
         places = [(f"{j} lost", self.times[0]) for j in range(losses + 1)] + waits + begins
         ages = [0.0, age, *(age * rng.random(3))]
         return (
@@ -89,7 +89,7 @@ class Forms:
                 for s in ages
             )
             and self._edges_hold(losses, bool(waits), bool(begins))
-            and self._starts("start" if begins else "0 lost")
+            and self._starts("start, 0 later" if begins else "0 lost")
         )
 
     def _flow_holds(self, place: str, length: float, node: int, age: float) -> bool:
@@ -99,7 +99,7 @@ class Forms:
         return self._positive(place, M, [-P @ c for c, _ in unknowns], unknowns, f"m/flow/{place}/{node}")
 
     def _output_holds(self, output: str, place: str, node: int, age: float) -> bool:
-        if output == "drift" and place == "start":
+        if output == "drift" and place == "start, 0 later":
             return True
         F, unknowns = self.flow(place, age)
         outputs = {"x": self.x, "e_s": self.W @ self.e, "e_c": self.W @ (self.e + self.w)}
@@ -136,7 +136,7 @@ class Forms:
 
     def _is_psd(self, place: str, M: Array) -> bool:
         n = self.n
-        has_w = place not in ("0 lost", "start")
+        has_w = place not in ("0 lost", "start, 0 later")
         kept = [i for i in range(len(M)) if (has_w or not 2 * n <= i < 3 * n) and M[i].any()]
         M = M[np.ix_(kept, kept)]
         scale = 1 / np.sqrt(np.maximum(np.abs(np.diag(M)), 1e-300))
@@ -149,12 +149,12 @@ class Forms:
         lost[self.n : 2 * self.n] = 0
         found = []
         for j in range(losses + 1):
-            sent = (
-                ("on its way", f"{j} sent", lost) if waits else ("0 lost", f"{j} delivered", arrival @ lost)
-            )
-            following = [sent] + ([(f"{j + 1} lost", f"{j} lost", lost)] if j < losses else [])
+            to, name, jump = ("0 later", "sent", lost) if waits else ("0 lost", "delivered", arrival @ lost)
+            following = [(to, f"{j} lost, {name}", jump)]
+            following += [(f"{j + 1} lost", f"{j} lost, lost", lost)] if j < losses else []
             found += [(f"{j} lost", *each, node, 0, True) for each in following for node in (0, 1)]
-        for place, name in [("on its way", "arrival")] * waits + [("start", "first input")] * begins:
+        for place in ["0 later"] * waits + ["start, 0 later"] * begins:
+            name = f"{place}, all lost"
             found += [(place, "0 lost", name, arrival, i, j, False) for i in (0, 1) for j in (0, 1)]
         return all(self._edge_holds(*each) for each in found)
 

@@ -41,6 +41,7 @@ class _Plant:
         self.B = floats(loop.B) + signs[1] * floats(loop.half_B)
         self.pushes = floats(loop.pushes) * np.array([float(size.mid()) for size in loop.sizes])
         self.step = functools.lru_cache(4096)(self._step)
+        self.predict = functools.lru_cache(4096)(lambda dt: np.asarray(expm(self.H * dt)))
         self.input_matrix = functools.lru_cache(16)(self._input_matrix)
 
     def _input_matrix(self, age: float | None) -> Array:
@@ -67,7 +68,9 @@ def exceeded(loop: Loop, proof: Proof, rng: np.random.Generator, until: float) -
     first_input = start * rng.choice([0.0, 1.0, rng.random()])
     style = rng.integers(3)
     ages = [0.0, age, age / 2]
-    t, arriving, lost, events = 0.0, None, 0, [0.0]
+    t, lost, events = 0.0, 0, [0.0]
+    arriving: list[tuple[float, float, Array]] = []
+    """Of each update on its way: when it acts, when it was sent, and the prediction that starts with it."""
     next_test, found = sampling, list[Exceeded]()
     current = ages[rng.integers(3)]
     signs = tuple(rng.choice([-1.0, 1.0], len(loop.sizes)))
@@ -76,33 +79,36 @@ def exceeded(loop: Loop, proof: Proof, rng: np.random.Generator, until: float) -
     ]
     r = float(proof.rate.mid())
     while t < until:
-        stop = min(v for v in (next_test, arriving or np.inf) if v > t)
+        stop = min(v for v in (next_test, *(update[0] for update in arriving)) if v > t)
         if t < first_input < stop:
             stop = first_input
         acting = current if t >= first_input else None
         step = plant.step(acting, signs, round((stop - t) / 2, 12))
         for half in (1, 2):
             z = step @ z
+            decay = plant.predict(round((stop - t) / 2, 12))
+            arriving = [(acts, sent, decay @ state) for acts, sent, state in arriving]
             _compare(found, plant, z, W, t + half * (stop - t) / 2, bounds, r, acting, signs)
         t = stop
-        if arriving and t >= arriving:
-            z[2 * n : 3 * n], arriving = z[n : 2 * n], None
+        if acting_now := [update for update in arriving if update[0] <= t]:
+            newest = max(acting_now, key=lambda update: update[1])
+            z[2 * n : 3 * n] = newest[2]
+            arriving = [update for update in arriving if update[1] > newest[1]]
         if t >= next_test:
             e = W @ (z[n : 2 * n] - z[:n])
             threshold = max(level * np.exp(-rate * t), floor)
             fires = np.linalg.norm(e) > threshold or (rule.always and rng.random() < 0.2)
             if fires:
-                if arriving:
-                    found.append(Exceeded("an event while an update is on its way", t, 0.0, 0.0))
-                if t < first_input:
+                if t < first_input and proof.is_quiet:
                     found.append(Exceeded("an event before the first input", t, 0.0, first_input))
-                _apart(found, proof, events, t)
+                _apart(found, proof, events, t, first_input)
                 z[n : 2 * n] = z[:n]
                 loses = lost < loop.losses and (style == 0 or (style == 1 and rng.random() < 0.7))
                 lost = lost + 1 if loses else 0
                 if not loses and delay:
                     late = delay * rng.choice([1.0, 1.0, 0.5, 0.0])
-                    arriving = t + max(round(late, 9), 1e-9)
+                    acts = max(t + max(round(late, 9), 1e-9), first_input)
+                    arriving.append((acts, t, z[n : 2 * n].copy()))
                 elif not loses:
                     z[2 * n : 3 * n] = z[n : 2 * n]
             next_test = t + (round(rng.choice([least, sampling]), 9))
@@ -112,8 +118,10 @@ def exceeded(loop: Loop, proof: Proof, rng: np.random.Generator, until: float) -
     return found
 
 
-def _apart(found: list[Exceeded], proof: Proof, events: list[float], t: float) -> None:
+def _apart(found: list[Exceeded], proof: Proof, events: list[float], t: float, first_input: float) -> None:
     least = proof.first_event if len(events) == 1 else proof.inter_event
+    if not proof.is_quiet and events[-1] < first_input:
+        least = None
     if least is not None and t - events[-1] < float(least.mid()) - 1e-9:
         found.append(Exceeded("inter-event time", t, t - events[-1], float(least.mid())))
     events.append(t)

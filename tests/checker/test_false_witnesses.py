@@ -8,14 +8,24 @@ from typing import Any
 import pytest
 from flint import arb, fmpq
 
-from noack.theory.witnesses.documents import NoWitnessError, Witness, find_witness
+from noack.theory.witnesses.documents import Witness, find_witness
 from noack_check.balls import identity, is_positive, matrix, number, zeros
 from noack_check.check import RejectedError, _value
 from noack_check.keys import RefusedError
 from noack_check.loop import Loop
 from noack_check.model import Model, thresholds
 from noack_check.norms import decays_below
-from noack_check.proof import Bound, Proof, _at_first_input, _prove_quiet_start, error_without_input, prove
+from noack_check.proof import (
+    Assumptions,
+    Bound,
+    Proof,
+    _at_first_input,
+    _prove_quiet_start,
+    error_without_input,
+    prove,
+    require_few_at_start,
+    require_few_later,
+)
 from noack_check.scenario import _checked
 from noack_check.sentences import formula, sentences
 from tests.checker.test_witnesses import IDEAL, SCHEDULE, double_integrator
@@ -139,8 +149,9 @@ def test_the_threshold_at_the_first_input_is_one_constant_at_rate_0() -> None:
 
 def test_the_second_event_has_a_sentence_of_its_own() -> None:
     apart, first = arb(0.25), arb(0.125)
-    assert list(sentences(Proof(arb(1), (), apart, apart))) == ["two events are at least 0.25 s apart"]
-    assert "0.125" in next(iter(sentences(Proof(arb(1), (), apart, first))))
+    assert list(sentences(Proof(arb(1), (), apart, apart, True))) == ["two events are at least 0.25 s apart"]
+    assert "0.125" in next(iter(sentences(Proof(arb(1), (), apart, first, True))))
+    assert "after the first input" in next(iter(sentences(Proof(arb(1), (), apart, first, False))))
 
 
 def test_what_does_not_decay_counts_in_the_limit() -> None:
@@ -166,23 +177,56 @@ def test_the_chain_has_one_more_update_where_updates_take_time(witness: Witness)
     assert bounds["e_c"] == pytest.approx((1 + 3 * gain) * bounds["e_s"])
 
 
-def test_no_event_may_come_while_an_update_is_on_its_way() -> None:
-    loop = double_integrator(SCHEDULE._replace(delay=fmpq(1, 100)))
+def test_later_events_are_those_that_tests_or_the_drift_allow() -> None:
+    """Events are some 0.04 s apart, tests 0.01 s: within 0.1 s there are more than none, 2 at most."""
+    loop = double_integrator(SCHEDULE._replace(delay=fmpq(1, 10)))
     found = find_witness(loop)
-    longer = loop._replace(times=loop.times._replace(delay=fmpq(3, 10)))
-    with pytest.raises(NoWitnessError):
-        find_witness(longer)
+    later = found.document["later"]
+    assert isinstance(later, int)
+    assert later > 0
+    rejects(loop, {**found.document, "later": later - 1})
+    rejects(loop, {**found.document, "later_at_start": 1})
     rejects(loop, {**found.document, "inter_event_s": 0.3}, "inter_event_s")
 
 
-@pytest.mark.parametrize("overshoot", [0.0, 0.5, 1.0, -2.0])
-def test_the_overshoot_has_to_reproduce_itself(witness: Witness, overshoot: float) -> None:
-    rejects(DEFAULT, {**witness.document, "overshoot": overshoot})
+def test_later_events_by_tests_need_no_bound_of_the_drift() -> None:
+    loop = double_integrator(SCHEDULE._replace(delay=fmpq(3, 100)))
+    none = Assumptions(None, 0, 0, None)
+    with pytest.raises(RejectedError, match="later"):
+        require_few_later(loop, none, None)
+    with pytest.raises(RejectedError, match="later"):
+        require_few_later(loop, none._replace(later=1), None)
+    require_few_later(loop, none._replace(later=2), None)
+    require_few_later(loop, none, arb(3) / 100 + arb(2) ** -60)
+    require_few_later(loop, none, arb(21) / 1000)  # two silent tests: the third is at 0.03 s
 
 
-def test_the_overshoot_needs_the_chain(witness: Witness) -> None:
+def test_the_start_has_as_many_events_as_tests() -> None:
+    loop = double_integrator(SCHEDULE._replace(start=fmpq(3, 100)), level=1e-6)
+    with pytest.raises(RejectedError, match="an event may happen before the first input"):
+        require_few_at_start(loop, Assumptions(None, 2, 0, None))
+    with pytest.raises(RejectedError, match="later_at_start"):
+        require_few_at_start(loop, Assumptions(None, 2, 1, None))
+    assert not require_few_at_start(loop, Assumptions(None, 2, 2, None))
+
+
+@pytest.mark.parametrize("size", [0.0, 0.02, -2.0])
+def test_the_errors_have_to_reproduce_themselves(witness: Witness, size: float) -> None:
+    rejects(DEFAULT, {**witness.document, "errors": {"decaying": size, "constant": 0.0}})
+
+
+def test_errors_have_the_units_of_the_loop(witness: Witness) -> None:
+    rejects(DEFAULT, {**witness.document, "errors": {"decaying": 1.0, "constant": 1.0}}, "unit")
+
+
+def test_the_errors_need_the_chain(witness: Witness) -> None:
     document = {key: value for key, value in witness.document.items() if key != "chain"}
-    rejects(DEFAULT, {**document, "overshoot": 2.0}, "needs the chain")
+    rejects(DEFAULT, {**document, "errors": {"decaying": 2.0, "constant": 0.0}}, "need the chain")
+
+
+@pytest.mark.parametrize("value", [-1, 9, 1.0, True, "1", None])
+def test_the_number_of_later_events_is_a_small_whole_number(witness: Witness, value: object) -> None:
+    rejects(DEFAULT, {**witness.document, "later": value}, "later: not a whole number")
 
 
 @pytest.mark.parametrize("factor", [0.0, 0.9, 0.999, -1.0])
@@ -220,17 +264,17 @@ def failing(loop: Loop, entry: Mapping[str, Any], rate: float) -> set[str]:
 @pytest.mark.parametrize(
     ("name", "by", "fails"),
     [
-        ("c1/on its way, 1", 1.0, "edge/arrival/1 0"),
-        ("c1/on its way, 1", 1.0, "edge/arrival/1 1"),
-        ("c1/start, 1", 1.0, "edge/first input/1 0"),
-        ("c1/start, 0", 1.0, "edge/first input/0 0"),
-        ("c1/start, 0", -1.0, "start"),
-        ("c1/on its way, 0", -1.0, "edge/0 sent/1 0"),
-        ("c1/on its way, 0", 1.0, "edge/arrival/0 0"),
-        ("c1/1 lost", -1.0, "edge/0 lost/0 0"),
-        ("c1/2 lost", -1.0, "edge/1 lost/1 0"),
-        ("c1/2 lost", 1.0, "edge/2 sent/1 0"),
-        ("c1/0 lost", -1.0, "edge/arrival/1 1"),
+        ("c1/0 later, 1", 1.0, "edge/0 later, all lost/1 0"),
+        ("c1/0 later, 1", 1.0, "edge/0 later, all lost/1 1"),
+        ("c1/start, 0 later, 1", 1.0, "edge/start, 0 later, all lost/1 0"),
+        ("c1/start, 0 later, 0", 1.0, "edge/start, 0 later, all lost/0 0"),
+        ("c1/start, 0 later, 0", -1.0, "start"),
+        ("c1/0 later, 0", -1.0, "edge/0 lost, sent/1 0"),
+        ("c1/0 later, 0", 1.0, "edge/0 later, all lost/0 0"),
+        ("c1/1 lost", -1.0, "edge/0 lost, lost/0 0"),
+        ("c1/2 lost", -1.0, "edge/1 lost, lost/1 0"),
+        ("c1/2 lost", 1.0, "edge/2 lost, sent/1 0"),
+        ("c1/0 lost", -1.0, "edge/0 later, all lost/1 1"),
         ("level 1", -0.1, "output/0 lost/0/0"),
     ],
 )

@@ -11,21 +11,22 @@ from typing import Any
 
 import numpy as np
 import pytest
-from flint import arb
+from flint import arb, fmpq
 
 from noack.theory.witnesses.documents import find_witness
 from noack_check.balls import matrix, number
 from noack_check.check import RejectedError
 from noack_check.loop import Loop
 from noack_check.model import Model
-from noack_check.proof import prove
+from noack_check.proof import prove, read_assumptions
 from tests.checker.floating_forms import Forms
 from tests.checker.runs import exceeded
-from tests.checker.test_witnesses import double_integrator
+from tests.checker.test_witnesses import SCHEDULE, double_integrator
 
 Document = dict[str, Any]
 Rng = np.random.Generator
 _OUTPUTS = ("x", "x[1]", "e_s", "e_c")
+NAMES = ("plain", "pushed", "errors", "later")
 
 
 def pushed() -> Loop:
@@ -40,21 +41,29 @@ def pushed() -> Loop:
     )
 
 
+def with_later_events() -> Loop:
+    """Return a loop in which two events may happen while an update is on its way, and two before any acts."""
+    times = SCHEDULE._replace(delay=fmpq(25, 1000), start=fmpq(25, 1000))
+    return double_integrator(times, level=0.012)._replace(losses=1)
+
+
 @functools.cache
 def base(name: str) -> tuple[Loop, Document]:
-    """Return a loop and a document that is accepted; "overshoot" uses facts about w."""
-    loop = pushed() if name == "pushed" else double_integrator()
+    """Return a loop and a document that is accepted; "errors" uses facts about w."""
+    loop = {"pushed": pushed, "later": with_later_events}.get(name, double_integrator)()
     document = dict(find_witness(loop, _OUTPUTS).document)
-    return loop, with_overshoot(loop, document) if name == "overshoot" else document
+    return loop, with_errors(loop, document) if name == "errors" else document
 
 
-def with_overshoot(loop: Loop, document: Document) -> Document:
+def with_errors(loop: Loop, document: Document) -> Document:
     """Return a document in which the facts about w are used, with multipliers of 0."""
     proof = prove(loop, document)
     sensor = [bound for bound in proof.bounds if bound.output == "e_s"][-1]
-    found = {**copy.deepcopy(document), "overshoot": float((sensor.decaying / loop.rule.level).mid()) * 1.001}
+    errors = {"decaying": float(sensor.decaying.mid()) * 1.001, "constant": 0.0}
+    found = {**copy.deepcopy(document), "errors": errors}
+    assumed = read_assumptions(loop, number(found["rate"]), found)
     for entry in found["bounds"]:
-        model = Model(loop, number(found["rate"]), number(entry["decay"]), arb(1))
+        model = Model(loop, number(found["rate"]), number(entry["decay"]), assumed.errors)
         for item in model.inequalities(entry["output"], starts=True):
             for name, _ in item.scalars:
                 entry["numbers"].setdefault(name, 0.0)
@@ -135,9 +144,8 @@ def _scaled_entry(document: Document, rng: Rng) -> None:
 
 def _scaled(key: str, factor: float) -> Callable[[Document, Rng], None]:
     def change(document: Document, rng: Rng) -> None:
-        table = (
-            document if key in document else _entry(document, rng) if key == "decay" else document["chain"]
-        )
+        tables = [document, _entry(document, rng), document["chain"], document.get("errors", {})]
+        table = next((each for each in tables if key in each), document)
         table[key] = table.get(key, 1.0) * factor
 
     return change
@@ -170,8 +178,11 @@ DOCUMENTS: dict[str, Callable[[Document, Rng], object]] = {
     "first event x 2": _scaled("first_event_s", 2.0),
     "gain of the chain - 1 %": _scaled("gain", 0.99),
     "gain of the chain + 1 %": _scaled("gain", 1.01),
-    "overshoot - 5 %": _scaled("overshoot", 0.95),
-    "overshoot + 5 %": _scaled("overshoot", 1.05),
+    "errors - 5 %": _scaled("decaying", 0.95),
+    "errors + 5 %": _scaled("decaying", 1.05),
+    "one later event more": lambda d, rng: d.update(later=d["later"] + 1),
+    "one later event less": lambda d, rng: d.update(later=max(d["later"] - 1, 0)),
+    "other events before the first input": lambda d, rng: d.update(later_at_start=int(rng.integers(0, 3))),
 }
 
 # Changes of loops.
@@ -248,7 +259,7 @@ def is_true_or_rejected(loop: Loop, document: Document, seed: int) -> bool:
     except RejectedError:
         return True
     rng = np.random.default_rng(seed)
-    if "overshoot" not in document:
+    if "errors" not in document and not document["later"]:
         for entry in document["bounds"]:
             assert entry["output"] == "x[1]" or Forms(loop, document["rate"], entry).holds(
                 entry["output"], rng
@@ -270,7 +281,7 @@ def mutated_loop(name: str, change: str, seed: int) -> bool:
     return is_true_or_rejected(LOOPS[change](loop, np.random.default_rng(seed)), document, seed)
 
 
-@pytest.mark.parametrize("name", ["plain", "pushed", "overshoot"])
+@pytest.mark.parametrize("name", NAMES)
 def test_the_documents_are_true(name: str) -> None:
     loop, document = base(name)
     assert not is_true_or_rejected(loop, document, 0)
@@ -301,7 +312,7 @@ def test_some_changed_loops_are_rejected(change: str) -> None:
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("name", ["plain", "pushed", "overshoot"])
+@pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("change", DOCUMENTS)
 def test_changed_documents_prove_nothing_false(name: str, change: str) -> None:
     for seed in range(4):
@@ -309,7 +320,7 @@ def test_changed_documents_prove_nothing_false(name: str, change: str) -> None:
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("name", ["plain", "pushed", "overshoot"])
+@pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("change", LOOPS)
 def test_changed_loops_make_nothing_false_proven(name: str, change: str) -> None:
     for seed in range(2):
