@@ -72,7 +72,7 @@ def test_every_rule_of_the_guarantee_counts() -> None:
     void = certificate_time(packet_trace(sent * MS, (sent + 1) * MS, lost), scenario)
     (cause,) = void.causes
     assert (cause.cause, cause.worst, cause.first_s) == ("atmost 2 in 5", 3, pytest.approx(0.06))
-    assert void.kept["dropouts"] == "kept: 1 consecutive updates lost, 2 allowed"
+    assert void.kept["dropouts"] == "kept: 1 update lost, 2 allowed"
     assert cause.share == pytest.approx(11 / 141)
 
 
