@@ -35,11 +35,18 @@ def assumptions(scenario: Mapping[str, object], loop: Loop) -> str:
 def sentences(proof: Proof) -> Iterator[str]:
     """Yield each bound of a proof; of two bounds of the same output the smaller one."""
     for bound in smallest_bounds(proof):
-        yield f"{_NAMES.get(bound.output, f'|{bound.output}|')} ≤ {formula(bound, proof.rate)}"
+        yield f"{norm(bound.output)} ≤ {formula(bound, proof.rate)}"
     if proof.inter_event is not None and proof.inter_event > 0:
         which = "" if proof.is_quiet else " after the first input"
         exception = _exception(proof) if proof.is_quiet else ""
         yield f"two events{which} are at least {at_least(proof.inter_event)} s apart{exception}"
+
+
+def norm(output: str) -> str:
+    """Return the norm of an output as a symbol: |x_1| of "x[0]"."""
+    if output in _NAMES:
+        return _NAMES[output]
+    return f"|x_{int(output.removeprefix('x[').removesuffix(']')) + 1}|"
 
 
 def _exception(proof: Proof) -> str:

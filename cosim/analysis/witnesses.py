@@ -114,10 +114,15 @@ def resolved_content(resolved: Scenario, late_periods: int) -> dict[str, object]
 
 
 def find_statement(content: dict[str, object], plants: str, conditions: str) -> WitnessedStatement:
-    """Search for the witness of one statement of a resolved scenario: its plants and conditions."""
+    """Search for the witness of one statement of a resolved scenario: its plants and conditions.
+
+    Where disturbances act, ‖x‖ and each state are bounded in the limit t → ∞, too, under the schedule.
+    """
     try:
         loop = read_loop(content, box=plants == "box", ideal=conditions == "ideal")
-        witness = find_witness(loop)
+        has_limit = bool(loop.sizes) and conditions == "schedule"
+        states = ("x", *(f"x[{i}]" for i in range(loop.n))) if has_limit else ()
+        witness = find_witness(loop, ultimate=states)
     except (RefusedError, NoWitnessError) as error:
         return WitnessedStatement(plants, conditions, None, None, str(error))
     document = {"plants": plants, "conditions": conditions, **witness.document}

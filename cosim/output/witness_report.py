@@ -1,5 +1,7 @@
 """What the checker has proven of a scenario, as a table."""
 
+from collections.abc import Iterator, Sequence
+
 from flint import arb
 from rich.console import Console
 from rich.markup import escape
@@ -8,7 +10,7 @@ from cosim.analysis.witnesses import Witnesses
 from cosim.output.result_tables import ResultTable, terminal_table
 from noack.core.number_format import NONE
 from noack_check.proof import Bound, Proof
-from noack_check.sentences import at_least, at_most, smallest_bounds
+from noack_check.sentences import at_least, at_most, norm, smallest_bounds
 
 _ROWS = {"x": "‖x‖", "e_s": "‖e_s‖", "e_c": "‖e_c‖"}
 _HEADINGS = {"own": "plant", "box": "box", "ideal": "paper", "schedule": "schedule"}
@@ -20,7 +22,8 @@ def print_witnesses(console: Console, witnesses: Witnesses) -> None:
         console.print(terminal_table(table))
         console.print(
             "[dim]noack-check has derived the loop from the scenario, and verified these bounds in ball "
-            "arithmetic. The bounds are multiplied by e^(−rate·t); those without decay are added.[/]"
+            "arithmetic. The bounds are multiplied by e^(−rate·t); those without decay are added. In the "
+            "limit: for t → ∞, from any start.[/]"
         )
     for statement in witnesses.statements:
         if statement.proof is None:
@@ -35,15 +38,24 @@ def witness_table(witnesses: Witnesses) -> ResultTable | None:
         return None
     headings = ["", *(f"{_HEADINGS[s.conditions]},\n{_HEADINGS[s.plants]}" for s, _ in proven)]
     rows = [["decay rate, 1/s", *(at_least(proof.rate) for _, proof in proven)]]
-    for name, norm in _ROWS.items():
+    for name, symbol in _ROWS.items():
         bounds = [_bound(proof, name) for _, proof in proven]
-        rows.append([f"bound of {norm}", *(NONE if b is None else at_most(b.decaying) for b in bounds)])
+        rows.append([f"bound of {symbol}", *(NONE if b is None else at_most(b.decaying) for b in bounds)])
         if any(b is not None and b.constant != 0 for b in bounds):
             rows.append(["+ without decay", *(NONE if b is None else at_most(b.constant) for b in bounds)])
+    rows += _limits([proof for _, proof in proven])
     rows.append(["inter-event time, s", *(_time(proof.inter_event) for _, proof in proven)])
     if any(proof.first_event != proof.inter_event for _, proof in proven):
         rows.append(["the first one, s", *(_time(proof.first_event) for _, proof in proven)])
     return ResultTable("proven", f"{witnesses.scenario['name']}: proven bounds", headings, rows)
+
+
+def _limits(proofs: Sequence[Proof]) -> Iterator[list[str]]:
+    """Yield a row for each output that has a bound in the limit t → ∞."""
+    limits = [{b.output: b.constant for b in proof.bounds if not b.from_start} for proof in proofs]
+    for output in dict.fromkeys(name for each in limits for name in each):
+        cells = [at_most(each[output]) if output in each else NONE for each in limits]
+        yield [f"bound of {norm(output)} in the limit", *cells]
 
 
 def _time(least: arb | None) -> str:

@@ -92,7 +92,7 @@ def test_another_scenario_is_told_apart(
         ("network", "protocol", "ack", "network.protocol"),
         ("controller", "predictions", 3, "controller.predictions = 3"),
         ("controller", "safe_input", [1.0], "controller.safe_input"),
-        ("trigger", "new_key", 1, "trigger.new_key: unknown"),
+        ("trigger", "new_key", 1, "trigger.new_key: no statement covers this key"),
     ],
 )
 def test_a_changed_scenario_is_not_proven(
