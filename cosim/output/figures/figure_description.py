@@ -260,12 +260,15 @@ def series_colour(i: int) -> Colour:
 
 
 def finite(values: Reals, *, positive: bool = False) -> Reals:
-    """Return values with NaN for infinite and huge ones, and, if ``positive``, those not > 0."""
+    """Return values with NaN for infinite and huge ones, and, if ``positive``, for those not above 0.
+
+    What is not above 1 / LARGEST counts as 0 there.
+    """
     values = np.asarray(values, dtype=np.float64)
     with np.errstate(invalid="ignore"):
         shown = np.abs(values) < LARGEST
         if positive:
-            shown &= values > 0
+            shown &= values > 1 / LARGEST
     return np.where(shown, values, np.nan)
 
 
@@ -274,7 +277,7 @@ def log_ends(values: Reals, measured: Reals, decades: int) -> tuple[float, float
     measured = finite(measured, positive=True)
     if not np.isfinite(measured).any():
         return None
-    values = values[values > 1 / LARGEST]  # without zeros
+    values = values[values > 1 / LARGEST]  # without what is drawn as zero
     decade = 10.0 ** math.floor(math.log10(np.nanmax(measured)))
     low, high = max(values.min(), decade / 10**decades), min(values.max(), decade * 10**decades)
     margin = max((high / low) ** 0.05, 1.1)

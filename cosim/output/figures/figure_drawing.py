@@ -272,16 +272,17 @@ def _(item: Bars, axes: Axes, norm: Normalize | None) -> Artist | None:
     if not len(item.heights) or not item.heights.any():
         return None
     style: dict[str, Any] = {"color": rgb(item.colour), "alpha": item.opacity}
+    seen = item.heights != 0  # each bar is an artist: a million of them take minutes
+    middles, heights, widths = middles[seen], item.heights[seen], widths[seen]
     if item.horizontal:
-        return axes.barh(middles, item.heights, widths, **style).patches[0]
+        return axes.barh(middles, heights, widths, **style).patches[0]
     if item.numbers:
         axes.margins(y=0.15)
-        for x, height in zip(middles, item.heights, strict=True):
-            if height:
-                axes.text(
-                    x, height, f"{height:,g}", ha="center", va="bottom", size=mpl.rcParams["legend.fontsize"]
-                )
-    return axes.bar(middles, item.heights, widths, **style).patches[0]
+        for x, height in zip(middles, heights, strict=True):
+            axes.text(
+                x, height, f"{height:,g}", ha="center", va="bottom", size=mpl.rcParams["legend.fontsize"]
+            )
+    return axes.bar(middles, heights, widths, **style).patches[0]
 
 
 @_draw_item.register
@@ -355,12 +356,13 @@ def _draw_colour_bar(
 def _for_log_axis(values: Reals) -> Reals:
     """Return values for a curve on a logarithmic axis.
 
-    A zero (an error after a reset) becomes a value far below every axis, so that the curve falls
-    vertically; a NaN would leave a gap. If all values are zero, they become NaN.
+    A zero (an error after a reset), or what is nearly zero, becomes a value far below every axis, so that
+    the curve falls vertically; a NaN would leave a gap. If all values are zero, they become NaN.
     """
     heights = finite(values, positive=True)
     if np.isfinite(heights).any():
-        heights[np.asarray(values) == 0] = 1 / LARGEST
+        with np.errstate(invalid="ignore"):
+            heights[(np.asarray(values) >= 0) & (np.asarray(values) <= 1 / LARGEST)] = 1 / LARGEST
     return heights
 
 

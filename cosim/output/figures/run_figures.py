@@ -76,6 +76,8 @@ _DECADES = 6
 _FAR_RATIO, _FAR_OPACITY = 20.0, 0.45
 """A bound that is mostly over this ratio times the curve is drawn with this opacity."""
 _MOST_NUMBERED_BARS = 12
+_NEAR_LIMIT, _NEAR_LIMIT_RATIO = 50, 10
+"""A limit of losses is drawn up to this number, or to this multiple of the largest number that occurred."""
 _SYMBOLS = {
     "x": "$x$",
     "x_s": "$x_s$",
@@ -473,9 +475,15 @@ def _losses(record: RunRecord) -> FigureDescription:
 
 
 def _loss_panel(title: str, label: str, counted: str, values: NDArray[np.int64], limit: int | None) -> Panel:
-    """Describe a histogram of whole numbers (k,), and the largest number that is allowed."""
+    """Describe a histogram of whole numbers (k,), and the largest number that is allowed.
+
+    A limit that is far beyond all numbers is in the label only: beside it no bar could be seen.
+    """
     counts = Counter(values.tolist())
-    low, high = min([1, *counts]), max([1 if limit is None else limit, *counts])
+    low, high = min([1, *counts]), max([1, *counts])
+    if limit is not None and limit > max(_NEAR_LIMIT, _NEAR_LIMIT_RATIO * high):
+        label, limit = f"{label} (allowed: {limit:,})", None
+    high = max(high, limit or 1)
     bars = Bars(
         edges=np.arange(low, high + 2) - 0.5,
         heights=np.array([counts[number] for number in range(low, high + 1)], np.float64),

@@ -30,7 +30,13 @@ from cosim.output.figures.figure_drawing import draw
 from cosim.output.figures.figure_files import inline, save_figure, save_figures
 from cosim.output.figures.figure_format import requested_files
 from cosim.output.figures.figure_layout import use_figure_width
-from cosim.output.figures.run_figures import Transmissions, run_curves, run_figures, states_figure
+from cosim.output.figures.run_figures import (
+    Transmissions,
+    _loss_panel,
+    run_curves,
+    run_figures,
+    states_figure,
+)
 from cosim.output.figures.timing_figures import later_than
 from noack.core.errors import CallerError
 from tests.cosim.output.conftest import CASES, HOSTILE
@@ -131,6 +137,28 @@ def test_signal_names_are_drawn_literally() -> None:
     figure = norms(*lines)
     assert len(labels(draw(figure).axes[0])) == len(names)
     assert "<script" not in inline(figure.captioned(HOSTILE))
+
+
+def test_curves_that_are_nearly_zero_are_not_drawn_on_a_logarithmic_axis() -> None:
+    (curve,) = draw(norms(line(T_S, 1e-320 * T_S))).axes[0].lines
+    assert np.isnan(curve.get_ydata()).all()
+
+
+def test_a_limit_far_beyond_all_losses_is_in_the_label() -> None:
+    """A bar for each number up to a limit of a million takes minutes."""
+    panel = _loss_panel("losses", "consecutive losses", "bursts", np.array([1, 1, 3]), 1_000_000)
+    axes = draw(one_panel("losses", panel, 2.0)).axes[0]
+    assert axes.get_xlabel() == "consecutive losses (allowed: 1,000,000)"
+    assert axes.get_xlim()[1] < 5
+    assert [bar.get_height() for bar in axes.patches] == [2, 1]
+
+
+def test_a_near_limit_is_drawn_and_bars_are_few() -> None:
+    panel = _loss_panel("losses", "consecutive losses", "bursts", np.array([1, 200_000]), 200_000)
+    axes = draw(one_panel("losses", panel, 2.0)).axes[0]
+    assert axes.get_xlabel() == "consecutive losses"
+    assert len(axes.patches) == 2
+    assert axes.get_xlim()[1] > 200_000
 
 
 def test_a_curve_of_zeros_is_not_drawn_on_a_logarithmic_axis() -> None:
