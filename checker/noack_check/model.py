@@ -193,6 +193,7 @@ class Model:
         self.level, self.floor = thresholds(loop, rate)
         self.silent = self._comparison(self.level, self.floor)
         self._guards = self._event_guards()
+        self._forms: dict[tuple[int, int], Form] = {}
         self.locations = self._locations()
         self.edges = self._edges()
 
@@ -379,6 +380,11 @@ class Model:
         comparison is ≤ 0, since a ≥ 0. Waiting locations have Q, c₁ and c₂ for each node.
         Where an event's guard contains x, each location has a form of x, e and w of its own.
         """
+        if (location, node) not in self._forms:
+            self._forms[location, node] = self._new_form(location, node)
+        return self._forms[location, node]
+
+    def _new_form(self, location: int, node: int) -> Form:
         place = self.locations[location]
         E = columns_of(identity(self.size), place.coordinates)
         errors = stack([f for f in (self.e, self.w, *self.v) if not is_zero(f * E)])
@@ -404,14 +410,23 @@ class Model:
 
         ``starts``: from the loop's start on; else in the limit t → ∞.
         """
-        for index, place in enumerate(self.locations):
+        yield from self.common_inequalities()
+        yield from self.output_inequalities(output)
+        if starts:
+            yield self.start_inequality()
+
+    def common_inequalities(self) -> Iterator[Inequality]:
+        """Yield those of flows and edges, which are the same for all outputs, and affine in ν."""
+        for index in range(len(self.locations)):
             yield from self._flow_inequalities(index)
-            if not place.name.startswith("start") or output != "drift":
-                yield from self._output_inequalities(index, output)
         for edge in self.edges:
             yield from self._edge_inequalities(edge)
-        if starts:
-            yield self._start_inequality()
+
+    def output_inequalities(self, output: str) -> Iterator[Inequality]:
+        """Yield those of an output; the drift has none before the first input."""
+        for index, place in enumerate(self.locations):
+            if not place.name.startswith("start") or output != "drift":
+                yield from self._output_inequalities(index, output)
 
     def _flow_inequalities(self, index: int) -> Iterator[Inequality]:
         """dV/dt + νV ≤ Σ m q + Σ τ (|p|² − |Rz|²), at both ends of each piece of θ."""
@@ -510,7 +525,7 @@ class Model:
                 terms.scalar(f"m/{name}/{number_}", transpose(E) * fact * E)
             yield terms.inequality(name, edge.source, 0)
 
-    def _start_inequality(self) -> Inequality:
+    def start_inequality(self) -> Inequality:
         """V(z(0)) ≤ 0."""
         index = self.loop.losses + 1 + self._waiting if self.loop.times.start > 0 else 0
         z = transpose(self.x) * self.loop.start + transpose(self.f1) + transpose(self.f2)

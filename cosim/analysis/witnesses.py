@@ -11,7 +11,8 @@ from typing import NamedTuple
 from noack.core.errors import CallerError
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.conditions import with_stated_times
-from noack.theory.witnesses.documents import NoWitnessError, find_witness
+from noack.theory.witnesses.documents import find_witness
+from noack.theory.witnesses.effort import NoWitnessError
 from noack_check.keys import RefusedError
 from noack_check.proof import Proof
 from noack_check.scenario import read_loop

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from noack.theory.witnesses.documents import NoWitnessError, find_witness
+from noack.theory.witnesses.documents import find_witness
+from noack.theory.witnesses.effort import NoWitnessError
 from noack_check.balls import number
 from tests.checker.random_loops import random_loop
 from tests.checker.runs import exceeded

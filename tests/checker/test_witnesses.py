@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from flint import arb, fmpq
 
-from noack.theory.witnesses.documents import NoWitnessError, Witness, find_witness
+from noack.theory.witnesses.documents import Witness, find_witness
+from noack.theory.witnesses.effort import NoWitnessError
 from noack_check.balls import matrix, number, zeros
 from noack_check.check import RejectedError
 from noack_check.loop import Loop, Rule, Times

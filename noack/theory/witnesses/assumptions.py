@@ -33,6 +33,9 @@ _ROOM = 1.01
 _FURTHER = 1.3
 """The next guess exceeds what followed from the last one by this factor."""
 
+_NEARLY, _MOST_STEPS = 1 - 1e-4, 30
+"""A time is accepted if e_s reaches nearly the threshold."""
+
 
 def first_assumptions(loop: Loop, rate: float) -> dict[str, object]:
     """Return a document without bounds: its rate, its chain, and what is assumed at first.
@@ -55,6 +58,11 @@ def first_assumptions(loop: Loop, rate: float) -> dict[str, object]:
         share = 1.1 if loop.times.sampling > 0 else 1.0
         document = with_errors(document, [share * float(each) for each in thresholds(loop, number(rate))])
     return document
+
+
+def without_drift(loop: Loop, document: Mapping[str, object]) -> dict[str, object]:
+    """Return a document that assumes nothing that follows from a bound of the drift."""
+    return {**document, "later": _most_between(loop, loop.times.delay)}
 
 
 def with_errors(document: Mapping[str, object], sizes: Sequence[float]) -> dict[str, object]:
@@ -130,7 +138,9 @@ def _sups(G: Matrix) -> Iterator[float]:
     """Yield the largest of ‖e^{Gτ}‖ on grids of 256 times until it has decayed."""
     slowest = -float(np.linalg.eigvals(G).real.max())
     step = 0.02 / max(float(np.linalg.norm(G, 2)), slowest)
-    cells = np.array([expm(G * step * k) for k in range(256)])
+    cells = np.eye(len(G))[None]
+    for doubling in range(8):
+        cells = np.concatenate([cells, cells @ expm(G * step * 2**doubling)])
     power, following = np.eye(len(G)), expm(G * step * 256)
     for _ in range(400):
         sizes = np.linalg.norm(cells @ power, 2, axis=(1, 2))
@@ -152,12 +162,13 @@ def inter_event_s(loop: Loop, rate: float, drift: Sequence[float]) -> float:
     most = min((threshold / size) ** 0.5 * (1 - 1e-9) for threshold, size in shares if size)
     W = floats(loop.weight)
     G = W @ floats(loop.H) @ np.linalg.inv(W) + rate * np.eye(loop.n)
-    low, high = 0.0, most
-    for _ in range(30):
-        middle = (low + high) / 2
-        total = float(growth(matrix(G.tolist()), number(middle))[1].mid())
-        low, high = (middle, high) if total * (1 + 1e-9) < most else (low, middle)
-    return low
+    grown, time = matrix(G.tolist()), most
+    for _ in range(_MOST_STEPS):
+        total = float(growth(grown, number(time))[1].mid()) * (1 + 1e-9)
+        if _NEARLY * most < total < most:
+            break
+        time *= (1 + _NEARLY) / 2 * most / total
+    return time if total < most else 0.0
 
 
 def first_event_s(loop: Loop, drift: Sequence[float], most: float) -> float:

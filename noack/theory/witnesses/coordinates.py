@@ -160,7 +160,7 @@ class _Runs:
             self._counts[location] += len(z)
 
     def _quadratic(self, M: Matrix) -> Vector:
-        return np.asarray(np.einsum("ri,ij,rj->r", self._z, M, self._z))
+        return np.asarray((self._z @ M * self._z).sum(1))
 
 
 def _seconds(time: fmpq) -> float:

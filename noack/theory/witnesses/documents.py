@@ -1,7 +1,8 @@
 """The search for a whole witness: a document that :mod:`noack_check.proof` accepts."""
 
 import contextlib
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,26 +12,39 @@ from noack.theory.witnesses.assumptions import (
     first_event_s,
     inter_event_s,
     next_assumptions,
+    without_drift,
 )
-from noack.theory.witnesses.coordinates import Frames, floats, simulated_frames
+from noack.theory.witnesses.coordinates import floats, simulated_frames
+from noack.theory.witnesses.effort import MOST_WORK, Effort, EndedError, NoWitnessError
+from noack.theory.witnesses.line_search import search_lowest
 from noack.theory.witnesses.search import Found, Search, refined
+from noack.theory.witnesses.semidefinite import Accuracy
+from noack.theory.witnesses.templates import Templates
 from noack_check.balls import number
 from noack_check.check import RejectedError
 from noack_check.loop import Loop
 from noack_check.model import Model
 from noack_check.proof import Proof, compares_error, prove, prove_bound, read_assumptions
 
-_MARGINS = (1e-6, 1e-5, 1e-4, 1e-3)
+_COARSE = Accuracy(gap=1e-3, feasibility=1e-3, improves_steps=False)
+_ATTEMPTS = (
+    (1e-5, Accuracy(gap=1e-3, feasibility=2e-8, improves_steps=False)),
+    *(
+        (margin, Accuracy(gap=1e-8, feasibility=1e-8, improves_steps=True))
+        for margin in (1e-6, 1e-5, 1e-4, 1e-3)
+    ),
+)
 """Margins of the inequalities, in the coordinates of the search, until the checker accepts."""
-_SHARES = (0.2, 0.42, 0.64)
-"""ν between 2r and twice the loop's rate of decay, as shares; three, then one more by interpolation."""
+_COARSE_MARGIN = 1e-6
+_FIRST_SHARE, _FIRST_SLOW_SHARE = 0.42, 0.04
+"""ν is between 2r and twice the loop's rate of decay, at a share."""
+_MOST_TRIES, _FEW_TRIES, _LARGE = 5, 2, 1.0
+"""Shares that are tried for an output, also for a problem that is large: its work is above a limit."""
 _ROOM, _NEAR = 1 + 1e-6, 1.04
 _MOST_LOSSES = 24
 _MOST_GUESSES = 6
-
-
-class NoWitnessError(ArithmeticError):
-    """No witness was found; the message says what fails first."""
+_EXPECTED = 5
+"""Problems that are solved for an output, about."""
 
 
 class Witness(NamedTuple):
@@ -41,7 +55,12 @@ class Witness(NamedTuple):
 
 
 def find_witness(
-    loop: Loop, outputs: Sequence[str] = ("x", "e_c"), *, ultimate: Sequence[str] = ()
+    loop: Loop,
+    outputs: Sequence[str] = ("x", "e_c"),
+    *,
+    ultimate: Sequence[str] = (),
+    progress: Callable[[float], None] = lambda share: None,
+    most_work: float = MOST_WORK,
 ) -> Witness:
     """Return a witness for bounds of some outputs, and of what follows from them.
 
@@ -49,6 +68,8 @@ def find_witness(
         loop: the loop.
         outputs: those that are bounded from the start on.
         ultimate: those that are bounded in the limit t → ∞.
+        progress: called with the completed share.
+        most_work: limit of the search, see :class:`Effort`.
 
     Raises:
         NoWitnessError: none was found.
@@ -58,28 +79,45 @@ def find_witness(
     rates = _Rates(loop)
     if rates.slowest <= 0:
         raise NoWitnessError("the loop does not decay without losses")
-    if compares_error(loop):
-        return _by_threshold(loop, rates, outputs, ultimate)
-    with contextlib.suppress(NoWitnessError):
-        return _by_quadratic_forms(loop, rates, outputs, ultimate)
-    return _by_quadratic_forms(loop, _Rates(loop, slow=True), outputs, ultimate)
+    effort = Effort(progress, most_work)
+    effort.expect(_EXPECTED * (1 + len(outputs) + len(ultimate)))
+    wanted = _Wanted(outputs, ultimate)
+    if not compares_error(loop):
+        with contextlib.suppress(NoWitnessError):
+            return _by_quadratic_forms(loop, rates, wanted, effort)
+        return _by_quadratic_forms(loop, _Rates(loop, slow=True), wanted, effort)
+    try:
+        return _by_threshold(loop, rates, wanted, effort)
+    except EndedError:
+        raise
+    except NoWitnessError as error:
+        with contextlib.suppress(NoWitnessError):
+            return _by_quadratic_forms(loop, rates, wanted, effort)
+        raise error
 
 
-def _by_threshold(loop: Loop, rates: "_Rates", outputs: Sequence[str], ultimate: Sequence[str]) -> Witness:
+class _Wanted(NamedTuple):
+    """Outputs to bound: from the start on, and in the limit."""
+
+    outputs: Sequence[str]
+    ultimate: Sequence[str]
+
+
+def _by_threshold(loop: Loop, rates: "_Rates", wanted: _Wanted, effort: Effort) -> Witness:
     """Return a witness for a rule that compares ‖W e_s‖: its drift bounds e_s and times between events."""
     document = first_assumptions(loop, rates.rate)
     for _ in range(_MOST_GUESSES):
-        search = _OutputSearch(loop, rates, document)
-        levels = search.best_decay("drift", starts=True)[1].levels
+        search = _OutputSearch(loop, rates, document, effort)
+        levels = search.best_share("drift", starts=True)[1].levels
         following = next_assumptions(loop, document, levels)
         if following is None:
             break
         document = following
+        effort.expect(_EXPECTED)
     else:
         raise NoWitnessError("errors: the sensor's error may be larger than each guess of it")
-    bounds = search.bounds(outputs, ultimate)
     entry = search.bound("drift")
-    document["bounds"] = [*bounds, entry]
+    document["bounds"] = [*search.bounds(wanted), entry]
     numbers = entry["numbers"]
     assert isinstance(numbers, dict)
     drift = tuple(float(np.sqrt(numbers.get(name, 0.0))) for name in ("level 1", "level 2"))
@@ -88,15 +126,12 @@ def _by_threshold(loop: Loop, rates: "_Rates", outputs: Sequence[str], ultimate:
     return _proven(loop, document)
 
 
-def _by_quadratic_forms(
-    loop: Loop, rates: "_Rates", outputs: Sequence[str], ultimate: Sequence[str]
-) -> Witness:
-    """Return a witness for another rule: e_s has quadratic forms as other outputs have."""
-    document = first_assumptions(loop, rates.rate)
-    bounds = _OutputSearch(loop, rates, document).bounds([*outputs, "e_s"], ultimate)
-    if not bounds:
-        raise NoWitnessError("the solver finds no quadratic forms at any rate of decay")
-    return _proven(loop, {**document, "bounds": bounds})
+def _by_quadratic_forms(loop: Loop, rates: "_Rates", wanted: _Wanted, effort: Effort) -> Witness:
+    """Return a witness for any rule: e_s has quadratic forms, too, and each test may be an event."""
+    document = without_drift(loop, first_assumptions(loop, rates.rate))
+    search = _OutputSearch(loop, rates, document, effort)
+    sensor = search.bound("e_s")
+    return _proven(loop, {**document, "bounds": [*search.bounds(wanted), sensor]})
 
 
 def _proven(loop: Loop, document: Mapping[str, object]) -> Witness:
@@ -115,7 +150,7 @@ class _Rates:
         self.slowest = min(-float(np.linalg.eigvals(M).real.max()) for M in own)
         threshold, level = float(loop.rule.rate), float(loop.rule.level)
         wanted = threshold if level else (0.01 if slow else 0.3) * self.slowest
-        self.shares = (0.01, 0.04, 0.15) if slow else _SHARES
+        self.first_share = _FIRST_SLOW_SHARE if slow else _FIRST_SHARE
         if loop.holds or (level and not threshold):
             self.rate = 0.0
         else:
@@ -133,13 +168,17 @@ class _OutputSearch:
         loop: the loop.
         rates: its rates of decay.
         document: a witness's document with its assumptions.
+        effort: counts the work.
     """
 
-    def __init__(self, loop: Loop, rates: _Rates, document: Mapping[str, object]) -> None:
-        self._loop, self._rates, self.document = loop, rates, document
+    def __init__(self, loop: Loop, rates: _Rates, document: Mapping[str, object], effort: "Effort") -> None:
+        self._loop, self._rates, self.document, self._effort = loop, rates, document, effort
         self._rate = number(rates.rate)
         self._assumed = read_assumptions(loop, self._rate, document)
-        self._frames = simulated_frames(self._model(rates.decay(rates.shares[0])))
+        self._templates = Templates(self._model)
+        self._frames = simulated_frames(self._templates.model)
+        self._search = Search(self._templates, self._frames)
+        self._best: dict[tuple[str, bool], tuple[float, Found]] = {}
         self._share: float | None = None
 
     def _model(self, decay: float) -> Model:
@@ -154,10 +193,10 @@ class _OutputSearch:
             is_exact=False,
         )
 
-    def bounds(self, outputs: Sequence[str], ultimate: Sequence[str]) -> list[dict[str, object]]:
+    def bounds(self, wanted: _Wanted) -> list[dict[str, object]]:
         """Return the entries of those outputs for which there is one."""
         found = []
-        for starts, names in ((True, outputs), (False, ultimate)):
+        for starts, names in ((True, wanted.outputs), (False, wanted.ultimate)):
             for output in names:
                 with contextlib.suppress(NoWitnessError):
                     found.append(self.bound(output, starts=starts))
@@ -166,76 +205,95 @@ class _OutputSearch:
     def bound(self, output: str, *, starts: bool = True) -> dict[str, object]:
         """Return the entry of a document for an output, from the start on or in the limit.
 
-        ν is found by coarse solutions. The best of them gives the coordinates for accurate ones, of
-        which the first that is accepted and not much larger than the coarse one is taken.
+        ν is found by coarse solutions. Accurate ones follow, with larger margins and in coordinates of
+        the one before, until one is accepted that is not much larger than the coarse one.
         """
-        decay, coarse = self.best_decay(output, starts=starts)
-        frames, why = refined(self._frames, coarse), f"{output}: the solver finds no quadratic forms"
+        share, coarse = self.best_share(output, starts=starts)
+        decay, why = self._rates.decay(share), f"{output}: {self._nothing_found()}"
         accepted: list[tuple[float, dict[str, object]]] = []
-        for margin in _MARGINS:
-            for coordinates in (frames, self._frames) if margin == _MARGINS[0] else (frames,):
-                found = self._solve(output, decay, coordinates, starts=starts, margin=margin)
-                if found is None:
-                    continue
-                entry = _entry(output, decay, found, starts=starts)
-                try:
-                    prove_bound(self._loop, self._rate, entry, self._assumed)
-                except RejectedError as error:
-                    why = str(error)
-                    frames = refined(coordinates, found)
-                else:
-                    accepted.append((found.size, entry))
-                    if found.size < _NEAR * coarse.size:
-                        return entry
-            if accepted:
-                return min(accepted, key=lambda pair: pair[0])[1]
+        for is_last, found in self._accurate(output, decay, coarse, starts=starts):
+            entry = _entry(output, decay, found, starts=starts)
+            try:
+                prove_bound(self._loop, self._rate, entry, self._assumed)
+            except RejectedError as error:
+                why = str(error)
+            else:
+                accepted.append((found.size, entry))
+                if found.size < _NEAR * coarse.size:
+                    return entry
+            if accepted and is_last:
+                break
+        if accepted:
+            return min(accepted, key=lambda pair: pair[0])[1]
         raise NoWitnessError(why)
 
-    def best_decay(self, output: str, *, starts: bool) -> tuple[float, Found]:
-        """Return ν with its coarse solution; the first output tries all shares, the others its neighbours."""
-        found: dict[float, Found] = {}
-        first = self._share
-        self._try(
-            output, starts, self._rates.shares if first is None else (first, min(1.5 * first, 0.9)), found
-        )
-        if first is not None and min(found, key=lambda share: found[share].size, default=first) == first:
-            self._try(output, starts, [0.65 * first], found)
-        if not found:
-            raise NoWitnessError(f"{output}: the solver finds no quadratic forms at any rate of decay")
-        if len(found) == 3:
-            # the lowest point of a parabola
-            sizes = [np.log(each.size) for each in found.values()]
-            fit = np.polyfit(list(found), sizes, 2)
-            if fit[0] > 0:
-                lowest = float(np.clip(-fit[1] / (2 * fit[0]), min(found) / 2, 0.9))
-                if min(abs(lowest - share) for share in found) > 0.03:
-                    self._try(output, starts, [lowest], found)
-        best = min(found, key=lambda share: found[share].size)
-        self._share = self._share or best
-        return self._rates.decay(best), found[best]
+    def _accurate(
+        self, output: str, decay: float, coarse: Found, *, starts: bool
+    ) -> Iterator[tuple[bool, Found]]:
+        """Yield accurate solutions, with larger margins and in coordinates of the one before.
 
-    def _try(self, output: str, starts: bool, shares: Sequence[float], found: dict[float, Found]) -> None:
-        for share in shares:
+        With each comes whether more will not give a smaller bound.
+        """
+        search, attempts = self._search, list(enumerate(_ATTEMPTS))
+        if self._is_large(output):  # the coarse one is as accurate
+            yield False, coarse
+            search = Search(self._templates, refined(search.frames, coarse))
+            del attempts[0]
+        last = coarse
+        for index, (margin, accuracy) in attempts:
+            found = self._solve(search, output, decay, starts=starts, margin=margin, accuracy=accuracy)
+            if found is not None:
+                last = found
+                yield index > 1, found
+            search = Search(self._templates, refined(search.frames, last))
+
+    def _nothing_found(self) -> str:
+        """Return that there is no solution, and what was assumed."""
+        later = self._assumed.later
+        events = f" with {later} later event{'s' * (later > 1)}" if later else ""
+        return f"the solver finds no quadratic forms{events}"
+
+    def best_share(self, output: str, *, starts: bool) -> tuple[float, Found]:
+        """Return the share for ν with its coarse solution."""
+        key = output, starts
+        if key not in self._best:
+            found = self._tried(output, starts=starts)
+            if not found:
+                raise NoWitnessError(f"{output}: {self._nothing_found()}")
+            best = min(found, key=lambda share: found[share].size)
+            self._share = self._share or best
+            self._best[key] = best, found[best]
+        return self._best[key]
+
+    def _tried(self, output: str, *, starts: bool) -> dict[float, Found]:
+        """Return coarse solutions by their shares."""
+        found: dict[float, Found] = {}
+        margin, accuracy = _ATTEMPTS[0] if self._is_large(output) else (_COARSE_MARGIN, _COARSE)
+
+        def size(share: float) -> float:
             decay = self._rates.decay(share)
             solution = self._solve(
-                output, decay, self._frames, starts=starts, margin=_MARGINS[0], tolerance=1e-3
+                self._search, output, decay, starts=starts, margin=margin, accuracy=accuracy
             )
-            if solution is not None:
-                found[share] = solution
+            if solution is None:
+                return math.inf
+            found[share] = solution
+            return solution.size
+
+        most = _MOST_TRIES
+        if self._is_large(output):
+            most = 1 if self._share else _FEW_TRIES
+        search_lowest(size, self._share or self._rates.first_share, most, upwards=not self._share)
+        return found
+
+    def _is_large(self, output: str) -> bool:
+        return self._templates.work(output) > _LARGE
 
     def _solve(
-        self,
-        output: str,
-        decay: float,
-        frames: Frames,
-        *,
-        starts: bool,
-        margin: float,
-        tolerance: float = 1e-8,
+        self, search: Search, output: str, decay: float, *, starts: bool, margin: float, accuracy: Accuracy
     ) -> Found | None:
-        search = Search(self._model(decay), frames)
-        found = search.solve(output, starts=starts, margin=margin, tolerance=tolerance)
-        return found if found.status in {"Solved", "AlmostSolved"} else None
+        self._effort.add(output, self._templates.work(output))
+        return search.solve(output, decay, starts=starts, margin=margin, accuracy=accuracy)
 
 
 def _entry(output: str, decay: float, found: Found, *, starts: bool) -> dict[str, object]:

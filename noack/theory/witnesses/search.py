@@ -11,8 +11,8 @@ import numpy as np
 
 from noack.core.linear_systems import Matrix
 from noack.theory.witnesses.coordinates import Frames, floats
-from noack.theory.witnesses.semidefinite import MatrixInequality, SolverAnswer, minimise
-from noack_check.model import Inequality, Model
+from noack.theory.witnesses.semidefinite import Accuracy, MatrixInequality, SolverAnswer, minimise
+from noack.theory.witnesses.templates import Template, Templates
 
 
 class Found(NamedTuple):
@@ -22,7 +22,7 @@ class Found(NamedTuple):
     numbers: Mapping[str, float]
     status: str
     size: float
-    """What was minimised: (D₁² + D₂²)^½ from the start on, D₂ in the limit."""
+    """What was minimised, a root: see :meth:`Search.solve`."""
 
     @property
     def levels(self) -> tuple[float, float]:
@@ -32,39 +32,57 @@ class Found(NamedTuple):
 
 
 class Search:
-    """The search for bounds of one model's outputs."""
+    """The search for bounds of one model's outputs in some coordinates."""
 
-    def __init__(self, model: Model, frames: Frames) -> None:
-        self.model, self.frames = model, dict(frames)
-        level, floor = float(model.loop.rule.level), float(model.loop.rule.floor)
+    def __init__(self, templates: Templates, frames: Frames) -> None:
+        self.templates, self.model, self.frames = templates, templates.model, dict(frames)
+        level, floor = float(self.model.loop.rule.level), float(self.model.loop.rule.floor)
         self._f_units = (1.0, level / floor if level and floor else 1.0)
+        self._inverse = {name: np.linalg.inv(T) for name, T in self.frames.items()}
+        self._whole = [self._frame(index) for index in range(len(self.model.locations))]
 
-    def solve(self, output: str, *, starts: bool, margin: float = 1e-7, tolerance: float = 1e-8) -> Found:
-        """Return the smallest bound of an output for this model's ν: from the start on, or in the limit."""
-        model = self.model
+    def solve(
+        self, output: str, decay: float, *, starts: bool, margin: float, accuracy: Accuracy
+    ) -> Found | None:
+        """Return the smallest bound of an output for a ν: from the start on, or in the limit.
+
+        Minimised is D₁² + D₂² from the start on, and D₂² in the limit. D₁ and D₂ of the drift are
+        divided by the thresholds c and f of their units: the time between events depends on these quotients.
+        """
         size = self._output_size(output)
-        problem = [self._scaled(item, size) for item in model.inequalities(output, starts=starts)]
+        items = self.templates.at(decay, output, starts=starts)
+        problem = [self._scaled(item, size) for item in items]
         units = _units(problem)
         problem = [
             item._replace(scalars=tuple((name, units[name] * M) for name, M in item.scalars))
             for item in problem
         ]
-        objective = {
-            name: weight * units[name]
-            for name, weight in (("level 1", 1.0 if starts else 1e-6), ("level 2", 1.0))
-            if name in units
-        }
+        weights = self._weights(output, starts=starts)
+        objective = {name: weight * units[name] for name, weight in weights.items() if name in units}
         largest = max(objective.values())
         objective = {name: w / largest for name, w in objective.items()}
         free = {name for name in units if name.startswith("c")}
-        solution = minimise(objective, problem, free=free, margin=margin, tolerance=tolerance)
+        solution = minimise(objective, problem, free=free, margin=margin, accuracy=accuracy)
+        if not solution.is_solved:
+            return None
         found = self._unscaled(solution, size, units)
-        return found._replace(size=float(np.hypot(*found.levels)) if starts else found.levels[1])
+        squares = (weights[name] * max(found.numbers.get(name, 0.0), 0.0) for name in weights)
+        return found._replace(size=sum(squares) ** 0.5)
+
+    def _weights(self, output: str, *, starts: bool) -> Mapping[str, float]:
+        """Return the weights of D₁² and D₂²."""
+        if not starts:
+            return {"level 1": 1e-6, "level 2": 1.0}
+        level, floor = float(self.model.level), float(self.model.floor)
+        if output == "drift" and level and floor:
+            return {"level 1": floor / level, "level 2": level / floor}
+        return {"level 1": 1.0, "level 2": 1.0}
 
     def _output_size(self, output: str) -> float:
-        place = self.model.locations[min(1, len(self.model.locations) - 1)]
+        index = min(1, len(self.model.locations) - 1)
+        place = self.model.locations[index]
         rows = floats(self.model.output(output, place)[0][0])[:, list(place.coordinates)]
-        return float(np.linalg.norm(rows @ self._frame(min(1, len(self.model.locations) - 1)))) or 1.0
+        return float(np.linalg.norm(rows @ self._whole[index])) or 1.0
 
     def _frame(self, location: int) -> Matrix:
         """Return the coordinates of a location: block diagonal of those of its matrices."""
@@ -82,26 +100,23 @@ class Search:
             frame[np.ix_(where, where)] = self.frames[name]
         return frame
 
-    def _scaled(self, item: Inequality, size: float) -> MatrixInequality:
-        parts = []
-        for part in item.parts:
-            inverse = np.linalg.inv(self.frames[part.name])
-            parts.append((part.name, inverse @ floats(part.left), inverse @ floats(part.right)))
-        scalars = tuple((name, floats(M)) for name, M in item.scalars)
-        constant = floats(item.constant) / size**2
-        result = MatrixInequality(tuple(parts), scalars, constant)
+    def _scaled(self, item: Template, size: float) -> MatrixInequality:
+        parts = tuple(
+            (name, self._inverse[name] @ left, self._inverse[name] @ right)
+            for name, left, right in item.parts
+        )
+        result = MatrixInequality(parts, item.scalars, item.constant / size**2)
         if item.signals < 0:
             return result
-        frame = self._frame(item.location)
-        q = len(constant)
-        whole = np.eye(q)
+        frame = self._whole[item.location]
+        whole = np.eye(len(item.constant))
         whole[: len(frame), : len(frame)] = frame
         return result.within(whole[:, _occurring(result, whole)])
 
     def _unscaled(self, solution: SolverAnswer, size: float, units: Mapping[str, float]) -> Found:
         matrices = {}
         for name, V in solution.matrices.items():
-            inverse = np.linalg.inv(self.frames[name])
+            inverse = self._inverse[name]
             matrices[name] = size**2 * inverse.T @ V @ inverse
         numbers = {name: size**2 * units[name] * value for name, value in solution.numbers.items()}
         return Found(matrices, numbers, solution.status, 0.0)
@@ -109,7 +124,7 @@ class Search:
 
 def refined(frames: Frames, found: Found) -> Frames:
     """Return the coordinates in which the matrices of a solution are of order 1."""
-    scale = max(found.size, 1e-150)
+    scale = max(float(np.hypot(*found.levels)), 1e-150)
     better = dict(frames)
     for name, V in found.matrices.items():
         T = frames[name]

@@ -1,0 +1,48 @@
+"""The effort of a search: how far it is, and when it ends. It is counted in problems, not in seconds."""
+
+from collections.abc import Callable
+
+MOST_WORK = 60.0
+"""A search ends after so many 10⁹ products per step of the solver: some minutes."""
+_LAST_SHARE = 0.99
+
+
+class NoWitnessError(ArithmeticError):
+    """No witness was found; the message says what fails first."""
+
+
+class EndedError(NoWitnessError):
+    """The search was ended."""
+
+
+class Effort:
+    """Counts the problems that a search solves.
+
+    Args:
+        progress: called with the completed share, which does not fall.
+        most_work: the search ends before the problem with which its work would exceed this.
+    """
+
+    def __init__(self, progress: Callable[[float], None], most_work: float = MOST_WORK) -> None:
+        self._progress, self._most_work = progress, most_work
+        self._problems, self._expected, self._work, self._share = 0, 0, 0.0, 0.0
+
+    def expect(self, problems: int) -> None:
+        """Add problems to those that are expected."""
+        self._expected += problems
+
+    def add(self, output: str, work: float) -> None:
+        """Count the next problem.
+
+        Raises:
+            EndedError: it is one too many.
+        """
+        if self._work + work > self._most_work:
+            raise EndedError(
+                f"{output}: the search ended after {self._problems} problems, which it tries at most "
+                "of this size"
+            )
+        self._problems, self._work = self._problems + 1, self._work + work
+        done = self._problems / max(self._expected, self._problems + 1)
+        self._share = max(self._share, min(done, _LAST_SHARE))
+        self._progress(self._share)
