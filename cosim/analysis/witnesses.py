@@ -6,6 +6,7 @@ the loop from the resolved scenario itself.
 
 import json
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 from noack.core.errors import CallerError
@@ -74,10 +75,15 @@ def find_witnesses(
     ]
     found = []
     for index, (plants, under) in enumerate(wanted):
-        progress(index / len(wanted))
-        found.append(find_statement(content, plants, under))
+        part = partial(_part_of, progress, index, len(wanted))
+        found.append(find_statement(content, plants, under, part))
     progress(1.0)
     return Witnesses(content, found)
+
+
+def _part_of(progress: Callable[[float], None], index: int, count: int, share: float) -> None:
+    """Report the progress of one of several searches."""
+    progress((index + share) / count)
 
 
 def needs_matrices(resolved: Scenario) -> str:
@@ -114,7 +120,12 @@ def resolved_content(resolved: Scenario, late_periods: int) -> dict[str, object]
     return dict(stated.content())
 
 
-def find_statement(content: dict[str, object], plants: str, conditions: str) -> WitnessedStatement:
+def find_statement(
+    content: dict[str, object],
+    plants: str,
+    conditions: str,
+    progress: Callable[[float], None] = lambda share: None,
+) -> WitnessedStatement:
     """Search for the witness of one statement of a resolved scenario: its plants and conditions.
 
     Where disturbances act, ‖x‖ and each state are bounded in the limit t → ∞, too, under the schedule.
@@ -123,7 +134,7 @@ def find_statement(content: dict[str, object], plants: str, conditions: str) -> 
         loop = read_loop(content, box=plants == "box", ideal=conditions == "ideal")
         has_limit = bool(loop.sizes) and conditions == "schedule"
         states = ("x", *(f"x[{i}]" for i in range(loop.n))) if has_limit else ()
-        witness = find_witness(loop, ultimate=states)
+        witness = find_witness(loop, ultimate=states, progress=progress)
     except (RefusedError, NoWitnessError) as error:
         return WitnessedStatement(plants, conditions, None, None, str(error))
     document = {"plants": plants, "conditions": conditions, **witness.document}

@@ -39,8 +39,7 @@ class Effort:
         """
         if self._work + work > self._most_work:
             raise EndedError(
-                f"{output}: the search ended after {self._problems} problems, which it tries at most "
-                "of this size"
+                f"{output}: the search ended after {self._problems} problems, at its limit of work"
             )
         self._problems, self._work = self._problems + 1, self._work + work
         done = self._problems / max(self._expected, self._problems + 1)

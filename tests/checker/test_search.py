@@ -1,0 +1,99 @@
+"""The search for witnesses: which ν it tries, what it minimises, how far it is, and when it ends."""
+
+import math
+
+import numpy as np
+import pytest
+from flint import arb
+
+from noack.theory.witnesses.coordinates import floats
+from noack.theory.witnesses.documents import find_witness
+from noack.theory.witnesses.effort import Effort, EndedError, NoWitnessError
+from noack.theory.witnesses.line_search import search_lowest
+from noack.theory.witnesses.templates import Templates
+from noack_check.balls import matrix, number
+from noack_check.model import Model
+from tests.checker.test_witnesses import double_integrator
+
+
+@pytest.mark.parametrize("lowest", [0.15, 0.42, 0.6, 0.85])
+def test_the_lowest_value_is_found_with_few_values(lowest: float) -> None:
+    values: dict[float, float] = {}
+
+    def value(share: float) -> float:
+        assert share not in values
+        values[share] = math.exp(math.log(share / lowest) ** 2) if share > 0.08 else math.inf
+        return values[share]
+
+    search_lowest(value, 0.42, 5, upwards=True)
+    assert len(values) <= 6
+    assert all(0 < share < 1 for share in values)
+    assert min(values.values()) < 1.05
+
+
+def test_without_a_finite_value_the_search_ends() -> None:
+    tried: list[float] = []
+
+    def value(share: float) -> float:
+        tried.append(share)
+        return math.inf
+
+    search_lowest(value, 0.42, 5, upwards=True)
+    assert len(tried) == 5
+
+
+@pytest.mark.parametrize("decay", [0.7, 1.3])
+def test_templates_are_the_inequalities_of_the_model(decay: float) -> None:
+    loop = double_integrator()._replace(half_B=matrix([[0.0], [0.02]]))
+
+    def model(decay: float) -> Model:
+        return Model(loop, number(0.3), number(decay), later=1, later_at_start=1, is_exact=False)
+
+    rng, matrices = np.random.default_rng(0), {}
+    items = list(model(decay).inequalities("drift", starts=True))
+    found = Templates(model).at(decay, "drift", starts=True)
+    for item, template in zip(items, found, strict=True):
+        exact, own = floats(item.constant), template.constant
+        for name, left, right in item.parts:
+            n = left.nrows()
+            V = matrices.setdefault(name, (M := rng.normal(size=(n, n))) + M.T)
+            product = floats(left).T @ V @ floats(right)
+            exact = exact + product + product.T
+        for name, left_float, right_float in template.parts:
+            product = left_float.T @ matrices[name] @ right_float
+            own = own + product + product.T
+        assert own == pytest.approx(exact, abs=1e-9)
+        for (name, M), (other, M_float) in zip(item.scalars, template.scalars, strict=True):
+            assert (name, M_float) == (other, pytest.approx(floats(M), abs=1e-12))
+
+
+def test_progress_rises_to_its_end() -> None:
+    shares: list[float] = []
+    find_witness(double_integrator(), progress=shares.append)
+    assert len(shares) > 8
+    assert shares == sorted(shares)
+    assert 0 < shares[0] < 0.2 < shares[-1] < 1
+
+
+def test_a_search_ends_at_its_limit_of_work() -> None:
+    with pytest.raises(EndedError, match=r"^drift: the search ended after 0 problems"):
+        find_witness(double_integrator(), most_work=1e-9)
+    effort = Effort(lambda share: None, 2.5)
+    effort.add("x", 1.0)
+    effort.add("x", 1.0)
+    with pytest.raises(EndedError, match="x: the search ended after 2 problems"):
+        effort.add("x", 1.0)
+
+
+def test_what_fails_is_named() -> None:
+    loop = double_integrator()
+    with pytest.raises(NoWitnessError, match=r"^drift: the solver finds no quadratic forms"):
+        find_witness(loop._replace(half_B=matrix([[0.0], [0.9]])))
+
+
+def test_a_disturbance_shortens_the_time_between_events_as_little_as_possible() -> None:
+    """Both parts of the drift's bound count in units of their thresholds, 0.05 and 0.0005."""
+    loop = double_integrator(floor=0.0005)._replace(pushes=matrix([[0.0], [1.0]]), sizes=(arb(0.0005),))
+    apart = find_witness(loop, ("x",)).proof.inter_event
+    assert apart is not None
+    assert float(apart.mid()) > 0.02
