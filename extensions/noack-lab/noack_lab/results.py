@@ -139,7 +139,7 @@ def guarantee_of(scenario: noack.Scenario) -> Guarantee:
         bounds = [(ERRORS, certificate.controller_error(t_s)), (NORM, certificate.state(t_s))]
     facts = [
         Fact("minimum inter-event time", f"{_number(1e3 * (certificate.inter_event_s or 0.0))} ms"),
-        Fact("decay rate of all bounds", f"{_number(constants.rate_per_s)} /s"),
+        Fact("decay rate of the bounds", f"{_number(constants.rate_per_s)} /s"),
         Fact("Δ of ‖e_c‖ ≤ Δ · threshold", _number(constants.delta)),
     ]
     facts += [
@@ -147,8 +147,11 @@ def guarantee_of(scenario: noack.Scenario) -> Guarantee:
         for assumption in certificate.assumptions
         if assumption.verdict != "holds"
     ]
-    decay = f"all errors decay at {_number(constants.rate_per_s)} /s" if constants.rate_per_s > 0 else ""
-    words = decay or "all errors stay bounded"
+    words = "all errors stay bounded"
+    if constants.rate_per_s > 0:
+        words = f"all errors decay at {_number(constants.rate_per_s)} /s"
+        if certificate.persistent_constants is not None or np.isfinite(certificate.floor_from_s):
+            words += ", to a bound that does not decay"  # a floor, disturbances, noise
     line = VerdictText(f"{answer.text}: {words}, for every loss pattern that the guarantee allows", "good")
     curves = [noack.Curve(panel, "certified bound", "", t_s, values, style) for panel, values in bounds]
     return Guarantee(line, curves, facts)
