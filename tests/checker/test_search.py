@@ -1,11 +1,13 @@
 """The search for witnesses: which ν it tries, what it minimises, how far it is, and when it ends."""
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 import pytest
 from flint import arb
 
+from noack.theory.witnesses import semidefinite
 from noack.theory.witnesses.coordinates import floats
 from noack.theory.witnesses.documents import find_witness
 from noack.theory.witnesses.effort import Effort, EndedError, NoWitnessError
@@ -97,3 +99,25 @@ def test_a_disturbance_shortens_the_time_between_events_as_little_as_possible() 
     apart = find_witness(loop, ("x",)).proof.inter_event
     assert apart is not None
     assert float(apart.mid()) > 0.02
+
+
+def test_steps_are_improved_where_rounding_errors_end_the_solver(monkeypatch: pytest.MonkeyPatch) -> None:
+    solve, improved = semidefinite._Problem.solve, []
+
+    def first_fails(
+        self: semidefinite._Problem,
+        objective: Mapping[str, float],
+        free: set[str],
+        accuracy: semidefinite.Accuracy,
+    ) -> semidefinite.SolverAnswer:
+        improved.append(accuracy.improves_steps)
+        answer = solve(self, objective, free, accuracy)
+        return answer if accuracy.improves_steps else answer._replace(status="NumericalError")
+
+    monkeypatch.setattr(semidefinite._Problem, "solve", first_fails)
+    one = semidefinite.MatrixInequality((), (("level 1", np.eye(1)),), -np.eye(1))
+    accuracy = semidefinite.Accuracy(gap=1e-6, feasibility=1e-6, improves_steps=False)
+    answer = semidefinite.minimise({"level 1": 1.0}, [one], margin=0.0, accuracy=accuracy)
+    assert answer.is_solved
+    assert answer.numbers["level 1"] == pytest.approx(1, rel=1e-3)
+    assert improved == [False, True]

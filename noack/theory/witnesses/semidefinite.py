@@ -59,6 +59,11 @@ class SolverAnswer(NamedTuple):
         """Whether the solver claims a solution; only a check can tell."""
         return self.status in {"Solved", "AlmostSolved"}
 
+    @property
+    def is_inaccurate(self) -> bool:
+        """Whether the solver ended by rounding errors."""
+        return self.status in {"NumericalError", "InsufficientProgress"}
+
 
 def minimise(
     objective: Mapping[str, float],
@@ -75,12 +80,15 @@ def minimise(
         inequalities: all of them.
         free: numbers that may be negative.
         margin: each inequality is solved as (·) ⪰ margin · 1.
-        accuracy: of the solution.
+        accuracy: of the solution; if rounding errors end the solver, its steps are improved in any case.
     """
     problem = _Problem()
     for inequality in inequalities:
         problem.add(inequality, margin)
-    return problem.solve(objective, set(free), accuracy)
+    answer = problem.solve(objective, set(free), accuracy)
+    if answer.is_inaccurate and not accuracy.improves_steps:
+        return problem.solve(objective, set(free), accuracy._replace(improves_steps=True))
+    return answer
 
 
 class _Problem:
