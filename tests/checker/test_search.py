@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import pytest
-from flint import arb
+from flint import arb, fmpq
 
 from noack.theory.witnesses import semidefinite
 from noack.theory.witnesses.coordinates import floats
@@ -121,3 +121,10 @@ def test_steps_are_improved_where_rounding_errors_end_the_solver(monkeypatch: py
     assert answer.is_solved
     assert answer.numbers["level 1"] == pytest.approx(1, rel=1e-3)
     assert improved == [False, True]
+
+
+def test_with_many_events_while_an_update_is_on_its_way_there_is_no_witness() -> None:
+    loop = double_integrator()
+    slow = loop._replace(times=loop.times._replace(delay=fmpq(1)), half_B=matrix([[0.0], [0.9]]))
+    with pytest.raises(NoWitnessError):
+        find_witness(slow)

@@ -174,7 +174,10 @@ class _OutputSearch:
     def __init__(self, loop: Loop, rates: _Rates, document: Mapping[str, object], effort: "Effort") -> None:
         self._loop, self._rates, self.document, self._effort = loop, rates, document, effort
         self._rate = number(rates.rate)
-        self._assumed = read_assumptions(loop, self._rate, document)
+        try:
+            self._assumed = read_assumptions(loop, self._rate, document)
+        except RejectedError as error:
+            raise NoWitnessError(str(error)) from None
         self._templates = Templates(self._model)
         self._frames = simulated_frames(self._templates.model)
         self._search = Search(self._templates, self._frames)
