@@ -13,8 +13,7 @@ _MOST_STATES, _MOST_LOSSES = 40, 1000
 class Rule(NamedTuple):
     """The trigger's rule: with z = (x, e_s), an event needs ‖P z‖² > max(c e^{−ρt}, f)² + ‖N z‖².
 
-    With ``period`` above 0 nothing is compared; an event is due at each period. ``always`` says that
-    events may also come without the comparison, as after a deadline.
+    ``always`` says that events may also come without the comparison, as after a deadline.
     """
 
     positive: arb_mat  # P, (p, 2n)
@@ -22,7 +21,6 @@ class Rule(NamedTuple):
     level: arb  # c
     rate: arb  # ρ, 1/s
     floor: arb  # f
-    period: arb  # s
     always: bool = False
 
 
@@ -39,6 +37,15 @@ class Times(NamedTuple):
     """The input that acts at t is K e^{−Hs} x_c(t) for an s of at most this."""
     start: fmpq
     """The first input acts within this time; until then the input is 0."""
+    least_period: fmpq = fmpq(0)
+    """Two events of a periodic rule, which compares nothing, are at least this far apart."""
+    period: fmpq = fmpq(0)
+    """They are at most this far apart; 0 for other rules."""
+
+    @property
+    def least_apart(self) -> fmpq:
+        """Two events are at least this far apart, whatever is measured."""
+        return self.least_period if self.period > 0 else self.least_sampling
 
 
 class Loop(NamedTuple):
@@ -90,7 +97,7 @@ class Loop(NamedTuple):
                 return f"{name}: not {' x '.join(map(str, shapes[name]))}"
             if not all(entry.is_finite() for entry in M.entries()):
                 return f"{name}: not finite"
-        sizes = {"rule.level": rule.level, "rule.floor": rule.floor, "rule.period": rule.period}
+        sizes = {"rule.level": rule.level, "rule.floor": rule.floor}
         sizes |= {f"sizes[{i}]": size for i, size in enumerate(self.sizes)}
         halves = (*self.half_A.entries(), *self.half_B.entries())
         sizes |= {f"half-width {i}": half for i, half in enumerate(halves)}
@@ -101,8 +108,12 @@ class Loop(NamedTuple):
             return "no states, or not one size for each disturbance"
         if not all(time >= 0 for time in times) or times.least_sampling > times.sampling:
             return "times: below 0, or tests further apart than they may be"
-        if rule.period > 0 and rule.positive.nrows():
+        if times.period > 0 and rule.positive.nrows():
             return "rule: compares and is periodic"
+        if times.least_period > times.period or (times.period > 0 and not times.least_period > 0):
+            return "times: events of a periodic rule further apart than they may be, or at once"
+        if times.period > 0 and times.least_period < times.least_sampling:
+            return "times: events between tests"
         if times.sampling == 0 and not is_zero(rule.positive * stack([identity(n), zeros(n, n)])):
             return "rule: tested at all times, it may hold at once after an event"
         return ""

@@ -17,6 +17,11 @@ was computed from:
 In "k later" z has k vectors more: v₁, …, v_k with v̇ᵢ = Hvᵢ, what w will be when the updates act that
 have k, …, 1 later ones. An event adds e to all of them, since it changes x_s by −e and no prediction.
 
+A periodic rule (``times.period`` > 0) compares nothing, so its events depend on the time only. In each
+location a clock shows the time since the last event, at which the next one happens. Nothing depends on
+the error of the newest update if this one is lost; so in "j lost" x_s is x_c: w = 0, and the event of
+an update that is lost changes no error.
+
 At most M − 1 consecutive updates are lost, and at most ``later`` events are assumed to happen within d
 after an event. :mod:`.proof` shows both assumptions from bounds of the same loop, by induction over the
 events.
@@ -25,7 +30,8 @@ An *inequality* of :meth:`Model.inequalities` is a symmetric matrix that depends
 numbers of a witness (matrices, multipliers, levels) and has to be positive semidefinite. Together they
 prove the statement:
 
-* V(z) = zᵀPz, with P of the location and the time θ since the last test (affine between nodes of θ).
+* V(z) = zᵀPz, with P of the location and the time θ since the last test, or that of the location's clock
+  (affine between nodes of θ).
   V ≤ 0 is invariant: along flows dV/dt ≤ −νV, over edges V does not grow, and V ≤ 0 at the start.
 * Where V ≤ 0, each output obeys |Cz|² ≤ D₁² f₁² + D₂² f₂².
 * Quadratic facts q(z) ≤ 0 that hold where an inequality is used (the rule's comparison, a bound of w)
@@ -39,7 +45,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from math import comb
 from typing import NamedTuple
 
-from flint import arb, arb_mat
+from flint import arb, arb_mat, fmpq
 
 from noack_check.balls import (
     around_zero,
@@ -56,6 +62,8 @@ from noack_check.balls import (
 )
 from noack_check.loop import Loop
 
+_CLOSE = 1000
+"""Nodes of a periodic rule's clock are at least such a share of the period apart."""
 DEGREE, SMALL = 8, 1e-12
 """The degree of Taylor polynomials in the age of inputs, and a remainder that needs no smaller parts."""
 
@@ -81,7 +89,7 @@ class Location(NamedTuple):
     coordinates: tuple[int, ...]
     """The entries of z that may differ from 0."""
     nodes: tuple[arb, ...]
-    """Times θ since it was entered, or since the last test."""
+    """Times θ since it was entered, since the last test or, with a periodic rule, since the last event."""
     flows: tuple[Flow, ...]
     facts: tuple[arb_mat, ...]
     """Symmetric Q with zᵀQz ≤ 0."""
@@ -166,6 +174,7 @@ class Model:
         errors: what is assumed of e_s, if it is used: then w is bounded by the paper's chain.
         later: most events within d after an event.
         later_at_start: most events after the one at t = 0 before the first input acts.
+        pieces: of the period of a periodic rule, on which P is affine.
         is_exact: with False a coarse approximation of K e^{−Hs} replaces its hull, for a search.
     """
 
@@ -178,11 +187,14 @@ class Model:
         *,
         later: int = 0,
         later_at_start: int = 0,
+        pieces: int = 1,
         is_exact: bool = True,
     ) -> None:
         self.loop, self.rate, self.decay, self.errors = loop, rate, decay, errors
         self.later, self.is_exact = later, is_exact
         self.later_at_start = later_at_start
+        self.is_periodic = loop.times.period > 0
+        self._clock = self._clock_nodes(pieces) if self.is_periodic else []
         n, copies = loop.n, max(later, later_at_start)
         self.size = (3 + copies) * n + 2
         every = identity(self.size)
@@ -231,22 +243,67 @@ class Model:
     def _locations(self) -> list[Location]:
         losses, times = self.loop.losses, self.loop.times
         flows = self._flows(self._gains())
-        tested = (arb(0), arb(times.sampling)) if times.sampling > 0 else (arb(0),)
-        compared = () if times.sampling > 0 else (self.silent,)
+        tested: tuple[arb, ...] = (arb(0), arb(times.sampling)) if times.sampling > 0 else (arb(0),)
+        compared = () if times.sampling > 0 or self.is_periodic else (self.silent,)
+        if self.is_periodic:
+            tested = self._nodes_until(times.period)
         found = []
         for lost in range(losses + 1):
             facts = compared + (self._chain(lost) if lost else ())
-            found.append(Location(f"{lost} lost", self._coordinates(lost > 0, 0), tested, flows, facts, True))
+            coordinates = self._coordinates(lost > 0 and not self.is_periodic, 0)
+            found.append(Location(f"{lost} lost", coordinates, tested, flows, facts, True))
         for later in range(self._waiting):
-            facts, nodes = self._chain(losses + 1 + later), (arb(0), arb(times.delay))
+            facts, nodes = self._chain(losses + 1 + later), self._time_to(times.delay, later)
             name, coordinates = f"{later} later", self._coordinates(True, later)
             found.append(Location(name, coordinates, nodes, flows, facts, False))
         if times.start > 0:
-            no_input, nodes = self._flows([0 * self.loop.gain]), (arb(0), arb(times.start))
+            no_input = self._flows([0 * self.loop.gain])
             for later in range(self.later_at_start + 1):
                 name, coordinates = f"start, {later} later", self._coordinates(False, later)
+                nodes = self._time_to(times.start, later)
                 found.append(Location(name, coordinates, nodes, no_input, (), False))
         return found
+
+    def _clock_nodes(self, pieces: int) -> list[fmpq]:
+        """Return the nodes of a periodic rule's clock, from 0 to its largest period.
+
+        Between the times at which a location may begin or end to have an edge each node is at most a
+        piece after the one before. Of two such times that are close to each other one is left out.
+        """
+        times, (zero, last) = self.loop.times, (fmpq(0), self.loop.times.period)
+        ends = {times.least_period}
+        ends |= {times.delay - later * times.least_period for later in range(self.later + 1)}
+        ends |= {times.start - later * times.least_period for later in range(self.later_at_start + 1)}
+        marks = [zero]
+        for end in sorted(ends):
+            if min(end - marks[-1], last - end) > last / _CLOSE:
+                marks.append(end)
+        nodes = [zero]
+        for begin, end in zip(marks, [*marks[1:], last], strict=True):
+            count = max(int(((end - begin) * pieces / last).ceil()), 1)
+            nodes += [begin + (end - begin) * k / count for k in range(1, count + 1)]
+        return nodes
+
+    def _nodes_until(self, end: fmpq) -> tuple[arb, ...]:
+        """Return the clock's nodes up to the first one that is not before a time, at least two."""
+        count = sum(node < end for node in self._clock[:-1]) + 1
+        return tuple(arb(node) for node in self._clock[: max(count, 2)])
+
+    def _time_to(self, end: fmpq, later: int) -> tuple[arb, ...]:
+        """Return the nodes of a location in which an update with so many later ones acts before a time.
+
+        The time counts from its event, a periodic rule's clock from the last one.
+        """
+        if self.is_periodic:
+            return self._nodes_until(end - later * self.loop.times.least_period)
+        return arb(0), arb(end)
+
+    def _event_pairs(self, nodes: tuple[arb, ...]) -> tuple[tuple[int, int], ...]:
+        """Return an event's pairs of nodes: it sets the clock since the last test, or event, to 0."""
+        first = 0
+        if self.is_periodic:
+            first = sum(node <= self.loop.times.least_period for node in self._clock) - 1
+        return tuple((node, 0) for node in range(first, len(nodes)))
 
     def _coordinates(self, has_w: bool, copies: int) -> tuple[int, ...]:
         """Return those of x, e, w, some v and the units."""
@@ -323,12 +380,13 @@ class Model:
         losses = self.loop.losses
         event = tuple(self._guards.values())
         delivered = self.jump(0 * self.e, 0 * self.w, ())
-        lost = self.jump(0 * self.e, self.w + self.e, ())
-        tests = tuple((node, 0) for node in range(len(self.locations[0].nodes)))
+        sent = self.jump(0 * self.e, self.w + self.e, ())
+        lost = self.jump(self.e, self.w, ()) if self.is_periodic else sent
+        tests = self._event_pairs(self.locations[0].nodes)
         found = []
         for j in range(losses + 1):
             if self._waiting:
-                found.append(Edge(f"{j} lost, sent", j, losses + 1, tests, lost, event))
+                found.append(Edge(f"{j} lost, sent", j, losses + 1, tests, sent, event))
             else:
                 found.append(Edge(f"{j} lost, delivered", j, 0, tests, delivered, event))
             if j < losses:
@@ -341,7 +399,8 @@ class Model:
                 found += self._on_its_way(first + later, later, self.later_at_start)
             for later in range(self.later_at_start):
                 name = f"start, {later} later, event"
-                found.append(Edge(name, first + later, first, ((0, 0), (1, 1)), delivered, event))
+                pairs = self._events_while_waiting(first + later)
+                found.append(Edge(name, first + later, first, pairs, delivered, event))
         return found
 
     def _on_its_way(self, source: int, later: int, most: int) -> Iterator[Edge]:
@@ -351,18 +410,26 @@ class Model:
         if later < most:
             copies = [v + self.e for v in self.v[:later]] + [self.e]
             jump = self.jump(0 * self.e, self.w + self.e, copies)
-            yield Edge(f"{name}, event", source, source + 1, ((0, 0), (1, 1)), jump, event)
+            pairs = self._events_while_waiting(source)
+            yield Edge(f"{name}, event", source, source + 1, pairs, jump, event)
         w, others = (self.v[0], self.v[1:later]) if later else (0 * self.w, [])
         if later <= losses:
-            yield self._arrival(f"{name}, all lost", source, later, self.jump(self.e, w, ()))
+            jump = self.jump(self.e + w, 0 * w, ()) if self.is_periodic else self.jump(self.e, w, ())
+            yield self._arrival(f"{name}, all lost", source, later, jump)
         for following in range(min(later, self._waiting)):
             jump = self.jump(self.e, w, others[len(others) - following :])
             yield self._arrival(f"{name}, {following} later", source, losses + 1 + following, jump)
 
+    def _events_while_waiting(self, location: int) -> tuple[tuple[int, int], ...]:
+        """Return the pairs of nodes of an event: its clock goes on, or is one since the last event."""
+        return self._event_pairs(self.locations[location].nodes) if self.is_periodic else ((0, 0), (1, 1))
+
     def _arrival(self, name: str, source: int, target: int, jump: arb_mat) -> Edge:
-        """Return the edge of the first input with an update. All times are open."""
+        """Return the edge of the first input with an update: a periodic rule's clock is as it was."""
         nodes, target_nodes = (range(len(self.locations[index].nodes)) for index in (source, target))
         pairs = tuple((node, target_node) for node in nodes for target_node in target_nodes)
+        if self.is_periodic:
+            pairs = tuple(zip(nodes, target_nodes, strict=False))
         return Edge(name, source, target, pairs, jump, ())
 
     def jump(self, e: arb_mat, w: arb_mat, v: Sequence[arb_mat]) -> arb_mat:
@@ -378,7 +445,8 @@ class Model:
         P is that of xᵀXx + (e, w)ᵀQ(e, w) − c₁ f₁² − c₂ f₂² − a θ·(comparison), with X common to all
         locations: then x drops out of the edges, and a silent test at θ leaves V as it is where the
         comparison is ≤ 0, since a ≥ 0. Waiting locations have Q, c₁ and c₂ for each node.
-        Where an event's guard contains x, each location has a form of x, e and w of its own.
+        Where an event's guard contains x, each location has a form of x, e and w of its own, and with a
+        periodic rule each node of each location.
         """
         if (location, node) not in self._forms:
             self._forms[location, node] = self._new_form(location, node)
@@ -388,17 +456,19 @@ class Model:
         place = self.locations[location]
         E = columns_of(identity(self.size), place.coordinates)
         errors = stack([f for f in (self.e, self.w, *self.v) if not is_zero(f * E)])
-        own = f"{place.name}" if place.is_tested else f"{place.name}, {node}"
+        by_node = self.is_periodic or not place.is_tested
+        own = f"{place.name}, {node}" if by_node else place.name
         starts = place.name.startswith("start")
         X = f"X/start, {node}" if starts else "X"
         parts: tuple[tuple[str, arb_mat], ...] = ((X, self.x * E), (f"Q/{own}", errors * E))
-        if self.loop.rule.negative.nrows():
+        if self.loop.rule.negative.nrows() or self.is_periodic:
             parts = ((f"P/{own}", stack([self.x, errors]) * E),)
         units = [(name, f) for name, f in (("c1", self.f1), ("c2", self.f2)) if not is_zero(f * E)]
         scalars = []
         for name, f in units:
             common = f"{name}/start, {node}" if starts else name
-            scalars.append((f"{name}/{own}" if name in self._guards else common, -1 * square(f * E)))
+            is_own = name in self._guards or self.is_periodic
+            scalars.append((f"{name}/{own}" if is_own else common, -1 * square(f * E)))
         if place.is_tested and node and self.loop.rule.positive.nrows():
             scalars.append((f"a/{own}", -1 * place.nodes[node] * transpose(E) * self.silent * E))
         return Form(parts, tuple(scalars))

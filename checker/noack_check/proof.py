@@ -26,6 +26,7 @@ from noack_check.loop import Loop, Times
 from noack_check.model import Errors, Model, has_decaying_unit, needs_constant, thresholds
 from noack_check.norms import decays_below, growth
 
+MOST_PIECES = 64
 MOST_LATER = 8
 """Most events within the time that an update may be on its way."""
 _MOST_TESTS = 1_000_000
@@ -101,6 +102,8 @@ class Assumptions(NamedTuple):
     later: int
     later_at_start: int
     chain_gain: arb | None
+    pieces: int = 1
+    """Parts of the period of a periodic rule: the nodes of its clock."""
 
 
 def read_assumptions(loop: Loop, rate: arb, document: Mapping[str, object]) -> Assumptions:
@@ -111,8 +114,13 @@ def read_assumptions(loop: Loop, rate: arb, document: Mapping[str, object]) -> A
     """
     gain = _chain_gain(loop, rate, document)
     later, at_start = (_count(document, key) for key in ("later", "later_at_start"))
+    pieces = _count(document, "pieces", MOST_PIECES) if "pieces" in document else 1
+    if pieces < 1:
+        raise RejectedError("pieces: below 1")
     if "errors" not in document:
-        return Assumptions(None, later, at_start, gain)
+        return Assumptions(None, later, at_start, gain, pieces)
+    if loop.times.period > 0:
+        raise RejectedError("errors: of no use with a periodic rule")
     table = document["errors"]
     if not isinstance(table, Mapping):
         raise RejectedError("errors: not a table")
@@ -122,12 +130,12 @@ def read_assumptions(loop: Loop, rate: arb, document: Mapping[str, object]) -> A
     units = has_decaying_unit(loop, rate), needs_constant(loop)
     if not all(size == 0 or (size > 0 and is_unit) for size, is_unit in zip(sizes, units, strict=True)):
         raise RejectedError("errors: below 0, or in a unit that the loop does not have")
-    return Assumptions(Errors(*sizes, gain), later, at_start, gain)
+    return Assumptions(Errors(*sizes, gain), later, at_start, gain, pieces)
 
 
 def require_few_at_start(loop: Loop, assumed: Assumptions) -> bool:
     """Prove that no more events than assumed precede the first input; return whether there is none."""
-    if (assumed.later_at_start + 1) * loop.times.least_sampling < loop.times.start:
+    if (assumed.later_at_start + 1) * loop.times.least_apart < loop.times.start:
         if assumed.later_at_start:
             raise RejectedError("later_at_start: more events may happen before the first input acts")
         _prove_quiet_start(loop)
@@ -147,7 +155,7 @@ def require_few_later(loop: Loop, assumed: Assumptions, apart: arb | None) -> No
             return
         while times.sampling > 0 and silent < _MOST_TESTS and arb((silent + 1) * times.sampling) <= apart:
             silent += 1
-    if not (silent + 1) * times.least_sampling * (assumed.later + 1) >= times.delay:
+    if not (silent + 1) * times.least_apart * (assumed.later + 1) >= times.delay:
         raise RejectedError("later: more events may happen while an update is on its way")
 
 
@@ -253,10 +261,13 @@ def prove_bound(loop: Loop, rate: arb, entry: Mapping[str, object], assumed: Ass
         assumed.errors,
         later=assumed.later,
         later_at_start=assumed.later_at_start,
+        pieces=assumed.pieces,
     )
     output, starts = str(entry.get("output")), bool(entry.get("from_start", True))
     if output not in {"x", "e_s", "e_c", "drift", *(f"x[{i}]" for i in range(loop.n))}:
         raise RejectedError(f"output: {output[:50]!r} is none of the loop's")
+    if output == "e_s" and model.is_periodic:
+        raise RejectedError("e_s: the model of a periodic rule has no error of an update that is lost")
     matrices, numbers = entry.get("matrices"), entry.get("numbers")
     if not isinstance(matrices, Mapping) or not isinstance(numbers, Mapping):
         raise RejectedError(f"{output}: matrices or numbers are missing")
@@ -363,10 +374,10 @@ def _entries(document: Mapping[str, object], key: str) -> list[Mapping[str, obje
     return entries
 
 
-def _count(table: Mapping[str, object], key: str) -> int:
+def _count(table: Mapping[str, object], key: str, most: int = MOST_LATER) -> int:
     value = table.get(key, 0)
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MOST_LATER:
-        raise RejectedError(f"{key}: not a whole number from 0 to {MOST_LATER}")
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= most:
+        raise RejectedError(f"{key}: not a whole number from 0 to {most}")
     return value
 
 

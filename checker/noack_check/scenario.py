@@ -113,7 +113,9 @@ def _times(resolved: Table, trigger: Table, *, ideal: bool) -> Times:
     """Return the times; a rule with a grid is tested at its points, and otherwise at measurements."""
     plant, controller, certificate = (_table(resolved, key) for key in ("plant", "controller", "certificate"))
     zero = fmpq(0)
-    times = Times(zero, zero, zero, zero, zero)
+    due_ns = _due_ns(trigger)
+    period = fmpq(due_ns, NS_PER_S)
+    times = Times(zero, zero, zero, zero, zero, period, period)
     if not ideal:
         schedule = Schedule(
             _rate(plant, "plant.rate_hz"),
@@ -124,6 +126,9 @@ def _times(resolved: Table, trigger: Table, *, ideal: bool) -> Times:
             _real(certificate, "certificate.network_delay_s") if "network_delay_s" in certificate else 0.0,
         )
         times = schedule.times
+        if due_ns:
+            least, most = schedule.between_events(due_ns)
+            times = times._replace(least_period=least, period=most)
         _require_watchdog(_optional_table(plant, "watchdog"), times)
     inner = trigger
     while inner.get("policy") == "deadline":
@@ -134,6 +139,21 @@ def _times(resolved: Table, trigger: Table, *, ideal: bool) -> Times:
         least = grid if inner is trigger else times.least_sampling
         times = times._replace(sampling=grid, least_sampling=least)
     return times
+
+
+def _due_ns(trigger: Table) -> int:
+    """Return the time after which the next event of a periodic rule is due, in ns; 0 for other rules."""
+    if trigger.get("policy") == "periodic":
+        due_ns = nanoseconds(_real(trigger, "trigger.period_s"))
+        if not due_ns:
+            raise RefusedError("trigger.period_s: below 1 ns")
+        return due_ns
+    if trigger.get("policy") != "deadline":
+        return 0
+    interval_ns = nanoseconds(_real(trigger, "trigger.interval_s"))
+    if not interval_ns:
+        raise RefusedError("trigger.interval_s: below 1 ns")
+    return min(_due_ns(_table(trigger, "rule")), interval_ns)
 
 
 def _require_watchdog(watchdog: Table, times: Times) -> None:
@@ -167,7 +187,7 @@ def _rule(trigger: Table, weight: arb_mat) -> Rule:
     """Return the rule of a trigger, in which W e_s is compared."""
     n, policy = weight.nrows(), trigger.get("policy")
     errors, nothing = beside(zeros(n, n), weight), zeros(0, 2 * n)
-    rule = Rule(errors, nothing, arb(0), arb(0), arb(0), arb(0))
+    rule = Rule(errors, nothing, arb(0), arb(0), arb(0))
     if policy == "decaying":
         names = ("trigger.beta", "trigger.alpha_per_s", "trigger.floor")
         level, rate, floor = (number(_real(trigger, name)) for name in names)
@@ -188,14 +208,10 @@ def _rule(trigger: Table, weight: arb_mat) -> Rule:
             always=_whole(trigger, "trigger.heartbeat") > 0,
         )
     if policy == "periodic":
-        due = fmpq(nanoseconds(_real(trigger, "trigger.period_s")), NS_PER_S)
-        return rule._replace(positive=nothing, period=arb(due))
+        return rule._replace(positive=nothing)
     if policy == "deadline":
         rule = _rule(_table(trigger, "rule"), weight)
-        due = fmpq(nanoseconds(_real(trigger, "trigger.interval_s")), NS_PER_S)
-        if rule.period > 0:
-            return rule._replace(period=rule.period.min(arb(due)))
-        return rule._replace(always=True)
+        return rule._replace(always=rule.positive.nrows() > 0)
     raise RefusedError(f"trigger.policy = {policy!r}: not covered")
 
 

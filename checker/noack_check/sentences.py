@@ -27,6 +27,9 @@ def assumptions(scenario: Mapping[str, object], loop: Loop) -> str:
             f"inputs at most {ms['age']} old",
             f"the first within {ms['start']}",
         ]
+        if times.period > 0:
+            least = f"{ms['least_period']} to " if times.least_period < times.period else ""
+            parts.append(f"events every {least}{ms['period']}")
     if scenario.get("changes"):
         parts.append("until the first change of settings")
     return ", ".join(parts)

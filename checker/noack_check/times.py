@@ -93,6 +93,21 @@ class Schedule:
         age = self._oldest_tick() + ceil(self.step) + self._late
         return Times(*(fmpq(t, NS_PER_S) for t in (longest, shortest, delay, age, start)))
 
+    def between_events(self, due_ns: int) -> tuple[fmpq, fmpq]:
+        """Return the least and the largest time from an event to the first measurement that late.
+
+        Measurement k is at round(kT); what follows depends on k modulo the denominator of T.
+        """
+        T = self.sample
+        found = set()
+        for k in range(T.denominator):
+            start = _rounded(k * T)
+            later = k + max(floor((due_ns - 1) / T), 1)
+            while _rounded(later * T) - start < due_ns:
+                later += 1
+            found.add(_rounded(later * T) - start)
+        return fmpq(min(found), NS_PER_S), fmpq(max(found), NS_PER_S)
+
     def _oldest_tick(self) -> int:
         """Return the largest age of the newest tick at a step; what it lacks of a tick's period is kept."""
         newest = self.tick - self._phase % _common(self.step, self.tick) + self._rounded
@@ -112,6 +127,11 @@ class Schedule:
     def _next_step(self, t: Fraction | int) -> int:
         """Return a time up to which the next step after a time has come."""
         return ceil(((t + self._rounded) // self.step + 1) * self.step) + self._rounded
+
+
+def _rounded(t: Fraction) -> int:
+    """Return the nearest whole number, halves up."""
+    return floor(t + Fraction(1, 2))
 
 
 def _common(first: Fraction, second: Fraction) -> Fraction:

@@ -8,6 +8,20 @@ from noack_check.balls import beside, identity, matrix, number, zeros
 from noack_check.loop import Loop, Rule, Times
 
 
+def random_periodic_loop(rng: np.random.Generator) -> Loop:
+    """Return a loop whose events come periodically, or nearly so; some under ideal conditions."""
+    loop, zero = random_loop(rng), fmpq(0)
+    times, rule, n = loop.times, loop.rule, loop.n
+    least = times.sampling * int(rng.integers(1, 40))
+    most = least + times.sampling * fmpq(int(rng.integers(0, 4)), 4) * int(rng.integers(0, 2))
+    if rng.random() < 0.2:
+        times, most = Times(zero, zero, zero, zero, zero), least
+    return loop._replace(
+        rule=rule._replace(positive=zeros(0, 2 * n), level=arb(0), rate=arb(0), floor=arb(0)),
+        times=times._replace(least_period=least, period=most),
+    )
+
+
 def random_loop(rng: np.random.Generator) -> Loop:
     """Return a loop with at most three states and three consecutive losses."""
     n, m = int(rng.integers(1, 4)), 1
@@ -39,7 +53,6 @@ def random_loop(rng: np.random.Generator) -> Loop:
             number(rng.choice([0.0, 0.1, 0.3])),
             number(round(rate, 4)),
             number(rng.choice([0.02, 0.1])),
-            arb(0),
         ),
         pushes=matrix(np.round(rng.normal(size=(n, 1)), 2).tolist()) if has_push else zeros(n, 0),
         sizes=(arb(0.02),) if has_push else (),

@@ -15,6 +15,8 @@ from noack_check.proof import Proof
 
 Array = NDArray[np.float64]
 _ROUNDING = 1e-9
+_PARTS = 5
+"""Of the period of a periodic rule: ages and disturbances may change after each."""
 
 
 def floats(M: object) -> Array:
@@ -60,7 +62,10 @@ class _Plant:
 def exceeded(loop: Loop, proof: Proof, rng: np.random.Generator, until: float) -> list[Exceeded]:
     """Return where a random run exceeds what is proven."""
     plant, times, rule = _Plant(loop, rng), [float(t.p) / float(t.q) for t in loop.times], loop.rule
-    sampling, least, delay, age, start = times
+    sampling, least, delay, age, start, *periods = times
+    next_event = rng.choice(periods) if periods[1] else np.inf  # of a periodic rule
+    if periods[1]:
+        least = sampling = periods[1] / _PARTS
     W, n = floats(loop.weight), loop.n
     level, rate, floor = (float(v.mid()) for v in (rule.level, rule.rate, rule.floor))
     x = floats(loop.start)[:, 0]
@@ -79,7 +84,7 @@ def exceeded(loop: Loop, proof: Proof, rng: np.random.Generator, until: float) -
     ]
     r = float(proof.rate.mid())
     while t < until:
-        stop = min(v for v in (next_test, *(update[0] for update in arriving)) if v > t)
+        stop = min(v for v in (next_test, next_event, *(update[0] for update in arriving)) if v > t)
         if t < first_input < stop:
             stop = first_input
         acting = current if t >= first_input else None
@@ -94,10 +99,12 @@ def exceeded(loop: Loop, proof: Proof, rng: np.random.Generator, until: float) -
             newest = max(acting_now, key=lambda update: update[1])
             z[2 * n : 3 * n] = newest[2]
             arriving = [update for update in arriving if update[1] > newest[1]]
-        if t >= next_test:
+        if t >= min(next_test, next_event):
             e = W @ (z[n : 2 * n] - z[:n])
             threshold = max(level * np.exp(-rate * t), floor)
             fires = np.linalg.norm(e) > threshold or (rule.always and rng.random() < 0.2)
+            if periods[1]:
+                fires = t >= next_event
             if fires:
                 if t < first_input and proof.is_quiet:
                     found.append(Exceeded("an event before the first input", t, 0.0, first_input))
@@ -111,6 +118,7 @@ def exceeded(loop: Loop, proof: Proof, rng: np.random.Generator, until: float) -
                     arriving.append((acts, t, z[n : 2 * n].copy()))
                 elif not loses:
                     z[2 * n : 3 * n] = z[n : 2 * n]
+                next_event = t + rng.choice(periods) if periods[1] else np.inf
             next_test = t + (round(rng.choice([least, sampling]), 9))
             current = ages[rng.integers(3)] if rng.random() < 0.3 else current
             if rng.random() < 0.05:

@@ -78,7 +78,9 @@ WRONG: dict[str, Callable[[Loop], Loop]] = {
     "a negative size": lambda loop: loop._replace(pushes=matrix([[0.0], [1.0]]), sizes=(arb(-1),)),
     "a billion losses": lambda loop: loop._replace(losses=10**9),
     "less than no losses": lambda loop: loop._replace(losses=-1),
-    "two comparisons at once": lambda loop: loop._replace(rule=loop.rule._replace(period=arb(1))),
+    "two comparisons at once": lambda loop: loop._replace(
+        times=loop.times._replace(least_period=fmpq(1), period=fmpq(1))
+    ),
     "rare and frequent tests": lambda loop: loop._replace(times=loop.times._replace(least_sampling=fmpq(1))),
     "negative delay": lambda loop: loop._replace(times=loop.times._replace(delay=fmpq(-1))),
     "another shape": lambda loop: loop._replace(half_B=zeros(1, 1)),

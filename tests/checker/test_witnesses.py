@@ -22,9 +22,7 @@ def double_integrator(
     times: Times = SCHEDULE, *, level: float = 0.05, floor: float = 0.0, losses: int = 2
 ) -> Loop:
     A, B, K = [[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], [[-1.0, -1.4]]
-    rule = Rule(
-        matrix([[0, 0, 1, 0], [0, 0, 0, 1]]), zeros(0, 4), number(level), number(0.3), number(floor), arb(0)
-    )
+    rule = Rule(matrix([[0, 0, 1, 0], [0, 0, 0, 1]]), zeros(0, 4), number(level), number(0.3), number(floor))
     return Loop(
         A=matrix([[0.0, 1.0], [0.0, 0.0]]),
         B=matrix([[0.0], [0.9]]),

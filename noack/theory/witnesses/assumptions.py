@@ -38,13 +38,13 @@ _NEARLY, _MOST_STEPS = 1 - 1e-4, 30
 
 
 def first_assumptions(loop: Loop, rate: float) -> dict[str, object]:
-    """Return a document without bounds: its rate, its chain, and what is assumed at first.
+    """Return a document without bounds: its rate, its chain if it is used, and what is assumed at first.
 
     A rule that compares ‖W e_s‖ may have no event while an update is on its way; of others each test may
     be one.
     """
     document: dict[str, object] = {"rate": rate}
-    if (chain := _chain(loop, rate)) is not None:
+    if not loop.times.period > 0 and (chain := _chain(loop, rate)) is not None:
         document["chain"] = chain
     later, at_start = 0, 0
     try:
@@ -112,7 +112,7 @@ def _needed_later(loop: Loop, document: Mapping[str, object], apart_s: float) ->
 
 def _most_between(loop: Loop, time: fmpq) -> int:
     """Return the most events within a time after an event, if each test may be one."""
-    least = loop.times.least_sampling
+    least = loop.times.least_apart
     return max(int((time / least).ceil()) - 1, 0) if least > 0 else 0
 
 

@@ -18,6 +18,8 @@ from noack_check.model import Model
 Frames = Mapping[str, Matrix]
 """By the name of a witness's matrix V: T with V = T⁻ᵀ V̂ T⁻¹, V̂ of order 1."""
 _RUNS, _MOST_STEPS = 120, 3000
+_STEPS = 16
+"""At least, of the period of a periodic rule."""
 _LOSS_RATES = (0.0, 0.3, 0.6, 0.9, 1.0)
 
 
@@ -59,7 +61,10 @@ class _Runs:
         closed = flows[0][:n, :n]
         fastest = max(float(np.abs(np.linalg.eigvals(M)).max()) for M in (*flows, closed))
         slowest = max(-float(np.linalg.eigvals(closed).real.max()), 1e-3)
+        self._period_s = _seconds(self._loop.times.period)
         self._h = _seconds(self._loop.times.sampling) or (0.02 if self._loop.holds else 0.1) / fastest
+        if self._period_s:
+            self._h = self._period_s / max(round(self._period_s / self._h), _STEPS)
         self._steps = int(min(max(6.0 / slowest / self._h, 200), _MOST_STEPS))
         self._sway = self._h * slowest * np.array([0.3, 1.0, 3.0])
         self._exact = [expm(flow * self._h) for flow in flows]
@@ -86,6 +91,8 @@ class _Runs:
     @staticmethod
     def _jump_matrix(model: Model, later: int, *, arrives: bool) -> Matrix:
         """Return the jump of an event, or of an input, if an update with so many later ones is on its way."""
+        if arrives and model.is_periodic:
+            return floats(model.jump(model.e + (model.v[0] if later else 0 * model.w), 0 * model.w, ()))
         if arrives:
             return floats(model.jump(model.e, model.v[0] if later else 0 * model.w, ()))
         copies = [*(v + model.e for v in model.v[:later]), model.e][: len(model.v)]
@@ -115,18 +122,19 @@ class _Runs:
         self._z = moved
 
     def _events(self, step: int) -> NDArray[np.bool_]:
-        if period := float(self._loop.rule.period):
-            return np.full(_RUNS, (step + 1) % max(round(period / self._h), 1) == 0)
+        if self._period_s:
+            return np.full(_RUNS, (step + 1) % round(self._period_s / self._h) == 0)
         return self._quadratic(self._silent) > 0
 
     def _jump(self, event: NDArray[np.bool_]) -> None:
         z, delay_s = self._z, _seconds(self._loop.times.delay)
         arrives = self._waiting & (self._rng.random(_RUNS) < 2.0 * self._h / max(delay_s, self._h))
         self._arrive(arrives | self._waiting & event & (self._later >= self._most))
-        for later, matrix in enumerate(self._sent):
-            these = event & (self._later == later)
-            z[these] = z[these] @ matrix.T
         drops = event & (self._rng.random(_RUNS) < self._loss_rate) & (self._missing < self._loop.losses)
+        resets = event & ~(drops & ~self._waiting) if self._period_s else event
+        for later, matrix in enumerate(self._sent):
+            these = resets & (self._later == later)
+            z[these] = z[these] @ matrix.T
         self._later[event & self._waiting] += 1
         self._missing[drops & ~self._waiting] += 1
         passes = event & ~drops

@@ -41,6 +41,8 @@ _FIRST_SHARE, _FIRST_SLOW_SHARE = 0.42, 0.04
 _MOST_TRIES, _FEW_TRIES, _LARGE = 5, 2, 1.0
 """Shares that are tried for an output, also for a problem that is large: its work is above a limit."""
 _ROOM, _NEAR = 1 + 1e-6, 1.04
+_PIECES = (4, 16)
+"""Of the period of a periodic rule, until there is a witness."""
 _MOST_LOSSES = 24
 _MOST_GUESSES = 6
 _EXPECTED = 5
@@ -82,10 +84,12 @@ def find_witness(
     effort = Effort(progress, most_work)
     effort.expect(_EXPECTED * (1 + len(outputs) + len(ultimate)))
     wanted = _Wanted(outputs, ultimate)
+    if loop.times.period > 0:
+        return _by_clock(loop, wanted, effort)
     if not compares_error(loop):
         with contextlib.suppress(NoWitnessError):
             return _by_quadratic_forms(loop, rates, wanted, effort)
-        return _by_quadratic_forms(loop, _Rates(loop, slow=True), wanted, effort)
+        return _by_quadratic_forms(loop, _Rates(loop, slow=0.01), wanted, effort)
     try:
         return _by_threshold(loop, rates, wanted, effort)
     except EndedError:
@@ -134,6 +138,19 @@ def _by_quadratic_forms(loop: Loop, rates: "_Rates", wanted: _Wanted, effort: Ef
     return _proven(loop, {**document, "bounds": [*search.bounds(wanted), sensor]})
 
 
+def _by_clock(loop: Loop, wanted: _Wanted, effort: Effort) -> Witness:
+    """Return a witness for a periodic rule, with the fewest parts of its period for which there is one."""
+    for pieces in _PIECES:
+        for share in (0.3, 0.05):
+            rates = _Rates(loop, slow=share)
+            document = {**first_assumptions(loop, rates.rate), "pieces": pieces}
+            effort.expect(_EXPECTED)
+            bounds = _OutputSearch(loop, rates, document, effort).bounds(wanted)
+            if bounds:
+                return _proven(loop, {**document, "bounds": bounds})
+    raise NoWitnessError("the solver finds no quadratic forms at any rate of decay")
+
+
 def _proven(loop: Loop, document: Mapping[str, object]) -> Witness:
     try:
         return Witness(document, prove(loop, document))
@@ -142,14 +159,17 @@ def _proven(loop: Loop, document: Mapping[str, object]) -> Witness:
 
 
 class _Rates:
-    """The rates of decay of a loop: that of the bounds, r, and the largest that ν may have, halved."""
+    """The rates of decay of a loop: that of the bounds, r, and the largest that ν may have, halved.
 
-    def __init__(self, loop: Loop, *, slow: bool = False) -> None:
+    ``slow`` is r, without a threshold that decays, as a share of the latter; then ν is small, too.
+    """
+
+    def __init__(self, loop: Loop, *, slow: float | None = None) -> None:
         closed = floats(loop.A + loop.B * loop.gain)
         own = [closed] if loop.holds else [closed, floats(loop.H)]
         self.slowest = min(-float(np.linalg.eigvals(M).real.max()) for M in own)
         threshold, level = float(loop.rule.rate), float(loop.rule.level)
-        wanted = threshold if level else (0.01 if slow else 0.3) * self.slowest
+        wanted = threshold if level else (slow or 0.3) * self.slowest
         self.first_share = _FIRST_SLOW_SHARE if slow else _FIRST_SHARE
         if loop.holds or (level and not threshold):
             self.rate = 0.0
@@ -193,6 +213,7 @@ class _OutputSearch:
             assumed.errors,
             later=assumed.later,
             later_at_start=assumed.later_at_start,
+            pieces=assumed.pieces,
             is_exact=False,
         )
 

@@ -1,0 +1,245 @@
+"""Periodic rules: witnesses, false witnesses, and runs."""
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from flint import arb, fmpq
+
+from noack.core.periods import period_of
+from noack.theory.witnesses.documents import NoWitnessError, Witness, find_witness
+from noack_check.balls import matrix, number, zeros
+from noack_check.check import RejectedError
+from noack_check.loop import Loop, Times
+from noack_check.model import Edge, Model
+from noack_check.proof import prove
+from noack_check.times import Schedule
+from tests.checker.random_loops import random_periodic_loop
+from tests.checker.runs import exceeded
+from tests.checker.test_witnesses import IDEAL, SCHEDULE, double_integrator
+
+
+def periodic(least: fmpq, most: fmpq, times: Times = SCHEDULE) -> Loop:
+    """Return a double integrator whose events come periodically."""
+    loop = double_integrator(times)
+    rule = loop.rule._replace(positive=zeros(0, 4), level=arb(0), rate=arb(0), floor=arb(0))
+    return loop._replace(rule=rule, times=loop.times._replace(least_period=least, period=most))
+
+
+EXACT = periodic(fmpq(3, 10), fmpq(3, 10))
+SHORT = periodic(fmpq(3, 200), fmpq(1, 50), SCHEDULE._replace(start=fmpq(1, 100)))._replace(losses=1)
+"""Its updates may be on their way for 20 ms, in which one more event may come."""
+LOOPS = {"exact": EXACT, "short": SHORT}
+
+
+@pytest.fixture(scope="module", params=LOOPS)
+def found(request: pytest.FixtureRequest) -> tuple[Loop, Witness]:
+    loop = LOOPS[request.param]
+    return loop, find_witness(loop, ("x", "e_c"))
+
+
+def test_runs_stay_below_the_bounds(found: tuple[Loop, Witness]) -> None:
+    loop, witness = found
+    rng = np.random.default_rng(1)
+    for _ in range(12):
+        assert exceeded(loop, witness.proof, rng, 6.0) == []
+
+
+def test_runs_come_near_the_bounds(found: tuple[Loop, Witness]) -> None:
+    loop, witness = found
+    rng = np.random.default_rng(1)
+    shares = {"x": 0.9, "e_c": 0.15}
+    bounds = tuple(b._replace(decaying=b.decaying * number(shares[b.output])) for b in witness.proof.bounds)
+    smaller = witness.proof._replace(bounds=bounds)
+    assert {each.output for _ in range(6) for each in exceeded(loop, smaller, rng, 6.0)} == {"x", "e_c"}
+
+
+def test_updates_may_be_on_their_way_for_more_than_a_period() -> None:
+    assert find_witness(SHORT, ("x",)).document["later"] == 1
+    with pytest.raises(RejectedError, match="later"):
+        prove(SHORT, {**find_witness(SHORT, ("x",)).document, "later": 0})
+
+
+CHANGES: dict[str, Callable[[Loop], Loop]] = {
+    "period x 2": lambda loop: loop._replace(
+        times=loop.times._replace(least_period=2 * loop.times.least_period, period=2 * loop.times.period)
+    ),
+    "period 5 % longer": lambda loop: loop._replace(
+        times=loop.times._replace(period=loop.times.period * fmpq(21, 20))
+    ),
+    "one loss more": lambda loop: loop._replace(losses=loop.losses + 1),
+    "longer delays": lambda loop: loop._replace(times=loop.times._replace(delay=fmpq(1, 4))),
+    "later start": lambda loop: loop._replace(times=loop.times._replace(start=fmpq(1, 4))),
+    "larger start": lambda loop: loop._replace(start=loop.start * number(1.01)),
+    "another plant": lambda loop: loop._replace(B=loop.B * number(1.05)),
+    "a disturbance": lambda loop: loop._replace(pushes=matrix([[0.0], [1.0]]), sizes=(arb(0.01),)),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_witness_proves_nothing_about_another_loop(found: tuple[Loop, Witness], change: str) -> None:
+    loop, witness = found
+    with pytest.raises(RejectedError):
+        prove(CHANGES[change](loop), witness.document)
+
+
+@pytest.mark.parametrize("pieces", [1, 2, 3, 5, 8, 0, -1, 65, True, 4.0, "4", None])
+def test_another_number_of_nodes_is_rejected(found: tuple[Loop, Witness], pieces: object) -> None:
+    loop, witness = found
+    if loop is SHORT and pieces in (1, 2, 3):
+        pytest.skip("its edges begin and end at the same nodes as with 4")
+    with pytest.raises(RejectedError):
+        prove(loop, {**witness.document, "pieces": pieces})
+
+
+def test_the_sensors_error_and_its_assumed_size_are_rejected(found: tuple[Loop, Witness]) -> None:
+    """In the model x_s is not reset by an update that is lost: its error is not that of the sensor."""
+    loop, witness = found
+    document: Any = copy.deepcopy(dict(witness.document))
+    document["bounds"][0]["output"] = "e_s"
+    with pytest.raises(RejectedError, match="e_s"):
+        prove(loop, document)
+    chain = {"gain": 9.0, "tail": [[3.0, 1.0], [1.0, 2.0]]}
+    with pytest.raises(RejectedError, match="errors: of no use"):
+        prove(loop, {**witness.document, "chain": chain, "errors": {"decaying": 1.0, "constant": 0.0}})
+
+
+def test_a_form_at_another_node_is_rejected(found: tuple[Loop, Witness]) -> None:
+    """As if an event came at another time."""
+    loop, witness = found
+    document: Any = copy.deepcopy(dict(witness.document))
+    forms = document["bounds"][0]["matrices"]
+    last = max(int(name.rpartition(" ")[2]) for name in forms if name.startswith("P/0 lost"))
+    forms[f"P/0 lost, {last}"] = forms[f"P/0 lost, {last - 1}"]
+    with pytest.raises(RejectedError):
+        prove(loop, document)
+
+
+def test_no_form_may_be_missing(found: tuple[Loop, Witness]) -> None:
+    loop, witness = found
+    for name in list(witness.document["bounds"][0]["matrices"])[::4]:  # type: ignore[index]
+        document: Any = copy.deepcopy(dict(witness.document))
+        del document["bounds"][0]["matrices"][name]
+        with pytest.raises(RejectedError, match="missing"):
+            prove(loop, document)
+
+
+# The model.
+
+
+def times_of(model: Model, part: str) -> list[list[tuple[float, float]]]:
+    """Return the times of both clocks at the edges with some name."""
+    return [_times(model, edge) for edge in model.edges if part in edge.name]
+
+
+def _times(model: Model, edge: Edge) -> list[tuple[float, float]]:
+    source, target = model.locations[edge.source].nodes, model.locations[edge.target].nodes
+    return [(round(float(source[i]), 9), round(float(target[k]), 9)) for i, k in edge.pairs]
+
+
+@pytest.mark.parametrize("pieces", [1, 2, 7, 64])
+def test_events_come_at_the_period_and_inputs_before_their_delay(pieces: int) -> None:
+    model = Model(periodic(fmpq(29, 100), fmpq(3, 10)), arb(0), arb(1), pieces=pieces)
+    for name in ("lost, sent", "lost, lost"):
+        for times in times_of(model, name):
+            assert {begin for begin, _ in times} >= {0.29, 0.3}
+            assert all(begin >= 0.29 and end == 0 for begin, end in times)
+    for times in times_of(model, "all lost"):
+        assert {begin for begin, _ in times} >= {0, 0.02}
+        assert all(begin == end <= 0.02 for begin, end in times)
+
+
+def test_nodes_are_close_only_where_an_edge_begins_or_ends() -> None:
+    least = fmpq(299_999_999, 10**9)
+    model = Model(periodic(least, fmpq(3, 10)), arb(0), arb(1), pieces=4)
+    nodes = [float(node) for node in model.locations[0].nodes]
+    assert np.diff(nodes).min() > 1e-3
+    assert nodes[-1] == pytest.approx(0.3, rel=1e-15)
+    # an event at the least period is one from the node before it on
+    assert {begin for begin, _ in times_of(model, "0 lost, sent")[0]} == {round(t, 9) for t in nodes[-2:]}
+
+
+def test_a_later_event_shortens_the_time_that_an_update_has_left() -> None:
+    loop = SHORT._replace(times=SHORT.times._replace(start=fmpq(1, 50)))
+    model = Model(loop, arb(0), arb(1), later=1, later_at_start=1, pieces=4)
+    ends = {place.name: float(place.nodes[-1]) for place in model.locations}
+    assert ends["0 later"] == ends["start, 0 later"] == ends["0 lost"] == pytest.approx(0.02)
+    assert ends["1 later"] == ends["start, 1 later"] == pytest.approx(0.005)
+    assert all(begin >= 0.015 for begin, _ in times_of(model, "0 later, event")[0])
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "measure_every", "period_s"),
+    [(500.0, 1, 0.5), (30.0, 1, 0.1), (30.0, 1, 0.11), (59.94, 2, 0.25), (7.0, 1, 0.01), (120.0, 7, 1.0)],
+)
+def test_the_times_between_events_are_those_of_measurements(
+    rate_hz: float, measure_every: int, period_s: float
+) -> None:
+    schedule = Schedule(rate_hz, measure_every, 100.0, 0.0, 0, 0.0)
+    due_ns = round(period_s * 10**9)
+    least, most = schedule.between_events(due_ns)
+    period = period_of(rate_hz).times(measure_every)
+    found, event = set(), 0
+    for step in range(1, 20_000):
+        t_ns = period.time_ns(step)
+        if t_ns - event >= due_ns:
+            found.add(t_ns - event)
+            event = t_ns
+    assert all(least <= fmpq(ns, 10**9) <= most for ns in found)
+    assert float(most.p) / float(most.q) - period_s <= measure_every / rate_hz + 2e-9
+
+
+# Wrong loops.
+
+WRONG = {
+    "a period of 0 at least": Times(*SCHEDULE[:5], fmpq(0), fmpq(1)),
+    "least and largest exchanged": Times(*SCHEDULE[:5], fmpq(2), fmpq(1)),
+    "events between tests": Times(*SCHEDULE[:5], fmpq(1, 1000), fmpq(1)),
+    "a negative period": Times(*SCHEDULE[:5], fmpq(-2), fmpq(-1)),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_periods_are_rejected(name: str) -> None:
+    document = {"rate": 0.0, "bounds": []}
+    with pytest.raises(RejectedError, match=r"^loop: times: "):
+        prove(EXACT._replace(times=WRONG[name]), document)
+
+
+# Random loops.
+
+
+def _found_for(seed: int) -> bool:
+    """Return whether there is a witness, after runs of the loop."""
+    rng = np.random.default_rng(seed)
+    loop = random_periodic_loop(rng)
+    try:
+        proof = find_witness(loop, ("x",) if seed % 2 else ("e_c",)).proof
+    except NoWitnessError:
+        return False
+    period = float(loop.times.period.p) / float(loop.times.period.q)
+    for _ in range(6):
+        assert exceeded(loop, proof, rng, 40 * period) == []
+    return True
+
+
+def test_bounds_of_a_few_random_loops_are_not_exceeded() -> None:
+    found = [_found_for(seed) for seed in (11, 14)]  # with one state: fast
+    assert any(found)
+
+
+@pytest.mark.system
+@pytest.mark.timeout(2400)
+def test_bounds_of_random_loops_are_not_exceeded() -> None:
+    seeds = range(100)
+    assert sum(_found_for(seed) for seed in seeds) >= len(seeds) // 2
+
+
+def test_ideal_conditions_have_a_witness() -> None:
+    loop = periodic(fmpq(1, 2), fmpq(1, 2), IDEAL)
+    proof = find_witness(loop, ("x",)).proof
+    (bound,) = proof.bounds
+    assert 1.0 <= float(bound.decaying.mid()) < 1.5
+    assert proof.rate > 0
