@@ -145,7 +145,10 @@ def _by_clock(loop: Loop, wanted: _Wanted, effort: Effort) -> Witness:
             rates = _Rates(loop, slow=share)
             document = {**first_assumptions(loop, rates.rate), "pieces": pieces}
             effort.expect(_EXPECTED)
-            bounds = _OutputSearch(loop, rates, document, effort).bounds(wanted)
+            search, (output, *_) = _OutputSearch(loop, rates, document, effort), wanted.outputs
+            if not search.has_solution(output):
+                continue
+            bounds = search.bounds(wanted)
             if bounds:
                 return _proven(loop, {**document, "bounds": bounds})
     raise NoWitnessError("the solver finds no quadratic forms at any rate of decay")
@@ -288,6 +291,16 @@ class _OutputSearch:
             self._share = self._share or best
             self._best[key] = best, found[best]
         return self._best[key]
+
+    def has_solution(self, output: str) -> bool:
+        """Return whether the solver finds forms that bound an output from the start on."""
+        try:
+            self.best_share(output, starts=True)
+        except EndedError:
+            raise
+        except NoWitnessError:
+            return False
+        return True
 
     def _tried(self, output: str, *, starts: bool) -> dict[float, Found]:
         """Return coarse solutions by their shares."""
