@@ -36,7 +36,7 @@ _ATTEMPTS = (
 )
 """Margins of the inequalities, in the coordinates of the search, until the checker accepts."""
 _COARSE_MARGIN = 1e-6
-_FIRST_SHARE, _FIRST_SLOW_SHARE = 0.42, 0.04
+_FIRST_SHARE, _FIRST_SLOW_SHARE, _FIRST_CLOCK_SHARE = 0.42, 0.04, 0.02
 """ν is between 2r and twice the loop's rate of decay, at a share."""
 _MOST_TRIES, _FEW_TRIES, _LARGE = 5, 2, 1.0
 """Shares that are tried for an output, also for a problem that is large: its work is above a limit."""
@@ -141,8 +141,9 @@ def _by_quadratic_forms(loop: Loop, rates: "_Rates", wanted: _Wanted, effort: Ef
 def _by_clock(loop: Loop, wanted: _Wanted, effort: Effort) -> Witness:
     """Return a witness for a periodic rule, with the fewest parts of its period for which there is one."""
     for pieces in _PIECES:
-        for share in (0.3, 0.05):
+        for share in (0.3, 0.02):
             rates = _Rates(loop, slow=share)
+            rates.first_share = _FIRST_CLOCK_SHARE
             document = {**first_assumptions(loop, rates.rate), "pieces": pieces}
             effort.expect(_EXPECTED)
             search, (output, *_) = _OutputSearch(loop, rates, document, effort), wanted.outputs
