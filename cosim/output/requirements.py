@@ -26,7 +26,7 @@ def uncovered_as_unmet(required: Sequence[Requirement]) -> Iterator[None]:
     except CallerError as error:
         if not required:
             raise
-        raise NoackError(unmet(required[0], str(error))) from None
+        raise NoackError("\n".join(unmet(word, str(error)) for word in dict.fromkeys(required))) from None
 
 
 def unmet_by_scenario(results: Certificates, required: Sequence[Requirement]) -> Iterator[str]:

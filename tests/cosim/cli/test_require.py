@@ -29,8 +29,9 @@ UNENFORCED = ("--set", "network.enforce_mansd=false")
         (("cart_pole", *ALL), [f"{word}: no certificate for the plant, which is not linear"
                                for word in Requirement]),
         (("sine_pendulum", "--require", "certificate"), []),
-        (("model_predictive", *ALL), ['certificate: controller.kind = "python": u is not K x_c']),
-        (("lane_acknowledged", *ALL), ['certificate: network.protocol = "ack"']),
+        (("model_predictive", *ALL), [f'{word}: controller.kind = "python": u is not K x_c'
+                                      for word in Requirement]),
+        (("lane_acknowledged", *ALL), [f'{word}: network.protocol = "ack"' for word in Requirement]),
     ],
 )  # fmt: skip
 def test_certify_exits_with_1_unless_what_is_required_is_certified(
