@@ -253,7 +253,10 @@ def _reason(loop: LoopSummary) -> GuaranteeVerdict:
     uncovered = _without_certificate(loop)
     # A certificate that covered the run for some time says more than one that does not exist.
     candidates = [claim for claim in uncovered if claim.has_bound] or uncovered or _void_claims(loop)
-    claim = min(candidates, key=lambda claim: (claim.since_s or 0.0, _why(claim)))
+    # Of equal times, the certificate of the scenario's own plant gives the reason, as in noack certify.
+    claim = min(
+        candidates, key=lambda claim: (claim.since_s or 0.0, claim.source == "box certificate", _why(claim))
+    )
     reason, late = _why(claim), _lateness(loop)
     if late and late[0] == reason:
         reason = f"{reason}; {_what_does_not_cover(loop, claim)}"

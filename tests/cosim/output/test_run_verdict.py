@@ -14,7 +14,7 @@ from cosim.live.finalize import finalize
 from cosim.output import run_verdict
 from cosim.output.page_kit import TERMS
 from cosim.output.run_tables import run_title, short_numbers
-from cosim.output.run_verdict import SETTLED_SHARE, Tone, remarks, state_text, verdict
+from cosim.output.run_verdict import SETTLED_SHARE, Tone, guarantee_of, remarks, state_text, verdict
 from cosim.record.divergence import GROWTH
 from cosim.simulation.virtual_time import simulate_run
 from noack.protocol.wire_format import Rejection
@@ -218,3 +218,11 @@ def test_the_numbers_and_reasons_of_datagrams_are_written_out(outcome: Outcome) 
 
 def test_every_reason_for_a_rejection_has_words() -> None:
     assert {*Rejection, DROPPED_IN_FLOOD} == {*run_verdict._REJECTIONS}
+
+
+def test_without_any_certificate_the_reason_is_that_of_the_scenarios_own_plant(outcome: Outcome) -> None:
+    """It was the one that comes first in the alphabet: certify gave another loop gain."""
+    why = "the loop gain of the errors is {}, not below 1"
+    box = claim("void", source="box certificate", why=why.format(1.37))
+    summary = with_values(outcome.summary, claims=[box, claim("void", why=why.format(4.37))])
+    assert guarantee_of(summary.loops[0]).why == f"{why.format(4.37)}"
