@@ -43,7 +43,7 @@ def test_the_controller_has_no_state_before_its_first_update() -> None:
 @pytest.mark.parametrize(("scenario", "reason"), [
     ("shared_channel", "this is for one"),
     ("lane_5g_urban", "has no delay"),
-    ("dc_motor", "the plant is not linear"),
+    ("dc_motor", "the plant is not given by matrices A and B"),
 ])  # fmt: skip
 def test_what_the_exact_simulation_does_not_cover_is_refused(scenario: str, reason: str) -> None:
     with pytest.raises(noack.NoackError, match=reason):

@@ -90,7 +90,10 @@ def test_what_a_statement_does_not_cover_is_refused_by_its_key(
 def test_a_plant_that_is_not_linear_may_have_a_certificate_on_a_region() -> None:
     scenario = resolved("sine_pendulum")
     assert refusals(scenario) == ()
-    assert refusal(scenario, "linear") == 'plant.system.kind = "python": the plant is not linear'
+    assert (
+        refusal(scenario, "linear")
+        == 'plant.system.kind = "python": the plant is not given by matrices A and B'
+    )
     with pytest.raises(CallerError, match=r"^plant\.system\.kind = .* this needs a linear plant"):
         require_exact(scenario)
 
