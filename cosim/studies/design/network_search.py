@@ -99,8 +99,8 @@ def _require_possible(scenario: Scenario, request: DesignRequest) -> None:
     """Raise CallerError unless a scenario can be searched with this request."""
     if not scenario.coverage.is_linear:
         raise CallerError(
-            f'plant.system.kind = "{scenario.plant.system.kind}": the plant is not given by matrices A and B; '
-            "--set 'plant.system={kind=\"linear\"}' designs for its model"
+            f'plant.system.kind = "{scenario.plant.system.kind}": the plant is not given by matrices A and '
+            "B; --set 'plant.system={kind=\"linear\"}' designs for its model"
         )
     require_exact(without_timeout(scenario))
     scenario.coverage.require_unchanging()
