@@ -108,9 +108,10 @@ def ending_line(end: ExitPart, reached_s: float, horizon_s: float, states: str =
     length = f"{reached_s:g} s"
     length_of_horizon = f"{length} of {horizon_s:g} s"
     reason = "" if end.status == ExitStatus.OK and end.reason == HORIZON else end.reason
+    says_when = reason.startswith("the plant failed at ")  # a simulation goes on to its horizon
     outcome, tone = {
         ExitStatus.OK: (f"completed {length}", Tone.GOOD),
-        ExitStatus.FAILED: (f"failed after {length_of_horizon}", Tone.BAD),
+        ExitStatus.FAILED: ("failed" if says_when else f"failed after {length_of_horizon}", Tone.BAD),
     }.get(ExitStatus(end.status), (f"stopped after {length_of_horizon}", Tone.DOUBTFUL))
     details = "; ".join(filter(None, (reason.removeprefix("stopped "), states)))
     return VerdictLine(f"{outcome}: {details}" if details else outcome, tone)

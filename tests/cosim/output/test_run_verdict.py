@@ -9,7 +9,7 @@ import pytest
 
 import noack
 from cosim.analysis.summary.run_summary import Outcome
-from cosim.analysis.summary.summary_model import Claim
+from cosim.analysis.summary.summary_model import Claim, ExitPart
 from cosim.live.finalize import finalize
 from cosim.output import run_verdict
 from cosim.output.page_kit import TERMS
@@ -226,3 +226,11 @@ def test_without_any_certificate_the_reason_is_that_of_the_scenarios_own_plant(o
     box = claim("void", source="box certificate", why=why.format(1.37))
     summary = with_values(outcome.summary, claims=[box, claim("void", why=why.format(4.37))])
     assert guarantee_of(summary.loops[0]).why == f"{why.format(4.37)}"
+
+
+def test_a_plant_that_fails_in_a_simulation_says_when_once() -> None:
+    """The simulation goes on to its horizon, which is not when the plant failed."""
+    end = ExitPart(status=1, reason="the plant failed at 0.02 s: x is not finite")
+    assert run_verdict.ending_line(end, 4.0, 4.0).text == f"failed: {end.reason}"
+    killed = ExitPart(status=1, reason="sensor exited with status 9")
+    assert run_verdict.ending_line(killed, 2.0, 4.0).text.startswith("failed after 2 s of 4 s: ")
