@@ -16,6 +16,7 @@ Both are proven from bounds of this model, by induction over the events: all bou
 """
 
 from collections.abc import Mapping, Sequence
+from functools import reduce
 from typing import NamedTuple
 
 from flint import arb, arb_mat, fmpq
@@ -35,7 +36,10 @@ _CELLS = 32
 
 
 class Bound(NamedTuple):
-    """|output| ≤ (D₁² e^{−2rt} + D₂²)^½, for all t ≥ 0, or only in the limit t → ∞."""
+    """|output| ≤ D₁ e^{−rt} + D₂, for all t ≥ 0, or only in the limit t → ∞.
+
+    A bound by quadratic forms, as that of the drift, is even (D₁² e^{−2rt} + D₂²)^½.
+    """
 
     output: str
     decaying: arb  # D₁
@@ -85,7 +89,7 @@ def prove(loop: Loop, document: Mapping[str, object]) -> Proof:
     is_quiet = require_few_at_start(loop, assumed)
     require_few_later(loop, assumed, apart if is_quiet else None)
     if assumed.errors is not None:
-        _require_errors(loop, rate, sensor, assumed.errors)
+        _require_errors(loop, rate, proven, assumed.errors)
     if assumed.chain_gain is not None and sensor is not None:
         missing = loop.losses + (1 + assumed.later if loop.times.delay > 0 else 0)
         factor = 1 + missing * assumed.chain_gain
@@ -179,6 +183,8 @@ def _prove_quiet_start(loop: Loop) -> None:
         return
     if rule.always or not rule.positive.nrows():
         raise RejectedError("times: an event without a comparison may happen before the first input acts")
+    if not _exceeds_by_error(loop):
+        raise RejectedError("times: an event of this rule may happen before the first input acts")
     if not error_without_input(loop, last) < (rule.level * (-rule.rate * last).exp()).max(rule.floor):
         raise RejectedError("times: an event may happen before the first input acts")
 
@@ -313,8 +319,13 @@ def _prove_inter_event(loop: Loop, rate: arb, drift: Bound, apart: arb) -> None:
 
 def compares_error(loop: Loop) -> bool:
     """Return whether the rule compares ‖W e_s‖ with a threshold."""
+    return _exceeds_by_error(loop) and not loop.rule.negative.nrows()
+
+
+def _exceeds_by_error(loop: Loop) -> bool:
+    """Return whether the rule compares ‖W e_s‖ with at least its threshold."""
     n, positive = loop.n, loop.rule.positive
-    if positive.nrows() != n or loop.rule.negative.nrows():
+    if positive.nrows() != n:
         return False
     entries = (
         (positive[i, j], loop.weight[i, j - n] if j >= n else 0) for i in range(n) for j in range(2 * n)
@@ -324,16 +335,20 @@ def compares_error(loop: Loop) -> bool:
 
 def sensor_error(loop: Loop, rate: arb, drift: Bound) -> Bound:
     """Return the bound of W e_s: the threshold at the last test, grown, plus what the drift adds."""
+    decaying, constant = (sum(sizes, arb(0)) for sizes in zip(*_sensor_parts(loop, rate, drift), strict=True))
+    return Bound("e_s", decaying, constant, True)
+
+
+def _sensor_parts(loop: Loop, rate: arb, drift: Bound) -> list[tuple[arb, arb]]:
+    """Return pairs (a, b): ‖W e_s‖ is at most the sum of their (a² f₁² + b² f₂²)^½."""
     if not compares_error(loop):
         raise RejectedError("drift: bounds e_s only for a rule that compares ‖W e_s‖")
     level, floor = thresholds(loop, rate)
     if loop.times.sampling == 0:
-        return Bound("e_s", level, floor, True)
+        return [(level, floor)]
     largest, total = growth(weighted(loop, rate), arb(loop.times.sampling))
     most = largest * _at_first_input(loop, rate)
-    parts = zip((level, floor), (drift.decaying, drift.constant), strict=True)
-    decaying, constant = (most * at_test + total * added for at_test, added in parts)
-    return Bound("e_s", decaying, constant, True)
+    return [(most * level, most * floor), (total * drift.decaying, total * drift.constant)]
 
 
 def _at_first_input(loop: Loop, rate: arb) -> arb:
@@ -348,20 +363,37 @@ def _at_first_input(loop: Loop, rate: arb) -> arb:
     return arb((error_without_input(loop, until) / threshold).max(arb(1)).abs_upper())
 
 
-def _require_errors(loop: Loop, rate: arb, sensor: Bound | None, errors: Errors) -> None:
+def _require_errors(loop: Loop, rate: arb, proven: Mapping[str, Bound], errors: Errors) -> None:
     """Prove that ‖W e_s‖ is below what is assumed of it, strictly: then what used it holds on.
 
     Up to some time the assumption holds; so do all bounds, and ‖W e_s‖ is below what is assumed, also a
     little later, since e_s is continuous but for its jumps to 0. A rule that is tested at all times keeps
     ‖W e_s‖ at its threshold or below: there nothing is assumed.
     """
-    if sensor is None:
+    if "drift" in proven:
+        share = share_of_errors(loop, rate, proven["drift"], errors)
+    elif "e_s" in proven:
+        share = _share([(proven["e_s"].decaying, proven["e_s"].constant)], errors)
+    else:
         raise RejectedError("errors: no bound of e_s, or of the drift, from the start on")
     exact = loop.times.sampling == 0 and compares_error(loop)
-    pairs = zip((sensor.decaying, sensor.constant), (errors.decaying, errors.constant), strict=True)
-    for proven, assumed in pairs:
-        if not (proven < assumed or (proven == 0 and assumed == 0) or (exact and proven <= assumed)):
-            raise RejectedError("errors: the sensor's error may exceed them")
+    if not (share < 1 or (exact and share <= 1)):
+        raise RejectedError("errors: the sensor's error may exceed them")
+
+
+def share_of_errors(loop: Loop, rate: arb, drift: Bound, errors: Errors) -> arb:
+    """Return the largest share of what is assumed of ‖W e_s‖ that it reaches, by a bound of the drift."""
+    return _share(_sensor_parts(loop, rate, drift), errors)
+
+
+def _share(parts: Sequence[tuple[arb, arb]], errors: Errors) -> arb:
+    """Return the sum of the shares of parts, (a² f₁² + b² f₂²)^½: each is the larger one of both units."""
+    assumed = errors.decaying, errors.constant
+    shares = [
+        [size / limit for size, limit in zip(part, assumed, strict=True) if not size == limit == 0]
+        for part in parts
+    ]
+    return sum((reduce(arb.max, each, arb(0)) for each in shares), arb(0))
 
 
 # Reading a document.

@@ -38,7 +38,8 @@ def assumptions(scenario: Mapping[str, object], loop: Loop) -> str:
 def sentences(proof: Proof) -> Iterator[str]:
     """Yield each bound of a proof; of two bounds of the same output the smaller one."""
     for bound in smallest_bounds(proof):
-        yield f"{norm(bound.output)} ≤ {formula(bound, proof.rate)}"
+        from_then = "" if proof.is_quiet or bound.output != "e_c" else ", from the first input on"
+        yield f"{norm(bound.output)} ≤ {formula(bound, proof.rate)}{from_then}"
     if proof.inter_event is not None and proof.inter_event > 0:
         which = "" if proof.is_quiet else " after the first input"
         exception = _exception(proof) if proof.is_quiet else ""
@@ -73,12 +74,12 @@ def smallest_bounds(proof: Proof) -> list[Bound]:
 
 
 def size(bound: Bound) -> float:
-    """Return the bound at t = 0, or in the limit."""
-    return float((bound.decaying**2 + bound.constant**2).sqrt().mid())
+    """Return the bound at t = 0, as it is printed, or a size of one in the limit."""
+    return float((bound.decaying + bound.constant).mid())
 
 
 def formula(bound: Bound, rate: arb) -> str:
-    """Return a bound of D₁ e^{−rt} + D₂, which is at least (D₁² e^{−2rt} + D₂²)^½."""
+    """Return D₁ e^{−rt} + D₂ in decimals, or what is left of it in the limit, by quadratic forms."""
     if not bound.from_start:
         last = bound.constant if rate > 0 else (bound.decaying**2 + bound.constant**2).sqrt()
         return f"{at_most(last)} in the limit"

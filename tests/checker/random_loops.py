@@ -59,3 +59,21 @@ def random_loop(rng: np.random.Generator) -> Loop:
         losses=int(rng.integers(0, 4)),
         times=Times(sampling, least, delay, age, start),
     )
+
+
+def random_loop_with_long_delays(rng: np.random.Generator) -> Loop:
+    """Return a loop of one state: delays up to four tests, events before the first input, several rules."""
+    while (loop := random_loop(rng)).n > 1:
+        pass
+    sampling, least = loop.times.sampling, loop.times.least_sampling
+    delay, start = (sampling * fmpq(int(rng.integers(low, 9)), 2) for low in (1, 0))
+    rule, loop = loop.rule, loop._replace(losses=int(rng.integers(0, 3)), holds=bool(rng.random() < 0.2))
+    kind = rng.choice(["threshold", "relative", "quadratic", "deadline"], p=[0.4, 0.3, 0.2, 0.1])
+    if kind in {"relative", "quadratic"}:
+        size = number(round(float(rng.uniform(0.02, 0.2)), 3))
+        rule = rule._replace(level=arb(0), negative=beside(size * loop.weight, zeros(1, 1)))
+    if kind == "quadratic":
+        rule = rule._replace(positive=rule.positive * number(round(float(rng.uniform(0.5, 5)), 2)))
+    rule = rule._replace(always=bool(kind == "deadline"))
+    times = loop.times._replace(sampling=sampling, least_sampling=least, delay=delay, start=min(start, delay))
+    return loop._replace(rule=rule, times=times)

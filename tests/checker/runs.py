@@ -66,7 +66,7 @@ def exceeded(loop: Loop, proof: Proof, rng: np.random.Generator, until: float) -
     next_event = rng.choice(periods) if periods[1] else np.inf  # of a periodic rule
     if periods[1]:
         least = sampling = periods[1] / _PARTS
-    W, n = floats(loop.weight), loop.n
+    W, n, positive, negative = floats(loop.weight), loop.n, floats(rule.positive), floats(rule.negative)
     level, rate, floor = (float(v.mid()) for v in (rule.level, rule.rate, rule.floor))
     x = floats(loop.start)[:, 0]
     z = np.concatenate([x, x, x, [1.0]])
@@ -82,6 +82,8 @@ def exceeded(loop: Loop, proof: Proof, rng: np.random.Generator, until: float) -
     bounds = [
         (b.output, float(b.decaying.mid()), float(b.constant.mid())) for b in proof.bounds if b.from_start
     ]
+    early = [b for b in bounds if b[0] != "drift" and (proof.is_quiet or b[0] != "e_c")]
+    """Those that hold before the first input acts, too."""
     r = float(proof.rate.mid())
     while t < until:
         stop = min(v for v in (next_test, next_event, *(update[0] for update in arriving)) if v > t)
@@ -93,16 +95,17 @@ def exceeded(loop: Loop, proof: Proof, rng: np.random.Generator, until: float) -
             z = step @ z
             decay = plant.predict(round((stop - t) / 2, 12))
             arriving = [(acts, sent, decay @ state) for acts, sent, state in arriving]
-            _compare(found, plant, z, W, t + half * (stop - t) / 2, bounds, r, acting, signs)
+            compared = bounds if acting is not None else early
+            _compare(found, plant, z, W, t + half * (stop - t) / 2, compared, r, acting, signs)
         t = stop
         if acting_now := [update for update in arriving if update[0] <= t]:
             newest = max(acting_now, key=lambda update: update[1])
             z[2 * n : 3 * n] = newest[2]
             arriving = [update for update in arriving if update[1] > newest[1]]
         if t >= min(next_test, next_event):
-            e = W @ (z[n : 2 * n] - z[:n])
-            threshold = max(level * np.exp(-rate * t), floor)
-            fires = np.linalg.norm(e) > threshold or (rule.always and rng.random() < 0.2)
+            pair = np.concatenate([z[:n], z[n : 2 * n] - z[:n]])
+            threshold = np.hypot(max(level * np.exp(-rate * t), floor), np.linalg.norm(negative @ pair))
+            fires = np.linalg.norm(positive @ pair) > threshold or (rule.always and rng.random() < 0.2)
             if periods[1]:
                 fires = t >= next_event
             if fires:
@@ -152,9 +155,8 @@ def _compare(
     motion = plant.A @ x + plant.B @ u + plant.pushes @ np.array(signs)
     values = {"x": x, "e_s": W @ (xs - x), "e_c": W @ (xc - x), "drift": W @ (motion - plant.H @ x)}
     for output, decaying, constant in bounds:
-        if output == "drift" and age is None:
-            continue
         value = values[output] if output in values else np.array([x[int(output[2:-1])]])
-        size, bound = float(np.linalg.norm(value)), float(np.hypot(decaying * np.exp(-rate * t), constant))
+        added = np.add if output in {"e_s", "e_c"} else np.hypot
+        size, bound = float(np.linalg.norm(value)), float(added(decaying * np.exp(-rate * t), constant))
         if size > bound * (1 + _ROUNDING):
             found.append(Exceeded(output, t, size, bound))

@@ -5,14 +5,16 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
 import pytest
 from flint import arb, fmpq
 
+from noack.theory.witnesses.assumptions import inter_event_s
 from noack.theory.witnesses.documents import Witness, find_witness
 from noack_check.balls import identity, is_positive, matrix, number, zeros
 from noack_check.check import RejectedError, _value
 from noack_check.keys import RefusedError
-from noack_check.loop import Loop
+from noack_check.loop import Loop, Rule
 from noack_check.model import Model, thresholds
 from noack_check.norms import decays_below
 from noack_check.proof import (
@@ -28,6 +30,7 @@ from noack_check.proof import (
 )
 from noack_check.scenario import _checked
 from noack_check.sentences import formula, sentences
+from tests.checker.runs import exceeded
 from tests.checker.test_witnesses import IDEAL, SCHEDULE, double_integrator
 
 DEFAULT = double_integrator()
@@ -104,6 +107,65 @@ def test_a_weight_without_inverse_is_rejected(witness: Witness) -> None:
     rejects(DEFAULT._replace(weight=matrix([[1, 0], [0, 0]])), witness.document, "inverse")
 
 
+# The sensor's error between two tests.
+
+
+def slow_model(floor: float = 0.01) -> Loop:
+    """Return ẋ = −0.05x + d, |d| ≤ 1, tested each 0.5 s: the threshold decays, and the drift does not."""
+    loop = double_integrator(IDEAL._replace(sampling=fmpq(1, 2), least_sampling=fmpq(1, 2)))
+    rule = Rule(matrix([[0.0, 1.0]]), zeros(0, 2), number(0.5), number(0.01), number(floor))
+    A, none, one = matrix([[-0.05]]), zeros(1, 1), identity(1)
+    return loop._replace(
+        A=A, B=one, half_A=none, half_B=none, model_A=A, model_B=one, gain=none, weight=one,
+        start=one, rule=rule, pushes=one, sizes=(arb(1),), losses=0,
+    )  # fmt: skip
+
+
+SLOW_DRIFT = {
+    "output": "drift",
+    "decay": 0.0536,
+    "matrices": {"X": [[4.95993e-11]], "Q/0 lost": [[7.99425e-06]]},
+    "numbers": {
+        "c1/0 lost": 0.000121906, "c2/0 lost": 0.000113734, "a/0 lost": 1.21795e-05,
+        "level 1": 0.000122908, "level 2": 1.00012,
+        "m/flow/0 lost/0/signal 0": 6.0942e-06, "m/flow/0 lost/1/signal 0": 4.1006e-06,
+        "m/output/0 lost/0/signal 0": 1.0, "m/output/0 lost/1/signal 0": 1.0,
+        "m/edge/0 lost, delivered/0 0/0": 3.99396e-06, "m/edge/0 lost, delivered/0 0/1": 4.00014e-06,
+        "m/edge/0 lost, delivered/1 0/0": 1.00046e-06, "m/edge/0 lost, delivered/1 0/1": 3.89911e-07,
+    },
+}  # fmt: skip
+SLOW = {
+    "rate": 0.01,
+    "chain": {"gain": 1.01, "tail": [[12.5]]},
+    "bounds": [SLOW_DRIFT],
+    "inter_event_s": 0,
+}
+
+
+def test_the_threshold_and_the_drift_of_different_units_add_up() -> None:
+    """Up to 0.5 from the last test and 0.5 since: a run exceeds the root of both squares."""
+    proof = prove(slow_model(), SLOW)
+    sensor = next(bound for bound in proof.bounds if bound.output == "e_s")
+    root = (sensor.decaying**2 + sensor.constant**2).sqrt()
+    as_root = proof._replace(bounds=(sensor._replace(decaying=root, constant=arb(0)),))
+    assert any(exceeded(slow_model(), as_root, np.random.default_rng(k), 20.0) for k in range(3))
+    assert not any(exceeded(slow_model(), proof, np.random.default_rng(k), 20.0) for k in range(3))
+
+
+def test_errors_of_different_units_are_assumed_large_enough() -> None:
+    """What is assumed is the root of two squares: below the sum of both that is proven."""
+    sensor = next(bound for bound in prove(slow_model(), SLOW).bounds if bound.output == "e_s")
+    for factor in (1.001, 1.9):
+        errors = {name: float(getattr(sensor, name)) * factor for name in ("decaying", "constant")}
+        rejects(slow_model(), {**SLOW, "errors": errors}, "errors: the sensor's error may exceed them")
+    prove(slow_model(), {**SLOW, "errors": {name: size * 1.1 for name, size in errors.items()}})
+
+
+def test_no_time_between_events_is_searched_if_the_threshold_decays_and_the_drift_does_not() -> None:
+    assert inter_event_s(slow_model(0.0), 0.01, (0.1, 1.0)) == 0
+    assert inter_event_s(slow_model(0.0), 0.01, (0.1, 0.0)) > 0
+
+
 # The time before the first input.
 
 
@@ -136,6 +198,19 @@ def test_events_without_a_comparison_may_come_before_the_first_input() -> None:
         _prove_quiet_start(loop._replace(rule=loop.rule._replace(always=True)))
 
 
+def test_a_start_is_quiet_only_if_the_error_is_what_is_compared() -> None:
+    """‖W e_s‖ below the floor says nothing of 20 ‖W e_s‖, nor of ‖W x‖."""
+    loop = double_integrator(SCHEDULE._replace(start=fmpq(3, 100)))
+    few = Assumptions(None, 2, 0, None)
+    rule = loop.rule._replace(level=arb(0), floor=number(0.06))
+    assert require_few_at_start(loop._replace(rule=rule), few)
+    assert require_few_at_start(loop._replace(rule=rule._replace(negative=rule.positive)), few)
+    positive = rule.positive * 20, matrix([[0, 0, 1, 0]]), matrix([[1, 0, 0, 0], [0, 1, 0, 0]])
+    for each in positive:
+        with pytest.raises(RejectedError, match="an event of this rule may happen"):
+            require_few_at_start(loop._replace(rule=rule._replace(positive=each)), few)
+
+
 def test_a_start_in_which_an_event_may_come_is_rejected(witness: Witness) -> None:
     rejects(DEFAULT._replace(times=SCHEDULE._replace(start=fmpq(1, 2))), witness.document)
 
@@ -154,6 +229,13 @@ def test_the_second_event_has_a_sentence_of_its_own() -> None:
     assert list(sentences(Proof(arb(1), (), apart, apart, True))) == ["two events are at least 0.25 s apart"]
     assert "0.125" in next(iter(sentences(Proof(arb(1), (), apart, first, True))))
     assert "after the first input" in next(iter(sentences(Proof(arb(1), (), apart, first, False))))
+
+
+def test_the_controller_has_an_error_from_the_first_input_on() -> None:
+    """x_c is what the acting input is computed from; before, events may have been."""
+    proof = Proof(arb(0), (Bound("e_c", arb(1), arb(0), True),), None, None, False)
+    assert list(sentences(proof)) == ["‖W e_c‖ ≤ 1.0, from the first input on"]
+    assert list(sentences(proof._replace(is_quiet=True))) == ["‖W e_c‖ ≤ 1.0"]
 
 
 def test_what_does_not_decay_counts_in_the_limit() -> None:

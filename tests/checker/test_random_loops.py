@@ -1,28 +1,33 @@
 """What a witness proves of random loops is never exceeded in runs of them."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from noack.theory.witnesses.documents import find_witness
 from noack.theory.witnesses.effort import NoWitnessError
 from noack_check.balls import number
-from tests.checker.random_loops import random_loop
+from noack_check.loop import Loop
+from tests.checker.random_loops import random_loop, random_loop_with_long_delays
 from tests.checker.runs import exceeded
 from tests.checker.test_witnesses import double_integrator
 
 _RUNS = 6
 
 
-def _found_for(seed: int) -> bool:
+def _found_for(
+    seed: int, draw: Callable[[np.random.Generator], Loop] = random_loop, runs: int = _RUNS
+) -> bool:
     """Return whether there is a witness, after runs of the loop."""
     rng = np.random.default_rng(seed)
-    loop = random_loop(rng)
+    loop = draw(rng)
     try:
         proof = find_witness(loop).proof
     except NoWitnessError:
         return False
     until = 600 * float(loop.times.sampling.p) / float(loop.times.sampling.q)
-    for _ in range(_RUNS):
+    for _ in range(runs):
         assert exceeded(loop, proof, rng, until) == []
     return True
 
@@ -30,6 +35,10 @@ def _found_for(seed: int) -> bool:
 def test_bounds_of_a_few_random_loops_are_not_exceeded() -> None:
     found = [_found_for(seed) for seed in (105, 108)]  # with one state: fast
     assert any(found)
+
+
+def test_bounds_with_long_delays_and_events_before_the_first_input_are_not_exceeded() -> None:
+    assert _found_for(9, random_loop_with_long_delays, 2)  # a relative rule, one later event
 
 
 def test_runs_come_near_the_bounds() -> None:
@@ -52,3 +61,10 @@ def test_runs_come_near_the_bounds() -> None:
 def test_bounds_of_random_loops_are_not_exceeded() -> None:
     seeds = range(100, 150)
     assert sum(_found_for(seed) for seed in seeds) >= len(seeds) // 4
+
+
+@pytest.mark.system
+@pytest.mark.timeout(1200)
+def test_bounds_of_random_loops_with_long_delays_are_not_exceeded() -> None:
+    seeds = range(30)
+    assert sum(_found_for(seed, random_loop_with_long_delays) for seed in seeds) >= len(seeds) // 2

@@ -16,7 +16,7 @@ from noack.theory.witnesses.coordinates import floats
 from noack_check.balls import matrix, number
 from noack_check.check import RejectedError
 from noack_check.loop import Loop
-from noack_check.model import thresholds
+from noack_check.model import Errors, thresholds
 from noack_check.norms import growth
 from noack_check.proof import (
     Assumptions,
@@ -26,6 +26,7 @@ from noack_check.proof import (
     require_few_at_start,
     require_few_later,
     sensor_error,
+    share_of_errors,
 )
 
 _ROOM = 1.01
@@ -71,13 +72,11 @@ def with_errors(document: Mapping[str, object], sizes: Sequence[float]) -> dict[
     return {**document, "errors": {"decaying": decaying, "constant": constant}}
 
 
-def are_below(sizes: Sequence[float], document: Mapping[str, object]) -> bool:
-    """Return whether errors are below what a document assumes."""
-    errors = document.get("errors")
-    if not isinstance(errors, Mapping):
-        return True
-    most = errors["decaying"], errors["constant"]
-    return all(_ROOM * size < limit or size == 0 for size, limit in zip(sizes, most, strict=True))
+def _share_of(sizes: Sequence[float], loop: Loop, rate: float, drift: Sequence[float]) -> float:
+    """Return the share of errors of some sizes that the sensor's error reaches."""
+    decaying, constant = (number(size) for size in sizes)
+    errors = Errors(decaying, constant, number(1.0))
+    return float(share_of_errors(loop, number(rate), _bound(drift), errors).mid())
 
 
 def next_assumptions(
@@ -86,16 +85,20 @@ def next_assumptions(
     """Return the next document, or None if a bound of the drift confirms what the present one assumes."""
     rate = document["rate"]
     assert isinstance(rate, float)
+    later = _needed_later(loop, document, inter_event_s(loop, rate, drift) / _ROOM)
+    following, errors = {**document, "later": later}, document.get("errors")
+    if not isinstance(errors, Mapping):
+        return None if later == document["later"] else following
+    share = _share_of((errors["decaying"], errors["constant"]), loop, rate, drift)
+    is_exact = not loop.times.sampling > 0
+    if later == document["later"] and (is_exact or _ROOM * share < 1):
+        return None
     units = [float(each) for each in thresholds(loop, number(rate))]
     sensor = sensor_error(loop, number(rate), _bound(drift))
     needed = [float(sensor.decaying), float(sensor.constant)]
-    later = _needed_later(loop, document, inter_event_s(loop, rate, drift) / _ROOM)
-    is_exact = not loop.times.sampling > 0
-    if later == document["later"] and (is_exact or are_below(needed, document)):
-        return None
     grown = [unit + _FURTHER * (size - unit) for size, unit in zip(needed, units, strict=True)]
-    following = {**document, "later": later}
-    return with_errors(following, grown) if "errors" in document else following
+    factor = max(_ROOM**2 * _share_of(grown, loop, rate, drift), 1.0)
+    return with_errors(following, [factor * size for size in grown])
 
 
 def _needed_later(loop: Loop, document: Mapping[str, object], apart_s: float) -> int:
@@ -156,7 +159,7 @@ def inter_event_s(loop: Loop, rate: float, drift: Sequence[float]) -> float:
     level, floor = float(loop.rule.level), float(loop.rule.floor)
     if rate != float(loop.rule.rate):
         level = 0.0
-    if loop.rule.always or loop.rule.negative.nrows() or not (level or floor):
+    if loop.rule.always or loop.rule.negative.nrows() or not (floor or (level and not D2)):
         return 0.0
     shares = [(max(level**2 * v, floor**2), D1 * v + D2) for v in _kinks(level, floor)]
     most = min((threshold / size) ** 0.5 * (1 - 1e-9) for threshold, size in shares if size)

@@ -23,7 +23,7 @@ def proven_limit(proof: Proof, output: str, t_s: Vector) -> Vector:
     for bound in proof.bounds:
         if bound.output == output and bound.from_start:
             decaying = float(bound.decaying.mid()) * np.exp(-float(proof.rate.mid()) * t_s)
-            limit = np.minimum(limit, np.hypot(decaying, float(bound.constant.mid())))
+            limit = np.minimum(limit, decaying + float(bound.constant.mid()))
     return limit
 
 
