@@ -75,7 +75,7 @@ class Forms:
             or self.decay <= 2 * self.rate
         ):
             return False
-        losses, (_, _, delay, age, start) = self.loop.losses, self.times
+        losses, (_, _, delay, age, start, *_) = self.loop.losses, self.times
         waits = [("0 later", delay)] if delay else []
         begins = [("start, 0 later", start)] if start else []
         places = [(f"{j} lost", self.times[0]) for j in range(losses + 1)] + waits + begins

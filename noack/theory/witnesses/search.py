@@ -129,7 +129,8 @@ def refined(frames: Frames, found: Found) -> Frames:
     for name, V in found.matrices.items():
         T = frames[name]
         values, vectors = np.linalg.eigh(T.T @ V @ T)
-        better[name] = scale * T @ vectors / np.sqrt(np.maximum(values, 1e-6 * values[-1]))
+        if values[-1] > 0:
+            better[name] = scale * T @ vectors / np.sqrt(np.maximum(values, 1e-6 * values[-1]))
     return better
 
 
