@@ -121,7 +121,7 @@ def test_a_process_without_a_coordinator_says_so(
     descriptor: RunDescriptor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(noack.runtime.connections.zenoh_session, "_CONNECT_MS", 200)
-    with pytest.raises(NoAnswerError, match="cannot reach the run's coordinator: (Unable|no connection)"):
+    with pytest.raises(NoAnswerError, match=r"cannot reach the run's coordinator: (Unable|no connection)"):
         ControlPlane(descriptor, "plant")
     error = zenoh.ZError("Timeout! at /home/builder/.cargo/git/zenoh/orchestrator.rs:388.")
     assert cause_of(error) == "Timeout!"
