@@ -60,7 +60,7 @@ def test_a_loop_that_is_unstable_says_why_and_is_drawn() -> None:
 def test_a_plant_that_is_not_linear_is_simulated_in_virtual_time_with_the_reason() -> None:
     run = noack_lab.explore("dc_motor", {"horizon_s": 0.2}).run
     assert run.kind == results.SIMULATED
-    assert "not linear" in run.note
+    assert "not given by matrices" in run.note
     assert len(run.verdict) == 3
 
 
