@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.analysis.tried_settings import Tried, helpful_box, helpful_settings, largest_settings
+from cosim.analysis.tried_settings import TriedSettings, helpful_box, helpful_settings, largest_settings
 from cosim.analysis.witnesses import Witnesses, find_witnesses, needs_matrices, no_witnesses
 from noack.core.errors import CallerError, one_line
 from noack.core.linear_systems import Matrix
@@ -230,7 +230,7 @@ class Certificates:
         }
 
     @cached_property
-    def largest_settings(self) -> list[Tried]:
+    def largest_settings(self) -> list[TriedSettings]:
         """Settings with which the scenario's own plant has a certificate, at their largest, each alone."""
         own = self.of_own_plant
         if own is None or not own.exists:
@@ -239,7 +239,7 @@ class Certificates:
         return [*largest_settings(self._own_scenario, self.late_periods, limits.delay_s, limits.sampling_s)]
 
     @cached_property
-    def helpful_settings(self) -> list[Tried]:
+    def helpful_settings(self) -> list[TriedSettings]:
         """Settings, each of which alone gives the scenario's own plant its missing certificate."""
         own, scenario = self.of_own_plant, self._own_scenario
         if own is None or own.exists:
@@ -252,7 +252,7 @@ class Certificates:
         return [*helpful_settings(scenario, self.late_periods)]
 
     @cached_property
-    def helpful_box(self) -> Tried | None:
+    def helpful_box(self) -> TriedSettings | None:
         """A smaller uncertainty box with its missing certificate, while the plant has one."""
         box = self.schedule_box
         if box is None or box.exists or not self.schedule.exists:

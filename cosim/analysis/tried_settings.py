@@ -41,7 +41,7 @@ Values = Mapping[str, object]
 """Values of settings by their keys."""
 
 
-class Tried(NamedTuple):
+class TriedSettings(NamedTuple):
     """Settings with which there is a certificate."""
 
     values: Values
@@ -90,7 +90,7 @@ class SettingTrials:
         self.left = _MOST_TRIALS if is_linear else max(_TRIALS_BY_STATES // n, _LEAST_TRIALS)
         """How many may still be tried."""
 
-    def first(self, candidates: Iterable[Values], *, box: bool = False) -> Tried | None:
+    def first(self, candidates: Iterable[Values], *, box: bool = False) -> TriedSettings | None:
         """Return the first settings with a certificate for the scenario's schedule, None if there are none.
 
         ``box``: of all plants of the uncertainty box; else of the scenario's own.
@@ -100,10 +100,10 @@ class SettingTrials:
                 break
             trial = self._trial(values, box=box)
             if trial is not None and trial.has_loop_gain and trial.is_certified:
-                return Tried(values)
+                return TriedSettings(values)
         return None
 
-    def largest(self, key: str, low: float, high: float) -> Tried | None:
+    def largest(self, key: str, low: float, high: float) -> TriedSettings | None:
         """Return nearly the largest value with a certificate, of those with three digits above ``low``.
 
         None if there is none. ``low`` has a certificate, and ``high`` has perhaps none.
@@ -119,7 +119,7 @@ class SettingTrials:
             else:
                 high = value
         largest = (value for value, trial in reversed(found[-2:]) if trial.is_certified)
-        return next((Tried({key: value}) for value in largest), None)
+        return next((TriedSettings({key: value}) for value in largest), None)
 
     def _trial(self, values: Values, *, box: bool = False) -> "_ChangedScope | None":
         """Return what is tried with some values; None if they are not legal, or cannot have a certificate."""
@@ -145,7 +145,7 @@ class SettingTrials:
         return scenario
 
 
-def helpful_settings(resolved: Scenario, late_periods: int) -> Iterator[Tried]:
+def helpful_settings(resolved: Scenario, late_periods: int) -> Iterator[TriedSettings]:
     """Yield settings, each of which alone gives a scenario's own plant a certificate.
 
     A higher rate may be one of both plant and controller.
@@ -160,7 +160,7 @@ def helpful_settings(resolved: Scenario, late_periods: int) -> Iterator[Tried]:
             yield tried
 
 
-def helpful_box(resolved: Scenario, late_periods: int) -> Tried | None:
+def helpful_box(resolved: Scenario, late_periods: int) -> TriedSettings | None:
     """Return smaller half-widths with which the uncertainty box has a certificate, None if none was found."""
     plant, trials = resolved.plant, SettingTrials(resolved, late_periods)
     halfwidths = {"plant.uncertainty_A": plant.uncertainty_A, "plant.uncertainty_B": plant.uncertainty_B}
@@ -171,13 +171,13 @@ def helpful_box(resolved: Scenario, late_periods: int) -> Tried | None:
             if rows is not None
         }
         if trials.first([values], box=True) is not None:
-            return Tried(values, share)
+            return TriedSettings(values, share)
     return None
 
 
 def largest_settings(
     resolved: Scenario, late_periods: int, delay_s: float, sampling_s: float | None
-) -> Iterator[Tried]:
+) -> Iterator[TriedSettings]:
     """Yield the largest delay of the network and period of measurements that were tried, each alone.
 
     Args:

@@ -93,7 +93,7 @@ def needs_matrices(resolved: Scenario) -> str:
 
 
 def require_covered(resolved: Scenario, late_periods: int) -> None:
-    """Raise CallerError if the checker's model covers a scenario under no conditions."""
+    """Raise CallerError if the checker covers a scenario neither under its schedule nor under ideal ones."""
     if not resolved.coverage.is_linear:
         raise CallerError(f"--witness: {needs_matrices(resolved)}")
     content = resolved_content(resolved, late_periods)

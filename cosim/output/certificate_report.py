@@ -13,7 +13,7 @@ from rich.markup import escape
 from cosim.analysis.certificates import SCHEDULE, Certificates, constant_rows, covered_plants
 from cosim.analysis.margin_search import MarginResult
 from cosim.analysis.mean_cost import CostUnder, MeanCost
-from cosim.analysis.tried_settings import Tried
+from cosim.analysis.tried_settings import TriedSettings
 from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.output.terminal_output import print_assumptions
 from noack.core.linear_systems import Matrix
@@ -87,7 +87,7 @@ def _print_advice(console: Console, results: Certificates) -> None:
     )
 
 
-def _listed(what: str, tried: Sequence[Tried]) -> str:
+def _listed(what: str, tried: Sequence[TriedSettings]) -> str:
     """Return settings that were tried as one text; empty if there are none."""
     if not tried:
         return ""

@@ -10,12 +10,12 @@ from flint import arb, fmpq
 from noack.theory.witnesses import semidefinite
 from noack.theory.witnesses.coordinates import floats
 from noack.theory.witnesses.documents import find_witness
-from noack.theory.witnesses.effort import Effort, EndedError, NoWitnessError
+from noack.theory.witnesses.effort import Effort, NoWitnessError, WorkLimitError
 from noack.theory.witnesses.line_search import search_lowest
 from noack.theory.witnesses.templates import Templates
 from noack_check.balls import matrix, number
 from noack_check.model import Model
-from tests.checker.test_witnesses import double_integrator
+from tests.checker.test_witnesses import IDEAL, double_integrator, relative
 
 
 @pytest.mark.parametrize("lowest", [0.15, 0.42, 0.6, 0.85])
@@ -78,12 +78,12 @@ def test_progress_rises_to_its_end() -> None:
 
 
 def test_a_search_ends_at_its_limit_of_work() -> None:
-    with pytest.raises(EndedError, match=r"^drift: the search ended after 0 problems"):
+    with pytest.raises(WorkLimitError, match=r"^drift: the search ended after 0 problems"):
         find_witness(double_integrator(), most_work=1e-9)
     effort = Effort(lambda share: None, 2.5)
     effort.add("x", 1.0)
     effort.add("x", 1.0)
-    with pytest.raises(EndedError, match="x: the search ended after 2 problems"):
+    with pytest.raises(WorkLimitError, match="x: the search ended after 2 problems"):
         effort.add("x", 1.0)
 
 
@@ -128,3 +128,10 @@ def test_with_many_events_while_an_update_is_on_its_way_there_is_no_witness() ->
     slow = loop._replace(times=loop.times._replace(delay=fmpq(1)), half_B=matrix([[0.0], [0.9]]))
     with pytest.raises(NoWitnessError):
         find_witness(slow)
+
+
+def test_the_reason_is_the_number_of_events_if_it_is_too_large() -> None:
+    """Of a relative rule each test may be an event: 9 within 0.1 s after one."""
+    times = IDEAL._replace(sampling=fmpq(1, 100), least_sampling=fmpq(1, 100), delay=fmpq(1, 10))
+    with pytest.raises(NoWitnessError, match="^9 events may happen while an update is on its way: at most 8"):
+        find_witness(relative(0.1)._replace(times=times))

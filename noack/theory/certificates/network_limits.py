@@ -19,7 +19,7 @@ MOST_S = 10.0
 _LEAST_S = 1e-6
 """A smaller limit is 0."""
 _USUAL_S = 1e-3
-"""Tried first, if the schedule's time is 0."""
+"""TriedSettings first, if the schedule's time is 0."""
 _RESOLUTION = 1e-3
 """Relative accuracy of a limit."""
 _DIGITS, _SHORTER = 3, (0.0, 0.02, 0.1)

@@ -13,12 +13,14 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 
 from noack.core.linear_systems import Matrix
 from noack.theory.witnesses.coordinates import floats
+from noack.theory.witnesses.effort import NoWitnessError
 from noack_check.balls import matrix, number
 from noack_check.check import RejectedError
 from noack_check.loop import Loop
 from noack_check.model import Errors, thresholds
 from noack_check.norms import growth
 from noack_check.proof import (
+    MOST_LATER,
     Assumptions,
     Bound,
     compares_error,
@@ -64,6 +66,16 @@ def first_assumptions(loop: Loop, rate: float) -> dict[str, object]:
 def without_drift(loop: Loop, document: Mapping[str, object]) -> dict[str, object]:
     """Return a document that assumes nothing that follows from a bound of the drift."""
     return {**document, "later": _most_between(loop, loop.times.delay)}
+
+
+def require_few(document: Mapping[str, object]) -> None:
+    """Raise NoWitnessError if more events are assumed than the checker accepts."""
+    later, at_start = document["later"], document["later_at_start"]
+    assert isinstance(later, int)
+    assert isinstance(at_start, int)
+    for events, when in ((later, "while an update is on its way"), (at_start, "before the first input acts")):
+        if events > MOST_LATER:
+            raise NoWitnessError(f"{events} events may happen {when}: at most {MOST_LATER} are covered")
 
 
 def with_errors(document: Mapping[str, object], sizes: Sequence[float]) -> dict[str, object]:

@@ -12,10 +12,11 @@ from noack.theory.witnesses.assumptions import (
     first_event_s,
     inter_event_s,
     next_assumptions,
+    require_few,
     without_drift,
 )
 from noack.theory.witnesses.coordinates import floats, simulated_frames
-from noack.theory.witnesses.effort import MOST_WORK, Effort, EndedError, NoWitnessError
+from noack.theory.witnesses.effort import MOST_WORK, Effort, NoWitnessError, WorkLimitError
 from noack.theory.witnesses.line_search import search_lowest
 from noack.theory.witnesses.search import Found, Search, refined
 from noack.theory.witnesses.semidefinite import Accuracy
@@ -92,7 +93,7 @@ def find_witness(
         return _by_quadratic_forms(loop, _Rates(loop, slow=0.01), wanted, effort)
     try:
         return _by_threshold(loop, rates, wanted, effort)
-    except EndedError:
+    except WorkLimitError:
         raise
     except NoWitnessError as error:
         with contextlib.suppress(NoWitnessError):
@@ -196,8 +197,9 @@ class _OutputSearch:
     """
 
     def __init__(self, loop: Loop, rates: _Rates, document: Mapping[str, object], effort: "Effort") -> None:
-        self._loop, self._rates, self.document, self._effort = loop, rates, document, effort
+        self._loop, self._rates, self._effort = loop, rates, effort
         self._rate = number(rates.rate)
+        require_few(document)
         try:
             self._assumed = read_assumptions(loop, self._rate, document)
         except RejectedError as error:
@@ -297,7 +299,7 @@ class _OutputSearch:
         """Return whether the solver finds forms that bound an output from the start on."""
         try:
             self.best_share(output, starts=True)
-        except EndedError:
+        except WorkLimitError:
             raise
         except NoWitnessError:
             return False

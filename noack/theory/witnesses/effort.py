@@ -11,8 +11,8 @@ class NoWitnessError(ArithmeticError):
     """No witness was found; the message says what fails first."""
 
 
-class EndedError(NoWitnessError):
-    """The search was ended."""
+class WorkLimitError(NoWitnessError):
+    """The search has reached its limit of work."""
 
 
 class Effort:
@@ -35,10 +35,10 @@ class Effort:
         """Count the next problem.
 
         Raises:
-            EndedError: it is one too many.
+            WorkLimitError: it is one too many.
         """
         if self._work + work > self._most_work:
-            raise EndedError(
+            raise WorkLimitError(
                 f"{output}: the search ended after {self._problems} problems, at its limit of work"
             )
         self._problems, self._work = self._problems + 1, self._work + work

@@ -20,7 +20,6 @@ class Found(NamedTuple):
 
     matrices: Mapping[str, Matrix]
     numbers: Mapping[str, float]
-    status: str
     size: float
     """What was minimised, a root: see :meth:`Search.solve`."""
 
@@ -119,7 +118,7 @@ class Search:
             inverse = self._inverse[name]
             matrices[name] = size**2 * inverse.T @ V @ inverse
         numbers = {name: size**2 * units[name] * value for name, value in solution.numbers.items()}
-        return Found(matrices, numbers, solution.status, 0.0)
+        return Found(matrices, numbers, 0.0)
 
 
 def refined(frames: Frames, found: Found) -> Frames:
