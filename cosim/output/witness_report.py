@@ -1,6 +1,6 @@
 """What the checker has proven of a scenario, as a table."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 from flint import arb
 from rich.console import Console
@@ -20,10 +20,10 @@ def print_witnesses(console: Console, witnesses: Witnesses) -> None:
     """Print the bounds that were proven, and why there are no others."""
     if (table := witness_table(witnesses)) is not None:
         console.print(terminal_table(table))
+        limit = " In the limit: for t → ∞, from any start." if _limits(_proofs(witnesses)) else ""
         console.print(
             "[dim]noack-check has derived the loop from the scenario, and verified these bounds in ball "
-            "arithmetic. The bounds are multiplied by e^(−rate·t); those without decay are added. In the "
-            "limit: for t → ∞, from any start.[/]"
+            f"arithmetic. The bounds are multiplied by e^(−rate·t); those without decay are added.{limit}[/]"
         )
     for statement in witnesses.statements:
         if statement.proof is None:
@@ -43,19 +43,27 @@ def witness_table(witnesses: Witnesses) -> ResultTable | None:
         rows.append([f"bound of {symbol}", *(NONE if b is None else at_most(b.decaying) for b in bounds)])
         if any(b is not None and b.constant != 0 for b in bounds):
             rows.append(["+ without decay", *(NONE if b is None else at_most(b.constant) for b in bounds)])
-    rows += _limits([proof for _, proof in proven])
+    rows += _limits(_proofs(witnesses))
     rows.append(["inter-event time, s", *(_time(proof.inter_event) for _, proof in proven)])
     if any(proof.first_event != proof.inter_event for _, proof in proven):
         rows.append(["the first one, s", *(_time(proof.first_event) for _, proof in proven)])
     return ResultTable("proven", f"{witnesses.scenario['name']}: proven bounds", headings, rows)
 
 
-def _limits(proofs: Sequence[Proof]) -> Iterator[list[str]]:
-    """Yield a row for each output that has a bound in the limit t → ∞."""
+def _proofs(witnesses: Witnesses) -> list[Proof]:
+    return [statement.proof for statement in witnesses.statements if statement.proof is not None]
+
+
+def _limits(proofs: Sequence[Proof]) -> list[list[str]]:
+    """Return a row for each output that has a bound in the limit t → ∞."""
     limits = [{b.output: b.constant for b in proof.bounds if not b.from_start} for proof in proofs]
-    for output in dict.fromkeys(name for each in limits for name in each):
-        cells = [at_most(each[output]) if output in each else NONE for each in limits]
-        yield [f"bound of {norm(output)} in the limit", *cells]
+    return [
+        [
+            f"bound of {norm(output)} in the limit",
+            *(at_most(each[output]) if output in each else NONE for each in limits),
+        ]
+        for output in dict.fromkeys(name for each in limits for name in each)
+    ]
 
 
 def _time(least: arb | None) -> str:

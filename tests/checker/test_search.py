@@ -135,3 +135,10 @@ def test_the_reason_is_the_number_of_events_if_it_is_too_large() -> None:
     times = IDEAL._replace(sampling=fmpq(1, 100), least_sampling=fmpq(1, 100), delay=fmpq(1, 10))
     with pytest.raises(NoWitnessError, match=r"^9 events may happen while an update is on its way: at most"):
         find_witness(relative(0.1)._replace(times=times))
+
+
+def test_a_problem_that_would_take_minutes_is_not_begun() -> None:
+    effort = Effort(lambda share: None)
+    effort.add("x", 1.0)
+    with pytest.raises(WorkLimitError, match="drift: its inequalities are too large for the search"):
+        effort.add("drift", 9.0)

@@ -4,6 +4,8 @@ from collections.abc import Callable
 
 MOST_WORK = 60.0
 """A search ends after so many 10⁹ products per step of the solver: some minutes."""
+_MOST_PER_PROBLEM = 8.0
+"""A larger problem takes minutes, and seldom ends well: those of the F-16 under its schedule are 12 to 14."""
 _LAST_SHARE = 0.99
 
 
@@ -35,8 +37,10 @@ class Effort:
         """Count the next problem.
 
         Raises:
-            WorkLimitError: it is one too many.
+            WorkLimitError: it is one too many, or too large.
         """
+        if work > _MOST_PER_PROBLEM:
+            raise WorkLimitError(f"{output}: its inequalities are too large for the search")
         if self._work + work > self._most_work:
             raise WorkLimitError(
                 f"{output}: the search ended after {self._problems} problems, at its limit of work"
