@@ -172,7 +172,7 @@ def _cost_under(resolved: Scenario, periods: LoopPeriods, guarantee: LossGuarant
     outcomes = loss_process(resolved.network.link).outcomes(guarantee)
     if resolved.network.initial_sync == "known_state":  # nothing is sent at t = 0
         outcomes = outcomes.after_pause()
-    moments, start = LoopMoments(periods, outcomes), start_of(resolved, outcomes)
+    moments, start = LoopMoments(periods, outcomes), start_of(resolved, outcomes, periods.size)
     n, m = resolved.model.dimensions[:2]
     whole_cost = n + m  # the number of the last form
 
@@ -189,7 +189,7 @@ def _cost_under(resolved: Scenario, periods: LoopPeriods, guarantee: LossGuarant
     horizon_cost: float | None = None
     horizon = resolved.timing.horizon_ns * periods.times.parts
     with suppress(NotPredictableError):  # there are too many periods
-        horizon_cost = float(moments.until(start, horizon)[1][whole_cost])
+        horizon_cost = float(moments.from_start(start, horizon)[1][whole_cost])
     transient = moments.of_cost(whole_cost).transient(start)
     return CostUnder(
         guarantee.meaning,

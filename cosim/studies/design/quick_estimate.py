@@ -38,7 +38,9 @@ class _Map(NamedTuple):
 
 
 class QuickLoop:
-    """A loop of the times of :class:`TimeTriggeredLoop`, with (x, x_c, u, w) as its state.
+    """A loop of the times of :class:`TimeTriggeredLoop`, with (x, x_c, u, w, older x) as its state.
+
+    The older x are those of the transmissions before whose updates are on their way.
 
     Args:
         matrices: A, (n, n), B, (n, m), K, (m, n), and H, (n, n).
@@ -54,18 +56,23 @@ class QuickLoop:
     ) -> None:
         A, B, K, H = matrices
         n, m = B.shape
-        self.times, self._m, size = times, m, 2 * (n + m)
-        x, x_c, u, w = np.split(np.eye(size), [n, 2 * n, 2 * n + m])
+        self.times, self._first_older = times, 2 * (n + m)
+        sizes = np.cumsum([n, n, m, m, *[n] * times.behind])
+        size = sizes[-1]
+        x, x_c, u, w, *older = np.split(np.eye(size), sizes[:-1])
+        sent = [x, *older]
         self._generator = x.T @ A @ x + x_c.T @ H @ x_c + x.T @ B @ u
         self._weight = x.T @ weights[0] @ x + u.T @ weights[1] @ u
         without_update = w if times.holds_input else 0 * w
         occurrences = [(x, x_c, w, w), (x, x_c, u, K @ x_c), (x, x_c, u, without_update)]
-        steps = (_Map(np.vstack(rows), np.zeros((size, size))) for rows in occurrences)
+        steps = (_Map(np.vstack([*rows, *older]), np.zeros((size, size))) for rows in occurrences)
         self._between = Timeline(times, self._exponential, *steps).between
-        self._x_c, self._arrived = slice(n, 2 * n), expm(H * times.seconds(times.delay)) @ x
+        self._x_c, self._arrived = slice(n, 2 * n), expm(H * times.seconds(times.whole_delay)) @ sent[-1]
+        self._shifted = np.vstack([np.zeros((0, size)), *sent[:-1]])
+        self._none = _Map(np.eye(size), np.zeros((size, size)))
         self._lost, self._delivered = cache(self._lost_period), cache(self._delivered_period)
         self._z = np.eye(size), np.eye(size)
-        if not times.delay:  # just after a delivery x_c = x and w = u
+        if not times.whole_delay:  # just after a delivery x_c = x and w = u
             self._z = np.vstack([x, u]), np.vstack([x, x, u, u]) @ np.vstack([x, u]).T
 
     def _exponential(self, dt: int) -> _Map:
@@ -77,33 +84,47 @@ class QuickLoop:
         return _Map(M, M.T @ exponential[:n, n:])
 
     def _lost_period(self, slot: int, usable: int) -> _Map:
-        """Return the map of a period whose update is lost; x_c is used for some time."""
+        """Return the map of a period without an arrival; x_c is used for some time."""
         begin = slot * self.times.period
-        return self._between(begin, begin + self.times.period, begin + usable)
+        return self._shift(self._between(begin, begin + self.times.period, begin + usable))
 
     def _delivered_period(self, slot: int, usable: int) -> _Map:
-        """Return the map of a period whose update is delivered; x_c before it is used for some time."""
+        """Return the map of a period with an arrival; x_c before it is used for some time."""
         begin = slot * self.times.period
         end, arrival = begin + self.times.period, begin + self.times.delay
         first = self._between(begin, arrival, begin + usable)
         second = self._between(arrival, end, begin + self.times.timeout)
         M = first.M.copy()
         M[self._x_c] = self._arrived
-        return _Map(M, first.C).then(second)
+        return self._shift(_Map(M, first.C).then(second))
+
+    def _shift(self, period: _Map) -> _Map:
+        """Return a period at whose end each older x is that of one transmission later."""
+        M = period.M.copy()
+        M[self._first_older :] = self._shifted
+        return _Map(M, period.C)
 
     def cost(self, x0: Vector) -> float:
         """Return ∫ xᵀQx + uᵀRu dt from x(0) with every update delivered; infinite if unstable.
 
         The controller knows x(0), and the input is 0 until its first tick.
         """
-        usable = self.times.usable(1, self.times.delay)
-        round_map = self._delivered(0, usable)
-        for slot in range(1, self.times.slots):
-            round_map = round_map.then(self._delivered(slot, usable))
-        if not np.isfinite([round_map.M, round_map.C]).all() or not spectral_radii(round_map.M) < 1 - 1e-9:
+        times = self.times
+        usable = times.usable(1, times.delay)
+        before = reduce(
+            _Map.then,
+            (self._lost(slot % times.slots, times.period) for slot in range(times.behind)),
+            self._none,
+        )
+        slots = range(times.behind, times.behind + times.slots)
+        whole = reduce(_Map.then, (self._delivered(slot % times.slots, usable) for slot in slots))
+        if not np.isfinite([whole.M, whole.C]).all() or not spectral_radii(whole.M) < 1 - 1e-9:
             return np.inf
-        z0 = np.concatenate([x0, x0, np.zeros(2 * self._m)])
-        return float(z0 @ solve_discrete_lyapunov(round_map.M.T, round_map.C) @ z0)
+        z0 = np.zeros(len(whole.M))
+        z0[: 2 * len(x0)] = np.tile(x0, 2)
+        first = before.M @ z0
+        later = first @ solve_discrete_lyapunov(whole.M.T, whole.C) @ first
+        return float(z0 @ before.C @ z0 + later)
 
     def maps(self, bursts: Sequence[Burst]) -> Matrix:
         """Return the maps of bursts between two deliveries, (k, d, d)."""

@@ -230,7 +230,8 @@ class LossMargin:
         self.loop = TimeTriggeredLoop(loop.A, loop.B, loop.K, loop.H, times)
         # A controller that knows x(0) gets its first update after a period.
         knows_start = resolved.network.initial_sync == "known_state"
-        self._first_slot = int(knows_start) % self.loop.times.slots
+        # Where updates are on their way for several periods, the first one arrives so much later.
+        self._first_slot = (int(knows_start) + times.behind) % times.slots
         self.maps: Callable[[int, int, int], IntervalMatrix] = cache(self.loop.map)
         """The loop's maps by slot, use of the update before, and number of lost updates."""
 

@@ -18,6 +18,8 @@ from noack.scenario.scenario import Scenario
 from noack.theory.coverage import require_exact
 from noack.theory.margins.time_triggered_loop import NEVER, LoopTimes
 
+_MOST_ON_THEIR_WAY = 40
+"""Most updates on their way at once, times the number of states: the size of what is followed."""
 _WITHOUT_DELAY = ("loss", "corrupt", "blackout", "duplicate")
 """Kinds of impairments that do not change the delay of a packet."""
 
@@ -78,11 +80,13 @@ def intervals(resolved: Scenario) -> tuple[int, int]:
 def loop_times(resolved: Scenario, measurements: int) -> LoopTimes:
     """Return the times of a loop with an update after so many measurements, or at multiples of it.
 
+    An update may be on its way for several such times.
+
     Runs round times to nanoseconds, down or up so that what is at one time stays in its order
     (:mod:`noack.core.periods`). Here nothing is rounded.
 
     Raises:
-        CallerError: the delay of the updates is longer.
+        CallerError: too many updates are on their way, or they become too old on it.
     """
     timing = resolved.timing
     periods = timing.plant_period, timing.controller_period, timing.measurement_period.times(measurements)
@@ -93,12 +97,8 @@ def loop_times(resolved: Scenario, measurements: int) -> LoopTimes:
         timeout = Fraction(timing.update_timeout_ns) if timing.has_whole_periods else exact_ns(timeout_s)
     if not timing.has_whole_periods:
         phase = simplest_fraction(resolved.controller.phase) * tick
-    if delay >= unit:
-        pair = "two measurements" if measurements == 1 else "two updates"
-        raise CallerError(
-            f"network.impairments: a delay of {float(delay / NS_PER_S):g} s; expected less "
-            f"than the period between {pair}, {periods[-1].seconds:g} s"
-        )
+    behind = int(delay // unit)
+    _require_few_on_their_way(resolved, float(delay / NS_PER_S), periods[-1].seconds, behind)
     parts = math.lcm(*(time.denominator for time in (step, tick, unit, phase, delay, timeout)))
 
     def whole(time_ns: Fraction) -> int:
@@ -109,11 +109,27 @@ def loop_times(resolved: Scenario, measurements: int) -> LoopTimes:
         whole(tick),
         whole(phase),
         whole(unit),
-        whole(delay),
+        whole(delay - behind * unit),
         NEVER if timeout_s is None else whole(timeout),
         resolved.controller.timeout_input == "hold",
         parts,
+        behind,
     )
+
+
+def _require_few_on_their_way(resolved: Scenario, delay_s: float, period_s: float, behind: int) -> None:
+    """Raise CallerError unless a delay of some periods, rounded down, is covered."""
+    most = _MOST_ON_THEIR_WAY // resolved.model.dimensions[0]
+    if behind > most:
+        raise CallerError(
+            f"network.impairments: a delay of {delay_s:g} s is {behind} periods of {period_s:g} s; "
+            f"a loop of this size is followed for at most {most}"
+        )
+    if behind and resolved.controller.update_timeout_s is not None:
+        raise CallerError(
+            f"controller.update_timeout_s: not covered with a delay of {delay_s:g} s, which is longer than "
+            f"the {period_s:g} s between two updates"
+        )
 
 
 def update_delay_ns(resolved: Scenario) -> Fraction:

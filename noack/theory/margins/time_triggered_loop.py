@@ -13,7 +13,8 @@ A delivered update removes all knowledge of older ones. So the state of the loop
 delivery, if d = 0, is z = (x, u): x_c = x and w = u there. If 0 < d < T, z is the state at the
 time of the transmission, (x, x_c); there u is K e^{−Hδ} x_c for the last tick, δ ago, unless there
 may be no tick since the last arrival, or Θ is finite; then z = (x, x_c, u), and the map depends on
-how much longer x_c may be used.
+how much longer x_c may be used. If d ≥ T, z has, too, the x of the ⌊d/T⌋ transmissions before, whose
+updates are on their way, and "delivered" is said at the transmission before which an update arrives.
 """
 
 import math
@@ -43,13 +44,15 @@ class LoopTimes(NamedTuple):
     period: int
     """T, between two transmissions; a multiple of h."""
     delay: int
-    """d, of an update; below T."""
+    """d, of an update, or what is left of it after whole periods; below T."""
     timeout: int = NEVER
     """Θ, from the time of the newest update on."""
     holds_input: bool = False
     """Whether w is then sent once more; else it is 0."""
     parts: int = 1
     """Number of parts of a nanosecond."""
+    behind: int = 0
+    """⌊d/T⌋: so many further transmissions happen while an update is on its way."""
 
     def seconds(self, duration: int) -> float:
         """Return a time in seconds."""
@@ -58,6 +61,11 @@ class LoopTimes(NamedTuple):
     def usable(self, periods: int, most: int) -> int:
         """Return how much longer, up to some time, an update is used that is some periods old."""
         return min(max(self.timeout - periods * self.period, 0), most)
+
+    @property
+    def whole_delay(self) -> int:
+        """d, of an update."""
+        return self.behind * self.period + self.delay
 
     @property
     def slots(self) -> int:
@@ -164,25 +172,29 @@ class TimeTriggeredLoop:
         generator[:n, 2 * n : 2 * n + m] = B
         x, x_c, u, w = np.split(np.eye(size), [n, 2 * n, 2 * n + m])
         self._x, self._x_c, self._K = slice(n), slice(n, 2 * n), fixed(K)
-        self._inputs = slice(2 * n, size)
+        self._inputs, self._loop = slice(2 * n, size), slice(size)
+        self._older = [slice(size + i * n, size + (i + 1) * n) for i in range(times.behind)]
+        """x of the transmissions before, the newest one first."""
         without_update = w if times.holds_input else 0 * w
         occurrences = [(x, x_c, w, w), (x, x_c, u, K @ x_c), (x, x_c, u, without_update)]
-        self._start = fixed(np.eye(size))
+        whole = size + n * times.behind
+        self._start = fixed(np.eye(whole))
         self._between = Timeline(
             times,
             lambda dt: exponential(generator, dt, times.parts),
             *(fixed(np.vstack(rows)) for rows in occurrences),
         ).between
         self._states: dict[tuple[int, int], list[FixedPointMatrix]] = {}
-        """States by slot and use of x_c: (x, x_c, u, w) after 1, 2, … periods, as functions of z."""
+        """States by slot and use of x_c after 1, 2, … periods, as functions of z."""
         since = [times.since_tick(k * times.period) for k in range(times.slots)]
         follows = max(since) <= times.period - times.delay and times.timeout == NEVER
-        if times.delay == 0:
+        self._has_new_x_c = times.whole_delay == 0
+        if self._has_new_x_c:
             self._kept = [*range(n), *range(2 * n, 2 * n + m)]  # x, u
-        else:
-            self._kept = [*range(2 * n if follows else 2 * n + m)]  # x, x_c and perhaps u
-        self.dimension = len(self._kept)
-        rows = np.vstack([of_x, of_x, of_u, of_u])[self._kept]
+        else:  # x, x_c and perhaps u, and what is on its way
+            self._kept = [*range(2 * n if follows else 2 * n + m), *range(size, whole)]
+        self._follows, self.dimension = follows, len(self._kept)
+        rows = np.vstack([of_x, of_x, of_u, of_u, *[of_x] * times.behind])[self._kept]
         self._given_units = rows.T - rows
 
     def map(self, slot: int, usable: int, losses: int) -> IntervalMatrix:
@@ -196,21 +208,21 @@ class TimeTriggeredLoop:
         return self._state_after(slot, usable, losses).rows(self._kept).interval().scaled(self._given_units)
 
     def period(self, slot: int, is_delivered: bool) -> IntervalMatrix:
-        """Return the map of (x, x_c, u, w), in units of its own, from one transmission to the next.
+        """Return the map of the state, in units of its own, from one transmission to the next.
+
+        The state is (x, x_c, u, w) with the x of the transmissions before whose updates are on their way.
 
         Updates are used without a limit of time.
 
         Args:
             slot: number of the first transmission, modulo the number of slots.
-            is_delivered: whether its update arrives.
+            is_delivered: whether an update arrives before the next one.
 
         Raises:
             OverflowError: an entry is beyond double precision.
         """
-        begin = slot * self.times.period
-        if is_delivered:
-            return self._updated(self._start, begin, NEVER, NEVER).interval()
-        return self._between(begin, begin + self.times.period).interval()
+        arrival = self.times.delay if is_delivered else None
+        return self._next(self._start, slot * self.times.period, arrival, NEVER, NEVER).interval()
 
     def _state_after(self, slot: int, usable: int, losses: int) -> FixedPointMatrix:
         period = self.times.period
@@ -219,32 +231,44 @@ class TimeTriggeredLoop:
         while len(states) <= losses:
             begin = (slot + len(states)) * period
             if states:
-                states.append(self._between(begin, begin + period, timeout) @ states[-1])
+                states.append(self._next(states[-1], begin, None, timeout, timeout))
             else:
-                state = self._state(begin)
-                states.append(self._updated(state, begin, begin + usable, timeout))
+                first = self._state(begin)
+                states.append(self._next(first, begin, self.times.delay, begin + usable, timeout))
         return states[losses]
 
-    def _updated(
-        self, state: FixedPointMatrix, begin: int, old_timeout: int, timeout: int
+    def _next(
+        self, state: FixedPointMatrix, begin: int, delay: int | None, old_timeout: int, timeout: int
     ) -> FixedPointMatrix:
-        """Return the state a period after the transmission of a delivered update."""
-        end = begin + self.times.period
-        # Until the update arrives, x_c is that of older ones.
-        sent, arrival = state.rows(self._x), begin + self.times.delay
-        state = self._between(begin, arrival, old_timeout) @ state
-        updated = exponential(self._H, self.times.delay, self.times.parts) @ sent
-        state = stacked(state.rows(self._x), updated, state.rows(self._inputs))
-        return self._between(arrival, end, timeout) @ state
+        """Return the state a period after a transmission.
+
+        Args:
+            state: that at the transmission.
+            begin: time of the transmission.
+            delay: time until an update arrives; None: none does.
+            old_timeout: time from which on x_c is too old until then.
+            timeout: the same, afterwards.
+        """
+        end, sent = begin + self.times.period, [state.rows(part) for part in (self._x, *self._older)]
+        loop, arrival = state.rows(self._loop), begin
+        if delay is not None:
+            arrival += delay
+            loop = self._between(begin, arrival, old_timeout) @ loop
+            updated = exponential(self._H, self.times.whole_delay, self.times.parts) @ sent[-1]
+            loop = stacked(loop.rows(self._x), updated, loop.rows(self._inputs))
+        return stacked(self._between(arrival, end, timeout) @ loop, *sent[:-1])
 
     def _state(self, t: int) -> FixedPointMatrix:
-        """Return (x, x_c, u, w) as a function of z at a transmission."""
+        """Return the state as a function of z at a transmission."""
         z, n = fixed(np.eye(self.dimension)), self._x.stop
-        if self.times.delay == 0:
+        if self._has_new_x_c:
             x, u = z.rows(slice(n)), z.rows(slice(n, None))
             return stacked(x, x, u, u)
-        if self.dimension > 2 * n:
-            return stacked(z, z.rows(slice(2 * n, None)))
-        since = self.times.since_tick(t)
-        u = self._K @ exponential(-self._H, since, self.times.parts) @ z.rows(self._x_c)
-        return stacked(z, u, u)
+        known = self.dimension - n * self.times.behind
+        x_and_x_c, older = z.rows(slice(2 * n)), z.rows(slice(known, None))
+        if self._follows:
+            since = self.times.since_tick(t)
+            u = self._K @ exponential(-self._H, since, self.times.parts) @ z.rows(self._x_c)
+        else:
+            u = z.rows(slice(2 * n, known))
+        return stacked(x_and_x_c, u, u, older)

@@ -1,7 +1,8 @@
 """Second moments and quadratic cost of a time-triggered loop under random losses, not bounded but computed.
 
 From one transmission to the next, z = (x, x_c, u, w) becomes M₀z + v₀ if the update is delivered
-and M₁z + v₁ if it is lost. v has the covariance W₀ or W₁ of what the disturbances and the noise of
+and M₁z + v₁ if it is lost. With delays of several periods z has what the sensor measured at the
+transmissions before, too, and the update is the one that arrives. v has the covariance W₀ or W₁ of what the disturbances and the noise of
 the measurement add; it is independent of z and of the losses. With the outcomes L_ij and P_ij and
 the probability π_i of the state i (:mod:`noack.theory.random_losses.mean_square_growth`),
 
@@ -129,7 +130,7 @@ class SecondMoments(NamedTuple):
 
 
 class LoopPeriods:
-    """The periods of a loop, of which each is a ``MomentStep`` of z = (x, x_c, u, w).
+    """The periods of a loop, of which each is a ``MomentStep`` of z = (x, x_c, u, w, older states).
 
     Args:
         loop: the loop's matrices.
@@ -142,43 +143,52 @@ class LoopPeriods:
     def __init__(
         self, loop: LoopMatrices, times: LoopTimes, disturbance: Matrix, noise: Matrix, forms: Stack
     ) -> None:
-        n, m = loop.n, loop.m
-        # The states are (x, x_c, u, w), the held disturbance d, and the state s in flight.
-        sizes = np.cumsum([n, n, m, m, n])
-        x, x_c, u, w, d, s = np.split(np.eye(4 * n + 2 * m), sizes)
-        self.times, self.size = times, 2 * (n + m)
+        n, m, behind = loop.n, loop.m, times.behind
+        # z, the held disturbance d, and the measurements on their way, the newest one first.
+        sizes = np.cumsum([n, n, m, m, *[n] * behind, n])
+        x, x_c, u, w, *older, d, newest = np.split(np.eye(sizes[-1] + n), sizes)
+        nothing, loop_rows, sent = 0 * d, [x, x_c, u, w], [newest, *older]
+        self.times, self.size = times, 2 * (n + m) + behind * n
         generator = x.T @ (loop.A @ x + loop.B @ u + d) + x_c.T @ (loop.H @ x_c)
         xu = np.vstack([x, u])
         forms = np.einsum("ia,kij,jb->kab", xu, forms, xu, optimize=True)
-        count, fresh, nothing = len(forms), d.T @ disturbance @ d, 0 * d
-        self._fresh = jump(np.vstack([x, x_c, u, w, nothing, s]), count, fresh)
-        latch = jump(np.vstack([x, x_c, w, w, nothing, s]), count, fresh)
-        tick = jump(np.vstack([x, x_c, u, loop.K @ x_c, d, s]), count)
+        count, fresh = len(forms), d.T @ disturbance @ d
+
+        def change(rows: Sequence[Matrix], held: Matrix = d, noise: Matrix | None = None) -> MomentStep:
+            return jump(np.vstack([*rows, *older, held, newest]), count, noise)
+
+        self._fresh = change(loop_rows, nothing, fresh)
+        latch, tick = change([x, x_c, w, w], nothing, fresh), change([x, x_c, u, loop.K @ x_c])
 
         def flow_of(dt: int) -> MomentStep:
             return propagation(generator, 0 * generator, forms, times.seconds(dt))
 
         self._between = Timeline(times, flow_of, latch, tick, tick).between
-        self._send = jump(np.vstack([x, x_c, u, w, d, x]), count, s.T @ noise @ s)
-        delay_s = times.seconds(times.delay)
-        during_delay = propagation(loop.H, 0 * loop.H, np.zeros((0, n, n)), delay_s).matrix
-        self._receive = jump(np.vstack([x, during_delay @ s, u, w, d, s]), count)
+        measured = np.vstack([*loop_rows, *older, d, x])
+        self._send = jump(measured, count, newest.T @ noise @ newest)
+        during_delay = propagation(
+            loop.H, 0 * loop.H, np.zeros((0, n, n)), times.seconds(times.whole_delay)
+        ).matrix
+        self._receive = change([x, during_delay @ sent[-1], u, w])
+        self._shift = jump(np.vstack([*loop_rows, *sent[:-1], d, newest]), count)
 
     def step(self, slot: int, delivered: bool, duration: int | None = None) -> MomentStep:
         """Return a period, or its first part, from just before its transmission.
 
         Args:
             slot: number of the transmission, modulo the number of slots.
-            delivered: whether its update arrives.
+            delivered: whether the update arrives that is due in this period.
             duration: length of this part; by default the period.
         """
         begin, duration = slot * self.times.period, duration or self.times.period
         end, arrival = begin + duration, begin + self.times.delay
-        if not delivered or arrival > end:
-            return self._fresh.then(self._between(begin, end)).of_states(range(self.size))
-        sent = self._fresh.then(self._send).then(self._between(begin, arrival))
-        received = sent.then(self._receive).then(self._between(arrival, end))
-        return received.of_states(range(self.size))
+        part = self._fresh.then(self._send)
+        if delivered and arrival <= end:
+            part = part.then(self._between(begin, arrival)).then(self._receive)
+            part = part.then(self._between(arrival, end))
+        else:
+            part = part.then(self._between(begin, end))
+        return part.then(self._shift).of_states(range(self.size))
 
 
 class LoopMoments:
@@ -207,7 +217,10 @@ class LoopMoments:
         self.growth = mean_square_growth(maps, outcomes)
         """Of √E‖z‖² per period."""
 
-    def _step(self, slot: int, *, delivered: bool, duration: int | None = None) -> MomentStep:
+    def _step(self, number: int, *, delivered: bool, duration: int | None = None) -> MomentStep:
+        """Return a period; number 0 is the first one in which an update may arrive."""
+        times = self._periods.times
+        slot = (number + times.behind) % times.slots
         return self._periods.step(slot, delivered, duration).of_states(self.states)
 
     @cached_method
@@ -260,12 +273,45 @@ class LoopMoments:
         if self.growth >= 1:
             return None
         rows, columns = np.ix_(self.states, self.states)
-        moments = start.moments[:, rows, columns]
-        all_cycles = from_triangles(self._sum(triangles(moments)), len(self.states))
-        return self._cycle(SecondMoments(all_cycles, 0 * start.shares))[1]
+        first = SecondMoments(start.moments[:, rows, columns], 0 * start.shares)
+        first, costs = self._before_arrivals(first, self._before_first)
+        all_cycles = from_triangles(self._sum(triangles(first.moments)), len(self.states))
+        return costs + self._cycle(SecondMoments(all_cycles, 0 * start.shares))[1]
+
+    @property
+    def _before_first(self) -> int:
+        """Time from the first transmission to the beginning of the first period with an arrival."""
+        return self._periods.times.behind * self._periods.times.period
+
+    def _before_arrivals(self, start: SecondMoments, duration: int) -> tuple[SecondMoments, Vector]:
+        """Return the moments after a time before the first arrival, and the mean costs until then."""
+        times, current, costs = self._periods.times, start, np.zeros_like(self._slots[0][0].constants)
+        for number in range(-(-duration // times.period)):
+            part = min(duration - number * times.period, times.period)
+            step = self._step(number - times.behind, delivered=False, duration=part)
+            costs = costs + np.einsum("kab,jab->k", step.costs, current.moments)
+            costs = costs + current.shares.sum() * step.constants
+            moments = step.matrix @ current.moments @ step.matrix.T
+            current = current._replace(moments=moments + current.shares[:, None, None] * step.noise)
+        return current, costs
+
+    def from_start(self, start: SecondMoments, duration: int) -> tuple[SecondMoments, Vector]:
+        """Return the moments a time after the first transmission, and the mean costs until then.
+
+        Raises:
+            NotPredictableError: there are too many periods.
+        """
+        before = min(duration, self._before_first)
+        current, costs = self._before_arrivals(start, before)
+        if duration == before:
+            return current, costs
+        current, further = self.until(current, duration - before)
+        return current, costs + further
 
     def until(self, start: SecondMoments, duration: int) -> tuple[SecondMoments, Vector]:
         """Return the moments after a time, in the unit of the loop's, and the mean costs until then.
+
+        It starts with a period in which an update may arrive.
 
         Raises:
             NotPredictableError: there are too many periods.
@@ -367,10 +413,10 @@ def periods_of(resolved: Scenario, forms: Stack) -> LoopPeriods:
     return LoopPeriods(loop, times, disturbance, np.diag(noise.output), forms)
 
 
-def start_of(resolved: Scenario, outcomes: OutcomeChain) -> SecondMoments:
-    """Return the moments before the first packet: x = x(0), and the input is 0."""
+def start_of(resolved: Scenario, outcomes: OutcomeChain, size: int) -> SecondMoments:
+    """Return the moments of z, of this size, before the first packet: x = x(0), and the input is 0."""
     loop, n = loop_of(resolved), resolved.model.dimensions[0]
-    z = np.zeros(2 * (n + loop.m))
+    z = np.zeros(size)
     z[:n] = loop.x0
     if resolved.network.initial_sync == "known_state":
         z[n : 2 * n] = loop.x0

@@ -55,13 +55,23 @@ def patterns(packets: int, longest: int, forced: int) -> dict[tuple[bool, ...], 
 
 
 @pytest.mark.parametrize(
-    ("mode", "sync"), [("model", "first_packet"), ("zoh", "first_packet"), ("model", "known_state")]
+    ("mode", "sync", "delay_s"),
+    [
+        ("model", "first_packet", 0.03),
+        ("zoh", "first_packet", 0.03),
+        ("model", "known_state", 0.03),
+        ("zoh", "first_packet", 0.53),
+        ("model", "known_state", 0.28),
+        ("model", "first_packet", 1.35),
+    ],
 )
-def test_the_mean_cost_is_that_of_all_patterns_of_simulated_runs(mode: str, sync: str) -> None:
-    """With a delay, ticks that drift, and a horizon within a period: three slots."""
+def test_the_mean_cost_is_that_of_all_patterns_of_simulated_runs(
+    mode: str, sync: str, delay_s: float
+) -> None:
+    """With a delay, also of several periods, ticks that drift, and a horizon within a period: three slots."""
     constraint = {"kind": "at_most", "losses": 2, "window": 4}
     timing = {"mode": mode, "controller.rate_hz": 16.0, "horizon_s": 1.4}
-    always = {"mansd": 5, "initial_sync": sync, "impairments": [{"kind": "delay", "delay_s": 0.03}]}
+    always = {"mansd": 5, "initial_sync": sync, "impairments": [{"kind": "delay", "delay_s": delay_s}]}
     network = {**always, "loss": BURSTS, "constraints": [constraint]}
     cost = find_mean_cost(scenario(**timing, network=network)).with_guarantee
     mean, forced = 0.0, int(sync == "first_packet")

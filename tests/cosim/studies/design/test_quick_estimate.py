@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from cosim.analysis.mean_cost import CostUnder, find_mean_cost
 from cosim.studies.design.network_search import DesignRequest, NetworkSearch
 from cosim.studies.design.quick_estimate import PatternGraph
 from noack.scenario.resolution import resolve
@@ -17,7 +18,8 @@ def test_quick_bounds_are_those_of_the_exact_maps() -> None:
         (*settings, "controller.update_timeout_s=0.65", 'controller.timeout_input="hold"'),
         (*settings, "controller.update_timeout_s=0.62", "controller.phase=0.9"),
     ]
-    for more in ((), settings, (*settings, "mode=zoh"), *timeouts):
+    delayed = [tuple(text.replace("0.0333", f"{d_s}") for text in settings) for d_s in (0.7, 0.93)]
+    for more in ((), settings, (*settings, "mode=zoh"), *timeouts, *delayed):
         given = shipped("double_integrator", *more)
         search = NetworkSearch(given, DesignRequest(period_s=0.31))
         exact = LossMargin(resolve(search.scenario))
@@ -30,3 +32,16 @@ def test_quick_bounds_are_those_of_the_exact_maps() -> None:
         lower = np.exp(PatternGraph(bursts).growth(quick))
         assert lower <= stability.upper
         assert lower == pytest.approx(stability.lower, rel=2e-2)
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.2, 0.7])
+def test_the_cost_without_losses_is_the_exact_one(delay_s: float) -> None:
+    settings = (
+        f"network.impairments=[{{kind='delay', delay_s={delay_s}}}]",
+        "network.loss={model='lossless'}",
+    )
+    given = shipped("double_integrator", *settings, "network.mansd=0", "network.initial_sync=known_state")
+    search = NetworkSearch(given, DesignRequest(period_s=0.31))
+    exact = find_mean_cost(resolve(search.scenario)).with_guarantee
+    assert isinstance(exact, CostUnder)
+    assert search.cost(search.given_gain) == pytest.approx(exact.transient_cost, rel=1e-6)

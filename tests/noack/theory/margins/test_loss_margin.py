@@ -73,13 +73,18 @@ def scenario(name: str, *settings: str) -> Scenario:
         ("double_integrator", (*at(30.0, 30.0, 4), *timeout(8 / 30), late(2 / 30), "horizon_s=20")),
         ("double_integrator", (*at(30.0, 90.0, 4), *timeout(17 / 90), HOLDS)),
         ("double_integrator", (*at(3.0, 30.0, 1), "plant.watchdog.timeout_s=2", "horizon_s=30")),
+        # Delays of several periods.
+        ("double_integrator", (late(0.2324),)),
+        ("double_integrator", ("mode=zoh", late(0.1), at(100.0, 100.0, 5)[2])),
+        ("lane_following", ("controller.phase=0", "controller.rate_hz=125", late(0.31))),
+        ("lane_following", (*at(90.0, 120.0, 9), "controller.phase=0", late(0.2))),
     ],
 )
 def test_maps_are_those_of_a_simulated_run(name: str, settings: Sequence[str]) -> None:
     resolved = scenario(name, "horizon_s=6", *settings)
     margin, loop = LossMargin(resolved), loop_of(resolved)
     times = margin.loop.times
-    delay_ns = times.delay // times.parts
+    delay_ns, behind = times.whole_delay // times.parts, times.behind
     fates = np.random.default_rng(1).random(1000) < 0.5
     fates[0] = True
     numbers = iter(range(1000))
@@ -91,22 +96,26 @@ def test_maps_are_those_of_a_simulated_run(name: str, settings: Sequence[str]) -
     delivered = np.flatnonzero(fates[: len(sent_ns)])
     assert len(delivered) > 15
 
-    def state(number: int, before: int) -> Vector:
-        step = steps[np.searchsorted(steps["t_ns"], sent_ns[number])]
+    def state(number: int, newest: int) -> Vector:
+        """Return z at a transmission, at which x_c is that of an update."""
+        step, *older = (steps[np.searchsorted(steps["t_ns"], sent_ns[number - i])] for i in range(behind + 1))
         if not delay_ns:
             return np.concatenate([step["x"], step["u"]])
-        older = steps[np.searchsorted(steps["t_ns"], sent_ns[before])]
-        x_c = expm(loop.H * (sent_ns[number] - sent_ns[before]) * 1e-9) @ older["x"]
-        return np.concatenate([step["x"], x_c, step["u"]])[: margin.loop.dimension]
+        used = steps[np.searchsorted(steps["t_ns"], sent_ns[newest])]
+        x_c = expm(loop.H * (sent_ns[number] - sent_ns[newest]) * 1e-9) @ used["x"]
+        loop_state = np.concatenate([step["x"], x_c, step["u"]])[: margin.loop.dimension - behind * loop.n]
+        return np.concatenate([loop_state, *(row["x"] for row in older)])
 
     slots = margin.loop.times.slots
     tolerance = 1e-11 if resolved.timing.has_whole_periods else 1e-7  # times are rounded there
+    delivered = delivered[delivered < len(sent_ns) - behind]
     for before, present, following in zip(delivered[1:], delivered[2:], delivered[3:], strict=False):
         usable = times.usable(int(present - before), times.delay)
-        map_ = margin.loop.map(int(present % slots), usable, int(following - present - 1)).middle
-        expected = state(following, present)
+        slot = int((present + behind) % slots)
+        map_ = margin.loop.map(slot, usable, int(following - present - 1)).middle
+        expected = state(following + behind, present)
         np.testing.assert_allclose(
-            map_ @ state(present, before), expected, rtol=0, atol=tolerance * np.abs(expected).max()
+            map_ @ state(present + behind, before), expected, rtol=0, atol=tolerance * np.abs(expected).max()
         )
 
 
@@ -130,6 +139,17 @@ def test_the_margin_does_not_depend_on_the_unit_of_the_input() -> None:
         assert stability.pattern == expected.pattern
         assert stability.lower == pytest.approx(expected.lower, rel=1e-9)
         assert stability.upper == pytest.approx(expected.upper, rel=1e-3)
+
+
+@pytest.mark.parametrize(("gain", "verdict"), [(29.89, "stable"), (29.894, "destabilised")])
+def test_a_delay_of_ten_periods_has_the_known_limit(gain: float, verdict: str) -> None:
+    """x⁺ = x − kh x ten steps before is stable for k below 2 sin(π / 42) / h = 29.892 per second."""
+    settings = (
+        "mode=zoh", "model={A=[[0.0]], B=[[1.0]], gain=[[%r]]}" % -gain, "network.mansd=0", "horizon_s=6",
+        "plant={initial_state=[1.0], rate_hz=200.0}", "controller.rate_hz=200",
+        'trigger={policy="periodic", period_s=0.005}', late(0.045),
+    )  # fmt: skip
+    assert LossMargin(scenario("double_integrator", *settings)).stability().verdict == verdict
 
 
 def test_what_is_not_covered_is_refused_with_the_approved_line() -> None:

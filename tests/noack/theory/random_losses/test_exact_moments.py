@@ -100,16 +100,17 @@ def test_without_losses_the_moments_solve_a_lyapunov_equation() -> None:
     assert stationary[0].moments.sum(axis=0) == pytest.approx(expected, rel=1e-9, abs=1e-12)
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.07])
-def test_the_maps_with_all_rounding_contain_those_of_the_moments(delay: float) -> None:
+@pytest.mark.parametrize(("behind", "delay"), [(0, 0.0), (0, 0.07), (1, 0.0), (2, 0.07)])
+def test_the_maps_with_all_rounding_contain_those_of_the_moments(behind: int, delay: float) -> None:
     """Traces of products are the same in all units; the ticks drift against the transmissions."""
     given = scenario(network={"mansd": 2, "loss": BURSTS}, **{"controller.rate_hz": 16.0})
-    loop, times = loop_of(given), loop_times(given, 10)._replace(delay=round(delay * 1e9))
+    loop, times = loop_of(given), loop_times(given, 10)
+    times = times._replace(delay=round(delay * 1e9), behind=behind)
     nothing = np.zeros((2, 2))
     periods = LoopPeriods(loop, times, nothing, nothing, np.zeros((0, 3, 3)))
     exact = TimeTriggeredLoop(loop.A, loop.B, loop.K, loop.H, times)
     for slot, outcomes in product(range(times.slots), product([True, False], repeat=3)):
-        products = np.eye(6), exactly(np.eye(6))
+        products = np.eye(periods.size), exactly(np.eye(periods.size))
         for delivered in outcomes:
             enclosed = exact.period(slot, delivered)
             products = periods.step(slot, delivered).matrix @ products[0], enclosed @ products[1]
@@ -140,7 +141,7 @@ def test_many_periods_are_the_sum_of_few(guarantee: LossGuarantee) -> None:
     given = scenario(**NOISE, network={"mansd": 2, "loss": BURSTS}, **{"controller.rate_hz": 10.0})
     outcomes = loss_process(given.network.link).outcomes(guarantee)
     periods = periods_of(given, np.eye(3)[None])
-    moments, start = LoopMoments(periods, outcomes), start_of(given, outcomes)
+    moments, start = LoopMoments(periods, outcomes), start_of(given, outcomes, periods.size)
     few_ns, rest_ns = 8 * periods.times.slots * periods.times.period, 70_000_000
     many, costs = moments.until(start, 150 * few_ns + rest_ns)
     expected, expected_costs = start, np.zeros(1)
