@@ -2,9 +2,10 @@
 
 From one transmission to the next, z = (x, x_c, u, w) becomes M₀z + v₀ if the update is delivered
 and M₁z + v₁ if it is lost. With delays of several periods z has what the sensor measured at the
-transmissions before, too, and the update is the one that arrives. v has the covariance W₀ or W₁ of what the disturbances and the noise of
-the measurement add; it is independent of z and of the losses. With the outcomes L_ij and P_ij and
-the probability π_i of the state i (:mod:`noack.theory.random_losses.mean_square_growth`),
+transmissions before, too, and the update is the one that arrives. v has the covariance W₀ or W₁ of
+what the disturbances and the noise of the measurement add; it is independent of z and of the losses.
+With the outcomes L_ij and P_ij and the probability π_i of the state i
+(:mod:`noack.theory.random_losses.mean_square_growth`),
 
     X_j ← Σ_i L_ij (M₁ X_i M₁ᵀ + π_i W₁) + P_ij (M₀ X_i M₀ᵀ + π_i W₀).
 
