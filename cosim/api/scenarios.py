@@ -22,7 +22,7 @@ from noack.core.number_format import to_digits
 from noack.scenario.given_settings import given_settings, plain, plain_table
 from noack.scenario.matrix_files import matrices_of, model_of
 from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_file import completed_with, load_with
+from noack.scenario.scenario_file import completed_with, load_with, network_of
 from noack.settings.section import ReadTable, Table
 
 Source = Scenario | str | PathLike[str] | ReadTable
@@ -31,7 +31,9 @@ _NAMED = "settings: "
 """What stands before a key in a message about a setting."""
 
 
-def load(source: Source, settings: ReadTable | None = None) -> Scenario:
+def load(
+    source: Source, settings: ReadTable | None = None, *, network: str | PathLike[str] | None = None
+) -> Scenario:
     """Load a scenario.
 
     >>> import noack
@@ -45,15 +47,22 @@ def load(source: Source, settings: ReadTable | None = None) -> Scenario:
             ...}``. Relative file names in a table are relative to the working directory. A scenario
             is returned as it is.
         settings: values that replace the source's, as in :func:`with_settings`.
+        network: a file whose table ``[network]`` replaces the source's, before the settings: e.g. one
+            that :meth:`Measurement.write_network` wrote.
 
     Raises:
         NoackError: one line per mistake, each with key, value and remedy.
     """
+    given, table = given_settings(settings), None if network is None else network_of(Path(network))
     if isinstance(source, Scenario):
+        if table is not None:
+            source = load(source.model_dump(mode="json", exclude_none=True) | {"network": table})
         return with_settings(source, settings) if settings else source
     if isinstance(source, Mapping):
-        return completed_with(plain_table(source), given_settings(settings), Path("scenario"), _NAMED)
-    return load_with(find_shipped(str(source), "scenarios"), given_settings(settings), _NAMED)
+        content = plain_table(source) | ({} if table is None else {"network": table})
+        return completed_with(content, given, Path("scenario"), _NAMED)
+    path = None if network is None else Path(network)
+    return load_with(find_shipped(str(source), "scenarios"), given, _NAMED, network=path)
 
 
 def scenarios() -> dict[str, str]:

@@ -95,18 +95,20 @@ def find_scenario(name: str) -> Path:
     return find_shipped(name, "scenarios")
 
 
-def load_scenario(name: str, settings: Sequence[str] | None) -> "Scenario":
-    """Load a scenario given by path or name, with the values of ``--set``."""
+def load_scenario(name: str, settings: Sequence[str] | None, network: Path | None = None) -> "Scenario":
+    """Load a scenario given by path or name, with the network of a file and the values of ``--set``."""
     from noack.scenario.scenario_file import load
 
-    return load(find_scenario(name), settings or ())
+    return load(find_scenario(name), settings or (), network=network)
 
 
-def load_loop(name: str, settings: Sequence[str] | None, loop: str | None) -> "Scenario":
+def load_loop(
+    name: str, settings: Sequence[str] | None, loop: str | None, network: Path | None = None
+) -> "Scenario":
     """Load the scenario of one loop; of a scenario with several, that of the loop named."""
     from noack.scenario.resolution import loop_named
 
-    return loop_named(load_scenario(name, settings), loop)
+    return loop_named(load_scenario(name, settings, network), loop)
 
 
 def require_linux() -> None:
@@ -137,6 +139,14 @@ SetOption = Annotated[
         metavar="KEY=VALUE",
         help="Replace a value of the scenario, e.g. trigger.beta=0.3, or for short beta=0.3.",
         autocompletion=complete_settings,
+    ),
+]
+NetworkOption = Annotated[
+    Path | None,
+    Option(
+        "--network",
+        metavar="FILE",
+        help="Take the table [network] of this file, e.g. one of `noack measure TRACE --write FILE`.",
     ),
 ]
 RunArgument = Annotated[

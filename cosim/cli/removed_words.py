@@ -16,6 +16,7 @@ REMOVED: Mapping[str, str] = {
     "design --share": "compare event-triggered loops by a campaign",
     "design --window": "compare event-triggered loops by a campaign",
     "export --format fmu": "`noack netem` is a network between other programs",
+    "measure --for-scenario": "`--for SCENARIO`",
     "measure --listen": "`irtt client -o FILE`, then `noack measure FILE`",
     "record --invitation": "the folder of credentials of `noack record --listen`",
     "record --invite": "the folder of credentials of `noack record --listen`",

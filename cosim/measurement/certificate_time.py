@@ -76,9 +76,22 @@ class CertificateTime:
         """When a condition was first violated, None if never: a claim is void from then on."""
         return min((cause.first_s for cause in self.causes), default=None)
 
+    @property
+    def answer(self) -> str:
+        """Whether a certificate of the scenario covers the network as it was measured, and why not."""
+        reasons = [*self.certificates.values()]
+        if all(reasons):
+            why = f"no, because there is no certificate: {reasons[0]}"
+        elif self.causes:
+            first = min(self.causes, key=lambda cause: cause.first_s)
+            why = f"no, because {first.text} at worst; first violated at {first.first_s:.3f} s"
+        else:
+            why = "yes"
+        return f"{self.scenario}: certified on this network: {why}"
+
     def to_json(self) -> dict[str, object]:
         """Return all fields for JSON."""
-        return asdict(self) | {"first_s": self.first_s}
+        return asdict(self) | {"first_s": self.first_s, "answer": self.answer}
 
 
 def certificate_time(trace: PacketTrace, scenario: Scenario) -> CertificateTime:

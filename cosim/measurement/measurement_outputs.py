@@ -252,6 +252,7 @@ def void_remarks(void: CertificateTime | None) -> Iterator[str]:
         f"each packet counts as an update of {void.scenario}; a claim about a run is void from the "
         "first violation on"
     )
+    yield void.answer
 
 
 def write_page(

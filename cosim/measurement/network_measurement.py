@@ -314,7 +314,7 @@ class NetworkMeasurement:
         Raises:
             CallerError: the delays are not known.
         """
-        self.require_delays("a scenario's certificate (--for-scenario)")
+        self.require_delays("a scenario's certificate (--for)")
         return certificate_time(self.trace, scenario)
 
     @cached_property

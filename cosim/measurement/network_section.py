@@ -78,8 +78,8 @@ def _comment(measurement: NetworkMeasurement, form: Form) -> str:
     lines.append("mansd is not enforced, so that the network behaves as measured.")
     if measurement.is_outage.any():
         lines.append("mansd does not cover the outages; no certificate does.")
-    hint = "; the CSV belongs beside that file" if form == "trace" else ""
-    lines.append(f"To use it, put this section in a scenario file instead of its own [network]{hint}.")
+    hint = "; the CSV belongs beside it" if form == "trace" else ""
+    lines.append(f"To use it: noack run SCENARIO --network with this file{hint}.")
     return "".join(f"# {line}\n" for line in lines)
 
 

@@ -8,7 +8,7 @@ speed, ports and real-time settings of the file have no effect.
 
 import copy
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from os.path import commonprefix
 from pathlib import Path
@@ -23,7 +23,7 @@ from noack.scenario.overload import refuse_overload
 from noack.scenario.runtime_parameters import SHORT, full_key
 from noack.scenario.scenario import LOOP_NEEDS, PARTS, Scenario, parts_model, with_loop_tables
 from noack.scenario.scenario_checks import check_target_loss
-from noack.scenario.sections import DirectionSection
+from noack.scenario.sections import DirectionSection, NetworkSection
 from noack.scenario.toml_file import keys as known_keys
 from noack.scenario.toml_file import nearest_key
 from noack.settings.section import ReadTable, Table
@@ -36,18 +36,24 @@ MOST_RECORDED_BYTES = 2**28
 """Largest size of a run's scenario file, which includes the losses and delays read from files."""
 
 
-def load(path: Path, overrides: Iterable[str] = (), most_bytes: int = toml_file.MOST_BYTES) -> Scenario:
+def load(
+    path: Path,
+    overrides: Iterable[str] = (),
+    most_bytes: int = toml_file.MOST_BYTES,
+    network: Path | None = None,
+) -> Scenario:
     """Read and validate a scenario file.
 
     Args:
         path: the TOML file, or a run directory: its scenario has all that the run read from files.
         overrides: ``key=value`` settings that replace the file's, e.g. ``trigger.beta=0.3``.
         most_bytes: largest size of the file.
+        network: a file whose table ``[network]`` replaces the scenario's, before the overrides.
 
     Raises:
         CallerError: one line per mistake, each with file (or ``--set``), key, value and remedy.
     """
-    return load_with(path, [setting_of(override) for override in overrides], "--set ", most_bytes)
+    return load_with(path, [setting_of(override) for override in overrides], "--set ", most_bytes, network)
 
 
 def load_with(
@@ -55,11 +61,46 @@ def load_with(
     settings: Sequence[tuple[str, object]],
     named: str,
     most_bytes: int = toml_file.MOST_BYTES,
+    network: Path | None = None,
 ) -> Scenario:
     """Read a scenario file, or that of a run directory, as :func:`load` does; for ``settings`` see below."""
     if (recorded := path / "scenario.toml").is_file():
         path, most_bytes = recorded, MOST_RECORDED_BYTES
-    return completed_with(toml_file.read(path, Scenario, most_bytes), settings, path, named)
+    content = toml_file.read(path, Scenario, most_bytes)
+    if network is not None:
+        content["network"] = network_of(network)
+    return completed_with(content, settings, path, named)
+
+
+def network_of(path: Path) -> Table:
+    """Return the table ``[network]`` of a TOML file, with absolute names of the files in it.
+
+    `noack measure TRACE --write FILE` writes such a file; a scenario file has one, too.
+
+    Raises:
+        CallerError: the file cannot be read, or has no such table, or a wrong one.
+    """
+    table = toml_file.read(path, Scenario).get("network")
+    if not isinstance(table, dict):
+        raise CallerError(f"{path}: no table [network]; `noack measure TRACE --write FILE.toml` writes one")
+    section = toml_file.validated(NetworkSection, table, f"{path}: network")
+    for place, direction in section.directions.items():
+        _without_files(direction, path.parent, f"{path}: {place}")
+    folder = path.absolute().parent
+    return with_file_names(table, lambda name: str(folder / name))
+
+
+def with_file_names(table: ReadTable, rename: Callable[[str], str]) -> Table:
+    """Return a table of a network with other names of files, which are its keys ``file``, at any depth."""
+
+    def renamed(key: str, value: object) -> object:
+        if isinstance(value, dict):
+            return with_file_names(value, rename)
+        if isinstance(value, list):
+            return [renamed("", entry) for entry in value]
+        return rename(value) if key == "file" and isinstance(value, str) else value
+
+    return {key: renamed(key, value) for key, value in table.items()}
 
 
 def completed_with(

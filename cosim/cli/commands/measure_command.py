@@ -43,7 +43,7 @@ class ClockRelation(StrEnum):
             "with a page of figures",
         ),
         (
-            "noack measure rural_n8_10kmh --for-scenario lane_following",
+            "noack measure rural_n8_10kmh --for lane_following",
             "when its certificate is void",
         ),
         ("noack measure sent.json", "round trips that `irtt client -o sent.json` has measured"),
@@ -114,9 +114,11 @@ def measure(
     for_scenario: Annotated[
         str | None,
         Option(
+            "--for",
             metavar="SCENARIO",
             autocompletion=opt.complete_scenarios,
-            help="Report for which share of the time its certificate would have been void.",
+            help="Report for which share of the time its certificate would have been void, and whether "
+            "it is certified on this network.",
         ),
     ] = None,
     settings: opt.SetOption = None,
@@ -157,7 +159,7 @@ def measure(
         within,
     )
     if settings and for_scenario is None:
-        raise CallerError("--set: replaces a value of the scenario of --for-scenario; give one")
+        raise CallerError("--set: replaces a value of the scenario of --for; give one")
     scenario = None if for_scenario is None else opt.load_scenario(for_scenario, settings)
     if form is NetworkForm.MODEL and write is None:
         raise CallerError("--as model: is the form of --write; give its FILE.toml")

@@ -130,6 +130,7 @@ def new(
     file: Annotated[Path, Argument(metavar="FILE.toml", help="The scenario file to write.")],
     plant: Annotated[str, Option("--plant", metavar="PLANT", help="As for linearise.")],
     settings: opt.SetOption = None,
+    network: opt.NetworkOption = None,
     x0: Annotated[
         str | None,
         Option("--x0", help="The initial state x(0), e.g. 0.1,0,0.1,0; by default chosen."),
@@ -154,6 +155,7 @@ def new(
             file,
             initial_state=_numbers("--x0", x0),
             settings=_table(settings),
+            network=network,
             report=change,
         )
     result.save(file)

@@ -63,6 +63,7 @@ def run(
     context: typer.Context,
     scenario: opt.ScenarioArgument,
     settings: opt.SetOption = None,
+    network: opt.NetworkOption = None,
     runs: opt.RunsOption = DEFAULT_RUNS,
     live: opt.LiveOption = False,
     log_format: opt.LogFormatOption = LogFormat.TEXT,
@@ -78,7 +79,7 @@ def run(
     opt.require_linux()
     from cosim.cli.execute_run import run_processes
 
-    loaded = opt.load_scenario(scenario, settings)
+    loaded = opt.load_scenario(scenario, settings, network)
     return run_processes(
         loaded, runs, live=live, report=report, verbose=verbose, json=json,
         required=require or (), server=context.obj,
@@ -100,6 +101,7 @@ def run(
 def simulate(
     scenario: opt.ScenarioArgument,
     settings: opt.SetOption = None,
+    network: opt.NetworkOption = None,
     trigger: opt.TriggerOption = opt.TriggerMode.SAMPLED,
     runs: opt.RunsOption = DEFAULT_RUNS,
     require: opt.RequireOption = None,
@@ -117,7 +119,7 @@ def simulate(
     from cosim.live.monitoring.progress import error_console, simulation_bar
     from cosim.simulation.virtual_time import simulate_run
 
-    loaded = opt.load_scenario(scenario, settings)
+    loaded = opt.load_scenario(scenario, settings, network)
     warn_of_violations(loaded, is_sampled=trigger is opt.TriggerMode.SAMPLED)
     if trigger is opt.TriggerMode.CONTINUOUS:
         return simulate_continuously(loaded, json=json, required=require or ())

@@ -76,6 +76,7 @@ def _print_shipped(files: Sequence[ShippedFile]) -> None:
 def check(
     scenario: opt.ScenarioArgument,
     settings: opt.SetOption = None,
+    network: opt.NetworkOption = None,
     resolved: Annotated[
         bool, Option("--resolved", help="Print one loop with numbers only, also for times that have none.")
     ] = False,
@@ -90,7 +91,7 @@ def check(
     """
     from cosim.cli.scenario_check import check_scenario, print_resolved
 
-    loaded = opt.load_loop(scenario, settings, loop)
+    loaded = opt.load_loop(scenario, settings, loop, network)
     print_resolved(loaded, json=json) if resolved else check_scenario(loaded, json=json)
 
 

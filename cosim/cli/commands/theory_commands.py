@@ -39,6 +39,7 @@ class NormName(StrEnum):
 def certify(
     scenario: opt.ScenarioArgument,
     settings: opt.SetOption = None,
+    network: opt.NetworkOption = None,
     loop: opt.LoopOption = None,
     weight: Annotated[
         NormName,
@@ -101,7 +102,7 @@ def certify(
 
     if out is not None:
         require_suffix(out, "--out", ".mat")
-    loaded, chosen = opt.load_loop(scenario, settings, loop), None
+    loaded, chosen = opt.load_loop(scenario, settings, loop, network), None
     if witness is not None:
         resolved = resolve(loaded)
         require_covered(resolved, resolved.certificate.late_periods if late is None else late)
@@ -161,6 +162,7 @@ class AdversaryAim(StrEnum):
 def adversary(
     scenario: opt.ScenarioArgument,
     settings: opt.SetOption = None,
+    network: opt.NetworkOption = None,
     loop: opt.LoopOption = None,
     objective: Annotated[
         AdversaryAim,
@@ -201,7 +203,7 @@ def adversary(
 
     try:
         within = [] if horizon is None else [f"horizon_s={horizon}"]
-        resolved = resolve(opt.load_loop(scenario, [*(settings or ()), *within], loop))
+        resolved = resolve(opt.load_loop(scenario, [*(settings or ()), *within], loop, network))
     except CallerError as error:  # a message about the horizon names the option that set it
         if horizon is None:
             raise
@@ -257,6 +259,7 @@ def margin(
     context: typer.Context,
     scenario: opt.ScenarioArgument,
     settings: opt.SetOption = None,
+    network: opt.NetworkOption = None,
     loop: opt.LoopOption = None,
     most: Annotated[int, Option(help="Largest M to examine, 1 to 1000.")] = 16,
     accuracy: Annotated[
@@ -298,7 +301,7 @@ def margin(
     stops: list[StopRequestError] = []
     with status("examining") as change:
         result = find_margin(
-            resolve(opt.load_loop(scenario, settings, loop)),
+            resolve(opt.load_loop(scenario, settings, loop, network)),
             on_stop=stops.append,
             most_m=most,
             accuracy=accuracy,
@@ -323,7 +326,9 @@ def margin(
     from cosim.cli.played_pattern import until_it_shows
 
     with status("trying how long the pattern must be played until its growth shows"):
-        played = until_it_shows(opt.load_loop(scenario, [*(settings or ()), *pattern.settings], loop))
+        played = until_it_shows(
+            opt.load_loop(scenario, [*(settings or ()), *pattern.settings], loop, network)
+        )
     print(played.expected, flush=True)
     return run_processes(played.scenario, runs, server=context.obj)
 
@@ -339,6 +344,7 @@ def margin(
 def cost(
     scenario: opt.ScenarioArgument,
     settings: opt.SetOption = None,
+    network: opt.NetworkOption = None,
     loop: opt.LoopOption = None,
     Q: opt.StateWeightOption = None,
     R: opt.InputWeightOption = None,
@@ -359,7 +365,7 @@ def cost(
     from cosim.output.certificate_report import mean_cost_tables, print_mean_cost
     from noack.scenario.resolution import resolve
 
-    resolved = resolve(opt.load_loop(scenario, settings, loop))
+    resolved = resolve(opt.load_loop(scenario, settings, loop, network))
     costs = find_mean_cost(resolved, given_weight(Q), given_weight(R))
     if json:
         print_json(costs.to_json())

@@ -44,7 +44,7 @@ from noack.plants.linear import LinearSettings
 from noack.scenario.given_settings import given_settings
 from noack.scenario.resolution import resolve, resolve_run
 from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_file import completed, put, toml_text
+from noack.scenario.scenario_file import completed, network_of, put, toml_text, with_file_names
 from noack.settings.section import ReadTable, Table
 from noack.theory.certificates.certified_bounds import ScenarioCertificate, envelope_formula
 from noack.theory.certificates.conditions import nominal_conditions
@@ -136,6 +136,7 @@ def new(
     *,
     initial_state: Sequence[float] | None = None,
     settings: ReadTable | None = None,
+    network: str | PathLike[str] | None = None,
     report: Callable[[str], None] = lambda text: None,
 ) -> NewScenario:
     """Choose a complete scenario for a plant; its ``save`` writes the file.
@@ -145,12 +146,15 @@ def new(
         path: the file that the scenario will have; file names in it are relative to its folder.
         initial_state: x(0), n entries; by default chosen.
         settings: values by the keys of a scenario that are not to be chosen.
+        network: a file whose table ``[network]`` is used, before the settings.
         report: called with what is being done.
 
     Raises:
         NoackError: the plant does not rest at x = 0, u = 0, or a value is wrong.
     """
     values = dict(given_settings(settings))
+    if network is not None:
+        values = {"network": _network(Path(network), Path(path)), **values}
     plant_model = plant if isinstance(plant, LinearModel | LoopGain) else model_or_gain(plant, values)
     fixed = {key: value for key, value in values.items() if not key.startswith("plant.system")}
     fixed_state = fixed.pop("plant.initial_state", initial_state)
@@ -170,6 +174,12 @@ def new(
     text = _file_text(trials.content(best), notes, best, fixed)
     found_certificate = certificate if certificate.exists else None
     return NewScenario(best.gain, trials.scenario(best), text, found_certificate, notes)
+
+
+def _network(source: Path, path: Path) -> Table:
+    """Return the network of a file; names of files become relative to the folder of another one."""
+    folder = path.absolute().parent
+    return with_file_names(network_of(source), lambda name: os.path.relpath(name, folder))
 
 
 def _require_rest(model: LinearModel) -> None:

@@ -263,8 +263,8 @@ STUDIES: dict[str, Call] = {
     f"measure {TRACE} --write run/scenario.toml": lambda: noack.measure(TRACE).write_network(
         "run/scenario.toml"
     ),
-    f"measure {TRACE} --for-scenario nothing": lambda: noack.measure(TRACE).certificate_time("nothing"),
-    f"measure {TRACE} --for-scenario priority_channel": lambda: noack.measure(TRACE).certificate_time(
+    f"measure {TRACE} --for nothing": lambda: noack.measure(TRACE).certificate_time("nothing"),
+    f"measure {TRACE} --for priority_channel": lambda: noack.measure(TRACE).certificate_time(
         "priority_channel"
     ),
 }

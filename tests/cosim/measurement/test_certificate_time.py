@@ -111,3 +111,16 @@ def test_conditions_that_change_during_the_run_are_not_compared_with_a_trace() -
     scenario = noack.load("lane_following", {"network.mansd": 8, "changes": changes})
     with pytest.raises(CallerError, match="changes: needs settings that stay the same"):
         certificate_time(trace, scenario)
+
+
+def test_the_answer_is_yes_or_the_first_reason_against_it() -> None:
+    trace = read_trace(TRACES / "rural_n8_10kmh.csv")
+    assert certificate_time(trace, lane()).answer == (
+        "lane_following: certified on this network: no, because an update was in the network for 9.744 s, "
+        "0.004 s allowed at worst; first violated at 0.004 s"
+    )
+    slow = certificate_time(trace, lane(impairments=[{"kind": "delay", "delay_s": 9.8}])).answer
+    assert slow.startswith("lane_following: certified on this network: no, because there is no certificate: ")
+    sent_ns = 100 * MS * np.arange(15)
+    kept = packet_trace(sent_ns, sent_ns + 1 * MS, np.zeros(15, bool))
+    assert certificate_time(kept, lane()).answer == "lane_following: certified on this network: yes"

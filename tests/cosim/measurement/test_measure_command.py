@@ -36,7 +36,7 @@ def chain_csv(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_json_tables_and_page_have_the_same_numbers(tmp_path: Path) -> None:
     page = tmp_path / "page.html"
-    words = (RURAL, "--deadline", "100ms", "--for-scenario", "lane_following", "--window", 20)
+    words = (RURAL, "--deadline", "100ms", "--for", "lane_following", "--window", 20)
     document = json.loads(measure(*words, "--json", "--out", page).stdout)
     assert (document["packets"], document["late"], document["M"]) == (2178, 616, 49)
     assert document["windows"] == {"20": {"most_losses": 20, "without_outages": 20}}
@@ -87,7 +87,7 @@ def test_a_network_without_losses_is_measured(tmp_path: Path) -> None:
     path = tmp_path / "all.csv"
     path.write_text("sent_ms,received_ms\n0,1\n")
     for words in ((), ("--out", tmp_path / "a.html"), ("--write", tmp_path / "a.toml")):
-        document = measure(path, "--for-scenario", "lane_following", "--json", *words)
+        document = measure(path, "--for", "lane_following", "--json", *words)
         assert json.loads(document.stdout)["M"] == 1
     path.write_text("sent_ms,received_ms\n0,\n5,\n")
     for words in ((), ("--out", tmp_path / "a.html")):
