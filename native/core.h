@@ -37,6 +37,38 @@ static inline int is_between(int64_t least, int64_t number, int64_t most) {
 static inline int64_t floor_div(int64_t a, int64_t b) { return a / b - (a % b < 0); }
 static inline int64_t floor_mod(int64_t a, int64_t b) { return a % b + (a % b < 0 ? b : 0); }
 
+/* memory.c: zeros, or a copy, of a number of elements; NULL if there is no memory. */
+void *zeros(int64_t count, size_t size);
+void *copy_of(const void *elements, int64_t count, size_t size);
+/* Lengthen an array, to which `array` points, by zeros; return 0 if there is no memory. */
+int lengthen(void *array, int64_t before, int64_t after, size_t size);
+
+/* One direction of a link. */
+struct noack_link {
+    /* Settings: see noack_link_settings */
+    int64_t stage_count, window_count;
+    noack_stage *stages;
+    int64_t *integers;
+    double *reals;
+    noack_window *windows;
+    int64_t recovery, mansd, limit, tracks;
+    /* the stage that chooses which packet of its queue the link sends next; -1: none */
+    int64_t scheduler;
+
+    /* State */
+    int64_t rows;               /* flows that have room */
+    int64_t recent_width;       /* a power of 2, of mansd + 1 at least if it tracks */
+    int64_t loss_width;         /* a power of 2 */
+    noack_flow *flows;          /* (rows,) */
+    noack_stage_memory *memory; /* (rows, stage_count) */
+    int64_t *recent_ns;         /* (rows, recent_width) release times of the last packets */
+    int64_t *losses;            /* (rows, loss_width) numbers of losses so far, S */
+    noack_queue *queues;        /* (stage_count,) */
+    int64_t *departures_ns;     /* the rings of the queues */
+    int64_t in_flight;          /* delayed packets and copies */
+    noack_counters counters;
+};
+
 /* A packet for which a link decides, seen by a stage. */
 typedef struct {
     noack_link *link;

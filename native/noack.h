@@ -264,45 +264,44 @@ typedef struct {
     int64_t losses, packets;
 } noack_window;
 
-/* One direction of a link. */
+/* One direction of a link: native/core.h. */
+typedef struct noack_link noack_link;
+
+/* Its settings. */
 typedef struct {
-    /* Settings */
     int64_t stage_count, integer_count, real_count, window_count;
-    noack_stage *stages;        /* in order of application */
-    int64_t *integers;          /* tables of the stages */
-    double *reals;
-    noack_window *windows;      /* further maxima of losses */
+    const noack_stage *stages;     /* in order of application; queue_begin is not read */
+    const int64_t *integers;       /* tables of the stages */
+    const double *reals;
+    const noack_window *windows;   /* further maxima of losses */
     /* minimum of consecutive deliveries between two loss bursts; 0: none */
     int64_t recovery;
-    int64_t mansd;              /* maximum of consecutive losses, M - 1; -1: none */
-    int64_t limit;              /* maximum number of packets delayed at once */
-    int64_t tracks;             /* 1: packets can be delivered out of order */
-    /* the stage that chooses which packet of its queue the link sends next; -1: none */
-    int64_t scheduler;
-
-    /* State */
-    int64_t rows;               /* flows that have room */
-    int64_t recent_width;       /* a power of 2, of mansd + 1 at least if it tracks */
-    int64_t loss_width;         /* a power of 2 */
-    int64_t departure_places;
-    noack_flow *flows;          /* (rows,) */
-    noack_stage_memory *memory; /* (rows, stage_count) */
-    int64_t *recent_ns;         /* (rows, recent_width) release times of the last packets */
-    int64_t *losses;            /* (rows, loss_width) numbers of losses so far, S */
-    noack_queue *queues;        /* (stage_count,) */
-    int64_t *departures_ns;     /* (departure_places,) the rings of the queues */
-    int64_t in_flight;          /* delayed packets and copies */
-    noack_counters counters;
-} noack_link;
+    int64_t mansd;                 /* maximum of consecutive losses, M - 1; -1: none */
+    int64_t limit;                 /* maximum number of packets delayed at once */
+    int64_t tracks;                /* 1: packets can be delivered out of order */
+    int64_t rows;                  /* flows for which there is room at first */
+} noack_link_settings;
 
 /* ---- A link ---------------------------------------------------------------------------------- */
 
-/* Return NULL, or what is wrong with the numbers of a link: all that the other functions assume. */
-const char *noack_link_check(const noack_link *link);
+/* Return a link with copies of the settings. NULL: wrong says what is wrong with them, or, if it is
+   NULL, too, there is no memory; so do all functions with this argument. */
+noack_link *noack_link_new(const noack_link_settings *settings, const char **wrong);
+void noack_link_free(noack_link *link);
 
-/* Begin a flow in a row. */
-void noack_link_start_flow(
+/* Begin a flow in a row, for which room is made; return 0 if there is no memory. */
+int64_t noack_link_start_flow(
     noack_link *link, int64_t row, int64_t number, int64_t first_delivered);
+
+/* Its flows, (rows,), until a flow begins; its stages and their table of reals; its counts; its number
+   of rows; whether packets can be delivered out of order; the number of delayed packets and copies. */
+noack_flow *noack_link_flows(const noack_link *link);
+const noack_stage *noack_link_stages(const noack_link *link);
+const double *noack_link_reals(const noack_link *link);
+const noack_counters *noack_link_counters(const noack_link *link);
+int64_t noack_link_rows(const noack_link *link);
+int64_t noack_link_tracks(const noack_link *link);
+int64_t noack_link_in_flight(const noack_link *link);
 
 /* Decide for a packet that arrives at now_ns; row is that of its flow. */
 void noack_link_decide(
@@ -322,10 +321,11 @@ int64_t noack_link_leave(
 /* Load the state of a flow into the processor's caches; return a number that depends on it. */
 int64_t noack_link_touch(const noack_link *link, int64_t row);
 
-/* Transfer the state of a link to one with other settings, which has as many rows and shares the
-   array of flows. No packet waits in a scheduler's queue. latest_ns: (rows,) last departure time of
-   the packets in flight; -1: none. */
-void noack_link_change(const noack_link *before, noack_link *after, const int64_t *latest_ns);
+/* Apply other settings; return 0 if they are wrong. No packet waits in a scheduler's queue. latest_ns:
+   (rows,) last departure time of the packets in flight; -1: none. */
+int64_t noack_link_change(
+    noack_link *link, const noack_link_settings *settings, const int64_t *latest_ns,
+    const char **wrong);
 
 /* Begin the flow of row 0 again, with other keys, (stage_count, 2): another run of a batch. */
 void noack_link_renew(noack_link *link, const int64_t *keys, int64_t first_delivered);
@@ -450,7 +450,8 @@ enum noack_question {
     NOACK_ASK_UPDATE,   /* the user's control law receives the state of an update */
     NOACK_ASK_INPUT,    /* the user's control law: set u */
     NOACK_ASK_ROOM,     /* there is no room for another update that waits for its acknowledgement */
-    NOACK_ROWS_FULL     /* a table of rows or notes must be emptied */
+    NOACK_ROWS_FULL,    /* a table of rows or notes must be emptied */
+    NOACK_NO_MEMORY     /* the step cannot be done */
 };
 
 /* A message of the loop, decoded. */
@@ -1158,10 +1159,9 @@ typedef struct {
     noack_datagram datagram;
 } noack_delayed;
 
-/* Questions of a channel besides NOACK_ASK_CHANGE and NOACK_ROWS_FULL. */
+/* A question of a channel besides NOACK_ASK_CHANGE and NOACK_ROWS_FULL. */
 enum noack_channel_question {
-    NOACK_ASK_OUTCOME = 16, /* the user's network: set outcome_ns for the datagram in asked */
-    NOACK_ASK_PLACES        /* there is no room for more delayed datagrams */
+    NOACK_ASK_OUTCOME = 16 /* the user's network: set outcome_ns for the datagram in asked */
 };
 
 /* The network of a run in both directions; each flow has the row of its loop. */
@@ -1184,18 +1184,18 @@ typedef struct {
     noack_heap_entry *heap;      /* (places,) */
     noack_delayed *delayed;      /* (places,) */
     noack_waiting *waiting;      /* (places,) */
-    int64_t row_places, packet_count, release_count;
-    noack_packet_row *packets;   /* (row_places,) */
-    noack_release_row *releases; /* (row_places,) */
+    int64_t packet_count, release_count;
+    noack_packet_row *packets;   /* (packet_count,) */
+    noack_release_row *releases; /* (release_count,) */
     int64_t leaving_count;       /* of the last input: what leaves at once */
     noack_datagram leaving[2];
 } noack_channel;
 
-/* Return NULL, or what is wrong with the numbers of a channel: all that it assumes. */
-const char *noack_channel_check(const noack_channel *channel);
-
-/* Put the places from a number on into the list of free ones. */
-void noack_channel_add_places(noack_channel *channel, int64_t from);
+/* Return a channel; its links, (directions,), must outlive it. */
+noack_channel *noack_channel_new(
+    int64_t loops, int64_t directions, noack_link *const *links, int64_t is_scripted,
+    const char **wrong);
+void noack_channel_free(noack_channel *channel);
 
 /* Time of the next departure; INT64_MAX: nothing is delayed. */
 int64_t noack_channel_due_ns(const noack_channel *channel);
@@ -1224,13 +1224,11 @@ typedef struct {
 
 /* Why a simulation returned, besides NOACK_DONE and the questions of who asks. */
 enum noack_simulation_reason {
-    NOACK_ASK_SENT_PLACES = 32, /* there is no room for more datagrams that have been sent */
-    NOACK_STEPS_DONE            /* steps_left is 0 */
+    NOACK_STEPS_DONE = 32 /* steps_left is 0 */
 };
 
 /* A simulation: the machines of all roles and the network between them. */
 typedef struct {
-    int64_t loops;
     noack_process *processes[3]; /* by enum noack_role: the machines of all loops */
     noack_channel *channel;
     noack_wire wire;
@@ -1244,8 +1242,11 @@ typedef struct {
     noack_sent_datagram *sent;   /* (sent_places,) a ring, in the order of sending */
 } noack_simulation;
 
-/* Return NULL, or what is wrong with the numbers of a simulation. */
-const char *noack_simulation_check(const noack_simulation *simulation);
+/* Return a simulation; the machines and the network must outlive it. */
+noack_simulation *noack_simulation_new(
+    noack_process *const processes[3], noack_channel *channel, const noack_wire *wire,
+    const int64_t directions[5], const char **wrong);
+void noack_simulation_free(noack_simulation *simulation);
 
 /* Run until nothing is due up to until_ns. Return NOACK_DONE, or why Python is needed: after the
    answer the call is repeated. */

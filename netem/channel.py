@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from netem.link_state import LinkState
-from noack.core.clock import NEVER_NS
-from noack.core.core_library import CData, core, dtype_of, ffi, pointer_to
+from noack.core.core_library import CData, core, dtype_of, ffi, new_handle, pointer_to, rows_at
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, NETEM_SETTING, PACKET_HEAD_BYTES
@@ -35,13 +34,10 @@ PACKET_ROW = np.dtype(
         ("head", f"V{PACKET_HEAD_BYTES}"),
     ]
 )
-_RELEASE_ROW = dtype_of("noack_release_row")
 RUN_ID = 0
 """Run number in the datagrams of every simulated run: a record depends on the scenario alone.
 
 A simulation receives no foreign traffic, so its key need not be secret."""
-_PLACES, _ROWS = 64, 4096
-"""Delayed datagrams for which there is room at first, and rows of each table until they are taken."""
 
 
 def link_name(flow: Flow) -> str:
@@ -69,7 +65,7 @@ class Departure(NamedTuple):
 
 
 class Channel:
-    """Memory and settings of a ``noack_channel``.
+    """A ``noack_channel`` with its settings.
 
     Args:
         links: the direction from the sensors, and that from the controllers if there is one; each
@@ -92,23 +88,10 @@ class Channel:
         for number, link in enumerate(links):
             for loop in range(loops):
                 link.start_flow(loop, number * loops + loop)
-        self.core: CData = ffi.new("noack_channel *", {
-            "loops": loops, "directions": len(links), "links": [link.core for link in links],
-            "is_scripted": network is not None, "reached_ns": -1, "change_ns": NEVER_NS, "free_place": -1,
-            "row_places": _ROWS,
-        })  # fmt: skip
+        cores = [link.core for link in links]
+        self.core: CData = new_handle("channel", loops, len(cores), cores, network is not None)
         """The channel, as the core's functions take it; valid as long as this object lives."""
-        self._packets: Rows = np.zeros(_ROWS, dtype_of("noack_packet_row"))
-        self._releases: Rows = np.zeros(_ROWS, _RELEASE_ROW)
-        self.core.packets = pointer_to(self._packets, "noack_packet_row *")
-        self.core.releases = pointer_to(self._releases, "noack_release_row *")
-        self._heap: Rows = np.zeros(0, dtype_of("noack_heap_entry"))
-        self._delayed: CData = ffi.new("noack_delayed[]", 0)
-        self._waiting: Rows = np.zeros(0, dtype_of("noack_waiting"))
         self._earlier_rows: list[tuple[str, Rows]] = []
-        self._add_places(_PLACES)
-        if (wrong := core.noack_channel_check(self.core)) != ffi.NULL:
-            raise ValueError(f"network: {ffi.string(wrong).decode()}")
 
     @property
     def links(self) -> Sequence[LinkState]:
@@ -119,13 +102,13 @@ class Channel:
         """Do what the core asked for; the call is then repeated."""
         if question == core.NOACK_ASK_CHANGE:
             self._change()
-        elif question == core.NOACK_ASK_PLACES:
-            self._add_places(self.core.places)
         elif question == core.NOACK_ASK_OUTCOME:
             self.decide(encode_message(self.core.asked.message))
-        else:
-            assert question == core.NOACK_ROWS_FULL
+        elif question == core.NOACK_ROWS_FULL:
             self._earlier_rows = self.take_rows()
+        else:
+            assert question == core.NOACK_NO_MEMORY
+            raise MemoryError
 
     def send(self, flow: int, number: int, size_bytes: int, now_ns: int) -> tuple[list[Departure], int]:
         """Take a packet of a flow; return what leaves at once, and the number of its copies.
@@ -160,8 +143,8 @@ class Channel:
     def take_rows(self) -> list[tuple[str, Rows]]:
         """Return all rows since the last call, in batches of a table in their order."""
         channel, batches = self.core, self._earlier_rows
-        packets = self._packets[: channel.packet_count].view(PACKET_ROW).copy()
-        releases = self._releases[: channel.release_count].copy()
+        packets = rows_at(channel.packets, channel.packet_count).view(PACKET_ROW).copy()
+        releases = rows_at(channel.releases, channel.release_count).copy()
         channel.packet_count = channel.release_count = 0
         self._earlier_rows = []
         return [*batches, (NETEM_PACKET, packets), (NETEM_RELEASE, releases)]
@@ -196,22 +179,6 @@ class Channel:
         delay_ns = self._network(data, self.core.asked_ns)
         self.core.outcome_ns = -1 if delay_ns is None else delay_ns
         self.core.answered = 1
-
-    def _add_places(self, count: int) -> None:
-        """Add room for delayed datagrams."""
-        channel, earlier_places = self.core, self.core.places
-        heap = np.zeros(earlier_places + count, dtype_of("noack_heap_entry"))
-        heap[:earlier_places] = self._heap
-        delayed = ffi.new("noack_delayed[]", earlier_places + count)
-        ffi.memmove(delayed, self._delayed, earlier_places * ffi.sizeof("noack_delayed"))
-        self._heap, self._delayed = heap, delayed
-        channel.heap, channel.delayed = pointer_to(heap, "noack_heap_entry *"), delayed
-        waiting: Rows = np.zeros(earlier_places + count, dtype_of("noack_waiting"))
-        waiting[:earlier_places] = self._waiting
-        self._waiting = waiting
-        channel.waiting = pointer_to(waiting, "noack_waiting *")
-        channel.places = earlier_places + count
-        core.noack_channel_add_places(channel, earlier_places)
 
 
 def channel_of(resolved: Scenario, *, loops: int = 1, network: UserNetwork | None = None) -> Channel:

@@ -1,17 +1,17 @@
-"""One direction of a link: its settings as numbers and its state, in memory that the core uses.
+"""One direction of a link: its settings as numbers for the core, which has its state.
 
 Random streams are named after the link, the direction and the impairment, with a number if there
 are several of a kind. Hence adding a delay does not change which packets are lost.
 """
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.core_library import AnyArray, CData, core, dtype_of, ffi, pointer_to
+from noack.core.core_library import CData, core, dtype_of, ffi, new_handle, pointer_to, require, rows_at
 from noack.core.random_streams import stream_key
 from noack.guarantee.loss_guarantee import DeliveriesBetweenBursts, LossesInWindow
 from noack.impairments.feature import Stage, StageTables
@@ -33,7 +33,8 @@ class LinkState:
         rows: number of flows that have room; more are added as needed.
 
     Raises:
-        ValueError: the settings name a file that has not been read, or a loss rate cannot be kept.
+        ValueError: the settings name a file that has not been read, a loss rate cannot be kept, or the
+            core refuses a number.
 
     >>> link = LinkState(LinkSettings(mansd=4), 1, "update")
     >>> link.start_flow(0, 0)
@@ -51,42 +52,48 @@ class LinkState:
     ) -> None:
         self.settings = settings
         self._seed, self._name = seed, name
-        self.flows: NDArray[np.void] = np.zeros(rows, dtype_of("noack_flow"))
-        """(rows,) of ``noack_flow``."""
         self.decision: CData = ffi.new("noack_decision *")
         """The decision for the last packet, a ``noack_decision``; overwritten by the next."""
-        self.core: CData = ffi.new("noack_link *")
-        """The link, as the core's functions take it; its address does not change. It is valid as
-        long as this object lives."""
-        self._memory: dict[str, AnyArray] = {}
-        self._stages: CData = None
-        self.core[0] = self._new_link(settings, rows, tracks=any_order)[0]
+        numbers, _arrays = _link_numbers(settings, seed, name)
+        numbers.tracks |= any_order
+        numbers.rows = rows
+        self.core: CData = new_handle("link", numbers)
+        """The link, as the core's functions take it; valid as long as this object lives."""
 
     @property
     def rows(self) -> int:
         """Number of flows that have room."""
-        return len(self.flows)
+        return int(core.noack_link_rows(self.core))
+
+    @property
+    def flows(self) -> NDArray[np.void]:
+        """(rows,) of ``noack_flow``; valid until a flow begins."""
+        return rows_at(core.noack_link_flows(self.core), self.rows)
+
+    @property
+    def in_flight(self) -> int:
+        """Number of delayed packets and copies."""
+        return int(core.noack_link_in_flight(self.core))
 
     @property
     def tracks(self) -> bool:
         """Whether packets can be delivered out of order."""
-        return bool(self.core.tracks)
+        return bool(core.noack_link_tracks(self.core))
 
     @property
     def counters(self) -> Counters:
         """The counts so far."""
-        return Counters(*(getattr(self.core.counters, name) for name in _COUNTED))
+        counters = core.noack_link_counters(self.core)
+        return Counters(*(getattr(counters, name) for name in _COUNTED))
 
     def flow(self, row: int) -> CData:
         """Return the ``noack_flow`` in a row."""
-        return self.core.flows[row]
+        return core.noack_link_flows(self.core)[row]
 
     def start_flow(self, row: int, number: int) -> None:
         """Begin a new flow in a free row; make room if necessary."""
-        while row >= self.rows:
-            self._add_rows()
-        first = self.settings.first_delivered
-        core.noack_link_start_flow(self.core, row, number, first)
+        if not core.noack_link_start_flow(self.core, row, number, self.settings.first_delivered):
+            raise MemoryError
 
     def decide(self, row: int, size_bytes: int, now_ns: int) -> CData:
         """Decide for the next packet of the flow in a row; return :attr:`decision`."""
@@ -126,69 +133,11 @@ class LinkState:
             settings: the new settings.
             latest_ns: (rows,) last departure time of the packets in flight of each flow; −1: none.
         """
-        earlier = self._memory, self._stages  # kept alive until the core has read it
-        try:
-            changed = self._new_link(settings, self.rows, tracks=self.tracks)
-        except ValueError:  # the link goes on as it was
-            self._memory, self._stages = earlier
-            raise
-        core.noack_link_change(self.core, changed, pointer_to(latest_ns, "int64_t *"))
-        self.core[0] = changed[0]
+        wrong = ffi.new("const char **")
+        numbers, _arrays = _link_numbers(settings, self._seed, self._name)
+        pointer = pointer_to(latest_ns, "int64_t *")
+        require(core.noack_link_change(self.core, numbers, pointer, wrong), wrong, "link")
         self.settings = settings
-
-    def _new_link(self, settings: LinkSettings, rows: int, *, tracks: bool) -> CData:
-        """Return a new ``noack_link`` of these settings, which shares the array of flows."""
-        # What the core reads: stages, and the numbers to which they refer.
-        settings = with_target_loss(settings)
-        tables = StageTables(
-            scored=any(getattr(impairment, "loss_correlation", 0) != 0 for impairment in settings.impairments)
-        )
-        keyed_stages = list(_stages(settings, tables, self._seed, self._name))
-        stage_array, stages = _stage_array(keyed_stages), [stage for stage, *_ in keyed_stages]
-        limits, windows = _loss_limits(settings)
-        tracks = tracks or any(impairment.delays for impairment in settings.impairments)
-        mansd = limits["mansd"]
-        link = ffi.new(
-            "noack_link *",
-            {
-                "stages": stage_array,
-                "stage_count": len(keyed_stages),
-                "limit": settings.limit,
-                "tracks": tracks,
-                "scheduler": next((index for index, stage in enumerate(stages) if stage.schedules), -1),
-                "rows": rows,
-                "recent_width": 1 << mansd.bit_length() if tracks and mansd >= 0 else 1,
-                "departure_places": sum(stage.queue_places for stage in stages),
-                **limits,
-            },
-        )
-        # Python owns the memory to which the link points; the core checks what is in it.
-        read_only = {
-            "integers": np.array(tables.integers, np.int64),
-            "reals": np.array(tables.reals, np.float64),
-            "windows": np.array(windows, dtype_of("noack_window")),
-        }
-        for name, array in read_only.items():
-            setattr(link, f"{name.removesuffix('s')}_count", len(array))
-        self._stages, self._memory = stage_array, read_only | _link_memory(link) | {"flows": self.flows}
-        self._point(link)
-        _require(core.noack_link_check(link))
-        return link
-
-    def _point(self, link: CData) -> None:
-        for name, array in self._memory.items():
-            setattr(link, name, ffi.cast(ffi.typeof(getattr(link, name)), array.ctypes.data))
-
-    def _add_rows(self) -> None:
-        """Double the number of flows that have room."""
-        for name in ("flows", "memory", "recent_ns", "losses"):
-            old = self._memory[name]
-            empty = core.NOACK_NEVER_NS if name == "recent_ns" else 0
-            # The type is given: numpy would pack the rows of padded structures.
-            self._memory[name] = np.concatenate((old, np.full_like(old, empty)), dtype=old.dtype)
-        self.flows = self._memory["flows"].view(self.flows.dtype)
-        self.core.rows = len(self.flows)
-        self._point(self.core)
 
 
 class _KeyedStage(NamedTuple):
@@ -204,27 +153,36 @@ def stream_names(settings: LinkSettings, *name: str) -> list[tuple[str, ...]]:
     return [keyed_stage.stream for keyed_stage in _stages(settings, StageTables(), 0, name)]
 
 
-def _link_memory(link: CData) -> dict[str, AnyArray]:
-    """Return the arrays of a ``noack_link`` that the core writes, but for the flows."""
-    rows, stages = link.rows, link.stage_count
-    return {
-        "memory": np.zeros((rows, stages), dtype_of("noack_stage_memory")),
-        "recent_ns": np.full((rows, link.recent_width), core.NOACK_NEVER_NS, np.int64),
-        "losses": np.zeros((rows, link.loss_width), np.int64),
-        "queues": np.zeros(stages, dtype_of("noack_queue")),
-        "departures_ns": np.zeros(link.departure_places, np.int64),
-    }
-
-
-def _loss_limits(settings: LinkSettings) -> tuple[dict[str, int], list[tuple[int, int]]]:
-    """Return the fields of a ``noack_link`` that limit losses, and limit and length of each window."""
+def _link_numbers(
+    settings: LinkSettings, seed: int, name: Sequence[str]
+) -> tuple[CData, Mapping[str, CData]]:
+    """Return the settings as a ``noack_link_settings``, and the arrays to which it points."""
+    settings = with_target_loss(settings)
+    tables = StageTables(
+        scored=any(getattr(impairment, "loss_correlation", 0) != 0 for impairment in settings.impairments)
+    )
+    keyed_stages = list(_stages(settings, tables, seed, name))
     rules = [constraint.rule for constraint in settings.constraints]
-    windows = [(rule.limit, rule.window) for rule in rules if isinstance(rule, LossesInWindow)]
     between = (rule.deliveries for rule in rules if isinstance(rule, DeliveriesBetweenBursts))
-    mansd = -1 if settings.longest_burst is None else settings.longest_burst
-    recovery, longest = max(between, default=0), max((packets for _, packets in windows), default=0)
-    width = 1 << max(longest + 1, mansd + recovery + 1).bit_length() if windows or recovery else 1
-    return {"mansd": mansd, "recovery": recovery, "loss_width": width}, windows
+    numbers = ffi.new("noack_link_settings *", {
+        "recovery": max(between, default=0),
+        "mansd": -1 if settings.longest_burst is None else settings.longest_burst,
+        "limit": settings.limit,
+        "tracks": any(impairment.delays for impairment in settings.impairments),
+    })  # fmt: skip
+    arrays = {
+        "stages": _stage_array(keyed_stages),
+        "integers": ffi.new("int64_t[]", tables.integers),
+        "reals": ffi.new("double[]", tables.reals),
+        "windows": ffi.new(
+            "noack_window[]",
+            [(rule.limit, rule.window) for rule in rules if isinstance(rule, LossesInWindow)],
+        ),
+    }
+    for array_name, array in arrays.items():
+        setattr(numbers, array_name, array)
+        setattr(numbers, f"{array_name.removesuffix('s')}_count", len(array))
+    return numbers, arrays
 
 
 def _stages(
@@ -244,19 +202,12 @@ def _stages(
 
 
 def _stage_array(stages: Sequence[_KeyedStage]) -> CData:
-    """Return the stages as an array of ``noack_stage``; their queues lie one after the other."""
-    array, queue_begin = ffi.new("noack_stage[]", max(len(stages), 1)), 0
-    for row, (stage, key, _) in zip(array, stages, strict=False):
+    """Return the stages as an array of ``noack_stage``."""
+    array = ffi.new("noack_stage[]", len(stages))
+    for row, (stage, key, _) in zip(array, stages, strict=True):
         row.kind = getattr(core, f"NOACK_{stage.kind.upper()}")
         row.key0, row.key1 = key
-        row.queue_places, row.queue_begin = stage.queue_places, queue_begin
-        queue_begin += stage.queue_places
+        row.queue_places = stage.queue_places
         for field, number in stage.numbers.items():
             setattr(getattr(row, stage.structure or stage.kind), field, number)
     return array
-
-
-def _require(wrong: CData) -> None:
-    """Raise ValueError for what the core found wrong with a link."""
-    if wrong != ffi.NULL:
-        raise ValueError(f"link: {ffi.string(wrong).decode()}")

@@ -28,7 +28,7 @@ from cosim.record.run_record import NETWORK_ROLES, RecordedRun, Rows, RunRecord,
 from cosim.record.run_scenario import write_scenario
 from netem.channel import RUN_ID, UserNetwork, channel_of
 from noack.core.clock import NEVER_NS
-from noack.core.core_library import CData, core, ffi
+from noack.core.core_library import CData, core, ffi, new_handle
 from noack.core.errors import ExitStatus, MachineError, why
 from noack.core.file_access import remove_folder
 from noack.core.system_processes import require_limits
@@ -56,8 +56,6 @@ _ROLES: Mapping[str, Callable[..., LoopMachines]] = {
 _REASONS = tuple(reason.value for reason in Rejection)
 _INPUTS_PER_PROGRESS = 2048
 """Inputs between two reports of progress."""
-_SENT_PLACES = 64
-"""Datagrams that one step may send."""
 _PIECE_BYTES = 2**24
 """Bytes of rows that are allocated at once."""
 
@@ -167,10 +165,7 @@ class VirtualRun:
         """The row types of the tables of each kind of loops (:func:`settings_key`)."""
         run_types = {**row_types(map(shape_of, kinds.values())), **network_tables()}
         self.record = RecordCollector(run_types, len(loops))
-        self.core: CData = self._new_core(len(loops))
-        wrong = core.noack_simulation_check(self.core)
-        if wrong != ffi.NULL:
-            raise ValueError(f"simulation: {ffi.string(wrong).decode()}")
+        self.core: CData = self._new_core()
 
     def run(self, until_ns: int = NEVER_NS, progress: Progress | None = None) -> None:
         """Run until nothing is due up to a time."""
@@ -183,8 +178,8 @@ class VirtualRun:
                 simulation.steps_left = _INPUTS_PER_PROGRESS
                 if progress is not None:
                     progress(int(simulation.now_ns))
-            elif reason == core.NOACK_ASK_SENT_PLACES:
-                self._add_sent_places()
+            elif reason == core.NOACK_NO_MEMORY:
+                raise MemoryError
             elif simulation.asking == core.NOACK_NETWORK:
                 self.channel.answer(reason)
             elif reason == core.NOACK_ROWS_FULL:
@@ -218,35 +213,17 @@ class VirtualRun:
             "rejected": {reason: count for reason, count in rejected if count},
         }
 
-    def _new_core(self, loops: int) -> CData:
+    def _new_core(self) -> CData:
         """Return the ``noack_simulation``."""
         key, flows = ffi.from_buffer("uint8_t[]", bytes(KEY_BYTES)), self._scenario.network.flows
-        simulation = ffi.new(
-            "noack_simulation *",
-            {
-                "loops": loops,
-                "processes": [machines.core for machines in self.machines.values()],
-                "channel": self.channel.core,
-                "wire": {"run_id": RUN_ID},
-                # Numbers of flows begin at 1; place 0 is unused.
-                "directions": [flows.index(flow) if flow in flows else -1 for flow in (0, *Flow)],
-                "steps_left": _INPUTS_PER_PROGRESS,
-            },
-        )
-        core.noack_wire_key(ffi.addressof(simulation, "wire"), key)
-        self._sent = ffi.new("noack_sent_datagram[]", _SENT_PLACES)
-        simulation.sent, simulation.sent_places = self._sent, _SENT_PLACES
+        wire = ffi.new("noack_wire *", {"run_id": RUN_ID})
+        core.noack_wire_key(wire, key)
+        # Numbers of flows begin at 1; place 0 is unused.
+        directions = [flows.index(flow) if flow in flows else -1 for flow in (0, *Flow)]
+        processes = [machines.core for machines in self.machines.values()]
+        simulation = new_handle("simulation", processes, self.channel.core, wire, directions)
+        simulation.steps_left = _INPUTS_PER_PROGRESS
         return simulation
-
-    def _add_sent_places(self) -> None:
-        """Double the room for datagrams that have been sent."""
-        simulation, size = self.core, ffi.sizeof("noack_sent_datagram")
-        places, first = simulation.sent_places, simulation.sent_first
-        memory = ffi.new("noack_sent_datagram[]", 2 * places)
-        ffi.memmove(memory, self._sent + first, (places - first) * size)
-        ffi.memmove(memory + (places - first), self._sent, first * size)
-        self._sent = simulation.sent = memory
-        simulation.sent_places, simulation.sent_first = 2 * places, 0
 
     def _take(self, role: str, *, last: bool = False) -> None:
         """Take the rows and notices of the machines of a role."""

@@ -5,9 +5,11 @@
    delayed datagrams from the network, datagrams in the order of sending, ticks of the controllers;
    steps and ticks in the order of the loops. Messages pass as structures: of a datagram, only what
    the record shows is written, unless the network has flipped a bit of it. */
+#include <stdlib.h>
+
 #include "../core.h"
 
-enum { MOST_PLACES = 1 << 24, MOST_OUTPUTS = 2 };
+enum { FIRST_PLACES = 256, MOST_OUTPUTS = 2 };
 
 /* No datagram is rejected for its source, and none of it is read at a socket. */
 enum { FROM_PEER = 1, OPENED = 0 };
@@ -20,30 +22,57 @@ static const int64_t RECEIVER[] = {
     [NOACK_ACKNOWLEDGEMENT] = NOACK_SENSOR,
 };
 
-const char *noack_simulation_check(const noack_simulation *simulation) {
-    const noack_channel *channel = simulation->channel;
-    const char *wrong = noack_channel_check(channel);
-    if (wrong != NULL)
-        return wrong;
-    if (!is_between(1, simulation->loops, MOST_LOOPS) || channel->loops != simulation->loops)
-        return "the network has a different number of loops, or there are no loops";
-    for (int64_t role = NOACK_PLANT; role <= NOACK_CONTROLLER; role++) {
-        const noack_process *process = simulation->processes[role];
-        if (process == NULL || process->role != role || process->loops != simulation->loops)
-            return "the loops lack the machines of a role";
-    }
+static const char *check(
+    noack_process *const processes[3], const noack_channel *channel, const int64_t directions[5]) {
+    for (int64_t role = NOACK_PLANT; role <= NOACK_CONTROLLER; role++)
+        if (processes[role] == NULL || processes[role]->role != role
+            || processes[role]->loops != channel->loops)
+            return "the loops lack the machines of a role, or the network has other loops";
     for (int64_t flow = NOACK_MEASUREMENT; flow <= NOACK_ACKNOWLEDGEMENT; flow++)
-        if (!is_between(-1, simulation->directions[flow], channel->directions - 1))
+        if (!is_between(-1, directions[flow], channel->directions - 1))
             return "a flow has no direction of the network";
-    int64_t places = simulation->sent_places;
-    if (!is_between(MOST_OUTPUTS, places, MOST_PLACES) || (places & (places - 1)) != 0
-        || !is_between(0, simulation->sent_count, places)
-        || !is_between(0, simulation->sent_first, places - 1))
-        return "there is no room for datagrams that have been sent";
     return NULL;
 }
 
+noack_simulation *noack_simulation_new(
+    noack_process *const processes[3], noack_channel *channel, const noack_wire *wire,
+    const int64_t directions[5], const char **wrong) {
+    noack_simulation *simulation = NULL;
+    if ((*wrong = check(processes, channel, directions)) == NULL)
+        simulation = zeros(1, sizeof *simulation);
+    if (simulation == NULL)
+        return NULL;
+    memcpy(simulation->processes, processes, sizeof simulation->processes);
+    memcpy(simulation->directions, directions, sizeof simulation->directions);
+    simulation->channel = channel;
+    simulation->wire = *wire;
+    return simulation;
+}
+
+void noack_simulation_free(noack_simulation *simulation) {
+    if (simulation != NULL)
+        free(simulation->sent);
+    free(simulation);
+}
+
 /* Datagrams that have been sent. --------------------------------------------------------------- */
+
+/* Double the ring; return 0 if there is no memory. */
+static int add_places(noack_simulation *simulation) {
+    int64_t places = simulation->sent_places, first = simulation->sent_first;
+    noack_sent_datagram *ring = zeros(max_of(2 * places, FIRST_PLACES), sizeof *ring);
+    if (ring == NULL)
+        return 0;
+    if (places > 0) {
+        memcpy(ring, simulation->sent + first, (size_t)(places - first) * sizeof *ring);
+        memcpy(ring + places - first, simulation->sent, (size_t)first * sizeof *ring);
+    }
+    free(simulation->sent);
+    simulation->sent = ring;
+    simulation->sent_places = max_of(2 * places, FIRST_PLACES);
+    simulation->sent_first = 0;
+    return 1;
+}
 
 static noack_sent_datagram *next_place(noack_simulation *simulation) {
     int64_t place = simulation->sent_first + simulation->sent_count++;
@@ -69,7 +98,7 @@ static void send(noack_simulation *simulation, const noack_output *output) {
     if (direction < 0)
         return;
     sent->to = NOACK_NETWORK;
-    datagram->flow = direction * simulation->loops + message->loop;
+    datagram->flow = direction * simulation->channel->loops + message->loop;
     datagram->size_bytes = NOACK_HEADER_BYTES + 8 * message->entries + NOACK_TAG_BYTES;
     datagram->arrival_ns = UNKNOWN_ARRIVAL_NS;
     noack_wire_header(&simulation->wire, &datagram->message, datagram->head);
@@ -132,7 +161,8 @@ static void examine_flipped(
     int64_t size_bytes = noack_wire_encode(&simulation->wire, &datagram->message, data);
     data[datagram->bit / 8] ^= (uint8_t)(1 << (datagram->bit % 8));
     int64_t loop = noack_wire_loop(data, size_bytes);
-    loop = loop < simulation->loops ? loop : 0; /* its receiver rejects a datagram of no loop */
+    loop = loop < simulation->channel->loops ? loop
+                                             : 0; /* its receiver rejects a datagram of no loop */
     noack_reception *reception = reception_of(simulation, role, datagram->message.flow, loop);
     int64_t examination = noack_wire_examine(
         &simulation->wire, reception, loop, data, size_bytes, FROM_PEER, OPENED, &message);
@@ -177,8 +207,9 @@ int64_t noack_simulate(noack_simulation *simulation, int64_t until_ns) {
             return NOACK_DONE;
         if (simulation->steps_left <= 0)
             return NOACK_STEPS_DONE;
-        if (simulation->sent_count + MOST_OUTPUTS > simulation->sent_places)
-            return NOACK_ASK_SENT_PLACES;
+        if (simulation->sent_count + MOST_OUTPUTS > simulation->sent_places
+            && !add_places(simulation))
+            return NOACK_NO_MEMORY;
         simulation->now_ns = now_ns;
         int64_t question;
         if (plants_ns == now_ns) {

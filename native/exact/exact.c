@@ -138,7 +138,7 @@ const char *noack_exact_check(const noack_exact *exact) {
         if (!is_between(0, exact->fate_count, MOST_FATES)
             || (exact->fate_count > 0 && exact->fates == NULL))
             return "a simulation has no packet fates";
-    } else if (noack_link_check(exact->link) != NULL || exact->link->rows < 1)
+    } else if (exact->link->rows < 1)
         return "a simulation has no link";
     return check_exact_rule(exact);
 }

@@ -3,28 +3,62 @@
 
    Datagrams come in; those that survive go out, at once or later. Each input has one row of the
    record, numbered over both directions. */
+#include <stdlib.h>
+
 #include "../core.h"
 
-const char *noack_channel_check(const noack_channel *channel) {
-    if (!is_between(1, channel->loops, MOST_LOOPS) || !is_between(1, channel->directions, 2))
-        return "a network has 1 to 65535 loops, and one or two directions";
-    for (int64_t i = 0; i < channel->directions; i++) {
-        if (channel->links[i] == NULL || channel->links[i]->rows < channel->loops)
-            return "a direction of the network has no row for a loop";
-    }
-    if (!is_between(2, channel->places, INT32_MAX) || channel->row_places < 1
-        || !is_between(0, channel->heap_count, channel->places)
-        || !is_between(0, channel->packet_count, channel->row_places)
-        || !is_between(0, channel->release_count, channel->row_places))
-        return "a table of the network has no room, or more rows than room";
-    return NULL;
-}
+enum { FIRST_PLACES = 64, ROWS = 4096 };
 
-void noack_channel_add_places(noack_channel *channel, int64_t from) {
-    for (int64_t i = channel->places - 1; i >= from; i--) {
+/* Double the room for delayed datagrams; return 0 if there is no memory. */
+static int add_places(noack_channel *channel) {
+    int64_t before = channel->places, places = max_of(2 * before, FIRST_PLACES);
+    if (!lengthen(&channel->heap, before, places, sizeof *channel->heap)
+        || !lengthen(&channel->delayed, before, places, sizeof *channel->delayed)
+        || !lengthen(&channel->waiting, before, places, sizeof *channel->waiting))
+        return 0;
+    for (int64_t i = places - 1; i >= before; i--) {
         channel->delayed[i].next = channel->free_place;
         channel->free_place = i;
     }
+    channel->places = places;
+    return 1;
+}
+
+noack_channel *noack_channel_new(
+    int64_t loops, int64_t directions, noack_link *const *links, int64_t is_scripted,
+    const char **wrong) {
+    *wrong = NULL;
+    if (!is_between(1, loops, MOST_LOOPS) || !is_between(1, directions, 2))
+        *wrong = "a network has 1 to 65535 loops, and one or two directions";
+    for (int64_t i = 0; *wrong == NULL && i < directions; i++)
+        if (links[i] == NULL || links[i]->rows < loops)
+            *wrong = "a direction of the network has no row for a loop";
+    noack_channel *channel = *wrong == NULL ? zeros(1, sizeof *channel) : NULL;
+    if (channel == NULL)
+        return NULL;
+    channel->loops = loops;
+    channel->directions = directions;
+    memcpy(channel->links, links, (size_t)directions * sizeof *links);
+    channel->is_scripted = is_scripted;
+    channel->reached_ns = channel->free_place = -1;
+    channel->change_ns = INT64_MAX;
+    channel->packets = zeros(ROWS, sizeof *channel->packets);
+    channel->releases = zeros(ROWS, sizeof *channel->releases);
+    if (channel->packets != NULL && channel->releases != NULL && add_places(channel))
+        return channel;
+    noack_channel_free(channel);
+    return NULL;
+}
+
+void noack_channel_free(noack_channel *channel) {
+    if (channel == NULL)
+        return;
+    free(channel->heap);
+    free(channel->delayed);
+    free(channel->waiting);
+    free(channel->packets);
+    free(channel->releases);
+    free(channel);
 }
 
 int64_t noack_channel_due_ns(const noack_channel *channel) {
@@ -93,10 +127,11 @@ int64_t noack_channel_handle(
     channel->leaving_count = 0;
     if (now_ns >= channel->change_ns)
         return NOACK_ASK_CHANGE;
-    if (channel->packet_count == channel->row_places)
+    if (channel->packet_count == ROWS)
         return NOACK_ROWS_FULL;
-    if (channel->free_place < 0 || channel->delayed[channel->free_place].next < 0)
-        return NOACK_ASK_PLACES;
+    if ((channel->free_place < 0 || channel->delayed[channel->free_place].next < 0)
+        && !add_places(channel))
+        return NOACK_NO_MEMORY;
     if (asks && !channel->answered) {
         copy_datagram(&channel->asked, datagram);
         channel->asked_ns = now_ns;
@@ -122,7 +157,7 @@ int64_t noack_channel_handle(
 
 int64_t noack_channel_release(noack_channel *channel, int64_t now_ns) {
     channel->leaving_count = 0;
-    if (channel->release_count == channel->row_places)
+    if (channel->release_count == ROWS)
         return NOACK_ROWS_FULL;
     noack_heap_entry entry = channel->heap[0];
     noack_delayed *leaving = &channel->delayed[entry.slot];

@@ -25,30 +25,6 @@ static stage_function *const APPLY[NOACK_STAGE_KINDS] = {
     [NOACK_SCHEDULE] = apply_schedule,
 };
 
-void noack_link_start_flow(noack_link *link, int64_t row, int64_t number, int64_t first_delivered) {
-    link->flows[row] = (noack_flow){
-        .number = number,
-        .forced_first = first_delivered != 0,
-        .first_release_ns = NOACK_NEVER_NS,
-        .newest = -1,
-    };
-    memset(
-        link->memory + row * link->stage_count, 0,
-        (size_t)link->stage_count * sizeof *link->memory);
-    for (int64_t i = 0; i < link->recent_width; i++)
-        link->recent_ns[row * link->recent_width + i] = NOACK_NEVER_NS;
-    for (int64_t i = 0; i < link->loss_width; i++)
-        link->losses[row * link->loss_width + i] = 0;
-}
-
-void noack_link_renew(noack_link *link, const int64_t *keys, int64_t first_delivered) {
-    noack_link_start_flow(link, 0, 0, first_delivered);
-    for (int64_t i = 0; i < link->stage_count; i++) {
-        link->stages[i].key0 = keys[2 * i];
-        link->stages[i].key1 = keys[2 * i + 1];
-    }
-}
-
 /* Decide as the user's network did; a packet that must pass leaves nevertheless. */
 static void apply_outcome(int64_t outcome_ns, noack_decision *decision) {
     if (outcome_ns < 0)

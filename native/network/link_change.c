@@ -128,19 +128,35 @@ static void change_releases(
         flow->first_release_ns = max_of(flow->first_release_ns, latest_ns);
 }
 
-void noack_link_change(const noack_link *before, noack_link *after, const int64_t *latest_ns) {
+int64_t noack_link_change(
+    noack_link *link, const noack_link_settings *settings, const int64_t *latest_ns,
+    const char **wrong) {
+    noack_link_settings changed = *settings;
+    changed.rows = link->rows;
+    changed.tracks |= link->tracks;
+    noack_link *after = noack_link_new(&changed, wrong);
+    if (after == NULL)
+        return 0;
+    noack_flow *unused_flows = after->flows;
+    after->flows = link->flows;
     for (int64_t place = 0; place < after->stage_count; place++)
-        change_stage(before, after, place);
-    for (int64_t row = 0; row < before->rows; row++) {
+        change_stage(link, after, place);
+    for (int64_t row = 0; row < link->rows; row++) {
         noack_flow *flow = &after->flows[row];
         flow->since = flow->packets;
         flow->longest_loss_burst = 0;
         if (counts_losses(after))
-            change_losses(before, after, row);
+            change_losses(link, after, row);
         if (after->tracks)
-            change_releases(before, after, row, latest_ns[row]);
+            change_releases(link, after, row, latest_ns[row]);
     }
-    after->in_flight = before->in_flight;
-    after->counters = before->counters;
+    after->in_flight = link->in_flight;
+    after->counters = link->counters;
     after->counters.longest_loss_burst = 0;
+    noack_link old = *link;
+    *link = *after;
+    *after = old;
+    after->flows = unused_flows;
+    noack_link_free(after);
+    return 1;
 }

@@ -206,7 +206,7 @@ class Relay:
             settings=direction.settings,
             counters=direction.counters,
             unintended=self._losses[number].counts(),
-            in_flight=direction.core.in_flight,
+            in_flight=direction.in_flight,
             flows=self._report_flows(number),
             delays=direction.counts_of("delays"),
             lateness=direction.counts_of("lateness"),

@@ -111,6 +111,31 @@ def pointer_to(array: AnyArray, kind: str) -> CData:
     return ffi.cast(kind, ffi.from_buffer(array))  # faster than numpy's address
 
 
+def new_handle(kind: str, *arguments: object) -> CData:
+    """Return a new ``noack_KIND *`` of the core, which is freed with the object returned.
+
+    Args:
+        kind: what it is, e.g. ``"link"``.
+        arguments: those of its function ``noack_KIND_new``.
+
+    Raises:
+        ValueError: the core refuses the arguments; the text says why.
+        MemoryError: there is no memory.
+    """
+    wrong = ffi.new("const char **")
+    handle = getattr(core, f"noack_{kind}_new")(*arguments, wrong)
+    require(handle != ffi.NULL, wrong, kind)
+    return ffi.gc(handle, getattr(core, f"noack_{kind}_free"))
+
+
+def require(done: bool, wrong: CData, kind: str) -> None:
+    """Raise ValueError with the text that the core has set, or MemoryError, unless a call was ``done``."""
+    if not done:
+        if wrong[0] == ffi.NULL:
+            raise MemoryError
+        raise ValueError(f"{kind}: {ffi.string(wrong[0]).decode()}")
+
+
 def address_of(pointer: CData) -> int:
     """Return the address that a pointer of the core has."""
     return int(ffi.cast("intptr_t", pointer))
@@ -246,3 +271,9 @@ def reals_at(pointer: CData, *shape: int) -> Reals:
     """Return the numbers at a ``double *`` as an array, which shares their memory."""
     data = ffi.buffer(pointer, 8 * math.prod(shape))
     return np.frombuffer(data, np.float64).reshape(shape)
+
+
+def rows_at(pointer: CData, count: int) -> StructRows:
+    """Return the rows of a structure at a pointer as an array, which shares their memory."""
+    kind = dtype_of(ffi.typeof(pointer).item.cname)
+    return np.frombuffer(ffi.buffer(pointer, count * kind.itemsize), kind)

@@ -9,11 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem import link_state
 from netem.channel import Datagram, channel_of
 from netem.link_state import LinkState
 from netem.tc_words import settings_of
-from noack.core.core_library import address_of, core
+from noack.core.core_library import core
 from noack.impairments.kinds.opportunities import Opportunities
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.record_tables import NETEM_PACKET, Fate, tables
@@ -167,19 +166,22 @@ def test_the_link_of_a_scenario_keeps_its_mansd(
     assert letters == expected
 
 
-def test_a_refused_change_leaves_a_link_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refused_change_leaves_a_link_as_it_was() -> None:
     link = LinkState(settings_of("delay 1ms"), 1, "any")
     link.start_flow(0, 0)
-    begin = address_of(link.core.memory), address_of(link.core.stages)
-
-    def refuse(wrong: object) -> None:
-        raise ValueError("link: refused")
-
-    monkeypatch.setattr(link_state, "_require", refuse)
-    with pytest.raises(ValueError, match="refused"):
-        link.change(LinkSettings(), np.full(1, core.NOACK_NEVER_NS))
-    assert (link._memory["memory"].ctypes.data, address_of(link._stages)) == begin
+    refused = LinkSettings.model_construct(limit=-1)
+    with pytest.raises(ValueError, match="link: a length or limit is negative"):
+        link.change(refused, np.full(1, core.NOACK_NEVER_NS))
     assert link.decide(0, 72, 0).release_ns == MS
+
+
+@pytest.mark.sanitized
+def test_a_link_has_room_for_any_number_of_flows() -> None:
+    link = LinkState(settings_of("loss 50% mansd 4 atmost 3 in 7 delay 1ms"), 1, "any")
+    for row in (0, 1, 2, 3, 100):
+        link.start_flow(row, row)
+    assert len(link.flows) == link.rows == 101
+    assert link.flows["number"][[0, 1, 2, 3, 100]].tolist() == [0, 1, 2, 3, 100]
 
 
 @pytest.mark.sanitized

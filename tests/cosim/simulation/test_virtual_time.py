@@ -7,7 +7,8 @@ import pytest
 from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import VirtualRun, simulate
-from noack.core.core_library import core, ffi
+from netem.channel import channel_of
+from noack.core.core_library import ffi, new_handle
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, NETEM_PACKET, SENSOR_MEASUREMENT
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
@@ -44,18 +45,16 @@ def test_a_scripted_network_decides_as_in_the_plain_driver() -> None:
 @pytest.mark.sanitized
 def test_numbers_of_no_simulation_are_refused() -> None:
     scenario = resolved("unstable_pendulum", "horizon_s=1.0")
-    run = VirtualRun(scenario, (scenario,))
-    simulation = run.core
-    for name, value in (("loops", 2), ("sent_places", 3), ("sent_count", -1)):
-        old_value = getattr(simulation, name)
-        setattr(simulation, name, value)
-        assert core.noack_simulation_check(simulation) != ffi.NULL
-        setattr(simulation, name, old_value)
-    simulation.directions[2] = 1
-    assert core.noack_simulation_check(simulation) != ffi.NULL
-    simulation.directions[2] = 0
-    simulation.processes[1] = simulation.processes[0]
-    assert core.noack_simulation_check(simulation) != ffi.NULL
+    run, wire = VirtualRun(scenario, (scenario,)), ffi.new("noack_wire *")
+    processes = [machines.core for machines in run.machines.values()]
+    two = channel_of(scenario, loops=2)
+    for roles, channel, directions in (
+        (processes, two, [0] * 5),
+        (processes[::-1], run.channel, [0] * 5),
+        (processes, run.channel, [0, 0, 1, 0, 0]),
+    ):
+        with pytest.raises(ValueError, match="simulation: "):
+            new_handle("simulation", roles, channel.core, wire, directions)
 
 
 @pytest.fixture

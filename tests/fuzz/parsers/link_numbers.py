@@ -3,13 +3,14 @@
 The long run uses the core that is built with sanitizers (:mod:`tests.native.sanitized_core`).
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.link_state import LinkState
-from noack.core.core_library import core, dtype_of, ffi, pointer_to
+from netem.link_state import _link_numbers
+from noack.core.core_library import core, ffi, pointer_to
 from noack.impairments.link_settings import LinkSettings
 from tests.fuzz.edits import Choices
 from tests.noack.impairments.feature_examples import CONSTRAINED, IMPAIRED, keeps_loss, names_file
@@ -17,10 +18,8 @@ from tests.noack.impairments.feature_examples import CONSTRAINED, IMPAIRED, keep
 _COMPUTABLE = [
     impairment for impairment in IMPAIRED if not names_file(impairment) and not keeps_loss(impairment)
 ]
-_FIELDS = [(name, of.type.cname) for name, of in ffi.typeof("noack_link").fields]
+_FIELDS = [(name, of.type.cname) for name, of in ffi.typeof("noack_link_settings").fields]
 _SCALARS = [name for name, kind in _FIELDS if kind == "int64_t"]
-_COUNTED = ("stages", "integers", "reals", "windows")
-"""The tables, of which ``noack_link`` has the length."""
 _MOST = 4096
 LATEST_NS, LARGEST_BYTES = 2**61, 65_535
 """What the core assumes of packets."""
@@ -29,22 +28,21 @@ Words = NDArray[np.int64]
 
 
 def link_numbers_input(choices: Choices) -> None:
-    """Make two links, decide for packets of the first, and go on with the second."""
-    links = [link for link in (_link(choices), _link(choices)) if link is not None]
-    for number, (link, kept) in enumerate(links):
-        if number == 0:
-            for row in range(link.rows):
-                core.noack_link_start_flow(link, row, row, choices.below(2))
-        else:
-            before, owner = links[0]
-            if link.rows != before.rows:
-                return
-            link.flows = before.flows
-            latest_ns = np.full(link.rows, core.NOACK_NEVER_NS, np.int64)
-            core.noack_link_change(before, link, pointer_to(latest_ns, "int64_t *"))
-            kept |= {"flows": owner["flows"]}
-        if link.rows:
-            _decide(link, choices)
+    """Make a link of some numbers, decide for packets, and go on with other numbers."""
+    wrong = ffi.new("const char **")
+    numbers, _arrays = _settings(choices)
+    link = core.noack_link_new(numbers, wrong)
+    if link == ffi.NULL:
+        assert ffi.string(wrong[0]).decode().isprintable()
+        return
+    link = ffi.gc(link, core.noack_link_free)
+    for row in range(core.noack_link_rows(link)):
+        assert core.noack_link_start_flow(link, row, row, choices.below(2))
+    _decide(link, choices)
+    other, _arrays = _settings(choices)
+    latest_ns = np.full(core.noack_link_rows(link), core.NOACK_NEVER_NS, np.int64)
+    core.noack_link_change(link, other, pointer_to(latest_ns, "int64_t *"), wrong)
+    _decide(link, choices)
 
 
 def _decide(link: Any, choices: Choices) -> None:
@@ -52,7 +50,7 @@ def _decide(link: Any, choices: Choices) -> None:
     decision = ffi.new("noack_decision *")
     now_ns = choices.integer() % LATEST_NS
     for _ in range(12):
-        row, size = choices.below(256) % link.rows, choices.integer() % (LARGEST_BYTES + 1)
+        row, size = choices.below(256) % core.noack_link_rows(link), choices.integer() % (LARGEST_BYTES + 1)
         core.noack_link_decide(link, row, size, now_ns, decision)
         assert core.NOACK_DELIVERED <= decision.fate <= core.NOACK_BLACKED_OUT
         if decision.release_ns != core.NOACK_NEVER_NS and choices.flag():
@@ -62,8 +60,8 @@ def _decide(link: Any, choices: Choices) -> None:
         now_ns = min(now_ns + abs(step_ns), LATEST_NS)
 
 
-def _link(choices: Choices) -> tuple[Any, dict[str, Any]] | None:
-    """Return a link of numbers that the core accepts, and the arrays that it has; or None."""
+def _settings(choices: Choices) -> tuple[Any, dict[str, Any]]:
+    """Return settings of any numbers, and the arrays that they have."""
     chain = [choices.choose(_COMPUTABLE) for _ in range(choices.below(4))]
     # A link has one scheduler at most.
     chosen = [impairment for impairment in chain if getattr(impairment, "scheduler", None)][1:]
@@ -72,16 +70,10 @@ def _link(choices: Choices) -> tuple[Any, dict[str, Any]] | None:
         constraints=tuple(choices.choose(CONSTRAINED) for _ in range(choices.below(3))),
         mansd=choices.choose((None, 0, 1, 5)),
     )
-    state = LinkState(settings, 1, "fuzz", any_order=choices.below(4) == 1, rows=1 + choices.below(3))
-    valid = state.core
-    link = ffi.new("noack_link *", valid[0])
-    tables = {
-        name: np.frombuffer(
-            ffi.buffer(getattr(valid, name), _length(valid, name) * ffi.sizeof(_kind(name))),
-            np.int64,
-        ).copy()
-        for name in _COUNTED
-    }
+    link, arrays = _link_numbers(settings, 1, ("fuzz",))
+    link.tracks |= choices.below(4) == 1
+    link.rows = 1 + choices.below(3)
+    tables = {name: np.frombuffer(ffi.buffer(array), np.int64).copy() for name, array in arrays.items()}
     keys = tables["stages"].reshape(-1, ffi.sizeof("noack_stage") // 8)[:, 1:3]
     keys[:] = choices.below(2)  # a change of settings transfers states between equal keys
     for _ in range(choices.below(6)):
@@ -93,12 +85,7 @@ def _link(choices: Choices) -> tuple[Any, dict[str, Any]] | None:
                 words[choices.below(1 << 16) % len(words)] = number
         else:
             setattr(link, choices.choose(_SCALARS), number)
-    kept = _allocate(link, tables)
-    wrong = core.noack_link_check(link)
-    if wrong != ffi.NULL:
-        assert ffi.string(wrong).decode().isprintable()
-        return None
-    return link, kept
+    return link, _allocate(link, tables, arrays)
 
 
 def _integer(choices: Choices) -> int:
@@ -108,38 +95,22 @@ def _integer(choices: Choices) -> int:
     return (choices.integer() + 2**63) % 2**64 - 2**63
 
 
-def _kind(name: str) -> Any:
-    return ffi.typeof(getattr(ffi.new("noack_link *"), name)).item
-
-
-def _length(link: Any, name: str) -> int:
-    return int(getattr(link, f"{name.removesuffix('s')}_count"))
-
-
-def _allocate(link: Any, tables: dict[str, Words]) -> dict[str, Any]:
-    """Give a link memory of exactly the lengths that it names; shorten those that are too long.
+def _allocate(link: Any, tables: dict[str, Words], arrays: Mapping[str, Any]) -> dict[str, Any]:
+    """Give settings arrays of exactly the lengths that they name; shorten those that are too long.
 
     No check can know how much memory there is.
     """
-    lengths = [name for name in _SCALARS if name.endswith(("_count", "_flows", "_places", "rows"))]
-    for name in (*lengths, "recent_width", "loss_width"):
-        if getattr(link, name) > _MOST:
+    for name in _SCALARS:
+        if name != "tracks" and getattr(link, name) > _MOST:
             setattr(link, name, getattr(link, name) % 64)
-    sizes = {name: max(_length(link, name), 0) for name in tables}
-    kept: dict[str, Any] = {
-        name: _resized(words, sizes[name] * ffi.sizeof(_kind(name)) // 8) for name, words in tables.items()
-    }
-    rows, stages = max(link.rows, 0), sizes["stages"]
-    kept |= {
-        "flows": np.zeros(rows, dtype_of("noack_flow")),
-        "memory": np.zeros(rows * stages, dtype_of("noack_stage_memory")),
-        "recent_ns": np.full(rows * max(link.recent_width, 0), core.NOACK_NEVER_NS, np.int64),
-        "losses": np.zeros(rows * max(link.loss_width, 0), np.int64),
-        "queues": np.zeros(stages, dtype_of("noack_queue")),
-        "departures_ns": np.zeros(max(link.departure_places, 0), np.int64),
-    }
-    for name, array in kept.items():
-        setattr(link, name, ffi.cast(ffi.typeof(getattr(link, name)), array.ctypes.data))
+    kept: dict[str, Any] = {}
+    for name, words in tables.items():
+        length = max(getattr(link, f"{name.removesuffix('s')}_count"), 0)
+        kept[name] = _resized(words, length * ffi.sizeof(ffi.typeof(arrays[name]).item) // 8)
+        setattr(link, name, ffi.cast(ffi.typeof(getattr(link, name)), kept[name].ctypes.data))
+    for stage in link.stages[0 : max(link.stage_count, 0)]:
+        if stage.queue_places > _MOST:
+            stage.queue_places %= 64
     return kept
 
 

@@ -73,8 +73,8 @@ def test_the_paretonormal_delay_combines_the_quantiles_of_both() -> None:
 def quantile_of(settings: LinkSettings) -> Callable[[float], float]:
     """The delay in ns that belongs to a uniform number."""
     state = LinkState(settings, 0, "a")
-    delay = ffi.addressof(state.core.stages[0], "delay")
-    return lambda u: float(core.noack_delay_quantile_ns(delay, state.core.reals, u))
+    delay = ffi.addressof(core.noack_link_stages(state.core)[0], "delay")
+    return lambda u: float(core.noack_delay_quantile_ns(delay, core.noack_link_reals(state.core), u))
 
 
 def test_observed_delays_have_the_quantiles_of_the_sample(decide: Any) -> None:

@@ -89,7 +89,8 @@ def test_a_rate_serves_packets_as_a_queue(rate: Rate, steps: list[tuple[int, int
         room = core.noack_queue_enters(link, 1, t_ns)
         leaves_ns.append(core.noack_queue_serve(link, 1, size_bytes) if room or forced else None)
     assert leaves_ns == departures(rate, arrivals)
-    assert list(link.departures_ns[0:3]) == [0, 0, 0]
+    assert core.noack_queue_enters(link, 0, 0)  # the other queue was empty
+    assert [core.noack_queue_serve(link, 0, 125)] == departures(other, [(0, 125, False)])
 
 
 def test_packets_lost_before_the_queue_and_dropped_copies_use_no_line_time(decide: Any) -> None:
@@ -324,7 +325,7 @@ def core_departures(settings: LinkSettings, arrivals: Any) -> tuple[list[int], l
             numbers[flow, number] = number
             send(channel, flow, number, size, now_ns, level)
             losses.append(link.flow(flow).consecutive_losses)
-    assert link.core.in_flight == 0
+    assert link.in_flight == 0
     assert link.counters.delivered_out_of_order == 0
     return leaves_ns, losses
 

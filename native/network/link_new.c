@@ -1,5 +1,5 @@
-/* Checks the numbers of a link once, where they enter the core: all that the other files assume. */
-#include <stddef.h>
+/* Makes a link of settings, which it checks and copies: the other files assume what is checked. */
+#include <stdlib.h>
 
 #include "../core.h"
 
@@ -13,8 +13,6 @@ static const int64_t LONGEST_DELAY_NS = INT64_C(1000000000000000); /* 11.6 days,
 static int in_range(int64_t begin, int64_t end, int64_t count) {
     return 0 <= begin && begin <= end && end <= count;
 }
-
-static int is_power_of_2(int64_t number) { return number > 0 && (number & (number - 1)) == 0; }
 
 /* Whether the numbers in [begin, end) ascend, or are equal, from first to last. */
 static int ascends(
@@ -41,10 +39,8 @@ static const char *check_bottleneck(const noack_stage *stage) {
     return stage->queue_places < 1 ? "a bottleneck has no queue" : NULL;
 }
 
-static const char *check_scheduler(const noack_link *link, const noack_stage *stage) {
+static const char *check_scheduler(const noack_link_settings *link, const noack_stage *stage) {
     const noack_bottleneck *settings = &stage->bottleneck;
-    if (link->scheduler != stage - link->stages)
-        return "a stage is a scheduler, but not that of the link";
     if (!is_between(1, settings->flows, link->integer_count)
         || !is_between(0, settings->begin, link->integer_count - settings->flows))
         return "the numbers of flows are outside the table of integers";
@@ -54,7 +50,7 @@ static const char *check_scheduler(const noack_link *link, const noack_stage *st
     return check_bottleneck(stage);
 }
 
-static const char *check_opportunities(const noack_link *link, const noack_stage *stage) {
+static const char *check_opportunities(const noack_link_settings *link, const noack_stage *stage) {
     const noack_opportunities *settings = &stage->opportunities;
     if (!in_range(settings->begin, settings->end, link->integer_count)
         || settings->begin == settings->end)
@@ -73,7 +69,7 @@ static const char *check_opportunities(const noack_link *link, const noack_stage
     return NULL;
 }
 
-static const char *check_replay(const noack_link *link, const noack_replay *settings) {
+static const char *check_replay(const noack_link_settings *link, const noack_replay *settings) {
     if (!in_range(settings->begin, settings->end, link->integer_count)
         || settings->begin == settings->end)
         return "a trace is outside the table of integers";
@@ -92,7 +88,7 @@ static const char *check_replay(const noack_link *link, const noack_replay *sett
     return NULL;
 }
 
-static const char *check_schedule(const noack_link *link, const noack_schedule *settings) {
+static const char *check_schedule(const noack_link_settings *link, const noack_schedule *settings) {
     int64_t flows = settings->flows, count = link->integer_count;
     if (!is_between(1, settings->slots, MOST_EVER) || !is_between(1, flows, MOST_EVER)
         || !is_between(1, settings->slot_ns, FAR_NS / 4 / settings->slots)
@@ -112,11 +108,9 @@ static const char *check_schedule(const noack_link *link, const noack_schedule *
     return NULL;
 }
 
-static const char *check_stage(const noack_link *link, const noack_stage *stage) {
-    if (!is_between(0, stage->queue_places, MOST_EVER)
-        || (stage->queue_places > 0
-            && !is_between(0, stage->queue_begin, link->departure_places - stage->queue_places)))
-        return "a stage's queue is outside the table of departures";
+static const char *check_stage(const noack_link_settings *link, const noack_stage *stage) {
+    if (!is_between(0, stage->queue_places, MOST_EVER))
+        return "a stage's queue is longer than 2^30";
     switch (stage->kind) {
     case NOACK_BERNOULLI:
     case NOACK_CORRUPT:
@@ -167,47 +161,155 @@ static const char *check_stage(const noack_link *link, const noack_stage *stage)
     }
 }
 
-static const char *check_guarantee(const noack_link *link) {
-    if (!is_between(-1, link->mansd, MOST_EVER) || !is_between(0, link->recovery, MOST_EVER)
-        || !is_between(0, link->limit, MOST_EVER))
-        return "the guarantee or the limit is negative, or more than 2^30";
-    int64_t longest = 0;
+static const char *check(const noack_link_settings *link) {
+    const int64_t lengths[] = {
+        link->rows,     link->stage_count,  link->integer_count, link->real_count,
+        link->recovery, link->window_count, link->limit,
+    };
+    for (size_t i = 0; i < sizeof lengths / sizeof *lengths; i++)
+        if (!is_between(0, lengths[i], MOST_EVER))
+            return "a length or limit is negative, or more than 2^30";
+    if (!is_between(-1, link->mansd, MOST_EVER) || link->stage_count > MOST_STAGES)
+        return "there are more than 1024 stages, or the guarantee is out of range";
     for (int64_t i = 0; i < link->window_count; i++) {
         const noack_window *window = &link->windows[i];
         if (!is_between(0, window->losses, MOST_EVER) || !is_between(1, window->packets, MOST_EVER))
             return "a window has no packets, or more than 2^30";
-        longest = max_of(longest, window->packets);
     }
-    if (!is_power_of_2(link->recent_width) || !is_power_of_2(link->loss_width))
-        return "the width of a ring must be a power of 2";
-    if (link->tracks && link->mansd >= 0 && link->recent_width <= link->mansd)
-        return "the ring of release times is shorter than M packets";
-    if (counts_losses(link)
-        && link->loss_width <= max_of(longest + 1, link->mansd + link->recovery + 1))
-        return "the ring of losses is shorter than the guarantee needs";
+    int64_t schedulers = 0, places = 0;
+    for (int64_t i = 0; i < link->stage_count; i++) {
+        const char *wrong = check_stage(link, &link->stages[i]);
+        if (wrong != NULL)
+            return wrong;
+        schedulers += is_scheduler(&link->stages[i]);
+        places += link->stages[i].queue_places;
+    }
+    if (schedulers > 1 || places > MOST_EVER)
+        return "more than one stage chooses what leaves next, or queues have more than 2^30 places";
     return NULL;
 }
 
-static const char *check_lengths(const noack_link *link) {
-    const int64_t lengths[] = {
-        link->rows,          link->stage_count, link->departure_places,
-        link->integer_count, link->real_count,  link->window_count,
-        link->recent_width,  link->loss_width,  link->in_flight,
-    };
-    for (size_t i = 0; i < sizeof lengths / sizeof *lengths; i++)
-        if (!is_between(0, lengths[i], MOST_EVER))
-            return "a table has a negative length, or one of more than 2^30";
-    return link->stage_count > MOST_STAGES ? "there are more than 1024 stages" : NULL;
+/* The smallest power of 2 above a number. */
+static int64_t power_above(int64_t number) {
+    int64_t power = 1;
+    while (power <= number)
+        power *= 2;
+    return power;
 }
 
-const char *noack_link_check(const noack_link *link) {
-    const char *wrong = check_lengths(link);
-    if (wrong == NULL)
-        wrong = check_guarantee(link);
-    for (int64_t i = 0; wrong == NULL && i < link->stage_count; i++)
-        wrong = check_stage(link, &link->stages[i]);
-    if (wrong == NULL && link->scheduler >= 0
-        && (link->scheduler >= link->stage_count || !is_scheduler(&link->stages[link->scheduler])))
-        wrong = "the scheduler of the link is not a stage that chooses";
-    return wrong;
+/* The lengths of the rings: how far back the guarantee looks. */
+static void set_widths(noack_link *link) {
+    int64_t longest = 0;
+    for (int64_t i = 0; i < link->window_count; i++)
+        longest = max_of(longest, link->windows[i].packets);
+    link->recent_width = link->tracks && link->mansd >= 0 ? power_above(link->mansd) : 1;
+    link->loss_width = counts_losses(link)
+                           ? power_above(max_of(longest + 1, link->mansd + link->recovery + 1))
+                           : 1;
 }
+
+/* Which stage chooses, and where each has its queue; return the places of all queues. */
+static int64_t place_queues(noack_link *link) {
+    int64_t places = 0;
+    link->scheduler = -1;
+    for (int64_t i = 0; i < link->stage_count; places += link->stages[i++].queue_places) {
+        link->stages[i].queue_begin = places;
+        if (is_scheduler(&link->stages[i]))
+            link->scheduler = i;
+    }
+    return places;
+}
+
+/* Make room for flows; return 0 if there is no memory. */
+static int add_rows(noack_link *link, int64_t rows) {
+    int64_t before = link->rows, stages = link->stage_count;
+    if (!lengthen(&link->flows, before, rows, sizeof *link->flows)
+        || !lengthen(&link->memory, before * stages, rows * stages + 1, sizeof *link->memory)
+        || !lengthen(
+            &link->recent_ns, before * link->recent_width, rows * link->recent_width,
+            sizeof *link->recent_ns)
+        || !lengthen(
+            &link->losses, before * link->loss_width, rows * link->loss_width,
+            sizeof *link->losses))
+        return 0;
+    for (int64_t i = before * link->recent_width; i < rows * link->recent_width; i++)
+        link->recent_ns[i] = NOACK_NEVER_NS;
+    link->rows = rows;
+    return 1;
+}
+
+noack_link *noack_link_new(const noack_link_settings *settings, const char **wrong) {
+    if ((*wrong = check(settings)) != NULL)
+        return NULL;
+    noack_link *link = zeros(1, sizeof *link);
+    if (link == NULL)
+        return NULL;
+    link->stage_count = settings->stage_count;
+    link->window_count = settings->window_count;
+    link->recovery = settings->recovery;
+    link->mansd = settings->mansd;
+    link->limit = settings->limit;
+    link->tracks = settings->tracks;
+    link->stages = copy_of(settings->stages, link->stage_count, sizeof *link->stages);
+    link->integers = copy_of(settings->integers, settings->integer_count, sizeof *link->integers);
+    link->reals = copy_of(settings->reals, settings->real_count, sizeof *link->reals);
+    link->windows = copy_of(settings->windows, link->window_count, sizeof *link->windows);
+    link->queues = zeros(link->stage_count, sizeof *link->queues);
+    if (link->stages != NULL && link->integers != NULL && link->reals != NULL
+        && link->windows != NULL && link->queues != NULL) {
+        set_widths(link);
+        link->departures_ns = zeros(place_queues(link), sizeof *link->departures_ns);
+        if (link->departures_ns != NULL && add_rows(link, max_of(settings->rows, 1)))
+            return link;
+    }
+    noack_link_free(link);
+    return NULL;
+}
+
+void noack_link_free(noack_link *link) {
+    if (link == NULL)
+        return;
+    void *const arrays[] = {
+        link->stages, link->integers,  link->reals,  link->windows, link->flows,
+        link->memory, link->recent_ns, link->losses, link->queues,  link->departures_ns,
+    };
+    for (size_t i = 0; i < sizeof arrays / sizeof *arrays; i++)
+        free(arrays[i]);
+    free(link);
+}
+
+int64_t noack_link_start_flow(
+    noack_link *link, int64_t row, int64_t number, int64_t first_delivered) {
+    if (row >= link->rows && !add_rows(link, max_of(2 * link->rows, row + 1)))
+        return 0;
+    link->flows[row] = (noack_flow){
+        .number = number,
+        .forced_first = first_delivered != 0,
+        .first_release_ns = NOACK_NEVER_NS,
+        .newest = -1,
+    };
+    memset(
+        link->memory + row * link->stage_count, 0,
+        (size_t)link->stage_count * sizeof *link->memory);
+    for (int64_t i = 0; i < link->recent_width; i++)
+        link->recent_ns[row * link->recent_width + i] = NOACK_NEVER_NS;
+    for (int64_t i = 0; i < link->loss_width; i++)
+        link->losses[row * link->loss_width + i] = 0;
+    return 1;
+}
+
+void noack_link_renew(noack_link *link, const int64_t *keys, int64_t first_delivered) {
+    noack_link_start_flow(link, 0, 0, first_delivered);
+    for (int64_t i = 0; i < link->stage_count; i++) {
+        link->stages[i].key0 = keys[2 * i];
+        link->stages[i].key1 = keys[2 * i + 1];
+    }
+}
+
+noack_flow *noack_link_flows(const noack_link *link) { return link->flows; }
+const noack_stage *noack_link_stages(const noack_link *link) { return link->stages; }
+const double *noack_link_reals(const noack_link *link) { return link->reals; }
+const noack_counters *noack_link_counters(const noack_link *link) { return &link->counters; }
+int64_t noack_link_rows(const noack_link *link) { return link->rows; }
+int64_t noack_link_tracks(const noack_link *link) { return link->tracks; }
+int64_t noack_link_in_flight(const noack_link *link) { return link->in_flight; }

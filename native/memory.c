@@ -1,0 +1,23 @@
+/* Memory of handles: arrays of zeros, and copies of what the caller has. */
+#include <stdlib.h>
+
+#include "core.h"
+
+void *zeros(int64_t count, size_t size) { return calloc((size_t)max_of(count, 1), size); }
+
+void *copy_of(const void *elements, int64_t count, size_t size) {
+    void *copied = zeros(count, size);
+    if (copied != NULL && count > 0)
+        memcpy(copied, elements, (size_t)count * size);
+    return copied;
+}
+
+int lengthen(void *array, int64_t before, int64_t after, size_t size) {
+    void *old, *new;
+    memcpy(&old, array, sizeof old);
+    if ((size_t)after > PTRDIFF_MAX / size || (new = realloc(old, (size_t)after * size)) == NULL)
+        return 0;
+    memset((uint8_t *)new + (size_t)before * size, 0, (size_t)(after - before) * size);
+    memcpy(array, &new, sizeof new);
+    return 1;
+}
