@@ -81,7 +81,7 @@ def faulted_run(name: str, settings: Sequence[str], fault: Fault) -> FaultedRun:
         (summary,) = finalize(ending, report=False, view=False).summary.loops
         record = load_record(ending.run_dir)
         for table in (*STEPS.values(), CONTROLLER_DELIVERY):
-            record.source.whole(table)  # kept in memory: the folder is removed
+            record[table]  # kept in memory: the folder is removed
     return FaultedRun(record, summary, began_s, ended_s)
 
 

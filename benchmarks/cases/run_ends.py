@@ -19,7 +19,7 @@ from benchmarks.report import Goal, Peer, Row, announce, benchmark
 from benchmarks.rounds import Figures
 from cosim.analysis.replay.run_replay import stored_verdict
 from cosim.cli.options import find_scenario
-from cosim.record.record_source import concatenate_rows
+from cosim.record.rows import concatenate_rows
 from cosim.record.run_directory import RECORD, write_environment
 from cosim.record.table_files import TableFile
 from cosim.simulation.virtual_time import simulate_run

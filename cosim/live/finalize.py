@@ -58,8 +58,8 @@ from noack.theory.certificates.certified_bounds import ScenarioCertificate
 
 _FEW_LOOPS = 4
 """A run with at most this number of loops also gets one report per loop."""
-_LOOPS_AT_ONCE, _LEAST_LOOPS, _ROWS_AT_ONCE = 64, 8, 2**18
-"""Largest and smallest number of loops that are evaluated together, and rows of one of their tables."""
+_LEAST_LOOPS = 8
+"""Smallest number of loops that are evaluated together."""
 
 
 @np.errstate(all="ignore")
@@ -127,7 +127,7 @@ def _write_recording_if_missing(
     quiet = (MachineError,) if is_recorded else ()
     with _warning_if_not_written(run_dir / RECORDING_FILE), suppress(*quiet):
         require_viewer()
-        if len(run.loops) > 1 and helpers.count:  # they have imported the viewer
+        if len(run.names) > 1 and helpers.count:  # they have imported the viewer
             # The worst loop is the only one whose summary is shown.
             worst = [summary.loops[worst_loop(summary.loops).number]]
             brief = summary.model_copy(update={"loops": worst})
@@ -195,7 +195,7 @@ def _evaluate_run(
     run: RecordedRun, ending: RunEnding, helpers: FinalizeHelpers
 ) -> tuple[RunSummary, Sequence[LoopOverTime] | None]:
     """Evaluate every loop and the network; return the summary of the run, and how each loop went."""
-    loops, replayed = len(run.loops), None
+    loops, replayed = len(run.names), None
     replay_in_helper = ReplayInHelper(helpers, ending.run_dir) if helpers.count and loops == 1 else None
 
     def evaluate_here(block: range) -> list[_LoopResults]:
@@ -231,19 +231,11 @@ def _summary(run: RecordedRun, ending: RunEnding, loops: Sequence[LoopSummary]) 
     return summarise_run(run.network, loops, end, ending.startup_s)
 
 
-def _steps(run: RecordedRun) -> int:
-    """Return the steps of the plant of a loop."""
-    timing = run.scenario.timing
-    return max(timing.horizon_ns // timing.plant_period_ns, 1)
-
-
 def _blocks(run: RecordedRun) -> Iterator[range]:
     """Yield the loops that are evaluated together: as many as fit into memory, at the end fewer."""
-    loops, first = len(run.loops), 0
-    # A power of 2, as in the row groups of early tables.
-    most = 2 ** (min(_LOOPS_AT_ONCE, max(_ROWS_AT_ONCE // _steps(run), 1)).bit_length() - 1)
+    loops, first = len(run.names), 0
     while first < loops:
-        width = min(max((loops - first) // (2 * cores()), _LEAST_LOOPS), most, loops - first)
+        width = min(max((loops - first) // (2 * cores()), _LEAST_LOOPS), run.loops_at_once, loops - first)
         yield range(first, first + width)
         first += width
 
@@ -268,7 +260,7 @@ def _evaluate_loops(
     block: range,
 ) -> list[_LoopResults]:
     """Evaluate some loops; a helper may replay the only one."""
-    records, results, expected = run.together(block), list[_LoopResults](), dict[str, _Expectations]()
+    records, results, expected = run.read(block), list[_LoopResults](), dict[str, _Expectations]()
     shared = SharedMachines(records if len(block) > 1 else ())
     for record in records:
         key = record.scenario.model_dump_json(exclude={"name", "seeds"})
@@ -279,7 +271,7 @@ def _evaluate_loops(
         phase_ns = run.phases_ns[record.number]
         status, reason = int(ending.status), ending.reason
         summary = summarise_loop(record, status, reason, phase_ns, own.assumptions)
-        if len(run.loops) == 1:
+        if len(run.names) == 1:
             # Written again with the results, so that none of them can cost the summary.
             _write_summary(ending.run_dir, _summary(run, ending, [summary]))
         results.append(_with_results(run, summary, claims, shared, replay_in_helper))
@@ -331,7 +323,7 @@ def _with_results(
         results |= {"replay": replayed, "exit": _exit_after_replay(summary.exit, replayed)}
     over_time = None
     with suppress(Exception):  # the recording reports it
-        if len(run.loops) > 1:
+        if len(run.names) > 1:
             over_time = loop_over_time(record, run.phases_ns[record.number])
     return _LoopResults(summary.model_copy(update=results), over_time)
 

@@ -127,12 +127,12 @@ def write_report(
     """
     shown = summary if loop is None else summary.of_loop(loop)
     worst = worst_loop(shown.loops)
-    if worst.number >= len(run.loops):
+    if worst.number >= len(run.names):
         raise CallerError(
-            f"{run_dir / SUMMARY_FILE}: has loop {worst.number}, and the run has {len(run.loops)}; if it is "
+            f"{run_dir / SUMMARY_FILE}: has loop {worst.number}, and the run has {len(run.names)}; if it is "
             "of another run, remove it: `noack summary RUN` computes it again"
         )
-    record = run.loops[worst.number]
+    record = run.record(worst.number)
     described = run_figures(record, envelopes(record), timed=shown.kind == "live")
     report = Report(
         shown,

@@ -13,7 +13,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from cosim.record.record_source import Rows
+from cosim.record.rows import Rows
 from cosim.record.run_directory import (
     ENVIRONMENT_FILE,
     PROCESSES_FILE,
@@ -150,9 +150,9 @@ def _records(run_dir: Path) -> Iterator[RunRecord]:
 
 def _contains(before: RunRecord, after: RunRecord, table: str) -> bool:
     """Whether each row of a table is, with the same bits, in the table of a later record."""
-    batches = after.source.batches(table)
+    batches = after.batches(table)
     rows: Rows = np.zeros(0, after.tables[table])
-    for old in before.source.batches(table):
+    for old in before.batches(table):
         while not len(rows) or rows["input"][-1] < old["input"][-1]:
             if (batch := next(batches, None)) is None:
                 return False

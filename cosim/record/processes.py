@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.record.record_source import Rows, Slice
+from cosim.record.rows import Rows, Slice
 from cosim.record.run_directory import REPORTS_FILE, read_object
 from noack.core.errors import PeerError
 from noack.core.file_access import write_whole

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from cosim.record import table_files
 from cosim.record.processes import joint_reports
-from cosim.record.record_source import Rows, with_loop
+from cosim.record.rows import Rows, with_loop
 from cosim.record.run_directory import RECORD, REPORTS_FILE
 from cosim.record.run_record import NOTICES_FILE, Notice, RecordedRun
 from noack.core.file_access import PARTIAL, create_folder, new_file, remove_file, write_whole
@@ -28,11 +28,11 @@ def write_run(run: RecordedRun, run_dir: Path) -> None:
 
     def rows(table: str) -> Iterator[Rows]:
         if is_of_network(table):
-            yield from run.network.source.batches(table)
+            yield from run.network.batches(table)
             return
         for number, record in enumerate(run.loops):
             if table in record.tables:
-                for batch in record.source.batches(table):
+                for batch in record.batches(table):
                     yield with_loop(batch, number, types[table])
 
     common = list(run.network.notices)

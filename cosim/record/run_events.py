@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.record.record_source import Rows, messages_in
+from cosim.record.rows import Rows, messages_in
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.errors import CallerError
@@ -171,7 +171,7 @@ class PacketOutcome(NamedTuple):
 def packet_outcomes(record: RunRecord, flow: Flow = Flow.UPDATE) -> PacketOutcome:
     """Return the outcomes of a flow's datagrams that reached the network emulator."""
     departures = _released(record, flow)
-    batches = [*record.source.batches(NETEM_PACKET)] or [np.zeros(0, record.tables[NETEM_PACKET])]
+    batches = [*record.batches(NETEM_PACKET)] or [np.zeros(0, record.tables[NETEM_PACKET])]
     parts = [_outcomes(record.with_departures(rows), flow, *departures) for rows in batches]
     return PacketOutcome(*map(np.concatenate, zip(*parts, strict=True)))
 

@@ -4,16 +4,16 @@
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.record import table_files
 from cosim.record.processes import (
     ROW_COLUMNS,
+    Entries,
     ProcessRows,
     Report,
     entries_of_loop,
@@ -21,20 +21,17 @@ from cosim.record.processes import (
     report_entries,
     valid_reports,
 )
-from cosim.record.record_source import (
+from cosim.record.rows import (
     BATCH_ROWS,
-    DerivedRows,
-    LoopTables,
     NetworkRows,
-    RecordSource,
-    RowsInMemory,
+    ReadRows,
     Slice,
     concatenate_rows,
     pack_rows,
     slices,
     with_columns,
 )
-from cosim.record.record_source import Rows as Rows
+from cosim.record.rows import Rows as Rows
 from cosim.record.run_directory import (
     RECORD,
     SCENARIO_FILE,
@@ -43,6 +40,7 @@ from cosim.record.run_directory import (
     kind_of,
     require_run_directory,
 )
+from cosim.record.table_files import TableFile
 from noack.core.cached_method import cached_method
 from noack.core.errors import CallerError, PeerError
 from noack.protocol.record_tables import (
@@ -92,7 +90,8 @@ class RunRecord:
 
     Args:
         scenario: the resolved scenario of the loop; that of the run for the network.
-        rows: the rows of each table, in the order of the machine's inputs, or where to read them.
+        rows: the rows of each table, in the order of the machine's inputs, or what reads them. A
+            table that is read as a whole is kept.
         notices: the lines of the run's log, each with t_ns, level, text and process.
         reports: each process's final report; a process that died has none.
         kind: live or simulated.
@@ -104,7 +103,7 @@ class RunRecord:
     def __init__(
         self,
         scenario: Scenario,
-        rows: Mapping[str, Rows] | RecordSource,
+        rows: Mapping[str, Rows] | ReadRows,
         notices: list[Notice],
         reports: Mapping[str, Report],
         kind: Kind = "live",
@@ -115,7 +114,8 @@ class RunRecord:
         self.notices = notices
         self.reports = reports
         self.kind: Kind = kind
-        self.source = rows if isinstance(rows, RecordSource) else RowsInMemory(rows)
+        self._read, self._rows = (rows, dict[str, Rows]()) if callable(rows) else (_no_rows, dict(rows))
+        self._counts: dict[str, int] = {}
         self.tables = network_tables() if self.is_network else tables_of(scenario)
 
     @cached_property
@@ -125,11 +125,33 @@ class RunRecord:
 
     def __getitem__(self, table: str) -> Rows:
         """All rows of a table of ``noack.protocol.record_tables``; for a long run, see `slices`."""
-        return self.source.whole(table)
+        if table not in self._rows:
+            self._rows[table] = concatenate_rows([*self._read(table, ())], self.tables[table])
+        return self._rows[table]
 
     def count(self, table: str) -> int:
         """Return the number of rows of a table."""
-        return self.source.count(table)
+        if table in self._rows:
+            return len(self._rows[table])
+        if table not in self._counts:
+            self._counts[table] = sum(map(len, self._read(table, ("input",))))
+        return self._counts[table]
+
+    def batches(self, table: str, columns: Sequence[str] = ()) -> Iterator[Rows]:
+        """Yield the rows of a table in order, with all columns or at least some.
+
+        A table of at most ``BATCH_ROWS`` rows is one part; a longer one is not kept in memory.
+        """
+        if table not in self._rows and self.count(table) > BATCH_ROWS:
+            yield from self._read(table, columns)
+            return
+        rows = self[table]
+        for first in range(0, len(rows), BATCH_ROWS):
+            yield rows[first : first + BATCH_ROWS]
+
+    def keep(self, table: str, parts: Sequence[Rows]) -> None:
+        """Keep the rows of a table, which have been read with those of other loops."""
+        self._rows[table] = concatenate_rows(parts, self.tables[table])
 
     @cached_property
     def is_short(self) -> bool:
@@ -177,9 +199,11 @@ class RunRecord:
         """
         names, columns = tables or [*self.tables], (*columns, "now_ns") if columns else ()
         if any(self.count(table) > BATCH_ROWS for table in names):
-            yield from slices(self.source, names, self._slice_ns, columns)
+            readers = {table: self.batches(table, columns) for table in names}
+            empty = {table: np.zeros(0, with_columns(self.tables[table], columns)) for table in names}
+            yield from slices(readers, empty, self._slice_ns)
         elif any(map(self.count, names)):
-            yield {table: self.source.whole(table) for table in names}
+            yield {table: self[table] for table in names}
 
     def columns(
         self, table: str, *names: str, where: Callable[[Rows], NDArray[np.bool_]] | None = None
@@ -188,7 +212,7 @@ class RunRecord:
 
         For a long run, only tables of few rows and selections of few rows fit into memory.
         """
-        batches = self.source.batches(table, names)
+        batches = self.batches(table, names)
         selection = (rows if where is None else rows.compress(where(rows)) for rows in batches)
         dtype = with_columns(self.tables[table], names)
         return concatenate_rows([pack_rows(rows, dtype) for rows in selection], dtype)
@@ -207,7 +231,7 @@ class RunRecord:
     def last_ns(self, table: str) -> int | None:
         """Return the nominal time of the last row of a table; None if it has none."""
         last_ns = None
-        for rows in self.source.batches(table, ("t_ns",)):
+        for rows in self.batches(table, ("t_ns",)):
             last_ns = int(rows["t_ns"][-1]) if len(rows) else last_ns
         return last_ns
 
@@ -216,7 +240,10 @@ class RunRecord:
 
         ``derive`` gets a table's name and some of its rows, in order.
         """
-        rows = DerivedRows(self.source, derive)
+
+        def rows(table: str, _: Sequence[str]) -> Iterator[Rows]:
+            return (derive(table, part) for part in self.batches(table))
+
         derived = RunRecord(
             scenario,
             rows,
@@ -282,17 +309,48 @@ class RunRecord:
         return BATCH_ROWS // 2 * period_ns
 
 
+def _no_rows(table: str, _: Sequence[str]) -> Iterator[Rows]:
+    """Read a table of a record that is in memory, and does not have it."""
+    raise KeyError(table)
+
+
+_LOOPS_AT_ONCE, _ROWS_AT_ONCE = 64, 2**18
+"""Largest number of loops whose rows are read together, and of rows of one of their tables."""
+
+
 class RecordedRun:
     """The record of a run: of its network, and of each of its loops.
 
     Args:
         network: the tables of the network, for all loops, in the time of the run.
-        loops: the record of each loop, in the order of their numbers.
+        read: ``read(numbers)`` returns the records of some loops. Of several, the rows are read at
+            once and kept in memory; those of one loop are read when they are used.
     """
 
-    def __init__(self, network: RunRecord, loops: Sequence[RunRecord]) -> None:
-        self.network, self.loops = network, loops
+    def __init__(self, network: RunRecord, read: Callable[[range], Sequence[RunRecord]]) -> None:
+        self.network, self.read = network, read
         self.scenario, self.kind = network.scenario, network.kind
+        self._newest: RunRecord | None = None
+        """The loop that was used last."""
+
+    @property
+    def loops(self) -> Iterator[RunRecord]:
+        """Yield the record of each loop; as many are in memory as :attr:`loops_at_once` says."""
+        for first in range(0, len(self.names), self.loops_at_once):
+            yield from self.read(range(first, min(first + self.loops_at_once, len(self.names))))
+
+    @cached_property
+    def loops_at_once(self) -> int:
+        """How many loops are read together: a power of 2, as in the row groups of early tables."""
+        timing = self.scenario.timing
+        steps = max(timing.horizon_ns // timing.plant_period_ns, 1)
+        return int(2 ** (min(_LOOPS_AT_ONCE, max(_ROWS_AT_ONCE // steps, 1)).bit_length() - 1))
+
+    def record(self, number: int) -> RunRecord:
+        """Return the record of the loop of a number; it stays in memory until another is used."""
+        if self._newest is None or self._newest.number != number:
+            (self._newest,) = self.read(range(number, number + 1))
+        return self._newest
 
     @cached_property
     def phases_ns(self) -> Sequence[int]:
@@ -323,16 +381,7 @@ class RecordedRun:
 
     def loop(self, name: str | None = None) -> RunRecord:
         """Return the record of a loop; see :meth:`number_of`."""
-        return self.loops[self.number_of(name)]
-
-    def together(self, numbers: range) -> Sequence[RunRecord]:
-        """Return the records of some loops, whose rows are read at once and kept in memory.
-
-        The rows of one loop are read when they are used.
-        """
-        if len(numbers) > 1 and isinstance(self.loops, StoredLoops):
-            return self.loops.together(numbers)
-        return [self.loops[number] for number in numbers]
+        return self.record(self.number_of(name))
 
 
 def no_such_loop(name: str | None, names: Sequence[str]) -> CallerError:
@@ -344,72 +393,6 @@ def no_such_loop(name: str | None, names: Sequence[str]) -> CallerError:
             f"compare, run.loops[NAME] in Python; they are {few}"
         )
     return CallerError(f"{name}: the run has no such loop; it has {few}")
-
-
-class StoredLoops(Sequence[RunRecord]):
-    """The loops of a run directory, each read when it is used."""
-
-    def __init__(
-        self,
-        run_dir: Path,
-        network: RunRecord,
-        stored: table_files.StoredTables,
-        loops: Sequence[Scenario],
-    ) -> None:
-        self._kind, self._stored, self._scenario = network.kind, stored, network.scenario
-        self._loops, self._phases_ns = loops, phases_ns(network.scenario)
-        self._entries, self._notices = report_entries(run_dir), read_notices(run_dir / RECORD)
-        self._newest: RunRecord | None = None
-        """The loop that was used last."""
-
-    def __len__(self) -> int:
-        return len(self._loops)
-
-    @overload
-    def __getitem__(self, number: int) -> RunRecord: ...
-    @overload
-    def __getitem__(self, number: slice) -> list[RunRecord]: ...
-    def __getitem__(self, number: int | slice) -> RunRecord | list[RunRecord]:
-        if isinstance(number, slice):
-            return [self[index] for index in range(len(self))[number]]
-        number = range(len(self))[number]
-        if self._newest is None or self._newest.number != number:
-            self._newest = self._record_of(number)
-        return self._newest
-
-    def together(self, numbers: range) -> list[RunRecord]:
-        """See :meth:`RecordedRun.together`."""
-        records = [self._record_of(number) for number in numbers]
-        for table in run_tables(self._scenario):
-            if is_of_network(table):
-                continue
-            having = [record for record in records if table in record.tables]
-            types = [record.tables[table] for record in having]
-            loops = [record.number for record in having]
-            for position, rows in self._stored.of_loops(table, loops, types):
-                having[position].source.keep(table, rows)
-        for table, dtype in network_tables().items():
-            parts = zip(*self._shared.of_loops(table, numbers), strict=True)
-            for record, own in zip(records, parts, strict=False):  # none if there are no rows
-                record.source.keep(table, concatenate_rows(own, dtype))
-        return records
-
-    def _record_of(self, number: int) -> RunRecord:
-        loop = self._loops[number]
-        entries = entries_of_loop(self._entries, number, self._shared.count_of_others)
-        source = LoopTables(number, tables_of(loop), self._stored, self._shared)
-        reports = valid_reports(entries, source.types)
-        notices = [
-            {key: value for key, value in notice.items() if key != LOOP}
-            for notice in self._notices
-            if notice.get(LOOP, number) == number
-        ]
-        roles = loop_roles(self._phases_ns)
-        return RunRecord(loop, source, notices, reports, self._kind, number, roles)
-
-    @cached_property
-    def _shared(self) -> NetworkRows:
-        return NetworkRows(self._stored, self._phases_ns)
 
 
 def scenarios_of(run_dir: Path) -> tuple[Scenario, Sequence[Scenario]]:
@@ -443,12 +426,83 @@ def load_run(run_dir: Path) -> RecordedRun:
         raise CallerError(f"{run_dir}: has no numeric record{hint}")
     scenario, loops = scenarios_of(run_dir)
     most_rows = _ROWS_PER_STEP * steps_of(scenario) + _MORE_ROWS
-    stored = table_files.StoredTables(folder, run_tables(scenario), most_rows)
+    types = run_tables(scenario)
+    files = {table: TableFile(folder / f"{table}.parquet", types[table], most_rows) for table in types}
     reports = valid_reports(report_entries(run_dir), network_tables())
-    notices = [notice for notice in read_notices(folder) if LOOP not in notice]
-    kind = kind_of(run_dir)
-    network = RunRecord(scenario, stored, notices, reports, kind, roles=NETWORK_ROLES)
-    return RecordedRun(network, StoredLoops(run_dir, network, stored, loops))
+    notices = read_notices(folder)
+    of_all = [notice for notice in notices if LOOP not in notice]
+
+    def read(table: str, columns: Sequence[str]) -> Iterator[Rows]:
+        return files[table].batches(with_columns(types[table], columns))
+
+    network = RunRecord(scenario, read, of_all, reports, kind_of(run_dir), roles=NETWORK_ROLES)
+    return RecordedRun(network, _loops_reader(network, loops, files, report_entries(run_dir), notices))
+
+
+def _loops_reader(
+    network: RunRecord,
+    loops: Sequence[Scenario],
+    files: Mapping[str, TableFile],
+    entries: Entries,
+    notices: Sequence[Notice],
+) -> Callable[[range], list[RunRecord]]:
+    """Return what reads the records of some loops; see :class:`RecordedRun`."""
+    phases = phases_ns(network.scenario)
+
+    @cache
+    def network_rows() -> NetworkRows:
+        return NetworkRows(network.batches, phases)
+
+    def record_of(number: int) -> RunRecord:
+        types = tables_of(loops[number])
+
+        def read(table: str, columns: Sequence[str]) -> Iterator[Rows]:
+            if is_of_network(table):
+                return network_rows().of_loop(table, number)
+            dtype = with_columns(types[table], columns)
+            return (rows for _, rows in files[table].of_loops(range(number, number + 1), dtype))
+
+        own = entries_of_loop(entries, number, network_rows().count_of_others)
+        return RunRecord(
+            loops[number],
+            read,
+            [
+                {key: value for key, value in notice.items() if key != LOOP}
+                for notice in notices
+                if notice.get(LOOP, number) == number
+            ],
+            valid_reports(own, types),
+            network.kind,
+            number,
+            loop_roles(phases),
+        )
+
+    def read_loops(numbers: range) -> list[RunRecord]:
+        records = [record_of(number) for number in numbers]
+        if len(records) > 1:
+            _keep_rows(records, files, network_rows())
+        return records
+
+    return read_loops
+
+
+def _keep_rows(records: Sequence[RunRecord], files: Mapping[str, TableFile], network: NetworkRows) -> None:
+    """Read the rows of consecutive loops at once, and keep them."""
+    numbers = range(records[0].number, records[-1].number + 1)
+    for table, file in files.items():
+        having = {record.number: record for record in records if table in record.tables}
+        parts: dict[int, list[Rows]] = {number: [] for number in having}
+        if is_of_network(table):
+            for of_loops in network.of_loops(table, numbers):
+                for number, rows in zip(numbers, of_loops, strict=True):
+                    parts[number].append(rows)
+        else:
+            for dtype in {record.tables[table] for record in having.values()}:
+                for number, rows in file.of_loops(numbers, dtype):
+                    if number in having and having[number].tables[table] == dtype:
+                        parts[number].append(rows)
+        for number, record in having.items():
+            record.keep(table, parts[number])
 
 
 def load_record(run_dir: Path, loop: str | None = None) -> RunRecord:

@@ -24,8 +24,8 @@ import numpy as np
 
 from cosim.record import table_files
 from cosim.record.processes import add_kept_reports
-from cosim.record.record_source import BATCH_ROWS, Rows, Segment, concatenate_rows
 from cosim.record.record_writing import record_folder, vector_names
+from cosim.record.rows import BATCH_ROWS, Rows, Segment, concatenate_rows
 from cosim.record.run_directory import RECORD
 from cosim.record.run_record import Notice, RecordedRun, load_run, read_notices, scenarios_of
 from noack.core.errors import MachineError, PeerError, why

@@ -17,17 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from cosim.record.record_source import (
-    BATCH_ROWS,
-    RecordSource,
-    Rows,
-    Segment,
-    concatenate_rows,
-    pack_rows,
-    parts_by_loop,
-    with_columns,
-)
-from noack.core.cached_method import cached_method
+from cosim.record.rows import BATCH_ROWS, Rows, Segment, concatenate_rows, parts_by_loop, with_columns
 from noack.core.errors import CallerError, one_line, why
 from noack.core.file_access import new_file
 from noack.protocol.record_tables import LOOP, OWNER, entry_names
@@ -49,96 +39,6 @@ _ENCODINGS = {
 RowType = np.dtype[np.void]
 
 
-class StoredTables(RecordSource):
-    """The tables of a record in its folder.
-
-    Args:
-        folder: the folder.
-        types: the types of the tables' rows.
-        most_rows: number of rows that a table can have; a file of a few kilobytes may claim more
-            than fit into memory.
-
-    Raises:
-        CallerError: as :class:`TableFile`.
-    """
-
-    def __init__(self, folder: Path, types: Mapping[str, RowType], most_rows: int) -> None:
-        super().__init__(types)
-        self._files = {
-            table: TableFile(folder / f"{table}.parquet", dtype, most_rows) for table, dtype in types.items()
-        }
-        self._newest: dict[str, dict[int, Rows]] = {}
-        """The groups of several loops that were read last, by table and index."""
-
-    def count(self, table: str) -> int:
-        """Return the number of rows of a table."""
-        return self._files[table].rows
-
-    def _read(self, table: str, columns: Sequence[str]) -> Iterator[Rows]:
-        yield from self._files[table].batches(with_columns(self.types[table], columns))
-
-    def of_loop(self, table: str, number: int, dtype: RowType) -> Iterator[Rows]:
-        """Read the rows of a loop in order, as rows of a type; of a table without loops, all."""
-        if LOOP not in (self.types[table].names or ()):
-            yield from self.batches(table, dtype.names or ())
-            return
-        groups = self._groups_with(table, number, number)
-        alone = [group for group, is_alone in groups.items() if is_alone]
-        batches, previous = self._files[table].batches(dtype, alone), self._newest.pop(table, {})
-        # The loops are usually read in turn: the next one is in the same groups.
-        newest = self._newest[table] = {group: previous[group] for group in groups if group in previous}
-        for group, is_alone in groups.items():
-            if is_alone:
-                yield next(batches)
-            else:
-                if group not in newest:
-                    (newest[group],) = self._files[table].batches(groups=[group])
-                rows = newest[group]
-                yield pack_rows(rows.compress(rows[LOOP] == number), dtype)
-
-    def of_loops(
-        self, table: str, loops: Sequence[int], types: Sequence[RowType]
-    ) -> Iterator[tuple[int, Rows]]:
-        """Yield index and rows of each of some loops, as rows of its type; a group is read once."""
-        groups = [*self._groups_with(table, loops[0], loops[-1])]
-        for dtype in dict.fromkeys(types):
-            parts_of: dict[int, list[Rows]] = {
-                number: [] for number, row_type in zip(loops, types, strict=True) if row_type == dtype
-            }
-            for numbers, rows in self._files[table].batches_by_loop(dtype, groups):
-                for number, part in parts_by_loop(rows, numbers):
-                    if number in parts_of:
-                        parts_of[number].append(part)
-            for number, parts in parts_of.items():
-                yield loops.index(number), concatenate_rows(parts, dtype)
-
-    def count_of_loop(self, table: str, number: int) -> int:
-        """Return the number of rows of a loop; of a table without loops, of all rows."""
-        if LOOP not in (self.types[table].names or ()):
-            return self.count(table)
-        return int(self._counts_of_loops(table)[number])
-
-    @cached_method
-    def _counts_of_loops(self, table: str) -> NDArray[np.int64]:
-        """Return the number of rows of each loop, by its number."""
-        counts, groups = np.zeros(MAX_LOOPS + 1, np.int64), self._files[table].groups
-        for group in groups:
-            counts[group.first] += group.rows * (group.first == group.last)
-        mixed_groups = [number for number, group in enumerate(groups) if group.first != group.last]
-        dtype = with_columns(self.types[table], (LOOP,))
-        for rows in self._files[table].batches(dtype, mixed_groups):
-            counts += np.bincount(rows[LOOP], minlength=len(counts))
-        return counts
-
-    def _groups_with(self, table: str, first: int, last: int) -> dict[int, bool]:
-        """Return the groups that may have rows of some loops: whether they have those of one."""
-        return {
-            number: group.first == group.last
-            for number, group in enumerate(self._files[table].groups)
-            if group.first <= last and first <= group.last
-        }
-
-
 class _Group(NamedTuple):
     """A row group of a file."""
 
@@ -155,7 +55,8 @@ class TableFile:
     Args:
         path: the file.
         dtype: the type of its rows; the file may have more columns.
-        most_rows: as of :class:`StoredTables`.
+        most_rows: number of rows that the table can have; a file of a few kilobytes may claim more
+            than fit into memory.
 
     Raises:
         CallerError: the file cannot be read, has too many rows, also in one group, does not have
@@ -192,15 +93,17 @@ class TableFile:
                 table = self._read(file, group, dtype or self._dtype)
                 yield self._rows(table, dtype or self._dtype)
 
-    def batches_by_loop(
-        self, dtype: RowType, groups: Iterable[int]
-    ) -> Iterator[tuple[NDArray[np.uint16], Rows]]:
-        """Yield the number of the loop of each row, and the rows, of some groups."""
+    def of_loops(self, loops: range, dtype: RowType) -> Iterator[tuple[int, Rows]]:
+        """Yield the rows of some loops in order, as rows of a type, in parts with their loop's number."""
         kind = self._dtype[LOOP]
         with self._open() as file:
-            for group in groups:
-                table = self._read(file, group, dtype, LOOP)
-                yield _values(self._path, LOOP, table[LOOP], kind), self._rows(table, dtype)
+            for group, (_, first, last) in enumerate(self.groups):
+                if first < loops.stop and loops.start <= last:
+                    table = self._read(file, group, dtype, LOOP)
+                    numbers = _values(self._path, LOOP, table[LOOP], kind)
+                    for number, rows in parts_by_loop(self._rows(table, dtype), numbers):
+                        if number in loops:
+                            yield number, rows
 
     def whole(self) -> pa.Table:
         """Return the table, loop after loop, with all columns of the file."""

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller_node.controller import controllers_of
-from cosim.record.record_source import NetworkRows, RecordSource, RowsInMemory, concatenate_rows, pack_rows
 from cosim.record.record_writing import write_run
+from cosim.record.rows import NetworkRows, ReadRows, concatenate_rows, pack_rows
 from cosim.record.run_directory import (
     EndingFile,
     RunEnding,
@@ -252,7 +252,7 @@ def simulate(
     """
     if network is not None:
         resolved.coverage.require_unchanging()
-    return _simulate(resolved, (resolved,), network, progress).loops[0]
+    return _simulate(resolved, (resolved,), network, progress).record(0)
 
 
 def simulate_loops(scenario: Scenario, progress: Progress | None = None) -> RecordedRun:
@@ -312,7 +312,10 @@ def _simulate(
     with np.errstate(all="ignore"):  # a diverging loop overflows and is recorded all the same
         run.run(progress=progress)
     of_network = {table: run.record.take_whole(table) for table in network_tables()}
-    packets = NetworkRows(RowsInMemory(of_network), run.phases_ns)
+    of_all = {table: len(rows) for table, rows in of_network.items()}
+    reports = {"netem": _report(of_all, "netem", {"rejected": {}})}
+    common = RunRecord(scenario, of_network, run.record.notices(), reports, "simulated", roles=NETWORK_ROLES)
+    packets = NetworkRows(common.batches, run.phases_ns)
     tables = {table for types in run.types.values() for table in types}
     counts = packets.counts() | {
         table: run.record.counts(table) for table in tables if not is_of_network(table)
@@ -320,47 +323,31 @@ def _simulate(
     numbers = {table: of_loops.tolist() for table, of_loops in counts.items()}
     records = []
     for number, loop in enumerate(loops):
-        rows = _LoopRows(run.record, packets, number, run.types[settings_key(loop)])
-        own_counts = {table: numbers[table][number] for table in rows.types}
+        types = run.types[settings_key(loop)]
+        own_counts = {table: numbers[table][number] for table in types}
+        rows = _reader_of_loop(run.record, packets, number, types)
         reports = _reports(run, own_counts, scenario, number)
         notices = run.record.notices(number)
         roles = loop_roles(run.phases_ns)
         records.append(RunRecord(loop, rows, notices, reports, "simulated", number, roles))
-    of_all = {table: len(rows) for table, rows in of_network.items()}
-    reports = {"netem": _report(of_all, "netem", {"rejected": {}})}
-    common = RunRecord(scenario, of_network, run.record.notices(), reports, "simulated", roles=NETWORK_ROLES)
-    return RecordedRun(common, records)
+    return RecordedRun(common, lambda chosen: records[chosen.start : chosen.stop])
 
 
-class _LoopRows(RecordSource):
-    """The rows of a loop, which are separated from those of the other loops when they are read.
+def _reader_of_loop(
+    record: RecordCollector,
+    packets: NetworkRows,
+    number: int,
+    types: Mapping[str, np.dtype[np.void]],
+) -> ReadRows:
+    """Return what reads the rows of a loop: they are separated from those of other loops at first use."""
 
-    Args:
-        record: the rows of the run's machines.
-        packets: the rows of the network.
-        number: the number of the loop.
-        types: the types of the loop's rows.
-    """
-
-    def __init__(
-        self,
-        record: RecordCollector,
-        packets: NetworkRows,
-        number: int,
-        types: Mapping[str, np.dtype[np.void]],
-    ) -> None:
-        super().__init__(types)
-        self._record, self._packets, self._number = record, packets, number
-
-    def count(self, table: str) -> int:
-        """Return the number of rows of a table."""
-        return len(self.whole(table))
-
-    def _read(self, table: str, columns: Sequence[str]) -> Iterator[Rows]:
+    def read(table: str, _: Sequence[str]) -> Iterator[Rows]:
         if is_of_network(table):
-            yield from self._packets.of_loop(table, self._number)
+            yield from packets.of_loop(table, number)
         else:
-            yield pack_rows(self._record.of_loop(table, self._number), self.types[table])
+            yield pack_rows(record.of_loop(table, number), types[table])
+
+    return read
 
 
 def _split(rows: Rows, loops: int) -> list[Rows]:

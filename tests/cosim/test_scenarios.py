@@ -75,9 +75,9 @@ def test_the_loops_of_a_shipped_network_settle_and_keep_what_is_claimed(name: st
         assert summary["assumption_violations"] == []
         assert summary["longest_loss_burst"] <= record.scenario.network.mansd
         assert summary["final_state_norm"] < 0.1 * summary["initial_state_norm"]
-    count = len(shared.loops)
+    count = len(shared.names)
     for number in {0, count // 2, count - 1}:  # of every kind of loop
-        verdicts = [claim.verdict for claim in RunClaims(shared.loops[number]).evaluate()]
+        verdicts = [claim.verdict for claim in RunClaims(shared.record(number)).evaluate()]
         assert ClaimVerdict.HELD in verdicts
         assert ClaimVerdict.VIOLATED not in verdicts
 

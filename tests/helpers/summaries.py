@@ -10,8 +10,8 @@ from cosim.record.run_record import NETWORK_ROLES, RecordedRun, RunRecord
 
 def run_of_one_loop(record: RunRecord) -> RecordedRun:
     """Return the record of a run whose only loop has the network for itself."""
-    network = RunRecord(record.scenario, record.source, [], record.reports, record.kind, roles=NETWORK_ROLES)
-    return RecordedRun(network, [record])
+    network = RunRecord(record.scenario, record.batches, [], record.reports, record.kind, roles=NETWORK_ROLES)
+    return RecordedRun(network, lambda _: [record])
 
 
 def summary_of(record: RunRecord, **more: Any) -> RunSummary:

@@ -39,7 +39,7 @@ def up_to_common_end(record: RunRecord) -> RunRecord:
     before: dict[str, int] = {}
     for role, table in STEP_TABLES.items():
         column = "now_ns" if role == "netem" else "t_ns"
-        later = (rows["input"][rows[column] > end_ns] for rows in record.source.batches(table))
+        later = (rows["input"][rows[column] > end_ns] for rows in record.batches(table))
         first = next(filter(len, later), None)
         before[role] = int(np.iinfo(np.int64).max if first is None else first[0])
 

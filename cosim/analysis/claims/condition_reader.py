@@ -14,7 +14,7 @@ from cosim.analysis.claims.observed_conditions import (
     SampledSeries,
     clock_cause,
 )
-from cosim.record.record_source import messages_in
+from cosim.record.rows import messages_in
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import NETEM_PACKET, NO_SEQUENCE, PLANT_STEP, SENSOR_MEASUREMENT, effective
@@ -86,7 +86,7 @@ def _early_messages(record: RunRecord) -> dict[str, SampledSeries]:
 def _passed(record: RunRecord) -> dict[int, bool]:
     """Return whether the emulator let each update pass, by number."""
     passed: dict[int, bool] = {}
-    for batch in record.source.batches(NETEM_PACKET, _PACKET_COLUMNS):
+    for batch in record.batches(NETEM_PACKET, _PACKET_COLUMNS):
         rows, sequences, _ = messages_in(batch)
         for sequence, forwarded in zip(sequences.tolist(), effective(rows["fate"]).tolist(), strict=True):
             passed[sequence] = passed.get(sequence, False) or forwarded

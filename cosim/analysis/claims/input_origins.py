@@ -99,7 +99,7 @@ def _steps(record: RunRecord) -> tuple[Times, Times, NDArray[np.float64], Times]
     columns = ("t_ns", "actuation", "u", *(["entry"] if "entry" in names else []))
     times, newest, sizes, ahead = [], [], [], []
     whole_ns, part, parts = record.scenario.timing.controller_period.core
-    for rows in record.source.batches(PLANT_STEP, columns):
+    for rows in record.batches(PLANT_STEP, columns):
         times.append(rows["t_ns"])
         newest.append(rows["actuation"])
         with np.errstate(invalid="ignore"):

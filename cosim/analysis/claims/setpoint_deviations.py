@@ -53,7 +53,7 @@ def start_error(record: RunRecord, started_s: float) -> float:
     period_ns = record.scenario.timing.plant_period_ns
     before_ns = -period_ns
     largest, last = 0.0, np.zeros(0, record.tables[PLANT_STEP])
-    for batch in record.source.batches(PLANT_STEP):
+    for batch in record.batches(PLANT_STEP):
         steps = np.concatenate([last, batch])
         ended = int(np.searchsorted(steps["t_ns"] * 1e-9, started_s)) + 1
         if (np.diff(steps["t_ns"][:ended], prepend=before_ns) > period_ns).any():

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.record.record_source import Rows
+from cosim.record.rows import Rows
 from cosim.record.run_events import changes_of
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NEVER_NS, NS_PER_S

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from controller_node.controller import controllers_of
 from cosim.analysis.replay.replay_result import ProcessReplay, difference, first_row_difference
 from cosim.analysis.summary.summary_model import ReplayDifference
-from cosim.record.record_source import Rows, Slice
+from cosim.record.rows import Rows, Slice
 from cosim.record.run_record import RunRecord
 from netem.channel import Channel, channel_of
 from noack.core.cached_method import cached_method

@@ -29,7 +29,7 @@ from cosim.analysis.replay.replay_result import (
     first_entry,
 )
 from cosim.analysis.summary.summary_model import ReplayPart
-from cosim.record.record_source import Rows, Slice
+from cosim.record.rows import Rows, Slice
 from cosim.record.run_record import RecordedRun, RunRecord, load_run
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,

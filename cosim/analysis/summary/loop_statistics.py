@@ -49,7 +49,7 @@ def lateness_parts(record: RunRecord, role: str) -> Iterator[NDArray[np.float64]
     sensor, and the arrival of the datagram at its socket for the network. A simulated network has
     no socket; its rows have ``now_ns`` there, and are left out.
     """
-    for rows in record.source.batches(STEP_TABLES[role], ("now_ns", "t_ns")):
+    for rows in record.batches(STEP_TABLES[role], ("now_ns", "t_ns")):
         late_ns = rows["now_ns"] - rows["t_ns"]
         known = late_ns[late_ns != 0] if role == "netem" else late_ns
         yield np.asarray(known / (1e3 * record.scenario.speed))

@@ -182,7 +182,7 @@ def _why_failed(record: RunRecord, missing: Mapping[str, int], diverged: Diverge
 
 def _divergence(record: RunRecord) -> Divergence | None:
     scenarios = [record.scenario, *(change.scenario for change in changes_of(record))]
-    batches = record.source.batches(PLANT_STEP, ("t_ns", "x"))
+    batches = record.batches(PLANT_STEP, ("t_ns", "x"))
     parts = ((steps["t_ns"] * 1e-9, steps["x"]) for steps in batches)
     diverged = divergence(parts, record.count(PLANT_STEP), scenarios)
     for notice in record.notices:

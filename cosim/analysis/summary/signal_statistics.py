@@ -181,7 +181,7 @@ class SignalStatistics:
         """Return norms of the state, of the errors, and of the residual of (I1)."""
         first, last, largest = None, None, None
         since_ns, points = setpoints_of(self._record)
-        for steps in self._record.source.batches(PLANT_STEP, ("t_ns", "x")):
+        for steps in self._record.batches(PLANT_STEP, ("t_ns", "x")):
             x = steps["x"]
             if points.any():
                 x = x - points[np.searchsorted(since_ns, steps["t_ns"], "right")]
@@ -232,7 +232,7 @@ def disturbances(record: RunRecord) -> list[DisturbancePart]:
         if column not in (record.tables[PLANT_STEP].names or ()):
             continue
         sizes = SizeStatistics()
-        for steps in record.source.batches(PLANT_STEP, (column,)):
+        for steps in record.batches(PLANT_STEP, (column,)):
             sizes.add(row_norms(steps[column]))
         kinds = [cause.kind for cause in record.scenario.plant.disturbances if cause.at == entry]
         parts.append(DisturbancePart(at=entry, kinds=kinds, rms=sizes.rms, max=sizes.max))

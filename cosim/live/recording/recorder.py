@@ -20,7 +20,7 @@ from zenoh.handlers import FifoChannel, RingChannel
 from cosim.live.recording.telemetry_store import TelemetryStore
 from cosim.record.decimation import is_long
 from cosim.record.processes import report_of, write_reports
-from cosim.record.record_source import Rows, messages_in
+from cosim.record.rows import Rows, messages_in
 from cosim.record.run_directory import RECORDING_FILE, active_run
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from cosim.record.record_source import Rows
+from cosim.record.rows import Rows
 from noack.core.errors import PeerError
 from noack.protocol.record_tables import OWNER
 from noack.protocol.roles import LOOP_ROLES, RECORDER, Notice

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cosim.analysis.certificates import certificates_of
 from cosim.output.export.export_formats import ExportedRun
 from cosim.record.data_frames import events, samples
-from cosim.record.record_source import Rows
+from cosim.record.rows import Rows
 from cosim.record.run_directory import write_output
 from noack.core.errors import CallerError, MachineError
 from noack.scenario.scenario import Scenario

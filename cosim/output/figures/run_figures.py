@@ -208,7 +208,7 @@ def _decimated(
 ) -> tuple[Reals, Reals]:
     """Return times in s (k,) and curves of a vector column (k, …), reduced like the samples."""
     t_s, values = [np.zeros(0)], [curves(np.zeros((0, *record.tables[table][column].shape)))]
-    for rows in record.source.batches(table, ("t_ns", column)):
+    for rows in record.batches(table, ("t_ns", column)):
         part_s, part = _seconds(rows["t_ns"]), curves(rows[column])
         keep = decimate_all(part_s, part.reshape(len(part), -1), record.slice_columns)
         t_s.append(part_s[keep])

@@ -18,7 +18,7 @@ from cosim.analysis.summary.run_summary import counts_inside, times_inside
 from cosim.output.viewer.loop_feed import LAG_S, SHOWN_TABLES, LoopFeed, log_level
 from cosim.output.viewer.run_recording import ALL_ERRORS, ALL_SIZES, RunRecording
 from cosim.record.align import Reals
-from cosim.record.record_source import Rows, rows_by_loop
+from cosim.record.rows import Rows, rows_by_loop
 from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.linear_systems import Propagator
 from noack.core.row_operations import row_norms

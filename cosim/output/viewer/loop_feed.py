@@ -22,7 +22,7 @@ from cosim.record.align import (
     true_states,
 )
 from cosim.record.decimation import decimate_all
-from cosim.record.record_source import Rows, concatenate_rows, messages_in
+from cosim.record.rows import Rows, concatenate_rows, messages_in
 from cosim.record.run_events import claimed_until_s, model_flow
 from noack.core.clock import NS_PER_S
 from noack.core.row_operations import row_norms

@@ -294,7 +294,7 @@ def write_view(
     Raises:
         ViewError: the recording cannot be written.
     """
-    if loop is None and len(run.loops) > 1:
+    if loop is None and len(run.names) > 1:
         _write_network_view(run, summary, run_dir, loops_over_time(run, over_time))
     else:
         write_loop_view(run.loop(loop), run_dir / file_of_loop(RECORDING_FILE, loop))
@@ -317,9 +317,9 @@ def _write_network_view(
     run: RecordedRun, summary: RunSummary, run_dir: Path, over_time: LoopsOverTime
 ) -> None:
     require_space(run_dir)
-    worst, count, path = worst_loop(summary.loops), len(run.loops), run_dir / RECORDING_FILE
+    worst, count, path = worst_loop(summary.loops), len(run.names), run_dir / RECORDING_FILE
     numbers = range(count) if count <= MOST_PICTURED else [worst.number]
-    loops = {number: run.loops[number].scenario for number in numbers}
+    loops = {number: run.record(number).scenario for number in numbers}
     with RunRecording(
         run.scenario, path, _new_id(), loops, run.kind, worst=worst, complete=True
     ) as recording:
@@ -336,7 +336,7 @@ def _write_network_view(
         for notice in run.network.notices:
             recording.log(int(notice["t_ns"]), log_level(notice), str(notice["text"]))
         for number in numbers:
-            _feed_record(run.loops[number], recording, number)
+            _feed_record(run.record(number), recording, number)
 
 
 def _feed_record(record: RunRecord, recording: RunRecording, number: int = 0) -> None:

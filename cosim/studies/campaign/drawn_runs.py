@@ -195,7 +195,7 @@ class SharedNetworkWork(SampledWork):
         rows = np.zeros(len(draws), LOOPS_ROW)
         for row, draw in zip(rows, draws, strict=True):
             seeds = seeds_of(self.seed, draw)
-            records = simulate_loops(self.scenario.model_copy(update={"seeds": seeds})).loops
+            records = [*simulate_loops(self.scenario.model_copy(update={"seeds": seeds})).loops]
             loops = np.zeros(len(records), ROW)
             with np.errstate(all="ignore"):  # loops may diverge
                 for loop_row, record in zip(loops, records, strict=True):

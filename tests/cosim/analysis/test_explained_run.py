@@ -31,7 +31,7 @@ _SETTINGS = (
 
 @cache
 def _record(*settings: str) -> RunRecord:
-    return simulate_loops(resolve_run(shipped("lane_following", *(settings or _SETTINGS)))).loops[0]
+    return simulate_loops(resolve_run(shipped("lane_following", *(settings or _SETTINGS)))).record(0)
 
 
 def _number(rows: Rows, column: str, place: int, amount: float) -> None:
@@ -178,7 +178,7 @@ def test_events_are_those_of_the_rule(policy: str, other: str) -> None:
 
 def test_events_follow_the_dynamic_variable() -> None:
     name, settings = "tabuada_dynamic", ("horizon_s=4",)
-    record = simulate_loops(resolve_run(shipped(name, *settings))).loops[0]
+    record = simulate_loops(resolve_run(shipped(name, *settings))).record(0)
     assert explains(record) == []
     other = resolved(name, *settings, f"trigger.decay_per_s={record.scenario.trigger.decay_per_s + 0.1}")
     assert any(finding.part == "trigger" for finding in explains(changed(record, scenario=other)))
@@ -199,7 +199,7 @@ def test_a_run_that_diverges_is_explained_up_to_its_first_extreme_number() -> No
     """Numbers that overflow are not sent: inputs and updates then stay away."""
     gain = "model.gain=[[200.0,100.0]]"
     scenario = shipped("double_integrator", "horizon_s=12", gain, "model.allow_unstable=true")
-    record = simulate_loops(resolve_run(scenario)).loops[0]
+    record = simulate_loops(resolve_run(scenario)).record(0)
     assert not np.isfinite(record["plant_step"]["x"][-1]).all()
     assert explains(record) == []
     tables = copied(record)

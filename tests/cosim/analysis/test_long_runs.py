@@ -69,7 +69,7 @@ def test_the_results_do_not_depend_on_the_parts(record: RunRecord, monkeypatch: 
     whole = results(record)
     monkeypatch.setattr(run_record, "BATCH_ROWS", PART_ROWS)
     monkeypatch.setattr(RunRecord, "slice_columns", 10**6)
-    in_parts = RunRecord(record.scenario, record.source, record.notices, record.reports, "live")
+    in_parts = RunRecord(record.scenario, record.batches, record.notices, record.reports, "live")
     in_parts.kind = record.kind
     assert len(list(in_parts.slices())) > 5
     assert without_sums(results(in_parts)) == without_sums(whole)

@@ -14,8 +14,8 @@ import pytest
 from cosim.analysis.summary.loop_statistics import missing_rows
 from cosim.record import run_directory
 from cosim.record.added_rows import add_rows
-from cosim.record.record_source import with_loop
 from cosim.record.record_writing import write_run
+from cosim.record.rows import with_loop
 from cosim.record.run_record import Rows, RunRecord, load_record
 from cosim.record.run_scenario import write_scenario
 from cosim.record.spool_conversion import finish_record

@@ -15,7 +15,7 @@ from cosim.record.run_directory import REPORTS_FILE, write_environment
 from cosim.record.run_record import RecordedRun, Rows, load_run
 from cosim.record.run_scenario import write_scenario
 from cosim.record.spool_conversion import Segment, finish_record, merge_segments, write_early
-from cosim.record.table_files import StoredTables, TableFile, write_table
+from cosim.record.table_files import TableFile, write_table
 from cosim.simulation.virtual_time import simulate_loops
 from noack.core.errors import MachineError
 from noack.protocol.record_tables import LOOP, NETEM_PACKET, PLANT_STEP, network_tables
@@ -208,9 +208,12 @@ def test_a_loop_without_rows_between_long_ones_is_empty(tmp_path: Path) -> None:
     for number, rows in enumerate(batches):
         rows[LOOP], rows["input"] = number, range(len(rows))
     write_table(tmp_path / f"{PLANT_STEP}.parquet", batches, dtype, {})
-    stored = StoredTables(tmp_path, {PLANT_STEP: dtype}, 10**6)
-    assert stored.whole(PLANT_STEP).tobytes() == np.concatenate(batches).tobytes()
-    assert [stored.count_of_loop(PLANT_STEP, k) for k in range(len(counts))] == list(counts)
+    file = TableFile(tmp_path / f"{PLANT_STEP}.parquet", dtype)
+    assert np.concatenate([*file.batches()]).tobytes() == np.concatenate(batches).tobytes()
+    for number, count in enumerate(counts):
+        parts = [*file.of_loops(range(number, number + 1), dtype)]
+        assert sum(len(rows) for _, rows in parts) == count
+        assert {loop for loop, _ in parts} <= {number}
 
 
 @given(st.lists(st.tuples(st.integers(0, 40), st.integers(0, 12)), max_size=12), st.integers(1, 30))

@@ -57,11 +57,11 @@ def test_the_first_loop_is_the_run_without_loops(short: Content, protocol: str, 
     short["network"] |= {"protocol": protocol, "impairments": delay}
     alone = simulate(resolve(validate(short, "here")))
     assert len(alone[NETEM_PACKET]) > 10
-    only = run(short, {"name": "only"}).loops[0]
+    only = run(short, {"name": "only"}).record(0)
     assert all(only[t].tobytes() == alone[t].tobytes() for t in alone.tables)
     assert (only.notices, only.reports) == (alone.notices, alone.reports)
     if protocol == "none":  # the flow of an acknowledgement has another number among four loops
-        require_same_rows(alone, run(short, {"name": "a", "count": 4}).loops[0])
+        require_same_rows(alone, run(short, {"name": "a", "count": 4}).record(0))
 
 
 @pytest.fixture
@@ -108,7 +108,7 @@ def test_a_single_loop_with_a_phase_replays_with_the_network_in_the_time_of_the_
     result = replay_run(only)
     assert (result.bit_exact, result.gaps) == (True, [])
     assert {process.process for process in result.processes} == {"plant", "sensor", "netem", "controller"}
-    assert (only.loops[0][NETEM_PACKET]["release_ns"] % 5_800_000 != 0).all()
+    assert (only.record(0)[NETEM_PACKET]["release_ns"] % 5_800_000 != 0).all()
 
 
 @pytest.mark.sanitized
@@ -116,7 +116,7 @@ def test_a_replay_is_exact_and_finds_a_changed_bit(crowded: Content) -> None:
     shared = run(crowded, {"name": "a", "count": 3}, {"name": "b", "mode": "zoh"})
     result = replay(shared.network)
     assert (result.bit_exact, result.gaps, len(result.processes)) == (True, [], 1)
-    machines = SharedMachines(shared.loops)
+    machines = SharedMachines([*shared.loops])
     for record in shared.loops:
         result = replay(record, machines)
         assert result == replay(record)
@@ -125,13 +125,13 @@ def test_a_replay_is_exact_and_finds_a_changed_bit(crowded: Content) -> None:
     packets = shared.network[NETEM_PACKET].copy()
     packets["release_ns"][-1] += 1
     assert replay(changed(shared.network, {NETEM_PACKET: packets})).bit_exact is False
-    packets = shared.loops[2][NETEM_PACKET].copy()
+    packets = shared.record(2)[NETEM_PACKET].copy()
     head = bytearray(packets["head"][3].tobytes())
     head[6] = 1  # the number of another loop
     packets["head"][3] = bytes(head)
-    other = changed(shared.loops[2], {NETEM_PACKET: packets})
+    other = changed(shared.record(2), {NETEM_PACKET: packets})
     result = replay(other)
-    assert result == replay(other, SharedMachines([*shared.loops[:2], other]))
+    assert result == replay(other, SharedMachines([*shared.read(range(2)), other]))
     assert result.first_difference is not None
     assert result.first_difference.column == "head"
 

@@ -21,8 +21,8 @@ from cosim.analysis.summary.summary_model import ExitPart, LoopSummary
 from cosim.live.finalize import reopen
 from cosim.live.recording.recorder import Recorder
 from cosim.output.terminal_output import print_outcome
-from cosim.record.record_source import with_loop
 from cosim.record.record_writing import write_run
+from cosim.record.rows import with_loop
 from cosim.record.run_directory import (
     ENVIRONMENT_FILE,
     RECORD,
@@ -89,7 +89,7 @@ def files(acknowledged: bool, live: bool) -> Mapping[str, bytes]:
     }
     kind = "live" if live else "simulated"
     run = run_of_one_loop(
-        RunRecord(resolved, record.source, record.notices, reports, "live" if live else "simulated")
+        RunRecord(resolved, record.batches, record.notices, reports, "live" if live else "simulated")
     )
     own = summarise_loop(run.loop(), 0, "finished").to_json()
     own |= {

@@ -14,7 +14,7 @@ import zenoh
 
 from cosim.live.recording.recorder import Recorder
 from cosim.output.viewer.loop_recording import ViewError
-from cosim.record.record_source import with_loop
+from cosim.record.rows import with_loop
 from cosim.record.run_directory import SCENARIO_FILE
 from cosim.record.run_record import RunRecord
 from cosim.record.spool_conversion import finish_record

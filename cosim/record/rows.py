@@ -1,15 +1,17 @@
-"""Where the rows of a record come from: memory, files, or another record, batch by batch.
+"""Rows of a record: parts of tables as structured arrays, and which loop they are of.
+
+A structured array has the bytes that the machines write, so that a replay can compare them; its
+columns are ``rows["x"]``, as those of a dictionary of arrays.
 
 The rows of plant, sensor and controller have the number of their loop. Those of the network are of
-all loops. As rows of a loop (:class:`LoopTables`), they have the loop's own time, which is 0 at its
-phase; its flows are numbered as if the loop were alone; and its inputs are numbered in turn
-(:class:`NetworkRows`). A row that is missing in the record leaves its number free in every loop.
+all loops. As rows of a loop, they have the loop's own time, which is 0 at its phase; its flows are
+numbered as if the loop were alone; and its inputs are numbered in turn (:class:`NetworkRows`). A row
+that is missing in the record leaves its number free in every loop.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +20,12 @@ from noack.core.row_operations import firsts_of_equal
 from noack.protocol.record_tables import LOOP, NETEM_SETTING, is_of_network, network_tables
 from noack.protocol.wire_format import HEADER_ROW, MAGIC, VERSIONS, Flow
 
-if TYPE_CHECKING:
-    from cosim.record.table_files import StoredTables
-
 Rows = NDArray[np.void]
 Slice = Mapping[str, Rows]
 """Consecutive rows of several tables, up to the same time."""
+ReadRows = Callable[[str, Sequence[str]], Iterator[Rows]]
+"""``read(table, columns)`` yields the rows of a table in order, part by part, with all columns or, if
+some are given, at least with these."""
 
 BATCH_ROWS = 16_384
 """A table of at most this many rows is read whole; a longer one in parts of this size."""
@@ -68,73 +70,6 @@ def parts_by_loop(rows: Rows, numbers: NDArray[np.integer]) -> Iterator[tuple[in
         yield int(numbers[begin]), rows[begin:end]
 
 
-class RecordSource(ABC):
-    """The tables of a record, with their row types; a table that is read as a whole is kept."""
-
-    def __init__(self, types: Mapping[str, np.dtype[np.void]]) -> None:
-        self.types = types
-        self._whole: dict[str, Rows] = {}
-
-    def whole(self, table: str) -> Rows:
-        """Return all rows of a table."""
-        if table not in self._whole:
-            self._whole[table] = concatenate_rows([*self._read(table, ())], self.types[table])
-        return self._whole[table]
-
-    def keep(self, table: str, rows: Rows) -> None:
-        """Use these rows of a table, which have been read with those of other loops."""
-        self._whole[table] = rows
-
-    @abstractmethod
-    def count(self, table: str) -> int:
-        """Return the number of rows of a table."""
-
-    def batches(self, table: str, columns: Sequence[str] = ()) -> Iterator[Rows]:
-        """Yield the rows of a table in order, with all columns or at least some."""
-        if table not in self._whole and self.count(table) > BATCH_ROWS:
-            yield from self._read(table, columns)
-            return
-        rows = self.whole(table)
-        for first in range(0, len(rows), BATCH_ROWS):
-            yield rows[first : first + BATCH_ROWS]
-
-    @abstractmethod
-    def _read(self, table: str, columns: Sequence[str]) -> Iterator[Rows]:
-        """Yield the rows of a table in order; it may have other columns, too, if some are given."""
-
-
-class RowsInMemory(RecordSource):
-    """Tables that are in memory."""
-
-    def __init__(self, rows: Mapping[str, Rows]) -> None:
-        super().__init__({table: own.dtype for table, own in rows.items()})
-        self._whole = dict(rows)
-
-    def count(self, table: str) -> int:
-        """Return the number of rows of a table."""
-        return len(self._whole[table])
-
-    def _read(self, table: str, columns: Sequence[str]) -> Iterator[Rows]:
-        yield self._whole[table]
-
-
-class DerivedRows(RecordSource):
-    """The rows of another source, each batch changed or filtered by ``derive(table, rows)``."""
-
-    def __init__(self, source: RecordSource, derive: Callable[[str, Rows], Rows]) -> None:
-        super().__init__(source.types)
-        self._source = source
-        self._derive = derive
-
-    def count(self, table: str) -> int:
-        """Return the number of rows of a table."""
-        return sum(map(len, self._read(table, ())))
-
-    def _read(self, table: str, columns: Sequence[str]) -> Iterator[Rows]:
-        for rows in self._source.batches(table):
-            yield self._derive(table, rows)
-
-
 def with_columns(dtype: np.dtype[np.void], columns: Sequence[str]) -> np.dtype[np.void]:
     """Return a row type with only some columns; all of them if none are given."""
     if not columns:
@@ -142,56 +77,47 @@ def with_columns(dtype: np.dtype[np.void], columns: Sequence[str]) -> np.dtype[n
     return np.dtype([(name, dtype[name]) for name in dtype.names or () if name in columns])
 
 
-def slices(
-    source: RecordSource, tables: Sequence[str], width_ns: int, columns: Sequence[str] = ()
-) -> Iterator[Slice]:
-    """Yield consecutive parts of some tables, with all columns or only some.
+def slices(readers: Mapping[str, Iterator[Rows]], empty: Slice, width_ns: int) -> Iterator[Slice]:
+    """Yield consecutive parts of some tables.
 
     A part contains the rows of each table up to the first row whose actual time ``now_ns`` is not
     before the part's end. The ends are multiples of ``width_ns``; intervals without rows are
     omitted.
+
+    Args:
+        readers: the rows of each table, in order.
+        empty: no row of each table.
+        width_ns: the duration of a part.
     """
-    readers = {table: _TableReader(source, table, columns) for table in tables}
+    waiting = dict(empty)
     end_ns: int | None = None
     while True:
-        next_ns = [at for reader in readers.values() if (at := reader.next_ns()) is not None]
+        for table, reader in readers.items():
+            while not len(waiting[table]) and (rows := next(reader, None)) is not None:
+                waiting[table] = rows
+        next_ns = [int(rows["now_ns"][0]) for rows in waiting.values() if len(rows)]
         if not next_ns:
             return
         after_ns = (min(next_ns) // width_ns + 1) * width_ns
         end_ns = after_ns if end_ns is None else max(end_ns + width_ns, after_ns)
-        yield {table: reader.until(end_ns) for table, reader in readers.items()}
+        part = {}
+        for table, reader in readers.items():
+            part[table], waiting[table] = _split_at(end_ns, waiting[table], reader)
+        yield part
 
 
-class _TableReader:
-    """Reads the rows of one table up to given times."""
-
-    def __init__(self, source: RecordSource, table: str, columns: Sequence[str]) -> None:
-        self._batches = source.batches(table, columns)
-        self._rows: Rows = np.zeros(0, with_columns(source.types[table], columns))
-
-    def next_ns(self) -> int | None:
-        """Return the time of the next row; None if there is none."""
-        while not len(self._rows):
-            batch = next(self._batches, None)
-            if batch is None:
-                return None
-            self._rows = batch
-        return int(self._rows["now_ns"][0])
-
-    def until(self, end_ns: int) -> Rows:
-        """Return the next rows, up to the first one that is not before ``end_ns``."""
-        parts: list[Rows] = []
-        while self.next_ns() is not None:
-            later = self._rows["now_ns"] >= end_ns
-            count = int(np.argmax(later)) if later.any() else len(later)
-            if count:  # a part of its own need not be copied
-                parts.append(self._rows[:count])
-            self._rows = self._rows[count:]
-            if len(self._rows):
-                break
-        if not parts:
-            return self._rows[:0]
-        return concatenate_rows(parts, parts[0].dtype)
+def _split_at(end_ns: int, rows: Rows, reader: Iterator[Rows]) -> tuple[Rows, Rows]:
+    """Return the next rows up to the first one that is not before ``end_ns``, and those after them."""
+    parts: list[Rows] = []
+    while True:
+        later = rows["now_ns"] >= end_ns
+        count = int(np.argmax(later)) if later.any() else len(rows)
+        if count:  # a part of its own need not be copied
+            parts.append(rows[:count])
+        rows = rows[count:]
+        if len(rows) or (batch := next(reader, None)) is None:
+            return concatenate_rows(parts or [rows[:0]], rows.dtype), rows
+        rows = batch
 
 
 def with_loop(rows: Rows, number: int, dtype: np.dtype[np.void]) -> Rows:
@@ -258,17 +184,17 @@ class NetworkRows:
     """The rows of each loop in the tables of the network.
 
     Args:
-        source: the rows of all loops.
+        read: reads the rows of all loops.
         phases_ns: when each loop begins.
     """
 
-    def __init__(self, source: RecordSource, phases_ns: Sequence[int]) -> None:
-        self._source, self._phases_ns = source, phases_ns
+    def __init__(self, read: ReadRows, phases_ns: Sequence[int]) -> None:
+        self._read, self._phases_ns = read, phases_ns
         self._inputs: dict[str, NDArray[np.int64]] = {}
         self._indices: dict[str, list[NDArray[np.int32]]] = {}
         """The indices of the rows of each loop in a table."""
         for table in network_tables():
-            batches = [*source.batches(table, ("input", "flow"))]
+            batches = [*read(table, ("input", "flow"))]
             inputs = [rows["input"] for rows in batches]
             self._inputs[table] = np.concatenate([np.zeros(0, np.int64), *inputs])
             if table == NETEM_SETTING:  # a change of settings concerns every loop
@@ -286,10 +212,6 @@ class NetworkRows:
         """Return the number of rows of each loop by table, shape (loops,)."""
         return {table: np.array(list(map(len, indices))) for table, indices in self._indices.items()}
 
-    def count(self, table: str, number: int) -> int:
-        """Return the number of rows of a loop in a table."""
-        return len(self._indices[table][number])
-
     def of_loop(self, table: str, number: int) -> Iterator[Rows]:
         """Yield the rows of a loop in order."""
         return (rows for (rows,) in self.of_loops(table, [number]))
@@ -300,7 +222,7 @@ class NetworkRows:
         parts = [[*map(np.take, self._inputs.values(), indices)] for indices in by_number]
         inputs_of_loops = [np.sort(np.concatenate(inputs)) for inputs in parts]
         first = 0
-        for rows in self._source.batches(table):
+        for rows in self._read(table, ()):
             by_loop = []
             for number, inputs in zip(numbers, inputs_of_loops, strict=True):
                 indices = self._indices[table][number]
@@ -323,44 +245,6 @@ class NetworkRows:
     def count_of_others(self, number: int, table: str) -> int:
         """Return how many rows of a table are of other loops than a loop."""
         return len(self._inputs[table]) - len(self._indices[table][number])
-
-
-class LoopTables(RecordSource):
-    """The tables of a loop in the record of a run.
-
-    Args:
-        number: the number of the loop.
-        types: the types of its rows.
-        stored: the tables of the run.
-        network: the rows of the network.
-    """
-
-    def __init__(
-        self,
-        number: int,
-        types: Mapping[str, np.dtype[np.void]],
-        stored: "StoredTables",
-        network: NetworkRows,
-    ) -> None:
-        super().__init__(types)
-        self._number, self._stored, self._network = number, stored, network
-        self._counts: dict[str, int] = {}
-
-    def count(self, table: str) -> int:
-        """Return the number of rows of a table."""
-        if table in self._whole:
-            return len(self._whole[table])
-        if table not in self._counts:
-            source = self._network.count if is_of_network(table) else self._stored.count_of_loop
-            self._counts[table] = source(table, self._number)
-        return self._counts[table]
-
-    def _read(self, table: str, columns: Sequence[str]) -> Iterator[Rows]:
-        if is_of_network(table):
-            yield from self._network.of_loop(table, self._number)
-            return
-        dtype = with_columns(self.types[table], columns)
-        yield from self._stored.of_loop(table, self._number, dtype)
 
 
 def _of_loop(rows: Rows, number: int, phases_ns: Sequence[int]) -> Rows:
