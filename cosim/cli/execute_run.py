@@ -13,7 +13,6 @@ from cosim.live import launcher
 from cosim.live.coordination.remote_access import ListenSettings
 from cosim.live.monitoring.run_observers import RunLog, RunObserver, log_end
 from cosim.live.monitoring.run_terminal import RunTerminal
-from cosim.live.processes.fork_server import ForkServer, fork_server
 from cosim.record.run_directory import RunEnding, how_to_complete
 from noack.core.core_library import require_live_runs
 from noack.core.errors import PeerError
@@ -39,7 +38,6 @@ def run_processes(
     required: "Sequence[Requirement]" = (),
     spawn: Sequence[str] | None = None,
     session: str | None = None,
-    server: ForkServer | None = None,
     listening: ListenSettings | None = None,
 ) -> int:
     """Run a scenario live; print its verdict and return the exit status.
@@ -54,32 +52,30 @@ def run_processes(
         required: what the run must meet; otherwise the status is 1.
         spawn: roles of the processes to start, all by default; the others join by ``session``.
         session: name that the processes of the run share.
-        server: starts the processes, and ends with the run; by default a new one.
         listening: how processes on other hosts join.
     """
     require_live_runs()
-    with fork_server(server) as server:
-        ending = None
-        if live:
-            from cosim.output.viewer.rerun_program import require_viewer  # imports http.client and TLS
+    ending = None
+    if live:
+        from cosim.output.viewer.rerun_program import require_viewer  # imports http.client and TLS
 
-            require_viewer()
-        warn_of_other_runs()
-        try:
-            with RunTerminal(loaded) as terminal:
-                ending = launcher.launch(
-                    loaded,
-                    runs,
-                    spawn=spawn or ROLES,
-                    session=session,
-                    live=live,
-                    observers=[_TheoryWarnings(loaded), terminal, RunLog()],
-                    server=server,
-                    listening=listening,
-                )
-        except OSError:  # a closed terminal must not end the run
-            if ending is None:
-                raise
+        require_viewer()
+    warn_of_other_runs()
+    try:
+        with RunTerminal(loaded) as terminal:
+            ending = launcher.launch(
+                loaded,
+                runs,
+                spawn=spawn or ROLES,
+                session=session,
+                live=live,
+                fork=True,
+                observers=[_TheoryWarnings(loaded), terminal, RunLog()],
+                listening=listening,
+            )
+    except OSError:  # a closed terminal must not end the run
+        if ending is None:
+            raise
     return finalize_run(ending, report=report, verbose=verbose, json=json, required=required)
 
 

@@ -21,7 +21,6 @@ from cosim.live.disk_space import require_disk_space
 from cosim.live.monitoring.run_observers import RunObserver, RunObservers, observers_of_extensions
 from cosim.live.processes.child_processes import ChildProcesses, EndReason
 from cosim.live.processes.finalize_helpers import FinalizeHelpers, RunEndingWithHelpers, lasting_helpers
-from cosim.live.processes.fork_server import ForkServer, fork_server
 from cosim.live.wait_limit import WaitLimit
 from cosim.record.run_directory import (
     PROCESSES_FILE,
@@ -61,8 +60,8 @@ def launch(
     spawn: Sequence[str] = ROLES,
     session: str | None = None,
     live: bool = False,
+    fork: bool = False,
     observers: Sequence[RunObserver] = (),
-    server: ForkServer | None = None,
     listening: remote_access.ListenSettings | None = None,
 ) -> RunEndingWithHelpers:
     """Run a scenario; :func:`cosim.live.finalize.finalize` completes its record.
@@ -73,8 +72,8 @@ def launch(
         spawn: the roles to launch; the others are started by hand and join by ``session``.
         session: session name for processes started by hand.
         live: show the run in a viewer while it runs.
+        fork: fork this process, which is a command and has one thread, to make the others.
         observers: who follows the run; those of extensions do so, too.
-        server: starts the processes; by default a new one.
         listening: how processes on other hosts join.
 
     Raises:
@@ -83,10 +82,13 @@ def launch(
     """
     began_ns = time.monotonic_ns()
     with contextlib.ExitStack() as stack:
-        server = server or stack.enter_context(fork_server())
         resolved = _prepare(scenario, runs, spawn, across_hosts=listening is not None)
         run_dir = new_run_dir(runs, resolved.name)
         signals = stack.enter_context(_stop_signals(run_dir))
+        children = ChildProcesses(run_dir, spawn, live=live, fork=fork)
+        stack.callback(children.end)
+        with _no_directory_if_refused(run_dir):
+            children.start()  # before this process has threads, and files that a fork would inherit
         resolved = write_scenario(resolved, run_dir)
         descriptor = new_descriptor(resolved, run_dir.resolve(), launched=True)
         stack.enter_context(active_run(run_dir))
@@ -108,8 +110,8 @@ def launch(
         told = RunObservers([*observers, *observers_of_extensions(resolved)])
         if listening is not None:
             told.tell(lambda observer: observer.listening(listening))
-        children = ChildProcesses(descriptor, run_dir, spawn, server)
-        stack.enter_context(children.started(live=live))
+        stack.callback(children.end)  # before all else ends
+        children.send(descriptor)
         run = _Run(descriptor, run_dir, coordinator, children, told, helpers)
         status, reason = run.watch(signals, ending.store)
         if coordinator.epoch_ns is None:

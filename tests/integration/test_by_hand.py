@@ -142,7 +142,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> ByHandRun:
         twice = by_hand("sensor")
         assert twice.wait(live.PATIENCE_S) == 1
         seen = visible_in_processes(recording, [*processes.values()])
-        assert len(seen) == 3 * 7  # with the fork server
+        assert len(seen) == 3 * 6
         run_dir = (recording.runs / "latest").resolve()
         seen |= files(run_dir) | files(private)
         del seen[str(descriptor)]  # the run descriptor contains the key

@@ -25,7 +25,6 @@ app = typer.Typer()
     ),
 )
 def record(
-    context: typer.Context,
     scenario: opt.ScenarioArgument,
     settings: opt.SetOption = None,
     session: Annotated[str, opt.SESSION] = "default",
@@ -65,7 +64,7 @@ def record(
     loaded = opt.load_scenario(scenario, settings)
     return run_processes(
         loaded, runs, live=live, report=report, verbose=verbose, json=json,
-        server=context.obj, spawn=(RECORDER,), session=session, listening=listening,
+        spawn=(RECORDER,), session=session, listening=listening,
     )  # fmt: skip
 
 

@@ -24,7 +24,6 @@ app = typer.Typer()
     ),
 )
 def demo(
-    context: typer.Context,
     zoh: Annotated[
         bool, Option("--zoh", help="Hold the last update (ZOH) instead of using a model.")
     ] = False,
@@ -47,7 +46,7 @@ def demo(
     loaded = opt.load_scenario("lane_following", [*(['mode="zoh"'] if zoh else []), *(settings or ())])
     return run_processes(
         loaded, runs, live=live, report=report, verbose=verbose, json=json,
-        required=require or (), server=context.obj,
+        required=require or (),
     )  # fmt: skip
 
 
@@ -60,7 +59,6 @@ def demo(
     ),
 )
 def run(
-    context: typer.Context,
     scenario: opt.ScenarioArgument,
     settings: opt.SetOption = None,
     network: opt.NetworkOption = None,
@@ -82,7 +80,7 @@ def run(
     loaded = opt.load_scenario(scenario, settings, network)
     return run_processes(
         loaded, runs, live=live, report=report, verbose=verbose, json=json,
-        required=require or (), server=context.obj,
+        required=require or (),
     )  # fmt: skip
 
 

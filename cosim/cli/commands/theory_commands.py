@@ -256,7 +256,6 @@ def adversary(
     ),
 )
 def margin(
-    context: typer.Context,
     scenario: opt.ScenarioArgument,
     settings: opt.SetOption = None,
     network: opt.NetworkOption = None,
@@ -330,7 +329,7 @@ def margin(
             opt.load_loop(scenario, [*(settings or ()), *pattern.settings], loop, network)
         )
     print(played.expected, flush=True)
-    return run_processes(played.scenario, runs, server=context.obj)
+    return run_processes(played.scenario, runs)
 
 
 @app.command(

@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from importlib import import_module
@@ -14,6 +14,7 @@ from multiprocessing.connection import Connection
 from types import ModuleType
 
 from noack.core.system_processes import be_idle
+from noack.runtime.command_line import END_SIGNALS
 
 _KEPT_BYTES = str(32 * 2**20)
 _ENVIRONMENT = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1") | {
@@ -25,6 +26,8 @@ _ENVIRONMENT = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NU
 keep freed memory: with new memory for each part of a record, half of the time is page faults."""
 
 _STARTS = threading.Lock()
+ENDINGS = {getattr(signal, name) for name in END_SIGNALS}
+"""Numbers of the signals that end a program."""
 
 
 @contextmanager
@@ -36,17 +39,26 @@ def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
     # A fork would inherit threads of the libraries.
     context = multiprocessing.get_context("spawn")
     child_end, own_end = context.Pipe(duplex=False)
-    before = {name: os.environ.get(name) for name in _ENVIRONMENT}
-    os.environ.update(_ENVIRONMENT)  # inherited by the children
-    with process_starts():  # it starts a process for semaphores
-        pool = ProcessPoolExecutor(workers, context, _depend_on, (child_end, gc.get_threshold()))
+    with environment(_ENVIRONMENT):
+        with process_starts():  # it starts a process for semaphores
+            pool = ProcessPoolExecutor(workers, context, _depend_on, (child_end, gc.get_threshold()))
+        try:
+            yield pool
+            pool.shutdown()
+        finally:
+            own_end.close()  # ends processes that still compute
+            pool.shutdown(cancel_futures=True)
+            child_end.close()
+
+
+@contextmanager
+def environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Set environment variables within this context, for the processes that are started in it."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
     try:
-        yield pool
-        pool.shutdown()
+        yield
     finally:
-        own_end.close()  # ends processes that still compute
-        pool.shutdown(cancel_futures=True)
-        child_end.close()
         for name, value in before.items():
             if value is None:
                 del os.environ[name]
@@ -86,8 +98,7 @@ def _block_endings() -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
-    endings = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, endings)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDINGS)
     try:
         yield
     finally:

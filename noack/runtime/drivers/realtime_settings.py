@@ -7,7 +7,7 @@ idle states 16/39.
 All memory is locked, so that the loop does not wait for a page. Mappings of up to 16 MiB with code,
 or with data that the process may write, are loaded beforehand. The larger ones are mostly unused:
 buffers of BLAS (32 MiB each), of which the loop uses some pages. These are locked when they are
-first used, as are constants of libraries. What the process shares with the fork server is not
+first used, as are constants of libraries. What the process shares with the one that it was forked from is not
 copied beforehand: its pages are in memory, and the loop writes to few of them, each of which then
 takes a microsecond. Nor are the stacks of other threads (2 MiB each) loaded, most of which is never
 used.

@@ -67,8 +67,7 @@ launcher._Run.watch = show
 main()
 """
 _PROCESSES = """
-from cosim.live.processes import fork_server
-fork_server._import(fork_server._IMPORTS)
+import cosim.live.processes.preloaded
 show()
 """
 

@@ -29,16 +29,10 @@ LOG = "noack sensor: no room\n"
 class Child:
     """A process that has exited with a status, or is running."""
 
-    stdin = None
     pid = 0
 
-    def __init__(self, code: int | None = None) -> None:
-        self.code = code
-
-    def poll(self) -> int | None:
-        return self.code
-
-    wait = poll
+    def __init__(self, exitcode: int | None = None) -> None:
+        self.exitcode = exitcode
 
 
 class FakeCoordinator:
@@ -76,12 +70,12 @@ class FakeCoordinator:
 class FakeChildren(ChildProcesses):
     """All processes run except the sensor, which has exited."""
 
-    def __init__(self, descriptor: Any, run_dir: Path, code: int | None) -> None:
-        super().__init__(descriptor, run_dir, ROLES)
+    def __init__(self, run_dir: Path, code: int | None) -> None:
+        super().__init__(run_dir, ROLES, fork=False)
         self._children = cast(Any, {role: Child() for role in ROLES} | {"sensor": Child(code)})
 
     def exit(self, role: str, code: int) -> None:
-        cast(Any, self._children[role]).code = code
+        cast(Any, self._children[role]).exitcode = code
 
 
 class Calls(RunObserver):
@@ -103,7 +97,7 @@ class Case:
         self.log.write_text(LOG)
 
     def children(self, code: int | None) -> FakeChildren:
-        return FakeChildren(self.descriptor, self.run_dir, code)
+        return FakeChildren(self.run_dir, code)
 
     def run(self, children: FakeChildren, coordinator: FakeCoordinator, **watch: Any) -> _Run:
         observers, helpers = RunObservers([Calls(**watch)]), FinalizeHelpers(self.descriptor.scenario)
