@@ -43,6 +43,9 @@ void *copy_of(const void *elements, int64_t count, size_t size);
 /* Lengthen an array, to which `array` points, by zeros; return 0 if there is no memory. */
 int lengthen(void *array, int64_t before, int64_t after, size_t size);
 
+/* Zeros that begin at a cache line, in memory that is to be freed. */
+void *zeros_in_lines(int64_t count, size_t size, void **memory);
+
 /* One direction of a link. */
 struct noack_link {
     /* Settings: see noack_link_settings */

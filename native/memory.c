@@ -3,6 +3,8 @@
 
 #include "core.h"
 
+enum { LINE_BYTES = 64 }; /* of the caches */
+
 void *zeros(int64_t count, size_t size) { return calloc((size_t)max_of(count, 1), size); }
 
 void *copy_of(const void *elements, int64_t count, size_t size) {
@@ -20,4 +22,9 @@ int lengthen(void *array, int64_t before, int64_t after, size_t size) {
     memset((uint8_t *)new + (size_t)before * size, 0, (size_t)(after - before) * size);
     memcpy(array, &new, sizeof new);
     return 1;
+}
+
+void *zeros_in_lines(int64_t count, size_t size, void **memory) {
+    *memory = calloc((size_t)count * size + LINE_BYTES, 1);
+    return *memory == NULL ? NULL : (uint8_t *)*memory + (-(uintptr_t)*memory) % LINE_BYTES;
 }

@@ -2,9 +2,9 @@
 
    native/build.py gives this file to cffi, and noack/core/core_library.py makes numpy's row types
    of it. Therefore it has declarations, enumerations and these comments only; every number is a
-   double or an integer of a stated width. Times are integer nanoseconds. Python allocates all
-   memory; the core allocates none. Machines, link and simulators call no clock and no socket; the
-   driver and the relay do.
+   double or an integer of a stated width. Times are integer nanoseconds. What noack_..._new returns
+   owns its memory, until noack_..._free. Machines, link and simulators call no clock and no socket;
+   the driver and the relay do.
 
    The comment of a field stands beside it, a long one above it. A blank line begins a group of
    fields, whose heading may follow. */
@@ -968,7 +968,6 @@ enum {
 enum noack_reason {
     NOACK_HOUSEKEEPING, /* the time for housekeeping has come */
     NOACK_NEW_CLIENT,   /* the current datagram is from a new client */
-    NOACK_STORE_FULL,   /* there is no room to store the current datagram */
     NOACK_RECORD_FULL,  /* a buffer of the record's rows is full and must be emptied */
     NOACK_CHANGE_DUE,   /* other settings apply from the current datagram on */
     NOACK_INTERRUPTED,  /* by a signal: Python handles it */
@@ -1077,6 +1076,8 @@ typedef struct {
     int64_t inputs;              /* number of the next row of the record */
     int64_t no_memory;           /* 1: no memory for more delayed datagrams */
 
+    int64_t headroom_bytes;      /* of memory, that delayed datagrams leave free */
+
     /* Tables; after the sockets of the links (listening, then sending), those of the clients. */
     int64_t client_rows, table_places, slot_count, block_count, row_count;
     noack_socket *sockets;       /* (2 links + client_rows,) */
@@ -1095,13 +1096,20 @@ typedef struct {
     int64_t heap_length, packet_rows, release_rows;
     int64_t delayed_count;       /* datagrams that have been delayed so far */
     int64_t free_slot, free_slots, free_block, free_blocks;
-    void *scratch;               /* noack_relay_scratch_bytes() bytes, which are 0 at first */
+    struct relay_scratch *scratch;
+    void *client_memory, *scratch_memory;
 } noack_relay;
 
-int64_t noack_relay_scratch_bytes(void);
+/* Return a relay that has room for some clients, keeps row_count rows of each table of the record (0:
+   there is no record), and waits with a descriptor of epoll. secret: see above. NULL: there is no
+   memory. */
+noack_relay *noack_relay_new(
+    int64_t links, int64_t clients, int64_t row_count, int64_t epoll, const uint64_t secret[2],
+    const char **wrong);
+void noack_relay_free(noack_relay *relay);
 
-/* Prepare the scratch. */
-void noack_relay_open(noack_relay *relay);
+/* Double the room for clients; return 0 if there is no memory. */
+int64_t noack_relay_add_clients(noack_relay *relay);
 
 /* Receive the kernel's timestamps of arrivals, too: delays count from the arrival. */
 void noack_relay_read_stamps(noack_relay *relay);

@@ -40,9 +40,7 @@ class RunNetwork:
 
     def __init__(self, resolved: Scenario, loops: int = 1) -> None:
         self._loops = loops
-        self._memory = RelayMemory(1, row_count=_ROWS)
-        while len(self._memory.clients) < self._loops:
-            self._memory.add_clients()
+        self._memory = RelayMemory(1, clients=loops, row_count=_ROWS)
         self._relay, clients = self._memory.core, self._memory.clients
         self._relay.loops = self._loops
         flows = np.arange(self._loops)
@@ -53,7 +51,7 @@ class RunNetwork:
         if len(links) == 1:  # the relay has two directions; nothing arrives in the second
             links.append((LinkSettings(), "none"))
         for number, (settings, name) in enumerate(links):
-            direction = RelayDirection(settings, resolved.seeds.loss, [name], self._memory.directions[number])
+            direction = RelayDirection(settings, resolved.seeds.loss, [name], self._relay.directions[number])
             for loop in range(self._loops):
                 direction.start_flow(loop, number * self._loops + loop)
             self._directions.append(direction)
@@ -80,7 +78,7 @@ class RunNetwork:
         relay, clients = self._relay, self._memory.clients
         relay.spin_ns = spin_ns
         self.set_clock(clock)
-        self._memory.sockets["fd"][1] = sender.fileno()
+        relay.sockets[1].fd = sender.fileno()
         for place, endpoint in zip((0, self._memory.first_path), receivers.values(), strict=False):
             stamp_arrivals(endpoint)
             if len(receivers) == 1:
@@ -166,8 +164,6 @@ class RunNetwork:
             for settings in due_settings(self._schedule, updates.settings, relay.now_ns):
                 updates.change(settings, self._memory.latest_ns(0, updates.rows))
             self._relay.change_ns = self._schedule.next_ns
-        elif reason == core.NOACK_STORE_FULL:
-            self._memory.add_room()
         elif reason == core.NOACK_HOUSEKEEPING:
             relay.no_memory = 0  # check again
         return reason

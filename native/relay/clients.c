@@ -1,11 +1,13 @@
 /* Clients by address: a hash table with open addressing and linear probing. */
 #include "relay.h"
 
+#include <stdlib.h>
 #include <string.h>
 
 enum {
     IPV4 = AF_INET,
-    FEW = 512 /* the data of so few clients fits into the caches */
+    TABLE_SHARE = 4, /* places of the table per client */
+    FEW = 512        /* the data of so few clients fits into the caches */
 };
 
 /* A client's key in five words: family, port, host, scope and link; or the flow through devices. */
@@ -99,6 +101,43 @@ void noack_client_insert(noack_relay *relay, int64_t row) {
     while (relay->table[place] >= 0)
         place = (place + 1) & mask;
     relay->table[place] = (int32_t)row;
+}
+
+int add_clients(noack_relay *relay, int64_t rows) {
+    int64_t before = relay->client_rows, first = 2 * relay->links;
+    void *memory;
+    noack_client *clients = zeros_in_lines(rows, sizeof *clients, &memory);
+    int32_t *table = zeros(TABLE_SHARE * rows, sizeof *table);
+    if (clients == NULL || table == NULL
+        || !lengthen(
+            &relay->sockets, before == 0 ? 0 : first + before, first + rows,
+            sizeof *relay->sockets)) {
+        free(memory);
+        free(table);
+        return 0;
+    }
+    if (before > 0)
+        memcpy(clients, relay->clients, (size_t)before * sizeof *clients);
+    free(relay->client_memory);
+    free(relay->table);
+    relay->clients = clients;
+    relay->client_memory = memory;
+    relay->table = table;
+    relay->table_places = TABLE_SHARE * rows;
+    relay->client_rows = rows;
+    memset(table, -1, (size_t)relay->table_places * sizeof *table);
+    for (int64_t k = before == 0 ? 0 : first + before; k < first + rows; k++)
+        relay->sockets[k].fd = -1;
+    for (int64_t row = before; row < rows; row++)
+        clients[row].number = -1;
+    for (int64_t row = 0; row < before; row++)
+        if (clients[row].number >= 0)
+            noack_client_insert(relay, row);
+    return 1;
+}
+
+int64_t noack_relay_add_clients(noack_relay *relay) {
+    return add_clients(relay, 2 * relay->client_rows);
 }
 
 /* Remove a client from the table, and close the gap. */

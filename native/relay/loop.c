@@ -3,6 +3,7 @@
 
 #include <errno.h>
 #include <poll.h>
+#include <stdlib.h>
 #include <string.h>
 #include <time.h>
 
@@ -11,9 +12,7 @@ enum {
     BUSY_NS = 10000 /* a datagram that comes so soon after others is expected to be one of many */
 };
 
-enum { NO_CLIENT = -1, REFUSED = -2, NO_ROOM = -3 };
-
-int64_t noack_relay_scratch_bytes(void) { return (int64_t)sizeof(relay_scratch); }
+enum { NO_CLIENT = -1, REFUSED = -2, FIRST_CLIENTS = 64, HEADROOM_BYTES = 48 * 1024 * 1024 };
 
 static void renew_header(noack_relay *relay, int64_t k) {
     relay_scratch *scratch = scratch_of(relay);
@@ -22,7 +21,7 @@ static void renew_header(noack_relay *relay, int64_t k) {
     message->msg_controllen = (size_t)scratch->control_bytes;
 }
 
-void noack_relay_open(noack_relay *relay) {
+static void point_headers(noack_relay *relay) {
     relay_scratch *scratch = scratch_of(relay);
     for (int k = 0; k < BUFFERS; k++) {
         scratch->in_vectors[k] = (struct iovec){scratch->buffers[k], MOST_BYTES};
@@ -35,6 +34,54 @@ void noack_relay_open(noack_relay *relay) {
         scratch->hints[k] = -1;
         renew_header(relay, k);
     }
+}
+
+noack_relay *noack_relay_new(
+    int64_t links, int64_t clients, int64_t row_count, int64_t epoll, const uint64_t secret[2],
+    const char **wrong) {
+    *wrong = NULL;
+    noack_relay *relay = zeros(1, sizeof *relay);
+    if (relay == NULL)
+        return NULL;
+    relay->links = links;
+    relay->epoll = epoll;
+    relay->only_socket = relay->free_slot = relay->free_block = -1;
+    relay->clock.speed = 1.0;
+    relay->change_ns = INT64_MAX;
+    relay->segment_below = 1 << 16;
+    relay->row_count = row_count;
+    relay->records = row_count > 0;
+    relay->headroom_bytes = HEADROOM_BYTES;
+    memcpy(relay->secret, secret, sizeof relay->secret);
+    relay->directions = zeros(2 * links, sizeof *relay->directions);
+    relay->packets = zeros(row_count, sizeof *relay->packets);
+    relay->releases = zeros(row_count, sizeof *relay->releases);
+    relay->scratch = zeros_in_lines(1, sizeof *relay->scratch, &relay->scratch_memory);
+    int64_t rows = FIRST_CLIENTS;
+    while (rows < clients)
+        rows *= 2;
+    if (relay->directions == NULL || relay->packets == NULL || relay->releases == NULL
+        || relay->scratch == NULL || !add_clients(relay, rows) || !make_room(relay, MOST_BYTES)) {
+        noack_relay_free(relay);
+        return NULL;
+    }
+    point_headers(relay);
+    return relay;
+}
+
+void noack_relay_free(noack_relay *relay) {
+    if (relay == NULL)
+        return;
+    for (int64_t k = 0; k < relay->block_count / NOACK_CHUNK_BLOCKS; k++)
+        free(relay->chunks[k]);
+    void *const arrays[] = {
+        relay->directions, relay->packets, relay->releases, relay->scratch_memory,
+        relay->sockets,    relay->table,   relay->heap,     relay->client_memory,
+        relay->slots,      relay->waiting, relay->chunks,   relay->block_next,
+    };
+    for (size_t k = 0; k < sizeof arrays / sizeof *arrays; k++)
+        free(arrays[k]);
+    free(relay);
 }
 
 void noack_relay_read_stamps(noack_relay *relay) {
@@ -149,9 +196,7 @@ static int64_t client_of(noack_relay *relay, int64_t direction, int64_t size_byt
     relay_scratch *scratch = scratch_of(relay);
     noack_direction *own = &relay->directions[direction];
     const uint8_t *data = scratch->buffers[scratch->batch_next];
-    if (own->keeps && (relay->free_slots < 2 || relay->free_blocks < 2 * blocks_for(size_bytes))) {
-        if (!relay->no_memory)
-            return NO_ROOM;
+    if (own->keeps && !make_room(relay, size_bytes)) {
         own->errors[ENOMEM]++;
         return REFUSED;
     }
@@ -285,8 +330,6 @@ static int64_t decide_batch(noack_relay *relay) {
         int64_t row = client_of(relay, 2 * link + reverse, size_bytes);
         if (row == NO_CLIENT)
             return NOACK_NEW_CLIENT;
-        if (row == NO_ROOM)
-            return NOACK_STORE_FULL;
         if (row >= 0)
             decide(relay, 2 * link + reverse, row, size_bytes);
         renew_header(relay, scratch->batch_next);

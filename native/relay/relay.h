@@ -40,7 +40,7 @@ typedef union {
     uint8_t bytes[ERROR_CONTROL_BYTES];
 } error_control;
 
-typedef struct {
+typedef struct relay_scratch {
     struct mmsghdr in_headers[BUFFERS], error_headers[ERRORS], out_headers[LEAVING];
     struct iovec in_vectors[BUFFERS], out_vectors[VECTORS];
     uint8_t in_names[BUFFERS][NOACK_NAME_BYTES];
@@ -83,6 +83,9 @@ static inline int64_t client_of_socket(const noack_relay *relay, int64_t socket)
 
 /* store.c: delayed datagrams. */
 int64_t blocks_for(int64_t size_bytes);
+/* Make room for a datagram and its copy, if it is missing and there is memory; return whether there
+   is room. */
+int make_room(noack_relay *relay, int64_t size_bytes);
 uint8_t *block_address(const noack_relay *relay, int64_t block);
 int64_t store_payload(noack_relay *relay, const uint8_t *data, noack_slot *datagram);
 void free_payload(noack_relay *relay, int64_t slot_number);
@@ -93,6 +96,7 @@ int read_packets(noack_relay *relay, int64_t socket, int most);
 int write_packets(int fd, const struct mmsghdr *headers, int count);
 
 /* clients.c */
+int add_clients(noack_relay *relay, int64_t rows);
 void touch_clients(noack_relay *relay);
 int64_t find_sender(noack_relay *relay);
 

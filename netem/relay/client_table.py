@@ -11,8 +11,8 @@ import numpy as np
 from netem.relay.link_sockets import Endpoint, has_data, return_path, stamp_arrivals
 from netem.relay.loss_warnings import LinkWarnings
 from netem.relay.relay_links import DeviceLink, OpenLink
-from netem.relay.relay_memory import RelayDirection, RelayMemory, name_array
-from noack.core.core_library import core
+from netem.relay.relay_memory import RelayDirection, RelayMemory
+from noack.core.core_library import CData, core
 from noack.runtime.address import packed_name
 from noack.runtime.udp_sockets import drops_of
 
@@ -156,42 +156,42 @@ class ClientTable:
         self.present_counts[link] += 1
         for direction in self._directions[2 * link : 2 * link + 2]:
             direction.start_flow(flow_row, number)
-        memory = self._memory
+        relay = self._memory.core
         _, name_bytes = packed_name(self._links[link].name)
-        client = memory.clients[row]
-        client["last_ns"] = memory.core.now_ns
-        client["number"], client["link"], client["flow_row"] = number, link, flow_row
-        client["in_flight"] = 0
-        client["name_bytes"] = name_bytes
-        client["name"] = name_array(name)
-        core.noack_client_insert(memory.core, row)
-        memory.sockets["error"][self._memory.first_path + row] = error
-        memory.sockets["fd"][self._memory.first_path + row] = -1
+        client = relay.clients[row]
+        client.last_ns = relay.now_ns
+        client.number, client.link, client.flow_row = number, link, flow_row
+        client.in_flight = 0
+        client.name, client.name_bytes = name, name_bytes
+        core.noack_client_insert(relay, row)
+        self._socket(row).error, self._socket(row).fd = error, -1
         if path is not None:
             self._set_path(row, path)
         return row
 
+    def _socket(self, row: int) -> CData:
+        return self._memory.core.sockets[self._memory.first_path + row]
+
     def _set_path(self, row: int, path: Endpoint) -> None:
         memory = self._memory
-        if self._directions[2 * int(memory.clients["link"][row]) + 1].tracks:
+        if self._directions[2 * memory.core.clients[row].link + 1].tracks:
             stamp_arrivals(path)
         self._paths[row] = path
         self._drops[row] = 0
         memory.watch(path.fileno(), memory.first_path + row)
 
     def _forget(self, row: int) -> None:
-        memory = self._memory
-        link = int(memory.clients["link"][row])
-        core.noack_client_remove(memory.core, row)
+        relay = self._memory.core
+        client, link = relay.clients[row], relay.clients[row].link
+        core.noack_client_remove(relay, row)
         if row in self._paths:
             self._query_drops(row)
             del self._drops[row]
             self._paths.pop(row).close()
-        memory.clients["number"][row] = -1
-        memory.sockets["fd"][self._memory.first_path + row] = -1
-        memory.sockets["error"][self._memory.first_path + row] = 0
+        client.number = self._socket(row).fd = -1
+        self._socket(row).error = 0
         self._free_rows.append(row)
-        self._free_flow_rows[link].append(int(memory.clients["flow_row"][row]))
+        self._free_flow_rows[link].append(client.flow_row)
         self.present_counts[link] -= 1
         self._outside_rows.discard(row)
         for direction in (2 * link, 2 * link + 1):
@@ -208,5 +208,5 @@ class ClientTable:
     def _query_drops(self, row: int) -> None:
         drops = drops_of(self._paths[row])
         if drops is not None:
-            self.drops[int(self._memory.clients["link"][row])] += drops - self._drops[row]
+            self.drops[self._memory.core.clients[row].link] += drops - self._drops[row]
             self._drops[row] = drops

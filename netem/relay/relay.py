@@ -68,7 +68,7 @@ class Relay:
                 getattr(spec, side),
                 spec.seed,
                 (spec.name, side),
-                self._memory.directions[2 * number + reverse],
+                self._memory.core.directions[2 * number + reverse],
             )
             for number, spec in enumerate(self.specs)
             for reverse, side in enumerate(DIRECTIONS)
@@ -174,8 +174,6 @@ class Relay:
                 receiver = core.noack_relay_receiver(relay)
                 outside = bool(relay.devices) and receiver > 0
                 self._clients.add(receiver % len(self.specs), name, from_outside=outside)
-            elif reason == core.NOACK_STORE_FULL:
-                self._memory.add_room()
 
     def _do_housekeeping(self, now_ns: int) -> None:
         """Remove idle clients, open return paths again, check for losses."""
@@ -243,7 +241,7 @@ class Relay:
             self._memory.watch(link.endpoint.fileno(), number)
         sends = core.NOACK_OWN_SOCKET
         if link.path is not None:
-            self._memory.sockets["fd"][len(self.specs) + number] = link.path.fileno()
+            self._memory.core.sockets[len(self.specs) + number].fd = link.path.fileno()
             sends = core.NOACK_DESTINATION_NAME
             with suppress(OSError):  # there is no route now; perhaps later
                 # For a connected socket, the kernel looks up the route once, not per datagram.

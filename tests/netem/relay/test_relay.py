@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 
-from netem.relay import relay_memory
 from netem.relay.relay_reports import DirectionReport
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError
@@ -219,13 +218,11 @@ def test_send_errors_are_counted_by_reason(return_path: bool, capfd: pytest.Capt
     assert "could not be sent (Permission denied)" in capfd.readouterr().err
 
 
-def test_datagrams_beyond_the_available_memory_are_dropped_and_counted(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_datagrams_beyond_the_available_memory_are_dropped_and_counted() -> None:
     with relayed(settings_of("delay 1000s")) as (_, client, emulator):
         client.sendto(b"stored", emulator.address())
         emulator.until(lambda: emulator.report().forward.in_flight == 1)
-        monkeypatch.setattr(relay_memory, "_HEADROOM_BYTES", 2**60)
+        emulator.relay._memory.core.headroom_bytes = 2**60
         for _ in range(50):
             client.sendto(bytes(60_000), emulator.address())
         emulator.until(lambda: all_of(emulator.report().forward) == 51)

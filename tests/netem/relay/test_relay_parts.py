@@ -23,7 +23,7 @@ from netem.relay.relay import Relay
 from netem.relay.relay_links import DeviceLink, LinkSpec, open_links
 from netem.relay.relay_memory import RelayMemory, name_array
 from netem.tc_words import settings_of
-from noack.core.core_library import core, pointer_to
+from noack.core.core_library import core, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import packed_name, unpacked_address
@@ -102,8 +102,8 @@ def test_the_table_of_clients_is_a_dictionary(
 ) -> None:
     """A small table, so that many keys collide."""
     memory = RelayMemory(2)
-    table = np.full(PLACES, -1, np.int32)
-    memory.core.table, memory.core.table_places = pointer_to(table, "int32_t *"), PLACES
+    memory.core.table_places = PLACES
+    table = np.frombuffer(ffi.buffer(memory.core.table, 4 * PLACES), np.int32)
     model: dict[tuple[tuple[str, int], int], int] = {}
     free = list(range(ROWS))
     for comes, address, number in steps:
@@ -184,8 +184,8 @@ def test_chosen_addresses_do_not_meet_in_the_table_of_clients() -> None:
     assert len(chosen) == 60
     for _ in range(2):
         memory = RelayMemory(1)
-        table = np.full(256, -1, np.int32)
-        memory.core.table, memory.core.table_places = pointer_to(table, "int32_t *"), 256
+        assert memory.core.table_places == 256
+        table = np.frombuffer(ffi.buffer(memory.core.table, 4 * 256), np.int32)
         for row, host in enumerate(chosen):
             name = struct.pack("<HHI24x", socket.AF_INET, 0x100, host)
             memory.clients["name"][row, : len(name)] = np.frombuffer(name, np.uint8)
