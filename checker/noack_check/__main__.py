@@ -16,10 +16,11 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from noack_check.check import RejectedError
+from noack_check.growth import prove_growth, read_periodic_loop
 from noack_check.keys import RefusedError, Table
 from noack_check.proof import prove
 from noack_check.scenario import read_loop
-from noack_check.sentences import assumptions, sentences
+from noack_check.sentences import assumptions, growth_sentences, sentences
 
 _PLANTS = {"own": "its plant", "box": "all plants of its uncertainty box"}
 _CONDITIONS = {"ideal": "ideal conditions", "schedule": "its schedule"}
@@ -84,8 +85,14 @@ def check_file(file: Table, given: Table | None) -> Iterator[str]:
             raise RejectedError("a statement has no plants or conditions")
         if plants not in _PLANTS or conditions not in _CONDITIONS:
             raise RejectedError("a statement has no plants or conditions")
-        loop = read_loop(scenario, box=plants == "box", ideal=conditions == "ideal")
+        if document.get("statement") == "growth" and (plants, conditions) != ("own", "schedule"):
+            raise RejectedError("growth: is of the plant itself under its schedule")
         of = f"{name}, {_PLANTS[plants]}, {_CONDITIONS[conditions]}"
+        if document.get("statement") == "growth":
+            growth = prove_growth(read_periodic_loop(scenario), document)
+            yield from (f"PROVED {of}, nothing late: {sentence}" for sentence in growth_sentences(growth))
+            continue
+        loop = read_loop(scenario, box=plants == "box", ideal=conditions == "ideal")
         for sentence in sentences(prove(loop, document)):
             yield f"PROVED {of}: {sentence}"
         yield f"       if there are {assumptions(scenario, loop)}"

@@ -15,9 +15,11 @@ from flint import arb, arb_mat, fmpq
 from noack_check.balls import beside, identity, matrix, number, rows_of, stack, zeros
 from noack_check.keys import RefusedError, Table, refusals
 from noack_check.loop import Loop, Rule, Times
-from noack_check.times import NS_PER_S, Schedule, nanoseconds
+from noack_check.times import NS_PER_S, Schedule, fraction, nanoseconds
 
 Rows = Sequence[Sequence[float]]
+_WITHOUT_DELAY = ("loss", "corrupt", "blackout", "duplicate")
+"""Kinds of impairments that do not change the delay of an update."""
 
 
 class _Plants(NamedTuple):
@@ -111,20 +113,11 @@ def _losses(network: Table) -> int:
 
 def _times(resolved: Table, trigger: Table, *, ideal: bool) -> Times:
     """Return the times; a rule with a grid is tested at its points, and otherwise at measurements."""
-    plant, controller, certificate = (_table(resolved, key) for key in ("plant", "controller", "certificate"))
-    zero = fmpq(0)
-    due_ns = _due_ns(trigger)
+    plant, zero, due_ns = _table(resolved, "plant"), fmpq(0), _due_ns(trigger)
     period = fmpq(due_ns, NS_PER_S)
     times = Times(zero, zero, zero, zero, zero, period, period)
     if not ideal:
-        schedule = Schedule(
-            _rate(plant, "plant.rate_hz"),
-            max(_whole(plant, "plant.measure_every"), 1),
-            _rate(controller, "controller.rate_hz"),
-            _real(controller, "controller.phase"),
-            _whole(certificate, "certificate.late_periods"),
-            _real(certificate, "certificate.network_delay_s") if "network_delay_s" in certificate else 0.0,
-        )
+        schedule = read_schedule(resolved)
         times = schedule.times
         if due_ns:
             least, most = schedule.between_events(due_ns)
@@ -139,6 +132,49 @@ def _times(resolved: Table, trigger: Table, *, ideal: bool) -> Times:
         least = grid if inner is trigger else times.least_sampling
         times = times._replace(sampling=grid, least_sampling=least)
     return times
+
+
+def read_schedule(resolved: Table) -> Schedule:
+    """Return the schedule of a resolved scenario."""
+    plant, controller, certificate = (_table(resolved, key) for key in ("plant", "controller", "certificate"))
+    return Schedule(
+        _rate(plant, "plant.rate_hz"),
+        max(_whole(plant, "plant.measure_every"), 1),
+        _rate(controller, "controller.rate_hz"),
+        _real(controller, "controller.phase"),
+        _whole(certificate, "certificate.late_periods"),
+        _real(certificate, "certificate.network_delay_s") if "network_delay_s" in certificate else 0.0,
+    )
+
+
+def constant_delay_ns(resolved: Table) -> int:
+    """Return the delay of all updates in the network; raise RefusedError if it may vary."""
+    total = Fraction(0)
+    for entry in _tables(_table(resolved, "network"), "network.impairments"):
+        kind = entry.get("kind")
+        if kind == "delay" and not (entry.get("jitter_s") or entry.get("samples_s") or entry.get("file")):
+            delay_s = _real(entry, "network.impairments.delay_s")
+            total += fraction(delay_s) * NS_PER_S if delay_s else 0
+        elif kind not in _WITHOUT_DELAY:
+            raise RefusedError(f"network.impairments: {kind}: the delay of updates is not constant")
+    if total.denominator > 1:
+        raise RefusedError("network.impairments.delay_s: not a whole number of nanoseconds")
+    return int(total)
+
+
+def loss_windows(resolved: Table) -> Sequence[tuple[int, int]]:
+    """Return for each rule of the guarantee its most losses, and in how many successive updates.
+
+    Raises:
+        RefusedError: there is a rule of another kind.
+    """
+    found = []
+    for entry in _tables(_table(resolved, "network"), "network.constraints"):
+        if entry.get("kind") != "at_most":
+            raise RefusedError(f"network.constraints: {entry.get('kind')}: not covered")
+        names = ("network.constraints.losses", "network.constraints.window")
+        found.append((_whole(entry, names[0]), _whole(entry, names[1])))
+    return found
 
 
 def _due_ns(trigger: Table) -> int:

@@ -5,6 +5,7 @@ from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 
 from flint import arb
 
+from noack_check.growth import Growth
 from noack_check.loop import Loop
 from noack_check.proof import Bound, Proof
 
@@ -44,6 +45,23 @@ def sentences(proof: Proof) -> Iterator[str]:
         which = "" if proof.is_quiet else " after the first input"
         exception = _exception(proof) if proof.is_quiet else ""
         yield f"two events{which} are at least {at_least(proof.inter_event)} s apart{exception}"
+
+
+def growth_sentences(growth: Growth) -> Iterator[str]:
+    """Yield what is proven of the growth of a time-triggered loop."""
+    per = f"per period of {float(arb(growth.period).mid()):.6g} s, in the long run"
+    if growth.upper is not None:
+        end = ": stable" if growth.upper < 1 else ""
+        yield (
+            f"with at most {growth.losses} consecutive losses no pattern changes the loop's state by more "
+            f"than the factor {at_most(growth.upper)} {per}{end}"
+        )
+    if growth.lower is not None:
+        end = ": unstable" if growth.lower > 1 else ""
+        yield (
+            f"with {growth.losses} consecutive losses allowed, {growth.pattern}, repeated, changes the "
+            f"loop's state at least by the factor {at_least(growth.lower)} {per}{end}"
+        )
 
 
 def norm(output: str) -> str:

@@ -75,9 +75,9 @@ class Schedule:
         self._rounded = 0 if self.is_whole else _ROUNDED_NS
         self._late = late_periods * ceil(self.step)
         if self.tick.denominator == 1:
-            self._phase = round(phase * int(self.tick))
+            self.phase = round(phase * int(self.tick))
         else:
-            self._phase = ceil(fraction(phase) * self.tick) if phase else 0
+            self.phase = ceil(fraction(phase) * self.tick) if phase else 0
         if self.is_whole:
             self._in_flight = self._late + ceil(network_delay_s * NS_PER_S)
         else:
@@ -88,7 +88,7 @@ class Schedule:
         """The times that the statements need."""
         longest = ceil(self.sample)
         shortest = longest if self.is_whole else floor(self.sample)
-        delay, first = self._next_step(self._wait()), self._next_step(self._phase)
+        delay, first = self._next_step(self._wait()), self._next_step(self.phase)
         start = max(first + self._late, delay) if self._in_flight else first
         age = self._oldest_tick() + ceil(self.step) + self._late
         return Times(*(fmpq(t, NS_PER_S) for t in (longest, shortest, delay, age, start)))
@@ -110,13 +110,13 @@ class Schedule:
 
     def _oldest_tick(self) -> int:
         """Return the largest age of the newest tick at a step; what it lacks of a tick's period is kept."""
-        newest = self.tick - self._phase % _common(self.step, self.tick) + self._rounded
+        newest = self.tick - self.phase % _common(self.step, self.tick) + self._rounded
         return ceil(newest + self.tick - floor(self.tick))
 
     def _wait(self) -> Fraction:
         """Return the longest time from an event to the tick that uses its update."""
         common = _common(self.sample, self.tick)
-        rest = self._phase % common
+        rest = self.phase % common
         if not self._in_flight:
             return self.tick - common + rest
         wait = self._in_flight + self.tick - 1  # it may just miss a tick

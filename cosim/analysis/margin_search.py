@@ -11,6 +11,7 @@ from itertools import combinations, permutations
 from typing import NamedTuple
 
 from cosim.analysis.certificates import CertificateAnswer, answer_for
+from cosim.analysis.growth_proof import GrowthProof, prove_growths
 from netem.tc_words import guarantee_words, settings_of
 from noack.core.errors import CallerError
 from noack.core.number_checks import real_number, whole_number
@@ -218,6 +219,8 @@ class MarginResult:
     """The growth under the scenario's losses if nothing limits them, or why it is not known."""
     certificate: CertificateAnswer | None = None
     """Whether the scenario has a certificate; None if this was not examined."""
+    proof: GrowthProof | None = None
+    """What noack-check has proven of the largest stable M and of the destabilising pattern."""
     effort: float = 1.0
     """Factor of the limits of the work for a decision."""
     compared: GuaranteeComparison = _NOT_COMPARED
@@ -270,8 +273,9 @@ class MarginResult:
     def __repr__(self) -> str:
         """Return the verdicts."""
         period = [self.period.text] if self.period else []
-        relations = self.compared.relations
-        return "\n".join([self.verdict, *relations, *period, self.random_text, *self.certificate_texts])
+        proof = [] if self.proof is None else self.proof.lines
+        texts = [self.verdict, *proof, *self.compared.relations, *period, self.random_text]
+        return "\n".join([*texts, *self.certificate_texts])
 
     @property
     def random_text(self) -> str:
@@ -307,6 +311,9 @@ class MarginResult:
             "period": period,
             "without_guarantee": growth if isinstance(growth, str) else growth._asdict(),
             "certificate": None if self.certificate is None else self.certificate._asdict(),
+            "proof": None
+            if self.proof is None
+            else {"proven": self.proof.proven, "reason": self.proof.reason},
         }
 
 
@@ -363,6 +370,7 @@ def find_margin(
     limit: PeriodLimit | None = None
     growth: MeanSquareGrowth | str = "not examined"
     certificate: CertificateAnswer | None = None
+    proof: GrowthProof | None = None
     missing = [_CAPS, *([_OTHERS] if others_read else []), *([_PERIOD] if with_period else [])]
     missing += [_RANDOM, _CERTIFICATE]
     try:
@@ -373,6 +381,8 @@ def find_margin(
             if every_m or caps[-1].stability.verdict == "destabilised":
                 break
         missing.remove(_CAPS)
+        progress("a proof for noack-check")
+        proof = prove_growths(resolved, [(cap.m - 1, cap.stability) for cap in caps])
         if others_read:
             compared = compare_guarantees([network.guarantee, *others_read], examine)
             missing.remove(_OTHERS)
@@ -396,12 +406,13 @@ def find_margin(
         guarantee=network.guarantee.meaning,
         shortest_s=margin.seconds(margin.shortest),
         period_s=margin.seconds(margin.longest),
-        delay_s=margin.loop.times.seconds(margin.loop.times.delay),
+        delay_s=margin.loop.times.seconds(margin.loop.times.whole_delay),
         caps=_with_implied_bounds(caps),
         every_m=every_m,
         period=limit,
         without_guarantee=growth,
         certificate=certificate,
+        proof=proof,
         effort=effort,
         compared=compared,
         missing=tuple(f"M from {len(caps) + 1} on" if what == _CAPS else what for what in missing),
@@ -455,7 +466,7 @@ def find_longest_period(resolved: Scenario, progress: MarginProgress = lambda te
     is_longest = own_margin.shortest < own_margin.longest
     times, measurement_ns = own_margin.loop.times, resolved.timing.measurement_period.exact
     longest = max(int(resolved.timing.horizon_ns / measurement_ns), own_margin.longest)
-    shortest = int(times.delay / (times.parts * measurement_ns)) + 1
+    shortest = min(int(times.whole_delay / (times.parts * measurement_ns)) + 1, own_margin.longest)
     if is_longest:  # below the policy's least time, all times between updates would be equal
         shortest = max(shortest, own_margin.shortest)
     stable, unstable = 0, 0

@@ -257,7 +257,8 @@ def print_margin(console: Console, margin: MarginResult) -> None:
     for table in margin_tables(margin):
         last = len(table.headings) - 1
         console.print(terminal_table(table, left=[last], styles=_MARGIN_STYLES))
-    for text in (margin.verdict, *margin.compared.relations):
+    proof = [] if margin.proof is None else margin.proof.lines
+    for text in (margin.verdict, *proof, *margin.compared.relations):
         console.print(text, soft_wrap=True, highlight=False)
     if margin.period is not None:
         text = f"for {margin.guarantee}: {margin.period.text}"

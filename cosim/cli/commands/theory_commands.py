@@ -276,6 +276,10 @@ def margin(
     ] = None,
     effort: Annotated[float, Option(help="Factor of the work that a decision may take.")] = 1.0,
     play: Annotated[bool, Option("--play", help="Play the destabilising pattern in a live run.")] = False,
+    witness: Annotated[
+        Path | None,
+        Option(callback=opt.usable_path, help="Write what the program noack-check verifies (.json)."),
+    ] = None,
     runs: opt.RunsOption = DEFAULT_RUNS,
     tables: opt.TablesOption = None,
     json: opt.JsonOption = False,
@@ -293,6 +297,7 @@ def margin(
     """
     from cosim.analysis.margin_search import find_margin
     from cosim.output.certificate_report import margin_tables, print_margin
+    from cosim.record.run_directory import write_output
     from noack.scenario.resolution import resolve
 
     if play and json:
@@ -314,6 +319,8 @@ def margin(
     else:
         print_margin(console(), result)
     write_tables(margin_tables(result), tables, json=json)
+    if witness is not None and result.proof is not None and result.proof.documents:
+        write_output(witness, result.proof.file_text())
     if stops:  # the results so far are shown
         print_to_stderr(f"noack: {stops[0]}; missing: {', '.join(result.missing)}")
         return stops[0].exit_status
