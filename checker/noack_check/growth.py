@@ -239,4 +239,4 @@ def _lower(loop: PeriodicLoop, pattern: str, table: Mapping[str, object]) -> arb
     least = arb(trace.abs_lower()) / Π.nrows()
     if not (least > 0 and least.is_finite()):
         raise RejectedError("unstable: the trace of the product is not above 0")
-    return (least.log() / (periods * 2**squarings)).exp()
+    return arb((least.log() / (periods * 2**squarings)).exp())

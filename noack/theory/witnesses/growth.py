@@ -134,4 +134,4 @@ def _frame(loop: PeriodicLoop, maps: Mapping[str, Sequence[Matrix]]) -> Matrix:
             z /= scale
             moments += np.outer(z, z)
     values, vectors = np.linalg.eigh(moments / max(np.trace(moments), 1e-300))
-    return vectors * np.sqrt(np.maximum(values, 1e-8))
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 1e-8)))
