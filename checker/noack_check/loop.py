@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 from flint import arb, arb_mat, fmpq
 
-from noack_check.balls import identity, is_zero, stack, zeros
+from noack_check.balls import frobenius, identity, is_zero, stack, zeros
 
 _MOST_STATES, _MOST_LOSSES = 40, 1000
 """A proof of a larger loop would take hours."""
@@ -64,6 +64,7 @@ class Loop(NamedTuple):
     rule: Rule
     pushes: arb_mat  # columns D of disturbances, (n, k)
     sizes: tuple[arb, ...]  # |d_i| ≤ sizes[i]
+    noise: arb_mat  # columns of the noise of measurements, (n, k): Σ column p with |p_i| ≤ 1 for each
     losses: int  # most consecutive losses, M − 1
     times: Times
 
@@ -71,6 +72,12 @@ class Loop(NamedTuple):
     def n(self) -> int:
         """Number of states."""
         return int(self.A.nrows())
+
+    @property
+    def noise_size(self) -> arb:
+        """The largest ‖W n‖ of the noise n of measurements."""
+        rows = (self.weight * self.noise).tolist() if self.noise.ncols() else []
+        return frobenius(arb_mat(1, len(rows), [sum((abs(entry) for entry in row), arb(0)) for row in rows]))
 
     @property
     def H(self) -> arb_mat:
@@ -82,11 +89,12 @@ class Loop(NamedTuple):
         """Return what is wrong with the numbers, or an empty text."""
         n, rule, times = self.n, self.rule, self.times
         m, k = self.B.ncols(), self.pushes.ncols()
-        if not 0 < max(n, m, k) <= _MOST_STATES or not 0 <= self.losses <= _MOST_LOSSES:
+        if not 0 < max(n, m, k, self.noise.ncols()) <= _MOST_STATES or not 0 <= self.losses <= _MOST_LOSSES:
             return f"not from 1 to {_MOST_STATES} states, or not from 0 to {_MOST_LOSSES} losses"
         shapes = {
             "A": (n, n), "B": (n, m), "half_A": (n, n), "half_B": (n, m), "model_A": (n, n),
             "model_B": (n, m), "gain": (m, n), "weight": (n, n), "start": (n, 1), "pushes": (n, k),
+            "noise": (n, self.noise.ncols()),
         }  # fmt: skip
         matrices = {name: getattr(self, name) for name in shapes} | {
             "rule.positive": rule.positive, "rule.negative": rule.negative,

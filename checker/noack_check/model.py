@@ -6,8 +6,12 @@ of constant bounds. With the input u = K e^{−Hs} x_c of age s,
 
     ẋ = Ax + Bu + Dd,   ė = H(x + e) − ẋ,   ẇ = Hw,   ḟ₁ = −r f₁,   ḟ₂ = 0.
 
-An event sets e := 0 at once, since the sensor's model is reset whether or not the update arrives, and w
-grows by e. A location says what becomes of the updates that were sent since the one that the acting input
+A test measures x + n with a noise n = Σ column p, |p| ≤ f₂, which is another one at each test. An event
+sets x_s := x + n, so e := n at once, since the sensor's model is reset whether or not the update arrives,
+and w grows by e − n. The rule compares x + n and e − n. The entries of z for p are used at tests only; with
+tests at all times also in flows, where some p at each time makes the rule silent.
+
+A location says what becomes of the updates that were sent since the one that the acting input
 was computed from:
 
 * "j lost": j updates, which never act. At an event the next one is lost, too, or is on its way.
@@ -15,7 +19,7 @@ was computed from:
   since that. It acts before the clock shows d. Of the k later updates one acts next, or all are lost.
 
 In "k later" z has k vectors more: v₁, …, v_k with v̇ᵢ = Hvᵢ, what w will be when the updates act that
-have k, …, 1 later ones. An event adds e to all of them, since it changes x_s by −e and no prediction.
+have k, …, 1 later ones. An event adds e − n to all of them, since it changes x_s by n − e and no prediction.
 
 A periodic rule (``times.period`` > 0) compares nothing, so its events depend on the time only. In each
 location a clock shows the time since the last event, at which the next one happens. Nothing depends on
@@ -34,14 +38,14 @@ prove the statement:
   (affine between nodes of θ).
   V ≤ 0 is invariant: along flows dV/dt ≤ −νV, over edges V does not grow, and V ≤ 0 at the start.
 * Where V ≤ 0, each output obeys |Cz|² ≤ D₁² f₁² + D₂² f₂².
-* Quadratic facts q(z) ≤ 0 that hold where an inequality is used (the rule's comparison, a bound of w)
-  enter with multipliers m ≥ 0, and unknown signals p with |p|² ≤ |Rz|² with multipliers, too.
+* Quadratic facts q(z) ≤ 0 that hold where an inequality is used (the rule's comparison, bounds of p and
+  of w) enter with multipliers m ≥ 0, and unknown signals p with |p|² ≤ |Rz|² with multipliers, too.
 
 Flows are affine in the input's matrix K e^{−Hs}, so its hull's corners suffice; inequalities are affine
 in θ between two nodes, so both ends suffice.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from math import comb
 from typing import NamedTuple
 
@@ -93,6 +97,8 @@ class Location(NamedTuple):
     flows: tuple[Flow, ...]
     facts: tuple[arb_mat, ...]
     """Symmetric Q with zᵀQz ≤ 0."""
+    silent: tuple[arb_mat, ...]
+    """Those that say that a rule which is tested at all times is silent."""
     is_tested: bool
 
 
@@ -106,10 +112,12 @@ class Edge(NamedTuple):
     """Nodes of the source and of the target; between two pairs both times are affine."""
     jump: arb_mat
     facts: tuple[arb_mat, ...]
+    is_test: bool
+    """z has the noise of a measurement."""
 
 
 class Errors(NamedTuple):
-    """What is assumed of e_s at all times: ‖W e_s‖² ≤ ``decaying``² f₁² + ``constant``² f₂²."""
+    """What is assumed at all times: ‖W (e_s − n)‖² ≤ ``decaying``² f₁² + ``constant``² f₂²."""
 
     decaying: arb
     constant: arb
@@ -146,7 +154,9 @@ class Form(NamedTuple):
 
 def needs_constant(loop: Loop) -> bool:
     """Return whether f₂ is a state."""
-    is_needless = loop.rule.floor == 0 and not loop.sizes  # false for a ball around 0
+    is_needless = (
+        loop.rule.floor == 0 and not loop.sizes and not loop.noise.ncols()
+    )  # false for a ball around 0
     return not is_needless
 
 
@@ -196,11 +206,15 @@ class Model:
         self.is_periodic = loop.times.period > 0
         self._clock = self._clock_nodes(pieces) if self.is_periodic else []
         n, copies = loop.n, max(later, later_at_start)
-        self.size = (3 + copies) * n + 2
+        self._sources = range((3 + copies) * n, (3 + copies) * n + loop.noise.ncols())
+        self.size = self._sources.stop + 2
         every = identity(self.size)
-        vectors = [rows_of(every, range(i, i + n)) for i in range(0, self.size - 2, n)]
+        vectors = [rows_of(every, range(i, i + n)) for i in range(0, self._sources.start, n)]
         self.x, self.e, self.w, *self.v = vectors
+        self.p = rows_of(every, self._sources)
         self.f1, self.f2 = (rows_of(every, [self.size - 2 + i]) for i in range(2))
+        self.noise = loop.noise * self.p if self._sources else 0 * self.x
+        self._noise_bounds = tuple(square(rows_of(every, [i])) - square(self.f2) for i in self._sources)
         self._has_f1 = has_decaying_unit(loop, rate)
         self.level, self.floor = thresholds(loop, rate)
         self.silent = self._comparison(self.level, self.floor)
@@ -228,13 +242,15 @@ class Model:
         return found
 
     def _comparison(self, level: arb, floor: arb) -> arb_mat:
-        """Return ‖P z‖² − ‖N z‖² − c² f₁² − f² f₂²."""
-        pair = stack([self.x, self.e])
+        """Return ‖P z‖² − ‖N z‖² − c² f₁² − f² f₂² of what is measured."""
         rule = self.loop.rule
-        form = square(rule.positive * pair) if rule.positive.nrows() else zeros(self.size, self.size)
-        if rule.negative.nrows():
-            form = form - square(rule.negative * pair)
+        form = self._measured(rule.positive) - self._measured(rule.negative)
         return form - level**2 * square(self.f1) - floor**2 * square(self.f2)
+
+    def _measured(self, rows: arb_mat) -> arb_mat:
+        """Return the square of some rows of a measurement and its error."""
+        pair = stack([self.x + self.noise, self.e - self.noise])
+        return square(rows * pair) if rows.nrows() else zeros(self.size, self.size)
 
     def threshold_squared(self) -> arb_mat:
         """Return c² f₁² + f² f₂², at least the square of the threshold."""
@@ -244,24 +260,24 @@ class Model:
         losses, times = self.loop.losses, self.loop.times
         flows = self._flows(self._gains())
         tested: tuple[arb, ...] = (arb(0), arb(times.sampling)) if times.sampling > 0 else (arb(0),)
-        compared = () if times.sampling > 0 or self.is_periodic else (self.silent,)
+        silent = () if times.sampling > 0 or self.is_periodic else (self.silent, *self._noise_bounds)
         if self.is_periodic:
             tested = self._nodes_until(times.period)
         found = []
         for lost in range(losses + 1):
-            facts = compared + (self._chain(lost) if lost else ())
+            facts = self._chain(lost) if lost else ()
             coordinates = self._coordinates(lost > 0 and not self.is_periodic, 0)
-            found.append(Location(f"{lost} lost", coordinates, tested, flows, facts, True))
+            found.append(Location(f"{lost} lost", coordinates, tested, flows, facts, silent, True))
         for later in range(self._waiting):
             facts, nodes = self._chain(losses + 1 + later), self._time_to(times.delay, later)
             name, coordinates = f"{later} later", self._coordinates(True, later)
-            found.append(Location(name, coordinates, nodes, flows, facts, False))
+            found.append(Location(name, coordinates, nodes, flows, facts, (), False))
         if times.start > 0:
             no_input = self._flows([0 * self.loop.gain])
             for later in range(self.later_at_start + 1):
                 name, coordinates = f"start, {later} later", self._coordinates(False, later)
                 nodes = self._time_to(times.start, later)
-                found.append(Location(name, coordinates, nodes, no_input, (), False))
+                found.append(Location(name, coordinates, nodes, no_input, (), (), False))
         return found
 
     def _clock_nodes(self, pieces: int) -> list[fmpq]:
@@ -348,7 +364,9 @@ class Model:
             velocity = loop.A * self.x + loop.B * u
             error = H * (self.x + self.e) - velocity
             copies = (H * v for v in self.v)
-            matrix = stack([velocity, error, H * self.w, *copies, -self.rate * self.f1, 0 * self.f2])
+            matrix = stack(
+                [velocity, error, H * self.w, *copies, 0 * self.p, -self.rate * self.f1, 0 * self.f2]
+            )
             found.append(Flow(matrix, tuple(self._unknowns(u))))
         return tuple(found)
 
@@ -378,19 +396,22 @@ class Model:
 
     def _edges(self) -> list[Edge]:
         losses = self.loop.losses
-        event = tuple(self._guards.values())
-        delivered = self.jump(0 * self.e, 0 * self.w, ())
-        sent = self.jump(0 * self.e, self.w + self.e, ())
+        event = (*self._guards.values(), *self._noise_bounds)
+        delivered = self.jump(self.noise, 0 * self.w, ())
+        sent = self.jump(self.noise, self.w + self.e - self.noise, ())
         lost = self.jump(self.e, self.w, ()) if self.is_periodic else sent
         tests = self._event_pairs(self.locations[0].nodes)
         found = []
         for j in range(losses + 1):
             if self._waiting:
-                found.append(Edge(f"{j} lost, sent", j, losses + 1, tests, sent, event))
+                found.append(Edge(f"{j} lost, sent", j, losses + 1, tests, sent, event, True))
             else:
-                found.append(Edge(f"{j} lost, delivered", j, 0, tests, delivered, event))
+                found.append(Edge(f"{j} lost, delivered", j, 0, tests, delivered, event, True))
             if j < losses:
-                found.append(Edge(f"{j} lost, lost", j, j + 1, tests, lost, event))
+                found.append(Edge(f"{j} lost, lost", j, j + 1, tests, lost, event, True))
+            if self._has_silent_edges:
+                silent, stays = (self.silent, *self._noise_bounds), identity(self.size)
+                found.append(Edge(f"{j} lost, silent", j, j, ((1, 0),), stays, silent, True))
         for later in range(self._waiting):
             found += self._on_its_way(losses + 1 + later, later, self.later)
         if self.loop.times.start > 0:
@@ -400,18 +421,17 @@ class Model:
             for later in range(self.later_at_start):
                 name = f"start, {later} later, event"
                 pairs = self._events_while_waiting(first + later)
-                found.append(Edge(name, first + later, first, pairs, delivered, event))
+                found.append(Edge(name, first + later, first, pairs, delivered, event, True))
         return found
 
     def _on_its_way(self, source: int, later: int, most: int) -> Iterator[Edge]:
         """Yield the edges of a location in which an update is on its way that has so many later ones."""
         losses, name = self.loop.losses, self.locations[source].name
-        event = tuple(self._guards.values())
         if later < most:
-            copies = [v + self.e for v in self.v[:later]] + [self.e]
-            jump = self.jump(0 * self.e, self.w + self.e, copies)
+            event, added = (*self._guards.values(), *self._noise_bounds), self.e - self.noise
+            jump = self.jump(self.noise, self.w + added, [v + added for v in self.v[:later]] + [added])
             pairs = self._events_while_waiting(source)
-            yield Edge(f"{name}, event", source, source + 1, pairs, jump, event)
+            yield Edge(f"{name}, event", source, source + 1, pairs, jump, event, True)
         w, others = (self.v[0], self.v[1:later]) if later else (0 * self.w, [])
         if later <= losses:
             jump = self.jump(self.e + w, 0 * w, ()) if self.is_periodic else self.jump(self.e, w, ())
@@ -430,12 +450,17 @@ class Model:
         pairs = tuple((node, target_node) for node in nodes for target_node in target_nodes)
         if self.is_periodic:
             pairs = tuple(zip(nodes, target_nodes, strict=False))
-        return Edge(name, source, target, pairs, jump, ())
+        return Edge(name, source, target, pairs, jump, (), False)
 
     def jump(self, e: arb_mat, w: arb_mat, v: Sequence[arb_mat]) -> arb_mat:
         """Return z after a jump; other vectors than these become 0."""
         rest = [0 * self.w] * (len(self.v) - len(v))
-        return stack([self.x, e, w, *v, *rest, self.f1, self.f2])
+        return stack([self.x, e, w, *v, *rest, self.p, self.f1, self.f2])
+
+    @property
+    def _has_silent_edges(self) -> bool:
+        """Whether V has to be shown not to grow at a silent test."""
+        return bool(self._sources) and self.loop.times.sampling > 0 and self.loop.rule.positive.nrows() > 0
 
     # The quadratic forms.
 
@@ -444,7 +469,8 @@ class Model:
 
         P is that of xᵀXx + (e, w)ᵀQ(e, w) − c₁ f₁² − c₂ f₂² − a θ·(comparison), with X common to all
         locations: then x drops out of the edges, and a silent test at θ leaves V as it is where the
-        comparison is ≤ 0, since a ≥ 0. Waiting locations have Q, c₁ and c₂ for each node.
+        comparison is ≤ 0, since a ≥ 0. With noise each of its four terms has an a of its own, and there is an
+        inequality for silent tests. Waiting locations have Q, c₁ and c₂ for each node.
         Where an event's guard contains x, each location has a form of x, e and w of its own, and with a
         periodic rule each node of each location.
         """
@@ -454,14 +480,14 @@ class Model:
 
     def _new_form(self, location: int, node: int) -> Form:
         place = self.locations[location]
-        E = columns_of(identity(self.size), place.coordinates)
+        rule, E = self.loop.rule, columns_of(identity(self.size), place.coordinates)
         errors = stack([f for f in (self.e, self.w, *self.v) if not is_zero(f * E)])
         by_node = self.is_periodic or not place.is_tested
         own = f"{place.name}, {node}" if by_node else place.name
         starts = place.name.startswith("start")
         X = f"X/start, {node}" if starts else "X"
         parts: tuple[tuple[str, arb_mat], ...] = ((X, self.x * E), (f"Q/{own}", errors * E))
-        if self.loop.rule.negative.nrows() or self.is_periodic:
+        if rule.negative.nrows() or self.is_periodic:
             parts = ((f"P/{own}", stack([self.x, errors]) * E),)
         units = [(name, f) for name, f in (("c1", self.f1), ("c2", self.f2)) if not is_zero(f * E)]
         scalars = []
@@ -469,8 +495,15 @@ class Model:
             common = f"{name}/start, {node}" if starts else name
             is_own = name in self._guards or self.is_periodic
             scalars.append((f"{name}/{own}" if is_own else common, -1 * square(f * E)))
-        if place.is_tested and node and self.loop.rule.positive.nrows():
-            scalars.append((f"a/{own}", -1 * place.nodes[node] * transpose(E) * self.silent * E))
+        if place.is_tested and node and rule.positive.nrows():
+            compared = {"": self.silent}
+            if self._has_silent_edges:
+                compared = {"": self._measured(rule.positive), "/N": -1 * self._measured(rule.negative)}
+                sizes = ("c1", self.f1, self.level), ("c2", self.f2, self.floor)
+                compared |= {f"/{name}": -1 * square(f) for name, f, size in sizes if size > 0}
+            for name, M in compared.items():
+                if not is_zero(transpose(E) * M * E):
+                    scalars.append((f"a/{own}{name}", -1 * place.nodes[node] * transpose(E) * M * E))
         return Form(parts, tuple(scalars))
 
     # The inequalities.
@@ -501,7 +534,7 @@ class Model:
     def _flow_inequalities(self, index: int) -> Iterator[Inequality]:
         """dV/dt + νV ≤ Σ m q + Σ τ (|p|² − |Rz|²), at both ends of each piece of θ."""
         place = self.locations[index]
-        E0 = columns_of(identity(self.size), place.coordinates)
+        E0 = self._columns(place, with_noise=bool(place.silent))
         last = len(place.nodes) - 1
         for piece in range(max(last, 1)):
             for end in (piece, piece + 1) if last else (0,):
@@ -511,17 +544,16 @@ class Model:
                     motion = flow.matrix * E0
                     for unknown in flow.unknowns:
                         motion = beside(motion, unknown.column)
-                    F = rows_of(motion, place.coordinates)
+                    F, z = rows_of(motion, place.coordinates), rows_of(E0 * E, place.coordinates)
                     terms = _Terms(E.ncols())
-                    terms.add(self.form(index, end), E, F, arb(-1))
-                    terms.add(self.form(index, end), E, E, -self.decay / 2)
+                    terms.add(self.form(index, end), z, F, arb(-1))
+                    terms.add(self.form(index, end), z, z, -self.decay / 2)
                     if last:
                         length = place.nodes[piece + 1] - place.nodes[piece]
-                        terms.add(self.form(index, piece + 1), E, E, -1 / length / 2)
-                        terms.add(self.form(index, piece), E, E, 1 / length / 2)
+                        terms.add(self.form(index, piece + 1), z, z, -1 / length / 2)
+                        terms.add(self.form(index, piece), z, z, 1 / length / 2)
                     name = f"flow/{place.name}/{end}"
-                    for number_, fact in enumerate(place.facts):
-                        terms.scalar(f"m/{name}/{number_}", transpose(E0 * E) * fact * (E0 * E))
+                    terms.facts(f"m/{name}", place.silent + place.facts, E0 * E)
                     self._add_signals(terms, f"m/{name}", flow.unknowns, E0 * E)
                     yield terms.inequality(f"{name}/{corner}", index, k)
 
@@ -550,19 +582,18 @@ class Model:
     def _output_inequalities(self, index: int, output: str) -> Iterator[Inequality]:
         """|Cz + Σ C p|² ≤ D₁² f₁² + D₂² f₂² + V + Σ m q + Σ τ (|p|² − |Rz|²)."""
         place = self.locations[index]
-        E0 = columns_of(identity(self.size), place.coordinates)
+        E0 = self._columns(place, with_noise=bool(place.silent))
         for node in range(len(place.nodes)):
             for corner, (C, flow) in enumerate(self.output(output, place)):
                 unknowns = flow.unknowns if flow is not None else ()
                 E = beside(identity(E0.ncols()), zeros(E0.ncols(), len(unknowns)))
-                terms = _Terms(E.ncols())
-                terms.add(self.form(index, node), E, E, arb(1) / 2)
+                terms, z = _Terms(E.ncols()), rows_of(E0 * E, place.coordinates)
+                terms.add(self.form(index, node), z, z, arb(1) / 2)
                 for level, f in (("level 1", self.f1), ("level 2", self.f2)):
                     if not is_zero(f * E0):
                         terms.scalar(level, square(f * E0 * E))
                 name = f"output/{place.name}/{node}"
-                for number_, fact in enumerate(place.facts):
-                    terms.scalar(f"m/{name}/{number_}", transpose(E0 * E) * fact * (E0 * E))
+                terms.facts(f"m/{name}", place.silent + place.facts, E0 * E)
                 whole = C * E0
                 for unknown in unknowns:
                     whole = beside(whole, self._drift(unknown.column))
@@ -579,29 +610,39 @@ class Model:
             terms.scalar(f"{name}/signal {signal}", square(one) - square(unknown.rows * E))
 
     def _edge_inequalities(self, edge: Edge) -> Iterator[Inequality]:
-        """V_target(jump z) ≤ V_source(z) + Σ m q."""
+        """V_target(jump z) ≤ V_source(z) + Σ m q.
+
+        That the rule is silent before a test says nothing with another noise at the test.
+        """
         source, target = self.locations[edge.source], self.locations[edge.target]
-        E = columns_of(identity(self.size), source.coordinates)
-        jump = rows_of(edge.jump * E, target.coordinates)
+        E = self._columns(source, with_noise=edge.is_test)
+        z, jump = rows_of(E, source.coordinates), rows_of(edge.jump * E, target.coordinates)
         units = {name for name, f in (("c1", self.f1), ("c2", self.f2)) if not is_zero(f * E)}
-        facts = edge.facts + (source.facts if units <= set(self._guards) else ())
+        facts = edge.facts
+        if units <= set(self._guards):
+            facts += source.facts + (() if self._sources else source.silent)
         for node, target_node in edge.pairs:
             terms = _Terms(E.ncols())
-            one = identity(E.ncols())
-            terms.add(self.form(edge.source, node), one, one, arb(1) / 2)
+            terms.add(self.form(edge.source, node), z, z, arb(1) / 2)
             terms.add(self.form(edge.target, target_node), jump, jump, arb(-1) / 2)
             name = f"edge/{edge.name}/{node} {target_node}"
-            for number_, fact in enumerate(facts):
-                terms.scalar(f"m/{name}/{number_}", transpose(E) * fact * E)
+            terms.facts(f"m/{name}", facts, E)
             yield terms.inequality(name, edge.source, 0)
 
+    def _columns(self, place: Location, *, with_noise: bool) -> arb_mat:
+        """Return the columns of a location's coordinates, and of the noise."""
+        return columns_of(identity(self.size), (*place.coordinates, *(self._sources if with_noise else ())))
+
     def start_inequality(self) -> Inequality:
-        """V(z(0)) ≤ 0."""
+        """V(z(0)) ≤ Σ m q: e = n at the start, for all p. The columns of z are a constant, and p."""
         index = self.loop.losses + 1 + self._waiting if self.loop.times.start > 0 else 0
         z = transpose(self.x) * self.loop.start + transpose(self.f1) + transpose(self.f2)
-        z = rows_of(z, self.locations[index].coordinates)
-        terms = _Terms(1)
-        terms.add(self.form(index, 0), z, z, arb(-1) / 2)
+        if self._sources:
+            z = beside(z, transpose(self.e) * self.loop.noise + transpose(self.p))
+        at_start = rows_of(z, self.locations[index].coordinates)
+        terms = _Terms(z.ncols())
+        terms.add(self.form(index, 0), at_start, at_start, arb(-1) / 2)
+        terms.facts("m/start", self._noise_bounds, z)
         return terms.inequality("start", index, -1)
 
 
@@ -648,6 +689,11 @@ class _Terms:
     def scalar(self, name: str, M: arb_mat) -> None:
         """Add number · M."""
         self.scalars[name] = self.scalars[name] + M if name in self.scalars else M
+
+    def facts(self, name: str, facts: Iterable[arb_mat], z: arb_mat) -> None:
+        """Add Σ m zᵀQz of facts zᵀQz ≤ 0."""
+        for index, fact in enumerate(facts):
+            self.scalar(f"{name}/{index}", transpose(z) * fact * z)
 
     def inequality(self, name: str, location: int, signals: int) -> Inequality:
         """Return what was collected."""

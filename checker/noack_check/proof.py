@@ -4,14 +4,17 @@ A document names the plants ("own" or "box") and the conditions ("schedule" or "
 each output the numbers that :mod:`.check` verifies. From the bound of the drift W(ẋ − Hx) follow
 
 * the sensor's error between two tests: e^{Hs} times its value at the test, plus what the drift adds;
-* the least time between events, since e_s begins at 0 and has to reach the threshold.
+* the least time between events, since e_s begins at the noise n of the event's measurement and has to
+  reach the threshold, to within the noise of another one.
 
 Rules that do not compare ‖W e_s‖ with a threshold have a bound of e_s by quadratic forms, and their
 events are as far apart as tests. From a bound of e_s follows
 
-* the controller's error, e_c = e_s + Σ e^{H(t−t_i)} e_s(t_i⁻) over the missing updates: the paper's chain.
+* the controller's error, e_c = e_s + Σ e^{H(t−t_i)} (e_s(t_i⁻) − n_i) over the missing updates: the paper's
+  chain.
 
-The model assumes a bound of e_s ("errors") and a number of events while an update is on its way ("later").
+The model assumes a bound of e_s − n ("errors"), and how many events happen while an update is on its way
+("later").
 Both are proven from bounds of this model, by induction over the events: all bounds hold up to the next one.
 """
 
@@ -92,8 +95,9 @@ def prove(loop: Loop, document: Mapping[str, object]) -> Proof:
         _require_errors(loop, rate, proven, assumed.errors)
     if assumed.chain_gain is not None and sensor is not None:
         missing = loop.losses + (1 + assumed.later if loop.times.delay > 0 else 0)
-        factor = 1 + missing * assumed.chain_gain
-        bounds.append(Bound("e_c", factor * sensor.decaying, factor * sensor.constant, True))
+        jumps = missing * assumed.chain_gain
+        constant = sensor.constant + jumps * (sensor.constant + loop.noise_size)
+        bounds.append(Bound("e_c", (1 + jumps) * sensor.decaying, constant, True))
     if not all(size.is_finite() for bound in bounds for size in (bound.decaying, bound.constant)):
         raise RejectedError("bounds: not finite")
     return Proof(rate, tuple(bounds), apart, first, is_quiet)
@@ -185,21 +189,24 @@ def _prove_quiet_start(loop: Loop) -> None:
         raise RejectedError("times: an event without a comparison may happen before the first input acts")
     if not _exceeds_by_error(loop):
         raise RejectedError("times: an event of this rule may happen before the first input acts")
-    if not error_without_input(loop, last) < (rule.level * (-rule.rate * last).exp()).max(rule.floor):
+    if not error_without_input(loop, last) + loop.noise_size < (rule.level * (-rule.rate * last).exp()).max(
+        rule.floor
+    ):
         raise RejectedError("times: an event may happen before the first input acts")
 
 
 def error_without_input(loop: Loop, until: fmpq) -> arb:
-    """Return a bound of ‖W e_s‖ until a time, if no input acts and no event happens after t = 0.
+    """Return a bound of ‖W e_s‖ until a time, if no input acts.
 
-    Without an input x(t) = e^{At} x(0), and the disturbances add at most t · sup‖e^{As}‖ · ‖D d‖.
+    It begins at a noise, at t = 0 or at an event. Without an input x(t) = e^{At} x(0), and the disturbances
+    add at most t · sup‖e^{As}‖ · ‖D d‖.
     """
     A = loop.A + arb_mat(loop.n, loop.n, [around_zero(h) for h in loop.half_A.entries()])
     pushes = arb_mat(loop.n, 1)
     if loop.sizes:
         pushes = loop.pushes * arb_mat(len(loop.sizes), 1, [around_zero(size) for size in loop.sizes])
     largest, _ = growth(weighted(loop, arb(0)), arb(until))
-    step, x, reached = arb(until) / _CELLS, loop.start, arb(0)
+    step, x, reached = arb(until) / _CELLS, loop.start, largest * loop.noise_size
     within, forward = (upto(step) * A).exp(), (step * A).exp()
     for _ in range(_CELLS):
         during = within * x + upto(step) * (within * pushes)
@@ -222,7 +229,7 @@ def prove_first_event(loop: Loop, drift: Bound, first: arb, until: fmpq) -> None
     largest, total = growth(weighted(loop, arb(0)), first)
     added = total * (drift.decaying**2 + drift.constant**2).sqrt()
     threshold = (rule.level * (-rule.rate * first).exp()).max(rule.floor)
-    if not largest * error_without_input(loop, until) + added < threshold:
+    if not largest * error_without_input(loop, until) + added + loop.noise_size < threshold:
         raise RejectedError("first_event_s: an event may come earlier")
 
 
@@ -293,27 +300,29 @@ def prove_bound(loop: Loop, rate: arb, entry: Mapping[str, object], assumed: Ass
 
 
 def _prove_inter_event(loop: Loop, rate: arb, drift: Bound, apart: arb) -> None:
-    """Prove that e_s stays below the threshold for ``apart`` after an event, or that this is 0.
+    """Prove that e_s − n stays below the threshold for ``apart`` after an event, or that this is 0.
 
-    ‖W e_s‖ ≤ (D₁² v + D₂²)^½ I, v = e^{−2rt} and I = ∫ ‖W e^{(H+r)s} W⁻¹‖ ds. Its square is affine in
-    v, and that of the threshold max(c² v, f²) convex and piecewise affine: its ends and its kink suffice.
+    With v = e^{−rt}, ‖W (e_s − n)‖ ≤ (D₁² v² + D₂²)^½ I + (g + 1) ‖W n‖, where g and I are the supremum
+    and the integral of ‖W e^{(H+r)s} W⁻¹‖. This is convex in v, and the threshold max(c v, f) piecewise
+    affine: its ends and its kink suffice.
     """
     if apart == 0:
         return
     rule = loop.rule
     if rule.always or not compares_error(loop) or not apart > 0:
         raise RejectedError("inter_event_s: not proven for this rule; 0 is")
-    _, total = growth(weighted(loop, rate), apart)
+    largest, total = growth(weighted(loop, rate), apart)
+    noise = (largest + 1) * loop.noise_size
     level = rule.level if bool(rate == rule.rate) else arb(0)
     kinks = [arb(0), arb(1)]
     if level > 0 and rule.floor > 0:
-        kinks.append((rule.floor / level) ** 2)
+        kinks.append(rule.floor / level)
     for v in kinks:
         if v > 1:
             continue
-        threshold = (level**2 * v).max(rule.floor**2)
-        reached = (drift.decaying**2 * v + drift.constant**2) * total**2
-        if not (reached < threshold or (v == 0 and rule.floor == 0 and drift.constant == 0)):
+        reached = (drift.decaying**2 * v**2 + drift.constant**2).sqrt() * total + noise
+        is_nothing = v == 0 and rule.floor == 0 and drift.constant == 0 and noise == 0
+        if not (reached < (level * v).max(rule.floor) or is_nothing):
             raise RejectedError("inter_event_s: an event may come earlier")
 
 
@@ -340,15 +349,19 @@ def sensor_error(loop: Loop, rate: arb, drift: Bound) -> Bound:
 
 
 def _sensor_parts(loop: Loop, rate: arb, drift: Bound) -> list[tuple[arb, arb]]:
-    """Return pairs (a, b): ‖W e_s‖ is at most the sum of their (a² f₁² + b² f₂²)^½."""
+    """Return pairs (a, b): ‖W e_s‖ is at most the sum of their (a² f₁² + b² f₂²)^½.
+
+    After a test it is at most the sum of threshold and noise, by an event or without one.
+    """
     if not compares_error(loop):
         raise RejectedError("drift: bounds e_s only for a rule that compares ‖W e_s‖")
-    level, floor = thresholds(loop, rate)
+    (level, floor), noise = thresholds(loop, rate), loop.noise_size
     if loop.times.sampling == 0:
-        return [(level, floor)]
+        return [(level, floor), (arb(0), noise)]
     largest, total = growth(weighted(loop, rate), arb(loop.times.sampling))
     most = largest * _at_first_input(loop, rate)
-    return [(most * level, most * floor), (total * drift.decaying, total * drift.constant)]
+    added = total * drift.decaying, total * drift.constant
+    return [(most * level, most * floor), (arb(0), largest * noise), added]
 
 
 def _at_first_input(loop: Loop, rate: arb) -> arb:
@@ -364,16 +377,16 @@ def _at_first_input(loop: Loop, rate: arb) -> arb:
 
 
 def _require_errors(loop: Loop, rate: arb, proven: Mapping[str, Bound], errors: Errors) -> None:
-    """Prove that ‖W e_s‖ is below what is assumed of it, strictly: then what used it holds on.
+    """Prove that ‖W (e_s − n)‖ is below what is assumed of it, strictly: then what used it holds on.
 
-    Up to some time the assumption holds; so do all bounds, and ‖W e_s‖ is below what is assumed, also a
-    little later, since e_s is continuous but for its jumps to 0. A rule that is tested at all times keeps
-    ‖W e_s‖ at its threshold or below: there nothing is assumed.
+    Up to some time the assumption holds; so do all bounds, and ‖W (e_s − n)‖ is below what is assumed, also
+    a little later, since e_s is continuous but for its jumps to a noise. A rule that is tested at all times
+    keeps ‖W e_s‖ at its threshold plus the noise, or below: there nothing is assumed.
     """
     if "drift" in proven:
         share = share_of_errors(loop, rate, proven["drift"], errors)
     elif "e_s" in proven:
-        share = _share([(proven["e_s"].decaying, proven["e_s"].constant)], errors)
+        share = _share([(proven["e_s"].decaying, proven["e_s"].constant), (arb(0), loop.noise_size)], errors)
     else:
         raise RejectedError("errors: no bound of e_s, or of the drift, from the start on")
     exact = loop.times.sampling == 0 and compares_error(loop)
@@ -382,8 +395,8 @@ def _require_errors(loop: Loop, rate: arb, proven: Mapping[str, Bound], errors: 
 
 
 def share_of_errors(loop: Loop, rate: arb, drift: Bound, errors: Errors) -> arb:
-    """Return the largest share of what is assumed of ‖W e_s‖ that it reaches, by a bound of the drift."""
-    return _share(_sensor_parts(loop, rate, drift), errors)
+    """Return the largest share of what is assumed of ‖W (e_s − n)‖ that it reaches, by the drift."""
+    return _share([*_sensor_parts(loop, rate, drift), (arb(0), loop.noise_size)], errors)
 
 
 def _share(parts: Sequence[tuple[arb, arb]], errors: Errors) -> arb:

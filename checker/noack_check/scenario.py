@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from flint import arb, arb_mat, fmpq
 
-from noack_check.balls import beside, identity, matrix, number, rows_of, stack, zeros
+from noack_check.balls import beside, columns_of, identity, matrix, number, rows_of, stack, zeros
 from noack_check.keys import RefusedError, Table, refusals
 from noack_check.loop import Loop, Rule, Times
 from noack_check.times import NS_PER_S, Schedule, fraction, nanoseconds
@@ -69,6 +69,7 @@ def read_loop(resolved: Table, *, box: bool, ideal: bool) -> Loop:
         rule=rule,
         pushes=arb_mat(n, len(pushes), [column[i] for i in range(n) for column in pushes]),
         sizes=(arb(1),) * len(pushes),
+        noise=_noise(resolved, n),
         losses=_losses(_table(resolved, "network")),
         times=_times(resolved, trigger, ideal=ideal),
     )
@@ -320,6 +321,19 @@ def _at_rest(A: Rows, x_r: Sequence[float]) -> Iterator[list[arb]]:
             for row in A
         ]
     )
+
+
+def _noise(resolved: Table, n: int) -> arb_mat:
+    """Return the columns of the noise of measurements."""
+    measurement = _optional_table(_table(resolved, "plant"), "measurement")
+    name = "plant.measurement.noise_bound"
+    sizes = _row(measurement, name) if "noise_bound" in measurement else [0.0] * n
+    if len(sizes) != n or min(sizes) < 0:
+        raise RefusedError(f"{name}: not {n} numbers of at least 0")
+    if any(sizes) and _value(_table(resolved, "network"), "network.initial_sync") == "known_state":
+        raise RefusedError(f'{name}: with network.initial_sync = "known_state" noise is not covered')
+    noisy = [i for i, size in enumerate(sizes) if size > 0]
+    return columns_of(matrix([[size * (i == k) for k in range(n)] for i, size in enumerate(sizes)]), noisy)
 
 
 def _product(M: Rows, v: Sequence[float]) -> list[arb]:

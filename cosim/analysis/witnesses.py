@@ -128,11 +128,12 @@ def find_statement(
 ) -> WitnessedStatement:
     """Search for the witness of one statement of a resolved scenario: its plants and conditions.
 
-    Where disturbances act, ‖x‖ and each state are bounded in the limit t → ∞, too, under the schedule.
+    Where disturbances or noise act, ‖x‖ and each state have bounds in the limit t → ∞, too, under the
+    schedule.
     """
     try:
         loop = read_loop(content, box=plants == "box", ideal=conditions == "ideal")
-        has_limit = bool(loop.sizes) and conditions == "schedule"
+        has_limit = bool(loop.sizes or loop.noise.ncols()) and conditions == "schedule"
         states = ("x", *(f"x[{i}]" for i in range(loop.n))) if has_limit else ()
         witness = find_witness(loop, ultimate=states, progress=progress)
     except (RefusedError, NoWitnessError) as error:

@@ -1,10 +1,13 @@
 """The inequalities of a witness in floating point, written anew from the statement, not from the checker.
 
 V = xᵀXx + (e, w)ᵀQ(e, w) − c₁ f₁² − c₂ f₂² − a θ (‖W e‖² − c² f₁² − f² f₂²), for a rule that compares
-W e_s, under a schedule. The inputs K e^{−Hs} x_c are those of random ages, not corners of a hull.
+W e_s, under a schedule. With noise n = Σ column p, |p| ≤ f₂, the last term is
+−θ (a ‖W e‖² − a₁ f₁² − a₂ f₂²), and there are inequalities of silent tests. The inputs K e^{−Hs} x_c are
+those of random ages, not corners of a hull.
 """
 
 from collections.abc import Mapping
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -25,14 +28,18 @@ class Forms:
         self.loop, self.rate, self.numbers, self.matrices = loop, rate, entry["numbers"], entry["matrices"]
         self.decay, self.n = entry["decay"], loop.n
         n = self.n
-        every = np.eye(3 * n + 2)
+        every = np.eye(3 * n + 2 + loop.noise.ncols())
         self.x, self.e, self.w = every[:n], every[n : 2 * n], every[2 * n : 3 * n]
-        self.f1, self.f2 = every[3 * n : 3 * n + 1], every[3 * n + 1 :]
+        self.f1, self.f2 = every[3 * n : 3 * n + 1], every[3 * n + 1 : 3 * n + 2]
+        self.p = every[3 * n + 2 :]
+        self.noise = floats(loop.noise) @ self.p
+        self.noise_bounds = [row[None].T @ row[None] - self.f2.T @ self.f2 for row in self.p]
         self.W, self.H = floats(loop.weight), floats(loop.H)
         self.times = [float(t.p) / float(t.q) for t in loop.times]
         level, floor = float(loop.rule.level.mid()), float(loop.rule.floor.mid())
         self.threshold = level**2 * self.f1.T @ self.f1 + floor**2 * self.f2.T @ self.f2
-        self.compared = self.e.T @ self.W.T @ self.W @ self.e - self.threshold
+        difference = self.W @ (self.e - self.noise)
+        self.compared = difference.T @ difference - self.threshold
         self.floor_only = floor**2 * self.f2.T @ self.f2
         self.level_only = level**2 * self.f1.T @ self.f1
         self.exact_level = level > 0 and rate == float(loop.rule.rate.mid())
@@ -47,7 +54,15 @@ class Forms:
         P: Array = self.x.T @ X @ self.x + errors.T @ Q @ errors
         for name, f in (("c1", self.f1), ("c2", self.f2)):
             P = P - self.numbers.get(f"{name}/{own}", self.numbers.get(name, 0.0)) * f.T @ f
-        return P - self.numbers[f"a/{own}"] * self.times[0] * self.compared if tested and node else P
+        if not tested or not node:
+            return P
+        error = self.W @ self.e
+        silent = self.numbers[f"a/{own}"] * (error.T @ error - self.threshold)
+        if len(self.p):
+            silent = self.numbers[f"a/{own}"] * error.T @ error
+            for name, f in (("c1", self.f1), ("c2", self.f2)):
+                silent = silent - self.numbers.get(f"a/{own}/{name}", 0.0) * f.T @ f
+        return P - self.times[0] * silent
 
     def flow(self, place: str, age: float) -> tuple[Array, list[tuple[Array, Array]]]:
         """Return F and unknown signals (column, rows) of ż = Fz + column p, |p| ≤ |rows z|."""
@@ -55,7 +70,10 @@ class Forms:
         u = K @ (self.x + self.e + self.w)
         moved = floats(self.loop.A) @ self.x + floats(self.loop.B) @ u
         F = np.vstack(
-            [moved, self.H @ (self.x + self.e) - moved, self.H @ self.w, -self.rate * self.f1, 0 * self.f2]
+            [
+                *(moved, self.H @ (self.x + self.e) - moved, self.H @ self.w),
+                *(-self.rate * self.f1, 0 * self.f2, 0 * self.p),
+            ]
         )
         unknowns = []
         for half, signal in ((floats(self.loop.half_A), self.x), (floats(self.loop.half_B), u)):
@@ -143,16 +161,18 @@ class Forms:
         return len(M) == 0 or bool(np.linalg.eigvalsh(scale[:, None] * M * scale).min() > -_TOLERANCE)
 
     def _edges_hold(self, losses: int, waits: bool, begins: bool) -> bool:
-        arrival, lost = np.eye(3 * self.n + 2), np.eye(3 * self.n + 2)
+        arrival, lost, stays = (np.eye(3 * self.n + 2 + len(self.p)) for _ in range(3))
         arrival[2 * self.n : 3 * self.n] = 0
-        lost[2 * self.n : 3 * self.n] = self.w + self.e
-        lost[self.n : 2 * self.n] = 0
+        lost[2 * self.n : 3 * self.n] = self.w + self.e - self.noise
+        lost[self.n : 2 * self.n] = self.noise
         found = []
         for j in range(losses + 1):
             to, name, jump = ("0 later", "sent", lost) if waits else ("0 lost", "delivered", arrival @ lost)
             following = [(to, f"{j} lost, {name}", jump)]
             following += [(f"{j + 1} lost", f"{j} lost, lost", lost)] if j < losses else []
             found += [(f"{j} lost", *each, node, 0, True) for each in following for node in (0, 1)]
+            if len(self.p):
+                found.append((f"{j} lost", f"{j} lost", f"{j} lost, silent", stays, 1, 0, False))
         for place in ["0 later"] * waits + ["start, 0 later"] * begins:
             name = f"{place}, all lost"
             found += [(place, "0 lost", name, arrival, i, j, False) for i in (0, 1) for j in (0, 1)]
@@ -162,16 +182,23 @@ class Forms:
         self, source: str, target: str, name: str, jump: Array, node: int, other: int, event: bool
     ) -> bool:
         M = self.form(source, node) - jump.T @ self.form(target, other) @ jump
+        facts = [self.compared, *self.noise_bounds] if name.endswith("silent") else []
         if event and not self.loop.rule.always:
             compared = self.compared + self.threshold
             above_floor = float(self.loop.rule.floor.mid()) > 0 or not self.exact_level
             facts = [self.level_only - compared] * self.exact_level + [
                 self.floor_only - compared
             ] * above_floor
-            for i, fact in enumerate(facts):
-                M = M + self.numbers[f"m/edge/{name}/{node} {other}/{i}"] * fact
+        facts += self.noise_bounds if event else []
+        for i, fact in enumerate(facts):
+            M = M + self.numbers[f"m/edge/{name}/{node} {other}/{i}"] * fact
         return self._is_psd(source, M)
 
     def _starts(self, place: str) -> bool:
-        z = np.concatenate([floats(self.loop.start)[:, 0], np.zeros(2 * self.n), [1.0, 1.0]])
-        return bool(z @ self.form(place, 0) @ z <= _TOLERANCE)
+        """Return whether V ≤ 0 at the start for all p; one direction suffices, at its largest V."""
+        n, noise = self.n, floats(self.loop.noise)
+        z = np.zeros((len(self.x.T), 1 + noise.shape[1]))
+        z[:n, 0], z[3 * n : 3 * n + 2, 0] = floats(self.loop.start)[:, 0], 1.0
+        z[n : 2 * n, 1:] = noise
+        signs = np.array([[1.0, *each] for each in product((-1.0, 1.0), repeat=noise.shape[1])])
+        return bool(max(v @ z.T @ self.form(place, 0) @ z @ v for v in signs) <= _TOLERANCE)

@@ -22,6 +22,18 @@ def random_periodic_loop(rng: np.random.Generator) -> Loop:
     )
 
 
+def random_noisy_loop(rng: np.random.Generator) -> Loop:
+    """Return a loop with noise, often below half the threshold, of some of the kinds above."""
+    kinds = [random_loop, random_loop, random_periodic_loop, random_loop_with_long_delays]
+    loop = kinds[rng.integers(len(kinds))](rng)
+    n, k = loop.n, int(rng.integers(1, loop.n + 1))
+    columns = matrix(np.round(rng.normal(size=(n, k)), 2).tolist())
+    size = loop._replace(noise=columns).noise_size
+    share = number(round(float(rng.uniform(0.02, 0.45)), 3)) if size > 0 else arb(0)
+    floor = loop.rule.floor.max(number(0.02))
+    return loop._replace(noise=columns * (share * floor / size).mid() if size > 0 else columns)
+
+
 def random_loop(rng: np.random.Generator) -> Loop:
     """Return a loop with at most three states and three consecutive losses."""
     n, m = int(rng.integers(1, 4)), 1
@@ -56,6 +68,7 @@ def random_loop(rng: np.random.Generator) -> Loop:
         ),
         pushes=matrix(np.round(rng.normal(size=(n, 1)), 2).tolist()) if has_push else zeros(n, 0),
         sizes=(arb(0.02),) if has_push else (),
+        noise=zeros(n, 0),
         losses=int(rng.integers(0, 4)),
         times=Times(sampling, least, delay, age, start),
     )

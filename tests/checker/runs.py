@@ -68,8 +68,19 @@ def exceeded(loop: Loop, proof: Proof, rng: np.random.Generator, until: float) -
         least = sampling = periods[1] / _PARTS
     W, n, positive, negative = floats(loop.weight), loop.n, floats(rule.positive), floats(rule.negative)
     level, rate, floor = (float(v.mid()) for v in (rule.level, rule.rate, rule.floor))
-    x = floats(loop.start)[:, 0]
-    z = np.concatenate([x, x, x, [1.0]])
+    x, noise = floats(loop.start)[:, 0], floats(loop.noise)
+    kind_of_noise = rng.choice(["random", "hides", "provokes"])
+
+    def measured(x: Array, x_s: Array) -> Array:
+        """Return a measurement with the largest noise: in random directions, or against or for an event."""
+        signs = rng.choice([-1.0, 1.0], noise.shape[1])
+        if kind_of_noise != "random":
+            along = (W @ noise).T @ (W @ (x_s - x))
+            signs = np.where(along == 0, signs, np.sign(along)) * (1 if kind_of_noise == "hides" else -1)
+        return np.asarray(x + noise @ signs)
+
+    y = measured(x, x)
+    z = np.concatenate([x, y, y, [1.0]])
     first_input = start * rng.choice([0.0, 1.0, rng.random()])
     style = rng.integers(3)
     ages = [0.0, age, age / 2]
@@ -103,7 +114,8 @@ def exceeded(loop: Loop, proof: Proof, rng: np.random.Generator, until: float) -
             z[2 * n : 3 * n] = newest[2]
             arriving = [update for update in arriving if update[1] > newest[1]]
         if t >= min(next_test, next_event):
-            pair = np.concatenate([z[:n], z[n : 2 * n] - z[:n]])
+            y = measured(z[:n], z[n : 2 * n])
+            pair = np.concatenate([y, z[n : 2 * n] - y])
             threshold = np.hypot(max(level * np.exp(-rate * t), floor), np.linalg.norm(negative @ pair))
             fires = np.linalg.norm(positive @ pair) > threshold or (rule.always and rng.random() < 0.2)
             if periods[1]:
@@ -112,7 +124,7 @@ def exceeded(loop: Loop, proof: Proof, rng: np.random.Generator, until: float) -
                 if t < first_input and proof.is_quiet:
                     found.append(Exceeded("an event before the first input", t, 0.0, first_input))
                 _apart(found, proof, events, t, first_input)
-                z[n : 2 * n] = z[:n]
+                z[n : 2 * n] = y
                 loses = lost < loop.losses and (style == 0 or (style == 1 and rng.random() < 0.7))
                 lost = lost + 1 if loses else 0
                 if not loses and delay:

@@ -117,7 +117,7 @@ def slow_model(floor: float = 0.01) -> Loop:
     A, none, one = matrix([[-0.05]]), zeros(1, 1), identity(1)
     return loop._replace(
         A=A, B=one, half_A=none, half_B=none, model_A=A, model_B=one, gain=none, weight=one,
-        start=one, rule=rule, pushes=one, sizes=(arb(1),), losses=0,
+        start=one, rule=rule, pushes=one, sizes=(arb(1),), noise=zeros(1, 0), losses=0,
     )  # fmt: skip
 
 

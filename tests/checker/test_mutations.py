@@ -14,7 +14,7 @@ import pytest
 from flint import arb, fmpq
 
 from noack.theory.witnesses.documents import find_witness
-from noack_check.balls import matrix, number
+from noack_check.balls import beside, matrix, number, zeros
 from noack_check.check import RejectedError
 from noack_check.loop import Loop
 from noack_check.model import Model
@@ -26,7 +26,7 @@ from tests.checker.test_witnesses import SCHEDULE, double_integrator
 Document = dict[str, Any]
 Rng = np.random.Generator
 _OUTPUTS = ("x", "x[1]", "e_s", "e_c")
-NAMES = ("plain", "pushed", "errors", "later")
+NAMES = ("plain", "pushed", "errors", "later", "noisy")
 
 
 def pushed() -> Loop:
@@ -41,6 +41,14 @@ def pushed() -> Loop:
     )
 
 
+def noisy() -> Loop:
+    """Return a loop with noise, in one direction of its own and in one of another weight."""
+    loop, W = double_integrator(floor=0.02), matrix([[1, 0], [0.1, 1]])
+    rule = loop.rule._replace(positive=beside(zeros(2, 2), W))
+    noise = matrix([[0.003, 0.001], [0.0, 0.002]])
+    return loop._replace(noise=noise, weight=W, rule=rule, losses=1)
+
+
 def with_later_events() -> Loop:
     """Return a loop in which two events may happen while an update is on its way, and two before any acts."""
     times = SCHEDULE._replace(delay=fmpq(25, 1000), start=fmpq(25, 1000))
@@ -50,7 +58,7 @@ def with_later_events() -> Loop:
 @functools.cache
 def base(name: str) -> tuple[Loop, Document]:
     """Return a loop and a document that is accepted; "errors" uses facts about w."""
-    loop = {"pushed": pushed, "later": with_later_events}.get(name, double_integrator)()
+    loop = {"pushed": pushed, "later": with_later_events, "noisy": noisy}.get(name, double_integrator)()
     document = dict(find_witness(loop, _OUTPUTS).document)
     return loop, with_errors(loop, document) if name == "errors" else document
 
@@ -232,6 +240,11 @@ LOOPS: dict[str, Callable[[Loop, Rng], Loop]] = {
     "start of the other sign": lambda loop, rng: loop._replace(start=loop.start * -1),
     "another push": _one_of("pushes"),
     "larger disturbance": lambda loop, rng: loop._replace(sizes=tuple(s * number(1.1) for s in loop.sizes)),
+    "noise + 5 %": _one_of("noise", (1.05,)),
+    "noise - 5 %": _one_of("noise", (0.95,)),
+    "noise of another direction": _one_of("noise", (-1.0,)),
+    "twice the noise": lambda loop, rng: loop._replace(noise=loop.noise * 2),
+    "no noise": lambda loop, rng: loop._replace(noise=loop.noise * 0),
     "level + 5 %": _rule("level", 1.05),
     "level - 5 %": _rule("level", 0.95),
     "floor + 5 %": _rule("floor", 1.05),

@@ -9,7 +9,7 @@ from noack.theory.witnesses.documents import find_witness
 from noack.theory.witnesses.effort import NoWitnessError
 from noack_check.balls import number
 from noack_check.loop import Loop
-from tests.checker.random_loops import random_loop, random_loop_with_long_delays
+from tests.checker.random_loops import random_loop, random_loop_with_long_delays, random_noisy_loop
 from tests.checker.runs import exceeded
 from tests.checker.test_witnesses import double_integrator
 
@@ -61,6 +61,13 @@ def test_runs_come_near_the_bounds() -> None:
 def test_bounds_of_random_loops_are_not_exceeded() -> None:
     seeds = range(100, 150)
     assert sum(_found_for(seed) for seed in seeds) >= len(seeds) // 4
+
+
+@pytest.mark.system
+@pytest.mark.timeout(1200)
+def test_bounds_of_random_loops_with_noise_are_not_exceeded() -> None:
+    seeds = range(60)
+    assert sum(_found_for(seed, random_noisy_loop) for seed in seeds) >= len(seeds) // 5
 
 
 @pytest.mark.system

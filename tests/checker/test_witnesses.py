@@ -37,6 +37,7 @@ def double_integrator(
         rule=rule,
         pushes=zeros(2, 0),
         sizes=(),
+        noise=zeros(2, 0),
         losses=2,
         times=times,
     )

@@ -167,23 +167,31 @@ def _sups(G: Matrix) -> Iterator[float]:
 
 def inter_event_s(loop: Loop, rate: float, drift: Sequence[float]) -> float:
     """Return a time that :mod:`noack_check.proof` accepts between two events; 0 without one."""
-    D1, D2 = (level**2 for level in drift)
+    (D1, D2), noise = drift, float(loop.noise_size)
     level, floor = float(loop.rule.level), float(loop.rule.floor)
     if rate != float(loop.rule.rate):
         level = 0.0
-    if loop.rule.always or loop.rule.negative.nrows() or not (floor or (level and not D2)):
+    if loop.rule.always or loop.rule.negative.nrows() or not (floor or (level and not D2 and not noise)):
         return 0.0
-    shares = [(max(level**2 * v, floor**2), D1 * v + D2) for v in _kinks(level, floor)]
-    most = min((threshold / size) ** 0.5 * (1 - 1e-9) for threshold, size in shares if size)
+    pairs = [(max(level * v, floor), float(np.hypot(D1 * v, D2))) for v in _kinks(level, floor)]
     W = floats(loop.weight)
     G = W @ floats(loop.H) @ np.linalg.inv(W) + rate * np.eye(loop.n)
-    grown, time = matrix(G.tolist()), most
+
+    def share(time: float) -> float:
+        """Return the largest share of the threshold that e_s − n reaches within a time after an event."""
+        largest, total = (float(each.mid()) for each in growth(matrix(G.tolist()), number(time)))
+        return (1 + 1e-9) * max((size * total + (largest + 1) * noise) / limit for limit, size in pairs)
+
+    at_once = share(0.0)
+    if at_once >= _NEARLY:
+        return 0.0
+    time = min(limit / size for limit, size in pairs if size)
     for _ in range(_MOST_STEPS):
-        total = float(growth(grown, number(time))[1].mid()) * (1 + 1e-9)
-        if _NEARLY * most < total < most:
+        reached = share(time)
+        if _NEARLY < reached < 1:
             break
-        time *= (1 + _NEARLY) / 2 * most / total
-    return time if total < most else 0.0
+        time *= ((1 + _NEARLY) / 2 - at_once) / (reached - at_once)
+    return time if reached < 1 else 0.0
 
 
 def first_event_s(loop: Loop, drift: Sequence[float], most: float) -> float:
@@ -198,4 +206,4 @@ def first_event_s(loop: Loop, drift: Sequence[float], most: float) -> float:
 def _kinks(level: float, floor: float) -> list[float]:
     if not level:
         return [0.0, 1.0]
-    return [1.0, *([0.0, min((floor / level) ** 2, 1.0)] if floor else [])]
+    return [1.0, *([0.0, min(floor / level, 1.0)] if floor else [])]

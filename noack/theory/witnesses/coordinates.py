@@ -72,6 +72,7 @@ class _Runs:
         self._unknowns = [
             (floats(u.column)[:, 0], floats(u.rows)) for u in model.locations[0].flows[0].unknowns
         ]
+        self._noise = np.flatnonzero(floats(model.p).any(axis=0))
         self._silent, self._unit = floats(model.silent), floats(model.threshold_squared())
         self._sent = [self._jump_matrix(model, later, arrives=False) for later in range(model.later + 1)]
         self._used = [self._jump_matrix(model, later, arrives=True) for later in range(model.later + 1)]
@@ -95,13 +96,15 @@ class _Runs:
             return floats(model.jump(model.e + (model.v[0] if later else 0 * model.w), 0 * model.w, ()))
         if arrives:
             return floats(model.jump(model.e, model.v[0] if later else 0 * model.w, ()))
-        copies = [*(v + model.e for v in model.v[:later]), model.e][: len(model.v)]
-        return floats(model.jump(0 * model.e, model.w + model.e, copies))
+        added = model.e - model.noise
+        copies = [*(v + added for v in model.v[:later]), added][: len(model.v)]
+        return floats(model.jump(model.noise, model.w + added, copies))
 
     def advance(self) -> None:
         """Simulate all steps."""
         for step in range(self._steps):
             self._flow(step)
+            self._z[:, self._noise] = self._rng.choice([-1.0, 1.0], (_RUNS, len(self._noise)))
             self._jump(self._events(step))
             self._observe()
 

@@ -39,6 +39,8 @@ class Search:
         self._f_units = (1.0, level / floor if level and floor else 1.0)
         self._inverse = {name: np.linalg.inv(T) for name, T in self.frames.items()}
         self._whole = [self._frame(index) for index in range(len(self.model.locations))]
+        noise = np.linalg.norm(floats(self.model.loop.weight * self.model.loop.noise), axis=0)
+        self._noise_units = (floor or level or 1.0) / np.maximum(noise, 1e-12)
 
     def solve(
         self, output: str, decay: float, *, starts: bool, margin: float, accuracy: Accuracy
@@ -105,11 +107,15 @@ class Search:
             for name, left, right in item.parts
         )
         result = MatrixInequality(parts, item.scalars, item.constant / size**2)
-        if item.signals < 0:
-            return result
-        frame = self._whole[item.location]
-        whole = np.eye(len(item.constant))
-        whole[: len(frame), : len(frame)] = frame
+        frame = np.eye(1) if item.signals < 0 else self._whole[item.location]
+        whole, first = np.eye(len(item.constant)), len(frame)
+        whole[:first, :first] = frame
+        if len(whole) > first + max(item.signals, 0):
+            noise = range(first, first + len(self._noise_units))
+            whole[noise, noise] = self._noise_units
+        if not parts:  # a silent test: w is in no term, but the frame mixes it with e
+            kept = np.eye(len(whole))[:, _occurring(result, np.eye(len(whole)))]
+            return result.within(kept @ np.linalg.qr(whole.T @ kept).R.T)
         return result.within(whole[:, _occurring(result, whole)])
 
     def _unscaled(self, solution: SolverAnswer, size: float, units: Mapping[str, float]) -> Found:
