@@ -37,7 +37,7 @@ from noack.core.file_access import remove_folder, write_whole
 from noack.protocol.roles import RECORDER, ROLES
 from noack.runtime.active_runs import registered_run, run_name
 from noack.runtime.command_line import Signals, StopRequestError, stop_reason
-from noack.runtime.life_cycle import HORIZON
+from noack.runtime.end_reasons import HORIZON
 from noack.runtime.run_descriptor import RunDescriptor, descriptor_file, new_descriptor
 from noack.scenario.resolution import resolve_run, resolved_loops
 from noack.scenario.scenario import Scenario

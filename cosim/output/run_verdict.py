@@ -17,7 +17,7 @@ from noack.core.errors import ExitStatus
 from noack.core.number_format import counted, duration_at_least
 from noack.protocol.roles import RECORDER
 from noack.protocol.wire_format import Rejection
-from noack.runtime.life_cycle import HORIZON
+from noack.runtime.end_reasons import HORIZON
 from noack.runtime.udp_sockets import DROPPED_IN_FLOOD
 from noack.theory.certificates.assumptions import AssumptionStatus
 

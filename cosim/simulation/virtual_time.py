@@ -36,7 +36,7 @@ from noack.machines.loop_machines import LoopMachines, row_types
 from noack.protocol.record_tables import LOOP, OWNER, is_of_network, network_tables
 from noack.protocol.roles import CHANGEABLE, LOOP_ROLES, RECORDER, Notice, Record
 from noack.protocol.wire_format import KEY_BYTES, Flow, Rejection
-from noack.runtime.life_cycle import HORIZON
+from noack.runtime.end_reasons import HORIZON
 from noack.scenario.parameter_changes import change_notice, scheduled, settings_key
 from noack.scenario.resolution import resolve_run, resolved_loops, shape_of, tables_of
 from noack.scenario.scenario import Scenario, phases_ns

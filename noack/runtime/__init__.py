@@ -3,10 +3,9 @@
 Read ``join_run.py`` first, then ``run_process.py`` from top to bottom. They use, in this order:
 
 * ``command_line.py`` and ``run_descriptor.py``, with which a process starts,
-* ``control_plane.py``, its messages (``control_messages.py``) and the life cycle that they change
-  (``life_cycle.py``; the start barrier is held and opened by the coordinator, in
-  ``cosim/live/coordination``), over sessions of ``connections``; on another host ``host_clocks``,
-  too,
+* ``control_plane.py`` and its messages (``control_messages.py``), over sessions of ``connections``
+  (the start barrier is held and opened by the coordinator, in ``cosim/live/coordination``); on another
+  host ``host_clocks``, too,
 * ``udp_sockets.py`` with ``address.py``,
 * ``drivers``, with the real-time loop,
 * ``telemetry.py`` and ``spool.py`` for the rows; ``private_folder.py`` for files of the user.

@@ -23,7 +23,7 @@ from noack.runtime.address import address_text
 from noack.runtime.command_line import DESCRIPTOR_ON_STDIN, Parser, Signals, report_failure
 from noack.runtime.connections.credentials import read_credentials
 from noack.runtime.control_plane import ControlPlane
-from noack.runtime.life_cycle import HORIZON, Event
+from noack.runtime.end_reasons import HORIZON
 from noack.runtime.run_descriptor import DEFAULT_SESSION, RunDescriptor, find_descriptor, loads
 from noack.runtime.run_process import RunProcess, launcher_has_ended
 
@@ -91,7 +91,6 @@ def join_run(role: str, arguments: Sequence[str] | None = None) -> Iterator[RunP
                     process.fail(error)
                     raise
                 finally:
-                    process.life.apply(Event.END)
                     process.plane.report_end(process.ended)
         if options.json:
             print(json.dumps(process.report, indent=2))

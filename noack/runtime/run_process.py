@@ -39,9 +39,9 @@ from noack.runtime.control_messages import (
 from noack.runtime.control_plane import ControlPlane, ParameterUpdates
 from noack.runtime.drivers.real_time_loop import Driver, ProcessSockets, run_loop
 from noack.runtime.drivers.realtime_settings import realtime
+from noack.runtime.end_reasons import HORIZON, LAUNCHER_GONE, LOST_AFTER_S
 from noack.runtime.host_clocks import RECEIVED, CausalityCheck, clock_error, realtime_offset_ns
 from noack.runtime.kept_rows import KeptFile, KeptHead
-from noack.runtime.life_cycle import HORIZON, LAUNCHER_GONE, LOST_AFTER_S, Event, LifeCycle, Side, State
 from noack.runtime.run_descriptor import RunDescriptor
 from noack.runtime.spool import SPOOL
 from noack.runtime.telemetry import OwnSpool, TelemetryBuffer, deliver_report, persisted_rows
@@ -83,9 +83,11 @@ class RunProcess:
         self.phases_ns = phases_ns(descriptor.scenario)
         """When each loop begins."""
         self.plane = plane
-        self.life = LifeCycle(role, Side.PROCESS)
         self.updates = ParameterUpdates(plane)
         self._signals = signals
+        self._reason: str | None = None
+        """Why it stops before the horizon."""
+        self._has_started = False
         self.report: dict[str, object] = {}
         self._realtime: dict[str, str] = {}
         self._clocks: Mapping[str, ClockError] = {}
@@ -99,7 +101,6 @@ class RunProcess:
         """
         request = AdmissionRequest(instance=self.plane.instance, clock=self._clock_error())
         self._request("admit", request, Admission, _ADMISSION_TIMEOUT_S)
-        self.life.apply(Event.ADMIT)
 
     def join(self, address: Address | None) -> Mapping[str, Address]:
         """Wait at the start barrier; return all addresses. Sets the common epoch.
@@ -108,7 +109,6 @@ class RunProcess:
         never started.
         """
         prepare_changes()
-        self.life.apply(Event.JOIN)
         request = JoinRequest(instance=self.plane.instance, address=address)
         begin = self._request("join", request, RunStart, _JOIN_TIMEOUT_S)
         epoch_ns = begin.epoch_ns
@@ -118,7 +118,7 @@ class RunProcess:
         self.updates.extend(begin.changes)
         if not begin.addresses.keys() >= set(LOOP_ROLES):
             raise PeerError("the coordinator did not send the addresses of all processes")
-        self.life.apply(Event.START)
+        self._has_started = True
         if not self.descriptor.launched:
             print_to_stderr(f"noack {self.role}: started")
         return begin.addresses
@@ -129,7 +129,7 @@ class RunProcess:
             message = self.plane.request(query, request, timeout_s=timeout_s, give_up=lambda: self.stopping)
         except PeerError as error:
             # The reason to stop explains more than a missing answer.
-            raise PeerError(self.life.reason) if self.life.reason else error from None
+            raise PeerError(self._reason) if self._reason else error from None
         return parse_message(answer, message)
 
     def _clock_error(self) -> ClockError | None:
@@ -262,7 +262,7 @@ class RunProcess:
         reached_ns = self.clock.now_ns() - late_ns
         if late_ns and not self.stopping:
             late_s = late_ns / NS_PER_S
-            self.life.apply(Event.STOP, f"overrun: {late_s:g} s late; reduce the speed or the rates")
+            self._reason = f"overrun: {late_s:g} s late; reduce the speed or the rates"
         return reached_ns
 
     def _all_done(self, is_done: bool) -> bool:
@@ -283,19 +283,19 @@ class RunProcess:
     def fail(self, error: BaseException) -> None:
         """Stop with an error as the reason."""
         is_expected = isinstance(error, NoackError)
-        self.life.reason = one_line(error) if is_expected else f"internal error: {error!r}"
+        self._reason = one_line(error) if is_expected else f"internal error: {error!r}"
 
     @property
     def ended(self) -> str:
         """The reason why the process ended."""
-        return self.life.reason or HORIZON
+        return self._reason or HORIZON
 
     @property
     def stopping(self) -> bool:
         """Whether there is a reason to stop before the horizon."""
-        if self.life.reason is None and (reason := self._reason_to_stop()) is not None:
-            self.life.apply(Event.STOP, reason)
-        return self.life.reason is not None
+        if self._reason is None:
+            self._reason = self._reason_to_stop()
+        return self._reason is not None
 
     def _reason_to_stop(self) -> str | None:
         if self._signals.received is not None:
@@ -306,8 +306,7 @@ class RunProcess:
             return LAUNCHER_GONE if launcher_has_ended() else None
         # A running loop does not need the control plane. A launched process ends with its launcher
         # only: on a busy machine the coordinator may only seem to be gone.
-        waiting = self.life.state in (State.REQUESTED, State.AT_BARRIER)
-        if waiting and self.plane.coordinator_gone(for_s=LOST_AFTER_S):
+        if not self._has_started and self.plane.coordinator_gone(for_s=LOST_AFTER_S):
             return "the connection to `noack record` is lost"
         return None
 

@@ -7,7 +7,7 @@ role in the environment's ``FROZEN``, if any, stops before it requests admission
 import os
 import signal
 
-from noack.runtime import join_run, life_cycle
+from noack.runtime import end_reasons, join_run
 
 
 def stop_if_frozen(title: str) -> None:
@@ -22,7 +22,7 @@ _setproctitle = join_run.setproctitle
 
 def main() -> None:
     """Run a command; the processes that it forks have the same time-outs."""
-    life_cycle.LOST_AFTER_S, life_cycle.LAUNCHED_LOST_S = 4.0, 8.0
+    end_reasons.LOST_AFTER_S, end_reasons.LAUNCHED_LOST_S = 4.0, 8.0
     join_run.setproctitle = stop_if_frozen
     from cosim.cli import main as noack  # it copies the time-outs
     from cosim.live import launcher  # the same

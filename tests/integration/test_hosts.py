@@ -129,7 +129,7 @@ def test_several_loops_run_on_hosts_with_different_clocks(
         assert loop["conditions"]["clock_error_s"] == 0.001  # as stated
         assert not loop["assumption_violations"]
     run = load_run((tmp_path / "runs" / "latest").resolve())
-    clocks = run.loops[0].clocks
+    clocks = next(iter(run.loops)).clocks
     assert {role: (clock.error_ns, clock.source) for role, clock in clocks.items()} == {
         "plant": (500_000, "chronyc tracking"),
         "sensor": (500_000, "chronyc tracking"),

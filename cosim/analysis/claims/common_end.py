@@ -8,7 +8,7 @@ import numpy as np
 from cosim.record.run_record import Rows, RunRecord
 from noack.protocol.record_tables import OWNER, SENSOR_MEASUREMENT, STEP_TABLES
 from noack.protocol.roles import LOOP_ROLES
-from noack.runtime.life_cycle import HORIZON
+from noack.runtime.end_reasons import HORIZON
 
 
 def common_end_ns(record: RunRecord) -> int | None:

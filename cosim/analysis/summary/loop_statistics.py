@@ -38,7 +38,7 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.roles import ENDS, LOOP_ROLES
 from noack.protocol.wire_format import Flow, Rejection
-from noack.runtime.life_cycle import HORIZON
+from noack.runtime.end_reasons import HORIZON
 from plant_server.plant import too_old
 
 

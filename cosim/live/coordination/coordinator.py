@@ -1,13 +1,14 @@
-"""The coordinator of a run: admission, start barrier, liveliness, stop, changes of settings.
+"""The coordinator of a run: admission, start barrier, changes of settings, liveliness, stop.
 
-It keeps the life cycle (:mod:`noack.runtime.life_cycle`) of each process. ``change_requests.py`` has
-the changes of settings.
+Read :meth:`Coordinator.poll` first: it handles what has arrived, in the order in which a process
+sends it. ``change_requests.py`` has the changes of settings.
 """
 
 import os
 import time
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
@@ -28,8 +29,8 @@ from noack.runtime.control_messages import (
     parse_message,
 )
 from noack.runtime.control_plane import ControlPlane
+from noack.runtime.end_reasons import HORIZON, LAUNCHED_LOST_S, LOST_AFTER_S
 from noack.runtime.host_clocks import STATED, realtime_offset_ns, require_small_error
-from noack.runtime.life_cycle import HORIZON, LAUNCHED_LOST_S, LOST_AFTER_S, Event, LifeCycle, Side, State
 from noack.runtime.run_descriptor import RunDescriptor
 
 _REPORT_GRACE_S = 0.3
@@ -41,29 +42,41 @@ _START_DELAY_NS, _LONG_START_DELAY_NS = 30_000_000, 100_000_000
 longer one is for processes on other hosts, and for a loaded machine."""
 
 
-class _Member(LifeCycle):
-    """A process that has asked for admission."""
+@dataclass
+class _Member:
+    """A process that was admitted."""
 
-    def __init__(self, role: str, instance: str) -> None:
-        super().__init__(role, Side.COORDINATOR)
-        self.instance = instance
-        self.clock: ClockError | None = None
-        """Of a host with another clock than the coordinator's."""
-        self.address: tuple[str, int] | None = None
-        self.query: zenoh.Query | None = None
-        """Its unanswered join request."""
+    role: str
+    instance: str
+    lost_after_s: float
+    """It is lost when its connection is not back after this time."""
+    clock: ClockError | None
+    """Of a host with another clock than the coordinator's."""
+    address: tuple[str, int] | None = None
+    query: zenoh.Query | None = None
+    """Its unanswered join request, while it waits at the start barrier."""
+    vanished_s: float | None = None
+    """Reading of the monotonic clock when its connection broke; None while it is connected."""
+    ended: str | None = None
+    """Why it ended, by its own report."""
+    ended_s: float = 0.0
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether its connection broke, and neither came back nor was followed by a report."""
+        if self.ended is not None or self.vanished_s is None:
+            return False
+        return time.monotonic() - self.vanished_s > self.lost_after_s
 
     def failure(self) -> str | None:
         """Why it is over before its work was done; None if it is not over, or did its work."""
-        if self.state is State.LOST:
-            return "stopped responding"
-        if self.state is State.GONE and self.reason != HORIZON:
-            return f"ended early: {self.reason}"
-        return None
+        if self.ended is not None:
+            return None if self.ended == HORIZON else f"ended early: {self.ended}"
+        return "stopped responding" if self.is_lost else None
 
 
 class Coordinator:
-    """Admission, start barrier, liveliness and stop of one run.
+    """The coordinator of one run.
 
     Args:
         descriptor: of the run.
@@ -100,8 +113,9 @@ class Coordinator:
         self._admitted: dict[tuple[str, str], _Member] = {}
         """By role and instance."""
         self._members: dict[str, _Member] = {}
-        """The process of each role that has joined."""
+        """The process of each role that waits at the start barrier, or has passed it."""
         self._reported: dict[str, str] = {}
+        """Why processes ended, by role."""
         self._stopped: str | None = None
 
     @property
@@ -120,49 +134,35 @@ class Coordinator:
     def poll(self) -> None:
         """Handle all messages that have arrived; call often."""
         while (end := self._ends.try_recv()) is not None:
-            if header_of(end) is None:
-                continue
-            reason = end.payload.to_bytes().decode(errors="replace")
-            self._reported[_sender(end.key_expr)[0]] = reason
-            self._apply(end.key_expr, Event.END, reason)
+            if header_of(end) is not None:
+                self._note_end(end)
         while (token := self._tokens.try_recv()) is not None:
-            vanished = token.kind == zenoh.SampleKind.DELETE
-            self._apply(token.key_expr, Event.DISCONNECT if vanished else Event.RECONNECT)
-        for member in self._members.values():
-            if member.state is State.UNREACHABLE and self._remaining_s(member) < 0:
-                member.apply(Event.TIME_OUT)
-        if self._clock is None:
-            self._clear_barrier()
+            self._note_connection(token)
         while (query := self._admissions.try_recv()) is not None:
             self._answer(query, self._admit)
         while (query := self._joins.try_recv()) is not None:
             self._answer(query, self._join)
-        while (query := self._change_queries.try_recv()) is not None:
-            self._answer_change(query)
         if self._clock is None and self._stopped is None and not self.missing():
             self._start()
+        while (query := self._change_queries.try_recv()) is not None:
+            self._answer_change(query)
 
     def stop(self, reason: str) -> None:
         """Stop all processes of the run, those at the start barrier too."""
         self._stopped = reason
         self.plane.request_stop(reason)
         for member in self._members.values():
-            if member.state is State.AT_BARRIER and member.query is not None:
+            if member.query is not None:
                 self.plane.refuse(member.query, reason)
                 member.query = None
-            member.apply(Event.STOP)
 
     def instances(self) -> dict[str, str]:
         """The roles of the processes that have joined, by instance."""
         return {member.instance: role for role, member in self._members.items()}
 
     def missing(self) -> tuple[str, ...]:
-        """Roles that are not at the start barrier."""
-        return tuple(
-            role
-            for role in ROLES
-            if (member := self._members.get(role)) is None or member.state is not State.AT_BARRIER
-        )
+        """Before the start: the roles that are not at the start barrier."""
+        return tuple(role for role in ROLES if role not in self._members)
 
     def failures(self) -> Mapping[str, str]:
         """Roles of which the process is over before its work was done, and why."""
@@ -171,15 +171,16 @@ class Coordinator:
 
     def is_over(self, role: str) -> bool:
         """Whether the process of a role has joined, and has ended or is lost."""
-        return role in self._members and self._members[role].is_over
+        member = self._members.get(role)
+        return member is not None and (member.ended is not None or member.is_lost)
 
     def has_ended(self, role: str) -> bool:
         """Whether the process of a role has reported its end; one that is lost has not."""
-        return role in self._members and self._members[role].state is State.GONE
+        return role in self._members and self._members[role].ended is not None
 
     def is_exiting(self, role: str) -> bool:
         """Whether a process reported its end a moment ago, so that it may not have exited yet."""
-        return self.has_ended(role) and self._members[role].age_s() < _EXIT_GRACE_S
+        return self.has_ended(role) and time.monotonic() - self._members[role].ended_s < _EXIT_GRACE_S
 
     def await_reported_failure(self, role: str) -> str | None:
         """Why a process ended early, by its own report; None without a report."""
@@ -197,24 +198,6 @@ class Coordinator:
                 return parse_message(RunProgress, payload)
         return None
 
-    def _apply(self, key_expr: object, event: Event, reason: str | None = None) -> None:
-        if (member := self._admitted.get(_sender(key_expr))) is not None:
-            member.apply(event, reason)
-
-    def _remaining_s(self, member: _Member) -> float:
-        """For how long an unreachable process may still come back, in seconds."""
-        most_s = LAUNCHED_LOST_S if member.role in self._launched else LOST_AFTER_S
-        return most_s - member.age_s()
-
-    def _clear_barrier(self) -> None:
-        """Before the start: free the place of a process that has left the barrier."""
-        for role, member in list(self._members.items()):
-            if member.state in (State.ADMITTED, State.GONE):
-                del self._members[role]
-                if member.query is not None:
-                    self.plane.dismiss(member.query)
-                    member.query = None
-
     def _answer(self, query: zenoh.Query, respond: Callable[[str, zenoh.Query], None]) -> None:
         role = str(query.key_expr).rpartition("/")[2]
         if self._stopped is not None:
@@ -225,17 +208,6 @@ class Coordinator:
         except PeerError as error:
             self.plane.refuse(query, f"cannot join: {error}")
 
-    def _answer_change(self, query: zenoh.Query) -> None:
-        obstacle = "the run has not started" if self._clock is None else None
-        if self._stopped is not None:
-            obstacle = f"the run is stopping: {self._stopped}"
-        try:
-            answer = self._changes.answer(_payload(query), self.now_ns, obstacle)
-        except (CallerError, PeerError) as error:
-            self.plane.refuse(query, str(error))
-        else:
-            self.plane.answer(query, answer)
-
     def _admit(self, role: str, query: zenoh.Query) -> None:
         """Admit a process to the run; raise PeerError if it cannot join."""
         request = parse_message(AdmissionRequest, _payload(query))
@@ -243,10 +215,9 @@ class Coordinator:
             raise PeerError("a run has no such process")
         if role in self._members:
             raise PeerError(f"another {role} is in this run already")
-        member = _Member(role, request.instance)
-        member.clock = self._checked_clock(role, request.clock)
-        member.apply(Event.ADMIT)
-        self._admitted[role, request.instance] = member
+        clock = self._checked_clock(role, request.clock)
+        lost_after_s = LAUNCHED_LOST_S if role in self._launched else LOST_AFTER_S
+        self._admitted[role, request.instance] = _Member(role, request.instance, lost_after_s, clock)
         self.plane.answer(query, Admission())
 
     def _checked_clock(self, role: str, clock: ClockError | None) -> ClockError | None:
@@ -259,50 +230,47 @@ class Coordinator:
         return clock
 
     def _join(self, role: str, query: zenoh.Query) -> None:
-        """Let a process wait at the start barrier; pass it if the run has started.
+        """Let a process wait at the start barrier; raise PeerError if it cannot join.
 
-        Raise PeerError if it cannot join.
+        It asks again when its connection was interrupted, and passes if the run has started.
         """
         request = parse_message(JoinRequest, _payload(query))
         member = self._admitted.get((role, request.instance))
         if member is None:
             raise PeerError("it was not admitted")
+        if member.ended is not None:
+            raise PeerError("it has ended")
         if self._members.get(role, member) is not member:
             raise PeerError(f"another {role} is in this run already")
         if (request.address is None) == (role in LOOP_ROLES):
             raise PeerError("a process of the loop needs an address, the recorder has none")
         if self._clock is not None and request.address != member.address:
             raise PeerError("its address must not change during the run")
-        member.apply(Event.JOIN)
-        member.address, member.query = request.address, query
+        member.address, member.query, member.vanished_s = request.address, query, None
         self._members[role] = member
         if self._clock is not None:
-            self._let_pass(member)
+            self._let_pass(member, self._clock.epoch_ns)
 
     def _start(self) -> None:
+        """Open the start barrier."""
         is_quick = {*self._launched} == {*ROLES} and os.getloadavg()[0] <= cores()
         delay_ns = _START_DELAY_NS if is_quick else _LONG_START_DELAY_NS
         self._clock = RunClock(time.monotonic_ns() + delay_ns, self._speed)
         self._realtime_offset_ns = realtime_offset_ns()
         for member in self._members.values():
-            self._let_pass(member)
+            self._let_pass(member, self._clock.epoch_ns)
 
-    def _let_pass(self, member: _Member) -> None:
+    def _let_pass(self, member: _Member, epoch_ns: int) -> None:
         """Answer a join request with the start of the run."""
-        if member.state is State.AT_BARRIER:
-            member.apply(Event.START)
         members = [self._members[role] for role in LOOP_ROLES]
-        addresses = {member.role: member.address for member in members if member.address is not None}
         query, member.query = member.query, None
         assert query is not None
-        assert self._clock is not None
-        epoch_ns, changes = self._clock.epoch_ns, self._changes.announced
         start = RunStart(
             epoch_ns=epoch_ns,
             epoch_realtime_ns=epoch_ns + self._realtime_offset_ns,
             clocks=self._clocks(),
-            addresses=addresses,
-            changes=changes,
+            addresses={member.role: member.address for member in members if member.address is not None},
+            changes=self._changes.announced,
         )
         self.plane.answer(query, start)
 
@@ -311,6 +279,44 @@ class Coordinator:
         if self._own_clock is None or all(self._members[role].clock is None for role in LOOP_ROLES):
             return {}
         return {role: self._members[role].clock or self._own_clock for role in LOOP_ROLES}
+
+    def _answer_change(self, query: zenoh.Query) -> None:
+        obstacle = "the run has not started" if self._clock is None else None
+        if self._stopped is not None:
+            obstacle = f"the run is stopping: {self._stopped}"
+        try:
+            answer = self._changes.answer(_payload(query), self.now_ns, obstacle)
+        except (CallerError, PeerError) as error:
+            self.plane.refuse(query, str(error))
+        else:
+            self.plane.answer(query, answer)
+
+    def _note_connection(self, token: zenoh.Sample) -> None:
+        """Note that a process lost its connection, or has it again."""
+        member = self._admitted.get(_sender(token.key_expr))
+        if member is None:
+            return
+        member.vanished_s = None
+        if token.kind == zenoh.SampleKind.DELETE:
+            member.vanished_s = time.monotonic()
+            self._leave_barrier(member)
+
+    def _note_end(self, end: zenoh.Sample) -> None:
+        """Note why a process ended, by its own report."""
+        reason = end.payload.to_bytes().decode(errors="replace")
+        role, _ = sender = _sender(end.key_expr)
+        self._reported[role] = reason
+        if (member := self._admitted.get(sender)) is not None and member.ended is None:
+            member.ended, member.ended_s = reason, time.monotonic()
+            self._leave_barrier(member)
+
+    def _leave_barrier(self, member: _Member) -> None:
+        """Before the start: let another process, or the same one again, have the place of this one."""
+        if self._clock is None and self._members.get(member.role) is member:
+            del self._members[member.role]
+            if member.query is not None:
+                self.plane.dismiss(member.query)
+                member.query = None
 
 
 def _clock_line(which: str, clock: ClockError) -> str:

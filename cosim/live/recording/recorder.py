@@ -41,9 +41,9 @@ from noack.runtime.command_line import END_SIGNALS, print_to_stderr
 from noack.runtime.connections.zenoh_session import header_of
 from noack.runtime.control_messages import ChangeAnnouncement, ProcessReport, RunProgress, message_json
 from noack.runtime.control_plane import ControlPlane
+from noack.runtime.end_reasons import LAUNCHED_LOST_S, LAUNCHER_GONE
 from noack.runtime.host_clocks import CLOCK_NOTICE
 from noack.runtime.join_run import join_run
-from noack.runtime.life_cycle import LAUNCHED_LOST_S, LAUNCHER_GONE
 from noack.runtime.run_process import RunProcess
 from noack.runtime.spool import NOTICES
 from noack.runtime.telemetry import first_row

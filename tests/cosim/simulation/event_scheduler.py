@@ -14,7 +14,7 @@ from netem.channel import RUN_ID, Datagram, UserNetwork, channel_of
 from noack.protocol.record_tables import OWNER
 from noack.protocol.roles import CHANGEABLE, ENDS, LOOP_ROLES, RECEIVES, RECORDER, Notice, Record, receiver_of
 from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow
-from noack.runtime.life_cycle import HORIZON
+from noack.runtime.end_reasons import HORIZON
 from noack.scenario.parameter_changes import change_notice, scheduled
 from noack.scenario.resolution import tables_of
 from noack.scenario.scenario import Scenario

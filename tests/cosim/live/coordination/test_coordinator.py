@@ -54,6 +54,11 @@ def lose(plane: FakePlane, barrier: Coordinator) -> None:
     token(plane, barrier, zenoh.SampleKind.DELETE)
 
 
+def end(plane: FakePlane, barrier: Coordinator, reason: bytes) -> None:
+    plane.put("ended", Sample("noack/0/ended/sensor/one", reason, sent_as=""))
+    barrier.poll()
+
+
 def test_an_invalid_request_is_refused_and_the_others_join(plane: FakePlane, barrier: Coordinator) -> None:
     for junk in JUNK:
         plane.put("progress", Sample("progress", junk))
@@ -110,11 +115,33 @@ def test_a_running_process_is_lost_only_if_its_connection_does_not_come_back(
     assert barrier.failures() == {}
     assert ask(plane, barrier, "admit", "two").error == "cannot join: another sensor is in this run already"
     token(plane, barrier, None)
-    monkeypatch.setattr(coordinator, "LOST_AFTER_S", -1.0)
+    monkeypatch.setattr(barrier._members["sensor"], "lost_after_s", -1.0)
     barrier.poll()
     assert barrier.failures() == {}
     lose(plane, barrier)
     assert barrier.failures() == {"sensor": "sensor stopped responding"}
+    assert barrier.is_over("sensor")
+    assert not barrier.has_ended("sensor")
+    assert ask(plane, barrier, "join").answered  # it is back
+    assert barrier.failures() == {}
+    end(plane, barrier, b"the disk is full")
+    lose(plane, barrier)
+    assert barrier.failures() == {"sensor": "sensor ended early: the disk is full"}
+    assert barrier.has_ended("sensor")
+    assert ask(plane, barrier, "join").error == "cannot join: it has ended"
+
+
+def test_a_process_that_ends_before_the_start_leaves_its_place(
+    plane: FakePlane, barrier: Coordinator
+) -> None:
+    ask(plane, barrier, "admit")
+    waiting = ask(plane, barrier, "join")
+    end(plane, barrier, b"no memory")
+    assert waiting.dismissed
+    assert "sensor" in barrier.missing()
+    assert barrier.failures() == {}
+    ask(plane, barrier, "admit", "two")
+    assert ask(plane, barrier, "join", "two").error is None
 
 
 @pytest.mark.parametrize(("error_us", "refused"), [(999, False), (1000, False), (1001, True)])

@@ -1,4 +1,4 @@
-"""The life of a process: its states and events, signals, and its lock file."""
+"""Signals that end a process, and its lock file."""
 
 import os
 import resource
@@ -7,51 +7,16 @@ import subprocess
 import sys
 import time
 from contextlib import ExitStack
-from itertools import product
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from noack.core import file_access
-from noack.core.errors import CallerError, ExitStatus, MachineError, PeerError
+from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.runtime import private_folder
 from noack.runtime.command_line import Signals
-from noack.runtime.life_cycle import Event, LifeCycle, Side, State
 from noack.runtime.private_folder import open_private
-
-EXPECTED = """
-state       ADMIT    JOIN       START   STOP        END  DISCONNECT  RECONNECT  TIME_OUT REPLACE
-REQUESTED   ADMITTED -          -       STOPPING    GONE REQUESTED   REQUESTED  -        -
-ADMITTED    -        AT_BARRIER -       STOPPING    GONE ADMITTED    ADMITTED   -        -
-AT_BARRIER  -        AT_BARRIER RUNNING STOPPING    GONE ADMITTED    AT_BARRIER -        -
-RUNNING     -        RUNNING    -       STOPPING    GONE UNREACHABLE RUNNING    -        -
-STOPPING    -        -          -       STOPPING    GONE UNREACHABLE STOPPING   -        -
-UNREACHABLE -        RUNNING    -       UNREACHABLE GONE UNREACHABLE RUNNING    LOST     -
-LOST        -        RUNNING    -       LOST        GONE LOST        RUNNING    -        GONE
-GONE        -        -          -       GONE        GONE GONE        GONE       -        GONE
-"""
-(_, *HEAD), *ROWS = [line.split() for line in EXPECTED.strip().splitlines()]
-NEXT = {(row[0], event): state for row in ROWS for event, state in zip(HEAD, row[1:], strict=True)}
-
-
-@pytest.mark.parametrize(("state", "event"), list(product(State, Event)))
-def test_every_event_in_every_state_does_what_the_table_says(state: State, event: Event) -> None:
-    for side in Side:
-        life = LifeCycle("sensor", side)
-        life.state, expected = state, NEXT[state.name, event.name]
-        if expected == "-":
-            error = CallerError if event.side is side else PeerError
-            with pytest.raises(error, match=f"^sensor {event.value}, .*{state.value}$"):
-                life.apply(event)
-            assert life.state is state
-        else:
-            life.apply(event, "why")
-            assert life.state.name == expected
-            assert life.reason == "why"
-
-
-# --- signals --------------------------------------------------------------------------------------
 
 
 def test_a_second_signal_ends_the_process_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
