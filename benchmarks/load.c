@@ -23,15 +23,13 @@ static const int64_t QUIET_NS = 3000000;
 static const int64_t PATIENCE_NS = 300000000; /* after it, the rest of a burst counts as lost */
 static const int64_t POLL_NS = 500000;
 
-static int64_t now_ns(clockid_t clock)
-{
+static int64_t now_ns(clockid_t clock) {
     struct timespec t;
     clock_gettime(clock, &t);
     return t.tv_sec * SECOND_NS + t.tv_nsec;
 }
 
-static void sleep_until(int64_t due_ns)
-{
+static void sleep_until(int64_t due_ns) {
     struct timespec t = {due_ns / SECOND_NS, due_ns % SECOND_NS};
     while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &t, NULL) == EINTR)
         ;
@@ -43,8 +41,7 @@ struct arrival {
 };
 
 /* Receive the datagrams queued at the sink, at most BATCH, without waiting; -1 if there is none. */
-static int take(int sink, struct arrival arrivals[BATCH])
-{
+static int take(int sink, struct arrival arrivals[BATCH]) {
     static char data[BATCH][DATAGRAM_BYTES];
     static char control[BATCH][CONTROL_BYTES] __attribute__((aligned(16)));
     struct iovec parts[BATCH];
@@ -74,9 +71,8 @@ static int take(int sink, struct arrival arrivals[BATCH])
 
 /* Send the datagrams number first to first + count - 1 as fast as possible; if there are sources
  * (IPv4 addresses in network order), send datagram k from sources[k % n_sources]. */
-static int send_all(int out, int64_t first, int64_t count, const uint32_t *sources,
-                    int64_t n_sources)
-{
+static int send_all(
+    int out, int64_t first, int64_t count, const uint32_t *sources, int64_t n_sources) {
     static char data[BATCH][DATAGRAM_BYTES];
     static char control[BATCH][CMSG_SPACE(sizeof(struct in_pktinfo))] __attribute__((aligned(16)));
     struct iovec parts[BATCH];
@@ -110,8 +106,7 @@ static int send_all(int out, int64_t first, int64_t count, const uint32_t *sourc
 }
 
 /* Number of bytes that wait at the sink, and its maximum. */
-static int64_t waiting(int sink, int64_t *most)
-{
+static int64_t waiting(int sink, int64_t *most) {
     uint32_t memory[SK_MEMINFO_VARS] = {0};
     socklen_t length = sizeof memory;
     getsockopt(sink, SOL_SOCKET, SO_MEMINFO, memory, &length);
@@ -122,9 +117,8 @@ static int64_t waiting(int sink, int64_t *most)
 /* Receive datagrams from number first on. End when datagram count - slack has arrived and none
  * follows, or when none has arrived for PATIENCE_NS. The sink is read when it does not grow or gets
  * full: reading it while the relay writes to it would slow the relay down. */
-static void gather(int sink, int64_t first, int64_t count, int64_t slack, int64_t begun_ns,
-                   struct burst *found)
-{
+static void gather(
+    int sink, int64_t first, int64_t count, int64_t slack, int64_t begun_ns, struct burst *found) {
     struct arrival arrivals[BATCH];
     int64_t changed_ns = now_ns(CLOCK_MONOTONIC), held_before = 0, most;
 
@@ -153,9 +147,9 @@ static void gather(int sink, int64_t first, int64_t count, int64_t slack, int64_
 }
 
 /* Stop a child process, fill its receive buffer, continue it, wait until the buffer is empty. */
-int load_burst(int out, int sink, int64_t first, int64_t count, int relay, const uint32_t *sources,
-               int64_t n_sources, int64_t slack, struct burst *found)
-{
+int load_burst(
+    int out, int sink, int64_t first, int64_t count, int relay, const uint32_t *sources,
+    int64_t n_sources, int64_t slack, struct burst *found) {
     siginfo_t info;
     if (kill(relay, SIGSTOP) != 0 || waitid(P_PID, (id_t)relay, &info, WSTOPPED) != 0)
         return errno;
@@ -169,8 +163,7 @@ int load_burst(int out, int sink, int64_t first, int64_t count, int relay, const
 
 /* Send datagrams one by one, each after the previous one has arrived or timed out (the sink's
  * SO_RCVTIMEO); delay_ns[k] is -1 after a timeout. */
-int load_ping(int out, int sink, int64_t first, int64_t count, int64_t *delay_ns)
-{
+int load_ping(int out, int sink, int64_t first, int64_t count, int64_t *delay_ns) {
     char data[DATAGRAM_BYTES] = {0};
     for (int64_t k = 0; k < count; k++) {
         int64_t number = first + k, found = -1;
@@ -188,9 +181,8 @@ int load_ping(int out, int sink, int64_t first, int64_t count, int64_t *delay_ns
 
 /* Send a datagram every period_ns, then collect them until all have arrived or none has for
  * PATIENCE_NS; delay_ns of missing datagrams is negative. */
-int load_pace(int out, int sink, int64_t first, int64_t count, int64_t period_ns,
-              int64_t *delay_ns)
-{
+int load_pace(
+    int out, int sink, int64_t first, int64_t count, int64_t period_ns, int64_t *delay_ns) {
     char data[DATAGRAM_BYTES] = {0};
     struct arrival arrivals[BATCH];
     int64_t begun_ns = now_ns(CLOCK_MONOTONIC), missing = count;
@@ -219,8 +211,7 @@ int load_pace(int out, int sink, int64_t first, int64_t count, int64_t period_ns
     return 0;
 }
 
-static void count_arrivals(int sink, struct soak *state)
-{
+static void count_arrivals(int sink, struct soak *state) {
     struct arrival arrivals[BATCH];
     for (int taken; (taken = take(sink, arrivals)) > 0;)
         for (int k = 0; k < taken; k++) {
@@ -237,9 +228,8 @@ static void count_arrivals(int sink, struct soak *state)
 
 /* Send `groups` groups of `group` datagrams, one group every period_ns, and receive arrivals in
  * between; continues the numbering of `state`. */
-int load_soak(int out, int sink, int64_t groups, int64_t group, int64_t period_ns,
-              struct soak *state)
-{
+int load_soak(
+    int out, int sink, int64_t groups, int64_t group, int64_t period_ns, struct soak *state) {
     int64_t begun_ns = now_ns(CLOCK_MONOTONIC);
     for (int64_t k = 0; k < groups; k++) {
         sleep_until(begun_ns + (k + 1) * period_ns);

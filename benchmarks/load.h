@@ -6,11 +6,12 @@ struct burst {
     int64_t received; /* number of arrivals */
 };
 
-int load_burst(int out, int sink, int64_t first, int64_t count, int relay, const uint32_t *sources,
-               int64_t n_sources, int64_t slack, struct burst *found);
+int load_burst(
+    int out, int sink, int64_t first, int64_t count, int relay, const uint32_t *sources,
+    int64_t n_sources, int64_t slack, struct burst *found);
 int load_ping(int out, int sink, int64_t first, int64_t count, int64_t *delay_ns);
-int load_pace(int out, int sink, int64_t first, int64_t count, int64_t period_ns,
-              int64_t *delay_ns);
+int load_pace(
+    int out, int sink, int64_t first, int64_t count, int64_t period_ns, int64_t *delay_ns);
 
 struct soak {
     int64_t sent;
@@ -20,5 +21,5 @@ struct soak {
     int64_t disordered;  /* arrivals after a higher number; 0 through a FIFO */
 };
 
-int load_soak(int out, int sink, int64_t groups, int64_t group, int64_t period_ns,
-              struct soak *state);
+int load_soak(
+    int out, int sink, int64_t groups, int64_t group, int64_t period_ns, struct soak *state);

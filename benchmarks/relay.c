@@ -1,11 +1,11 @@
 /* A peer of the relay benchmarks: a relay that only forwards.
  *
- * Receives up to 64 datagrams with one recvmmsg and sends them with one sendmmsg through a connected
- * socket, to one destination on loopback. With "segment", successive datagrams of equal size are
- * sent as one message, which the kernel segments (UDP_SEGMENT). With "names", it also receives the
- * sources' addresses, and ignores them. With "paths", each source has a connected socket of its
- * own, which the last 16 bits of its address select, and whose answers go back to the source: as in
- * our relay, epoll waits for them.
+ * Receives up to 64 datagrams with one recvmmsg and sends them with one sendmmsg through a
+ * connected socket, to one destination on loopback. With "segment", successive datagrams of equal
+ * size are sent as one message, which the kernel segments (UDP_SEGMENT). With "names", it also
+ * receives the sources' addresses, and ignores them. With "paths", each source has a connected
+ * socket of its own, which the last 16 bits of its address select, and whose answers go back to the
+ * source: as in our relay, epoll waits for them.
  */
 #define _GNU_SOURCE
 #include <arpa/inet.h>
@@ -23,8 +23,7 @@
 
 enum { BATCH = 64, MAX_BYTES = 2048, BUFFER_BYTES = 4 * 1024 * 1024 };
 
-static void fail(const char *what)
-{
+static void fail(const char *what) {
     perror(what);
     exit(1);
 }
@@ -33,23 +32,24 @@ static char data[BATCH][MAX_BYTES];
 static struct iovec parts[BATCH];
 static struct mmsghdr batch[BATCH];
 
-static void forward(int out, int count)
-{
+static void forward(int out, int count) {
     for (int sent = 0; sent < count;) {
         int n = sendmmsg(out, batch + sent, (unsigned)(count - sent), 0);
         sent += n > 0 ? n : 1; /* a refused datagram (port unreachable) is lost */
     }
 }
 
-static void forward_segments(int out, int count)
-{
+static void forward_segments(int out, int count) {
     for (int first = 0, next; first < count; first = next) {
         uint16_t size = (uint16_t)parts[first].iov_len;
         for (next = first + 1; next < count && parts[next].iov_len == size;)
             next++;
         char control[CMSG_SPACE(sizeof size)] __attribute__((aligned(8))) = {0};
-        struct msghdr run = {.msg_iov = &parts[first], .msg_iovlen = (size_t)(next - first),
-                             .msg_control = control, .msg_controllen = sizeof control};
+        struct msghdr run = {
+            .msg_iov = &parts[first],
+            .msg_iovlen = (size_t)(next - first),
+            .msg_control = control,
+            .msg_controllen = sizeof control};
         struct cmsghdr *c = CMSG_FIRSTHDR(&run);
         c->cmsg_level = IPPROTO_UDP;
         c->cmsg_type = UDP_SEGMENT;
@@ -64,8 +64,7 @@ static struct sockaddr_in names[BATCH];
 static struct sockaddr_in clients[1 << 16]; /* the addresses of the sources with a socket */
 
 /* The socket of the source of datagram k; the first time, open it and wait for its answers, too. */
-static int path_of(int k, int epoll, const struct sockaddr_in *server)
-{
+static int path_of(int k, int epoll, const struct sockaddr_in *server) {
     static int paths[1 << 16];
     uint32_t number = ntohl(names[k].sin_addr.s_addr) & 0xffff;
     int *path = &paths[number];
@@ -73,8 +72,8 @@ static int path_of(int k, int epoll, const struct sockaddr_in *server)
         *path = socket(AF_INET, SOCK_DGRAM, 0);
         if (*path < 0 || connect(*path, (const struct sockaddr *)server, sizeof *server) != 0)
             fail("path");
-        struct epoll_event answers = {.events = EPOLLIN,
-                                      .data.u64 = (uint64_t)number << 32 | (uint32_t)*path};
+        struct epoll_event answers = {
+            .events = EPOLLIN, .data.u64 = (uint64_t)number << 32 | (uint32_t)*path};
         if (epoll_ctl(epoll, EPOLL_CTL_ADD, *path, &answers) != 0)
             fail("epoll_ctl");
         clients[number] = names[k];
@@ -82,8 +81,7 @@ static int path_of(int k, int epoll, const struct sockaddr_in *server)
     return *path;
 }
 
-static void forward_paths(int epoll, const struct sockaddr_in *server, int count)
-{
+static void forward_paths(int epoll, const struct sockaddr_in *server, int count) {
     for (int k = 0; k < count; k++)
         batch[k].msg_hdr.msg_name = NULL;
     for (int first = 0, next; first < count; first = next) {
@@ -98,8 +96,7 @@ static void forward_paths(int epoll, const struct sockaddr_in *server, int count
 }
 
 /* Receive up to BATCH datagrams; return their number. */
-static int receive(int in, int flags, bool with_names)
-{
+static int receive(int in, int flags, bool with_names) {
     for (int k = 0; k < BATCH; k++) {
         parts[k].iov_len = MAX_BYTES;
         batch[k].msg_hdr.msg_name = with_names ? &names[k] : NULL;
@@ -114,8 +111,7 @@ static int receive(int in, int flags, bool with_names)
 }
 
 /* Forward by a socket for each client, and return the answers. */
-static void relay_paths(int in, const struct sockaddr_in *server)
-{
+static void relay_paths(int in, const struct sockaddr_in *server) {
     int epoll = epoll_create1(0);
     struct epoll_event listening = {.events = EPOLLIN, .data.u64 = (uint32_t)in}, ready[BATCH];
     if (epoll < 0 || epoll_ctl(epoll, EPOLL_CTL_ADD, in, &listening) != 0)
@@ -139,8 +135,7 @@ static void relay_paths(int in, const struct sockaddr_in *server)
     }
 }
 
-int main(int argc, char **argv)
-{
+int main(int argc, char **argv) {
     struct sockaddr_in here = {.sin_family = AF_INET, .sin_addr.s_addr = htonl(INADDR_LOOPBACK)};
     struct sockaddr_in there = here;
     int in = socket(AF_INET, SOCK_DGRAM, 0), out = socket(AF_INET, SOCK_DGRAM, 0);

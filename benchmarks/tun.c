@@ -1,4 +1,5 @@
-/* A bare forwarder between two TUN devices: tun INSIDE OUTSIDE, their descriptors, which do not wait. */
+/* A bare forwarder between two TUN devices: tun INSIDE OUTSIDE, their descriptors, which do not
+ * wait. */
 #include <errno.h>
 #include <poll.h>
 #include <stdlib.h>

@@ -1,4 +1,4 @@
-"""Builds the core: a shared library of native/*.c, and the declarations of noack.h for cffi.
+"""Builds the core: a shared library of native/*.c, and the declarations of public.h for cffi.
 
 ``make setup`` and the wheel's build call it. It takes a few seconds, and nothing if no source has
 changed. Without a C compiler on the path it uses the one of the package ziglang, if that is there;
@@ -12,6 +12,7 @@ import importlib.util
 import io
 import os
 import platform
+import re
 import shlex
 import shutil
 import subprocess
@@ -104,8 +105,9 @@ def sources(target: str = OWN) -> list[Path]:
 
 
 def declarations() -> str:
-    """Return what Python knows of the library: the text of noack.h, and the function below."""
-    return (HERE / "noack.h").read_text() + "const char *noack_sources(void);\n"
+    """Return what Python knows of the library: the public headers, and the function below."""
+    headers = re.findall(r'^#include "(.*public\.h)"$', (HERE / "core.h").read_text(), re.MULTILINE)
+    return "".join((HERE / name).read_text() for name in headers) + "const char *noack_sources(void);\n"
 
 
 def is_current(into: Path = INTO, files: Sequence[str] = (LIBRARY, HEADER), target: str = OWN) -> bool:

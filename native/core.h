@@ -1,4 +1,4 @@
-/* What the files of the core share. The library hides all names but those of noack.h. */
+/* What the files of the core share. The library hides all names but those of the public headers. */
 #ifndef NOACK_CORE_H
 #define NOACK_CORE_H
 
@@ -9,7 +9,12 @@
 #include "elementary.h"
 
 #pragma GCC visibility push(default) /* what Python calls; all else is hidden */
-#include "noack.h"
+#include "public.h"
+#include "loop/public.h"
+#include "network/public.h"
+#include "driver/public.h"
+#include "relay/public.h"
+#include "exact/public.h"
 #pragma GCC visibility pop
 
 #if defined(__BYTE_ORDER__) && __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__

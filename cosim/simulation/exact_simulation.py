@@ -29,7 +29,7 @@ from noack.theory.coverage import require_exact
 from noack.trigger_policies.trigger_rule import TriggerRule, fill_rule
 
 ROW = dtype_of("noack_exact_row")
-"""The row of a run: ``noack_exact_row`` of native/noack.h."""
+"""The row of a run: ``noack_exact_row`` of native/exact/public.h."""
 
 OK: int = core.NOACK_EXACT_OK
 DIVERGED: int = core.NOACK_EXACT_DIVERGED

@@ -4,6 +4,7 @@
 
 #include <errno.h>
 #include <sched.h>
+#include <stdlib.h>
 #include <sys/epoll.h>
 #include <sys/syscall.h>
 #include <sys/timerfd.h>
@@ -26,23 +27,30 @@ int64_t run_time_ns(const noack_clock *clock) {
     return noack_clock_at_ns(clock, clock_ns(CLOCK_MONOTONIC));
 }
 
-int64_t noack_driver_scratch_bytes(void) { return (int64_t)sizeof(driver_scratch); }
-
-static int is_name(const noack_peer *peer) {
-    return 0 <= peer->name_bytes && peer->name_bytes <= NOACK_NAME_BYTES;
+noack_driver *noack_driver_new(
+    noack_process *process, const noack_wire *wire, int64_t spin_ns, int64_t coalescing_ns,
+    const char **wrong) {
+    int is_valid = spin_ns >= 0 && is_between(0, coalescing_ns, NS_PER_S - 1);
+    *wrong = is_valid ? NULL : "spin_ns and coalescing_ns must be from 0 to less than 1 s";
+    noack_driver *driver = is_valid ? zeros(1, sizeof *driver) : NULL;
+    if (driver == NULL)
+        return NULL;
+    driver->process = process;
+    driver->wire = *wire;
+    driver->clock.speed = 1.0;
+    driver->spin_ns = spin_ns;
+    driver->coalescing_ns = coalescing_ns;
+    driver->scratch = zeros_in_lines(1, sizeof *driver->scratch, &driver->scratch_memory);
+    if (driver->scratch != NULL)
+        return driver;
+    noack_driver_free(driver);
+    return NULL;
 }
 
-const char *noack_driver_check(const noack_driver *driver) {
-    if (!(driver->clock.speed > 0))
-        return "clock.speed must be above 0";
-    if (driver->spin_ns < 0 || driver->coalescing_ns < 0 || driver->coalescing_ns >= NS_PER_S)
-        return "spin_ns and coalescing_ns must be from 0 to less than 1 s";
-    if (driver->receiver_count < 0 || driver->receiver_count > 2)
-        return "receiver_count must be from 0 to 2";
-    for (int k = 0; k < 2; k++)
-        if (!is_name(&driver->sources[k]))
-            return "name_bytes must be from 0 to NOACK_NAME_BYTES";
-    return NULL;
+void noack_driver_free(noack_driver *driver) {
+    if (driver != NULL)
+        free(driver->scratch_memory);
+    free(driver);
 }
 
 /* Write the datagram of the message that a machine sends, if it sends one. There must be room. */

@@ -26,7 +26,7 @@ typedef struct { /* a datagram that was received */
     const uint8_t *name;
 } arrival;
 
-typedef struct {
+typedef struct driver_scratch {
     struct mmsghdr in_headers[MESSAGES], out_headers[BUFFERS];
     struct iovec in_vectors[MESSAGES], out_vectors[BUFFERS];
     control in_controls[MESSAGES];

@@ -38,7 +38,7 @@ except ImportError:
 
 
 def load_core(path: Path) -> CData:
-    """Return the functions and constants of native/noack.h in a library.
+    """Return the functions and constants of the public headers in a library.
 
     Raise CallerError if there is no library that goes with the declarations.
     """
@@ -54,7 +54,7 @@ def load_core(path: Path) -> CData:
 
 
 core: CData = load_core(LIBRARY)
-"""The functions and constants of native/noack.h."""
+"""The functions and constants of the headers native/**/public.h."""
 
 
 def require_live_runs() -> None:
@@ -79,7 +79,7 @@ _FORMATS = {
 
 @cache
 def dtype_of(name: str) -> np.dtype[np.void]:
-    """Return the row type of a structure of native/noack.h that has numbers and their arrays only.
+    """Return the row type of a structure of a public header that has numbers and their arrays only.
 
     >>> dtype_of("noack_window").names
     ('losses', 'packets')

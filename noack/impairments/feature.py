@@ -37,7 +37,7 @@ TC_CORRELATION = "its correlation changes the probability, or the spread, of wha
 
 
 class Stage(NamedTuple):
-    """A feature's settings as numbers, with which the core acts on packets (native/noack.h)."""
+    """A feature's settings as numbers, with which the core acts on packets (native/network/public.h)."""
 
     kind: str
     """Its behaviour: the name of a file in native/impairments."""

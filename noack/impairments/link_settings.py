@@ -2,7 +2,7 @@
 
 The ``correlation`` of a probability is the correlation of a latent first-order Gaussian process
 between successive packets of a flow. The probability itself stays exact, unlike in ``tc netem``. At
-the end are what reports and recorded packet fates use of a link; native/noack.h declares the rest.
+the end are what reports and recorded packet fates use of a link; native/network/public.h declares the rest.
 """
 
 from collections.abc import Iterable, Sequence

@@ -4,7 +4,7 @@ A driver in C (live, in virtual time, in replay) makes the steps. It returns to 
 step needs Python: users' code, changes of settings, rows to take.
 
 What a role describes of each machine is a *part*: it fills the core's structure, and answers the
-questions at which a step stops (``enum noack_question`` in native/noack.h).
+questions at which a step stops (``enum noack_question`` in native/loop/public.h).
 
 The loops may have vectors of different sizes. The rows of a table then have room for the longest;
 what a loop's own row lacks is missing in them (:func:`row_layout`).

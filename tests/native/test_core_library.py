@@ -1,4 +1,4 @@
-"""The loader of the core, its build, and the names that Python has for those of native/noack.h."""
+"""The loader of the core, its build, and the names that Python has for those of the public headers."""
 
 import os
 import shutil

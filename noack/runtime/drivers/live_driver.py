@@ -11,10 +11,8 @@ import weakref
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 
-import numpy as np
-
 from noack.core.clock import RunClock
-from noack.core.core_library import CData, core, ffi
+from noack.core.core_library import CData, core, ffi, new_handle
 from noack.machines.loop_machines import LoopMachines
 from noack.protocol.roles import ENDS, RECEIVES, SENDS, receiver_of, sender_to
 from noack.protocol.wire_format import (
@@ -89,19 +87,7 @@ class LiveDriver:
         coalescing_ns: int = 0,
     ) -> None:
         self.machines, self._wire = machines, wire
-        self._scratch = np.zeros(core.noack_driver_scratch_bytes() + 64, np.uint8)
-        self.core: CData = ffi.new(
-            "noack_driver *",
-            {
-                "process": machines.core,
-                "wire": wire.core[0],
-                "clock": {"speed": 1.0},
-                "spin_ns": spin_ns,
-                "coalescing_ns": coalescing_ns,
-                "scratch": ffi.cast("void *", -(-self._scratch.ctypes.data // 64) * 64),
-            },
-        )
-        self._check()
+        self.core: CData = new_handle("driver", machines.core, wire.core, spin_ns, coalescing_ns)
         _raise_error(core.noack_driver_open(self.core))
         self.close = weakref.finalize(self, core.noack_driver_close, self.core)
         """Close its timer and its epoll."""
@@ -130,7 +116,6 @@ class LiveDriver:
                     receiver.setsockopt(socket.IPPROTO_UDP, _UDP_GRO, 1)
         for peer, address in zip(self.core.sources, sources, strict=False):
             peer.name, peer.name_bytes = packed_name(address)
-        self._check()
         _raise_error(core.noack_driver_watch(self.core))
 
     def set_clock(self, clock: RunClock) -> None:
@@ -193,11 +178,6 @@ class LiveDriver:
     def _each_machine(self) -> list[CData]:
         process = self.machines.core
         return [core.noack_process_machine(process, loop) for loop in range(process.loops)]
-
-    def _check(self) -> None:
-        wrong = core.noack_driver_check(self.core)
-        if wrong != ffi.NULL:
-            raise ValueError(ffi.string(wrong).decode())
 
     def _pass_rows(self, sink: RecordSink) -> None:
         for table, rows in self.machines.take_rows(last=True):

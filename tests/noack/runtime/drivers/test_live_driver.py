@@ -191,6 +191,6 @@ def test_what_cannot_be_sent_is_counted(content: dict[str, Any]) -> None:
 @pytest.mark.sanitized
 def test_numbers_that_it_cannot_act_on_are_refused(content: dict[str, Any]) -> None:
     with closing(Live("sensor", [scenario(content)])) as live:
-        live.driver.core.receiver_count = 3
-        with pytest.raises(ValueError, match="receiver_count must be from 0 to 2"):
-            LiveDriver._check(live.driver)
+        for spin_ns, coalescing_ns in ((-1, 0), (0, -1), (0, 10**9)):
+            with pytest.raises(ValueError, match="driver: spin_ns and coalescing_ns must be"):
+                LiveDriver(live.machines, live.driver._wire, spin_ns=spin_ns, coalescing_ns=coalescing_ns)
