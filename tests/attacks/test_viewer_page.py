@@ -1,7 +1,6 @@
 """Another user at the web viewer's ports can neither read nor replace the recording."""
 
 import http.client
-import os
 import socket
 from collections.abc import Iterator
 from contextlib import closing, suppress
@@ -12,12 +11,8 @@ import psutil
 import pytest
 
 from cosim.output.viewer.recording_viewer import RECORDING, RecordingServer
-from cosim.output.viewer.rerun_program import HOST, peer_user
-from tests.attacks.other_user import NOBODY, as_another_user, needs_root, output_of_another_user
-
-pytestmark = pytest.mark.skipif(
-    not Path("/proc/net/tcp").exists(), reason="only Linux shows the user of a connection"
-)
+from cosim.output.viewer.rerun_program import HOST
+from tests.attacks.other_user import as_another_user, needs_root, output_of_another_user
 
 THEIR_SERVER = """
 class Handler(http.server.BaseHTTPRequestHandler):
@@ -27,13 +22,6 @@ class Handler(http.server.BaseHTTPRequestHandler):
 server = http.server.HTTPServer(("127.0.0.1", int(sys.argv[1])), Handler)
 print(server.server_port, flush=True)
 server.serve_forever()
-"""
-THEIR_GET = """
-try:
-    with urllib.request.urlopen(sys.argv[1]) as answer:
-        print(answer.status, len(answer.read()))
-except urllib.error.HTTPError as error:
-    print(error.code)
 """
 CONTENT = b"RRF2 and more"
 
@@ -95,9 +83,8 @@ def test_without_the_exact_secret_every_path_is_404(server: RecordingServer) -> 
 
 def test_the_secret_is_new_each_time_long_and_on_no_command_line(server: RecordingServer) -> None:
     with RecordingServer(server.path, follow=False) as other:
-        addresses = {server.address, server.window_address, other.address, other.window_address}
-        secrets = {urlsplit(address).path.strip("/") for address in addresses}
-    assert len(secrets) == 4
+        secrets = {secret_of(server), secret_of(other)}
+    assert len(secrets) == 2
     assert all(len(secret) >= 43 for secret in secrets)  # 256 bits in base64
     lines = []
     for child in psutil.Process().children(recursive=True):
@@ -135,53 +122,24 @@ for host in ("127.0.0.1", "0.0.0.0"):
 
 
 @needs_root
-def test_a_windows_address_is_served_to_this_user_only(server: RecordingServer) -> None:
-    """The address is on a command line, where other users can read it."""
-    server.requested.clear()
-    assert output_of_another_user(THEIR_GET, server.window_address + RECORDING) == "404"
-    assert not server.requested.is_set()
-    assert ask(server.window_address + RECORDING)[::2] == (200, CONTENT)
-    assert output_of_another_user(THEIR_GET, server.address + RECORDING) == f"200 {len(CONTENT)}"
-
-
-@needs_root
-def test_peer_user_is_the_user_at_the_other_end() -> None:
-    code = """
-import socket, time
-with socket.create_connection(("127.0.0.1", int(sys.argv[1]))):
-    print("connected", flush=True)
-    time.sleep(60)
-"""
-    with socket.create_server((HOST, 0)) as listening:
-        with as_another_user(code, str(listening.getsockname()[1])) as theirs:
-            assert theirs.stdout is not None
-            assert theirs.stdout.readline() == "connected\n"
-            connection, _ = listening.accept()
-            assert peer_user(connection) == NOBODY
-        connection.close()
-        with socket.create_connection(listening.getsockname()) as ours:
-            assert peer_user(ours) is None  # no connection accepted yet
-            accepted, _ = listening.accept()
-            assert peer_user(ours) == peer_user(accepted) == os.getuid()
-            accepted.close()
-            assert peer_user(ours) is None
-
-
-@needs_root
-def test_responses_of_another_users_program_on_reruns_port_are_refused(
-    server: RecordingServer,
+def test_an_answer_of_another_users_program_is_refused_once_rerun_has_ended(
+    tmp_path: Path,
 ) -> None:
-    """The other user has bound the port before rerun, or after it."""
-    viewer = server.web_viewer
-    assert viewer is not None
-    with as_another_user(THEIR_SERVER, "0") as theirs:
-        assert theirs.stdout is not None
-        viewer.port = int(theirs.stdout.readline())
-        assert ask(f"http://{HOST}:{viewer.port}/")[2] == b"theirs"
-        for name in ("?url=x", "re_viewer.js"):
-            status, _, body = ask(server.address + name)
-            assert status == 502
-            assert b"theirs" not in body
+    (tmp_path / "recording.rrd").write_bytes(CONTENT)
+    with RecordingServer(tmp_path / "recording.rrd", follow=False) as server:
+        server.start_page()
+        viewer = server.web_viewer
+        assert viewer is not None
+        viewer.process.kill()
+        viewer.process.wait()
+        with as_another_user(THEIR_SERVER, str(viewer.port)) as theirs:
+            assert theirs.stdout is not None
+            assert int(theirs.stdout.readline()) == viewer.port
+            assert ask(f"http://{HOST}:{viewer.port}/")[2] == b"theirs"
+            for name in ("?url=x", "re_viewer.js"):
+                status, _, body = ask(server.address + name)
+                assert status == 502
+                assert b"theirs" not in body
 
 
 def test_the_page_ends_with_the_rerun_program(server: RecordingServer) -> None:

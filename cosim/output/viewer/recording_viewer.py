@@ -1,12 +1,13 @@
 """Shows a recording: in a window if there is a display, else in a browser on loopback.
 
 A viewer and the recorder share only the recording's file. A separate process (this module run as a
-program) reads the file while it grows and serves it over HTTP, to each viewer at its own rate. A
-viewer that stalls delays only its own download: the recorder never waits, the file is complete, and
-no data are dropped.
+program) reads the file while it grows. It writes it to the standard input of a window, and serves it
+to browsers over HTTP, to each at its own rate. A viewer that stalls delays only its own copy: the
+recorder never waits, the file is complete, and no data are dropped.
 
-Every user of the machine can connect. Therefore all content is under a path that begins with a
-secret; other paths do not exist.
+Every user of the machine can connect to the server. Therefore all content is under a path that begins
+with a secret; other paths do not exist. rerun's own servers of recordings (``serve_grpc``, ``rerun
+--serve-web FILE``) have no secret: each user could read the run, and add to it.
 
 A finished run opens at the time of the largest ‖e_c‖.
 """
@@ -22,13 +23,14 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable
 from functools import partial
 from http.client import HTTPException
 from http.server import BaseHTTPRequestHandler
+from io import BufferedIOBase
 from pathlib import Path
 from types import FrameType
-from typing import Self
+from typing import IO, Self
 from urllib.parse import parse_qs, quote
 
 from cosim.analysis.summary.run_summary import worst_loop
@@ -41,10 +43,10 @@ from cosim.output.viewer.rerun_program import (
     end_process,
     has_display,
     move_window_to,
-    peer_user,
     require_recording,
     script_to_open_at,
     start_rerun,
+    window_port,
 )
 from cosim.record.run_directory import RECORDING_FILE, SUMMARY_FILE, loop_of_file, read_object
 from noack.core.clock import NS_PER_S
@@ -56,7 +58,9 @@ RECORDING = "recording.rrd"
 _BLOCK_BYTES = 1 << 18
 _POLL_S = 0.1
 _START_S = 10.0
-"""Maximum time to wait until a new window requests the recording."""
+"""Maximum time to wait until a new window accepts requests."""
+_FAILURE_S = 1.0
+"""By then a window has ended that could not be opened."""
 _DRAIN_S = 2.0
 """Maximum time to wait for downloads of a finished file."""
 _END_S = 5.0
@@ -81,9 +85,6 @@ class RecordingServer:
     Attributes:
         address: address of the page; the recording is ``recording.rrd`` below it. Everyone who has
             the address can read the recording.
-        window_address: the same for a window. It is on a command line, which every user can read;
-            therefore it is served to processes of this user only.
-        requested: set when a viewer has asked for the recording.
         downloaded: set when a viewer has received all of it.
 
     Raises:
@@ -94,11 +95,10 @@ class RecordingServer:
         self.path = path
         self.web_viewer: WebViewer | None = None
         self.finished = threading.Event()
-        self.requested = threading.Event()
         self.downloaded = threading.Event()
         self._downloads = 0
         self._lock = threading.Lock()
-        self._secret, self._window_secret = (secrets.token_urlsafe(_SECRET_BYTES) for _ in range(2))
+        self._secret = secrets.token_urlsafe(_SECRET_BYTES)
         if not follow:
             self.finished.set()
         try:
@@ -108,7 +108,6 @@ class RecordingServer:
         self._http.recording = self
         self.origin = f"http://{HOST}:{self._http.server_address[1]}"
         self.address = f"{self.origin}/{self._secret}/"
-        self.window_address = f"{self.origin}/{self._window_secret}/"
         threading.Thread(target=self._http.serve_forever, args=(0.2,), daemon=True).start()
 
     def start_page(self) -> str:
@@ -121,21 +120,27 @@ class RecordingServer:
         return self.address
 
     def open_window(self) -> subprocess.Popen[bytes] | None:
-        """Open a window with the recording; return None if it closed before requesting it."""
-        arguments = ["--port", "auto", "--bind", HOST, self.window_address + RECORDING]
+        """Open a window with the recording; return None if it cannot be opened."""
+        arguments = ["--port", "auto", "--bind", HOST, "-"]  # the recording comes on standard input
+        output = tempfile.TemporaryFile()  # noqa: SIM115 - the thread closes it
+        window = start_rerun(arguments, stdin=subprocess.PIPE, output=output, start_new_session=True)
+        threading.Thread(target=self._feed, args=(window,), daemon=True).start()
+        window_port(window, output, _START_S)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            window.wait(_FAILURE_S)
+            output.close()
+            return None
         t_ns = opening_time_ns(self.path)
-        if t_ns is None:
-            window = start_rerun(arguments, start_new_session=True)
-        else:
-            output = tempfile.TemporaryFile()  # noqa: SIM115 - the thread closes it
-            window = start_rerun(arguments, output=output, start_new_session=True)
+        if t_ns is not None:
             move = partial(move_window_to, TIMELINE, t_ns, window, output)
             threading.Thread(target=move, daemon=True).start()
-        deadline = time.monotonic() + _START_S
-        while not self.requested.wait(0.02) and time.monotonic() < deadline:
-            if window.poll() is not None:
-                return None
         return window
+
+    def _feed(self, window: "subprocess.Popen[bytes]") -> None:
+        """Write the recording to a window, until its end or that of the window."""
+        assert window.stdin is not None
+        with contextlib.suppress(OSError), window.stdin, self.path.open("rb") as file:
+            self.send(file, window.stdin)
 
     def drain(self) -> None:
         """Wait a moment for downloads in progress to reach the end of the file."""
@@ -156,33 +161,28 @@ class RecordingServer:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def admits(self, secret: str, user: Callable[[], int | None]) -> bool:
-        """Whether a request under this secret is answered.
+    def has_secret(self, text: str) -> bool:
+        """Whether a text is the secret, compared in constant time."""
+        return secrets.compare_digest(text.encode(), self._secret.encode())
 
-        Args:
-            secret: first part of the path.
-            user: returns the user id of the requesting process.
-        """
-        if _are_equal(secret, self._secret):
-            return True
-        return _are_equal(secret, self._window_secret) and user() == os.getuid()
-
-    @contextlib.contextmanager
-    def download(self) -> Iterator[None]:
-        """Count a download in progress."""
-        self.requested.set()
+    def send(self, file: IO[bytes], viewer: IO[bytes] | BufferedIOBase) -> None:
+        """Copy the recording to a viewer; wait for what is still to come."""
         with self._lock:
             self._downloads += 1
         try:
-            yield
+            while True:
+                # Checked before reading, so that data written before it was set are still sent.
+                is_finished = self.finished.is_set()
+                if block := file.read(_BLOCK_BYTES):
+                    viewer.write(block)
+                elif is_finished:
+                    self.downloaded.set()
+                    return
+                else:
+                    self.finished.wait(_POLL_S)
         finally:
             with self._lock:
                 self._downloads -= 1
-
-
-def _are_equal(secret: str, expected: str) -> bool:
-    """Whether two secrets are equal, compared in constant time."""
-    return secrets.compare_digest(secret.encode(), expected.encode())
 
 
 class _PageServer(socketserver.ThreadingTCPServer):
@@ -203,7 +203,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_error(400)
         elif not OWN_HOST.fullmatch(self.headers.get("Host", "")):
             self.send_error(403)  # DNS rebinding: a foreign name that resolves to loopback
-        elif match is None or not recording.admits(match[1], lambda: peer_user(self.connection)):
+        elif match is None or not recording.has_secret(match[1]):
             self.send_error(404)
         elif (name := match[2]) == RECORDING:
             self._send_recording(recording)
@@ -238,21 +238,12 @@ class _Handler(BaseHTTPRequestHandler):
         except OSError:
             self.send_error(404)
             return
-        with file, recording.download():
+        with file:
             self.send_response(200)
             self.send_header("Content-Type", "application/octet-stream")
             self.send_header("Cache-Control", "no-store")
             self.end_headers()
-            while True:
-                # Checked before reading, so that data written before it was set are still sent.
-                finished = recording.finished.is_set()
-                if block := file.read(_BLOCK_BYTES):
-                    self.wfile.write(block)
-                elif finished:
-                    break
-                else:
-                    recording.finished.wait(_POLL_S)
-            recording.downloaded.set()
+            recording.send(file, self.wfile)
 
     def _send_file(self, web_viewer: WebViewer | None, name: str) -> None:
         if web_viewer is None:

@@ -1,12 +1,14 @@
 """rerun's own program as a child process, and the web viewer that it contains.
 
-The program serves the web viewer's files on a port of its own. Any user of the machine could listen
-on that port once the program has ended. Therefore the kernel selects the port, and an answer is
-used only if it comes from a process of this user.
+The program serves the web viewer's files on a port of its own, on loopback only (the same server in
+the Python library listens on all addresses). Any user of the machine could listen on that port once
+the program has ended. Therefore the kernel selects the port, and an answer is used only if the
+program still runs after it: then the port was the program's.
 
 Neither a layout in a recording nor the address of a recording can set the viewer's time cursor; only
-requests to a running viewer can. The web viewer accepts a protobuf message ``ViewerControlRequest``,
-the window the requests of rerun's client.
+requests to a running viewer can. The window accepts the requests of rerun's client. The web viewer
+has one function for this, ``viewer_control``; it takes a protobuf message ``ViewerControlRequest``,
+which nothing in rerun's Python library writes.
 """
 
 import contextlib
@@ -16,7 +18,6 @@ import importlib.util
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -39,9 +40,6 @@ OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?")
 """The host in a request's header; another name would be that of a foreign page (DNS rebinding)."""
 _WEB_START_S = 10.0
 _ANSWER_S = 10.0
-_SOCKET_LIST = Path("/proc/net/tcp")
-_TRIES = 3
-"""Maximum tries: the kernel's list may miss a socket while others open and close."""
 _SERVED_AT = re.compile(rb"(?<!\+)http://127\.0\.0\.1:(\d+)")
 _RETRY_S = 0.25
 _LOAD_S = 60.0
@@ -94,6 +92,7 @@ def has_display() -> bool:
 def start_rerun(
     arguments: list[str],
     *,
+    stdin: int = subprocess.DEVNULL,
     output: int | IO[bytes] = subprocess.DEVNULL,
     start_new_session: bool = False,
 ) -> subprocess.Popen[bytes]:
@@ -101,6 +100,7 @@ def start_rerun(
 
     Args:
         arguments: arguments of the program; every user of this machine can read them.
+        stdin: its standard input.
         output: receives its log.
         start_new_session: whether it continues when this process ends.
 
@@ -112,7 +112,7 @@ def start_rerun(
         [_program_path(), *arguments],
         # CI disables other output; the log contains the address at which it serves.
         env=os.environ | {"CI": "1", "RUST_LOG": "info"},
-        stdin=subprocess.DEVNULL,
+        stdin=stdin,
         stdout=output,
         stderr=output,
         start_new_session=start_new_session,
@@ -199,21 +199,17 @@ class WebViewer:
         """Yield the answer to a request for a file; it is valid within the context.
 
         Raises:
-            PeerError: the program has ended, or the answering process is not this user's.
+            PeerError: the program has ended.
         """
         source = http.client.HTTPConnection(HOST, self.port, timeout=_ANSWER_S)
         with contextlib.closing(source):
             try:
-                source.connect()
-                connection = source.sock
                 source.request("GET", f"/{name}")
                 answer = source.getresponse()
             except (OSError, http.client.HTTPException):
                 raise PeerError("rerun's web viewer does not answer") from None
-            # Checked now, since a connection has no user before it is accepted. The answer comes
-            # over this same connection, even if another process listens on the port meanwhile.
-            if self.process.poll() is not None or peer_user(connection) != os.getuid():
-                raise PeerError("rerun's web viewer has ended, or another user's program answers")
+            if self.process.poll() is not None:  # another program may have answered
+                raise PeerError("rerun's web viewer has ended")
             yield answer
 
     def close(self) -> None:
@@ -221,45 +217,15 @@ class WebViewer:
         end_process(self.process)
 
 
-def peer_user(connection: socket.socket) -> int | None:
-    """Return the user id of the process at the other end; None if there is none, or it is unknown.
-
-    A connection that no process has accepted yet has no user.
-    """
-    try:
-        return socket_user(connection.getpeername(), connection.getsockname())
-    except OSError:  # the connection is broken
-        return None
-
-
-def socket_user(own: tuple[str, int], peer: tuple[str, int]) -> int | None:
-    """Return the user id of a socket by its addresses; None if there is none, or it is unknown.
-
-    Linux's list of sockets has the user of each.
-    """
-    try:
-        addresses = [_listed_address(own), _listed_address(peer)]
-        for _ in range(_TRIES):
-            for line in _SOCKET_LIST.read_text().splitlines()[1:]:
-                fields = line.split()
-                user, inode = fields[7], fields[9]
-                if fields[1:3] == addresses and inode != "0":
-                    return int(user)
-    except OSError:  # this is not Linux
-        pass
-    return None
-
-
-def _listed_address(address: tuple[str, int]) -> str:
-    """Return an address in the format of Linux's list of sockets."""
-    host, port = address
-    return f"{int.from_bytes(socket.inet_aton(host), sys.byteorder):08X}:{port:04X}"
-
-
 def script_to_open_at(timeline: str, t_ns: int) -> bytes:
     """Return HTML for the web viewer's page: it moves the cursor once the recording is loaded."""
     request = list(_cursor_request(timeline, t_ns))
     return _SCRIPT.format(retry_ms=round(1e3 * _RETRY_S), request=request).encode()
+
+
+def window_port(window: "subprocess.Popen[bytes]", output: IO[bytes], within_s: float) -> int | None:
+    """Return the port at which a window accepts requests, as :func:`logged_port` does."""
+    return logged_port(window, output, _TAKES_REQUESTS_AT, within_s)
 
 
 def move_window_to(timeline: str, t_ns: int, window: "subprocess.Popen[bytes]", output: IO[bytes]) -> None:
@@ -274,7 +240,7 @@ def move_window_to(timeline: str, t_ns: int, window: "subprocess.Popen[bytes]", 
     from rerun.experimental import ViewerClient  # slow to import
 
     with output:
-        port = logged_port(window, output, _TAKES_REQUESTS_AT, _LOAD_S)
+        port = window_port(window, output, _LOAD_S)
     while port is not None and window.poll() is None:
         try:
             client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")

@@ -122,12 +122,15 @@ def test_a_live_view_ends_when_the_recorder_is_killed(tmp_path: Path) -> None:
 
 
 WINDOW = """#!{python}
-import os, sys, time, urllib.request
+import os, sys, time
 if "--serve-web" in sys.argv:
     os.execv({viewer!r}, [{viewer!r}, *sys.argv[1:]])
+print("Connect by running `rerun --connect rerun+http://127.0.0.1:1/proxy`", flush=True)
 if {opens}:
-    with urllib.request.urlopen(sys.argv[-1]) as answer, open({seen!r}, "wb") as seen:
-        seen.write(answer.read())
+    received = sys.stdin.buffer.read()
+    with open({seen!r}, "wb") as seen:
+        seen.write(received)
+    time.sleep(2)
 sys.exit({status})
 """
 
