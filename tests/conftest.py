@@ -101,6 +101,17 @@ def runs_of_other_workers_are_unknown(
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def witnesses_are_found_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Give all workers one folder for what is found of scenarios, and none that was found before."""
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
+        yield
+
+
 @pytest.fixture
 def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
     """Finalise runs without a report, whose figures take longer than everything else."""

@@ -1,18 +1,19 @@
 """All certificates of a scenario: as one object, as JSON, and as rows of a table."""
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
+from cosim.analysis.constant_rows import constant_rows, covered_plants
 from cosim.analysis.tried_settings import TriedSettings, helpful_box, helpful_settings, largest_settings
-from cosim.analysis.witnesses import Witnesses, find_witnesses, needs_matrices, no_witnesses
+from cosim.analysis.witnesses import Unproven, Witnesses, find_witnesses, needs_matrices, no_witnesses
 from noack.core.errors import CallerError, one_line
 from noack.core.linear_systems import Matrix
 from noack.core.number_checks import one_of, whole_number
-from noack.core.number_format import NONE, TextRows, as_html, as_text, at_least, at_most
+from noack.core.number_format import TextRows, as_html, as_text
 from noack.plants.linear import LinearSettings
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
@@ -30,6 +31,7 @@ from noack.theory.certificates.conditions import (
 )
 from noack.theory.certificates.network_limits import NetworkLimits, network_limits
 from noack.theory.certificates.plant_equations import LinearEquations, linear_plant
+from noack.theory.certificates.proven_bounds import ProvenBounds
 from noack.theory.certificates.refusals import refusal_under, refusals_at_setpoint
 from noack.theory.certificates.region import RegionScope
 from noack.theory.certificates.scenario_certificates import box_scope, own_plant_scope
@@ -37,6 +39,8 @@ from noack.theory.certificates.trigger_weight import choose_weight
 from noack.theory.coverage import NOT_COVERED, refusals, require_certifiable
 from noack.theory.margins.loss_margin import LossMargin, Stability
 from noack.theory.paper import Theorem2, theorem_2
+from noack.theory.witnesses.effort import MOST_WORK
+from noack.theory.witnesses.outward import proven_bounds
 from noack.trigger_policies.decaying import DecayingSettings
 from noack.trigger_policies.periodic_trigger import PeriodicSettings
 
@@ -47,6 +51,9 @@ SCHEDULE = "schedule"
 
 MOST_LATE = 1000
 """Most steps of lateness that may be allowed."""
+_STATED = {(IDEAL, OWN_PLANT): ("own", "ideal"), (IDEAL, BOX): ("box", "ideal"),
+           (SCHEDULE, OWN_PLANT): ("own", "schedule"), (SCHEDULE, BOX): ("box", "schedule")}  # fmt: skip
+"""Plants and conditions of witnesses, by those of certificates."""
 
 
 class CertificateAnswer(NamedTuple):
@@ -65,7 +72,9 @@ class Certificates:
     ``inter_event_s``, the minimum inter-event time δ̲, and three bounds as functions of time in
     seconds: ``sensor_error``, ``controller_error`` and ``state``. The constants include ``delta``,
     Δ of ‖e_c‖ ≤ Δβe^(−αt), ``state``, X of ‖x‖ ≤ Xe^(−αt), and ``rate_per_s``, the decay rate of
-    all bounds. ``docs/theory.md`` derives them.
+    all bounds. ``docs/theory.md`` derives them. They are computed, and not checked. After
+    :meth:`prove`, ``proven`` has the bounds that the checker has proven; these are then the ones that
+    ``inter_event_s`` and the functions give.
 
     Iteration yields each certificate with the conditions that it assumes: IDEAL or SCHEDULE.
 
@@ -94,6 +103,8 @@ class Certificates:
     """Allowed lateness in steps of the plant."""
     nonlinear: str | None = None
     """Why the certificates are for the model as the plant, not for the plant itself; else None."""
+    unproven: Sequence[Unproven] = ()
+    """Plants and conditions of which nothing is proven, with the reasons."""
     _no_region: str | None = None
     """Why a nonlinear plant has no certificate on a region, if that is known from its settings."""
 
@@ -133,8 +144,37 @@ class Certificates:
         self.theorem_2 = _theorem_2(scenario, self.paper)
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Pickle what they are computed from; it is computed again."""
-        return Certificates, self._arguments
+        """Pickle what they are computed from, which is computed again, and what is proven."""
+        proven = {_STATED.get((under, each.scope)): each.proven for under, each in self if each.proven}
+        return Certificates, self._arguments, (proven, self.unproven)
+
+    def __setstate__(self, state: tuple[Mapping[tuple[str, str], ProvenBounds], Sequence[Unproven]]) -> None:
+        """Take what is proven."""
+        proven, self.unproven = state
+        self._certificates = [
+            (under, each.with_proof(proven.get(_STATED.get((under, each.scope), ("", "")))))
+            for under, each in self
+        ]
+
+    def prove(
+        self, progress: Callable[[float], None] = lambda share: None, most_work: float = MOST_WORK
+    ) -> Witnesses:
+        """Search for bounds that the checker proves; they take the place of computed ones.
+
+        Args:
+            progress: called with the completed share.
+            most_work: limit of each search, see :class:`noack.theory.witnesses.effort.Effort`.
+        """
+        scenario, late_periods, *_, nonlinear, equations = self._arguments
+        if (other := nonlinear or equations) is not None:
+            found = no_witnesses(scenario, needs_matrices(other))
+        else:
+            found = find_witnesses(scenario, late_periods, progress, most_work)
+        proven = {
+            (s.plants, s.conditions): proven_bounds(s.proof) for s in found.statements if s.proof is not None
+        }
+        self.__setstate__((proven, found.unproven))
+        return found
 
     def __iter__(self) -> Iterator[tuple[str, ScenarioCertificate]]:
         return iter(self._certificates)
@@ -222,7 +262,7 @@ class Certificates:
 
         They are computed at the first access, from dozens of certificates.
         """
-        certified = {certificate.scope for certificate in self._of(SCHEDULE) if certificate.exists}
+        certified = {each.scope for each in self._of(SCHEDULE) if each.constants is not None}
         return {
             scope.name: network_limits(scope, self.scheduled)
             for scope in self._scopes
@@ -233,7 +273,7 @@ class Certificates:
     def largest_settings(self) -> list[TriedSettings]:
         """Settings with which the scenario's own plant has a certificate, at their largest, each alone."""
         own = self.of_own_plant
-        if own is None or not own.exists:
+        if own is None or own.constants is None:
             return []
         limits = self.limits_by_scope[own.scope]
         return [*largest_settings(self._own_scenario, self.late_periods, limits.delay_s, limits.sampling_s)]
@@ -277,13 +317,6 @@ class Certificates:
             return LossMargin(self.scenario).first_bounds()
         return None
 
-    def witnesses(self, progress: Callable[[float], None] = lambda share: None) -> Witnesses:
-        """Search for bounds that the checker proves, for the same plants and conditions."""
-        scenario, late_periods, *_, nonlinear, equations = self._arguments
-        if (other := nonlinear or equations) is not None:
-            return no_witnesses(scenario, needs_matrices(other))
-        return find_witnesses(scenario, late_periods, progress)
-
     def to_json(self) -> dict[str, object]:
         """Return all certificates as one document, as ``noack certify --json`` prints it."""
         return {
@@ -297,6 +330,7 @@ class Certificates:
                 "theorem_2": None if self.theorem_2 is None else self.theorem_2._asdict(),
             },
             "certificates": [{"under": under, **certificate.to_json()} for under, certificate in self],
+            "unproven": [each._asdict() for each in self.unproven],
             "stability": None if self.stability is None else self.stability._asdict(),
             "schedule": {
                 f"{name}_s": getattr(self.scheduled, f"{name}_s") for name in ("sampling", "delay", "hold")
@@ -437,65 +471,3 @@ def in_chosen_norm(
         chosen = certificates_of(scenario, "chosen", certificates.late_periods, progress, of_model=True)
         return chosen if chosen.schedule.exists else None
     return None
-
-
-_PERSISTENT = {
-    "e_c": "delta",
-    "e_s": "overshoot",
-    "u − Kx": "input_error",
-    "x": "state",
-    "(x̂ − x)": "estimation_error",
-}
-_WEIGHTED = ("e_c", "e_s", "(x̂ − x)")
-"""Rows of the bounds that are added under disturbances, noise or an observer."""
-
-
-def covered_plants(certificate: ScenarioCertificate) -> str:
-    """Return which plants a certificate covers: "box", "region" or "plant"."""
-    return {BOX: "box", REGION: "region"}.get(certificate.scope, "plant")
-
-
-def constant_rows(
-    certificates: Sequence[ScenarioCertificate], theorem: Theorem2 | None, theorem_rate: float
-) -> Iterator[tuple[str, list[str], str]]:
-    """Yield rows: label, the value of each certificate, the value of Theorem 2."""
-
-    def row(
-        value: Callable[[ScenarioCertificate], float | None], text: Callable[[float | None], str] = at_most
-    ) -> list[str]:
-        return [text(value(c)) if c.constants else "void" for c in certificates]
-
-    def constant(name: str, text: Callable[[float | None], str] = at_most) -> list[str]:
-        return row(lambda c: getattr(c.constants, name), text)
-
-    def part(name: str, part_name: str) -> list[str]:
-        return row(lambda c: getattr(getattr(c, part_name), name, None))
-
-    delta_2 = state_2 = spacing_2 = NONE
-    if theorem is not None:
-        delta_2 = "(same)"
-        state_2 = at_most(theorem.state_start + theorem.state_forced)
-        spacing_2 = at_least(theorem.inter_event_s)
-    if not any(c.constants for c in certificates):
-        yield "certificate", ["void"] * len(certificates), NONE
-        return
-    yield "decay rate, 1/s", constant("rate_per_s", at_least), at_least(theorem_rate)
-    yield "undelivered updates", constant("missing_events"), NONE
-    unit = next((f"/{certificate.unit}" for certificate in certificates if certificate.unit), "")
-    w = "W " if any(certificate.weighted for certificate in certificates) else ""
-    yield f"Δ, bound of ‖{w}e_c‖{unit}", constant("delta"), delta_2
-    yield f"bound of ‖{w}e_s‖{unit}", constant("overshoot"), "1"
-    yield "bound of ‖u − Kx‖", constant("input_error"), NONE
-    yield "· all arrived", constant("received_input_error"), NONE
-    yield "X, bound of ‖x‖", constant("state"), state_2
-    yield "inter-event time, s", row(lambda c: c.inter_event_s, at_least), spacing_2
-    yield "loop gain (< 1)", constant("loop_gain"), NONE
-    if any(c.persistent_constants for c in certificates):
-        for quantity, name in _PERSISTENT.items():
-            if any(getattr(c.persistent_constants, name, None) for c in certificates):
-                norm = f"‖{w}{quantity}‖" if w and quantity in _WEIGHTED else f"‖{quantity.strip('()')}‖"
-                yield f"+ without decay: {norm}", part(name, "persistent_constants"), NONE
-    if any(c.floor_constants for c in certificates):
-        yield "floor reached at, s", row(lambda c: c.floor_from_s), NONE
-        yield f"bound of ‖{w}e_c‖/ε from then on", part("delta", "floor_constants"), NONE
-        yield "bound of ‖x‖ from then on", part("state", "floor_constants"), NONE

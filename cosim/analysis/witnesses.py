@@ -6,18 +6,21 @@ the loop from the resolved scenario itself.
 
 import json
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import NamedTuple
 
+from cosim.analysis.witness_store import StoredSearch, WitnessStore
 from noack.core.errors import CallerError
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.conditions import with_stated_times
-from noack.theory.witnesses.documents import find_witness
-from noack.theory.witnesses.effort import NoWitnessError
+from noack.theory.witnesses.documents import Witness, find_witness
+from noack.theory.witnesses.effort import MOST_WORK, NoWitnessError
+from noack_check.check import RejectedError
 from noack_check.keys import RefusedError
-from noack_check.proof import Proof
+from noack_check.loop import Loop
+from noack_check.proof import Proof, prove
 from noack_check.scenario import read_loop
-from noack_check.sentences import sentences
 
 
 class WitnessedStatement(NamedTuple):
@@ -32,10 +35,13 @@ class WitnessedStatement(NamedTuple):
     reason: str = ""
     """Why there is no witness."""
 
-    def to_json(self) -> dict[str, object]:
-        """Return what is proven, without the witness."""
-        proven = [] if self.proof is None else list(sentences(self.proof))
-        return {"plants": self.plants, "conditions": self.conditions, "proven": proven, "reason": self.reason}
+
+class Unproven(NamedTuple):
+    """Plants and conditions of which nothing is proven."""
+
+    plants: str
+    conditions: str
+    reason: str
 
 
 class Witnesses(NamedTuple):
@@ -50,6 +56,11 @@ class Witnesses(NamedTuple):
         """Whether something is proven."""
         return any(statement.proof is not None for statement in self.statements)
 
+    @property
+    def unproven(self) -> list[Unproven]:
+        """Of what nothing is proven."""
+        return [Unproven(s.plants, s.conditions, s.reason) for s in self.statements if s.proof is None]
+
     def file_text(self) -> str:
         """Return the file that ``noack-check`` reads."""
         documents = [s.document for s in self.statements if s.document is not None]
@@ -57,7 +68,10 @@ class Witnesses(NamedTuple):
 
 
 def find_witnesses(
-    resolved: Scenario, late_periods: int, progress: Callable[[float], None] = lambda share: None
+    resolved: Scenario,
+    late_periods: int,
+    progress: Callable[[float], None] = lambda share: None,
+    most_work: float = MOST_WORK,
 ) -> Witnesses:
     """Search for witnesses of a resolved scenario's bounds, for its plant and its uncertainty box.
 
@@ -65,6 +79,7 @@ def find_witnesses(
         resolved: the scenario.
         late_periods: allowed lateness in steps of the plant.
         progress: called with the completed share.
+        most_work: limit of each search, see :class:`noack.theory.witnesses.effort.Effort`.
     """
     content = resolved_content(resolved, late_periods)
     has_box = resolved.plant.uncertainty_A is not None or resolved.plant.uncertainty_B is not None
@@ -76,7 +91,7 @@ def find_witnesses(
     found = []
     for index, (plants, under) in enumerate(wanted):
         part = partial(_part_of, progress, index, len(wanted))
-        found.append(find_statement(content, plants, under, part))
+        found.append(find_statement(content, plants, under, part, most_work))
     progress(1.0)
     return Witnesses(content, found)
 
@@ -125,6 +140,7 @@ def find_statement(
     plants: str,
     conditions: str,
     progress: Callable[[float], None] = lambda share: None,
+    most_work: float = MOST_WORK,
 ) -> WitnessedStatement:
     """Search for the witness of one statement of a resolved scenario: its plants and conditions.
 
@@ -134,9 +150,36 @@ def find_statement(
     try:
         loop = read_loop(content, box=plants == "box", ideal=conditions == "ideal")
         has_limit = bool(loop.sizes or loop.noise.ncols()) and conditions == "schedule"
-        states = ("x", *(f"x[{i}]" for i in range(loop.n))) if has_limit else ()
-        witness = find_witness(loop, ultimate=states, progress=progress)
+        witness = known_or_found(loop, progress, most_work, has_limit=has_limit)
     except (RefusedError, NoWitnessError) as error:
         return WitnessedStatement(plants, conditions, None, None, str(error))
     document = {"plants": plants, "conditions": conditions, **witness.document}
     return WitnessedStatement(plants, conditions, document, witness.proof)
+
+
+def known_or_found(
+    loop: Loop, progress: Callable[[float], None], most_work: float, *, has_limit: bool
+) -> Witness:
+    """Return the witness of a loop that was found earlier, or search for it.
+
+    Raises:
+        NoWitnessError: none was found.
+    """
+    outputs = ("x", "e_c")
+    states = ("x", *(f"x[{i}]" for i in range(loop.n))) if has_limit else ()
+    store = WitnessStore(loop, (*outputs, "in the limit", *states))
+    known = store.read(most_work)
+    if known is not None and known.document is None:
+        raise NoWitnessError(known.reason)
+    if known is not None and known.document is not None:
+        with suppress(RejectedError):  # it was changed
+            return Witness(known.document, prove(loop, known.document))
+    try:
+        witness = find_witness(loop, outputs, ultimate=states, progress=progress, most_work=most_work)
+    except NoWitnessError as error:
+        store.write(StoredSearch(None, str(error)), most_work)
+        raise
+    bounded = [(bound.output, bound.from_start) for bound in witness.proof.bounds]
+    wanted = {*((output, True) for output in outputs), *((output, False) for output in states)}
+    store.write(StoredSearch(witness.document, is_complete=wanted <= {*bounded}), most_work)
+    return witness

@@ -1,24 +1,33 @@
 """Certificates, margins and mean costs of a scenario."""
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 
 from cosim.analysis.certificates import Certificates, certificates_of
 from cosim.analysis.margin_search import MOST_M, MarginResult, find_margin
 from cosim.analysis.mean_cost import MeanCost, find_mean_cost
 from cosim.api.scenarios import Source, load
+from cosim.live.monitoring.progress import work_bar
 from noack.scenario.resolution import resolve
 from noack.theory.margins.joint_spectral_radius import ACCURACY
 
 
-def certify(scenario: Source, *, weight: str = "given", late: int | None = None) -> Certificates:
+def certify(
+    scenario: Source,
+    *,
+    weight: str = "given",
+    late: int | None = None,
+    proofs: bool = True,
+    progress: bool = False,
+) -> Certificates:
     """Return the certificates of a scenario, with their constants and conditions.
 
     >>> import noack
     >>> certificates = noack.certify("lane_following")
     >>> certificates.schedule.constants is None  # there is one
     False
-    >>> print(f"no two events closer than {1e3 * certificates.schedule.inter_event_s:.0f} ms")
-    no two events closer than 10 ms
+    >>> certificates.schedule.is_proven("state")  # the bound of ‖x‖
+    True
 
     If the plant is not linear, the model is certified as the plant, and ``nonlinear`` says so.
 
@@ -28,12 +37,19 @@ def certify(scenario: Source, *, weight: str = "given", late: int | None = None)
             that more can be certified, which takes some seconds.
         late: plant steps by which the schedule may be late, 0 to 1000; by default the scenario's
             own value.
+        proofs: search for bounds that can be proven, for some seconds, at most some minutes; what is
+            found is kept in the cache folder of the user. Else all bounds are computed only.
+        progress: show a progress line on standard error.
 
     Raises:
         NoackError: the scenario is wrong, or there are no certificates for it: its trigger is not
             the paper's, its updates are acknowledged, or u is not K x_c.
     """
-    return certificates_of(load(scenario), weight, late, of_model=True)
+    certificates = certificates_of(load(scenario), weight, late, of_model=True)
+    if proofs:
+        with work_bar("searching for proofs", lines=True) if progress else nullcontext() as bar:
+            certificates.prove(bar or (lambda share: None))
+    return certificates
 
 
 def margin(

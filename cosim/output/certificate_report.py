@@ -10,7 +10,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from rich.console import Console
 from rich.markup import escape
 
-from cosim.analysis.certificates import SCHEDULE, Certificates, constant_rows, covered_plants
+from cosim.analysis.certificates import IDEAL, SCHEDULE, Certificates
+from cosim.analysis.constant_rows import PROVEN, constant_rows, covered_plants
 from cosim.analysis.margin_search import MarginResult
 from cosim.analysis.mean_cost import CostUnder, MeanCost
 from cosim.analysis.tried_settings import TriedSettings
@@ -20,7 +21,7 @@ from noack.core.linear_systems import Matrix
 from noack.core.number_format import NONE, at_least, at_most, duration, duration_at_least, number
 from noack.scenario.resolution import loop_of, policy_of
 from noack.theory.certificates.assumptions import assumptions
-from noack.theory.certificates.certified_bounds import envelope_formula
+from noack.theory.certificates.certified_bounds import ScenarioCertificate, envelope_formula
 from noack.theory.certificates.conditions import BOX, REGION
 from noack.theory.certificates.network_limits import MOST_S
 from noack.theory.certificates.scenario_certificates import outside_box
@@ -67,7 +68,7 @@ def print_certificates(console: Console, results: Certificates, chosen: Certific
 def _print_nonlinear(console: Console, results: Certificates, why_nonlinear: str) -> None:
     """Print for which plant the certificates of a nonlinear one are."""
     region = results.schedule_region
-    if region is None or region.constants is None:
+    if region is None or not region.exists:
         why = "" if region is None else f": {region.void}"
         own = f". The plant itself has no certificate from its x(0){why}"
     else:
@@ -113,23 +114,34 @@ def _print_weight(console: Console, chosen: Certificates, weight: Matrix) -> Non
 def _in_words(results: Certificates) -> Iterator[str]:
     """Yield sentences with the certified bounds for the scenario's schedule."""
     for level, certificate in results:
-        constants = certificate.constants
-        if level != SCHEDULE or constants is None:
+        first = certificate.first("state")
+        if level != SCHEDULE or first is None:
             continue
         other_plants = "the scenario's plant" if results.nonlinear is None else "the model as the plant"
         plants = {BOX: "every plant of the box", REGION: REGION}.get(certificate.scope, other_plants)
         apart = ""
         spacing_s = certificate.inter_event_s
         if spacing_s is not None and spacing_s < MOST_S:  # else there is no second event
-            apart = f" The inter-event time is at least {_limit(spacing_s)}."
+            apart = f" {_inter_event_in_words(certificate, _limit(spacing_s))}"
         meaning = certificate.conditions.guarantee.meaning
         losses = f"for every pattern of losses with {meaning}"
         if not results.scenario.network.enforce_mansd:
             losses = f"as long as there are {meaning}, which nothing enforces"
         yield (
             f"In words: for {plants}, under the assumptions above and {losses}: "
-            f"{envelope_formula('‖x‖', certificate, 'state').format(at_most(constants.state))}.{apart}"
+            f"{envelope_formula('‖x‖', certificate, 'state').format(at_most(first))} "
+            f"({_how_known(is_proven=certificate.is_proven('state'))}).{apart}"
         )
+
+
+def _inter_event_in_words(certificate: ScenarioCertificate, least: str) -> str:
+    proven, known = certificate.proven, _how_known(is_proven=certificate.has_proven_inter_event_time)
+    exception = proven.exception if proven and certificate.has_proven_inter_event_time else ""
+    return f"The inter-event time is at least {least}{f', {exception}' if exception else ''} ({known})."
+
+
+def _how_known(*, is_proven: bool) -> str:
+    return "proved" if is_proven else "computed"
 
 
 def _stability_in_words(results: Certificates) -> Iterator[str]:
@@ -163,7 +175,7 @@ def certificate_tables(results: Certificates) -> Iterator[ResultTable]:
     Plants and conditions without a certificate have neither a column nor a row. Nothing is yielded
     if there is none.
     """
-    columns = [(under, certificate) for under, certificate in results if certificate.constants]
+    columns = [(under, certificate) for under, certificate in results if certificate.exists]
     if not columns:
         return
     certificates = [certificate for _, certificate in columns]
@@ -194,7 +206,10 @@ def certificate_tables(results: Certificates) -> Iterator[ResultTable]:
 def _print_notes(console: Console, results: Certificates) -> None:
     """Explain the rows of the constants, and say why there are no other certificates."""
     certificates = [certificate for _, certificate in results]
-    if any(certificate.constants for certificate in certificates):
+    if any(certificate.exists for certificate in certificates):
+        are_proven = any(certificate.proven for certificate in certificates)
+        proven = f"{PROVEN} proved: noack-check has verified it. The other numbers are computed, and"
+        console.print(f"[dim]{proven if are_proven else 'All numbers are computed, and'} not checked.[/]")
         console.print(
             "[dim]Each bound of a norm is multiplied by e^(−rate·t). paper: no sampling, no delay, "
             "no hold. schedule: the scenario's rates, plus the lateness that it allows. Its inter-event "
@@ -216,10 +231,11 @@ def _print_notes(console: Console, results: Certificates) -> None:
         )
     reasons: dict[tuple[str, str], list[str]] = {}
     for under, certificate in results:
-        if certificate.void:
+        if certificate.void and not certificate.exists:
             reasons.setdefault((certificate.scope, certificate.void), []).append(under)
     for (scope, why), conditions in reasons.items():
         console.print(f"[yellow]no certificate[/] ({' and '.join(conditions)}, {scope}): {escape(why)}")
+    _print_unproven(console, results)
     if (box := results.helpful_box) is not None:
         console.print(f"the box has one{escape(_listed('', [box]))}", highlight=False)
     for under, certificate in results:
@@ -229,9 +245,19 @@ def _print_notes(console: Console, results: Certificates) -> None:
             text = ", ".join(f"|{name}| ≤ {at_most(limit)}" for name, limit in limits)
             console.print(f"[green]region[/] ({under}): {escape(text)}", highlight=False)
     policy = results.scenario.trigger.policy
-    exists = results.schedule.constants is not None  # else another norm is tried
+    exists = results.schedule.exists  # else another norm is tried
     if exists and results.weight is None and policy == "decaying" and any(c.void for c in certificates):
         console.print("--weight chosen searches for a norm in which more is certified")
+
+
+def _print_unproven(console: Console, results: Certificates) -> None:
+    """Print why no bound is proven for some plants under some conditions."""
+    names = {"ideal": IDEAL, "schedule": SCHEDULE, "own": "plant", "box": "box"}
+    reasons: dict[str, list[str]] = {}
+    for plants, conditions, reason in results.unproven:
+        reasons.setdefault(reason, []).append(f"{names[conditions]}, {names[plants]}")
+    for reason, columns in reasons.items():
+        console.print(f"[yellow]nothing is proven[/] ({'; '.join(columns)}): {escape(reason)}")
 
 
 LIMIT_HEADINGS = ("", "sampling period", "delay of updates", "age of inputs")

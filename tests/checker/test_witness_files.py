@@ -19,11 +19,14 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     words = ["certify", "unstable_pendulum", "--witness", str(path), "--json"]
     result = CliRunner().invoke(app, words)
     assert result.exit_code == ExitStatus.OK
-    witnesses = json.loads(result.stdout)["witnesses"]
-    assert [(w["plants"], w["conditions"]) for w in witnesses] == [
-        ("own", "ideal"), ("box", "ideal"), ("own", "schedule"), ("box", "schedule"),
-    ]  # fmt: skip
-    assert all(witness["proven"] for witness in witnesses)
+    certificates = json.loads(result.stdout)["certificates"]
+    assert [certificate["under"] for certificate in certificates] == [
+        "paper",
+        "paper",
+        "schedule",
+        "schedule",
+    ]
+    assert all(certificate["proven"]["bounds"]["x"] for certificate in certificates)
     return path
 
 

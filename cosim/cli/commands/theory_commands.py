@@ -32,7 +32,7 @@ class NormName(StrEnum):
         ("noack certify lane_following", "its plant, and all plants of its uncertainty box"),
         ("noack certify lane_following --weight chosen", "with a norm that certifies more"),
         ("noack certify lane_weighted --late 6 --json", "allow 6 steps of lateness"),
-        ("noack certify lane_following --witness lane.json", "bounds that noack-check proves"),
+        ("noack certify lane_following --witness lane.json", "for the program noack-check"),
         ("noack certify lane_following --require certificate", "exit status 1 if there is none"),
     ),
 )
@@ -72,10 +72,13 @@ def certify(
         Path | None,
         Option(
             callback=opt.usable_path,
-            help="Also search for bounds that the program noack-check proves, and write their witnesses "
-            "to this file (.json). Takes some seconds to minutes.",
+            help="Write the witnesses of the proven bounds to this file (.json), for the program "
+            "noack-check.",
         ),
     ] = None,
+    proofs: Annotated[
+        bool, Option(help="Search for bounds that can be proven; else all bounds are computed only.")
+    ] = True,
     json: opt.JsonOption = False,
 ) -> int:
     """Compute the bounds that are guaranteed for a scenario, and their conditions.
@@ -86,8 +89,11 @@ def certify(
     Exit status 1: nothing can be certified, not even under the paper's conditions; or --require
     is not met.
 
-    Takes two seconds; some 10 s for a nonlinear plant, or where events are due after many tests;
-    with --witness some seconds to minutes more.
+    Each bound says whether it is proved, by noack-check, or computed and not checked. Proofs are searched
+    for some seconds, at most some minutes, and kept in the cache folder of the user.
+
+    With --no-proofs takes two seconds; some 10 s for a nonlinear plant, or where events are due after
+    many tests.
     """
     from cosim.analysis.certificates import certificates_of, in_chosen_norm
     from cosim.analysis.witnesses import require_covered
@@ -95,13 +101,14 @@ def certify(
     from cosim.output.certificate_report import certificate_tables, print_certificates
     from cosim.output.export.mat_export import save_mat
     from cosim.output.requirements import uncovered_as_unmet, unmet_by_scenario
-    from cosim.output.witness_report import print_witnesses
     from cosim.record.run_directory import write_output
     from noack.core.file_access import require_suffix
     from noack.scenario.resolution import resolve
 
     if out is not None:
         require_suffix(out, "--out", ".mat")
+    if witness is not None and not proofs:
+        raise CallerError("--witness: there is none with --no-proofs")
     loaded, chosen = opt.load_loop(scenario, settings, loop, network), None
     if witness is not None:
         resolved = resolve(loaded)
@@ -112,27 +119,27 @@ def certify(
                 result = certificates_of(loaded, weight, late, bar, of_model=True)
         else:
             result = certificates_of(loaded, weight, late, of_model=True)
+    witnesses = None
+    if proofs:
+        with work_bar("searching for proofs", lines=True) as bar:
+            witnesses = result.prove(bar)
+        if witness is not None and witnesses.are_any:
+            write_output(witness, witnesses.file_text())
     if weight == NormName.GIVEN and not result.schedule.exists:
         with work_bar("no certificate in the given norm; choosing another") as bar:
             chosen = in_chosen_norm(loaded, result, bar)
-    witnesses = None
-    if witness is not None:
-        with work_bar("searching for witnesses", lines=True) as bar:
-            witnesses = result.witnesses(bar)
-        if witnesses.are_any:
-            write_output(witness, witnesses.file_text())
+        if chosen is not None and proofs:
+            with work_bar("searching for proofs in the other norm", lines=True) as bar:
+                chosen.prove(bar)
     if json:
-        proven = {} if witnesses is None else {"witnesses": [s.to_json() for s in witnesses.statements]}
-        print_json(result.to_json() | {"in_chosen_norm": chosen and chosen.to_json()} | proven)
+        print_json(result.to_json() | {"in_chosen_norm": chosen and chosen.to_json()})
     else:
         print_certificates(console(), result, chosen)
-        if witnesses is not None:
-            print_witnesses(console(), witnesses)
     write_tables(certificate_tables(result), tables, json=json)
     if out is not None:
         save_mat(result.to_json(), out)
-    certified = any(certificate.constants for _, certificate in result)
-    if witnesses is not None and not witnesses.are_any:
+    certified = any(certificate.exists for _, certificate in result)
+    if witness is not None and witnesses is not None and not witnesses.are_any:
         status("no witness was found; no file is written")
         return ExitStatus.FAILED
     if require:

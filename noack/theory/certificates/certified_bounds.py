@@ -16,8 +16,8 @@ newest one that the controller has received. All integrals are tabulated once fo
 """
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Literal, NamedTuple, Self
 
@@ -32,8 +32,16 @@ from noack.theory.bounds.certificate_terms import Constants, NetworkConditions
 from noack.theory.bounds.disturbances import bound_forcing
 from noack.theory.bounds.enclosure import KernelBounds, response
 from noack.theory.bounds.gains import Counts, Output, PlantGains, error_gains
-from noack.theory.certificates.assumptions import Assumption
+from noack.theory.certificates.assumptions import Assumption, AssumptionStatus
 from noack.theory.certificates.conditions import BOX, LINEAR_EQUATIONS, OWN_PLANT
+from noack.theory.certificates.proven_bounds import ProvenBounds
+
+Constant = Literal["delta", "overshoot", "state", "estimation_error"]
+"""A constant that bounds an output; :class:`Constants` has all."""
+_OUTPUTS: Mapping[Constant, str] = {"delta": "e_c", "overshoot": "e_s", "state": "x"}
+"""The outputs of proven bounds."""
+_IN_LEVELS = ("delta", "overshoot")
+"""Constants in units of the threshold."""
 
 
 class Region(NamedTuple):
@@ -85,11 +93,36 @@ class ScenarioCertificate:
     """A second certificate of the same plants under the same conditions: both bounds hold."""
     region: Region | None = None
     """Of a nonlinear plant: where the certificate holds, and what x and u do not leave."""
+    proven: ProvenBounds | None = None
+    """The bounds that the checker has proven. They take the place of those by ``constants``, which are
+    computed and not checked."""
 
     @property
     def exists(self) -> bool:
         """Whether there is a certificate."""
-        return self.constants is not None
+        return self.constants is not None or self.proven is not None
+
+    def with_proof(self, proven: ProvenBounds | None) -> Self:
+        """Return the certificate with bounds that were proven, also where none could be computed."""
+        assumptions = self.assumptions
+        if proven is not None and self.constants is None:
+            assumptions = tuple(
+                each._replace(verdict=AssumptionStatus.NOT_NEEDED, why="the bounds are proven without it")
+                if each.verdict is AssumptionStatus.VIOLATED
+                else each
+                for each in assumptions
+            )
+        return replace(self, proven=proven, assumptions=assumptions)
+
+    def is_proven(self, constant: Constant) -> bool:
+        """Whether the bound with this constant is a proven one."""
+        return self.proven is not None and _OUTPUTS.get(constant) in self.proven.bounds
+
+    def first(self, constant: Constant) -> float | None:
+        """The first number in a bound, see :func:`envelope_formula`; None if there is no such bound."""
+        if self.proven is not None and self.is_proven(constant):
+            return self.proven.bounds[_OUTPUTS[constant]].first
+        return None if self.constants is None else float(getattr(self.constants, constant))
 
     @property
     def source(self) -> str:
@@ -104,10 +137,29 @@ class ScenarioCertificate:
 
     @property
     def inter_event_s(self) -> float | None:
-        """Lower bound of the inter-event time; None if there is none."""
+        """Lower bound of the inter-event time; None if there is none. See :meth:`apart_s`."""
+        if self.has_proven_inter_event_time:
+            assert self.proven is not None
+            return self.proven.inter_event_s
         times_s = [c.inter_event_s for c in (self.constants, self.floor_constants) if c is not None]
         known = [value for value in times_s if value is not None]
         return min(known) if known and len(known) == len(times_s) else None
+
+    @property
+    def has_proven_inter_event_time(self) -> bool:
+        """Whether the inter-event time is a proven one."""
+        return self.proven is not None and self.proven.inter_event_s is not None
+
+    def apart_s(self, events_s: Vector, started_s: float) -> Vector:
+        """Return how far after each event the next one is at least, (k,); 0 where nothing is known.
+
+        Args:
+            events_s: times of the events, (k,); the first one is at 0.
+            started_s: when the first input acts.
+        """
+        if self.proven is not None and self.has_proven_inter_event_time:
+            return self.proven.apart_s(events_s, started_s)
+        return np.full(len(events_s), self.inter_event_s or 0.0)
 
     @property
     def unit(self) -> str:
@@ -126,19 +178,19 @@ class ScenarioCertificate:
 
     def sensor_error(self, t_s: Matrix) -> Matrix:
         """Bound of ‖e_s‖_W at times (k,); NaN without a certificate."""
-        return self._envelope(t_s, lambda c, level: c.overshoot * level)
+        return self._envelope(t_s, "overshoot")
 
     def controller_error(self, t_s: Matrix) -> Matrix:
         """Bound of ‖e_c‖_W at times (k,); NaN without a certificate."""
-        return self._envelope(t_s, lambda c, level: c.delta * level)
+        return self._envelope(t_s, "delta")
 
     def state(self, t_s: Matrix) -> Matrix:
         """Bound of ‖x‖ at times (k,); NaN without a certificate."""
-        return self._envelope(t_s, lambda c, level: c.state)
+        return self._envelope(t_s, "state")
 
     def estimation_error(self, t_s: Matrix) -> Matrix:
         """Bound of ‖x̂ − x‖_W at measurements (k,); NaN without a certificate."""
-        return self._envelope(t_s, lambda c, level: c.estimation_error)
+        return self._envelope(t_s, "estimation_error")
 
     def to_json(self) -> dict[str, object]:
         """Return all fields for JSON."""
@@ -154,11 +206,22 @@ class ScenarioCertificate:
             "inter_event_s": self.inter_event_s,
             "floor_from_s": None if self.floor == 0 else self.floor_from_s,
             "region": None if self.region is None else self.region._asdict(),
+            "proven": None if self.proven is None else self.proven.to_json(),
         }
 
-    def _envelope(self, t_s: Matrix, scale: Callable[[Constants, float], float]) -> Matrix:
+    def _envelope(self, t_s: Matrix, constant: Constant) -> Matrix:
+        if self.proven is not None and self.is_proven(constant):
+            return self.proven.at(_OUTPUTS[constant], t_s)
+        return self._computed(t_s, constant)
+
+    def _computed(self, t_s: Matrix, constant: Constant) -> Matrix:
         if self.constants is None:
             return np.full(len(t_s), np.nan)
+
+        def scale(constants: Constants, level: float) -> float:
+            value = float(getattr(constants, constant))
+            return value * level if constant in _IN_LEVELS else value
+
         level = max(self.beta, self.floor if self.constants.rate_per_s == 0 else 0.0)
         bound = scale(self.constants, level or 1.0) * np.exp(-self.constants.rate_per_s * t_s)
         if self.floor_constants is not None:
@@ -167,7 +230,7 @@ class ScenarioCertificate:
         if self.persistent_constants is not None:
             bound = bound + scale(self.persistent_constants, 1.0)
         if self.other is not None:
-            bound = np.minimum(bound, self.other._envelope(t_s, scale))
+            bound = np.minimum(bound, self.other._computed(t_s, constant))
         return np.asarray(bound)
 
 
@@ -178,13 +241,11 @@ def floor_from_s(beta: float, alpha_per_s: float, floor: float) -> float:
     return math.log(beta / floor) / alpha_per_s if beta > floor else 0.0
 
 
-def envelope_formula(
-    quantity: str,
-    certificate: ScenarioCertificate,
-    constant: Literal["delta", "overshoot", "state", "estimation_error"],
-) -> str:
+def envelope_formula(quantity: str, certificate: ScenarioCertificate, constant: Constant) -> str:
     """Return a certificate's bound of a quantity; ``{}`` stands for its first constant."""
-    in_levels = constant in {"delta", "overshoot"}
+    if certificate.proven is not None and certificate.is_proven(constant):
+        return certificate.proven.formula(quantity, _OUTPUTS[constant])
+    in_levels = constant in _IN_LEVELS
     parts: list[str] = []
     present: ScenarioCertificate | None = certificate
     while present is not None and present.constants is not None:

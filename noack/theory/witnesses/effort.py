@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-MOST_WORK = 60.0
+MOST_WORK = 20.0
 """A search ends after so many 10⁹ products per step of the solver: some minutes."""
 _MOST_PER_PROBLEM = 8.0
 """A larger problem takes minutes, and seldom ends well: those of the F-16 under its schedule are 12 to 14."""

@@ -10,6 +10,7 @@ from noack.core.linear_systems import Matrix
 from noack.theory.witnesses.coordinates import floats
 from noack_check.model import Inequality, Model, Part
 
+_PER_ENTRY = 20_000
 _LOW, _HIGH = 1.0, 2.0
 
 
@@ -48,9 +49,13 @@ class Templates:
         return [*flows, *self._low[len(self._high) :], *self._outputs[output], *start]
 
     def work(self, output: str) -> float:
-        """Return about how many 10⁹ products the solver needs per step to bound an output."""
+        """Return about how many 10⁹ products the solver needs per step to bound an output.
+
+        What it needs for each entry of an inequality counts as some thousand products.
+        """
         sizes = [len(item.constant) for item in self.at(_LOW, output, starts=False)]
-        return sum((q * (q + 1) / 2) ** 3 for q in sizes) / 1e9
+        entries = [q * (q + 1) / 2 for q in sizes]
+        return sum(count**3 + _PER_ENTRY * count for count in entries) / 1e9
 
 
 def _template(item: Inequality) -> Template:

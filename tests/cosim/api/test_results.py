@@ -83,11 +83,13 @@ def test_a_system_is_certified(scenario: noack.Scenario) -> None:
     assert pickle.loads(pickle.dumps(certificates)).to_json() == certificates.to_json()
     assert certificates.schedule.constants is not None
     assert json.loads(json.dumps(certificates.to_json()))["scenario"] == "own_system"
+    assert certificates.schedule.is_proven("state")
+    assert not noack.certify(scenario, proofs=False).schedule.is_proven("state")
 
 
 def test_the_box_is_certified_and_shown(scenario: noack.Scenario) -> None:
     box = {"plant.uncertainty_A": [[0.0, 0.0], [0.3, 0.1]]}
-    certificates = noack.certify(noack.with_settings(scenario, box), late=0)
+    certificates = noack.certify(noack.with_settings(scenario, box), late=0, proofs=False)
     assert certificates.paper_box is not None
     assert certificates.schedule_box is not None
     assert certificates.paper_box.constants is not None

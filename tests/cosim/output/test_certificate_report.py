@@ -10,19 +10,23 @@ from typing import Any
 
 import numpy as np
 import pytest
+from flint import arb
 from rich.console import Console
 from scipy.linalg import expm
 
-from cosim.analysis.certificates import Certificates, certificates_of, with_weight
+from cosim.analysis.certificates import _STATED, Certificates, certificates_of, with_weight
 from cosim.analysis.claims.claim_evaluation import RunClaims
-from cosim.output.certificate_report import print_certificates
+from cosim.analysis.witnesses import Unproven, find_statement, resolved_content
+from cosim.output.certificate_report import certificate_tables, print_certificates
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
 from noack.scenario.resolution import loop_of
 from noack.theory.bounds.certificate_terms import Constants
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import OWN_PLANT, most_events
+from noack.theory.certificates.proven_bounds import ProvenBound, ProvenBounds
 from noack.theory.certificates.scenario_certificates import CertificateScope, outside_box
+from noack_check.sentences import smallest_bounds
 from tests.helpers.command_line import invoke
 from tests.helpers.shipped import resolved, shipped
 
@@ -139,7 +143,9 @@ def test_advice_is_for_a_loop_gain_and_no_norm_is_said_to_be_tried(gain: str, ad
     trigger = 'trigger={policy="absolute", delta=0.1}'
     settings = [trigger, f"model.gain={gain}", "model.allow_unstable=true"]
     settings += ["plant.rate_hz=2", "controller.rate_hz=2"]
-    result = invoke("certify", "double_integrator", *(word for s in settings for word in ("--set", s)))
+    result = invoke(
+        "certify", "double_integrator", "--no-proofs", *(word for s in settings for word in ("--set", s))
+    )
     _, _, last = " ".join(result.stdout.split()).rpartition("no certificate for the schedule, ")
     assert last.startswith("so no bound of ‖x‖")
     assert ("plant.rate_hz" in last) == advised
@@ -151,7 +157,9 @@ def test_advice_names_only_what_helps() -> None:
     """With this delay neither faster rates nor fewer losses give a certificate."""
     settings = ['trigger={policy="absolute", delta=0.1}']
     settings += ['network.impairments=[{kind="delay", delay_s=1.0}]']
-    result = invoke("certify", "double_integrator", *(word for s in settings for word in ("--set", s)))
+    result = invoke(
+        "certify", "double_integrator", "--no-proofs", *(word for s in settings for word in ("--set", s))
+    )
     _, _, last = " ".join(result.stdout.split()).rpartition("no certificate for the schedule, ")
     assert "there is one with certificate.network_delay_s = 0.5 " in last
     assert "rate_hz =" not in last
@@ -160,7 +168,7 @@ def test_advice_names_only_what_helps() -> None:
 
 def test_advice_with_an_observer_leaves_its_period_alone() -> None:
     delay = 'network.impairments=[{kind="delay", delay_s=1.0}]'
-    result = invoke("certify", "pendulum_observed", "--set", delay)
+    result = invoke("certify", "pendulum_observed", "--no-proofs", "--set", delay)
     _, _, last = " ".join(result.stdout.split()).rpartition("no certificate for the schedule, ")
     assert "there is one with certificate.network_delay_s = 0.1 " in last
     assert "rate_hz" not in last
@@ -283,7 +291,7 @@ def test_linear_equations_are_certified_as_the_plant(tmp_path: Path) -> None:
     assert certificates.answer.is_certified
     assert certificates.schedule.constants == as_matrices.schedule.constants
     assert certificates.largest_settings == as_matrices.largest_settings
-    [statement] = certificates.witnesses().statements
+    [statement] = certificates.prove().statements
     assert 'plant.system.kind = "python": witnesses are for' in statement.reason
 
 
@@ -415,7 +423,7 @@ WRONG_SIGN = "model.gain=[[15.0, 5.0]]"
     ],
 )
 def test_a_loop_without_any_certificate_has_the_reasons(words: list[str], reason: str) -> None:
-    result = invoke("certify", *words)
+    result = invoke("certify", *words, "--no-proofs")
     assert result.exit_code == 1
     assert reason in " ".join(result.stdout.split())
     assert "largest certified value" not in result.stdout
@@ -429,7 +437,7 @@ def test_a_norm_with_certificates_is_found_and_can_be_pasted(
     monkeypatch.setattr(
         "cosim.output.certificate_report.print_certificates", lambda *given: printed.append(given)
     )
-    invoke("certify", "lane_following", *(f"--set={setting}" for setting in SLOW))
+    invoke("certify", "lane_following", "--no-proofs", *(f"--set={setting}" for setting in SLOW))
     ((_, result, in_chosen_norm),) = printed
     print_certificates(Console(file=(output := StringIO()), width=100), result, in_chosen_norm)
     text = output.getvalue()
@@ -440,3 +448,78 @@ def test_a_norm_with_certificates_is_found_and_can_be_pasted(
     assert result.schedule.constants is None
     constants = in_chosen_norm.schedule.constants
     assert constants.state == pytest.approx(weighted.schedule.constants.state, rel=1e-3)
+
+
+PROVEN = ProvenBounds(
+    rate_per_s=0.2,
+    bounds={"x": ProvenBound(7.0, 0.5), "e_c": ProvenBound(1.0, 0.0), "e_s": ProvenBound(0.25, 0.0)},
+    limits={"x[1]": 0.125},
+    inter_event_s=0.004,
+    first_event_s=None,
+    is_quiet=True,
+)
+
+
+def proven_lane(proven: ProvenBounds = PROVEN) -> Certificates:
+    lane = Certificates(resolved("lane_following"), 2)
+    lane.__setstate__(({("own", "schedule"): proven}, [Unproven("own", "ideal", "none was found")]))
+    return lane
+
+
+def printed(certificates: Certificates) -> str:
+    print_certificates(Console(file=(output := StringIO()), width=150), certificates)
+    return output.getvalue()
+
+
+def test_what_is_proven_takes_the_place_of_what_is_computed() -> None:
+    lane = proven_lane()
+    (table, *_) = certificate_tables(lane)
+    rows = {row[0]: row[3] for row in table.rows}
+    assert rows["decay rate, 1/s"] == "0.2✓"
+    assert rows["X, bound of ‖x‖"] == "7✓"
+    assert rows["+ without decay: ‖x‖"] == "0.5✓"
+    assert rows["Δ, bound of ‖e_c‖/β"] == "2✓"
+    assert rows["bound of ‖e_s‖/β"] == "0.5✓"
+    assert rows["bound of |x_2| in the limit"] == "0.125✓"
+    assert rows["inter-event time, s"] == "0.004✓"  # also where the computed one is larger
+    assert rows["bound of ‖u − Kx‖"] == "3.998"
+    t_s = np.array([0.0, 10.0])
+    np.testing.assert_allclose(lane.schedule.state(t_s), 7.0 * np.exp(-0.2 * t_s) + 0.5)
+    text = " ".join(printed(lane).split())
+    assert "‖x‖ ≤ 7 e^(−0.2t) + 0.5 (proved). The inter-event time is at least 4 ms, from the second" in text
+    assert "‖x‖ ≤ 970.5 e^(−0.25t) (computed)" in text
+    assert "nothing is proven (paper, plant): none was found" in text
+    assert "✓" not in printed(Certificates(resolved("lane_following"), 2))
+
+
+def test_a_computed_bound_is_not_shown_beside_a_larger_rate() -> None:
+    lane = proven_lane(PROVEN._replace(rate_per_s=0.3, bounds={"x": ProvenBound(7.0, 0.0)}))
+    (table, *_) = certificate_tables(lane)
+    rows = {row[0]: row[3] for row in table.rows}
+    assert (rows["X, bound of ‖x‖"], rows["Δ, bound of ‖e_c‖/β"]) == ("7✓", "-")
+    assert lane.schedule.controller_error(np.array([0.0]))[0] == pytest.approx(0.5 * 53.63, rel=1e-3)
+
+
+def test_a_proof_is_a_certificate_where_none_can_be_computed() -> None:
+    periodic = Certificates(resolved("lane_periodic"), 2)
+    assert not periodic.answer.is_certified
+    periodic.__setstate__(({("own", "schedule"): PROVEN}, ()))
+    assert periodic.answer.is_certified
+    text = " ".join(printed(periodic).split())
+    assert "the bounds are proven without it" in text
+    assert "violated" not in text.partition("assumptions of the paper's theorems")[0]
+    assert periodic.largest_settings == periodic.helpful_settings == []
+
+
+def test_proofs_of_the_command_are_those_of_the_checker() -> None:
+    result = json.loads(invoke("certify", "double_integrator", "--json").stdout)
+    found = [certificate["proven"]["bounds"]["x"]["decaying"] for certificate in result["certificates"]]
+    content = resolved_content(resolved("double_integrator"), 2)
+    statements = [find_statement(content, *which) for which in _STATED.values()]
+    proofs = {(s.plants, s.conditions): s.proof for s in statements}
+    for (under, plants), value in zip(_STATED, found, strict=True):
+        proof = proofs[_STATED[under, plants]]
+        assert proof is not None
+        (bound,) = (b for b in smallest_bounds(proof) if b.output == "x")
+        assert arb(value) >= bound.decaying
+        assert value == pytest.approx(float(bound.decaying.mid()), rel=1e-9)

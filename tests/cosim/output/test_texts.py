@@ -29,7 +29,7 @@ def run(simulated: noack.Run) -> Path:
     [
         ("summary", ["summary", "RUN"]),
         ("summary-verbose", ["summary", "RUN", "--verbose"]),
-        ("certify", ["certify", "lane_following"]),
+        ("certify", ["certify", "lane_following", "--no-proofs"]),
         ("margin", ["margin", "lane_periodic", "--most", "3", "--no-period"]),
     ],
 )  # fmt: skip

@@ -1,0 +1,96 @@
+"""Witnesses that were found earlier, in the user's cache folder: a search takes seconds, a check 0.3 s.
+
+Nothing that is stored is believed: the checker proves each document again, for the loop at hand. A file
+that is damaged, or another user's, counts as missing. That a search found nothing is stored, too; this
+counts for the same version of noack and searches that are not longer.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from importlib.metadata import version
+from pathlib import Path
+from typing import NamedTuple
+
+from flint import arb, arb_mat
+
+from noack.core.file_access import create_folder, new_file, open_regular, remove_file
+from noack_check.loop import Loop
+
+_FORM = "1"
+"""Of the documents; another one has other keys."""
+_MOST_BYTES, _MOST_FILES = 20_000_000, 300
+_UNREADABLE = (OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError)
+"""RuntimeError: there is no home, or the content is nested too deeply."""
+
+
+class StoredSearch(NamedTuple):
+    """What an earlier search found."""
+
+    document: Mapping[str, object] | None
+    reason: str = ""
+    """Why there is no witness."""
+    is_complete: bool = False
+    """Whether all outputs are bounded that were wanted."""
+
+
+class WitnessStore:
+    """The file of a loop, and of the outputs that are bounded.
+
+    Args:
+        loop: its exact numbers are the key, so that names, seeds and durations do not matter.
+        wanted: the outputs, as text.
+    """
+
+    def __init__(self, loop: Loop, wanted: Sequence[str]) -> None:
+        key = json.dumps([_FORM, _exact(loop), *wanted])
+        self._name = hashlib.sha256(key.encode()).hexdigest() + ".json"
+
+    def read(self, most_work: float) -> StoredSearch | None:
+        """Return what a search with this limit of work would find; None if that is not known."""
+        with suppress(*_UNREADABLE), open_regular(_folder() / self._name) as file:
+            if hasattr(os, "geteuid") and os.fstat(file.fileno()).st_uid != os.geteuid():
+                return None
+            content = json.loads(file.read(_MOST_BYTES))
+            if content["most_work"] < most_work and not content["is_complete"]:
+                return None
+            if content["document"] is not None:
+                return StoredSearch(content["document"])
+            if content["noack"] == version("noack"):
+                return StoredSearch(None, str(content["reason"]))
+        return None
+
+    def write(self, found: StoredSearch, most_work: float) -> None:
+        """Keep what a search found; without space or permission nothing is kept."""
+        content = {**found._asdict(), "noack": version("noack"), "most_work": most_work}
+        with suppress(OSError, ValueError, RuntimeError):
+            create_folder(folder := _folder(), mode=0o700)
+            with new_file(folder / self._name, mode=0o600) as file:
+                file.write(json.dumps(content, allow_nan=False).encode())
+            _remove_oldest(folder)
+
+
+def _folder() -> Path:
+    """Return the folder of the store, by the XDG Base Directory Specification."""
+    stated = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    base = stated if stated.is_absolute() else Path("~/.cache").expanduser()
+    return base / "noack" / "witnesses"
+
+
+def _remove_oldest(folder: Path) -> None:
+    files = sorted(folder.glob("*.json"), key=lambda path: path.stat().st_mtime)
+    for path in files[:-_MOST_FILES]:
+        remove_file(path)
+
+
+def _exact(value: object) -> object:
+    """Return numbers, exactly, as lists of texts."""
+    if isinstance(value, arb):
+        return [str(part.man_exp()) for part in (value.mid(), value.rad())]
+    if isinstance(value, arb_mat):
+        return [value.ncols(), *map(_exact, value.entries())]
+    if isinstance(value, tuple):
+        return [*map(_exact, value)]
+    return str(value)

@@ -1,0 +1,52 @@
+"""What was proven, as floats that are rounded outwards."""
+
+import math
+from decimal import MAX_EMAX, MIN_EMIN, ROUND_CEILING, ROUND_FLOOR, Context, Decimal
+from fractions import Fraction
+
+from flint import arb
+
+from noack.theory.certificates.proven_bounds import ProvenBound, ProvenBounds
+from noack_check.proof import Proof
+from noack_check.sentences import smallest_bounds
+
+_DIGITS = 12
+"""Significant digits: tables round decimals of this length, and stay true."""
+
+
+def proven_bounds(proof: Proof) -> ProvenBounds:
+    """Return the bounds of a proof; of two bounds of the same output the smaller one."""
+    bounds, limits = dict[str, ProvenBound](), dict[str, float]()
+    for bound in smallest_bounds(proof):
+        if bound.from_start:
+            bounds[bound.output] = ProvenBound(above(bound.decaying), above(bound.constant))
+        else:
+            last = bound.constant
+            if not proof.rate > 0:
+                last = (bound.decaying**2 + bound.constant**2).sqrt()
+            limits[bound.output] = above(last)
+    apart_s, first_s = (
+        None if t is None else below(t) or None for t in (proof.inter_event, proof.first_event)
+    )
+    return ProvenBounds(below(proof.rate), bounds, limits, apart_s, first_s, proof.is_quiet)
+
+
+def above(value: arb) -> float:
+    """Return a float of twelve digits that is at least a number, which is not negative."""
+    found, exact = _rounded(value.upper(), ROUND_CEILING)
+    return math.nextafter(found, math.inf) if Fraction(found) < exact else found
+
+
+def below(value: arb) -> float:
+    """Return a float of twelve digits that is at most a number; 0 for one that may be negative."""
+    found, exact = _rounded(value.lower().max(arb(0)), ROUND_FLOOR)
+    return math.nextafter(found, -math.inf) if Fraction(found) > exact else found
+
+
+def _rounded(value: arb, rounding: str) -> tuple[float, Fraction]:
+    parts = value.mid().fmpq()
+    exact = Fraction(int(parts.p), int(parts.q))
+    if exact == Fraction(short := float(f"{float(value):.{_DIGITS}g}")):
+        return short, exact
+    context = Context(prec=_DIGITS, rounding=rounding, Emin=MIN_EMIN, Emax=MAX_EMAX)
+    return float(context.divide(Decimal(exact.numerator), Decimal(exact.denominator))), exact

@@ -1,0 +1,116 @@
+"""Witnesses that were found earlier: used, proven again each time, and ignored where they are damaged."""
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cosim.analysis.witnesses import WitnessedStatement, find_statement, resolved_content
+from noack.theory.witnesses.documents import Witness, find_witness
+from noack.theory.witnesses.effort import NoWitnessError
+from noack_check.scenario import read_loop
+from tests.helpers.shipped import resolved
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path / "noack" / "witnesses"
+
+
+@pytest.fixture(scope="module")
+def witness() -> Witness:
+    """What is found of the loop below; the search takes a second."""
+    content = resolved_content(resolved("double_integrator"), 2)
+    return find_witness(read_loop(content, box=False, ideal=False))
+
+
+@pytest.fixture
+def searches(witness: Witness, monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The limits of the searches that were made; the loop need not be that of the witness."""
+    made = list[float]()
+
+    def search(*given: Any, most_work: float, **options: Any) -> Witness:
+        made.append(most_work)
+        if most_work < 1:
+            raise NoWitnessError("the limit of work")
+        return witness
+
+    monkeypatch.setattr("cosim.analysis.witnesses.find_witness", search)
+    return made
+
+
+def found(*settings: str, most_work: float = 20.0) -> WitnessedStatement:
+    scenario = resolved("double_integrator", *settings)
+    return find_statement(resolved_content(scenario, 2), "own", "schedule", most_work=most_work)
+
+
+def test_a_witness_is_found_once_for_the_same_numbers(folder: Path, searches: list[float]) -> None:
+    first = found()
+    assert first.proof is not None
+    assert found("horizon_s=3", "seeds.loss=7").document == first.document
+    assert len(searches) == 1
+    (file,) = folder.iterdir()
+    assert file.stat().st_mode & 0o777 == 0o600
+    assert folder.stat().st_mode & 0o777 == 0o700
+    found("trigger.beta=0.06")
+    assert len(searches) == 2
+
+
+def _with_smaller_bounds(content: dict[str, Any]) -> str:
+    for bound in content["document"]["bounds"]:
+        bound["numbers"]["level 1"] *= 0.5
+    return json.dumps(content)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        _with_smaller_bounds,
+        lambda content: json.dumps(content)[:1000],
+        lambda content: "[" * 100_000,
+        lambda content: json.dumps([content]),
+        lambda content: json.dumps({**content, "document": {"rate": "fast"}}),
+    ],
+)  # fmt: skip
+def test_a_document_that_was_changed_is_not_used(
+    folder: Path, searches: list[float], change: Callable[[dict[str, Any]], str]
+) -> None:
+    first = found()
+    (file,) = folder.iterdir()
+    file.write_text(change(json.loads(file.read_text())))
+    assert found().document == first.document
+    assert len(searches) == 2
+    assert found().document == first.document
+    assert len(searches) == 2  # it has been replaced
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="needs root")
+def test_a_file_of_another_user_is_not_used(folder: Path, searches: list[float]) -> None:
+    found()
+    (file,) = folder.iterdir()
+    os.chown(file, 65534, 65534)
+    found()
+    assert len(searches) == 2
+
+
+def test_a_search_that_found_nothing_is_not_repeated_unless_it_may_be_longer(
+    folder: Path, searches: list[float]
+) -> None:
+    first = found(most_work=0.2)
+    assert "limit of work" in first.reason
+    assert found(most_work=0.1) == first
+    assert searches == [0.2]
+    assert found().proof is not None
+    assert len(searches) == 2
+
+
+def test_a_folder_that_cannot_be_written_costs_nothing_but_time(
+    tmp_path: Path, searches: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    assert found().proof is not None
