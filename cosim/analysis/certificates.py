@@ -40,7 +40,6 @@ from noack.theory.coverage import NOT_COVERED, refusals, require_certifiable
 from noack.theory.margins.loss_margin import LossMargin, Stability
 from noack.theory.paper import Theorem2, theorem_2
 from noack.theory.witnesses.effort import MOST_WORK
-from noack.theory.witnesses.outward import proven_bounds
 from noack.trigger_policies.decaying import DecayingSettings
 from noack.trigger_policies.periodic_trigger import PeriodicSettings
 
@@ -170,9 +169,7 @@ class Certificates:
             found = no_witnesses(scenario, needs_matrices(other))
         else:
             found = find_witnesses(scenario, late_periods, progress, most_work)
-        proven = {
-            (s.plants, s.conditions): proven_bounds(s.proof) for s in found.statements if s.proof is not None
-        }
+        proven = {(s.plants, s.conditions): s.bounds for s in found.statements if s.bounds is not None}
         self.__setstate__((proven, found.unproven))
         return found
 

@@ -14,8 +14,10 @@ from cosim.analysis.witness_store import StoredSearch, WitnessStore
 from noack.core.errors import CallerError
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.conditions import with_stated_times
+from noack.theory.certificates.proven_bounds import ProvenBounds
 from noack.theory.witnesses.documents import Witness, find_witness
 from noack.theory.witnesses.effort import MOST_WORK, NoWitnessError
+from noack.theory.witnesses.outward import proven_bounds
 from noack_check.check import RejectedError
 from noack_check.keys import RefusedError
 from noack_check.loop import Loop
@@ -34,6 +36,8 @@ class WitnessedStatement(NamedTuple):
     proof: Proof | None
     reason: str = ""
     """Why there is no witness."""
+    bounds: ProvenBounds | None = None
+    """What is proven, as certificates have it."""
 
 
 class Unproven(NamedTuple):
@@ -154,7 +158,8 @@ def find_statement(
     except (RefusedError, NoWitnessError) as error:
         return WitnessedStatement(plants, conditions, None, None, str(error))
     document = {"plants": plants, "conditions": conditions, **witness.document}
-    return WitnessedStatement(plants, conditions, document, witness.proof)
+    bounds = proven_bounds(witness.proof, loop.noise_size)
+    return WitnessedStatement(plants, conditions, document, witness.proof, "", bounds)
 
 
 def known_or_found(

@@ -14,12 +14,20 @@ _DIGITS = 12
 """Significant digits: tables round decimals of this length, and stay true."""
 
 
-def proven_bounds(proof: Proof) -> ProvenBounds:
-    """Return the bounds of a proof; of two bounds of the same output the smaller one."""
+def proven_bounds(proof: Proof, noise: arb) -> ProvenBounds:
+    """Return the bounds of a proof; of two bounds of the same output the smaller one.
+
+    The errors of certificates and records are about the measured x + n; those of proofs are about x.
+
+    Args:
+        proof: what was proven.
+        noise: largest ‖W n‖ of the noise of measurements.
+    """
     bounds, limits = dict[str, ProvenBound](), dict[str, float]()
     for bound in smallest_bounds(proof):
         if bound.from_start:
-            bounds[bound.output] = ProvenBound(above(bound.decaying), above(bound.constant))
+            constant = bound.constant + noise if bound.output.startswith("e_") else bound.constant
+            bounds[bound.output] = ProvenBound(above(bound.decaying), above(constant))
         else:
             last = bound.constant
             if not proof.rate > 0:
