@@ -14,7 +14,6 @@ import pyarrow as pa
 from matplotlib.figure import Figure
 
 from cosim.live.monitoring.progress import runs_bar
-from cosim.output.figures.figure_drawing import draw
 from cosim.shipped_files import find_shipped
 from cosim.studies.campaign import campaign_figures, campaign_file, campaign_report, campaign_summary
 from cosim.studies.campaign.campaign_report import FinishedCampaign
@@ -119,7 +118,7 @@ class CampaignResult:
         known = []
         for description in campaign_figures.figures(self._finished.summary, self._finished.store):
             if figure in (None, description.name):
-                return draw(description)
+                return description.draw()
             known.append(description.name)
         named = f'"{figure}": no such figure' if figure else "no figure"
         raise CallerError(f"{named} in this campaign; it has {', '.join(known) or 'none'}")

@@ -24,9 +24,9 @@ from cosim.live.monitoring.run_terminal import RunTerminal
 from cosim.output import result_tables, run_tables, run_verdict
 from cosim.output.curves import Curve
 from cosim.output.export.export_formats import export_run
-from cosim.output.figures.figure_description import FigureDescription
 from cosim.output.figures.figure_format import requested_files
 from cosim.output.figures.network_figures import page_figures
+from cosim.output.figures.page_figure import PageFigure
 from cosim.output.figures.run_figures import BOUNDED, run_curves
 from cosim.output.run_verdict import VerdictLine
 from cosim.record import data_frames
@@ -198,11 +198,9 @@ class Run:
         Raises:
             NoackError: the run has no such figure.
         """
-        from cosim.output.figures.figure_drawing import draw  # imports matplotlib
+        return self._describe(figure).draw()
 
-        return draw(self._describe(figure))
-
-    def _describe(self, figure: str) -> FigureDescription:
+    def _describe(self, figure: str) -> PageFigure:
         """Return a figure of the report; raise CallerError if the run has no such figure."""
         known = self._figures(bounded=figure in BOUNDED)
         if figure not in known:
@@ -218,7 +216,7 @@ class Run:
         """Write the figures of the report into ``report-figures`` in the run directory.
 
         Args:
-            format: svg, png or pdf; a PDF has the fonts of LaTeX, which need not be installed.
+            format: svg, png or pdf; a PDF has fonts like those of printed papers (STIX).
             width: ``"column"`` (3.5 in), ``"page"`` (7.16 in), or inches; by default a column for
                 pdf, and 10 in for svg and png.
             figure: only this one; the names are those of :meth:`plot`. By default all.
@@ -278,7 +276,7 @@ class Run:
         """
         return replay_run(self._run, self._loop)
 
-    def _figures(self, *, bounded: bool) -> Mapping[str, Callable[[], FigureDescription]]:
+    def _figures(self, *, bounded: bool) -> Mapping[str, Callable[[], PageFigure]]:
         """Return functions that describe the figures, by name; ``bounded`` with their bounds."""
         return page_figures(self._run, lambda: self.summary, self._loop, bounded=bounded)
 

@@ -195,7 +195,7 @@ LogFormatOption = Annotated[
 ]
 FigureFormatOption = Annotated[
     FigureFormat | None,
-    Option("--format", help="Write each figure as a file, too; a PDF has the fonts of LaTeX."),
+    Option("--format", help="Write each figure as a file, too; a PDF has the fonts of printed papers."),
 ]
 WidthOption = Annotated[
     str | None,

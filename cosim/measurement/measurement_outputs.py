@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.console import Console
@@ -14,21 +15,12 @@ from cosim.measurement.interval_estimates import LEVEL, IntervalEstimate
 from cosim.measurement.loss_bursts import histogram, most_losses
 from cosim.measurement.network_measurement import NetworkMeasurement
 from cosim.measurement.network_section import Form, write_network
+from cosim.output.curves import DASHED
 from cosim.output.figures import palette
-from cosim.output.figures.figure_description import (
-    Axis,
-    Bars,
-    FigureDescription,
-    Item,
-    Line,
-    Marks,
-    Panel,
-    Rule,
-    Spans,
-    one_panel,
-    time_axis,
-)
+from cosim.output.figures.axes_parts import draw_bars, draw_line, rgb, set_times, whole_numbers
 from cosim.output.figures.figure_format import FigureFiles
+from cosim.output.figures.page_figure import PageFigure, one_panel
+from cosim.output.figures.palette import Colour
 from cosim.output.result_tables import KEY_VALUE, ResultTable, terminal_table
 from cosim.record.run_directory import write_output
 from noack.core.errors import CallerError
@@ -36,6 +28,9 @@ from noack.core.file_access import require_suffix
 from noack.core.number_format import NONE, duration, number, percent
 from noack.impairments.burst_prediction import chance_text
 from noack.scenario.scenario import Scenario
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True)
@@ -288,137 +283,120 @@ _HEIGHT_IN = 2.4
 _WINDOWS = 40
 """Most bars of a histogram, and most windows of a curve."""
 _LONGEST_WINDOW = 1000
+_MARK_HEIGHT = 0.97
+"""Of the marks of lost packets, as a share of the panel's height."""
 
 
-def measurement_figures(measurement: NetworkMeasurement) -> Iterator[FigureDescription]:
+def measurement_figures(measurement: NetworkMeasurement) -> Iterator[PageFigure]:
     """Yield the figures of a measurement."""
     deadline_s = measurement.options.deadline_s
     limit = "" if deadline_s is None else f" Dashed: the deadline of {duration(deadline_s)}."
-    bursts = measurement.bursts
-    yield one_panel("bursts", _histogram(measurement), _HEIGHT_IN).captioned(
-        "Number of loss bursts by length. A burst is a number of consecutive effective "
+    bursts, delays = measurement.bursts, measurement.delays
+    yield one_panel(
+        "bursts",
+        _HEIGHT_IN,
+        lambda axes: _draw_histogram(axes, measurement),
+        caption="Number of loss bursts by length. A burst is a number of consecutive effective "
         "losses: packets that were lost, out of order, or later than the deadline.",
-        f"Bars: {len(bursts.length)} loss bursts, the longest of {bursts.longest} packets.",
+        description=f"Bars: {len(bursts.length)} loss bursts, the longest of {bursts.longest} packets.",
     )
-    yield one_panel("delays", _delays(measurement), _HEIGHT_IN).captioned(
-        "Delay of each received packet, at its sending time; crosses at the top: lost "
+    yield one_panel(
+        "delays",
+        _HEIGHT_IN,
+        lambda axes: _draw_delays(axes, measurement),
+        caption="Delay of each received packet, at its sending time; crosses at the top: lost "
         f"packets. Shaded: outages.{limit}",
-        f"Points: the delays of {measurement.delays.received} packets over {measurement.observed_s:.1f} s.",
+        description=f"Points: the delays of {delays.received} packets over {measurement.observed_s:.1f} s.",
     )
-    yield one_panel("correlation", _correlation(measurement), _HEIGHT_IN).captioned(
-        "Correlation of the delays (of their normal scores) and of the effective losses of "
+    yield one_panel(
+        "correlation",
+        _HEIGHT_IN,
+        lambda axes: _draw_correlation(axes, measurement),
+        caption="Correlation of the delays (of their normal scores) and of the effective losses of "
         f"two packets, by their distance. Within the dashed lines: {100 * LEVEL:.0f} % of the "
         "correlations of independent delays.",
-        "Curves: correlation of delays and of losses over the distance in packets.",
+        description="Curves: correlation of delays and of losses over the distance in packets.",
     )
-    yield one_panel("windows", _windows(measurement), _HEIGHT_IN).captioned(
-        "(m, K): the largest number m of effective losses in any K consecutive packets. "
+    yield one_panel(
+        "windows",
+        _HEIGHT_IN,
+        lambda axes: _draw_windows(axes, measurement),
+        caption="(m, K): the largest number m of effective losses in any K consecutive packets. "
         "Dashed: all K packets lost.",
-        "Curve: most losses over the length of the window.",
+        description="Curve: most losses over the length of the window.",
     )
 
 
-def _histogram(measurement: NetworkMeasurement) -> Panel:
-    outages = measurement.is_outage
-    longest = measurement.bursts.longest
+def _draw_histogram(axes: "Axes", measurement: NetworkMeasurement) -> None:
+    outages, bursts = measurement.is_outage, measurement.bursts
     # Bins of one length, or, if the lengths differ much, of a constant ratio.
-    wide = longest > _WINDOWS
-    edges = np.arange(1.0, longest + 2)
+    wide = bursts.longest > _WINDOWS
+    edges = np.arange(1.0, bursts.longest + 2)
     if wide:
-        edges = np.unique(np.geomspace(1, longest + 1, _WINDOWS).round())
-    items = []
-    for label, bursts, colour in (
-        ("loss bursts", measurement.bursts.subset(~outages), _BURSTS),
-        ("outages", measurement.bursts.subset(outages), _OUTAGES),
-    ):
-        counts = np.histogram(bursts.length, edges)[0].astype(np.float64)
-        items.append(Bars(edges=edges - 0.5, heights=counts, label=label, colour=colour, opacity=0.85))
-    return Panel(
-        title="Loss bursts",
-        items=items,
-        x=Axis(label="consecutive effective losses", logarithmic=wide, whole=not wide),
-        y=Axis(label="bursts", whole=True),
-        legend=None if outages.any() else (),
-    )
+        edges = np.unique(np.geomspace(1, bursts.longest + 1, _WINDOWS).round())
+        axes.set_xscale("log")
+    for label, chosen, colour in (("loss bursts", ~outages, _BURSTS), ("outages", outages, _OUTAGES)):
+        counts = np.histogram(bursts.subset(chosen).length, edges)[0].astype(np.float64)
+        shown_label = label if outages.any() else None
+        draw_bars(axes, edges - 0.5, counts, colour, label=shown_label, alpha=0.85)
+    axes.set(title="Loss bursts", xlabel="consecutive effective losses", ylabel="bursts")
+    whole_numbers(axes, "y")
+    if not wide:
+        whole_numbers(axes, "x")
 
 
-def _delays(measurement: NetworkMeasurement) -> Panel:
+def _draw_delays(axes: "Axes", measurement: NetworkMeasurement) -> None:
     trace = measurement.trace
     sent_s, lost = np.asarray(trace.sent_ns * 1e-9), trace.lost
     unknown = lost | (trace.delays_unknown != "")
     values = np.asarray(np.where(unknown, np.nan, np.maximum(trace.delay_ns, 1)) * 1e-9)
+    axes.set(title="Delay over time", ylabel="delay [s]", yscale="linear" if unknown.all() else "log")
+    draw_line(axes, sent_s, values, _DELAYS, linewidth=0.8, marker=".", markersize=2.5)
     begin_s, duration_s = measurement.bursts.subset(measurement.is_outage).times_s(trace)
-    items: list[Item] = [
-        Line(x=sent_s, y=values, colour=_DELAYS, width=0.8, marker=".", size=2.5),
-        Spans(begin=begin_s, end=begin_s + duration_s, colour=_OUTAGES),
-        Marks(
-            x=sent_s[lost],
-            y=np.zeros(int(lost.sum())),
-            marker="x",
-            size=3.5,
-            colour=_LOST,
-            at_top=True,
-            reduced=False,
-        ),
-    ]
+    for begin, end in zip(begin_s, begin_s + duration_s, strict=True):
+        axes.axvspan(begin, end, color=rgb(_OUTAGES), alpha=0.2, linewidth=0)
+    axes.plot(
+        sent_s[lost], np.full(int(lost.sum()), _MARK_HEIGHT), "x", color=rgb(_LOST), markersize=3.5,
+        clip_on=False, transform=axes.get_xaxis_transform(),
+    )  # fmt: skip
     if measurement.options.deadline_s is not None:
-        items.append(Rule(at=measurement.options.deadline_s, colour=_LIMIT))
-    return Panel(
-        title="Delay over time",
-        items=items,
-        x=time_axis(sent_s, label="sending time [s]"),
-        y=Axis(label="delay [s]", logarithmic=bool((~unknown).any())),
-    )
+        axes.axhline(measurement.options.deadline_s, color=rgb(_LIMIT), dashes=DASHED, linewidth=1.6)
+    set_times(axes, sent_s)
+    axes.set_xlabel("sending time [s]")
 
 
-def _correlation(measurement: NetworkMeasurement) -> Panel:
+def _draw_correlation(axes: "Axes", measurement: NetworkMeasurement) -> None:
     delays, losses = measurement.delays, measurement.loss_correlation
-    items = [
-        _curve(correlation.lags, correlation.at_lags, label, colour)
-        for correlation, label, colour in (
-            (delays.correlation, "delays", _BURSTS),
-            (losses, "effective losses", _LOST),
-        )
-        if correlation.lags
-    ]
-    limits = [
-        Rule(at=level, colour=_LIMIT, width=1.0)
-        for level in (delays.white_noise_limit, -delays.white_noise_limit)
-    ]
-    return Panel(
-        title="Correlation",
-        items=[*items, *limits],
-        x=Axis(label="distance in packets", logarithmic=bool(items)),
-        y=Axis(label="correlation"),
-    )
+    for correlation, label, colour in (
+        (delays.correlation, "delays", _BURSTS),
+        (losses, "effective losses", _LOST),
+    ):
+        if correlation.lags:
+            axes.set_xscale("log")
+            _draw_dots(axes, correlation.lags, correlation.at_lags, label, colour)
+    for level in (delays.white_noise_limit, -delays.white_noise_limit):
+        axes.axhline(level, color=rgb(_LIMIT), dashes=DASHED, linewidth=1.0)
+    axes.set(title="Correlation", xlabel="distance in packets", ylabel="correlation")
 
 
-def _windows(measurement: NetworkMeasurement) -> Panel:
-    longest = max(min(_LONGEST_WINDOW, len(measurement.trace)), 1)
+def _draw_windows(axes: "Axes", measurement: NetworkMeasurement) -> None:
+    longest, has_outages = max(min(_LONGEST_WINDOW, len(measurement.trace)), 1), measurement.is_outage.any()
     windows = np.unique(np.geomspace(1, longest, _WINDOWS).round().astype(int)).tolist()
     in_all = most_losses(measurement.bursts, windows)
-    items = [_curve([*in_all], [*in_all.values()], "all packets", _OUTAGES)]
-    if measurement.is_outage.any():
-        without_outages = most_losses(measurement.bursts, windows, measurement.is_outage)
-        items.append(_curve([*without_outages], [*without_outages.values()], "without outages", _BURSTS))
-    all_lost = np.array(windows, np.float64)
     largest = max(in_all.values())
-    ends = (0.8, 1.4 * largest) if largest else (None, None)
-    return Panel(
-        title="Most losses in a window",
-        items=[*items, Line(x=all_lost, y=all_lost, colour=_LIMIT, dash=(6, 2.5))],
-        x=Axis(label="window K in packets", logarithmic=True),
-        y=Axis(label="losses m", logarithmic=largest > 0, ends=ends),
-        legend=None if measurement.is_outage.any() else (),
-    )
+    axes.set(title="Most losses in a window", xlabel="window K in packets", ylabel="losses m", xscale="log")
+    if largest:
+        axes.set(yscale="log", ylim=(0.8, 1.4 * largest))
+    _draw_dots(axes, [*in_all], [*in_all.values()], "all packets" if has_outages else "", _OUTAGES)
+    if has_outages:
+        without_outages = most_losses(measurement.bursts, windows, measurement.is_outage)
+        _draw_dots(axes, [*without_outages], [*without_outages.values()], "without outages", _BURSTS)
+    all_lost = np.array(windows, np.float64)
+    draw_line(axes, all_lost, all_lost, _LIMIT, DASHED)
 
 
-def _curve(x: Sequence[float], y: Sequence[float], label: str, colour: palette.Colour) -> Line:
-    return Line(
-        x=np.asarray(x, np.float64),
-        y=np.asarray(y, np.float64),
-        label=label,
-        colour=colour,
-        marker=".",
-        size=4,
-    )
+def _draw_dots(axes: "Axes", x: Sequence[float], y: Sequence[float], label: str, colour: Colour) -> None:
+    draw_line(
+        axes, np.asarray(x, np.float64), np.asarray(y, np.float64), colour, label=label, marker=".",
+        markersize=4,
+    )  # fmt: skip

@@ -11,8 +11,8 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from cosim.output.figures.figure_description import FigureDescription
 from cosim.output.figures.figure_files import inline
+from cosim.output.figures.page_figure import PageFigure
 from cosim.output.run_tables import interval_text
 from noack.core.number_format import number
 
@@ -47,7 +47,7 @@ def templates(folder: Path = PAGES) -> Environment:
     return environment
 
 
-def _markup(figure: FigureDescription) -> Markup:
+def _markup(figure: PageFigure) -> Markup:
     return Markup(inline(figure))
 
 

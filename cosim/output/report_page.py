@@ -16,8 +16,8 @@ import numpy as np
 from cosim.analysis.summary.loops_over_time import LoopOverTime
 from cosim.analysis.summary.run_summary import worst_loop
 from cosim.analysis.summary.summary_model import LoopSummary, RunSummary
-from cosim.output.figures.figure_description import FigureDescription
 from cosim.output.figures.network_figures import network_figures
+from cosim.output.figures.page_figure import PageFigure
 from cosim.output.figures.run_figures import envelopes, run_figures
 from cosim.output.page_kit import TERMS, templates, value_text, words
 from cosim.output.run_tables import (
@@ -68,9 +68,9 @@ class Report:
     """Of this loop."""
     why: str = ""
     """Why this loop is shown in detail."""
-    figures: Sequence[FigureDescription] = ()
+    figures: Sequence[PageFigure] = ()
     """Of this loop."""
-    network_figures: Sequence[FigureDescription] = ()
+    network_figures: Sequence[PageFigure] = ()
     description: str = ""
     scenario_toml: str = ""
     """The scenario of the run, as stored in the run directory."""

@@ -1,32 +1,29 @@
 """A comparison of runs: key numbers, settings that differ, distances, and one overlaid figure."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
 
 from cosim.analysis.summary.summary_model import IdealLoopPart, LoopSummary, RunSummary
 from cosim.live.finalize import reopen
-from cosim.output.curves import Dash
 from cosim.output.figures import palette
-from cosim.output.figures.figure_description import (
-    TIME,
-    Axis,
-    FigureDescription,
-    Item,
-    Line,
-    Marks,
-    Panel,
-    PanelRow,
+from cosim.output.figures.axes_parts import (
+    draw_line,
+    draw_marks,
     label_text,
+    limit_decades,
+    name_ticks,
     series_colour,
-    time_axis,
+    set_times,
 )
+from cosim.output.figures.page_figure import PageFigure
+from cosim.output.figures.panels import Panels
 from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.output.run_tables import caps_text
 from cosim.record.align import Reals, Times, align_tables
@@ -39,6 +36,7 @@ from noack.core.row_operations import row_norms
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, NO_SEQUENCE, PLANT_STEP, SENSOR_MEASUREMENT
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 LABELS = "ABCDEFG"
@@ -124,9 +122,7 @@ class RunComparison:
 
     def plot(self) -> "Figure":
         """Draw states, ‖e_s‖ with thresholds, ‖e_c‖ and transmissions of all runs overlaid."""
-        from cosim.output.figures.figure_drawing import draw  # it imports matplotlib
-
-        return draw(overlay_figure(self.runs))
+        return overlay_figure(self.runs).draw()
 
     def save(self, path: str | PathLike[str], width: str | float | None = None) -> None:
         """Write the overlay as a page (``.html``), or the figure alone (``.svg``, ``.pdf``, …).
@@ -282,72 +278,72 @@ _WIDEST_LINE, _WIDTH_RATIO, _NORM_LINE = 3.4, 0.75, 1.2
 """Widths of lines: of the first run's states, the ratio from run to run, and of norms."""
 
 
-def overlay_figure(runs: Sequence[ComparedRun]) -> FigureDescription:
-    """Describe states, ‖e_s‖ with thresholds, ‖e_c‖ and transmissions, one colour per run.
+def overlay_figure(runs: Sequence[ComparedRun]) -> PageFigure:
+    """Return states, ‖e_s‖ with thresholds, ‖e_c‖ and transmissions, one colour per run.
 
     Args:
         runs: runs with the same number of states; the first 6 states are drawn.
     """
-    with np.errstate(all="ignore"):  # a run may diverge
-        aligned = [align_tables(run.record) for run in runs]
-    times = [np.asarray(samples.t_ns / NS_PER_S, dtype=np.float64) for samples in aligned]
-    longest = time_axis(max(times, key=lambda t_s: t_s.max(initial=0.0)), numbers=False)
-    numbered_runs = list(enumerate(zip(runs, times, aligned, strict=True)))
-    panels = [
-        # Each run's line is thinner than the line below it.
-        Panel(x=longest, y=Axis(label=label_text(name)), legend=() if i else None, items=[
-            Line(x=t_s, y=samples.x[:, i], label=f"{run.label}: {label_text(run.title, 60)}",
-                 colour=series_colour(k), width=max(_WIDEST_LINE * _WIDTH_RATIO**k, 0.8))
-            for k, (run, t_s, samples) in numbered_runs
-        ])
-        for i, name in enumerate(runs[0].record.loop.state_names[:_MOST_STATES])
-    ]  # fmt: skip
-    rows = [PanelRow(panels=[panel], height_in=_STATE_IN) for panel in panels]
-    for title, name in (
-        (r"Sensor's error $\|e_s\|$ and threshold (dashed)", "e_s_norm"),
-        (r"Controller's error $\|e_c\|$", "e_c_norm"),
-    ):
-        items: list[Item] = []
-        for k, (_, t_s, samples) in numbered_runs:  # the first run is on top
-            curves: list[tuple[Reals, Dash]] = [(getattr(samples, name), ())]
-            curves += [(samples.threshold, (5, 2))] if name == "e_s_norm" else []
-            items += [
-                Line(x=t_s, y=values, colour=series_colour(k), width=_NORM_LINE, order=3 - 0.1 * k, dash=dash)
-                for values, dash in curves
-            ]
-        norms = np.concatenate([getattr(samples, name) for samples in aligned])
-        y = Axis(label="norm", logarithmic=True, about=norms, decades=_DECADES)
-        rows.append(PanelRow(panels=[Panel(title=title, items=items, x=longest, y=y)], height_in=_NORM_IN))
-    events = replace(_events(runs), x=replace(longest, label=TIME, numbers=True))
-    return FigureDescription(
+    return PageFigure(
         name="runs",
-        heading=f"{len(runs)} runs",
-        rows=[*rows, PanelRow(panels=[events], height_in=_EVENTS_IN * (len(runs) + 1))],
+        draw_panels=lambda figure: _draw_overlay(figure, runs),
         caption="One colour per run. Dashed: threshold. Bar: transmission delivered; cross: "
         "transmission lost.",
         description="States, error norms and transmissions of the runs over time, overlaid.",
     )
 
 
-def _events(runs: Sequence[ComparedRun]) -> Panel:
-    """One row of marks per run: a bar for a delivered transmission, a cross for a lost one."""
-    rows = range(len(runs) - 1, -1, -1)
-    items: list[Item] = []
-    for number, (run, row) in enumerate(zip(runs, rows, strict=True)):
+def _draw_overlay(figure: "Figure", runs: Sequence[ComparedRun]) -> list[Panels]:
+    with np.errstate(all="ignore"):  # a run may diverge
+        aligned = [align_tables(run.record) for run in runs]
+    times = [np.asarray(samples.t_ns / NS_PER_S, dtype=np.float64) for samples in aligned]
+    longest = max(times, key=lambda t_s: t_s.max(initial=0.0))
+    rows = []
+    for i, name in enumerate(runs[0].record.loop.state_names[:_MOST_STATES]):
+        axes = figure.add_axes((0, 0, 1, 1))
+        for k, (run, t_s, samples) in enumerate(zip(runs, times, aligned, strict=True)):
+            # Each run's line is thinner than the line below it.
+            width = max(_WIDEST_LINE * _WIDTH_RATIO**k, 0.8)
+            label = "" if i else f"{run.label}: {label_text(run.title, 60)}"
+            draw_line(axes, t_s, samples.x[:, i], series_colour(k), label=label, linewidth=width)
+        axes.set(ylabel=label_text(name), title="" if i else f"{len(runs)} runs")
+        rows.append(Panels([axes], _STATE_IN))
+    errors, received = figure.add_axes((0, 0, 1, 1)), figure.add_axes((0, 0, 1, 1))
+    for axes in (errors, received):
+        axes.set(yscale="log", ylabel="norm")
+        rows.append(Panels([axes], _NORM_IN))
+    for k, (t_s, samples) in enumerate(zip(times, aligned, strict=True)):  # the first run is on top
+        style: dict[str, Any] = {"linewidth": _NORM_LINE, "zorder": 3 - 0.1 * k}
+        draw_line(errors, t_s, samples.e_s_norm, series_colour(k), **style)
+        draw_line(errors, t_s, samples.threshold, series_colour(k), (5, 2), **style)
+        draw_line(received, t_s, samples.e_c_norm, series_colour(k), **style)
+    errors.set_title(r"Sensor's error $\|e_s\|$ and threshold (dashed)")
+    limit_decades(errors, np.concatenate([samples.e_s_norm for samples in aligned]), _DECADES)
+    received.set_title(r"Controller's error $\|e_c\|$")
+    limit_decades(received, np.concatenate([samples.e_c_norm for samples in aligned]), _DECADES)
+    rows.append(Panels([_draw_events(figure, runs)], _EVENTS_IN * (len(runs) + 1)))
+    for row in rows:
+        set_times(row.axes[0], longest, labelled=row is rows[-1])
+    return rows
+
+
+def _draw_events(figure: "Figure", runs: Sequence[ComparedRun]) -> "Axes":
+    """Draw a row of marks per run: a bar for a delivered transmission, a cross for a lost one."""
+    axes, heights = figure.add_axes((0, 0, 1, 1)), range(len(runs) - 1, -1, -1)
+    for number, (run, height) in enumerate(zip(runs, heights, strict=True)):
         sensor = run.record[SENSOR_MEASUREMENT]
         sent = sensor[sensor["event"] != NO_SEQUENCE]
         delivered = np.isin(sent["event"], run.record[CONTROLLER_DELIVERY]["sequence"])
-        t_s, heights = sent["t_ns"] / NS_PER_S, np.full(len(sent), float(row))
-        items += [
-            Marks(x=t_s[delivered], y=heights[delivered], marker="|", size=13.0, stroke=1.6,
-                  colour=series_colour(number)),
-            Marks(x=t_s[~delivered], y=heights[~delivered], marker="x", size=4.5, colour=palette.LOST,
-                  label="lost"),
-        ]  # fmt: skip
-    ticks = {float(row): run.label for row, run in zip(rows, runs, strict=True)}
-    y = Axis(ticks=ticks, ends=(-0.6, len(runs) - 0.4), grid=False)
-    title = "Transmissions (bar: delivered, cross: lost)"
-    return Panel(title=title, items=items, x=Axis(), y=y)
+        t_s, y = sent["t_ns"] / NS_PER_S, np.full(len(sent), float(height))
+        draw_marks(
+            axes, t_s[delivered], y[delivered], series_colour(number),
+            marker="|", markersize=13.0, markeredgewidth=1.6,
+        )  # fmt: skip
+        draw_marks(axes, t_s[~delivered], y[~delivered], palette.LOST, marker="x", markersize=4.5)
+    name_ticks(axes, "y", {float(height): run.label for height, run in zip(heights, runs, strict=True)})
+    axes.set(title="Transmissions (bar: delivered, cross: lost)", ylim=(-0.6, len(runs) - 0.4))
+    axes.grid(visible=False, axis="y")
+    return axes
 
 
 def print_comparison(console: Console, comparison: RunComparison, overlay: Path) -> None:

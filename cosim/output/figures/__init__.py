@@ -1,7 +1,7 @@
-"""Figures: described once, and drawn by matplotlib.
+"""Figures: functions that draw on the axes of matplotlib.
 
-``figure_description.py`` has the parts of a description. Those of a run are made in
-``run_figures.py``, ``timing_figures.py`` and ``network_figures.py``, those of a study beside it.
-``figure_layout.py`` gives all parts their places, ``figure_drawing.py`` draws them,
-``figure_files.py`` writes files.
+``run_figures.py``, ``timing_figures.py`` and ``network_figures.py`` draw those of a run; those of a
+study are beside it. ``axes_parts.py`` has what they share (curves, marks, axes), ``panels.py`` gives
+axes their places and legends, ``page_figure.py`` applies the style sheets, ``figure_files.py`` writes
+files.
 """

@@ -7,12 +7,8 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterable
 from pathlib import Path
 
-from matplotlib.figure import Figure
-
-from cosim.output.figures.figure_description import FigureDescription
-from cosim.output.figures.figure_drawing import draw
-from cosim.output.figures.figure_format import FigureFiles, FigureFormat, figure_width_in
-from cosim.output.figures.figure_layout import GRID, INK, PAPER, matplotlib_settings, use_figure_width
+from cosim.output.figures.figure_format import SCREEN_IN, FigureFiles, FigureFormat, figure_width_in
+from cosim.output.figures.page_figure import GRID, INK, PAPER, PageFigure, figure_style
 from cosim.record.run_directory import write_output
 from noack.core.errors import CallerError
 
@@ -31,7 +27,7 @@ _PAGE_COLOURS = {INK: "var(--ink)", GRID: "var(--grid)", PAPER: "var(--paper)"}
 FIGURE_SUFFIXES = tuple(f".{kind}" for kind in FigureFormat)
 
 
-def save_figure(figure: FigureDescription, path: Path, width: str | float | None = None) -> None:
+def save_figure(figure: PageFigure, path: Path, width: str | float | None = None) -> None:
     """Draw a figure for the width of a file, and write it in the format of the file's ending.
 
     Args:
@@ -49,7 +45,7 @@ def save_figure(figure: FigureDescription, path: Path, width: str | float | None
     write_output(path, file_content(figure, kind, figure_width_in(kind, width)))
 
 
-def save_figures(figures: Iterable[FigureDescription], page: Path, files: FigureFiles | None) -> list[Path]:
+def save_figures(figures: Iterable[PageFigure], page: Path, files: FigureFiles | None) -> list[Path]:
     """Write the figures of a page into ``PAGE-figures`` beside it; return the written files.
 
     Args:
@@ -69,29 +65,25 @@ def save_figures(figures: Iterable[FigureDescription], page: Path, files: Figure
     return written
 
 
-def file_content(figure: FigureDescription, kind: FigureFormat, width_in: float) -> bytes:
-    """Return a figure as the content of a file; a PDF has the fonts of LaTeX."""
-    with use_figure_width(width_in, latex=kind is FigureFormat.PDF):
-        return _file_bytes(draw(figure), kind)
-
-
-def _file_bytes(figure: Figure, kind: FigureFormat) -> bytes:
-    buffer = io.BytesIO()
-    with matplotlib_settings():
-        figure.savefig(buffer, format=kind, metadata=_WITHOUT_DATE[kind])
+def file_content(figure: PageFigure, kind: FigureFormat, width_in: float = SCREEN_IN) -> bytes:
+    """Return a figure as the content of a file; a PDF has the fonts of printed papers."""
+    buffer, is_print = io.BytesIO(), kind is FigureFormat.PDF
+    with figure_style(width_in, is_print=is_print):
+        drawing = figure.draw(width_in, is_print=is_print)
+        drawing.savefig(buffer, format=kind, metadata=_WITHOUT_DATE[kind])
     return buffer.getvalue()
 
 
-def inline(figure: FigureDescription) -> str:
+def inline(figure: PageFigure) -> str:
     """Return a figure as HTML: SVG with the page's colours, or PNG if the SVG would be large.
 
     The figure's name, a word, makes its ids unique on the page.
     """
-    drawing, description = draw(figure), figure.description or figure.caption
-    text = _page_svg(_file_bytes(drawing, FigureFormat.SVG), figure.name, description)
+    description = figure.description or figure.caption
+    text = _page_svg(file_content(figure, FigureFormat.SVG), figure.name, description)
     if len(text) <= _MOST_SVG_CHARACTERS:
         return text
-    picture = base64.b64encode(_file_bytes(drawing, FigureFormat.PNG)).decode()
+    picture = base64.b64encode(file_content(figure, FigureFormat.PNG)).decode()
     image = ET.Element("img", {"src": f"data:image/png;base64,{picture}", "alt": description})
     return ET.tostring(image, encoding="unicode")
 

@@ -14,7 +14,7 @@ _NARROWEST_IN, _WIDEST_IN = 3.0, 20.0
 
 
 class FigureFormat(StrEnum):
-    """Formats of figures; a PDF has the fonts of LaTeX."""
+    """Formats of figures; a PDF has the fonts of printed papers."""
 
     SVG = "svg"
     PNG = "png"

@@ -10,13 +10,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import groupby
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.claims.claim_evaluation import claims_of
 from cosim.output.curves import (
+    DASHED,
     BoundKind,
     Curve,
     Quantity,
@@ -28,22 +29,21 @@ from cosim.output.curves import (
     transmission_curves,
 )
 from cosim.output.figures import palette
-from cosim.output.figures.figure_description import (
-    Axis,
-    Bars,
-    FigureDescription,
-    Item,
-    Line,
-    Marks,
-    Panel,
-    PanelRow,
-    Rule,
+from cosim.output.figures.axes_parts import (
+    draw_bars,
+    draw_curve,
+    draw_marks,
     finite,
     label_text,
-    one_panel,
-    time_axis,
+    limit_decades,
+    mark_empty,
+    rgb,
+    set_times,
+    whole_numbers,
 )
+from cosim.output.figures.page_figure import PageFigure, one_panel
 from cosim.output.figures.palette import CONTROLLER, FORCED, LOST, SENSOR
+from cosim.output.figures.panels import Panels, columns
 from cosim.output.figures.timing_figures import (
     inter_event_figure,
     largest_text,
@@ -60,6 +60,10 @@ from noack.guarantee.loss_guarantee import LossesInWindow
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, PLANT_STEP, Fate
 from noack.protocol.wire_format import Flow
 from noack.scenario.scenario import Scenario
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 Flags = NDArray[np.bool_]
 Envelope = tuple[str, Quantity, Reals, Reals, BoundKind]
@@ -78,21 +82,11 @@ _FAR_RATIO, _FAR_OPACITY = 20.0, 0.45
 _MOST_NUMBERED_BARS = 12
 _NEAR_LIMIT, _NEAR_LIMIT_RATIO = 50, 10
 """A limit of losses is drawn up to this number, or to this multiple of the largest number that occurred."""
-_SYMBOLS = {
-    "x": "$x$",
-    "x_s": "$x_s$",
-    "x_c": "$x_c$",
-    "x̂": r"$\hat{x}$",
-    "‖x‖": r"$\|x\|$",
-    "‖e_s‖": r"$\|e_s\|$",
-    "‖e_c‖": r"$\|e_c\|$",
-}
-"""The symbols with which the names of curves begin, and how a figure writes them."""
 
 
 def run_figures(
     record: RunRecord, certified: Sequence[Envelope] = (), *, timed: bool | None = None
-) -> dict[str, Callable[[], FigureDescription]]:
+) -> dict[str, Callable[[], PageFigure]]:
     """Return functions that describe the figures of a loop, by name.
 
     Args:
@@ -106,9 +100,8 @@ def run_figures(
         with np.errstate(all="ignore"):  # a diverged run has figures, too
             return _thinned(record)
 
-    def bounds(quantity: Quantity) -> list[Line]:
-        curves = bound_curves(envelope for envelope in certified if envelope[1] == quantity)
-        return [_bound_line(curve) for curve in curves]
+    def bounds(quantity: Quantity) -> list[Curve]:
+        return bound_curves(envelope for envelope in certified if envelope[1] == quantity)
 
     figures = {
         "states": lambda: _states(record, aligned()),
@@ -140,27 +133,6 @@ def run_curves(record: RunRecord) -> list[Curve]:
         *transmission_curves(_seconds(events["t_ns"]), delivered),
         *bound_curves(envelopes(record)),
     ]
-
-
-def _line(curve: Curve, order: float = 2.0) -> Line:
-    """Return a curve for a figure, whose text names it by its symbol."""
-    symbol, _, source = curve.name.partition(" ")
-    label, style = f"{_SYMBOLS.get(symbol, symbol)} {source}".strip(), curve.style
-    return Line(
-        x=curve.t_s,
-        y=curve.values,
-        label=label,
-        colour=style.colour,
-        width=style.width,
-        dash=style.dash,
-        steps="post" if style.is_held else "",
-        order=order,
-    )
-
-
-def _bound_line(curve: Curve) -> Line:
-    """Return the curve of a bound, with gaps where it is 0: they show the curve behind."""
-    return replace(_line(curve), label=curve.name, y=finite(curve.values, positive=True))
 
 
 def envelopes(record: RunRecord) -> Sequence[Envelope]:
@@ -232,69 +204,34 @@ class Transmissions(NamedTuple):
     """(d,) whether the guarantee forced the delivery."""
 
 
-def states_figure(
-    mode: Literal["model", "zoh"],
-    title: str,
-    t_s: Reals,
-    states: Sequence[Curve],
-    transmissions: Transmissions,
-) -> FigureDescription:
-    """States, and broadcasting and receiving intervals: the paper's Fig. 2 and 3.
+def draw_states(
+    figure: "Figure", heading: str, t_s: Reals, states: Sequence[Curve], transmissions: Transmissions
+) -> list[Panels]:
+    """Draw states, and broadcasting and receiving intervals: the paper's Fig. 2 and 3.
 
     Args:
-        mode: ``model`` is the paper's MB-ET (Fig. 2), ``zoh`` its ZOH-ET (Fig. 3).
-        title: shown after "MB-ET" or "ZOH-ET".
+        figure: an empty one.
+        heading: its title; the number of states is added if only the first 16 are drawn.
         t_s: the times of the run.
-        states: their curves; the first 16 states are drawn.
+        states: the curves of the states.
         transmissions: what was sent and received.
     """
     by_state = [(name, [*curves]) for name, curves in groupby(states, lambda curve: curve.panel)]
-    n = len(by_state)
-    count = min(n, _MOST_STATES)
-    # A panel for each state; below, both kinds of intervals with a common vertical axis.
-    panels = [
-        Panel(
-            # Curves in front are thinner, so that equal curves stay visible.
-            items=[_line(curve, order=2.5 - 0.1 * curve.style.width) for curve in curves],
-            x=time_axis(t_s),
-            y=Axis(label=label_text(name)),
-            legend=() if i else None,
-        )
-        for i, (name, curves) in enumerate(by_state[:count])
-    ]
-    columns = _state_columns(count)
-    times_s = transmissions.sent_s, transmissions.received_s
-    between = [np.diff(times, prepend=np.nan) for times in times_s]
-    highest = 1.05 * max(np.nanmax(np.append(finite(gaps), 0.0)) for gaps in between) or None
-    y = Axis(label="interval [s]", ends=(0.0, highest))
-    intervals = [
-        Panel(
-            title="Broadcasting intervals",
-            items=_sent_marks(transmissions, between[0]),
-            x=time_axis(t_s, numbers=False),
-            y=y,
-        ),
-        Panel(
-            title="Receiving intervals",
-            items=_received_marks(transmissions, between[1]),
-            x=time_axis(t_s),
-            y=y,
-        ),
-    ]
-    head = "MB-ET" if mode == "model" else "ZOH-ET"
-    note = f" ({count} of {n} states)" if count < n else ""
-    of_states = PanelRow(
-        panels=panels,
-        height_in=1.45 if count <= 2 * columns else 1.15,
-        columns=columns,
-        common="x",
-        narrowest_in=_STATES_NARROWEST_IN,
-    )
-    return FigureDescription(
-        name="states",
-        heading=": ".join(filter(None, (head, label_text(title, _LONGEST_TITLE)))) + note,
-        rows=[of_states, *(PanelRow(panels=[panel], height_in=1.2) for panel in intervals)],
-    )
+    n, count = len(by_state), min(len(by_state), _MOST_STATES)
+    wide = columns(figure, _state_columns(count), _STATES_NARROWEST_IN)
+    panels = []
+    for i, (name, curves) in enumerate(by_state[:count]):
+        axes = figure.add_axes((0, 0, 1, 1))
+        for curve in curves:  # those in front are thinner, so that equal curves stay visible
+            style: dict[str, str] = {"label": ""} if i else {}
+            draw_curve(axes, curve, zorder=2.5 - 0.1 * curve.style.width, **style)
+        axes.set_ylabel(label_text(name))
+        set_times(axes, t_s, labelled=i + wide >= count)
+        panels.append(axes)
+    panels[0].set_title(heading + (f" ({count} of {n} states)" if count < n else ""))
+    height_in = 1.45 if count <= 2 * wide else 1.15
+    rows = [Panels(panels[i : i + wide], height_in, wide) for i in range(0, count, wide)]
+    return [*rows, *(Panels([axes], 1.2) for axes in _draw_intervals(figure, t_s, transmissions))]
 
 
 def _state_columns(count: int) -> int:
@@ -306,27 +243,31 @@ def _state_columns(count: int) -> int:
     return 3 if count <= 12 else 4
 
 
-def _sent_marks(transmissions: Transmissions, interval_s: Reals) -> list[Item]:
-    t_s, lost = transmissions.sent_s, transmissions.lost
-    arrived = Marks(x=t_s[~lost], y=interval_s[~lost], label="sent", colour=SENSOR, stems=SENSOR)
-    crosses = Marks(x=t_s[lost], y=interval_s[lost], label="sent, lost", colour=LOST, stems=SENSOR)
-    return [arrived, replace(crosses, marker="x", size=6.5, stroke=1.8)]
+def _draw_intervals(figure: "Figure", t_s: Reals, transmissions: Transmissions) -> "list[Axes]":
+    """Draw the times between transmissions and between deliveries; a lost packet is a cross."""
+    sent, received = figure.add_axes((0, 0, 1, 1)), figure.add_axes((0, 0, 1, 1))
+    sent_s, lost = transmissions.sent_s, transmissions.lost
+    received_s, forced = transmissions.received_s, transmissions.forced
+    since_sent, since_received = (np.diff(times, prepend=np.nan) for times in (sent_s, received_s))
+    lost_s = sent_s[lost]
+
+    draw_marks(sent, sent_s[~lost], since_sent[~lost], SENSOR, label="sent", stems=SENSOR)
+    draw_marks(sent, lost_s, since_sent[lost], LOST, label="sent, lost", stems=SENSOR,
+               marker="x", markersize=6.5, markeredgewidth=1.8)  # fmt: skip
+    draw_marks(received, received_s[~forced], since_received[~forced], CONTROLLER,
+               label="received", stems=CONTROLLER)  # fmt: skip
+    draw_marks(received, received_s[forced], since_received[forced], FORCED,
+               label="received, forced", stems=CONTROLLER, marker="D", markersize=6.0)  # fmt: skip
+    draw_marks(received, lost_s, np.zeros(len(lost_s)), LOST, label="lost", marker="x", zorder=3)
+
+    highest = max(np.nanmax(np.append(finite(gaps), 0.0)) for gaps in (since_sent, since_received))
+    for axes, title in ((sent, "Broadcasting intervals"), (received, "Receiving intervals")):
+        axes.set(title=title, ylabel="interval [s]", ylim=(0.0, 1.05 * highest or None))
+        set_times(axes, t_s, labelled=axes is received)
+    return [sent, received]
 
 
-def _received_marks(transmissions: Transmissions, interval_s: Reals) -> list[Item]:
-    t_s, forced = transmissions.received_s, transmissions.forced
-    lost_s = transmissions.sent_s[transmissions.lost]
-    dots = Marks(x=t_s[~forced], y=interval_s[~forced], label="received", colour=CONTROLLER)
-    diamonds = Marks(x=t_s[forced], y=interval_s[forced], label="received, forced", colour=FORCED)
-    crosses = Marks(x=lost_s, y=np.zeros(len(lost_s)), label="lost", colour=LOST, marker="x")
-    return [
-        replace(dots, stems=CONTROLLER),
-        replace(diamonds, marker="D", size=6.0, stems=CONTROLLER),
-        replace(crosses, order=3),
-    ]
-
-
-def _states(record: RunRecord, aligned: _Thinned) -> FigureDescription:
+def _states(record: RunRecord, aligned: _Thinned) -> PageFigure:
     outcomes, run, events = packet_outcomes(record), aligned.run, record.events()
     deliveries = record.columns(CONTROLLER_DELIVERY, "t_ns", "sequence")
     transmissions = Transmissions(
@@ -337,14 +278,17 @@ def _states(record: RunRecord, aligned: _Thinned) -> FigureDescription:
     )
     scenario, names = record.scenario, record.loop.state_names
     known, states = "x" if scenario.coverage.knows_state else "x̂", _states_of(record, aligned)
-    figure = states_figure(scenario.mode, scenario.name, _seconds(run.t_ns), states, transmissions)
-    return figure.captioned(
-        "States, and the times between transmissions and between deliveries: each stem is the time "
+    head = "MB-ET" if scenario.mode == "model" else "ZOH-ET"
+    heading = ": ".join(filter(None, (head, label_text(scenario.name, _LONGEST_TITLE))))
+    return PageFigure(
+        name="states",
+        draw_panels=lambda figure: draw_states(figure, heading, _seconds(run.t_ns), states, transmissions),
+        caption="States, and the times between transmissions and between deliveries: each stem is the time "
         "since the one before, so the first packet has none. "
         + scenario.protocol.states_caption.format(known=known)
         + _estimate_text(scenario)
         + "Cross: a lost packet. Diamond: a delivery that was forced by the guarantee.",
-        f"Above, the states {', '.join(names)} over time, each as x, x_s and x_c. "
+        description=f"Above, the states {', '.join(names)} over time, each as x, x_s and x_c. "
         f"Below, stems for {len(events)} transmissions, of which {int(transmissions.lost.sum())} were "
         f"lost, and for {len(deliveries)} deliveries, of which {int(transmissions.forced.sum())} were "
         "forced.",
@@ -374,52 +318,58 @@ def _estimate_text(scenario: Scenario) -> str:
 # Norms with their bounds, and inputs
 
 
-def _norms(
-    name: str, title: str, lines: Sequence[Line], height_in: float, bounds: Sequence[Line] = ()
-) -> FigureDescription:
-    """Describe a figure of norms; its axis is limited: resets fall to rounding errors."""
-    values = np.concatenate([line.y for line in lines])
-    y = Axis(label="norm", logarithmic=True, about=values, decades=_DECADES)
-    items = [replace(bound, opacity=_FAR_OPACITY) if _is_far(bound, lines) else bound for bound in bounds]
-    panel = Panel(title=title, items=[*lines, *items], x=time_axis(lines[0].x), y=y)
-    return one_panel(name, panel, height_in)
+def draw_norms(axes: "Axes", title: str, curves: Sequence[Curve], bounds: Sequence[Curve] = ()) -> None:
+    """Draw norms, and bounds of them; the axis is limited: resets fall to rounding errors."""
+    axes.set(title=title, ylabel="norm", yscale="log")
+    for curve in curves:
+        draw_curve(axes, curve)
+    for bound in bounds:
+        # With gaps where it is 0: they show the curve behind.
+        shown = replace(bound, values=finite(bound.values, positive=True))
+        draw_curve(axes, shown, label=bound.name, alpha=_FAR_OPACITY if _is_far(shown, curves) else 1.0)
+    limit_decades(axes, np.concatenate([curve.values for curve in curves]), _DECADES)
+    set_times(axes, curves[0].t_s)
 
 
 @np.errstate(all="ignore")
-def _is_far(bound: Line, curves: Sequence[Line]) -> bool:
+def _is_far(bound: Curve, curves: Sequence[Curve]) -> bool:
     """Whether a bound is many times larger than the curves, most of the time."""
-    if not len(bound.x) or not all(len(curve.x) for curve in curves):
+    if not len(bound.t_s) or not all(len(curve.t_s) for curve in curves):
         return False
-    at_bound = [np.interp(bound.x, curve.x, curve.y) for curve in curves]
-    ratios = bound.y / np.fmax.reduce(at_bound)
+    at_bound = [np.interp(bound.t_s, curve.t_s, curve.values) for curve in curves]
+    ratios = bound.values / np.fmax.reduce(at_bound)
     finite_ratios = ratios[np.isfinite(ratios)]
     return len(finite_ratios) > 0 and bool(np.median(finite_ratios) > _FAR_RATIO)
 
 
-def _errors(scenario: Scenario, run: AlignedRun, bounds: list[Line]) -> FigureDescription:
-    lines = [_line(curve) for curve in _errors_of(run)]
+def _errors(scenario: Scenario, run: AlignedRun, bounds: list[Curve]) -> PageFigure:
     relative = " Both are relative to x̂, the sensor's estimate of x."
-    return _norms("errors", "Error norms", lines, 2.7, bounds).captioned(
-        scenario.protocol.error_caption
+    return one_panel(
+        "errors",
+        2.7,
+        lambda axes: draw_norms(axes, "Error norms", _errors_of(run), bounds),
+        caption=scenario.protocol.error_caption
         + ("" if scenario.coverage.knows_state else relative)
         + _dashed(bounds),
-        "Error norms over time on a logarithmic axis: "
+        description="Error norms over time on a logarithmic axis: "
         f"‖e_s‖ up to {largest_text(run.e_s_norm)}, ‖e_c‖ up to {largest_text(run.e_c_norm)}.",
     )
 
 
-def _state_norm(record: RunRecord, bounds: list[Line]) -> FigureDescription:
+def _state_norm(record: RunRecord, bounds: list[Curve]) -> PageFigure:
     t_s, norm = _decimated(record, PLANT_STEP, "x", row_norms)
-    line = _line(norm_curve(t_s, norm))
     ends = f", from {norm[0]:.3g} to {norm[-1]:.3g}" if len(norm) else ""
-    return _norms("state-norm", "Norm of the state", [line], 2.1, bounds).captioned(
-        "Norm of the plant's state." + _dashed(bounds),
-        f"Norm of the state over time on a logarithmic axis{ends}.",
+    return one_panel(
+        "state-norm",
+        2.1,
+        lambda axes: draw_norms(axes, "Norm of the state", [norm_curve(t_s, norm)], bounds),
+        caption="Norm of the plant's state." + _dashed(bounds),
+        description=f"Norm of the state over time on a logarithmic axis{ends}.",
     )
 
 
-def _input(record: RunRecord) -> FigureDescription:
-    """Describe the inputs, each of which is held until the next."""
+def _input(record: RunRecord) -> PageFigure:
+    """Return the figure of the inputs, each of which is held until the next."""
     names, table = record.loop.input_names, CONTROLLER_STEP
     title, caption = "Control input $u = K x_c$", "Control input u = K x_c, held between ticks."
     if record.scenario.controller.update_timeout_s is not None:
@@ -428,15 +378,23 @@ def _input(record: RunRecord) -> FigureDescription:
         table, title = PLANT_STEP, "Applied input"
         caption = "Input that the plant applied, also while actuations were missing."
     t_s, u = _decimated(record, table, "u")
-    lines = [replace(_line(curve), label=label_text(curve.name)) for curve in input_curves(names, t_s, u)]
-    panel = Panel(title=title, items=lines, x=time_axis(t_s), y=Axis(label="input"))
-    return one_panel("input", panel, 1.7).captioned(
-        f"{caption} Equal inputs are drawn one inside the other.",
-        f"Control inputs {', '.join(names)} over time.",
+
+    def draw(axes: "Axes") -> None:
+        for curve in input_curves(names, t_s, u):
+            draw_curve(axes, curve, label=label_text(curve.name))
+        axes.set(title=title, ylabel="input")
+        set_times(axes, t_s)
+
+    return one_panel(
+        "input",
+        1.7,
+        draw,
+        caption=f"{caption} Equal inputs are drawn one inside the other.",
+        description=f"Control inputs {', '.join(names)} over time.",
     )
 
 
-def _dashed(curves: Sequence[Line]) -> str:
+def _dashed(curves: Sequence[Curve]) -> str:
     if not curves:
         return ""
     return f" Dashed: claimed bounds; a pale one is mostly over {_FAR_RATIO:g} times the curves."
@@ -446,36 +404,47 @@ def _seconds(t_ns: NDArray[np.int64]) -> Reals:
     return np.asarray(t_ns / NS_PER_S, dtype=np.float64)
 
 
-def _losses(record: RunRecord) -> FigureDescription:
-    """Describe the losses that occurred, beside what the guarantee allows."""
+def _losses(record: RunRecord) -> PageFigure:
+    """Return the figure of the losses that occurred, beside what the guarantee allows."""
     outcomes, network = packet_outcomes(record), record.scenario.network
     bursts, longest = outcomes.loss_bursts(), network.longest_burst
-    title, consecutive, actuation_text = "Consecutive losses", "consecutive losses", ""
-    panels = [_loss_panel(title, consecutive, "bursts", bursts, longest)]
+    panels: list[tuple[str, str, str, NDArray[np.int64], int | None]] = []
+    panels.append(("Consecutive losses", "consecutive losses", "bursts", bursts, longest))
     for rule in network.guarantee.rules[:3]:
         if isinstance(rule, LossesInWindow):
-            title = f"Losses in {rule.window} updates"
-            label = f"losses in {rule.window} consecutive updates"
-            counts = outcomes.losses_in(rule.window)
-            panels.append(_loss_panel(title, label, "positions", counts, rule.limit))
+            title, label = f"Losses in {rule.window} updates", f"losses in {rule.window} consecutive updates"
+            panels.append((title, label, "positions", outcomes.losses_in(rule.window), rule.limit))
+    actuation_text = ""
     if (actuation := network.actuation) is not None:
-        lost = packet_outcomes(record, Flow.ACTUATION).loss_bursts()
-        limit, label = actuation.link.longest_burst, "consecutive lost actuations"
-        panels.append(_loss_panel("Of actuations", label, "bursts", lost, limit))
+        lost, label = packet_outcomes(record, Flow.ACTUATION).loss_bursts(), "consecutive lost actuations"
+        panels.append(("Of actuations", label, "bursts", lost, actuation.link.longest_burst))
         actuation_text = " Last panel: the same of actuations."
-    narrowest_in, widest_in = _LOSSES_NARROWEST_IN, _LOSSES_WIDEST_IN
-    row = PanelRow(panels=panels, height_in=1.9, narrowest_in=narrowest_in, widest_in=widest_in)
+
+    def draw(figure: "Figure") -> list[Panels]:
+        axes = [figure.add_axes((0, 0, 1, 1)) for _ in panels]
+        for one, panel in zip(axes, panels, strict=True):
+            draw_losses(one, *panel)
+        wide = columns(figure, len(panels), _LOSSES_NARROWEST_IN)
+        return [
+            Panels(axes[i : i + wide], 1.9, wide, widest_in=_LOSSES_WIDEST_IN)
+            for i in range(0, len(axes), wide)
+        ]
+
     limit_name = "the guarantee" if network.enforce_mansd else "the assumption (not enforced)"
-    return FigureDescription(name="losses", rows=[row]).captioned(
-        "Effective losses of updates: dropped, corrupted, or delivered out of order. "
+    return PageFigure(
+        name="losses",
+        draw_panels=draw,
+        caption="Effective losses of updates: dropped, corrupted, or delivered out of order. "
         f"Dashed: the largest number that {limit_name} allows: {network.guarantee.meaning}.{actuation_text}",
-        f"{len(bursts)} bursts of losses, the longest of {int(bursts.max(initial=0))}; at most "
+        description=f"{len(bursts)} bursts of losses, the longest of {int(bursts.max(initial=0))}; at most "
         f"{longest} consecutive losses are allowed.",
     )
 
 
-def _loss_panel(title: str, label: str, counted: str, values: NDArray[np.int64], limit: int | None) -> Panel:
-    """Describe a histogram of whole numbers (k,), and the largest number that is allowed.
+def draw_losses(
+    axes: "Axes", title: str, label: str, counted: str, values: NDArray[np.int64], limit: int | None
+) -> None:
+    """Draw a histogram of whole numbers (k,), and the largest number that is allowed.
 
     A limit that is far beyond all numbers is in the label only: beside it no bar could be seen.
     """
@@ -484,16 +453,16 @@ def _loss_panel(title: str, label: str, counted: str, values: NDArray[np.int64],
     if limit is not None and limit > max(_NEAR_LIMIT, _NEAR_LIMIT_RATIO * high):
         label, limit = f"{label} (allowed: {limit:,})", None
     high = max(high, limit or 1)
-    bars = Bars(
-        edges=np.arange(low, high + 2) - 0.5,
-        heights=np.array([counts[number] for number in range(low, high + 1)], np.float64),
-        colour=LOST,
-        share=0.8,
-        numbers=len(counts) <= _MOST_NUMBERED_BARS,
-    )
-    items: list[Item] = [bars]
+    heights = np.array([counts[number] for number in range(low, high + 1)], np.float64)
+    draw_bars(axes, np.arange(low, high + 2) - 0.5, heights, LOST, share=0.8)
+    mark_empty(axes, "no loss")
+    if 0 < len(counts) <= _MOST_NUMBERED_BARS:
+        axes.margins(y=0.15)
+        for number, count in counts.items():
+            axes.text(number, count, f"{count:,g}", ha="center", va="bottom", size="small")
     if limit is not None:
-        items.append(Rule(at=limit + 0.5, colour=palette.CERTIFIED, vertical=True))
-    x = Axis(label=label, ends=(low - 0.6, high + 0.9), whole=True, grid=False)
-    y = Axis(label=counted, whole=True)
-    return Panel(title=title, items=items, x=x, y=y, empty="no loss")
+        axes.axvline(limit + 0.5, color=rgb(palette.CERTIFIED), dashes=DASHED, linewidth=1.6)
+    axes.set(title=title, xlabel=label, ylabel=counted, xlim=(low - 0.6, high + 0.9))
+    axes.grid(visible=False, axis="x")
+    whole_numbers(axes, "x")
+    whole_numbers(axes, "y")

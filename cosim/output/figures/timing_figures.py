@@ -1,83 +1,93 @@
 """The figures of a loop's times: between events, latencies, lateness of its processes, their clocks."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cosim.analysis.summary.loop_statistics import latency_us, lateness_parts
 from cosim.analysis.summary.quantiles import QuantileSketch
-from cosim.output.curves import DASHES
+from cosim.output.curves import DASHES, Curve
 from cosim.output.figures import palette
-from cosim.output.figures.figure_description import (
+from cosim.output.figures.axes_parts import (
     TIME,
-    Axis,
-    Bars,
-    FigureDescription,
-    Item,
-    Line,
-    Marks,
-    Panel,
-    Rule,
+    draw_bars,
+    draw_curve,
+    draw_line,
+    draw_marks,
     finite,
     histogram,
-    one_panel,
+    rgb,
+    whole_numbers,
 )
-from cosim.output.figures.palette import CONTROLLER, SENSOR, THRESHOLD
+from cosim.output.figures.page_figure import PAPER, PageFigure, one_panel
+from cosim.output.figures.palette import CONTROLLER, SENSOR, THRESHOLD, Colour
+from cosim.output.figures.panels import Panels
 from cosim.record.align import Reals
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NS_PER_S
 from noack.protocol.roles import LOOP_ROLES
 
-Flags = NDArray[np.bool_]
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 _RANKS = 120
 """Points of a distribution, with a logarithmic and again with a linear spacing."""
 _SHORTEST_US = 0.1  # a logarithmic axis has no zero
 
 
 def _times_figure(
-    name: str, title: str, dots: Marks, label: str, until_s: float, bounds: Sequence[Line] = ()
-) -> FigureDescription:
-    """Describe values over time, and their histogram on the same logarithmic axis."""
-    edges, counts = histogram(dots.y)
-    bars = Bars(edges=edges, heights=counts, colour=dots.colour, share=0.9, horizontal=True)
-    least = [
-        Rule(at=float(line.y.min()), colour=line.colour, dash=line.dash) for line in bounds if len(line.y)
-    ]
-    counted = Axis(label="count", whole=True)
-    panel = Panel(
-        title=title,
-        items=[*bounds, dots],
-        x=Axis(label=TIME, ends=(0.0, float(dots.x.max(initial=until_s)))),
-        y=Axis(label=label, logarithmic=True),
-        beside=Panel(items=[bars, *least], x=counted, y=Axis(logarithmic=True)),
-    )
-    return one_panel(name, panel, 2.1)
+    name: str, title: str, label: str, until_s: float, t_s: Reals, values: Reals, colour: Colour,
+    bounds: Sequence[Curve] = (), **texts: str,
+) -> PageFigure:  # fmt: skip
+    """Return a figure of values over time, and their histogram on the same logarithmic axis."""
+
+    def draw(figure: "Figure") -> list[Panels]:
+        axes = figure.add_axes((0, 0, 1, 1))
+        axes.set(yscale="log", title=title, ylabel=label, xlabel=TIME, xlim=(0.0, t_s.max(initial=until_s)))
+        counted = figure.add_axes((0, 0, 1, 1), sharey=axes)
+        edges, counts = histogram(values)
+        draw_bars(counted, edges, counts, colour, share=0.9, is_horizontal=True)
+        for bound in bounds:
+            draw_curve(axes, bound, label=bound.name)
+            if len(bound.values):
+                style = bound.style
+                counted.axhline(
+                    bound.values.min(), color=rgb(style.colour), linewidth=1.6, dashes=style.dash or (1, 0)
+                )
+        draw_marks(axes, t_s, values, colour, markeredgecolor=PAPER, markeredgewidth=0.5)
+        counted.set_xlabel("count")
+        counted.tick_params(which="both", labelleft=False)
+        whole_numbers(counted, "x")
+        return [Panels([axes, counted], 2.1, beside_in=2.0)]
+
+    return PageFigure(name=name, draw_panels=draw, **texts)
 
 
-def inter_event_figure(record: RunRecord, bounds: Sequence[Line]) -> FigureDescription:
-    """Describe the times between successive events."""
+def inter_event_figure(record: RunRecord, bounds: Sequence[Curve]) -> PageFigure:
+    """Return the figure of the times between successive events."""
     event_s, horizon_s = record.events()["t_ns"] / NS_PER_S, record.scenario.horizon_s
-    interval_s, title = np.diff(event_s), "Inter-event times"
-    dots = Marks(x=event_s[1:], y=interval_s, colour=SENSOR, framed=True)
+    interval_s = np.diff(event_s)
     shortest = f", the shortest {interval_s.min():.3g} s" if len(interval_s) else ""
-    label = "inter-event time [s]"
-    return _times_figure("inter-event", title, dots, label, horizon_s, bounds).captioned(
-        "Inter-event times, over time and as a histogram." + (" Dashed: claimed bounds." if bounds else ""),
-        f"Inter-event times on a logarithmic axis{shortest}.",
-    )
+    return _times_figure(
+        "inter-event", "Inter-event times", "inter-event time [s]",
+        horizon_s, event_s[1:], interval_s, SENSOR, bounds,
+        caption="Inter-event times, over time and as a histogram."
+        + (" Dashed: claimed bounds." if bounds else ""),
+        description=f"Inter-event times on a logarithmic axis{shortest}.",
+    )  # fmt: skip
 
 
-def latency_figure(record: RunRecord) -> FigureDescription:
-    """Describe the wall time from each event to the update of the controller."""
+def latency_figure(record: RunRecord) -> PageFigure:
+    """Return the figure of the wall time from each event to the update of the controller."""
     event_ns, taken_us = latency_us(record)
-    dots = Marks(x=event_ns / NS_PER_S, y=taken_us, colour=CONTROLLER, framed=True)
-    title, horizon_s = "Sensor-to-controller latency", record.scenario.horizon_s
-    return _times_figure("latency", title, dots, "latency [wall µs]", horizon_s).captioned(
-        "Sensor-to-controller latency: wall time from the event to the controller's update.",
-        f"Latencies of {len(taken_us)} updates, the longest {largest_text(taken_us)} µs.",
-    )
+    return _times_figure(
+        "latency", "Sensor-to-controller latency", "latency [wall µs]",
+        record.scenario.horizon_s, event_ns / NS_PER_S, taken_us, CONTROLLER,
+        caption="Sensor-to-controller latency: wall time from the event to the controller's update.",
+        description=f"Latencies of {len(taken_us)} updates, the longest {largest_text(taken_us)} µs.",
+    )  # fmt: skip
 
 
 def largest_text(values: Reals) -> str:
@@ -86,29 +96,35 @@ def largest_text(values: Reals) -> str:
     return f"{values.max():.3g}" if len(values) else "unknown"
 
 
-def lateness_figure(record: RunRecord) -> FigureDescription:
-    """Describe the share of each process's steps with at least a given lateness."""
-    scenario, items, longest = record.scenario, list[Item](), list[str]()
-    for i, role in enumerate(LOOP_ROLES):
-        late_us = QuantileSketch.of(lateness_parts(record, role))
-        most = late_us.quantiles(1.0)[0]
-        longest.append(f"{role} {'unknown' if most is None else f'{most:.3g}'} µs")
-        x, y = later_than(late_us)
-        colour, dash = palette.PROCESSES[role], DASHES[i % len(DASHES)]
-        items.append(Line(x=x, y=y, label=role, colour=colour, steps="pre", width=1.8, dash=dash))
-    period_us = scenario.timing.plant_period_ns / (1e3 * scenario.speed)
-    period = Rule(at=period_us, colour=THRESHOLD, label="one period", vertical=True, width=1.2)
-    panel = Panel(
-        title="Lateness",
-        items=[*items, replace(period, dash=(4, 3))],
-        x=Axis(label="lateness [wall µs]", logarithmic=True),
-        y=Axis(label="share of steps at least as late", logarithmic=True),
-    )
-    return one_panel("lateness", panel, 2.5).captioned(
-        "Share of a process's steps with at least this lateness. Lateness is measured "
+def lateness_figure(record: RunRecord) -> PageFigure:
+    """Return the figure of the share of each process's steps with at least a given lateness."""
+    scenario = record.scenario
+    late_us = {role: QuantileSketch.of(lateness_parts(record, role)) for role in LOOP_ROLES}
+    largest = {role: values.quantiles(1.0)[0] for role, values in late_us.items()}
+    longest = [f"{role} {'unknown' if most is None else f'{most:.3g}'} µs" for role, most in largest.items()]
+
+    def draw(axes: "Axes") -> None:
+        axes.set(
+            title="Lateness", xscale="log", xlabel="lateness [wall µs]",
+            yscale="log", ylabel="share of steps at least as late",
+        )  # fmt: skip
+        for i, (role, values) in enumerate(late_us.items()):
+            draw_line(
+                axes, *later_than(values), palette.PROCESSES[role], DASHES[i % len(DASHES)],
+                label=role, linewidth=1.8, drawstyle="steps-pre",
+            )  # fmt: skip
+        period_us = scenario.timing.plant_period_ns / (1e3 * scenario.speed)
+        axes.axvline(period_us, color=rgb(THRESHOLD), label="one period", linewidth=1.2, dashes=(4, 3))
+
+    return one_panel(
+        "lateness",
+        2.5,
+        draw,
+        caption="Share of a process's steps with at least this lateness. Lateness is measured "
         "from the deadline (plant, controller), the time of the measurement (sensor), or the "
         "arrival of the datagram at the socket (network).",
-        f"Complementary distribution of lateness on logarithmic axes; maximum: {', '.join(longest)}.",
+        description=f"Complementary distribution of lateness on logarithmic axes; "
+        f"maximum: {', '.join(longest)}.",
     )
 
 

@@ -3,22 +3,15 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from cosim.analysis.margin_search import stability_document
+from cosim.output.curves import DASHED
 from cosim.output.figures import palette
-from cosim.output.figures.figure_description import (
-    Axis,
-    FigureDescription,
-    Item,
-    Line,
-    Marks,
-    Panel,
-    Rule,
-    one_panel,
-)
+from cosim.output.figures.axes_parts import draw_line, rgb, whole_numbers
+from cosim.output.figures.page_figure import PageFigure, one_panel
 from cosim.studies.design.design_search import designed_name
 from cosim.studies.design.network_search import CertifiedLoop, DesignRequest, NetworkSearch, Progress
 from noack.core.clock import NS_PER_S
@@ -26,6 +19,9 @@ from noack.core.number_format import NONE, at_least, at_most
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import dumps, toml_text
 from noack.settings.section import MatrixRows
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _GROWTH_CAPTION = (
     "Growth of the worst loss pattern found, per period: a lower bound, quickly computed. Below 1 "
@@ -64,7 +60,7 @@ class DesignOutcome:
     """Whether it is another loop than the given one."""
     document: dict[str, object]
     """The limits and the size of the search, as JSON."""
-    figure: FigureDescription
+    figure: PageFigure
 
     @property
     def verdict(self) -> str:
@@ -165,19 +161,28 @@ def _beyond_text(loop: CertifiedLoop) -> str:
     return f"M = {loop.m + 1}: {f'{loop.beyond.text} destabilises' if destabilised else 'undecided'}"
 
 
-def _growth_figure(search: NetworkSearch, given: CertifiedLoop, best: CertifiedLoop) -> FigureDescription:
-    """Describe the growth of both loops over M."""
+def _growth_figure(search: NetworkSearch, given: CertifiedLoop, best: CertifiedLoop) -> PageFigure:
+    """Return the growth of both loops over M."""
     numbers = np.arange(1, min(max(best.m, given.m) + 4, search.most) + 1)
-    items: list[Item] = [Rule(at=1.0, colour=palette.CERTIFIED, label="stable below")]
-    for loop, label, colour in ((given, "given", palette.NETWORK), (best, "designed", palette.LOST)):
-        growth = np.exp(np.minimum([search.growth(loop.K, int(m)) for m in numbers], 1.1))
-        items.append(Line(x=numbers.astype(float), y=growth, colour=colour, label=label, marker="o"))
-        if loop.stability is not None:
-            x, y = np.array([float(loop.m)]), np.array([loop.stability.upper])
-            mark_label = f"{label}: proven"
-            items.append(Marks(x=x, y=y, colour=colour, marker="*", size=12, label=mark_label))
-    panel = Panel(items=items, x=Axis(label="M", whole=True), y=Axis(label="growth per period"))
-    return one_panel("growth", panel, HEIGHT_IN).captioned(_GROWTH_CAPTION)
+    loops = ((given, "given", palette.NETWORK), (best, "designed", palette.LOST))
+    growth = {
+        label: np.exp(np.minimum([search.growth(loop.K, int(m)) for m in numbers], 1.1))
+        for loop, label, _ in loops
+    }
+
+    def draw(axes: "Axes") -> None:
+        axes.axhline(1.0, color=rgb(palette.CERTIFIED), label="stable below", dashes=DASHED, linewidth=1.6)
+        for loop, label, colour in loops:
+            draw_line(axes, numbers.astype(float), growth[label], colour, label=label, marker="o")
+            if loop.stability is not None:
+                axes.plot(
+                    loop.m, loop.stability.upper, "*", color=rgb(colour), markersize=12,
+                    label=f"{label}: proven",
+                )  # fmt: skip
+        axes.set(xlabel="M", ylabel="growth per period")
+        whole_numbers(axes, "x")
+
+    return one_panel("growth", HEIGHT_IN, draw, caption=_GROWTH_CAPTION)
 
 
 def design_for_network(

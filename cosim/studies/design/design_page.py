@@ -5,26 +5,17 @@ for a network (:class:`~cosim.studies.design.design_outcome.DesignOutcome`).
 """
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.console import Console
 
+from cosim.output.curves import DASHED
 from cosim.output.figures import palette
-from cosim.output.figures.figure_description import (
-    MARKERS,
-    Axis,
-    FigureDescription,
-    Item,
-    Line,
-    Marks,
-    Panel,
-    Rule,
-    label_text,
-    one_panel,
-    series_colour,
-)
+from cosim.output.figures.axes_parts import MARKERS, draw_line, draw_points, label_text, rgb, series_colour
 from cosim.output.figures.figure_files import save_figures
 from cosim.output.figures.figure_format import FigureFiles
+from cosim.output.figures.page_figure import PageFigure, one_panel
 from cosim.output.page_kit import templates
 from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.record.run_directory import write_output
@@ -32,6 +23,9 @@ from cosim.studies.design.design_outcome import HEIGHT_IN, DesignOutcome
 from cosim.studies.design.design_search import WORDS, DesignResult, certified
 from noack.core.number_format import plus_minus
 from noack.scenario.scenario_file import dumps
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _CAPTION = (
     "Mean number of transmissions and quantile of the settling times of each candidate, all on the "
@@ -44,9 +38,7 @@ HEADINGS = ("transmissions", "settling time", "α [1/s]", "β", "weight", "gain"
 _LOOP_HEADINGS = ("", "given", "designed")
 
 
-def _write(
-    path: Path, figure: FigureDescription, figure_files: FigureFiles | None, **content: object
-) -> list[Path]:
+def _write(path: Path, figure: PageFigure, figure_files: FigureFiles | None, **content: object) -> list[Path]:
     template = templates(Path(__file__).parent).get_template("design.html.jinja")
     html = template.render(figure=figure, **content)
     return [write_output(path, html), *save_figures([figure], path, figure_files)]
@@ -81,45 +73,40 @@ def write_page(result: DesignResult, path: Path, figure_files: FigureFiles | Non
     )
 
 
-def trade_off(result: DesignResult) -> FigureDescription:
-    """Describe all tried candidates, the trade-off curve, the limit and the chosen candidate."""
-    items: list[Item] = []
+def trade_off(result: DesignResult) -> PageFigure:
+    """Return all tried candidates, the trade-off curve, the limit and the chosen candidate."""
+    return one_panel("trade-off", HEIGHT_IN, lambda axes: _draw_trade_off(axes, result), caption=_CAPTION)
+
+
+def _draw_trade_off(axes: "Axes", result: DesignResult) -> None:
+    if any(np.isfinite(trial.measured.settling_s) for trial in result.trials):
+        axes.set_xscale("log")
     for i, family in enumerate(result.space.families):
-        family_measures = [t.measured for t in result.trials if t.candidate.family == i]
-        family_measures = [m for m in family_measures if np.isfinite(m.settling_s)]
-        items.append(
-            Marks(
-                x=np.array([m.transmissions for m in family_measures]),
-                y=np.array([m.settling_s for m in family_measures]),
-                label=label_text(f"W {family.name}", 24),
-                colour=series_colour(i),
-                marker=MARKERS[i % len(MARKERS)],
-                size=3.5,
-                opacity=0.5,
-                reduced=False,
-            )
-        )
+        measured = [t.measured for t in result.trials if t.candidate.family == i]
+        measured = [m for m in measured if np.isfinite(m.settling_s)]
+        axes.plot(
+            [m.transmissions for m in measured], [m.settling_s for m in measured],
+            MARKERS[i % len(MARKERS)], color=rgb(series_colour(i)), markersize=3.5, alpha=0.5,
+            label=label_text(f"W {family.name}", 24),
+        )  # fmt: skip
     front, best = [trial.measured for trial in result.front], result.fresh
-    high_s = best.settling_high_s if np.isfinite(best.settling_high_s) else best.settling_s
-    items += [
-        Line(x=np.array([m.transmissions for m in front]),
-             y=np.array([m.settling_s for m in front]), label="trade-off", steps="post",
-             colour=palette.NETWORK, width=1.4),
-        Rule(at=result.limits.settling_s, colour=palette.CERTIFIED, label="limit"),
-        Marks(x=np.array([best.transmissions]), y=np.array([best.settling_s]), marker="*",
-              size=12, colour=palette.LOST,
-              label="the choice" if result.feasible else "the closest",
-              x_error=np.array([best.halfwidth]),
-              y_error=np.array([[best.settling_s - best.settling_low_s],
-                                [high_s - best.settling_s]])),
-    ]  # fmt: skip
-    settles = any(np.isfinite(trial.measured.settling_s) for trial in result.trials)
-    panel = Panel(
-        items=items,
-        x=Axis(label="transmissions (mean)", logarithmic=settles),
-        y=Axis(label=f"settling time, {100 * result.limits.quantile:g} % quantile [s]"),
+    draw_line(
+        axes, np.array([m.transmissions for m in front]), np.array([m.settling_s for m in front]),
+        palette.NETWORK, label="trade-off", drawstyle="steps-post", linewidth=1.4,
+    )  # fmt: skip
+    axes.axhline(
+        result.limits.settling_s, color=rgb(palette.CERTIFIED), label="limit", dashes=DASHED, linewidth=1.6
     )
-    return one_panel("trade-off", panel, HEIGHT_IN).captioned(_CAPTION)
+    high_s = best.settling_high_s if np.isfinite(best.settling_high_s) else best.settling_s
+    draw_points(
+        axes, np.array([best.transmissions]), np.array([best.settling_s]), np.array([best.halfwidth]),
+        np.array([[best.settling_s - best.settling_low_s], [high_s - best.settling_s]]), palette.LOST,
+        marker="*", markersize=12, label="the choice" if result.feasible else "the closest",
+    )  # fmt: skip
+    axes.set(
+        xlabel="transmissions (mean)",
+        ylabel=f"settling time, {100 * result.limits.quantile:g} % quantile [s]",
+    )
 
 
 def rows(result: DesignResult) -> list[tuple[str, ...]]:

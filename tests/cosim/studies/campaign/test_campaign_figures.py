@@ -1,26 +1,34 @@
 """The figures of a campaign."""
 
 import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosim.output.figures.figure_description import Band
 from cosim.output.figures.figure_files import inline
+from cosim.output.figures.page_figure import PageFigure, one_panel
 from cosim.studies.campaign.campaign_figures import (
     _left_out,
-    curve_figure,
-    distribution_figure,
-    heat_map_figure,
-    pareto_figure,
+    draw_distribution,
+    draw_heat_maps,
+    draw_means,
+    draw_pareto,
     undominated,
 )
 from cosim.studies.campaign.campaign_file import CampaignAxis
 from cosim.studies.campaign.campaign_report import metric_text
 from cosim.studies.campaign.metrics import estimate
 from tests.cosim.studies.campaign.conftest import HOSTILE
+
+
+def one(draw: Callable[..., None], *shown: Any) -> PageFigure:
+    return one_panel("figure", 2.0, lambda axes: draw(axes, *shown))
+
 
 points = st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), min_size=1, max_size=12)
 
@@ -51,15 +59,21 @@ def test_figures_and_texts_accept_infinite_single_and_many_values() -> None:
         series = {f"series {i}": values for i in range(12)}
         pairs = {name: (values, list(reversed(values))) for name in series}
         drawn += [
-            pareto_figure(pairs, "transmissions", "cost"),
-            curve_figure(None, labels, series, HOSTILE, "cost"),
+            one(draw_pareto, pairs, "transmissions", "cost"),
+            one(draw_means, None, labels, series, HOSTILE, "cost"),
         ]
-    drawn.append(curve_figure(np.array([1.0]), ["1"], {"a": [single]}, "x", "settling_s"))
+    drawn.append(one(draw_means, np.array([1.0]), ["1"], {"a": [single]}, "x", "settling_s"))
     for matrix in (np.full((2, 3), np.nan), np.array([[1.0, np.nan, 1e9]])):
         rows = (("x", ["a", "b", "c"]), ("y", ["d", "e"][: len(matrix)]))
-        drawn.append(heat_map_figure({f"map {i}": matrix for i in range(4)}, *rows, "cost"))
-    values = {"a": np.full(3, math.inf), "b": np.array([1.0]), "c": np.geomspace(1e-3, 1e3, 9)}
-    drawn.append(distribution_figure(values, "cost"))
+        maps = {f"map {i}": matrix for i in range(4)}
+        drawn.append(
+            PageFigure(
+                name="maps",
+                draw_panels=partial(draw_heat_maps, maps=maps, x=rows[0], y=rows[1], metric="cost"),
+            )
+        )
+    samples = {"a": np.full(3, math.inf), "b": np.array([1.0]), "c": np.geomspace(1e-3, 1e3, 9)}
+    drawn.append(one(draw_distribution, samples, "cost"))
     for figure in drawn:
         assert inline(figure).startswith("<svg")
 
@@ -79,8 +93,9 @@ def test_an_axis_has_the_unit_of_its_key_and_is_logarithmic_if_its_values_grow_b
 ) -> None:
     axis = CampaignAxis(name="rate", key=key, values=values)
     series = {"a": [estimate(np.ones(3)) for _ in values]}
-    drawn = curve_figure(np.array(values, np.float64), axis.labels, series, axis.heading, "cost")
-    assert (drawn.rows[0].panels[0].x.label, drawn.rows[0].panels[0].x.logarithmic) == (label, logarithmic)
+    drawn = one(draw_means, np.array(values, np.float64), axis.labels, series, axis.heading, "cost")
+    (axes,) = drawn.draw().axes
+    assert (axes.get_xlabel(), axes.get_xscale() == "log") == (label, logarithmic)
 
 
 def test_a_caption_says_what_the_means_leave_out() -> None:
@@ -88,7 +103,7 @@ def test_a_caption_says_what_the_means_leave_out() -> None:
     assert _left_out([whole]) == ""
     assert _left_out([whole, half]).endswith("left out, at one point 50 % of them")
     assert _left_out([whole, none]).endswith("left out; where none is left, the point is missing")
-    figure = curve_figure(np.array([1.0, 2.0]), ["1", "2"], {"a": [whole, half]}, "x", "cost")
-    ((panel,),) = (row.panels for row in figure.rows)
-    (band,) = (item for item in panel.items if isinstance(item, Band))
-    assert np.isfinite(band.high).tolist() == [True, False]  # a single run has no interval
+    figure = one(draw_means, np.array([1.0, 2.0]), ["1", "2"], {"a": [whole, half]}, "x", "cost")
+    (axes,) = figure.draw().axes
+    (band,) = axes.collections
+    assert band.get_paths()[0].get_extents().x1 == 1.0  # a single run has no interval
