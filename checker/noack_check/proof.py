@@ -24,8 +24,9 @@ from typing import NamedTuple
 
 from flint import arb, arb_mat, fmpq
 
-from noack_check.balls import around_zero, frobenius, identity, is_zero, number, upto
+from noack_check.balls import around_zero, frobenius, identity, is_zero, upto
 from noack_check.check import RejectedError, verify
+from noack_check.document import read_count, read_matrix, read_number
 from noack_check.loop import Loop, Times
 from noack_check.model import Errors, Model, has_decaying_unit, needs_constant, thresholds
 from noack_check.norms import decays_below, growth
@@ -73,7 +74,7 @@ def prove(loop: Loop, document: Mapping[str, object]) -> Proof:
         raise RejectedError("not a table")
     if fault := loop.fault():
         raise RejectedError(f"loop: {fault}")
-    rate = _number(document, "rate")
+    rate = read_number(document, "rate")
     if not rate >= 0 or not (loop.rule.level == 0 or rate <= loop.rule.rate):
         raise RejectedError("rate: not between 0 and that of the threshold")
     assumed = read_assumptions(loop, rate, document)
@@ -121,8 +122,8 @@ def read_assumptions(loop: Loop, rate: arb, document: Mapping[str, object]) -> A
         RejectedError: it has no meaning, or the chain's gain is not proven.
     """
     gain = _chain_gain(loop, rate, document)
-    later, at_start = (_count(document, key) for key in ("later", "later_at_start"))
-    pieces = _count(document, "pieces", MOST_PIECES) if "pieces" in document else 1
+    later, at_start = (read_count(document, key, MOST_LATER) for key in ("later", "later_at_start"))
+    pieces = read_count(document, "pieces", MOST_PIECES) if "pieces" in document else 1
     if pieces < 1:
         raise RejectedError("pieces: below 1")
     if "errors" not in document:
@@ -134,7 +135,7 @@ def read_assumptions(loop: Loop, rate: arb, document: Mapping[str, object]) -> A
         raise RejectedError("errors: not a table")
     if gain is None:
         raise RejectedError("errors: need the chain")
-    sizes = _number(table, "decaying"), _number(table, "constant")
+    sizes = read_number(table, "decaying"), read_number(table, "constant")
     units = has_decaying_unit(loop, rate), needs_constant(loop)
     if not all(size == 0 or (size > 0 and is_unit) for size, is_unit in zip(sizes, units, strict=True)):
         raise RejectedError("errors: below 0, or in a unit that the loop does not have")
@@ -171,10 +172,10 @@ def _times_between_events(
     loop: Loop, rate: arb, drift: Bound, assumed: Assumptions, document: Mapping[str, object]
 ) -> tuple[arb, arb]:
     """Return least times between two events, and of the first event after t = 0, as proven."""
-    apart = first = _number(document, "inter_event_s")
+    apart = first = read_number(document, "inter_event_s")
     _prove_inter_event(loop, rate, drift, apart)
     if loop.times.start > 0:
-        first = _number(document, "first_event_s") if "first_event_s" in document else arb(0)
+        first = read_number(document, "first_event_s") if "first_event_s" in document else arb(0)
         prove_first_event(loop, drift, first, loop.times.start)
     return apart, first
 
@@ -248,8 +249,8 @@ def _chain_gain(loop: Loop, rate: arb, document: Mapping[str, object]) -> arb | 
     chain = document["chain"]
     if not isinstance(chain, Mapping):
         raise RejectedError("chain: not a table")
-    gain, G = _number(chain, "gain"), weighted(loop, rate)
-    tail = _matrix(chain, "tail", loop.n)
+    gain, G = read_number(chain, "gain"), weighted(loop, rate)
+    tail = read_matrix(chain, "tail", loop.n)
     proven = gain >= 1 if is_zero(G) else decays_below(G, gain, tail)
     if not proven:
         raise RejectedError("chain: the growth of the model's error is not below its gain")
@@ -270,7 +271,7 @@ def prove_bound(loop: Loop, rate: arb, entry: Mapping[str, object], assumed: Ass
     model = Model(
         loop,
         rate,
-        _number(entry, "decay"),
+        read_number(entry, "decay"),
         assumed.errors,
         later=assumed.later,
         later_at_start=assumed.later_at_start,
@@ -288,13 +289,13 @@ def prove_bound(loop: Loop, rate: arb, entry: Mapping[str, object], assumed: Ass
         verify(
             model,
             output,
-            {name: _matrix(matrices, name, most=model.size - 2) for name in matrices},
-            {name: _number(numbers, name) for name in numbers},
+            {name: read_matrix(matrices, name, most=model.size - 2) for name in matrices},
+            {name: read_number(numbers, name) for name in numbers},
             starts=starts,
         )
     except RejectedError as error:
         raise RejectedError(f"{output}: {error}") from None
-    levels = (_number(numbers, name) if name in numbers else arb(0) for name in ("level 1", "level 2"))
+    levels = (read_number(numbers, name) if name in numbers else arb(0) for name in ("level 1", "level 2"))
     decaying, constant = (level.sqrt() for level in levels)
     return Bound(output, decaying, constant, starts)
 
@@ -417,38 +418,3 @@ def _entries(document: Mapping[str, object], key: str) -> list[Mapping[str, obje
     if not isinstance(entries, list) or not all(isinstance(entry, Mapping) for entry in entries):
         raise RejectedError(f"{key}: not a list of tables")
     return entries
-
-
-def _count(table: Mapping[str, object], key: str, most: int = MOST_LATER) -> int:
-    value = table.get(key, 0)
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= most:
-        raise RejectedError(f"{key}: not a whole number from 0 to {most}")
-    return value
-
-
-def _number(table: Mapping[str, object], key: str) -> arb:
-    value = table.get(key)
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise RejectedError(f"{key}: not a number")
-    if isinstance(value, int) and abs(value) > 2**63:
-        raise RejectedError(f"{key}: too large")
-    found = number(value)
-    if not found.is_finite():
-        raise RejectedError(f"{key}: not finite")
-    return found
-
-
-def _matrix(
-    table: Mapping[str, object], key: str, size: int | None = None, *, most: int | None = None
-) -> arb_mat:
-    rows = table.get(key)
-    if not isinstance(rows, list) or not rows or not all(isinstance(row, Sequence) for row in rows):
-        raise RejectedError(f"{key}: not a matrix")
-    n = len(rows)
-    wrong = (size is not None and n != size) or (most is not None and n > most)
-    if wrong or any(len(row) != n for row in rows):
-        raise RejectedError(f"{key}: not a square matrix of the right size")
-    found = arb_mat([[_number({key: value}, key) for value in row] for row in rows])
-    if any(found[i, j] != found[j, i] for i in range(n) for j in range(i)):
-        raise RejectedError(f"{key}: not symmetric")
-    return found
