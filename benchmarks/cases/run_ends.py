@@ -17,10 +17,11 @@ import numpy as np
 from benchmarks.programs import execute, in_new_process
 from benchmarks.report import Goal, Peer, Row, announce, benchmark
 from benchmarks.rounds import Figures
-from cosim.analysis.replay.run_replay import stored_verdict
+from cosim.analysis.replay import replay
 from cosim.cli.options import find_scenario
 from cosim.record.rows import concatenate_rows
 from cosim.record.run_directory import RECORD, write_environment
+from cosim.record.run_record import load_record
 from cosim.record.table_files import TableFile
 from cosim.simulation.virtual_time import simulate_run
 from noack.protocol.roles import RECORDER
@@ -56,7 +57,7 @@ def spooled_run(horizon_s: float, folder: Path) -> Path:
 def replay_s(run_dir: Path) -> float:
     """Replay a run as at its end; return the CPU time in s."""
     began_s = time.process_time()
-    stored_verdict(run_dir)
+    replay(load_record(run_dir)).verdict()
     return time.process_time() - began_s
 
 
@@ -84,10 +85,7 @@ def end_of(horizon_s: float, folder: Path) -> Figures:
 
 @benchmark("long_run", "The end of a long run")
 def long_run(short_s: float = 120.0, long_s: float = 600.0) -> Iterator[Row]:
-    """Complete a short and a long run; memory should not grow with the length.
-
-    At the end of both, a process of its own replays the run, as it does not for a shorter one.
-    """
+    """Complete a short and a long run; memory should not grow with the length."""
     with tempfile.TemporaryDirectory(prefix="noack-long-run-") as folder:
         short, long = end_of(short_s, Path(folder)), end_of(long_s, Path(folder))
     # Start and end of the program cost the same for every length.

@@ -1,23 +1,24 @@
 """The end of a run: its record completed, its summary, report and recording written."""
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager, nullcontext, suppress
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from cosim.analysis.claims.claim_evaluation import RunClaims, claims_of, list_violations
-from cosim.analysis.claims.run_certificates import scheduled_certificates
+from cosim.analysis.claims.run_certificates import Expectations, expectations, expectations_key
 from cosim.analysis.ideal_loop import ideal_loop_part
 from cosim.analysis.replay.machine_replay import SharedMachines
-from cosim.analysis.replay.run_replay import replay, stored_verdict
+from cosim.analysis.replay.run_replay import replay
 from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.analysis.summary.loops_over_time import LoopOverTime, loop_over_time
 from cosim.analysis.summary.plant_linearisation import linearisation
-from cosim.analysis.summary.run_summary import Outcome, summarise_run, worst_loop
+from cosim.analysis.summary.run_summary import Outcome, summarise_run
 from cosim.analysis.summary.summary_model import (
     ConditionsPart,
     ExitPart,
@@ -28,8 +29,9 @@ from cosim.analysis.summary.summary_model import (
     read_summary,
 )
 from cosim.live.monitoring.progress import work_bar
-from cosim.live.processes.finalize_helpers import FinalizeHelpers, RunEndingWithHelpers
-from cosim.output.viewer.rerun_program import is_installed, require_viewer
+from cosim.live.processes.early_certificates import LaunchedEnding
+from cosim.live.processes.process_pool import map_in, processes
+from cosim.output.viewer.rerun_program import require_viewer
 from cosim.record.run_directory import (
     ENDING_FILE,
     RECORD,
@@ -51,15 +53,17 @@ from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.core.file_access import remove_file, write_whole
 from noack.core.system_processes import cores
 from noack.runtime.spool import SPOOL
-from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import NetworkConditions
-from noack.theory.certificates.assumptions import Assumption, assumptions
-from noack.theory.certificates.certified_bounds import ScenarioCertificate
 
 _FEW_LOOPS = 4
 """A run with at most this number of loops also gets one report per loop."""
 _LEAST_LOOPS = 8
 """Smallest number of loops that are evaluated together."""
+_MANY_STEPS = 50_000
+"""Loops with fewer steps of the plant, all together, are evaluated in less time than processes
+start."""
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 
 @np.errstate(all="ignore")
@@ -77,35 +81,51 @@ def finalize(ending: RunEnding, *, report: bool = True, view: bool = True, again
         MachineError: record or summary cannot be written.
     """
     run_dir = ending.run_dir
-    with _with_reason(ending), finished_run(run_dir), ExitStack() as stack:
-        prepared = ending.helpers if isinstance(ending, RunEndingWithHelpers) else None
-        if prepared is not None:
-            stack.enter_context(closing(prepared))
+    with _with_reason(ending), finished_run(run_dir):
         if not (scenario_file := run_dir / SCENARIO_FILE).exists():
             raise MachineError(f"{scenario_file}: no such file; the run directory was deleted or replaced")
         is_complete = not (run_dir / SPOOL).is_dir() and (run_dir / RECORD).is_dir()
         # A recorder that completed its recording writes the reports afterwards.
         is_recorded = is_complete or (run_dir / REPORTS_FILE).is_file()
         is_recorded = is_recorded and (run_dir / RECORDING_FILE).is_file()
-        scenario, _ = scenarios_of(run_dir)
-        helpers = stack.enter_context(closing(prepared or FinalizeHelpers(scenario)))
-        helpers.end_preparation()
-        run = load_run(run_dir) if is_complete else _complete_record(run_dir, helpers)
-        summary, over_time = _evaluate_run(run, ending, helpers)
+        with _processes(run_dir) as pool:
+            if is_complete:
+                run = load_run(run_dir)
+            else:
+                run = finish_record(run_dir, partial(_map, pool, "the record of the run"))
+            summary, over_time = _evaluate_run(run, ending, pool)
         _write_summary(run_dir, summary)
         if view:
             _write_recording_if_missing(
-                run, summary, run_dir, over_time, helpers, is_recorded=is_recorded, again=again
+                run, summary, run_dir, over_time, is_recorded=is_recorded, again=again
             )
         if report:
             _write_reports(run, summary, run_dir, over_time)
     return Outcome(run_dir, ExitStatus(summary.exit.status), summary.exit.reason, summary)
 
 
-def _complete_record(run_dir: Path, helpers: FinalizeHelpers) -> RecordedRun:
-    """Write what is missing of the record; return the run."""
-    with work_bar("the record of the run") as show:
-        return finish_record(run_dir, partial(helpers.each, show=show), helpers.early)
+@contextmanager
+def _processes(run_dir: Path) -> Iterator[ProcessPoolExecutor | None]:
+    """Have processes on all cores for the loops of a long run; None if this one needs no help."""
+    scenario, loops = scenarios_of(run_dir)
+    timing, workers = scenario.timing, min(cores(), len(loops))
+    is_long = len(loops) * timing.horizon_ns >= _MANY_STEPS * timing.plant_period_ns
+    with processes(workers) if is_long and workers > 1 else nullcontext() as pool:
+        yield pool
+
+
+def _map(
+    pool: ProcessPoolExecutor | None, text: str, function: Callable[[Item], Result], items: Sequence[Item]
+) -> Iterator[Result]:
+    """Return ``function(item)`` of each item in order, see :func:`map_in`; show how many are computed."""
+    return _shown(text, map_in(pool, function, items), len(items))
+
+
+def _shown(text: str, results: Iterable[Result], count: int) -> Iterator[Result]:
+    with work_bar(text, lines=True) as show:
+        for number, result in enumerate(results, 1):
+            show(number / count)
+            yield result
 
 
 def _write_recording_if_missing(
@@ -113,7 +133,6 @@ def _write_recording_if_missing(
     summary: RunSummary,
     run_dir: Path,
     over_time: Sequence[LoopOverTime] | None,
-    helpers: FinalizeHelpers,
     *,
     is_recorded: bool,
     again: bool,
@@ -127,13 +146,7 @@ def _write_recording_if_missing(
     quiet = (MachineError,) if is_recorded else ()
     with _warning_if_not_written(run_dir / RECORDING_FILE), suppress(*quiet):
         require_viewer()
-        if len(run.names) > 1 and helpers.count:  # they have imported the viewer
-            # The worst loop is the only one whose summary is shown.
-            worst = [summary.loops[worst_loop(summary.loops).number]]
-            brief = summary.model_copy(update={"loops": worst})
-            helpers.call(_record_stored, run_dir, brief, over_time)
-        else:
-            _write_recording(run, summary, run_dir, None, over_time)
+        _write_recording(run, summary, run_dir, None, over_time)
 
 
 def _write_reports(
@@ -175,14 +188,6 @@ def _write_summary(run_dir: Path, summary: RunSummary) -> None:
         raise MachineError(f"{error}; try `noack summary {run_dir}` later") from None
 
 
-class _Expectations(NamedTuple):
-    """What follows from the scenario of a loop alone."""
-
-    assumptions: Sequence[Assumption]
-    certificates: Sequence[ScenarioCertificate] | None
-    """None if they cannot be computed, which the claims then report."""
-
-
 class _LoopResults(NamedTuple):
     """What the end of a run finds out about a loop."""
 
@@ -192,29 +197,19 @@ class _LoopResults(NamedTuple):
 
 
 def _evaluate_run(
-    run: RecordedRun, ending: RunEnding, helpers: FinalizeHelpers
+    run: RecordedRun, ending: RunEnding, pool: ProcessPoolExecutor | None
 ) -> tuple[RunSummary, Sequence[LoopOverTime] | None]:
     """Evaluate every loop and the network; return the summary of the run, and how each loop went."""
     loops, replayed = len(run.names), None
-    replay_in_helper = ReplayInHelper(helpers, ending.run_dir) if helpers.count and loops == 1 else None
-
-    def evaluate_here(block: range) -> list[_LoopResults]:
-        return _evaluate_loops(run, ending, replay_in_helper, block)
-
-    def evaluate_in_helper(block: range) -> list[_LoopResults]:
-        own = RunEnding(ending.run_dir, ending.run_id, ending.status, ending.reason)
-        return helpers.call(_evaluate_stored_loops, own, block)
-
-    with (
-        work_bar(
-            "checking claims" if loops == 1 else f"checking claims of {loops} loops", lines=True
-        ) as show,
-        helpers.share(_blocks(run), evaluate_in_helper, show) as evaluate,
-    ):
-        if run.kind == "live" and run.has_own_network:
-            replayed = _replay(run.network)
-        blocks = evaluate(evaluate_here)
-    results = [loop for block in sorted(blocks, key=min) for loop in blocks[block]]
+    text = "checking claims" if loops == 1 else f"checking claims of {loops} loops"
+    known = ending.expectations if isinstance(ending, LaunchedEnding) else {}
+    bare = RunEnding(ending.run_dir, ending.run_id, ending.status, ending.reason, ending.startup_s)
+    evaluate = partial(_evaluate_loops, run if pool is None else None, bare)
+    blocks = [{number: known.get(number) for number in block} for block in _blocks(run)]
+    by_block = _map(pool, text, evaluate, blocks)
+    if run.kind == "live" and run.has_own_network:
+        replayed = _replay(run.network)
+    results = [loop for block in by_block for loop in block]
     summary = _summary(run, ending, [loop.summary for loop in results])
     if replayed is not None:
         network = summary.network.model_copy(update={"replay": replayed})
@@ -241,32 +236,28 @@ def _blocks(run: RecordedRun) -> Iterator[range]:
 
 
 _stored_run = cache(load_run)
-"""The run of a helper, whose objects then live as long as the process."""
+"""The run of a process of the pool, whose objects then live as long as the process."""
 
 
 @np.errstate(all="ignore")
-def _evaluate_stored_loops(ending: RunEnding, block: range) -> list[_LoopResults]:
-    return _evaluate_loops(_stored_run(ending.run_dir), ending, None, block)
-
-
-def _record_stored(run_dir: Path, summary: RunSummary, over_time: Sequence[LoopOverTime] | None) -> None:
-    _write_recording(_stored_run(run_dir), summary, run_dir, None, over_time)
-
-
 def _evaluate_loops(
-    run: RecordedRun,
-    ending: RunEnding,
-    replay_in_helper: "ReplayInHelper | None",
-    block: range,
+    run: RecordedRun | None, ending: RunEnding, block: Mapping[int, Expectations | None]
 ) -> list[_LoopResults]:
-    """Evaluate some loops; a helper may replay the only one."""
-    records, results, expected = run.read(block), list[_LoopResults](), dict[str, _Expectations]()
-    shared = SharedMachines(records if len(block) > 1 else ())
+    """Evaluate consecutive loops, given by their numbers with what is known of them already.
+
+    In another process, ``run`` is None.
+    """
+    run = run or _stored_run(ending.run_dir)
+    numbers = range(min(block), max(block) + 1)
+    records, results, known = run.read(numbers), list[_LoopResults](), dict[str, Expectations]()
+    shared = SharedMachines(records if len(records) > 1 else ())
     for record in records:
-        key = record.scenario.model_dump_json(exclude={"name", "seeds"})
-        if key not in expected:  # equal loops share it
-            expected[key] = _expectations(record.scenario)
-        own, claims = expected[key], claims_of(record)
+        if (own := block[record.number]) is None:
+            key = expectations_key(record.scenario)
+            if key not in known:  # equal loops share it
+                known[key] = expectations(record.scenario)
+            own = known[key]
+        claims = claims_of(record)
         claims.certificates = own.certificates
         phase_ns = run.phases_ns[record.number]
         status, reason = int(ending.status), ending.reason
@@ -274,30 +265,8 @@ def _evaluate_loops(
         if len(run.names) == 1:
             # Written again with the results, so that none of them can cost the summary.
             _write_summary(ending.run_dir, _summary(run, ending, [summary]))
-        results.append(_with_results(run, summary, claims, shared, replay_in_helper))
+        results.append(_with_results(run, summary, claims, shared))
     return results
-
-
-def _expectations(scenario: Scenario) -> _Expectations:
-    """Return what to expect of a loop."""
-    certificates = None
-    with suppress(Exception):
-        certificates = scheduled_certificates(scenario)
-    return _Expectations(assumptions(scenario), certificates)
-
-
-class ReplayInHelper:
-    """The replay of the only loop of a run by another process."""
-
-    def __init__(self, helpers: FinalizeHelpers, run_dir: Path) -> None:
-        self._verdict = helpers.submit(stored_verdict, run_dir)
-
-    def part(self) -> ReplayPart | None:
-        """Wait for the result; None if the process could not replay the run."""
-        try:
-            return self._verdict.result()
-        except Exception:  # this process then finds the reason
-            return None
 
 
 def _with_results(
@@ -305,7 +274,6 @@ def _with_results(
     summary: LoopSummary,
     claims: RunClaims,
     shared: SharedMachines,
-    replay_in_helper: ReplayInHelper | None,
 ) -> _LoopResults:
     """Add the results of replay, ideal loop and claims; a failure of one is a line or a warning."""
     record = claims.record
@@ -319,7 +287,7 @@ def _with_results(
     except Exception as error:  # a failed analysis must not cost the run its summary
         print(f"noack: warning: the claims were not evaluated: {error!r}", file=sys.stderr)
     if record.kind == "live":
-        replayed = (replay_in_helper and replay_in_helper.part()) or _replay(record, shared)
+        replayed = _replay(record, shared)
         results |= {"replay": replayed, "exit": _exit_after_replay(summary.exit, replayed)}
     over_time = None
     with suppress(Exception):  # the recording reports it
@@ -427,17 +395,6 @@ def _open(run_dir: Path, loop: str | None, *, view: bool = True) -> tuple[RunSum
     if loop is not None:
         run.number_of(loop)  # refuses an unknown name
     return summary, run
-
-
-def import_libraries() -> None:
-    """Import what a recording needs, beside the imports of this module."""
-    if is_installed():
-        import matplotlib.figure  # noqa: F401  # for the map of many loops
-        import pyarrow as pa
-
-        import cosim.output.viewer.run_recording  # noqa: F401  # imports rerun
-
-        pa.array(np.zeros(1))  # the first one looks for pandas
 
 
 def _write_recording(

@@ -20,7 +20,7 @@ from cosim.live.coordination.coordinator import Coordinator
 from cosim.live.disk_space import require_disk_space
 from cosim.live.monitoring.run_observers import RunObserver, RunObservers, observers_of_extensions
 from cosim.live.processes.child_processes import ChildProcesses, EndReason
-from cosim.live.processes.finalize_helpers import FinalizeHelpers, RunEndingWithHelpers, lasting_helpers
+from cosim.live.processes.early_certificates import EarlyCertificates, LaunchedEnding
 from cosim.live.wait_limit import WaitLimit
 from cosim.record.run_directory import (
     PROCESSES_FILE,
@@ -49,6 +49,8 @@ _STOPPED_S = 15.0
 DEFAULT_START_S = 30.0
 """Wall time within which all processes have to be ready, if the scenario gives none."""
 _POLL_S, _STARTING_POLL_S = 0.01, 0.002
+_EARLY_CERTIFICATES_S = 5.0
+"""Wall time of a run during which a process computes its certificates; in less, it hardly starts."""
 _OVERTIME_S, _OVERTIME_SHARE = 20.0, 0.2
 """After the horizon: the recorder writes the record, and a long run has many rows."""
 
@@ -63,7 +65,7 @@ def launch(
     fork: bool = False,
     observers: Sequence[RunObserver] = (),
     listening: remote_access.ListenSettings | None = None,
-) -> RunEndingWithHelpers:
+) -> LaunchedEnding:
     """Run a scenario; :func:`cosim.live.finalize.finalize` completes its record.
 
     Args:
@@ -106,19 +108,21 @@ def launch(
             if session is not None:
                 by_hand = descriptor.model_copy(update={"launched": False})
                 stack.enter_context(descriptor_file(by_hand, session))
-        helpers = stack.enter_context(lasting_helpers(resolved))
+        certificates = stack.enter_context(EarlyCertificates())
         told = RunObservers([*observers, *observers_of_extensions(resolved)])
         if listening is not None:
             told.tell(lambda observer: observer.listening(listening))
         stack.callback(children.end)  # before all else ends
         children.send(descriptor)
-        run = _Run(descriptor, run_dir, coordinator, children, told, helpers)
+        run = _Run(descriptor, run_dir, coordinator, children, told, certificates)
         status, reason = run.watch(signals, ending.store)
         if coordinator.epoch_ns is None:
             raise NeverStartedError(f"{reason} (logs in {run_dir / 'logs'})", status)
         startup_s = (coordinator.epoch_ns - began_ns) * 1e-9
         ending.store(status, reason, startup_s)
-    return RunEndingWithHelpers(run_dir, descriptor.run_id, status, reason, startup_s, helpers)
+    return LaunchedEnding(
+        run_dir, descriptor.run_id, status, reason, startup_s, expectations=certificates.known
+    )
 
 
 def _prepare(scenario: Scenario, runs: Path, spawn: Sequence[str], *, across_hosts: bool) -> Scenario:
@@ -172,13 +176,13 @@ class _Run:
         coordinator: Coordinator,
         children: ChildProcesses,
         observers: RunObservers,
-        helpers: FinalizeHelpers,
+        certificates: EarlyCertificates,
     ) -> None:
         self._scenario, self._run_id = descriptor.scenario, descriptor.run_id
         self._run_dir = run_dir
         self._coordinator = coordinator
         self._children = children
-        self._observers, self._helpers = observers, helpers
+        self._observers, self._certificates = observers, certificates
         self._by_hand = [role for role in ROLES if role not in children]
         self._missing: tuple[str, ...] = ()
         self._has_started = self._has_ended = False
@@ -249,7 +253,8 @@ class _Run:
             self._write_processes()
             point_to_latest(self._run_dir)
             self._observers.tell(lambda observer: observer.started(self._run_dir))
-            self._helpers.prepare(self._run_dir)
+            if self._scenario.horizon_s / self._scenario.speed >= _EARLY_CERTIFICATES_S:
+                self._certificates.start(self._run_dir)
             self._limit = WaitLimit(overtime_s(self._scenario.horizon_s / self._scenario.speed))
         elif self._has_started and not self._has_ended and not self._is_in_loop():
             self._has_ended = True  # while the processes end: the imports take 0.3 s

@@ -3,20 +3,11 @@
 A spool is nearly sorted: batches follow each other, except those that were sent again. It is read
 in segments of consecutive batches, in the order of their first inputs. The rows of one loop are
 merged in bounded memory; of several loops, as many are sorted at once as fit into memory.
-
-The tables of many loops are written while the run goes on (:func:`write_early`), in slices of their
-spool, each loop after loop: one slice at a time is in memory, and little is left at the end of the
-run. The spool stays as it is until the record is complete, so whatever happens to these files,
-nothing is lost. :func:`finish_record` uses a file that has exactly what the spool has. If a batch
-did not arrive, there are no such files.
 """
 
 import json
 import os
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -29,23 +20,16 @@ from cosim.record.rows import BATCH_ROWS, Rows, Segment, concatenate_rows
 from cosim.record.run_directory import RECORD
 from cosim.record.run_record import Notice, RecordedRun, load_run, read_notices, scenarios_of
 from noack.core.errors import MachineError, PeerError, why
-from noack.core.file_access import create_folder, move, remove_file, remove_folder
-from noack.core.row_operations import firsts_of_equal
-from noack.core.system_processes import be_idle, cores
+from noack.core.file_access import move, remove_folder
 from noack.protocol.record_tables import LOOP, is_of_network
 from noack.protocol.roles import LOOP_ROLES, RECORDER
 from noack.runtime.control_messages import LogLine, parse_message
-from noack.runtime.spool import EARLY, EARLY_ENDED, SPOOL, batch_bytes, batches_in, spool_files, stored_lines
+from noack.runtime.spool import SPOOL, batch_bytes, batches_in, spool_files, stored_lines
 from noack.scenario.resolution import run_tables
 from noack.scenario.scenario import loop_names
 
 _SEGMENT_BYTES = 1024 * 1024
 """Bytes of consecutive batches that are read at once."""
-_SLICE_BYTES = 32 * 1024 * 1024
-"""Bytes of a table that are sorted by loops at once, during the run."""
-_MOST_SLICES = 32
-"""Of a longer table, the rows of a loop would be in too many places."""
-_POLL_S = 0.05
 
 
 def spool_segments(spool: Path, table: str, dtype: np.dtype[np.void]) -> Iterator[Segment]:
@@ -64,14 +48,6 @@ def spool_parts(
 
     The last one may be incomplete: it is left out.
     """
-    for first, last, batches in spool_batches(path, dtype, begin, end):
-        yield first, last, np.frombuffer(b"".join(rows for _, rows in batches), dtype)
-
-
-def spool_batches(
-    path: Path, dtype: np.dtype[np.void], begin: int = 0, end: int | None = None
-) -> Iterator[tuple[int, int, list[tuple[int, memoryview]]]]:
-    """Yield the same, the rows batch by batch, each with the number of its first row."""
     with path.open("rb", buffering=0) as file:
         end = file.seek(0, os.SEEK_END) if end is None else end
         while begin < end:
@@ -85,8 +61,8 @@ def spool_batches(
                 file.seek(begin)
                 batches, complete = batches_in(memoryview(file.read(length)))
             # Rows of a damaged batch cannot be located.
-            whole_batches = [batch for batch in batches if len(batch[1]) % dtype.itemsize == 0]
-            yield begin, begin + complete, whole_batches
+            whole_batches = [rows for _, rows in batches if len(rows) % dtype.itemsize == 0]
+            yield begin, begin + complete, np.frombuffer(b"".join(whole_batches), dtype)
             begin += complete
 
 
@@ -141,9 +117,7 @@ _BLOCK_BYTES = 32 * 1024 * 1024
 TableMap = Callable[[Callable[[str], None], Sequence[str]], Iterable[None]]
 
 
-def finish_record(
-    run_dir: Path, map_tables: TableMap = map, early: Mapping[str, int] | None = None
-) -> RecordedRun:
+def finish_record(run_dir: Path, map_tables: TableMap = map) -> RecordedRun:
     """Convert a run's spool to its record, and remove the spool.
 
     All spools are merged, without duplicate rows. An interrupted attempt can be repeated.
@@ -152,21 +126,16 @@ def finish_record(
         run_dir: the run directory.
         map_tables: ``map_tables(function, tables)`` calls a function for each table, the largest
             first; several processes may do so at once.
-        early: the tables that are in Parquet files of the spool, with the bytes of their spool.
 
     Raises:
         MachineError: the record cannot be written; the spool is kept.
     """
     add_kept_reports(run_dir)
     scenario, _ = scenarios_of(run_dir)
-    sizes = {table: _bytes_of(run_dir, table) for table in run_tables(scenario)}
-    ready = dict((early or {}).items() & sizes.items())
-    tables = sorted(sizes.keys() - ready, key=sizes.__getitem__, reverse=True)
+    tables = sorted(run_tables(scenario), key=partial(_bytes_of, run_dir), reverse=True)
     notices = _notices(run_dir / RECORD, run_dir / SPOOL, len(loop_names(scenario)))
     try:
         with record_folder(run_dir / RECORD, notices):
-            for file in [f"{table}.parquet" for table in ready]:
-                move(run_dir / SPOOL / EARLY / file, run_dir / RECORD / file)
             for _ in map_tables(partial(convert_table, run_dir), tables):
                 pass  # each table is written as the iteration reaches it
     except OSError as error:
@@ -257,128 +226,3 @@ def _notices(folder: Path, spool: Path, loops: int) -> list[Notice]:
                 texts.add(text)
                 notices.append(notice)
     return sorted(notices, key=lambda notice: int(notice["t_ns"]))
-
-
-def write_early(run_dir: Path) -> Mapping[str, int]:
-    """Write the tables of the loops of a run: at idle priority until it has ended, then the rest.
-
-    Returns:
-        By table: the bytes of its spool whose rows are in the file. A table without a whole slice is
-        left out.
-
-    Raises:
-        ValueError: rows are missing or not in order, a batch is incomplete, or a table is long.
-        OSError: a file cannot be read or written.
-    """
-    end_file = run_dir / SPOOL / EARLY / EARLY_ENDED
-    with ExitStack() as stack:
-        with ThreadPoolExecutor(1, initializer=be_idle) as thread:
-            tables = thread.submit(_open_tables, run_dir, stack).result()
-            thread.submit(_follow, tables, end_file).result()
-        remove_file(end_file)
-        with ThreadPoolExecutor(cores()) as threads:
-            for _ in threads.map(_EarlyTable.finish, tables):
-                pass  # an error of a thread is raised here
-    return {table.name: table.bytes for table in tables if table.bytes}
-
-
-def _open_tables(run_dir: Path, stack: ExitStack) -> "list[_EarlyTable]":
-    """Open the tables of the loops, in a new folder."""
-    scenario, loops = scenarios_of(run_dir)
-    folder, names = run_dir / SPOOL / EARLY, vector_names(scenario)
-    create_folder(folder, exist_ok=False)
-    tables = []
-    for table, dtype in run_tables(scenario).items():
-        spool = run_dir / SPOOL / f"{table}.{RECORDER}"
-        if not is_of_network(table) and spool.exists():
-            file = table_files.table_writer(folder / f"{table}.parquet", dtype, names)
-            tables.append(_EarlyTable(spool, dtype, len(loops), stack.enter_context(file)))
-    return tables
-
-
-def _follow(tables: "Sequence[_EarlyTable]", end_file: Path) -> None:
-    while not end_file.exists():
-        # The first that can: a slice is written before the next one is read.
-        if not any(table.advance(ended=False) for table in tables):
-            time.sleep(_POLL_S)
-
-
-class _EarlyTable:
-    """A table that is written as its spool grows.
-
-    Args:
-        spool: the file of its spool.
-        dtype: the type of its rows.
-        loops: the number of loops.
-        write: writes a row group.
-    """
-
-    def __init__(
-        self, spool: Path, dtype: np.dtype[np.void], loops: int, write: Callable[[Rows], None]
-    ) -> None:
-        self.name, self.bytes = spool.stem, 0
-        self._spool, self._dtype, self._write = spool, dtype, write
-        self._next, self._waiting = 0, dict[int, Rows]()
-        """The number of the next row, and later batches, by the number of their first row."""
-        self._newest = np.full(loops, -1, np.int64)
-        """The newest input of each loop."""
-        self._groups: Iterator[Rows] = iter(())
-        """The row groups of a slice that are still to be written."""
-
-    def advance(self, *, ended: bool) -> bool:
-        """Write the next row group, if there is one: the last slice can be short."""
-        while (rows := next(self._groups, None)) is None:
-            if self._spool.stat().st_size - self.bytes < (1 if ended else _SLICE_BYTES):
-                return False
-            self._groups = self._slice()
-        self._write(rows)
-        return True
-
-    def finish(self) -> None:
-        """Write the rest of a table that has been begun."""
-        while self.bytes and self.advance(ended=True):
-            pass
-        if self._waiting:
-            raise ValueError("rows are missing")
-
-    def _consecutive(self) -> Iterator[Rows]:
-        """Yield the next rows of the spool, in which a batch that was sent again comes late."""
-        begin = self.bytes
-        if begin >= _MOST_SLICES * _SLICE_BYTES:
-            raise ValueError("the table is long")
-        if sum(map(len, self._waiting.values())) * self._dtype.itemsize > _SLICE_BYTES:
-            raise ValueError("rows are missing")
-        for _, end, batches in spool_batches(self._spool, self._dtype, begin):
-            self._waiting |= {first: np.frombuffer(rows, self._dtype) for first, rows in batches}
-            self.bytes = end
-            if end - begin >= _SLICE_BYTES:
-                break
-        if self.bytes == begin:
-            raise ValueError("a batch is incomplete")
-        for first in sorted(self._waiting):
-            if first > self._next:
-                break
-            rows = self._waiting.pop(first)
-            if first == self._next:  # otherwise it came twice
-                self._next += len(rows)
-                yield rows
-
-    def _slice(self) -> Iterator[Rows]:
-        """Yield the next rows of the spool, loop after loop."""
-        rows = concatenate_rows([*self._consecutive()], self._dtype)
-        rows = rows.take(np.argsort(rows[LOOP], kind="stable"))
-        loops, inputs = rows[LOOP].astype(np.int64), rows["input"]
-        firsts = firsts_of_equal(loops)
-        previous_inputs = np.append(-1, inputs)[:-1]
-        previous_inputs[firsts] = self._newest[loops[firsts]]  # IndexError: damaged
-        if not (inputs > previous_inputs).all():
-            raise ValueError("rows of a loop are not in order")
-        lasts = np.append(firsts[1:], len(rows))[: len(firsts)] - 1
-        self._newest[loops[firsts]] = inputs[lasts]
-        # Loops in groups of a power of 2: so reading some loops rarely reads many others.
-        longest = max(int(np.diff(firsts, append=len(rows)).max(initial=1)), 1)
-        at_once = 2 ** max((BATCH_ROWS // longest).bit_length() - 1, 0)
-        ends = np.searchsorted(loops, np.arange(at_once, len(self._newest) + at_once, at_once))
-        for begin, end in zip([0, *ends[:-1]], ends, strict=True):
-            for first in range(begin, end, BATCH_ROWS):
-                yield rows[first : min(first + BATCH_ROWS, end)]

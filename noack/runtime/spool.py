@@ -18,10 +18,6 @@ from noack.core.errors import MachineError, why
 from noack.core.file_access import create_folder, open_append
 
 SPOOL = "spool"  # the spool's folder in the run directory
-EARLY = "early"
-"""Folder in the spool: tables that are written as Parquet files while the run goes on."""
-EARLY_ENDED = "ended"
-"""File there: the run has ended; it vanishes when its writer writes the rest."""
 KEPT_REPORT = "report"
 """Name of a process's final report in the spool, in place of a table's."""
 _BATCH_HEAD = struct.Struct("<QQ")

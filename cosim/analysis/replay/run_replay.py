@@ -6,7 +6,6 @@ its replay. Messages that were lost in the network are not compared.
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -28,9 +27,8 @@ from cosim.analysis.replay.replay_result import (
     difference,
     first_entry,
 )
-from cosim.analysis.summary.summary_model import ReplayPart
 from cosim.record.rows import Rows, Slice
-from cosim.record.run_record import RecordedRun, RunRecord, load_run
+from cosim.record.run_record import RecordedRun, RunRecord
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     NETEM_PACKET,
@@ -372,11 +370,6 @@ def replay_run(run: RecordedRun, loop: str | None = None) -> ReplayResult:
         processes=tuple(_add_up(processes[name]) for name in in_order),
         messages=tuple(map(_add_up, messages.values())),
     )
-
-
-def stored_verdict(run_dir: Path) -> ReplayPart:
-    """Replay the only loop of a run directory; return the result for its summary."""
-    return replay(load_run(run_dir).loop()).verdict()
 
 
 def _by_name(named: Iterable[tuple[str, Result]]) -> dict[str, list[Result]]:

@@ -6,12 +6,14 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from importlib import import_module
 from multiprocessing.connection import Connection
 from types import ModuleType
+from typing import TypeVar
 
 from noack.core.system_processes import be_idle
 from noack.runtime.command_line import END_SIGNALS
@@ -28,6 +30,8 @@ keep freed memory: with new memory for each part of a record, half of the time i
 _STARTS = threading.Lock()
 ENDINGS = {getattr(signal, name) for name in END_SIGNALS}
 """Numbers of the signals that end a program."""
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 
 @contextmanager
@@ -64,6 +68,32 @@ def environment(variables: Mapping[str, str]) -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
+
+
+def map_in(
+    pool: ProcessPoolExecutor | None, function: Callable[[Item], Result], items: Sequence[Item]
+) -> Iterable[Result]:
+    """Yield ``function(item)`` of each item in order, computed by processes; without them, here.
+
+    The processes begin at once. What a killed process leaves over is computed here.
+    """
+    if pool is None:
+        return map(function, items)
+    futures: list[Future[Result] | None] = []
+    with process_starts():
+        for item in items:
+            try:
+                futures.append(pool.submit(function, item))
+            except BrokenProcessPool:
+                futures.append(None)
+    return (_result(future, function, item) for future, item in zip(futures, items, strict=True))
+
+
+def _result(future: Future[Result] | None, function: Callable[[Item], Result], item: Item) -> Result:
+    try:
+        return function(item) if future is None else future.result()
+    except BrokenProcessPool:
+        return function(item)
 
 
 def _depend_on(parent: Connection, threshold: tuple[int, int, int]) -> None:

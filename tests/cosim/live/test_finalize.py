@@ -3,12 +3,11 @@
 import json
 import os
 import shutil
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import suppress
+from contextlib import contextmanager
 from pathlib import Path
-from threading import Event, current_thread
 from typing import Any, NoReturn
 from unittest.mock import patch
 
@@ -16,11 +15,11 @@ import numpy as np
 import pytest
 
 import cosim.live.finalize
-from cosim.analysis.replay import replay
+from cosim.analysis.claims.run_certificates import Expectations, expectations
 from cosim.analysis.summary.summary_model import RunSummary
-from cosim.live.finalize import ReplayInHelper, finalize, reopen
-from cosim.live.processes import finalize_helpers
-from cosim.live.processes.finalize_helpers import FinalizeHelpers, RunEndingWithHelpers
+from cosim.live.finalize import finalize, reopen
+from cosim.live.processes.early_certificates import LaunchedEnding
+from cosim.live.processes.process_pool import process_starts, processes
 from cosim.record.record_writing import write_run
 from cosim.record.run_directory import (
     ENDING_FILE,
@@ -32,13 +31,14 @@ from cosim.record.run_directory import (
     RunEnding,
     write_environment,
 )
-from cosim.record.run_record import load_record
+from cosim.record.run_record import load_record, load_run
 from cosim.record.spool_conversion import finish_record
 from cosim.simulation.virtual_time import simulate, simulate_run
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.protocol.record_tables import PLANT_STEP
 from noack.runtime.spool import SPOOL, SpoolWriter
-from noack.scenario.scenario_file import dumps, load
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import dumps
 from tests.cosim.record.changed_records import changed
 from tests.helpers.shipped import resolved, shipped
 from tests.helpers.summaries import run_of_one_loop
@@ -216,22 +216,16 @@ def test_an_interrupted_finalisation_is_completed(run_dir: Path) -> None:
     assert (run_dir / RECORDING_FILE).stat().st_size > 10_000
 
 
-# --- processes that help with the end of a long run -----------------------------------------------
+# --- other processes ------------------------------------------------------------------------------
 
 
 JudgedRun = tuple[Path, RunSummary]
 LOOPS = 3
-_NEVER_IDLE = """
-from cosim.live.processes import process_pool
-from cosim.record import spool_conversion
-process_pool.be_idle = spool_conversion.be_idle = lambda: None
-"""
-"""For a helper: on a busy machine, idle priority can get no time for minutes."""
 
 
 @pytest.fixture(scope="module")
 def judged_alone(tmp_path_factory: pytest.TempPathFactory) -> JudgedRun:
-    """A run of more loops than are prepared at once, and its summary without help."""
+    """A run of several loops, and its summary by one process."""
     scenario = shipped("shared_bottleneck", "horizon_s=0.2")
     assert scenario.loops is not None
     loops = (scenario.loops[0].model_copy(update={"count": LOOPS}),)
@@ -246,109 +240,55 @@ def judged_alone(tmp_path_factory: pytest.TempPathFactory) -> JudgedRun:
 def many_loops(
     judged_alone: tuple[Path, RunSummary], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Path:
-    """A copy of the run, whose end processes help with."""
-    monkeypatch.setattr(finalize_helpers, "_MANY_STEPS", 10)
-    monkeypatch.setattr(finalize_helpers, "_FEW_LOOPS", LOOPS - 1)
-    monkeypatch.setattr(cosim.live.finalize, "_LEAST_LOOPS", LOOPS - 1)  # helpers judge loops, too
-    monkeypatch.setattr(finalize_helpers, "cores", lambda: 2)
+    """A copy of the run, whose loops are evaluated by other processes."""
+    monkeypatch.setattr(cosim.live.finalize, "_MANY_STEPS", 10)
+    monkeypatch.setattr(cosim.live.finalize, "_LEAST_LOOPS", LOOPS - 1)  # two blocks
+    monkeypatch.setattr(cosim.live.finalize, "cores", lambda: 2)
     run_dir, _ = judged_alone
     return Path(shutil.copytree(run_dir, tmp_path / run_dir.name))
 
 
 @pytest.mark.parametrize("is_killed", [False, True])
-def test_a_prepared_end_is_that_of_a_run_without_preparation(
+def test_other_processes_find_the_same_even_if_one_is_killed(
     judged_alone: tuple[Path, RunSummary],
     many_loops: Path,
     monkeypatch: pytest.MonkeyPatch,
     *,
     is_killed: bool,
 ) -> None:
-    ending_arguments = (many_loops, 0, ExitStatus.OK, "horizon")
-    helpers = FinalizeHelpers(load(many_loops / SCENARIO_FILE))
-    helpers.end_preparation()
-    helpers.submit(exec, _NEVER_IDLE).result()
-    helpers.prepare(many_loops)
-    for thread in helpers._threads:
-        thread.join()
+    @contextmanager
+    def killed(workers: int) -> Iterator[ProcessPoolExecutor]:
+        with processes(workers) as pool:
+            with process_starts():
+                killing = pool.submit(os._exit, 1)
+            with pytest.raises(BrokenProcessPool):
+                killing.result()
+            yield pool
+
     if is_killed:
-        assert helpers.submit(os.getpid).result() != os.getpid()
-        with pytest.raises(BrokenProcessPool):
-            helpers.submit(os._exit, 1).result()
-    ending = RunEndingWithHelpers(*ending_arguments, helpers=helpers)
+        monkeypatch.setattr(cosim.live.finalize, "processes", killed)
     _, expected = judged_alone
-    assert finalize(ending, report=False, view=not is_killed).summary == expected
+    assert finalize(ended_well(many_loops), report=False, view=not is_killed).summary == expected
 
 
-@pytest.mark.parametrize("part", ["_call_at_idle_priority", "_write_early"])
-def test_the_end_does_not_wait_for_a_preparation_that_gets_no_time(
-    many_loops: Path, monkeypatch: pytest.MonkeyPatch, part: str
+def test_certificates_that_are_known_at_the_end_are_used(
+    judged_alone: tuple[Path, RunSummary], many_loops: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A table writer that has not made its folder is not waited for either."""
-    preparation_started = Event()
+    """Those of other loops are computed; here no other process is asked."""
+    known = {
+        record.number: expectations(record.scenario)
+        for record in load_run(many_loops).loops
+        if record.number != 1
+    }
+    computed = []
 
-    def endless(helpers: FinalizeHelpers, *_: object) -> None:
-        if part == "_write_early":
-            helpers._end_file, helpers._writer = many_loops / "none" / "ended", current_thread()
-        waiting = helpers.submit(time.sleep, 1e6)
-        preparation_started.set()
-        waiting.result()
+    def recorded_expectations(scenario: Scenario) -> Expectations:
+        computed.append(scenario.name)
+        return expectations(scenario)
 
-    for method in ("_write_early", "_call_at_idle_priority"):
-        monkeypatch.setattr(FinalizeHelpers, method, endless if method == part else lambda *_: None)
-    monkeypatch.setattr(finalize_helpers, "_GRACE_S", 0.0)
-    helpers = FinalizeHelpers(load(many_loops / SCENARIO_FILE))
-    helpers.prepare(many_loops)
-    preparation_started.wait()
-    ending = RunEndingWithHelpers(many_loops, 0, ExitStatus.OK, "horizon", helpers=helpers)
-    assert len(finalize(ending, report=False, view=False).summary.loops) == LOOPS
-
-
-def test_the_end_waits_for_the_table_writer(many_loops: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The writer has seen the end file, and is no longer at idle priority."""
-    writing_started, end_file_made = Event(), Event()
-
-    def write(helpers: FinalizeHelpers, *_: object) -> None:
-        helpers._end_file, helpers._writer = many_loops / "ended", current_thread()
-        writing_started.set()
-        end_file_made.wait()
-        time.sleep(20 * finalize_helpers._POLL_S)
-
-    def make_end_file(_: FinalizeHelpers) -> bool:
-        end_file_made.set()
-        return True
-
-    for method, replacement in (("_write_early", write), ("_make_end_file", make_end_file)):
-        monkeypatch.setattr(FinalizeHelpers, method, replacement)
-    monkeypatch.setattr(FinalizeHelpers, "_call_at_idle_priority", lambda *_: None)
-    monkeypatch.setattr(finalize_helpers, "_GRACE_S", 0.0)
-    helpers = FinalizeHelpers(load(many_loops / SCENARIO_FILE))
-    helpers.prepare(many_loops)
-    writing_started.wait()
-    with patch.object(helpers, "_abort") as aborted:
-        helpers.end_preparation()
-    helpers.close()
-    assert not aborted.called
-
-
-def _killed(*_: object) -> None:
-    raise MemoryError
-
-
-@pytest.mark.parametrize("part", [ReplayInHelper.part, _killed])
-def test_a_replay_in_a_helper_equals_one_in_this_process(
-    run_dir: Path, monkeypatch: pytest.MonkeyPatch, part: Callable[..., Any]
-) -> None:
-    monkeypatch.setattr(finalize_helpers, "_MANY_STEPS", 10)
-    monkeypatch.setattr(finalize_helpers, "cores", lambda: 2)
-    replays = []
-
-    def recorded_part(self: ReplayInHelper) -> Any:
-        replays.append(self)
-        with suppress(MemoryError):
-            return part(self)
-
-    monkeypatch.setattr(ReplayInHelper, "part", recorded_part)
-    finalize(ended_well(run_dir), report=False, view=False)
-    stored = summary_of(run_dir)["loops"][0]["replay"]
-    assert stored == replay(load_record(run_dir)).verdict().model_dump()
-    assert len(replays) == 1
+    monkeypatch.setattr(cosim.live.finalize, "cores", lambda: 1)
+    monkeypatch.setattr(cosim.live.finalize, "expectations", recorded_expectations)
+    ending = LaunchedEnding(many_loops, 0, ExitStatus.OK, "horizon", expectations=known)
+    _, expected = judged_alone
+    assert finalize(ending, report=False, view=False).summary == expected
+    assert computed == [load_run(many_loops).names[1]]

@@ -13,7 +13,7 @@ from cosim.live.finalize import reopen
 from cosim.live.launcher import _Run, launch
 from cosim.live.monitoring.run_observers import RunObserver, RunObservers
 from cosim.live.processes.child_processes import ChildProcesses, EndReason
-from cosim.live.processes.finalize_helpers import FinalizeHelpers
+from cosim.live.processes.early_certificates import EarlyCertificates
 from noack.core.errors import CallerError, ExitStatus
 from noack.protocol.roles import RECORDER, ROLES
 from noack.runtime import command_line
@@ -100,8 +100,8 @@ class Case:
         return FakeChildren(self.run_dir, code)
 
     def run(self, children: FakeChildren, coordinator: FakeCoordinator, **watch: Any) -> _Run:
-        observers, helpers = RunObservers([Calls(**watch)]), FinalizeHelpers(self.descriptor.scenario)
-        return _Run(self.descriptor, self.run_dir, cast(Any, coordinator), children, observers, helpers)
+        observers, certificates = RunObservers([Calls(**watch)]), EarlyCertificates()
+        return _Run(self.descriptor, self.run_dir, cast(Any, coordinator), children, observers, certificates)
 
 
 @pytest.fixture

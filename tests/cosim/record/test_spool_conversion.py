@@ -1,7 +1,6 @@
 """The records of a live run of several loops, from a spool with the rows of a simulated one."""
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -14,13 +13,13 @@ from hypothesis import strategies as st
 from cosim.record.run_directory import REPORTS_FILE, write_environment
 from cosim.record.run_record import RecordedRun, Rows, load_run
 from cosim.record.run_scenario import write_scenario
-from cosim.record.spool_conversion import Segment, finish_record, merge_segments, write_early
+from cosim.record.spool_conversion import Segment, finish_record, merge_segments
 from cosim.record.table_files import TableFile, write_table
 from cosim.simulation.virtual_time import simulate_loops
 from noack.core.errors import MachineError
 from noack.protocol.record_tables import LOOP, NETEM_PACKET, PLANT_STEP, network_tables
 from noack.protocol.roles import Notice
-from noack.runtime.spool import EARLY, EARLY_ENDED, SPOOL, SpoolWriter, notices_of
+from noack.runtime.spool import SPOOL, SpoolWriter, notices_of
 from noack.scenario.scenario_file import validate
 from tests.helpers.rows_of_loops import mixed_rows
 
@@ -52,21 +51,14 @@ def spool(run_dir: Path, table: str, rows: Rows, *, writer: str = "recorder") ->
     spool_writer.close()
 
 
-def same_rows(run_dir: Path, shared: RecordedRun, early: Mapping[str, int] | None = None) -> list[str]:
-    """Finish a record and compare its rows; return the tables that were still to be written."""
-    written_tables: list[str] = []
-
-    def each(function: Callable[[str], None], tables: Sequence[str]) -> Iterable[None]:
-        written_tables.extend(tables)
-        return map(function, tables)
-
-    finished = finish_record(run_dir, each, early)
+def same_rows(run_dir: Path, shared: RecordedRun) -> None:
+    """Finish a record and compare its rows."""
+    finished = finish_record(run_dir)
     for record, expected in zip(
         (finished.network, *load_run(run_dir).loops), (shared.network, *shared.loops), strict=True
     ):
         for table in expected.tables:
             assert record[table].tobytes() == expected[table].tobytes(), table
-    return written_tables
 
 
 def opened(shared: RecordedRun, run_dir: Path) -> Path:
@@ -118,51 +110,6 @@ def test_an_interrupted_attempt_is_repeated_and_later_rows_are_added(
     for table, batch in later.items():  # a process that was frozen spools its rows after the end
         spool(run_dir, table, batch, writer="frozen")
     same_rows(run_dir, shared)
-
-
-@pytest.mark.parametrize("kind", ["in order", "sent again", "a batch less", "rows afterwards"])
-def test_tables_written_during_the_run_have_the_same_rows(
-    shared: RecordedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
-) -> None:
-    run_dir, rows = opened(shared, tmp_path / "run"), mixed_rows(shared)
-    # Sent again: one comes late, another one twice.
-    repeated_firsts, fewer_firsts = [0, 50, 150, 150, 200, 100, 250, 300], [0, 50, 150, 200, 250, 300]
-    order = {"sent again": repeated_firsts, "a batch less": fewer_firsts}.get(kind, range(0, 350, 50))
-    out, batches = SpoolWriter(run_dir / SPOOL, "recorder"), iter(order)
-    out.prepare(rows)
-
-    def more(_: float) -> None:
-        """Spool what comes while the writer waits, and then say that the run has ended."""
-        if (first := next(batches, None)) is None:
-            (run_dir / SPOOL / EARLY / EARLY_ENDED).touch()
-            return
-        until = 10**6 if first == 300 and kind != "rows afterwards" else first + 50
-        for table, batch in rows.items():
-            out.append(table, first, batch[first:until].tobytes())
-
-    monkeypatch.setattr("cosim.record.spool_conversion.time.sleep", more)
-    monkeypatch.setattr("cosim.record.spool_conversion._SLICE_BYTES", 10_000)
-    monkeypatch.setattr("cosim.record.spool_conversion.BATCH_ROWS", 50)
-    early = None
-    if kind == "a batch less":
-        with pytest.raises(ValueError, match="missing"):
-            write_early(run_dir)
-        assert not [*(run_dir / SPOOL / EARLY).iterdir()]
-        for table, batch in rows.items():
-            spool(run_dir, table, batch[100:150], writer="sensor")
-    else:
-        early = write_early(run_dir)
-        assert {file.stem for file in (run_dir / SPOOL / EARLY).iterdir()} > early.keys()
-    if kind == "rows afterwards":
-        for table, batch in rows.items():
-            spool(run_dir, table, batch[350:], writer="frozen")
-    out.close()
-    written = same_rows(run_dir, shared, early)
-    assert (PLANT_STEP in written) == (kind in ("a batch less", "rows afterwards"))
-    file = TableFile(run_dir / f"record/{PLANT_STEP}.parquet", rows[PLANT_STEP].dtype)
-    assert len(file.groups) > 2 * LOOPS or PLANT_STEP in written
-    numbers = file.whole()[LOOP].to_pylist()
-    assert numbers == sorted(rows[PLANT_STEP][LOOP].tolist())
 
 
 def _fail(*_: object) -> None:

@@ -1,0 +1,51 @@
+"""The certificates that a process computes while a run goes on."""
+
+import time
+from pathlib import Path
+
+import pytest
+
+from cosim.analysis.claims.run_certificates import expectations
+from cosim.live.processes import early_certificates
+from cosim.live.processes.early_certificates import EarlyCertificates
+from cosim.live.processes.process_pool import call_by_name
+from cosim.record.run_record import scenarios_of
+from cosim.record.run_scenario import write_scenario
+from noack.scenario.resolution import resolve_run
+from tests.helpers.shipped import shipped
+from tests.helpers.waiting import wait_for
+
+
+def sleep_long(*_: object) -> None:
+    """For the process: it computes no certificate in the time of a run."""
+    time.sleep(1e6)
+
+
+@pytest.fixture
+def run_dir(tmp_path: Path) -> Path:
+    """A run of three loops, of which two are equal."""
+    scenario = shipped("shared_bottleneck")
+    assert scenario.loops is not None
+    loops = (scenario.loops[0].model_copy(update={"count": 2}), scenario.loops[1])
+    write_scenario(resolve_run(scenario.model_copy(update={"loops": loops})), tmp_path)
+    return tmp_path
+
+
+def test_they_are_those_of_each_loop(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # On a busy machine, idle priority can get no time for minutes.
+    monkeypatch.setattr(early_certificates, "at_idle_priority", call_by_name)
+    _, loops = scenarios_of(run_dir)
+    with EarlyCertificates() as certificates:
+        certificates.start(run_dir)
+        wait_for(lambda: len(certificates.known) == len(loops))
+    for number, loop in enumerate(loops):
+        expected, known = expectations(loop), certificates.known[number]
+        assert known.assumptions == expected.assumptions
+        assert str(known.certificates) == str(expected.certificates)
+
+
+def test_the_end_of_a_run_does_not_wait_for_them(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(early_certificates, "at_idle_priority", sleep_long)
+    with EarlyCertificates() as certificates:
+        certificates.start(run_dir)
+    assert certificates.known == {}
