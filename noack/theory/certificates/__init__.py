@@ -14,8 +14,7 @@ loop"):
    eq:Normec, but without Proposition 1), X (eq:normXt) and β̃.
 2. ``solution.py``. The minimum inter-event time δ is the time that e_s needs from 0 to the
    threshold under these bounds (eq:miet_errdyn; the paper's is eq:tau). N and D_C depend on δ, so
-   the largest consistent δ is used. For one known plant ``deliveries/`` sharpens the bounds by what
-   holds from one delivery to the next.
+   the largest consistent δ is used.
 3. ``persistent_bounds.py``. With persistent disturbances, noise, an observer or a constant threshold, each
    bound has a decaying part and a persistent part. All inequalities are linear in functions of
    time, so the bounds of the two parts are added.

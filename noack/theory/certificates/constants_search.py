@@ -28,7 +28,7 @@ from noack.theory.bounds.gains import PlantGains, error_gains, first_equal
 from noack.theory.bounds.trigger_bounds import TriggerBounds
 from noack.theory.certificates.assumptions import is_below_decay_rate
 from noack.theory.certificates.persistent_bounds import DisturbedCertificate, PlantAt, choose_rate
-from noack.theory.certificates.solution import Problem, sharpened
+from noack.theory.certificates.solution import Problem, solve_problem
 
 _SLOWER = 0.9
 """Rate that is certified if α is too large, as a share of the decay rate of the loop."""
@@ -215,10 +215,9 @@ class ConstantsSearch:
             plant = replace(plant, further_outputs=self._trigger.outputs)
             self._plants[alpha_per_s] = first_equal(plant)
         plant = self._plants[alpha_per_s]
-        # Inputs of an earlier run are covered by their norm only.
-        earlier = self._start_error
         part = CertificatePart(plant.error, plant, self._trigger.bound(conditions, level, least_level))
-        return sharpened(Problem((part,), conditions, earlier, structured=earlier == 0.0, longest=longest))
+        (constants,) = solve_problem(Problem((part,), conditions, self._start_error, longest))
+        return constants
 
 
 _BOUNDS = (
@@ -240,13 +239,6 @@ def _at_floor(constants: Constants, share: float) -> Constants:
     """
     names = ("start_error", *_BOUNDS)
     return constants._replace(rate_per_s=0.0, **{name: share * getattr(constants, name) for name in names})
-
-
-def is_within(inner: Constants, outer: Constants) -> bool:
-    """Return whether no bound of ``outer`` is below that of ``inner`` at any time."""
-    return inner.rate_per_s >= outer.rate_per_s and all(
-        getattr(inner, name) <= getattr(outer, name) for name in ("delta", "overshoot", *_BOUNDS)
-    )
 
 
 def _is_finite(constants: Constants) -> bool:

@@ -31,7 +31,7 @@ from noack.theory.bounds.disturbances import EstimationError, bound_forcing
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, Forcing, PlantGains, error_gains, first_equal
 from noack.theory.bounds.trigger_bounds import TriggerBounds
-from noack.theory.certificates.solution import Problem, sharpened, solve_problem
+from noack.theory.certificates.solution import Problem, solve_problem
 
 PlantAt = Callable[[ErrorGains, Matrix, float], PlantGains]
 """Returns the plant's gains from the gains of the models, the start of x, and α."""
@@ -79,7 +79,6 @@ class DisturbedCertificate:
             NotDecayingError: a mode of the loop or of the observer does not decay.
         """
         conditions = self.trigger.conditions_of_tests(conditions)
-        structured = self.start_error == 0.0
         # A part that decays as the threshold does, if there is one.
         if decays and self.resolved.coverage.is_decaying:
             try:
@@ -88,7 +87,6 @@ class DisturbedCertificate:
                     self._persistent,
                     conditions,
                     self.start_error,
-                    structured=structured,
                     shares=SHARES if longest else (),
                 )
                 return [AddedConstants(*parts)]
@@ -119,9 +117,8 @@ class DisturbedCertificate:
         """
         level, floor = max(self.trigger.beta, self.trigger.floor), self.trigger.floor
         bound = self.trigger.bound(conditions, level, floor or None)
-        part, structured = self._undivided._replace(bound=bound), self.start_error == 0.0
-        problem = Problem((part,), conditions, self.start_error, structured, longest)
-        constants = sharpened(problem)
+        part = self._undivided._replace(bound=bound)
+        (constants,) = solve_problem(Problem((part,), conditions, self.start_error, longest))
         # The mean of an integral bounds e_s over a time that suits only one of several parts.
         is_divided = not self.trigger.beta and not self.trigger.area and not self.start_error
         divided: list[AddedConstants] = []
@@ -233,7 +230,6 @@ def solve_two_parts(
     conditions: NetworkConditions,
     earlier_error: float = 0.0,
     *,
-    structured: bool = True,
     shares: Sequence[float] = SHARES,
 ) -> tuple[Constants, Constants]:
     """Return the constants of both parts, with the λ of ``shares`` for which δ is longest.
@@ -252,9 +248,7 @@ def solve_two_parts(
             part._replace(bound=part.bound._replace(least_event_error=level))
             for part, level in zip((decaying, persistent), levels, strict=True)
         ]
-        first_constants, second_constants = solve_problem(
-            Problem(tuple(parts), conditions, earlier_error, structured)
-        )
+        first_constants, second_constants = solve_problem(Problem(tuple(parts), conditions, earlier_error))
         return first_constants, second_constants
 
     if floor == 0:

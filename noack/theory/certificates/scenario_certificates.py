@@ -3,9 +3,8 @@
 :class:`CertificateScope` is a scenario's own plant, or its uncertainty box.
 """
 
-import contextlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,19 +17,15 @@ from noack.settings.section import MatrixRows
 from noack.theory.bounds.box import BoxGains
 from noack.theory.bounds.certificate_terms import Constants, NetworkConditions, NoCertificateError
 from noack.theory.bounds.enclosure import NotDecayingError
-from noack.theory.bounds.gains import ErrorGains, PlantGains, error_gains
+from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.bounds.trigger_bounds import TriggerBounds
 from noack.theory.certificates.assumptions import certificate_assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import BOX, OWN_PLANT, kept_probability
-from noack.theory.certificates.constants_search import ConstantsSearch, Phases, is_within
-from noack.theory.certificates.deliveries.due_deliveries import Deliveries
+from noack.theory.certificates.constants_search import ConstantsSearch, Phases
 from noack.theory.certificates.persistent_bounds import PlantAt
 from noack.theory.certificates.refusals import refusal_under
 
-_TIMED_RATES = (0.7, 0.4, 0.1)
-"""Rates that are tried where events are due, as shares of the decay rate of A + BK: the first that
-has a certificate is used."""
 _SMALLEST_START, _LARGEST_START = 1e-150, 1e150
 """The squares of larger entries of x(0) may overflow."""
 
@@ -252,13 +247,10 @@ class CertificateScope:
         try:
             constants = self._constants.phases(conditions, longest=self._start_error > 0)
         except NoCertificateError as error:
-            gain = max(error.loop_gain, 1.0)
+            return max(error.loop_gain, 1.0)
         except NotDecayingError:
-            gain = math.inf
-        else:
-            return max(phase.loop_gain for phase in constants[0] if phase is not None)
-        # A certificate exists most easily for the slowest rate.
-        return next((deliveries.gain for deliveries in self._deliveries(conditions, _TIMED_RATES[-1:])), gain)
+            return math.inf
+        return max(phase.loop_gain for phase in constants[0] if phase is not None)
 
     def _decay_under(self, conditions: NetworkConditions) -> Mapping[str, float]:
         """Return the decay rates of the certificate under some conditions."""
@@ -271,46 +263,4 @@ class CertificateScope:
             NoCertificateError: there is no certificate.
             NotDecayingError: a mode of the loop decays too slowly.
         """
-        try:
-            solved = self._constants.phases(conditions, longest=True)
-        except (NoCertificateError, NotDecayingError) as error:
-            solved, void = [], error
-        inter_event_s = max((main.inter_event_s or 0.0 for main, *_ in solved), default=0.0)
-        timed = self._constants_from_due_times(conditions, inter_event_s)
-        if timed is None:
-            if not solved:
-                raise void
-            return solved
-        inter_event_s = max(inter_event_s, timed.inter_event_s or 0.0)
-        useful = [phases for phases in solved if not is_within(timed, phases.main)]
-        return [Phases(timed._replace(inter_event_s=inter_event_s)), *useful]
-
-    def _constants_from_due_times(
-        self, conditions: NetworkConditions, inter_event_s: float
-    ) -> Constants | None:
-        """Return constants that follow from the times of deliveries alone, if they exist.
-
-        ``inter_event_s`` is a known lower bound of the inter-event time.
-        """
-        deliveries = next(self._deliveries(conditions, _TIMED_RATES, inter_event_s), None)
-        return None if deliveries is None else deliveries.constants(self._trigger.beta or 1.0)
-
-    def _deliveries(
-        self, conditions: NetworkConditions, shares: Sequence[float], inter_event_s: float = 0.0
-    ) -> Iterator[Deliveries]:
-        """Yield what is known of the deliveries where events are due, for each rate that is tried."""
-        trigger, loop = self._trigger, self._loop
-        if not trigger.has_due_time or not self._resolved.coverage.is_undisturbed:
-            return
-        if self._start_error or self._start.shape[1] != 1 or self._resolved.observer is not None:
-            return
-        tested = trigger.conditions_of_tests(conditions)
-        for share in shares if self.decay_per_s["A + BK"] > 0 else ():
-            rate = share * self.decay_per_s["A + BK"]
-            plant = self._plant_at(error_gains(loop, rate), self._start, rate)
-            if plant.is_one_plant:
-                with contextlib.suppress(NoCertificateError, NotDecayingError, np.linalg.LinAlgError):
-                    bound = trigger.bound(tested, 0.0, None)
-                    least_s = max(bound.times.shortest_s, inter_event_s)
-                    bound = bound._replace(times=bound.times._replace(shortest_s=least_s))
-                    yield Deliveries(plant, tested, bound)
+        return self._constants.phases(conditions, longest=True)

@@ -3,19 +3,16 @@
 The bounds are the solution of the inequalities of :mod:`noack.theory.certificates.inequalities`.
 The minimum inter-event time δ is the time that ‖e_s‖_W needs from 0 to β under these bounds. If an
 assumed δ gives a time of at least δ, it holds by induction over the events; the largest such δ is
-used. The constants are sharpened by the flow between two updates
-(:mod:`noack.theory.certificates.deliveries.sharpened_constants`).
+used.
 """
 
-import contextlib
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.cached_method import cached_function
 from noack.core.linear_systems import Vector
 from noack.core.number_format import apart_from
 from noack.theory.bounds.certificate_terms import (
@@ -25,10 +22,8 @@ from noack.theory.bounds.certificate_terms import (
     NoCertificateError,
     TriggerBound,
 )
-from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.error_growth import LONGEST_S
 from noack.theory.bounds.gains import Counts, ErrorGains, PlantGains
-from noack.theory.certificates.deliveries.sharpened_constants import can_be_sharpened, sharpened_constants
 from noack.theory.certificates.error_rows import BoundMethod, Signal
 from noack.theory.certificates.inequalities import MOST_MISSING, ErrorInequalities, LoopConstants
 
@@ -60,20 +55,12 @@ class Problem(NamedTuple):
     conditions: NetworkConditions
     earlier_error: float = 0.0
     """Bound of sup‖p‖ of the first part while the plant still applies its first inputs at a set-point."""
-    structured: bool = True
-    """Whether p = u − Kx consists at every time of the errors of the events and of the age of the
-    input. Otherwise it is only known that its norm is at most π."""
     longest: bool = True
     """Whether the longest δ is sought; otherwise only if there is no certificate without it."""
 
 
 def solve(
-    error: ErrorGains,
-    plant: PlantGains,
-    conditions: NetworkConditions,
-    bound: TriggerBound,
-    *,
-    structured: bool = True,
+    error: ErrorGains, plant: PlantGains, conditions: NetworkConditions, bound: TriggerBound
 ) -> Constants:
     """Return the constants of one part that are certified for all times; see :class:`Problem`.
 
@@ -81,31 +68,8 @@ def solve(
         NoCertificateError: the loop gain is not below 1.
         NotDecayingError: a mode of the loop decays more slowly than the threshold.
     """
-    return sharpened(Problem((CertificatePart(error, plant, bound),), conditions, structured=structured))
-
-
-@np.errstate(all="ignore")
-def sharpened(problem: Problem) -> Constants:
-    """Return the constants of a problem of one part, sharpened where that is possible.
-
-    Raises: as :func:`solve`.
-    """
-    (constants,) = solve_problem(problem)
-    (part,), conditions, *_ = problem
-    is_plain = problem.structured and problem.earlier_error == 0.0
-    if problem.longest and is_plain and can_be_sharpened(part):
-        with contextlib.suppress(np.linalg.LinAlgError, NotDecayingError):
-            return sharpened_once(constants, part, conditions)
+    (constants,) = solve_problem(Problem((CertificatePart(error, plant, bound),), conditions))
     return constants
-
-
-def _sharpening_key(constants: Constants, part: CertificatePart, conditions: NetworkConditions) -> Hashable:
-    # The id is that of one plant only, because the part is kept, and keeps its plant.
-    return id(part.plant), constants, repr((part.bound, conditions))
-
-
-sharpened_once = cached_function(32, _sharpening_key)(sharpened_constants)
-"""Sharpen constants; runs, their claims and reports need those of the same scenario repeatedly."""
 
 
 @np.errstate(all="ignore")

@@ -118,7 +118,7 @@ class _Samples:
         error = _SampledError(loop.H, loop.K, weight, self.alpha_per_s, samples=self)
         plant = _SampledPlant(error, loop.A, loop.B, loop.x0[:, None], self.alpha_per_s, samples=self)
         try:
-            constants = solve(error, plant, conditions, bound, structured=False)
+            constants = solve(error, plant, conditions, bound)
         except NoCertificateError as void:
             return _VOID + min(void.loop_gain, _VOID)
         return math.log(constants.state) - 3 * math.log(constants.inter_event_s or math.inf)

@@ -55,19 +55,15 @@ def certify_loop(
     system: System,
     conditions: NetworkConditions | None = None,
     plant: PlantGains | None = None,
-    *,
-    structured: bool = True,
 ) -> Constants:
     plant, level = plant or gains_of(system), TriggerBound(system.beta, system.beta)
     conditions = conditions or conditions_of(system)
-    return solve(plant.error, plant, conditions, level, structured=structured)
+    return solve(plant.error, plant, conditions, level)
 
 
-def certified_or_skipped(
-    system: System, conditions: NetworkConditions | None = None, *, structured: bool = True
-) -> Constants:
+def certified_or_skipped(system: System, conditions: NetworkConditions | None = None) -> Constants:
     try:
-        return certify_loop(system, conditions, structured=structured)
+        return certify_loop(system, conditions)
     except NoCertificateError:
         assume(False)
         raise

@@ -1,17 +1,11 @@
 """Certificates of random loops: no bound is exceeded, and those of broken copies are."""
 
-from dataclasses import replace
 from functools import cache, reduce
 
-import numpy as np
 import pytest
 
-from noack.theory.bounds.certificate_terms import NetworkConditions
 from tests.noack.theory.certificates.certificate_kinds import Tally
 from tests.noack.theory.certificates.certificate_kinds.comparison import KINDS, examine
-from tests.noack.theory.certificates.certificate_kinds.continuous import CONTINUOUS, constants_of
-from tests.noack.theory.certificates.certificate_kinds.decaying import dominated_by_errors
-from tests.noack.theory.certificates.certified_loops import certify_loop
 
 MOST = 60
 LOOPS = dict.fromkeys(KINDS, 1) | {"decaying": 2, "continuous time": 2, "self_triggered": 2}
@@ -55,24 +49,3 @@ def test_the_first_event_of_an_integral_needs_no_large_error(seed: int) -> None:
     Certificates that took the latter for granted had events too close, and a bound of e_c too small.
     """
     assert examined("send_on_area", seed).violated[""] == 0
-
-
-def test_the_flow_makes_the_bounds_much_smaller_and_runs_come_close_to_them() -> None:
-    system, conditions = dominated_by_errors(None, far=True), NetworkConditions(3)
-    sharp = certify_loop(system, conditions)
-    plain = certify_loop(system, conditions, structured=False)
-    assert sharp.state < 0.6 * plain.state
-    assert sharp.mismatch < 0.6 * plain.mismatch
-    assert (sharp.inter_event_s or 0.0) > 1.3 * (plain.inter_event_s or 0.0)
-    worst = CONTINUOUS.simulate(system, np.random.default_rng(1)).worst
-    bounds = constants_of(sharp, system.beta)
-    assert {name for name, bound in bounds.items() if worst[name] < 0.6 * bound} == set()
-
-
-def test_the_flow_between_updates_makes_the_bounds_of_a_schedule_smaller() -> None:
-    system = dominated_by_errors(None, far=True)
-    system = replace(system, step_s=0.004, delay_steps=1, hold_steps=1)
-    sharp, plain = certify_loop(system), certify_loop(system, structured=False)
-    assert sharp.state < 0.6 * plain.state
-    assert sharp.delta < plain.delta
-    assert (sharp.inter_event_s or 0.0) >= (plain.inter_event_s or 1.0)

@@ -77,14 +77,14 @@ def test_all_times_or_none_may_have_a_certificate() -> None:
 
 
 def test_no_shorter_sampling_period_makes_an_update_too_late() -> None:
-    """With updates 0.72 s apart there is a certificate; of a period of 0.5 s, they are 3 · 0.25 s apart."""
-    scenario = resolved("double_integrator", 'trigger={policy="periodic", period_s=0.5}')
+    """With tests of three quarters of the period, updates are half a period further apart."""
+    scenario = resolved("double_integrator", 'trigger={policy="periodic", period_s=0.165}')
     scope, scheduled = own_plant_scope(scenario), nominal_conditions(scenario)
 
     def gain(t_s: float) -> float:
         return scope.loop_gain(scheduled._replace(sampling_s=t_s, spacing_s=t_s))
 
     limit_s = network_limit(scope, scheduled, "sampling")
-    assert gain(0.24) < 1 < gain(0.375)
-    assert gain(0.72) < 1
-    assert 0.24 < limit_s < 0.25
+    assert gain(0.48 * 0.165) < 1 < gain(0.75 * 0.165)
+    assert gain(1.44 * 0.165) < 1
+    assert 0.48 * 0.165 < limit_s < 0.5 * 0.165

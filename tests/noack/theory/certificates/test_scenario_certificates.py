@@ -63,15 +63,6 @@ def test_what_would_take_minutes_is_refused_with_its_reason(
     assert re.match(r"up to [\d,]+ updates may be missing at once, .* for at most 1,000", void)
 
 
-def test_constants_with_many_missing_updates_are_not_sharpened(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The sharpening would follow each of them in every round."""
-    monkeypatch.setattr(
-        "noack.theory.certificates.deliveries.sharpened_constants.SharpenedBounds", None
-    )  # fmt: skip
-    resolved = shipped("double_integrator", "network.mansd=300")
-    assert certify(resolved, ideal_conditions(resolved)).constants is not None
-
-
 LATE_INPUT = systems(hold_steps=4, lag_steps=2, step_share=0.03, beta=0.01)
 
 

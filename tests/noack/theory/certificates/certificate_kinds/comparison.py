@@ -13,7 +13,7 @@ import numpy as np
 
 from cosim.live.processes.process_pool import process_starts, processes
 from tests.noack.theory.certificates.certificate_kinds import Broken, Kind, Tally
-from tests.noack.theory.certificates.certificate_kinds.continuous import CONTINUOUS, SCHEDULED
+from tests.noack.theory.certificates.certificate_kinds.continuous import CONTINUOUS
 from tests.noack.theory.certificates.certificate_kinds.decaying import DECAYING
 from tests.noack.theory.certificates.certificate_kinds.disturbed_policies import DISTURBED_POLICIES
 from tests.noack.theory.certificates.certificate_kinds.margins import MARGINS
@@ -24,7 +24,7 @@ from tests.noack.theory.certificates.certificate_kinds.shares import DISTURBED, 
 KINDS: Mapping[str, Kind] = {
     kind.name: kind
     for kind in (
-        DECAYING, CONTINUOUS, SCHEDULED, DISTURBED, OBSERVED, KNOWN_STATE,
+        DECAYING, CONTINUOUS, DISTURBED, OBSERVED, KNOWN_STATE,
         *POLICIES, *DISTURBED_POLICIES, MARGINS, REGIONS,
     )
 }  # fmt: skip

@@ -23,8 +23,6 @@ from noack.theory.bounds.certificate_terms import NetworkConditions, TriggerBoun
 from noack.theory.bounds.trigger_bounds import ComparisonBound, TriggerBounds
 from noack.theory.certificates import scenario_certificates
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.deliveries import due_deliveries
-from noack.theory.certificates.deliveries.delivery_balls import BallHistory
 from noack.theory.certificates.scenario_certificates import certify, trigger_bounds
 from tests.noack.theory.certificates.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificates.certificate_kinds.decaying import search
@@ -375,11 +373,7 @@ def with_trigger(kind: type[TriggerBounds]) -> Callable[[Scenario, Conditions], 
     def broken(resolved: Scenario, conditions: Conditions) -> ScenarioCertificate:
         true = trigger_bounds(resolved)
         wrong = kind(true.rule, true.weight, true.fastest_per_s)
-        with (
-            patch.object(scenario_certificates, "trigger_bounds", lambda *_, **__: wrong),
-            # What follows from times alone uses no bound of e_s.
-            patch.object(scenario_certificates, "_TIMED_RATES", ()),
-        ):
+        with patch.object(scenario_certificates, "trigger_bounds", lambda *_, **__: wrong):
             return certify(resolved, conditions)
 
     return broken
@@ -387,7 +381,7 @@ def with_trigger(kind: type[TriggerBounds]) -> Callable[[Scenario, Conditions], 
 
 def patched(target: Any, name: str, wrong: Any) -> Callable[[Scenario, Conditions], Any]:
     def broken(resolved: Scenario, conditions: Conditions) -> ScenarioCertificate:
-        with patch.object(target, name, wrong), patch.object(scenario_certificates, "_TIMED_RATES", ()):
+        with patch.object(target, name, wrong):
             return certify(resolved, conditions)
 
     return broken
@@ -409,15 +403,6 @@ def without(name: str) -> Callable[[Scenario, Conditions], Any]:
         return certify(resolved, conditions._replace(**{name: 0.0}))
 
     return broken
-
-
-def without_later_times(resolved: Scenario, conditions: Conditions) -> ScenarioCertificate:
-    """The certificate if nothing followed from what is left of the first return."""
-    with (
-        patch.object(BallHistory, "last_return", lambda history, last: (0.0, 0.0)),
-        patch.object(due_deliveries, "BALLS_AT_ONCE", 1),
-    ):
-        return certify(resolved, conditions)
 
 
 INSTANT = {"delay_steps": 0, "hold_steps": 0, "known_start": True, "window": (1, 1), "recovery": 0}
@@ -446,7 +431,6 @@ BROKEN_POLICIES: dict[str, tuple[str, Callable[[Scenario, Conditions], Any], dic
             **LATE, "sample_steps": 1, "delay_steps": 6, "hold_steps": 0, "step_share": 0.03,
         },
     ),
-    "periodic, no later times": ("periodic", without_later_times, {}),
     "lyapunov, no start without an input": (
         "lyapunov", without("start_s"), {
             **LATE, "delay_steps": 2, "hold_steps": 0, "mismatch": 0.0, "known_start": False,
