@@ -60,7 +60,7 @@ def test_the_documentation_quotes_computed_figures(lane: Certificates, weighted:
     theorem = lane.theorem_2
     assert rows["Δ"] == ["(same)", f"{scenario_norm.delta:.3g}", f"{other_norm.delta:.3g}"]
     assert scenario_norm.inter_event_s >= 100 * theorem.inter_event_s
-    assert 3.06 < other_norm.delta < 1.5 * 3.06  # 3.06: the worst run of 30 s
+    assert 3.06 < other_norm.delta < 1.7 * 3.06  # 3.06: the worst run of 30 s
     assert constants(weighted.paper_box).delta == pytest.approx(5.0, abs=1e-9)  # Δ ≤ M
     paper_bound = theorem.state_start + theorem.state_forced
     assert rows["X"] == [f"{paper_bound:.3g}", f"{scenario_norm.state:.3g}", f"{other_norm.state:.3g}"]

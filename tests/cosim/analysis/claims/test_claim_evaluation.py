@@ -144,13 +144,13 @@ def test_a_wrong_value_violates_its_claim_from_its_time_on(
 
 BETWEEN = {
     "name": "between", "horizon_s": 2.0,
-    "model": {"A": [[0.0, 1.0], [0.0, 0.0]], "B": [[0.0], [1.0]], "gain": [[-1.0, -1.7]]},
+    "model": {"A": [[0.0, 1.5], [-0.1, -0.2]], "B": [[0.0], [1.0]], "gain": [[-0.2, -0.4]]},
     "plant": {"initial_state": [1.0, 3.0], "rate_hz": 50.0, "measure_every": 50},
     "trigger": {"policy": "periodic", "period_s": 1.0},
     "network": {"mansd": 0, "loss": {"model": "lossless"}},
     "controller": {"rate_hz": 50.0},
 }  # fmt: skip
-"""A scenario with three measurements: x is largest between the first two."""
+"""A scenario with three measurements: x is largest between two of them."""
 
 
 @pytest.mark.parametrize("claim", ["the state is bounded", "the state is bounded from the newest event on"])

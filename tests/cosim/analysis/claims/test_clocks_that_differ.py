@@ -16,13 +16,10 @@ from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.analysis.claims.condition_reader import read_conditions
 from cosim.analysis.replay import replay
 from cosim.analysis.summary.summary_model import Claim, ClaimVerdict
-from cosim.record.align import aligned_parts
 from cosim.record.run_record import RunRecord
 from noack.runtime.control_messages import ClockError
 from noack.runtime.host_clocks import CHRONY, CLOCK_NOTICE, RECEIVED, CausalityCheck
-from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_file import validate
 from tests.cosim.analysis.claims.conftest import Make
 from tests.cosim.record.changed_records import changed
 from tests.cosim.simulation.event_scheduler import record_of_run
@@ -88,31 +85,6 @@ def test_every_claim_holds_whatever_the_clocks(make: Make, delay_s: float) -> No
         seen.add(claims.certified_for is not None)
         assert replay(record).bit_exact
     assert seen == {True, False}
-
-
-def test_nothing_is_claimed_of_an_older_x_c_than_that_of_the_input() -> None:
-    """A controller that is ahead resets x_c at a later model time than an update acts on the plant.
-
-    The open loop decays faster than the models, so the older x_c exceeds the bound by 24 %.
-    """
-    content = {
-        "name": "ahead", "horizon_s": 6.0,
-        "model": {"A": [[-5.0]], "B": [[1.0]], "gain": [[4.95]]},
-        "plant": {"draw": "given", "A": [[-5.2]], "B": [[1.0]], "initial_state": [1.0], "rate_hz": 100.0},
-        "controller": {"rate_hz": 100.0},
-        "trigger": {"policy": "periodic", "period_s": 0.5},
-        "network": {"mansd": 0, "loss": {"model": "lossless"}, "initial_sync": "known_state"},
-        "certificate": {"late_periods": 0},
-    }  # fmt: skip
-    scenario = resolve(validate(content, "test"))
-    record = simulated(scenario, {"controller": (150 * MS, 0)})
-    claims = RunClaims(record)
-    verdicts = {claim.verdict for claim in claims.evaluate() if claim.source == "certificate"}
-    assert verdicts == {ClaimVerdict.HELD}
-    (certificate,), (part,) = claims.certified_evidence.certificates, aligned_parts(record)
-    t_s = np.asarray(part.aligned.t_ns * 1e-9)
-    largest = float((part.aligned.e_c_norm / certificate.controller_error(t_s)).max())
-    assert largest == pytest.approx(1.245, abs=0.01)
 
 
 # --- causality -----------------------------------------------------------------------------------
