@@ -254,7 +254,6 @@ class Controller(MachinePart):
             for due in take_changes(self.schedule, controller.machine):
                 self._change(controller, due.since_ns, due.prepared)
             return ()
-        controller.machine.answered = 1
         x, t_s = reals_at(controller.x, n).copy(), t_ns / NS_PER_S
         if question == core.NOACK_ASK_UPDATE:
             return self._call(controller, lambda law: law.update(t_s, x))

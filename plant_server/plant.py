@@ -264,7 +264,6 @@ class Plant(MachinePart):
             self._set_signals(plant)
             return ()
         assert question == core.NOACK_ASK_STATE
-        plant.machine.answered = 1
         last_ns, t_ns = map(self.period.time_ns, (plant.machine.step - 1, plant.machine.step))
         x, z = reals_at(plant.x, plant.machine.n), reals_at(plant.z, plant.internal)
         applied = reals_at(plant.applied, plant.sources).copy()

@@ -206,7 +206,6 @@ class Sensor(MachinePart):
             assert self._trigger is not None
             n = sensor.machine.n
             self._trigger.restart(sensor.trigger.event_ns, reals_at(sensor.event_x, n).copy())
-            sensor.machine.answered = 1
         else:
             assert question == core.NOACK_ASK_DECISION
             self._decide(sensor)
@@ -224,7 +223,6 @@ class Sensor(MachinePart):
         if (decision.event or sensor.first) and not sensor.acknowledged:
             trigger.start(t_ns, x)
         sensor.event, sensor.left, sensor.right = decision
-        sensor.machine.answered = 1
 
     def _start(self, sensor: CData, t_ns: int, x: Vector) -> None:
         """Restart the trigger's condition at an event at x, (n,)."""

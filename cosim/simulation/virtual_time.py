@@ -185,7 +185,7 @@ class VirtualRun:
             elif reason == core.NOACK_ROWS_FULL:
                 self._take([*_ROLES][simulation.asking])
             else:
-                self.machines[[*_ROLES][simulation.asking]].answer(reason)
+                self.machines[[*_ROLES][simulation.asking]].raise_failure()
         self._take_all()
 
     def announce(self) -> None:

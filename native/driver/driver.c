@@ -83,11 +83,9 @@ static int must_seal(noack_driver *driver) {
     return scratch->is_sealing != 0;
 }
 
-/* Ask Python for what a step needs. */
-static int64_t ask(noack_driver *driver, int64_t question) {
-    driver->question = question;
-    scratch_of(driver)->has_asked = question != NOACK_ROWS_FULL;
-    return question == NOACK_ROWS_FULL ? NOACK_DRIVER_ROWS : NOACK_DRIVER_QUESTION;
+/* Why the driver returns for a step that was not done. */
+static int64_t reason_of(int64_t question) {
+    return question == NOACK_ROWS_FULL ? NOACK_DRIVER_ROWS : NOACK_DRIVER_FAILED;
 }
 
 /* Examine the current datagram; return NOACK_DRIVER_OPEN if it must be opened. */
@@ -119,9 +117,8 @@ static int64_t examine(noack_driver *driver) {
 
 /* Whether to look at the time and the sockets after a step: Python's answer may have taken long. */
 static int has_asked(noack_driver *driver) {
-    driver_scratch *scratch = scratch_of(driver);
-    int asked = scratch->has_asked != 0;
-    scratch->has_asked = 0;
+    int asked = driver->process->has_asked != 0;
+    driver->process->has_asked = 0;
     return asked;
 }
 
@@ -135,7 +132,7 @@ static int64_t handle_messages(noack_driver *driver) {
             int64_t question =
                 noack_process_handle(driver->process, &scratch->message, scratch->now_ns);
             if (question != NOACK_DONE)
-                return ask(driver, question);
+                return reason_of(question);
             put_output(driver);
         }
         scratch->is_accepted = 0;
@@ -161,7 +158,7 @@ static int64_t do_ticks(noack_driver *driver) {
         }
         int64_t question = noack_process_tick(driver->process, scratch->now_ns);
         if (question != NOACK_DONE)
-            return ask(driver, question);
+            return reason_of(question);
         scratch->is_ticking = 0;
         put_output(driver);
         if (has_asked(driver))

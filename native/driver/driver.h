@@ -40,15 +40,14 @@ typedef struct driver_scratch {
     int64_t is_sealing;        /* 1: Python encrypts what waits to be sent */
     int64_t reason;            /* why the driver returns then */
     int64_t is_accepted;       /* 1: the current datagram has become the message */
-    int64_t is_ticking;        /* 1: a tick waits for an answer */
+    int64_t is_ticking;        /* 1: a tick waits for room for its rows */
     int64_t now_ns;            /* time of the message or tick */
     int64_t batch;             /* datagrams that one call receives */
     int64_t timer_ns;          /* when the timer expires, on the monotonic clock */
     int8_t out_flows[BUFFERS]; /* the sockets of what waits to be sent */
     noack_pauses pauses;
-    int64_t has_more;  /* 1: a socket may have more datagrams than were received */
-    int64_t first;     /* the socket that is read first the next time */
-    int64_t has_asked; /* 1: the present step has asked Python */
+    int64_t has_more; /* 1: a socket may have more datagrams than were received */
+    int64_t first;    /* the socket that is read first the next time */
     noack_message message;
     uint8_t out_data[BUFFERS][BUFFER_BYTES];
     uint8_t in_data[MESSAGES][MESSAGE_BYTES];

@@ -6,7 +6,7 @@
 enum noack_driver_reason {
     NOACK_DRIVEN,          /* the time has come, or a signal: housekeeping */
     NOACK_DRIVER_ROWS,     /* a table of rows or notes must be emptied */
-    NOACK_DRIVER_QUESTION, /* a machine asks; question says what */
+    NOACK_DRIVER_FAILED,   /* Python could not answer a machine */
     NOACK_DRIVER_OPEN,     /* decrypt the datagram in place; set opened */
     NOACK_DRIVER_SEAL,     /* encrypt the datagram in place, and write its tag */
     NOACK_DRIVER_NOTHING   /* within the driver only */
@@ -45,7 +45,6 @@ typedef struct {
     int64_t unknown_source;       /* datagrams from other addresses */
     int64_t sent;
     int64_t errors[NOACK_ERRNOS]; /* datagrams that could not be sent, by errno */
-    int64_t question;             /* a noack_question */
     int64_t opened;               /* a noack_opened, of the datagram below */
     uint8_t *datagram;
     int64_t datagram_bytes;

@@ -189,7 +189,6 @@ static int64_t replay_machine(
     noack_process *process = replay->process;
     const noack_output *output = &process->output;
     const noack_message *message = &output->message;
-    process->asking = replay->loop;
     int64_t question =
         table->kind == NOACK_TICKS ? tick(replay, now_ns) : handle(replay, table, recorded, now_ns);
     if (question != NOACK_DONE)

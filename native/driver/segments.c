@@ -141,6 +141,13 @@ static void control(noack_segments *segments, int64_t run, int64_t step, noack_o
     }
 }
 
+/* The user's trigger of a run without tests: there is no event. */
+static int64_t answer_nothing(int64_t loop, int64_t question) {
+    (void)loop;
+    (void)question;
+    return 0;
+}
+
 /* Let the sensor receive the measurement; return whether it is an event. */
 static int64_t measure(
     noack_segments *segments, int64_t run, int64_t step, int64_t tests, noack_output *output) {
@@ -152,9 +159,12 @@ static int64_t measure(
             (double *)segments->gains + measurement * n * sensor->observer.p; /* not written */
     noack_message message;
     copy_message(&message, &output->message);
-    sensor->is_user = sensor->machine.answered = !tests;
+    int64_t (*ask)(int64_t, int64_t) = sensor->machine.ask;
+    sensor->is_user = !tests;
     sensor->event = 0;
+    sensor->machine.ask = answer_nothing;
     noack_sensor_handle(sensor, &message, message.t_ns, output);
+    sensor->machine.ask = ask;
     sensor->is_user = 0;
     if (segments->controller->has_state) {
         advance_controller(segments, step, error);

@@ -14,14 +14,15 @@ int64_t noack_controller_handle(
     noack_machine *machine = &controller->machine;
     int64_t n = machine->n, event_ns = message->t_ns;
     int64_t model_ns = max_of(controller->model_ns, event_ns);
-    if (model_ns >= machine->change_ns)
-        return NOACK_ASK_CHANGE;
-    if (controller->is_user && !machine->answered) {
+    while (model_ns >= machine->change_ns)
+        if (!ask(machine, NOACK_ASK_CHANGE))
+            return NOACK_NOT_ANSWERED;
+    if (controller->is_user) {
         copy(n, message->vector, controller->x);
         controller->asked_ns = event_ns;
-        return NOACK_ASK_UPDATE;
+        if (!ask(machine, NOACK_ASK_UPDATE))
+            return NOACK_NOT_ANSWERED;
     }
-    machine->answered = 0;
     double *x_c_before = controller->scratch;
     noack_model_advance(
         &controller->model, controller->x_c, controller->model_ns, model_ns, x_c_before);
@@ -94,16 +95,17 @@ int64_t noack_controller_tick(noack_controller *controller, int64_t now_ns, noac
     int64_t n = machine->n, m = machine->m;
     int64_t t_ns = time_of_tick_ns(machine, machine->step);
     int64_t model_ns = max_of(t_ns, controller->model_ns);
-    if (model_ns >= machine->change_ns)
-        return NOACK_ASK_CHANGE;
+    while (model_ns >= machine->change_ns)
+        if (!ask(machine, NOACK_ASK_CHANGE))
+            return NOACK_NOT_ANSWERED;
     double *x_c = controller->scratch;
     noack_model_advance(&controller->model, controller->x_c, controller->model_ns, model_ns, x_c);
-    if (controller->is_user && controller->has_state && !machine->answered) {
+    if (controller->is_user && controller->has_state) {
         copy(n, x_c, controller->x);
         controller->asked_ns = t_ns;
-        return NOACK_ASK_INPUT;
+        if (!ask(machine, NOACK_ASK_INPUT))
+            return NOACK_NOT_ANSWERED;
     }
-    machine->answered = 0;
     copy(n, x_c, controller->x_c);
     controller->model_ns = machine->reached_ns = model_ns;
     int64_t sequence = machine->step++;

@@ -50,6 +50,11 @@ static inline void append(noack_output *output, int64_t count, const double *val
     output->message.entries += count;
 }
 
+/* Let Python do what a step needs; return whether it did. */
+static inline int ask(const noack_machine *machine, int64_t question) {
+    return machine->ask(machine->loop, question) == 0;
+}
+
 /* The nearest whole number of nanoseconds to k periods, halves up; k >= 0. */
 static inline int64_t periods_ns(const noack_period *period, int64_t k) {
     return k * period->ns + (2 * k * period->part + period->parts) / (2 * period->parts);

@@ -23,6 +23,8 @@ static const char *check_machine(const noack_machine *machine) {
     if (!is_between(1, machine->n, NOACK_MAX_ENTRIES)
         || !is_between(1, machine->m, NOACK_MAX_ENTRIES))
         return "a machine needs 1 to 64 states and 1 to 64 inputs";
+    if (machine->ask == NULL)
+        return "a machine has nobody to ask";
     if (!is_between(0, machine->phase_ns, MOST_NS) || !is_between(0, machine->horizon_ns, MOST_NS)
         || !is_between(0, machine->first_ns, MOST_NS) || !is_period(&machine->period, 0))
         return "a machine has a phase, a horizon or a period out of range";

@@ -166,12 +166,12 @@ int64_t noack_plant_tick(
     noack_machine *machine = &plant->machine;
     int64_t step = machine->step, t_ns = time_of_tick_ns(machine, step);
     int measures = step % plant->measure_every == 0;
-    if (!has(&plant->at_input, step) || !has(&plant->at_state, step)
-        || (measures && !has(&plant->noise, plant->measurements)))
-        return NOACK_ASK_SIGNALS;
-    if (step > 0 && plant->system == NOACK_USER && !machine->answered)
-        return NOACK_ASK_STATE;
-    machine->answered = 0;
+    int has_signals = has(&plant->at_input, step) && has(&plant->at_state, step)
+                      && (!measures || has(&plant->noise, plant->measurements));
+    if (!has_signals && !ask(machine, NOACK_ASK_SIGNALS))
+        return NOACK_NOT_ANSWERED;
+    if (step > 0 && plant->system == NOACK_USER && !ask(machine, NOACK_ASK_STATE))
+        return NOACK_NOT_ANSWERED;
     if (step > 0)
         advance(plant);
     int64_t entry = choose_input(plant, t_ns);

@@ -68,7 +68,6 @@ static void append_row(noack_process *process, int64_t loop) {
 
 /* Keep the outputs of a step that is done. */
 static int64_t keep_outputs(noack_process *process, int64_t loop, int64_t question) {
-    process->asking = loop;
     if (question != NOACK_DONE)
         return question;
     append_row(process, loop);

@@ -5,7 +5,7 @@
    the network delivers the update: nothing is acknowledged. Its time is the time of the
    measurements: what it sends does not depend on when a datagram was read. With an observer the
    estimate x-hat takes the place of x. The trigger compares with x - x_r, the distance from the set
-   point. Where the step needs Python, it returns a question; with the answer it is repeated.
+   point. Where the step needs Python, it asks.
 
    In the acknowledgement baseline only an acknowledged update resets x_s: at that of update k,
    x_s <- e^(H(t - t_k)) x(t_k), which equals the controller's model then. After a transmission the
@@ -113,15 +113,16 @@ static int64_t handle_measurement(
     noack_machine *machine = &sensor->machine;
     int64_t n = machine->n, t_ns = message->t_ns, first = !sensor->has_state;
     double *x_s = sensor->scratch, sides[2];
-    if (sensor->acknowledged && sensor->sent_count == sensor->sent_places)
-        return NOACK_ASK_ROOM;
+    if (sensor->acknowledged && sensor->sent_count == sensor->sent_places
+        && !ask(machine, NOACK_ASK_ROOM))
+        return NOACK_NOT_ANSWERED;
     advance_model(sensor, t_ns, x_s);
     for (int64_t k = 0; k < n; k++)
         sensor->e_s[k] = x_s[k] - sensor->x[k];
     sensor->first = first;
     sensor->asked_ns = t_ns;
-    if (sensor->is_user && !machine->answered)
-        return NOACK_ASK_DECISION;
+    if (sensor->is_user && !ask(machine, NOACK_ASK_DECISION))
+        return NOACK_NOT_ANSWERED;
     if (first)
         start_condition(sensor, t_ns, sensor->x);
     int64_t due = test_trigger(sensor, t_ns, sides);
@@ -165,11 +166,6 @@ static int64_t handle_acknowledgement(
     int64_t n = machine->n, t_ns = message->t_ns, place = find_sent(sensor, message->sequence);
     double *x_s_before = sensor->scratch;
     int is_unacknowledged = place < sensor->sent_count;
-    if (is_unacknowledged && sensor->is_user && !machine->answered) {
-        sensor->trigger.event_ns = t_ns;
-        copy(n, sensor->sent_x + place * n, sensor->event_x);
-        return NOACK_ASK_RESTART;
-    }
     copy(n, sensor->x_s, x_s_before);
     if (is_unacknowledged) {
         const double *x = sensor->sent_x + place * n;
@@ -179,6 +175,8 @@ static int64_t handle_acknowledgement(
         if (!sensor->is_user)
             noack_trigger_restart(
                 &sensor->rule, &sensor->trigger, n, t_ns, x, rule_scratch(sensor));
+        else if (!ask(machine, NOACK_ASK_RESTART))
+            return NOACK_NOT_ANSWERED;
         drop_acknowledged(sensor, place + 1);
     }
     begin_row(output, NOACK_ACKNOWLEDGEMENTS, machine, message->sequence, t_ns, now_ns);
@@ -191,23 +189,16 @@ static int64_t handle_acknowledgement(
 int64_t noack_sensor_handle(
     noack_sensor *sensor, const noack_message *message, int64_t now_ns, noack_output *output) {
     noack_machine *machine = &sensor->machine;
-    if (message->t_ns >= machine->change_ns && message->flow == NOACK_MEASUREMENT)
-        return NOACK_ASK_CHANGE;
-    int64_t question;
-    if (message->flow == NOACK_ACKNOWLEDGEMENT) {
-        question = handle_acknowledgement(sensor, message, now_ns, output);
+    if (message->flow == NOACK_ACKNOWLEDGEMENT)
+        return handle_acknowledgement(sensor, message, now_ns, output);
+    while (message->t_ns >= machine->change_ns)
+        if (!ask(machine, NOACK_ASK_CHANGE))
+            return NOACK_NOT_ANSWERED;
+    if (sensor->observer.kind == NOACK_NO_OBSERVER) {
+        copy(machine->n, message->vector, sensor->x);
     } else {
-        if (sensor->observer.kind == NOACK_NO_OBSERVER) {
-            copy(machine->n, message->vector, sensor->x);
-        } else if (!machine->observed) {
-            noack_observe(
-                &sensor->observer, message, machine->n, machine->m, &sensor->plant_period);
-            copy(machine->n, sensor->observer.x, sensor->x);
-            machine->observed = 1;
-        }
-        question = handle_measurement(sensor, message, now_ns, output);
+        noack_observe(&sensor->observer, message, machine->n, machine->m, &sensor->plant_period);
+        copy(machine->n, sensor->observer.x, sensor->x);
     }
-    if (question == NOACK_DONE)
-        machine->answered = machine->observed = 0;
-    return question;
+    return handle_measurement(sensor, message, now_ns, output);
 }

@@ -1,10 +1,10 @@
 """The machines of one role, of all loops of a run: the core's steps, and Python's part of them.
 
-A driver in C (live, in virtual time, in replay) makes the steps. It returns to this class where a
-step needs Python: users' code, changes of settings, rows to take.
+A driver in C (live, in virtual time, in replay) makes the steps. A step calls this class where it
+needs Python: users' code, changes of settings. The driver returns when there are rows to take.
 
 What a role describes of each machine is a *part*: it fills the core's structure, and answers the
-questions at which a step stops (``enum noack_question`` in native/loop/public.h).
+questions of a step (``enum noack_question`` in native/loop/public.h).
 
 The loops may have vectors of different sizes. The rows of a table then have room for the longest;
 what a loop's own row lacks is missing in them (:func:`row_layout`).
@@ -14,7 +14,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from functools import cache, lru_cache
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, NoReturn, TypeVar
+from weakref import proxy
 
 import numpy as np
 from numpy.typing import NDArray
@@ -175,6 +176,9 @@ class LoopMachines:
         self.memory = CoreMemory()
         """What the structures refer to."""
         self._notices: list[Notice] = []
+        self._failure: BaseException | None = None
+        self.before_answer: Callable[[MachinePart], None] | None = None
+        """Called before a part answers a question."""
         self.core: CData = self.memory.keep(ffi.new("noack_process *"))
         """The ``noack_process``; its address does not change."""
         self._fill_machines(templates or range(len(self.parts)))
@@ -210,8 +214,13 @@ class LoopMachines:
             for number in others:
                 if self.parts[number] is not self.parts[first]:
                     self.parts[number].set_drawn_values(machines[number], self.memory)
-        for structure, phase_ns in zip(machines, self.phases_ns, strict=True):
-            structure.machine.phase_ns = phase_ns
+        this = proxy(self)  # what the core calls must not keep these machines alive
+        ask = keep(ffi.callback(
+            "int64_t(int64_t, int64_t)", lambda *asked: this._answer(*asked), error=1,
+            onerror=lambda *failed: this._keep_failure(*failed),
+        ))  # fmt: skip
+        for loop, (structure, phase_ns) in enumerate(zip(machines, self.phases_ns, strict=True)):
+            structure.machine.phase_ns, structure.machine.loop, structure.machine.ask = phase_ns, loop, ask
 
     def _fill_tables(self, rows: int) -> None:
         self.core.notes = pointer_to(self._notes, "noack_note *")
@@ -261,16 +270,23 @@ class LoopMachines:
             if part.external is not None:
                 part.external.connect()
 
-    @property
-    def asking_part(self) -> External | None:
-        """The part outside of noack of the machine whose step has stopped at a question."""
-        return self.parts[int(self.core.asking)].external
+    def raise_failure(self) -> NoReturn:
+        """Raise the exception of the answer for lack of which a step was not done."""
+        failure, self._failure = self._failure, None
+        assert failure is not None
+        raise failure
 
-    def answer(self, question: int) -> None:
-        """Do what a step needs before it goes on."""
-        loop = self.core.asking
+    def _answer(self, loop: int, question: int) -> int:
+        """Do what a step needs before it goes on; the core calls this. Return 0."""
+        self.core.has_asked = 1
+        if self.before_answer is not None:
+            self.before_answer(self.parts[loop])
         self._keep_notices(loop, self.parts[loop].answer(question, self.machines[loop]))
         self._update_counting(loop)
+        return 0
+
+    def _keep_failure(self, _: object, failure: BaseException, __: object) -> None:
+        self._failure = failure
 
     def take_rows(self, *, last: bool = False) -> list[tuple[str, StructRows]]:
         """Return the rows since the last call, by table, and empty the core's tables.

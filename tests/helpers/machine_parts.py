@@ -56,7 +56,7 @@ class SteppedMachines(LoopMachines):
         outputs: list[Output] = []
         while (question := step()) != core.NOACK_DONE:
             if question != core.NOACK_ROWS_FULL:
-                self.answer(question)
+                self.raise_failure()
             outputs += self._taken()
         if self.core.output.sends:
             outputs.insert(0, message_of(self.core.output.message))

@@ -21,7 +21,7 @@ from noack.core.cached_method import cached_method
 from noack.core.clock import NEVER_NS
 from noack.core.core_library import CData, core, ffi, pointer_to
 from noack.core.errors import CallerError
-from noack.machines.loop_machines import LoopMachines
+from noack.machines.loop_machines import LoopMachines, MachinePart
 from noack.protocol.record_tables import (
     CONTROLLER_STEP,
     LOOP,
@@ -108,15 +108,18 @@ class InputReplay:
         if (wrong := core.noack_replay_check(replay)) != ffi.NULL:
             raise ValueError(f"replay: {ffi.string(wrong).decode()}")
         locate = _InputRows(tables, order, before)
+        if not isinstance(self._machine, Channel):
+            self._machine.before_answer = lambda part: self._recall(part, locate)
         try:
             while (reason := core.noack_replay_inputs(replay)) != core.NOACK_DONE:
                 if reason == core.NOACK_CANNOT_TAKE:
                     raise ValueError("no run has these numbers")
                 if reason == core.NOACK_REPLAY_SETTING:
                     self._announce(locate)
-                else:
-                    self._recall(locate)
+                elif isinstance(self._machine, Channel):
                     self._machine.answer(reason)
+                else:
+                    self._machine.raise_failure()
         except _DAMAGE as error:
             self._explain(locate)
             self._note(locate, replay.next, f"the machine cannot take this input: {error}")
@@ -143,9 +146,9 @@ class InputReplay:
         heads = np.ascontiguousarray(sent[:, 1:]).view(f"V{PACKET_HEAD_BYTES}")
         return sent[:, 0], heads[:, 0]
 
-    def _recall(self, locate: "_InputRows") -> None:
+    def _recall(self, part: MachinePart, locate: "_InputRows") -> None:
         """Let a part that is outside of noack answer as recorded."""
-        if not isinstance(self._machine, Channel) and (asked := self._machine.asking_part) is not None:
+        if (asked := part.external) is not None:
             table, row, rows = locate(self._core.next)
             if table in _ANSWERS:
                 asked.recorded = rows[_ANSWERS[table]][row].copy()

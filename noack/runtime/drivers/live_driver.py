@@ -2,7 +2,7 @@
 
 ``native/driver/driver.c`` waits for ticks and datagrams, passes them to the machines, sends their
 messages, and collects the rows of the record. It returns to Python at housekeeping, if a table of
-rows is full, if users' code is to answer, and for each datagram that is encrypted.
+rows is full, and for each datagram that is encrypted.
 """
 
 import os
@@ -132,8 +132,8 @@ class LiveDriver:
         while (reason := core.noack_drive(driver, until_ns)) != core.NOACK_DRIVEN:
             if reason == core.NOACK_DRIVER_ROWS:
                 self._pass_rows(sink)
-            elif reason == core.NOACK_DRIVER_QUESTION:
-                machines.answer(driver.question)
+            elif reason == core.NOACK_DRIVER_FAILED:
+                machines.raise_failure()
             elif reason == core.NOACK_DRIVER_OPEN:
                 self._open_datagram()
             else:

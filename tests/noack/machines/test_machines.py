@@ -1,6 +1,7 @@
-"""The machines of a process: several loops, interrupted steps, and refusals of wrong numbers."""
+"""The machines of a process: several loops, steps that fail, and refusals of wrong numbers."""
 
 import re
+import weakref
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -13,13 +14,15 @@ from hypothesis import strategies as st
 from controller_node.controller import Controller
 from noack.core.core_library import ffi
 from noack.core.errors import CallerError
+from noack.core.linear_systems import Vector
 from noack.machines.loop_machines import LoopMachines, row_types
 from noack.protocol.record_tables import LOOP, tables
 from noack.protocol.roles import Record
-from noack.protocol.wire_format import Message
+from noack.protocol.wire_format import Flow, Message
 from noack.scenario.parameter_changes import ParameterChange
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
+from noack.trigger_policies.trigger_rule import TriggerDecision
 from plant_server.plant import Plant
 from sensor_node.sensor import Sensor, sensors_of
 from tests.helpers.approved import compare_lines
@@ -29,6 +32,7 @@ from tests.noack.machines.any_machines import (
     MS,
     Inputs,
     Sizes,
+    UserTrigger,
     controller,
     driven,
     observer,
@@ -133,6 +137,26 @@ def test_a_change_that_a_later_loop_refuses_changes_no_loop(content: dict[str, A
         together.announce(ParameterChange(0, 50 * MS, {"trigger.beta": 0.5}), 0)
     assert [structure.machine.inputs for structure in together.machines] == [0, 0]
     assert not any(part.schedule.has_changes for part in together.parts if part.schedule)
+
+
+def test_an_exception_of_users_code_leaves_the_step_undone() -> None:
+    class Interrupted(UserTrigger):
+        def test(self, t_ns: int, x: Vector, e_s: Vector) -> TriggerDecision:
+            raise KeyboardInterrupt
+
+    part = sensor(0, Sizes(1, 1), form=len(TABLES))
+    part._trigger = Interrupted(1.0)
+    own = SteppedMachines([part])
+    with pytest.raises(KeyboardInterrupt):
+        own.handle(Message(Flow.MEASUREMENT, 0, 0, np.zeros(1), 0), 0)
+    assert own.machines[0].machine.inputs == 0
+
+
+def test_machines_live_no_longer_than_they_are_used() -> None:
+    own = machine(sensor(0, Sizes(1, 1), form=0))
+    reference = weakref.ref(own)
+    del own
+    assert reference() is None
 
 
 # --- wrong numbers --------------------------------------------------------------------------------
