@@ -4,7 +4,7 @@ import shutil
 import sys
 import tempfile
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from os import PathLike
@@ -20,6 +20,7 @@ from cosim.studies.campaign.campaign_report import FinishedCampaign
 from cosim.studies.campaign.campaign_workers import local_runner, worker_count
 from noack.core.errors import CallerError
 from noack.core.number_format import TextRows, as_html, as_text
+from noack.core.progress import Progress
 from noack.runtime.console import SafeConsole
 from noack.scenario.given_settings import plain_table
 from noack.scenario.toml_file import validated
@@ -198,7 +199,7 @@ def campaign(
     return CampaignResult(finished, temporary)
 
 
-def _runs_bar() -> AbstractContextManager[Callable[[int, int], None]]:
+def _runs_bar() -> AbstractContextManager[Progress]:
     return runs_bar(SafeConsole(file=sys.stderr))
 
 

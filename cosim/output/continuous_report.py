@@ -5,7 +5,7 @@ from rich.console import Console
 
 from cosim.analysis.summary.summary_model import ExitPart
 from cosim.output.result_tables import ResultTable, terminal_table
-from cosim.output.run_tables import interval_rows, longest_burst, lost_row, title_of
+from cosim.output.run_tables import burst_row, interval_rows, lost_row, title_of
 from cosim.output.run_verdict import ending_line, state_text, transmission_line
 from cosim.output.terminal_output import print_line, print_numbers
 from cosim.simulation.continuous import ContinuousRun, ContinuousSummary
@@ -32,7 +32,7 @@ def print_continuous_run(
         print_line(console, line)
     rows = (
         lost_row(summary.drops, summary.deliveries),
-        longest_burst(summary.mansd, constraints, summary.longest_loss_burst),
+        burst_row(summary.mansd, constraints, summary.longest_loss_burst),
         *interval_rows(
             summary.inter_event_min_s, summary.inter_event_median_s, summary.inter_delivery_median_s
         ),

@@ -171,7 +171,7 @@ def _losses(summary: RunSummary, loop: LoopSummary) -> Iterator[tuple[str, str]]
             yield name, str(sent.sent)
             yield f"{name} lost", f"{sent.lost} ({ratio(sent.lost, sent.sent)})"
             yield f"longest loss burst of {name}", str(sent.longest_loss_burst)
-    yield longest_burst(max(caps(summary)), summary.constraints, loop.longest_loss_burst)
+    yield burst_row(max(caps(summary)), summary.constraints, loop.longest_loss_burst)
     violated = [violation.cause for violation in loop.assumption_violations]
     yield "loss bursts beyond M − 1", str(violated.count("dropouts"))
     for constraint in summary.constraints:
@@ -194,7 +194,7 @@ def caps_text(summary: RunSummary) -> str:
     return f"M − 1 = {' → '.join(map(str, caps(summary)))}"
 
 
-def longest_burst(cap: int, constraints: Sequence[str], longest: int) -> tuple[str, str]:
+def burst_row(cap: int, constraints: Sequence[str], longest: int) -> tuple[str, str]:
     """Return the row of the longest loss burst, with the most consecutive losses allowed."""
     words = [f"mansd {cap}", *constraints]
     limit = settings_of(" ".join(words)).longest_burst
@@ -368,7 +368,7 @@ def network_rows(summary: RunSummary) -> list[tuple[str, str]]:
     rows = [
         ("updates of all loops", f"{sent} ({sent / reached_s:.4g} /s)"),
         ("lost", f"{lost} ({ratio(lost, sent)}){causes}"),
-        longest_burst(max(caps(summary)), summary.constraints, network.longest_loss_burst),
+        burst_row(max(caps(summary)), summary.constraints, network.longest_loss_burst),
         ("forced by the guarantee", str(network.forced_deliveries)),
         ("datagrams in flight: mean, max", f"{in_flight.mean:.3g}, {in_flight.max}"),
     ]

@@ -27,10 +27,11 @@ from cosim.record.run_directory import (
 from cosim.record.run_record import NETWORK_ROLES, RecordedRun, Rows, RunRecord, loop_roles
 from cosim.record.run_scenario import write_scenario
 from netem.channel import RUN_ID, UserNetwork, channel_of
-from noack.core.clock import NEVER_NS
+from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.core_library import CData, core, ffi, new_handle
 from noack.core.errors import ExitStatus, MachineError, why
 from noack.core.file_access import remove_folder
+from noack.core.progress import Progress, no_progress
 from noack.core.system_processes import require_limits
 from noack.machines.loop_machines import LoopMachines, row_types
 from noack.protocol.record_tables import LOOP, OWNER, is_of_network, network_tables
@@ -43,9 +44,6 @@ from noack.scenario.scenario import Scenario, phases_ns
 from noack.settings.section import ReadTable
 from plant_server.plant import plants_of
 from sensor_node.sensor import sensors_of
-
-Progress = Callable[[int], None]
-"""Called from time to time with the simulated time, in ns."""
 
 _ROLES: Mapping[str, Callable[..., LoopMachines]] = {
     "plant": plants_of,
@@ -167,7 +165,7 @@ class VirtualRun:
         self.record = RecordCollector(run_types, len(loops))
         self.core: CData = self._new_core()
 
-    def run(self, until_ns: int = NEVER_NS, progress: Progress | None = None) -> None:
+    def run(self, until_ns: int = NEVER_NS, progress: Progress = no_progress) -> None:
         """Run until nothing is due up to a time."""
         simulation = self.core
         while True:
@@ -176,8 +174,7 @@ class VirtualRun:
                 break
             if reason == core.NOACK_STEPS_DONE:
                 simulation.steps_left = _INPUTS_PER_PROGRESS
-                if progress is not None:
-                    progress(int(simulation.now_ns))
+                progress(simulation.now_ns / NS_PER_S, self._scenario.horizon_s)
             elif reason == core.NOACK_NO_MEMORY:
                 raise MemoryError
             elif simulation.asking == core.NOACK_NETWORK:
@@ -240,7 +237,7 @@ class VirtualRun:
 
 
 def simulate(
-    resolved: Scenario, network: UserNetwork | None = None, progress: Progress | None = None
+    resolved: Scenario, network: UserNetwork | None = None, progress: Progress = no_progress
 ) -> RunRecord:
     """Run a resolved scenario of one loop in virtual time; see :func:`simulate_loops`.
 
@@ -248,19 +245,19 @@ def simulate(
         resolved: the scenario.
         network: decides the fate of each update; by default the scenario's own network, as in a
             live run.
-        progress: called with the simulated time.
+        progress: called with the simulated time and the horizon, in seconds.
     """
     if network is not None:
         resolved.coverage.require_unchanging()
     return _simulate(resolved, (resolved,), network, progress).record(0)
 
 
-def simulate_loops(scenario: Scenario, progress: Progress | None = None) -> RecordedRun:
+def simulate_loops(scenario: Scenario, progress: Progress = no_progress) -> RecordedRun:
     """Run the loops of a scenario in virtual time, with the sampling of a live run.
 
     Args:
         scenario: the scenario; speed, ports and real-time settings have no effect.
-        progress: called with the simulated time.
+        progress: called with the simulated time and the horizon, in seconds.
 
     Returns:
         The record of the run; its reports have no entries about sockets or real-time settings.
@@ -268,7 +265,7 @@ def simulate_loops(scenario: Scenario, progress: Progress | None = None) -> Reco
     return _simulate(scenario, resolved_loops(scenario), None, progress)
 
 
-def simulate_run(scenario: Scenario, runs: Path, progress: Progress | None = None) -> RunEnding:
+def simulate_run(scenario: Scenario, runs: Path, progress: Progress = no_progress) -> RunEnding:
     """Simulate a scenario into a new run directory; :func:`cosim.live.finalize.finalize` ends it.
 
     An interrupted simulation leaves no run directory.
@@ -276,7 +273,7 @@ def simulate_run(scenario: Scenario, runs: Path, progress: Progress | None = Non
     Args:
         scenario: as loaded; it is resolved here.
         runs: where run directories are made.
-        progress: called with the simulated time.
+        progress: called with the simulated time and the horizon, in seconds.
 
     Raises:
         CallerError: the scenario's numbers are too large.
@@ -305,7 +302,7 @@ def _simulate(
     scenario: Scenario,
     loops: Sequence[Scenario],
     network: UserNetwork | None,
-    progress: Progress | None,
+    progress: Progress,
 ) -> RecordedRun:
     run = VirtualRun(scenario, loops, network=network)
     run.announce()

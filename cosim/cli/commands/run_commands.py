@@ -121,7 +121,7 @@ def simulate(
     warn_of_violations(loaded, is_sampled=trigger is opt.TriggerMode.SAMPLED)
     if trigger is opt.TriggerMode.CONTINUOUS:
         return simulate_continuously(loaded, json=json, required=require or ())
-    with simulation_bar(error_console(), loaded.horizon_s) as bar:
+    with simulation_bar(error_console()) as bar:
         ending = simulate_run(loaded, runs, bar)
     return finalize_run(ending, report=report, verbose=verbose, json=json, required=require or ())
 

@@ -6,16 +6,10 @@ from contextlib import contextmanager
 from threading import Event, Thread
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    SpinnerColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress as RichProgress
 
-from noack.core.clock import NS_PER_S
+from noack.core.progress import Progress
 from noack.runtime.command_line import print_to_stderr
 from noack.runtime.console import SafeConsole
 
@@ -37,7 +31,7 @@ def _bar(
     """Show a bar while the context lasts, on a terminal only; yields what updates it."""
     head = (TextColumn("{task.description}"),) if description else ()
     disabled = not console.is_terminal
-    with Progress(
+    with RichProgress(
         *head, BarColumn(), *columns, console=console, disable=disabled, transient=True
     ) as progress:
         task = progress.add_task(description, total=total, rate="")
@@ -72,7 +66,7 @@ def activity(text: str) -> Iterator[Callable[[str], None]]:
     """
     console = error_console()
     columns = SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn()
-    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
+    with RichProgress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
         task = progress.add_task(text)
 
         def change(new_text: str) -> None:
@@ -96,7 +90,7 @@ def activity(text: str) -> Iterator[Callable[[str], None]]:
 
 
 @contextmanager
-def work_bar(description: str, *, lines: bool = False) -> Iterator[Callable[[float], None]]:
+def work_bar(description: str, *, lines: bool = False) -> Iterator[Progress]:
     """Show the completed share of some work, and an estimate of the remaining time.
 
     Where there is no terminal, print them as a line at intervals if ``lines``.
@@ -106,7 +100,8 @@ def work_bar(description: str, *, lines: bool = False) -> Iterator[Callable[[flo
     columns = TextColumn("{task.percentage:.0f} %"), TimeRemainingColumn()
     with _bar(console, 1.0, *columns, description=description) as update:
 
-        def show(share: float) -> None:
+        def show(done: float, total: float = 1.0, /) -> None:
+            share = done / total
             update(completed=share)
             if lines and 0 < share < 1:
                 spent_s = sparse_lines.spent_s
@@ -119,15 +114,15 @@ def work_bar(description: str, *, lines: bool = False) -> Iterator[Callable[[flo
 
 
 @contextmanager
-def simulation_bar(console: Console, horizon_s: float) -> Iterator[Callable[[int], None]]:
-    """Show the simulated time of a simulation."""
+def simulation_bar(console: Console) -> Iterator[Progress]:
+    """Show the simulated time of a simulation, in seconds."""
     column = TextColumn("{task.completed:.1f}/{task.total:g} s simulated")
-    with _bar(console, horizon_s, column) as update:
-        yield lambda now_ns: update(completed=now_ns / NS_PER_S)
+    with _bar(console, 1, column) as update:
+        yield lambda done, total=1.0, /: update(completed=done, total=total)
 
 
 @contextmanager
-def runs_bar(console: Console) -> Iterator[Callable[[int, int], None]]:
+def runs_bar(console: Console) -> Iterator[Progress]:
     """Show the number of completed runs, their rate and the remaining time.
 
     Where there is no terminal, print the number as a line at intervals.
@@ -138,17 +133,17 @@ def runs_bar(console: Console) -> Iterator[Callable[[int, int], None]]:
         TimeRemainingColumn(),
     )
     sparse_lines = _SparseLines(console)
-    before: int | None = None
+    before: float | None = None
     with _bar(console, 1, *columns) as show:
 
-        def update(done: int, total: int) -> None:
+        def update(done: float, total: float = 1.0, /) -> None:
             nonlocal before
             before = done if before is None else before
             spent_s = sparse_lines.spent_s
             rate = (done - before) / max(spent_s, 1e-3)
             text = f"{rate:,.0f}/s" if done > before else "starting"
             show(completed=done, total=total, rate=text)
-            sparse_lines.print(f"{done:,} of {total:,} runs after {spent_s:.0f} s")
+            sparse_lines.print(f"{done:,.0f} of {total:,.0f} runs after {spent_s:.0f} s")
 
         yield update
 

@@ -1,5 +1,6 @@
 """Code, libraries and arithmetic of a process: results depend on them bit by bit."""
 
+import json
 import platform
 from collections.abc import Mapping
 from functools import cache
@@ -12,6 +13,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from noack.core.core_library import SOURCES
+from noack.core.errors import shortened
 
 _PACKAGES = ("noack", "numpy", "scipy")
 _CODE = ("noack", "netem", "cosim", "plant_server", "sensor_node", "controller_node")
@@ -35,12 +37,25 @@ def arithmetic() -> Mapping[str, str]:
     }
 
 
-def difference(stored: Mapping[str, str], running: Mapping[str, str]) -> str | None:
+def difference(stored: object, running: object, key: str = "") -> str | None:
     """Return the first difference as text; None if there is none."""
-    for name in running:
-        if stored.get(name) != running[name]:
-            return f"{name} is {stored.get(name, 'unknown')} there, {running[name]} here"
-    return None
+    if isinstance(stored, dict) and isinstance(running, dict):
+        names: list[object] = sorted(stored.keys() | running.keys())
+        pairs = [(stored.get(name), running.get(name)) for name in names]
+    elif isinstance(stored, list) and isinstance(running, list):
+        if len(stored) != len(running):
+            return f"{key} has {len(stored)} entries there, {len(running)} here"
+        names, pairs = list(range(len(running))), list(zip(stored, running, strict=True))
+    else:
+        texts = [shortened(_text(value), 60) for value in (stored, running)]
+        return None if stored == running else f"{key} is {texts[0]} there, {texts[1]} here"
+    keys = (f"{key}.{name}".removeprefix(".") for name in names)
+    differences = (difference(*pair, inner_key) for pair, inner_key in zip(pairs, keys, strict=True))
+    return next(filter(None, differences), None)
+
+
+def _text(value: object) -> str:
+    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
 
 
 def _version(package: str) -> str:

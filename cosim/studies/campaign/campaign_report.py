@@ -22,11 +22,12 @@ from cosim.studies.campaign.campaign_file import MOST_DRAWS, Campaign
 from cosim.studies.campaign.campaign_grid import base_of, grid
 from cosim.studies.campaign.campaign_summary import CampaignSummary, summarise
 from cosim.studies.campaign.campaign_workers import Runner
-from cosim.studies.campaign.chunk_store import RUNS, Progress, Store, locked_folder, run_campaign
+from cosim.studies.campaign.chunk_store import RUNS, Store, locked_folder, run_campaign
 from cosim.studies.campaign.metrics import METRICS, Estimate, Metric, to_shown_unit
 from noack.core.file_access import write_whole
 from noack.core.number_checks import whole_number
 from noack.core.number_format import plus_minus
+from noack.core.progress import Progress, no_progress
 from noack.runtime.command_line import stop_requests_raised
 
 PAGE, SUMMARY = CAMPAIGN_PAGE, SUMMARY_FILE
@@ -290,7 +291,7 @@ def finish_campaign(
     draws: int | None = None,
     figure_files: FigureFiles | None = None,
     show: Show = nullcontext,
-    bar: AbstractContextManager[Progress | None] | None = None,
+    bar: AbstractContextManager[Progress] | None = None,
 ) -> FinishedCampaign:
     """Run or continue a campaign; write its page.
 
@@ -314,7 +315,7 @@ def finish_campaign(
     _, base = base_of(plan, path)
     store = Store(folder, points, draws, plan.chunk)
     with stop_requests_raised(), locked_folder(plan, base, store):
-        with workers() as runner, bar or nullcontext() as progress:
+        with workers() as runner, bar or nullcontext(no_progress) as progress:
             new_runs = run_campaign(store, runner, progress)
         with show("summarising"):
             summary = summarise(plan, store)

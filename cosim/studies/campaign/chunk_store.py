@@ -7,7 +7,7 @@ computed again.
 
 import io
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from hashlib import blake2b
 from pathlib import Path
@@ -23,8 +23,9 @@ from cosim.studies.campaign.arithmetic import arithmetic, difference
 from cosim.studies.campaign.campaign_file import Campaign
 from cosim.studies.campaign.campaign_grid import Point, row_type
 from cosim.studies.campaign.campaign_workers import Chunk, LostWorkersError, OtherArithmeticError, Runner
-from noack.core.errors import CallerError, ExitStatus, MachineError, NoackError, shortened, why
+from noack.core.errors import CallerError, ExitStatus, MachineError, NoackError, why
 from noack.core.file_access import PARTIAL, create_folder, locked, remove_file, write_whole
+from noack.core.progress import Progress, no_progress
 
 RUNS = "runs"
 _LOCK = ".lock"
@@ -189,7 +190,7 @@ def _claim(folder: Path, manifest: Mapping[str, object]) -> Mapping[str, str]:
     if not isinstance(stored_manifest, dict) or not isinstance(stored_manifest.get("arithmetic"), dict):
         raise CallerError(f"{path}: not a manifest of a campaign; give another --out")
     made_by: dict[str, str] = stored_manifest.pop("arithmetic")
-    mismatch = _difference(stored_manifest, {k: v for k, v in manifest.items() if k != "arithmetic"})
+    mismatch = difference(stored_manifest, {k: v for k, v in manifest.items() if k != "arithmetic"})
     if mismatch is not None:
         raise CallerError(
             f"{folder}: holds another campaign ({mismatch}); give another --out, or remove the folder"
@@ -209,27 +210,6 @@ def _identity(campaign: Campaign) -> dict[str, object]:
     return content
 
 
-def _difference(stored: object, running: object, key: str = "") -> str | None:
-    """Return the first difference as text; None if there is none."""
-    if isinstance(stored, dict) and isinstance(running, dict):
-        names: list[object] = sorted(stored.keys() | running.keys())
-        pairs = [(stored.get(name), running.get(name)) for name in names]
-    elif isinstance(stored, list) and isinstance(running, list):
-        if len(stored) != len(running):
-            return f"{key} has {len(stored)} entries there, {len(running)} here"
-        names, pairs = list(range(len(running))), list(zip(stored, running, strict=True))
-    else:
-        texts = [shortened(json.dumps(value, ensure_ascii=False), 60) for value in (stored, running)]
-        return None if stored == running else f"{key} is {texts[0]} there, {texts[1]} here"
-    keys = (f"{key}.{name}".removeprefix(".") for name in names)
-    differences = (_difference(*pair, inner_key) for pair, inner_key in zip(pairs, keys, strict=True))
-    return next(filter(None, differences), None)
-
-
-Progress = Callable[[int, int], None]
-"""Called with the number of finished runs and the number of all runs."""
-
-
 class InterruptedCampaignError(NoackError):
     """A user or a signal interrupted the campaign; written runs are kept."""
 
@@ -238,7 +218,7 @@ class InterruptedCampaignError(NoackError):
         self.exit_status = exit_status
 
 
-def run_campaign(store: Store, runner: Runner, progress: Progress | None = None) -> int:
+def run_campaign(store: Store, runner: Runner, progress: Progress = no_progress) -> int:
     """Compute the missing runs; return their number.
 
     Raises:
@@ -252,8 +232,7 @@ def run_campaign(store: Store, runner: Runner, progress: Progress | None = None)
         return total - sum(len(chunk.draws) for chunk in store.missing())
 
     stored_before = runs_done = stored()
-    report = progress or (lambda runs_done, total: None)
-    report(runs_done, total)
+    progress(runs_done, total)
 
     def message(ending: object) -> str:
         return (
@@ -265,7 +244,7 @@ def run_campaign(store: Store, runner: Runner, progress: Progress | None = None)
         for chunk, rows in runner([point.work for point in store.points], list(store.missing())):
             store.write(chunk, rows)
             runs_done += len(chunk.draws)
-            report(runs_done, total)
+            progress(runs_done, total)
     except KeyboardInterrupt as error:
         status = getattr(error, "exit_status", ExitStatus.INTERRUPTED)
         runs_done = stored()  # it may have come after a chunk was written, and before it was counted

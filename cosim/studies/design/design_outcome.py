@@ -13,9 +13,10 @@ from cosim.output.figures import palette
 from cosim.output.figures.axes_parts import draw_line, rgb, whole_numbers
 from cosim.output.figures.page_figure import PageFigure, one_panel
 from cosim.studies.design.design_search import designed_name
-from cosim.studies.design.network_search import CertifiedLoop, DesignRequest, NetworkSearch, Progress
+from cosim.studies.design.network_search import CertifiedLoop, DesignRequest, NetworkSearch
 from noack.core.clock import NS_PER_S
 from noack.core.number_format import NONE, at_least, at_most
+from noack.core.progress import Progress, no_progress
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import dumps, toml_text
 from noack.settings.section import MatrixRows
@@ -186,7 +187,7 @@ def _growth_figure(search: NetworkSearch, given: CertifiedLoop, best: CertifiedL
 
 
 def design_for_network(
-    scenario: Scenario, request: DesignRequest, progress: Progress = lambda share: None
+    scenario: Scenario, request: DesignRequest, progress: Progress = no_progress
 ) -> DesignOutcome:
     """Search for the gain of a time-triggered loop that tolerates the largest M; it is deterministic.
 

@@ -7,7 +7,7 @@ the quantile itself must meet its limit, with all draws the upper end of its int
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Literal, NamedTuple
 
@@ -20,6 +20,7 @@ from cosim.studies.campaign.random_draws import Box, box_of
 from cosim.studies.design.design_space import DesignSpace, TriggerCandidate, space_of
 from noack.core.errors import CallerError
 from noack.core.number_format import at_most, plus_minus
+from noack.core.progress import Progress, no_progress
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.conditions import ideal_conditions, nominal_conditions
@@ -30,8 +31,6 @@ BoundedQuantity = Literal["state", "error"]
 Bounds = Mapping[BoundedQuantity, float]
 """Certified sup‖x‖ and sup‖e_c‖, Euclidean; infinite if there is no bound."""
 WORDS: dict[BoundedQuantity, str] = {"state": "sup‖x‖", "error": "sup‖e_c‖"}
-Progress = Callable[[float], None]
-"""Called with the approximate share of the work that is done."""
 _SMALLEST_STEP = 0.04
 """Smallest step of the refinement, as a share of the grid's steps."""
 _MOST_ROUNDS = 24
@@ -389,7 +388,7 @@ def design(
     *,
     draws: int,
     seed: int,
-    progress: Progress = lambda share: None,
+    progress: Progress = no_progress,
 ) -> DesignResult:
     """Choose among families; the result is deterministic.
 

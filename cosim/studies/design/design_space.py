@@ -11,12 +11,13 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_continuous_are
 
 from cosim.analysis.mean_cost import require_weight
+from cosim.studies.regulator import lqr_gain
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.core.number_format import to_digits
+from noack.core.progress import Progress, no_progress, part_of
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.settings.section import MatrixRows
@@ -149,7 +150,7 @@ def families_of(
     scenario: Scenario,
     norms: Sequence[str],
     lqr: tuple[Matrix, Matrix] | None,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Progress = no_progress,
 ) -> dict[tuple[str, str], Scenario]:
     """Return scenarios by the names of gain and norm.
 
@@ -164,12 +165,8 @@ def families_of(
     gains = {"given": scenario} if lqr is None else dict(_with_regulators(scenario, *lqr))
     scenarios = {}
     for i, (gain, regulated) in enumerate(gains.items()):
-
-        def report(share: float, finished: int = i) -> None:
-            progress((finished + share) / len(gains))
-
         for norm in norms:
-            scenarios[gain, norm] = _with_norm(regulated, norm, report)
+            scenarios[gain, norm] = _with_norm(regulated, norm, part_of(progress, i, len(gains)))
     return scenarios
 
 
@@ -181,7 +178,7 @@ def _with_regulators(scenario: Scenario, Q: Matrix, R: Matrix) -> list[tuple[str
             raise CallerError(f"{name}: expected {size} x {size}, or {size} numbers for its diagonal")
     scenarios = []
     for cost in COSTS_OF_INPUT:
-        K = lqr_gain(loop.A_model, loop.B_model, Q, cost * R)
+        K = weighed_gain(loop.A_model, loop.B_model, Q, cost * R)
         model = scenario.model.model_copy(update={"gain": tuple(map(tuple, K.tolist()))})
         scenarios.append((f"lqr R × {cost:g}", scenario.model_copy(update={"model": model})))
     return scenarios
@@ -192,8 +189,8 @@ def round_gain(K: Matrix) -> MatrixRows:
     return tuple(tuple(to_digits(entry, 6) for entry in row) for row in K.tolist())
 
 
-def lqr_gain(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
-    """Return K of u = K x, (m, n): K = −R⁻¹BᵀP, AᵀP + PA − PBR⁻¹BᵀP + Q = 0.
+def weighed_gain(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
+    """Return the gain of a regulator, (m, n), see :func:`lqr_gain`.
 
     Raises:
         CallerError: Q or R is not a valid weight, the sizes of both are too different, or no P makes
@@ -202,10 +199,7 @@ def lqr_gain(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
     require_weight("--Q", Q)
     require_weight("--R", R, definite=True)
     with suppress(np.linalg.LinAlgError):
-        P = solve_continuous_are(A, B, Q, R)
-        K = np.asarray(-np.linalg.solve(R, B.T @ P), dtype=np.float64)
-        if spectral_abscissa(A + B @ K) < 0:
-            return K
+        return lqr_gain(A, B, Q, R)
     sizes = np.log10([np.abs(weight).max() or 1.0 for weight in (Q, R)])
     if abs(sizes[1] - sizes[0]) > _MOST_DIGITS_APART:
         raise CallerError(

@@ -12,17 +12,17 @@ consecutive losses (and the network's further constraints) is proven stable.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 
-from cosim.studies.design.design_space import lqr_gain, round_gain
+from cosim.studies.design.design_space import round_gain, weighed_gain
 from cosim.studies.design.quick_estimate import PatternGraph, QuickLoop
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
+from noack.core.progress import Progress, no_progress
 from noack.guarantee.loss_guarantee import LossGuarantee
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
@@ -32,7 +32,6 @@ from noack.theory.margins.loss_margin import LossMargin, Stability, capped, list
 from noack.theory.margins.scenario_times import without_timeout
 from noack.trigger_policies.periodic_trigger import PeriodicSettings
 
-Progress = Callable[[float], None]
 COSTS_OF_INPUT = np.geomspace(1e-3, 1e3, 13)
 """Factors of R of the regulators that the search begins with."""
 MOST_M = 16
@@ -129,7 +128,7 @@ class NetworkSearch:
         self.most = request.most if burst is None else min(request.most, burst + 1)
         n, m = self.plant.n, self.plant.m
         self.weights = request.weights or (np.eye(n), np.eye(m))
-        lqr_gain(self.plant.A_model, self.plant.B_model, *self.weights)  # raises if there is none
+        weighed_gain(self.plant.A_model, self.plant.B_model, *self.weights)  # raises if there is none
         self.given_gain = rows_of(self.plant.K)
         self.cost_limit = request.cost * self.cost(self.given_gain)
         """Largest cost; infinite if the given loop is unstable without losses."""
@@ -214,7 +213,7 @@ class NetworkSearch:
             m, stability, beyond = m + 1, beyond, None
         return CertifiedLoop(K, m, stability, beyond, self.cost(K))
 
-    def run(self, progress: Progress = lambda share: None) -> tuple[CertifiedLoop, CertifiedLoop]:
+    def run(self, progress: Progress = no_progress) -> tuple[CertifiedLoop, CertifiedLoop]:
         """Return what the given loop is proven to tolerate, and the best loop found."""
         # The given loop, which the others must exceed.
         given = self.certify(self.given_gain, self.largest_possible(self.given_gain, 1)[0])
@@ -222,7 +221,7 @@ class NetworkSearch:
         progress(0.1)
         # Rank the starts by the M that is not excluded, then by the excess for the next one.
         plant, (Q, R) = self.plant, self.weights
-        starts = [round_gain(lqr_gain(plant.A_model, plant.B_model, Q, c * R)) for c in COSTS_OF_INPUT]
+        starts = [round_gain(weighed_gain(plant.A_model, plant.B_model, Q, c * R)) for c in COSTS_OF_INPUT]
         ranked = sorted(
             ((*self.largest_possible(K, max(best_m, 1)), K) for K in [given.K, *starts]),
             key=lambda entry: (-entry[0], entry[1]),

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cosim.record.run_directory import write_output
 from cosim.studies.new_loop.plant_reference import PlantReference, plant_reference
+from cosim.studies.regulator import lqr_gain
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, norm
 from noack.core.number_checks import real_number
@@ -295,7 +296,10 @@ def gain(
         raise CallerError(f"{label}: no gain stabilises it: the eigenvalue {worst} /s is not controllable")
     if poles is None:
         Q, R = (_weight_matrix(*weight) for weight in (("q", q, model.A), ("r", r, model.B.T)))
-        K = _regulator_gain(model, Q, R)
+        try:
+            K = lqr_gain(model.A, model.B, Q, R)
+        except (np.linalg.LinAlgError, ValueError) as error:
+            raise CallerError(f"{label}: no linear-quadratic regulator: {error}") from None
         method = f"linear-quadratic regulator, Q = {_diagonal_text(Q)}, R = {_diagonal_text(R)}"
     elif q is not None or r is not None:
         raise CallerError("poles: give either these or the weights q and r")
@@ -306,16 +310,6 @@ def gain(
     if (reason := instability(model.A, model.B, K)) is not None:
         raise CallerError(f"{label}: {reason}")
     return LoopGain(model, K, method)
-
-
-def _regulator_gain(model: LinearModel, Q: Matrix, R: Matrix) -> Matrix:
-    from scipy.linalg import solve_continuous_are  # importing scipy takes 0.2 s
-
-    try:
-        P = solve_continuous_are(model.A, model.B, Q, R)
-    except (np.linalg.LinAlgError, ValueError) as error:
-        raise CallerError(f"{model.plant.label}: no linear-quadratic regulator: {error}") from None
-    return np.asarray(-np.linalg.solve(R, model.B.T @ P), dtype=np.float64)
 
 
 def _place_poles(model: LinearModel, poles: Complex) -> Matrix:

@@ -104,9 +104,13 @@ def test_each_packet_of_a_long_run_is_recorded_once_and_progress_is_reported(
     """The network's memory for rows is full three times."""
     busy_content["trigger"] = {"policy": "periodic", "period_s": 0.01}
     busy_content["horizon_s"] = 150.0
-    reported_ns: list[int] = []
-    record = simulate(resolve(validate(busy_content, "test")), progress=reported_ns.append)
+    reported: list[tuple[float, float]] = []
+    record = simulate(
+        resolve(validate(busy_content, "test")),
+        progress=lambda done, total=1.0, /: reported.append((done, total)),
+    )
     assert record[NETEM_PACKET]["input"].tolist() == list(range(15_001))
-    assert len(reported_ns) > 2
-    assert reported_ns == sorted(reported_ns)
-    assert 0 <= reported_ns[0] < reported_ns[-1] <= record.scenario.timing.horizon_ns
+    assert len(reported) > 2
+    assert reported == sorted(reported)
+    assert 0 <= reported[0][0] < reported[-1][0] <= 150.0
+    assert {total for _, total in reported} == {150.0}

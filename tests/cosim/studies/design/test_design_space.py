@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_continuous_lyapunov
 
-from cosim.studies.design.design_space import lqr_gain
+from cosim.studies.design.design_space import weighed_gain
 from noack.core.errors import CallerError
 from noack.core.linear_systems import spectral_abscissa
 from noack.plants.linear import lane_following
@@ -13,7 +13,7 @@ from noack.plants.linear import lane_following
 def test_the_gain_comes_from_a_solution_of_the_riccati_equation() -> None:
     A, B, *_ = lane_following()
     Q, R = np.diag([1.0, 2.0, 3.0, 4.0]), np.array([[2.0, 0.5], [0.5, 1.0]])
-    K = lqr_gain(A, B, Q, R)
+    K = weighed_gain(A, B, Q, R)
     closed = A + B @ K
     assert spectral_abscissa(closed) < 0
     # P is the cost of the closed loop by another equation; K must follow from it.
@@ -35,4 +35,4 @@ def test_a_system_without_a_regulator_is_refused(
     A: list[list[float]], Q: list[list[float]], R: float, word: str
 ) -> None:
     with pytest.raises(CallerError, match=word):
-        lqr_gain(np.array(A), np.array([[0.0], [1.0]]), np.array(Q), np.array([[R]]))
+        weighed_gain(np.array(A), np.array([[0.0], [1.0]]), np.array(Q), np.array([[R]]))
