@@ -2,10 +2,8 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
-from pathlib import Path
 from typing import NamedTuple
 
-from cosim.record.run_record import scenarios_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.certificates.assumptions import Assumption, assumptions
@@ -33,25 +31,6 @@ def expectations(scenario: Scenario) -> Expectations:
 def expectations_key(scenario: Scenario) -> str:
     """Return what the expectations of loops depend on: equal loops share them."""
     return scenario.model_dump_json(exclude={"name", "seeds"})
-
-
-_sent = set[str]()
-"""The keys whose expectations this process has returned."""
-
-
-def expectations_of_loop(run_dir: Path, number: int) -> tuple[str, Expectations | None] | None:
-    """Return key and expectations of a loop of a run; the expectations only once for each key.
-
-    None: the run has no such loop. It is for a process of which each loop is asked in turn.
-    """
-    _, loops = scenarios_of(run_dir)
-    if number >= len(loops):
-        return None
-    key = expectations_key(loops[number])
-    if key in _sent:
-        return key, None
-    _sent.add(key)
-    return key, expectations(loops[number])
 
 
 def scheduled_certificates(scenario: Scenario, start_error: float | None = None) -> list[ScenarioCertificate]:

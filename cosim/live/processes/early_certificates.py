@@ -4,24 +4,24 @@ It runs at idle priority: a process of the run that wakes up takes the core at o
 computed when the run ends, or what is lost with it, is computed then.
 """
 
+import multiprocessing
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from threading import Event, Thread
-from typing import TYPE_CHECKING, Self, cast
+from typing import TYPE_CHECKING, Self
 
-from cosim.live.processes.process_pool import at_idle_priority, process_starts, processes
+from cosim.live.processes.process_pool import start_alone
 from cosim.record.run_directory import RunEnding
+from noack.core.system_processes import be_idle
 
 if TYPE_CHECKING:
     from cosim.analysis.claims.run_certificates import Expectations
 
 _POLL_S = 0.05
-
-
-class _RunEndedError(Exception):
-    """The run has ended: the process is no longer waited for."""
 
 
 class EarlyCertificates:
@@ -31,38 +31,51 @@ class EarlyCertificates:
         self.known: dict[int, Expectations] = {}
         """What is computed, by the number of the loop; complete when the context has ended."""
         self._ended = Event()
+        self._process: BaseProcess | None = None
         self._thread: Thread | None = None
 
     def start(self, run_dir: Path) -> None:
         """Begin to compute them, in the order of the loops."""
-        self._thread = Thread(target=self._compute, args=(run_dir,), daemon=True)
-        self._thread.start()
+        receiver, sender = multiprocessing.Pipe(duplex=False)
+        with suppress(OSError):  # there is no memory for a process, and the end of the run computes them
+            self._process = start_alone(_compute, run_dir, sender)
+            sender.close()
+            self._thread = Thread(target=self._receive, args=(receiver,), daemon=True)
+            self._thread.start()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         self._ended.set()
+        if self._process is not None:
+            self._process.kill()  # at idle priority it may not even get the time to end by itself
         if self._thread is not None:
             self._thread.join()
 
-    def _compute(self, run_dir: Path) -> None:
-        module = "cosim.analysis.claims.run_certificates"
+    def _receive(self, receiver: Connection) -> None:
         by_key: dict[str, Expectations] = {}
-        with suppress(Exception), processes(1) as pool:  # the end of the run reports an error
-            while True:
-                number = len(self.known)
-                with process_starts():
-                    future = pool.submit(at_idle_priority, module, "expectations_of_loop", run_dir, number)
-                while not future.done():
-                    if self._ended.wait(_POLL_S):
-                        raise _RunEndedError
-                if (found := cast("tuple[str, Expectations | None] | None", future.result())) is None:
-                    return
-                key, expectations = found
-                if expectations is not None:
-                    by_key[key] = expectations
-                self.known[number] = by_key[key]
+        with suppress(EOFError, OSError), receiver:  # the process has ended
+            while not self._ended.is_set():
+                if receiver.poll(_POLL_S):
+                    key, found = receiver.recv()
+                    if found is not None:
+                        by_key[key] = found
+                    self.known[len(self.known)] = by_key[key]
+
+
+def _compute(run_dir: Path, sender: Connection) -> None:
+    """Send what to expect of each loop in turn: its key, and the expectations at their first time."""
+    be_idle()
+    from cosim.analysis.claims.run_certificates import expectations, expectations_key
+    from cosim.record.run_record import scenarios_of
+
+    _, loops = scenarios_of(run_dir)
+    sent = set[str]()
+    for loop in loops:
+        key = expectations_key(loop)
+        sender.send((key, None if key in sent else expectations(loop)))
+        sent.add(key)
 
 
 @dataclass(frozen=True)

@@ -7,15 +7,14 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from importlib import import_module
 from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from types import ModuleType
 from typing import TypeVar
 
-from noack.core.system_processes import be_idle
 from noack.runtime.command_line import END_SIGNALS
 
 _KEPT_BYTES = str(32 * 2**20)
@@ -53,6 +52,20 @@ def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
             own_end.close()  # ends processes that still compute
             pool.shutdown(cancel_futures=True)
             child_end.close()
+
+
+def start_alone(function: Callable[..., object], *arguments: object) -> BaseProcess:
+    """Start a process of one thread that calls a function; it ends with this one, however this one ends."""
+    with environment(_ENVIRONMENT), process_starts():
+        process = multiprocessing.get_context("spawn").Process(target=_call, args=(function, *arguments))
+        process.daemon = True
+        process.start()
+    return process
+
+
+def _call(function: Callable[..., object], *arguments: object) -> None:
+    _end_when(multiprocessing.parent_process().join)  # type: ignore[union-attr]
+    function(*arguments)
 
 
 @contextmanager
@@ -99,9 +112,14 @@ def _result(future: Future[Result] | None, function: Callable[[Item], Result], i
 def _depend_on(parent: Connection, threshold: tuple[int, int, int]) -> None:
     """End this process when the parent closes its end of the pipe; collect garbage as it does."""
     gc.set_threshold(*threshold)
+    _end_when(lambda: parent.poll(None))
+
+
+def _end_when(wait: Callable[[], object]) -> None:
+    """End this process when a function returns."""
 
     def follow() -> None:
-        parent.poll(None)
+        wait()
         os._exit(1)
 
     threading.Thread(target=follow, daemon=True).start()
@@ -133,17 +151,3 @@ def _block_endings() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def call_by_name(module: str, function: str, *arguments: object) -> object:
-    """Import a module and call its function; the caller need not import it."""
-    return getattr(import_module(module), function)(*arguments)
-
-
-def at_idle_priority(*call: object) -> object:
-    """Call a function by name, see :func:`call_by_name`, on a core that nothing else needs.
-
-    A thread does so: without permission of the system, it could not leave that priority again.
-    """
-    with ThreadPoolExecutor(1, initializer=be_idle) as thread:
-        return thread.submit(call_by_name, *call).result()  # type: ignore[arg-type]

@@ -1,14 +1,14 @@
 """The certificates that a process computes while a run goes on."""
 
 import time
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import pytest
 
 from cosim.analysis.claims.run_certificates import expectations
 from cosim.live.processes import early_certificates
-from cosim.live.processes.early_certificates import EarlyCertificates
-from cosim.live.processes.process_pool import call_by_name
+from cosim.live.processes.early_certificates import EarlyCertificates, _compute
 from cosim.record.run_record import scenarios_of
 from cosim.record.run_scenario import write_scenario
 from noack.scenario.resolution import resolve_run
@@ -16,7 +16,13 @@ from tests.helpers.shipped import shipped
 from tests.helpers.waiting import wait_for
 
 
-def sleep_long(*_: object) -> None:
+def compute_at_usual_priority(run_dir: Path, sender: Connection) -> None:
+    """For the process: on a busy machine, idle priority can get no time for minutes."""
+    early_certificates.be_idle = lambda: None
+    _compute(run_dir, sender)
+
+
+def compute_for_days(run_dir: Path, sender: Connection) -> None:
     """For the process: it computes no certificate in the time of a run."""
     time.sleep(1e6)
 
@@ -32,8 +38,7 @@ def run_dir(tmp_path: Path) -> Path:
 
 
 def test_they_are_those_of_each_loop(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # On a busy machine, idle priority can get no time for minutes.
-    monkeypatch.setattr(early_certificates, "at_idle_priority", call_by_name)
+    monkeypatch.setattr(early_certificates, "_compute", compute_at_usual_priority)
     _, loops = scenarios_of(run_dir)
     with EarlyCertificates() as certificates:
         certificates.start(run_dir)
@@ -45,7 +50,20 @@ def test_they_are_those_of_each_loop(run_dir: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_the_end_of_a_run_does_not_wait_for_them(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(early_certificates, "at_idle_priority", sleep_long)
+    monkeypatch.setattr(early_certificates, "_compute", compute_for_days)
     with EarlyCertificates() as certificates:
         certificates.start(run_dir)
+    assert certificates.known == {}
+
+
+def test_a_process_that_is_killed_costs_what_it_has_not_computed(
+    run_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(early_certificates, "_compute", compute_for_days)
+    with EarlyCertificates() as certificates:
+        certificates.start(run_dir)
+        assert certificates._process is not None
+        assert certificates._thread is not None
+        certificates._process.kill()
+        wait_for(lambda: not certificates._thread.is_alive())
     assert certificates.known == {}
