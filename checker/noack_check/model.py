@@ -116,13 +116,28 @@ class Edge(NamedTuple):
     """z has the noise of a measurement."""
 
 
+class Chain(NamedTuple):
+    """The paper's chain: w = Σ e^{H(t − t_i)} e_s(t_i⁻) over the updates that the acting input lacks."""
+
+    gain: arb
+    """At least sup ‖W e^{(H + r)s} W⁻¹‖ over all s ≥ 0."""
+    recent: arb
+    """The same over 0 ≤ s ≤ d."""
+
+    def factor(self, lost: int, sent: int) -> arb:
+        """Return a bound of ‖W w‖ in multiples of that of ‖W e_s‖.
+
+        It is for so many lost updates, and so many whose events are at most d ago.
+        """
+        return self.gain * lost + self.recent * sent
+
+
 class Errors(NamedTuple):
-    """What is assumed at all times: ‖W (e_s − n)‖² ≤ ``decaying``² f₁² + ``constant``² f₂²."""
+    """What is assumed at all times: ‖W (e_s − n)‖² ≤ ``decaying``² f₁² + ``constant``² f₂², for each n."""
 
     decaying: arb
     constant: arb
-    gain: arb
-    """At least sup ‖W e^{(H + r)s} W⁻¹‖ over all s ≥ 0."""
+    chain: Chain
 
 
 class Part(NamedTuple):
@@ -181,7 +196,7 @@ class Model:
         loop: the loop.
         rate: r ≥ 0 in f₁ = e^{−rt}, in 1/s.
         decay: ν in dV/dt ≤ −νV, in 1/s.
-        errors: what is assumed of e_s, if it is used: then w is bounded by the paper's chain.
+        errors: what is assumed of e_s, if it is used: then w is bounded by the paper's chain, too.
         later: most events within d after an event.
         later_at_start: most events after the one at t = 0 before the first input acts.
         pieces: of the period of a periodic rule, on which P is affine.
@@ -263,13 +278,17 @@ class Model:
         silent = () if times.sampling > 0 or self.is_periodic else (self.silent, *self._noise_bounds)
         if self.is_periodic:
             tested = self._nodes_until(times.period)
+        assumed = self._assumed() if times.sampling > 0 else ()
+        if assumed and not self._units() <= set(self._guards):
+            tested = (arb(0),)  # an input may act at any time after a test, and leaves all c as they are
         found = []
         for lost in range(losses + 1):
-            facts = self._chain(lost) if lost else ()
+            facts = assumed + (self._chain(lost, 0) if lost else ())
             coordinates = self._coordinates(lost > 0 and not self.is_periodic, 0)
             found.append(Location(f"{lost} lost", coordinates, tested, flows, facts, silent, True))
         for later in range(self._waiting):
-            facts, nodes = self._chain(losses + 1 + later), self._time_to(times.delay, later)
+            facts, nodes = self._chain(losses, later + 1), self._time_to(times.delay, later)
+            facts += self._assumed()
             name, coordinates = f"{later} later", self._coordinates(True, later)
             found.append(Location(name, coordinates, nodes, flows, facts, (), False))
         if times.start > 0:
@@ -328,13 +347,23 @@ class Model:
         w = range(2 * n, 3 * n) if has_w else range(0)
         return (*range(2 * n), *w, *range(3 * n, (3 + copies) * n), *units)
 
-    def _chain(self, missing: int) -> tuple[arb_mat, ...]:
-        """Return ‖W w‖² minus its bound by the paper's chain, if that is known."""
+    def _units(self) -> set[str]:
+        """Return the names of c of all units."""
+        return ({"c1"} if self._has_f1 else set()) | ({"c2"} if needs_constant(self.loop) else set())
+
+    def _assumed(self) -> tuple[arb_mat, ...]:
+        """Return ‖W e_s‖² minus its bound, if one is assumed."""
+        return self._at_most(self.e, arb(1))
+
+    def _chain(self, lost: int, sent: int) -> tuple[arb_mat, ...]:
+        """Return ‖W w‖² minus its bound by the chain, if that is known."""
+        return self._at_most(self.w, self.errors.chain.factor(lost, sent)) if self.errors else ()
+
+    def _at_most(self, error: arb_mat, factor: arb) -> tuple[arb_mat, ...]:
         if self.errors is None:
             return ()
-        decaying, constant, gain = self.errors
-        assumed = decaying**2 * square(self.f1) + constant**2 * square(self.f2)
-        return (square(self.loop.weight * self.w) - (gain * missing) ** 2 * assumed,)
+        assumed = self.errors.decaying**2 * square(self.f1) + self.errors.constant**2 * square(self.f2)
+        return (square(self.loop.weight * error) - factor**2 * assumed,)
 
     def _gains(self) -> list[arb_mat]:
         """Return matrices in whose hull K e^{−Hs} is, for all ages s.
@@ -617,9 +646,8 @@ class Model:
         source, target = self.locations[edge.source], self.locations[edge.target]
         E = self._columns(source, with_noise=edge.is_test)
         z, jump = rows_of(E, source.coordinates), rows_of(edge.jump * E, target.coordinates)
-        units = {name for name, f in (("c1", self.f1), ("c2", self.f2)) if not is_zero(f * E)}
         facts = edge.facts
-        if units <= set(self._guards):
+        if self._units() <= set(self._guards):
             facts += source.facts + (() if self._sources else source.silent)
         for node, target_node in edge.pairs:
             terms = _Terms(E.ncols())

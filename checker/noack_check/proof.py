@@ -28,7 +28,7 @@ from noack_check.balls import around_zero, frobenius, identity, is_zero, upto
 from noack_check.check import RejectedError, verify
 from noack_check.document import read_count, read_matrix, read_number
 from noack_check.loop import Loop, Times
-from noack_check.model import Errors, Model, has_decaying_unit, needs_constant, thresholds
+from noack_check.model import Chain, Errors, Model, has_decaying_unit, needs_constant, thresholds
 from noack_check.norms import decays_below, growth
 
 MOST_PIECES = 64
@@ -94,9 +94,8 @@ def prove(loop: Loop, document: Mapping[str, object]) -> Proof:
     require_few_later(loop, assumed, apart if is_quiet else None)
     if assumed.errors is not None:
         _require_errors(loop, rate, proven, assumed.errors)
-    if assumed.chain_gain is not None and sensor is not None:
-        missing = loop.losses + (1 + assumed.later if loop.times.delay > 0 else 0)
-        jumps = missing * assumed.chain_gain
+    if assumed.chain is not None and sensor is not None:
+        jumps = assumed.chain.factor(loop.losses, 1 + assumed.later if loop.times.delay > 0 else 0)
         constant = sensor.constant + jumps * (sensor.constant + loop.noise_size)
         bounds.append(Bound("e_c", (1 + jumps) * sensor.decaying, constant, True))
     if not all(size.is_finite() for bound in bounds for size in (bound.decaying, bound.constant)):
@@ -110,7 +109,7 @@ class Assumptions(NamedTuple):
     errors: Errors | None
     later: int
     later_at_start: int
-    chain_gain: arb | None
+    chain: Chain | None
     pieces: int = 1
     """Parts of the period of a periodic rule: the nodes of its clock."""
 
@@ -121,25 +120,25 @@ def read_assumptions(loop: Loop, rate: arb, document: Mapping[str, object]) -> A
     Raises:
         RejectedError: it has no meaning, or the chain's gain is not proven.
     """
-    gain = _chain_gain(loop, rate, document)
+    chain = _chain(loop, rate, document)
     later, at_start = (read_count(document, key, MOST_LATER) for key in ("later", "later_at_start"))
     pieces = read_count(document, "pieces", MOST_PIECES) if "pieces" in document else 1
     if pieces < 1:
         raise RejectedError("pieces: below 1")
     if "errors" not in document:
-        return Assumptions(None, later, at_start, gain, pieces)
+        return Assumptions(None, later, at_start, chain, pieces)
     if loop.times.period > 0:
         raise RejectedError("errors: of no use with a periodic rule")
     table = document["errors"]
     if not isinstance(table, Mapping):
         raise RejectedError("errors: not a table")
-    if gain is None:
+    if chain is None:
         raise RejectedError("errors: need the chain")
     sizes = read_number(table, "decaying"), read_number(table, "constant")
     units = has_decaying_unit(loop, rate), needs_constant(loop)
     if not all(size == 0 or (size > 0 and is_unit) for size, is_unit in zip(sizes, units, strict=True)):
         raise RejectedError("errors: below 0, or in a unit that the loop does not have")
-    return Assumptions(Errors(*sizes, gain), later, at_start, gain, pieces)
+    return Assumptions(Errors(*sizes, chain), later, at_start, chain, pieces)
 
 
 def require_few_at_start(loop: Loop, assumed: Assumptions) -> bool:
@@ -242,19 +241,20 @@ def _last_test_before(times: Times, until: fmpq) -> fmpq:
     return min(tests * times.sampling, until)
 
 
-def _chain_gain(loop: Loop, rate: arb, document: Mapping[str, object]) -> arb | None:
-    """Return g ≥ sup ‖W e^{(H+r)τ} W⁻¹‖ over τ ≥ 0, as proven; None: the document has none."""
+def _chain(loop: Loop, rate: arb, document: Mapping[str, object]) -> Chain | None:
+    """Return the chain, its gain as proven; None: the document has none."""
     if "chain" not in document:
         return None
-    chain = document["chain"]
-    if not isinstance(chain, Mapping):
+    table = document["chain"]
+    if not isinstance(table, Mapping):
         raise RejectedError("chain: not a table")
-    gain, G = read_number(chain, "gain"), weighted(loop, rate)
-    tail = read_matrix(chain, "tail", loop.n)
+    gain, G = read_number(table, "gain"), weighted(loop, rate)
+    tail = read_matrix(table, "tail", loop.n)
     proven = gain >= 1 if is_zero(G) else decays_below(G, gain, tail)
     if not proven:
         raise RejectedError("chain: the growth of the model's error is not below its gain")
-    return gain
+    recent, _ = growth(G, arb(loop.times.delay))
+    return Chain(gain, arb(min(gain, recent)))
 
 
 def weighted(loop: Loop, rate: arb) -> arb_mat:

@@ -10,8 +10,17 @@ from noack_check.balls import identity, matrix, number, zeros
 from noack_check.check import RejectedError
 from noack_check.keys import RefusedError
 from noack_check.loop import Loop
-from noack_check.model import Errors, Model
-from noack_check.proof import Bound, Proof, _prove_quiet_start, error_without_input, prove, share_of_errors
+from noack_check.model import Chain, Errors, Model
+from noack_check.norms import growth
+from noack_check.proof import (
+    Bound,
+    Proof,
+    _prove_quiet_start,
+    error_without_input,
+    prove,
+    share_of_errors,
+    weighted,
+)
 from noack_check.scenario import read_loop
 from tests.checker.runs import exceeded, floats
 from tests.checker.test_false_witnesses import early, failing, rejects
@@ -196,7 +205,8 @@ def test_the_chain_has_the_noise_of_each_missing_event(witness: Witness) -> None
     bounds = {bound.output: bound for bound in witness.proof.bounds}
     gain = witness.document["chain"]["gain"]  # type: ignore[index]
     constant, size = float(bounds["e_s"].constant.mid()), SIZE * 2**0.5
-    missing = 3 * gain
+    recent = float(growth(weighted(LOOP, witness.proof.rate), arb(LOOP.times.delay))[0])
+    missing = 2 * gain + recent
     by_chain = constant + missing * (constant + size)
     assert float(bounds["e_c"].constant.mid()) == pytest.approx(by_chain)
 
@@ -209,7 +219,7 @@ def test_errors_are_assumed_with_the_noise(witness: Witness) -> None:
     rejects(LOOP, {**witness.document, "errors": sizes}, "errors|missing")
     decaying, constant = drift_of(witness.proof)
     drift = Bound("drift", number(decaying), number(constant), True)
-    assumed = Errors(number(with_noise["decaying"]), number(with_noise["constant"]), arb(1))
+    assumed = Errors(number(with_noise["decaying"]), number(with_noise["constant"]), Chain(arb(1), arb(1)))
     loops = LOOP, LOOP._replace(noise=zeros(2, 0))
     shares = [float(share_of_errors(loop, number(0.3), drift, assumed).mid()) for loop in loops]
     # The noise twice: within e_s after a test, and at the next one.

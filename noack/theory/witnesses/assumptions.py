@@ -17,7 +17,7 @@ from noack.theory.witnesses.effort import NoWitnessError
 from noack_check.balls import matrix, number
 from noack_check.check import RejectedError
 from noack_check.loop import Loop
-from noack_check.model import Errors, thresholds
+from noack_check.model import Chain, Errors, thresholds
 from noack_check.norms import growth
 from noack_check.proof import (
     MOST_LATER,
@@ -57,7 +57,7 @@ def first_assumptions(loop: Loop, rate: float) -> dict[str, object]:
     if at_start or not compares_error(loop):
         later = _most_between(loop, loop.times.delay)
     document |= {"later": later, "later_at_start": at_start}
-    if loop.holds and compares_error(loop) and "chain" in document:
+    if (loop.holds or loop.rule.always) and compares_error(loop) and "chain" in document:
         share = 1.1 if loop.times.sampling > 0 else 1.0
         document = with_errors(document, [share * float(each) for each in thresholds(loop, number(rate))])
     return document
@@ -87,7 +87,7 @@ def with_errors(document: Mapping[str, object], sizes: Sequence[float]) -> dict[
 def _share_of(sizes: Sequence[float], loop: Loop, rate: float, drift: Sequence[float]) -> float:
     """Return the share of errors of some sizes that the sensor's error reaches."""
     decaying, constant = (number(size) for size in sizes)
-    errors = Errors(decaying, constant, number(1.0))
+    errors = Errors(decaying, constant, Chain(number(1.0), number(1.0)))
     return float(share_of_errors(loop, number(rate), _bound(drift), errors).mid())
 
 

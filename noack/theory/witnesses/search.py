@@ -35,7 +35,7 @@ class Search:
 
     def __init__(self, templates: Templates, frames: Frames) -> None:
         self.templates, self.model, self.frames = templates, templates.model, dict(frames)
-        level, floor = float(self.model.loop.rule.level), float(self.model.loop.rule.floor)
+        level, floor = float(self.model.level), float(self.model.floor)
         self._f_units = (1.0, level / floor if level and floor else 1.0)
         self._inverse = {name: np.linalg.inv(T) for name, T in self.frames.items()}
         self._whole = [self._frame(index) for index in range(len(self.model.locations))]

@@ -1,0 +1,93 @@
+"""Witnesses with an assumed size of the sensor's error, between tests and while updates are on their way."""
+
+import numpy as np
+import pytest
+from flint import arb, fmpq
+
+from noack.theory.witnesses.documents import Witness, find_witness
+from noack_check.balls import identity, number
+from noack_check.check import RejectedError
+from noack_check.loop import Loop
+from noack_check.model import Chain, Errors, Model
+from noack_check.proof import prove
+from tests.checker.runs import exceeded, floats
+from tests.checker.test_witnesses import bounds_of, double_integrator
+
+LOOPS = {
+    "holds": double_integrator(floor=0.02, level=0.0)._replace(holds=True),
+    "holds, threshold decays": double_integrator(floor=0.01)._replace(holds=True),
+    "deadline": double_integrator(floor=0.01)._replace(
+        rule=double_integrator(floor=0.01).rule._replace(always=True)
+    ),
+}
+
+
+@pytest.fixture(scope="module", params=LOOPS)
+def found(request: pytest.FixtureRequest) -> tuple[Loop, Witness]:
+    loop = LOOPS[request.param]
+    return loop, find_witness(loop)
+
+
+def test_runs_under_the_schedule_stay_below_the_bounds(found: tuple[Loop, Witness]) -> None:
+    loop, witness = found
+    assert 1.0 <= bounds_of(witness)["x"] < 1.8
+    for seed in range(12):
+        assert not exceeded(loop, witness.proof, np.random.default_rng(seed), 4.0)
+
+
+@pytest.mark.parametrize("share", [0.5, 0.97])
+def test_errors_below_those_that_are_proven_are_rejected(found: tuple[Loop, Witness], share: float) -> None:
+    loop, witness = found
+    sensor = next(bound for bound in witness.proof.bounds if bound.output == "e_s")
+    errors = {name: share * float(getattr(sensor, name)) for name in ("decaying", "constant")}
+    with pytest.raises(RejectedError, match="errors: the sensor's error may exceed them"):
+        prove(loop, {**witness.document, "errors": errors})
+
+
+def test_larger_errors_are_not_covered_by_the_same_forms(found: tuple[Loop, Witness]) -> None:
+    loop, witness = found
+    assumed = witness.document["errors"]
+    assert isinstance(assumed, dict)
+    with pytest.raises(RejectedError):
+        prove(loop, {**witness.document, "errors": {name: 1.5 * size for name, size in assumed.items()}})
+
+
+@pytest.mark.parametrize("change", ["slower tests", "later updates", "more losses", "another plant"])
+def test_a_witness_proves_nothing_about_another_loop(found: tuple[Loop, Witness], change: str) -> None:
+    loop, witness = found
+    times = loop.times
+    changed = {
+        "slower tests": loop._replace(
+            times=times._replace(sampling=3 * times.sampling, least_sampling=3 * times.sampling)
+        ),
+        "later updates": loop._replace(times=times._replace(delay=times.delay + fmpq(1, 50))),
+        "more losses": loop._replace(losses=loop.losses + 2),
+        "another plant": loop._replace(B=2 * loop.B),
+    }[change]
+    with pytest.raises(RejectedError):
+        prove(changed, witness.document)
+
+
+def test_facts_about_errors_bound_those_of_each_location() -> None:
+    """Lost updates may be of any age, those on their way are at most as old as their delay."""
+    loop = double_integrator()
+    errors = Errors(number(0.5), arb(0), Chain(number(7.0), number(1.25)))
+    model = Model(loop, number(0.3), number(1.0), errors, later=1)
+    sizes = {}
+    for place in model.locations:
+        E = floats(identity(model.size))
+        size = {"e": [], "w": []}  # type: dict[str, list[float]]
+        for fact in map(floats, place.facts):
+            name = "e" if fact[2, 2] else "w"
+            assert np.allclose(fact, fact.T)
+            assert np.allclose(np.diag(fact)[: len(E) - 2].sum(), loop.n)
+            size[name].append(np.sqrt(-fact[-2, -2]) / 0.5)
+        sizes[place.name] = size
+    assert sizes == {
+        "0 lost": {"e": [1.0], "w": []},
+        "1 lost": {"e": [1.0], "w": [pytest.approx(7.0)]},
+        "2 lost": {"e": [1.0], "w": [pytest.approx(14.0)]},
+        "0 later": {"e": [1.0], "w": [pytest.approx(15.25)]},
+        "1 later": {"e": [1.0], "w": [pytest.approx(16.5)]},
+        "start, 0 later": {"e": [], "w": []},
+    }
