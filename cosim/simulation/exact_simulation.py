@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from netem.channel import UPDATE_LINK
 from netem.link_state import LinkState, stream_names
-from noack.core.core_library import CData, CoreMemory, core, dtype_of, ffi, pointer_to
+from noack.core.core_library import CData, CoreMemory, core, dtype_of, ffi, new_handle, pointer_to
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.random_streams import stream_keys
@@ -84,7 +84,7 @@ class ExactSimulation:
         known_start: both models start from x(0); else from 0, and event 0 happens at t = 0.
         link: decides which updates arrive.
         delivered: without a link, whether the update of each event arrives; later ones arrive.
-        numbers: further fields of the structure.
+        numbers: further fields of ``noack_exact_settings``.
 
     Raises:
         CallerError: the loop has more than 64 states or inputs.
@@ -106,26 +106,22 @@ class ExactSimulation:
         m, n = K.shape
         if max(n, m) > _MOST_ENTRIES:
             raise CallerError(f"plant: exact simulation has at most {_MOST_ENTRIES} states and inputs")
-        self.n, self.m, self._link, self._memory = n, m, link, CoreMemory()
-        self.core: CData = ffi.new("noack_exact *")
-        """The structure, as the core's functions take it."""
-        fill_rule(self.core.rule, trigger, n, self._memory)
-        self._memory.fill(self.core, {
+        self.n, self.m, self._link = n, m, link
+        settings, memory = ffi.new("noack_exact_settings *"), CoreMemory()
+        fill_rule(settings.rule, trigger, n, memory)
+        memory.fill(settings, {
             "n": n, "m": m, "H": H, "K": K, "horizon_s": horizon_s, "known_start": known_start,
             "most_events": 2**62, "fading_per_s": trigger.fading_per_s, "fading_until_s": np.inf,
             **numbers,
         })  # fmt: skip
         # The network: a link, or whether each update arrives.
         if link is not None:
-            self.core.link = link.core
-            self.core.first_delivered = link.settings.first_delivered
+            settings.link, settings.first_delivered = link.core, link.settings.first_delivered
         elif delivered is not None:
-            fates = self._memory.keep(np.array(delivered, np.uint8))
-            self.core.fate_count, self.core.fates = len(fates), pointer_to(fates, "uint8_t *")
-        self.core.scratch = self._memory.zeros(core.noack_exact_scratch(self.core))
-        mistake = core.noack_exact_check(self.core)
-        if mistake != ffi.NULL:
-            raise ValueError(ffi.string(mistake).decode())
+            fates = memory.keep(np.array(delivered, np.uint8))
+            settings.fate_count, settings.fates = len(fates), pointer_to(fates, "uint8_t *")
+        self.core: CData = new_handle("exact", settings)
+        """The simulation, as the core's functions take it."""
 
     def runs(
         self,
@@ -155,20 +151,18 @@ class ExactSimulation:
             np.empty((k, places), np.bool_),
             np.empty((k, places, 3, self.n)) if states else None,
         )
-        self.core.event_places = places
         # The core writes the rows and logs of some runs per call, so that Ctrl-C can interrupt.
         for begin in range(0, k, _RUNS_AT_ONCE):
             part = slice(begin, min(begin + _RUNS_AT_ONCE, k))
-            self.core.event_s = pointer_to(log.event_s[part], "double *")
-            self.core.delivered = pointer_to(log.delivered[part], "uint8_t *")
-            if log.states is not None:
-                self.core.states = pointer_to(log.states[part], "double *")
+            states_of = ffi.NULL if log.states is None else pointer_to(log.states[part], "double *")
+            event_s, arrived = _pointer(log.event_s[part]), pointer_to(log.delivered[part], "uint8_t *")
             core.noack_exact_runs(
                 self.core,
                 part.stop - begin,
                 *(pointer_to(population[part], "double *") for population in (A, B, x0)),
                 ffi.NULL if keys is None else pointer_to(keys[part], "int64_t *"),
                 pointer_to(rows[part], "noack_exact_row *"),
+                ffi.new("noack_exact_log *", (places, event_s, arrived, states_of)),
             )
         return rows, log
 

@@ -226,7 +226,6 @@ class SampledLoop:
             sensor.observer.kind = core.NOACK_LUENBERGER
         weight = _dense(scales.weight)
         levels = [_dense(level) for level in (scales.error, scales.state)]
-        scratch = np.zeros(3 * self.matrices.n)
         segments = ffi.new("noack_segments *", {
             "plant": self._plant, "sensor": ffi.addressof(sensor),
             "controller": ffi.addressof(controller), "last": self.last, "delay_ns": self.delay_ns,
@@ -235,7 +234,6 @@ class SampledLoop:
             "gains": pointer_to(self._gains, "double *") if len(self._gains) else ffi.NULL,
             "error_scale": pointer_to(levels[0], "double *"),
             "state_scale": pointer_to(levels[1], "double *"),
-            "scratch": pointer_to(scratch, "double *"),
         })  # fmt: skip
         for name, array in runs._asdict().items():
             setattr(segments, name, pointer_to(array, _POINTERS[array.dtype.kind]))

@@ -155,8 +155,6 @@ typedef struct {
     double *error, *state;
     double *cost;                 /* (runs,) the integral of |x|^2, as a sum over the steps */
     int64_t *error_at, *state_at; /* (runs,) steps of the largest values */
-
-    double *scratch;              /* (3n,) */
 } noack_segments;
 
 /* Return NULL, or what is wrong with the machines or the lengths. */

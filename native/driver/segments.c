@@ -153,7 +153,7 @@ static int64_t measure(
     noack_segments *segments, int64_t run, int64_t step, int64_t tests, noack_output *output) {
     noack_sensor *sensor = segments->sensor;
     int64_t n = sensor->machine.n, measurement = step / segments->plant->measure_every;
-    double *error = segments->scratch, *image = error + n;
+    double error[NOACK_MAX_ENTRIES], image[NOACK_MAX_ENTRIES];
     if (segments->gains != NULL)
         sensor->observer.gain =
             (double *)segments->gains + measurement * n * sensor->observer.p; /* not written */

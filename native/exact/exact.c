@@ -6,7 +6,9 @@
    0; the last bits of a loop do not depend on the size chosen. */
 #include "exact.h"
 
-enum { MOST_FATES = 1 << 30, CACHE_LINE = 8 /* doubles */ };
+#include <stdlib.h>
+
+enum { MOST_FATES = 1 << 30 };
 
 #if defined(__x86_64__)
 #include <cpuid.h>
@@ -43,7 +45,7 @@ static const exact_code *const *const code_by_instructions[] = {code_plain};
 int64_t noack_exact_instructions(void) { return instructions; }
 
 /* The code for the fewest states that suffice. That for 3 sums in another order than the others. */
-static const exact_code *code_for(const noack_exact *exact) {
+static const exact_code *code_for(const noack_exact_settings *exact) {
     const exact_code *const *code = code_by_instructions[instructions];
     int64_t entries = max_of(exact->n, exact->m);
     while ((*code)->n < entries || ((*code)->n == 3 && entries != 3))
@@ -57,7 +59,7 @@ void pad(int64_t rows, int64_t columns, const double *matrix, int64_t stride, do
             result[i] = i < rows ? matrix[i * columns + j] : 0.0;
 }
 
-int arrives(const noack_exact *exact, exact_run *run) {
+int arrives(const noack_exact_settings *exact, exact_run *run) {
     noack_decision decision;
     int delivered = 1;
     if (exact->link != NULL) {
@@ -81,7 +83,7 @@ static int64_t blocks_of(const noack_trigger_rule *rule, const exact_code *code)
 }
 
 /* Whether the rule compares |W e_s|, or its integral. */
-static int is_plain(const noack_exact *exact) {
+static int is_plain(const noack_exact_settings *exact) {
     const noack_trigger_rule *rule = &exact->rule;
     int64_t n = exact->n;
     if (rule->positive_rows != n || rule->negative_rows != 0)
@@ -95,16 +97,15 @@ static int is_plain(const noack_exact *exact) {
     return 1;
 }
 
-int is_quadratic(const noack_exact *exact) {
+static int is_quadratic(const noack_exact_settings *exact) {
     const noack_trigger_rule *rule = &exact->rule;
     return rule->positive_rows > 0
            && (!is_plain(exact) || rule->is_dynamic || rule->from_event || rule->grid_ns > 0);
 }
 
-/* noack_exact_check() checks the numbers once: all that the other files assume. */
 static int is_finite_nonnegative(double number) { return number >= 0.0 && number < INFINITY; }
 
-static const char *check_exact_rule(const noack_exact *exact) {
+static const char *check_exact_rule(const noack_exact_settings *exact) {
     const noack_trigger_rule *rule = &exact->rule;
     const char *wrong = noack_check_rule(rule, NEVER_NS);
     if (wrong != NULL)
@@ -119,21 +120,19 @@ static const char *check_exact_rule(const noack_exact *exact) {
     return NULL;
 }
 
-const char *noack_exact_check(const noack_exact *exact) {
+/* All that the other files assume. */
+static const char *check(const noack_exact_settings *exact) {
     if (!is_between(1, exact->n, NOACK_EXACT_ENTRIES)
         || !is_between(1, exact->m, NOACK_EXACT_ENTRIES))
         return "a loop needs 1 to 64 states and 1 to 64 inputs";
-    if (exact->H == NULL || exact->K == NULL || exact->scratch == NULL)
-        return "a simulation has no matrix or no memory";
+    if (exact->H == NULL || exact->K == NULL)
+        return "a simulation has no matrix";
     if (!is_finite_nonnegative(exact->horizon_s) || !is_finite_nonnegative(exact->settle)
         || !is_finite_nonnegative(exact->fading_per_s) || !(exact->fading_until_s >= 0.0))
         return "a simulation has a time, a share or a rate below 0";
     if (!is_between(0, exact->most_events, INT64_MAX)
         || !is_between(NOACK_EXACT_ROW, exact->measure, NOACK_EXACT_TIMES))
         return "a simulation has an unknown measure, or a negative number of events";
-    if (!is_between(0, exact->event_places, MOST_FATES)
-        || (exact->event_places > 0 && (exact->event_s == NULL || exact->delivered == NULL)))
-        return "a simulation has no room for its events";
     if (exact->link == NULL) {
         if (!is_between(0, exact->fate_count, MOST_FATES)
             || (exact->fate_count > 0 && exact->fates == NULL))
@@ -188,18 +187,20 @@ static block_form take_form(
     return taken;
 }
 
-/* Lay a simulation's memory out in the scratch; with memory NULL only count its numbers. */
-static int64_t lay_out(const noack_exact *exact, const exact_code *code, exact_memory *memory) {
+/* Doubles that a simulation needs. */
+static int64_t scratch_length(const noack_trigger_rule *rule, const exact_code *code) {
+    int64_t square = code->n * code->stride, curve = TERMS * code->stride;
+    return (5 * (TERMS + 1) + 10) * square + 8 * curve
+           + 2 * blocks_of(rule, code) * (2 * square + code->stride + curve);
+}
+
+/* Lay a simulation's memory out in the scratch, and copy the settings to it. */
+static void lay_out(
+    const noack_exact_settings *exact, const exact_code *code, double *begin,
+    exact_memory *memory) {
     const noack_trigger_rule *rule = &exact->rule;
     int64_t square = code->n * code->stride, n = exact->n, curve = TERMS * code->stride;
     int64_t blocks = blocks_of(rule, code);
-    int64_t count = (5 * (TERMS + 1) + 10) * square + 8 * curve
-                    + 2 * blocks * (2 * square + code->stride + curve) + CACHE_LINE;
-    if (memory == NULL)
-        return count;
-    double *begin = exact->scratch;
-    memset(begin, 0, (size_t)count * sizeof *begin);
-    begin += (0 - (uintptr_t)begin / sizeof *begin) % CACHE_LINE; /* vectors do not cross lines */
     free_scratch scratch = {begin, code};
     memory->exact = exact;
     memory->rule = rule;
@@ -243,7 +244,42 @@ static int64_t lay_out(const noack_exact *exact, const exact_code *code, exact_m
         memory->w = take(&scratch, blocks * curve);
     }
     code->prepare_shared(memory);
-    return count;
+}
+
+struct noack_exact {
+    noack_exact_settings settings;
+    const exact_code *code;
+    exact_memory memory;
+    void *scratch;
+    uint8_t *fates;
+};
+
+noack_exact *noack_exact_new(const noack_exact_settings *settings, const char **wrong) {
+    noack_exact *exact = NULL;
+    if ((*wrong = check(settings)) == NULL)
+        exact = zeros(1, sizeof *exact);
+    if (exact == NULL)
+        return NULL;
+    exact->settings = *settings;
+    exact->code = code_for(settings);
+    exact->fates = copy_of(settings->fates, settings->fate_count, sizeof *exact->fates);
+    double *begin = zeros_in_lines(
+        scratch_length(&settings->rule, exact->code), sizeof *begin, &exact->scratch);
+    if (exact->fates == NULL || begin == NULL) {
+        noack_exact_free(exact);
+        return NULL;
+    }
+    exact->settings.fates = exact->fates;
+    lay_out(&exact->settings, exact->code, begin, &exact->memory);
+    return exact;
+}
+
+void noack_exact_free(noack_exact *exact) {
+    if (exact == NULL)
+        return;
+    free(exact->scratch);
+    free(exact->fates);
+    free(exact);
 }
 
 /* Copy a state (3, n) to a padded one, or back. */
@@ -258,50 +294,46 @@ static void unpack(int64_t n, int64_t stride, const double *padded, double *stat
         memcpy(state + i * n, padded + i * stride, (size_t)n * sizeof *state);
 }
 
-int64_t noack_exact_scratch(const noack_exact *exact) {
-    return lay_out(exact, code_for(exact), NULL);
-}
-
 void noack_exact_runs(
-    const noack_exact *exact, int64_t runs, const double *A, const double *B, const double *x0,
-    const int64_t *keys, noack_exact_row *rows) {
-    const exact_code *code = code_for(exact);
+    noack_exact *simulation, int64_t runs, const double *A, const double *B, const double *x0,
+    const int64_t *keys, noack_exact_row *rows, const noack_exact_log *events) {
+    const noack_exact_settings *exact = &simulation->settings;
+    const exact_code *code = simulation->code;
+    exact_memory *memory = &simulation->memory;
     int64_t n = exact->n, m = exact->m, stages = exact->link == NULL ? 0 : exact->link->stage_count;
     double state[3 * NOACK_EXACT_ENTRIES];
-    exact_memory memory = {0};
-    lay_out(exact, code, &memory);
     for (int64_t number = 0; number < runs; number++) {
-        exact_run run = {.row = rows + number, .number = number, .state = state};
+        exact_run run = {.row = rows + number, .number = number, .events = events, .state = state};
         *run.row = (noack_exact_row){.inter_event_min_s = INFINITY};
         if (exact->link != NULL)
             noack_link_renew(exact->link, keys + number * stages * 2, exact->first_delivered);
-        code->prepare(&memory, A + number * n * n, B + number * n * m);
+        code->prepare(memory, A + number * n * n, B + number * n * m);
         memset(state, 0, sizeof state);
         for (int64_t i = 0; i < n; i++) {
             state[i] = x0[number * n + i];
             state[2 * code->stride + i] = exact->known_start ? 0.0 : 0.0 - state[i];
         }
         run.event = !exact->known_start;
-        run.auxiliary = memory.dynamic ? exact->rule.initial : 0.0;
-        code->follow(&memory, &run);
+        run.auxiliary = memory->dynamic ? exact->rule.initial : 0.0;
+        code->follow(memory, &run);
     }
 }
 
 void noack_exact_follow(
-    const noack_exact *exact, const double *A, const double *B, noack_exact_segments *segments) {
-    const exact_code *code = code_for(exact);
+    noack_exact *simulation, const double *A, const double *B, noack_exact_segments *segments) {
+    const noack_exact_settings *exact = &simulation->settings;
+    const exact_code *code = simulation->code;
+    exact_memory *memory = &simulation->memory;
     int64_t n = exact->n, stride = code->stride;
     double state[3 * NOACK_EXACT_ENTRIES];
-    exact_memory memory = {0};
-    lay_out(exact, code, &memory);
-    code->prepare(&memory, A, B);
+    code->prepare(memory, A, B);
     for (int64_t i = 0; i < segments->count; i++) {
         noack_exact_row row = {.inter_event_min_s = INFINITY};
         double begin_s = segments->t_s[i], *own = segments->states + 3 * n * i;
         exact_run run = {.row = &row, .stops = 1, .t_s = begin_s, .at_s = begin_s, .state = state};
         run.auxiliary = segments->auxiliaries[i];
         pack(n, stride, own, state);
-        code->follow(&memory, &run);
+        code->follow(memory, &run);
         unpack(n, stride, state, own);
         segments->t_s[i] = run.t_s;
         segments->auxiliaries[i] = run.auxiliary;
@@ -313,13 +345,13 @@ void noack_exact_follow(
 }
 
 void noack_exact_sample(
-    const noack_exact *exact, const double *A, const double *B, const noack_exact_states *starts,
+    noack_exact *simulation, const double *A, const double *B, const noack_exact_states *starts,
     noack_exact_states *samples) {
-    const exact_code *code = code_for(exact);
+    const noack_exact_settings *exact = &simulation->settings;
+    const exact_code *code = simulation->code;
+    exact_memory *memory = &simulation->memory;
     int64_t size = 3 * exact->n, sampled = 0;
-    exact_memory memory = {0};
-    lay_out(exact, code, &memory);
-    code->prepare(&memory, A, B);
+    code->prepare(memory, A, B);
     for (int64_t start = 0; start < starts->count; start++) {
         double state[3 * NOACK_EXACT_ENTRIES];
         int is_last = start + 1 == starts->count;
@@ -328,7 +360,7 @@ void noack_exact_sample(
             end++;
         pack(exact->n, code->stride, starts->states + size * start, state);
         code->sample(
-            &memory, state, starts->t_s[start], end - sampled, samples->t_s + sampled,
+            memory, state, starts->t_s[start], end - sampled, samples->t_s + sampled,
             samples->states + size * sampled);
         sampled = end;
     }

@@ -48,8 +48,8 @@ typedef struct {   /* a quadratic form |P z|^2 - |N z|^2 of z = (x, e_s), in blo
     double *signs; /* (blocks, N) of each row */
 } block_form;
 
-typedef struct { /* memory of a simulation; arrays begin in the caller's scratch */
-    const noack_exact *exact;
+typedef struct { /* memory of a simulation; arrays are in its scratch */
+    const noack_exact_settings *exact;
     const noack_trigger_rule *rule;
     int64_t blocks;            /* of N rows each, of [P; N] and of [P_eta; N_eta] */
     int integrates, quadratic; /* what is compared; otherwise |W e_s| or nothing */
@@ -77,7 +77,8 @@ typedef struct { /* memory of a simulation; arrays begin in the caller's scratch
 
 typedef struct { /* a run, or a part of one */
     noack_exact_row *row;
-    int64_t number;   /* of the run */
+    int64_t number; /* of the run */
+    const noack_exact_log *events;
     int64_t stops;    /* 1: at its first event */
     double t_s;       /* start, then end */
     double *state;    /* (3, n) x, e_s, e_c at the start, then at the end */
@@ -105,10 +106,9 @@ extern const exact_code exact_wide_4, exact_wide_8, exact_fused_3, exact_fused_4
 #endif
 extern const exact_code exact_plain_3, exact_plain_4, exact_plain_8, exact_plain_16, exact_plain_64;
 
-/* exact.c: whether a rule compares more than |W e_s|; whether the next update arrives; a column of
+/* exact.c: whether the next update arrives; a column of
    STRIDE numbers for each of the matrix. */
-int is_quadratic(const noack_exact *exact);
-int arrives(const noack_exact *exact, exact_run *run);
+int arrives(const noack_exact_settings *exact, exact_run *run);
 void pad(int64_t rows, int64_t columns, const double *matrix, int64_t stride, double *result);
 
 /* rule.c */

@@ -46,7 +46,10 @@ typedef struct {
     int64_t status;
 } noack_exact_row;
 
-/* A simulation: what the runs share. Matrices are in row-major order. */
+/* A simulation: what the runs share, and the memory of a run. */
+typedef struct noack_exact noack_exact;
+
+/* Its settings. Matrices are in row-major order. */
 typedef struct {
     int64_t n, m;
     double *H, *K;           /* (n, n) of both models between updates; (m, n) the gain */
@@ -65,33 +68,30 @@ typedef struct {
     int64_t measure;         /* enum noack_exact_measure */
     double fading_per_s;     /* r of the supremum */
     double fading_until_s;   /* r is 0 from this time on */
+} noack_exact_settings;
 
-    /* The events of all runs: a row of event_places for each. */
-    int64_t event_places;
-    double *event_s;         /* (runs, event_places) */
-    uint8_t *delivered;      /* likewise */
-    /* (runs, event_places, 3, n) just before the event; NULL: not wanted */
-    double *states;
-
-    double *scratch;         /* noack_exact_scratch() numbers */
-} noack_exact;
+/* The events of runs: a row of places for each. */
+typedef struct {
+    int64_t places;
+    double *event_s;    /* (runs, places) */
+    uint8_t *delivered; /* likewise */
+    double *states;     /* (runs, places, 3, n) just before the event; NULL: not wanted */
+} noack_exact_log;
 
 /* Return which of the processor's instructions runs use: 2: AVX2, FMA and registers of AVX-512;
    1: AVX2 and FMA; 0: neither, so that runs take many times as long. */
 int64_t noack_exact_instructions(void);
 
-/* Numbers of the scratch that n, m and the rule need; the other fields are not read. */
-int64_t noack_exact_scratch(const noack_exact *exact);
-
-/* Return NULL, or what is wrong: all that the functions below assume. The numbers of matrices and
-   states may be any. */
-const char *noack_exact_check(const noack_exact *exact);
+/* Return a simulation with copies of the settings; its link must outlive it. The numbers of matrices
+   and states may be any. */
+noack_exact *noack_exact_new(const noack_exact_settings *settings, const char **wrong);
+void noack_exact_free(noack_exact *exact);
 
 /* Run every draw; a row depends on what the runs share and on its own draw only. A is (runs, n, n),
    B (runs, n, m), x0 (runs, n), keys (runs, stages of the link, 2). */
 void noack_exact_runs(
-    const noack_exact *exact, int64_t runs, const double *A, const double *B, const double *x0,
-    const int64_t *keys, noack_exact_row *rows);
+    noack_exact *simulation, int64_t runs, const double *A, const double *B, const double *x0,
+    const int64_t *keys, noack_exact_row *rows, const noack_exact_log *events);
 
 /* Segments of runs: from a state just after an event to the next event or the horizon. */
 typedef struct {
@@ -118,11 +118,11 @@ typedef struct {
 
 /* Follow a plant over segments. */
 void noack_exact_follow(
-    const noack_exact *exact, const double *A, const double *B, noack_exact_segments *segments);
+    noack_exact *simulation, const double *A, const double *B, noack_exact_segments *segments);
 
 /* Fill samples with the states of a plant at their times, from the first start on. A start is a
    state just after an event; the last one up to a time applies. NAN where a million polynomials do
    not reach. */
 void noack_exact_sample(
-    const noack_exact *exact, const double *A, const double *B, const noack_exact_states *starts,
+    noack_exact *simulation, const double *A, const double *B, const noack_exact_states *starts,
     noack_exact_states *samples);

@@ -166,7 +166,7 @@ static double find_event(
 }
 
 /* e^(rt) of the supremum; r is 0 from some time on. */
-static double growth_at(const noack_exact *exact, double t_s) {
+static double growth_at(const noack_exact_settings *exact, double t_s) {
     double rate = exact->fading_per_s;
     return rate > 0.0 ? fixed_exp(rate * least(t_s, exact->fading_until_s)) : 1.0;
 }
@@ -180,7 +180,7 @@ typedef struct { /* a piece of a run, which has been followed */
 
 /* Raise a row's supremum by that of a piece with curves of degree q; return 0 if UNRESOLVED. */
 static int measure_supremum(exact_memory *memory, exact_run *run, const piece *done, int q) {
-    const noack_exact *exact = memory->exact;
+    const noack_exact_settings *exact = memory->exact;
     double end_s = done->t_s + done->length_s;
     int of_state = exact->measure == NOACK_EXACT_STATE, fades = done->t_s < exact->fading_until_s;
     lanes last =
@@ -234,15 +234,16 @@ static double measure_piece(
 /* Count an event, log it, and return whether its update arrives. */
 static int count_event(
     const exact_memory *memory, exact_run *run, loop_state state, double t_s, double last_s) {
-    const noack_exact *exact = memory->exact;
+    const noack_exact_settings *exact = memory->exact;
     noack_exact_row *row = run->row;
     int delivered = arrives(exact, run);
-    if (row->transmissions < exact->event_places) {
-        int64_t at = run->number * exact->event_places + row->transmissions;
-        exact->event_s[at] = t_s;
-        exact->delivered[at] = (uint8_t)delivered;
-        for (int64_t i = 0; exact->states != NULL && i < exact->n; i++) {
-            double *to = exact->states + 3 * exact->n * at + i;
+    const noack_exact_log *events = run->events;
+    if (events != NULL && row->transmissions < events->places) {
+        int64_t at = run->number * events->places + row->transmissions;
+        events->event_s[at] = t_s;
+        events->delivered[at] = (uint8_t)delivered;
+        for (int64_t i = 0; events->states != NULL && i < exact->n; i++) {
+            double *to = events->states + 3 * exact->n * at + i;
             to[0] = entry(plant_of(state), (int)i);
             to[exact->n] = entry(sensor_error(state), (int)i);
             to[2 * exact->n] = entry(controller_error(state), (int)i);
@@ -389,7 +390,7 @@ static int has_diverged(const rule_phase *phase, loop_state state, double s) {
    rule reach. Return a status. */
 static inline __attribute__((always_inline)) int64_t
 follow_piece(exact_memory *memory, exact_run *run, progress *now) {
-    const noack_exact *exact = memory->exact;
+    const noack_exact_settings *exact = memory->exact;
     if (now->begins)
         begin_span(memory, now);
     now->state = renew_reference(memory, now->state);
@@ -458,7 +459,7 @@ static void prepare_shared(exact_memory *memory) {
 
 /* Compute a plant's tables; A is (n, n), B (n, m). */
 static void prepare(exact_memory *memory, const double *A, const double *B) {
-    const noack_exact *exact = memory->exact;
+    const noack_exact_settings *exact = memory->exact;
     pad(exact->n, exact->n, A, STRIDE, memory->A);
     pad(exact->n, exact->m, B, STRIDE, memory->B);
     for (int j = 0; j < N; j++) {

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from cosim.simulation.exact_simulation import ExactSimulation, run_with_events
 from noack.core import core_library
-from noack.core.core_library import core, ffi, load_core
+from noack.core.core_library import CoreMemory, core, ffi, load_core, new_handle
 from noack.core.errors import CallerError
 from noack.protocol.wire_format import Flow, Message
-from noack.trigger_policies.trigger_rule import TriggerRule
+from noack.trigger_policies.trigger_rule import TriggerRule, fill_rule
 from tests.cosim.simulation.exact_populations import random_population, random_setting
 from tests.helpers.example_rules import TABLES, area_rule, decaying_rule, random_rule
 from tests.helpers.machine_parts import SteppedMachines
@@ -207,32 +207,32 @@ def test_matrices_and_states_of_any_numbers_run_clean(
 
 
 def test_batches_with_impossible_numbers_or_sizes_are_refused() -> None:
-    plain = {"horizon_s": 1.0, "known_start": True}
     identity, trigger = np.eye(2), decaying_rule(0.5, 1.0)
     for wrong in (
         {"horizon_s": np.nan}, {"horizon_s": -1.0}, {"settle": np.inf}, {"measure": 9},
-        {"measure": -1}, {"fading_per_s": -1.0}, {"most_events": -1}, {"event_places": 3},
+        {"measure": -1}, {"fading_per_s": -1.0}, {"most_events": -1},
         {"H": None}, {"K": None}, {"n": 0}, {"m": 65}, {"fate_count": 1},
     ):  # fmt: skip
-        numbers = {name: ffi.NULL if value is None else value for name, value in wrong.items()}
         with pytest.raises(ValueError, match=r"a (simulation|loop) (has|needs)"):
-            _refused(identity, trigger, {**plain, **numbers})
+            exact_simulation(identity, trigger, wrong)
     for field, value in (
         ("level", -1.0), ("level", np.nan), ("rate_per_s", np.inf), ("floor", -1.0),
         ("positive_rows", 257), ("positive_rows", -1), ("negative_rows", 2), ("grid_ns", -1),
         ("shortest_ns", -1), ("longest_ns", -1), ("longest_ns", 2**63 - 1), ("idle_ns", -(2**63)),
         ("decay_per_s", -1.0),
     ):  # fmt: skip
-        simulation = ExactSimulation(identity, identity, trigger, **plain)
-        setattr(simulation.core.rule, field, value)
-        assert core.noack_exact_check(simulation.core) != ffi.NULL, field
+        with pytest.raises(ValueError, match="a trigger rule"):
+            exact_simulation(identity, trigger, {}, **{field: value})
 
 
-def _refused(identity: np.ndarray, trigger: TriggerRule, numbers: dict[str, object]) -> None:
-    """Change a simulation's numbers, and check it again."""
-    simulation = ExactSimulation(identity, identity, trigger, horizon_s=1.0, known_start=True)
-    for name, value in numbers.items():
-        setattr(simulation.core, name, value)
-    mistake = core.noack_exact_check(simulation.core)
-    if mistake != ffi.NULL:
-        raise ValueError(ffi.string(mistake).decode())
+def exact_simulation(
+    identity: np.ndarray, trigger: TriggerRule, numbers: dict[str, Any], **of_rule: float
+) -> Any:
+    """A simulation of these numbers, and of a rule with others."""
+    settings, memory = ffi.new("noack_exact_settings *"), CoreMemory()
+    fill_rule(settings.rule, trigger, 2, memory)
+    plain = {"n": 2, "m": 2, "H": identity, "K": identity, "horizon_s": 1.0, "known_start": True}
+    memory.fill(settings, plain | numbers)
+    for name, value in of_rule.items():
+        setattr(settings.rule, name, value)
+    return new_handle("exact", settings)
