@@ -2,7 +2,6 @@
 
 import shutil
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 from cosim.record.run_directory import LEAST_FREE_BYTES
@@ -10,7 +9,7 @@ from noack.core.errors import MachineError
 from noack.core.number_format import byte_size
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_ACTUATION, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.resolution import tables_of
-from noack.scenario.scenario import Scenario
+from noack.scenario.scenario import Scenario, loop_scenario, loop_sections
 
 _COPIES_AT_END = 3
 """At the end of a run, spool, record and view exist together, each of about the same size."""
@@ -35,15 +34,18 @@ def needed_bytes(resolved: Scenario) -> int:
     return _COPIES_AT_END * spool_bytes(resolved)
 
 
-def require_disk_space(loops: Sequence[Scenario], runs: Path) -> None:
+def require_disk_space(run: Scenario, runs: Path) -> None:
     """Check that a run's record fits on the disk; warn if it may not.
 
-    Raise MachineError if the record needs more than the free space.
+    ``run`` is the scenario of the run, resolved. Raise MachineError if the record needs more than the
+    free space.
     """
     folder = next((path for path in (runs, *runs.absolute().parents) if path.is_dir()), None)
     if folder is None:
         return
-    free, spool = shutil.disk_usage(folder).free, sum(map(spool_bytes, loops))
+    sections = loop_sections(run)
+    spool = sum(section.count * spool_bytes(loop_scenario(run, section)) for section in sections)
+    free = shutil.disk_usage(folder).free
     if free >= _COPIES_AT_END * spool or free < LEAST_FREE_BYTES:  # then no run can begin at all
         return
     most = byte_size(_COPIES_AT_END * spool)

@@ -21,7 +21,7 @@ from noack.protocol.record_tables import LOOP
 from noack.runtime.active_runs import RUNS, OpenRun, active_runs, find_run
 from noack.runtime.connections.zenoh_session import cause_of, header_of, open_session
 from noack.scenario import scenario_file
-from noack.scenario.resolution import loop_of, resolve_run, resolved_loops, run_tables
+from noack.scenario.resolution import loop_of, resolved_loops, run_tables
 from noack.scenario.scenario import phases_ns
 
 _WAITING_BATCHES = 4096
@@ -58,7 +58,7 @@ class FollowedRun:
         self._run = run
         self.directory = Path(run.run_dir)
         """The run directory, which is being written."""
-        scenario = resolve_run(scenario_file.load(self.directory / SCENARIO_FILE))
+        scenario = scenario_file.load(self.directory / SCENARIO_FILE)  # it is resolved
         self._types = run_tables(scenario)
         matrices = [(loop.name, loop_of(loop)) for loop in resolved_loops(scenario)]
         self.loops = tuple(

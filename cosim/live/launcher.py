@@ -39,7 +39,7 @@ from noack.runtime.active_runs import registered_run, run_name
 from noack.runtime.command_line import Signals, StopRequestError, stop_reason
 from noack.runtime.end_reasons import HORIZON
 from noack.runtime.run_descriptor import RunDescriptor, descriptor_file, new_descriptor
-from noack.scenario.resolution import resolve_run, resolved_loops
+from noack.scenario.resolution import resolve_run
 from noack.scenario.scenario import Scenario
 
 _STOP_TIMEOUT_S = 15.0
@@ -129,8 +129,8 @@ def _prepare(scenario: Scenario, runs: Path, spawn: Sequence[str], *, across_hos
     """Return the resolved scenario, for whose record there is space on the disk."""
     if across_hosts:
         scenario = remote_access.with_clocks(scenario)
-    loops, resolved = resolved_loops(scenario), resolve_run(scenario)
-    require_disk_space(loops, runs)
+    resolved = resolve_run(scenario)
+    require_disk_space(resolved, runs)
     return resolved
 
 

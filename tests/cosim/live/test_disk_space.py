@@ -11,7 +11,7 @@ from cosim.live.disk_space import require_disk_space, spool_bytes
 from cosim.live.launcher import launch
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import MachineError
-from noack.scenario.resolution import resolve
+from noack.scenario.resolution import resolve, resolve_run
 from noack.scenario.scenario_file import validate
 
 
@@ -38,8 +38,10 @@ def test_a_run_that_cannot_fit_is_refused_and_one_that_may_not_fit_begins_with_a
     with pytest.raises(MachineError, match=r"this run records .* are free on the disk"):
         launch(scenario, tmp_path / "runs")
     assert not (tmp_path / "runs").exists()
-    resolved = resolve(validate(content | {"horizon_s": 1000.0}, ""))
+    longer = content | {"horizon_s": 1000.0}
+    resolved = resolve(validate(longer, ""))
+    run = resolve_run(validate(longer | {"loops": [{"name": "one"}, {"name": "two"}]}, ""))
     for share, warned in ((1.0, True), (2.9, True), (3.0, False)):
         with_free(monkeypatch, share * 2 * spool_bytes(resolved))
-        require_disk_space([resolved] * 2, tmp_path / "not" / "yet")
+        require_disk_space(run, tmp_path / "not" / "yet")
         assert ("warning: " in capsys.readouterr().err) == warned
