@@ -51,6 +51,42 @@ int lengthen(void *array, int64_t before, int64_t after, size_t size);
 /* Zeros that begin at a cache line, in memory that is to be freed. */
 void *zeros_in_lines(int64_t count, size_t size, void **memory);
 
+/* A stage's memory of a flow. */
+typedef struct {
+    int64_t state;          /* of a Markov chain, or 1: a score is stored */
+    int64_t taken_until_ns; /* the slots of a schedule that begin before this time are taken */
+    double score;           /* of the packet before */
+} noack_stage_memory;
+
+/* A stage's state that all flows share; departure times lie in a ring. */
+typedef struct {
+    int64_t head, count;
+    int64_t entry_ns;
+    int64_t busy_until_ns; /* opportunities: time of the last opportunity that was used */
+    int64_t carry;         /* fraction of a nanosecond, in units of 1/rate_bps */
+    /* CoDel: the variables of RFC 8289, Section 5 */
+    int64_t first_above_ns, drop_next_ns;
+    int64_t drops; /* count_ of the RFC */
+    int64_t last_drops, dropping;
+    int64_t dropped_before; /* 1: the law dropped the previous packet; drop_next_ns is not new */
+    /* opportunities: number of the one in use among those at busy_until_ns, from 1 */
+    int64_t used;
+    int64_t left_bytes;  /* bytes that it can still carry */
+    int64_t total_bytes; /* all bytes that were put into the queue */
+    /* Gilbert-Elliott, common to all flows: state, and number of its step */
+    int64_t state, step;
+    /* of the packets that wait until the link is free, the place + 1; 0: none */
+    int64_t first_waiting;
+    int64_t waiting_count;
+} noack_queue;
+
+/* A stored datagram that waits until the link is free; see native/network/waiting.c. */
+struct noack_waiting {
+    int64_t key, order, row, size_bytes, after_ns, earliest_ns;
+    int64_t left, right, parent; /* the heap: places + 1; 0: none */
+    int64_t before;              /* the place of the one before it in its flow, if that waits */
+};
+
 /* One direction of a link. */
 struct noack_link {
     /* Settings: see noack_link_settings */

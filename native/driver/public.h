@@ -87,12 +87,6 @@ enum noack_destination {
     NOACK_NETWORK = 3
 };
 
-/* A datagram that has been sent and not received. */
-typedef struct {
-    int64_t to; /* enum noack_role, or NOACK_NETWORK */
-    noack_datagram datagram;
-} noack_sent_datagram;
-
 /* Why a simulation returned, besides NOACK_DONE and the questions of who asks. */
 enum noack_simulation_reason {
     NOACK_STEPS_DONE = 32 /* steps_left is 0 */
@@ -110,7 +104,7 @@ typedef struct {
     int64_t asking;              /* enum noack_role or NOACK_NETWORK: who asks */
     int64_t sent_places;         /* a power of 2 */
     int64_t sent_first, sent_count;
-    noack_sent_datagram *sent;   /* (sent_places,) a ring, in the order of sending */
+    struct sent_datagram *sent;   /* (sent_places,) a ring, in the order of sending */
 } noack_simulation;
 
 /* Return a simulation; the machines and the network must outlive it. */

@@ -11,6 +11,12 @@
 
 enum { FIRST_PLACES = 256, MOST_OUTPUTS = 2 };
 
+/* A datagram that has been sent and not received. */
+typedef struct sent_datagram {
+    int64_t to; /* enum noack_role, or NOACK_NETWORK */
+    noack_datagram datagram;
+} sent_datagram;
+
 /* No datagram is rejected for its source, and none of it is read at a socket. */
 enum { FROM_PEER = 1, OPENED = 0 };
 static const int64_t UNKNOWN_ARRIVAL_NS = INT64_C(1) << 62;
@@ -60,7 +66,7 @@ void noack_simulation_free(noack_simulation *simulation) {
 /* Double the ring; return 0 if there is no memory. */
 static int add_places(noack_simulation *simulation) {
     int64_t places = simulation->sent_places, first = simulation->sent_first;
-    noack_sent_datagram *ring = zeros(max_of(2 * places, FIRST_PLACES), sizeof *ring);
+    sent_datagram *ring = zeros(max_of(2 * places, FIRST_PLACES), sizeof *ring);
     if (ring == NULL)
         return 0;
     if (places > 0) {
@@ -74,7 +80,7 @@ static int add_places(noack_simulation *simulation) {
     return 1;
 }
 
-static noack_sent_datagram *next_place(noack_simulation *simulation) {
+static sent_datagram *next_place(noack_simulation *simulation) {
     int64_t place = simulation->sent_first + simulation->sent_count++;
     return &simulation->sent[place & (simulation->sent_places - 1)];
 }
@@ -89,7 +95,7 @@ static void send(noack_simulation *simulation, const noack_output *output) {
     if (!output->sends)
         return;
     const noack_message *message = &output->message;
-    noack_sent_datagram *sent = next_place(simulation);
+    sent_datagram *sent = next_place(simulation);
     noack_datagram *datagram = &sent->datagram;
     int64_t direction = simulation->directions[message->flow];
     copy_message(&datagram->message, message);
@@ -108,7 +114,7 @@ static void send(noack_simulation *simulation, const noack_output *output) {
 static void forward(noack_simulation *simulation) {
     const noack_channel *channel = simulation->channel;
     for (int64_t i = 0; i < channel->leaving_count; i++) {
-        noack_sent_datagram *sent = next_place(simulation);
+        sent_datagram *sent = next_place(simulation);
         copy_datagram(&sent->datagram, &channel->leaving[i]);
         sent->to = RECEIVER[sent->datagram.message.flow];
     }
@@ -217,7 +223,7 @@ int64_t noack_simulate(noack_simulation *simulation, int64_t until_ns) {
         } else if (network_ns == now_ns) {
             question = release(simulation);
         } else if (sent_ns == now_ns) {
-            noack_sent_datagram *first = &simulation->sent[simulation->sent_first];
+            sent_datagram *first = &simulation->sent[simulation->sent_first];
             question = first->to == NOACK_NETWORK
                            ? cross(simulation, &first->datagram)
                            : receive(simulation, first->to, &first->datagram);

@@ -9,6 +9,16 @@
 
 enum { FIRST_PLACES = 64, ROWS = 4096 };
 
+/* A delayed datagram or copy. */
+struct noack_delayed {
+    int64_t packet;
+    int64_t copy;
+    int64_t counts;  /* 1: it is the datagram's first intact copy */
+    int64_t delayed; /* 0: an overdue one was before it */
+    int64_t next;    /* next free place */
+    noack_datagram datagram;
+};
+
 /* Double the room for delayed datagrams; return 0 if there is no memory. */
 static int add_places(noack_channel *channel) {
     int64_t before = channel->places, places = max_of(2 * before, FIRST_PLACES);

@@ -192,13 +192,6 @@ typedef struct {
 
 /* ---- State ----------------------------------------------------------------------------------- */
 
-/* A stage's memory of a flow. */
-typedef struct {
-    int64_t state;          /* of a Markov chain, or 1: a score is stored */
-    int64_t taken_until_ns; /* the slots of a schedule that begin before this time are taken */
-    double score;           /* of the packet before */
-} noack_stage_memory;
-
 /* A link's state of a flow. */
 typedef struct {
     int64_t number;             /* never used again on this link; selects its random numbers */
@@ -216,28 +209,6 @@ typedef struct {
     int64_t last_waiting;       /* place of the last one */
     int64_t longest_loss_burst; /* since then; counts final losses only */
 } noack_flow;
-
-/* A stage's state that all flows share; departure times lie in a ring. */
-typedef struct {
-    int64_t head, count;
-    int64_t entry_ns;
-    int64_t busy_until_ns;  /* opportunities: time of the last opportunity that was used */
-    int64_t carry;          /* fraction of a nanosecond, in units of 1/rate_bps */
-    /* CoDel: the variables of RFC 8289, Section 5 */
-    int64_t first_above_ns, drop_next_ns;
-    int64_t drops;          /* count_ of the RFC */
-    int64_t last_drops, dropping;
-    int64_t dropped_before; /* 1: the law dropped the previous packet; drop_next_ns is not new */
-    /* opportunities: number of the one in use among those at busy_until_ns, from 1 */
-    int64_t used;
-    int64_t left_bytes;     /* bytes that it can still carry */
-    int64_t total_bytes;    /* all bytes that were put into the queue */
-    /* Gilbert-Elliott, common to all flows: state, and number of its step */
-    int64_t state, step;
-    /* of the packets that wait until the link is free, the place + 1; 0: none */
-    int64_t first_waiting;
-    int64_t waiting_count;
-} noack_queue;
 
 /* What has happened to the packets of one direction of a link. */
 typedef struct {
@@ -352,13 +323,6 @@ void noack_philox(const int64_t counter[4], const int64_t key[2], int64_t words[
 void noack_uniforms(
     int64_t key0, int64_t key1, int64_t flow, int64_t packet, int64_t block, double uniform[2]);
 
-/* A stored datagram that waits until the link is free; see native/network/waiting.c. */
-typedef struct {
-    int64_t key, order, row, size_bytes, after_ns, earliest_ns;
-    int64_t left, right, parent; /* the heap: places + 1; 0: none */
-    int64_t before;              /* the place of the one before it in its flow, if that waits */
-} noack_waiting;
-
 /* A row of the record's table netem_packet. */
 typedef struct {
     int64_t input, sequence, t_ns, now_ns, flow, fate, consecutive_losses;
@@ -383,20 +347,14 @@ typedef struct {
     noack_message message;          /* what it carries, in a simulation */
 } noack_datagram;
 
-/* A delayed datagram or copy. */
-typedef struct {
-    int64_t packet;
-    int64_t copy;
-    int64_t counts;  /* 1: it is the datagram's first intact copy */
-    int64_t delayed; /* 0: an overdue one was before it */
-    int64_t next;    /* next free place */
-    noack_datagram datagram;
-} noack_delayed;
-
 /* A question of a channel besides NOACK_ASK_CHANGE and NOACK_ROWS_FULL. */
 enum noack_channel_question {
     NOACK_ASK_OUTCOME = 16 /* the user's network: set outcome_ns for the datagram in asked */
 };
+
+/* Memory of delayed datagrams: native/core.h, native/network/channel.c. */
+typedef struct noack_waiting noack_waiting;
+typedef struct noack_delayed noack_delayed;
 
 /* The network of a run in both directions; each flow has the row of its loop. */
 typedef struct {

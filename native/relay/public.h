@@ -64,18 +64,6 @@ typedef struct {
     int64_t errors[NOACK_ERRNOS];     /* datagrams that could not be sent or stored, by errno */
 } noack_direction;
 
-/* A datagram that is stored, or about to be sent. */
-typedef struct {
-    int64_t packet, arrival_ns, bit;
-    int32_t size_bytes;
-    int32_t block;  /* first block of the payload */
-    int32_t direction, client;
-    int32_t next;   /* next free slot */
-    uint8_t copy;
-    uint8_t counts; /* 1: it is the first intact copy */
-    uint8_t unused[2];
-} noack_slot;
-
 /* The relay. Times are simulated and count from its start, unless stated otherwise. */
 typedef struct {
     int64_t links;
@@ -113,7 +101,7 @@ typedef struct {
     int32_t *table;
     noack_direction *directions; /* (2 links,) forward and reverse direction of each link */
     noack_heap_entry *heap;      /* (slot_count,) */
-    noack_slot *slots;
+    struct noack_slot *slots;
     noack_waiting *waiting;      /* (slot_count,) */
     uint8_t **chunks;            /* chunks of blocks */
     int32_t *block_next;         /* (block_count,) */

@@ -21,6 +21,18 @@ enum {
     ERROR_CONTROL_BYTES = 128 /* timestamp, error, address of the reporter */
 };
 
+/* A datagram that is stored, or about to be sent. */
+typedef struct noack_slot {
+    int64_t packet, arrival_ns, bit;
+    int32_t size_bytes;
+    int32_t block; /* first block of the payload */
+    int32_t direction, client;
+    int32_t next; /* next free slot */
+    uint8_t copy;
+    uint8_t counts; /* 1: it is the first intact copy */
+    uint8_t unused[2];
+} noack_slot;
+
 typedef struct { /* a datagram that is about to be sent */
     noack_slot datagram;
     const uint8_t *address; /* of the payload, in a receive buffer, unless it has a slot: */
