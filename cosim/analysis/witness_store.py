@@ -32,39 +32,37 @@ class StoredSearch(NamedTuple):
     document: Mapping[str, object] | None
     reason: str = ""
     """Why there is no witness."""
-    is_complete: bool = False
-    """Whether all outputs are bounded that were wanted."""
+    bounded: Sequence[str] = ()
+    """The outputs that are bounded."""
 
 
 class WitnessStore:
-    """The file of a loop, and of the outputs that are bounded.
+    """The file of a loop.
 
     Args:
         loop: its exact numbers are the key, so that names, seeds and durations do not matter.
-        wanted: the outputs, as text.
     """
 
-    def __init__(self, loop: Loop, wanted: Sequence[str]) -> None:
-        key = json.dumps([_FORM, _exact(loop), *wanted])
+    def __init__(self, loop: Loop) -> None:
+        key = json.dumps([_FORM, _exact(loop)])
         self._name = hashlib.sha256(key.encode()).hexdigest() + ".json"
 
-    def read(self, most_work: float) -> StoredSearch | None:
-        """Return what a search with this limit of work would find; None if that is not known."""
+    def read(self, wanted: Sequence[str], most_work: float) -> StoredSearch | None:
+        """Return what a search for some outputs with this limit of work would find; None: it is not known."""
         with suppress(*_UNREADABLE), open_regular(_folder() / self._name) as file:
             if hasattr(os, "geteuid") and os.fstat(file.fileno()).st_uid != os.geteuid():
                 return None
             content = json.loads(file.read(_MOST_BYTES))
-            if content["most_work"] < most_work and not content["is_complete"]:
-                return None
-            if content["document"] is not None:
+            as_long = {*wanted} <= {*content["wanted"]} and content["most_work"] >= most_work
+            if content["document"] is not None and (as_long or {*wanted} <= {*content["bounded"]}):
                 return StoredSearch(content["document"])
-            if content["noack"] == version("noack"):
+            if content["document"] is None and as_long and content["noack"] == version("noack"):
                 return StoredSearch(None, str(content["reason"]))
         return None
 
-    def write(self, found: StoredSearch, most_work: float) -> None:
+    def write(self, found: StoredSearch, wanted: Sequence[str], most_work: float) -> None:
         """Keep what a search found; without space or permission nothing is kept."""
-        content = {**found._asdict(), "noack": version("noack"), "most_work": most_work}
+        content = found._asdict() | {"noack": version("noack"), "wanted": wanted, "most_work": most_work}
         with suppress(OSError, ValueError, RuntimeError):
             create_folder(folder := _folder(), mode=0o700)
             with new_file(folder / self._name, mode=0o600) as file:

@@ -163,28 +163,31 @@ def find_statement(
 
 
 def known_or_found(
-    loop: Loop, progress: Callable[[float], None], most_work: float, *, has_limit: bool
+    loop: Loop, progress: Callable[[float], None], most_work: float, *, has_limit: bool = False
 ) -> Witness:
-    """Return the witness of a loop that was found earlier, or search for it.
+    """Return the witness of a loop that was found earlier, or search for it, unless the limit of work is 0.
 
     Raises:
         NoWitnessError: none was found.
     """
     outputs = ("x", "e_c")
     states = ("x", *(f"x[{i}]" for i in range(loop.n))) if has_limit else ()
-    store = WitnessStore(loop, (*outputs, "in the limit", *states))
-    known = store.read(most_work)
+    wanted = (*outputs, *(f"{output} in the limit" for output in states))
+    store = WitnessStore(loop)
+    known = store.read(wanted, most_work)
     if known is not None and known.document is None:
         raise NoWitnessError(known.reason)
     if known is not None and known.document is not None:
         with suppress(RejectedError):  # it was changed
             return Witness(known.document, prove(loop, known.document))
+    if not most_work:
+        raise NoWitnessError("no witness was found earlier")
     try:
         witness = find_witness(loop, outputs, ultimate=states, progress=progress, most_work=most_work)
     except NoWitnessError as error:
-        store.write(StoredSearch(None, str(error)), most_work)
+        store.write(StoredSearch(None, str(error)), wanted, most_work)
         raise
-    bounded = [(bound.output, bound.from_start) for bound in witness.proof.bounds]
-    wanted = {*((output, True) for output in outputs), *((output, False) for output in states)}
-    store.write(StoredSearch(witness.document, is_complete=wanted <= {*bounded}), most_work)
+    bounds = witness.proof.bounds
+    bounded = [bound.output if bound.from_start else f"{bound.output} in the limit" for bound in bounds]
+    store.write(StoredSearch(witness.document, bounded=bounded), wanted, most_work)
     return witness

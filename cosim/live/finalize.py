@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from cosim.analysis.claims.claim_evaluation import RunClaims, claims_of, list_violations
-from cosim.analysis.claims.run_certificates import Expectations, expectations, expectations_key
+from cosim.analysis.claims.run_certificates import Expectations, expectations, expectations_key, search_limit
 from cosim.analysis.ideal_loop import ideal_loop_part
 from cosim.analysis.replay.machine_replay import SharedMachines
 from cosim.analysis.replay.run_replay import replay
@@ -248,21 +248,21 @@ def _evaluate_loops(
     In another process, ``run`` is None.
     """
     run = run or _stored_run(ending.run_dir)
-    numbers = range(min(block), max(block) + 1)
+    loops, numbers = len(run.names), range(min(block), max(block) + 1)
     records, results, known = run.read(numbers), list[_LoopResults](), dict[str, Expectations]()
     shared = SharedMachines(records if len(records) > 1 else ())
     for record in records:
         if (own := block[record.number]) is None:
             key = expectations_key(record.scenario)
             if key not in known:  # equal loops share it
-                known[key] = expectations(record.scenario)
+                known[key] = expectations(record.scenario, loops)
             own = known[key]
         claims = claims_of(record)
-        claims.certificates = own.certificates
+        claims.certificates, claims.most_work = own.certificates, search_limit(loops)
         phase_ns = run.phases_ns[record.number]
         status, reason = int(ending.status), ending.reason
         summary = summarise_loop(record, status, reason, phase_ns, own.assumptions)
-        if len(run.names) == 1:
+        if loops == 1:
             # Written again with the results, so that none of them can cost the summary.
             _write_summary(ending.run_dir, _summary(run, ending, [summary]))
         results.append(_with_results(run, summary, claims, shared))

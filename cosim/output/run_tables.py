@@ -287,7 +287,7 @@ def _claims_table(claims: Claims, title: str) -> ResultTable:
         since = "" if claim.since_s is None else f" since {claim.since_s:.3f} s"
         share = NONE if claim.ratio is None else f"{100 * claim.ratio:.3g} %"
         rows.append(
-            (claim.source, claim.bound, *(interval if has_interval else ()), share, claim.verdict + since)
+            (claim.origin, claim.bound, *(interval if has_interval else ()), share, claim.verdict + since)
         )
     return ResultTable("claims", title, headings, rows)
 

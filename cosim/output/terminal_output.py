@@ -168,7 +168,7 @@ def _print_claims(console: Console, table: ResultTable, claims: Sequence[Claim])
     sources: dict[tuple[str, str], list[str]] = {}
     for claim in claims:
         if claim.verdict != "held" and claim.why:
-            sources.setdefault((claim.verdict, claim.why), []).append(claim.source)
+            sources.setdefault((claim.verdict, claim.why), []).append(claim.origin)
     for (word, reason), claim_sources in sources.items():
         text = f"{word}: {'; '.join(dict.fromkeys(claim_sources))}: {reason}"
         console.print(text, highlight=False, markup=False)

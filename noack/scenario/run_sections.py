@@ -22,6 +22,8 @@ class CertificateSection(ScenarioSection):
     exceedance_probability: Annotated[FiniteFloat, Field(gt=0, le=0.5)] = 1e-6
     """Normally distributed disturbances and noise have no bound. The certificates assume one that a
     run exceeds with at most this probability."""
+    prove: bool = True
+    """At the end of a run, search for witnesses of the certificates' bounds, for some seconds."""
 
 
 class ClocksSection(ScenarioSection):

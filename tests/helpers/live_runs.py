@@ -23,8 +23,8 @@ from tests.helpers.command_line import invoke
 from tests.helpers.waiting import PATIENCE_S, wait_for
 
 EPHEMERAL = ("--set", "ports={}")
-BARE = (*EPHEMERAL, "--no-report")
-"""Without a report; tests that need one add ``--report``."""
+BARE = (*EPHEMERAL, "--set", "certificate.prove=false", "--no-report")
+"""Without a report, and a search for witnesses; tests that need a report add ``--report``."""
 WITHOUT_VIEWER = {"PYTHONPATH": str(Path(__file__).parents[1] / "integration" / "without_viewer")}
 """Of commands whose recording is not looked at."""
 

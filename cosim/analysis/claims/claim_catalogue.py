@@ -17,8 +17,7 @@ from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples
 from noack.core.linear_systems import Propagator
 from noack.core.number_format import at_most
 from noack.core.row_operations import row_norms
-from noack.theory.bounds.certificate_terms import Constants
-from noack.theory.certificates.certified_bounds import ScenarioCertificate, envelope_formula
+from noack.theory.certificates.certified_bounds import Constant, ScenarioCertificate, envelope_formula
 from noack.theory.coverage import refusals
 
 _LEAST_MARGIN, _LARGEST_MARGIN = 1e-9, 1e-6
@@ -84,11 +83,19 @@ class ClaimDefinition:
 
 @dataclass(frozen=True)
 class CertifiedClaim:
-    """A claim of a certificate with constants; it is evaluated for each one of the scenario."""
+    """A claim of a certificate; it is evaluated for each one of the scenario."""
 
     statement: str
-    find: Callable[[RunEvidence, Samples, ScenarioCertificate, Constants], ClaimBound]
+    find: Callable[[RunEvidence, Samples, ScenarioCertificate], ClaimBound]
+    constant: Constant | Literal["inter_event"] | None = None
+    """What bounds it: proven or computed; None: it is computed always."""
     assumes: str = "the conditions of the certificate"
+
+    def is_proven(self, certificate: ScenarioCertificate) -> bool:
+        """Whether a certificate has proven this."""
+        if self.constant == "inter_event":
+            return certificate.has_proven_inter_event_time
+        return self.constant is not None and certificate.is_proven(self.constant)
 
 
 def claim(
@@ -99,10 +106,10 @@ def claim(
 
 
 def certified(
-    statement: str,
-) -> Callable[[Callable[[RunEvidence, Samples, ScenarioCertificate, Constants], ClaimBound]], CertifiedClaim]:
+    statement: str, constant: Constant | Literal["inter_event"] | None = None
+) -> Callable[[Callable[[RunEvidence, Samples, ScenarioCertificate], ClaimBound]], CertifiedClaim]:
     """Make a function the definition of a claim of certificates."""
-    return lambda find: CertifiedClaim(statement, find)
+    return lambda find: CertifiedClaim(statement, find, constant)
 
 
 def norm_text(run: RunEvidence, vector: str) -> str:
@@ -129,13 +136,16 @@ def controller_error_bound(
     constant: float | None = None,
     void: VoidFrom | None = None,
     *,
-    by_certificate: bool = False,
+    certificate: ScenarioCertificate | None = None,
 ) -> Bound:
     """Return a bound of ‖e_c‖_W at the measurements, by a certificate or without one.
 
-    It is void from a record's first gap.
+    It is void from a record's first gap. A proven bound is one of the x_c with which the acting input was
+    computed.
     """
-    here = samples.is_bounded & (run.bounds_controller_error(samples.t_s) if by_certificate else True)
+    here = samples.is_bounded
+    if certificate is not None:
+        here = here & run.bounds_controller_error(samples.t_s, of_input=certificate.is_proven("delta"))
     # Allow for the rounding of x, which matters for a bound of that size.
     slack = run.rounding(samples.aligned.x_norm[here])
     shares = upper_shares(samples.aligned.e_c_norm[here], values[here] + slack)
@@ -148,13 +158,20 @@ def least_inter_event_time(
     least_s: float,
     void: VoidFrom | None,
     label: str,
-    kind: Literal["certified", "printed"] = "certified",
+    certificate: ScenarioCertificate | None = None,
 ) -> ClaimBound:
-    """Return a lower bound of the inter-event time, and the same as a line over the run."""
+    """Return a lower bound of the inter-event time, and the same as a line over the run.
+
+    It may not be proven between the first events.
+    """
     t_s, passed_s = samples.inter_event_s
+    apart_s: Reals | float = least_s
+    kind: Literal["certified", "printed"] = "printed"
+    if certificate is not None:
+        apart_s, kind = certificate.apart_s(t_s - passed_s, run.started_s), "certified"
     formula = "t_(i+1) − t_i ≥ {} s"
     void = earliest([void, run.lost_in_rounding])
-    bound = Bound(formula, t_s, least_s / passed_s, void, least_s, is_lower=True)
+    bound = Bound(formula, t_s, apart_s / passed_s, void, least_s, is_lower=True)
     ends_s = np.array([0.0, run.record.scenario.horizon_s])
     return ClaimBound(bound, Envelope(label, "inter_event", ends_s, np.full(2, least_s), kind))
 
@@ -251,7 +268,6 @@ def theorem_2_inter_event_time(run: RunEvidence, samples: Samples) -> ClaimBound
         run.theorem_2.inter_event_s,
         run.paper_violation,
         "Theorem 2 (eq:tau)",
-        "printed",
     )
     knows_state = run.record.scenario.coverage.knows_state
     return least if knows_state else ClaimBound(None, least.envelope)
@@ -275,22 +291,24 @@ def theorem_2_state(run: RunEvidence, samples: Samples) -> ClaimBound:
 # What a certificate claims.
 
 
-@certified("the controller's error is bounded")
-def controller_error(
-    run: RunEvidence, samples: Samples, certificate: ScenarioCertificate, constants: Constants
-) -> ClaimBound:
+@certified("the controller's error is bounded", "delta")
+def controller_error(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> ClaimBound:
     """‖e_c‖_W from when the plant applies the controller's input on, with the x_c of this input."""
+    if certificate.first("delta") is None:
+        return ClaimBound()
     formula = envelope_formula(norm_text(run, "e_c"), certificate, "delta")
     values, void = certificate.controller_error(samples.t_s), run.violation_of(certificate)
     return ClaimBound(
-        controller_error_bound(run, samples, formula, values, constants.delta, void, by_certificate=True),
+        controller_error_bound(
+            run, samples, formula, values, certificate.first("delta"), void, certificate=certificate
+        ),
         Envelope(f"certified for {certificate.scope}", "e_c", samples.t_s, values),
     )
 
 
 @certified("the controller's error is bounded by the events it misses")
 def controller_error_from_events(
-    run: RunEvidence, samples: Samples, certificate: ScenarioCertificate, constants: Constants
+    run: RunEvidence, samples: Samples, certificate: ScenarioCertificate
 ) -> ClaimBound:
     """‖e_c‖_W, given the number of missing events."""
     bounds, since = run.known_state_bounds(certificate), samples.since_event
@@ -303,18 +321,16 @@ def controller_error_from_events(
     void = run.violation_of(certificate)
     label = "bound, given the updates missing now"
     return ClaimBound(
-        controller_error_bound(run, samples, formula, values, void=void, by_certificate=True),
+        controller_error_bound(run, samples, formula, values, void=void, certificate=certificate),
         Envelope(label, "e_c", samples.t_s, np.where(samples.is_bounded, values, np.nan)),
     )
 
 
 @certified("the estimation error is bounded")
-def estimation_error(
-    run: RunEvidence, samples: Samples, certificate: ScenarioCertificate, constants: Constants
-) -> ClaimBound:
+def estimation_error(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> ClaimBound:
     """‖x̂ − x‖_W at the measurements."""
     scenario, loop = run.record.scenario, run.record.loop
-    if scenario.coverage.knows_state:
+    if scenario.coverage.knows_state or certificate.first("estimation_error") is None:
         return ClaimBound()
     weight = np.eye(loop.n) if loop.weight is None else loop.weight
     here, void = samples.with_x, run.violation_of(certificate)
@@ -322,51 +338,47 @@ def estimation_error(
     errors = row_norms((samples.aligned.x - samples.true_x).compress(here, axis=0) @ weight.T)
     formula = envelope_formula(norm_text(run, "x̂ − x"), certificate, "estimation_error")
     shares = upper_shares(errors, certificate.estimation_error(t_s))
-    return ClaimBound(Bound(formula, t_s, shares, void, constants.estimation_error))
+    return ClaimBound(Bound(formula, t_s, shares, void, certificate.first("estimation_error")))
 
 
-@certified("minimum inter-event time")
-def inter_event_time(
-    run: RunEvidence, samples: Samples, certificate: ScenarioCertificate, constants: Constants
-) -> ClaimBound:
+@certified("minimum inter-event time", "inter_event")
+def inter_event_time(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> ClaimBound:
     """The time between two events."""
     if certificate.inter_event_s is None:
         return ClaimBound()
     void, label = run.violation_of(certificate), f"certified for {certificate.scope}"
-    return least_inter_event_time(run, samples, certificate.inter_event_s, void, label)
+    return least_inter_event_time(run, samples, certificate.inter_event_s, void, label, certificate)
 
 
-@certified("the sensor's error is bounded")
-def sensor_error(
-    run: RunEvidence, samples: Samples, certificate: ScenarioCertificate, constants: Constants
-) -> ClaimBound:
+@certified("the sensor's error is bounded", "overshoot")
+def sensor_error(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> ClaimBound:
     """‖e_s‖_W before each reset."""
+    if certificate.first("overshoot") is None:
+        return ClaimBound()
     formula = envelope_formula(norm_text(run, "e_s"), certificate, "overshoot")
     slack = run.rounding(samples.aligned.x_norm)
     shares = upper_shares(samples.aligned.e_s_norm, certificate.sensor_error(samples.t_s) + slack)
     void = run.violation_of(certificate)
-    return ClaimBound(Bound(formula, samples.t_s, shares, void, constants.overshoot))
+    return ClaimBound(Bound(formula, samples.t_s, shares, void, certificate.first("overshoot")))
 
 
-@certified("the state is bounded")
-def state(
-    run: RunEvidence, samples: Samples, certificate: ScenarioCertificate, constants: Constants
-) -> ClaimBound:
+@certified("the state is bounded", "state")
+def state(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> ClaimBound:
     """‖x‖ at each step of the plant."""
+    if certificate.first("state") is None:
+        return ClaimBound()
     formula = envelope_formula("‖x‖", certificate, "state")
     values, slack = certificate.state(samples.step_s), ROUNDING * run.offset
     shares = upper_shares(row_norms(samples.plant.x), values + slack)
     void = run.violation_of(certificate)
     return ClaimBound(
-        Bound(formula, samples.step_s, shares, void, constants.state),
+        Bound(formula, samples.step_s, shares, void, certificate.first("state")),
         Envelope(f"certified for {certificate.scope}", "x", samples.step_s, values),
     )
 
 
 @certified("x stays in the region")
-def region(
-    run: RunEvidence, samples: Samples, certificate: ScenarioCertificate, constants: Constants
-) -> ClaimBound:
+def region(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> ClaimBound:
     """The region of a nonlinear plant, coordinate by coordinate."""
     if certificate.region is None:
         return ClaimBound()
@@ -378,9 +390,7 @@ def region(
 
 
 @certified("the state is bounded from the newest event on")
-def state_from_events(
-    run: RunEvidence, samples: Samples, certificate: ScenarioCertificate, constants: Constants
-) -> ClaimBound:
+def state_from_events(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> ClaimBound:
     """‖x‖ from the newest event on, at which the sensor knows x."""
     bounds, since, t_s = run.known_state_bounds(certificate), samples.since_event_at_steps, samples.step_s
     if bounds is None or since is None:

@@ -65,11 +65,15 @@ def void_claim(claimed: str, source: str, why: str) -> Claim:
 class ClaimCheck:
     """Checks a run against a bound, samples by samples, up to the end of the claim.
 
-    If the run cannot meet an assumption, ``unmet`` names it.
+    If the run cannot meet an assumption, ``unmet`` names it. ``proved`` says of the claim of a certificate
+    whether the checker has proven it.
     """
 
-    def __init__(self, statement: str, source: str, until_s: float, unmet: str = "") -> None:
+    def __init__(
+        self, statement: str, source: str, until_s: float, unmet: str = "", *, proved: bool | None = None
+    ) -> None:
         self._statement, self._source, self.until_s, self._unmet = statement, source, until_s, unmet
+        self._proved = proved
         self._ratio: float | None = None
         self._exceeded_s: float | None = None
         self._bound: Bound | None = None
@@ -125,7 +129,7 @@ class ClaimCheck:
             what=self._statement, source=self._source, bound=bound.formula.format(text), certified=constant,
             observed=observed, ratio=ratio, verdict=verdict,
             since_s=since_s, why=why,
-            until_s=round(self.until_s, 9) if math.isfinite(self.until_s) else None,
+            until_s=round(self.until_s, 9) if math.isfinite(self.until_s) else None, proved=self._proved,
         )  # fmt: skip
 
 
@@ -165,6 +169,8 @@ class RunClaims:
     record: RunRecord
     certificates: Sequence[ScenarioCertificate] | None = None
     """Those of the run's scenario, if they are known."""
+    most_work: float = 0.0
+    """Limit of the search for a witness; 0: only those are used that are known."""
 
     @cached_property
     def _checked_record(self) -> RunRecord:
@@ -207,7 +213,8 @@ class RunClaims:
         changes = [change.first_ns for change in changes_of(self._checked_record) if change.touches_claims]
         until_s = changes[0] * 1e-9 if changes else math.inf  # as the times of samples are computed
         void = refusals_at_setpoint(self.record.scenario, knows_inputs=True)
-        return RunEvidence(record, self.record, until_s, error, void, certificates, offset)
+        whole, most_work = self.record, self.most_work
+        return RunEvidence(record, whole, until_s, error, void, certificates, offset, most_work)
 
     @property
     def _is_evaluated(self) -> bool:
@@ -271,12 +278,13 @@ class RunClaims:
         """Yield the claims of each certificate, and those that need none."""
         run = self.certified_evidence
         for certificate in run.certificates:
-            if (constants := certificate.constants) is None:
+            if not certificate.exists:
                 continue
             outside = outside_box(run.record.scenario) if certificate.scope == BOX else None
             for claim in definitions(CertifiedClaim):
-                check = ClaimCheck(claim.statement, certificate.source, run.until_s)
-                find = partial(claim.find, certificate=certificate, constants=constants)
+                proved = claim.is_proven(certificate)
+                check = ClaimCheck(claim.statement, certificate.source, run.until_s, proved=proved)
+                find = partial(claim.find, certificate=certificate)
                 yield _ClaimInstance(run, find, check, [], certificate, outside)
         for definition in definitions(ClaimDefinition):
             unmet = _IDEAL_LOOP if definition.needs_ideal_loop else ""

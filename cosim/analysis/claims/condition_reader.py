@@ -42,6 +42,10 @@ def read_conditions(record: RunRecord) -> ObservedConditions:
         for update in inputs.updates
         if update.applied_ns is not None and update.applied_ns < update.model_ns
     ]
+    acts_s = [
+        (u.model_ns * 1e-9, np.inf if u.applied_ns is None else u.applied_ns * 1e-9) for u in inputs.updates
+    ]
+    waiting = [(reset_s, at_s) for reset_s, at_s in acts_s if reset_s < at_s]
     clocks = record.clocks
     return ObservedConditions(
         losses=losses,
@@ -60,6 +64,7 @@ def read_conditions(record: RunRecord) -> ObservedConditions:
         clock_error_s=max((clock.error_ns / NS_PER_S for clock in clocks.values()), default=None),
         reached_s=end_ns * 1e-9,
         early=SampledSeries(*np.array(early).reshape(-1, 2).T),
+        waiting=SampledSeries(*np.array(waiting).reshape(-1, 2).T),
         first_delay_s=first_delay_s,
     )
 

@@ -176,6 +176,9 @@ class ObservedConditions(NamedTuple):
     early: SampledSeries = SampledSeries(np.zeros(0), np.zeros(0))
     """Model time at which an update reset x_c, in seconds, by the earlier time at which the plant
     first applied an input computed with it: its step was late, or the controller's clock ahead."""
+    waiting: SampledSeries = SampledSeries(np.zeros(0), np.zeros(0))
+    """Time at which the plant first applied an input computed with an update, infinite for never, by the
+    earlier model time at which the update reset x_c, in seconds."""
     first_delay_s: float | None = None
     """Largest time from an event to the first input, if that was computed with the event's update."""
 

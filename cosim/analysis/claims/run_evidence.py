@@ -121,6 +121,8 @@ class RunEvidence:
     """The certificates under the scenario's schedule, if they are known."""
     offset: float = 0.0
     """‖x_r‖ of the set-point: x in deviations has the rounding errors of x."""
+    most_work: float = 0.0
+    """Limit of the search for a witness; 0: only those are used that are known."""
     _known_states: dict[int, KnownStateBounds | None] = field(default_factory=dict, init=False)
     """Bounds from the newest event that are known already, by the ``id`` of their certificate."""
     _violations: dict[int, VoidFrom | None] = field(default_factory=dict, init=False)
@@ -175,7 +177,10 @@ class RunEvidence:
         """The certificates under the scenario's schedule."""
         if self.scheduled is not None:
             return self.scheduled
-        return scheduled_certificates(self.record.scenario, self.start_error)
+        whole_record = self.whole_record or self.record
+        return scheduled_certificates(
+            self.record.scenario, self.start_error, whole_record.scenario, self.most_work
+        )
 
     @cached_property
     def late(self) -> Sequence[ScenarioCertificate] | None:
@@ -192,7 +197,10 @@ class RunEvidence:
             return None
         if not any(certificate.exists for certificate in self._scheduled):
             return None
-        certificates = certificates_under(widest, self.record.scenario, self.start_error)
+        stated, most_work = whole_record.scenario, self.most_work
+        certificates = certificates_under(
+            widest, self.record.scenario, self.start_error, stated, most_work=most_work
+        )
         return certificates if any(certificate.exists for certificate in certificates) else None
 
     @cached_property
@@ -202,9 +210,8 @@ class RunEvidence:
         for scheduled, late in zip(self._scheduled, self.late or self._scheduled, strict=True):
             used = late if late.exists else scheduled
             if scheduled.scope in self.void:
-                used = replace(
-                    scheduled, constants=None, floor_constants=None, void=self.void[scheduled.scope]
-                )
+                void = self.void[scheduled.scope]
+                used = replace(scheduled, constants=None, floor_constants=None, proven=None, void=void)
             certificates.append(used)
         return certificates
 
@@ -243,14 +250,19 @@ class RunEvidence:
         """When the plant applied the first input of the controller; infinite if never."""
         return self._as_read.start_s
 
-    def bounds_controller_error(self, t_s: Reals) -> NDArray[np.bool_]:
+    def bounds_controller_error(self, t_s: Reals, *, of_input: bool = False) -> NDArray[np.bool_]:
         """Return where the certificates bound e_c, (k,).
 
-        The plant applies the controller's input, and x_c has every update with which it was computed.
+        The plant applies the controller's input, and x_c has every update with which it was computed; with
+        ``of_input`` no other one.
         """
+        is_bounded = t_s >= self.started_s - 1e-9
         acts_s, reset_s = map(np.sort, self._as_read.early)
-        is_behind = np.searchsorted(acts_s, t_s, "right") > np.searchsorted(reset_s, t_s, "right")
-        return np.asarray((t_s >= self.started_s - 1e-9) & ~is_behind)
+        is_bounded &= np.searchsorted(acts_s, t_s, "right") <= np.searchsorted(reset_s, t_s, "right")
+        if of_input:
+            reset_s, acts_s = map(np.sort, self._as_read.waiting)
+            is_bounded &= np.searchsorted(reset_s, t_s, "right") <= np.searchsorted(acts_s, t_s, "right")
+        return np.asarray(is_bounded)
 
     def violations(self) -> list[AssumptionViolation]:
         """The assumptions of certificates that the run violated, each at the first time.
@@ -322,6 +334,8 @@ class RunEvidence:
 
     def known_state_bounds(self, certificate: ScenarioCertificate) -> KnownStateBounds | None:
         """Return the bounds from the newest event of a certificate; None if it has none."""
+        if certificate.constants is None:
+            return None
         known = self._known_states
         if id(certificate) not in known:
             known[id(certificate)] = known_state_bounds(self.record.scenario, certificate)

@@ -249,6 +249,16 @@ class Claim(SummaryPart):
     until_s: Real
     """The claim ends here, at the first change of a setting on which it depends; None: at the end of
     the run."""
+    proved: bool | None = None
+    """Whether the checker has proven the bound of a certificate, or it is computed only; None: it follows
+    from the definitions of the loop, or there is no bound."""
+
+    @property
+    def origin(self) -> str:
+        """The source, and how the bound is known."""
+        if self.proved is None:
+            return self.source
+        return f"{self.source} ({'proved' if self.proved else 'computed'})"
 
     @property
     def is_certified(self) -> bool:

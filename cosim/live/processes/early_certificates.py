@@ -74,7 +74,7 @@ def _compute(run_dir: Path, sender: Connection) -> None:
     sent = set[str]()
     for loop in loops:
         key = expectations_key(loop)
-        sender.send((key, None if key in sent else expectations(loop)))
+        sender.send((key, None if key in sent else expectations(loop, len(loops))))
         sent.add(key)
 
 

@@ -7,6 +7,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.analysis.claims import run_certificates
 from cosim.output.viewer.loop_recording import LoopView
 from cosim.output.viewer.pictures.picture import Frames
 from cosim.record.align import (
@@ -211,7 +212,8 @@ class LoopFeed:
         """The run's certificate; None if there is none. Computed at first use, since it is slow."""
         if not self._is_certified or self._loop.setpoint is not None:
             return None  # with a set-point, it bounds the deviations from it
-        certificate = certify(self._scenario, allowed_conditions(self._scenario))
+        computed = certify(self._scenario, allowed_conditions(self._scenario))
+        (certificate,) = run_certificates.with_proofs([computed], self._scenario, 0.0)  # as far as known
         if certificate.inter_event_s is not None:
             self._view.add_certified_interval(certificate.inter_event_s, self._scenario.timing.horizon_ns)
         return certificate
@@ -224,7 +226,7 @@ class LoopFeed:
 
     @cached_property
     def _known_state(self) -> KnownStateBounds | None:
-        if self._certificate is None:
+        if self._certificate is None or self._certificate.constants is None:
             return None
         return known_state_bounds(self._scenario, self._certificate)
 

@@ -1,0 +1,107 @@
+"""The claims of a run about bounds that the checker has proven."""
+
+import numpy as np
+import pytest
+
+from cosim.analysis.claims import run_certificates
+from cosim.analysis.claims.claim_evaluation import RunClaims
+from cosim.analysis.claims.run_certificates import RUN_WORK, certificates_under, with_proofs
+from cosim.analysis.summary.summary_model import Claim
+from cosim.analysis.witnesses import find_statement, resolved_content
+from cosim.record.run_record import RunRecord
+from cosim.simulation.virtual_time import simulate
+from noack.core.number_format import at_most
+from noack.theory.certificates.conditions import allowed_conditions
+from noack.theory.certificates.proven_bounds import ProvenBound, ProvenBounds
+from tests.helpers.shipped import resolved
+
+PROVEN = ProvenBounds(0.2, {"x": ProvenBound(7.0, 0.5)}, {}, 0.25, 0.125, is_quiet=True)
+
+
+@pytest.fixture(autouse=True)
+def runs_are_proved(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run_certificates, "with_proofs", with_proofs)
+
+
+@pytest.fixture(scope="module")
+def record() -> RunRecord:
+    return simulate(resolved("double_integrator", "horizon_s=4"))
+
+
+def claims_of(record: RunRecord) -> dict[str, Claim]:
+    claims = RunClaims(record, most_work=RUN_WORK).evaluate()
+    assert {claim.verdict for claim in claims} <= {"held", "not applicable"}
+    return {claim.what: claim for claim in claims if claim.source == "certificate"}
+
+
+def test_the_claims_of_a_run_name_the_proven_bounds(record: RunRecord) -> None:
+    claims = claims_of(record)
+    content = resolved_content(record.scenario, record.scenario.certificate.late_periods)
+    bounds = find_statement(content, "own", "schedule").bounds
+    assert bounds is not None
+    x = bounds.bounds["x"]
+    state = claims["the state is bounded"]
+    assert state.bound == f"‖x‖ ≤ {at_most(x.decaying)} e^(−0.3t) + {at_most(x.constant)}"
+    assert (state.origin, state.certified) == ("certificate (proved)", x.decaying)
+    assert claims["the controller's error is bounded"].certified == bounds.bounds["e_c"].decaying
+    assert claims["the sensor's error is bounded"].proved
+    assert claims["minimum inter-event time"].certified == bounds.inter_event_s
+    assert claims["the state is bounded from the newest event on"].origin == "certificate (computed)"
+    assert {claim.proved for claim in RunClaims(record).evaluate() if claim.source == "(I1)"} == {None}
+
+
+def test_a_scenario_may_leave_the_search_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run_certificates, "known_or_found", None)
+    claims = claims_of(simulate(resolved("double_integrator", "horizon_s=1", "certificate.prove=false")))
+    assert {claim.proved for claim in claims.values()} == {False}
+
+
+def test_a_bound_of_the_input_is_compared_where_it_is_the_one_that_acts(record: RunRecord) -> None:
+    """Between its arrival at the controller and the plant's next step an update has reset x_c only."""
+    run = RunClaims(record).evidence
+    reset_s, acts_s = run._as_read.waiting
+    assert len(reset_s)
+    assert (reset_s < acts_s).all()
+    between_s = (reset_s + acts_s)[np.isfinite(acts_s)] / 2
+    assert run.bounds_controller_error(between_s).any()
+    assert not run.bounds_controller_error(between_s, of_input=True).any()
+    assert run.bounds_controller_error(acts_s[:1], of_input=True).all()
+
+
+@pytest.mark.parametrize(
+    ("proven", "apart_s", "exception"),
+    [
+        (PROVEN, [0.125, 0.25, 0.25], "from the second event on"),
+        (PROVEN._replace(first_event_s=None), [0.0, 0.25, 0.25], "from the second event on"),
+        (PROVEN._replace(first_event_s=0.25), [0.25, 0.25, 0.25], ""),
+        (PROVEN._replace(is_quiet=False), [0.0, 0.0, 0.25], "after the first input"),
+    ],
+)
+def test_the_time_between_the_first_events_may_be_unproven(
+    proven: ProvenBounds, apart_s: list[float], exception: str
+) -> None:
+    assert proven.apart_s(np.array([0.0, 0.5, 1.0]), started_s=0.75).tolist() == apart_s
+    assert proven.exception == exception
+
+
+def test_a_proof_is_for_the_times_that_occurred() -> None:
+    """A witness for the schedule proves nothing about a run that was later."""
+    scenario = resolved("double_integrator")
+    allowed = allowed_conditions(scenario)
+    (usual, *_) = certificates_under(allowed, scenario, most_work=RUN_WORK)
+    (late, *_) = certificates_under(
+        allowed._replace(delay_s=2 * allowed.delay_s), scenario, most_work=RUN_WORK
+    )
+    assert usual.proven is not None
+    assert late.proven is not None
+    assert late.proven.bounds["x"].decaying > usual.proven.bounds["x"].decaying
+    more_losses = allowed._replace(dropouts=allowed.dropouts + 1)
+    assert certificates_under(more_losses, scenario, most_work=RUN_WORK)[0].proven is None
+
+
+def test_many_loops_use_what_was_found_before_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cosim.analysis.witnesses.find_witness", None)
+    scenario = resolved("double_integrator", "trigger.beta=0.0501")
+    (certificate, *_) = certificates_under(allowed_conditions(scenario), scenario)
+    assert certificate.proven is None
+    assert certificate.exists
