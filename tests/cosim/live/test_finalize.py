@@ -275,20 +275,21 @@ def test_certificates_that_are_known_at_the_end_are_used(
     judged_alone: tuple[Path, RunSummary], many_loops: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Those of other loops are computed; here no other process is asked."""
+    run = load_run(many_loops)
     known = {
-        record.number: expectations(record.scenario)
-        for record in load_run(many_loops).loops
+        record.number: expectations(record.scenario, len(run.names))
+        for record in run.loops
         if record.number != 1
     }
     computed = []
 
-    def recorded_expectations(scenario: Scenario) -> Expectations:
+    def recorded_expectations(scenario: Scenario, loops: int) -> Expectations:
         computed.append(scenario.name)
-        return expectations(scenario)
+        return expectations(scenario, loops)
 
     monkeypatch.setattr(cosim.live.finalize, "cores", lambda: 1)
     monkeypatch.setattr(cosim.live.finalize, "expectations", recorded_expectations)
     ending = LaunchedEnding(many_loops, 0, ExitStatus.OK, "horizon", expectations=known)
     _, expected = judged_alone
     assert finalize(ending, report=False, view=False).summary == expected
-    assert computed == [load_run(many_loops).names[1]]
+    assert computed == [run.names[1]]
