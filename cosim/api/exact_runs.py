@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from cosim.api.scenarios import Source, load
 from cosim.output import curves
 from cosim.output.curves import Curve
-from cosim.output.run_verdict import VerdictLine, verdict_of_exact_run
+from cosim.output.document import Sentence
+from cosim.output.run_verdict import verdict_of_exact_run
 from cosim.simulation import continuous
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.number_checks import whole_number
@@ -49,7 +50,7 @@ class ExactRun:
         return continuous.summary(self._run, self.scenario)
 
     @property
-    def verdict(self) -> list[VerdictLine]:
+    def verdict(self) -> list[Sentence]:
         """How the run ended and its transmissions: lines with ``text`` and ``tone``."""
         return verdict_of_exact_run(self.summary)
 

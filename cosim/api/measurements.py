@@ -8,10 +8,11 @@ from typing import Literal, TypeVar
 from cosim.api.scenarios import Source, load
 from cosim.measurement.certificate_time import CertificateTime
 from cosim.measurement.loss_bursts import WINDOWS
-from cosim.measurement.measurement_outputs import write_page
+from cosim.measurement.measurement_outputs import measurement_document
 from cosim.measurement.network_measurement import QUANTILES, MeasurementOptions, NetworkMeasurement
 from cosim.measurement.network_section import write_network
 from cosim.measurement.trace_sources import USUAL_PERIOD_NS, SourceOptions, probe_period_ns, read_source
+from noack.core.file_access import require_suffix
 from noack.core.number_checks import one_of
 from noack.impairments.burst_prediction import USUAL_PACKETS
 from noack.traces.packet_trace import find_trace
@@ -39,7 +40,10 @@ class Measurement(NetworkMeasurement):
         Raises:
             NoackError: the name has another ending, or the file cannot be written.
         """
-        write_page(self, None, Path(path))
+        from cosim.output.page_kit import save_page  # imports matplotlib
+
+        require_suffix(Path(path), "--out", ".html")
+        save_page(measurement_document(self), Path(path))
 
     def write_network(self, path: str | PathLike[str], form: Literal["trace", "model"] = "trace") -> None:
         """Write a ``[network]`` section that reproduces the network (``.toml``).

@@ -23,12 +23,12 @@ from cosim.live.monitoring.run_observers import RunObserver
 from cosim.live.monitoring.run_terminal import RunTerminal
 from cosim.output import result_tables, run_tables, run_verdict
 from cosim.output.curves import Curve
+from cosim.output.document import Sentence
 from cosim.output.export.export_formats import export_run
 from cosim.output.figures.figure_format import requested_files
 from cosim.output.figures.network_figures import page_figures
 from cosim.output.figures.page_figure import PageFigure
 from cosim.output.figures.run_figures import BOUNDED, run_curves
-from cosim.output.run_verdict import VerdictLine
 from cosim.record import data_frames
 from cosim.record.run_directory import RECORD, REPORT_FILE, chosen_run, file_of_loop, require_run_directory
 from cosim.record.run_record import RecordedRun, RunRecord, load_run, no_such_loop
@@ -91,7 +91,7 @@ class Run:
         return self._outcome.reason
 
     @property
-    def verdict(self) -> list[VerdictLine]:
+    def verdict(self) -> list[Sentence]:
         """How the run ended, whether its guarantee was kept, its transmissions.
 
         Each line has a ``text``, and a ``tone``: good, doubt, bad or empty.

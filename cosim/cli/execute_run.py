@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cosim.cli.printing import console, print_json, status, status_of
+from cosim.cli.printing import show, status, status_of
 from cosim.live import launcher
 from cosim.live.coordination.remote_access import ListenSettings
 from cosim.live.monitoring.run_observers import RunLog, RunObserver, log_end
@@ -134,7 +134,7 @@ def warn_of_other_runs() -> None:
 
 def simulate_continuously(loaded: Scenario, *, json: bool, required: "Sequence[Requirement]" = ()) -> int:
     """Simulate a scenario in continuous time, print the result, and return the exit status."""
-    from cosim.output.continuous_report import print_continuous_run
+    from cosim.output.continuous_report import continuous_document
     from cosim.output.requirements import refuse_for_exact_runs, unmet_by_exact_run
     from cosim.simulation import continuous
 
@@ -143,11 +143,7 @@ def simulate_continuously(loaded: Scenario, *, json: bool, required: "Sequence[R
     with status("simulating"):
         run = continuous.run_continuous(resolved)
     summary = continuous.summary(run, resolved)
-    if json:
-        print_json(continuous.document(run, resolved))
-    else:
-        constraints = [rule.text() for rule in resolved.network.constraints]
-        print_continuous_run(console(), run, summary, constraints)
+    show(continuous_document(run, resolved), json=json)
     return status_of(unmet_by_exact_run(summary, required), summary.exit_status)
 
 
@@ -173,7 +169,7 @@ def finalize_run(
     """Finish a run's record, print its verdict, and return its exit status."""
     from cosim.live.finalize import finalize
     from cosim.output.requirements import unmet_by_run
-    from cosim.output.terminal_output import print_outcome
+    from cosim.output.run_document import run_document
 
     try:
         # This takes minutes for a run of an hour.
@@ -183,8 +179,5 @@ def finalize_run(
         error.add_note(how_to_complete(ending.run_dir))
         raise
     log_end(outcome.status, outcome.reason, outcome.run_dir)
-    if json:
-        print_json(outcome.summary.to_json())
-    else:
-        print_outcome(console(), outcome, verbose=verbose)
+    show(run_document(outcome, verbose=verbose), json=json)
     return status_of(unmet_by_run(outcome.summary, required), outcome.status)

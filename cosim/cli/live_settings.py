@@ -4,7 +4,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from cosim.output.result_tables import ResultTable, terminal_table
+from cosim.output.result_tables import ResultTable
+from cosim.output.terminal_writer import terminal_table
 from noack.core.errors import CallerError
 from noack.runtime.control_messages import ChangeReply
 from noack.scenario.runtime_parameters import SHORT, full_key, text_of
@@ -48,6 +49,6 @@ def print_parameters(console: Console, answer: ChangeReply) -> None:
             loop_text = "all" if len(loops) == len(entries) else ", ".join(loops)
             rows.append((key, short.get(key, ""), loop_text, value))
     title = f"{answer.name}, at {answer.t_s:.1f} s"
-    table = ResultTable("", title, ("key", "short", "loops", "value"), rows)
-    console.print(terminal_table(table, left=range(4)))
+    table = ResultTable("", title, ("key", "short", "loops", "value"), rows, left=range(4))
+    console.print(terminal_table(table))
     console.print(answer.run_dir, style="dim", markup=False, soft_wrap=True)

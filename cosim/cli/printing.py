@@ -1,7 +1,7 @@
 """What commands print: the result as text or as JSON, tables in files, what is being done."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from json import dumps
 from pathlib import Path
@@ -11,6 +11,7 @@ from noack.core.errors import ExitStatus
 from noack.runtime.command_line import print_to_stderr
 
 if TYPE_CHECKING:
+    from cosim.output.document import Document
     from cosim.output.result_tables import ResultTable
     from noack.runtime.console import SafeConsole
 
@@ -27,6 +28,24 @@ def status(activity: str) -> AbstractContextManager[Callable[[str], None]]:
     from cosim.live.monitoring.progress import activity as shown_activity
 
     return shown_activity(activity)
+
+
+def show(document: "Document", *, json: bool, tables: Path | None = None, **added: object) -> None:
+    """Print a document as text or, with what is added, as JSON; write the tables of ``--tables``."""
+    if json:
+        print_json({**document.data, **added})
+    else:
+        from cosim.output.terminal_writer import print_document
+
+        print_document(console(), document)
+    write_tables(document.tables, tables, json=json)
+
+
+def show_written(document: "Document", files: Sequence[Path], *, json: bool) -> None:
+    """Print a document, and the files that were written."""
+    show(document, json=json, files=[str(file) for file in files])
+    if not json:
+        print(*files, sep="\n")
 
 
 def write_tables(tables: "Iterable[ResultTable]", folder: Path | None, *, json: bool) -> None:

@@ -9,7 +9,8 @@ from cosim.analysis.summary.plant_linearisation import linearisation, linearisat
 from cosim.cli.printing import console as standard_console
 from cosim.cli.printing import print_json
 from cosim.live.launcher import DEFAULT_START_S
-from cosim.output.terminal_output import print_assumptions
+from cosim.output.run_document import assumption_table
+from cosim.output.terminal_writer import terminal_table
 from noack.core.clock import NS_PER_S
 from noack.scenario.resolution import policy_of, resolve, resolved_loops
 from noack.scenario.scenario import Scenario, loop_names, phases_ns
@@ -36,7 +37,7 @@ def check_scenario(loaded: Scenario, *, json: bool) -> None:
     console.width -= len(_COMMENT)
     with console.capture() as captured:  # printed last: the plant may be rejected
         console.print("the paper's assumptions for this scenario:")
-        print_assumptions(console, assumptions(resolved))
+        console.print(terminal_table(assumption_table(assumptions(resolved))))
         _print_plant(console, resolved)
     if json:
         print_json(resolved.model_dump(mode="json"))

@@ -1,4 +1,4 @@
-"""All outputs of a measurement: tables, figures (bursts, delays, correlation, (m, K)), page, JSON."""
+"""The result of a measurement as a document: tables, figures (bursts, delays, correlation, (m, K))."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -6,8 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from rich.console import Console
-from rich.markup import escape
 
 from cosim.live.monitoring.progress import activity
 from cosim.measurement.certificate_time import CertificateTime
@@ -16,13 +14,13 @@ from cosim.measurement.loss_bursts import histogram, most_losses
 from cosim.measurement.network_measurement import NetworkMeasurement
 from cosim.measurement.network_section import Form, write_network
 from cosim.output.curves import DASHED
+from cosim.output.document import Document, Role, Sentence
 from cosim.output.figures import palette
 from cosim.output.figures.axes_parts import draw_bars, draw_line, rgb, set_times, whole_numbers
 from cosim.output.figures.figure_format import FigureFiles
 from cosim.output.figures.page_figure import PageFigure, one_panel
 from cosim.output.figures.palette import Colour
-from cosim.output.result_tables import KEY_VALUE, ResultTable, terminal_table
-from cosim.record.run_directory import write_output
+from cosim.output.result_tables import KEY_VALUE, ResultTable
 from noack.core.errors import CallerError
 from noack.core.file_access import require_suffix
 from noack.core.number_format import NONE, duration, number, percent
@@ -55,31 +53,47 @@ class OutputRequest:
             require_suffix(self.network, "--write", ".toml")
 
 
-def report(
-    measurement: NetworkMeasurement, request: OutputRequest, console: Console | None
-) -> dict[str, object]:
-    """Write what is requested, print the tables, and return the document of ``--json``.
+def write_outputs(measurement: NetworkMeasurement, request: OutputRequest) -> tuple[Document, list[Path]]:
+    """Write what is requested; return the document of a measurement, and the written files.
 
     Raises:
         NoackError: one line; a file cannot be written, or the scenario cannot be resolved.
     """
     with activity("measuring"):
         void = None if request.scenario is None else measurement.certificate_time(request.scenario)
-        document = measurement.to_json()
-    if console is not None:
-        print_measurement(console, measurement, void)
+        document = measurement_document(measurement, void)
     written: list[Path] = []
     if request.page is not None:
-        written += write_page(measurement, void, request.page, request.figure_files)
+        from cosim.output.page_kit import save_page  # imports matplotlib
+
+        written += save_page(document, request.page, request.figure_files)
     if request.network is not None:
         written += write_network(measurement, request.network, request.form)
-    if console is not None:
-        for path in written:
-            console.print(f"written: {path}", markup=False, highlight=False, soft_wrap=True)
-    document["written"] = [str(path) for path in written]
-    if void is not None:
-        document["certificate"] = void.to_json()
-    return document
+    return document, written
+
+
+def measurement_document(measurement: NetworkMeasurement, void: CertificateTime | None = None) -> Document:
+    """Return tables, figures and remarks of a measurement, and of a scenario's certificate."""
+    outages, longest = int(measurement.is_outage.sum()), measurement.longest_loss_burst
+    also = f", and {outages} outage{'s' * (outages > 1)}" if outages else ""
+    where = "Outside the outages, at" if outages else "At"
+    return Document(
+        title=measurement.name,
+        kind="network measured",
+        data=measurement.to_json() | ({} if void is None else {"certificate": void.to_json()}),
+        blocks=[
+            Sentence(text=measurement.name, on_page=False),
+            *measurement_figures(measurement),
+            *measurement_tables(measurement, void),
+            Sentence(text=f"M = {longest + 1}{also}", role=Role.VERDICT, on_terminal=False),
+            Sentence(
+                text=f"{where} most M − 1 = {longest} consecutive packets were not effectively delivered.",
+                role=Role.REMARK,
+                on_terminal=False,
+            ),
+            *(Sentence(text=line, role=Role.REMARK) for line in (*measurement.remarks, *void_remarks(void))),
+        ],
+    )
 
 
 _MODELS = {"bernoulli": "independent losses", "gilbert": "Gilbert", "gilbert_elliott": "Gilbert–Elliott"}
@@ -141,18 +155,6 @@ def measurement_tables(
         caption = f"{void.scenario}: when the network violates a condition of its certificates"
         heads = ("condition", "share of the time", "first", "worst")
         yield ResultTable("certificate", caption, heads, [*_void_rows(void)])
-
-
-def print_measurement(
-    console: Console, measurement: NetworkMeasurement, void: CertificateTime | None = None
-) -> None:
-    """Print the tables and the remarks."""
-    console.print(measurement.name, markup=False, highlight=False, soft_wrap=True)
-    for table in measurement_tables(measurement, void):
-        console.print(f"\n[bold]{escape(table.caption)}[/]", highlight=False)
-        console.print(terminal_table(table._replace(caption="")))
-    for line in (*measurement.remarks, *void_remarks(void)):
-        console.print(line, markup=False, highlight=False)
 
 
 def _numbers(measurement: NetworkMeasurement, suffix: str) -> Iterator[tuple[str, str]]:
@@ -248,33 +250,6 @@ def void_remarks(void: CertificateTime | None) -> Iterator[str]:
         "first violation on"
     )
     yield void.answer
-
-
-def write_page(
-    measurement: NetworkMeasurement,
-    void: CertificateTime | None,
-    path: Path,
-    figure_files: FigureFiles | None = None,
-) -> list[Path]:
-    """Write the page, in which all text is escaped, and its figures; return the files.
-
-    Raises:
-        CallerError: the name does not end in .html.
-        MachineError: the page cannot be written.
-    """
-    from cosim.output.figures.figure_files import save_figures  # they import matplotlib
-    from cosim.output.page_kit import templates
-
-    require_suffix(path, "--out", ".html")
-    template = templates(Path(__file__).parent).get_template("measurement.html.jinja")
-    figures = list(measurement_figures(measurement))
-    html = template.render(
-        measurement=measurement,
-        remarks=[*measurement.remarks, *void_remarks(void)],
-        tables=list(measurement_tables(measurement, void)),
-        figures=figures,
-    )
-    return [write_output(path, html), *save_figures(figures, path, figure_files)]
 
 
 _BURSTS, _OUTAGES, _DELAYS = palette.SENSOR, palette.CONTROLLER, palette.PLANT

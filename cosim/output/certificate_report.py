@@ -1,8 +1,8 @@
 """What is certified for a scenario, as tables and in words.
 
 :func:`print_certificates` prints the constants, the limits of the schedule, the assumptions and, if
-losses are not limited, what holds for random ones; :func:`print_margin` prints the margin of a
-time-triggered loop, :func:`print_mean_cost` its mean cost under random losses.
+losses are not limited, what holds for random ones; :func:`margin_document` has the margin of a
+time-triggered loop, :func:`mean_cost_document` its mean cost under random losses.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -15,8 +15,10 @@ from cosim.analysis.constant_rows import PROVEN, constant_rows, covered_plants
 from cosim.analysis.margin_search import MarginResult
 from cosim.analysis.mean_cost import CostUnder, MeanCost
 from cosim.analysis.tried_settings import TriedSettings
-from cosim.output.result_tables import ResultTable, terminal_table
-from cosim.output.terminal_output import print_assumptions
+from cosim.output.document import Block, Document, Role, Sentence
+from cosim.output.result_tables import ResultTable, Tone
+from cosim.output.run_document import assumption_table
+from cosim.output.terminal_writer import terminal_table
 from noack.core.linear_systems import Matrix
 from noack.core.number_format import NONE, at_least, at_most, duration, duration_at_least, number
 from noack.scenario.resolution import loop_of, policy_of
@@ -50,9 +52,9 @@ def print_certificates(console: Console, results: Certificates, chosen: Certific
     if (outside := outside_box(results.scenario)) is not None:
         console.print(f"[yellow]the box certificates do not cover this plant:[/] {escape(outside)}")
     console.print("assumptions of the certificates for the schedule:")
-    print_assumptions(console, (results.schedule_region or results.schedule).assumptions)
+    console.print(terminal_table(assumption_table((results.schedule_region or results.schedule).assumptions)))
     console.print("assumptions of the paper's theorems:")
-    print_assumptions(console, assumptions(results.scenario))
+    console.print(terminal_table(assumption_table(assumptions(results.scenario))))
     for sentence in (*_in_words(results), *_stability_in_words(results)):
         console.print(sentence, markup=False, highlight=False)
     if results.weight is not None and results.schedule.exists:
@@ -271,32 +273,33 @@ def _limit(value_s: float | None) -> str:
     return f"≥ {MOST_S:g} s" if value_s >= MOST_S else duration_at_least(value_s)
 
 
-_MARGIN_STYLES = {"stable": "green", "destabilised": "red", "undecided": "yellow"}
+_MARGIN_TONES = {"stable": Tone.GOOD, "destabilised": Tone.BAD, "undecided": Tone.DOUBTFUL}
 
 
 def _growth(growth: Stability) -> tuple[str, str]:
     return at_least(growth.lower, decimals=9), at_most(growth.upper, decimals=9)
 
 
-def print_margin(console: Console, margin: MarginResult) -> None:
-    """Print the bounds for each M, and the verdicts."""
-    for table in margin_tables(margin):
-        last = len(table.headings) - 1
-        console.print(terminal_table(table, left=[last], styles=_MARGIN_STYLES))
+def margin_document(margin: MarginResult) -> Document:
+    """Return the bounds for each M, and the verdicts."""
     proof = [] if margin.proof is None else margin.proof.lines
-    for text in (margin.verdict, *proof, *margin.compared.relations):
-        console.print(text, soft_wrap=True, highlight=False)
+    texts = [margin.verdict, *proof, *margin.compared.relations]
     if margin.period is not None:
-        text = f"for {margin.guarantee}: {margin.period.text}"
-        console.print(text, soft_wrap=True, highlight=False)
-    for text in (margin.random_text, *margin.certificate_texts):
-        console.print(text, soft_wrap=True, highlight=False, markup=False)
+        texts.append(f"for {margin.guarantee}: {margin.period.text}")
     note = "D delivered, L lost, repeated. Below 1: every pattern is stable."
     if not margin.is_periodic:
         note += " In brackets: the time to the next update."
     if margin.certificate is not None and not margin.certificate.is_certified:
         note += " A loop without a certificate may be stable."
-    console.print(f"[dim]{note}[/]")
+    return Document(
+        title=margin.scenario,
+        data=margin.to_json(),
+        blocks=[
+            *margin_tables(margin),
+            *(Sentence(text=text) for text in (*texts, margin.random_text, *margin.certificate_texts)),
+            Sentence(text=note, role=Role.NOTE),
+        ],
+    )
 
 
 def margin_tables(margin: MarginResult) -> Iterator[ResultTable]:
@@ -311,6 +314,8 @@ def margin_tables(margin: MarginResult) -> Iterator[ResultTable]:
         f"{times}, {margin.between_updates}{delay}",
         ("M", "M − 1", "at least", "at most", "verdict"),
         [(str(m), str(m - 1), *_growth(growth), growth.verdict) for m, growth in margin.caps],
+        left=[4],
+        tones=_MARGIN_TONES,
     )
     if margin.compared.guarantees:
         rows = [
@@ -319,21 +324,25 @@ def margin_tables(margin: MarginResult) -> Iterator[ResultTable]:
         ]
         title = f"{margin.scenario}: the scenario's guarantee, and others"
         headings = ("guarantee", "at least", "at most", "worst pattern", "verdict")
-        yield ResultTable("guarantees", title, headings, rows)
+        yield ResultTable("guarantees", title, headings, rows, left=[4], tones=_MARGIN_TONES)
 
 
-def print_mean_cost(console: Console, cost: MeanCost) -> None:
-    """Print the moments and costs with and without the guarantee."""
-    for table in mean_cost_tables(cost):
-        console.print(terminal_table(table))
-    for name in ("with_guarantee", "without_guarantee"):
-        if isinstance(reason := getattr(cost, name), str):
-            console.print(f"[yellow]{name.replace('_', ' the ')}:[/] {escape(reason)}")
-    console.print(
-        "[dim]The cost is ∫ xᵀQx + uᵀRu dt, between the samples, too; u: of the controller. "
+def mean_cost_document(cost: MeanCost) -> Document:
+    """Return the moments and costs with and without the guarantee."""
+    unknown = {name: getattr(cost, name) for name in ("with_guarantee", "without_guarantee")}
+    blocks: list[Block] = [*mean_cost_tables(cost)]
+    blocks += [
+        Sentence(text=reason, lead=f"{name.replace('_', ' the ')}:", tone=Tone.DOUBTFUL)
+        for name, reason in unknown.items()
+        if isinstance(reason, str)
+    ]
+    note = (
+        "The cost is ∫ xᵀQx + uᵀRu dt, between the samples, too; u: of the controller. "
         "Rms: stationary, what the loop tends to from any start, over time. Growth below 1: stable "
-        "in mean square; z: the loop's state, x, x_c and the inputs in use.[/]"
+        "in mean square; z: the loop's state, x, x_c and the inputs in use."
     )
+    blocks.append(Sentence(text=note, role=Role.NOTE))
+    return Document(title=cost.scenario, data=cost.to_json(), blocks=blocks)
 
 
 def mean_cost_tables(costs: MeanCost) -> Iterator[ResultTable]:

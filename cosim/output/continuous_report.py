@@ -1,35 +1,22 @@
-"""The result of ``noack simulate --trigger continuous`` on the terminal."""
+"""The result of ``noack simulate --trigger continuous`` as a document."""
 
 import numpy as np
-from rich.console import Console
 
-from cosim.analysis.summary.summary_model import ExitPart
-from cosim.output.result_tables import ResultTable, terminal_table
+from cosim.output.document import Document, Role, Sentence
+from cosim.output.result_tables import KEY_VALUE, ResultTable, Tone
 from cosim.output.run_tables import burst_row, interval_rows, lost_row, title_of
-from cosim.output.run_verdict import ending_line, state_text, transmission_line
-from cosim.output.terminal_output import print_line, print_numbers
-from cosim.simulation.continuous import ContinuousRun, ContinuousSummary
+from cosim.output.run_verdict import verdict_of_exact_run
+from cosim.simulation import continuous
+from cosim.simulation.continuous import ContinuousRun
 from noack.core.number_format import number
+from noack.scenario.scenario import Scenario
 
 _EVENTS_SHOWN = 40
 
 
-def print_continuous_run(
-    console: Console,
-    run: ContinuousRun,
-    summary: ContinuousSummary,
-    constraints: list[str],
-) -> None:
-    """Print how the run ended, its key numbers, and its first 40 events."""
-    ended = ExitPart(status=int(summary.exit_status), reason=summary.reason)
-    state = (
-        ""
-        if summary.diverged_at_s
-        else state_text(summary.initial_state_norm, summary.sup_state_norm, summary.final_state_norm, None)
-    )
-    ending = ending_line(ended, summary.reached_s, summary.horizon_s, state)
-    for line in (ending, transmission_line(summary.events, summary.deliveries)):
-        print_line(console, line)
+def continuous_document(run: ContinuousRun, scenario: Scenario) -> Document:
+    """Return how the run of a resolved scenario ended, its key numbers, and its first 40 events."""
+    summary, constraints = continuous.summary(run, scenario), [r.text() for r in scenario.network.constraints]
     rows = (
         lost_row(summary.drops, summary.deliveries),
         burst_row(summary.mansd, constraints, summary.longest_loss_burst),
@@ -41,11 +28,18 @@ def print_continuous_run(
     )
     cap = f"M − 1 = {summary.mansd}"
     title = title_of(summary.scenario, summary.mode, cap, constraints, "continuous")
-    print_numbers(console, title, rows)
-    table = _event_table(run)
-    console.print(terminal_table(table, left=(), styles={"lost": "red"}))
-    if len(run.before) > _EVENTS_SHOWN:
-        console.print(f"and {len(run.before) - _EVENTS_SHOWN} more events: --json has them all")
+    return Document(
+        title=title,
+        data=continuous.document(run, scenario),
+        blocks=[
+            *(
+                Sentence(text=line.text, tone=line.tone, role=Role.VERDICT)
+                for line in verdict_of_exact_run(summary)
+            ),
+            ResultTable("numbers", title, KEY_VALUE, rows),
+            _event_table(run),
+        ],
+    )
 
 
 def _event_table(run: ContinuousRun) -> ResultTable:
@@ -68,4 +62,8 @@ def _event_table(run: ContinuousRun) -> ResultTable:
         for i, (state, (x, e_c)) in enumerate(zip(run.before, norms, strict=False))
     ]
     headings = ("event", "t, s", "inter-event time, s", "‖x‖", "‖e_c‖ before", "fate")
-    return ResultTable("events", "events", headings, events)
+    more = len(run.before) - _EVENTS_SHOWN
+    return ResultTable(
+        "events", "events", headings, events, left=(), tones={"lost": Tone.BAD},
+        more=f"and {more} more events: --json has them all" if more > 0 else "",
+    )  # fmt: skip

@@ -11,9 +11,13 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from cosim.output.figures.figure_files import inline
+from cosim.output.document import Document, Role, Sentence
+from cosim.output.figures.figure_files import inline, save_figures
+from cosim.output.figures.figure_format import FigureFiles
 from cosim.output.figures.page_figure import PageFigure
+from cosim.output.result_tables import Tone
 from cosim.output.run_tables import interval_text
+from cosim.record.run_directory import write_output
 from noack.core.number_format import number
 
 PAGES = Path(__file__).with_name("pages")
@@ -45,6 +49,29 @@ def templates(folder: Path = PAGES) -> Environment:
     }
     environment.filters |= filters
     return environment
+
+
+def document_page(document: Document) -> str:
+    """Return a document as a page: verdict and remarks first, then the other blocks in their order."""
+    tones = {line.tone for line in (*document.verdict, *document.remarks)}
+    tone = next((tone for tone in (Tone.BAD, Tone.DOUBTFUL, Tone.GOOD) if tone in tones), Tone.NEUTRAL)
+    blocks = [
+        (type(block).__name__, block)
+        for block in document.blocks
+        if not (isinstance(block, Sentence) and (block.role != Role.TEXT or not block.on_page))
+    ]
+    return templates().get_template("document.html.jinja").render(document=document, tone=tone, blocks=blocks)
+
+
+def save_page(document: Document, path: Path, files: FigureFiles | None = None) -> list[Path]:
+    """Write the page of a document, and its figures beside it; return the paths.
+
+    Raises:
+        MachineError: a file cannot be written.
+    """
+    return [
+        write_output(path, document_page(document)), *save_figures(document.figures, path, files),
+    ]  # fmt: skip
 
 
 def _markup(figure: PageFigure) -> Markup:

@@ -20,6 +20,7 @@ from cosim.output.figures.network_figures import network_figures
 from cosim.output.figures.page_figure import PageFigure
 from cosim.output.figures.run_figures import envelopes, run_figures
 from cosim.output.page_kit import TERMS, templates, value_text, words
+from cosim.output.result_tables import Tone
 from cosim.output.run_tables import (
     LOOPS_CAPTION,
     badness,
@@ -32,7 +33,7 @@ from cosim.output.run_tables import (
     shares_network,
     timing_table,
 )
-from cosim.output.run_verdict import Tone, remarks, verdict
+from cosim.output.run_verdict import remarks, verdict
 from cosim.record.run_directory import (
     ENVIRONMENT_FILE,
     REPORT_FILE,

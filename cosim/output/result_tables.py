@@ -1,4 +1,4 @@
-"""Tables of results: for a terminal, and as CSV for papers and spreadsheets.
+"""Tables of results, and their files: CSV for papers and spreadsheets.
 
 A table is rows of text. Before it is written as CSV, the units of its values move to the heads.
 """
@@ -7,13 +7,10 @@ import csv
 import io
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from enum import StrEnum
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
-
-from rich.box import HEAVY_HEAD, SIMPLE_HEAD
-from rich.markup import escape
-from rich.table import Table
-from rich.text import Text
 
 from cosim.record.run_directory import require_folder, write_output
 from noack.core.number_format import NONE
@@ -23,46 +20,42 @@ KEY_VALUE = ("quantity", "value")
 _WITH_UNIT = re.compile(r"([-−+]?\d[\d.,]*(?:e[-+]?\d+)?) (s|ms|µs|ns|%|/s|Hz|bytes)")
 
 
+class Tone(StrEnum):
+    """What a text means for the reader; each output has its own look for it."""
+
+    GOOD = "good"
+    DOUBTFUL = "doubt"
+    BAD = "bad"
+    NEUTRAL = ""
+    QUIET = "quiet"
+
+
 class ResultTable(NamedTuple):
     """A table of text."""
 
     name: str
-    """Name of its files."""
+    """Name of its files; empty: it has none."""
     caption: str
     headings: Sequence[str]
+    """Empty for a list of words and what they are about."""
     rows: Sequence[Sequence[str]]
+    names: int = 1
+    """Number of first columns that name a row; the others have values."""
+    left: Collection[int] | None = None
+    """Columns that begin at the left on a terminal; by default those with names."""
+    tones: Mapping[str, Tone] = MappingProxyType({})
+    """Tones of texts in the last column (of a list: in the first), by their first words."""
+    is_dense: bool = False
+    """On a terminal: save width, break no words, and no lines at the right."""
+    shown: Collection[int] | None = None
+    """Rows that a terminal shows; None: all."""
+    more: str = ""
+    """Line below the table on a terminal."""
 
-
-def terminal_table(
-    table: ResultTable,
-    *,
-    left: Collection[int] = (0,),
-    styles: Mapping[str, str] | None = None,
-    dense: bool = False,
-) -> Table:
-    """Return a table for a terminal.
-
-    Args:
-        table: the table.
-        left: numbers of the columns that begin at the left; the others end at the right.
-        styles: styles of texts in the last column, by their first words.
-        dense: save width, break no words, and no lines at the right.
-    """
-    rich_table = Table(
-        title=escape(table.caption) if table.caption else None,
-        box=SIMPLE_HEAD if dense else HEAVY_HEAD,
-        collapse_padding=dense,
-        pad_edge=not dense,
-    )
-    for i, heading in enumerate(table.headings):
-        words = " ".join([heading, *(row[i] for row in table.rows)]).split()
-        min_width = max(map(len, words)) if dense else None
-        rich_table.add_column(escape(heading), justify="left" if i in left else "right", min_width=min_width)
-        rich_table.columns[-1].no_wrap = dense and i not in left
-    for *cells, last in table.rows:
-        style = next((style for word, style in (styles or {}).items() if last.startswith(word)), "")
-        rich_table.add_row(*map(escape, cells), Text(last, style))
-    return rich_table
+    @property
+    def rows_on_terminal(self) -> list[Sequence[str]]:
+        """The rows that a terminal shows."""
+        return [row for i, row in enumerate(self.rows) if self.shown is None or i in self.shown]
 
 
 def save_tables(tables: Iterable[ResultTable], folder: Path) -> list[Path]:

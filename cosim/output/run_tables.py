@@ -1,6 +1,6 @@
 """Tables of a run, as rows of text: of its network and loops, and of one loop in detail.
 
-The terminal (:mod:`cosim.output.terminal_output`), the report and the files of ``--tables`` show them.
+The terminal (:mod:`cosim.output.run_document`), the report and the files of ``--tables`` show them.
 """
 
 import math
@@ -21,7 +21,7 @@ from cosim.analysis.summary.summary_model import (
     RunSummary,
     WatchdogPart,
 )
-from cosim.output.result_tables import KEY_VALUE, ResultTable
+from cosim.output.result_tables import KEY_VALUE, ResultTable, Tone
 from netem.tc_words import settings_of
 from noack.core.errors import ExitStatus
 from noack.core.number_format import NONE, counted, duration, duration_at_least, number, ratio, seconds, whole
@@ -38,6 +38,9 @@ LOOPS_CAPTION = (
     "burst: most consecutive losses; forced: delivered by the guarantee; share: of the "
     "forwarded bytes; delay and ‖e_c‖: largest"
 )
+_CLAIM_TONES = {
+    "held": Tone.GOOD, "violated": Tone.BAD, "void": Tone.DOUBTFUL, "not applicable": Tone.QUIET,
+}  # fmt: skip
 _SCHEDULE = {
     "sampling_s": "between two measurements",
     "delay_s": "from an event to the plant",
@@ -289,7 +292,8 @@ def _claims_table(claims: Claims, title: str) -> ResultTable:
         rows.append(
             (claim.origin, claim.bound, *(interval if has_interval else ()), share, claim.verdict + since)
         )
-    return ResultTable("claims", title, headings, rows)
+    left = [i for i, heading in enumerate(headings) if heading != "share used"]
+    return ResultTable("claims", title, headings, rows, left=left, tones=_CLAIM_TONES)
 
 
 def _replay(verdict: ReplayPart | None) -> Iterator[tuple[str, str]]:

@@ -1,16 +1,17 @@
 """A run's summary in words: a verdict of three lines, and remarks on its validity.
 
-The terminal (:mod:`cosim.output.terminal_output`) and the report show them; :attr:`noack.Run.verdict`.
+The terminal (:mod:`cosim.output.run_document`) and the report show them; :attr:`noack.Run.verdict`.
 """
 
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from enum import StrEnum
 from typing import NamedTuple
 
 from cosim.analysis.claims.observed_conditions import CAUSES, SCHEDULE, worst_time
 from cosim.analysis.summary.summary_model import Claim, ExitPart, IdealLoopPart, LoopSummary, RunSummary
+from cosim.output.document import Role, Sentence
+from cosim.output.result_tables import Tone
 from cosim.output.run_tables import changes_in, shares_network, state_norm
 from cosim.simulation.continuous import ContinuousSummary
 from noack.core.errors import ExitStatus
@@ -55,23 +56,11 @@ _REJECTIONS: Mapping[str, str] = {
 """Why a process rejected datagrams, in words."""
 
 
-class Tone(StrEnum):
-    """What a line of the verdict means for the run; each output has its own look for it."""
-
-    GOOD = "good"
-    DOUBTFUL = "doubt"
-    BAD = "bad"
-    NEUTRAL = ""
+def _line(text: str, tone: Tone) -> Sentence:
+    return Sentence(text=text, tone=tone, role=Role.VERDICT)
 
 
-class VerdictLine(NamedTuple):
-    """A line of the verdict."""
-
-    text: str
-    tone: Tone
-
-
-def verdict(summary: RunSummary) -> tuple[VerdictLine, ...]:
+def verdict(summary: RunSummary) -> tuple[Sentence, ...]:
     """Return how the run ended and its state, whether its guarantee was kept, its transmissions."""
     loops = summary.loops
     events, deliveries = sum(loop.events for loop in loops), sum(loop.deliveries for loop in loops)
@@ -91,7 +80,7 @@ def verdict(summary: RunSummary) -> tuple[VerdictLine, ...]:
     )
 
 
-def verdict_of_exact_run(summary: ContinuousSummary) -> list[VerdictLine]:
+def verdict_of_exact_run(summary: ContinuousSummary) -> list[Sentence]:
     """Return how a run in continuous time ended, and its transmissions."""
     state, failed = "", summary.exit_status == ExitStatus.FAILED
     if not failed:
@@ -103,7 +92,7 @@ def verdict_of_exact_run(summary: ContinuousSummary) -> list[VerdictLine]:
     ]
 
 
-def ending_line(end: ExitPart, reached_s: float, horizon_s: float, states: str = "") -> VerdictLine:
+def ending_line(end: ExitPart, reached_s: float, horizon_s: float, states: str = "") -> Sentence:
     """Return how a run ended, with the words of :func:`state_text` about its loops."""
     length = f"{reached_s:g} s"
     length_of_horizon = f"{length} of {horizon_s:g} s"
@@ -114,7 +103,7 @@ def ending_line(end: ExitPart, reached_s: float, horizon_s: float, states: str =
         ExitStatus.FAILED: ("failed" if says_when else f"failed after {length_of_horizon}", Tone.BAD),
     }.get(ExitStatus(end.status), (f"stopped after {length_of_horizon}", Tone.DOUBTFUL))
     details = "; ".join(filter(None, (reason.removeprefix("stopped "), states)))
-    return VerdictLine(f"{outcome}: {details}" if details else outcome, tone)
+    return _line(f"{outcome}: {details}" if details else outcome, tone)
 
 
 def state_of(largest: float | None, final: float | None, diverged_at_s: float | None) -> str:
@@ -162,11 +151,11 @@ def _states(loops: Sequence[LoopSummary]) -> str:
     return ", ".join([*words, *(f"{count} {word}" for word, count in rest)])
 
 
-def transmission_line(events: int, deliveries: int, ideal: int | None = None) -> VerdictLine:
+def transmission_line(events: int, deliveries: int, ideal: int | None = None) -> Sentence:
     """Return the numbers of transmissions and deliveries, and that of the ideal loop."""
     beside = "" if ideal is None else f" ({ideal} in the ideal loop)"
     sent = "1 transmission" if events == 1 else f"{events} transmissions"
-    return VerdictLine(f"{sent}{beside}, {deliveries} delivered", Tone.NEUTRAL)
+    return _line(f"{sent}{beside}, {deliveries} delivered", Tone.NEUTRAL)
 
 
 class GuaranteeVerdict(NamedTuple):
@@ -314,7 +303,7 @@ def _covers_lateness(loop: LoopSummary) -> bool:
     return loop.certified_for is not None and not late
 
 
-def _guarantee_line(loops: Sequence[LoopSummary]) -> VerdictLine:
+def _guarantee_line(loops: Sequence[LoopSummary]) -> Sentence:
     """Return whether the guarantee was kept in the loops, the worst first."""
     guarantees = [(guarantee_of(loop), loop) for loop in loops]
     held = sum(claim.verdict == "held" for loop in loops for claim in loop.claims)
@@ -340,20 +329,10 @@ def _guarantee_line(loops: Sequence[LoopSummary]) -> VerdictLine:
         text = f"guarantee kept until {since}, then not checkable{why}"
     else:
         text = f"guarantee not checkable{why}"
-    return VerdictLine(text, worst)
+    return _line(text, worst)
 
 
-class Remark(NamedTuple):
-    """One sentence."""
-
-    text: str
-    severe: bool = False
-    """Whether a guarantee was broken."""
-    neutral: bool = False
-    """Whether it only reports what the user requested: a change of settings."""
-
-
-def remarks(summary: RunSummary) -> Iterator[Remark]:
+def remarks(summary: RunSummary) -> Iterator[Sentence]:
     """Yield the remarks on one loop, the severe ones first; none if all went well."""
     (loop,) = summary.loops
     reason = guarantee_of(loop).why
@@ -368,15 +347,25 @@ def remarks(summary: RunSummary) -> Iterator[Remark]:
         where = f"from t = {violation.t_s:.3f} s on ({source})"
         what = violation.what + worst_time(violation.t_s, violation.worst_at_s)
         severe = violation.cause not in CAUSES  # the guarantee, or a change
-        yield Remark(f"assumption violated {where}: {what}", severe=severe)
+        text = f"assumption violated {where}: {what}"
+        yield _severe(text) if severe else _warning(text)
     if (more := len(violations) - _MOST_VIOLATIONS) > 0:
         plural = "s" if more > 1 else ""
-        yield Remark(f"{more} more violation{plural} of an assumption", severe=True)
+        yield _severe(f"{more} more violation{plural} of an assumption")
     if loop.replay is not None and loop.replay.bit_exact is False:
-        yield Remark("the replay of the run differs from its record", severe=True)
-    yield from map(Remark, _warnings(summary, loop))
+        yield _severe("the replay of the run differs from its record")
+    yield from map(_warning, _warnings(summary, loop))
     for interval, change in changes_in(loop.changes):
-        yield Remark(f"{interval}: {change}", neutral=True)
+        yield Sentence(text=f"{interval}: {change}", role=Role.REMARK)
+
+
+def _severe(text: str) -> Sentence:
+    """Return a remark about a guarantee that was broken."""
+    return Sentence(text=text, tone=Tone.BAD, role=Role.REMARK)
+
+
+def _warning(text: str) -> Sentence:
+    return Sentence(text=text, lead="warning:", tone=Tone.DOUBTFUL, role=Role.REMARK)
 
 
 def _has_clocks(loop: LoopSummary) -> bool:

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from rich.console import Console
 
 from cosim.analysis.summary.summary_model import IdealLoopPart, LoopSummary, RunSummary
 from cosim.live.finalize import reopen
+from cosim.output.document import Block, Document, Sentence
 from cosim.output.figures import palette
 from cosim.output.figures.axes_parts import (
     draw_line,
@@ -24,10 +24,10 @@ from cosim.output.figures.axes_parts import (
 )
 from cosim.output.figures.page_figure import PageFigure
 from cosim.output.figures.panels import Panels
-from cosim.output.result_tables import ResultTable, terminal_table
+from cosim.output.result_tables import ResultTable
 from cosim.output.run_tables import caps_text
 from cosim.record.align import Reals, Times, align_tables
-from cosim.record.run_directory import chosen_run, write_output
+from cosim.record.run_directory import chosen_run
 from cosim.record.run_record import RunRecord, load_record
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, shortened
@@ -136,7 +136,7 @@ class RunComparison:
             MachineError: the file cannot be written.
         """
         from cosim.output.figures.figure_files import FIGURE_SUFFIXES, save_figure  # they import matplotlib
-        from cosim.output.page_kit import templates
+        from cosim.output.page_kit import save_page
 
         path = Path(path)
         if path.suffix in FIGURE_SUFFIXES:
@@ -147,8 +147,20 @@ class RunComparison:
             raise CallerError(f"{path}: a comparison is written as .html, {suffixes}")
         if width is not None:
             raise CallerError(f"{path}: a page has its own width; --width is that of a figure")
-        template = templates(Path(__file__).parent).get_template("overlay.html.jinja")
-        write_output(path, template.render(comparison=self, figure=overlay_figure(self.runs)))
+        save_page(self.document, path)
+
+    @property
+    def document(self) -> Document:
+        """Runs, their key numbers, the settings that differ, and the figure."""
+        labels = [run.label for run in self.runs]
+        blocks: list[Block] = [
+            *(Sentence(lead=run.label, text=f" {run.title}  {run.directory}") for run in self.runs),
+            overlay_figure(self.runs),
+            ResultTable("numbers", "key numbers (in brackets: difference to A)", ("", *labels), self.rows),
+        ]
+        if self.settings:
+            blocks.append(ResultTable("settings", "settings that differ", ("", *labels), self.setting_rows))
+        return Document(title=f"{len(self.runs)} runs compared", data=self.to_json(), blocks=blocks)
 
     def to_json(self) -> dict[str, object]:
         """Return the comparison without the figure, for programs."""
@@ -344,18 +356,3 @@ def _draw_events(figure: "Figure", runs: Sequence[ComparedRun]) -> "Axes":
     axes.set(title="Transmissions (bar: delivered, cross: lost)", ylim=(-0.6, len(runs) - 0.4))
     axes.grid(visible=False, axis="y")
     return axes
-
-
-def print_comparison(console: Console, comparison: RunComparison, overlay: Path) -> None:
-    """Print the runs, their key numbers, the settings that differ, and the file of the overlay."""
-    for run in comparison.runs:
-        line = f"{run.label}  {run.title}  {run.directory}"
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
-    labels = [run.label for run in comparison.runs]
-    tables = {"key numbers (in brackets: difference to A)": comparison.rows}
-    if comparison.settings:
-        tables["settings that differ"] = comparison.setting_rows
-    for title, rows in tables.items():
-        table = ResultTable("", title, ("", *labels), rows)
-        console.print(terminal_table(table))
-    console.print(f"overlay: {overlay}", markup=False, highlight=False, soft_wrap=True)

@@ -11,7 +11,7 @@ from typer import Option
 
 from cosim.cli import options as opt
 from cosim.cli.options import CAMPAIGNS, examples
-from cosim.cli.printing import console, print_json
+from cosim.cli.printing import show_written
 from cosim.output.figures.figure_format import requested_files
 from cosim.record.run_directory import DEFAULT_RUNS
 from noack.core.errors import CallerError, ExitStatus
@@ -157,6 +157,7 @@ def design(
     from cosim.cli.cost_weights import cost_weights
     from cosim.cli.execute_run import warn_of_left_out
     from cosim.live.monitoring.progress import work_bar
+    from cosim.output.page_kit import save_page
     from cosim.record.run_directory import write_output
     from cosim.studies.design import design_page, design_search
     from cosim.studies.design.design_outcome import design_for_network
@@ -187,14 +188,11 @@ def design(
         with work_bar("trying gains", lines=True) as bar:
             outcome = design_for_network(loaded, request, bar)
         page = page or DEFAULT_RUNS / "design" / f"{loaded.name}-network.html"
-        written = design_page.write_outcome(outcome, page, figure_files)
+        document = design_page.loop_document(outcome)
+        written = save_page(document, page, figure_files)
         if out is not None and outcome.is_certified:
             written.append(write_output(out, outcome.scenario_toml()))
-        if json:
-            print_json(outcome.to_json() | {"files": [str(file) for file in written]})
-        else:
-            design_page.print_loop_design(console(), outcome)
-            print(*written, sep="\n")
+        show_written(document, written, json=json)
         return ExitStatus.OK if outcome.is_certified else ExitStatus.FAILED
 
     for option, value in (("period", period), ("most", most), ("cost", cost), ("effort", effort)):
@@ -221,14 +219,11 @@ def design(
     with work_bar("trying candidates", lines=True) as bar:
         result = design_search.design(families, limits, draws=draws, seed=seed, progress=bar)
     page = page or DEFAULT_RUNS / "design" / f"{loaded.name}.html"
-    written = design_page.write_page(result, page, figure_files)
+    document = design_page.trigger_document(result)
+    written = save_page(document, page, figure_files)
     if out is not None and result.feasible:
         written.append(write_output(out, dumps(result.scenario)))
-    if json:
-        print_json(result.to_json() | {"files": [str(file) for file in written]})
-    else:
-        design_page.print_trigger_design(console(), result)
-        print(*written, sep="\n")
+    show_written(document, written, json=json)
     if not result.confirmed:
         print_to_stderr(f"noack: {result.verdict()}")
     return ExitStatus.OK if result.confirmed else ExitStatus.FAILED

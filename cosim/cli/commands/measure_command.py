@@ -11,7 +11,7 @@ from typer import Argument, Option
 
 from cosim.cli import options as opt
 from cosim.cli.options import MEASURING, examples
-from cosim.cli.printing import console, print_json
+from cosim.cli.printing import show
 from cosim.output.figures.figure_format import requested_files
 from noack.core.errors import CallerError
 
@@ -146,7 +146,7 @@ def measure(
     Takes some seconds.
     """
     from cosim.measurement.loss_bursts import WINDOWS
-    from cosim.measurement.measurement_outputs import OutputRequest, report
+    from cosim.measurement.measurement_outputs import OutputRequest, write_outputs
     from cosim.measurement.network_measurement import QUANTILES, MeasurementOptions, NetworkMeasurement
     from cosim.measurement.trace_sources import SourceOptions, read_source
     from noack.traces.packet_trace import find_trace
@@ -168,9 +168,10 @@ def measure(
     reading = SourceOptions(differ, flow, far_flow, sequence_at, _period_ns(rate))
     trace = read_source([*map(find_trace, sources)], reading)
     measurement = NetworkMeasurement(trace, options, " ".join(sources), trace.notes)
-    document = report(measurement, request, None if json else console())
-    if json:
-        print_json(document)
+    document, written = write_outputs(measurement, request)
+    show(document, json=json, written=[str(path) for path in written])
+    if not json:
+        print(*(f"written: {path}" for path in written), sep="\n", end="\n" * bool(written))
 
 
 def _period_ns(rate: str) -> int:

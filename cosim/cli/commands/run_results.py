@@ -9,7 +9,7 @@ from typer import Argument, Option
 
 from cosim.cli import options as opt
 from cosim.cli.options import RUNS, examples
-from cosim.cli.printing import console, print_json, print_lines, status, write_tables
+from cosim.cli.printing import console, print_json, print_lines, show, status, write_tables
 from cosim.output.figures.figure_format import requested_files
 from cosim.record.run_directory import (
     DEFAULT_RUNS,
@@ -104,8 +104,8 @@ def summary(
     from cosim.analysis.summary.run_summary import outcome_of_loop
     from cosim.cli.execute_run import reopen_run
     from cosim.live.finalize import reopen
+    from cosim.output.run_document import run_document
     from cosim.output.run_tables import summary_tables
-    from cosim.output.terminal_output import print_outcome
     from cosim.record.added_rows import add_rows
     from cosim.record.run_record import load_run
 
@@ -116,10 +116,7 @@ def summary(
         outcome = replace(merged, run_dir=path)
         print_to_stderr(f"noack: {file}: added what the {role} kept")
     outcome = outcome_of_loop(outcome, loop)
-    if json:
-        print_json(outcome.summary.to_json())
-    else:
-        print_outcome(console(), outcome, verbose=verbose)
+    show(run_document(outcome, verbose=verbose), json=json)
     write_tables(summary_tables(outcome.summary), tables, json=json)
     try:
         load_run(path)
@@ -194,15 +191,14 @@ def compare(
 
     Takes about a second.
     """
-    from cosim.studies.run_comparison import compare_runs, print_comparison
+    from cosim.studies.run_comparison import compare_runs
 
     with status("comparing"):
         comparison = compare_runs(directories)
         comparison.save(out, width)
-    if json:
-        print_json(comparison.to_json() | {"overlay": str(out)})
-    else:
-        print_comparison(console(), comparison, out)
+    show(comparison.document, json=json, overlay=str(out))
+    if not json:
+        print(f"overlay: {out}")
 
 
 @app.command(

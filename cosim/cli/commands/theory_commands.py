@@ -9,7 +9,7 @@ from typer import Option
 
 from cosim.cli import options as opt
 from cosim.cli.options import THEORY, examples
-from cosim.cli.printing import console, print_json, status, status_of, write_tables
+from cosim.cli.printing import console, print_json, show, status, status_of, write_tables
 from cosim.output.requirement import Requirement
 from cosim.record.run_directory import DEFAULT_RUNS
 from noack.core.errors import CallerError, ExitStatus
@@ -303,7 +303,7 @@ def margin(
     Takes some seconds; minutes where the times of events vary, as with a deadline.
     """
     from cosim.analysis.margin_search import find_margin
-    from cosim.output.certificate_report import margin_tables, print_margin
+    from cosim.output.certificate_report import margin_document
     from cosim.record.run_directory import write_output
     from noack.scenario.resolution import resolve
 
@@ -321,11 +321,7 @@ def margin(
             effort=effort,
             progress=lambda text: change(f"examining {text}"),
         )
-    if json:
-        print_json(result.to_json())
-    else:
-        print_margin(console(), result)
-    write_tables(margin_tables(result), tables, json=json)
+    show(margin_document(result), json=json, tables=tables)
     if witness is not None and result.proof is not None and result.proof.documents:
         write_output(witness, result.proof.file_text())
     if stops:  # the results so far are shown
@@ -375,16 +371,12 @@ def cost(
     """
     from cosim.analysis.mean_cost import find_mean_cost
     from cosim.cli.cost_weights import given_weight
-    from cosim.output.certificate_report import mean_cost_tables, print_mean_cost
+    from cosim.output.certificate_report import mean_cost_document
     from noack.scenario.resolution import resolve
 
     resolved = resolve(opt.load_loop(scenario, settings, loop, network))
     costs = find_mean_cost(resolved, given_weight(Q), given_weight(R))
-    if json:
-        print_json(costs.to_json())
-    else:
-        print_mean_cost(console(), costs)
-    write_tables(mean_cost_tables(costs), tables, json=json)
+    show(mean_cost_document(costs), json=json, tables=tables)
     guaranteed = costs.with_guarantee
     bounded = not isinstance(guaranteed, str) and not guaranteed.grows
     return ExitStatus.OK if bounded else ExitStatus.FAILED

@@ -1,24 +1,19 @@
-"""The output of a design: one page (HTML) with figure and tables, and a table for a terminal.
+"""The result of a design as a document.
 
 A design is of a trigger (:class:`~cosim.studies.design.design_search.DesignResult`) or of a loop
 for a network (:class:`~cosim.studies.design.design_outcome.DesignOutcome`).
 """
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from rich.console import Console
 
 from cosim.output.curves import DASHED
+from cosim.output.document import Block, Document, Folded, Heading, Role, Sentence
 from cosim.output.figures import palette
 from cosim.output.figures.axes_parts import MARKERS, draw_line, draw_points, label_text, rgb, series_colour
-from cosim.output.figures.figure_files import save_figures
-from cosim.output.figures.figure_format import FigureFiles
 from cosim.output.figures.page_figure import PageFigure, one_panel
-from cosim.output.page_kit import templates
-from cosim.output.result_tables import ResultTable, terminal_table
-from cosim.record.run_directory import write_output
+from cosim.output.result_tables import ResultTable, Tone
 from cosim.studies.design.design_outcome import HEIGHT_IN, DesignOutcome
 from cosim.studies.design.design_search import WORDS, DesignResult, certified
 from noack.core.number_format import plus_minus
@@ -32,45 +27,66 @@ _CAPTION = (
     "same draws. Candidates that settle too rarely to have a quantile are left out. The star is "
     "the chosen candidate on new draws."
 )
-_FRONT_CAPTION = "The trade-off curve; intervals have 95 % confidence, not corrected for the selection"
 _MOST_ROWS = 20
 HEADINGS = ("transmissions", "settling time", "α [1/s]", "β", "weight", "gain")
 _LOOP_HEADINGS = ("", "given", "designed")
 
 
-def _write(path: Path, figure: PageFigure, figure_files: FigureFiles | None, **content: object) -> list[Path]:
-    template = templates(Path(__file__).parent).get_template("design.html.jinja")
-    html = template.render(figure=figure, **content)
-    return [write_output(path, html), *save_figures([figure], path, figure_files)]
-
-
-def write_page(result: DesignResult, path: Path, figure_files: FigureFiles | None = None) -> list[Path]:
-    """Write page and figure; return the files. All text except the figure is escaped.
-
-    Raises:
-        MachineError: they cannot be written.
-    """
+def trigger_document(result: DesignResult) -> Document:
+    """Return the trade-off curve, the chosen candidate, and what is certified for it."""
     limits, bounds = result.limits, result.bounds or {}
-    tone = "doubt" if result.feasible else "bad"
-    return _write(
-        path,
-        trade_off(result),
-        figure_files,
+    tone = Tone.DOUBTFUL if result.feasible else Tone.BAD
+    all_rows = rows(result)
+    step = max(-(-len(all_rows) // _MOST_ROWS), 1)
+    shown = {i for i in range(len(all_rows)) if i % step == 0 or result.front[i] is result.best}
+    blocks: list[Block] = [Heading("Trade-off"), trade_off(result)]
+    if all_rows:
+        title = f"{result.name}: trade-off, intervals with 95 % confidence, not corrected for the selection"
+        more = f"{len(shown)} of {len(all_rows)} rows; the page has all" if len(shown) < len(all_rows) else ""
+        last = len(HEADINGS)
+        blocks.append(
+            ResultTable("design", title, HEADINGS, all_rows, 0, (last - 2, last - 1), shown=shown, more=more)
+        )
+    blocks += [
+        Sentence(
+            text=f"required: {100 * limits.quantile:g} % of draws settle to {limits.settle:g} ‖x(0)‖ "
+            f"within {limits.settling_s:g} s",
+            role=Role.REMARK,
+        ),
+        *(
+            Sentence(text=f"required: {WORDS[name]} ≤ {limit:g}, certified", role=Role.REMARK)
+            for name, limit in limits.bounds.items()
+        ),
+        # The command writes on standard error that no candidate is feasible.
+        Sentence(
+            text=result.verdict(),
+            role=Role.VERDICT,
+            tone=Tone.GOOD if result.confirmed else tone,
+            on_terminal=result.feasible,
+        ),
+    ]
+    if result.feasible:
+        blocks.append(
+            Sentence(
+                text=f"chosen among {len(result.trials):,} candidates on {result.best.measured.draws:,} "
+                f"draws; the numbers are from {result.fresh.draws:,} other draws",
+                role=Role.REMARK,
+            )
+        )
+    if bounds:
+        texts = ", ".join(certified(name, value) for name, value in bounds.items())
+        blocks.append(Sentence(text=f"certified {result.conditions}: {texts}", role=Role.REMARK))
+    return Document(
         title=result.name,
         kind="design",
         subtitle=f"{len(result.trials):,} candidates, {result.fresh.draws:,} draws, seed {result.seed}",
-        verdict=result.verdict(),
-        tone="good" if result.confirmed else tone,
-        notes=[
-            f"required: {100 * limits.quantile:g} % of draws settle to {limits.settle:g} ‖x(0)‖ "
-            f"within {limits.settling_s:g} s",
-            *(f"required: {WORDS[name]} ≤ {limit:g}, certified" for name, limit in limits.bounds.items()),
-            *(f"certified {result.conditions}: {certified(*bound)}" for bound in bounds.items()),
-        ],
-        heading="Trade-off",
-        tables=[(_FRONT_CAPTION, HEADINGS, rows(result), 0)],
-        scenario_toml=dumps(result.scenario),
+        data=result.to_json(),
+        blocks=[*blocks, *_scenario(dumps(result.scenario))],
     )
+
+
+def _scenario(toml: str) -> list[Block]:
+    return [Heading("The scenario"), Folded("TOML", toml)]
 
 
 def trade_off(result: DesignResult) -> PageFigure:
@@ -125,58 +141,25 @@ def rows(result: DesignResult) -> list[tuple[str, ...]]:
     ]
 
 
-def print_trigger_design(console: Console, result: DesignResult) -> None:
-    """Print the trade-off curve, thinned if it is long, and the verdict."""
-    all_rows = rows(result)
-    step = -(-len(all_rows) // _MOST_ROWS)
-    table_rows = [row for i, row in enumerate(all_rows) if i % step == 0 or result.front[i] is result.best]
-    title = f"{result.name}: trade-off, {len(table_rows)} of {len(all_rows)} rows"
-    if all_rows:
-        words = range(len(HEADINGS) - 2, len(HEADINGS))
-        console.print(terminal_table(ResultTable("design", title, HEADINGS, table_rows), left=words))
-    lines = []
-    if result.feasible:
-        lines = [
-            result.verdict(),
-            f"chosen among {len(result.trials):,} candidates on {result.best.measured.draws:,} "
-            f"draws; the numbers are from {result.fresh.draws:,} other draws",
-        ]
-    if result.bounds:
-        bounds = [certified(name, value) for name, value in result.bounds.items()]
-        lines.append(f"certified {result.conditions}: {', '.join(bounds)}")
-    for line in lines:
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
-
-
-def write_outcome(outcome: DesignOutcome, path: Path, figure_files: FigureFiles | None = None) -> list[Path]:
-    """Write page and figure; return the files.
-
-    Raises:
-        MachineError: they cannot be written.
-    """
-    return _write(
-        path,
-        outcome.figure,
-        figure_files,
+def loop_document(outcome: DesignOutcome) -> Document:
+    """Return the comparison of both loops, and the lines for the scenario."""
+    title = f"{outcome.name}: loops under the worst losses"
+    lines = f"for the scenario:\n{outcome.lines.rstrip()}"
+    return Document(
         title=outcome.name,
         kind="design for a network",
-        subtitle="",
-        verdict=outcome.verdict,
-        tone="good" if outcome.is_better else "doubt",
-        notes=outcome.notes,
-        heading="Worst losses",
-        tables=[("Both loops", _LOOP_HEADINGS, outcome.rows, 1)],
-        scenario_toml=outcome.scenario_toml(),
+        data=outcome.to_json(),
+        blocks=[
+            Heading("Worst losses"),
+            outcome.figure,
+            ResultTable("design", title, _LOOP_HEADINGS, outcome.rows, left=range(3)),
+            Sentence(
+                text=outcome.verdict,
+                role=Role.VERDICT,
+                tone=Tone.GOOD if outcome.is_better else Tone.DOUBTFUL,
+            ),
+            *(Sentence(text=note, role=Role.REMARK) for note in outcome.notes),
+            *([Sentence(text=lines, on_page=False)] if outcome.is_certified else []),
+            *_scenario(outcome.scenario_toml()),
+        ],
     )
-
-
-def print_loop_design(console: Console, outcome: DesignOutcome) -> None:
-    """Print the comparison, the verdict, and the lines for the scenario."""
-    title = f"{outcome.name}: loops under the worst losses"
-    table = ResultTable("design", title, _LOOP_HEADINGS, outcome.rows)
-    console.print(terminal_table(table, left=range(3)))
-    lines = [outcome.verdict, *outcome.notes]
-    if outcome.is_certified:
-        lines.append(f"for the scenario:\n{outcome.lines.rstrip()}")
-    for line in lines:
-        console.print(line, highlight=False, markup=False, soft_wrap=True)

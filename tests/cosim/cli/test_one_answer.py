@@ -8,7 +8,7 @@ import noack
 from cosim.analysis.certificates import answer_for
 from cosim.cli.options import load_scenario
 from cosim.cli.played_pattern import GROWN, until_it_shows
-from cosim.output.run_verdict import Tone
+from cosim.output.result_tables import Tone
 from tests.helpers.command_line import invoke
 
 

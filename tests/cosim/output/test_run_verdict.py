@@ -13,8 +13,9 @@ from cosim.analysis.summary.summary_model import Claim, ExitPart
 from cosim.live.finalize import finalize
 from cosim.output import run_verdict
 from cosim.output.page_kit import TERMS
+from cosim.output.result_tables import Tone
 from cosim.output.run_tables import run_title, short_numbers
-from cosim.output.run_verdict import SETTLED_SHARE, Tone, guarantee_of, remarks, state_text, verdict
+from cosim.output.run_verdict import SETTLED_SHARE, guarantee_of, remarks, state_text, verdict
 from cosim.record.divergence import GROWTH
 from cosim.simulation.virtual_time import simulate_run
 from noack.protocol.wire_format import Rejection
@@ -39,7 +40,8 @@ def test_the_second_line_states_whether_the_guarantee_was_kept(outcome: Outcome)
     def stated(line: str) -> list[str]:
         content = json.loads(line)
         content["claims"] = [claim(**changes) for changes in content["claims"]]
-        text, tone = verdict(with_values(outcome.summary, **content))[1]
+        line = verdict(with_values(outcome.summary, **content))[1]
+        text, tone = line.text, line.tone
         return [f"{tone}: {text}"]
 
     compare_lines(Path(__file__).with_name("approved") / "verdicts.txt", stated)
@@ -85,7 +87,7 @@ def test_the_verdict_of_several_loops_counts_them() -> None:
     loops[2] = loops[2].model_copy(update={"claims": [Claim(**claim("violated"))]})
     broken = verdict(summary.model_copy(update={"loops": loops}))[1]
     name = loops[2].name
-    assert broken == (
+    assert (broken.text, broken.tone) == (
         f"guarantee broken in 1 of 4 loops, since 1.000 s: {name}: violated: a",
         Tone.BAD,
     )

@@ -20,7 +20,8 @@ from cosim.analysis.summary.run_summary import Outcome, summarise_run
 from cosim.analysis.summary.summary_model import ExitPart, LoopSummary
 from cosim.live.finalize import reopen
 from cosim.live.recording.recorder import Recorder
-from cosim.output.terminal_output import print_outcome
+from cosim.output.run_document import run_document
+from cosim.output.terminal_writer import print_document
 from cosim.record.record_writing import write_run
 from cosim.record.rows import with_loop
 from cosim.record.run_directory import (
@@ -188,7 +189,7 @@ def _show(run_dir: Path) -> None:
         outcome = reopen(run_dir)
     changed_since(run_dir)
     if outcome.summary is not None:
-        print_outcome(Console(file=io.StringIO(), width=80), outcome)
+        print_document(Console(file=io.StringIO(), width=80), run_document(outcome))
 
 
 def _read(run_dir: Path) -> None:

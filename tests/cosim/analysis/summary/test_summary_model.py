@@ -16,8 +16,9 @@ import noack
 from cosim.analysis.summary.run_summary import Outcome
 from cosim.analysis.summary.summary_model import LoopSummary, NetworkPart, RunSummary, read_summary
 from cosim.output.report_page import Report, page
+from cosim.output.run_document import run_document
 from cosim.output.run_tables import key_numbers
-from cosim.output.terminal_output import print_outcome
+from cosim.output.terminal_writer import print_document
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import ExitStatus
@@ -113,7 +114,7 @@ def changed(summary: dict[str, Any], place: tuple[Any, ...], value: Any) -> dict
 def show(record: RunRecord, summary: RunSummary) -> None:
     """Every function that reads a summary."""
     outcome = Outcome(Path("run"), ExitStatus.OK, "horizon", summary)
-    print_outcome(Console(file=io.StringIO()), outcome)
+    print_document(Console(file=io.StringIO()), run_document(outcome))
     page(Report(summary, record.scenario, 0))
     run = noack.Run(outcome.run_dir, lambda: outcome)
     assert repr(run)

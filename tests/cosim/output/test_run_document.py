@@ -12,7 +12,8 @@ import noack
 from cosim.analysis.summary.run_summary import Outcome
 from cosim.analysis.summary.summary_model import Claim
 from cosim.live.finalize import finalize, reopen
-from cosim.output.terminal_output import print_outcome
+from cosim.output.run_document import run_document
+from cosim.output.terminal_writer import print_document
 from cosim.simulation.virtual_time import simulate_run
 from tests.helpers.shipped import shipped
 from tests.helpers.summaries import claim, with_values
@@ -31,7 +32,8 @@ def printed(outcome: Outcome, *, verbose: bool = False, **changed: Any) -> str:
     """The output on a terminal of 80 columns, colours included."""
     file = io.StringIO()
     console = Console(file=file, width=80, force_terminal=True, color_system="standard")
-    print_outcome(console, replace(outcome, summary=with_values(outcome.summary, **changed)), verbose=verbose)
+    changed_outcome = replace(outcome, summary=with_values(outcome.summary, **changed))
+    print_document(console, run_document(changed_outcome, verbose=verbose))
     return file.getvalue()
 
 
@@ -56,7 +58,7 @@ def test_reasons_of_several_loops_that_differ_only_in_numbers_are_one_line(tmp_p
         for loop, why in zip(outcome.summary.loops, reasons, strict=True)
     ]
     summary = outcome.summary.model_copy(update={"loops": loops})
-    print_outcome(Console(file=(file := io.StringIO())), replace(outcome, summary=summary))
+    print_document(Console(file=(file := io.StringIO())), run_document(replace(outcome, summary=summary)))
     assert [line for line in file.getvalue().splitlines() if line.startswith("void: ")] == [
         "void: gain 1.5 to 2.25, not below 1 (3 loops)",
         f"void: an input was old ({loops[0].name})",
@@ -66,7 +68,7 @@ def test_reasons_of_several_loops_that_differ_only_in_numbers_are_one_line(tmp_p
 def test_one_more_loop_has_no_plural(outcome: Outcome) -> None:
     loops = [outcome.summary.loops[0].model_copy(update={"name": f"loop-{i}"}) for i in range(13)]
     summary = outcome.summary.model_copy(update={"loops": loops})
-    print_outcome(Console(file=(file := io.StringIO())), replace(outcome, summary=summary))
+    print_document(Console(file=(file := io.StringIO())), run_document(replace(outcome, summary=summary)))
     assert "and 1 more loop: --verbose shows all" in file.getvalue()
 
 

@@ -1,6 +1,6 @@
-"""Terminal output about a run: its verdict and key numbers, or all tables; what is wrong; its files.
+"""A run as a document: its verdict and key numbers, or all tables; what is wrong; its files.
 
-:func:`print_outcome` prints the texts of ``run_verdict.py`` with the tables of ``run_tables.py``.
+:func:`run_document` has the texts of ``run_verdict.py`` and the tables of ``run_tables.py``.
 """
 
 import re
@@ -11,14 +11,10 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
-from rich.text import Text
-
 from cosim.analysis.summary.run_summary import Outcome
 from cosim.analysis.summary.summary_model import AssumptionPart, Claim, LoopSummary, RunSummary
-from cosim.output.result_tables import KEY_VALUE, ResultTable, terminal_table
+from cosim.output.document import Block, Document, Role, Sentence
+from cosim.output.result_tables import KEY_VALUE, ResultTable, Tone
 from cosim.output.run_tables import (
     LOOPS_CAPTION,
     badness,
@@ -29,20 +25,16 @@ from cosim.output.run_tables import (
     short_numbers,
     summary_tables,
 )
-from cosim.output.run_verdict import Tone, VerdictLine, remarks, verdict
+from cosim.output.run_verdict import remarks, verdict
 from cosim.record.run_directory import RECORDING_FILE, REPORT_FILE, file_of_loop
 from noack.core.number_format import counted
 from noack.theory.certificates.assumptions import Assumption, AssumptionStatus
 
-_GOOD, _DOUBTFUL, _BAD = "green", "yellow", "bold red"
-_TONE_STYLES = {Tone.GOOD: _GOOD, Tone.DOUBTFUL: _DOUBTFUL, Tone.BAD: _BAD, Tone.NEUTRAL: ""}
-_CLAIM_STYLES = {"held": _GOOD, "violated": _BAD, "void": _DOUBTFUL, "not applicable": "dim"}
-_ASSUMPTION_STYLES: dict[str, str] = {
-    AssumptionStatus.HOLDS: "green",
-    AssumptionStatus.VIOLATED: "bold yellow",
-    AssumptionStatus.IDEALISED: "dim",
-    AssumptionStatus.NOT_NEEDED: "dim",
-    AssumptionStatus.ASSUMED: "cyan",
+_ASSUMPTION_TONES: dict[str, Tone] = {
+    AssumptionStatus.HOLDS: Tone.GOOD,
+    AssumptionStatus.VIOLATED: Tone.DOUBTFUL,
+    AssumptionStatus.IDEALISED: Tone.QUIET,
+    AssumptionStatus.NOT_NEEDED: Tone.QUIET,
 }
 _MOST_LOOPS, _MOST_REASONS = 12, 3
 """Loops in the table, and reasons below it, without --verbose."""
@@ -50,74 +42,53 @@ _NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 """A number in a reason."""
 
 
-def print_outcome(console: Console, outcome: Outcome, *, verbose: bool = False) -> None:
-    """Print the verdict, the key numbers, the remarks, and where to find more.
+def run_document(outcome: Outcome, *, verbose: bool = False) -> Document:
+    """Return the verdict, the key numbers, the remarks, and where to find more.
 
     Args:
-        console: console for the output.
         outcome: outcome of the run, or of one of its loops.
-        verbose: print all tables instead of the key numbers.
+        verbose: with all tables instead of the key numbers.
     """
     summary = outcome.summary
-    for line in verdict(summary):
-        print_line(console, line)
     if shares_network(summary):
-        _print_loops(console, summary, verbose=verbose)
+        blocks = _loops(summary, verbose=verbose)
     else:
-        _print_loop(console, summary, verbose=verbose)
-    for where in _where(outcome, verbose=verbose):
-        console.print(where, highlight=False, soft_wrap=True, markup=False)
+        numbers = ResultTable("numbers", run_title(summary), KEY_VALUE, short_numbers(summary))
+        blocks = [*(_details(summary) if verbose else [numbers]), *remarks(summary)]
+    where = (Sentence(text=line) for line in _where(outcome, verbose=verbose))
+    data = summary.to_json()
+    return Document(title=run_title(summary), data=data, blocks=[*verdict(summary), *blocks, *where])
 
 
-def print_line(console: Console, line: VerdictLine) -> None:
-    """Print a line of a verdict."""
-    console.print(Text(line.text, _TONE_STYLES[line.tone]), soft_wrap=True)
-
-
-def _print_loop(console: Console, summary: RunSummary, *, verbose: bool) -> None:
-    if verbose:
-        _print_details(console, summary)
-    else:
-        print_numbers(console, run_title(summary), short_numbers(summary))
-    for remark in remarks(summary):
-        start = "" if remark.neutral else "[bold yellow]warning:[/] "
-        start = f"[{_BAD}]" if remark.severe else start
-        console.print(start + escape(remark.text), highlight=False, soft_wrap=True)
-
-
-def print_numbers(console: Console, title: str, rows: Sequence[tuple[str, str]]) -> None:
-    """Print quantities and their values."""
-    console.print(terminal_table(ResultTable("numbers", title, KEY_VALUE, rows)))
-
-
-def _print_details(console: Console, summary: RunSummary) -> None:
-    """Print everything that the summary of one loop has: numbers, timing, assumptions, claims."""
+def _details(summary: RunSummary) -> list[Block]:
+    """Return everything that the summary of one loop has: numbers, timing, assumptions, claims."""
     (loop,), tables = summary.loops, {table.name: table for table in summary_tables(summary)}
-    console.print(terminal_table(tables["numbers"]))
+    blocks: list[Block] = [tables["numbers"]]
     if "timing" in tables:
-        console.print(terminal_table(tables["timing"]))
-        _print_realtime(console, loop.realtime)
-    console.print("the paper's assumptions for this scenario:")
-    print_assumptions(console, loop.assumptions)
+        blocks += [tables["timing"], *_realtime(loop.realtime)]
+    blocks += [
+        Sentence(text="the paper's assumptions for this scenario:"), assumption_table(loop.assumptions)
+    ]  # fmt: skip
     if "claims" in tables:
-        _print_claims(console, tables["claims"], loop.claims)
-    if "schedule" in tables:
-        console.print(terminal_table(tables["schedule"]))
+        blocks += [tables["claims"], *_notes_on_claims(loop.claims)]
+    return [*blocks, *([tables["schedule"]] if "schedule" in tables else [])]
 
 
-def _print_loops(console: Console, summary: RunSummary, *, verbose: bool) -> None:
-    """Print the network and the loops; without ``verbose`` the worst only."""
-    for line in _void_lines(summary.loops):
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
-    print_numbers(console, f"network of {run_title(summary)}", network_rows(summary))
+def _loops(summary: RunSummary, *, verbose: bool) -> list[Block]:
+    """Return the network and the loops; without ``verbose`` the worst only."""
     loops, title = summary.loops, f"{len(summary.loops)} loops"
     if not verbose and len(loops) > _MOST_LOOPS:
         loops = sorted(loops, key=badness, reverse=True)[:_MOST_LOOPS]
         title += ", the worst first"
-    console.print(terminal_table(loops_table(loops, title), dense=True))
-    console.print(LOOPS_CAPTION, style="table.caption")
-    if more := len(summary.loops) - len(loops):
-        console.print(f"and {counted(more, 'more loop')}: --verbose shows all")
+    more = len(summary.loops) - len(loops)
+    more_text = f"and {counted(more, 'more loop')}: --verbose shows all"
+    return [
+        *(Sentence(text=line) for line in _void_lines(summary.loops)),
+        ResultTable("network", f"network of {run_title(summary)}", KEY_VALUE, network_rows(summary)),
+        loops_table(loops, title)._replace(is_dense=True),
+        Sentence(text=LOOPS_CAPTION, role=Role.NOTE),
+        *([Sentence(text=more_text)] if more else []),
+    ]
 
 
 def _void_lines(loops: Sequence[LoopSummary]) -> list[str]:
@@ -153,29 +124,27 @@ def _with_ranges(texts: Sequence[str]) -> str:
     return _NUMBER.sub(lambda _: next(following), texts[0])
 
 
-def _print_claims(console: Console, table: ResultTable, claims: Sequence[Claim]) -> None:
-    """Print the claims about a loop and their verdicts."""
-    left = [i for i, heading in enumerate(table.headings) if heading != "share used"]
-    console.print(terminal_table(table, left=left, styles=_CLAIM_STYLES))
+def _notes_on_claims(claims: Sequence[Claim]) -> Iterator[Sentence]:
+    """Yield what the words of the table of claims mean, and why claims did not hold."""
     if any(claim.ratio is not None for claim in claims):
-        console.print(
-            "[dim]share used: largest share of the bound reached during the run; a bound "
+        yield Sentence(
+            role=Role.NOTE,
+            text="share used: largest share of the bound reached during the run; a bound "
             "computed from the run itself is reached by construction. ε: the trigger's floor; t_k: "
             "the k-th event; H = Â + B̂K, or 0 with a hold; β̃: bound of the sensor's error; W: "
             "trigger.weight. Sources: (I1) and "
-            "certificates, docs/theory.md; eq:... and theorems, the paper[/]"
+            "certificates, docs/theory.md; eq:... and theorems, the paper",
         )
     sources: dict[tuple[str, str], list[str]] = {}
     for claim in claims:
         if claim.verdict != "held" and claim.why:
             sources.setdefault((claim.verdict, claim.why), []).append(claim.origin)
     for (word, reason), claim_sources in sources.items():
-        text = f"{word}: {'; '.join(dict.fromkeys(claim_sources))}: {reason}"
-        console.print(text, highlight=False, markup=False)
+        yield Sentence(text=f"{word}: {'; '.join(dict.fromkeys(claim_sources))}: {reason}")
 
 
-def _print_realtime(console: Console, realtime: dict[str, dict[str, str]]) -> None:
-    """Print one line for all processes with the same real-time settings."""
+def _realtime(realtime: dict[str, dict[str, str]]) -> Iterator[Sentence]:
+    """Yield one line for all processes with the same real-time settings."""
     roles_by_settings: dict[str, list[str]] = {}
     for role in sorted(realtime):
         verdicts = realtime[role]
@@ -185,17 +154,16 @@ def _print_realtime(console: Console, realtime: dict[str, dict[str, str]]) -> No
         roles_by_settings.setdefault(text, []).append(role)
     for text, roles in roles_by_settings.items():
         whose = "" if len(roles) == len(realtime) else f" of {', '.join(roles)}"
-        console.print(f"real-time settings{whose}: {text}", highlight=False, markup=False)
+        yield Sentence(text=f"real-time settings{whose}: {text}")
 
 
-def print_assumptions(console: Console, assumptions: Sequence[Assumption | AssumptionPart]) -> None:
-    """Print assumptions with their verdicts."""
-    table = Table.grid(padding=(0, 2))
+def assumption_table(assumptions: Sequence[Assumption | AssumptionPart]) -> ResultTable:
+    """Return assumptions with their verdicts."""
+    rows = []
     for assumption in assumptions:
         source = assumption.source if assumption.source.startswith("(") else f"({assumption.source})"
-        text = escape(f"{assumption.what} {source}: {assumption.why}")
-        table.add_row(Text(assumption.verdict, _ASSUMPTION_STYLES.get(assumption.verdict, "")), text)
-    console.print(table)
+        rows.append((str(assumption.verdict), f"{assumption.what} {source}: {assumption.why}"))
+    return ResultTable("", "", (), rows, tones=_ASSUMPTION_TONES)
 
 
 def _where(outcome: Outcome, *, verbose: bool) -> Iterator[str]:

@@ -1,0 +1,92 @@
+"""What an analysis found, as one document of sentences, tables and figures.
+
+Each analysis builds a :class:`Document`. :func:`cosim.output.terminal_writer.print_document` writes it
+on a terminal, :func:`cosim.output.page_kit.document_page` as a page; its JSON is ``data``, and
+:func:`cosim.output.result_tables.save_tables` writes its tables as CSV.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+from cosim.output.figures.page_figure import PageFigure
+from cosim.output.result_tables import ResultTable, Tone
+
+
+class Role(StrEnum):
+    """What a sentence is for; a page shows verdict and remarks in a box at its top."""
+
+    TEXT = "text"
+    VERDICT = "verdict"
+    REMARK = "remark"
+    NOTE = "note"
+    """Explains a table; it may be broken into lines."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sentence:
+    """A line of text."""
+
+    text: str
+    role: Role = Role.TEXT
+    tone: Tone = Tone.NEUTRAL
+    lead: str = ""
+    """First words of the line: they have the tone; without them, the text has it."""
+    on_terminal: bool = True
+    on_page: bool = True
+
+
+@dataclass(frozen=True)
+class Heading:
+    """Title of the following blocks of a page."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Folded:
+    """A long text that a page shows on request."""
+
+    title: str
+    text: str
+
+
+Block = Sentence | ResultTable | PageFigure | Heading | Folded
+
+
+@dataclass(frozen=True, kw_only=True)
+class Document:
+    """What an analysis found."""
+
+    title: str
+    kind: str = ""
+    """What it is, in the title of a page."""
+    subtitle: str = ""
+    description: str = ""
+    data: Mapping[str, object] = field(default_factory=dict)
+    """As JSON."""
+    blocks: Sequence[Block]
+    """In the order in which a terminal shows them."""
+
+    @property
+    def tables(self) -> list[ResultTable]:
+        """The tables that have files: those with a name."""
+        return [block for block in self.blocks if isinstance(block, ResultTable) and block.name]
+
+    @property
+    def figures(self) -> list[PageFigure]:
+        """The figures."""
+        return [block for block in self.blocks if isinstance(block, PageFigure)]
+
+    @property
+    def verdict(self) -> list[Sentence]:
+        """The lines of the verdict."""
+        return self._of_role(Role.VERDICT)
+
+    @property
+    def remarks(self) -> list[Sentence]:
+        """The remarks."""
+        return self._of_role(Role.REMARK)
+
+    def _of_role(self, role: Role) -> list[Sentence]:
+        return [block for block in self.blocks if isinstance(block, Sentence) and block.role == role]
