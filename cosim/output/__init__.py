@@ -1,6 +1,6 @@
 """Output for people: figures, tables, pages, the terminal, the viewer, and exports.
 
-A figure is described once and drawn by one renderer per medium (``figures``). Tables are
-rows of text (``result_tables``, ``run_tables``), and ``run_verdict`` has words about how a run went;
-``terminal_output`` prints both. ``page_kit`` has the templates of all pages.
+Each analysis builds a ``document`` of sentences, tables (``result_tables``) and figures
+(``figures``). ``terminal_writer`` prints it, ``page_kit`` makes a page of it. ``run_document`` is that of
+a run, with the rows of ``run_tables`` and the words of ``run_verdict``; ``report_page`` is its page.
 """

@@ -1,4 +1,4 @@
-"""What an analysis found, as one document of sentences, tables and figures.
+"""What an analysis found: a document of sentences, tables and figures.
 
 Each analysis builds a :class:`Document`. :func:`cosim.output.terminal_writer.print_document` writes it
 on a terminal, :func:`cosim.output.page_kit.document_page` as a page; its JSON is ``data``, and
