@@ -14,7 +14,7 @@ from cosim.measurement.loss_bursts import histogram, most_losses
 from cosim.measurement.network_measurement import NetworkMeasurement
 from cosim.measurement.network_section import Form, write_network
 from cosim.output.curves import DASHED
-from cosim.output.document import Document, Role, Sentence
+from cosim.output.document import Document, Sentence, SentenceRole
 from cosim.output.figures import palette
 from cosim.output.figures.axes_parts import draw_bars, draw_line, rgb, set_times, whole_numbers
 from cosim.output.figures.figure_format import FigureFiles
@@ -85,13 +85,16 @@ def measurement_document(measurement: NetworkMeasurement, void: CertificateTime 
             Sentence(text=measurement.name, on_page=False),
             *measurement_figures(measurement),
             *measurement_tables(measurement, void),
-            Sentence(text=f"M = {longest + 1}{also}", role=Role.VERDICT, on_terminal=False),
+            Sentence(text=f"M = {longest + 1}{also}", role=SentenceRole.VERDICT, on_terminal=False),
             Sentence(
                 text=f"{where} most M − 1 = {longest} consecutive packets were not effectively delivered.",
-                role=Role.REMARK,
+                role=SentenceRole.REMARK,
                 on_terminal=False,
             ),
-            *(Sentence(text=line, role=Role.REMARK) for line in (*measurement.remarks, *void_remarks(void))),
+            *(
+                Sentence(text=line, role=SentenceRole.REMARK)
+                for line in (*measurement.remarks, *void_remarks(void))
+            ),
         ],
     )
 

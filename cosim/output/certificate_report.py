@@ -15,7 +15,7 @@ from cosim.analysis.constant_rows import PROVEN, constant_rows, covered_plants
 from cosim.analysis.margin_search import MarginResult
 from cosim.analysis.mean_cost import CostUnder, MeanCost
 from cosim.analysis.tried_settings import TriedSettings
-from cosim.output.document import Block, Document, Role, Sentence
+from cosim.output.document import Block, Document, Sentence, SentenceRole
 from cosim.output.result_tables import ResultTable, Tone
 from cosim.output.run_document import assumption_table
 from cosim.output.terminal_writer import terminal_table
@@ -297,7 +297,7 @@ def margin_document(margin: MarginResult) -> Document:
         blocks=[
             *margin_tables(margin),
             *(Sentence(text=text) for text in (*texts, margin.random_text, *margin.certificate_texts)),
-            Sentence(text=note, role=Role.NOTE),
+            Sentence(text=note, role=SentenceRole.NOTE),
         ],
     )
 
@@ -341,7 +341,7 @@ def mean_cost_document(cost: MeanCost) -> Document:
         "Rms: stationary, what the loop tends to from any start, over time. Growth below 1: stable "
         "in mean square; z: the loop's state, x, x_c and the inputs in use."
     )
-    blocks.append(Sentence(text=note, role=Role.NOTE))
+    blocks.append(Sentence(text=note, role=SentenceRole.NOTE))
     return Document(title=cost.scenario, data=cost.to_json(), blocks=blocks)
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from cosim.output.document import Document, Role, Sentence
+from cosim.output.document import Document, Sentence, SentenceRole
 from cosim.output.result_tables import KEY_VALUE, ResultTable, Tone
 from cosim.output.run_tables import burst_row, interval_rows, lost_row, title_of
 from cosim.output.run_verdict import verdict_of_exact_run
@@ -33,7 +33,7 @@ def continuous_document(run: ContinuousRun, scenario: Scenario) -> Document:
         data=continuous.document(run, scenario),
         blocks=[
             *(
-                Sentence(text=line.text, tone=line.tone, role=Role.VERDICT)
+                Sentence(text=line.text, tone=line.tone, role=SentenceRole.VERDICT)
                 for line in verdict_of_exact_run(summary)
             ),
             ResultTable("numbers", title, KEY_VALUE, rows),

@@ -13,7 +13,7 @@ from cosim.output.figures.page_figure import PageFigure
 from cosim.output.result_tables import ResultTable, Tone
 
 
-class Role(StrEnum):
+class SentenceRole(StrEnum):
     """What a sentence is for; a page shows verdict and remarks in a box at its top."""
 
     TEXT = "text"
@@ -28,7 +28,7 @@ class Sentence:
     """A line of text."""
 
     text: str
-    role: Role = Role.TEXT
+    role: SentenceRole = SentenceRole.TEXT
     tone: Tone = Tone.NEUTRAL
     lead: str = ""
     """First words of the line: they have the tone; without them, the text has it."""
@@ -81,12 +81,12 @@ class Document:
     @property
     def verdict(self) -> list[Sentence]:
         """The lines of the verdict."""
-        return self._of_role(Role.VERDICT)
+        return self._of_role(SentenceRole.VERDICT)
 
     @property
     def remarks(self) -> list[Sentence]:
         """The remarks."""
-        return self._of_role(Role.REMARK)
+        return self._of_role(SentenceRole.REMARK)
 
-    def _of_role(self, role: Role) -> list[Sentence]:
+    def _of_role(self, role: SentenceRole) -> list[Sentence]:
         return [block for block in self.blocks if isinstance(block, Sentence) and block.role == role]

@@ -11,7 +11,7 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from cosim.output.document import Document, Role, Sentence
+from cosim.output.document import Document, Sentence, SentenceRole
 from cosim.output.figures.figure_files import inline, save_figures
 from cosim.output.figures.figure_format import FigureFiles
 from cosim.output.figures.page_figure import PageFigure
@@ -58,7 +58,7 @@ def document_page(document: Document) -> str:
     blocks = [
         (type(block).__name__, block)
         for block in document.blocks
-        if not (isinstance(block, Sentence) and (block.role != Role.TEXT or not block.on_page))
+        if not (isinstance(block, Sentence) and (block.role != SentenceRole.TEXT or not block.on_page))
     ]
     return templates().get_template("document.html.jinja").render(document=document, tone=tone, blocks=blocks)
 

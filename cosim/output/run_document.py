@@ -13,7 +13,7 @@ from pathlib import Path
 
 from cosim.analysis.summary.run_summary import Outcome
 from cosim.analysis.summary.summary_model import AssumptionPart, Claim, LoopSummary, RunSummary
-from cosim.output.document import Block, Document, Role, Sentence
+from cosim.output.document import Block, Document, Sentence, SentenceRole
 from cosim.output.result_tables import KEY_VALUE, ResultTable, Tone
 from cosim.output.run_tables import (
     LOOPS_CAPTION,
@@ -86,7 +86,7 @@ def _loops(summary: RunSummary, *, verbose: bool) -> list[Block]:
         *(Sentence(text=line) for line in _void_lines(summary.loops)),
         ResultTable("network", f"network of {run_title(summary)}", KEY_VALUE, network_rows(summary)),
         loops_table(loops, title)._replace(is_dense=True),
-        Sentence(text=LOOPS_CAPTION, role=Role.NOTE),
+        Sentence(text=LOOPS_CAPTION, role=SentenceRole.NOTE),
         *([Sentence(text=more_text)] if more else []),
     ]
 
@@ -128,7 +128,7 @@ def _notes_on_claims(claims: Sequence[Claim]) -> Iterator[Sentence]:
     """Yield what the words of the table of claims mean, and why claims did not hold."""
     if any(claim.ratio is not None for claim in claims):
         yield Sentence(
-            role=Role.NOTE,
+            role=SentenceRole.NOTE,
             text="share used: largest share of the bound reached during the run; a bound "
             "computed from the run itself is reached by construction. ε: the trigger's floor; t_k: "
             "the k-th event; H = Â + B̂K, or 0 with a hold; β̃: bound of the sensor's error; W: "

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from cosim.analysis.claims.observed_conditions import CAUSES, SCHEDULE, worst_time
 from cosim.analysis.summary.summary_model import Claim, ExitPart, IdealLoopPart, LoopSummary, RunSummary
-from cosim.output.document import Role, Sentence
+from cosim.output.document import Sentence, SentenceRole
 from cosim.output.result_tables import Tone
 from cosim.output.run_tables import changes_in, shares_network, state_norm
 from cosim.simulation.continuous import ContinuousSummary
@@ -57,7 +57,7 @@ _REJECTIONS: Mapping[str, str] = {
 
 
 def _line(text: str, tone: Tone) -> Sentence:
-    return Sentence(text=text, tone=tone, role=Role.VERDICT)
+    return Sentence(text=text, tone=tone, role=SentenceRole.VERDICT)
 
 
 def verdict(summary: RunSummary) -> tuple[Sentence, ...]:
@@ -356,16 +356,16 @@ def remarks(summary: RunSummary) -> Iterator[Sentence]:
         yield _severe("the replay of the run differs from its record")
     yield from map(_warning, _warnings(summary, loop))
     for interval, change in changes_in(loop.changes):
-        yield Sentence(text=f"{interval}: {change}", role=Role.REMARK)
+        yield Sentence(text=f"{interval}: {change}", role=SentenceRole.REMARK)
 
 
 def _severe(text: str) -> Sentence:
     """Return a remark about a guarantee that was broken."""
-    return Sentence(text=text, tone=Tone.BAD, role=Role.REMARK)
+    return Sentence(text=text, tone=Tone.BAD, role=SentenceRole.REMARK)
 
 
 def _warning(text: str) -> Sentence:
-    return Sentence(text=text, lead="warning:", tone=Tone.DOUBTFUL, role=Role.REMARK)
+    return Sentence(text=text, lead="warning:", tone=Tone.DOUBTFUL, role=SentenceRole.REMARK)
 
 
 def _has_clocks(loop: LoopSummary) -> bool:

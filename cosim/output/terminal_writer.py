@@ -6,7 +6,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from cosim.output.document import Document, Role, Sentence
+from cosim.output.document import Document, Sentence, SentenceRole
 from cosim.output.result_tables import ResultTable, Tone
 
 _STYLES = {
@@ -26,11 +26,11 @@ def print_document(console: Console, document: Document) -> None:
 
 
 def _print_sentence(console: Console, sentence: Sentence) -> None:
-    style = "dim" if sentence.role == Role.NOTE else _STYLES[sentence.tone]
+    style = "dim" if sentence.role == SentenceRole.NOTE else _STYLES[sentence.tone]
     line = Text(sentence.text, style)
     if sentence.lead:
         line = Text.assemble((sentence.lead, style), f" {sentence.text}")
-    console.print(line, highlight=False, soft_wrap=sentence.role != Role.NOTE)
+    console.print(line, highlight=False, soft_wrap=sentence.role != SentenceRole.NOTE)
 
 
 def terminal_table(table: ResultTable) -> Table:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cosim.output.curves import DASHED
-from cosim.output.document import Block, Document, Folded, Heading, Role, Sentence
+from cosim.output.document import Block, Document, Folded, Heading, Sentence, SentenceRole
 from cosim.output.figures import palette
 from cosim.output.figures.axes_parts import MARKERS, draw_line, draw_points, label_text, rgb, series_colour
 from cosim.output.figures.page_figure import PageFigure, one_panel
@@ -51,16 +51,16 @@ def trigger_document(result: DesignResult) -> Document:
         Sentence(
             text=f"required: {100 * limits.quantile:g} % of draws settle to {limits.settle:g} ‖x(0)‖ "
             f"within {limits.settling_s:g} s",
-            role=Role.REMARK,
+            role=SentenceRole.REMARK,
         ),
         *(
-            Sentence(text=f"required: {WORDS[name]} ≤ {limit:g}, certified", role=Role.REMARK)
+            Sentence(text=f"required: {WORDS[name]} ≤ {limit:g}, certified", role=SentenceRole.REMARK)
             for name, limit in limits.bounds.items()
         ),
         # The command writes on standard error that no candidate is feasible.
         Sentence(
             text=result.verdict(),
-            role=Role.VERDICT,
+            role=SentenceRole.VERDICT,
             tone=Tone.GOOD if result.confirmed else tone,
             on_terminal=result.feasible,
         ),
@@ -70,12 +70,12 @@ def trigger_document(result: DesignResult) -> Document:
             Sentence(
                 text=f"chosen among {len(result.trials):,} candidates on {result.best.measured.draws:,} "
                 f"draws; the numbers are from {result.fresh.draws:,} other draws",
-                role=Role.REMARK,
+                role=SentenceRole.REMARK,
             )
         )
     if bounds:
         texts = ", ".join(certified(name, value) for name, value in bounds.items())
-        blocks.append(Sentence(text=f"certified {result.conditions}: {texts}", role=Role.REMARK))
+        blocks.append(Sentence(text=f"certified {result.conditions}: {texts}", role=SentenceRole.REMARK))
     return Document(
         title=result.name,
         kind="design",
@@ -155,10 +155,10 @@ def loop_document(outcome: DesignOutcome) -> Document:
             ResultTable("design", title, _LOOP_HEADINGS, outcome.rows, left=range(3)),
             Sentence(
                 text=outcome.verdict,
-                role=Role.VERDICT,
+                role=SentenceRole.VERDICT,
                 tone=Tone.GOOD if outcome.is_better else Tone.DOUBTFUL,
             ),
-            *(Sentence(text=note, role=Role.REMARK) for note in outcome.notes),
+            *(Sentence(text=note, role=SentenceRole.REMARK) for note in outcome.notes),
             *([Sentence(text=lines, on_page=False)] if outcome.is_certified else []),
             *_scenario(outcome.scenario_toml()),
         ],
