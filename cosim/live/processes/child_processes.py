@@ -13,6 +13,7 @@ import contextlib
 import ctypes
 import gc
 import multiprocessing
+import multiprocessing.util
 import os
 import signal
 import sys
@@ -85,6 +86,8 @@ class ChildProcesses:
             import_module(_PRELOADED)
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # an inherited "ignore" hides exit statuses
         else:
+            # Python 3.11.0 would listen on an abstract socket, to which each user can connect.
+            multiprocessing.util.abstract_sockets_supported = False  # type: ignore[misc]
             self._context.set_forkserver_preload([_PRELOADED])
         for role in self._roles:
             try:

@@ -1,8 +1,11 @@
 """The processes of a run: forked from a command, or by Python's fork server; they end as others do."""
 
 import json
+import multiprocessing.forkserver
+import multiprocessing.util
 import os
 import signal
+import stat
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
@@ -156,6 +159,14 @@ def test_a_process_has_the_environment_and_the_folder_of_its_launcher(
 def test_a_process_that_cannot_be_started_is_an_error(tmp_path: Path, fork: bool) -> None:
     with pytest.raises(MachineError, match=r"^plant cannot be started: No such file"):
         ChildProcesses(tmp_path / "missing", ["plant"], fork=fork).start()
+
+
+def test_another_user_cannot_reach_the_fork_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(multiprocessing.util, "abstract_sockets_supported", True)
+    with started(tmp_path, "plant"):
+        address = multiprocessing.forkserver._forkserver._forkserver_address  # type: ignore[attr-defined]
+        assert stat.S_IMODE(Path(address).parent.stat().st_mode) == 0o700
+    assert not multiprocessing.util.abstract_sockets_supported
 
 
 def test_a_fork_server_that_cannot_be_started_is_an_error(tmp_path: Path) -> None:
