@@ -91,6 +91,10 @@ class CertifiedClaim:
     """What bounds it: proven or computed; None: it is computed always."""
     assumes: str = "the conditions of the certificate"
 
+    def find_for(self, certificate: ScenarioCertificate) -> Callable[[RunEvidence, Samples], ClaimBound]:
+        """Return the function that finds the bound of a certificate."""
+        return lambda run, samples: self.find(run, samples, certificate)
+
     def is_proven(self, certificate: ScenarioCertificate) -> bool:
         """Whether a certificate has proven this."""
         if self.constant == "inter_event":
@@ -406,3 +410,25 @@ def state_from_events(run: RunEvidence, samples: Samples, certificate: ScenarioC
         Bound(formula, t_s[here], shares, run.violation_of(certificate)),
         Envelope("bound, given x at the last event", "x", t_s, values),
     )
+
+
+CLAIMS = (
+    i1_controller_error,
+    i1_model_difference,
+    paper_error_bound,
+    theorem_1_controller_error,
+    theorem_2_inter_event_time,
+    theorem_2_state,
+)
+"""The claims that need no certificate, in the order in which they are shown."""
+CERTIFIED_CLAIMS = (
+    controller_error,
+    controller_error_from_events,
+    estimation_error,
+    inter_event_time,
+    sensor_error,
+    state,
+    region,
+    state_from_events,
+)
+"""The claims of a certificate, in the order in which they are shown."""

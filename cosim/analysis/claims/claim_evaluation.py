@@ -11,13 +11,12 @@ reached.
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property, lru_cache, partial
-from typing import NamedTuple, TypeVar
+from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
-from cosim.analysis.claims import claim_catalogue
-from cosim.analysis.claims.claim_catalogue import Bound, CertifiedClaim, ClaimBound, ClaimDefinition, Envelope
+from cosim.analysis.claims.claim_catalogue import CERTIFIED_CLAIMS, CLAIMS, Bound, ClaimBound, Envelope
 from cosim.analysis.claims.common_end import common_end_ns, up_to_common_end
 from cosim.analysis.claims.observed_conditions import AssumptionViolation, VoidFrom
 from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples
@@ -42,16 +41,6 @@ _ACKNOWLEDGED = (
     'network.protocol = "ack": x_s is reset when an update is acknowledged, and not at every '
     "event as (I1), and every claim that follows from it, assumes"
 )
-_Kind = TypeVar("_Kind", ClaimDefinition, CertifiedClaim)
-
-
-@cache
-def definitions(kind: type[_Kind]) -> list[_Kind]:
-    """Return the claims of a kind, in the order of the catalogue.
-
-    Certified claims are those of a certificate; the others need none.
-    """
-    return [claim for claim in vars(claim_catalogue).values() if isinstance(claim, kind)]
 
 
 def void_claim(claimed: str, source: str, why: str) -> Claim:
@@ -281,12 +270,11 @@ class RunClaims:
             if not certificate.exists:
                 continue
             outside = outside_box(run.record.scenario) if certificate.scope == BOX else None
-            for claim in definitions(CertifiedClaim):
+            for claim in CERTIFIED_CLAIMS:
                 proved = claim.is_proven(certificate)
                 check = ClaimCheck(claim.statement, certificate.source, run.until_s, proved=proved)
-                find = partial(claim.find, certificate=certificate)
-                yield _ClaimInstance(run, find, check, [], certificate, outside)
-        for definition in definitions(ClaimDefinition):
+                yield _ClaimInstance(run, claim.find_for(certificate), check, [], certificate, outside)
+        for definition in CLAIMS:
             unmet = _IDEAL_LOOP if definition.needs_ideal_loop else ""
             evidence, until_s = (self.evidence, math.inf) if definition.to_the_end else (run, run.until_s)
             check = ClaimCheck(definition.statement, definition.source, until_s, unmet)
