@@ -12,7 +12,7 @@ import numpy as np
 
 from noack.core.linear_systems import Vector
 from noack.theory.bounds.certificate_terms import TriggerBound
-from noack.theory.bounds.gains import Columns, Growth, Output, PlantGains
+from noack.theory.bounds.gains import Growth, PlantGains
 from noack.theory.bounds.stacked_norms import spectral_norm
 
 COARSE_CELLS = 64
@@ -39,7 +39,7 @@ class ErrorGrowth:
     ) -> None:
         outputs = plant.outputs
         self.ages_s = np.array([longest_s]) if ages_s is None else ages_s
-        self.mean_s, self.highest = float(self.ages_s.mean()), np.zeros(())
+        self.mean_s, self.highest = float(self.ages_s.mean()), 0.0
         self.longest_s, self.stretch = longest_s, plant.error.stretch(longest_s)
         self.fixed, self.shares, self.root_output = after.beta, after.shares, after.root_output
         # The trigger tests x_s − x̂, and may compare it with x̂.
@@ -47,11 +47,10 @@ class ErrorGrowth:
             share * spectral_norm(outputs[C] @ plant.error.inverse_weight)
             for C, share in after.shares.items()
         )
-        zero = np.zeros(())
-        self.driven: tuple[Vector, Vector, Vector] = (zero, zero, zero)
+        self.driven = (0.0, 0.0, 0.0)
         if longest_s > 0:
             growth = plant.growth(longest_s, COARSE_CELLS)
-            self.driven, self.highest = growth.means(self.ages_s), growth.input_error.sup_on_grid()
+            self.driven, self.highest = growth.means(self.ages_s), float(growth.input_error.sup_on_grid())
 
     def after_test(self, states: Mapping[str, float]) -> float:
         """Return b, given bounds of sup‖C x‖; not linear in them."""
@@ -84,9 +83,9 @@ def _mean_ages_s(bound: TriggerBound, sampling_s: float) -> Vector | None:
 
 
 def first_passage_s(
-    plant: PlantGains, level: Vector, mismatch: Vector, input_error: Vector, error_gain: Vector, start: Vector
-) -> Vector:
-    """Return times before which ‖e_s‖_W, starting at ``start``, cannot reach ``level``, (…, loops).
+    plant: PlantGains, *, level: float, mismatch: float, input_error: float, error_gain: float, start: float
+) -> float:
+    """Return a time before which ‖e_s‖_W, starting at ``start``, cannot reach ``level``.
 
     Let ρ(r) = sup_{s≤r} ‖e_s‖_W. The part of e_c that equals the present e_s is bounded by ρ:
 
@@ -96,76 +95,55 @@ def first_passage_s(
     every iterate is a bound until the level is reached.
 
     Args:
-        plant: one plant, or as many as there are values, (loops,).
-        level: one ‖e_s‖_W or several of each loop, (…, loops).
-        mismatch: sup‖R_E x‖, (loops,).
-        input_error: π', the input error without the effect of the present e_s, (loops,).
-        error_gain: k = ‖K W^{−1}‖, (loops,).
-        start: ‖e_s‖_W at first, (loops,).
+        plant: the plant.
+        level: ‖e_s‖_W.
+        mismatch: sup‖R_E x‖.
+        input_error: π', the input error without the effect of the present e_s.
+        error_gain: k = ‖K W^{−1}‖.
+        start: ‖e_s‖_W at first.
     """
-    window_s = _first_windows_s(plant, level, mismatch, input_error, error_gain)
-    is_open, shape, loops = (level > start).ravel(), level.shape, level.shape[-1]
-    level, window_s = level.ravel(), window_s.ravel()
-    known_s, cells = np.zeros(level.size), np.full(level.size, COARSE_CELLS)
-    while is_open.any():
-        # All searches with the fewest cells together; e_s grows over the window of each.
-        count = int(cells[is_open].min())
-        places = np.flatnonzero(is_open & (cells == count))
-        loop = places % loops
-        columns = Columns(*(column[loop] if column.ndim == 3 else column for column in plant.columns))
-        error = plant.error
-        growth = error.growths(columns, window_s[places], count, error.stacked_norm)[Output.WEIGHTED]
-        started = [
-            size and size * error.stretch(until_s)
-            for size, until_s in zip(start[loop].tolist(), window_s[places].tolist(), strict=True)
-        ]
-        first_cells = _first_crossed(
-            growth,
-            level[places],
-            mismatch[loop],
-            input_error[loop],
-            error_gain[loop],
-            np.array(started),
-        )
+    known_s, cells = 0.0, COARSE_CELLS
+    if level <= start:
+        return known_s
+    window_s = _first_window_s(plant, level, mismatch, input_error, error_gain)
+    while True:
+        growth, started = plant.growth(window_s, cells), start and start * plant.error.stretch(window_s)
+        cell = _first_crossed(growth, level, mismatch, input_error, error_gain, started)
+        edges_s = growth.mismatch.edges_s
         # The next window: the cell of the crossing with more cells, or twice the time.
-        for place, edge_s, cell in zip(places.tolist(), growth.mismatch.edges_s, first_cells, strict=True):
-            if cell < count:
-                known_s[place] = max(known_s[place], edge_s[cell])
-                is_open[place] = count != _FINE_CELLS
-                window_s[place], cells[place] = edge_s[cell + 1], _FINE_CELLS
-            elif window_s[place] >= LONGEST_S:
-                known_s[place], is_open[place] = window_s[place], False
-            else:  # not reached, also after a coarse grid's overestimate: extend the window
-                known_s[place], window_s[place] = window_s[place], 2 * window_s[place]
-    return known_s.reshape(shape)
+        if cell < cells:
+            known_s = max(known_s, float(edges_s[cell]))
+            if cells == _FINE_CELLS:
+                return known_s
+            window_s, cells = float(edges_s[cell + 1]), _FINE_CELLS
+        elif window_s >= LONGEST_S:
+            return window_s
+        else:  # not reached, also after a coarse grid's overestimate: extend the window
+            known_s, window_s = window_s, 2 * window_s
 
 
-def _first_windows_s(
-    plant: PlantGains, level: Vector, mismatch: Vector, input_error: Vector, error_gain: Vector
-) -> Vector:
-    """Return twice the times to the level at the speed at which e_s can grow at first, limited."""
+def _first_window_s(
+    plant: PlantGains, level: float, mismatch: float, input_error: float, error_gain: float
+) -> float:
+    """Return twice the time to the level at the speed at which e_s can grow at first, limited."""
     growth = plant.growth(_SHORTEST_S, 1)
-    speed = growth.mismatch.sup_on_grid() * mismatch
-    speed = speed + growth.input_error.sup_on_grid() * (input_error + error_gain * level)
-    speed = speed + growth.forced.sum(axis=-1) / _SHORTEST_S
-    windows_s = np.where(speed > 0, 2 * level / np.where(speed > 0, speed, 1.0), LONGEST_S)
-    return windows_s.clip(_SHORTEST_S, LONGEST_S)
+    speed = float(growth.mismatch.sup_on_grid()) * mismatch
+    speed += float(growth.input_error.sup_on_grid()) * (input_error + error_gain * level)
+    speed += float(growth.forced.sum()) / _SHORTEST_S
+    return min(max(2 * level / speed if speed > 0 else LONGEST_S, _SHORTEST_S), LONGEST_S)
 
 
 def _first_crossed(
-    growth: Growth, level: Vector, mismatch: Vector, input_error: Vector, error_gain: Vector, started: Vector
-) -> list[int]:
-    """Return the first cell of each loop in which the level may be reached, or their number."""
-    areas = growth.mismatch.area * mismatch[:, None]
-    areas = areas + growth.input_error.area * input_error[:, None]
-    fixed = np.cumsum(areas + growth.forced, axis=-1) + started[:, None]
-    rho = np.repeat(level[:, None], fixed.shape[-1], axis=1)
-    echoing = np.broadcast_to(growth.input_error.area, rho.shape)
+    growth: Growth, level: float, mismatch: float, input_error: float, error_gain: float, started: float
+) -> int:
+    """Return the first cell in which the level may be reached, or the number of cells."""
+    areas = growth.mismatch.area * mismatch + growth.input_error.area * input_error + growth.forced
+    fixed = np.cumsum(areas) + started
+    rho = np.full(len(fixed), level)
     for _ in range(_PICARD_ROUNDS):
-        echo = [np.convolve(area, r)[: len(r)] for area, r in zip(echoing, rho, strict=True)]
-        before, rho = rho, np.minimum(level[:, None], fixed + error_gain[:, None] * np.array(echo))
+        echo = np.convolve(growth.input_error.area, rho)[: len(rho)]
+        before, rho = rho, np.minimum(level, fixed + error_gain * echo)
         if np.array_equal(before, rho):
             break
-    crossed = rho >= level[:, None]
-    cells: list[int] = np.where(crossed.any(axis=1), crossed.argmax(axis=1), rho.shape[1]).tolist()
-    return cells
+    crossed = rho >= level
+    return int(crossed.argmax()) if crossed.any() else len(rho)

@@ -116,20 +116,20 @@ class Growth(NamedTuple):
     """Σ_i ∫‖C e^{Hτ} D_i‖ over each cell of the grid, from the disturbances."""
 
     @property
-    def totals(self) -> tuple[Vector, Vector, Vector]:
-        """The integrals over the grid: of the input error, the mismatch, the disturbances, (…)."""
-        disturbed = np.asarray(self.forced.sum(axis=-1))
-        return self.input_error.integral_on_grid(), self.mismatch.integral_on_grid(), disturbed
+    def totals(self) -> tuple[float, float, float]:
+        """The integrals over the grid: of the input error, the mismatch, the disturbances."""
+        driven = (self.input_error.integral_on_grid(), self.mismatch.integral_on_grid(), self.forced.sum())
+        return float(driven[0]), float(driven[1]), float(driven[2])
 
-    def means(self, times_s: Vector) -> tuple[Vector, Vector, Vector]:
-        """Return the means over some times of the integrals up to each, (…)."""
+    def means(self, times_s: Vector) -> tuple[float, float, float]:
+        """Return the means over some times of the integrals up to each."""
         cells = self.forced.shape[-1]
         # A time that is a node but for rounding counts as that node.
         nodes = np.sort(np.ceil(times_s / times_s.max() * cells * (1 - 1e-9)))
         # The share of the times that are after the start of each cell.
         weights = 1 - np.searchsorted(nodes, np.arange(cells), side="right") / len(nodes)
-        by_input, mismatched = (np.asarray(k.area @ weights) for k in (self.input_error, self.mismatch))
-        return by_input, mismatched, np.asarray(self.forced @ weights)
+        by_input, mismatched = (float(k.area @ weights) for k in (self.input_error, self.mismatch))
+        return by_input, mismatched, float(self.forced @ weights)
 
 
 @dataclass(frozen=True)
@@ -214,10 +214,9 @@ class ErrorGains:
         """
         return sum_of_sups(self.kernels[output], events, inter_event_s)
 
-    def missing_until(self, output: Output, events: Counts, due_s: float) -> Vector:
+    def missing_until(self, output: Output, events: int, due_s: float) -> float:
         """Return Σ_{j<N} sup_{τ ≤ (j+1)L} ‖C e^{(H+αI)τ} W^{−1}‖, for events at most L apart."""
-        gains = [self._all_missing_until(N, due_s)[output] for N in events.ravel().tolist()]
-        return np.reshape(gains, events.shape)
+        return self._all_missing_until(events, due_s)[output]
 
     @cached_method
     def _all_missing_until(self, events: int, due_s: float) -> Mapping[Output, float]:

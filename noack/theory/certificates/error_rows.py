@@ -7,7 +7,7 @@ inter-event times and missing events.
 
 import math
 from collections.abc import Mapping, Sequence
-from enum import Enum, IntEnum
+from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.bounds.certificate_terms import CertificatePart, NetworkConditions
 from noack.theory.bounds.error_growth import COARSE_CELLS, ErrorGrowth
-from noack.theory.bounds.gains import Counts, Output, sum_of_sups
+from noack.theory.bounds.gains import Output, sum_of_sups
 
 
 class Signal(IntEnum):
@@ -41,34 +41,34 @@ MOST_STAGES = 16
 """With more missing events π is used for all of them."""
 
 
-class BoundMethod(Enum):
-    """The ways to bound e_c. Bounds of parts may be added only if they use the same method."""
-
-    MISSING = "by e_s and by the errors of all missing events"
-    DRIFTING = "by its value d ago, and by what has driven it since"
-
-
 class ErrorRows:
     """The rows of one part's errors.
 
     Args:
-        part: that of one loop, or of several, as in the inequalities.
+        part: the part.
         conditions: those of the network.
         first_input_error: bound of ‖p‖ before the first input.
         begin_s: time of the first input; infinite if the first inputs at a set-point are applied before.
+        drifts: whether e_c is bounded by its value d ago, and by what has driven it since; otherwise by
+            e_s and by the errors of all missing events. Bounds of parts may be added only if all are
+            of the same of these two kinds.
     """
 
     def __init__(
-        self, part: CertificatePart, conditions: NetworkConditions, first_input_error: Vector, begin_s: float
+        self,
+        part: CertificatePart,
+        conditions: NetworkConditions,
+        first_input_error: float,
+        begin_s: float,
+        *,
+        drifts: bool,
     ) -> None:
         self._error, self._plant, bound, _ = part
         self._longest_s = bound.times.longest_s
         self._conditions = conditions
-        self._first_input_error, self._begin_s = first_input_error, begin_s
+        self._first_input_error, self._begin_s, self._drifts = first_input_error, begin_s, drifts
 
-    def signals(
-        self, method: BoundMethod, events: Counts, inter_event_s: Vector, own_growth: ErrorGrowth | None
-    ) -> "SignalRows":
+    def signals(self, events: int, inter_event_s: float, own_growth: ErrorGrowth | None) -> "SignalRows":
         """Return how all outputs depend on v.
 
         Every ‖e_s‖_W has grown by ``own_growth`` from at most b at the last test; without it b is β̃. An
@@ -79,34 +79,30 @@ class ErrorRows:
             sensor = self.with_start(
                 signal_row(own_growth.stretch, 0.0, own_growth.driven), own_growth.highest
             )
-        counted = events
-        at_present = present = {output: self._present(output, own_growth) for output in self._error.outputs}
-        if drifts := method is BoundMethod.DRIFTING:
-            # d ago, e_c consisted of e_s and of the errors of events that are lost.
-            counted = np.full_like(events, self._conditions.dropouts)
-            present = {
-                output: self._present(output, own_growth, self._conditions.delay_s) for output in at_present
-            }
+        later_s = 0.0
+        if self._drifts:  # d ago, e_c consisted of e_s and of the errors of events that are lost
+            events, later_s = self._conditions.dropouts, self._conditions.delay_s
+        present = {output: self._present(output, own_growth, later_s) for output in self._error.outputs}
+        stages = self._stages(present[Output.GAIN], events, inter_event_s, own_growth)
+        missing = {
+            output: self._with_missing(output, row, events, inter_event_s, own_growth, stages)
+            for output, row in present.items()
+        }
+        at_present = self._present(Output.GAIN, own_growth)
+        received = self._with_missing(Output.GAIN, at_present, 0, inter_event_s, own_growth)
+        earlier = missing[Output.GAIN]
+        if not self._drifts:
+            nothing = np.zeros(len(Signal))
+            earlier = self._with_missing(Output.GAIN, nothing, events, inter_event_s, own_growth, stages)
+        return SignalRows(missing, sensor, received, earlier)
 
-        def with_missing(
-            output: Output, present: Matrix, count: Counts, stages: _Stages | None = None
-        ) -> Matrix:
-            return self._with_missing(output, present, count, inter_event_s, own_growth, stages)
-
-        stages = self._stages(present[Output.GAIN], counted, inter_event_s, own_growth)
-        errors = {output: with_missing(output, row, counted, stages) for output, row in present.items()}
-        input_error = errors[Output.GAIN]
-        earlier = input_error if drifts else with_missing(Output.GAIN, np.zeros(len(Signal)), counted, stages)
-        received = with_missing(Output.GAIN, at_present[Output.GAIN], 0 * events)
-        return SignalRows(errors, sensor, received, earlier)
-
-    def _present(self, output: Output, own_growth: ErrorGrowth | None, later_s: float = 0.0) -> Matrix:
+    def _present(self, output: Output, own_growth: ErrorGrowth | None, later_s: float = 0.0) -> Vector:
         """Return the bound of sup‖C e_s‖ as a row of the signals.
 
         It is that of what e_s becomes, if nothing resets it, up to ``later_s`` after.
         """
-        until_s, zero = later_s + (0.0 if own_growth is None else own_growth.longest_s), np.zeros(())
-        driven: tuple[Vector, Vector, Vector] = (zero, zero, zero)
+        until_s = later_s + (0.0 if own_growth is None else own_growth.longest_s)
+        driven = (0.0, 0.0, 0.0)
         if until_s > 0:
             growth = self._plant.growths(until_s, COARSE_CELLS)[output]
             driven = growth.totals if own_growth is None else growth.means(own_growth.ages_s + later_s)
@@ -115,57 +111,56 @@ class ErrorRows:
     def _with_missing(
         self,
         output: Output,
-        present: Matrix,
-        events: Counts,
-        inter_event_s: Vector,
+        present: Vector,
+        events: int,
+        inter_event_s: float,
         own_growth: ErrorGrowth | None,
         stages: "_Stages | None" = None,
-    ) -> Matrix:
+    ) -> Vector:
         """Return the bound of sup‖C e_c‖ as a row of the signals, given that of e_s, ``present``.
 
         The part of e_s that has grown since the last test is followed from where it entered.
         """
         gain = self._missing_gain(output, events, inter_event_s)
-        driven: list[Vector | float] = (
-            [0.0] * 3 if own_growth is None else [gain * size for size in own_growth.driven]
-        )
+        driven = [0.0] * 3 if own_growth is None else [gain * size for size in own_growth.driven]
         if own_growth is not None and own_growth.longest_s > 0:
             for index, kernel in enumerate(self._plant.driven[output]):
-                followed = own_growth.mean_s * sum_of_sups(kernel, events, inter_event_s)
-                driven[index] = np.minimum(driven[index], followed)
-        highest = self._plant.driven[output][0].sup() if self._error.decays else 0.0
+                followed = own_growth.mean_s * float(sum_of_sups(kernel, events, inter_event_s))
+                driven[index] = min(driven[index], followed)
+        highest = float(self._plant.driven[output][0].sup()) if self._error.decays else 0.0
         row = self.with_start(present + signal_row(gain, gain, driven), highest)
         if stages is not None and own_growth is not None:
-            row[..., Signal.INPUT_ERROR] = present[..., Signal.INPUT_ERROR]
-            row += stages.entered(
-                *self._input_effects(output, len(stages.inputs), inter_event_s, own_growth), events
-            )
+            row[Signal.INPUT_ERROR] = present[Signal.INPUT_ERROR]
+            effects = self._input_effects(output, len(stages.inputs), inter_event_s, own_growth)
+            row += stages.entered(*effects, events)
         return row
 
-    def with_start(self, row: Matrix, highest: Vector | float) -> Matrix:
+    def with_start(self, row: Vector, highest: float) -> Vector:
         """Add what enters before the first input, where ‖p‖ is not bounded by π.
 
         ``highest`` bounds what a p of 1 adds in a unit of time.
         """
-        by_first_input = np.fmin(row[..., Signal.INPUT_ERROR], self._begin_s * highest)
-        return np.asarray(row + (self._first_input_error * by_first_input)[..., None] * UNIT_ROWS[Signal.ONE])
+        by_first_input = row[Signal.INPUT_ERROR]
+        if not (highest == 0 and math.isinf(self._begin_s)):
+            by_first_input = min(by_first_input, self._begin_s * highest)
+        return np.asarray(row + self._first_input_error * by_first_input * UNIT_ROWS[Signal.ONE])
 
     def _input_effects(
-        self, output: Output, count: int, inter_event_s: Vector, own_growth: ErrorGrowth
-    ) -> tuple[Matrix, Matrix]:
+        self, output: Output, count: int, inter_event_s: float, own_growth: ErrorGrowth
+    ) -> tuple[Vector, Vector]:
         """Bound how inputs before missing events move C e_c, from the newest event on.
 
         Returns:
             Of the inputs since the test before the event, for ‖p‖ ≤ 1, and of those of one second,
-            (count, loops) each.
+            (count,) each.
         """
-        ages_s = inter_event_s[:, None] * np.arange(count)
-        sups = np.broadcast_to(self._plant.driven[output][0].sups(ages_s), ages_s.shape).T
-        gains = self._error.kernels[output].sups(ages_s).T
+        ages_s = inter_event_s * np.arange(count, dtype=np.float64)
+        sups = np.broadcast_to(self._plant.driven[output][0].sups(ages_s), ages_s.shape)
+        gains = self._error.kernels[output].sups(ages_s)
         return np.minimum(gains * own_growth.driven[0], own_growth.mean_s * sups), sups
 
     def _stages(
-        self, present: Matrix, events: Counts, inter_event_s: Vector, own_growth: ErrorGrowth | None
+        self, present: Vector, events: int, inter_event_s: float, own_growth: ErrorGrowth | None
     ) -> "_Stages | None":
         """Bound ‖p‖ while at most 0, 1, … events are missing; None where π is used instead.
 
@@ -173,39 +168,30 @@ class ErrorRows:
         update that was received has taken effect. ``present`` is the part of sup‖K e_c‖ that is not
         from missing events.
         """
-        count, delay_s = int(events.max(initial=0)), self._conditions.delay_s
-        if (
-            own_growth is None
-            or own_growth.longest_s == 0
-            or not 0 < count <= MOST_STAGES
-            or not inter_event_s.all()
-        ):
+        if own_growth is None or own_growth.longest_s == 0 or inter_event_s == 0:
             return None
-        # p of each stage: a row of the signals.
-        sizes, sups = self._input_effects(Output.GAIN, count, inter_event_s, own_growth)
-        shape = len(inter_event_s), len(Signal)
-        late_s = (delay_s - np.arange(count)[:, None] * inter_event_s).clip(0.0, own_growth.longest_s)
-        counts = np.arange(count)[:, None] + np.zeros_like(events)
-        rows = self._with_missing(Output.GAIN, present, counts, inter_event_s, own_growth)
-        rows += UNIT_ROWS[Signal.AGE_INPUT]
-        # The share of π from updates that act late.
-        highest = float(np.max(self._plant.driven[Output.GAIN][0].sup()))
-        by_input = present[..., Signal.INPUT_ERROR]
-        input_before_update = np.minimum(by_input, highest * (delay_s - counts * inter_event_s).clip(min=0.0))
-        rows[..., Signal.INPUT_ERROR] = input_before_update
-        shares_left = 1 - (by_input - input_before_update)[..., None]
-        # Stage by stage; π where its own share is 1 or more.
-        stages = _Stages(np.zeros((0, *shape)), late_s)
-        for row, share_left, number in zip(rows, shares_left, counts, strict=True):
-            row = row + stages.entered(sizes, sups, number)
-            solved = row / np.where(share_left > 0, share_left, 1.0)
-            row = np.where(share_left > 0, solved, UNIT_ROWS[Signal.INPUT_ERROR])
-            stages = stages._replace(inputs=np.concatenate([stages.inputs, row[None]]))
+        if not 0 < events <= MOST_STAGES:
+            return None
+        sizes, sups = self._input_effects(Output.GAIN, events, inter_event_s, own_growth)
+        left_s = np.maximum(self._conditions.delay_s - inter_event_s * np.arange(events), 0.0)
+        stages = _Stages(np.zeros((0, len(Signal))), np.minimum(left_s, own_growth.longest_s))
+        highest = float(self._plant.driven[Output.GAIN][0].sup())
+        by_input = present[Signal.INPUT_ERROR]
+        for number in range(events):
+            row = self._with_missing(Output.GAIN, present, number, inter_event_s, own_growth)
+            row += UNIT_ROWS[Signal.AGE_INPUT]
+            # The share of π from updates that act late.
+            row[Signal.INPUT_ERROR] = before_update = min(by_input, highest * left_s[number])
+            row += stages.entered(sizes, sups, number)
+            # π where its own share is 1 or more.
+            share_left = 1 - (by_input - before_update)
+            row = row / share_left if share_left > 0 else UNIT_ROWS[Signal.INPUT_ERROR]
+            stages = stages._replace(inputs=np.vstack([stages.inputs, row]))
         return stages
 
-    def _missing_gain(self, output: Output, events: Counts, inter_event_s: Vector) -> Vector:
+    def _missing_gain(self, output: Output, events: int, inter_event_s: float) -> float:
         if self._error.decays or math.isinf(self._longest_s):
-            return self._error.missing(output, events, inter_event_s)
+            return float(self._error.missing(output, events, inter_event_s))
         return self._error.missing_until(output, events, self._longest_s)
 
 
@@ -213,27 +199,27 @@ class _Stages(NamedTuple):
     """Bounds of ‖p‖ while few events are missing."""
 
     inputs: Matrix
-    """Rows of the signals, while 0, 1, … events are missing, (count, loops, 6)."""
-    late_s: Matrix
+    """Rows of the signals, while 0, 1, … events are missing, (count, 6)."""
+    late_s: Vector
     """For how long after the test before the first, second, … missing event an earlier update may
-    not have taken effect yet, (count, loops)."""
+    not have taken effect yet."""
 
-    def entered(self, sizes: Matrix, sups: Matrix, events: Counts) -> Matrix:
-        """Bound what has entered e_c before up to ``events`` missing events, (loops, 6).
+    def entered(self, sizes: Vector, sups: Vector, events: int) -> Vector:
+        """Bound what has entered e_c before up to ``events`` missing events, (6,).
 
         ``sizes`` and ``sups`` are those of :meth:`ErrorRows._input_effects`.
         """
-        largest = np.zeros(self.inputs.shape[1:])
-        for count in range(1, len(self.inputs) + 1):
+        largest = np.zeros(len(Signal))
+        for count in range(1, min(len(self.inputs), events) + 1):
             late = np.minimum(sizes[:count], self.late_s[count - 1 :: -1] * sups[:count])
-            row = np.einsum("kl,klj->lj", sizes[:count] - late, self.inputs[count - 1 :: -1])
-            row[:, Signal.INPUT_ERROR] += late.sum(axis=0)
-            largest = np.where((count <= events)[:, None], np.maximum(largest, row), largest)
+            row = (sizes[:count] - late) @ self.inputs[count - 1 :: -1]
+            row[Signal.INPUT_ERROR] += late.sum()
+            largest = np.maximum(largest, row)
         return largest
 
 
 class SignalRows(NamedTuple):
-    """The errors as linear functions of the signals: rows, (…, 6)."""
+    """The errors as linear functions of the signals: rows, (6,)."""
 
     errors: Mapping[Output, Vector]
     """Of sup‖C e_c‖."""
@@ -250,16 +236,6 @@ class SignalRows(NamedTuple):
         return np.asarray(self.errors[Output.GAIN] + UNIT_ROWS[Signal.AGE_INPUT])
 
 
-def signal_row(
-    after_test: Vector | float, estimation_error: Vector | float, driven: Sequence[Vector | float]
-) -> Matrix:
+def signal_row(after_test: float, estimation_error: float, driven: Sequence[float]) -> Vector:
     """Return a row of the signals; ``driven`` has the entries of π, sup‖R_E x‖ and 1."""
-    return columns(0.0, after_test, estimation_error, *driven)
-
-
-def columns(*values: Vector | float) -> Matrix:
-    """Return values of loops, (…), side by side, (…, k)."""
-    columns = np.empty((*np.broadcast(*values).shape, len(values)))
-    for index, value in enumerate(values):
-        columns[..., index] = value
-    return columns
+    return np.array([0.0, after_test, estimation_error, *driven])

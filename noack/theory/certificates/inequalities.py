@@ -28,26 +28,17 @@ misses g by r, adding w max r/(w − F w) is enough.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.bounds.certificate_terms import CertificatePart, Constants, NetworkConditions
 from noack.theory.bounds.error_growth import ErrorGrowth, first_passage_s, list_growths
-from noack.theory.bounds.gains import Coefficients, Counts, Output
-from noack.theory.certificates.error_rows import (
-    UNIT_ROWS,
-    BoundMethod,
-    ErrorRows,
-    Signal,
-    SignalRows,
-    columns,
-    signal_row,
-)
+from noack.theory.bounds.gains import Coefficients, Output
+from noack.theory.certificates.error_rows import UNIT_ROWS, ErrorRows, Signal, SignalRows, signal_row
 
 MOST_MISSING = 1000
 """No bounds are computed for more missing events at once: the work grows with their number."""
@@ -56,231 +47,189 @@ _EPSILON = float(np.finfo(float).eps)
 
 
 class Solution(NamedTuple):
-    """The bound of v, of one loop or of several."""
+    """The bound of v."""
 
-    loop_gain: Vector
-    """(…) 1 minus the smallest leading principal minor of I − F; below 1 if and only if ρ(F) < 1.
+    loop_gain: float
+    """1 minus the smallest leading principal minor of I − F; below 1 if and only if ρ(F) < 1.
     If it is not below 1: at least the largest entry of the diagonal."""
     bound: Vector
-    """(…, k) upper bound of v; infinite where ρ(F) < 1 was not confirmed."""
-    failing: Counts
-    """(…) The first signal with which no bound follows from those before it: that of the first
+    """(k,) upper bound of v; infinite where ρ(F) < 1 was not confirmed."""
+    failing: Signal
+    """The first signal with which no bound follows from those before it: that of the first
     leading principal minor not above 0. Of no use where ρ(F) < 1."""
 
 
 def solve_inequalities(F: Matrix, g: Vector) -> Solution:
-    """Return the smallest bound of v that follows, for F of shape (…, k, k) and g of (…, k)."""
-    size = F.shape[-1]
+    """Return the smallest bound of v that follows, for F of shape (k, k) and g of (k,)."""
+    size = len(g)
     # A signal that is 0 affects nothing.
-    F = np.where((F.any(axis=-1) | (g > 0))[..., None, :], F, 0.0)
+    F = np.where((F.any(axis=1) | (g > 0))[:, None], F, 0.0)
     # A right side of the size of x makes w/x dimensionless.
-    scales = g + _apply(F, g + _apply(F, g))
-    least = np.where(scales > 0, scales, np.inf).min(axis=-1, keepdims=True)
-    right = np.where(scales > 0, scales, np.where(np.isfinite(least), least, 1.0))
+    scales = g + F @ (g + F @ g)
+    least = scales[scales > 0].min(initial=np.inf)
+    right = np.where(scales > 0, scales, least if math.isfinite(least) else 1.0)
     remainder = np.eye(size) - F
     minor, x, w = _eliminate(remainder, g, right)
-    loop_gain = np.asarray(1 - minor)
-    is_small, failing = loop_gain < 1, np.zeros(minor.shape, dtype=np.int64)
-    if not is_small.all():  # the elimination ends too early there
-        large = ~is_small
-        with np.errstate(invalid="ignore"):
-            minors = [np.linalg.det(remainder[large][..., :k, :k]) for k in range(1, size + 1)]
-        failing[large] = (np.stack(minors, axis=-1) <= 0).argmax(axis=-1)
-        diagonal = np.diagonal(F[large], axis1=-2, axis2=-1)
-        gains = np.concatenate([1 - np.min(minors, axis=0)[..., None], diagonal], axis=-1)
-        is_finite = np.isfinite(gains).all(axis=-1)
-        loop_gain[large] = np.where(is_finite, np.maximum(gains.max(axis=-1), 1.0), np.inf)
+    loop_gain, failing = 1 - minor, Signal(0)
+    is_small = loop_gain < 1
+    if not is_small:  # the elimination ends too early there
+        minors = np.array([np.linalg.det(remainder[:k, :k]) for k in range(1, size + 1)])
+        failing = Signal(int((minors <= 0).argmax()))
+        gains = np.append(np.diagonal(F), 1 - minors.min())
+        loop_gain = max(float(gains.max()), 1.0) if np.isfinite(gains).all() else math.inf
     # F w < w is confirmed with all rounding, and x is raised until x − F x ≥ g.
     rounding = (size + 4) * _EPSILON
-    F_x, F_w = _apply(F, x), _apply(F, w)
+    F_x, F_w = F @ x, F @ w
     slack = w - F_w - rounding * (w + F_w)
+    if not (is_small and (w > 0).all() and (slack > 0).all()):
+        return Solution(loop_gain, np.full(size, np.inf), failing)
     shortfall = F_x + g - x + rounding * (F_x + g + x)
-    largest = np.maximum((shortfall / slack).max(axis=-1, keepdims=True), 0.0)
-    bound = np.where(F.any(axis=-1), x + w * largest * (1 + rounding), g)
-    confirmed = is_small & (w > 0).all(axis=-1) & (slack > 0).all(axis=-1)
-    return Solution(loop_gain, np.where(confirmed[..., None], bound, np.inf), failing)
+    raised = x + w * max(float((shortfall / slack).max()), 0.0) * (1 + rounding)
+    return Solution(loop_gain, np.where(F.any(axis=1), raised, g), failing)
 
 
-def _apply(F: Matrix, v: Vector) -> Vector:
-    return np.asarray((F @ v[..., None])[..., 0])
-
-
-def _eliminate(matrix: Matrix, *right_sides: Vector) -> tuple[Vector, ...]:
-    """Return the smallest leading principal minor, (…), and the solutions, (…, k).
+def _eliminate(matrix: Matrix, *right_sides: Vector) -> tuple[float, Vector, Vector]:
+    """Return the smallest leading principal minor, and the solutions of two right sides, (k,).
 
     Minors after the first one not above 0 are left out; the solutions are then of no use. The
     elimination is that of Gauss without exchanges.
     """
-    size = matrix.shape[-1]
-    rows = np.concatenate([matrix, np.stack(right_sides, axis=-1)], axis=-1)
-    minor = np.ones(matrix.shape[:-2])
-    smallest, counts = np.full_like(minor, np.inf), np.ones_like(minor, dtype=bool)
+    size = len(matrix)
+    rows = np.column_stack([matrix, *right_sides])
+    minor, smallest = 1.0, math.inf
     for k in range(size):
-        minor = minor * rows[..., k, k]
-        smallest = np.where(counts, np.minimum(smallest, minor), smallest)
-        counts = counts & (minor > 0)
-        rows[..., k, :] /= rows[..., k, k, None].copy()
-        shares = rows[..., k].copy()
-        shares[..., k] = 0.0
-        rows -= np.where(shares != 0, shares, 0.0)[..., None] * rows[..., k : k + 1, :]
-    return smallest, *np.moveaxis(rows[..., size:], -1, 0)
+        minor *= float(rows[k, k])
+        smallest = min(smallest, minor)
+        if not minor > 0:
+            break
+        rows[k] /= rows[k, k]
+        shares = rows[:, k].copy()
+        shares[k] = 0.0
+        rows -= np.where(shares != 0, shares, 0.0)[:, None] * rows[k]
+    return smallest, rows[:, size], rows[:, size + 1]
 
 
-class LoopConstants(NamedTuple):
-    """The constants of several loops but δ, (loops,) each: see ``Constants`` in ``certificate_terms``."""
+class PartSolution(NamedTuple):
+    """What the inequalities of a part give for an assumed inter-event time."""
 
-    missing_events: Counts
-    delta: Vector
-    overshoot: Vector
-    input_error: Vector
-    start_error: Vector
-    state: Vector
-    state_weighted: Vector
-    mismatch: Vector
-    loop_gain: Vector
-    estimation_error: Vector
-    received_input_error: Vector
-    earlier_input_error: Vector
-    """The part of the input error that does not come from the present e_s."""
-    failing: Counts
+    constants: Constants | None
+    """None: there is no certificate. Without δ."""
+    loop_gain: float
+    """Not below 1, and perhaps infinite, where there is no certificate."""
+    failing: Signal
     """The first signal without a bound, where there is no certificate: see :class:`Solution`."""
-    exists: NDArray[np.bool_]
-    """Where there is a certificate; of the others only ``loop_gain`` and ``failing`` are of use."""
-
-    def of_loop(self, loop: int, rate_per_s: float, inter_event_s: float | None) -> Constants:
-        """Return the constants of one loop."""
-        fields = {name: values[loop].item() for name, values in self._asdict().items()}
-        del fields["exists"], fields["failing"], fields["earlier_input_error"]
-        fields["present_input_error"] = fields["received_input_error"]
-        return Constants(rate_per_s=rate_per_s, inter_event_s=inter_event_s, **fields)
-
-
-def _without_bounds(events: Counts) -> LoopConstants:
-    """Return that loops have no certificate, because their missing events are too many."""
-    infinite = np.full(len(events), np.inf)
-    names = [name for name in LoopConstants._fields if name not in ("missing_events", "failing", "exists")]
-    others = dict.fromkeys(names, infinite)
-    return LoopConstants(missing_events=events, failing=0 * events, exists=infinite < 0, **others)
+    missing_events: int
+    earlier_input_error: float
+    """The part of the input error that does not come from the present e_s."""
 
 
 class ErrorInequalities:
     """The inequalities of one part, and their solution for assumed inter-event times.
 
-    The part is that of one loop, or of several (:meth:`PlantGains.together`), with the same
-    trigger and conditions; inter-event times and solutions are those of each loop.
+    ``earlier_error``: sup‖p‖ while first inputs at a set-point are applied. ``drifts``: as for
+    :class:`ErrorRows`.
     """
 
-    def __init__(self, part: CertificatePart, conditions: NetworkConditions, earlier_error: float) -> None:
+    def __init__(
+        self, part: CertificatePart, conditions: NetworkConditions, earlier_error: float, *, drifts: bool
+    ) -> None:
         self._error, self._plant, self._bound, self._estimation = error, plant, bound, _ = part
-        self._conditions = conditions
+        self._conditions, self._drifts = conditions, drifts
         self.age_gains = error.age_gains(conditions.hold_s)
-        self._start_error, start = plant.start_up(conditions.start_s)
-        self._first_input_error = np.maximum(self._start_error, earlier_error)
+        start_error, start = plant.start_up(conditions.start_s)
+        self._start_error = float(start_error)
+        self._first_input_error = max(self._start_error, earlier_error)
         self._states = {
             output: Coefficients(free + start[output], gain) for output, (free, gain) in plant.states.items()
         }
         self._growths = [
             list_growths(plant, conditions.sampling_s, part_bound) for part_bound in bound.all_bounds
         ]
-        self._begin_s = math.inf if earlier_error else conditions.start_s
-        self._error_rows = ErrorRows(part, conditions, self._first_input_error, self._begin_s)
-
-    @property
-    def methods(self) -> Sequence[BoundMethod]:
-        """The methods by which e_c can be bounded; the first one is usually the tighter one."""
-        if self._conditions.delay_s > 0 and self._error.decays:
-            return [BoundMethod.DRIFTING, BoundMethod.MISSING]
-        return [BoundMethod.MISSING]
+        begin_s = math.inf if earlier_error else conditions.start_s
+        self._error_rows = ErrorRows(part, conditions, self._first_input_error, begin_s, drifts=drifts)
 
     @cached_method
-    def constants(self, inter_event_s: Vector, method: BoundMethod) -> LoopConstants:
-        """Return all constants but δ, given inter-event times of at least ``inter_event_s``, (loops,).
-
-        A loop without a certificate has a loop gain that is not below 1, and perhaps infinite.
-        """
-        conditions = self._conditions
-        events = np.full(len(inter_event_s), conditions.dropouts)
-        is_spaced = inter_event_s > 0
+    def solution(self, inter_event_s: float) -> PartSolution:
+        """Return all constants but δ, given inter-event times of at least ``inter_event_s``."""
+        conditions, events = self._conditions, self._conditions.dropouts
         if conditions.delay_s > 0:  # of arbitrarily close events, any number of updates may be in flight
-            events[is_spaced] += np.ceil(conditions.delay_s / inter_event_s[is_spaced]).astype(np.int64)
-        is_counted = (is_spaced | (conditions.delay_s == 0)) & (events <= MOST_MISSING)
-        if not is_counted.any():
-            return _without_bounds(events)
-        solved = self._solutions(method, np.where(is_counted, events, conditions.dropouts), inter_event_s)
+            if inter_event_s == 0:
+                return PartSolution(None, math.inf, Signal(0), events, math.inf)
+            events += math.ceil(conditions.delay_s / inter_event_s)
+        if events > MOST_MISSING:
+            return PartSolution(None, math.inf, Signal(0), events, math.inf)
+        solved = self._solutions(events, inter_event_s)
         smallest = np.min([solution.bound for _, solution in solved], axis=0)
-        gains = np.array([solution.loop_gain for _, solution in solved])
-        gain = np.where(is_counted, gains.min(axis=0), np.inf)
-        failing = _taken([solution.failing for _, solution in solved], gains.argmin(axis=0))
-        by_bound = []
+        _, best = min(solved, key=lambda pair: pair[1].loop_gain)
+        implied = []
         for signals, solution in solved:  # b differs from bound to bound
             bound = np.where(UNIT_ROWS[Signal.AFTER_TEST] == 1, solution.bound, smallest)
-            implied = self._implied_bounds(signals, events, gain, bound, is_counted)
-            by_bound.append(implied._replace(failing=failing))
-        exists = np.any([constants.exists for constants in by_bound], axis=0)
-        return LoopConstants(*map(np.fmin.reduce, zip(*by_bound, strict=True)))._replace(exists=exists)
+            if np.isfinite(bound).all():
+                implied.append(self._implied_bounds(signals, events, best.loop_gain, bound))
+        if not implied:
+            return PartSolution(None, best.loop_gain, best.failing, events, math.inf)
+        constants, earlier = zip(*implied, strict=True)
+        smallest_fields = {
+            name: min(getattr(known, name) for known in constants)
+            for name in Constants._fields
+            if name != "inter_event_s"
+        }
+        least = Constants(inter_event_s=None, **smallest_fields)
+        return PartSolution(least, best.loop_gain, best.failing, events, min(earlier))
 
-    def _solutions(
-        self, method: BoundMethod, events: Counts, inter_event_s: Vector
-    ) -> list[tuple[SignalRows, Solution]]:
+    def _solutions(self, events: int, inter_event_s: float) -> list[tuple[SignalRows, Solution]]:
         """Return the signals, and what bounds them all, for each bound of e_s."""
         solved = []
         for growths in self._growths:  # all bounds of e_s hold; of each, one growth applies
             own_growth = growths[0] if len(growths) == 1 and self._error.decays else None
-            signals = self._error_rows.signals(method, events, inter_event_s, own_growth)
+            signals = self._error_rows.signals(events, inter_event_s, own_growth)
             solutions = [self._solve_for_growth(signals, growth, own_growth) for growth in growths]
-            gains = np.array([solution.loop_gain for solution in solutions])
-            failing = _taken([solution.failing for solution in solutions], gains.argmax(axis=0))
+            worst = max(solutions, key=lambda solution: solution.loop_gain)
             bound = np.max([solution.bound for solution in solutions], axis=0)
-            solved.append((signals, Solution(gains.max(axis=0), bound, failing)))
+            solved.append((signals, worst._replace(bound=bound)))
         return solved
 
     def _implied_bounds(
-        self,
-        signals: SignalRows,
-        events: Counts,
-        loop_gain: Vector,
-        solved: Matrix,
-        is_counted: NDArray[np.bool_],
-    ) -> LoopConstants:
-        """Return what follows from bounds of v, (loops, 6)."""
-        age_input, estimation = solved[..., Signal.AGE_INPUT], solved[..., Signal.ESTIMATION_ERROR]
-        input_error = _product(signals.input_error, solved)
-        state = {C: free + gain * input_error for C, (free, gain) in self._states.items()}
-        constants = LoopConstants(
+        self, signals: SignalRows, events: int, loop_gain: float, solved: Vector
+    ) -> tuple[Constants, float]:
+        """Return what follows from bounds of v, (6,): the constants, and the earlier input error."""
+        age_input, estimation = float(solved[Signal.AGE_INPUT]), float(solved[Signal.ESTIMATION_ERROR])
+        input_error = float(signals.input_error @ solved)
+        state = {C: float(free + gain * input_error) for C, (free, gain) in self._states.items()}
+        received = float(signals.received @ solved) + age_input
+        constants = Constants(
+            rate_per_s=self._error.alpha_per_s,
             missing_events=events,
-            delta=(_product(signals.errors[Output.WEIGHTED], solved) + estimation) / self.unit,
-            overshoot=(_product(signals.sensor, solved) + estimation) / self.unit,
+            delta=float(signals.errors[Output.WEIGHTED] @ solved + estimation) / self.unit,
+            overshoot=float(signals.sensor @ solved + estimation) / self.unit,
             input_error=input_error,
             start_error=self._start_error,
             state=state[Output.STATE],
             state_weighted=state[Output.WEIGHTED],
             mismatch=state[Output.MISMATCH],
+            inter_event_s=None,
             loop_gain=loop_gain,
             estimation_error=estimation,
-            received_input_error=_product(signals.received, solved) + age_input,
-            earlier_input_error=_product(signals.earlier, solved) + age_input,
-            failing=0 * events,
-            exists=np.isfinite(solved).all(axis=-1) & is_counted,
+            received_input_error=received,
+            present_input_error=received,
         )
-        return LoopConstants._make(np.broadcast_to(values, events.shape) for values in constants)
+        return constants, float(signals.earlier @ solved) + age_input
 
     @property
     def unit(self) -> float:
         """The unit of Δ and β̃/β."""
         return self._bound.beta if self._bound.unit is None else self._bound.unit
 
-    def _by_state(self, signals: SignalRows, shares: Mapping[str, Vector | float]) -> tuple[Matrix, Vector]:
-        """Return Σ_C share_C sup‖C x‖ as a row of the signals, (…, 6), and a constant, (…)."""
-        free, gain = np.zeros(()), np.zeros(())
-        for C, share in shares.items():
-            free = free + share * self._states[C].free
-            gain = gain + share * self._states[C].gain
-        return gain[..., None] * signals.input_error, free
+    def _by_state(self, signals: SignalRows, shares: Mapping[str, float]) -> tuple[Vector, float]:
+        """Return Σ_C share_C sup‖C x‖ as a row of the signals, (6,), and a constant."""
+        free = sum(share * float(self._states[C].free) for C, share in shares.items())
+        gain = sum(share * float(self._states[C].gain) for C, share in shares.items())
+        return gain * signals.input_error, free
 
     def _solve_for_growth(
         self, signals: SignalRows, growth: ErrorGrowth, own_growth: ErrorGrowth | None
     ) -> Solution:
-        """Return the loop gains, (loops,), and the bounds of the signals, (loops, 6).
+        """Return the loop gain, and the bounds of the signals, (6,).
 
         The inequality of each signal is a row of the signals and a constant.
         """
@@ -307,69 +256,32 @@ class ErrorInequalities:
             Signal.MISMATCH: mismatch,
             Signal.ONE: (0.0 * input_error, 1.0),
         }
-        rows = _rows(*(inequalities[signal][0] for signal in Signal))
-        right = columns(*(inequalities[signal][1] for signal in Signal))
-        return solve_inequalities(rows, np.broadcast_to(right, rows.shape[:-1]))
+        rows = np.stack([inequalities[signal][0] for signal in Signal])
+        right = np.array([inequalities[signal][1] for signal in Signal])
+        return solve_inequalities(rows, right)
 
-    def inter_event_s(
-        self,
-        *,
-        mismatch: Vector,
-        earlier_input_error: Vector,
-        estimation_error: Vector,
-        drifts: NDArray[np.bool_],
-        searched: NDArray[np.bool_],
-    ) -> Vector:
-        """Return the times that ‖e_s‖_W needs to the next event, (loops,).
-
-        Args:
-            mismatch: bounds of ‖E x‖_W until then, (loops,).
-            earlier_input_error: those of the input error without the part of the present e_s.
-            estimation_error: those of ‖x̂ − x‖_W at the measurements.
-            drifts: where the method is ``DRIFTING``, (loops,).
-            searched: the loops whose times are needed, (loops,); the others are of no use.
-        """
+    def inter_event_s(self, solution: PartSolution) -> float:
+        """Return the time that ‖e_s‖_W needs to the next event under the bounds of a solution."""
+        constants = solution.constants
+        assert constants is not None
         # The part of D_K that is the e_s of now.
-        error_gain = np.where(drifts, 0.0, self._error.now(Output.GAIN))
-        input_error = np.maximum(earlier_input_error, self._first_input_error)
-        estimation = np.where(searched, estimation_error, 0.0)
-        # After an event e_s is the estimation error, and x_s − x̂ differs from e_s by one, too.
-        levels_and_times = [
-            (bound.least_event_error, bound.window_s or math.inf)
-            for bound in self._bound.all_bounds
-            if bound.least_event_error is not None
-        ]
-        levels, most_s = (np.array(values)[:, None] for values in zip(*levels_and_times, strict=True))
-        passed_s = first_passage_s(
-            self._plant,
-            level=np.where(searched, levels - estimation, 0.0),
-            mismatch=np.where(searched, mismatch, 0.0),
-            input_error=np.where(searched, input_error, 0.0),
-            error_gain=error_gain,
-            start=estimation,
-        )
-        next_event_s = np.minimum(passed_s, most_s).max(axis=0)
+        error_gain = 0.0 if self._drifts else self._error.now(Output.GAIN)
+        input_error = max(solution.earlier_input_error, self._first_input_error)
+        next_event_s = 0.0
+        for bound in self._bound.all_bounds:
+            if bound.least_event_error is not None:
+                # After an event e_s is the estimation error, and x_s − x̂ differs from e_s by one, too.
+                passed_s = first_passage_s(
+                    self._plant,
+                    level=bound.least_event_error - constants.estimation_error,
+                    mismatch=constants.mismatch,
+                    input_error=input_error,
+                    error_gain=error_gain,
+                    start=constants.estimation_error,
+                )
+                next_event_s = max(next_event_s, min(passed_s, bound.window_s or math.inf))
         times = self._bound.times
-        next_event_s = np.maximum(np.minimum(next_event_s, times.earliest_due_s), times.shortest_s)
+        next_event_s = max(min(next_event_s, times.earliest_due_s), times.shortest_s)
         if (grid_s := self._conditions.spacing_s) == 0:
-            return np.asarray(next_event_s)
-        return np.asarray(grid_s * np.maximum(np.ceil(next_event_s / grid_s - 1e-9), 1.0))
-
-
-def _taken(values: Sequence[Counts], index: Counts) -> Counts:
-    """Return of several values of each loop, (loops,) each, that of an index, (loops,)."""
-    return np.asarray(np.take_along_axis(np.stack(values), index[None], axis=0)[0])
-
-
-def _product(row: Vector, column: Vector) -> Vector:
-    """Return the scalar products of vectors, (…, k)."""
-    return np.asarray((row[..., None, :] @ column[..., None])[..., 0, 0])
-
-
-def _rows(*values: Vector) -> Matrix:
-    """Return vectors of loops, (…, j), one below the other, (…, k, j)."""
-    *lead, size = np.broadcast(*values).shape
-    rows = np.empty((*lead, len(values), size))
-    for index, value in enumerate(values):
-        rows[..., index, :] = value
-    return rows
+            return next_event_s
+        return grid_s * max(math.ceil(next_event_s / grid_s - 1e-9), 1)

@@ -4,7 +4,7 @@ For given events all inequalities of a certificate are linear in functions of ti
 with a positive T. So for g = g₁ + g₂, v is at most the sum of both solutions: one for what decays
 (the start, βe^{−αt}, the first estimate), scaled by e^{αt}; the other, not scaled, for what
 persists (disturbances, noise, the floor ε of the threshold, which is at most βe^{−αt} + ε). Both
-use the same δ. An event needs a threshold of at least λβe^{−αt} + (1 − λ)ε, for any λ in [0, 1]. If
+use the same δ. An event needs a threshold of at least (βe^{−αt} + ε)/2. If
 α is too large, all are bounded together, without decay.
 """
 
@@ -39,8 +39,6 @@ _CHORD_ROUNDS = 2
 """Number of rounds that shorten the chord of the threshold by the last bound of x."""
 _RATE_SHARES = (0.7, 0.4, 0.2, 0.05)
 """Rates that are tried, as shares of the loop's decay rate."""
-SHARES = (0.5, 0.2, 0.8)
-"""Values of λ that are tried."""
 ConstantsOfParts = TypeVar("ConstantsOfParts", bound=Sequence[Constants])
 
 
@@ -87,7 +85,7 @@ class DisturbedCertificate:
                     self._persistent,
                     conditions,
                     self.start_error,
-                    shares=SHARES if longest else (),
+                    longest=longest,
                 )
                 return [AddedConstants(*parts)]
             except NotDecayingError:
@@ -230,39 +228,25 @@ def solve_two_parts(
     conditions: NetworkConditions,
     earlier_error: float = 0.0,
     *,
-    shares: Sequence[float] = SHARES,
+    longest: bool = True,
 ) -> tuple[Constants, Constants]:
-    """Return the constants of both parts, with the λ of ``shares`` for which δ is longest.
+    """Return the constants of both parts.
 
-    Without ``shares`` δ is searched for only if there is no certificate otherwise.
+    Without ``longest`` δ is searched for only if there is no certificate otherwise.
 
     Raises:
         NoCertificateError: the loop gain of one part is not below 1.
         NotDecayingError: a mode of the loop decays more slowly than a part's bounds.
     """
-    beta, floor = decaying.bound.beta, persistent.bound.beta
-
-    def solve_with(share: float | None) -> tuple[Constants, Constants]:
-        levels = (None, None) if share is None else (share * beta, (1 - share) * floor)
-        parts = [
-            part._replace(bound=part.bound._replace(least_event_error=level))
-            for part, level in zip((decaying, persistent), levels, strict=True)
-        ]
-        first_constants, second_constants = solve_problem(Problem(tuple(parts), conditions, earlier_error))
-        return first_constants, second_constants
-
-    if floor == 0:
-        return solve_with(None)
-    if not shares:
-        with contextlib.suppress(NoCertificateError):
-            return solve_with(None)
-    best: tuple[Constants, Constants] | None = None
-    for share in shares or SHARES[:1]:
-        pair = solve_with(share)
-        if best is None or (pair[0].inter_event_s or 0.0) > (best[0].inter_event_s or 0.0):
-            best = pair
-    assert best is not None
-    return best
+    if persistent.bound.beta > 0:  # an event needs half of one of the thresholds
+        decaying, persistent = (
+            part._replace(bound=part.bound._replace(least_event_error=part.bound.beta / 2))
+            for part in (decaying, persistent)
+        )
+    first_constants, second_constants = solve_problem(
+        Problem((decaying, persistent), conditions, earlier_error, longest)
+    )
+    return first_constants, second_constants
 
 
 def choose_rate(

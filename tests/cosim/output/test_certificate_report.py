@@ -97,13 +97,13 @@ def test_an_observer_has_no_limit_of_the_sampling_period() -> None:
     assert rarely.schedule.constants is None
 
 
-RATE_HZ = 1 / 0.048
+RATE_HZ = 1 / 0.0458
 SLOW = (
     'model={name="double_integrator"}',
     f"plant={{initial_state=[1.0,0.0],rate_hz={RATE_HZ}}}",
     f"controller.rate_hz={RATE_HZ}",
 )
-"""With a step of 48 ms, this loop has no certificate for its schedule in the Euclidean norm."""
+"""With a step of 45.8 ms, this loop has no certificate for its schedule in the Euclidean norm."""
 
 
 @pytest.fixture(scope="module")

@@ -12,9 +12,13 @@ from tests.noack.theory.certificates.certified_loops import certify_loop, gains_
 from tests.oracles.lossy_loops import System
 
 
-def passage_s(plant: PlantGains, *values: float) -> float:
-    """The first passage of one loop from 0."""
-    return float(first_passage_s(plant, *np.array([*values, 0.0])[:, None])[0])
+def passage_s(
+    plant: PlantGains, level: float, mismatch: float, input_error: float, error_gain: float
+) -> float:
+    """The first passage from 0."""
+    return first_passage_s(
+        plant, level=level, mismatch=mismatch, input_error=input_error, error_gain=error_gain, start=0.0
+    )
 
 
 def test_without_mismatch_or_push_the_threshold_is_never_reached() -> None:
