@@ -74,6 +74,7 @@ def write_outputs(measurement: NetworkMeasurement, request: OutputRequest) -> tu
 
 def measurement_document(measurement: NetworkMeasurement, void: CertificateTime | None = None) -> Document:
     """Return tables, figures and remarks of a measurement, and of a scenario's certificate."""
+    remarks = (*measurement.remarks, *void_remarks(void))
     outages, longest = int(measurement.is_outage.sum()), measurement.longest_loss_burst
     also = f", and {outages} outage{'s' * (outages > 1)}" if outages else ""
     where = "Outside the outages, at" if outages else "At"
@@ -91,10 +92,7 @@ def measurement_document(measurement: NetworkMeasurement, void: CertificateTime 
                 role=SentenceRole.REMARK,
                 on_terminal=False,
             ),
-            *(
-                Sentence(text=line, role=SentenceRole.REMARK)
-                for line in (*measurement.remarks, *void_remarks(void))
-            ),
+            *(Sentence(text=line, role=SentenceRole.REMARK, is_prose=True) for line in remarks),
         ],
     )
 

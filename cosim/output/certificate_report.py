@@ -1,14 +1,11 @@
 """What is certified for a scenario, as tables and in words.
 
-:func:`print_certificates` prints the constants, the limits of the schedule, the assumptions and, if
+:func:`certificate_document` has the constants, the limits of the schedule, the assumptions and, if
 losses are not limited, what holds for random ones; :func:`margin_document` has the margin of a
 time-triggered loop, :func:`mean_cost_document` its mean cost under random losses.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-
-from rich.console import Console
-from rich.markup import escape
 
 from cosim.analysis.certificates import IDEAL, SCHEDULE, Certificates
 from cosim.analysis.constant_rows import PROVEN, constant_rows, covered_plants
@@ -18,7 +15,6 @@ from cosim.analysis.tried_settings import TriedSettings
 from cosim.output.document import Block, Document, Sentence, SentenceRole
 from cosim.output.result_tables import ResultTable, Tone
 from cosim.output.run_document import assumption_table
-from cosim.output.terminal_writer import terminal_table
 from noack.core.linear_systems import Matrix
 from noack.core.number_format import NONE, at_least, at_most, duration, duration_at_least, number
 from noack.scenario.resolution import loop_of, policy_of
@@ -30,63 +26,79 @@ from noack.theory.certificates.scenario_certificates import outside_box
 from noack.theory.margins.loss_margin import Stability
 
 
-def print_certificates(console: Console, results: Certificates, chosen: Certificates | None = None) -> None:
-    """Print the tables, and what is certified in a norm that noack chose instead."""
-    if results.nonlinear is not None:
-        _print_nonlinear(console, results, results.nonlinear)
-    tables = list(certificate_tables(results))
-    if tables:
-        console.print(terminal_table(tables[0]))
-    else:
-        console.print(f"{_title(results)}: none", markup=False, highlight=False)
-    _print_notes(console, results)
+def certificate_document(results: Certificates, chosen: Certificates | None = None) -> Document:
+    """Return the tables, and what is certified in a norm that noack chose instead."""
+    tables: list[Block] = list(certificate_tables(results))
+    blocks = [*_on_nonlinear(results), *(tables[:1] or [_prose(f"{_title(results)}: none")])]
+    blocks += _notes(results)
     if any(results.setpoint or ()):
-        console.print(
-            "[dim]x is the distance from the set-point, x − x_r. If the plant does not rest there, "
-            "A x_r + B u_r is a disturbance: a step at the state.[/]"
+        blocks.append(
+            _note(
+                "x is the distance from the set-point, x − x_r. If the plant does not rest there, "
+                "A x_r + B u_r is a disturbance: a step at the state."
+            )
         )
-    for table in tables[1:]:
-        console.print(terminal_table(table))
+    blocks += tables[1:]
     if largest := _listed("as settings, the certificate is kept", results.largest_settings):
-        console.print(largest, markup=False, highlight=False)
+        blocks.append(_prose(largest))
     if (outside := outside_box(results.scenario)) is not None:
-        console.print(f"[yellow]the box certificates do not cover this plant:[/] {escape(outside)}")
-    console.print("assumptions of the certificates for the schedule:")
-    console.print(terminal_table(assumption_table((results.schedule_region or results.schedule).assumptions)))
-    console.print("assumptions of the paper's theorems:")
-    console.print(terminal_table(assumption_table(assumptions(results.scenario))))
-    for sentence in (*_in_words(results), *_stability_in_words(results)):
-        console.print(sentence, markup=False, highlight=False)
+        blocks.append(_doubt("the box certificates do not cover this plant:", outside))
+    blocks += [
+        _prose("assumptions of the certificates for the schedule:"),
+        assumption_table((results.schedule_region or results.schedule).assumptions),
+        _prose("assumptions of the paper's theorems:"),
+        assumption_table(assumptions(results.scenario)),
+        *map(_prose, (*_in_words(results), *_stability_in_words(results))),
+    ]
     if results.weight is not None and results.schedule.exists:
-        _print_weight(console, results, results.weight)
+        blocks += _weight_lines(results, results.weight)
     if not (chosen or results).answer.is_certified:
-        _print_advice(console, results)
+        blocks.append(_advice(results))
     if chosen is not None and chosen.weight is not None:
-        console.print("[bold]With another norm, also in the trigger, there are certificates:[/]")
-        console.print(terminal_table(next(certificate_tables(chosen))))
-        _print_weight(console, chosen, chosen.weight)
+        blocks += [
+            _prose("With another norm, also in the trigger, there are certificates:"),
+            next(certificate_tables(chosen))._replace(name=""),
+            *_weight_lines(chosen, chosen.weight),
+        ]
+    data = results.to_json() | {"in_chosen_norm": chosen and chosen.to_json()}
+    return Document(title=results.scenario.name, data=data, blocks=blocks)
 
 
-def _print_nonlinear(console: Console, results: Certificates, why_nonlinear: str) -> None:
-    """Print for which plant the certificates of a nonlinear one are."""
+def _prose(text: str) -> Sentence:
+    return Sentence(text=text, is_prose=True)
+
+
+def _note(text: str) -> Sentence:
+    return Sentence(text=text, role=SentenceRole.NOTE)
+
+
+def _doubt(lead: str, text: str) -> Sentence:
+    return Sentence(lead=lead, text=text, tone=Tone.DOUBTFUL, is_prose=True)
+
+
+def _on_nonlinear(results: Certificates) -> Iterator[Sentence]:
+    """Yield for which plant the certificates of a nonlinear one are."""
+    if results.nonlinear is None:
+        return
     region = results.schedule_region
     if region is None or not region.exists:
         why = "" if region is None else f": {region.void}"
         own = f". The plant itself has no certificate from its x(0){why}"
     else:
         own = ", except under “region”: that is certified for the plant itself"
-    console.print(
-        f"[yellow]the plant is not linear[/] ({escape(why_nonlinear)}): what follows is "
-        f"certified for the linear plant ẋ = Âx + B̂u in its place{escape(own)}"
+    yield _doubt(
+        "the plant is not linear",
+        f"({results.nonlinear}): what follows is "
+        f"certified for the linear plant ẋ = Âx + B̂u in its place{own}",
     )
 
 
-def _print_advice(console: Console, results: Certificates) -> None:
-    """Print that there is no certificate, and settings with which there is one."""
+def _advice(results: Certificates) -> Sentence:
+    """Return that there is no certificate, and settings with which there is one."""
     advice = _listed("; there is one", results.helpful_settings)
-    console.print(
-        f"[yellow]no certificate for the schedule[/], so no bound of ‖x‖{escape(advice)}; noack adversary "
-        "shows what losses can do to it"
+    return _doubt(
+        "no certificate for the schedule,",
+        f"so no bound of ‖x‖{advice}; noack adversary shows what losses can do to it",
     )
 
 
@@ -97,20 +109,15 @@ def _listed(what: str, tried: Sequence[TriedSettings]) -> str:
     return f"{what} with {', or with '.join(settings.text for settings in tried)}; each was tried alone"
 
 
-def _print_weight(console: Console, chosen: Certificates, weight: Matrix) -> None:
+def _weight_lines(chosen: Certificates, weight: Matrix) -> Iterator[Sentence]:
+    """Yield what a norm bounds, and its lines for the scenario file."""
     if (bound := chosen.error_in_given_norm) is not None:
-        console.print(
+        yield _prose(
             "With W below in the trigger, the error in the scenario's own norm is bounded, too "
-            f"(schedule, plant): ‖e_c‖ ≤ {at_most(bound)} {chosen.schedule.level}",
-            markup=False,
+            f"(schedule, plant): ‖e_c‖ ≤ {at_most(bound)} {chosen.schedule.level}"
         )
     rows = ",\n".join(f"  {[float(f'{v:.6g}') for v in row]}" for row in weight)
-    console.print(
-        f"for the scenario file, below [trigger]:\nweight = [\n{rows},\n]",
-        markup=False,
-        highlight=False,
-        soft_wrap=True,
-    )
+    yield Sentence(text=f"for the scenario file, below [trigger]:\nweight = [\n{rows},\n]")
 
 
 def _in_words(results: Certificates) -> Iterator[str]:
@@ -205,61 +212,61 @@ def certificate_tables(results: Certificates) -> Iterator[ResultTable]:
         yield ResultTable("limits", caption, LIMIT_HEADINGS, [present, *limits])
 
 
-def _print_notes(console: Console, results: Certificates) -> None:
-    """Explain the rows of the constants, and say why there are no other certificates."""
+def _notes(results: Certificates) -> Iterator[Sentence]:
+    """Yield what the rows of the constants mean, and why there are no other certificates."""
     certificates = [certificate for _, certificate in results]
     if any(certificate.exists for certificate in certificates):
         are_proven = any(certificate.proven for certificate in certificates)
         proven = f"{PROVEN} proved: noack-check has verified it. The other numbers are computed, and"
-        console.print(f"[dim]{proven if are_proven else 'All numbers are computed, and'} not checked.[/]")
-        console.print(
-            "[dim]Each bound of a norm is multiplied by e^(−rate·t). paper: no sampling, no delay, "
+        yield _note(f"{proven if are_proven else 'All numbers are computed, and'} not checked.")
+        yield _note(
+            "Each bound of a norm is multiplied by e^(−rate·t). paper: no sampling, no delay, "
             "no hold. schedule: the scenario's rates, plus the lateness that it allows. Its inter-event "
             "time can be the larger one: events are at measurements only. plant: the "
             "scenario's plant. box: every plant of the uncertainty box. undelivered updates: "
             "updates not yet delivered (lost or in flight), maximum. all arrived: the bound "
-            "while every update has arrived. inter-event time: minimum.[/]"
+            "while every update has arrived. inter-event time: minimum."
         )
     if any(certificate.persistent_constants for certificate in certificates):
-        console.print(
-            "[dim]The rows with + are added: they are the bounds from disturbances, noise, and the "
+        yield _note(
+            "The rows with + are added: they are the bounds from disturbances, noise, and the "
             "threshold's constant or floor. With noise or an observer, e_s and e_c are x_s − x̂ "
-            "and x_c − x̂.[/]"
+            "and x_c − x̂."
         )
     if any(certificate.other for certificate in certificates):
-        console.print(
-            "[dim]More than one bound holds at all times. The table has the one that tends to the "
-            "smallest value; all are in the words below.[/]"
+        yield _note(
+            "More than one bound holds at all times. The table has the one that tends to the "
+            "smallest value; all are in the words below."
         )
     reasons: dict[tuple[str, str], list[str]] = {}
     for under, certificate in results:
         if certificate.void and not certificate.exists:
             reasons.setdefault((certificate.scope, certificate.void), []).append(under)
     for (scope, why), conditions in reasons.items():
-        console.print(f"[yellow]no certificate[/] ({' and '.join(conditions)}, {scope}): {escape(why)}")
-    _print_unproven(console, results)
+        yield _doubt("no certificate", f"({' and '.join(conditions)}, {scope}): {why}")
+    yield from _unproven(results)
     if (box := results.helpful_box) is not None:
-        console.print(f"the box has one{escape(_listed('', [box]))}", highlight=False)
+        yield _prose(f"the box has one{_listed('', [box])}")
     for under, certificate in results:
         if certificate.region is not None:
             loop, region = loop_of(results.scenario), certificate.region
             limits = zip((*loop.state_names, *loop.input_names), region.x + region.u, strict=True)
             text = ", ".join(f"|{name}| ≤ {at_most(limit)}" for name, limit in limits)
-            console.print(f"[green]region[/] ({under}): {escape(text)}", highlight=False)
+            yield Sentence(lead="region", text=f"({under}): {text}", tone=Tone.GOOD, is_prose=True)
     policy = results.scenario.trigger.policy
     exists = results.schedule.exists  # else another norm is tried
     if exists and results.weight is None and policy == "decaying" and any(c.void for c in certificates):
-        console.print("--weight chosen searches for a norm in which more is certified")
+        yield _prose("--weight chosen searches for a norm in which more is certified")
 
 
-def _print_unproven(console: Console, results: Certificates) -> None:
-    """Print why no bound is proven for some plants under some conditions."""
+def _unproven(results: Certificates) -> Iterator[Sentence]:
+    """Yield why no bound is proven for some plants under some conditions."""
     names = {"ideal": IDEAL, "schedule": SCHEDULE, "own": "plant", "box": "box"}
     reasons: dict[str, list[str]] = {}
     for plants, conditions, reason in results.unproven:
         reasons.setdefault(reason, []).append(f"{names[conditions]}, {names[plants]}")
     for reason, columns in reasons.items():
-        console.print(f"[yellow]nothing is proven[/] ({'; '.join(columns)}): {escape(reason)}")
+        yield _doubt("nothing is proven", f"({'; '.join(columns)}): {reason}")
 
 
 LIMIT_HEADINGS = ("", "sampling period", "delay of updates", "age of inputs")

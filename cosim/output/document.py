@@ -20,7 +20,7 @@ class SentenceRole(StrEnum):
     VERDICT = "verdict"
     REMARK = "remark"
     NOTE = "note"
-    """Explains a table; it may be broken into lines."""
+    """Explains a table."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +32,8 @@ class Sentence:
     tone: Tone = Tone.NEUTRAL
     lead: str = ""
     """First words of the line: they have the tone; without them, the text has it."""
+    is_prose: bool = False
+    """Whether a terminal breaks it into lines between words; a note is, in any case."""
     on_terminal: bool = True
     on_page: bool = True
 

@@ -47,6 +47,8 @@ class ResultTable(NamedTuple):
     """Tones of texts in the last column (of a list: in the first), by their first words."""
     is_dense: bool = False
     """On a terminal: save width, break no words, and no lines at the right."""
+    splits: bool = False
+    """Whether a terminal shows a wide table in parts, without columns that have the same text everywhere."""
     shown: Collection[int] | None = None
     """Rows that a terminal shows; None: all."""
     more: str = ""

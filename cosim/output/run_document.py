@@ -140,7 +140,8 @@ def _notes_on_claims(claims: Sequence[Claim]) -> Iterator[Sentence]:
         if claim.verdict != "held" and claim.why:
             sources.setdefault((claim.verdict, claim.why), []).append(claim.origin)
     for (word, reason), claim_sources in sources.items():
-        yield Sentence(text=f"{word}: {'; '.join(dict.fromkeys(claim_sources))}: {reason}")
+        text = f"{word}: {'; '.join(dict.fromkeys(claim_sources))}: {reason}"
+        yield Sentence(text=text, is_prose=True)
 
 
 def _realtime(realtime: dict[str, dict[str, str]]) -> Iterator[Sentence]:
@@ -154,7 +155,7 @@ def _realtime(realtime: dict[str, dict[str, str]]) -> Iterator[Sentence]:
         roles_by_settings.setdefault(text, []).append(role)
     for text, roles in roles_by_settings.items():
         whose = "" if len(roles) == len(realtime) else f" of {', '.join(roles)}"
-        yield Sentence(text=f"real-time settings{whose}: {text}")
+        yield Sentence(text=f"real-time settings{whose}: {text}", is_prose=True)
 
 
 def assumption_table(assumptions: Sequence[Assumption | AssumptionPart]) -> ResultTable:

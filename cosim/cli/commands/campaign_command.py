@@ -9,7 +9,7 @@ from typer import Argument, Option
 
 from cosim.cli import options as opt
 from cosim.cli.options import CAMPAIGNS, examples
-from cosim.cli.printing import console, print_json, write_tables
+from cosim.cli.printing import show, write_tables
 from cosim.output.figures.figure_format import requested_files
 from cosim.record.run_directory import DEFAULT_RUNS
 from noack.core.errors import CallerError, ExitStatus
@@ -101,10 +101,9 @@ def campaign(
             "kept, and a larger --draws shows them again"
         )
     summary, files = finished.summary, [str(file) for file in finished.files]
-    if json:
-        print_json(summary.to_json() | {"made": finished.made, "files": files})
-    else:
-        campaign_report.print_summary(console(), summary)
+    document = campaign_report.campaign_document(summary)
+    show(document, json=json, made=finished.made, files=files)
+    if not json:
         print(*files, sep="\n")
-    write_tables(campaign_report.campaign_tables(summary), tables, json=json)
+    write_tables(document.tables, tables, json=json)
     return ExitStatus.FAILED if summary.breaches else ExitStatus.OK

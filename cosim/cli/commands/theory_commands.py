@@ -9,7 +9,7 @@ from typer import Option
 
 from cosim.cli import options as opt
 from cosim.cli.options import THEORY, examples
-from cosim.cli.printing import console, print_json, show, status, status_of, write_tables
+from cosim.cli.printing import console, print_json, show, status, status_of
 from cosim.output.requirement import Requirement
 from cosim.record.run_directory import DEFAULT_RUNS
 from noack.core.errors import CallerError, ExitStatus
@@ -98,7 +98,7 @@ def certify(
     from cosim.analysis.certificates import certificates_of, in_chosen_norm
     from cosim.analysis.witnesses import require_covered
     from cosim.live.monitoring.progress import work_bar
-    from cosim.output.certificate_report import certificate_tables, print_certificates
+    from cosim.output.certificate_report import certificate_document
     from cosim.output.export.mat_export import save_mat
     from cosim.output.requirements import uncovered_as_unmet, unmet_by_scenario
     from cosim.record.run_directory import write_output
@@ -131,11 +131,7 @@ def certify(
         if chosen is not None and proofs:
             with work_bar("searching for proofs in the other norm", lines=True) as bar:
                 chosen.prove(bar)
-    if json:
-        print_json(result.to_json() | {"in_chosen_norm": chosen and chosen.to_json()})
-    else:
-        print_certificates(console(), result, chosen)
-    write_tables(certificate_tables(result), tables, json=json)
+    show(certificate_document(result, chosen), json=json, tables=tables)
     if out is not None:
         save_mat(result.to_json(), out)
     certified = any(certificate.exists for _, certificate in result)

@@ -7,15 +7,12 @@ from typing import NamedTuple
 
 import tomli_w
 from pydantic_core import to_json
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
+from cosim.output.document import Block, Document, Folded, Heading, Sentence, SentenceRole
 from cosim.output.figures.figure_files import save_figures
 from cosim.output.figures.figure_format import FigureFiles
-from cosim.output.page_kit import templates
-from cosim.output.result_tables import ResultTable
+from cosim.output.page_kit import document_page
+from cosim.output.result_tables import ResultTable, Tone
 from cosim.record.run_directory import CAMPAIGN_PAGE, SUMMARY_FILE, read_object
 from cosim.studies.campaign.campaign_figures import figures
 from cosim.studies.campaign.campaign_file import MOST_DRAWS, Campaign
@@ -34,10 +31,19 @@ PAGE, SUMMARY = CAMPAIGN_PAGE, SUMMARY_FILE
 _NONE = "–"
 _MOST_ROWS = 40
 """Rows of a table in the terminal."""
-_APART = 3
-"""Largest distance between columns, margins included."""
 _MOST_REMARKS = 5
 """Remarks in the terminal."""
+_PAIRED = (
+    "Draw i has the same plant, initial state and losses everywhere: what is left of a difference is "
+    "due to the settings."
+)
+_INTERVALS = (
+    "Intervals are Student's t, of the runs in which the metric is finite; quantiles are in summary.json."
+)
+_CONTINUOUS = (
+    "continuous time: the trigger acts at once and the network has no delay; with "
+    'time = "sampled" the runs have the sampling and delays of a live run'
+)
 
 
 def write_report(
@@ -51,12 +57,13 @@ def write_report(
     Raises:
         MachineError: they cannot be written.
     """
-    document = to_json(summary.to_json(), indent=1, inf_nan_mode="null")
+    document = campaign_document(summary, store, base)
+    content = to_json(document.data, indent=1, inf_nan_mode="null")
     return [
-        write_whole(store.folder / PAGE, page(summary, store, base)),
-        write_whole(store.folder / SUMMARY, document + b"\n"),
+        write_whole(store.folder / PAGE, document_page(document)),
+        write_whole(store.folder / SUMMARY, content + b"\n"),
         store.folder / RUNS,
-        *save_figures(figures(summary, store), store.folder / PAGE, figure_files),
+        *save_figures(document.figures, store.folder / PAGE, figure_files),
     ]
 
 
@@ -101,116 +108,69 @@ def campaign_tables(summary: CampaignSummary, *, shares: bool = False) -> Iterat
         yield ResultTable("differences", title, headings, differences)
 
 
-def page(summary: CampaignSummary, store: Store, base: Mapping[str, object]) -> str:
-    """Return the page as HTML; all text except the figures is escaped.
+def campaign_document(
+    summary: CampaignSummary, store: Store | None = None, base: Mapping[str, object] | None = None
+) -> Document:
+    """Return the tables, remarks and verdict of a campaign.
 
-    ``base`` is the content of the scenario of all runs.
+    With its store and ``base``, the content of the scenario of all runs, it is that of the page,
+    which has the figures and the scenarios.
     """
-    campaign = summary.campaign
-    content = campaign.model_dump(mode="json", exclude_none=True)
-    remarks = list(_unfinished(summary))
-    tables = {table.name: table for table in campaign_tables(summary, shares=True)}
-    tone = "doubt" if remarks else "good"
-    return (
-        templates(Path(__file__).parent)
-        .get_template("campaign.html.jinja")
-        .render(
-            title=campaign.name,
-            description=campaign.description,
-            subtitle=f"{len(summary.results):,} grid points, {summary.draws:,} draws at each, "
-            f"seed {campaign.seed}",
-            verdict=_verdict(summary),
-            tone="bad" if summary.breaches else tone,
-            remarks=[*remarks, *_bursts(summary)],
-            figures=list(figures(summary, store)),
-            tables=tables,
-            axes=len(campaign.axes),
-            reference=_reference(summary),
-            campaign_toml=tomli_w.dumps(content, indent=2),
-            scenario_toml=tomli_w.dumps(base, indent=2),
-        )
-    )
-
-
-def print_summary(console: Console, summary: CampaignSummary) -> None:
-    """Print the tables of a summary."""
-    campaign = summary.campaign
-    for full_table in campaign_tables(summary):
-        table, names = without_constants(full_table, len(campaign.axes))
-        table = table._replace(rows=table.rows[:_MOST_ROWS])
-        for part in split_table(table, names, console.width):
-            console.print(part)
-        if (surplus := len(full_table.rows) - _MOST_ROWS) > 0:
-            console.print(f"and {surplus} more grid points: see the page")
-    if campaign.time == "continuous":
-        console.print(
-            "continuous time: the trigger acts at once and the network has no delay; with "
-            'time = "sampled" the runs have the sampling and delays of a live run',
-            style="dim",
-            highlight=False,
-        )
-    remarks = [*_unfinished(summary), *_bursts(summary)]
-    for remark in remarks[:_MOST_REMARKS]:
-        console.print(remark, style="yellow", markup=False, highlight=False)
-    if len(remarks) > _MOST_REMARKS:
-        console.print(f"and at {len(remarks) - _MOST_REMARKS} more grid points: see the page")
-    console.print(_verdict(summary), style="bold red" if summary.breaches else "bold")
-
-
-def without_constants(table: ResultTable, names: int) -> tuple[ResultTable, int]:
-    """Move columns with the same text in all rows to the caption; return how many labels are left.
-
-    The first ``names`` columns are labels. A table of one row is returned as it is, as is one in
-    which no other column varies.
-    """
-    columns = list(zip(*table.rows, strict=True))
-    varying = [i for i, column in enumerate(columns) if len(set(column)) > 1]
-    if len(varying) == len(columns) or all(i < names for i in varying):
-        return table, names
-    constants = (f"{table.headings[i]} {columns[i][0]}" for i in range(len(columns)) if i not in varying)
-    left = ResultTable(
-        table.name,
-        f"{table.caption}; everywhere {', '.join(constants)}",
-        [table.headings[i] for i in varying],
-        [[row[i] for i in varying] for row in table.rows],
-    )
-    return left, sum(i < names for i in varying)
-
-
-def split_table(table: ResultTable, names: int, width: int) -> Iterator[Table]:
-    """Split a table into as many tables as a terminal of this width needs; nothing is truncated.
-
-    Each has the first ``names`` columns, which are labels.
-    """
-    columns = list(zip(table.headings, *table.rows, strict=True))
-    # A heading may break between words.
-    widths = [max(map(len, (*head.split(), *cells))) + _APART for head, *cells in columns]
-    begin = names
-    while begin < len(columns):
-        end = begin + 1
-        while end < len(columns) and sum(widths[:names]) + sum(widths[begin : end + 1]) <= width:
-            end += 1
-        part = Table(
-            title=escape(table.caption) if begin == names else None,
-            title_justify="left",
-            box=SIMPLE_HEAD,
-            pad_edge=False,
-            collapse_padding=True,
-        )
-        shown = [*range(names), *range(begin, end)]
-        unbroken = sum(max(len(table.headings[i]) + _APART, widths[i]) for i in shown)
-        for i in shown:
-            part.add_column(
-                escape(table.headings[i]),
-                justify="left" if i < names else "right",
-                overflow="fold",
-                min_width=None if i < names else widths[i] - _APART,
-                max_width=widths[i] - _APART if unbroken > width else None,
+    campaign, is_page = summary.campaign, store is not None
+    unfinished = [*_unfinished(summary)]
+    remarks = [*unfinished, *_bursts(summary)]
+    more = len(remarks) - _MOST_REMARKS
+    more_text = f"and at {more} more grid points: see the page"
+    tone = Tone.DOUBTFUL if unfinished else Tone.GOOD
+    blocks: list[Block] = []
+    if store is not None and campaign.figures:
+        blocks += [Heading("Figures"), *figures(summary, store)]
+    blocks.append(Heading("Grid points"))
+    for table in campaign_tables(summary, shares=is_page):
+        if table.name == "differences":
+            blocks += [Heading("Differences draw by draw"), Sentence(text=_PAIRED, on_terminal=False)]
+        surplus = len(table.rows) - _MOST_ROWS
+        blocks.append(
+            table._replace(
+                names=len(campaign.axes),
+                splits=True,
+                shown=range(_MOST_ROWS),
+                more=f"and {surplus} more grid points: see the page" if surplus > 0 else "",
             )
-        for row in table.rows:
-            part.add_row(*(escape(row[i]) for i in shown))
-        yield part
-        begin = end
+        )
+    if campaign.time == "continuous":
+        blocks.append(Sentence(text=_CONTINUOUS, role=SentenceRole.NOTE))
+    blocks += [
+        Sentence(text=_INTERVALS, on_terminal=False),
+        *(
+            Sentence(
+                text=text, role=SentenceRole.REMARK, tone=Tone.DOUBTFUL, is_prose=True,
+                on_terminal=number < _MOST_REMARKS,
+            )
+            for number, text in enumerate(remarks)
+        ),
+        *([Sentence(text=more_text, on_page=False)] if more > 0 else []),
+        Sentence(
+            text=_verdict(summary), role=SentenceRole.VERDICT, is_prose=True,
+            tone=Tone.BAD if summary.breaches else tone,
+        ),
+    ]  # fmt: skip
+    if base is not None:
+        content = campaign.model_dump(mode="json", exclude_none=True)
+        blocks += [
+            Heading("What was run"),
+            Folded("The campaign (TOML)", tomli_w.dumps(content, indent=2)),
+            Folded("The scenario that all runs start from (TOML)", tomli_w.dumps(base, indent=2)),
+        ]
+    return Document(
+        title=campaign.name,
+        kind="campaign",
+        subtitle=f"{len(summary.results):,} grid points, {summary.draws:,} draws at each, "
+        f"seed {campaign.seed}",
+        description=campaign.description,
+        data=summary.to_json(),
+        blocks=blocks,
+    )
 
 
 def _verdict(summary: CampaignSummary) -> str:

@@ -17,7 +17,9 @@ from scipy.linalg import expm
 from cosim.analysis.certificates import _STATED, Certificates, certificates_of, with_weight
 from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.analysis.witnesses import Unproven, find_statement, resolved_content
-from cosim.output.certificate_report import certificate_tables, print_certificates
+from cosim.output.certificate_report import certificate_document, certificate_tables
+from cosim.output.document import Document
+from cosim.output.terminal_writer import print_document
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
 from noack.scenario.resolution import loop_of
@@ -434,12 +436,16 @@ def test_a_norm_with_certificates_is_found_and_can_be_pasted(
 ) -> None:
     printed = list[Any]()
     monkeypatch.setattr("cosim.analysis.certificates.choose_weight", lambda *_: chosen.weight)
-    monkeypatch.setattr(
-        "cosim.output.certificate_report.print_certificates", lambda *given: printed.append(given)
-    )
+
+    def document(*given: Any) -> Document:
+        printed.append(given)
+        return Document(title="", blocks=[])
+
+    monkeypatch.setattr("cosim.output.certificate_report.certificate_document", document)
     invoke("certify", "lane_following", "--no-proofs", *(f"--set={setting}" for setting in SLOW))
-    ((_, result, in_chosen_norm),) = printed
-    print_certificates(Console(file=(output := StringIO()), width=100), result, in_chosen_norm)
+    ((result, in_chosen_norm),) = printed
+    shown = certificate_document(result, in_chosen_norm)
+    print_document(Console(file=(output := StringIO()), width=100), shown)
     text = output.getvalue()
     pasted_lines = text[text.index("\nweight = [") :].splitlines()[1:]
     rows = "".join(line.strip() for line in pasted_lines)
@@ -467,7 +473,7 @@ def proven_lane(proven: ProvenBounds = PROVEN) -> Certificates:
 
 
 def printed(certificates: Certificates) -> str:
-    print_certificates(Console(file=(output := StringIO()), width=150), certificates)
+    print_document(Console(file=(output := StringIO()), width=150), certificate_document(certificates))
     return output.getvalue()
 
 

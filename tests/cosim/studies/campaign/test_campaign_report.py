@@ -7,10 +7,11 @@ from typing import Any
 import pytest
 
 from cosim.output.result_tables import ResultTable
+from cosim.output.terminal_writer import without_constants
 from cosim.studies.campaign import campaign_grid
 from cosim.studies.campaign.campaign_file import load
 from cosim.studies.campaign.campaign_grid import base_of
-from cosim.studies.campaign.campaign_report import without_constants, write_report
+from cosim.studies.campaign.campaign_report import write_report
 from cosim.studies.campaign.campaign_summary import summarise
 from cosim.studies.campaign.chunk_store import Store
 from tests.cosim.studies.campaign.conftest import HOSTILE, Command, Write
