@@ -38,9 +38,14 @@ def read_number(table: Mapping[str, object], key: str) -> arb:
 
 
 def read_matrix(
-    table: Mapping[str, object], key: str, size: int | None = None, *, most: int | None = None
+    table: Mapping[str, object],
+    key: str,
+    size: int | None = None,
+    *,
+    most: int | None = None,
+    symmetric: bool = True,
 ) -> arb_mat:
-    """Return a symmetric matrix, perhaps of a given size, or of at most some size."""
+    """Return a square matrix, perhaps of a given size, or of at most some size."""
     rows = table.get(key)
     if not isinstance(rows, list) or not rows or not all(isinstance(row, Sequence) for row in rows):
         raise RejectedError(f"{key}: not a matrix")
@@ -49,6 +54,6 @@ def read_matrix(
     if wrong or any(len(row) != n for row in rows):
         raise RejectedError(f"{key}: not a square matrix of the right size")
     found = arb_mat([[read_number({key: value}, key) for value in row] for row in rows])
-    if any(found[i, j] != found[j, i] for i in range(n) for j in range(i)):
+    if symmetric and any(found[i, j] != found[j, i] for i in range(n) for j in range(i)):
         raise RejectedError(f"{key}: not symmetric")
     return found

@@ -48,6 +48,28 @@ class Times(NamedTuple):
         return self.least_period if self.period > 0 else self.least_sampling
 
 
+class Observer(NamedTuple):
+    """An observer in the sensor, for a plant that has the matrices A and B that it uses.
+
+    At each test its error becomes I − LC times that of the prediction, plus the noise of the test.
+    """
+
+    correction: arb_mat  # I − LC, (n, n)
+    start: arb_mat  # x̂ − x before the first test, at t = 0, (n, 1)
+    period: fmpq  # T, s, exactly between two tests
+
+
+class Noise(NamedTuple):
+    """Bounds of n, where x + n is what the sensor takes for the state at a test: n = s + Σ column p."""
+
+    columns: arb_mat  # (n, k)
+    decaying: int  # of so many columns, the first ones, |p| ≤ f₁; of the others |p| ≤ f₂
+    smooth: arb_mat  # Λ in ṡ = Λs, (n, n); (0, 0): s = 0
+    start: arb_mat  # s(0), (n, 1)
+    sizes: tuple[arb, arb]
+    """‖W n‖ is at most their sum, times f₁ and f₂."""
+
+
 class Loop(NamedTuple):
     """A loop with n states and m inputs, in coordinates in which its set-point is 0."""
 
@@ -64,9 +86,10 @@ class Loop(NamedTuple):
     rule: Rule
     pushes: arb_mat  # columns D of disturbances, (n, k)
     sizes: tuple[arb, ...]  # |d_i| ≤ sizes[i]
-    noise: arb_mat  # columns of the noise of measurements, (n, k): Σ column p with |p_i| ≤ 1 for each
+    noise: arb_mat  # columns of the noise of tests, (n, k): Σ column p with |p_i| ≤ 1 for each
     losses: int  # most consecutive losses, M − 1
     times: Times
+    observer: Observer | None = None
 
     @property
     def n(self) -> int:
@@ -74,10 +97,21 @@ class Loop(NamedTuple):
         return int(self.A.nrows())
 
     @property
-    def noise_size(self) -> arb:
-        """The largest ‖W n‖ of the noise n of measurements."""
-        rows = (self.weight * self.noise).tolist() if self.noise.ncols() else []
-        return frobenius(arb_mat(1, len(rows), [sum((abs(entry) for entry in row), arb(0)) for row in rows]))
+    def plain_noise(self) -> Noise:
+        """Bounds of n without an observer."""
+        n, rows = self.n, (self.weight * self.noise).tolist() if self.noise.ncols() else []
+        size = frobenius(arb_mat(1, len(rows), [sum((abs(entry) for entry in row), arb(0)) for row in rows]))
+        return Noise(self.noise, 0, zeros(0, 0), zeros(n, 1), (arb(0), size))
+
+    @property
+    def needs_constant(self) -> bool:
+        """Whether f₂ is a state."""
+        is_needless = self.rule.floor == 0 and not self.sizes and not self.noise.ncols()
+        return not is_needless  # also for a ball around 0
+
+    def has_decaying_unit(self, rate: arb) -> bool:
+        """Return whether f₁ is a state; with r = 0 it equals f₂, and one of both is enough."""
+        return not (rate == 0 and self.needs_constant)
 
     @property
     def H(self) -> arb_mat:
@@ -99,6 +133,9 @@ class Loop(NamedTuple):
         matrices = {name: getattr(self, name) for name in shapes} | {
             "rule.positive": rule.positive, "rule.negative": rule.negative,
         }  # fmt: skip
+        if self.observer is not None:
+            shapes |= {"correction": (n, n), "first estimate": (n, 1)}
+            matrices |= {"correction": self.observer.correction, "first estimate": self.observer.start}
         shapes |= {name: (matrices[name].nrows(), 2 * n) for name in ("rule.positive", "rule.negative")}
         for name, M in matrices.items():
             if (M.nrows(), M.ncols()) != shapes[name]:
@@ -112,6 +149,12 @@ class Loop(NamedTuple):
         for name, size in sizes.items():
             if not (size.is_finite() and size >= 0):
                 return f"{name}: not a number of at least 0"
+        if self.observer is not None:
+            is_known = is_zero(self.half_A) and is_zero(self.half_B)
+            if not (is_known and self.model_A == self.A and self.model_B == self.B):
+                return "observer: its model may not be the plant"
+            if not (times.sampling > 0 and self.observer.period > 0):
+                return "observer: without tests at times"
         if n == 0 or len(self.sizes) != k:
             return "no states, or not one size for each disturbance"
         if not all(time >= 0 for time in times) or times.least_sampling > times.sampling:

@@ -6,10 +6,11 @@ of constant bounds. With the input u = K e^{−Hs} x_c of age s,
 
     ẋ = Ax + Bu + Dd,   ė = H(x + e) − ẋ,   ẇ = Hw,   ḟ₁ = −r f₁,   ḟ₂ = 0.
 
-A test measures x + n with a noise n = Σ column p, |p| ≤ f₂, which is another one at each test. An event
-sets x_s := x + n, so e := n at once, since the sensor's model is reset whether or not the update arrives,
-and w grows by e − n. The rule compares x + n and e − n. The entries of z for p are used at tests only; with
-tests at all times also in flows, where some p at each time makes the rule silent.
+At a test the sensor takes x + n for x, with n = s + Σ column p: see :mod:`.noise`. Here s is a state, and
+the p with |p| ≤ f₁ or f₂ are others at each test. An event sets x_s := x + n, so e := n at once, since the
+sensor's model is reset whether or not the update arrives, and w grows by e − n. The rule compares x + n and
+e − n. The entries of z for e are those of e − s. Those for p are used at tests only; with tests at all times
+also in flows, where some p at each time makes the rule silent.
 
 A location says what becomes of the updates that were sent since the one that the acting input
 was computed from:
@@ -64,7 +65,7 @@ from noack_check.balls import (
     upto,
     zeros,
 )
-from noack_check.loop import Loop
+from noack_check.loop import Loop, Noise
 
 _CLOSE = 1000
 """Nodes of a periodic rule's clock are at least such a share of the period apart."""
@@ -167,26 +168,13 @@ class Form(NamedTuple):
     scalars: tuple[tuple[str, arb_mat], ...]
 
 
-def needs_constant(loop: Loop) -> bool:
-    """Return whether f₂ is a state."""
-    is_needless = (
-        loop.rule.floor == 0 and not loop.sizes and not loop.noise.ncols()
-    )  # false for a ball around 0
-    return not is_needless
-
-
-def has_decaying_unit(loop: Loop, rate: arb) -> bool:
-    """Return whether f₁ is a state; with r = 0 it equals f₂, and one of both is enough."""
-    return not (rate == 0 and needs_constant(loop))
-
-
 def thresholds(loop: Loop, rate: arb) -> tuple[arb, arb]:
     """Return c and f with c² f₁² + f² f₂² at least the square of the threshold.
 
     Without f₁ the threshold is at most the constant max(c, f).
     """
     rule = loop.rule
-    return (rule.level, rule.floor) if has_decaying_unit(loop, rate) else (arb(0), rule.level.max(rule.floor))
+    return (rule.level, rule.floor) if loop.has_decaying_unit(rate) else (arb(0), rule.level.max(rule.floor))
 
 
 class Model:
@@ -197,6 +185,7 @@ class Model:
         rate: r ≥ 0 in f₁ = e^{−rt}, in 1/s.
         decay: ν in dV/dt ≤ −νV, in 1/s.
         errors: what is assumed of e_s, if it is used: then w is bounded by the paper's chain, too.
+        noise: bounds of n; by default those without an observer.
         later: most events within d after an event.
         later_at_start: most events after the one at t = 0 before the first input acts.
         pieces: of the period of a periodic rule, on which P is affine.
@@ -209,6 +198,7 @@ class Model:
         rate: arb,
         decay: arb,
         errors: Errors | None = None,
+        noise: Noise | None = None,
         *,
         later: int = 0,
         later_at_start: int = 0,
@@ -221,16 +211,25 @@ class Model:
         self.is_periodic = loop.times.period > 0
         self._clock = self._clock_nodes(pieces) if self.is_periodic else []
         n, copies = loop.n, max(later, later_at_start)
-        self._sources = range((3 + copies) * n, (3 + copies) * n + loop.noise.ncols())
+        if noise is None and loop.observer is not None:
+            raise ValueError("noise: that of the observer is missing")
+        self.bounds = noise = noise or loop.plain_noise
+        smooth = range((3 + copies) * n, (3 + copies) * n + noise.smooth.nrows())
+        self._sources = range(smooth.stop, smooth.stop + noise.columns.ncols())
         self.size = self._sources.stop + 2
         every = identity(self.size)
-        vectors = [rows_of(every, range(i, i + n)) for i in range(0, self._sources.start, n)]
-        self.x, self.e, self.w, *self.v = vectors
-        self.p = rows_of(every, self._sources)
+        vectors = [rows_of(every, range(i, i + n)) for i in range(0, smooth.start, n)]
+        self.x, self._error, self.w, *self.v = vectors
+        self.s, self.p = rows_of(every, smooth), rows_of(every, self._sources)
+        self.e = self._error + self.s if smooth else self._error
         self.f1, self.f2 = (rows_of(every, [self.size - 2 + i]) for i in range(2))
-        self.noise = loop.noise * self.p if self._sources else 0 * self.x
-        self._noise_bounds = tuple(square(rows_of(every, [i])) - square(self.f2) for i in self._sources)
-        self._has_f1 = has_decaying_unit(loop, rate)
+        self.noise = self.s if smooth else 0 * self.x
+        if self._sources:
+            self.noise += noise.columns * self.p
+        units = [self.f1] * noise.decaying + [self.f2] * len(self._sources)
+        bounds = zip(self._sources, units, strict=False)
+        self._noise_bounds = tuple(square(rows_of(every, [i])) - square(unit) for i, unit in bounds)
+        self._has_f1 = loop.has_decaying_unit(rate)
         self.level, self.floor = thresholds(loop, rate)
         self.silent = self._comparison(self.level, self.floor)
         self._guards = self._event_guards()
@@ -343,13 +342,13 @@ class Model:
     def _coordinates(self, has_w: bool, copies: int) -> tuple[int, ...]:
         """Return those of x, e, w, some v and the units."""
         n, first = self.loop.n, self.size - 2
-        units = ([first] if self._has_f1 else []) + ([first + 1] if needs_constant(self.loop) else [])
-        w = range(2 * n, 3 * n) if has_w else range(0)
-        return (*range(2 * n), *w, *range(3 * n, (3 + copies) * n), *units)
+        units = ([first] if self._has_f1 else []) + ([first + 1] if self.loop.needs_constant else [])
+        w, s = range(2 * n, 3 * n) if has_w else range(0), self._sources.start - self.s.nrows()
+        return (*range(2 * n), *w, *range(3 * n, (3 + copies) * n), *range(s, self._sources.start), *units)
 
     def _units(self) -> set[str]:
         """Return the names of c of all units."""
-        return ({"c1"} if self._has_f1 else set()) | ({"c2"} if needs_constant(self.loop) else set())
+        return ({"c1"} if self._has_f1 else set()) | ({"c2"} if self.loop.needs_constant else set())
 
     def _assumed(self) -> tuple[arb_mat, ...]:
         """Return ‖W e_s‖² minus its bound, if one is assumed."""
@@ -391,11 +390,13 @@ class Model:
         for gain in gains:
             u = gain * (self.x + self.e + self.w)
             velocity = loop.A * self.x + loop.B * u
-            error = H * (self.x + self.e) - velocity
+            error, smooth = H * (self.x + self.e) - velocity, self.s
             copies = (H * v for v in self.v)
-            matrix = stack(
-                [velocity, error, H * self.w, *copies, 0 * self.p, -self.rate * self.f1, 0 * self.f2]
-            )
+            if self.s.nrows():
+                smooth = self.bounds.smooth * self.s
+                error -= smooth
+            units = 0 * self.p, -self.rate * self.f1, 0 * self.f2
+            matrix = stack([velocity, error, H * self.w, *copies, smooth, *units])
             found.append(Flow(matrix, tuple(self._unknowns(u))))
         return tuple(found)
 
@@ -416,7 +417,7 @@ class Model:
 
     def _push(self, column: arb_mat) -> arb_mat:
         """Return the column of ż for one of ẋ."""
-        return transpose(self.x) * column - transpose(self.e) * column
+        return transpose(self.x) * column - transpose(self._error) * column
 
     @property
     def _waiting(self) -> int:
@@ -484,12 +485,14 @@ class Model:
     def jump(self, e: arb_mat, w: arb_mat, v: Sequence[arb_mat]) -> arb_mat:
         """Return z after a jump; other vectors than these become 0."""
         rest = [0 * self.w] * (len(self.v) - len(v))
-        return stack([self.x, e, w, *v, *rest, self.p, self.f1, self.f2])
+        error = e - self.s if self.s.nrows() else e
+        return stack([self.x, error, w, *v, *rest, self.s, self.p, self.f1, self.f2])
 
     @property
     def _has_silent_edges(self) -> bool:
         """Whether V has to be shown not to grow at a silent test."""
-        return bool(self._sources) and self.loop.times.sampling > 0 and self.loop.rule.positive.nrows() > 0
+        changes = len(self.locations[0].nodes) > 1 and not self.is_periodic
+        return bool(self._sources) and changes and self.loop.rule.positive.nrows() > 0
 
     # The quadratic forms.
 
@@ -498,10 +501,10 @@ class Model:
 
         P is that of xᵀXx + (e, w)ᵀQ(e, w) − c₁ f₁² − c₂ f₂² − a θ·(comparison), with X common to all
         locations: then x drops out of the edges, and a silent test at θ leaves V as it is where the
-        comparison is ≤ 0, since a ≥ 0. With noise each of its four terms has an a of its own, and there is an
-        inequality for silent tests. Waiting locations have Q, c₁ and c₂ for each node.
-        Where an event's guard contains x, each location has a form of x, e and w of its own, and with a
-        periodic rule each node of each location.
+        comparison is ≤ 0, since a ≥ 0. With s it is (x, s)ᵀX(x, s), and e − s for e. With noise each of the
+        comparison's four terms has an a of its own, and there is an inequality for silent tests.
+        Waiting locations have Q, c₁ and c₂ for each node. Where an event's guard contains x, each location
+        has a form of x, e and w of its own, and with a periodic rule each node of each location.
         """
         if (location, node) not in self._forms:
             self._forms[location, node] = self._new_form(location, node)
@@ -510,14 +513,14 @@ class Model:
     def _new_form(self, location: int, node: int) -> Form:
         place = self.locations[location]
         rule, E = self.loop.rule, columns_of(identity(self.size), place.coordinates)
-        errors = stack([f for f in (self.e, self.w, *self.v) if not is_zero(f * E)])
+        errors = stack([f for f in (self._error, self.w, *self.v) if not is_zero(f * E)])
         by_node = self.is_periodic or not place.is_tested
         own = f"{place.name}, {node}" if by_node else place.name
         starts = place.name.startswith("start")
         X = f"X/start, {node}" if starts else "X"
-        parts: tuple[tuple[str, arb_mat], ...] = ((X, self.x * E), (f"Q/{own}", errors * E))
+        parts: tuple[tuple[str, arb_mat], ...] = ((X, stack([self.x, self.s]) * E), (f"Q/{own}", errors * E))
         if rule.negative.nrows() or self.is_periodic:
-            parts = ((f"P/{own}", stack([self.x, errors]) * E),)
+            parts = ((f"P/{own}", stack([self.x, self.s, errors]) * E),)
         units = [(name, f) for name, f in (("c1", self.f1), ("c2", self.f2)) if not is_zero(f * E)]
         scalars = []
         for name, f in units:
@@ -665,8 +668,10 @@ class Model:
         """V(z(0)) ≤ Σ m q: e = n at the start, for all p. The columns of z are a constant, and p."""
         index = self.loop.losses + 1 + self._waiting if self.loop.times.start > 0 else 0
         z = transpose(self.x) * self.loop.start + transpose(self.f1) + transpose(self.f2)
+        if self.s.nrows():
+            z += transpose(self.s) * self.bounds.start
         if self._sources:
-            z = beside(z, transpose(self.e) * self.loop.noise + transpose(self.p))
+            z = beside(z, transpose(self._error) * self.bounds.columns + transpose(self.p))
         at_start = rows_of(z, self.locations[index].coordinates)
         terms = _Terms(z.ncols())
         terms.add(self.form(index, 0), at_start, at_start, arb(-1) / 2)

@@ -26,9 +26,10 @@ from flint import arb, arb_mat, fmpq
 
 from noack_check.balls import around_zero, frobenius, identity, is_zero, upto
 from noack_check.check import RejectedError, verify
-from noack_check.document import read_count, read_matrix, read_number
-from noack_check.loop import Loop, Times
-from noack_check.model import Chain, Errors, Model, has_decaying_unit, needs_constant, thresholds
+from noack_check.document import read_count, read_matrix, read_number, read_table
+from noack_check.loop import Loop, Noise, Times
+from noack_check.model import Chain, Errors, Model, thresholds
+from noack_check.noise import noise_of
 from noack_check.norms import decays_below, growth
 
 MOST_PIECES = 64
@@ -96,8 +97,10 @@ def prove(loop: Loop, document: Mapping[str, object]) -> Proof:
         _require_errors(loop, rate, proven, assumed.errors)
     if assumed.chain is not None and sensor is not None:
         jumps = assumed.chain.factor(loop.losses, 1 + assumed.later if loop.times.delay > 0 else 0)
-        constant = sensor.constant + jumps * (sensor.constant + loop.noise_size)
-        bounds.append(Bound("e_c", (1 + jumps) * sensor.decaying, constant, True))
+        noise = noise_of(loop, rate).sizes
+        decaying = sensor.decaying + jumps * (sensor.decaying + noise[0])
+        constant = sensor.constant + jumps * (sensor.constant + noise[1])
+        bounds.append(Bound("e_c", decaying, constant, True))
     if not all(size.is_finite() for bound in bounds for size in (bound.decaying, bound.constant)):
         raise RejectedError("bounds: not finite")
     return Proof(rate, tuple(bounds), apart, first, is_quiet)
@@ -112,6 +115,8 @@ class Assumptions(NamedTuple):
     chain: Chain | None
     pieces: int = 1
     """Parts of the period of a periodic rule: the nodes of its clock."""
+    noise: Noise | None = None
+    """Of an observer."""
 
 
 def read_assumptions(loop: Loop, rate: arb, document: Mapping[str, object]) -> Assumptions:
@@ -125,8 +130,12 @@ def read_assumptions(loop: Loop, rate: arb, document: Mapping[str, object]) -> A
     pieces = read_count(document, "pieces", MOST_PIECES) if "pieces" in document else 1
     if pieces < 1:
         raise RejectedError("pieces: below 1")
+    smooth = None
+    if "observer" in document:
+        smooth = read_matrix(read_table(document, "observer"), "smooth", loop.n, symmetric=False)
+    noise = noise_of(loop, rate, smooth)
     if "errors" not in document:
-        return Assumptions(None, later, at_start, chain, pieces)
+        return Assumptions(None, later, at_start, chain, pieces, noise)
     if loop.times.period > 0:
         raise RejectedError("errors: of no use with a periodic rule")
     table = document["errors"]
@@ -135,10 +144,10 @@ def read_assumptions(loop: Loop, rate: arb, document: Mapping[str, object]) -> A
     if chain is None:
         raise RejectedError("errors: need the chain")
     sizes = read_number(table, "decaying"), read_number(table, "constant")
-    units = has_decaying_unit(loop, rate), needs_constant(loop)
+    units = loop.has_decaying_unit(rate), loop.needs_constant
     if not all(size == 0 or (size > 0 and is_unit) for size, is_unit in zip(sizes, units, strict=True)):
         raise RejectedError("errors: below 0, or in a unit that the loop does not have")
-    return Assumptions(Errors(*sizes, chain), later, at_start, chain, pieces)
+    return Assumptions(Errors(*sizes, chain), later, at_start, chain, pieces, noise)
 
 
 def require_few_at_start(loop: Loop, assumed: Assumptions) -> bool:
@@ -189,7 +198,7 @@ def _prove_quiet_start(loop: Loop) -> None:
         raise RejectedError("times: an event without a comparison may happen before the first input acts")
     if not _exceeds_by_error(loop):
         raise RejectedError("times: an event of this rule may happen before the first input acts")
-    if not error_without_input(loop, last) + loop.noise_size < (rule.level * (-rule.rate * last).exp()).max(
+    if not error_without_input(loop, last) + _most_noise(loop) < (rule.level * (-rule.rate * last).exp()).max(
         rule.floor
     ):
         raise RejectedError("times: an event may happen before the first input acts")
@@ -206,7 +215,7 @@ def error_without_input(loop: Loop, until: fmpq) -> arb:
     if loop.sizes:
         pushes = loop.pushes * arb_mat(len(loop.sizes), 1, [around_zero(size) for size in loop.sizes])
     largest, _ = growth(weighted(loop, arb(0)), arb(until))
-    step, x, reached = arb(until) / _CELLS, loop.start, largest * loop.noise_size
+    step, x, reached = arb(until) / _CELLS, loop.start, largest * _most_noise(loop)
     within, forward = (upto(step) * A).exp(), (step * A).exp()
     for _ in range(_CELLS):
         during = within * x + upto(step) * (within * pushes)
@@ -229,7 +238,7 @@ def prove_first_event(loop: Loop, drift: Bound, first: arb, until: fmpq) -> None
     largest, total = growth(weighted(loop, arb(0)), first)
     added = total * (drift.decaying**2 + drift.constant**2).sqrt()
     threshold = (rule.level * (-rule.rate * first).exp()).max(rule.floor)
-    if not largest * error_without_input(loop, until) + added + loop.noise_size < threshold:
+    if not largest * error_without_input(loop, until) + added + _most_noise(loop) < threshold:
         raise RejectedError("first_event_s: an event may come earlier")
 
 
@@ -273,6 +282,7 @@ def prove_bound(loop: Loop, rate: arb, entry: Mapping[str, object], assumed: Ass
         rate,
         read_number(entry, "decay"),
         assumed.errors,
+        assumed.noise,
         later=assumed.later,
         later_at_start=assumed.later_at_start,
         pieces=assumed.pieces,
@@ -303,7 +313,7 @@ def prove_bound(loop: Loop, rate: arb, entry: Mapping[str, object], assumed: Ass
 def _prove_inter_event(loop: Loop, rate: arb, drift: Bound, apart: arb) -> None:
     """Prove that e_s − n stays below the threshold for ``apart`` after an event, or that this is 0.
 
-    With v = e^{−rt}, ‖W (e_s − n)‖ ≤ (D₁² v² + D₂²)^½ I + (g + 1) ‖W n‖, where g and I are the supremum
+    With v = e^{−rt}, ‖W (e_s − n)‖ ≤ (D₁² v² + D₂²)^½ I + (g + 1) (n₁ v + n₂), where g and I are the supremum
     and the integral of ‖W e^{(H+r)s} W⁻¹‖. This is convex in v, and the threshold max(c v, f) piecewise
     affine: its ends and its kink suffice.
     """
@@ -313,7 +323,7 @@ def _prove_inter_event(loop: Loop, rate: arb, drift: Bound, apart: arb) -> None:
     if rule.always or not compares_error(loop) or not apart > 0:
         raise RejectedError("inter_event_s: not proven for this rule; 0 is")
     largest, total = growth(weighted(loop, rate), apart)
-    noise = (largest + 1) * loop.noise_size
+    noise = [(largest + 1) * size for size in noise_of(loop, rate).sizes]
     level = rule.level if bool(rate == rule.rate) else arb(0)
     kinks = [arb(0), arb(1)]
     if level > 0 and rule.floor > 0:
@@ -321,8 +331,9 @@ def _prove_inter_event(loop: Loop, rate: arb, drift: Bound, apart: arb) -> None:
     for v in kinks:
         if v > 1:
             continue
-        reached = (drift.decaying**2 * v**2 + drift.constant**2).sqrt() * total + noise
-        is_nothing = v == 0 and rule.floor == 0 and drift.constant == 0 and noise == 0
+        reached = (drift.decaying**2 * v**2 + drift.constant**2).sqrt() * total
+        reached += noise[0] * v + noise[1]
+        is_nothing = v == 0 and rule.floor == 0 and drift.constant == 0 and noise[1] == 0
         if not (reached < (level * v).max(rule.floor) or is_nothing):
             raise RejectedError("inter_event_s: an event may come earlier")
 
@@ -356,13 +367,24 @@ def _sensor_parts(loop: Loop, rate: arb, drift: Bound) -> list[tuple[arb, arb]]:
     """
     if not compares_error(loop):
         raise RejectedError("drift: bounds e_s only for a rule that compares ‖W e_s‖")
-    (level, floor), noise = thresholds(loop, rate), loop.noise_size
+    (level, floor), noise = thresholds(loop, rate), _noise_parts(loop, rate)
     if loop.times.sampling == 0:
-        return [(level, floor), (arb(0), noise)]
+        return [(level, floor), *noise]
     largest, total = growth(weighted(loop, rate), arb(loop.times.sampling))
     most = largest * _at_first_input(loop, rate)
     added = total * drift.decaying, total * drift.constant
-    return [(most * level, most * floor), (arb(0), largest * noise), added]
+    return [(most * level, most * floor), *((largest * a, largest * b) for a, b in noise), added]
+
+
+def _noise_parts(loop: Loop, rate: arb) -> list[tuple[arb, arb]]:
+    """Return pairs as :func:`_sensor_parts` of ‖W n‖."""
+    decaying, constant = noise_of(loop, rate).sizes
+    return [(decaying, arb(0)), (arb(0), constant)]
+
+
+def _most_noise(loop: Loop) -> arb:
+    """Return a bound of ‖W n‖ at all times."""
+    return sum(noise_of(loop, arb(0)).sizes, arb(0))
 
 
 def _at_first_input(loop: Loop, rate: arb) -> arb:
@@ -387,7 +409,8 @@ def _require_errors(loop: Loop, rate: arb, proven: Mapping[str, Bound], errors: 
     if "drift" in proven:
         share = share_of_errors(loop, rate, proven["drift"], errors)
     elif "e_s" in proven:
-        share = _share([(proven["e_s"].decaying, proven["e_s"].constant), (arb(0), loop.noise_size)], errors)
+        sensor = proven["e_s"].decaying, proven["e_s"].constant
+        share = _share([sensor, *_noise_parts(loop, rate)], errors)
     else:
         raise RejectedError("errors: no bound of e_s, or of the drift, from the start on")
     exact = loop.times.sampling == 0 and compares_error(loop)
@@ -397,7 +420,7 @@ def _require_errors(loop: Loop, rate: arb, proven: Mapping[str, Bound], errors: 
 
 def share_of_errors(loop: Loop, rate: arb, drift: Bound, errors: Errors) -> arb:
     """Return the largest share of what is assumed of ‖W (e_s − n)‖ that it reaches, by the drift."""
-    return _share([*_sensor_parts(loop, rate, drift), (arb(0), loop.noise_size)], errors)
+    return _share([*_sensor_parts(loop, rate, drift), *_noise_parts(loop, rate)], errors)
 
 
 def _share(parts: Sequence[tuple[arb, arb]], errors: Errors) -> arb:

@@ -14,7 +14,7 @@ from flint import arb, arb_mat, fmpq
 
 from noack_check.balls import beside, columns_of, identity, matrix, number, rows_of, stack, zeros
 from noack_check.keys import RefusedError, Table, refusals
-from noack_check.loop import Loop, Rule, Times
+from noack_check.loop import Loop, Observer, Rule, Times
 from noack_check.times import NS_PER_S, Schedule, fraction, nanoseconds
 
 Rows = Sequence[Sequence[float]]
@@ -48,7 +48,7 @@ def read_loop(resolved: Table, *, box: bool, ideal: bool) -> Loop:
     model, plant, trigger = (_table(resolved, key) for key in ("model", "plant", "trigger"))
     A, B = _matrix(model, "model.A"), _matrix(model, "model.B")
     n, m = len(A), len(B[0])
-    _require_shapes(model, plant, n, m)
+    _require_shapes(resolved, n, m)
     own = _Plants(_matrix(plant, "plant.A"), _matrix(plant, "plant.B"), [[0] * n] * n, [[0] * m] * n)
     plants = _box(plant, A, B, own) if box else own
     x_r = _setpoint(resolved, A, plants)
@@ -70,6 +70,7 @@ def read_loop(resolved: Table, *, box: bool, ideal: bool) -> Loop:
         pushes=arb_mat(n, len(pushes), [column[i] for i in range(n) for column in pushes]),
         sizes=(arb(1),) * len(pushes),
         noise=_noise(resolved, n),
+        observer=_observer(resolved, plants, ideal=ideal),
         losses=_losses(_table(resolved, "network")),
         times=_times(resolved, trigger, ideal=ideal),
     )
@@ -82,7 +83,8 @@ def _box(plant: Table, A: Rows, B: Rows, own: _Plants) -> _Plants:
     return _Plants(A, B, half_A, half_B)
 
 
-def _require_shapes(model: Table, plant: Table, n: int, m: int) -> None:
+def _require_shapes(resolved: Table, n: int, m: int) -> None:
+    model, plant = _table(resolved, "model"), _table(resolved, "plant")
     shapes = {"model.A": (n, n), "model.B": (n, m), "model.gain": (m, n), "plant.A": (n, n)}
     shapes |= {"plant.B": (n, m), "plant.uncertainty_A": (n, n), "plant.uncertainty_B": (n, m)}
     for name, (height, width) in shapes.items():
@@ -97,7 +99,10 @@ def _require_shapes(model: Table, plant: Table, n: int, m: int) -> None:
     if len(_row(plant, "plant.initial_state")) != n:
         raise RefusedError(f"plant.initial_state: not {n} numbers")
     measured = _optional_table(plant, "measurement").get("C")
-    if measured is not None and measured != [[int(i == j) for j in range(n)] for i in range(n)]:
+    if "observer" not in resolved and measured not in (
+        None,
+        [[int(i == j) for j in range(n)] for i in range(n)],
+    ):
         raise RefusedError("plant.measurement.C: the sensor does not measure the state")
 
 
@@ -324,16 +329,56 @@ def _at_rest(A: Rows, x_r: Sequence[float]) -> Iterator[list[arb]]:
 
 
 def _noise(resolved: Table, n: int) -> arb_mat:
-    """Return the columns of the noise of measurements."""
-    measurement = _optional_table(_table(resolved, "plant"), "measurement")
+    """Return the columns of the noise of measurements, or of what an observer adds to x̂ by it."""
+    through = matrix([[int(i == k) for k in range(n)] for i in range(n)])
+    if "observer" in resolved:
+        through, _ = _observed(resolved, n)
+    measurement, p = _optional_table(_table(resolved, "plant"), "measurement"), through.ncols()
     name = "plant.measurement.noise_bound"
-    sizes = _row(measurement, name) if "noise_bound" in measurement else [0.0] * n
-    if len(sizes) != n or min(sizes) < 0:
-        raise RefusedError(f"{name}: not {n} numbers of at least 0")
-    if any(sizes) and _value(_table(resolved, "network"), "network.initial_sync") == "known_state":
-        raise RefusedError(f'{name}: with network.initial_sync = "known_state" noise is not covered')
-    noisy = [i for i, size in enumerate(sizes) if size > 0]
-    return columns_of(matrix([[size * (i == k) for k in range(n)] for i, size in enumerate(sizes)]), noisy)
+    sizes = _row(measurement, name) if "noise_bound" in measurement else [0.0] * p
+    if len(sizes) != p or min(sizes) < 0:
+        raise RefusedError(f"{name}: not {p} numbers of at least 0")
+    if any(sizes):
+        _require_unknown_start(resolved, name)
+    bounds = matrix([[size * (i == k) for k in range(p)] for i, size in enumerate(sizes)])
+    return columns_of(through * bounds, [i for i, size in enumerate(sizes) if size > 0])
+
+
+def _observed(resolved: Table, n: int) -> tuple[arb_mat, arb_mat]:
+    """Return the observer's gain L, (n, p), and the output's matrix C, (p, n)."""
+    gain = _matrix(_table(resolved, "observer"), "observer.gain")
+    measurement = _optional_table(_table(resolved, "plant"), "measurement")
+    every = [[int(i == j) for j in range(n)] for i in range(n)]
+    C = _matrix(measurement, "plant.measurement.C") if "C" in measurement else every
+    if len(gain) != n or len(C[0]) != n or len(C) != len(gain[0]):
+        raise RefusedError("observer.gain: not a row for each state, and a column for each output")
+    return matrix(gain), matrix(C)
+
+
+def _observer(resolved: Table, plants: _Plants, *, ideal: bool) -> Observer | None:
+    """Return the observer in the sensor, if there is one, of a plant that its matrices describe exactly."""
+    if "observer" not in resolved:
+        return None
+    _require_unknown_start(resolved, "observer")
+    model, plant, observer = (_table(resolved, key) for key in ("model", "plant", "observer"))
+    for key, rows, half in (("A", plants.A, plants.half_A), ("B", plants.B, plants.half_B)):
+        if rows != model[key] or any(map(any, half)):
+            raise RefusedError(f"plant.{key}: with an observer only plants with model.{key} are covered")
+    n, schedule = len(plants.A), read_schedule(resolved)
+    if ideal or not schedule.is_whole:
+        raise RefusedError("observer: not covered without tests a whole number of nanoseconds apart")
+    (L, C), x_0 = _observed(resolved, n), _row(plant, "plant.initial_state")
+    estimate = _row(observer, "observer.initial_estimate") if "initial_estimate" in observer else [0.0] * n
+    if len(estimate) != n:
+        raise RefusedError(f"observer.initial_estimate: not {n} numbers")
+    start = matrix([[value] for value in estimate]) - matrix([[value] for value in x_0])
+    return Observer(identity(n) - L * C, start, fmpq(int(schedule.sample), NS_PER_S))
+
+
+def _require_unknown_start(resolved: Table, name: str) -> None:
+    """Require that the first update is sent at t = 0: else the test at this time may be an event."""
+    if _value(_table(resolved, "network"), "network.initial_sync") == "known_state":
+        raise RefusedError(f'{name}: with network.initial_sync = "known_state" not covered')
 
 
 def _product(M: Rows, v: Sequence[float]) -> list[arb]:

@@ -28,7 +28,7 @@ def random_noisy_loop(rng: np.random.Generator) -> Loop:
     loop = kinds[rng.integers(len(kinds))](rng)
     n, k = loop.n, int(rng.integers(1, loop.n + 1))
     columns = matrix(np.round(rng.normal(size=(n, k)), 2).tolist())
-    size = loop._replace(noise=columns).noise_size
+    size = loop._replace(noise=columns).plain_noise.sizes[1]
     share = number(round(float(rng.uniform(0.02, 0.45)), 3)) if size > 0 else arb(0)
     floor = loop.rule.floor.max(number(0.02))
     return loop._replace(noise=columns * (share * floor / size).mid() if size > 0 else columns)

@@ -50,9 +50,11 @@ class _Plant:
         return 0 * self.gain if age is None else self.gain @ expm(-self.H * age)
 
     def _step(self, age: float | None, signs: tuple[float, ...], dt: float) -> Array:
-        """Return the exact step of (x, x_s, x_c, 1)."""
+        """Return the exact step of (x, x_s, x_c, x̂, 1)."""
         n = self.n
-        F = np.zeros((3 * n + 1, 3 * n + 1))
+        F = np.zeros((4 * n + 1, 4 * n + 1))
+        F[3 * n : 4 * n, 3 * n : 4 * n] = self.A
+        F[3 * n : 4 * n, 2 * n : 3 * n] = self.B @ self.input_matrix(age)
         F[:n, :n], F[:n, 2 * n : 3 * n] = self.A, self.B @ self.input_matrix(age)
         F[:n, -1] = self.pushes @ np.array(signs)
         F[n : 2 * n, n : 2 * n] = F[2 * n : 3 * n, 2 * n : 3 * n] = self.H
@@ -64,23 +66,28 @@ def exceeded(loop: Loop, proof: Proof, rng: np.random.Generator, until: float) -
     plant, times, rule = _Plant(loop, rng), [float(t.p) / float(t.q) for t in loop.times], loop.rule
     sampling, least, delay, age, start, *periods = times
     next_event = rng.choice(periods) if periods[1] else np.inf  # of a periodic rule
-    if periods[1]:
+    if periods[1] and loop.observer is None:
         least = sampling = periods[1] / _PARTS
     W, n, positive, negative = floats(loop.weight), loop.n, floats(rule.positive), floats(rule.negative)
     level, rate, floor = (float(v.mid()) for v in (rule.level, rule.rate, rule.floor))
     x, noise = floats(loop.start)[:, 0], floats(loop.noise)
     kind_of_noise = rng.choice(["random", "hides", "provokes"])
+    correction = np.zeros((n, n)) if loop.observer is None else floats(loop.observer.correction)
 
-    def measured(x: Array, x_s: Array) -> Array:
-        """Return a measurement with the largest noise: in random directions, or against or for an event."""
+    def measured(x: Array, x_s: Array, x_hat: Array) -> Array:
+        """Return a measurement with the largest noise: in random directions, or against or for an event.
+
+        An observer's estimate takes its place.
+        """
+        x = x + correction @ (x_hat - x)
         signs = rng.choice([-1.0, 1.0], noise.shape[1])
         if kind_of_noise != "random":
             along = (W @ noise).T @ (W @ (x_s - x))
             signs = np.where(along == 0, signs, np.sign(along)) * (1 if kind_of_noise == "hides" else -1)
         return np.asarray(x + noise @ signs)
 
-    y = measured(x, x)
-    z = np.concatenate([x, y, y, [1.0]])
+    y = measured(x, x, x if loop.observer is None else x + floats(loop.observer.start)[:, 0])
+    z = np.concatenate([x, y, y, y, [1.0]])
     first_input = start * rng.choice([0.0, 1.0, rng.random()])
     style = rng.integers(3)
     ages = [0.0, age, age / 2]
@@ -114,7 +121,7 @@ def exceeded(loop: Loop, proof: Proof, rng: np.random.Generator, until: float) -
             z[2 * n : 3 * n] = newest[2]
             arriving = [update for update in arriving if update[1] > newest[1]]
         if t >= min(next_test, next_event):
-            y = measured(z[:n], z[n : 2 * n])
+            y = z[3 * n : 4 * n] = measured(z[:n], z[n : 2 * n], z[3 * n : 4 * n])
             pair = np.concatenate([y, z[n : 2 * n] - y])
             threshold = np.hypot(max(level * np.exp(-rate * t), floor), np.linalg.norm(negative @ pair))
             fires = np.linalg.norm(positive @ pair) > threshold or (rule.always and rng.random() < 0.2)

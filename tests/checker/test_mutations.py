@@ -21,12 +21,13 @@ from noack_check.model import Model
 from noack_check.proof import prove, read_assumptions
 from tests.checker.floating_forms import Forms
 from tests.checker.runs import exceeded
+from tests.checker.test_observers import LOOP as OBSERVED
 from tests.checker.test_witnesses import SCHEDULE, double_integrator
 
 Document = dict[str, Any]
 Rng = np.random.Generator
 _OUTPUTS = ("x", "x[1]", "e_s", "e_c")
-NAMES = ("plain", "pushed", "errors", "later", "noisy")
+NAMES = ("plain", "pushed", "errors", "later", "noisy", "observed")
 
 
 def pushed() -> Loop:
@@ -58,7 +59,9 @@ def with_later_events() -> Loop:
 @functools.cache
 def base(name: str) -> tuple[Loop, Document]:
     """Return a loop and a document that is accepted; "errors" uses facts about w."""
-    loop = {"pushed": pushed, "later": with_later_events, "noisy": noisy}.get(name, double_integrator)()
+    loop = {"pushed": pushed, "later": with_later_events, "noisy": noisy, "observed": lambda: OBSERVED}.get(
+        name, double_integrator
+    )()
     document = dict(find_witness(loop, _OUTPUTS).document)
     return loop, with_errors(loop, document) if name == "errors" else document
 
@@ -222,6 +225,20 @@ def _rule(field: str, factor: float) -> Callable[[Loop, Rng], Loop]:
     return change
 
 
+def _of_observer(field: str, factor: float) -> Callable[[Loop, Rng], Loop]:
+    def change(loop: Loop, rng: Rng) -> Loop:
+        if loop.observer is None:
+            return loop
+        value = getattr(loop.observer, field)
+        scaled = value * factor if field == "period" else value * number(factor)
+        times = loop.times
+        if field == "period":
+            times = times._replace(sampling=scaled, least_sampling=scaled)
+        return loop._replace(observer=loop.observer._replace(**{field: scaled}), times=times)
+
+    return change
+
+
 LOOPS: dict[str, Callable[[Loop, Rng], Loop]] = {
     "one loss more": lambda loop, rng: loop._replace(losses=loop.losses + 1),
     "one loss less": lambda loop, rng: loop._replace(losses=loop.losses - 1),
@@ -240,6 +257,10 @@ LOOPS: dict[str, Callable[[Loop, Rng], Loop]] = {
     "start of the other sign": lambda loop, rng: loop._replace(start=loop.start * -1),
     "another push": _one_of("pushes"),
     "larger disturbance": lambda loop, rng: loop._replace(sizes=tuple(s * number(1.1) for s in loop.sizes)),
+    "another observer": _of_observer("correction", 0.98),
+    "another estimate": _of_observer("start", 1.02),
+    "a much worse estimate": _of_observer("start", 20.0),
+    "tests of the observer half as often": _of_observer("period", 2),
     "noise + 5 %": _one_of("noise", (1.05,)),
     "noise - 5 %": _one_of("noise", (0.95,)),
     "noise of another direction": _one_of("noise", (-1.0,)),
@@ -272,7 +293,7 @@ def is_true_or_rejected(loop: Loop, document: Document, seed: int) -> bool:
     except RejectedError:
         return True
     rng = np.random.default_rng(seed)
-    if "errors" not in document and not document["later"]:
+    if "errors" not in document and not document["later"] and loop.observer is None:
         for entry in document["bounds"]:
             assert entry["output"] == "x[1]" or Forms(loop, document["rate"], entry).holds(
                 entry["output"], rng

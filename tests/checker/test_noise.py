@@ -233,7 +233,7 @@ def test_bounded_noise_is_read() -> None:
     tables = resolved_tables("double_integrator", "plant.measurement.noise_bound=[0.01, 0.0]")
     loop = read_loop(tables, box=False, ideal=False)
     assert loop.noise == matrix([[0.01], [0.0]])
-    assert float(loop.noise_size.mid()) == pytest.approx(0.01)
+    assert float(loop.plain_noise.sizes[1].mid()) == pytest.approx(0.01)
 
 
 @pytest.mark.parametrize("value", [[0.1], [0.1, -0.1], [0.1, "1"], 0.1, [float("nan"), 0.0]])

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from flint import fmpq
-from scipy.linalg import expm, solve_continuous_lyapunov
+from scipy.linalg import expm, logm, solve_continuous_lyapunov
 
 from noack.core.linear_systems import Matrix
 from noack.theory.witnesses.coordinates import floats
@@ -18,6 +18,7 @@ from noack_check.balls import matrix, number
 from noack_check.check import RejectedError
 from noack_check.loop import Loop
 from noack_check.model import Chain, Errors, thresholds
+from noack_check.noise import noise_of
 from noack_check.norms import growth
 from noack_check.proof import (
     MOST_LATER,
@@ -36,6 +37,8 @@ _ROOM = 1.01
 _FURTHER = 1.3
 """The next guess exceeds what followed from the last one by this factor."""
 
+_FASTEST, _MOST_TURN = 1e-6, 3.0
+"""An error of an observer that decays, or turns, more between two tests has no smooth part."""
 _NEARLY, _MOST_STEPS = 1 - 1e-4, 30
 """A time is accepted if e_s reaches nearly the threshold."""
 
@@ -49,6 +52,8 @@ def first_assumptions(loop: Loop, rate: float) -> dict[str, object]:
     document: dict[str, object] = {"rate": rate}
     if not loop.times.period > 0 and (chain := _chain(loop, rate)) is not None:
         document["chain"] = chain
+    if (smooth := _smooth(loop)) is not None:
+        document["observer"] = {"smooth": smooth.tolist()}
     later, at_start = 0, 0
     try:
         require_few_at_start(loop, Assumptions(None, 0, 0, None))
@@ -165,27 +170,53 @@ def _sups(G: Matrix) -> Iterator[float]:
         power = following @ power
 
 
+def _smooth(loop: Loop) -> Matrix | None:
+    """Return Λ with e^{ΛT} = (I − LC) e^{AT}: as the error of the observer decays; None without one."""
+    observer = loop.observer
+    if observer is None or not floats(observer.start).any():
+        return None
+    period_s = float(observer.period.p) / float(observer.period.q)
+    F = floats(observer.correction) @ expm(floats(loop.A) * period_s)
+    values = np.linalg.eigvals(F)
+    if (np.abs(values) < _FASTEST).any() or (np.abs(np.angle(values)) > _MOST_TURN).any():
+        return None
+    return np.asarray(logm(F).real / period_s)
+
+
+def observer_decay(loop: Loop) -> float:
+    """Return the rate at which the error of the observer decays; infinite without one."""
+    if loop.observer is None:
+        return np.inf
+    period_s = float(loop.observer.period.p) / float(loop.observer.period.q)
+    F = floats(loop.observer.correction) @ expm(floats(loop.A) * period_s)
+    return float(-np.log(np.abs(np.linalg.eigvals(F)).max()) / period_s)
+
+
 def inter_event_s(loop: Loop, rate: float, drift: Sequence[float]) -> float:
     """Return a time that :mod:`noack_check.proof` accepts between two events; 0 without one."""
-    (D1, D2), noise = drift, float(loop.noise_size)
+    (D1, D2), (noise1, noise2) = drift, map(float, noise_of(loop, number(rate)).sizes)
     level, floor = float(loop.rule.level), float(loop.rule.floor)
     if rate != float(loop.rule.rate):
         level = 0.0
-    if loop.rule.always or loop.rule.negative.nrows() or not (floor or (level and not D2 and not noise)):
+    if loop.rule.always or loop.rule.negative.nrows() or not (floor or (level and not D2 and not noise2)):
         return 0.0
-    pairs = [(max(level * v, floor), float(np.hypot(D1 * v, D2))) for v in _kinks(level, floor)]
+    triples = [
+        (max(level * v, floor), float(np.hypot(D1 * v, D2)), noise1 * v + noise2)
+        for v in _kinks(level, floor)
+    ]
     W = floats(loop.weight)
     G = W @ floats(loop.H) @ np.linalg.inv(W) + rate * np.eye(loop.n)
 
     def share(time: float) -> float:
         """Return the largest share of the threshold that e_s − n reaches within a time after an event."""
         largest, total = (float(each.mid()) for each in growth(matrix(G.tolist()), number(time)))
-        return (1 + 1e-9) * max((size * total + (largest + 1) * noise) / limit for limit, size in pairs)
+        reached = ((size * total + (largest + 1) * noise) / limit for limit, size, noise in triples)
+        return (1 + 1e-9) * max(reached)
 
     at_once = share(0.0)
     if at_once >= _NEARLY:
         return 0.0
-    time = min(limit / size for limit, size in pairs if size)
+    time = min(limit / size for limit, size, _ in triples if size)
     for _ in range(_MOST_STEPS):
         reached = share(time)
         if _NEARLY < reached < 1:

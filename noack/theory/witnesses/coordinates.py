@@ -79,6 +79,8 @@ class _Runs:
         self._z = np.ones((_RUNS, N))
         self._z[:, n : N - 2] = 0
         self._z[:, :n] = floats(self._loop.start)[:, 0]
+        smooth = np.flatnonzero(floats(model.s).any(axis=0))
+        self._z[:, smooth] = floats(model.bounds.start)[:, 0][: len(smooth)]
         spread = float(np.linalg.norm(floats(self._loop.start))) or 1.0
         half = _RUNS // 2
         self._z[half:, :n] = spread * self._rng.standard_normal((_RUNS - half, n)) / np.sqrt(n)

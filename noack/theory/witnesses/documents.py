@@ -12,6 +12,7 @@ from noack.theory.witnesses.assumptions import (
     first_event_s,
     inter_event_s,
     next_assumptions,
+    observer_decay,
     require_few,
     without_drift,
 )
@@ -173,6 +174,7 @@ class _Rates:
         closed = floats(loop.A + loop.B * loop.gain)
         own = [closed] if loop.holds else [closed, floats(loop.H)]
         self.slowest = min(-float(np.linalg.eigvals(M).real.max()) for M in own)
+        self.slowest = min(self.slowest, observer_decay(loop))
         threshold, level = float(loop.rule.rate), float(loop.rule.level)
         wanted = threshold if level else (slow or 0.3) * self.slowest
         self.first_share = _FIRST_SLOW_SHARE if slow else _FIRST_SHARE
@@ -217,6 +219,7 @@ class _OutputSearch:
             self._rate,
             number(decay),
             assumed.errors,
+            assumed.noise,
             later=assumed.later,
             later_at_start=assumed.later_at_start,
             pieces=assumed.pieces,

@@ -14,20 +14,21 @@ _DIGITS = 12
 """Significant digits: tables round decimals of this length, and stay true."""
 
 
-def proven_bounds(proof: Proof, noise: arb) -> ProvenBounds:
+def proven_bounds(proof: Proof, noise: tuple[arb, arb]) -> ProvenBounds:
     """Return the bounds of a proof; of two bounds of the same output the smaller one.
 
     The errors of certificates and records are about the measured x + n; those of proofs are about x.
 
     Args:
         proof: what was proven.
-        noise: largest ‖W n‖ of the noise of measurements.
+        noise: ‖W n‖ of measurements and estimates is at most the first, decaying, plus the second.
     """
     bounds, limits = dict[str, ProvenBound](), dict[str, float]()
     for bound in smallest_bounds(proof):
         if bound.from_start:
-            constant = bound.constant + noise if bound.output.startswith("e_") else bound.constant
-            bounds[bound.output] = ProvenBound(above(bound.decaying), above(constant))
+            added = noise if bound.output.startswith("e_") else (arb(0), arb(0))
+            decaying, constant = bound.decaying + added[0], bound.constant + added[1]
+            bounds[bound.output] = ProvenBound(above(decaying), above(constant))
         else:
             last = bound.constant
             if not proof.rate > 0:

@@ -39,7 +39,7 @@ class Search:
         self._f_units = (1.0, level / floor if level and floor else 1.0)
         self._inverse = {name: np.linalg.inv(T) for name, T in self.frames.items()}
         self._whole = [self._frame(index) for index in range(len(self.model.locations))]
-        noise = np.linalg.norm(floats(self.model.loop.weight * self.model.loop.noise), axis=0)
+        noise = np.linalg.norm(floats(self.model.loop.weight * self.model.bounds.columns), axis=0)
         self._noise_units = (floor or level or 1.0) / np.maximum(noise, 1e-12)
 
     def solve(

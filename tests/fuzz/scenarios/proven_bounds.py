@@ -28,12 +28,18 @@ def proven_limit(proof: Proof, output: str, t_s: Vector) -> Vector:
 
 
 def sizes_of(record: RunRecord) -> Iterator[tuple[str, Vector, Vector]]:
-    """Yield x at the plant's steps, and e_s at the measurements: times and norms, (k,)."""
+    """Yield x at the plant's steps, and e_s = x_s − x at the measurements: times and norms, (k,).
+
+    The recorded norm is that of x_s minus what was measured or estimated.
+    """
     loop = loop_of(record.scenario)
+    W = np.eye(loop.n) if loop.weight is None else loop.weight
     steps, measured = record[PLANT_STEP], record[SENSOR_MEASUREMENT]
     x_r = 0.0 if loop.setpoint is None else loop.setpoint
     yield "x", steps["t_ns"] / NS_PER_S, np.linalg.norm(steps["x"] - x_r, axis=1)
-    yield "e_s", measured["t_ns"] / NS_PER_S, measured["e_s_norm"]
+    measured = measured[np.isin(measured["t_ns"], steps["t_ns"])]
+    x = steps["x"][np.searchsorted(steps["t_ns"], measured["t_ns"])]
+    yield "e_s", measured["t_ns"] / NS_PER_S, np.linalg.norm((measured["x_s"] - x) @ W.T, axis=1)
 
 
 def with_proven_bounds(

@@ -1,0 +1,278 @@
+"""The error of an observer: its bounds, the loops that they are for, and documents that prove nothing."""
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from flint import arb, fmpq
+from scipy.linalg import expm
+
+from noack.observers.observer_settings import observer_gain
+from noack.theory.witnesses.documents import Witness, find_witness
+from noack_check.balls import identity, matrix, number, zeros
+from noack_check.check import RejectedError
+from noack_check.keys import RefusedError
+from noack_check.loop import Loop, Noise, Observer
+from noack_check.model import Model
+from noack_check.noise import noise_of
+from noack_check.proof import prove
+from noack_check.scenario import read_loop
+from tests.checker.runs import exceeded, floats
+from tests.checker.test_false_witnesses import rejects
+from tests.checker.test_witnesses import double_integrator
+from tests.helpers.resolved_tables import resolved_tables
+
+RATE = number(0.3)
+C = np.array([[1.0, 0.0]])
+
+
+def observed(
+    loop: Loop,
+    start: tuple[float, float] = (-0.2, 0.1),
+    noise: float = 0.001,
+    poles: tuple[float, ...] = (-8, -10),
+) -> Loop:
+    """Return a loop whose sensor measures its first state, with noise, and estimates the second one."""
+    A, period_s = floats(loop.model_A), float(loop.times.sampling.p) / float(loop.times.sampling.q)
+    L = observer_gain(expm(A * period_s), C, tuple(np.exp(np.array(poles) * period_s)))
+    correction = matrix((np.eye(2) - L @ C).tolist())
+    observer = Observer(correction, matrix([[value] for value in start]), loop.times.sampling)
+    noise_columns = matrix((L * noise).tolist()) if noise else zeros(2, 0)
+    return loop._replace(B=loop.model_B, noise=noise_columns, observer=observer)
+
+
+LOOP = observed(double_integrator(floor=0.03)._replace(losses=1))
+PUSHED = LOOP._replace(pushes=matrix([[0.0], [1.0]]), sizes=(arb(0.05),), weight=matrix([[2, 0], [1, 1]]))
+
+
+@pytest.fixture(scope="module")
+def witness() -> Witness:
+    return find_witness(LOOP)
+
+
+# The bounds of the error.
+
+
+def simulated_errors(loop: Loop, rng: np.random.Generator, count: int) -> np.ndarray:
+    """Return x̂ − x at tests, from runs of the error with the largest noise and disturbances."""
+    assert loop.observer is not None
+    T = float(loop.observer.period.p) / float(loop.observer.period.q)
+    A, correction, noise = floats(loop.A), floats(loop.observer.correction), floats(loop.noise)
+    pushes = floats(loop.pushes) * np.array([float(size.mid()) for size in loop.sizes])
+    n = loop.n
+    whole = expm(np.block([[A, np.eye(n)], [np.zeros((n, 2 * n))]]) * T)
+    Ad, Gd = whole[:n, :n], whole[:n, n:]
+    o, found, turn = floats(loop.observer.start)[:, 0], [], int(rng.integers(1, 60))
+    signs = [rng.choice([-1.0, 1.0], M.shape[1]) for M in (noise, pushes)]
+    for k in range(count):
+        if k % turn == turn - 1:
+            signs = [-sign for sign in signs]
+        predicted = Ad @ o - Gd @ (pushes @ signs[1]) if k else o
+        o = correction @ predicted + noise @ signs[0]
+        found.append(o)
+    return np.array(found)
+
+
+def largest_share(loop: Loop, bounds: Noise, rate: float, errors: np.ndarray) -> float:
+    """Return the largest share of the bounds that W n reaches in an entry, or ‖W n‖."""
+    assert loop.observer is not None
+    T = float(loop.observer.period.p) / float(loop.observer.period.q)
+    W, start = floats(loop.weight), floats(bounds.start)[:, 0]
+    sides = np.abs(W @ floats(bounds.columns))
+    found = []
+    for k, error in enumerate(errors):
+        f1 = np.exp(-rate * k * T)
+        rest = error - expm(floats(bounds.smooth) * k * T) @ start if bounds.smooth.nrows() else error
+        box = sides[:, : bounds.decaying].sum(axis=1) * f1 + sides[:, bounds.decaying :].sum(axis=1)
+        norm = float(bounds.sizes[0].mid()) * f1 + float(bounds.sizes[1].mid())
+        found += [*(np.abs(W @ rest) / box), float(np.linalg.norm(W @ error)) / norm]
+    return max(found)
+
+
+def smooth_of(loop: Loop) -> np.ndarray:
+    from noack.theory.witnesses.assumptions import _smooth
+
+    found = _smooth(loop)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("loop", [LOOP, PUSHED])
+@pytest.mark.parametrize("part", ["none", "its own", "another"])
+def test_errors_stay_within_their_bounds_and_come_near(loop: Loop, part: str) -> None:
+    smooth = {"none": None, "its own": smooth_of(loop), "another": smooth_of(loop) * 1.1}[part]
+    bounds = noise_of(loop, RATE, None if smooth is None else matrix(smooth.tolist()))
+    assert bounds.smooth.nrows() == (0 if smooth is None else 2)
+    rng = np.random.default_rng(0)
+    shares = [largest_share(loop, bounds, 0.3, simulated_errors(loop, rng, 400)) for _ in range(40)]
+    assert max(shares) <= 1 + 1e-9
+    assert max(shares) > 0.7
+
+
+def test_a_smooth_part_leaves_little(witness: Witness) -> None:
+    bounds = [noise_of(LOOP, RATE, M) for M in (None, matrix(smooth_of(LOOP).tolist()))]
+    assert bounds[0].decaying == 2
+    assert bounds[1].decaying == 0  # it is added to the constant bounds
+    assert float(bounds[1].columns[1, 1].mid()) < 1.02 * float(bounds[0].columns[1, 3].mid())
+    assert "observer" in witness.document
+
+
+@pytest.mark.parametrize("rate", [8.5, 1000.0])
+def test_bounds_do_not_decay_faster_than_the_error(rate: float) -> None:
+    with pytest.raises(RejectedError, match="observer: its error"):
+        noise_of(LOOP, number(rate))
+    slow = matrix([[-0.2, 0.0], [0.0, -0.2]])
+    with pytest.raises(RejectedError, match="observer: its error"):
+        noise_of(LOOP, RATE, slow)
+
+
+def test_an_observer_that_does_not_decay_is_rejected() -> None:
+    assert LOOP.observer is not None
+    useless = LOOP._replace(observer=LOOP.observer._replace(correction=identity(2)))
+    with pytest.raises(RejectedError, match="observer: its error"):
+        noise_of(useless, arb(0))
+
+
+def test_at_rate_0_all_bounds_are_constant() -> None:
+    bounds = noise_of(LOOP, arb(0))
+    assert bounds.decaying == 0
+    assert bounds.sizes[0] == 0
+    rng = np.random.default_rng(1)
+    assert largest_share(LOOP, bounds, 0.0, simulated_errors(LOOP, rng, 400)) <= 1
+
+
+# The model.
+
+
+def test_the_smooth_part_flows_and_is_in_the_error_after_an_event() -> None:
+    smooth = smooth_of(LOOP)
+    model = Model(LOOP, RATE, number(0.8), None, noise_of(LOOP, RATE, matrix(smooth.tolist())), later=1)
+    rng, n = np.random.default_rng(0), 2
+    for place in model.locations:
+        z = rng.normal(size=model.size)
+        moved = floats(place.flows[0].matrix) @ z
+        x, e, s = (floats(rows) for rows in (model.x, model.e, model.s))
+        assert s @ moved == pytest.approx(smooth @ (s @ z))
+        # x_s = x + e moves by its model alone.
+        assert (x + e) @ moved == pytest.approx(floats(LOOP.H) @ (x + e) @ z)
+        assert moved[:n] == pytest.approx(x @ moved)
+    edges = {edge.name: edge for edge in model.edges}
+    for name in ("0 lost, sent", "0 lost, lost", "0 later, event"):
+        z = rng.normal(size=model.size)
+        after = floats(edges[name].jump) @ z
+        noise = floats(model.s) @ z + floats(model.bounds.columns) @ (floats(model.p) @ z)
+        assert floats(model.e) @ after == pytest.approx(noise)
+        assert floats(model.s) @ after == pytest.approx(floats(model.s) @ z)
+        together = floats(model.x + model.e + model.w)
+        assert together @ after == pytest.approx(together @ z)
+
+
+def test_bounds_are_not_exceeded(witness: Witness) -> None:
+    for seed in range(12):
+        assert exceeded(LOOP, witness.proof, np.random.default_rng(seed), 8.0) == []
+
+
+# Documents and loops.
+
+
+def test_runs_from_another_estimate_exceed_the_bounds(witness: Witness) -> None:
+    assert LOOP.observer is not None
+    far = LOOP._replace(observer=LOOP.observer._replace(start=matrix([[-20.0], [10.0]])))
+    rejects(far, witness.document)
+    assert any(exceeded(far, witness.proof, np.random.default_rng(seed), 4.0) for seed in range(3))
+
+
+CHANGES: dict[str, Callable[[Loop], Loop]] = {
+    "another plant": lambda loop: loop._replace(B=loop.B * number(0.9)),
+    "a box": lambda loop: loop._replace(half_B=matrix([[0.0], [0.1]])),
+    "no tests": lambda loop: loop._replace(
+        times=loop.times._replace(sampling=fmpq(0), least_sampling=fmpq(0))
+    ),
+    "no period": lambda loop: loop._replace(observer=loop.observer._replace(period=fmpq(0))),  # type: ignore[union-attr]
+    "a wrong shape": lambda loop: loop._replace(observer=loop.observer._replace(start=zeros(1, 1))),  # type: ignore[union-attr]
+    "not finite": lambda loop: loop._replace(
+        observer=loop.observer._replace(correction=identity(2) * arb("nan"))  # type: ignore[union-attr]
+    ),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_loop_that_is_none_is_rejected(witness: Witness, change: str) -> None:
+    rejects(CHANGES[change](LOOP), witness.document, "^loop: ")
+
+
+@pytest.mark.parametrize(
+    "value", [1, [], {}, {"smooth": 1}, {"smooth": [[1]]}, {"smooth": [["a", 0], [0, 1]]}]
+)
+def test_a_smooth_part_is_a_matrix(witness: Witness, value: object) -> None:
+    rejects(LOOP, {**witness.document, "observer": value}, "observer|smooth")
+
+
+def test_a_document_without_the_smooth_part_proves_nothing(witness: Witness) -> None:
+    document: dict[str, Any] = copy.deepcopy(dict(witness.document))
+    prove(LOOP, document)
+    del document["observer"]
+    rejects(LOOP, document)
+
+
+def test_another_smooth_part_is_no_proof_by_the_same_forms(witness: Witness) -> None:
+    document: dict[str, Any] = copy.deepcopy(dict(witness.document))
+    document["observer"]["smooth"] = (np.array(document["observer"]["smooth"]) * 1.5).tolist()
+    rejects(LOOP, document)
+
+
+# The scenario.
+
+SCENARIO = (
+    'observer={kind="luenberger", poles_per_s=[-8, -10]}', "plant.measurement.C=[[1.0, 0.0]]",
+    "plant.measurement.noise_bound=[0.002]", "plant.draw=given", "plant.A=[[0.0, 1.0], [0.0, 0.0]]",
+    "plant.B=[[0.0], [1.0]]",
+)  # fmt: skip
+
+
+def test_an_observer_is_read() -> None:
+    tables = resolved_tables("double_integrator", *SCENARIO)
+    loop = read_loop(tables, box=False, ideal=False)
+    assert loop.observer is not None
+    L = np.array(tables["observer"]["gain"])
+    assert floats(loop.observer.correction) == pytest.approx(np.eye(2) - L @ C)
+    assert floats(loop.observer.start)[:, 0].tolist() == [-1.0, 0.0]
+    assert floats(loop.noise) == pytest.approx(L * 0.002)
+    assert loop.observer.period == loop.times.sampling == fmpq(1, 500)
+
+
+REFUSED = {
+    "plant.B=[[0.0], [0.9]]": r"plant\.B",
+    "network.initial_sync=known_state": "known_state",
+    "plant.rate_hz=300": "observer: not covered",
+    "plant.measurement.noise_std=[0.1]": r"plant\.measurement\.noise_std",
+    'observer={kind="kalman", process_std=[0.1, 0.1], noise_std=[0.1], initial_std=[1, 1]}': r"observer\.kind",
+}
+
+
+@pytest.mark.parametrize("setting", REFUSED)
+def test_what_is_not_covered_with_an_observer_is_refused(setting: str) -> None:
+    settings = [each for each in SCENARIO if each.partition("=")[0] != setting.partition("=")[0]]
+    tables = resolved_tables("double_integrator", *settings, setting)
+    with pytest.raises(RefusedError, match=REFUSED[setting]):
+        read_loop(tables, box=False, ideal=False)
+
+
+def test_a_box_and_ideal_conditions_are_refused() -> None:
+    tables = resolved_tables("double_integrator", *SCENARIO, "plant.uncertainty_B=[[0.0], [0.2]]")
+    with pytest.raises(RefusedError, match=r"plant\.B"):
+        read_loop(tables, box=True, ideal=False)
+    with pytest.raises(RefusedError, match="observer: not covered"):
+        read_loop(tables, box=False, ideal=True)
+
+
+@pytest.mark.parametrize(
+    "gain", [[[1.0]], [[1.0, 0.0], [0.0, 1.0]], [[1.0], [1.0], [1.0]], 1.0, [["1"], [1.0]]]
+)
+def test_a_gain_has_a_shape(gain: object) -> None:
+    tables = resolved_tables("double_integrator", *SCENARIO)
+    tables["observer"]["gain"] = gain
+    with pytest.raises(RefusedError, match=r"observer\.gain"):
+        read_loop(tables, box=False, ideal=False)
