@@ -282,6 +282,11 @@ def test_the_keys_that_the_table_calls_used_are_those_that_are_read() -> None:
         read_loop(Recorded(tables, read), box=True, ideal=False)
     tables = resolved_tables("double_integrator", "controller.setpoint=[2.0, 0.0]")
     read_loop(Recorded(tables, read), box=False, ideal=False)
+    observer = 'observer={kind="luenberger", poles_per_s=[-8, -10], initial_estimate=[1.0, 0.0]}'
+    settings = (observer, "plant.measurement.noise_bound=[0.1, 0.1]", "plant.draw=given")
+    plant = ("plant.A=[[0.0, 1.0], [0.0, 0.0]]", "plant.B=[[0.0], [1.0]]")
+    tables = resolved_tables("double_integrator", *settings, *plant)
+    read_loop(Recorded(tables, read), box=False, ideal=False)
     used = {key for key, (row, *_) in key_table().rows.items() if row.use == "used"}
     assert used <= read | {"network.initial_sync"}
     refused = {key for key, (row, *_) in key_table().rows.items() if row.use == "refused"}
