@@ -251,3 +251,15 @@ def test_noise_is_refused_if_the_start_is_known() -> None:
     )
     with pytest.raises(RefusedError, match="known_state"):
         read_loop(tables, box=False, ideal=False)
+
+
+def test_forms_that_do_not_change_between_tests_need_no_silent_edges() -> None:
+    """With a deadline and an assumed error they have one node: a silent test leaves V as it is."""
+    loop = noisy(double_integrator(floor=0.03))
+    loop = loop._replace(rule=loop.rule._replace(always=True))
+    errors = Errors(arb(1), arb(1), Chain(arb(2), arb(2)))
+    model = Model(loop, number(0.3), number(0.8), errors)
+    assert len(model.locations[0].nodes) == 1
+    names = {item.name for item in model.inequalities("x", starts=True)}
+    assert names
+    assert not any("silent" in name for name in names)
