@@ -21,7 +21,6 @@ from noack.theory.witnesses.outward import proven_bounds
 from noack_check.check import RejectedError
 from noack_check.keys import RefusedError
 from noack_check.loop import Loop
-from noack_check.noise import noise_of
 from noack_check.proof import Proof, prove
 from noack_check.scenario import read_loop
 
@@ -159,7 +158,7 @@ def find_statement(
     except (RefusedError, NoWitnessError) as error:
         return WitnessedStatement(plants, conditions, None, None, str(error))
     document = {"plants": plants, "conditions": conditions, **witness.document}
-    bounds = proven_bounds(witness.proof, noise_of(loop, witness.proof.rate).sizes)
+    bounds = proven_bounds(witness.proof, loop)
     return WitnessedStatement(plants, conditions, document, witness.proof, "", bounds)
 
 

@@ -120,7 +120,7 @@ def _with_proof(
         loop = _under(read_loop(content, box=is_box, ideal=False), certificate.conditions)
         if loop is not None:
             witness = known_or_found(loop, lambda share: None, most_work)
-            return certificate.with_proof(proven_bounds(witness.proof, loop.noise_size))
+            return certificate.with_proof(proven_bounds(witness.proof, loop))
     return certificate
 
 

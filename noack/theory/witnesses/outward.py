@@ -7,6 +7,8 @@ from fractions import Fraction
 from flint import arb
 
 from noack.theory.certificates.proven_bounds import ProvenBound, ProvenBounds
+from noack_check.loop import Loop
+from noack_check.noise import noise_of
 from noack_check.proof import Proof
 from noack_check.sentences import smallest_bounds
 
@@ -14,15 +16,13 @@ _DIGITS = 12
 """Significant digits: tables round decimals of this length, and stay true."""
 
 
-def proven_bounds(proof: Proof, noise: tuple[arb, arb]) -> ProvenBounds:
+def proven_bounds(proof: Proof, loop: Loop) -> ProvenBounds:
     """Return the bounds of a proof; of two bounds of the same output the smaller one.
 
-    The errors of certificates and records are about the measured x + n; those of proofs are about x.
-
-    Args:
-        proof: what was proven.
-        noise: ‖W n‖ of measurements and estimates is at most the first, decaying, plus the second.
+    The errors of certificates and records are about the measured or estimated x + n; those of proofs are
+    about x.
     """
+    noise = noise_of(loop, proof.rate).sizes
     bounds, limits = dict[str, ProvenBound](), dict[str, float]()
     for bound in smallest_bounds(proof):
         if bound.from_start:
