@@ -132,10 +132,9 @@ def _swapped_numbers(document: Document, rng: Rng) -> None:
 
 def _swapped_locations(document: Document, rng: Rng) -> None:
     entry = _entry(document, rng)
-    names = [n for n in entry["matrices"] if n.startswith("Q/") and np.shape(entry["matrices"][n]) == (4, 4)]
-    for first, second in [rng.choice(names, 2, replace=False)]:
-        M = entry["matrices"]
-        M[first], M[second] = M[second], M[first]
+    M, most = entry["matrices"], max(np.shape(each) for each in entry["matrices"].values())
+    first, second = rng.choice([name for name in M if np.shape(M[name]) == most], 2, replace=False)
+    M[first], M[second] = M[second], M[first]
 
 
 def _another_label(document: Document, rng: Rng) -> None:
@@ -155,7 +154,7 @@ def _scaled_entry(document: Document, rng: Rng) -> None:
 
 def _scaled(key: str, factor: float) -> Callable[[Document, Rng], None]:
     def change(document: Document, rng: Rng) -> None:
-        tables = [document, _entry(document, rng), document["chain"], document.get("errors", {})]
+        tables = [document, _entry(document, rng), document.get("chain", {}), document.get("errors", {})]
         table = next((each for each in tables if key in each), document)
         table[key] = table.get(key, 1.0) * factor
 
@@ -193,6 +192,7 @@ DOCUMENTS: dict[str, Callable[[Document, Rng], object]] = {
     "errors + 5 %": _scaled("decaying", 1.05),
     "one later event more": lambda d, rng: d.update(later=d["later"] + 1),
     "one later event less": lambda d, rng: d.update(later=max(d["later"] - 1, 0)),
+    "another number of pieces": lambda d, rng: d.update(pieces=int(rng.integers(1, 9))),
     "other events before the first input": lambda d, rng: d.update(later_at_start=int(rng.integers(0, 3))),
 }
 
@@ -214,6 +214,16 @@ def _time(field: str, factor: int) -> Callable[[Loop, Rng], Loop]:
     def change(loop: Loop, rng: Rng) -> Loop:
         times = loop.times._replace(**{field: getattr(loop.times, field) * factor})
         return loop._replace(times=times)
+
+    return change
+
+
+def _periods(factor: fmpq, fields: tuple[str, ...]) -> Callable[[Loop, Rng], Loop]:
+    """Change the times between the events of a periodic rule."""
+
+    def change(loop: Loop, rng: Rng) -> Loop:
+        changed = {field: getattr(loop.times, field) * factor for field in fields}
+        return loop._replace(times=loop.times._replace(**changed))
 
     return change
 
@@ -283,6 +293,10 @@ LOOPS: dict[str, Callable[[Loop, Rng], Loop]] = {
     "no delay": _time("delay", 0),
     "no age": _time("age", 0),
     "no start": _time("start", 0),
+    "period x 2": _periods(fmpq(2), ("least_period", "period")),
+    "period 5 % longer": _periods(fmpq(21, 20), ("period",)),
+    "period 5 % shorter": _periods(fmpq(19, 20), ("least_period", "period")),
+    "least period 5 % shorter": _periods(fmpq(19, 20), ("least_period",)),
 }
 
 

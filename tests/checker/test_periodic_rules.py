@@ -1,6 +1,7 @@
 """Periodic rules: witnesses, false witnesses, and runs."""
 
 import copy
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -18,6 +19,8 @@ from noack_check.proof import prove
 from noack_check.times import Schedule
 from tests.checker.random_loops import random_periodic_loop
 from tests.checker.runs import exceeded
+from tests.checker.test_mutations import DOCUMENTS
+from tests.checker.test_mutations import LOOPS as OTHER_LOOPS
 from tests.checker.test_witnesses import IDEAL, SCHEDULE, double_integrator
 
 
@@ -243,3 +246,28 @@ def test_ideal_conditions_have_a_witness() -> None:
     (bound,) = proof.bounds
     assert 1.0 <= float(bound.decaying.mid()) < 1.5
     assert proof.rate > 0
+
+
+@functools.cache
+def base(name: str) -> tuple[Loop, dict[str, Any]]:
+    loop = LOOPS[name]
+    return loop, dict(find_witness(loop, ("x", "e_c")).document)
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("name", LOOPS)
+@pytest.mark.parametrize("change", [*DOCUMENTS, *OTHER_LOOPS])
+def test_what_is_accepted_of_changed_witnesses_is_true(name: str, change: str) -> None:
+    """Random runs stay within what was accepted."""
+    loop, document = base(name)
+    for seed in range(3):
+        rng, other = np.random.default_rng(seed), copy.deepcopy(document)
+        changed = OTHER_LOOPS[change](loop, rng) if change in OTHER_LOOPS else loop
+        if change in DOCUMENTS:
+            DOCUMENTS[change](other, rng)
+        try:
+            proof = prove(changed, other)
+        except RejectedError:
+            continue
+        for _ in range(3):
+            assert exceeded(changed, proof, rng, 6.0) == []
