@@ -4,8 +4,8 @@ They are forked from a process that has imported what they need (``preloaded.py`
 long as it has one thread, from the command itself; of a program that uses the library, which may
 have threads, from Python's fork server, which remains for later runs.
 
-With Python's fork server ``noack run`` takes 1.5 times as long to its first control step (4.7 times
-as long as the import of numpy, scipy and zenoh, instead of 3.1 times, on two cores): the server
+With Python's fork server ``noack run`` takes 1.6 times as long to its first control step (on two busy
+cores 6.3 times as long as the import of numpy, scipy and zenoh, instead of 4.0 times): the server
 repeats the imports of the command.
 """
 
