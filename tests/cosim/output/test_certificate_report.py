@@ -134,7 +134,7 @@ def test_the_chosen_weight_makes_the_model_contract_and_keeps_the_volume(chosen:
     ages = [int(100 * scheduled.inter_event_s * j) for j in range(scheduled.missing_events)]
     followed = scheduled.overshoot * (gains[0] + sum(max(gains[age:]) for age in ages))
     expected = min(followed, gains[0] * scheduled.delta)
-    assert chosen.error_in_given_norm == pytest.approx(expected, rel=1e-2)
+    assert chosen.error_in_given_norm == pytest.approx(expected, rel=2e-2)
     assert unweighted.error_in_given_norm is None
     assert better.inter_event_s >= plain.inter_event_s
 
