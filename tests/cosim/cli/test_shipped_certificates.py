@@ -1,0 +1,47 @@
+"""``noack certify`` on every shipped scenario, from the command line, with searches that end early."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import noack
+from cosim.analysis.certificates import Certificates
+from cosim.analysis.witnesses import Witnesses
+from noack.core.errors import ExitStatus
+from noack.scenario.scenario import loop_names
+from tests.helpers.command_line import invoke
+
+FILES = (Path(__file__).parents[3] / "scenarios").glob("*.toml")
+LIKE_OTHERS = {"lane_5g_arterial", "lane_5g_rural", "lane_weighted"}
+"""Other numbers of scenarios that are tried."""
+SCENARIOS = sorted({file.stem for file in FILES} - LIKE_OTHERS)
+
+
+@pytest.fixture
+def short_searches(monkeypatch: pytest.MonkeyPatch) -> None:
+    prove = Certificates.prove
+
+    def shortly(self: Certificates, progress: Callable[[float], None]) -> Witnesses:
+        return prove(self, progress, most_work=0.2)
+
+    monkeypatch.setattr(Certificates, "prove", shortly)
+    monkeypatch.setattr("cosim.analysis.certificates.in_chosen_norm", lambda *_: None)
+
+
+@pytest.mark.usefixtures("short_searches")
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_a_shipped_scenario_has_bounds_or_reasons(name: str) -> None:
+    first, *others = loop_names(noack.load(name))
+    result = invoke("certify", name, "--json", *([f"--loop={first}"] if others else []))
+    if result.exit_code == ExitStatus.CALLER:
+        assert "no certificate covers this" in result.stderr or "pip install" in result.stderr
+        return
+    document = json.loads(result.stdout)
+    proven = [each for each in document["certificates"] if each["proven"] is not None]
+    assert proven or document["unproven"]
+    assert all(each["reason"] for each in document["unproven"])
+    assert result.exit_code == (
+        0 if any(c["proven"] or c["constants"] for c in document["certificates"]) else 1
+    )
