@@ -185,7 +185,7 @@ def print_worst(
     if certificate.void is not None:
         console.print(f"[dim]Nothing is certified: {escape(certificate.void)}[/]")
     elif trigger == "sampled":
-        console.print("[dim]certified: for the scenario's schedule, without lateness[/]")
+        console.print("[dim]certified: computed for the scenario's schedule, without lateness[/]")
     console.print("[dim]One letter per event: D delivered, L lost. --json prints their times[/]")
 
 

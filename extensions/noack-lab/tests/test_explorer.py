@@ -84,7 +84,7 @@ def test_the_chart_has_a_panel_for_each_quantity_and_is_json() -> None:
     drawn = np.array(series["‖x‖ plant", 2]["data"], float)
     (curve,) = [curve for curve in run.curves if curve.name == "‖x‖ plant"]
     np.testing.assert_allclose(drawn, np.column_stack([curve.t_s, curve.values]), rtol=1e-5)
-    assert {("for comparison", 0), ("for comparison", 2), ("certified bound", 1)} <= {*series}
+    assert {("for comparison", 0), ("for comparison", 2), ("certified bound (computed)", 1)} <= {*series}
     assert options["yAxis"][1]["type"] == "log"
     reached = [value for _, value in series["‖e_s‖ sensor", 1]["data"] if value is not None]
     assert min(reached) > 0  # it is 0 after a reset, which is a gap
