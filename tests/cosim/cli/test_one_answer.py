@@ -39,10 +39,10 @@ def test_the_answer_of_certify_is_that_of_the_run(name: str, is_certified: bool)
         assert answer.text.endswith(f": {reason}; only its model in its place has one")
 
 
-@pytest.mark.parametrize("losses", [0, 4])
-def test_the_answer_of_certify_is_that_of_margin(losses: int) -> None:
+@pytest.mark.parametrize(("period_s", "losses"), [(0.1, 0), (0.5, 4)])
+def test_the_answer_of_certify_is_that_of_margin(period_s: float, losses: int) -> None:
     """margin said of the first only that every pattern is stable."""
-    scenario = noack.load("lane_periodic", {"network.mansd": losses})
+    scenario = noack.load("lane_periodic", {"trigger.period_s": period_s, "network.mansd": losses})
     answer = noack.certify(scenario, proofs=False).answer
     assert answer.is_certified == (losses == 0)
     margin = noack.margin(scenario, most_m=1, period=False)
