@@ -32,7 +32,7 @@ def test_units_move_to_the_heads() -> None:
 def test_marks_of_proven_numbers_have_columns_of_their_own() -> None:
     table = result_tables.ResultTable("t", "c", ("", "plant", "box"), [("x", "1.2✓", "3"), ("e", "–", "2✓")])
     assert result_tables.as_csv(table) == (
-        ",plant,\"plant, proved\",box,\"box, proved\"\nx,1.2,yes,3,\ne,,,2,yes\n"
+        ',plant,"plant, proved",box,"box, proved"\nx,1.2,yes,3,\ne,,,2,yes\n'
     )
 
 
