@@ -191,6 +191,20 @@ def test_the_map_of_the_code_names_existing_files() -> None:
     assert named <= files
 
 
+def test_the_tour_of_the_code_names_existing_places() -> None:
+    page = (ROOT / "docs/tour.md").read_text()
+    stops = re.findall(r"^\| \[(\S+)\]\(\.\./(\S+)\) \| (.*?) \| (\d+) \|", page, re.MULTILINE)
+    assert len(stops) > 20
+    for label, target, names, lines in stops:
+        text = (ROOT / target).read_text()
+        assert label == target
+        assert int(lines) <= len(text.splitlines()), target
+        for name in re.findall(r"`(\w+)`", names):
+            begins = rf"^\s*(def|class) {name}\b" if target.endswith(".py") else rf"^\w.*\b{name}\("
+            assert re.search(begins, text, re.MULTILINE), f"{target}: {name}"
+    assert 2500 < sum(int(lines) for *_, lines in stops) < 3500
+
+
 REQUIRED = {"authors", "cff-version", "message", "title"}
 """Of the Citation File Format 1.2.0."""
 
