@@ -56,7 +56,7 @@ def draw(seed: int, number: int) -> Draw:
     content: Table = {"name": f"draw_{seed}_{number}", "horizon_s": horizon_s, **tables}
     of.put(content, 0.1, "description", lambda: "a random scenario")
     content["network"] = network(of, count, horizon_s, acknowledged=acknowledged)
-    of.put(content, 0.3, "certificate", lambda: _certificate(of))
+    of.put(content, 0.95, "certificate", lambda: _certificate(of))
     if not acknowledged:
         often = 0.1 if of.gentle else 0.25
         of.put(content, often, "changes", lambda: _changes(of, content, model, horizon_s))
@@ -73,14 +73,12 @@ def _some(of: Chances, table: Table) -> Table:
 
 
 def _certificate(of: Chances) -> Table:
-    return _some(
-        of,
-        {
-            "late_periods": of.integer(0, 5),
-            "network_delay_s": of.between(0.0, 0.2),
-            "exceedance_probability": of.size(1e-9, 1e-2),
-        },
-    )
+    table = {
+        "late_periods": of.integer(0, 5),
+        "network_delay_s": of.between(0.0, 0.2),
+        "exceedance_probability": of.size(1e-9, 1e-2),
+    }
+    return {"prove": of.chance(0.05), **_some(of, table)}  # the search of a proof takes seconds
 
 
 def _changes(of: Chances, content: Table, model: Model, horizon_s: float) -> list[Table]:
