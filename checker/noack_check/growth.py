@@ -1,10 +1,10 @@
 """The growth of a loop with a time-triggered sensor under every pattern of losses, or under one of them.
 
-The sensor transmits x every T, and nothing is late. From one transmission to the next the state
-z = (x, x_c, u, w, older x) is multiplied by a matrix D, if an update arrives before the next
-transmission, and else by L: u is the input that the plant applies, w the newest one of the controller, and
-the older x are those of transmissions whose updates are on their way. Both depend on the place of T
-relative to the controller's ticks, which repeats after some transmissions, the slots.
+The sensor transmits x, which it knows, every T; nothing is late, and nothing disturbs the loop. From one
+transmission to the next the state z = (x, x_c, u, w, older x) is multiplied by a matrix D, if an update
+arrives before the next transmission, and else by L: u is the input that the plant applies, w the newest one
+of the controller, and the older x are those of transmissions whose updates are on their way. Both depend on
+the place of T relative to the controller's ticks, which repeats after some transmissions, the slots.
 
 A *word* is what is known of the outcomes so far: it is how they end. A witness has words, each with a
 positive definite matrix P for every slot. From a word w, outcome o leads to the longest word that w·o ends
@@ -15,8 +15,10 @@ with. If for all slots and words, and all outcomes that the guarantee allows the
 then no pattern grows faster than by ρ per period, in the long run: with √(zᵀPz) as its measure. "D" has to
 be a word, since each pattern has a delivery, from which on there is a word.
 
+An outcome belongs to the update that arrives, or would, between two transmissions.
+
 A pattern that is repeated has the product Π of its matrices over all slots. |tr Π^k| ≤ N · (spectral radius
-of Π)^k, N its size: so it grows at least by (|tr Π^k| / N)^(1/k) over that time.
+of Π)^k, N its size: so some z grows at least by (|tr Π^k| / N)^(1/k) over that time.
 """
 
 from collections.abc import Mapping
@@ -79,6 +81,8 @@ def read_periodic_loop(resolved: Table) -> PeriodicLoop:
         RefusedError: a key is not covered, is missing or has a wrong value.
     """
     loop, schedule = read_loop(resolved, box=False, ideal=False), read_schedule(resolved)
+    if loop.observer is not None or loop.noise.ncols() or loop.sizes:
+        raise RefusedError("the growth is of a loop without observer, noise and disturbances")
     if not loop.times.period > 0 or loop.times.least_period != loop.times.period:
         raise RefusedError("trigger.policy: the sensor is not time-triggered")
     if not schedule.is_whole:

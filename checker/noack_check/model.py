@@ -134,7 +134,7 @@ class Chain(NamedTuple):
 
 
 class Errors(NamedTuple):
-    """What is assumed at all times: ‖W (e_s − n)‖² ≤ ``decaying``² f₁² + ``constant``² f₂², for each n."""
+    """What is assumed at all times: (‖W e_s‖ + ‖W n‖)² ≤ ``decaying``² f₁² + ``constant``² f₂²."""
 
     decaying: arb
     constant: arb

@@ -52,6 +52,7 @@ def read_loop(resolved: Table, *, box: bool, ideal: bool) -> Loop:
     own = _Plants(_matrix(plant, "plant.A"), _matrix(plant, "plant.B"), [[0] * n] * n, [[0] * m] * n)
     plants = _box(plant, A, B, own) if box else own
     x_r = _setpoint(resolved, A, plants)
+    _choice(_table(resolved, "network"), "network.initial_sync", ("first_packet", "known_state"))
     pushes = [*_disturbances(plant, plants), *_at_rest(plants.A, x_r)]
     weight = _weight(trigger, n)
     rule = _rule(trigger, weight)
@@ -111,10 +112,18 @@ def _losses(network: Table) -> int:
     most = _whole(network, "network.mansd")
     for entry in _tables(network, "network.constraints"):
         if entry.get("kind") == "at_most":
-            limit = _whole(entry, "network.constraints.losses")
-            if limit < _whole(entry, "network.constraints.window"):
+            limit, window = _window(entry)
+            if limit < window:
                 most = min(most, limit)
     return most
+
+
+def _window(constraint: Table) -> tuple[int, int]:
+    """Return the most losses of a rule, and in how many successive updates."""
+    losses, window = (_whole(constraint, f"network.constraints.{key}") for key in ("losses", "window"))
+    if window < 1:
+        raise RefusedError("network.constraints.window: below 1")
+    return losses, window
 
 
 def _times(resolved: Table, trigger: Table, *, ideal: bool) -> Times:
@@ -129,11 +138,15 @@ def _times(resolved: Table, trigger: Table, *, ideal: bool) -> Times:
             least, most = schedule.between_events(due_ns)
             times = times._replace(least_period=least, period=most)
         _require_watchdog(_optional_table(plant, "watchdog"), times)
+        _require_stated_delay(resolved)
     inner = trigger
     while inner.get("policy") == "deadline":
         inner = _table(inner, "rule")
     if inner.get("policy") == "quadratic":
-        grid = fmpq(nanoseconds(_real(inner, "trigger.period_s")), NS_PER_S)
+        grid_ns = nanoseconds(_real(inner, "trigger.period_s"))
+        if not grid_ns > 0 or Fraction(grid_ns) % read_schedule(resolved).sample:
+            raise RefusedError("trigger.period_s: not a multiple of the time between measurements")
+        grid = fmpq(grid_ns, NS_PER_S)
         # With a deadline an event may come between two points of the grid.
         least = grid if inner is trigger else times.least_sampling
         times = times._replace(sampling=grid, least_sampling=least)
@@ -151,6 +164,17 @@ def read_schedule(resolved: Table) -> Schedule:
         _whole(certificate, "certificate.late_periods"),
         _real(certificate, "certificate.network_delay_s") if "network_delay_s" in certificate else 0.0,
     )
+
+
+def _require_stated_delay(resolved: Table) -> None:
+    """Require that the delay of updates, where it is constant, is within the stated one."""
+    try:
+        delay_ns = constant_delay_ns(resolved)
+    except RefusedError:
+        return  # it varies: the run checks it
+    stated_s = _real(_table(resolved, "certificate"), "certificate.network_delay_s") if delay_ns else 0.0
+    if delay_ns > stated_s * NS_PER_S + 1:
+        raise RefusedError("certificate.network_delay_s: the network delays each update by more")
 
 
 def constant_delay_ns(resolved: Table) -> int:
@@ -178,8 +202,7 @@ def loss_windows(resolved: Table) -> Sequence[tuple[int, int]]:
     for entry in _tables(_table(resolved, "network"), "network.constraints"):
         if entry.get("kind") != "at_most":
             raise RefusedError(f"network.constraints: {entry.get('kind')}: not covered")
-        names = ("network.constraints.losses", "network.constraints.window")
-        found.append((_whole(entry, names[0]), _whole(entry, names[1])))
+        found.append(_window(entry))
     return found
 
 
@@ -291,7 +314,8 @@ def _disturbances(plant: Table, plants: _Plants) -> Iterator[list[arb]]:
     n, m = len(plants.A), len(plants.B[0])
     for entry in _tables(plant, "plant.disturbances"):
         at_input = _choice(entry, "plant.disturbances.at", ("input", "state")) == "input"
-        each_alone = entry.get("kind") == "uniform"
+        kind = _choice(entry, "plant.disturbances.kind", ("sine", "step", "uniform"))
+        each_alone = kind == "uniform"
         values = _row(entry, f"plant.disturbances.{'bound' if each_alone else 'amplitude'}")
         if len(values) != (m if at_input else n):
             raise RefusedError("plant.disturbances: not one number per input or state")
@@ -367,6 +391,7 @@ def _observer(resolved: Table, plants: _Plants, *, ideal: bool) -> Observer | No
     n, schedule = len(plants.A), read_schedule(resolved)
     if ideal or not schedule.is_whole:
         raise RefusedError("observer: not covered without tests a whole number of nanoseconds apart")
+    _choice(observer, "observer.kind", ("luenberger",))
     (L, C), x_0 = _observed(resolved, n), _row(plant, "plant.initial_state")
     estimate = _row(observer, "observer.initial_estimate") if "initial_estimate" in observer else [0.0] * n
     if len(estimate) != n:

@@ -142,7 +142,8 @@ def changed_scenario(content: Mapping[str, object], rng: np.random.Generator) ->
     elif kind == 2:
         trigger["period_s"] = float(rng.choice([0.05, 0.12, 0.2, 0.3]))
     elif kind == 3:
-        network["impairments"][0]["delay_s"] = float(rng.choice([0.0, 0.05, 0.2, 0.33]))
+        delay_s = float(rng.choice([0.0, 0.05, 0.2, 0.33]))
+        network["impairments"][0]["delay_s"] = changed["certificate"]["network_delay_s"] = delay_s
     elif kind == 4:
         plant["B"][1][0] *= 1 + 0.2 * rng.normal()
     else:
@@ -248,11 +249,23 @@ def test_a_decaying_pattern_is_not_called_unstable() -> None:
         (("trigger={policy='absolute', delta=0.1}",), "not time-triggered"),
         ((PERIODIC, "network.impairments=[{kind='delay', delay_s=0.01, jitter_s=0.005}]"), "not constant"),
         ((PERIODIC, "plant.rate_hz=30.0", "controller.rate_hz=30.0"), "no whole nanoseconds"),
+        ((PERIODIC, "plant.disturbances=[{kind='uniform', bound=[0.1]}]"), "without observer, noise and"),
+        ((PERIODIC, "plant.measurement.noise_bound=[0.1, 0.1]"), "without observer, noise and"),
     ],
 )
 def test_what_is_not_covered_is_refused(settings: Sequence[str], reason: str) -> None:
     with pytest.raises(RefusedError, match=reason):
         periodic("double_integrator", *settings)
+
+
+def test_an_observer_that_learns_nothing_is_not_called_stable() -> None:
+    """x̂ = 0 and u = 0 at all times, while x grows."""
+    plant = ("plant.draw=given", "plant.A=[[0.0, 1.0], [0.0, 0.0]]", "plant.B=[[0.0], [1.0]]")
+    resolved = scenario("double_integrator", *plant, PERIODIC)
+    content = resolved_content(resolved, resolved.certificate.late_periods)
+    content["observer"] = {"kind": "luenberger", "gain": [[0.0, 0.0]] * 2, "initial_estimate": [0.0, 0.0]}
+    with pytest.raises(RefusedError, match="observer"):
+        read_periodic_loop(content)
 
 
 def test_the_command_writes_what_noack_check_proves(tmp_path: Path) -> None:

@@ -233,14 +233,44 @@ def test_a_watchdog_that_may_act_is_refused() -> None:
         (("trigger", "beta"), -1.0, "trigger.beta: below 0"),
         (("trigger", "weight"), [[1.0]], "trigger.weight: not 2 x 2"),
         (("certificate", "late_periods"), True, "certificate.late_periods: not a number"),
+        (("network", "initial_sync"), "soon", "network.initial_sync: not one of first_packet, known_state"),
+        (
+            ("network", "constraints"),
+            [{"kind": "at_most", "losses": 0, "window": 0}],
+            "network.constraints.window: below 1",
+        ),
+        (
+            ("plant", "disturbances"),
+            [{"at": "input", "amplitude": [1.0]}],
+            "plant.disturbances.kind: missing",
+        ),
+        (
+            ("network", "impairments"),
+            [{"kind": "delay", "delay_s": 10.0}],
+            "certificate.network_delay_s: the network delays each update by more",
+        ),
     ],
 )
 def test_wrong_values_are_said_in_a_line(place: tuple[str, str], value: object, message: str) -> None:
     tables = resolved_tables("double_integrator")
+    tables["certificate"]["network_delay_s"] = 0.0
     tables[place[0]][place[1]] = value
     with pytest.raises(RefusedError) as caught:
         read_loop(tables, box=False, ideal=False)
     assert str(caught.value) == message
+
+
+@pytest.mark.parametrize("period_s", [0.0, 1e-10, 0.001, 0.015])
+def test_a_grid_that_is_none_of_measurements_is_refused(period_s: float) -> None:
+    """A grid of 0 was read as tests at all times."""
+    rows = "[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]"
+    trigger = f'trigger={{policy="quadratic", period_s=0.02, Q=[{rows}], epsilon=0.01}}'
+    tables = resolved_tables("double_integrator", trigger, "plant.rate_hz=100")
+    for ideal in (True, False):
+        read_loop(tables, box=False, ideal=ideal)
+        wrong = {**tables, "trigger": {**tables["trigger"], "period_s": period_s}}
+        with pytest.raises(RefusedError, match=r"trigger.period_s: not a multiple"):
+            read_loop(wrong, box=False, ideal=ideal)
 
 
 class Recorded(dict[str, Any]):
