@@ -31,6 +31,9 @@ def assumptions(scenario: Mapping[str, object], loop: Loop) -> str:
         if times.period > 0:
             least = f"{ms['least_period']} to " if times.least_period < times.period else ""
             parts.append(f"events every {least}{ms['period']}")
+    rule = loop.rule
+    if times.sampling == 0 and rule.positive.nrows() and rule.level == 0 and rule.floor == 0:
+        parts.append("as long as events do not accumulate")  # nothing keeps two of them apart
     if scenario.get("changes"):
         parts.append("until the first change of settings")
     return ", ".join(parts)

@@ -13,6 +13,7 @@ from noack_check.balls import matrix, number, zeros
 from noack_check.check import RejectedError
 from noack_check.loop import Loop, Rule, Times
 from noack_check.proof import prove
+from noack_check.sentences import assumptions
 
 IDEAL = Times(fmpq(0), fmpq(0), fmpq(0), fmpq(0), fmpq(0))
 SCHEDULE = Times(fmpq(1, 100), fmpq(1, 100), fmpq(1, 50), fmpq(3, 100), fmpq(1, 50))
@@ -197,3 +198,11 @@ def test_in_the_limit_bounds_are_those_of_disturbances_and_the_floor() -> None:
     assert 0.1 < float(ultimate.constant.mid()) < 0.7
     assert ultimate.constant <= whole.constant
     assert rate.constant < ultimate.constant
+
+
+def test_what_is_assumed_of_events_without_a_least_time_is_said() -> None:
+    """A relative rule that is tested at all times has no threshold that keeps two events apart."""
+    assert assumptions({}, relative(0.1)).endswith(", as long as events do not accumulate")
+    tested = relative(0.1)._replace(times=SCHEDULE)
+    for loop in (tested, double_integrator(IDEAL), double_integrator(IDEAL, level=0.0, floor=0.1)):
+        assert "accumulate" not in assumptions({}, loop)
