@@ -104,6 +104,27 @@ def test_an_example_runs_and_leaves_its_figures(
     assert {path.name for path in tmp_path.iterdir()} == FIGURES[name]
 
 
+def test_the_tests_of_a_page_pass(tmp_path: Path) -> None:
+    """The page "Test your controller" has files that belong into one folder."""
+    for code in blocks("docs/testing.md", "python"):
+        name = re.match(r"# (\w+\.py)\n", code)
+        assert name is not None
+        (tmp_path / name[1]).write_text(code)
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "-p",
+        "no:xdist",
+        str(tmp_path),
+    ]
+    finished = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=600)
+    assert finished.returncode == 0, finished.stdout
+
+
 # --- the tutorial ---------------------------------------------------------------------------------
 
 PAGE = "docs/tutorial.md"

@@ -316,7 +316,10 @@ class PlantSection(ScenarioSection):
             if self.draw != "given" and matrix is not None:
                 raise ValueError(f'{key}: matrices are for draw = "given", not "{self.draw}"')
         if self.draw != "nominal" and not isinstance(self.system, LinearSettings):
-            raise ValueError(f'draw: "{self.draw}" is for linear plants; a {self.system.kind} is what it is')
+            raise ValueError(
+                f'draw: "{self.draw}" gives a linear plant other entries of A and B; '
+                f'without draw, a plant of kind "{self.system.kind}" is used as it is'
+            )
         box = (self.uncertainty_A or ()) + (self.uncertainty_B or ())
         if self.draw in ("uniform", "vertex") and not box:
             raise ValueError(f'uncertainty_A: draw = "{self.draw}" needs uncertainty_A or uncertainty_B')

@@ -13,7 +13,7 @@ PAGES = (
     "README.md", "docs/record.md", "docs/scenarios.md", "docs/network.md", "docs/many-loops.md",
     "docs/paper.md", "docs/netem.md", "docs/netem-programs.md", "docs/campaigns.md",
     "docs/design.md", "docs/plants.md", "docs/library.md", "docs/command-line.md", "docs/howto.md",
-    "docs/guarantees.md", "docs/benchmarks.md", "docs/measure.md",
+    "docs/guarantees.md", "docs/benchmarks.md", "docs/measure.md", "docs/choosing-m.md",
     "docs/papers.md", "docs/published.md",
 )  # fmt: skip
 
@@ -49,6 +49,8 @@ def fill(folder: Path) -> Path:
                 exec(compile(code, "snippet", "exec"), {"__name__": "__main__"})
     run = invoke("simulate", "lane_following", "--set=horizon_s=2", "--no-report", "--runs", folder / "runs")
     assert run.exit_code == 0, run.stderr
+    network = ("--deadline", "100ms", "--as", "model", "--write", folder / "urban.toml")
+    assert invoke("measure", "urban_n78_40kmh", *network).exit_code == 0
     for name in ("model", "hold"):  # two runs for `compare`, as commands run in any order
         (folder / "runs" / name).mkdir()
         (folder / "runs" / name / "latest").symlink_to((folder / "runs/latest").resolve())

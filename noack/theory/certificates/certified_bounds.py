@@ -211,8 +211,8 @@ class ScenarioCertificate:
 
     def _envelope(self, t_s: Matrix, constant: Constant) -> Matrix:
         if self.proven is not None and self.is_proven(constant):
-            return self.proven.at(_OUTPUTS[constant], t_s)
-        return self._computed(t_s, constant)
+            return self.proven.at(_OUTPUTS[constant], np.asarray(t_s, dtype=float))
+        return self._computed(np.asarray(t_s, dtype=float), constant)
 
     def _computed(self, t_s: Matrix, constant: Constant) -> Matrix:
         if self.constants is None:
