@@ -27,7 +27,7 @@ from noack.theory.bounds.certificate_terms import Constants
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import OWN_PLANT, most_events
 from noack.theory.certificates.proven_bounds import ProvenBound, ProvenBounds
-from noack.theory.certificates.scenario_certificates import CertificateScope, outside_box
+from noack.theory.certificates.scenario_certificates import outside_box
 from noack_check.sentences import smallest_bounds
 from tests.helpers.command_line import invoke
 from tests.helpers.shipped import resolved, shipped
@@ -89,16 +89,6 @@ def test_the_documentation_quotes_computed_figures(lane: Certificates, weighted:
         assert quoted in " ".join(text.split())
 
 
-def test_an_observer_has_no_limit_of_the_sampling_period() -> None:
-    gain = 'observer={kind="luenberger", gain=[[1.0], [100.0]]}'
-    limits = Certificates(resolved("pendulum_observed", gain), 2).limits_by_scope[OWN_PLANT]
-    assert limits.sampling_s is None
-    assert limits.delay_s > 0.1
-    # At 32 ms the observer is unstable, although e_s grows by less than with 65 ms between two tests.
-    rarely = Certificates(resolved("pendulum_observed", gain, "plant.measure_every=16"), 2)
-    assert rarely.schedule.constants is None
-
-
 RATE_HZ = 1 / 0.0458
 SLOW = (
     'model={name="double_integrator"}',
@@ -139,22 +129,6 @@ def test_the_chosen_weight_makes_the_model_contract_and_keeps_the_volume(chosen:
     assert better.inter_event_s >= plain.inter_event_s
 
 
-@pytest.mark.parametrize(("gain", "advised"), [("[[-0.2, -0.7]]", True), ("[[0.2, -0.7]]", False)])
-def test_advice_is_for_a_loop_gain_and_no_norm_is_said_to_be_tried(gain: str, advised: bool) -> None:
-    """No rate helps a loop that is unstable without losses, and only "decaying" has other norms."""
-    trigger = 'trigger={policy="absolute", delta=0.1}'
-    settings = [trigger, f"model.gain={gain}", "model.allow_unstable=true"]
-    settings += ["plant.rate_hz=2", "controller.rate_hz=2"]
-    result = invoke(
-        "certify", "double_integrator", "--no-proofs", *(word for s in settings for word in ("--set", s))
-    )
-    _, _, last = " ".join(result.stdout.split()).rpartition("no certificate for the schedule, ")
-    assert last.startswith("so no bound of ‖x‖")
-    assert ("plant.rate_hz" in last) == advised
-    advice = re.findall(r"[\w.]+ = \d+", last)
-    assert not advised or certificates_of(shipped("double_integrator", *settings, *advice)).schedule.exists
-
-
 def test_advice_names_only_what_helps() -> None:
     """With this delay neither faster rates nor fewer losses give a certificate."""
     settings = ['trigger={policy="absolute", delta=0.1}']
@@ -166,14 +140,6 @@ def test_advice_names_only_what_helps() -> None:
     assert "there is one with certificate.network_delay_s = 0.5 " in last
     assert "rate_hz =" not in last
     assert "mansd" not in last
-
-
-def test_advice_with_an_observer_leaves_its_period_alone() -> None:
-    delay = 'network.impairments=[{kind="delay", delay_s=1.0}]'
-    result = invoke("certify", "pendulum_observed", "--no-proofs", "--set", delay)
-    _, _, last = " ".join(result.stdout.split()).rpartition("no certificate for the schedule, ")
-    assert "there is one with certificate.network_delay_s = 0.1 " in last
-    assert "rate_hz" not in last
 
 
 STICK = (
@@ -204,13 +170,6 @@ def test_the_largest_settings_are_certified_and_the_next_ones_are_not(settings: 
         ]
         assert certified == [True, False], (key, value)
     assert keys == {"certificate.network_delay_s", "plant.measure_every"}
-
-
-def test_the_tutorial_names_the_largest_settings() -> None:
-    [delay, period] = certificates_of(shipped("unstable_pendulum", *STICK)).largest_settings
-    text = " ".join((ROOT / "docs/tutorial.md").read_text().split())
-    assert delay.text in text
-    assert period.text in text
 
 
 @pytest.mark.parametrize(
@@ -246,39 +205,6 @@ def test_an_advised_box_has_a_certificate() -> None:
     assert box.exists
 
 
-def test_a_limited_number_of_settings_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
-    results = Certificates(resolved("lane_periodic"), 2)
-    tried: list[float] = []
-    monkeypatch.setattr(CertificateScope, "loop_gain", lambda *_: tried.append(1) or 2.0)
-    assert not results.helpful_settings
-    assert len(tried) <= 24
-
-
-def test_where_no_delay_is_known_no_limit_is_searched(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A full queue is an hour long, and a search takes minutes."""
-    monkeypatch.setattr("cosim.analysis.certificates.network_limits", None)
-    queue = 'network.impairments=[{kind="rate",rate_bps=24000,queue=1000}]'
-    results = Certificates(resolved("double_integrator", queue), 2)
-    assert not results.schedule.exists
-    assert results.limits_by_scope == {}
-
-
-@pytest.mark.parametrize(
-    ("settings", "reason"),
-    [
-        (("plant.rate_hz=2", "controller.rate_hz=2"), "already the part of u − Kx from the age of the input"),
-        (('trigger={policy="relative",sigma=0.9}',), "already ‖e_s‖ at the tests reproduces itself"),
-        (
-            ("certificate.network_delay_s=1.8", "trigger.beta=0.5"),
-            "‖u − Kx‖ reproduces itself through updates that are lost, late",
-        ),
-    ],
-)
-def test_the_first_inequality_without_a_bound_is_named(settings: Sequence[str], reason: str) -> None:
-    void = Certificates(resolved("double_integrator", *settings), 2).schedule.void
-    assert reason in (void or "")
-
-
 def test_linear_equations_are_certified_as_the_plant(tmp_path: Path) -> None:
     """From any x(0), with the same bounds and the same advice as A and B in the scenario."""
     (tmp_path / "own.py").write_text(
@@ -295,15 +221,6 @@ def test_linear_equations_are_certified_as_the_plant(tmp_path: Path) -> None:
     assert certificates.largest_settings == as_matrices.largest_settings
     [statement] = certificates.prove().statements
     assert 'plant.system.kind = "python": witnesses are for' in statement.reason
-
-
-def test_a_start_that_overflows_is_named() -> None:
-    certificates = certificates_of(shipped("double_integrator", "plant.initial_state=[1e200, 0]"))
-    reasons = {certificate.void for _, certificate in certificates}
-    assert reasons == {
-        "plant.initial_state is too large for floating point: an entry of x(0) is 1e+200; bounds are "
-        "computed up to 1e+150"
-    }
 
 
 def test_no_weight_improves_a_hold_and_identity_removes_the_weight() -> None:
@@ -496,14 +413,6 @@ def test_what_is_proven_takes_the_place_of_what_is_computed() -> None:
     assert "‖x‖ ≤ 970.5 e^(−0.25t) (computed)" in text
     assert "nothing is proven (paper, plant): none was found" in text
     assert "✓" not in printed(Certificates(resolved("lane_following"), 2))
-
-
-def test_a_computed_bound_is_not_shown_beside_a_larger_rate() -> None:
-    lane = proven_lane(PROVEN._replace(rate_per_s=0.3, bounds={"x": ProvenBound(7.0, 0.0)}))
-    (table, *_) = certificate_tables(lane)
-    rows = {row[0]: row[3] for row in table.rows}
-    assert (rows["X, bound of ‖x‖"], rows["Δ, bound of ‖e_c‖/β"]) == ("7✓", "-")
-    assert lane.schedule.controller_error(np.array([0.0]))[0] == pytest.approx(0.5 * 53.63, rel=1e-3)
 
 
 def test_a_proof_is_a_certificate_where_none_can_be_computed() -> None:

@@ -7,15 +7,12 @@ from typing import Any
 
 import pytest
 
-from cosim.analysis.replay.replay_result import difference
 from cosim.analysis.summary.summary_model import RunSummary
-from cosim.live import finalize as concluding
 from cosim.output import report_page
 from cosim.output.figures.run_figures import run_figures
 from cosim.output.report_page import Report, page, write_report
-from cosim.record.run_directory import REPORT_FILE, RunEnding
+from cosim.record.run_directory import REPORT_FILE
 from cosim.record.run_record import RunRecord
-from noack.core.errors import ExitStatus
 from noack.scenario.scenario_file import dumps as scenario_toml
 from tests.cosim.output.conftest import CASES, HOSTILE, make_record, scenario_of
 from tests.cosim.output.parsed_page import Page
@@ -165,25 +162,6 @@ def test_user_text_is_escaped(content: dict[str, Any], tmp_path: Path) -> None:
     assert parsed.attributes("title") == [{}]
 
 
-def test_the_report_names_what_is_not_replayed(record: RunRecord) -> None:
-    """A run without problems is among the approved texts."""
-    other = difference("plant_step", 7, 5, "another x", "x_1", 1.0, 2.0).model_dump()
-    replay = {"bit_exact": False, "complete": False, "inputs": 10001, "first_difference": other}
-    text = shown(record, replay=replay)
-    for words in (
-        "differs from its record", "plant_step row 7, x_1: another x: recorded 1.0",
-        "The record has gaps",
-    ):  # fmt: skip
-        assert words in text
-    text = shown(
-        record, ideal_loop={"reason": "it diverged"}, replay={"bit_exact": None, "error": "KeyError"}
-    )
-    assert "not compared: it diverged" in text
-    assert "Nothing could be replayed: KeyError." in text
-    exact = {"bit_exact": True, "complete": True, "inputs": 10001, "first_difference": None}
-    assert "The 10,001 recorded inputs were replayed" in shown(record, replay=exact)
-
-
 @pytest.mark.parametrize("case", CASES)
 def test_every_run_gets_a_report(case: str) -> None:
     record = CASES[case]()
@@ -197,20 +175,6 @@ def dead_run(content: dict[str, Any], tmp_path: Path) -> Path:
     (tmp_path / "scenario.toml").write_text(scenario_toml(scenario_of(content)), encoding="utf-8")
     (tmp_path / "ending.json").touch()
     return tmp_path
-
-
-def test_a_failed_report_does_not_fail_the_run(
-    dead_run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def fail(*_: object) -> None:
-        raise ZeroDivisionError("no such luck")
-
-    monkeypatch.setattr(report_page, "write_report", fail)
-    outcome = concluding.finalize(RunEnding(dead_run, 0, ExitStatus.OK, "horizon"))
-    assert "report" not in outcome.reason
-    assert (dead_run / "summary.json").is_file()
-    assert not (dead_run / REPORT_FILE).exists()
-    assert capsys.readouterr().err == "noack: warning: no report.html: no such luck\n"
 
 
 def test_the_command_writes_a_missing_report_and_others_only_if_asked(

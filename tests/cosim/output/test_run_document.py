@@ -8,10 +8,9 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-import noack
 from cosim.analysis.summary.run_summary import Outcome
 from cosim.analysis.summary.summary_model import Claim
-from cosim.live.finalize import finalize, reopen
+from cosim.live.finalize import finalize
 from cosim.output.run_document import run_document
 from cosim.output.terminal_writer import print_document
 from cosim.simulation.virtual_time import simulate_run
@@ -65,13 +64,6 @@ def test_reasons_of_several_loops_that_differ_only_in_numbers_are_one_line(tmp_p
     ]
 
 
-def test_one_more_loop_has_no_plural(outcome: Outcome) -> None:
-    loops = [outcome.summary.loops[0].model_copy(update={"name": f"loop-{i}"}) for i in range(13)]
-    summary = outcome.summary.model_copy(update={"loops": loops})
-    print_document(Console(file=(file := io.StringIO())), run_document(replace(outcome, summary=summary)))
-    assert "and 1 more loop: --verbose shows all" in file.getvalue()
-
-
 def test_a_broken_guarantee_is_shown_as_an_error(outcome: Outcome) -> None:
     lost = {"t_s": 2.5, "process": "controller", "cause": "dropouts", "what": "MANSD violated: 6 lost"}
     later_violations = [lost | {"what": f"MANSD violated: {n} lost"} for n in range(7, 13)]
@@ -79,11 +71,3 @@ def test_a_broken_guarantee_is_shown_as_an_error(outcome: Outcome) -> None:
     assert text.count("assumption violated from t = 2.500 s on (reported by controller): MANSD") == 5
     assert "1 more violation of an assumption" in text
     assert RED in text
-
-
-@pytest.mark.usefixtures("no_report", "no_recording")
-def test_an_assumption_that_a_scenario_violates_is_a_warning() -> None:
-    trigger = {"policy": "absolute", "delta": 0.02}
-    run = noack.simulate(noack.load("double_integrator", {"trigger": trigger}))
-    assert "warning:" in (text := printed(reopen(run.directory)))
-    assert "assumption violated: the trigger is" in text

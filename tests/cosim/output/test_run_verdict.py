@@ -9,14 +9,11 @@ import pytest
 
 import noack
 from cosim.analysis.summary.run_summary import Outcome
-from cosim.analysis.summary.summary_model import Claim, ExitPart
+from cosim.analysis.summary.summary_model import Claim
 from cosim.live.finalize import finalize
 from cosim.output import run_verdict
-from cosim.output.page_kit import TERMS
 from cosim.output.result_tables import Tone
-from cosim.output.run_tables import run_title, short_numbers
-from cosim.output.run_verdict import SETTLED_SHARE, guarantee_of, remarks, state_text, verdict
-from cosim.record.divergence import GROWTH
+from cosim.output.run_verdict import remarks, state_text, verdict
 from cosim.simulation.virtual_time import simulate_run
 from noack.protocol.wire_format import Rejection
 from noack.runtime.udp_sockets import DROPPED_IN_FLOOD
@@ -127,64 +124,12 @@ def test_a_run_across_hosts_names_the_firewall_the_network_and_how_to_add_rows(
     assert "lost elsewhere (kernel, or a process that did not respond): 3 on actuation" in alone
 
 
-def test_the_longest_burst_is_shown_with_the_limit_of_all_rules(outcome: Outcome) -> None:
-    assert "longest loss burst (cap M − 1 = 4)" in dict(short_numbers(outcome.summary))
-    change = {"number": 1, "t_s": 1.0, "settings": {"network.mansd": 9}, "what": ""}
-    raised = with_values(outcome.summary, changes=[change | {"in_force_from_s": {}}])
-    assert "longest loss burst (cap M − 1 = 9)" in dict(short_numbers(raised))
-    assert run_title(raised) == "lane_following, model-based, M − 1 = 4 → 9, simulated"
-    limited = with_values(outcome.summary, constraints=["atmost 3 in 8"])
-    assert "longest loss burst (at most 3 allowed)" in dict(short_numbers(limited))
-
-
-@pytest.mark.parametrize("scenario", ["four_tank", "lane_acknowledged"])
-def test_the_table_fits_eighty_columns(scenario: str) -> None:
-    run = noack.simulate(noack.load(scenario, {"horizon_s": 1.0}))
-    rows = short_numbers(run.summary)
-    assert max(len(name) for name, _ in rows) + max(len(value) for _, value in rows) <= 73
-    # There is no other value to compare with.
-    assert "ideal loop" not in verdict(run.summary)[2].text
-
-
-def test_the_glossary_has_the_limits_that_decide_the_words() -> None:
-    """It said that a loop diverges if it grows beyond all bounds."""
-    meaning = dict(TERMS)["stable, bounded, diverged"]
-    assert f"{GROWTH:g} times its expected size" in meaning
-    assert SETTLED_SHARE == 0.1
-    assert "at most a tenth of its largest value" in meaning
-
-
 def test_a_run_that_ends_before_its_first_input_is_due_keeps_its_guarantee() -> None:
     """Of 10 ms, it was said that no input came where the first has to come within 34 ms."""
     delay = {"network.impairments": [{"kind": "delay", "delay_s": 0.02}]}
     for horizon_s, held in ((0.01, 8), (0.2, 11)):  # nothing is compared for the other claims
         summary = noack.simulate(noack.load("lane_weighted", {"horizon_s": horizon_s, **delay})).summary
         assert verdict(summary)[1].text == f"guarantee kept: {held} claims held, none violated"
-
-
-def test_one_missing_sample_and_one_lost_datagram_have_no_plural(outcome: Outcome) -> None:
-    summary = with_values(
-        outcome.summary, missing_samples=1, missing_by_table={"plant_step": 1},
-        unintended_losses=1, unintended_losses_by_leg={"actuation": 1},
-    )  # fmt: skip
-    texts = "\n".join(remark.text for remark in remarks(summary))
-    assert "1 sample is missing from the record: 1 of plant_step" in texts
-    assert "1 datagram was lost elsewhere" in texts
-
-
-def test_where_the_plant_is_certified_only_the_box_is_said_to_be_uncovered(outcome: Outcome) -> None:
-    """It said that the machine was later than any certificate allows."""
-    claims = [claim("held"), claim("void", source="box certificate", why=LATE["what"])]
-    late = with_values(outcome.summary, kind="live", claims=claims, assumption_violations=[LATE])
-    texts = "\n".join(remark.text for remark in remarks(late))
-    assert "This machine was later than the box certificate of this loop allows, so some claims" in texts
-    assert (
-        "assumption violated from t = 1.000 s on (found in the record)" not in texts
-    )  # it is in the verdict
-    unseen = LATE | {"what": "no measurement for up to 1 s", "cause": "sampling"}
-    other = with_values(outcome.summary, claims=claims, assumption_violations=[LATE, unseen])
-    text = "\n".join(remark.text for remark in remarks(other))
-    assert "assumption violated from t = 1.000 s on (found in the record): no measurement" in text
 
 
 @pytest.mark.parametrize(
@@ -203,36 +148,5 @@ def test_a_late_run_says_which_certificate_does_not_cover_it(delay_s: float, end
     assert line.endswith(end.format(why))
 
 
-def test_the_numbers_and_reasons_of_datagrams_are_written_out(outcome: Outcome) -> None:
-    summary = with_values(
-        outcome.summary, missing_samples=2000, missing_by_table={"plant_step": 2000},
-        unintended_losses=1500, unintended_losses_by_leg={"actuation": 1500},
-        rejected_datagrams={"plant": {"length": 3, "shed": 4685}, "netem": {"source": 1}},
-    )  # fmt: skip
-    texts = "\n".join(remark.text for remark in remarks(summary))
-    assert "2,000 samples are missing from the record: 2,000 of plant_step" in texts
-    assert (
-        "1,500 datagrams were lost elsewhere (kernel, or a process that did not respond): 1,500 on" in texts
-    )
-    assert "plant rejected datagrams: 3 (wrong length), 4,685 (dropped in a flood)" in texts
-    assert "netem rejected datagrams: 1 (unknown source)" in texts
-
-
 def test_every_reason_for_a_rejection_has_words() -> None:
     assert {*Rejection, DROPPED_IN_FLOOD} == {*run_verdict._REJECTIONS}
-
-
-def test_without_any_certificate_the_reason_is_that_of_the_scenarios_own_plant(outcome: Outcome) -> None:
-    """It was the one that comes first in the alphabet: certify gave another loop gain."""
-    why = "the loop gain of the errors is {}, not below 1"
-    box = claim("void", source="box certificate", why=why.format(1.37))
-    summary = with_values(outcome.summary, claims=[box, claim("void", why=why.format(4.37))])
-    assert guarantee_of(summary.loops[0]).why == f"{why.format(4.37)}"
-
-
-def test_a_plant_that_fails_in_a_simulation_says_when_once() -> None:
-    """The simulation goes on to its horizon, which is not when the plant failed."""
-    end = ExitPart(status=1, reason="the plant failed at 0.02 s: x is not finite")
-    assert run_verdict.ending_line(end, 4.0, 4.0).text == f"failed: {end.reason}"
-    killed = ExitPart(status=1, reason="sensor exited with status 9")
-    assert run_verdict.ending_line(killed, 2.0, 4.0).text.startswith("failed after 2 s of 4 s: ")

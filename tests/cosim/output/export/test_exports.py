@@ -12,7 +12,6 @@ from scipy.io import loadmat
 
 import noack
 from cosim.output.export.mat_export import save_mat
-from noack.core.errors import CallerError
 from tests.helpers.command_line import invoke
 
 SCENARIO: dict[str, Any] = {
@@ -94,13 +93,3 @@ def test_csv_files_have_the_tables(run: noack.Run, tmp_path: Path) -> None:
     assert names == {*run.tables, "samples", "events"}
     steps = csv.read_csv(tmp_path / "csv/plant_step.csv")
     assert steps.equals(run.loops[run.scenario.name].table("plant_step"))
-
-
-def test_another_ending_and_a_missing_package_are_named(run: noack.Run, tmp_path: Path) -> None:
-    with pytest.raises(CallerError, match=r"run\.xls: .* to a folder or \.mat"):
-        run.export(tmp_path / "run.xls")
-    with pytest.raises(CallerError, match=r"run\.mcap: .* pip install noack-ros2$"):
-        run.export(tmp_path / "run.mcap")
-    result = invoke("export", str(run.directory), "--format", "mcap")
-    assert (result.exit_code, result.stderr.count("\n")) == (2, 1)
-    assert "pip install noack-ros2" in result.stderr

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import rerun.chunk
 
-from cosim.output.viewer.blueprint import LoopLayout, over_time
-from cosim.output.viewer.loop_recording import APPLICATION_ID, LoopView, RecordingFile, ViewError
+from cosim.output.viewer.loop_recording import APPLICATION_ID
 from cosim.output.viewer.pictures.picture import Frames
 from tests.cosim.output.viewer.recordings import (
     K,
@@ -72,11 +71,6 @@ def test_the_recording_shows_what_was_approved(tmp_path: Path) -> None:
     compare_output("recording.txt", "\n".join(shown_rows))
 
 
-def test_a_file_that_cannot_be_created_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ViewError, match=r"nowhere/recording.rrd: cannot create"):
-        new_view(tmp_path / "nowhere" / "recording.rrd")
-
-
 def test_a_disk_that_fills_during_the_run_is_reported_by_the_closing(tmp_path: Path) -> None:
     path = tmp_path / "recording.rrd"
     code = (
@@ -91,14 +85,3 @@ def test_a_disk_that_fills_during_the_run_is_reported_by_the_closing(tmp_path: P
     assert "ViewError" in last
     assert str(path) in last
     assert "the recording is incomplete" in last
-
-
-def test_a_loop_without_a_picture_has_a_panel_for_every_coordinate(tmp_path: Path) -> None:
-    """Names with special characters give different entities, too."""
-    path, layout = tmp_path / "recording.rrd", LoopLayout("", ["a/b", "a b", "ψ"], ["u"])
-    with RecordingFile(path, "1", over_time(layout.panels(), 1.0), indexed=True) as file:
-        LoopView(file, layout)
-    entities = {entity for entity in read(path) if entity.startswith("state/")}
-    origins = of_views(read(path, "blueprint"), "ViewBlueprint:space_origin")
-    assert len(entities) == 3
-    assert entities <= {origin.removeprefix("/") for origin in origins}

@@ -3,7 +3,6 @@
 import contextlib
 import http.client
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -18,20 +17,11 @@ import rerun.chunk
 import rerun.experimental
 
 from cosim.output.viewer.pictures.picture import TIMELINE
-from cosim.output.viewer.recording_viewer import (
-    RECORDING,
-    LiveView,
-    RecordingServer,
-    opening_time_ns,
-    view_recording,
-)
-from cosim.output.viewer.rerun_program import has_display, move_window_to, script_to_open_at
-from cosim.simulation.virtual_time import simulate
-from noack.core.errors import CallerError, ExitStatus
-from tests.cosim.output.viewer.recordings import K, add_samples, another_process, new_view, read
+from cosim.output.viewer.recording_viewer import RECORDING, LiveView
+from cosim.output.viewer.rerun_program import move_window_to
+from noack.core.errors import ExitStatus
+from tests.cosim.output.viewer.recordings import add_samples, another_process, new_view
 from tests.helpers.live_runs import noack_command
-from tests.helpers.shipped import resolved
-from tests.helpers.summaries import summary_of
 from tests.helpers.waiting import is_left, wait_for
 
 pytestmark = pytest.mark.skipif(
@@ -56,11 +46,6 @@ def live() -> Iterator[LiveView]:
     view = LiveView(native=False)
     yield view
     view.close()
-
-
-def rows_of(path: Path) -> int:
-    chunks = read(path).get("error/log10", [])
-    return sum(c.num_rows for c in chunks if not c.is_static)
 
 
 def test_a_live_viewer_receives_the_growing_file_to_its_end(tmp_path: Path, live: LiveView) -> None:
@@ -92,18 +77,6 @@ def test_a_live_viewer_receives_the_growing_file_to_its_end(tmp_path: Path, live
     os.kill(group, signal.SIGTERM)
     live.close()
     assert not is_left(group)
-
-
-def test_a_viewer_that_does_not_start_is_reported_and_the_run_is_recorded(
-    tmp_path: Path, live: LiveView, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("RERUN_CLI_PATH", shutil.which("false") or "false")
-    path = tmp_path / "recording.rrd"
-    with new_view(path, live=live) as view:
-        add_samples(view, 1)
-    assert live.url is None
-    assert live.status == "no live view: rerun's web viewer did not start"
-    assert rows_of(path) == K
 
 
 def test_a_live_view_ends_when_the_recorder_is_killed(tmp_path: Path) -> None:
@@ -162,16 +135,6 @@ def test_a_window_or_a_browser_is_served_the_whole_recording(
     wait_for(lambda: not opens or (seen.exists() and seen.read_bytes() == path.read_bytes()))
 
 
-@pytest.mark.parametrize("content", [None, b"", b"<html>"])
-def test_a_file_that_is_not_a_recording_is_not_served(content: bytes | None, tmp_path: Path) -> None:
-    path = tmp_path / "recording.rrd"
-    if content is not None:
-        path.write_bytes(content)
-    message = "no such recording" if content is None else "not a rerun recording"
-    with pytest.raises(CallerError, match=rf"recording\.rrd: {message}"):
-        view_recording(path)
-
-
 def listening(viewer: "subprocess.Popen[str]") -> list[str]:
     """Where a viewer listens: one port is for the page and the recording, one for rerun's files."""
     process = psutil.Process(viewer.pid)
@@ -222,11 +185,6 @@ def test_the_command_serves_a_page_on_the_loopback_until_it_is_ended(
 T_NS = 4_244_000_000
 
 
-def summary_at(at_s: float | None) -> str:
-    scenario = resolved("double_integrator", "horizon_s=0.1")
-    return summary_of(simulate(scenario), sup_e_c_at_s=at_s).model_dump_json()
-
-
 def test_the_time_is_sent_until_the_window_has_the_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -256,24 +214,3 @@ def test_the_time_is_sent_until_the_window_has_the_recording(
     assert requests == [connected, connected, wanted, connected, wanted]
     move_window_to(TIMELINE, T_NS, window, log.open("rb"))  # closed: no further request
     assert len(requests) == 5
-
-
-def test_only_the_page_of_a_finished_run_moves_the_cursor(tmp_path: Path) -> None:
-    path = tmp_path / "recording.rrd"
-    path.write_bytes(b"RRF2")
-    with RecordingServer(path, follow=False) as server:
-        page = server.start_page()
-        for text in (None, summary_at(None), "{}", "[]", "{"):
-            if text is not None:
-                (tmp_path / "summary.json").write_text(text)
-            assert opening_time_ns(path) is None
-            assert b"openAt" not in get(page)[1]
-        (tmp_path / "summary.json").write_text(summary_at(4.244))
-        assert opening_time_ns(path) == T_NS
-        assert get(page)[1].endswith(script_to_open_at(TIMELINE, T_NS))
-        assert b"openAt" not in get(page + "re_viewer.js")[1]
-
-
-def test_a_display_is_detected_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("WAYLAND_DISPLAY", ":0")
-    assert has_display()

@@ -1,7 +1,6 @@
 """The recording of a long run is written from its record, reduced; no extreme is lost."""
 
 from pathlib import Path
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -9,8 +8,6 @@ from numpy.typing import NDArray
 
 from cosim.live.finalize import finalize
 from cosim.output.viewer import blueprint as bp
-from cosim.output.viewer.loop_recording import ViewError
-from cosim.output.viewer.run_recording import write_loop_view
 from cosim.record import decimation, run_record
 from cosim.record.record_writing import write_run
 from cosim.record.run_directory import RECORDING_FILE, RunEnding, write_environment
@@ -80,12 +77,3 @@ def test_each_envelope_holds_all_samples_of_its_bin(tmp_path: Path, monkeypatch:
         kept_ns, kept = series(chunks, bp.state_path(name))
         require_envelope(measured["t_ns"], measured["x"][:, i : i + 1], kept_ns, kept[:, :1])
         require_envelope(measured["t_ns"], after_reset[:, i : i + 1], kept_ns, kept[:, 1:2])
-
-
-def test_no_recording_is_written_on_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """After a failed write rerun may wait forever."""
-    scenario = resolved("lane_following", "horizon_s=0.1")
-    monkeypatch.setattr("cosim.output.viewer.run_recording.disk_usage", lambda _: Mock(free=1 << 20))
-    with pytest.raises(ViewError, match="No space left"):
-        write_loop_view(simulate(scenario), tmp_path / RECORDING_FILE)
-    assert not [*tmp_path.iterdir()]
