@@ -15,7 +15,7 @@ with stoppable_imports():
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the controller of each loop in the run that a recorder or launcher has opened."""
     with join_run("controller", arguments) as run:
-        controllers = controllers_of(run.loops, run.phases_ns)
+        controllers = controllers_of(run.resolved.loops, run.resolved.phases_ns)
         controllers.connect()
         run_machines(run, controllers)
     return ExitStatus.OK

@@ -58,7 +58,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run_network(run: RunProcess) -> None:
     """Relay the datagrams of a run by the core."""
-    network = RunNetwork(run.scenario, loops=len(run.phases_ns))
+    loops = len(run.resolved.names)
+    network = RunNetwork(run.scenario, loops)
     with run.open_socket() as endpoint:
         addresses = run.join(endpoint.getsockname()[:2])
         routes = [
@@ -71,7 +72,7 @@ def run_network(run: RunProcess) -> None:
             network=network,
             clock=run.clock,
             spin_ns=run.spin_ns,
-            loops=len(run.phases_ns),
+            loops=loops,
         )
         run.run(network, sockets, network)
 

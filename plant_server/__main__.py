@@ -15,7 +15,7 @@ with stoppable_imports():
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the plant of each loop in the run that a recorder or launcher has opened."""
     with join_run("plant", arguments) as run:
-        plants = plants_of(run.loops, run.phases_ns)
+        plants = plants_of(run.resolved.loops, run.resolved.phases_ns)
         plants.connect()
         run_machines(run, plants)
     return ExitStatus.OK

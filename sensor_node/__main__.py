@@ -15,7 +15,7 @@ with stoppable_imports():
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the sensor of each loop in the run that a recorder or launcher has opened."""
     with join_run("sensor", arguments) as run:
-        sensors = sensors_of(run.loops, run.phases_ns)
+        sensors = sensors_of(run.resolved.loops, run.resolved.phases_ns)
         run_machines(run, sensors)
     return ExitStatus.OK
 

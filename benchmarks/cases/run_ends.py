@@ -26,7 +26,7 @@ from cosim.record.table_files import TableFile
 from cosim.simulation.virtual_time import simulate_run
 from noack.protocol.roles import RECORDER
 from noack.runtime.spool import SPOOL, SpoolWriter
-from noack.scenario.resolution import run_tables
+from noack.scenario.resolution import ResolvedRun
 from noack.scenario.scenario_file import load
 from tests.helpers.live_runs import noack_command
 
@@ -40,7 +40,7 @@ def spooled_run(horizon_s: float, folder: Path) -> Path:
     run_dir = simulate_run(scenario, folder).run_dir
     write_environment(run_dir, "live")
     writer = SpoolWriter(run_dir / SPOOL, RECORDER)
-    for table, dtype in run_tables(scenario).items():
+    for table, dtype in ResolvedRun(scenario).tables.items():
         rows = concatenate_rows([*TableFile(run_dir / RECORD / f"{table}.parquet", dtype).batches()], dtype)
         rows = rows.take(np.argsort(rows["now_ns"], kind="stable"))
         ends_ns = np.arange(_BATCH_NS, rows["now_ns"].max(initial=0) + _BATCH_NS, _BATCH_NS)

@@ -29,7 +29,7 @@ from noack.core.linear_systems import Vector
 from noack.protocol.record_tables import PLANT_STEP
 from noack.protocol.wire_format import Flow
 from noack.runtime.drivers.realtime_settings import realtime
-from noack.scenario.resolution import resolve
+from noack.scenario.resolution import ResolvedRun, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load, validate
 from noack.scenario.sections import PLANTS, POLICIES
@@ -111,7 +111,9 @@ def simulation() -> Iterator[Row]:
     name = f"{horizon_s:g} s of the machines in virtual time"
     yield compare(name, "ms", cpu_ms(lambda: simulate(lane)), live, Goal("<=", 1e-3))
     name = f"{_LOOPS} loops at {_LOOPS_HZ:g} Hz: loops × runs of {_LOOPS_S:g} s per second of CPU"
-    yield compare(name, "/s", per_cpu_s(_LOOPS, lambda: simulate_loops(many)), goal=Goal(">=", 3000))
+    yield compare(
+        name, "/s", per_cpu_s(_LOOPS, lambda: simulate_loops(ResolvedRun(many))), goal=Goal(">=", 3000)
+    )
     name, side = f"sampled runs of {horizon_s:g} s on one core", lambda: sampled_runs(loop)
     earlier = Peer("the Python machines of b3991367 in virtual time", 1 / _PYTHON_MACHINES_S)
     note = "the alternative was measured with that version, not in this run"

@@ -37,7 +37,6 @@ from cosim.simulation.virtual_time import simulate_run
 from cosim.studies.run_comparison import RunComparison, compare_runs
 from noack.core.errors import CallerError, ExitStatus
 from noack.core.number_format import as_html, as_text
-from noack.scenario import resolution
 from noack.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -127,7 +126,7 @@ class Run:
     @property
     def tables(self) -> tuple[str, ...]:
         """Names of the record's tables."""
-        return tuple(resolution.run_tables(self._run.scenario))
+        return tuple(self._run.resolved.tables)
 
     def table(self, name: str) -> pa.Table:
         """Return a table of the record, one row per input of a machine.
@@ -150,7 +149,7 @@ class Run:
         if self._loop is not None:
             return data_frames.with_seconds(arrow_table(self._record[name]))
         path = self.directory / RECORD / f"{name}.parquet"
-        file = TableFile(path, resolution.run_tables(self._run.scenario)[name])
+        file = TableFile(path, self._run.resolved.tables[name])
         return data_frames.with_seconds(file.whole())
 
     def samples(self) -> pa.Table:

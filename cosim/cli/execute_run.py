@@ -18,8 +18,8 @@ from noack.core.core_library import require_live_runs
 from noack.core.errors import PeerError
 from noack.protocol.roles import ROLES
 from noack.runtime.active_runs import active_runs
-from noack.scenario.resolution import resolve
-from noack.scenario.scenario import Scenario, loop_names, loop_scenario, loop_sections
+from noack.scenario.resolution import ResolvedRun, resolve
+from noack.scenario.scenario import Scenario
 from noack.scenario.uneven_periods import uneven_periods
 
 if TYPE_CHECKING:
@@ -97,10 +97,10 @@ def warn_of_violations(loaded: Scenario, *, is_sampled: bool = True) -> None:
     """
     from noack.theory.certificates.assumptions import violations_of_theorem_2
 
-    shares = len(loop_names(loaded)) > 1
-    for section in loop_sections(loaded):
-        prefix = f"{section.name}: " if shares else ""
-        resolved = resolve(loop_scenario(loaded, section))
+    run = ResolvedRun(loaded)
+    for entry in run.entries:
+        prefix = f"{entry.name}: " if len(run.names) > 1 else ""
+        resolved = resolve(entry.scenario)
         uneven = uneven_periods(resolved) if is_sampled else ()
         for line in (*violations_of_theorem_2(resolved), *uneven):
             print(f"noack: warning: {prefix}{line}", file=sys.stderr)

@@ -12,8 +12,8 @@ from cosim.live.launcher import DEFAULT_START_S
 from cosim.output.run_document import assumption_table
 from cosim.output.terminal_writer import terminal_table
 from noack.core.clock import NS_PER_S
-from noack.scenario.resolution import policy_of, resolve, resolved_loops
-from noack.scenario.scenario import Scenario, loop_names, phases_ns
+from noack.scenario.resolution import ResolvedRun, policy_of, resolve
+from noack.scenario.scenario import Scenario, loop_names
 from noack.scenario.scenario_file import dumps
 from noack.scenario.uneven_periods import uneven_periods
 from noack.theory.certificates.assumptions import assumptions
@@ -65,14 +65,14 @@ def _make_trigger(resolved: Scenario) -> None:
 
 def _check_loops(loaded: Scenario, *, json: bool) -> None:
     """Check each loop; print the scenario, which is not resolved."""
-    loops = resolved_loops(loaded)
-    for loop in loops:
+    run = ResolvedRun(loaded)
+    for loop in run.loops:
         _make_trigger(loop)
     if json:
         print_json(loaded.model_dump(mode="json"))
         return
     print(dumps(loaded))
-    for loop, phase_ns in zip(loops, phases_ns(loaded), strict=True):
+    for loop, phase_ns in zip(run.loops, run.phases_ns, strict=True):
         x0 = ", ".join(f"{value:.4g}" for value in loop.plant.initial_state)
         print(f"{_COMMENT}{loop.name}: begins at {phase_ns / NS_PER_S:.6f} s, x(0) = ({x0})")
         for line in _period_lines(loop):

@@ -29,6 +29,7 @@ from noack.runtime.active_runs import RUNS
 from noack.runtime.connections.zenoh_session import answer_to, cause_of, open_session
 from noack.runtime.private_folder import open_private
 from noack.runtime.udp_sockets import bind
+from noack.scenario.resolution import ResolvedRun
 from noack.scenario.scenario import Scenario
 
 T = TypeVar("T")
@@ -160,7 +161,7 @@ def measure(resolved: Scenario, required: RunRequirements, runs: Path, duration_
         buffer=_result_or_reason(_measure_buffer),
         ports_taken=list(_list_taken_ports(required)),
         control=_result_or_reason(_measure_query),
-        disk=_result_or_reason(lambda: _measure_disk(runs, needed_bytes(resolved))),
+        disk=_result_or_reason(lambda: _measure_disk(runs, needed_bytes(ResolvedRun(resolved).step_bytes))),
         runtime_folder=_runtime_folder_problem(),
         display=has_display(),
         viewer=recorded["packages"].get("rerun-sdk") if is_installed() else None,

@@ -47,7 +47,7 @@ from cosim.record.run_directory import (
     refuse_links,
     require_run_directory,
 )
-from cosim.record.run_record import RecordedRun, RunRecord, load_run, scenarios_of
+from cosim.record.run_record import RecordedRun, RunRecord, load_run, resolved_run
 from cosim.record.spool_conversion import finish_record
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.core.file_access import remove_file, write_whole
@@ -107,9 +107,9 @@ def finalize(ending: RunEnding, *, report: bool = True, view: bool = True, again
 @contextmanager
 def _processes(run_dir: Path) -> Iterator[ProcessPoolExecutor | None]:
     """Have processes on all cores for the loops of a long run; None if this one needs no help."""
-    scenario, loops = scenarios_of(run_dir)
-    timing, workers = scenario.timing, min(cores(), len(loops))
-    is_long = len(loops) * timing.horizon_ns >= _MANY_STEPS * timing.plant_period_ns
+    run = resolved_run(run_dir)
+    timing, workers = run.scenario.timing, min(cores(), len(run.names))
+    is_long = len(run.names) * timing.horizon_ns >= _MANY_STEPS * timing.plant_period_ns
     with processes(workers) if is_long and workers > 1 else nullcontext() as pool:
         yield pool
 

@@ -21,8 +21,7 @@ from noack.protocol.record_tables import LOOP
 from noack.runtime.active_runs import RUNS, OpenRun, active_runs, find_run
 from noack.runtime.connections.zenoh_session import cause_of, header_of, open_session
 from noack.scenario import scenario_file
-from noack.scenario.resolution import loop_of, resolved_loops, run_tables
-from noack.scenario.scenario import phases_ns
+from noack.scenario.resolution import ResolvedRun, loop_of
 
 _WAITING_BATCHES = 4096
 _POLL_S, _LOOK_S = 0.005, 0.5
@@ -58,12 +57,12 @@ class FollowedRun:
         self._run = run
         self.directory = Path(run.run_dir)
         """The run directory, which is being written."""
-        scenario = scenario_file.load(self.directory / SCENARIO_FILE)  # it is resolved
-        self._types = run_tables(scenario)
-        matrices = [(loop.name, loop_of(loop)) for loop in resolved_loops(scenario)]
+        resolved = ResolvedRun(scenario_file.load(self.directory / SCENARIO_FILE))
+        self._types = resolved.tables
+        matrices = [(loop.name, loop_of(loop)) for loop in resolved.loops]
         self.loops = tuple(
             FollowedLoop(name, loop.state_names, loop.input_names, phase_ns)
-            for (name, loop), phase_ns in zip(matrices, phases_ns(scenario), strict=True)
+            for (name, loop), phase_ns in zip(matrices, resolved.phases_ns, strict=True)
         )
         """Its loops."""
 

@@ -39,7 +39,8 @@ from noack.runtime.active_runs import registered_run, run_name
 from noack.runtime.command_line import Signals, StopRequestError, stop_reason
 from noack.runtime.end_reasons import HORIZON
 from noack.runtime.run_descriptor import RunDescriptor, descriptor_file, new_descriptor
-from noack.scenario.resolution import resolve_run
+from noack.scenario.resolution import ResolvedRun, resolve_run
+from noack.scenario.run_sections import ClocksSection
 from noack.scenario.scenario import Scenario
 
 _STOP_TIMEOUT_S = 15.0
@@ -84,22 +85,25 @@ def launch(
     """
     began_ns = time.monotonic_ns()
     with contextlib.ExitStack() as stack:
-        resolved = _prepare(scenario, runs, spawn, across_hosts=listening is not None)
-        run_dir = new_run_dir(runs, resolved.name)
+        if listening is not None:  # the run directory says how far the clocks may be off
+            scenario = scenario.model_copy(update={"clocks": scenario.clocks or ClocksSection()})
+        resolved = resolve_run(scenario)
+        require_disk_space(resolved.step_bytes, runs)
+        run_dir = new_run_dir(runs, scenario.name)
         signals = stack.enter_context(_stop_signals(run_dir))
         children = ChildProcesses(run_dir, spawn, live=live, fork=fork)
         stack.callback(children.end)
         with _no_directory_if_refused(run_dir):
             children.start()  # before this process has threads, and files that a fork would inherit
         resolved = write_scenario(resolved, run_dir)
-        descriptor = new_descriptor(resolved, run_dir.resolve(), launched=True)
+        descriptor = new_descriptor(resolved.scenario, run_dir.resolve(), launched=True)
         stack.enter_context(active_run(run_dir))
         ending = stack.enter_context(EndingFile(run_dir))
         _publish_run(stack, descriptor, session)  # first: its file leads to a killed run's socket
         with _no_directory_if_refused(run_dir):
             listening_descriptor, clock = descriptor, None
             if listening is not None:
-                clock = remote_access.own_clock(resolved)
+                clock = remote_access.own_clock(resolved.scenario.clocks or ClocksSection())
                 remote_access.require_free(listening.address)
                 listening_descriptor = stack.enter_context(remote_access.credentials(listening, descriptor))
                 descriptor = descriptor.model_copy(update={"host": listening.address[0]})
@@ -109,12 +113,12 @@ def launch(
                 by_hand = descriptor.model_copy(update={"launched": False})
                 stack.enter_context(descriptor_file(by_hand, session))
         certificates = stack.enter_context(EarlyCertificates())
-        told = RunObservers([*observers, *observers_of_extensions(resolved)])
+        told = RunObservers([*observers, *observers_of_extensions(resolved.scenario)])
         if listening is not None:
             told.tell(lambda observer: observer.listening(listening))
         stack.callback(children.end)  # before all else ends
         children.send(descriptor)
-        run = _Run(descriptor, run_dir, coordinator, children, told, certificates)
+        run = _Run(resolved, descriptor.run_id, run_dir, coordinator, children, told, certificates)
         status, reason = run.watch(signals, ending.store)
         if coordinator.epoch_ns is None:
             raise NeverStartedError(f"{reason} (logs in {run_dir / 'logs'})", status)
@@ -123,15 +127,6 @@ def launch(
     return LaunchedEnding(
         run_dir, descriptor.run_id, status, reason, startup_s, expectations=certificates.known
     )
-
-
-def _prepare(scenario: Scenario, runs: Path, spawn: Sequence[str], *, across_hosts: bool) -> Scenario:
-    """Return the resolved scenario, for whose record there is space on the disk."""
-    if across_hosts:
-        scenario = remote_access.with_clocks(scenario)
-    resolved = resolve_run(scenario)
-    require_disk_space(resolved, runs)
-    return resolved
 
 
 @contextlib.contextmanager
@@ -171,15 +166,16 @@ class _Run:
 
     def __init__(
         self,
-        descriptor: RunDescriptor,
+        resolved: ResolvedRun,
+        run_id: int,
         run_dir: Path,
         coordinator: Coordinator,
         children: ChildProcesses,
         observers: RunObservers,
         certificates: EarlyCertificates,
     ) -> None:
-        self._scenario, self._run_id = descriptor.scenario, descriptor.run_id
-        self._run_dir = run_dir
+        self._wall_s, self._horizon_ns = resolved.wall_s, resolved.scenario.timing.horizon_ns
+        self._run_id, self._run_dir = run_id, run_dir
         self._coordinator = coordinator
         self._children = children
         self._observers, self._certificates = observers, certificates
@@ -189,7 +185,10 @@ class _Run:
         self._last_s = self._next_look_s = time.monotonic()
         self._stopped_since_s: dict[str, float] = {}
         """Since when launched processes have been stopped, by role."""
-        self._limit = WaitLimit(self._start_within_s())
+        start_within_s = resolved.scenario.start_within_s
+        if start_within_s is None:
+            start_within_s = float("inf") if self._by_hand else DEFAULT_START_S
+        self._limit = WaitLimit(start_within_s)
         """How long the launcher still waits: for the start, for the end, or for the stop."""
 
     def watch(self, signals: Signals, store: Callable[[ExitStatus, str], None]) -> EndReason:
@@ -253,9 +252,9 @@ class _Run:
             self._write_processes()
             point_to_latest(self._run_dir)
             self._observers.tell(lambda observer: observer.started(self._run_dir))
-            if self._scenario.horizon_s / self._scenario.speed >= _EARLY_CERTIFICATES_S:
+            if self._wall_s >= _EARLY_CERTIFICATES_S:
                 self._certificates.start(self._run_dir)
-            self._limit = WaitLimit(overtime_s(self._scenario.horizon_s / self._scenario.speed))
+            self._limit = WaitLimit(overtime_s(self._wall_s))
         elif self._has_started and not self._has_ended and not self._is_in_loop():
             self._has_ended = True  # while the processes end: the imports take 0.3 s
             Thread(target=import_module, args=("cosim.live.finalize",), daemon=True).start()
@@ -271,7 +270,7 @@ class _Run:
             # The exit status of a launched process explains more than its report.
             if not (role in running and self._coordinator.is_exiting(role))
         }
-        if RECORDER in running and self._coordinator.now_ns() >= self._scenario.timing.horizon_ns:
+        if RECORDER in running and self._coordinator.now_ns() >= self._horizon_ns:
             failures.pop(RECORDER, None)  # sorting a long record, it may not respond
         for role, since_s in self._stopped_since_s.items():
             if role in failures or self._last_s - since_s > _STOPPED_S:
@@ -281,7 +280,7 @@ class _Run:
     def _is_in_loop(self) -> bool:
         """Whether the run has started and has not reached its horizon."""
         started = self._coordinator.epoch_ns is not None
-        return started and self._coordinator.now_ns() < self._scenario.timing.horizon_ns
+        return started and self._coordinator.now_ns() < self._horizon_ns
 
     def _write_processes(self) -> None:
         """Write which processes joined, for `noack summary --add`; without that the run goes on."""
@@ -303,12 +302,6 @@ class _Run:
 
     def _notify_line(self, line: str) -> None:
         self._observers.tell(lambda observer: observer.notice(line))
-
-    def _start_within_s(self) -> float:
-        given_s = self._scenario.start_within_s
-        if given_s is None:
-            return float("inf") if self._by_hand else DEFAULT_START_S
-        return given_s
 
     def _overdue(self) -> str:
         if self._stopped_since_s:

@@ -14,14 +14,8 @@ from typing import TypeVar
 import numpy as np
 
 from cosim.record.rows import Rows
-from cosim.record.run_directory import (
-    ENVIRONMENT_FILE,
-    PROCESSES_FILE,
-    SCENARIO_FILE,
-    finished_run,
-    read_object,
-)
-from cosim.record.run_record import RunRecord, load_run
+from cosim.record.run_directory import ENVIRONMENT_FILE, PROCESSES_FILE, finished_run, read_object
+from cosim.record.run_record import RunRecord, load_run, resolved_run
 from noack.core.errors import CallerError, MachineError, NoackError, PeerError, why
 from noack.core.file_access import move, open_folder
 from noack.protocol.record_tables import OWNER
@@ -29,8 +23,6 @@ from noack.protocol.roles import LOOP_ROLES
 from noack.runtime.control_messages import ProcessReport, parse_message
 from noack.runtime.kept_rows import KeptHead, KeptPart, read_kept
 from noack.runtime.spool import KEPT_REPORT, SPOOL, SpoolWriter, notices_of, writer_of
-from noack.scenario.resolution import run_tables
-from noack.scenario.scenario_file import MOST_RECORDED_BYTES, load
 
 T = TypeVar("T")
 
@@ -88,7 +80,7 @@ def _require_process(run_dir: Path, head: KeptHead, file: Path) -> None:
 
 def _take(run_dir: Path, head: KeptHead, parts: Iterator[tuple[KeptPart, bytes]], file: Path) -> None:
     """Copy what a process kept into the spool of a run; raise PeerError if the process has no such rows."""
-    types = run_tables(load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES))
+    types = resolved_run(run_dir).tables
     own = {table for table in types if OWNER[table] == head.process}
     spool = SpoolWriter(run_dir / SPOOL, writer_of(head.secret))
     try:

@@ -14,8 +14,7 @@ from cosim.record.run_record import NOTICES_FILE, Notice, RecordedRun
 from noack.core.file_access import PARTIAL, create_folder, new_file, remove_file, write_whole
 from noack.core.system_processes import cores
 from noack.protocol.record_tables import LOOP, is_of_network
-from noack.scenario.resolution import resolve, run_tables
-from noack.scenario.scenario import Scenario, loop_scenario, loop_sections
+from noack.scenario.resolution import ResolvedRun
 
 
 def write_run(run: RecordedRun, run_dir: Path) -> None:
@@ -24,7 +23,7 @@ def write_run(run: RecordedRun, run_dir: Path) -> None:
     Raises:
         OSError, NoackError: they cannot be written.
     """
-    types = run_tables(run.scenario)
+    types = run.resolved.tables
 
     def rows(table: str) -> Iterator[Rows]:
         if is_of_network(table):
@@ -45,7 +44,7 @@ def write_run(run: RecordedRun, run_dir: Path) -> None:
     notices = sorted([*common, *of_loops], key=lambda notice: int(notice["t_ns"]))
     reports = joint_reports(run.network.reports, [record.reports for record in run.loops])
     write_whole(run_dir / REPORTS_FILE, json.dumps(reports, indent=2), make_folder=False)
-    folder, names = run_dir / RECORD, vector_names(run.scenario)
+    folder, names = run_dir / RECORD, vector_names(run.resolved)
     with record_folder(folder, notices), ThreadPoolExecutor(cores()) as threads:
         tasks = [
             threads.submit(table_files.write_table, folder / f"{table}.parquet", rows(table), dtype, names)
@@ -55,9 +54,9 @@ def write_run(run: RecordedRun, run_dir: Path) -> None:
             task.result()
 
 
-def vector_names(scenario: Scenario) -> dict[str, Sequence[str]]:
+def vector_names(run: ResolvedRun) -> dict[str, Sequence[str]]:
     """Return the names of states and inputs, if they are the same in all loops."""
-    models = [resolve(loop_scenario(scenario, section)).model for section in loop_sections(scenario)]
+    models = [entry.scenario.model for entry in run.entries]
     names = {(model.state_names or (), model.input_names or ()) for model in models}
     if len(names) > 1:
         return {}

@@ -56,8 +56,8 @@ from noack.protocol.record_tables import (
 from noack.protocol.roles import LOOP_ROLES
 from noack.runtime.control_messages import ClockError, LogLine, parse_message
 from noack.runtime.host_clocks import STATED
-from noack.scenario.resolution import LoopMatrices, loop_of, resolved_loops, run_tables, tables_of
-from noack.scenario.scenario import Scenario, few_of, loop_names, loop_scenario, loop_sections, phases_ns
+from noack.scenario.resolution import LoopMatrices, ResolvedRun, loop_of, tables_of
+from noack.scenario.scenario import Scenario, few_of
 from noack.scenario.scenario_file import MOST_RECORDED_BYTES, load
 
 NOTICES_FILE = "notices.jsonl"
@@ -322,13 +322,16 @@ class RecordedRun:
     """The record of a run: of its network, and of each of its loops.
 
     Args:
+        resolved: the run's numbers.
         network: the tables of the network, for all loops, in the time of the run.
         read: ``read(numbers)`` returns the records of some loops. Of several, the rows are read at
             once and kept in memory; those of one loop are read when they are used.
     """
 
-    def __init__(self, network: RunRecord, read: Callable[[range], Sequence[RunRecord]]) -> None:
-        self.network, self.read = network, read
+    def __init__(
+        self, resolved: ResolvedRun, network: RunRecord, read: Callable[[range], Sequence[RunRecord]]
+    ) -> None:
+        self.resolved, self.network, self.read = resolved, network, read
         self.scenario, self.kind = network.scenario, network.kind
         self._newest: RunRecord | None = None
         """The loop that was used last."""
@@ -352,20 +355,20 @@ class RecordedRun:
             (self._newest,) = self.read(range(number, number + 1))
         return self._newest
 
-    @cached_property
+    @property
     def phases_ns(self) -> Sequence[int]:
         """When each loop begins, in the time of the run."""
-        return phases_ns(self.scenario)
+        return self.resolved.phases_ns
 
     @property
     def has_own_network(self) -> bool:
         """Whether the network is replayed for itself, and not with the only loop; see `loop_roles`."""
         return loop_roles(self.phases_ns) != LOOP_ROLES
 
-    @cached_property
-    def names(self) -> list[str]:
+    @property
+    def names(self) -> Sequence[str]:
         """The names of the loops."""
-        return loop_names(self.scenario)
+        return self.resolved.names
 
     def number_of(self, name: str | None) -> int:
         """Return the number of the loop of a name; of the only loop without a name.
@@ -395,20 +398,19 @@ def no_such_loop(name: str | None, names: Sequence[str]) -> CallerError:
     return CallerError(f"{name}: the run has no such loop; it has {few}")
 
 
-def scenarios_of(run_dir: Path) -> tuple[Scenario, Sequence[Scenario]]:
-    """Return the scenario of a run directory, and that of each loop; those of the last one stay.
+def resolved_run(run_dir: Path) -> ResolvedRun:
+    """Return the numbers of a run, by the scenario of its directory; those of the last one stay.
 
     Raises:
         CallerError: it cannot be read.
     """
     path = run_dir / SCENARIO_FILE
-    return _scenarios_of(path, path.stat().st_mtime_ns if path.exists() else 0)
+    return _resolved_run(path, path.stat().st_mtime_ns if path.exists() else 0)
 
 
 @lru_cache(maxsize=1)
-def _scenarios_of(path: Path, _changed_ns: int) -> tuple[Scenario, Sequence[Scenario]]:
-    scenario = load(path, most_bytes=MOST_RECORDED_BYTES)
-    return scenario, resolved_loops(scenario)
+def _resolved_run(path: Path, _changed_ns: int) -> ResolvedRun:
+    return ResolvedRun(load(path, most_bytes=MOST_RECORDED_BYTES))
 
 
 def load_run(run_dir: Path) -> RecordedRun:
@@ -424,9 +426,8 @@ def load_run(run_dir: Path) -> RecordedRun:
         ended = (run_dir / SUMMARY_FILE).is_file()
         hint = "" if ended else "; `noack summary` finalises an interrupted run"
         raise CallerError(f"{run_dir}: has no numeric record{hint}")
-    scenario, loops = scenarios_of(run_dir)
-    most_rows = _ROWS_PER_STEP * steps_of(scenario) + _MORE_ROWS
-    types = run_tables(scenario)
+    run = resolved_run(run_dir)
+    most_rows, types = _ROWS_PER_STEP * steps_of(run) + _MORE_ROWS, run.tables
     files = {table: TableFile(folder / f"{table}.parquet", types[table], most_rows) for table in types}
     reports = valid_reports(report_entries(run_dir), network_tables())
     notices = read_notices(folder)
@@ -435,19 +436,19 @@ def load_run(run_dir: Path) -> RecordedRun:
     def read(table: str, columns: Sequence[str]) -> Iterator[Rows]:
         return files[table].batches(with_columns(types[table], columns))
 
-    network = RunRecord(scenario, read, of_all, reports, kind_of(run_dir), roles=NETWORK_ROLES)
-    return RecordedRun(network, _loops_reader(network, loops, files, report_entries(run_dir), notices))
+    network = RunRecord(run.scenario, read, of_all, reports, kind_of(run_dir), roles=NETWORK_ROLES)
+    return RecordedRun(run, network, _loops_reader(run, network, files, report_entries(run_dir), notices))
 
 
 def _loops_reader(
+    run: ResolvedRun,
     network: RunRecord,
-    loops: Sequence[Scenario],
     files: Mapping[str, TableFile],
     entries: Entries,
     notices: Sequence[Notice],
 ) -> Callable[[range], list[RunRecord]]:
     """Return what reads the records of some loops; see :class:`RecordedRun`."""
-    phases = phases_ns(network.scenario)
+    loops, phases = run.loops, run.phases_ns
 
     @cache
     def network_rows() -> NetworkRows:
@@ -514,18 +515,18 @@ def load_record(run_dir: Path, loop: str | None = None) -> RunRecord:
     return load_run(run_dir).loop(loop)
 
 
-def steps_of(scenario: Scenario) -> int:
-    """Return the steps of all loops of a scenario together.
+def steps_of(run: ResolvedRun) -> int:
+    """Return the steps of all loops of a run together.
 
     A step is the shortest period of a loop's processes; a table of a record has at most a few rows
     for each.
     """
-    exchange_ns = max(round(scenario.speed * _CLOCK_EXCHANGE_NS), 1)
+    exchange_ns = max(round(run.scenario.speed * _CLOCK_EXCHANGE_NS), 1)
     steps = 0
-    for section in loop_sections(scenario):
-        timing = loop_scenario(scenario, section).timing
+    for entry in run.entries:
+        timing = entry.scenario.timing
         shortest_ns = min(timing.plant_period_ns, timing.controller_period_ns, exchange_ns)
-        steps += section.count * (timing.horizon_ns // shortest_ns + 1)
+        steps += entry.loops * (timing.horizon_ns // shortest_ns + 1)
     return steps
 
 

@@ -18,15 +18,13 @@ from cosim.record.processes import add_kept_reports
 from cosim.record.record_writing import record_folder, vector_names
 from cosim.record.rows import BATCH_ROWS, Rows, Segment, concatenate_rows
 from cosim.record.run_directory import RECORD
-from cosim.record.run_record import Notice, RecordedRun, load_run, read_notices, scenarios_of
+from cosim.record.run_record import Notice, RecordedRun, load_run, read_notices, resolved_run
 from noack.core.errors import MachineError, PeerError, why
 from noack.core.file_access import move, remove_folder
 from noack.protocol.record_tables import LOOP, is_of_network
 from noack.protocol.roles import LOOP_ROLES, RECORDER
 from noack.runtime.control_messages import LogLine, parse_message
 from noack.runtime.spool import SPOOL, batch_bytes, batches_in, spool_files, stored_lines
-from noack.scenario.resolution import run_tables
-from noack.scenario.scenario import loop_names
 
 _SEGMENT_BYTES = 1024 * 1024
 """Bytes of consecutive batches that are read at once."""
@@ -131,9 +129,9 @@ def finish_record(run_dir: Path, map_tables: TableMap = map) -> RecordedRun:
         MachineError: the record cannot be written; the spool is kept.
     """
     add_kept_reports(run_dir)
-    scenario, _ = scenarios_of(run_dir)
-    tables = sorted(run_tables(scenario), key=partial(_bytes_of, run_dir), reverse=True)
-    notices = _notices(run_dir / RECORD, run_dir / SPOOL, len(loop_names(scenario)))
+    run = resolved_run(run_dir)
+    tables = sorted(run.tables, key=partial(_bytes_of, run_dir), reverse=True)
+    notices = _notices(run_dir / RECORD, run_dir / SPOOL, len(run.names))
     try:
         with record_folder(run_dir / RECORD, notices):
             for _ in map_tables(partial(convert_table, run_dir), tables):
@@ -150,10 +148,10 @@ def convert_table(run_dir: Path, table: str) -> None:
     Raises:
         OSError: it cannot be written.
     """
-    scenario, _ = scenarios_of(run_dir)
-    dtype = run_tables(scenario)[table]
-    rows = _rows_loop_after_loop(run_dir, table, dtype, len(loop_names(scenario)))
-    table_files.write_table(run_dir / RECORD / f"{table}.parquet", rows, dtype, vector_names(scenario))
+    run = resolved_run(run_dir)
+    dtype = run.tables[table]
+    rows = _rows_loop_after_loop(run_dir, table, dtype, len(run.names))
+    table_files.write_table(run_dir / RECORD / f"{table}.parquet", rows, dtype, vector_names(run))
 
 
 def _bytes_of(run_dir: Path, table: str) -> int:

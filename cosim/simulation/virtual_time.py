@@ -39,8 +39,8 @@ from noack.protocol.roles import CHANGEABLE, LOOP_ROLES, RECORDER, Notice, Recor
 from noack.protocol.wire_format import KEY_BYTES, Flow, Rejection
 from noack.runtime.end_reasons import HORIZON
 from noack.scenario.parameter_changes import change_notice, scheduled, settings_key
-from noack.scenario.resolution import resolve_run, resolved_loops, shape_of, tables_of
-from noack.scenario.scenario import Scenario, phases_ns
+from noack.scenario.resolution import ResolvedRun, resolve_run, shape_of, tables_of
+from noack.scenario.scenario import Scenario
 from noack.settings.section import ReadTable
 from plant_server.plant import plants_of
 from sensor_node.sensor import sensors_of
@@ -136,20 +136,13 @@ class VirtualRun:
     """A run in virtual time.
 
     Args:
-        scenario: the scenario of the run.
-        loops: the resolved scenario of each loop.
+        run: the run.
         network: decides the fate of each update; by default the scenario's own network.
     """
 
-    def __init__(
-        self,
-        scenario: Scenario,
-        loops: Sequence[Scenario],
-        *,
-        network: UserNetwork | None = None,
-    ) -> None:
-        self._scenario = scenario
-        self.phases_ns = phases_ns(scenario)
+    def __init__(self, run: ResolvedRun, *, network: UserNetwork | None = None) -> None:
+        self._scenario, loops = run.scenario, run.loops
+        self.phases_ns = run.phases_ns
         """When each loop begins."""
         self.machines = {role: make(loops, self.phases_ns) for role, make in _ROLES.items()}
         """The machines of all loops, by role."""
@@ -157,7 +150,7 @@ class VirtualRun:
         for machines in self.machines.values():
             machines.connect()
             machines.take_rows_from(memory.rows)
-        self.channel = channel_of(scenario, loops=len(loops), network=network)
+        self.channel = channel_of(run.scenario, loops=len(loops), network=network)
         kinds = {settings_key(loop): loop for loop in loops}
         self.types = {kind: tables_of(loop) for kind, loop in kinds.items()}
         """The row types of the tables of each kind of loops (:func:`settings_key`)."""
@@ -249,20 +242,20 @@ def simulate(
     """
     if network is not None:
         resolved.coverage.require_unchanging()
-    return _simulate(resolved, (resolved,), network, progress).record(0)
+    return _simulate(ResolvedRun(resolved, (resolved,)), network, progress).record(0)
 
 
-def simulate_loops(scenario: Scenario, progress: Progress = no_progress) -> RecordedRun:
-    """Run the loops of a scenario in virtual time, with the sampling of a live run.
+def simulate_loops(run: ResolvedRun, progress: Progress = no_progress) -> RecordedRun:
+    """Run the loops of a run in virtual time, with the sampling of a live run.
 
     Args:
-        scenario: the scenario; speed, ports and real-time settings have no effect.
+        run: the run; speed, ports and real-time settings have no effect.
         progress: called with the simulated time and the horizon, in seconds.
 
     Returns:
         The record of the run; its reports have no entries about sockets or real-time settings.
     """
-    return _simulate(scenario, resolved_loops(scenario), None, progress)
+    return _simulate(run, None, progress)
 
 
 def simulate_run(scenario: Scenario, runs: Path, progress: Progress = no_progress) -> RunEnding:
@@ -298,13 +291,8 @@ def simulate_run(scenario: Scenario, runs: Path, progress: Progress = no_progres
     return RunEnding(run_dir, run_id, ExitStatus.OK, HORIZON)
 
 
-def _simulate(
-    scenario: Scenario,
-    loops: Sequence[Scenario],
-    network: UserNetwork | None,
-    progress: Progress,
-) -> RecordedRun:
-    run = VirtualRun(scenario, loops, network=network)
+def _simulate(resolved: ResolvedRun, network: UserNetwork | None, progress: Progress) -> RecordedRun:
+    scenario, run = resolved.scenario, VirtualRun(resolved, network=network)
     run.announce()
     with np.errstate(all="ignore"):  # a diverging loop overflows and is recorded all the same
         run.run(progress=progress)
@@ -319,7 +307,7 @@ def _simulate(
     }
     numbers = {table: of_loops.tolist() for table, of_loops in counts.items()}
     records = []
-    for number, loop in enumerate(loops):
+    for number, loop in enumerate(resolved.loops):
         types = run.types[settings_key(loop)]
         own_counts = {table: numbers[table][number] for table in types}
         rows = _reader_of_loop(run.record, packets, number, types)
@@ -327,7 +315,7 @@ def _simulate(
         notices = run.record.notices(number)
         roles = loop_roles(run.phases_ns)
         records.append(RunRecord(loop, rows, notices, reports, "simulated", number, roles))
-    return RecordedRun(common, lambda chosen: records[chosen.start : chosen.stop])
+    return RecordedRun(resolved, common, lambda chosen: records[chosen.start : chosen.stop])
 
 
 def _reader_of_loop(

@@ -47,8 +47,7 @@ from noack.runtime.spool import SPOOL
 from noack.runtime.telemetry import OwnSpool, TelemetryBuffer, deliver_report, persisted_rows
 from noack.runtime.udp_sockets import CountingSockets, bind, enlarge_buffer
 from noack.scenario.parameter_changes import ParameterChange
-from noack.scenario.resolution import resolved_loops, run_tables
-from noack.scenario.scenario import Scenario, loops_of, phases_ns
+from noack.scenario.resolution import ResolvedRun
 from noack.scenario.scenario_checks import prepare_changes
 
 _JOIN_TIMEOUT_S = 24 * 3600.0  # a person may start the other processes late; Ctrl-C ends the wait
@@ -79,9 +78,9 @@ class RunProcess:
     def __init__(self, role: str, descriptor: RunDescriptor, plane: ControlPlane, signals: Signals) -> None:
         self.role = role
         self.descriptor = descriptor
+        self.resolved = ResolvedRun(descriptor.scenario)
+        """All numbers of the run."""
         self.scenario = descriptor.scenario
-        self.phases_ns = phases_ns(descriptor.scenario)
-        """When each loop begins."""
         self.plane = plane
         self.updates = ParameterUpdates(plane)
         self._signals = signals
@@ -144,11 +143,6 @@ class RunProcess:
             )
         return clock_error(clock, settings.largest_error_us)
 
-    @cached_property
-    def loops(self) -> Sequence[Scenario]:
-        """The resolved scenario of each loop."""
-        return resolved_loops(self.scenario)
-
     @property
     def wire(self) -> Wire:
         """The common part of the run's datagrams."""
@@ -163,9 +157,9 @@ class RunProcess:
     @property
     def coalescing_ns(self) -> int:
         """Time for which the ticks of many loops are gathered."""
-        if len(self.phases_ns) <= _FEW_LOOPS:
+        if len(self.resolved.names) <= _FEW_LOOPS:
             return 0
-        period_ns = min(loop.timing.plant_period_ns for loop in loops_of(self.scenario))
+        period_ns = min(entry.scenario.timing.plant_period_ns for entry in self.resolved.entries)
         return min(int(period_ns / _COALESCING_SHARE / self.scenario.speed), _LONGEST_COALESCING_NS)
 
     @contextmanager
@@ -181,7 +175,7 @@ class RunProcess:
             # Before the barrier: locking memory may take a tenth of a second.
             realtime(settings.enabled, settings.fifo_priority, place) as self._realtime,
         ):
-            size_bytes = len(self.phases_ns) * _BUFFER_BYTES  # it may be late to the start
+            size_bytes = len(self.resolved.names) * _BUFFER_BYTES  # it may be late to the start
             enlarge_buffer(endpoint, min(size_bytes, _LARGEST_BUFFER_BYTES))
             yield endpoint
 
@@ -230,7 +224,7 @@ class RunProcess:
         return KeptFile(folder, KeptHead(run=name, process=self.role, secret=self.plane.secret))
 
     def _telemetry(self) -> TelemetryBuffer:
-        tables = run_tables(self.scenario)
+        tables = self.resolved.tables
         owned = {table: dtype for table, dtype in tables.items() if OWNER[table] == self.role}
         check = None
         if self._clocks and self.role in RECEIVED:
@@ -253,7 +247,7 @@ class RunProcess:
             channel,
             self.clock,
             telemetry,
-            end_ns=self._end_ns,
+            end_ns=self.resolved.end_ns,
             stop=lambda: self.stopping,
             turns_after_end=_GRACE_TURNS,
             all_done=self._all_done,
@@ -274,11 +268,6 @@ class RunProcess:
         if is_done and self.role in WITH_DEADLINES:
             self.plane.announce_done()
         return is_done and self.plane.roles_done().issuperset(WITH_DEADLINES)
-
-    @property
-    def _end_ns(self) -> int:
-        """The last horizon of all loops."""
-        return self.scenario.timing.horizon_ns + max(self.phases_ns)
 
     def fail(self, error: BaseException) -> None:
         """Stop with an error as the reason."""

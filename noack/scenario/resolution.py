@@ -1,22 +1,37 @@
 """From a scenario to a run: named models become matrices, random draws become numbers.
 
 The result is again a scenario: the resolved scenario. Running it repeats the run's draws exactly.
-What follows from it is here, too: matrices, the trigger's policy, and the tables of its record.
+:class:`ResolvedRun` has the numbers of a whole run: those of each loop, when the loops begin, and the
+tables of the record. What follows from the resolved scenario of one loop is here, too: matrices, the
+trigger's policy, and the tables of its record.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import cycle
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from noack.core.cached_method import cached_method
+from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, discretise, transition
 from noack.core.random_streams import stream
 from noack.observers.observer_settings import unobservable_mode
-from noack.protocol.record_tables import LOOP, RecordShape, entry_names, is_of_network, largest, tables
+from noack.protocol.record_tables import (
+    CONTROLLER_STEP,
+    LOOP,
+    PLANT_ACTUATION,
+    PLANT_STEP,
+    SENSOR_MEASUREMENT,
+    RecordShape,
+    entry_names,
+    is_of_network,
+    largest,
+    tables,
+)
 from noack.scenario.overload import refuse_overload
 from noack.scenario.scenario import (
     Scenario,
@@ -24,12 +39,14 @@ from noack.scenario.scenario import (
     loop_names,
     loop_scenario,
     loop_sections,
+    loop_seeds,
     loops_by_entry,
     loops_of,
 )
 from noack.scenario.scenario_checks import input_at
 from noack.scenario.sections import AnyObserver, ModelSection, PlantSection
 from noack.settings.section import rows_of
+from noack.trigger_policies.periodic_trigger import PeriodicSettings
 from noack.trigger_policies.trigger_rule import Policy, TriggerRule, require_rule
 
 _SURELY_FINITE = 600.0
@@ -83,8 +100,118 @@ def resolve(scenario: Scenario) -> Scenario:
     return resolved_loops(scenario)[0]
 
 
-def resolve_run(scenario: Scenario) -> Scenario:
-    """Return the scenario of a run as its directory has it; running it repeats the run's draws.
+class LoopEntry(NamedTuple):
+    """The loops of an entry of [[loops]]; they differ in their seeds and draws only."""
+
+    name: str
+    scenario: Scenario
+    """Of one loop, with the seeds of the run."""
+    loops: int
+    """Number of loops."""
+    phase: float | None
+    """When they begin, in periods; None: each draws it."""
+
+
+class ResolvedRun:
+    """A run with all its numbers; its processes, its simulation and its record are made from it.
+
+    Args:
+        scenario: of the run, as :func:`resolve_run` returns it and a run directory has it.
+        loops: the resolved scenario of each loop, if they are known.
+    """
+
+    def __init__(self, scenario: Scenario, loops: Sequence[Scenario] | None = None) -> None:
+        self.scenario = scenario
+        self._known_loops = loops
+
+    @cached_property
+    def loops(self) -> Sequence[Scenario]:
+        """(loops,) The resolved scenario of each loop."""
+        return resolved_loops(self.scenario) if self._known_loops is None else self._known_loops
+
+    @cached_property
+    def entries(self) -> Sequence[LoopEntry]:
+        """The entries of [[loops]]; a scenario without has one."""
+        return [
+            LoopEntry(section.name, loop_scenario(self.scenario, section), section.count, section.phase)
+            for section in loop_sections(self.scenario)
+        ]
+
+    @cached_property
+    def names(self) -> Sequence[str]:
+        """(loops,) The name of each loop."""
+        return loop_names(self.scenario)
+
+    @cached_property
+    def phases_ns(self) -> Sequence[int]:
+        """(loops,) When each loop begins: the time of the run at which the time of the loop is 0."""
+        is_drawn = any(entry.phase is None for entry in self.entries)
+        seeds = loop_seeds(self.scenario, ("initial_state",)) if is_drawn else []
+        phases_ns: list[int] = []
+        for _, loop, count, phase in self.entries:
+            period_ns = _phase_period_ns(loop)
+            for number in range(len(phases_ns), len(phases_ns) + count):
+                drawn = _drawn_phase(seeds[number].initial_state, number) if phase is None else phase
+                phases_ns.append(int(drawn * period_ns))
+        return tuple(phases_ns)
+
+    @property
+    def wall_s(self) -> float:
+        """Wall time from its start to its horizon."""
+        return self.scenario.horizon_s / self.scenario.speed
+
+    @property
+    def end_ns(self) -> int:
+        """The last horizon of all loops."""
+        return self.scenario.timing.horizon_ns + max(self.phases_ns)
+
+    @cached_property
+    def tables(self) -> Mapping[str, np.dtype[np.void]]:
+        """The row types of the tables, as its processes send them.
+
+        The rows of the network are those of all loops; each other row of a machine begins with the
+        number of its loop. Vectors have the largest size of all loops.
+        """
+        shapes = {shape_of(entry.scenario) for entry in self.entries}
+        return {
+            table: dtype if is_of_network(table) else np.dtype([(LOOP, "<u2"), *dtype.descr])
+            for table, dtype in tables(**vars(largest(shapes))).items()
+        }
+
+    @property
+    def step_bytes(self) -> int:
+        """Bytes of the rows of all steps; the number of rows of events is not known in advance."""
+        return sum(entry.loops * _step_bytes(entry.scenario) for entry in self.entries)
+
+
+def _step_bytes(loop: Scenario) -> int:
+    """Return the bytes of a loop's rows on fixed time grids."""
+    timing, types = loop.timing, tables_of(loop)
+    steps = timing.horizon_ns // timing.plant_period_ns + 1
+    ticks = timing.horizon_ns // timing.controller_period_ns
+    rows = {
+        PLANT_STEP: steps,
+        SENSOR_MEASUREMENT: steps // loop.plant.measure_every,
+        CONTROLLER_STEP: ticks,
+        PLANT_ACTUATION: ticks,
+    }
+    return sum(count * types[table].itemsize for table, count in rows.items())
+
+
+def _phase_period_ns(loop: Scenario) -> int:
+    """Return the time between two transmissions of a periodic trigger, else two measurements."""
+    if isinstance(loop.trigger, PeriodicSettings):
+        return round(loop.trigger.period_s * NS_PER_S)
+    return loop.timing.measurement_period_ns
+
+
+def _drawn_phase(seed: int, number: int) -> float:
+    """Return when the loop of a number begins, in periods; the first one begins at once."""
+    return float(stream(seed, "phase", str(number)).uniform()) if number else 0.0
+
+
+def resolve_run(scenario: Scenario) -> ResolvedRun:
+    """Return a run; the scenario in it repeats the run's draws.
 
     A scenario without [[loops]] is resolved. In an entry of [[loops]], the model and the observer
     become numbers; the draws of its loops follow from the seeds.
@@ -98,14 +225,14 @@ def resolve_run(scenario: Scenario) -> Scenario:
         raise CallerError(f"{scenario.name}: {error}") from None
     resolved = resolved_loops(scenario)
     if not scenario.loops:
-        return resolved[0]
+        return ResolvedRun(resolved[0], resolved)
     sections, first = [], 0
     for section in scenario.loops:
         loop, first = resolved[first], first + section.count
         tables = {"model": loop.model, "observer": loop.observer}
         update = {part: table.content() for part, table in tables.items() if table is not None}
         sections.append(section.model_copy(update=update))
-    return scenario.model_copy(update={"loops": tuple(sections)})
+    return ResolvedRun(scenario.model_copy(update={"loops": tuple(sections)}), resolved)
 
 
 def resolved_loops(scenario: Scenario) -> tuple[Scenario, ...]:
@@ -308,16 +435,3 @@ def shape_of(resolved: Scenario) -> RecordShape:
         outputs=0 if resolved.observer is None else resolved.message_sizes.outputs,
         inputs_reported=resolved.message_sizes.inputs_reported,
     )
-
-
-def run_tables(scenario: Scenario) -> Mapping[str, np.dtype[np.void]]:
-    """Return the row types of the tables of a run, as its processes send them.
-
-    The rows of the network are those of all loops; each other row of a machine begins with the
-    number of its loop. Vectors have the largest size of all loops.
-    """
-    shapes = {shape_of(loop_scenario(scenario, section)) for section in loop_sections(scenario)}
-    return {
-        table: dtype if is_of_network(table) else np.dtype([(LOOP, "<u2"), *dtype.descr])
-        for table, dtype in tables(**vars(largest(shapes))).items()
-    }

@@ -17,15 +17,12 @@ import numpy as np
 from pydantic import GetJsonSchemaHandler, ValidationError, create_model, model_validator
 from pydantic_core import CoreSchema
 
-from noack.core.cached_method import cached_method
-from noack.core.clock import NS_PER_S
-from noack.core.random_streams import named_stream_keys, stream
+from noack.core.random_streams import named_stream_keys
 from noack.scenario.run_sections import MOST_LOOPS, LoopSection, SeedsSection
 from noack.scenario.scenario_checks import check_changes, check_sections
 from noack.scenario.scenario_tables import ScenarioTables
 from noack.scenario.toml_file import explain
 from noack.settings.section import ReadTable, ScenarioSection, Table
-from noack.trigger_policies.periodic_trigger import PeriodicSettings
 
 
 class Scenario(ScenarioTables):
@@ -92,30 +89,12 @@ def few_of(names: Sequence[str]) -> str:
 
 def loops_by_entry(scenario: Scenario) -> list[list[Scenario]]:
     """Return the loops of each entry of [[loops]]; they differ in their names and seeds only."""
-    sections = loop_sections(scenario)
-    seeds = iter(_seeds(scenario, sections))
+    seeds = iter(loop_seeds(scenario))
     return [
         [entry.model_copy(update={"name": name, "seeds": next(seeds)}) for name in section.names]
-        for section in sections
+        for section in loop_sections(scenario)
         for entry in [loop_scenario(scenario, section)]
     ]
-
-
-@cached_method
-def phases_ns(scenario: Scenario) -> tuple[int, ...]:
-    """Return when each loop begins: the time of the run at which the time of the loop is 0."""
-    sections, phases = loop_sections(scenario), list[int]()
-    is_drawn = any(section.phase is None for section in sections)
-    seeds = _seeds(scenario, sections, ("initial_state",)) if is_drawn else []
-    for section in sections:
-        period_ns = _period_ns(loop_scenario(scenario, section))
-        for number in range(len(phases), len(phases) + section.count):
-            phase = section.phase
-            if phase is None:
-                seed = seeds[number].initial_state
-                phase = float(stream(seed, "phase", str(number)).uniform()) if number else 0.0
-            phases.append(int(phase * period_ns))
-    return tuple(phases)
 
 
 def with_loop_tables(
@@ -199,17 +178,9 @@ def check_loops(scenario: Scenario) -> None:
             raise ValueError(f"loops.{index}.count: a run has at most {MOST_LOOPS} loops")
 
 
-def _period_ns(loop: Scenario) -> int:
-    """Return the time between two transmissions of a periodic trigger, else two measurements."""
-    if isinstance(loop.trigger, PeriodicSettings):
-        return round(loop.trigger.period_s * NS_PER_S)
-    return loop.timing.measurement_period_ns
-
-
-def _seeds(
-    scenario: Scenario, sections: Sequence[LoopSection], drawn_names: Sequence[str] = _DRAWN
-) -> list[SeedsSection]:
+def loop_seeds(scenario: Scenario, drawn_names: Sequence[str] = _DRAWN) -> list[SeedsSection]:
     """Return the seeds of each loop; those of the given names are the loop's own."""
+    sections = loop_sections(scenario)
     seeds, count = scenario.seeds, sum(section.count for section in sections)
     drawn: list[dict[str, int]] = [{}]
     if count > 1:

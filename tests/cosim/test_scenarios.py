@@ -26,7 +26,7 @@ from noack.plants.plant_settings import OdeSystem
 from noack.plants.quadrotor import QuadrotorSettings
 from noack.plants.systems.linearisation import linearise
 from noack.protocol.record_tables import PLANT_STEP
-from noack.scenario.resolution import LoopMatrices, loop_of
+from noack.scenario.resolution import LoopMatrices, loop_of, resolve_run
 from noack.theory.certificates.conditions import allowed_conditions
 from tests.helpers.shipped import resolved, shipped
 
@@ -68,7 +68,7 @@ def test_a_shipped_scenario_meets_its_assumptions_and_settles(name: str) -> None
 
 @pytest.mark.parametrize("name", SHARED)
 def test_the_loops_of_a_shipped_network_settle_and_keep_what_is_claimed(name: str) -> None:
-    shared = simulate_loops(shipped(name))
+    shared = simulate_loops(resolve_run(shipped(name)))
     for record in shared.loops:
         summary = summarise_loop(record, 0, "horizon").to_json()
         assert summary["exit"]["status"] == 0

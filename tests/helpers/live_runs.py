@@ -17,7 +17,7 @@ import pytest
 from cosim.record.run_record import Rows
 from noack.protocol.roles import ROLES
 from noack.runtime.spool import read_batches
-from noack.scenario.resolution import run_tables
+from noack.scenario.resolution import ResolvedRun
 from noack.scenario.scenario_file import load
 from tests.helpers.command_line import invoke
 from tests.helpers.waiting import PATIENCE_S, wait_for
@@ -256,6 +256,6 @@ def start_runs(folder: Path) -> Iterator[Callable[..., Running]]:
 def spooled(running: Running, table: str) -> Rows:
     """Return the rows of a table that are on disk."""
     spool = running.runs / "latest" / "spool"
-    dtype = run_tables(load(running.runs / "latest" / "scenario.toml"))[table]
+    dtype = ResolvedRun(load(running.runs / "latest" / "scenario.toml")).tables[table]
     batches = [np.frombuffer(data, dtype) for _, data in read_batches(spool, table)]
     return np.concatenate([np.zeros(0, dtype), *batches])

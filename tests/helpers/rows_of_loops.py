@@ -6,7 +6,6 @@ import numpy as np
 
 from cosim.record.run_record import RecordedRun, Rows, RunRecord
 from noack.protocol.record_tables import LOOP, NETEM_PACKET, OWNER, network_tables
-from noack.scenario.resolution import run_tables
 
 BATCH_NS = 100_000_000
 
@@ -14,7 +13,7 @@ BATCH_NS = 100_000_000
 def mixed_rows(shared: RecordedRun) -> Mapping[str, Rows]:
     """All rows by table, as the processes emit them: with the loop's number, in order of time."""
     mixed = {}
-    for table, dtype in run_tables(shared.scenario).items():
+    for table, dtype in shared.resolved.tables.items():
         if table in network_tables():
             mixed[table] = shared.network[table]
             continue
@@ -28,7 +27,7 @@ def live_rows(run: RecordedRun) -> Iterator[tuple[str, Rows]]:
     """Yield the rows as the processes send them: those of all loops mixed, batch by batch."""
     network = run.network
     every = {NETEM_PACKET: network[NETEM_PACKET]}
-    for table, dtype in run_tables(network.scenario).items():
+    for table, dtype in run.resolved.tables.items():
         if OWNER[table] != "netem":
             of_loops = [numbered(record, i, table, dtype) for i, record in enumerate(run.loops)]
             every[table] = np.concatenate(of_loops)

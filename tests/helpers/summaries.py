@@ -6,12 +6,13 @@ from cosim.analysis.summary.loop_summary import summarise_loop
 from cosim.analysis.summary.run_summary import summarise_run
 from cosim.analysis.summary.summary_model import ExitPart, LoopSummary, RunSummary
 from cosim.record.run_record import NETWORK_ROLES, RecordedRun, RunRecord
+from noack.scenario.resolution import ResolvedRun
 
 
 def run_of_one_loop(record: RunRecord) -> RecordedRun:
     """Return the record of a run whose only loop has the network for itself."""
     network = RunRecord(record.scenario, record.batches, [], record.reports, record.kind, roles=NETWORK_ROLES)
-    return RecordedRun(network, lambda _: [record])
+    return RecordedRun(ResolvedRun(record.scenario, (record.scenario,)), network, lambda _: [record])
 
 
 def summary_of(record: RunRecord, **more: Any) -> RunSummary:

@@ -36,7 +36,7 @@ from noack.protocol.record_tables import (
 from noack.protocol.roles import RECEIVES, SENDS, Record
 from noack.protocol.wire_format import Flow
 from noack.scenario.parameter_changes import ParameterChange, settings_of
-from noack.scenario.scenario import Scenario, loops_of
+from noack.scenario.scenario import Scenario, loop_names
 from plant_server.plant import plants_of
 from sensor_node.sensor import sensors_of
 
@@ -371,7 +371,7 @@ class MachineReplay:
         role, scenario = self._role, self._record.scenario
         sizes = _sizes(role, scenario)
         if role == "netem":
-            return InputReplay(role, channel_of(scenario, loops=len(loops_of(scenario))), sizes)
+            return InputReplay(role, channel_of(scenario, loops=len(loop_names(scenario))), sizes)
         if (index := self._shared.index(self._record)) is not None:
             return InputReplay(role, self._shared.of(role), sizes, index)
         return InputReplay(role, _MACHINES[role]((scenario,)), sizes)

@@ -11,7 +11,6 @@ from cosim.record.align import Reals, aligned_parts
 from cosim.record.run_record import RecordedRun, Rows, RunRecord
 from noack.core.row_operations import firsts_of_equal, row_norms
 from noack.protocol.record_tables import NETEM_PACKET
-from noack.scenario.scenario import Scenario, phases_ns
 
 INTERVALS = 200
 """Intervals of equal width into which a run is divided."""
@@ -58,9 +57,9 @@ def loops_over_time(run: RecordedRun, over_time: Sequence[LoopOverTime] | None =
     if over_time is None:
         over_time = [
             loop_over_time(record, phase_ns)
-            for record, phase_ns in zip(run.loops, phases_ns(run.scenario), strict=True)
+            for record, phase_ns in zip(run.loops, run.phases_ns, strict=True)
         ]
-    together = empty_over_time(run.scenario)
+    together = empty_over_time(len(run.names), run.scenario.horizon_s)
     for number, (errors, states) in enumerate(over_time):
         together.errors[number], together.states[number] = errors, states
     add_link_bytes(together.link_bytes, run.network[NETEM_PACKET], run.scenario.timing.horizon_ns)
@@ -90,11 +89,10 @@ def _update_largest(largest: Reals, columns: NDArray[np.int64], values: Reals) -
         largest[at] = np.fmax(largest[at], np.fmax.reduceat(values, first))
 
 
-def empty_over_time(scenario: Scenario) -> LoopsOverTime:
-    """Return the quantities of a run of which nothing is known yet."""
-    loops = len(phases_ns(scenario))
+def empty_over_time(loops: int, horizon_s: float) -> LoopsOverTime:
+    """Return the quantities of a run of some loops, of which nothing is known yet."""
     errors, states = np.full((2, loops, INTERVALS), np.nan)
-    edges_s = np.linspace(0, scenario.horizon_s, INTERVALS + 1)
+    edges_s = np.linspace(0, horizon_s, INTERVALS + 1)
     return LoopsOverTime(edges_s, errors, states, np.zeros((loops, INTERVALS)))
 
 

@@ -19,9 +19,8 @@ from noack.scenario.parameter_changes import (
     current_parameters,
     scheduled,
 )
-from noack.scenario.resolution import policy_of, resolve
+from noack.scenario.resolution import ResolvedRun, policy_of, resolve
 from noack.scenario.run_sections import ScheduledChange
-from noack.scenario.scenario import loop_scenario, loop_sections
 from noack.scenario.scenario_tables import MOST_CHANGES
 from noack.settings.section import ReadTable, Table
 from noack.trigger_policies.trigger_rule import TriggerRule
@@ -39,8 +38,8 @@ class ChangeRequests:
         self._plane = plane
         self._schedule = ChangeSchedule[None](descriptor.scenario)
         self._entries = {
-            section.name: ChangeSchedule[None](loop_scenario(descriptor.scenario, section))
-            for section in loop_sections(descriptor.scenario)
+            entry.name: ChangeSchedule[None](entry.scenario)
+            for entry in ResolvedRun(descriptor.scenario).entries
         }
         """The changes of the loops of each entry of [[loops]], by its name."""
         self.announced: tuple[ChangeAnnouncement, ...] = ()

@@ -26,7 +26,6 @@ from noack.runtime.control_messages import ClockError
 from noack.runtime.host_clocks import clock_error, require_small_error
 from noack.runtime.run_descriptor import RunDescriptor
 from noack.scenario.run_sections import ClocksSection
-from noack.scenario.scenario import Scenario
 
 DEFAULT_PORT = 7447
 """Of zenoh."""
@@ -63,20 +62,12 @@ def listen_address(text: str) -> Address:
     return host, port
 
 
-def with_clocks(scenario: Scenario) -> Scenario:
-    """Return a scenario that says how far the clocks of its hosts may be off."""
-    if scenario.clocks is not None:
-        return scenario
-    return scenario.model_copy(update={"clocks": ClocksSection()})
-
-
-def own_clock(scenario: Scenario) -> ClockError:
+def own_clock(settings: ClocksSection) -> ClockError:
     """Return how far this host's clock may be off.
 
-    Raise PeerError if that is more than the scenario allows, MachineError if chrony has not
+    Raise PeerError if that is more than the settings allow, MachineError if chrony has not
     synchronised it.
     """
-    settings = scenario.clocks or ClocksSection()
     error = clock_error(clock_identity(), settings.largest_error_us)
     require_small_error("the clock of this host", error, settings)
     return error

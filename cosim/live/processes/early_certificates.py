@@ -68,9 +68,9 @@ def _compute(run_dir: Path, sender: Connection) -> None:
     """Send what to expect of each loop in turn: its key, and the expectations at their first time."""
     be_idle()
     from cosim.analysis.claims.run_certificates import expectations, expectations_key
-    from cosim.record.run_record import scenarios_of
+    from cosim.record.run_record import resolved_run
 
-    _, loops = scenarios_of(run_dir)
+    loops = resolved_run(run_dir).loops
     sent = set[str]()
     for loop in loops:
         key = expectations_key(loop)

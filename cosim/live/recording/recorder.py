@@ -48,7 +48,7 @@ from noack.runtime.run_process import RunProcess
 from noack.runtime.spool import NOTICES
 from noack.runtime.telemetry import first_row
 from noack.scenario.parameter_changes import change_notice
-from noack.scenario.scenario import Scenario, loop_names
+from noack.scenario.resolution import ResolvedRun
 
 if TYPE_CHECKING:
     from cosim.output.viewer.live_feed import LiveFeed
@@ -142,15 +142,15 @@ class Recorder:
 
     def __init__(
         self,
-        scenario: Scenario,
+        run: ResolvedRun,
         run_dir: Path,
         plane: ControlPlane,
         live: str | None = None,
     ) -> None:
         self._run_dir = run_dir
         self._plane = plane
-        self.store = TelemetryStore(scenario, run_dir)
-        self._scenario = scenario
+        self.store = TelemetryStore(run.tables, run_dir)
+        self._run = run
         self._feed: LiveFeed | None = None
         self.lost: MachineError | None = None
         """Why some stored rows are no longer on disk; known at the end."""
@@ -159,7 +159,7 @@ class Recorder:
         session, key = plane.session, plane.key
         self._batches = session.declare_subscriber(
             key("telemetry", "*", "*"),
-            RingChannel(max(_WAITING_BATCHES // len(loop_names(scenario)), _LEAST_BATCHES)),
+            RingChannel(max(_WAITING_BATCHES // len(run.names), _LEAST_BATCHES)),
         )
         self._report_queries = session.declare_queryable(key("report", "*"), FifoChannel(64))
         self._tokens = ProcessTokens(plane)
@@ -186,7 +186,7 @@ class Recorder:
         """Show the telemetry in a view, from the first batch that is handled afterwards."""
         from cosim.output.viewer.live_feed import LiveFeed  # imports rerun
 
-        self._feed = LiveFeed(self._scenario, view, self._progress.warnings.append)
+        self._feed = LiveFeed(self._run, view, self._progress.warnings.append)
 
     def poll(self) -> bool:
         """Handle messages that have arrived; return whether there may be more.
@@ -278,7 +278,7 @@ class Recorder:
             return
         self._progress.count(table, rows)
         if table in (PLANT_STEP, CONTROLLER_STEP):
-            late_us = float((rows["now_ns"] - rows["t_ns"]).max()) / (1e3 * self._scenario.speed)
+            late_us = float((rows["now_ns"] - rows["t_ns"]).max()) / (1e3 * self._run.scenario.speed)
             self._progress.late_us = max(self._progress.late_us, late_us)
         if self._feed is not None:
             self._feed.add(table, rows)
@@ -342,11 +342,11 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
     # load: the other processes do not wait for them.
     view = _open_view(process, live_view) if live_view else None
     status = live_view.status if live_view else None
-    recorder = Recorder(process.scenario, run_dir, process.plane, status)
+    recorder = Recorder(process.resolved, run_dir, process.plane, status)
     process.join(None)
     core.noack_prefer_others()  # without real-time settings, the loop would wait for milliseconds
     # The launcher writes the view of a long run, and of several loops.
-    unseen = len(process.phases_ns) > 1 or is_long(process.scenario)
+    unseen = len(process.resolved.names) > 1 or is_long(process.scenario)
     can_record = is_installed() and not unseen
     if view is not None or can_record:
         try:
@@ -382,7 +382,7 @@ def _open_view(process: RunProcess, live_view: "LiveView | None") -> "RunRecordi
     from cosim.output.viewer.run_recording import open_recording  # imports rerun
 
     run_dir, run_id = Path(process.descriptor.run_dir), process.descriptor.run_id
-    return open_recording(process.scenario, run_dir, run_id, live_view)
+    return open_recording(process.resolved, run_dir, run_id, live_view)
 
 
 def _poll_to_the_end(process: RunProcess, recorder: Recorder) -> bool:

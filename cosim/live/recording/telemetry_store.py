@@ -2,7 +2,7 @@
 
 import json
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,24 +15,21 @@ from noack.protocol.roles import LOOP_ROLES, RECORDER, Notice
 from noack.runtime.control_messages import LogLine, ProcessReport, parse_message
 from noack.runtime.spool import NOTICES, SPOOL, SpoolWriter, lines_in, notices_of
 from noack.runtime.telemetry import Ranges, ReceivedRows
-from noack.scenario.resolution import run_tables
-from noack.scenario.scenario import Scenario
 
 
 class TelemetryStore:
     """Writes batches of rows to the spool, and keeps a list of the rows that it has.
 
     Args:
-        scenario: the resolved scenario.
+        types: the row type of each table of the run.
         run_dir: the run's directory.
 
     Raises:
         MachineError: the spool cannot be written.
     """
 
-    def __init__(self, scenario: Scenario, run_dir: Path) -> None:
-        self.types = run_tables(scenario)
-        """Row type of each table."""
+    def __init__(self, types: Mapping[str, np.dtype[np.void]], run_dir: Path) -> None:
+        self.types = types
         self.writer = SpoolWriter(run_dir / SPOOL, RECORDER)
         self.writer.prepare([*self.types, *map(notices_of, (*LOOP_ROLES, RECORDER))])
         self._received: defaultdict[tuple[str, str], ReceivedRows] = defaultdict(ReceivedRows)

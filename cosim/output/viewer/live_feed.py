@@ -7,7 +7,7 @@ are in the finished recording only.
 """
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -29,8 +29,7 @@ from noack.protocol.record_tables import (
     NETEM_PACKET,
     SENSOR_MEASUREMENT,
 )
-from noack.scenario.resolution import loop_of, resolved_loops, tables_of
-from noack.scenario.scenario import Scenario, phases_ns
+from noack.scenario.resolution import ResolvedRun, loop_of, tables_of
 
 _TURN_S, _CORE_SHARE = 0.03, 0.3
 """CPU time of a turn; share of a core that all turns take."""
@@ -47,19 +46,18 @@ class LiveFeed:
     """Passes the rows of a run to its recording.
 
     Args:
-        scenario: the scenario of the run.
+        run: the run.
         view: the recording.
         warn: called with a line about what is not shown.
     """
 
-    def __init__(self, scenario: Scenario, view: RunRecording, warn: Callable[[str], None]) -> None:
-        loops = resolved_loops(scenario)
+    def __init__(self, run: ResolvedRun, view: RunRecording, warn: Callable[[str], None]) -> None:
         self._view, self._warn = view, warn
-        self._wall_ns = NS_PER_S * scenario.speed
-        self._phases_ns, self._types = phases_ns(scenario), [tables_of(loop) for loop in loops]
-        self._all_loops = _AllLoops(scenario, loops, view) if view.is_shared else None
+        self._wall_ns = NS_PER_S * run.scenario.speed
+        self._phases_ns, self._types = run.phases_ns, [tables_of(loop) for loop in run.loops]
+        self._all_loops = _AllLoops(run, view) if view.is_shared else None
         self._feeds = {
-            number: LoopFeed(loops[number], loop_view, certified=not view.is_shared)
+            number: LoopFeed(run.loops[number], loop_view, certified=not view.is_shared)
             for number, loop_view in view.views.items()
         }
         self._waiting: dict[str, list[Rows]] = {}
@@ -147,7 +145,8 @@ class LiveFeed:
 class _AllLoops:
     """Shows the norms and shares of all loops, and the network, interval by interval."""
 
-    def __init__(self, scenario: Scenario, loops: Sequence[Scenario], view: RunRecording) -> None:
+    def __init__(self, run: ResolvedRun, view: RunRecording) -> None:
+        scenario, loops = run.scenario, run.loops
         self._view, self._horizon_ns = view, scenario.timing.horizon_ns
         self._periods_ns = np.array([loop.timing.controller_period_ns for loop in loops])
         self._loops = [loop_of(loop) for loop in loops]
@@ -160,7 +159,7 @@ class _AllLoops:
                 setpoint[: loop.n] = loop.setpoint
         self._transitions: dict[int, Reals] = {}
         self._lag_ns = int(LAG_S * NS_PER_S * scenario.speed)
-        self._phases_ns = np.array(phases_ns(scenario))
+        self._phases_ns = np.array(run.phases_ns)
         numbers = [(name, "<i8") for name in (LOOP, "input", "t_ns")]
         self._no_rows = np.zeros(0, [*numbers, ("x", "<f8", (sizes.max(),))])
         self._newest = self._no_rows
@@ -170,7 +169,7 @@ class _AllLoops:
         knows_state = loops[0].network.initial_sync == "known_state"
         self._first_ns = np.full(len(loops), -1 if knows_state else NEVER_NS)
         """When each loop's controller received its first state."""
-        self._over_time = empty_over_time(scenario)
+        self._over_time = empty_over_time(len(loops), scenario.horizon_s)
         self._inside = np.zeros(0, np.int64), np.zeros(0, np.int64)
         self._intervals_sent = self._shares_sent = 0
         self._map_s = 0.0

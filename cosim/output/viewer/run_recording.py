@@ -55,8 +55,8 @@ from cosim.record.run_directory import RECORDING_FILE, Kind, file_of_loop
 from cosim.record.run_record import RecordedRun, RunRecord
 from noack.core.clock import NS_PER_S
 from noack.protocol.roles import LOOP_ROLES
-from noack.scenario.resolution import loop_of, resolved_loops
-from noack.scenario.scenario import Scenario, loop_names, phases_ns
+from noack.scenario.resolution import ResolvedRun, loop_of
+from noack.scenario.scenario import Scenario
 
 MOST_PICTURED = 12
 """Largest number of loops that are shown one by one, with their pictures."""
@@ -104,7 +104,8 @@ class RunRecording(RecordingFile):
         live: LiveView | None = None,
         complete: bool = False,
     ) -> None:
-        self.names, phases = loop_names(run), phases_ns(run)
+        of_run = ResolvedRun(run)
+        self.names, phases = of_run.names, of_run.phases_ns
         self.is_shared = len(self.names) > 1
         animated = len(shown) <= _MOST_ANIMATED and not (complete and is_long(run))
         loops = {
@@ -272,12 +273,11 @@ def map_pixels(errors: Reals) -> NDArray[np.uint8]:
     return np.asarray(pixels.repeat(height, axis=0).repeat(width, axis=1), np.uint8)
 
 
-def open_recording(scenario: Scenario, run_dir: Path, run_id: int, live: LiveView | None) -> RunRecording:
+def open_recording(run: ResolvedRun, run_dir: Path, run_id: int, live: LiveView | None) -> RunRecording:
     """Create the recording of a run, which is written while the run goes on."""
-    loops = dict(enumerate(resolved_loops(scenario)))
-    shown = loops if len(loops) <= MOST_PICTURED else {}
-    run = scenario if len(loops) > 1 else loops[0]
-    return RunRecording(run, run_dir / RECORDING_FILE, run_id, shown, live=live)
+    shown = dict(enumerate(run.loops)) if len(run.names) <= MOST_PICTURED else {}
+    scenario = run.scenario if len(run.names) > 1 else run.loops[0]
+    return RunRecording(scenario, run_dir / RECORDING_FILE, run_id, shown, live=live)
 
 
 def write_view(

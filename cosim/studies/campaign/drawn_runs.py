@@ -35,7 +35,7 @@ from noack.protocol.record_tables import (
     SENSOR_MEASUREMENT,
     effective,
 )
-from noack.scenario.resolution import policy_of
+from noack.scenario.resolution import ResolvedRun, policy_of
 from noack.scenario.run_sections import PortsSection, RealtimeSection, SeedsSection
 from noack.scenario.scenario import Scenario
 
@@ -195,7 +195,8 @@ class SharedNetworkWork(SampledWork):
         rows = np.zeros(len(draws), LOOPS_ROW)
         for row, draw in zip(rows, draws, strict=True):
             seeds = seeds_of(self.seed, draw)
-            records = [*simulate_loops(self.scenario.model_copy(update={"seeds": seeds})).loops]
+            run = ResolvedRun(self.scenario.model_copy(update={"seeds": seeds}))
+            records = [*simulate_loops(run).loops]
             loops = np.zeros(len(records), ROW)
             with np.errstate(all="ignore"):  # loops may diverge
                 for loop_row, record in zip(loops, records, strict=True):

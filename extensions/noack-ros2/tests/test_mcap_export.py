@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 import noack
 from cosim.output.export.export_formats import export_run
 from cosim.output.viewer.rerun_program import start_rerun
-from noack.scenario.scenario import phases_ns
+from noack.scenario.resolution import ResolvedRun
 
 SCENARIO: dict[str, Any] = {
     "horizon_s": 1.0, "changes": [{"at_s": 0.5, "set": {"trigger.beta": 0.05}}],
@@ -93,7 +93,7 @@ def test_channels_of_several_loops_have_the_loops_names(tmp_path: Path) -> None:
     by_topic = messages(loops.export(tmp_path / "a.mcap")[0])
     name, loop = list(loops.loops.items())[-1]
     steps = loop.table("plant_step")["now_ns"].to_pylist()
-    phase_ns = phases_ns(loops.scenario)[-1]
+    phase_ns = ResolvedRun(loops.scenario).phases_ns[-1]
     times = [log - phase_ns for log, *_ in by_topic[f"/{name}/plant/step"]]
     assert phase_ns > 0
     assert times == steps

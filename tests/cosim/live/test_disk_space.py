@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from cosim.live.disk_space import require_disk_space, spool_bytes
+from cosim.live.disk_space import require_disk_space
 from cosim.live.launcher import launch
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import MachineError
-from noack.scenario.resolution import resolve, resolve_run
+from noack.scenario.resolution import ResolvedRun, resolve, resolve_run
 from noack.scenario.scenario_file import validate
 
 
@@ -24,7 +24,7 @@ def test_the_estimated_size_is_that_of_all_rows_except_events(content: dict[str,
     record = simulate(resolved)
     events = ("controller_delivery", "netem_packet", "netem_release")
     rows = [record[table].nbytes for table in record.tables if table not in events]
-    assert spool_bytes(resolved) == pytest.approx(sum(rows), rel=0.002)
+    assert ResolvedRun(resolved).step_bytes == pytest.approx(sum(rows), rel=0.002)
 
 
 def test_a_run_that_cannot_fit_is_refused_and_one_that_may_not_fit_begins_with_a_warning(
@@ -34,7 +34,7 @@ def test_a_run_that_cannot_fit_is_refused_and_one_that_may_not_fit_begins_with_a
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     scenario = validate(content | {"horizon_s": 1e7}, "")
-    with_free(monkeypatch, spool_bytes(resolve(scenario)) - 1)
+    with_free(monkeypatch, resolve_run(scenario).step_bytes - 1)
     with pytest.raises(MachineError, match=r"this run records .* are free on the disk"):
         launch(scenario, tmp_path / "runs")
     assert not (tmp_path / "runs").exists()
@@ -42,6 +42,6 @@ def test_a_run_that_cannot_fit_is_refused_and_one_that_may_not_fit_begins_with_a
     resolved = resolve(validate(longer, ""))
     run = resolve_run(validate(longer | {"loops": [{"name": "one"}, {"name": "two"}]}, ""))
     for share, warned in ((1.0, True), (2.9, True), (3.0, False)):
-        with_free(monkeypatch, share * 2 * spool_bytes(resolved))
-        require_disk_space(run, tmp_path / "not" / "yet")
+        with_free(monkeypatch, share * 2 * ResolvedRun(resolved).step_bytes)
+        require_disk_space(run.step_bytes, tmp_path / "not" / "yet")
         assert ("warning: " in capsys.readouterr().err) == warned

@@ -19,7 +19,7 @@ from noack.protocol.roles import RECORDER, ROLES
 from noack.runtime import command_line
 from noack.runtime.command_line import Signals, StopRequestError
 from noack.runtime.run_descriptor import descriptor_file, new_descriptor
-from noack.scenario.resolution import resolve
+from noack.scenario.resolution import resolve, resolve_run
 from noack.scenario.scenario_file import validate
 from tests.helpers.waiting import wait_for
 
@@ -89,8 +89,7 @@ class Case:
     """A run of one second."""
 
     def __init__(self, content: dict[str, Any], run_dir: Path) -> None:
-        resolved = resolve(validate(content, ""))
-        self.descriptor = new_descriptor(resolved, run_dir, launched=True)
+        self.resolved = resolve_run(validate(content, ""))
         self.run_dir = run_dir
         (run_dir / "logs").mkdir()
         self.log = run_dir / "logs" / "sensor.log"
@@ -101,7 +100,7 @@ class Case:
 
     def run(self, children: FakeChildren, coordinator: FakeCoordinator, **watch: Any) -> _Run:
         observers, certificates = RunObservers([Calls(**watch)]), EarlyCertificates()
-        return _Run(self.descriptor, self.run_dir, cast(Any, coordinator), children, observers, certificates)
+        return _Run(self.resolved, 7, self.run_dir, cast(Any, coordinator), children, observers, certificates)
 
 
 @pytest.fixture

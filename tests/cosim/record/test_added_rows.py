@@ -26,7 +26,7 @@ from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP
 from noack.runtime.control_messages import ClockError
 from noack.runtime.kept_rows import KeptFile, KeptHead
 from noack.runtime.spool import writer_of
-from noack.scenario.resolution import resolve, run_tables
+from noack.scenario.resolution import ResolvedRun, resolve
 from noack.scenario.run_sections import ClocksSection
 from noack.scenario.scenario_file import validate
 from tests.cosim.record.changed_records import changed
@@ -51,7 +51,7 @@ def run_dir(full_record: RunRecord, tmp_path: Path) -> Path:
     """A run whose record lacks the second half of the controller's ticks, and its report."""
     folder = tmp_path / "runs" / "run"
     folder.mkdir(parents=True)
-    write_scenario(full_record.scenario, folder)
+    write_scenario(ResolvedRun(full_record.scenario), folder)
     run_directory.write_environment(folder, "live", RUN)
     reports = {role: report | {"process": role} for role, report in full_record.reports.items()}
     del reports["controller"]
@@ -66,7 +66,7 @@ def run_dir(full_record: RunRecord, tmp_path: Path) -> Path:
 
 def stored(record: RunRecord, table: str) -> Rows:
     """The rows of a table as its process stores them."""
-    return with_loop(record[table], 0, run_tables(record.scenario)[table])
+    return with_loop(record[table], 0, ResolvedRun(record.scenario).tables[table])
 
 
 class HostFile:

@@ -20,6 +20,7 @@ from noack.core.errors import MachineError
 from noack.protocol.record_tables import LOOP, NETEM_PACKET, PLANT_STEP, network_tables
 from noack.protocol.roles import Notice
 from noack.runtime.spool import SPOOL, SpoolWriter, notices_of
+from noack.scenario.resolution import resolve_run
 from noack.scenario.scenario_file import validate
 from tests.helpers.rows_of_loops import mixed_rows
 
@@ -34,7 +35,7 @@ def shared(content: dict[str, Any]) -> RecordedRun:
     content["trigger"]["beta"] = 0.01
     content["network"]["impairments"] = [{"kind": "delay", "delay_s": 0.012, "jitter_s": 0.009}]
     content["loops"] = [{"name": "a", "count": 2}, {"name": "b"}]
-    return simulate_loops(validate(content, "here"))
+    return simulate_loops(resolve_run(validate(content, "here")))
 
 
 def spool(run_dir: Path, table: str, rows: Rows, *, writer: str = "recorder") -> None:
@@ -63,7 +64,7 @@ def same_rows(run_dir: Path, shared: RecordedRun) -> None:
 
 def opened(shared: RecordedRun, run_dir: Path) -> Path:
     run_dir.mkdir()
-    write_scenario(shared.network.scenario, run_dir)
+    write_scenario(shared.resolved, run_dir)
     write_environment(run_dir, "live")
     return run_dir
 

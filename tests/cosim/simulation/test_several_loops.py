@@ -12,7 +12,7 @@ from cosim.record.run_record import RecordedRun, RunRecord
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, SENSOR_MEASUREMENT, Fate
 from noack.protocol.wire_format import HEADER_ROW, datagram_bytes
-from noack.scenario.resolution import resolve
+from noack.scenario.resolution import resolve, resolve_run
 from noack.scenario.scenario_file import validate
 from tests.cosim.record.changed_records import changed
 
@@ -44,7 +44,7 @@ def short(content: Content) -> Content:
 
 
 def run(content: Content, *loops: Content) -> RecordedRun:
-    return simulate_loops(validate(content | {"loops": list(loops)}, "here"))
+    return simulate_loops(resolve_run(validate(content | {"loops": list(loops)}, "here")))
 
 
 @pytest.mark.parametrize("protocol", ["none", "ack"])

@@ -10,7 +10,7 @@ from cosim.simulation.virtual_time import VirtualRun, simulate
 from netem.channel import channel_of
 from noack.core.core_library import ffi, new_handle
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, NETEM_PACKET, SENSOR_MEASUREMENT
-from noack.scenario.resolution import resolve
+from noack.scenario.resolution import ResolvedRun, resolve
 from noack.scenario.scenario_file import validate
 from tests.cosim.simulation.event_scheduler import record_of_run
 from tests.helpers.shipped import resolved
@@ -45,7 +45,7 @@ def test_a_scripted_network_decides_as_in_the_plain_driver() -> None:
 @pytest.mark.sanitized
 def test_numbers_of_no_simulation_are_refused() -> None:
     scenario = resolved("unstable_pendulum", "horizon_s=1.0")
-    run, wire = VirtualRun(scenario, (scenario,)), ffi.new("noack_wire *")
+    run, wire = VirtualRun(ResolvedRun(scenario, (scenario,))), ffi.new("noack_wire *")
     processes = [machines.core for machines in run.machines.values()]
     two = channel_of(scenario, loops=2)
     for roles, channel, directions in (

@@ -38,7 +38,7 @@ from cosim.record.spool_conversion import finish_record
 from cosim.simulation.virtual_time import simulate
 from noack.protocol.record_tables import OWNER
 from noack.runtime.spool import NOTICES, SPOOL, SpoolWriter, batch_of, notices_of
-from noack.scenario.resolution import resolve, run_tables
+from noack.scenario.resolution import ResolvedRun, resolve
 from noack.scenario.scenario_file import dumps, validate
 from tests.fuzz.edits import Choices, Vocabulary, damaged, edited, edited_table, written
 from tests.fuzz.harness import refusal, workspace
@@ -68,7 +68,7 @@ RECORD_KNOWN = Vocabulary(
 
 def spooled(record: RunRecord, table: str) -> Rows:
     """The rows of a table as its process spools them."""
-    return with_loop(record[table], 0, run_tables(record.scenario)[table])
+    return with_loop(record[table], 0, ResolvedRun(record.scenario).tables[table])
 
 
 @cache
@@ -213,7 +213,7 @@ REPORT = {
     "rows": {"plant_step": 4, "plant_actuation": 0, "notices": 1},
     "instance": "one",
 }  # fmt: skip
-_TYPES = run_tables(RESOLVED)
+_TYPES = ResolvedRun(RESOLVED).tables
 HEADER = {"first": 0, "rows": 4}
 TELEMETRY_KNOWN = Vocabulary(
     (*REPORT, *HEADER, *NOTICE, *OWNER, "accepted", "rejected"), (*OWNER, "horizon", "violation")
@@ -237,7 +237,7 @@ def telemetry_input(choices: Choices) -> None:
             case _:
                 messages.append(("telemetry", _batch(choices)))
     plane = FakePlane()
-    recorder = Recorder(RESOLVED, run_dir, plane)
+    recorder = Recorder(ResolvedRun(RESOLVED), run_dir, plane)
     for key, message in messages:
         plane.put(key, message)
     queries = [message for _, message in messages if isinstance(message, Query)]

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from noack.core.errors import CallerError
-from noack.scenario.resolution import loop_of, resolve
-from noack.scenario.scenario import Scenario, loop_names, loops_of, phases_ns
+from noack.scenario.resolution import ResolvedRun, loop_of, resolve
+from noack.scenario.scenario import Scenario, loop_names, loops_of
 from noack.scenario.scenario_file import load, toml_text, validate
 from tests.helpers.approved import compare_lines, lines_of_error
 
@@ -49,21 +49,21 @@ def test_each_loop_draws_its_own_plant_state_and_phase(content: dict[str, Any]) 
     drawn = [loop_of(resolve(loop)) for loop in loops_of(scenario)]
     assert len({system.A.tobytes() for system in drawn}) == count
     assert len({system.x0.tobytes() for system in drawn}) == count
-    phases, period_ns = phases_ns(scenario), scenario.timing.measurement_period_ns
+    phases, period_ns = ResolvedRun(scenario).phases_ns, scenario.timing.measurement_period_ns
     assert phases[0] == 0
     assert 0 <= min(phases) <= max(phases) < period_ns
     # Uniform phases: the mean of 200 is within 5 standard errors of one half.
     assert abs(np.mean(phases[1:]) / period_ns - 0.5) < 5 * 12**-0.5 / (count - 1) ** 0.5
     # Those of a periodic trigger are within its own period.
     periodic = {"name": "a", "count": count, "trigger": {"policy": "periodic", "period_s": 0.1}}
-    wide = phases_ns(with_loops(content, periodic))
+    wide = ResolvedRun(with_loops(content, periodic)).phases_ns
     assert 80_000_000 < max(wide) < 100_000_000
     # They are functions of the run's seeds and the loop's number.
     fewer = with_loops(content, {"name": "b", "count": 3}, {"name": "c"})
-    assert phases_ns(fewer) == phases[:4]
+    assert ResolvedRun(fewer).phases_ns == phases[:4]
     assert [loop.seeds for loop in loops_of(fewer)] == [loop.seeds for loop in loops_of(scenario)[:4]]
     other = with_loops(content | {"seeds": {"initial_state": 1}}, {"name": "a", "count": 3})
-    assert phases_ns(other)[1:] != phases[1:3]
+    assert ResolvedRun(other).phases_ns[1:] != phases[1:3]
 
 
 def test_a_file_is_not_read_where_tables_are_validated(content: dict[str, Any]) -> None:

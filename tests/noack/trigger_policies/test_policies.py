@@ -20,7 +20,7 @@ from cosim.simulation.exact_simulation import setting_of
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
 from noack.protocol.record_tables import SENSOR_MEASUREMENT
-from noack.scenario.resolution import resolve
+from noack.scenario.resolution import ResolvedRun, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from noack.scenario.sections import POLICIES
@@ -102,10 +102,10 @@ def test_a_run_keeps_the_file_and_replays_with_it(tmp_path: Path) -> None:
     resolved = scenario(tmp_path, SEND_ON_DELTA, parameters="{delta=0.05}")
     run_dir = tmp_path / "run"
     run_dir.mkdir()
-    kept = write_scenario(resolved, run_dir)
+    kept = write_scenario(ResolvedRun(resolved), run_dir)
     (tmp_path / "own.py").write_text("class Delta: pass")
     assert (run_dir / "trigger" / "own.py").is_file()
-    assert replay(simulate(kept)).bit_exact
+    assert replay(simulate(kept.scenario)).bit_exact
     with pytest.raises(CallerError, match=r"trigger\.file = .*has changed"):
         simulate(resolved)
 

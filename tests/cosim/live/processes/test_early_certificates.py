@@ -9,7 +9,7 @@ import pytest
 from cosim.analysis.claims.run_certificates import expectations
 from cosim.live.processes import early_certificates
 from cosim.live.processes.early_certificates import EarlyCertificates, _compute
-from cosim.record.run_record import scenarios_of
+from cosim.record.run_record import resolved_run
 from cosim.record.run_scenario import write_scenario
 from noack.scenario.resolution import resolve_run
 from tests.helpers.shipped import shipped
@@ -39,7 +39,7 @@ def run_dir(tmp_path: Path) -> Path:
 
 def test_they_are_those_of_each_loop(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(early_certificates, "_compute", compute_at_usual_priority)
-    _, loops = scenarios_of(run_dir)
+    loops = resolved_run(run_dir).loops
     with EarlyCertificates() as certificates:
         certificates.start(run_dir)
         wait_for(lambda: len(certificates.known) == len(loops))

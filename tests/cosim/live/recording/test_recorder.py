@@ -23,7 +23,7 @@ from noack.protocol.record_tables import OWNER, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.roles import LOOP_ROLES, RECORDER
 from noack.runtime.control_messages import RunProgress, parse_message
 from noack.runtime.spool import NOTICES, SPOOL, read_batches
-from noack.scenario.resolution import resolve, run_tables
+from noack.scenario.resolution import ResolvedRun, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import dumps, validate
 from tests.cosim.simulation.outage import with_outage
@@ -52,7 +52,7 @@ class Run:
         (run_dir / SCENARIO_FILE).write_text(dumps(scenario))
         self.sent: dict[str, int] = {}
         self.plane = plane = RecordingPlane()
-        self.recorder = Recorder(scenario, run_dir, plane)  # type: ignore[arg-type]
+        self.recorder = Recorder(ResolvedRun(scenario), run_dir, plane)  # type: ignore[arg-type]
         for role in LOOP_ROLES:
             plane.put("alive", Sample(f"noack/0/alive/{role}/{role}"))
         self.recorder.poll()
@@ -68,7 +68,7 @@ class Run:
             first = self.sent.get(table, 0)
             self.sent[table] = int(np.searchsorted(record[table]["now_ns"], until_ns))
             if len(rows := record[table][first : self.sent[table]]):
-                sent = with_loop(rows, 0, run_tables(record.scenario)[table])
+                sent = with_loop(rows, 0, ResolvedRun(record.scenario).tables[table])
                 self.send(table, first, sent.tobytes(), OWNER[table])
 
     def rows(self, table: str, count: int) -> None:

@@ -13,7 +13,7 @@ from noack.core.errors import MachineError, PeerError
 from noack.protocol.record_tables import PLANT_STEP
 from noack.runtime.control_messages import ChannelCounters, ProcessReport
 from noack.runtime.spool import NOTICES, SPOOL, batch_of, read_batches
-from noack.scenario.resolution import resolve
+from noack.scenario.resolution import ResolvedRun, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 
@@ -27,7 +27,7 @@ def scenario(content: dict[str, Any]) -> Scenario:
 
 @pytest.fixture
 def store(scenario: Scenario, tmp_path: Path) -> Iterator[TelemetryStore]:
-    telemetry_store = TelemetryStore(scenario, tmp_path)
+    telemetry_store = TelemetryStore(ResolvedRun(scenario).tables, tmp_path)
     yield telemetry_store
     telemetry_store.writer.close()
 

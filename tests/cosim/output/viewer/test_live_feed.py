@@ -19,7 +19,7 @@ from cosim.simulation.virtual_time import simulate_loops
 from noack.protocol.record_tables import NETEM_PACKET, PACKET_HEAD_BYTES, Fate, tables
 from noack.protocol.roles import Notice
 from noack.protocol.wire_format import Encoder, Flow, Message
-from noack.scenario.resolution import loop_of
+from noack.scenario.resolution import loop_of, resolve_run
 from tests.cosim.output.viewer.recordings import Chunks, read, series
 from tests.helpers.rows_of_loops import live_rows
 from tests.helpers.shipped import resolved, shipped
@@ -35,10 +35,10 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
 def shown(folder: Path, count: int, *settings: str) -> tuple[RecordedRun, Chunks, list[str]]:
     """Simulate loops, and pass their rows on as in a live run; read the recording."""
     all_settings = ["horizon_s=2.0", f'loops=[{{ name = "p", count = {count} }}]', *settings]
-    run = simulate_loops(shipped("shared_bottleneck", *all_settings))
-    scenario, messages = run.network.scenario, list[str]()
-    with open_recording(scenario, folder, 9, None) as view:
-        feed = LiveFeed(scenario, view, messages.append)
+    run = simulate_loops(resolve_run(shipped("shared_bottleneck", *all_settings)))
+    messages = list[str]()
+    with open_recording(run.resolved, folder, 9, None) as view:
+        feed = LiveFeed(run.resolved, view, messages.append)
         for table, rows in live_rows(run):
             feed.add(table, rows)
             feed.advance()

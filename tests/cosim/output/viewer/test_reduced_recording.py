@@ -16,6 +16,7 @@ from cosim.record.run_scenario import write_scenario
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import ExitStatus
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
+from noack.scenario.resolution import ResolvedRun
 from tests.cosim.output.viewer.recordings import read, series
 from tests.cosim.record.changed_records import changed, copied
 from tests.helpers.shipped import resolved
@@ -60,7 +61,7 @@ def require_envelope(t_ns: Times, values: Floats, kept_ns: Times, kept: Floats) 
 
 def test_each_envelope_holds_all_samples_of_its_bin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     record = with_peaks(simulate(resolved("double_integrator", "horizon_s=20")))
-    write_scenario(record.scenario, tmp_path)
+    write_scenario(ResolvedRun(record.scenario), tmp_path)
     write_environment(tmp_path, "live")
     write_run(run_of_one_loop(record), tmp_path)
     steps = record.count(PLANT_STEP)

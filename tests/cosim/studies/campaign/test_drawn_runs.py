@@ -22,7 +22,7 @@ from netem.channel import channel_of
 from noack.core.errors import CallerError, ExitStatus
 from noack.impairments.kinds.replay import Replay
 from noack.impairments.loss_models.lossless import NoLoss
-from noack.scenario.resolution import loop_of
+from noack.scenario.resolution import ResolvedRun, loop_of
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from tests.cosim.studies.campaign.conftest import Few, Write, few_of
@@ -150,7 +150,7 @@ def test_a_row_agrees_with_the_summaries_of_the_loops() -> None:
     rows = loops_work.run(range(2))
     assert rows.dtype == LOOPS_ROW
     seeds = seeds_of(loops_work.seed, 1)
-    shared = simulate_loops(loops_work.scenario.model_copy(update={"seeds": seeds}))
+    shared = simulate_loops(ResolvedRun(loops_work.scenario.model_copy(update={"seeds": seeds})))
     loops = [summarise_loop(record, 0, "").to_json() for record in shared.loops]
     row = rows[1]
     assert row["transmissions"] == sum(loop["events"] for loop in loops) != rows[0]["transmissions"]
