@@ -322,7 +322,7 @@ def _with_draws_of(controller: Controller, resolved: Scenario) -> Controller:
     return replace(
         controller,
         law=law if isinstance(law, LinearFeedback) else law_of(resolved),
-        x0=None if controller.x0 is None else np.array(resolved.plant.initial_state),
+        x0=None if controller.x0 is None else loop_of(resolved).known_x0,
         schedule=None if schedule is None else schedule.for_similar_loop(resolved),
     )
 
@@ -339,7 +339,7 @@ def _part(resolved: Scenario) -> Controller:
         first_ns=resolved.timing.controller_phase_ns,
         horizon_ns=resolved.timing.horizon_ns,
         guarantee=resolved.network.guarantee,
-        x0=loop.x0 if starts_from_x0 else None,
+        x0=loop.known_x0 if starts_from_x0 else None,
         acknowledges=acknowledges,
         safe_input=None if safe_input is None else np.array(safe_input),
         carries_model=resolved.message_sizes.carries_model,

@@ -345,8 +345,36 @@ def system_of(resolved: Scenario) -> PlantSystem:
     B: Matrix = np.array(model.B if plant.B is None else plant.B)
     if any(disturbance.at == "state" for disturbance in plant.disturbances):
         B = np.hstack([B, np.eye(len(A))])
-    start = PlantStart(np.array(plant.initial_state), A, B, resolved.timing.plant_period_ns)
-    return plant.system.system(start)
+    x0, k = np.array(plant.initial_state), model.load_states
+    step_ns = resolved.timing.plant_period_ns
+    if k and not resolved.coverage.is_linear:
+        n = len(x0) - k
+        return LoadedSystem(plant.system.system(PlantStart(x0[:n], A[:n, :n], B[:n], step_ns)), x0[n:])
+    return plant.system.system(PlantStart(x0, A, B, step_ns))
+
+
+class LoadedSystem:
+    """A plant that is not linear, whose state x goes on with its constant loads d, (n + k,).
+
+    Loads other than 0 are added to the input.
+    """
+
+    def __init__(self, system: PlantSystem, load: Vector) -> None:
+        self._system, self._load = system, load
+
+    @property
+    def x(self) -> Vector:
+        """The state and the loads."""
+        return np.concatenate([self._system.x, self._load])
+
+    @property
+    def z(self) -> Vector:
+        """The system's own state."""
+        return self._system.z
+
+    def advance(self, u: Vector, t_ns: int, dt_ns: int) -> None:
+        """Advance the system under u + d."""
+        self._system.advance(u + self._load if self._load.any() else u, t_ns, dt_ns)
 
 
 def disturbance_of(resolved: Scenario) -> Disturbance | None:

@@ -303,7 +303,7 @@ def _part(resolved: Scenario) -> Sensor:
     return Sensor(
         loop.H,
         policy_of(resolved),
-        loop.x0 if starts_from_x0 else None,
+        loop.known_x0 if starts_from_x0 else None,
         inputs=loop.m,
         period=resolved.timing.measurement_period,
         setpoint=None if acknowledges else loop.setpoint,
@@ -320,7 +320,7 @@ def _with_draws_of(sensor: Sensor, resolved: Scenario) -> Sensor:
     schedule, observer = sensor.schedule, sensor.observer
     return replace(
         sensor,
-        x0=None if sensor.x0 is None else np.array(resolved.plant.initial_state),
+        x0=None if sensor.x0 is None else loop_of(resolved).known_x0,
         schedule=None if schedule is None else schedule.for_similar_loop(resolved),
         observer=None if observer is None else observer_of(resolved),
     )
@@ -338,7 +338,7 @@ def observer_of(resolved: Scenario) -> Observer | None:
     if settings is None:
         return None
     starts_from_x0 = resolved.network.initial_sync == "known_state"
-    x = loop.x0 if starts_from_x0 else np.zeros(loop.n)
+    x = loop.known_x0 if starts_from_x0 else np.zeros(loop.n)
     if settings.initial_estimate is not None:
         x = np.array(settings.initial_estimate)
     return Observer(

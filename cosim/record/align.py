@@ -100,7 +100,7 @@ def initial_track(scenario: Scenario) -> ControllerTrack:
     """The controller's state before its first input."""
     loop = loop_of(scenario)
     known = scenario.network.initial_sync == "known_state"
-    x_c = loop.x0 if known else np.zeros(loop.n)
+    x_c = loop.known_x0 if known else np.zeros(loop.n)
     return ControllerTrack(np.zeros(1, np.int64), x_c[None, :], np.full(1, NO_SEQUENCE))
 
 

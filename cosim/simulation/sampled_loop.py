@@ -151,8 +151,8 @@ class SampledLoop:
         """Return one run at its start: after the delivered first packet, if there is one."""
         known_start = self.known_start
         runs = self.empty(1)
-        x0 = self.matrices.x0
-        runs.x[0], runs.auxiliary[0], runs.step[0] = x0, self._first_auxiliary, -1
+        x0 = self.matrices.known_x0
+        runs.x[0], runs.auxiliary[0], runs.step[0] = self.matrices.x0, self._first_auxiliary, -1
         if known_start:
             runs.x_s[0] = runs.x_c[0] = x0
         observer = self.resolved.observer

@@ -93,16 +93,22 @@ static void correct_covariance(noack_observer *observer, int64_t n) {
             observer->P[i * n + j] = 0.5 * (next[i * n + j] + next[j * n + i]);
 }
 
-void noack_observer_correct(noack_observer *observer, int64_t n, const double *y) {
+/* x <- x + gain (y - C x). */
+static void correct_estimate(
+    noack_observer *observer, int64_t n, const double *gain, const double *y) {
     int64_t p = observer->p;
-    noack_observer_gain(observer, n);
     double *innovation = observer->scratch, *change = innovation + p;
     noack_product(p, n, observer->C, observer->x, innovation);
     for (int64_t k = 0; k < p; k++)
         innovation[k] = y[k] - innovation[k];
-    noack_product(n, p, observer->gain, innovation, change);
+    noack_product(n, p, gain, innovation, change);
     for (int64_t k = 0; k < n; k++)
         observer->x[k] += change[k];
+}
+
+void noack_observer_correct(noack_observer *observer, int64_t n, const double *y) {
+    noack_observer_gain(observer, n);
+    correct_estimate(observer, n, observer->gain, y);
     if (observer->kind == NOACK_KALMAN)
         correct_covariance(observer, n);
 }
@@ -119,6 +125,9 @@ void noack_observe(
     const double *inputs = message->vector + observer->p;
     for (int64_t before = steps; before > 0; before--)
         noack_observer_predict(observer, n, m, inputs + m * max_of(known - before, 0));
-    noack_observer_correct(observer, n, message->vector);
+    if (observer->t_ns < 0 && observer->first_gain != NULL)
+        correct_estimate(observer, n, observer->first_gain, message->vector);
+    else
+        noack_observer_correct(observer, n, message->vector);
     observer->t_ns = t_ns;
 }

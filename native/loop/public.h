@@ -203,6 +203,7 @@ typedef struct {
     double *Ad, *Bd, *C;
     double *Q, *R;   /* (n, n), (p, p) */
     double *gain;    /* (n, p) */
+    double *first_gain; /* (n, p) at the first measurement, of an estimate without a time; NULL: gain */
     double *x, *P;   /* the state: (n,), (n, n) */
     int64_t t_ns;    /* time of the estimate; -1: that of the first measurement */
     double *scratch; /* (3 n n + n p + p p + 2n + p,) */

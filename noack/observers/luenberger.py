@@ -5,7 +5,7 @@ the model, the error follows e(t_k) = (I − L C) Â^(T) e(t_(k−1)).
 """
 
 from collections.abc import Iterator
-from itertools import repeat
+from itertools import chain, repeat
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -28,6 +28,8 @@ class LuenbergerSettings(ObserverSettings):
     kind: Literal["luenberger"]
     gain: MatrixRows | None = None
     """L by rows, n x p."""
+    first_gain: MatrixRows | None = None
+    """The gain at the first measurement, n x p; by default as later."""
     poles_per_s: tuple[Pole, ...] | None = None
     """Instead of gain: n poles s of the error in continuous time; a pair [re, im] stands for re ±
     im·j. With L, (I − LC)e^(ÂT) has the eigenvalues e^(sT), where T is the time between
@@ -48,7 +50,9 @@ class LuenbergerSettings(ObserverSettings):
 
     def check(self, n: int, m: int, p: int, noise: NoiseVariances) -> None:
         super().check(n, m, p, noise)
-        require_shape(self.gain, "observer.gain", (n, p), "one row per state, a column per output")
+        for key in ("gain", "first_gain"):
+            reason = "one row per state, a column per output"
+            require_shape(getattr(self, key), f"observer.{key}", (n, p), reason)
         if self.poles_per_s is not None and len(self.poles) != n:
             raise ValueError(
                 f"observer.poles_per_s: expected {n} poles (one per state, a pair counts twice), "
@@ -81,8 +85,11 @@ class LuenbergerSettings(ObserverSettings):
         return np.array(self.gain)
 
     def gains(self, assumed: EstimationModel) -> Iterator[Matrix]:
-        return repeat(np.array(self.gain))
+        gain = np.array(self.gain)
+        return chain([gain if self.first_gain is None else np.array(self.first_gain)], repeat(gain))
 
     def fill(self, observer: CData, assumed: EstimationModel, x: Vector, memory: CoreMemory) -> None:
         super().fill(observer, assumed, x, memory)
-        memory.fill(observer, {"kind": core.NOACK_LUENBERGER, "gain": np.array(self.gain)})
+        first = None if self.first_gain is None else np.array(self.first_gain)
+        gains = {"gain": np.array(self.gain), "first_gain": first}
+        memory.fill(observer, {"kind": core.NOACK_LUENBERGER, **gains})

@@ -72,8 +72,7 @@ def current_parameters(scenario: Scenario) -> Table:
     trigger = scenario.trigger
     loss = scenario.network.loss.content()
     values = {key: getattr(trigger, key.removeprefix("trigger.")) for key in trigger_parameters(trigger)}
-    n, _ = scenario.model.dimensions
-    setpoint = list(scenario.controller.setpoint or [0.0] * n)
+    setpoint = list(scenario.controller.setpoint or [0.0] * scenario.model.plant_states)
     network = {
         LOSS: loss,
         MANSD: scenario.network.mansd,

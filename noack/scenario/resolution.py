@@ -7,7 +7,7 @@ trigger's policy, and the tables of its record.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import cycle
 from typing import Literal, NamedTuple
@@ -32,6 +32,7 @@ from noack.protocol.record_tables import (
     largest,
     tables,
 )
+from noack.scenario.loads import loaded_model, loaded_observer, loaded_plant, loaded_trigger
 from noack.scenario.overload import refuse_overload
 from noack.scenario.scenario import (
     Scenario,
@@ -71,6 +72,26 @@ class LoopMatrices:
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]
     setpoint: Vector | None = None  # x_r, (n,); None is 0
+    loads: int = 0  # Number of the last states that are unknown constant loads
+
+    @property
+    def known_x0(self) -> Vector:
+        """x(0) as sensor and controller may know it, (n,): the loads are 0."""
+        known = self.x0.copy()
+        known[self.n - self.loads :] = 0.0
+        return known
+
+    @property
+    def without_loads(self) -> "LoopMatrices":
+        """The loop of the plant's states alone: the loads are known and compensated."""
+        k = self.n - self.loads
+        return replace(
+            self, A_model=self.A_model[:k, :k], B_model=self.B_model[:k], K=self.K[:, :k],
+            H=self.H[:k, :k], A=self.A[:k, :k], B=self.B[:k], x0=self.x0[:k],
+            weight=None if self.weight is None else self.weight[:k, :k],
+            setpoint=None if self.setpoint is None else self.setpoint[:k],
+            state_names=self.state_names[:k], loads=0,
+        )  # fmt: skip
 
     @property
     def n(self) -> int:
@@ -229,6 +250,11 @@ def resolve_run(scenario: Scenario) -> ResolvedRun:
     sections, first = [], 0
     for section in scenario.loops:
         loop, first = resolved[first], first + section.count
+        if (
+            loop_scenario(scenario, section).model.load is not None
+        ):  # the processes draw the loads of each loop
+            sections.append(section)
+            continue
         tables = {"model": loop.model, "observer": loop.observer}
         update = {part: table.content() for part, table in tables.items() if table is not None}
         sections.append(section.model_copy(update=update))
@@ -260,15 +286,25 @@ def loop_named(scenario: Scenario, name: str | None) -> Scenario:
 def _resolved(loops: Sequence[Scenario]) -> list[Scenario]:
     """Return the resolved scenarios of loops that differ in their names and seeds only."""
     scenario, plant = loops[0], loops[0].plant
-    model = _explicit_model(scenario.model)
-    is_drawn = plant.initial_state_halfwidth is not None or plant.draw in ("uniform", "vertex")
-    plants = [_resolved_plant(loop, model) for loop in (loops if is_drawn else loops[:1])]
+    explicit = _explicit_model(scenario.model)
+    is_drawn = (
+        plant.initial_state_halfwidth is not None
+        or plant.load_halfwidth is not None
+        or plant.draw in ("uniform", "vertex")
+    )
+    plants = [_resolved_plant(loop, explicit) for loop in (loops if is_drawn else loops[:1])]
+    model = loaded_model(explicit)
     if scenario.mode == "model":
         A, B, K = np.array(model.A), np.array(model.B), np.array(model.gain)
         _require_finite("model", A + B @ K, K.T, scenario.timing.controller_period_ns)
-    observer = _observer(scenario, model)
+    shared: dict[str, object] = {"model": model, "plant": plants[0]}
+    if explicit.load is not None:
+        shared["trigger"] = loaded_trigger(explicit, scenario.trigger)
+        shared["observer"] = loaded_observer(scenario.model_copy(update=shared))
+    else:
+        shared["observer"] = _observer(scenario, model)
     return [
-        loop.model_copy(update={"model": model, "plant": own_plant, "observer": observer})
+        loop.model_copy(update={**shared, "plant": own_plant})
         for loop, own_plant in zip(loops, cycle(plants), strict=False)
     ]
 
@@ -290,7 +326,14 @@ def _resolved_plant(loop: Scenario, model: ModelSection) -> PlantSection:
     if loop.coverage.is_linear:
         update = {"draw": "given", "A": rows_of(A), "B": rows_of(B)}
     update |= {"initial_state": tuple(x0.tolist()), "initial_state_halfwidth": None}
-    return plant.model_copy(update=update)
+    resolved = plant.model_copy(update=update)
+    if model.load is None:
+        return resolved
+    load = np.zeros(model.loads) if plant.load is None else np.array(plant.load)
+    if plant.load_halfwidth is not None:
+        unit = stream(loop.seeds.initial_state, "load").uniform(-1, 1, len(load))
+        load += np.array(plant.load_halfwidth) * unit
+    return loaded_plant(loop.model_copy(update={"model": model}), resolved, load)
 
 
 def _explicit_model(model: ModelSection) -> ModelSection:
@@ -302,6 +345,8 @@ def _explicit_model(model: ModelSection) -> ModelSection:
             gain=model.gain or rows_of(named_model.K),
             state_names=model.state_names or named_model.state_names,
             input_names=model.input_names or named_model.input_names,
+            load=model.load,
+            hold=model.hold,
             allow_unstable=model.allow_unstable,
         )
     n, m = np.array(model.B).shape
@@ -386,6 +431,7 @@ def loop_of(resolved: Scenario) -> LoopMatrices:
         setpoint=None if setpoint is None else setpoint[0],
         state_names=model.state_names or (),
         input_names=model.input_names or (),
+        loads=model.load_states,
     )
     for array in vars(matrices).values():
         if isinstance(array, np.ndarray):
@@ -409,7 +455,7 @@ def setpoint_of(resolved: Scenario) -> tuple[Vector, Vector] | None:
     setpoint = resolved.controller.setpoint
     if not any(setpoint or ()):
         return None
-    x_r = np.array(setpoint)
+    x_r = np.concatenate([setpoint, np.zeros(resolved.model.load_states)])
     return x_r, input_at(*resolved.model.matrices, x_r)
 
 
@@ -421,8 +467,10 @@ def tables_of(resolved: Scenario) -> Mapping[str, np.dtype[np.void]]:
 
 def shape_of(resolved: Scenario) -> RecordShape:
     """Return the sizes of a loop's vectors in the record."""
-    n, m = resolved.model.dimensions
+    n, m = resolved.model.states, resolved.model.dimensions[1]
     disturbed = {disturbance.at for disturbance in resolved.plant.disturbances}
+    if resolved.plant.load_changes:
+        disturbed.add("state")
     return RecordShape(
         n,
         m,
@@ -432,6 +480,6 @@ def shape_of(resolved: Scenario) -> RecordShape:
         predictions=resolved.controller.predictions,
         disturbed_input="input" in disturbed,
         disturbed_state="state" in disturbed,
-        outputs=0 if resolved.observer is None else resolved.message_sizes.outputs,
+        outputs=resolved.message_sizes.outputs if resolved.estimates_state else 0,
         inputs_reported=resolved.message_sizes.inputs_reported,
     )

@@ -23,6 +23,7 @@ from noack.impairments.loss_models import Loss
 from noack.impairments.loss_models.trace import TraceLoss
 from noack.impairments.target_loss import number_of_target_loss, with_target_loss
 from noack.protocol.wire_format import MAX_DIMENSION
+from noack.scenario.loads import check_loads, noise_with_loads
 from noack.scenario.runtime_parameters import LOSS, put_settings, require_runtime_parameters
 from noack.scenario.scenario_tables import ScenarioTables
 from noack.scenario.sections import AnyController, AnyTrigger, NetworkSection
@@ -62,6 +63,7 @@ def check_sections(scenario: ScenarioTables) -> None:
     m = scenario.model.dimensions[1]
     require_length(scenario.controller.safe_input, "controller.safe_input", m, "one per input")
     check_setpoint(scenario)
+    check_loads(scenario)
     _check_observer(scenario)
     _check_watchdog(scenario)
     _check_use_of_gain(scenario)
@@ -94,7 +96,8 @@ def check_trigger(scenario: ScenarioTables) -> None:
 def check_setpoint(scenario: ScenarioTables) -> None:
     """Raise ValueError unless the model can rest at the set point and other settings allow one."""
     key, setpoint = "controller.setpoint", scenario.controller.setpoint
-    require_length(setpoint, key, scenario.model.dimensions[0], "one per state")
+    n = scenario.model.plant_states
+    require_length(setpoint, key, n, "one per state")
     if setpoint is None:
         return
     if scenario.protocol.acknowledges:
@@ -106,7 +109,8 @@ def check_setpoint(scenario: ScenarioTables) -> None:
             f'{key}: the plant\'s watchdog does not have it; use plant.watchdog.policy = "hold" or "zero"'
         )
     try:
-        input_at(*scenario.model.matrices, np.array(setpoint))
+        A, B = scenario.model.matrices
+        input_at(A[:n, :n], B[:n], np.array(setpoint))
     except ValueError as error:
         raise ValueError(f"{key}: {error}") from None
 
@@ -149,7 +153,7 @@ def _check_plant(scenario: ScenarioTables) -> None:
     require_shape(plant.B, "plant.B", (n, m), dimensions)
     for key in ("initial_state", "initial_state_halfwidth"):
         require_length(getattr(plant, key), f"plant.{key}", n, "one per state")
-    plant.system.check(n, m)
+    plant.system.check(scenario.model.plant_states, m)
     _check_disturbances(scenario)
     plant.measurement.check(n, dimensions)
 
@@ -170,14 +174,15 @@ def _check_disturbances(scenario: ScenarioTables) -> None:
 def _check_observer(scenario: ScenarioTables) -> None:
     (n, m), plant, observer = scenario.model.dimensions, scenario.plant, scenario.observer
     sizes = scenario.message_sizes
-    if observer is None:
+    if not scenario.estimates_state:
         if not plant.measurement.selects_all(n):
             raise ValueError(
                 "plant.measurement.C: without an [observer] the sensor has to measure every "
                 "state; give an [observer], or no C"
             )
         return
-    observer.check(n, m, sizes.outputs, plant.noise_variances(n, m))
+    if observer is not None:
+        observer.check(scenario.model.states, m, sizes.outputs, noise_with_loads(scenario))
     if sizes.measurement_entries > MAX_DIMENSION:
         raise ValueError(
             "plant.measure_every: with an observer a measurement carries y and the inputs of "
@@ -216,7 +221,7 @@ def _check_actuation_size(scenario: ScenarioTables) -> None:
     """Raise ValueError if the numbers of an actuation do not fit into a message."""
     if scenario.message_sizes.actuation_entries <= MAX_DIMENSION:
         return
-    n, m = scenario.model.dimensions
+    n, m = scenario.model.states, scenario.model.dimensions[1]
     carries_model = scenario.message_sizes.carries_model
     if (predictions := scenario.controller.predictions) > 1:
         state_text = f" and {n} of x_c" if carries_model else ""

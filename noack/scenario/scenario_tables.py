@@ -87,7 +87,7 @@ class ScenarioTables(ScenarioSection):
         return f"{words} for {self.controller.update_timeout_s:g} s, then {later}"
 
     def _rows(self) -> list[tuple[str, str]]:
-        n, m = self.model.dimensions
+        n, m = self.model.states, self.model.dimensions[1]
         rows = [
             ("scenario", self.name + (f": {self.description}" if self.description else "")),
             ("mode", self.between_updates),
@@ -115,6 +115,11 @@ class ScenarioTables(ScenarioSection):
     def _repr_html_(self) -> str:
         """Show the same as a table in notebooks."""
         return as_html(self._rows())
+
+    @property
+    def estimates_state(self) -> bool:
+        """Whether the sensor has an observer: it is given, or the model has loads."""
+        return self.observer is not None or self.model.load is not None
 
     @property
     def timing(self) -> "Timing":
@@ -296,7 +301,7 @@ class MessageSizes:
 
         Only an observer needs them; without an observer it is 0.
         """
-        if self.scenario.observer is None:
+        if not self.scenario.estimates_state:
             return 0
         return self.scenario.plant.measure_every * self.scenario.model.dimensions[1]
 
@@ -313,14 +318,14 @@ class MessageSizes:
     @property
     def actuation_entries(self) -> int:
         """Number of entries of an actuation: its inputs, with x_c if it carries the model state."""
-        n, m = self.scenario.model.dimensions
+        n, m = self.scenario.model.states, self.scenario.model.dimensions[1]
         return m * self.scenario.controller.predictions + n * self.carries_model
 
     def entries(self, flow: Flow) -> int:
         """Number of entries of a message of a flow."""
         return {
             Flow.MEASUREMENT: self.measurement_entries,
-            Flow.UPDATE: self.scenario.model.dimensions[0],
+            Flow.UPDATE: self.scenario.model.states,
             Flow.ACTUATION: self.actuation_entries,
             Flow.ACKNOWLEDGEMENT: 0,
         }[flow]
@@ -345,7 +350,7 @@ class TheoryCoverage:
     @property
     def knows_state(self) -> bool:
         """Whether the sensor measures the state itself, without noise."""
-        return self.scenario.observer is None and not self.scenario.plant.measurement.is_noisy
+        return not self.scenario.estimates_state and not self.scenario.plant.measurement.is_noisy
 
     @property
     def is_undisturbed(self) -> bool:

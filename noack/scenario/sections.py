@@ -31,13 +31,14 @@ from noack.impairments.loss_models.lossless import NoLoss
 from noack.observers.observer_settings import NoiseVariances, ObserverSettings
 from noack.plants.linear import NAMED_MODELS, LinearSettings, NamedModel, parameters_of
 from noack.plants.plant_settings import PlantSettings
-from noack.protocol.wire_format import Flow
+from noack.protocol.wire_format import MAX_DIMENSION, Flow
 from noack.settings.section import (
     Bounds,
     Deviations,
     HalfWidthRows,
     HalfWidths,
     MatrixRows,
+    NonNegative,
     RateHz,
     Row,
     ScenarioSection,
@@ -100,6 +101,15 @@ class ModelSection(ScenarioSection):
     """Names of the n states, for plots."""
     input_names: tuple[str, ...] | None = None
     """Names of the m inputs, for plots."""
+    load: Literal["input"] | MatrixRows | None = None
+    """Unknown constant loads, which the sensor's observer estimates and the input compensates.
+    input: one at each input, ẋ = Âx + B̂(u + d); or E by rows, n x k, for ẋ = Âx + B̂u + E d."""
+    hold: tuple[str, ...] | None = None
+    """Names of the states that stay at 0, or at the set point, under a load that the input cannot
+    cancel in every state; at most m."""
+    load_states: Annotated[int, Field(ge=0, le=MAX_DIMENSION)] = 0
+    """Number of the last states that are loads: a resolved scenario has them in its matrices, in
+    place of load."""
     allow_unstable: bool = False
     """Accept a gain with which the model's closed loop Â + B̂K is unstable."""
 
@@ -114,12 +124,34 @@ class ModelSection(ScenarioSection):
         require_shape(self.gain, "gain", (m, n), "one row per input, one column per state")
         require_length(self.state_names, "state_names", n, "one name per state")
         require_length(self.input_names, "input_names", m, "one name per input")
+        self._check_loads(n)
         self._require_stable()
         return self
+
+    def _check_loads(self, n: int) -> None:
+        if self.load_states and (self.load is not None or self.load_states >= n):
+            raise ValueError(
+                "load_states: it is for resolved scenarios, whose matrices have the loads; give load"
+            )
+        if self.load is not None and self.load != "input":
+            _, k = shape(self.load, "load")
+            require_shape(self.load, "load", (n, k), "one row per state, one column per load")
+        if self.hold is None:
+            return
+        if self.load is None:
+            raise ValueError("hold: it names the states that stay at 0 under a load; give load, too")
+        if self.state_names is None and self.name is None:
+            raise ValueError("hold: it names states; give state_names, too")
+        known = self.state_names or self.named.state_names
+        for name in self.hold:
+            if name not in known:
+                raise ValueError(f"hold: no state is named {name}; they are {', '.join(known)}")
 
     def _require_stable(self) -> None:
         (A, B), uses_named_gain = self.matrices, self.gain is None  # a named model's own gain
         K = self.named.K if uses_named_gain else np.array(self.gain)
+        n = self.plant_states
+        A, B, K = A[:n, :n], B[:n], K[:, :n]  # a constant load does not decay
         key = "parameters" if uses_named_gain else "gain"
         if not np.isfinite(_closed_loop(A, B, K)).all():
             raise ValueError(f"{key}: A + BK has infinite entries; check the units of A, B and K")
@@ -166,6 +198,23 @@ class ModelSection(ScenarioSection):
             n, m = self.named.B.shape
             return n, m
         return (len(self.B), len(self.B[0])) if self.B else (0, 0)
+
+    @property
+    def plant_states(self) -> int:
+        """Number of states that are not loads."""
+        return self.dimensions[0] - self.load_states
+
+    @property
+    def loads(self) -> int:
+        """Number of unknown constant loads."""
+        if self.load is None:
+            return self.load_states
+        return self.dimensions[1] if self.load == "input" else len(self.load[0])
+
+    @property
+    def states(self) -> int:
+        """Number of states of the model with its loads, which an update carries."""
+        return self.plant_states + self.loads
 
     @property
     def matrices(self) -> tuple[Matrix, Matrix]:
@@ -273,6 +322,15 @@ class WatchdogSection(ScenarioSection):
     x_c."""
 
 
+class LoadChange(ScenarioSection):
+    """A time from which on the plant's loads are others."""
+
+    at_s: NonNegative
+    """Simulated time; the load changes within the step of the plant that follows."""
+    load: Row
+    """The true loads from then on."""
+
+
 class PlantSection(ScenarioSection):
     """The true plant, unknown to sensor and controller, and how it is drawn."""
 
@@ -297,6 +355,12 @@ class PlantSection(ScenarioSection):
     """x(0), n entries."""
     initial_state_halfwidth: HalfWidths | None = None
     """x(0) is drawn uniformly within these distances of initial_state; n entries."""
+    load: Row | None = None
+    """The true loads of model.load, which sensor and controller do not know; by default 0."""
+    load_halfwidth: HalfWidths | None = None
+    """The loads are drawn uniformly within these distances of load."""
+    load_changes: tuple[LoadChange, ...] = ()
+    """Other true loads during the run, in the order of time."""
     rate_hz: RateHz = 500.0
     """Steps per second of simulated time."""
     measure_every: Annotated[int, Field(ge=1, le=1_000_000)] = 1

@@ -46,7 +46,7 @@ def settings_of(scenario: Scenario) -> Settings:
         A=loop.A, B=loop.B, A_model=loop.A_model, B_model=loop.B_model, K=loop.K,
         H=loop.A_model + loop.B_model @ loop.K if scenario.mode == "model" else 0 * loop.A,
         C=np.eye(loop.n) if C is None else np.array(C),
-        x0=np.array(scenario.plant.initial_state), known_state=known,
+        x0=np.array(scenario.plant.initial_state), known_x0=_known_x0(scenario) if known else None,
         plant_period_ns=_period_ns(scenario.plant.rate_hz), measure_every=scenario.plant.measure_every,
         controller_period_ns=_period_ns(scenario.controller.rate_hz),
         controller_phase_ns=timing.controller_phase_ns, horizon_ns=timing.horizon_ns,
@@ -64,6 +64,12 @@ def settings_of(scenario: Scenario) -> Settings:
             timing.acknowledgement_timeout_ns if scenario.network.protocol == "ack" else None
         ),
     )  # fmt: skip
+
+
+def _known_x0(scenario: Scenario) -> Array:
+    """Return x(0) without the loads, which nobody knows."""
+    x = np.array(scenario.plant.initial_state)
+    return np.where(np.arange(len(x)) < len(x) - scenario.model.load_states, x, 0.0)
 
 
 def rule_of(scenario: Scenario) -> Rule:
@@ -85,11 +91,12 @@ def observer_of(scenario: Scenario) -> Mapping[str, Array]:
     observer: Any = scenario.observer
     plant, (n, m) = scenario.plant, scenario.model.dimensions
     known = scenario.network.initial_sync == "known_state"
-    x = np.array(plant.initial_state) if known else np.zeros(n)
+    x = _known_x0(scenario) if known else np.zeros(n)
     if observer.initial_estimate is not None:
         x = np.array(observer.initial_estimate)
     if observer.kind == "luenberger":
-        return {"x": x, "L": np.array(observer.gain)}
+        first = observer.gain if observer.first_gain is None else observer.first_gain
+        return {"x": x, "L": np.array(observer.gain), "first_L": np.array(first)}
     variances = {"state": np.zeros(n), "input": np.zeros(m)}
     for disturbance in plant.disturbances:
         if disturbance.kind == "gaussian":

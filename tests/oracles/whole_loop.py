@@ -44,7 +44,7 @@ class Settings:
     H: Array  # (n, n)
     C: Array  # measured outputs, (p, n)
     x0: Array  # x(0)
-    known_state: bool  # sensor and controller start from x(0); else from the first update
+    known_x0: Array | None  # what sensor and controller know of it; None: nothing before the first update
     plant_period_ns: Fraction  # h
     measure_every: int  # steps of the plant per measurement
     controller_period_ns: Fraction
@@ -58,7 +58,8 @@ class Settings:
     timeout_input: str  # from then on: "safe" or "hold"
     watchdog: str  # "hold", "zero" or "model"
     watchdog_timeout_ns: int
-    observer: Mapping[str, Array] | None  # first x̂; L, or P, Q and R of a Kalman filter
+    # first x̂; L, and that of the first measurement if it is another; or P, Q and R of a Kalman filter
+    observer: Mapping[str, Array] | None
     actuations_cross: bool  # whether actuations cross the network
     acknowledgement_timeout_ns: int | None  # None: nothing is acknowledged, as in the paper
 
@@ -120,6 +121,7 @@ class Observer:
     def __init__(self, s: Settings, given: Mapping[str, Array]) -> None:
         self.C, self.given, self.x, self.P = s.C, given, given["x"], given.get("P")
         self.Ad, self.Bd = held_input(s.A_model, s.B_model, s.plant_period_ns)
+        self.first_L = given.get("first_L", given.get("L"))
 
     def predict(self, u: Array) -> None:
         """Advance the estimate by a step of the plant."""
@@ -131,7 +133,8 @@ class Observer:
         """Correct the estimate by a measurement; return it."""
         C, P = self.C, self.P
         if P is None:
-            L = self.given["L"]
+            L = self.first_L
+            self.first_L = self.given["L"]
         else:
             L = P @ C.T @ np.linalg.inv(C @ P @ C.T + self.given["R"])
             rest = np.eye(len(P)) - L @ C
@@ -207,13 +210,13 @@ class Sensor:
         (_, rule), *self.rules_to_come = s.rules
         self.trigger = Trigger(rule, s.A_model + BK, BK)
         self.observer = None if s.observer is None else Observer(s, s.observer)
-        self.started = s.known_state
-        self.x_s, self.t_ns = (s.x0 if s.known_state else 0 * s.x0), 0
+        self.started = s.known_x0 is not None
+        self.x_s, self.t_ns = (0 * s.x0 if s.known_x0 is None else s.known_x0), 0
         self.events = 0
         self.waiting: dict[int, Array] = {}  # updates without an acknowledgement
         self.wait_until_ns = 0
-        if s.known_state:
-            self.trigger.event(0, s.x0 - in_force(s.setpoints, 0))
+        if s.known_x0 is not None:
+            self.trigger.event(0, s.known_x0 - in_force(s.setpoints, 0))
 
     def measure(self, number: int, t_ns: int, y: Array, u: Array) -> Array | None:
         """Process a measurement y, with the inputs since the last one; return x at an event."""
@@ -276,8 +279,8 @@ class Controller:
 
     def __init__(self, s: Settings, rows: Rows) -> None:
         self.s, self.rows, self.model = s, rows, Model(s)
-        self.x_c, self.t_ns = (s.x0 if s.known_state else 0 * s.x0), 0
-        self.has_state, self.newest = s.known_state, NONE
+        self.x_c, self.t_ns = (0 * s.x0 if s.known_x0 is None else s.known_x0), 0
+        self.has_state, self.newest = s.known_x0 is not None, NONE
         self.update_ns, self.u = 0, 0 * s.safe_input  # the newest update's time, the last input
 
     def update(self, number: int, event_ns: int, x: Array) -> None:

@@ -37,7 +37,7 @@ def check_controller(run: ExplainedLoop) -> None:
     sent_x = dict(zip(sent["event"].tolist(), sent["x"], strict=True))
     knows_start = run.scenario.network.initial_sync == "known_state"
     n, m = run.loop.n, run.loop.m
-    state = _State(run.loop.x0 if knows_start else np.zeros(n), 0, 0, knows_start, np.zeros(m))
+    state = _State(run.loop.known_x0 if knows_start else np.zeros(n), 0, 0, knows_start, np.zeros(m))
     rows = sorted([*ticks, *received], key=lambda row: int(row["input"]))
     actuations = {int(row["sequence"]): row for row in run.rows(PLANT_ACTUATION)}
     period = run.scenario.timing.controller_period

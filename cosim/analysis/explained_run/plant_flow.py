@@ -116,4 +116,4 @@ def _first_estimate(run: ExplainedLoop) -> Vector:
     if observer is not None and observer.initial_estimate is not None:
         return np.array(observer.initial_estimate)
     knows_start = run.scenario.network.initial_sync == "known_state"
-    return run.loop.x0 if knows_start else np.zeros(run.loop.n)
+    return run.loop.known_x0 if knows_start else np.zeros(run.loop.n)

@@ -29,9 +29,9 @@ def check_events(run: ExplainedLoop) -> None:
     policy, knows_start = policy_of(run.scenario), run.scenario.network.initial_sync == "known_state"
     rule = policy if isinstance(policy, TriggerRule) else None
     guard = None if rule is None else _Guard(rule)
-    x_s, model_ns, events = (run.loop.x0, 0, 0) if knows_start else (None, 0, 0)
+    x_s, model_ns, events = (run.loop.known_x0, 0, 0) if knows_start else (None, 0, 0)
     if guard is not None and knows_start:
-        guard.start(0, _from_setpoint(run, run.loop.x0))
+        guard.start(0, _from_setpoint(run, run.loop.known_x0))
     for number, row in enumerate(run.rows(SENSOR_MEASUREMENT)):
         t_ns, x = int(row["t_ns"]), row["x"]
         if row["sequence"] != number or not is_moderate(x, row["x_s"]):

@@ -76,7 +76,7 @@ def loop_over_time(record: RunRecord, phase_ns: int) -> LoopOverTime:
         columns = intervals_of(aligned.t_ns + phase_ns, horizon_ns)
         delivered = aligned.since_delivery(record.scenario)
         steps = intervals_of(part.plant.t_ns + phase_ns, horizon_ns)
-        _update_largest(states, steps, row_norms(part.plant.x))
+        _update_largest(states, steps, row_norms(part.plant.x[:, : record.scenario.model.plant_states]))
         _update_largest(errors, columns[delivered], aligned.e_c_norm[delivered])
     return LoopOverTime(errors, states)
 

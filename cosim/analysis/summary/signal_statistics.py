@@ -181,11 +181,12 @@ class SignalStatistics:
         """Return norms of the state, of the errors, and of the residual of (I1)."""
         first, last, largest = None, None, None
         since_ns, points = setpoints_of(self._record)
+        states = self._record.scenario.model.plant_states
         for steps in self._record.batches(PLANT_STEP, ("t_ns", "x")):
             x = steps["x"]
             if points.any():
                 x = x - points[np.searchsorted(since_ns, steps["t_ns"], "right")]
-            norms = row_norms(x)
+            norms = row_norms(x[:, :states])
             first = float(norms[0]) if first is None else first
             last, largest = float(norms[-1]), _larger(largest, norms)
         scale = max(self._scale, float(np.finfo(float).tiny))

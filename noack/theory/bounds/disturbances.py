@@ -155,7 +155,7 @@ class EstimationError:
         if observer is None:
             return EstimationBound()
         known = self._resolved.network.initial_sync == "known_state"
-        initial_estimate = loop.x0 if known else np.zeros(loop.n)
+        initial_estimate = loop.known_x0 if known else np.zeros(loop.n)
         if observer.initial_estimate is not None:
             initial_estimate = np.array(observer.initial_estimate)
         start = (self._correction[0] @ (initial_estimate - loop.x0))[None, :, None]

@@ -51,7 +51,8 @@ class Assumption(NamedTuple):
 
 def assumptions(resolved: Scenario) -> list[Assumption]:
     """Return the paper's assumptions for a resolved scenario, with verdicts."""
-    loop, linear = loop_of(resolved), resolved.coverage.is_linear
+    whole_loop, linear = loop_of(resolved), resolved.coverage.is_linear
+    loop = whole_loop.without_loads
     checked = [_closed_loop(loop)] if linear else _not_linear(loop, resolved)
     if not resolved.coverage.is_decaying:
         why = f'the policy is "{resolved.trigger.policy}": not covered by the paper\'s theorems'
@@ -73,7 +74,7 @@ def assumptions(resolved: Scenario) -> list[Assumption]:
             f"{disturbance.kind} at the {disturbance.at}" for disturbance in resolved.plant.disturbances
         )
         checked.append(_violated("the plant is not disturbed", "eq:plant", f"{kinds}: {_NOT_BY_THEOREMS}"))
-    return checked + _estimated(loop, resolved)
+    return checked + _estimated(whole_loop, resolved)
 
 
 def violations_of_theorem_2(resolved: Scenario) -> list[str]:

@@ -175,7 +175,7 @@ def check_identity(record: RunRecord) -> int:
             for rows in (measured, deliveries, steps)
         )
         last = max([*step, *delivery], key=lambda row: row["input"], default=None)
-        if last is None or not (len(row) and (settings.known_state or len(delivery))):
+        if last is None or not (len(row) and (settings.known_x0 is not None or len(delivery))):
             continue  # no common start of the two models yet
         received = max(deliveries["sequence"][deliveries["now_ns"] <= now_ns], default=NONE)
         x_s = row["x_s" if row["event"][0] == NONE else "x"][0]

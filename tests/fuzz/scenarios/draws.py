@@ -16,6 +16,7 @@ FILE = "scenario.toml"
 _LOOP_SEEDS = ("plant", "initial_state", "disturbance", "noise")
 
 NEVER_DRAWN: Mapping[str, str] = {
+    "ModelSection.load_states": "of resolved scenarios, which have the loads in their matrices",
     "PythonControllerSettings.sha256": "the user's own copy in a run directory",
     "PythonPlantSettings.sha256": "the user's own copy in a run directory",
     "PythonTriggerSettings.sha256": "the user's own copy in a run directory",

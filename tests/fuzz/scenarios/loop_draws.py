@@ -76,7 +76,25 @@ def loop(of: Chances, *, acknowledged: bool) -> tuple[Table, Model]:
     _measurement(of, model, plant, outputs, observed="observer" in content)
     content["trigger"] = trigger(of, model, _measured_s(plant))
     of.put(content, 0.8, "controller", lambda: controller(of, model, plant, acknowledged=acknowledged))
+    if of.chance(0.15) and "observer" not in content:
+        loads(of, model, content)
     return content, model
+
+
+def loads(of: Chances, model: Model, content: Table) -> None:
+    """Add unknown loads to a loop without an observer."""
+    table, plant, k = content["model"], content["plant"], model.m
+    table["load"] = "input"
+    if of.flag():
+        k = 1
+        table["load"] = [[entry] for entry in of.row(model.n)]
+        table["state_names"] = [f"state {index}" for index in range(model.n)]
+        table["hold"] = table["state_names"][:1]
+    of.put(plant, 0.8, "load", lambda: of.row(k, 0.5))
+    of.put(plant, 0.3, "load_halfwidth", lambda: of.positives(k, 0.5))
+    change = {"at_s": of.between(0.1, 0.9), "load": of.row(k, 0.5)}
+    of.put(plant, 0.3, "load_changes", lambda: [change])
+    content["trigger"] = {"policy": "decaying", "beta": 0.5, "alpha_per_s": 0.2, "floor": 0.05}
 
 
 def _nonlinear(of: Chances) -> tuple[Table, Model]:
@@ -279,6 +297,7 @@ def observer(of: Chances, model: Model, plant: Table, outputs: int) -> Table:
     table["kind"] = "luenberger"
     if of.chance(0.2):
         table["gain"] = (0.5 * np.eye(n)[:, :outputs]).tolist()
+        of.put(table, 0.5, "first_gain", lambda: np.eye(n)[:, :outputs].tolist())
     elif n >= 2 and of.chance(0.4):
         table["poles_per_s"] = [[-8.0, 3.0], *(-10.0 - 2 * index for index in range(n - 2))]
     else:
