@@ -23,7 +23,8 @@ SCENARIOS = Path(__file__).parents[2] / "scenarios"
 NAMES = sorted(file.stem for file in SCENARIOS.glob("*.toml"))
 REFUSED = {
     "cart_pole", "dc_motor", "dc_motor_load", "four_tank", "kinematic_car", "lane_acknowledged",
-    "lane_actuation_loss", "lane_crosswind_load", "lane_python_trigger", "model_predictive", "pendulum_observed", "quadrotor_hover", "saturated_lqr",
+    "lane_actuation_loss", "lane_crosswind_load", "lane_python_trigger",
+    "model_predictive", "pendulum_observed", "quadrotor_hover", "saturated_lqr",
     "selivanov_switching", "sine_pendulum", "tabuada_dynamic",
 }  # fmt: skip
 

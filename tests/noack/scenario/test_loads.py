@@ -12,7 +12,7 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.loads import load_gains
-from noack.scenario.resolution import loop_of, resolve, setpoint_of
+from noack.scenario.resolution import loop_of, resolve, resolve_run, setpoint_of
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from noack.settings.section import Table
@@ -206,7 +206,7 @@ def test_several_loops_have_loads_of_their_own() -> None:
         "plant": MASS["plant"] | {"load": [0.5]},
         "loops": loops,
     }  # type: ignore[operator]
-    run = simulate_loops(validate(content, "mass"))
+    run = simulate_loops(resolve_run(validate(content, "mass")))
     assert [loop[PLANT_STEP]["x"][0][2] for loop in run.loops] == [0.5, 0.5, 0.1]
 
 
