@@ -19,7 +19,7 @@ from noack_check.check import RejectedError
 from noack_check.growth import prove_growth, read_periodic_loop
 from noack_check.keys import RefusedError, Table
 from noack_check.proof import prove
-from noack_check.scenario import read_loop
+from noack_check.scenario import output_names, read_loop
 from noack_check.sentences import assumptions, growth_sentences, sentences
 
 _PLANTS = {"own": "its plant", "box": "all plants of its uncertainty box"}
@@ -93,7 +93,7 @@ def check_file(file: Table, given: Table | None) -> Iterator[str]:
             yield from (f"PROVED {of}, nothing late: {sentence}" for sentence in growth_sentences(growth))
             continue
         loop = read_loop(scenario, box=plants == "box", ideal=conditions == "ideal")
-        for sentence in sentences(prove(loop, document)):
+        for sentence in sentences(prove(loop, document), output_names(scenario)):
             yield f"PROVED {of}: {sentence}"
         yield f"       if there are {assumptions(scenario, loop)}"
 

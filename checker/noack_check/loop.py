@@ -90,6 +90,13 @@ class Loop(NamedTuple):
     losses: int  # most consecutive losses, M − 1
     times: Times
     observer: Observer | None = None
+    outputs: arb_mat = zeros(0, 0)
+    """The rows of C in y = Cx, (p, n); without rows y is x."""
+
+    @property
+    def output_rows(self) -> arb_mat:
+        """C, (p, n)."""
+        return self.outputs if self.outputs.nrows() else identity(self.n)
 
     @property
     def n(self) -> int:
@@ -128,9 +135,10 @@ class Loop(NamedTuple):
         shapes = {
             "A": (n, n), "B": (n, m), "half_A": (n, n), "half_B": (n, m), "model_A": (n, n),
             "model_B": (n, m), "gain": (m, n), "weight": (n, n), "start": (n, 1), "pushes": (n, k),
-            "noise": (n, self.noise.ncols()),
+            "noise": (n, self.noise.ncols()), "outputs": (self.output_rows.nrows(), n),
         }  # fmt: skip
-        matrices = {name: getattr(self, name) for name in shapes} | {
+        matrices = {name: getattr(self, name) for name in shapes if name != "outputs"} | {
+            "outputs": self.output_rows,
             "rule.positive": rule.positive, "rule.negative": rule.negative,
         }  # fmt: skip
         if self.observer is not None:

@@ -592,7 +592,7 @@ class Model:
     def output(self, name: str, place: Location) -> list[tuple[arb_mat, Flow | None]]:
         """Return C of an output in a location, for each flow if the output depends on the flow.
 
-        "x" is x, "x[i]" one of its entries, "e_s" and "e_c" are W e_s and W e_c, and
+        "x" is x, "y[j]" the j-th output, "e_s" and "e_c" are W e_s and W e_c, and
         "drift" is W (ẋ − H x), by which the sensor's error grows: ė = He − (ẋ − Hx). The bound of the
         drift is one from the first input on.
         """
@@ -605,8 +605,8 @@ class Model:
             return [(loop.weight * (self.e + self.w), None)]
         if name == "drift":
             return [(self._drift(flow.matrix) - loop.weight * loop.H * self.x, flow) for flow in place.flows]
-        index = int(name.removeprefix("x[").removesuffix("]"))
-        return [(rows_of(self.x, [index]), None)]
+        index = int(name.removeprefix("y[").removesuffix("]"))
+        return [(rows_of(loop.output_rows, [index]) * self.x, None)]
 
     def _drift(self, motion: arb_mat) -> arb_mat:
         return self.loop.weight * rows_of(motion, range(self.loop.n))

@@ -288,7 +288,7 @@ def prove_bound(loop: Loop, rate: arb, entry: Mapping[str, object], assumed: Ass
         pieces=assumed.pieces,
     )
     output, starts = str(entry.get("output")), bool(entry.get("from_start", True))
-    if output not in {"x", "e_s", "e_c", "drift", *(f"x[{i}]" for i in range(loop.n))}:
+    if output not in {"x", "e_s", "e_c", "drift", *(f"y[{j}]" for j in range(loop.output_rows.nrows()))}:
         raise RejectedError(f"output: {output[:50]!r} is none of the loop's")
     if output == "e_s" and model.is_periodic:
         raise RejectedError("e_s: the model of a periodic rule has no error of an update that is lost")

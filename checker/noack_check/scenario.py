@@ -72,6 +72,7 @@ def read_loop(resolved: Table, *, box: bool, ideal: bool) -> Loop:
         sizes=(arb(1),) * len(pushes),
         noise=_noise(resolved, n),
         observer=_observer(resolved, plants, ideal=ideal),
+        outputs=_outputs(resolved, n),
         losses=_losses(_table(resolved, "network")),
         times=_times(resolved, trigger, ideal=ideal),
     )
@@ -105,6 +106,23 @@ def _require_shapes(resolved: Table, n: int, m: int) -> None:
         [[int(i == j) for j in range(n)] for i in range(n)],
     ):
         raise RefusedError("plant.measurement.C: the sensor does not measure the state")
+
+
+def _outputs(resolved: Table, n: int) -> arb_mat:
+    """Return the rows of the outputs, (p, n); (0, n): they are the states."""
+    rows = [_row(entry, "outputs.row") for entry in _tables(resolved, "outputs")]
+    if any(len(row) != n for row in rows):
+        raise RefusedError(f"outputs.row: not {n} numbers")
+    return matrix(rows) if rows else zeros(0, n)
+
+
+def output_names(resolved: Table) -> list[str]:
+    """Return the names of a resolved scenario's outputs, which by default are the states."""
+    entries = _tables(resolved, "outputs")
+    names = [entry.get("name") for entry in entries] or _table(resolved, "model").get("state_names", [])
+    if not isinstance(names, list) or not all(isinstance(name, str) and name.isprintable() for name in names):
+        raise RefusedError("outputs.name: not a printable name")
+    return names
 
 
 def _losses(network: Table) -> int:

@@ -1,6 +1,6 @@
 """What was proven, in words; decimals are rounded so that the sentences stay true."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 
 from flint import arb
@@ -39,11 +39,16 @@ def assumptions(scenario: Mapping[str, object], loop: Loop) -> str:
     return ", ".join(parts)
 
 
-def sentences(proof: Proof) -> Iterator[str]:
-    """Yield each bound of a proof; of two bounds of the same output the smaller one."""
+def sentences(proof: Proof, outputs: Sequence[str] = ()) -> Iterator[str]:
+    """Yield each bound of a proof; of two bounds of the same output the smaller one.
+
+    Args:
+        proof: what was proven.
+        outputs: the names of the outputs; by default y_1, y_2, ….
+    """
     for bound in smallest_bounds(proof):
         from_then = "" if proof.is_quiet or bound.output != "e_c" else ", from the first input on"
-        yield f"{norm(bound.output)} ≤ {formula(bound, proof.rate)}{from_then}"
+        yield f"{norm(bound.output, outputs)} ≤ {formula(bound, proof.rate)}{from_then}"
     if proof.inter_event is not None and proof.inter_event > 0:
         which = "" if proof.is_quiet else " after the first input"
         exception = _exception(proof) if proof.is_quiet else ""
@@ -67,11 +72,12 @@ def growth_sentences(growth: Growth) -> Iterator[str]:
         )
 
 
-def norm(output: str) -> str:
-    """Return the norm of an output as a symbol: |x_1| of "x[0]"."""
+def norm(output: str, outputs: Sequence[str] = ()) -> str:
+    """Return the norm of an output as a symbol: |angle| of "y[0]", if its name is known."""
     if output in _NAMES:
         return _NAMES[output]
-    return f"|x_{int(output.removeprefix('x[').removesuffix(']')) + 1}|"
+    index = int(output.removeprefix("y[").removesuffix("]"))
+    return f"|{outputs[index] if outputs else f'y_{index + 1}'}|"
 
 
 def _exception(proof: Proof) -> str:

@@ -148,13 +148,13 @@ def find_statement(
 ) -> WitnessedStatement:
     """Search for the witness of one statement of a resolved scenario: its plants and conditions.
 
-    Where disturbances or noise act, ‖x‖ and each state have bounds in the limit t → ∞, too, under the
-    schedule.
+    The outputs that the scenario states have bounds under the schedule. Where disturbances or noise act, ‖x‖
+    and each output have bounds in the limit t → ∞, too.
     """
     try:
         loop = read_loop(content, box=plants == "box", ideal=conditions == "ideal")
-        has_limit = bool(loop.sizes or loop.noise.ncols()) and conditions == "schedule"
-        witness = known_or_found(loop, progress, most_work, has_limit=has_limit)
+        has_outputs = conditions == "schedule"
+        witness = known_or_found(loop, progress, most_work, has_outputs=has_outputs)
     except (RefusedError, NoWitnessError) as error:
         return WitnessedStatement(plants, conditions, None, None, str(error))
     document = {"plants": plants, "conditions": conditions, **witness.document}
@@ -163,16 +163,17 @@ def find_statement(
 
 
 def known_or_found(
-    loop: Loop, progress: Callable[[float], None], most_work: float, *, has_limit: bool = False
+    loop: Loop, progress: Callable[[float], None], most_work: float, *, has_outputs: bool = True
 ) -> Witness:
     """Return the witness of a loop that was found earlier, or search for it, unless the limit of work is 0.
 
     Raises:
         NoWitnessError: none was found.
     """
-    outputs = ("x", "e_c")
-    states = ("x", *(f"x[{i}]" for i in range(loop.n))) if has_limit else ()
-    wanted = (*outputs, *(f"{output} in the limit" for output in states))
+    rows = tuple(f"y[{j}]" for j in range(loop.output_rows.nrows())) if has_outputs else ()
+    outputs = ("x", "e_c", *(rows if loop.outputs.nrows() else ()))
+    ultimate = ("x", *rows) if has_outputs and (loop.sizes or loop.noise.ncols()) else ()
+    wanted = (*outputs, *(f"{output} in the limit" for output in ultimate))
     store = WitnessStore(loop)
     known = store.read(wanted, most_work)
     if known is not None and known.document is None:
@@ -183,7 +184,7 @@ def known_or_found(
     if not most_work:
         raise NoWitnessError("no witness was found earlier")
     try:
-        witness = find_witness(loop, outputs, ultimate=states, progress=progress, most_work=most_work)
+        witness = find_witness(loop, outputs, ultimate=ultimate, progress=progress, most_work=most_work)
     except NoWitnessError as error:
         store.write(StoredSearch(None, str(error)), wanted, most_work)
         raise

@@ -13,6 +13,7 @@ from cosim.analysis.margin_search import MarginResult
 from cosim.analysis.mean_cost import CostUnder, MeanCost
 from cosim.analysis.tried_settings import TriedSettings
 from cosim.output.document import Block, Document, Sentence, SentenceRole
+from cosim.output.guarantee_sentence import guarantee_sentence
 from cosim.output.result_tables import ResultTable, Tone
 from cosim.output.run_document import assumption_table
 from noack.core.linear_systems import Matrix
@@ -29,7 +30,11 @@ from noack.theory.margins.loss_margin import Stability
 def certificate_document(results: Certificates, chosen: Certificates | None = None) -> Document:
     """Return the tables, and what is certified in a norm that noack chose instead."""
     tables: list[Block] = list(certificate_tables(results))
-    blocks = [*_on_nonlinear(results), *(tables[:1] or [_prose(f"{_title(results)}: none")])]
+    blocks = [
+        *_first_sentence(results),
+        *_on_nonlinear(results),
+        *(tables[:1] or [_prose(f"{_title(results)}: none")]),
+    ]
     blocks += _notes(results)
     if any(results.setpoint or ()):
         blocks.append(
@@ -62,6 +67,12 @@ def certificate_document(results: Certificates, chosen: Certificates | None = No
         ]
     data = results.to_json() | {"in_chosen_norm": chosen and chosen.to_json()}
     return Document(title=results.scenario.name, data=data, blocks=blocks)
+
+
+def _first_sentence(results: Certificates) -> Iterator[Sentence]:
+    """Yield what is guaranteed, in one sentence."""
+    if (text := guarantee_sentence(results)) is not None:
+        yield Sentence(text=text, role=SentenceRole.VERDICT, tone=Tone.GOOD, is_prose=True)
 
 
 def _prose(text: str) -> Sentence:

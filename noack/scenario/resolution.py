@@ -33,6 +33,7 @@ from noack.protocol.record_tables import (
     tables,
 )
 from noack.scenario.loads import loaded_model, loaded_observer, loaded_plant, loaded_trigger
+from noack.scenario.outputs import LoopOutput
 from noack.scenario.overload import refuse_overload
 from noack.scenario.scenario import (
     Scenario,
@@ -73,6 +74,7 @@ class LoopMatrices:
     input_names: tuple[str, ...]
     setpoint: Vector | None = None  # x_r, (n,); None is 0
     loads: int = 0  # Number of the last states that are unknown constant loads
+    outputs: tuple[LoopOutput, ...] = ()
 
     @property
     def known_x0(self) -> Vector:
@@ -91,6 +93,7 @@ class LoopMatrices:
             weight=None if self.weight is None else self.weight[:k, :k],
             setpoint=None if self.setpoint is None else self.setpoint[:k],
             state_names=self.state_names[:k], loads=0,
+            outputs=tuple(output._replace(row=output.row[:k]) for output in self.outputs),
         )  # fmt: skip
 
     @property
@@ -303,6 +306,12 @@ def _resolved(loops: Sequence[Scenario]) -> list[Scenario]:
         shared["observer"] = loaded_observer(scenario.model_copy(update=shared))
     else:
         shared["observer"] = _observer(scenario, model)
+    n = model.dimensions[0]
+    if scenario.outputs is not None:
+        shared["outputs"] = tuple(
+            section.model_copy(update={"row": (*output.row, *(0.0,) * (n - len(output.row)))})
+            for section, output in zip(scenario.outputs, scenario.loop_outputs(), strict=True)
+        )
     return [
         loop.model_copy(update={**shared, "plant": own_plant})
         for loop, own_plant in zip(loops, cycle(plants), strict=False)
@@ -432,6 +441,7 @@ def loop_of(resolved: Scenario) -> LoopMatrices:
         state_names=model.state_names or (),
         input_names=model.input_names or (),
         loads=model.load_states,
+        outputs=resolved.loop_outputs(),
     )
     for array in vars(matrices).values():
         if isinstance(array, np.ndarray):

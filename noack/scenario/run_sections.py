@@ -169,6 +169,8 @@ class LoopSection(ScenarioSection):
     """Keys of the loop's observer."""
     controller: Table | None = None
     """Keys of the loop's controller."""
+    outputs: list[Table] | None = None
+    """The loop's outputs."""
     seeds: LoopSeeds = LoopSeeds.model_construct()
 
     @model_validator(mode="before")

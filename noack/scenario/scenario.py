@@ -45,7 +45,7 @@ class Scenario(ScenarioTables):
         return schema
 
 
-PARTS = ("mode", "model", "plant", "trigger", "observer", "controller")
+PARTS = ("mode", "model", "plant", "trigger", "observer", "controller", "outputs")
 """Keys of a scenario that each loop has for itself."""
 LOOP_NEEDS = ("model", "plant", "trigger")
 """Those without which there is no loop."""
@@ -136,6 +136,8 @@ def loop_scenario(scenario: Scenario, section: LoopSection) -> Scenario:
     if section.scenario is not None:
         loop = _with_parts(loop, section.scenario, PARTS, "scenario.")
     content: Table = {} if section.mode is None else {"mode": section.mode}
+    if section.outputs is not None:
+        content["outputs"] = section.outputs
     for part, kinds in _KINDS.items():
         if (entry_table := getattr(section, part)) is None:
             continue

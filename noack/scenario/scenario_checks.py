@@ -70,6 +70,7 @@ def check_sections(scenario: ScenarioTables) -> None:
     _check_actuation_size(scenario)
     check_trigger(scenario)
     check_target_loss(scenario)
+    scenario.loop_outputs()
 
 
 def check_target_loss(scenario: ScenarioTables) -> None:

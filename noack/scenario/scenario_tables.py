@@ -15,8 +15,10 @@ from noack.core.errors import CallerError
 from noack.core.number_format import as_html, as_text
 from noack.core.periods import Period, exact_ns, period_of, simplest_fraction
 from noack.plants.linear import LinearSettings
+from noack.protocol.record_tables import entry_names
 from noack.protocol.roles import PROTOCOLS, LoopProtocol
-from noack.protocol.wire_format import Flow
+from noack.protocol.wire_format import MAX_DIMENSION, Flow
+from noack.scenario.outputs import LoopOutput, OutputSection, loop_outputs
 from noack.scenario.run_sections import (
     NAME_PATTERN,
     CertificateSection,
@@ -66,6 +68,9 @@ class ScenarioTables(ScenarioSection):
     the measurement must be the state."""
     network: NetworkSection
     controller: AnyController = LinearFeedbackSettings.model_construct()
+    outputs: Annotated[tuple[OutputSection, ...], Field(min_length=1, max_length=MAX_DIMENSION)] | None = None
+    """The outputs that bounds and figures are about, with units and allowed errors: by default the
+    states."""
     certificate: CertificateSection = CertificateSection.model_construct()
     clocks: ClocksSection | None = None
     """The clocks of a run on several hosts."""
@@ -76,6 +81,12 @@ class ScenarioTables(ScenarioSection):
     seeds: SeedsSection = SeedsSection.model_construct()
     ports: PortsSection = PortsSection.model_construct()
     realtime: RealtimeSection = RealtimeSection.model_construct()
+
+    def loop_outputs(self) -> tuple[LoopOutput, ...]:
+        """Return the outputs; raise ValueError, with the key, if a row does not fit."""
+        names = self.model.state_names or (self.model.name and self.model.named.state_names)
+        n = self.model.dimensions[0]
+        return loop_outputs(self.outputs, names or entry_names("x", n), self.plant.system.states)
 
     @property
     def between_updates(self) -> str:

@@ -41,6 +41,7 @@ class _Plant:
         signs = [rng.choice([-1.0, 0.0, 1.0], floats(M).shape) for M in (loop.half_A, loop.half_B)]
         self.A = floats(loop.A) + signs[0] * floats(loop.half_A)
         self.B = floats(loop.B) + signs[1] * floats(loop.half_B)
+        self.outputs = floats(loop.output_rows)
         self.pushes = floats(loop.pushes) * np.array([float(size.mid()) for size in loop.sizes])
         self.step = functools.lru_cache(4096)(self._step)
         self.predict = functools.lru_cache(4096)(lambda dt: np.asarray(expm(self.H * dt)))
@@ -174,7 +175,7 @@ def _compare(
     motion = plant.A @ x + plant.B @ u + plant.pushes @ np.array(signs)
     values = {"x": x, "e_s": W @ (xs - x), "e_c": W @ (xc - x), "drift": W @ (motion - plant.H @ x)}
     for output, decaying, constant in bounds:
-        value = values[output] if output in values else np.array([x[int(output[2:-1])]])
+        value = values[output] if output in values else plant.outputs[[int(output[2:-1])]] @ x
         added = np.add if output in {"e_s", "e_c"} else np.hypot
         size, bound = float(np.linalg.norm(value)), float(added(decaying * np.exp(-rate * t), constant))
         if size > bound * (1 + _ROUNDING):

@@ -26,7 +26,7 @@ from tests.checker.test_witnesses import SCHEDULE, double_integrator
 
 Document = dict[str, Any]
 Rng = np.random.Generator
-_OUTPUTS = ("x", "x[1]", "e_s", "e_c")
+_OUTPUTS = ("x", "y[1]", "e_s", "e_c")
 NAMES = ("plain", "pushed", "errors", "later", "noisy", "observed")
 
 
@@ -39,6 +39,7 @@ def pushed() -> Loop:
         pushes=matrix([[0.0], [1.0]]),
         sizes=(arb(0.01),),
         losses=1,
+        outputs=matrix([[1.0, 0.0], [0.5, -2.0]]),
     )
 
 
@@ -309,7 +310,7 @@ def is_true_or_rejected(loop: Loop, document: Document, seed: int) -> bool:
     rng = np.random.default_rng(seed)
     if "errors" not in document and not document["later"] and loop.observer is None:
         for entry in document["bounds"]:
-            assert entry["output"] == "x[1]" or Forms(loop, document["rate"], entry).holds(
+            assert entry["output"] == "y[1]" or Forms(loop, document["rate"], entry).holds(
                 entry["output"], rng
             )
     for _ in range(3):

@@ -16,7 +16,7 @@ from noack.theory.certificates.conditions import about_setpoint, allowed_conditi
 from noack.theory.certificates.refusals import refusals_at_setpoint
 from noack_check.keys import RefusedError, key_table, refusals
 from noack_check.loop import Loop
-from noack_check.scenario import read_loop
+from noack_check.scenario import output_names, read_loop
 from tests.helpers.resolved_tables import first_loop, resolved_tables, tables_of
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
@@ -323,3 +323,16 @@ def test_the_keys_that_the_table_calls_used_are_those_that_are_read() -> None:
     refused = {key for key, (row, *_) in key_table().rows.items() if row.use == "refused"}
     inner = {key.removesuffix(".*") for key in key_table().rows}
     assert {key for key in read if key in inner} - refused - used <= {"network.impairments"}
+
+
+def test_the_outputs_of_a_scenario_are_rows_with_names() -> None:
+    tables = resolved_tables("unstable_pendulum", 'outputs=[{name="tip", row=[0.5, 0.1]}, {name="rate"}]')
+    loop = read_loop(tables, box=False, ideal=False)
+    np.testing.assert_array_equal(floats(loop.output_rows), [[0.5, 0.1], [0.0, 1.0]])
+    assert output_names(tables) == ["tip", "rate"]
+    states = resolved_tables("unstable_pendulum")
+    np.testing.assert_array_equal(floats(read_loop(states, box=False, ideal=False).output_rows), np.eye(2))
+    assert output_names(states) == ["angle", "rate"]
+    tables["outputs"][0]["row"] = [0.5]
+    with pytest.raises(RefusedError, match=r"outputs\.row: not 2 numbers"):
+        read_loop(tables, box=False, ideal=False)

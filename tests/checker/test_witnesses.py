@@ -14,6 +14,7 @@ from noack_check.check import RejectedError
 from noack_check.loop import Loop, Rule, Times
 from noack_check.proof import prove
 from noack_check.sentences import assumptions
+from tests.checker.runs import exceeded
 
 IDEAL = Times(fmpq(0), fmpq(0), fmpq(0), fmpq(0), fmpq(0))
 SCHEDULE = Times(fmpq(1, 100), fmpq(1, 100), fmpq(1, 50), fmpq(3, 100), fmpq(1, 50))
@@ -192,12 +193,29 @@ def test_without_a_bound_of_the_drift_tests_say_how_many_events_come_while_an_up
 def test_in_the_limit_bounds_are_those_of_disturbances_and_the_floor() -> None:
     push = matrix([[0.0], [0.1]])
     loop = double_integrator(floor=0.05)._replace(pushes=push, sizes=(arb(1),))
-    witness = find_witness(loop, ("x",), ultimate=("x", "x[1]"))
+    witness = find_witness(loop, ("x",), ultimate=("x", "y[1]"))
     whole, ultimate, rate, *_ = witness.proof.bounds
     assert (whole.from_start, ultimate.from_start, rate.from_start) == (True, False, False)
     assert 0.1 < float(ultimate.constant.mid()) < 0.7
     assert ultimate.constant <= whole.constant
     assert rate.constant < ultimate.constant
+
+
+def test_an_output_is_bounded_more_tightly_than_by_the_norm_of_the_state() -> None:
+    """The state turns: where both entries have opposite signs their sum is small."""
+    loop = double_integrator()._replace(outputs=matrix([[1.0, 1.0], [0.0, 3.0]]))
+    witness = find_witness(loop, ("x", "y[0]", "y[1]"))
+    sizes = bounds_of(witness)
+    assert sizes["y[0]"] < 0.9 * math.sqrt(2) * sizes["x"]
+    assert sizes["y[1]"] < 0.9 * 3 * sizes["x"]
+    rng = np.random.default_rng(5)
+    assert not [miss for _ in range(20) for miss in exceeded(loop, witness.proof, rng, 8.0)]
+    entry = next(e for e in witness.document["bounds"] if e["output"] == "y[1]")
+    with pytest.raises(RejectedError, match=r"y\[2\]"):
+        prove(loop, {**witness.document, "bounds": [{**entry, "output": "y[2]"}]})
+    larger = loop._replace(outputs=matrix([[1.0, 1.0], [0.0, 3.1]]))
+    with pytest.raises(RejectedError, match=r"y\[1\]"):
+        prove(larger, witness.document)
 
 
 def test_what_is_assumed_of_events_without_a_least_time_is_said() -> None:

@@ -18,6 +18,7 @@ from noack.core.linear_systems import Propagator
 from noack.core.number_format import at_most
 from noack.core.row_operations import row_norms
 from noack.theory.certificates.certified_bounds import Constant, ScenarioCertificate, envelope_formula
+from noack.theory.certificates.output_bounds import OutputBound, escaped, output_bounds
 from noack.theory.coverage import refusals
 
 _LEAST_MARGIN, _LARGEST_MARGIN = 1e-9, 1e-6
@@ -90,6 +91,8 @@ class CertifiedClaim:
     constant: Constant | Literal["inter_event"] | None = None
     """What bounds it: proven or computed; None: it is computed always."""
     assumes: str = "the conditions of the certificate"
+    output: str | None = None
+    """The output that it is about."""
 
     def find_for(self, certificate: ScenarioCertificate) -> Callable[[RunEvidence, Samples], ClaimBound]:
         """Return the function that finds the bound of a certificate."""
@@ -379,6 +382,43 @@ def state(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) 
         Bound(formula, samples.step_s, shares, void, certificate.first("state")),
         Envelope(f"certified for {certificate.scope}", "x", samples.step_s, values),
     )
+
+
+def output_claims(run: RunEvidence, certificate: ScenarioCertificate) -> list[CertifiedClaim]:
+    """Return the claims about the outputs that a run's scenario states: their bounds, and allowed errors."""
+    scenario = run.record.scenario
+    if scenario.outputs is None:
+        return []
+    claims = []
+    for bound in output_bounds(certificate, scenario.loop_outputs(), scenario.controller.setpoint):
+        if (settles_s := bound.settles_s) is not None:
+            claims.append(_output_claim(bound, bound.statement, settles_s))
+        claims.append(_output_claim(bound, f"{bound.output.name} is bounded"))
+    return claims
+
+
+def _output_claim(
+    output_bound: OutputBound, statement: str, settles_s: float | None = None
+) -> CertifiedClaim:
+    """Return the claim of an output's bound, or that it stays within its allowed error from a time on."""
+    output, certificate = output_bound.output, output_bound.certificate
+
+    def find(run: RunEvidence, samples: Samples, of_loop: ScenarioCertificate) -> ClaimBound:
+        observed = np.abs(samples.plant.x @ np.array(output.row))
+        slack, t_s = ROUNDING * run.offset, samples.step_s
+        void = run.violation_of(of_loop)
+        if settles_s is not None and output.allowed is not None:
+            later = t_s >= settles_s
+            shares = observed[later] / (output.allowed + slack)
+            limit = f"{escaped(output_bound.symbol)} ≤ {{}} {escaped(output.unit)}".rstrip()
+            formula = f"{limit} from {at_most(settles_s, 3)} s on"
+            return ClaimBound(Bound(formula, t_s[later], shares, void, output.allowed))
+        values, first = certificate.state(t_s), certificate.first("state")
+        return ClaimBound(
+            Bound(output_bound.pattern, t_s, upper_shares(observed, values + slack), void, first)
+        )
+
+    return CertifiedClaim(statement, find, "state", output=output.name)
 
 
 @certified("x stays in the region")

@@ -16,7 +16,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.analysis.claims.claim_catalogue import CERTIFIED_CLAIMS, CLAIMS, Bound, ClaimBound, Envelope
+from cosim.analysis.claims.claim_catalogue import (
+    CERTIFIED_CLAIMS,
+    CLAIMS,
+    Bound,
+    ClaimBound,
+    Envelope,
+    output_claims,
+)
 from cosim.analysis.claims.common_end import common_end_ns, up_to_common_end
 from cosim.analysis.claims.observed_conditions import AssumptionViolation, VoidFrom
 from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples
@@ -55,14 +62,21 @@ class ClaimCheck:
     """Checks a run against a bound, samples by samples, up to the end of the claim.
 
     If the run cannot meet an assumption, ``unmet`` names it. ``proved`` says of the claim of a certificate
-    whether the checker has proven it.
+    whether the checker has proven it; ``output`` is the output that it is about.
     """
 
     def __init__(
-        self, statement: str, source: str, until_s: float, unmet: str = "", *, proved: bool | None = None
+        self,
+        statement: str,
+        source: str,
+        until_s: float,
+        unmet: str = "",
+        *,
+        proved: bool | None = None,
+        output: str | None = None,
     ) -> None:
         self._statement, self._source, self.until_s, self._unmet = statement, source, until_s, unmet
-        self._proved = proved
+        self._proved, self._output = proved, output
         self._ratio: float | None = None
         self._exceeded_s: float | None = None
         self._bound: Bound | None = None
@@ -119,6 +133,7 @@ class ClaimCheck:
             observed=observed, ratio=ratio, verdict=verdict,
             since_s=since_s, why=why,
             until_s=round(self.until_s, 9) if math.isfinite(self.until_s) else None, proved=self._proved,
+            output=self._output,
         )  # fmt: skip
 
 
@@ -270,9 +285,10 @@ class RunClaims:
             if not certificate.exists:
                 continue
             outside = outside_box(run.record.scenario) if certificate.scope == BOX else None
-            for claim in CERTIFIED_CLAIMS:
+            for claim in (*output_claims(run, certificate), *CERTIFIED_CLAIMS):
                 proved = claim.is_proven(certificate)
-                check = ClaimCheck(claim.statement, certificate.source, run.until_s, proved=proved)
+                source = certificate.source
+                check = ClaimCheck(claim.statement, source, run.until_s, proved=proved, output=claim.output)
                 yield _ClaimInstance(run, claim.find_for(certificate), check, [], certificate, outside)
         for definition in CLAIMS:
             unmet = _IDEAL_LOOP if definition.needs_ideal_loop else ""

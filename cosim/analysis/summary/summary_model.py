@@ -252,6 +252,8 @@ class Claim(SummaryPart):
     proved: bool | None = None
     """Whether the checker has proven the bound of a certificate, or it is computed only; None: it follows
     from the definitions of the loop, or there is no bound."""
+    output: Text | None = None
+    """The output that is bounded, by its name; None: something else is."""
 
     @property
     def origin(self) -> str:

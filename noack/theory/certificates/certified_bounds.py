@@ -40,6 +40,8 @@ Constant = Literal["delta", "overshoot", "state", "estimation_error"]
 """A constant that bounds an output; :class:`Constants` has all."""
 _OUTPUTS: Mapping[Constant, str] = {"delta": "e_c", "overshoot": "e_s", "state": "x"}
 """The outputs of proven bounds."""
+LONGEST_S, _TIME_ACCURACY = 1e7, 1e-6
+"""The longest run, and the relative accuracy of the time at which a bound is small enough."""
 _IN_LEVELS = ("delta", "overshoot")
 """Constants in units of the threshold."""
 
@@ -113,6 +115,56 @@ class ScenarioCertificate:
                 for each in assumptions
             )
         return replace(self, proven=proven, assumptions=assumptions)
+
+    def of_output(self, index: int, row: Sequence[float]) -> Self:
+        """Return the certificate with the bound of an output, |c x|, in the place of that of ‖x‖.
+
+        It is the output's own, if one is proven, or else ‖c‖ times that of ‖x‖.
+
+        Args:
+            index: the output's place among those of the loop.
+            row: its row c, n factors.
+        """
+        size = math.nextafter(math.hypot(*row) * (1 + 4 * np.finfo(float).eps), math.inf)
+        return self._of_output(f"y[{index}]", size)
+
+    def _of_output(self, name: str, size: float) -> Self:
+        def scaled(constants: Constants | None) -> Constants | None:
+            return None if constants is None else constants._replace(state=size * constants.state)
+
+        proven = self.proven
+        return replace(
+            self,
+            constants=scaled(self.constants),
+            floor_constants=scaled(self.floor_constants),
+            persistent_constants=scaled(self.persistent_constants),
+            other=None if self.other is None else self.other._of_output(name, size),
+            proven=None if proven is None else proven.of_output(name, size),
+        )
+
+    @property
+    def ultimate_state(self) -> float:
+        """What the bound of ‖x‖, or of the output, tends to as t → ∞; NaN without a certificate."""
+        reached = float(self.state(np.array([LONGEST_S]))[0])
+        limit = math.inf if self.proven is None else self.proven.limits.get("x", math.inf)
+        return min(reached, limit)
+
+    def settles_s(self, allowed: float) -> float | None:
+        """Return from when on ‖x‖, or the output, is at most a value; None: it may exceed it for ever."""
+
+        def within(t_s: float) -> bool:
+            after_s = max(t_s, self.floor_from_s) if math.isfinite(self.floor_from_s) else t_s
+            return bool((self.state(np.array([t_s, after_s])) <= allowed).all())
+
+        if not within(LONGEST_S):
+            return None
+        if within(0.0):
+            return 0.0
+        low_s, high_s = 0.0, LONGEST_S
+        while high_s - low_s > _TIME_ACCURACY * high_s:
+            middle_s = (low_s + high_s) / 2
+            low_s, high_s = (low_s, middle_s) if within(middle_s) else (middle_s, high_s)
+        return high_s
 
     def is_proven(self, constant: Constant) -> bool:
         """Whether the bound with this constant is a proven one."""

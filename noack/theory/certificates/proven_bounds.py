@@ -1,7 +1,8 @@
 """Bounds that the checker has proven, as floats; ``noack.theory.witnesses.outward`` rounds them."""
 
+import math
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -21,15 +22,21 @@ class ProvenBound(NamedTuple):
         return self.decaying or self.constant
 
 
+def _times(size: float, bound: float) -> float:
+    """Return a product, rounded up."""
+    return math.nextafter(size * bound, math.inf) if bound else 0.0
+
+
 class ProvenBounds(NamedTuple):
     """What the checker has proven for some plants under some conditions."""
 
     rate_per_s: float
     """Of all bounds."""
     bounds: Mapping[str, ProvenBound]
-    """From the start on, by the output: "x", "e_s" and "e_c", the errors in the trigger's norm."""
+    """From the start on, by the output: "x"; "e_s" and "e_c", the errors in the trigger's norm; "y[0]", …
+    for the outputs of the loop."""
     limits: Mapping[str, float]
-    """In the limit t → ∞, by the output: "x", and "x[0]", "x[1]", … for the states."""
+    """In the limit t → ∞, by the output: "x", and "y[0]", "y[1]", … for the outputs of the loop."""
     inter_event_s: float | None
     """Two events after the one at t = 0 are at least this far apart; None: nothing is known."""
     first_event_s: float | None
@@ -41,6 +48,24 @@ class ProvenBounds(NamedTuple):
     def to_json(self) -> dict[str, object]:
         """Return all fields for JSON."""
         return self._asdict() | {"bounds": {name: bound._asdict() for name, bound in self.bounds.items()}}
+
+    def of_output(self, name: str, size: float) -> Self:
+        """Return the bounds with that of an output in the place of that of ‖x‖, which it is at most.
+
+        Args:
+            name: the output, e.g. "y[0]".
+            size: the norm of its row, rounded up: it is at most this times ‖x‖.
+        """
+        bounds, limits = dict(self.bounds), dict(self.limits)
+        if name in bounds:
+            bounds["x"] = bounds[name]
+        elif "x" in bounds:
+            bounds["x"] = ProvenBound(*(_times(size, part) for part in bounds["x"]))
+        if name in limits:
+            limits["x"] = limits[name]
+        elif "x" in limits:
+            limits["x"] = _times(size, limits["x"])
+        return self._replace(bounds=bounds, limits=limits)
 
     def at(self, output: str, t_s: Vector) -> Vector:
         """Return the bound of an output at times (k,)."""

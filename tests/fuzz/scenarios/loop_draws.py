@@ -67,6 +67,7 @@ def loop(of: Chances, *, acknowledged: bool) -> tuple[Table, Model]:
         return _nonlinear(of)
     table, model = _model(of)
     content: Table = {"model": table}
+    of.put(content, 0.3, "outputs", lambda: _outputs(of, model.n))
     of.put(content, 0.4, "mode", lambda: of.one_of("model", "zoh"))
     content["plant"] = plant = _plant(of, model)
     outputs = model.n
@@ -160,6 +161,17 @@ def _model(of: Chances) -> tuple[Table, Model]:
             table["gain"] = (0.9 * model.K).tolist()
             model = model._replace(K=0.9 * model.K)
     return table, model
+
+
+def _outputs(of: Chances, n: int) -> list[Table]:
+    """Return one or two outputs, with factors of the states."""
+    outputs = []
+    for index in range(of.integer(1, 2)):
+        table: Table = {"name": f"output {index}", "row": [of.between(0.5, 2.0) for _ in range(n)]}
+        of.put(table, 0.5, "unit", lambda: "m")
+        of.put(table, 0.5, "allowed", lambda: of.between(0.01, 1.0))
+        outputs.append(table)
+    return outputs
 
 
 def _named_model(of: Chances) -> tuple[Table, Model]:

@@ -1,5 +1,7 @@
 """The claims of a run about bounds that the checker has proven."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -105,3 +107,21 @@ def test_many_loops_use_what_was_found_before_only(monkeypatch: pytest.MonkeyPat
     (certificate, *_) = certificates_under(allowed_conditions(scenario), scenario)
     assert certificate.proven is None
     assert certificate.exists
+
+
+def test_outputs_are_claimed_with_their_bounds_and_allowed_errors() -> None:
+    """From ln(D₁/(a − D₂))/r on D₁e^(−rt) + D₂ is at most a."""
+    outputs = 'outputs=[{name="position", unit="m", allowed=0.05, row=[1.0, 0.0]}]'
+    run = simulate(resolved("double_integrator", "horizon_s=20", outputs))
+    content = resolved_content(run.scenario, run.scenario.certificate.late_periods)
+    bounds = find_statement(content, "own", "schedule").bounds
+    assert bounds is not None
+    decaying, constant = bounds.bounds["y[0]"]
+    settles_s = math.log(decaying / (0.05 - constant)) / bounds.rate_per_s
+    claims = claims_of(run)
+    bound = claims["position is bounded"]
+    assert bound.bound == f"|position| ≤ {at_most(decaying)} e^(−0.3t) + {at_most(constant)} m"
+    stays = claims[f"position stays within 0.05 m of its set-point from {at_most(settles_s, 3)} s on"]
+    late = run["plant_step"]["t_ns"] * 1e-9 >= settles_s
+    assert stays.observed == pytest.approx(np.abs(run["plant_step"]["x"][late, 0]).max())
+    assert (stays.output, stays.origin) == ("position", "certificate (proved)")

@@ -1,0 +1,91 @@
+"""The outputs of a loop: what bounds, claims and figures are about, in units of their own.
+
+An output is y = c x, a row c of n factors; by default the outputs are the states. With a set-point x_r
+its deviation is c (x - x_r).
+"""
+
+from collections.abc import Sequence
+from typing import Annotated, NamedTuple
+
+from pydantic import Field
+
+from noack.settings.section import Positive, Row, ScenarioSection, require_length
+
+_LONGEST_NAME, _LONGEST_UNIT = 64, 24
+
+
+class OutputSection(ScenarioSection):
+    """An output of the loop: a quantity that its user wants to know."""
+
+    name: Annotated[str, Field(min_length=1, max_length=_LONGEST_NAME)]
+    """The output's name."""
+    unit: Annotated[str, Field(max_length=_LONGEST_UNIT)] = ""
+    """Its unit, e.g. "rad"."""
+    row: Row | str | None = None
+    """The factors of the states whose sum it is, n entries, or the name of one state. By default the
+    state of the output's name."""
+    allowed: Positive | None = None
+    """The allowed error: how far the output may be from its set-point once the loop has settled.
+    ``noack certify`` says from when on it is within; each run checks it."""
+
+
+class LoopOutput(NamedTuple):
+    """An output of a resolved scenario."""
+
+    name: str
+    unit: str
+    row: tuple[float, ...]
+    """The factors of the n states."""
+    allowed: float | None = None
+    """The allowed error; None: nothing is asked."""
+
+    def quantity(self, value: str) -> str:
+        """Return a value with the output's unit."""
+        return f"{value} {self.unit}".rstrip()
+
+
+def loop_outputs(
+    sections: Sequence[OutputSection] | None, state_names: Sequence[str], described: Sequence[str]
+) -> tuple[LoopOutput, ...]:
+    """Return the outputs of a loop, p of them.
+
+    Args:
+        sections: those of the scenario; None: the n states.
+        state_names: the names of the states.
+        described: the states as the plant's kind describes them, e.g. "angle, rad"; may be empty.
+
+    Raises:
+        ValueError: a row does not fit; the message begins with its key.
+    """
+    n = len(state_names)
+    if sections is None:
+        units = [text.rpartition(", ")[2] if ", " in text else "" for text in described] or [""] * n
+        names = zip(state_names, units, strict=True)
+        return tuple(LoopOutput(name, unit, _unit_row(i, n)) for i, (name, unit) in enumerate(names))
+    found = list[LoopOutput]()
+    for index, section in enumerate(sections):
+        key = f"outputs.{index}"
+        if section.name in [output.name for output in found]:
+            raise ValueError(f"{key}.name: {section.name} is the name of another output, too")
+        if not section.name.isprintable() or not section.unit.isprintable():
+            raise ValueError(f"{key}.name: name and unit must be printable, on one line")
+        row = _row_of(section, f"{key}.row", state_names)
+        found.append(LoopOutput(section.name, section.unit, row, section.allowed))
+    return tuple(found)
+
+
+def _row_of(section: OutputSection, key: str, state_names: Sequence[str]) -> tuple[float, ...]:
+    if isinstance(section.row, tuple):
+        require_length(section.row, key, len(state_names), "one factor per state")
+        if not any(section.row):
+            raise ValueError(f"{key}: all factors are 0; the output would not depend on the state")
+        return section.row
+    state = section.name if section.row is None else section.row
+    if state not in state_names:
+        known = ", ".join(state_names)
+        raise ValueError(f"{key}: no state has the name {state}; the states are {known}; or give the factors")
+    return _unit_row(list(state_names).index(state), len(state_names))
+
+
+def _unit_row(index: int, n: int) -> tuple[float, ...]:
+    return tuple(float(i == index) for i in range(n))
