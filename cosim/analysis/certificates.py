@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cosim.analysis.allowed_errors import ThresholdTrials
 from cosim.analysis.constant_rows import constant_rows, covered_plants
 from cosim.analysis.tried_settings import TriedSettings, helpful_box, helpful_settings, largest_settings
 from cosim.analysis.witnesses import Unproven, Witnesses, find_witnesses, needs_matrices, no_witnesses
@@ -30,11 +31,12 @@ from noack.theory.certificates.conditions import (
     nominal_conditions,
 )
 from noack.theory.certificates.network_limits import NetworkLimits, network_limits
+from noack.theory.certificates.output_bounds import output_bounds
 from noack.theory.certificates.plant_equations import LinearEquations, linear_plant
 from noack.theory.certificates.proven_bounds import ProvenBounds
 from noack.theory.certificates.refusals import refusal_under, refusals_at_setpoint
 from noack.theory.certificates.region import RegionScope
-from noack.theory.certificates.scenario_certificates import box_scope, own_plant_scope
+from noack.theory.certificates.scenario_certificates import box_scope, outside_box, own_plant_scope
 from noack.theory.certificates.trigger_weight import choose_weight
 from noack.theory.coverage import NOT_COVERED, refusals, require_certifiable
 from noack.theory.margins.loss_margin import LossMargin, Stability
@@ -117,6 +119,8 @@ class Certificates:
         equations: Scenario | None = None,
     ) -> None:
         self._arguments = (scenario, late_periods, weight, given, nonlinear, equations)
+        self.threshold_advice = dict[str, str]()
+        """By output: what brings it within its allowed error, see :meth:`advise`."""
         require_certifiable(scenario, "linear", "whole run")
         self.setpoint, void = scenario.controller.setpoint, refusals_at_setpoint(scenario)
         if OWN_PLANT in void:
@@ -173,6 +177,18 @@ class Certificates:
         self.__setstate__((proven, found.unproven))
         return found
 
+    def advise(self, progress: Callable[[float], None] = lambda share: None) -> None:
+        """Search for a smaller threshold for each output whose bound exceeds its allowed error."""
+        certificate, scenario = self.guaranteed, self._own_scenario
+        if certificate is None or not scenario.coverage.is_linear:
+            return
+        plants = "box" if certificate.scope == BOX else "own"
+        bounds = output_bounds(certificate, self.scenario.loop_outputs(), self.setpoint)
+        for index, bound in enumerate(bounds):
+            if not bound.is_met:
+                stated = ThresholdTrials(scenario, self.late_periods, plants)
+                self.threshold_advice[bound.output.name] = stated.advice(bound, index, progress)
+
     def __iter__(self) -> Iterator[tuple[str, ScenarioCertificate]]:
         return iter(self._certificates)
 
@@ -208,6 +224,14 @@ class Certificates:
         None if the plant is not linear, and there is no certificate on a region for its settings.
         """
         return self.schedule if self.nonlinear is None else self.schedule_region
+
+    @property
+    def guaranteed(self) -> ScenarioCertificate | None:
+        """The one with most to say: of all plants within the uncertainty, or of the own plant; None: none."""
+        own, box = self.of_own_plant, self.schedule_box
+        if box is not None and box.first("state") is not None and outside_box(self.scenario) is None:
+            return box
+        return own if own is not None and own.first("state") is not None else None
 
     @property
     def answer(self) -> CertificateAnswer:
@@ -327,6 +351,11 @@ class Certificates:
                 "theorem_2": None if self.theorem_2 is None else self.theorem_2._asdict(),
             },
             "certificates": [{"under": under, **certificate.to_json()} for under, certificate in self],
+            "outputs": [
+                {"under": under, "plants": certificate.scope, **bound.to_json()}
+                for under, certificate in self
+                for bound in output_bounds(certificate, self.scenario.loop_outputs(), self.setpoint)
+            ],
             "unproven": [each._asdict() for each in self.unproven],
             "stability": None if self.stability is None else self.stability._asdict(),
             "schedule": {
@@ -346,7 +375,8 @@ class Certificates:
     def _rows(self) -> TextRows:
         heads = [f"{under}, {covered_plants(certificate)}" for under, certificate in self]
         certificates = [certificate for _, certificate in self]
-        rows = [[label, *values] for label, values, _ in constant_rows(certificates, None, 0.0)]
+        names = [output.name for output in self.scenario.loop_outputs()]
+        rows = [[label, *values] for label, values, _ in constant_rows(certificates, None, 0.0, names)]
         return [[self.scenario.name, *heads], *rows]
 
     def __repr__(self) -> str:

@@ -33,9 +33,12 @@ def covered_plants(certificate: ScenarioCertificate) -> str:
 
 
 def constant_rows(
-    certificates: Sequence[ScenarioCertificate], theorem: Theorem2 | None, theorem_rate: float
+    certificates: Sequence[ScenarioCertificate],
+    theorem: Theorem2 | None,
+    theorem_rate: float,
+    outputs: Sequence[str],
 ) -> Iterator[Row]:
-    """Yield the rows; numbers that are proven are marked."""
+    """Yield the rows; numbers that are proven are marked. ``outputs``: the names of the outputs."""
     if not any(c.exists for c in certificates):
         yield "certificate", ["void"] * len(certificates), NONE
         return
@@ -67,7 +70,7 @@ def constant_rows(
         if any(value not in (NONE, "void") for value in values):
             text = f"‖{w}{quantity}‖" if w and quantity in _WEIGHTED else f"‖{quantity.strip('()')}‖"
             yield f"+ without decay: {text}", values, NONE
-    yield from _limits(certificates)
+    yield from _limits(certificates, outputs)
     floors = [None if _is_replaced(c) else c.floor_constants for c in certificates]
     if any(floors):
         from_s = [
@@ -135,9 +138,9 @@ def _apart(certificate: ScenarioCertificate) -> str:
     return at_least(certificate.inter_event_s) + mark
 
 
-def _limits(certificates: Sequence[ScenarioCertificate]) -> Iterator[Row]:
+def _limits(certificates: Sequence[ScenarioCertificate], outputs: Sequence[str]) -> Iterator[Row]:
     """Yield a row for each output that has a bound in the limit t → ∞."""
     limits = [{} if c.proven is None else c.proven.limits for c in certificates]
     for output in dict.fromkeys(name for each in limits for name in each):
         values = [at_most(each[output]) + PROVEN if output in each else NONE for each in limits]
-        yield f"bound of {norm(output)} in the limit", values, NONE
+        yield f"bound of {norm(output, outputs)} in the limit", values, NONE

@@ -139,7 +139,7 @@ class SettingTrials:
     def _with(self, values: Values) -> Scenario:
         content = self._content
         for key, value in values.items():
-            content = _replaced(content, key.split("."), value)
+            content = replaced(content, key.split("."), value)
         scenario = validate(content, self._scenario.name)
         refuse_overload(scenario)
         return scenario
@@ -228,11 +228,11 @@ def _smaller(most: int) -> list[int]:
     return sorted({most - 1, 3 * most // 4, most // 2, most // 4, 1, 0} & {*range(most)}, reverse=True)
 
 
-def _replaced(content: Table, keys: list[str], value: object) -> Table:
+def replaced(content: Table, keys: list[str], value: object) -> Table:
     """Return a table with another value under nested keys."""
     key, *inner = keys
     table = content.get(key, {})
-    return content | {key: _replaced(table, inner, value) if inner and isinstance(table, dict) else value}
+    return content | {key: replaced(table, inner, value) if inner and isinstance(table, dict) else value}
 
 
 def _written(value: object) -> str:

@@ -1,7 +1,7 @@
 """What is certified for a scenario, as tables and in words.
 
-:func:`certificate_document` has the constants, the limits of the schedule, the assumptions and, if
-losses are not limited, what holds for random ones; :func:`margin_document` has the margin of a
+:func:`certificate_document` begins with one sentence of guarantee; in its long form it has the constants,
+the limits of the schedule and the assumptions, too; :func:`margin_document` has the margin of a
 time-triggered loop, :func:`mean_cost_document` its mean cost under random losses.
 """
 
@@ -13,48 +13,39 @@ from cosim.analysis.margin_search import MarginResult
 from cosim.analysis.mean_cost import CostUnder, MeanCost
 from cosim.analysis.tried_settings import TriedSettings
 from cosim.output.document import Block, Document, Sentence, SentenceRole
-from cosim.output.guarantee_sentence import guarantee_sentence
+from cosim.output.guarantee_sentence import bounds_of, guarantee_sentence
 from cosim.output.result_tables import ResultTable, Tone
 from cosim.output.run_document import assumption_table
 from noack.core.linear_systems import Matrix
 from noack.core.number_format import NONE, at_least, at_most, duration, duration_at_least, number
 from noack.scenario.resolution import loop_of, policy_of
-from noack.theory.certificates.assumptions import assumptions
+from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate, envelope_formula
 from noack.theory.certificates.conditions import BOX, REGION
 from noack.theory.certificates.network_limits import MOST_S
 from noack.theory.certificates.scenario_certificates import outside_box
 from noack.theory.margins.loss_margin import Stability
 
+_MOST_BOUNDS = 6
+"""Outputs whose bounds are printed without --verbose."""
+_MORE = Sentence(
+    role=SentenceRole.NOTE,
+    text="--verbose shows every constant, limit and assumption, and the paper's theorems",
+)
 
-def certificate_document(results: Certificates, chosen: Certificates | None = None) -> Document:
-    """Return the tables, and what is certified in a norm that noack chose instead."""
-    tables: list[Block] = list(certificate_tables(results))
-    blocks = [
-        *_first_sentence(results),
-        *_on_nonlinear(results),
-        *(tables[:1] or [_prose(f"{_title(results)}: none")]),
-    ]
-    blocks += _notes(results)
-    if any(results.setpoint or ()):
-        blocks.append(
-            _note(
-                "x is the distance from the set-point, x − x_r. If the plant does not rest there, "
-                "A x_r + B u_r is a disturbance: a step at the state."
-            )
-        )
-    blocks += tables[1:]
-    if largest := _listed("as settings, the certificate is kept", results.largest_settings):
-        blocks.append(_prose(largest))
-    if (outside := outside_box(results.scenario)) is not None:
-        blocks.append(_doubt("the box certificates do not cover this plant:", outside))
-    blocks += [
-        _prose("assumptions of the certificates for the schedule:"),
-        assumption_table((results.schedule_region or results.schedule).assumptions),
-        _prose("assumptions of the paper's theorems:"),
-        assumption_table(assumptions(results.scenario)),
-        *map(_prose, (*_in_words(results), *_stability_in_words(results))),
-    ]
+
+def certificate_document(
+    results: Certificates, chosen: Certificates | None = None, *, verbose: bool = False
+) -> Document:
+    """Return what is guaranteed: a sentence and few lines, or with ``verbose`` all tables, too.
+
+    Args:
+        results: the certificates.
+        chosen: those in a norm that noack chose instead.
+        verbose: with all constants, limits and assumptions.
+    """
+    blocks: list[Block] = [_first_sentence(results), *_too_large(results)]
+    blocks += _all_tables(results) if verbose else [*_few_lines(results), _MORE]
     if results.weight is not None and results.schedule.exists:
         blocks += _weight_lines(results, results.weight)
     if not (chosen or results).answer.is_certified:
@@ -62,17 +53,72 @@ def certificate_document(results: Certificates, chosen: Certificates | None = No
     if chosen is not None and chosen.weight is not None:
         blocks += [
             _prose("With another norm, also in the trigger, there are certificates:"),
-            next(certificate_tables(chosen))._replace(name=""),
+            *([next(certificate_tables(chosen))._replace(name="")] if verbose else _few_lines(chosen)),
             *_weight_lines(chosen, chosen.weight),
         ]
     data = results.to_json() | {"in_chosen_norm": chosen and chosen.to_json()}
     return Document(title=results.scenario.name, data=data, blocks=blocks)
 
 
-def _first_sentence(results: Certificates) -> Iterator[Sentence]:
-    """Yield what is guaranteed, in one sentence."""
-    if (text := guarantee_sentence(results)) is not None:
-        yield Sentence(text=text, role=SentenceRole.VERDICT, tone=Tone.GOOD, is_prose=True)
+def _all_tables(results: Certificates) -> Iterator[Block]:
+    """Yield the constants, the limits of the schedule, and the assumptions."""
+    tables = list(certificate_tables(results))
+    yield from _on_nonlinear(results)
+    yield tables[0] if tables else _prose(f"{_title(results)}: none")
+    yield from _notes(results)
+    if any(results.setpoint or ()):
+        yield _note(
+            "x is the distance from the set-point, x − x_r. If the plant does not rest there, "
+            "A x_r + B u_r is a disturbance: a step at the state."
+        )
+    yield from tables[1:]
+    if largest := _listed("as settings, the certificate is kept", results.largest_settings):
+        yield _prose(largest)
+    if (outside := outside_box(results.scenario)) is not None:
+        yield _doubt("the box certificates do not cover this plant:", outside)
+    yield _prose("assumptions of the certificates for the schedule:")
+    yield assumption_table((results.schedule_region or results.schedule).assumptions)
+    yield _prose("assumptions of the paper's theorems:")
+    yield assumption_table(assumptions(results.scenario))
+    yield from map(_prose, (*_in_words(results), *_stability_in_words(results)))
+
+
+def _few_lines(results: Certificates) -> Iterator[Sentence]:
+    """Yield the bounds of the outputs and of ‖x‖, what they assume, and what would void them."""
+    certificate = results.guaranteed
+    if certificate is not None:
+        bounds = bounds_of(results, certificate) if results.scenario.outputs else []
+        for bound in [bound for bound in bounds if bound.output.allowed is not None][:_MOST_BOUNDS]:
+            yield _prose(f"{bound.formula} ({_how_known(is_proven=bound.is_proven)})")
+        if results.scenario.outputs:  # else the first sentence has it
+            state = envelope_formula("‖x‖", certificate, "state").format(at_most(certificate.first("state")))
+            yield _prose(f"{state} ({_how_known(is_proven=certificate.is_proven('state'))})")
+        apart_s = certificate.inter_event_s
+        if apart_s is not None and apart_s < MOST_S:
+            yield _prose(_apart_in_words(certificate, apart_s))
+        assumed = [each.what for each in certificate.assumptions if each.verdict is AssumptionStatus.ASSUMED]
+        yield _prose(f"assumed, and checked in each run: {'; '.join(assumed)}")
+    if largest := _listed("the guarantee is kept", results.largest_settings):
+        yield _prose(largest)
+    if (outside := outside_box(results.scenario)) is not None:
+        yield _doubt("the stated uncertainty does not contain this plant:", outside)
+    yield from map(_prose, _stability_in_words(results))
+
+
+def _first_sentence(results: Certificates) -> Sentence:
+    """Return what is guaranteed, in one sentence."""
+    text = guarantee_sentence(results)
+    if text is not None:
+        return Sentence(text=text, role=SentenceRole.VERDICT, tone=Tone.GOOD, is_prose=True)
+    why = results.answer.text.removeprefix("no certificate").lstrip(": ")
+    text = f"no guarantee{f': {why}' if why else ''}"
+    return Sentence(text=text, role=SentenceRole.VERDICT, tone=Tone.DOUBTFUL, is_prose=True)
+
+
+def _too_large(results: Certificates) -> Iterator[Sentence]:
+    """Yield for each output whose bound exceeds its allowed error what would have to change."""
+    for name, advice in results.threshold_advice.items():
+        yield _doubt(f"{name} may exceed its allowed error:", advice)
 
 
 def _prose(text: str) -> Sentence:
@@ -142,7 +188,7 @@ def _in_words(results: Certificates) -> Iterator[str]:
         apart = ""
         spacing_s = certificate.inter_event_s
         if spacing_s is not None and spacing_s < MOST_S:  # else there is no second event
-            apart = f" {_inter_event_in_words(certificate, _limit(spacing_s))}"
+            apart = f" {_apart_in_words(certificate, spacing_s)}"
         meaning = certificate.conditions.guarantee.meaning
         losses = f"for every pattern of losses with {meaning}"
         if not results.scenario.network.enforce_mansd:
@@ -154,8 +200,12 @@ def _in_words(results: Certificates) -> Iterator[str]:
         )
 
 
-def _inter_event_in_words(certificate: ScenarioCertificate, least: str) -> str:
-    proven, known = certificate.proven, _how_known(is_proven=certificate.has_proven_inter_event_time)
+def _apart_in_words(certificate: ScenarioCertificate, apart_s: float) -> str:
+    least, proven, known = (
+        _limit(apart_s),
+        certificate.proven,
+        _how_known(is_proven=certificate.has_proven_inter_event_time),
+    )
     exception = proven.exception if proven and certificate.has_proven_inter_event_time else ""
     return f"The inter-event time is at least {least}{f', {exception}' if exception else ''} ({known})."
 
@@ -205,7 +255,10 @@ def certificate_tables(results: Certificates) -> Iterator[ResultTable]:
     rows = [
         (label, *values, *([of_theorem] if printed else []))
         for label, values, of_theorem in constant_rows(
-            certificates, results.theorem_2, policy_of(results.scenario).fading_per_s
+            certificates,
+            results.theorem_2,
+            policy_of(results.scenario).fading_per_s,
+            [output.name for output in results.scenario.loop_outputs()],
         )
     ]
     yield ResultTable("certificates", _title(results), headings, rows)

@@ -1,6 +1,6 @@
 """One sentence of guarantee, in words and numbers of the outputs: the first line of every result."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 from cosim.analysis.certificates import Certificates
 from noack.core.number_format import at_most, counted
@@ -8,7 +8,6 @@ from noack.scenario.scenario import Scenario
 from noack.theory.certificates.certified_bounds import ScenarioCertificate, envelope_formula
 from noack.theory.certificates.conditions import BOX, REGION
 from noack.theory.certificates.output_bounds import OutputBound, output_bounds
-from noack.theory.certificates.scenario_certificates import outside_box
 
 _MOST_OUTPUTS = 4
 """Outputs without an allowed error that the sentence names."""
@@ -16,22 +15,16 @@ _MOST_OUTPUTS = 4
 
 def guarantee_sentence(results: Certificates) -> str | None:
     """Return what is guaranteed for a scenario, in one sentence; None without a certificate."""
-    certificate = guaranteed(results)
+    certificate = results.guaranteed
     if certificate is None:
         return None
-    statements = _statements(bounds_of(results, certificate), certificate)
+    statements = _statements(
+        bounds_of(results, certificate), certificate, stated=results.scenario.outputs is not None
+    )
     known = "proved" if certificate.is_proven("state") else "computed, not proved"
     plants = {BOX: ", for every plant within the stated uncertainty", REGION: ", on its region"}
     losses = although_lost(results.scenario)
     return f"{' and '.join(statements)}{losses}{plants.get(certificate.scope, '')} ({known})"
-
-
-def guaranteed(results: Certificates) -> ScenarioCertificate | None:
-    """Return the certificate that says most: of all plants within the uncertainty, or of the own one."""
-    own, box = results.of_own_plant, results.schedule_box
-    if box is not None and box.first("state") is not None and outside_box(results.scenario) is None:
-        return box
-    return own if own is not None and own.first("state") is not None else None
 
 
 def bounds_of(results: Certificates, certificate: ScenarioCertificate) -> list[OutputBound]:
@@ -39,10 +32,12 @@ def bounds_of(results: Certificates, certificate: ScenarioCertificate) -> list[O
     return output_bounds(certificate, results.scenario.loop_outputs(), results.setpoint)
 
 
-def _statements(bounds: Sequence[OutputBound], certificate: ScenarioCertificate) -> Iterable[str]:
-    """Yield what is said of the outputs: of those with an allowed error, or else of the first few."""
+def _statements(
+    bounds: Sequence[OutputBound], certificate: ScenarioCertificate, *, stated: bool
+) -> Sequence[str]:
+    """Return what is said of stated outputs: of those with an allowed error, or of few; else of ‖x‖."""
     asked = [bound for bound in bounds if bound.output.allowed is not None]
-    if asked or len(bounds) <= _MOST_OUTPUTS:
+    if stated and (asked or len(bounds) <= _MOST_OUTPUTS):
         return [bound.statement for bound in asked or bounds]
     first = at_most(certificate.first("state"))
     return [envelope_formula("‖x‖", certificate, "state").format(first)]

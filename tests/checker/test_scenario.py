@@ -311,7 +311,8 @@ def test_the_keys_that_the_table_calls_used_are_those_that_are_read() -> None:
         settings = (f"trigger={{{trigger}}}", constraint, identity, DISTURBANCES, *box)
         tables = resolved_tables("double_integrator", *settings, "plant.watchdog.policy=zero")
         read_loop(Recorded(tables, read), box=True, ideal=False)
-    tables = resolved_tables("double_integrator", "controller.setpoint=[2.0, 0.0]")
+    outputs = 'outputs=[{name="position", row=[1.0, 0.0]}]'
+    tables = resolved_tables("double_integrator", "controller.setpoint=[2.0, 0.0]", outputs)
     read_loop(Recorded(tables, read), box=False, ideal=False)
     observer = 'observer={kind="luenberger", poles_per_s=[-8, -10], initial_estimate=[1.0, 0.0]}'
     settings = (observer, "plant.measurement.noise_bound=[0.1, 0.1]", "plant.draw=given")

@@ -79,6 +79,9 @@ def certify(
     proofs: Annotated[
         bool, Option(help="Search for bounds that can be proven; else all bounds are computed only.")
     ] = True,
+    verbose: Annotated[
+        bool, Option("--verbose", help="Print all tables: constants, limits, assumptions.")
+    ] = False,
     json: opt.JsonOption = False,
 ) -> int:
     """Compute the bounds that are guaranteed for a scenario, and their conditions.
@@ -125,13 +128,16 @@ def certify(
             witnesses = result.prove(bar)
         if witness is not None and witnesses.are_any:
             write_output(witness, witnesses.file_text())
+        with work_bar("trying smaller thresholds", lines=True) as bar:
+            result.advise(bar)
     if weight == NormName.GIVEN and not result.schedule.exists:
         with work_bar("no certificate in the given norm; choosing another") as bar:
             chosen = in_chosen_norm(loaded, result, bar)
         if chosen is not None and proofs:
             with work_bar("searching for proofs in the other norm", lines=True) as bar:
                 chosen.prove(bar)
-    show(certificate_document(result, chosen), json=json, tables=tables)
+    document = certificate_document(result, chosen, verbose=verbose or tables is not None)
+    show(document, json=json, tables=tables)
     if out is not None:
         save_mat(result.to_json(), out)
     certified = any(certificate.exists for _, certificate in result)

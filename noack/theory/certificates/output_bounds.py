@@ -71,7 +71,7 @@ class OutputBound(NamedTuple):
             when = f"from {at_most(settles_s, _DIGITS)} s on" if settles_s else "at all times"
             return f"{output.name} stays within {allowed} of its set-point {when}"
         least = output.quantity(at_most(self.ultimate, _DIGITS))
-        return f"{output.name} stays within {least} of its set-point in the end, but {allowed} are allowed"
+        return f"{output.name} stays within {least} of its set-point in the end, not within {allowed}"
 
     def to_json(self) -> dict[str, object]:
         """Return the bound for JSON."""

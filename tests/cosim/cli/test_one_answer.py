@@ -59,9 +59,9 @@ def test_a_setting_that_no_certificate_covers_is_the_reason_once() -> None:
 
 
 def test_what_is_violated_without_a_certificate_is_its_condition() -> None:
-    shown = " ".join(invoke("certify", "lane_periodic", "--no-proofs").stdout.split())
+    shown = " ".join(invoke("certify", "lane_periodic", "--no-proofs", "--verbose").stdout.split())
     assert "violated small-gain condition (certificate): the loop gain of the errors is 1e+04" in shown
-    shown = " ".join(invoke("certify", "cart_pole", "--no-proofs").stdout.split())
+    shown = " ".join(invoke("certify", "cart_pole", "--no-proofs", "--verbose").stdout.split())
     assert (
         "violated condition of the certificate (certificate): the bounds from x(0) need the region" in shown
     )

@@ -29,6 +29,7 @@ from noack.theory.certificates.conditions import OWN_PLANT, most_events
 from noack.theory.certificates.proven_bounds import ProvenBound, ProvenBounds
 from noack.theory.certificates.scenario_certificates import outside_box
 from noack_check.sentences import smallest_bounds
+from tests.helpers.approved import compare_text
 from tests.helpers.command_line import invoke
 from tests.helpers.shipped import resolved, shipped
 
@@ -342,7 +343,7 @@ WRONG_SIGN = "model.gain=[[15.0, 5.0]]"
     ],
 )
 def test_a_loop_without_any_certificate_has_the_reasons(words: list[str], reason: str) -> None:
-    result = invoke("certify", *words, "--no-proofs")
+    result = invoke("certify", *words, "--no-proofs", "--verbose")
     assert result.exit_code == 1
     assert reason in " ".join(result.stdout.split())
     assert "largest certified value" not in result.stdout
@@ -354,7 +355,7 @@ def test_a_norm_with_certificates_is_found_and_can_be_pasted(
     printed = list[Any]()
     monkeypatch.setattr("cosim.analysis.certificates.choose_weight", lambda *_: chosen.weight)
 
-    def document(*given: Any) -> Document:
+    def document(*given: Any, verbose: bool) -> Document:
         printed.append(given)
         return Document(title="", blocks=[])
 
@@ -376,7 +377,7 @@ def test_a_norm_with_certificates_is_found_and_can_be_pasted(
 PROVEN = ProvenBounds(
     rate_per_s=0.2,
     bounds={"x": ProvenBound(7.0, 0.5), "e_c": ProvenBound(1.0, 0.0), "e_s": ProvenBound(0.25, 0.0)},
-    limits={"x[1]": 0.125},
+    limits={"y[1]": 0.125},
     inter_event_s=0.004,
     first_event_s=None,
     is_quiet=True,
@@ -390,8 +391,31 @@ def proven_lane(proven: ProvenBounds = PROVEN) -> Certificates:
 
 
 def printed(certificates: Certificates) -> str:
-    print_document(Console(file=(output := StringIO()), width=150), certificate_document(certificates))
+    document = certificate_document(certificates, verbose=True)
+    print_document(Console(file=(output := StringIO()), width=150), document)
     return output.getvalue()
+
+
+def test_the_first_screen_is_a_sentence_and_a_few_lines() -> None:
+    """``APPROVE=1 pytest`` writes them anew: read the difference."""
+    outputs = 'outputs=[{name="angle", unit="rad", allowed=0.02}, {name="rate", unit="rad/s", allowed=0.005}]'
+    cases = {
+        "stated outputs": Certificates(resolved("unstable_pendulum", outputs), 2),
+        "the states": Certificates(resolved("unstable_pendulum"), 2),
+        "no certificate": Certificates(resolved("lane_following", *SLOW), 2),
+    }
+    proven = PROVEN._replace(
+        bounds={**PROVEN.bounds, "y[0]": ProvenBound(3.0, 0.015), "y[1]": PROVEN.bounds["x"]}
+    )
+    cases["stated outputs"].__setstate__(({("box", "schedule"): proven}, ()))
+    cases["stated outputs"].threshold_advice["rate"] = "trigger.floor = 0.0001 is small enough (proved)"
+    text = ""
+    for name, certificates in cases.items():
+        document = certificate_document(certificates)
+        assert len(document.blocks) <= 11
+        print_document(Console(file=(output := StringIO()), width=100), document)
+        text += f"# {name}\n{output.getvalue()}"
+    compare_text(Path(__file__).with_name("first_screens.txt"), text)
 
 
 def test_what_is_proven_takes_the_place_of_what_is_computed() -> None:
@@ -403,7 +427,7 @@ def test_what_is_proven_takes_the_place_of_what_is_computed() -> None:
     assert rows["+ without decay: ‖x‖"] == "0.5✓"
     assert rows["Δ, bound of ‖e_c‖/β"] == "2✓"
     assert rows["bound of ‖e_s‖/β"] == "0.5✓"
-    assert rows["bound of |x_2| in the limit"] == "0.125✓"
+    assert rows["bound of |r| in the limit"] == "0.125✓"
     assert rows["inter-event time, s"] == "0.004✓"  # also where the computed one is larger
     assert rows["bound of ‖u − Kx‖"] == "3.998"
     t_s = np.array([0.0, 10.0])
