@@ -45,14 +45,18 @@ class LoopOutput(NamedTuple):
 
 
 def loop_outputs(
-    sections: Sequence[OutputSection] | None, state_names: Sequence[str], described: Sequence[str]
+    sections: Sequence[OutputSection] | None,
+    state_names: Sequence[str],
+    described: Sequence[str] = (),
+    loads: int = 0,
 ) -> tuple[LoopOutput, ...]:
     """Return the outputs of a loop, p of them.
 
     Args:
-        sections: those of the scenario; None: the n states.
+        sections: those of the scenario; None: the states, without loads.
         state_names: the names of the states.
         described: the states as the plant's kind describes them, e.g. "angle, rad"; may be empty.
+        loads: the number of the last states that are loads.
 
     Raises:
         ValueError: a row does not fit; the message begins with its key.
@@ -60,7 +64,7 @@ def loop_outputs(
     n = len(state_names)
     if sections is None:
         units = [text.rpartition(", ")[2] if ", " in text else "" for text in described] or [""] * n
-        names = zip(state_names, units, strict=True)
+        names = zip(state_names[: n - loads], units, strict=False)
         return tuple(LoopOutput(name, unit, _unit_row(i, n)) for i, (name, unit) in enumerate(names))
     found = list[LoopOutput]()
     for index, section in enumerate(sections):

@@ -86,7 +86,8 @@ class ScenarioTables(ScenarioSection):
         """Return the outputs; raise ValueError, with the key, if a row does not fit."""
         names = self.model.state_names or (self.model.name and self.model.named.state_names)
         n = self.model.dimensions[0]
-        return loop_outputs(self.outputs, names or entry_names("x", n), self.plant.system.states)
+        described = self.plant.system.states
+        return loop_outputs(self.outputs, names or entry_names("x", n), described, self.model.load_states)
 
     @property
     def between_updates(self) -> str:
