@@ -104,15 +104,13 @@ def with_target_loss(settings: LinkSettings, *, known: ProbabilityCache = PROBAB
     return _with_probability(settings, target_loss, known[key])
 
 
-def find_probabilities(*links: LinkSettings, known: ProbabilityCache = PROBABILITIES) -> dict[str, float]:
-    """Return the probabilities of valid settings, for :func:`store_probabilities`.
+def known_probabilities(*links: LinkSettings, known: ProbabilityCache = PROBABILITIES) -> dict[str, float]:
+    """Return the probabilities that the check of these settings has found, for :func:`store_probabilities`.
 
     There is none where no loss rate is kept.
     """
-    # Each is read at once, as a further one may remove it.
-    return {
-        (key := _key(link)): known[key] for link in links if with_target_loss(link, known=known) is not link
-    }
+    keys = [_key(link) for link in links if _target_losses(link)]
+    return {key: known[key] for key in keys if key in known}
 
 
 def store_probabilities(

@@ -16,7 +16,7 @@ from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat, ValidationE
 
 from noack.core.clock import clock_identity
 from noack.core.errors import CallerError
-from noack.impairments.target_loss import find_probabilities, store_probabilities
+from noack.impairments.target_loss import known_probabilities, store_probabilities
 from noack.protocol.wire_format import KEY_BYTES
 from noack.runtime.address import LOOPBACK
 from noack.runtime.control_messages import SocketAddress
@@ -59,7 +59,7 @@ def new_descriptor(scenario: Scenario, run_dir: Path, *, launched: bool) -> RunD
         run_dir=str(run_dir),
         launched=launched,
         clock=clock_identity(),
-        target_losses=find_probabilities(*map(scenario.network.link_of, scenario.network.flows)),
+        target_losses=known_probabilities(*map(scenario.network.link_of, scenario.network.flows)),
         scenario=scenario,
     )
 

@@ -7,7 +7,7 @@ from operator import itemgetter
 
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
-from noack.impairments.target_loss import find_probabilities
+from noack.impairments.target_loss import known_probabilities
 from noack.runtime.control_messages import ChangeAnnouncement, ChangeReply, ChangeRequest, parse_message
 from noack.runtime.control_plane import ControlPlane
 from noack.runtime.run_descriptor import RunDescriptor
@@ -162,7 +162,7 @@ class ChangeRequests:
             settings=dict(change.settings),
             requested_ns=requested_ns,
             requested_at=requested_at,
-            target_losses=find_probabilities(*(changed_scenario.network.link for changed_scenario in later)),
+            target_losses=known_probabilities(*(changed_scenario.network.link for changed_scenario in later)),
         )
         self.announced += (announcement,)
         return announcement

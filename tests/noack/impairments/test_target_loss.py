@@ -12,7 +12,7 @@ from noack.impairments.loss_prediction import predict
 from noack.impairments.target_loss import (
     ProbabilityCache,
     expected_loss,
-    find_probabilities,
+    known_probabilities,
     store_probabilities,
     with_target_loss,
 )
@@ -45,8 +45,9 @@ def test_a_probability_that_another_process_found_is_not_computed_again() -> Non
     """Not even by the loops of a run; but other settings have another probability."""
     settings = settings_of("loss 10% keep loss 5% mansd 1 delay 1ms")
     there, here = ProbabilityCache(10), ProbabilityCache(10)
-    found = find_probabilities(settings, settings_of("delay 1ms"), known=there)
-    assert list(found.values()) == [probability(settings, there)]
+    computed = probability(settings, there)
+    found = known_probabilities(settings, settings_of("delay 1ms"), known=there)
+    assert list(found.values()) == [computed]
     received = 0.123  # no computation gives this
     store_probabilities(json.loads(json.dumps(dict.fromkeys(found, received))), known=here)
     assert probability(settings, here) == received
