@@ -5,6 +5,7 @@
 
 import math
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, FiniteFloat
@@ -183,7 +184,11 @@ _WATCHDOG_PERIODS = 50
 
 @dataclass(frozen=True)
 class Timing:
-    """Periods, phases and timeouts of a scenario, in nanoseconds of simulated time."""
+    """The schedule of a loop: periods, phases and timeouts, in nanoseconds of simulated time.
+
+    Machines use whole nanoseconds (``..._ns``). Theory needs the exact times where a period is none
+    (``exact_...``, and a period's :attr:`~noack.core.periods.Period.exact`): 10⁹/30 ns of 30 Hz.
+    """
 
     scenario: ScenarioTables
 
@@ -239,6 +244,17 @@ class Timing:
         if period.is_whole:
             return round(phase * period.longest_ns)
         return math.ceil(simplest_fraction(phase) * period.exact)
+
+    @property
+    def exact_controller_phase(self) -> Fraction:
+        """The same time without rounding, if machines round periods."""
+        if self.has_whole_periods:
+            return Fraction(self.controller_phase_ns)
+        return simplest_fraction(self.scenario.controller.phase) * self.controller_period.exact
+
+    def exact_time(self, seconds: float, used_ns: int) -> Fraction:
+        """Return a time for which machines use ``used_ns``: without rounding, if they round periods."""
+        return Fraction(used_ns) if self.has_whole_periods else exact_ns(seconds)
 
     @property
     def actuation_timeout_ns(self) -> int:

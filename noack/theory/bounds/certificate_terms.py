@@ -10,7 +10,11 @@ from noack.theory.bounds.gains import ErrorGains, PlantGains
 
 
 class NetworkConditions(NamedTuple):
-    """The assumptions of a certificate about network and schedule, in the plant's time."""
+    """The assumptions of a certificate about network and schedule, in the plant's time.
+
+    They are not a schedule, but what may happen at most under one with delays and lateness: bounds, in
+    seconds, which searches scale (:func:`noack.theory.certificates.conditions.nominal_conditions`).
+    """
 
     dropouts: int
     """The largest number of consecutive losses: M − 1, or less by further constraints."""
@@ -95,7 +99,7 @@ MEASURED = EstimationBound()
 
 
 class InterEventTimes(NamedTuple):
-    """Times between two events that a trigger guarantees, whatever happens to e_s."""
+    """Bounds of the time between two events that a trigger guarantees, whatever happens to e_s."""
 
     shortest_s: float = 0.0
     longest_s: float = math.inf

@@ -32,15 +32,8 @@ _COARSE_ACCURACY, _QUICK_ACCURACY = 1e-2, 3e-2
 """Wanted upper/lower − 1 of :meth:`LossMargin.coarse_bounds` and :meth:`LossMargin.first_bounds`."""
 
 
-class EventTimes(NamedTuple):
-    """The time between two transmissions, in steps: any number within these limits."""
-
-    shortest: int = 1
-    longest: int = 1
-
-
-EVERY_STEP = EventTimes()
-"""The sensor transmits at every step."""
+EVERY_STEP = range(1, 2)
+"""The numbers of steps that may be between two transmissions: the sensor transmits at every step."""
 
 
 class Burst(NamedTuple):
@@ -56,11 +49,14 @@ class Burst(NamedTuple):
     steps: int
     """Time between the two deliveries."""
 
-    def intervals(self, times: EventTimes) -> list[int]:
-        """Return times between the transmissions, (losses + 1,), in steps; the longest first."""
+    def intervals(self, between: range) -> list[int]:
+        """Return times between the transmissions, (losses + 1,), in steps; the longest first.
+
+        ``between`` are those that are possible.
+        """
         intervals, remaining = [], self.steps
         for further in range(self.losses, -1, -1):
-            intervals.append(min(times.longest, remaining - further * times.shortest))
+            intervals.append(min(between[-1], remaining - further * between[0]))
             remaining -= intervals[-1]
         return intervals
 
@@ -68,7 +64,7 @@ class Burst(NamedTuple):
 def list_bursts(
     guarantee: LossGuarantee,
     loop: LoopTimes,
-    times: EventTimes = EVERY_STEP,
+    between: range = EVERY_STEP,
 ) -> list[Burst]:
     """Return the graph of a guarantee between deliveries; node 0 is that of the first delivery.
 
@@ -89,7 +85,7 @@ def list_bursts(
         while state >= 0:
             after = int(automaton.after_delivery(np.array([state]))[0])
             sent = losses + 1
-            for steps in range(sent * times.shortest, sent * times.longest + 1):
+            for steps in range(sent * between[0], sent * between[-1] + 1):
                 target = after, (slot + steps) % loop.slots, loop.usable(steps, loop.delay)
                 if target not in numbers:
                     numbers[target] = len(numbers)
@@ -217,7 +213,8 @@ class LossMargin:
         require_covered(resolved)
         loop = loop_of(resolved)
         self.guarantee = resolved.network.guarantee
-        self.shortest, self.longest = intervals(resolved)
+        between = intervals(resolved)
+        self.shortest, self.longest = between[0], between[-1]
         if longest is not None:
             is_regular = self.shortest == self.longest
             self.shortest = longest if is_regular else min(self.shortest, longest)
@@ -225,7 +222,8 @@ class LossMargin:
         is_periodic = self.shortest == self.longest
         self._unit = unit = self.longest if is_periodic else 1
         self._measurement = resolved.timing.measurement_period
-        self._times = EventTimes(self.shortest // unit, self.longest // unit)
+        self._between = range(self.shortest // unit, self.longest // unit + 1)
+        """The numbers of steps that may be between two transmissions."""
         times = loop_times(resolved, unit)
         self.loop = TimeTriggeredLoop(loop.A, loop.B, loop.K, loop.H, times)
         # A controller that knows x(0) gets its first update after a period.
@@ -241,7 +239,7 @@ class LossMargin:
 
     def bursts(self, guarantee: LossGuarantee) -> list[Burst]:
         """Return the graph of a guarantee; raise CallerError if it has too many edges."""
-        return list_bursts(guarantee, self.loop.times, self._times)
+        return list_bursts(guarantee, self.loop.times, self._between)
 
     def edges(self, bursts: list[Burst]) -> list[Edge]:
         """Return a graph with the loop's maps."""
@@ -284,10 +282,10 @@ class LossMargin:
 
     def _bounded(self, bursts: list[Burst], accuracy: float, *, decide: bool, effort: float) -> Stability:
         # Short steps would need many vertices.
-        vertices = MOST_VERTICES if self._times == EVERY_STEP else 0
+        vertices = MOST_VERTICES if self._between == EVERY_STEP else 0
         radius = joint_spectral_radius(
             self.edges(bursts),
-            accuracy=accuracy / self._times.longest,
+            accuracy=accuracy / self._between[-1],
             most_vertices=vertices,
             threshold=1.0 if decide else None,
             effort=effort,
@@ -298,15 +296,15 @@ class LossMargin:
         begin = slots.index(self._first_slot) if self._first_slot in slots else 0
         path = path[begin:] + path[:begin]
         pattern = [delivered for burst in path for delivered in (True, *[False] * burst.losses)]
-        if path and self._times == EVERY_STEP:
+        if path and self._between == EVERY_STEP:
             begin = (self._first_slot - path[0].slot) % self.loop.times.slots
             pattern = pattern[begin:] + pattern[:begin]
         intervals_s = (
-            self.seconds(steps * self._unit) for burst in path for steps in burst.intervals(self._times)
+            self.seconds(steps * self._unit) for burst in path for steps in burst.intervals(self._between)
         )
         return Stability(
-            radius.lower**self._times.longest,
-            radius.upper**self._times.longest,
+            radius.lower ** self._between[-1],
+            radius.upper ** self._between[-1],
             tuple(pattern),
             tuple(intervals_s),
             radius.vertices,

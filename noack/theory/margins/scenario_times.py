@@ -11,7 +11,6 @@ import numpy as np
 
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
-from noack.core.periods import exact_ns, simplest_fraction
 from noack.impairments.kinds.delay import Delay
 from noack.scenario.resolution import rule_of, setpoint_of
 from noack.scenario.scenario import Scenario
@@ -56,8 +55,8 @@ def require_idle_watchdog(resolved: Scenario) -> None:
         )
 
 
-def intervals(resolved: Scenario) -> tuple[int, int]:
-    """Return the shortest and the longest time between two transmissions, in measurements.
+def intervals(resolved: Scenario) -> range:
+    """Return the times that may be between two transmissions, in measurements.
 
     Raises:
         CallerError: there is no longest time.
@@ -74,7 +73,7 @@ def intervals(resolved: Scenario) -> tuple[int, int]:
         max(math.ceil(Fraction(time_ns) / measurement.exact), 1)
         for time_ns in (rule.earliest_ns, rule.longest_ns)
     )
-    return shortest, longest
+    return range(shortest, longest + 1)
 
 
 def loop_times(resolved: Scenario, measurements: int) -> LoopTimes:
@@ -82,8 +81,8 @@ def loop_times(resolved: Scenario, measurements: int) -> LoopTimes:
 
     An update may be on its way for several such times.
 
-    Runs round times to nanoseconds, down or up so that what is at one time stays in its order
-    (:mod:`noack.core.periods`). Here nothing is rounded.
+    They are the exact times of :class:`noack.scenario.scenario_tables.Timing`, in whole parts of a
+    nanosecond.
 
     Raises:
         CallerError: too many updates are on their way, or they become too old on it.
@@ -91,12 +90,9 @@ def loop_times(resolved: Scenario, measurements: int) -> LoopTimes:
     timing = resolved.timing
     periods = timing.plant_period, timing.controller_period, timing.measurement_period.times(measurements)
     step, tick, unit = (period.exact for period in periods)
-    delay, phase = update_delay_ns(resolved), Fraction(timing.controller_phase_ns)
-    timeout_s, timeout = resolved.controller.update_timeout_s, Fraction(0)
-    if timeout_s is not None:
-        timeout = Fraction(timing.update_timeout_ns) if timing.has_whole_periods else exact_ns(timeout_s)
-    if not timing.has_whole_periods:
-        phase = simplest_fraction(resolved.controller.phase) * tick
+    delay, phase = update_delay_ns(resolved), timing.exact_controller_phase
+    timeout_s = resolved.controller.update_timeout_s
+    timeout = timing.exact_time(timeout_s or 0.0, timing.update_timeout_ns)
     behind = int(delay // unit)
     _require_few_on_their_way(resolved, float(delay / NS_PER_S), periods[-1].seconds, behind)
     parts = math.lcm(*(time.denominator for time in (step, tick, unit, phase, delay, timeout)))
@@ -143,8 +139,7 @@ def update_delay_ns(resolved: Scenario) -> Fraction:
             impairment.jitter_s or impairment.samples_s or impairment.file
         )
         if isinstance(impairment, Delay) and constant:
-            is_whole = resolved.timing.has_whole_periods or not impairment.delay_s
-            delay_ns += impairment.constant_ns if is_whole else exact_ns(impairment.delay_s)
+            delay_ns += resolved.timing.exact_time(impairment.delay_s, impairment.constant_ns)
         elif impairment.kind not in _WITHOUT_DELAY:
             raise CallerError(
                 f"network.impairments.{number}: {impairment.kind}: this needs a constant "

@@ -33,7 +33,11 @@ NEVER = 10**60
 
 
 class LoopTimes(NamedTuple):
-    """The times of a time-triggered loop, in parts of a nanosecond: no period is rounded."""
+    """The schedule of a time-triggered loop, in parts of a nanosecond: no period is rounded.
+
+    :func:`noack.theory.margins.scenario_times.loop_times` derives it from a scenario's ``Timing``. All
+    its times are whole numbers, so that what happens at the same time does so here, too.
+    """
 
     step: int
     """h, of the plant."""

@@ -73,10 +73,10 @@ def growth_without_guarantee(resolved: Scenario, losses: LossProcess) -> MeanSqu
         NotPredictableError: loop and losses have too many states, or the sensor is not
             time-triggered.
     """
-    shortest, longest = intervals(resolved)
-    if shortest != longest:
+    between = intervals(resolved)
+    if len(between) > 1:
         raise NotPredictableError("the times between updates are not known")
-    loop, times = loop_of(resolved), loop_times(resolved, longest)
+    loop, times = loop_of(resolved), loop_times(resolved, between[0])
     if times.timeout < NEVER:
         raise NotPredictableError("controller.update_timeout_s: the input depends on the update's age")
     require_few_slots(times)
