@@ -17,7 +17,6 @@ from noack.core.errors import CallerError
 from noack.core.number_checks import real_number, whole_number
 from noack.core.number_format import at_least, at_most, duration
 from noack.guarantee.loss_guarantee import LossGuarantee, OutcomePattern, find_counterexample, outcome_letters
-from noack.impairments.constraints import join_guarantee
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.markov_chain import NotPredictableError
 from noack.impairments.target_loss import loss_process
@@ -70,7 +69,7 @@ def read_guarantee(words: str) -> LossGuarantee:
             f'guarantee "{words}": expected only mansd, atmost and recover, e.g. '
             f'"{" ".join(guarantee_words(settings)) or "mansd 4 atmost 3 in 10"}"'
         )
-    guarantee = join_guarantee(settings.mansd, settings.constraints)
+    guarantee = settings.guarantee
     if guarantee.longest_burst is None:
         raise CallerError(f'guarantee "{words}": needs a maximum of losses: mansd or atmost')
     return guarantee

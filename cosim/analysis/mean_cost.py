@@ -13,7 +13,6 @@ from noack.core.errors import CallerError, one_line, shortened
 from noack.core.linear_systems import Matrix
 from noack.core.number_format import number
 from noack.guarantee.loss_guarantee import LossGuarantee
-from noack.impairments.constraints import join_guarantee
 from noack.impairments.markov_chain import NotPredictableError
 from noack.impairments.target_loss import loss_process
 from noack.scenario.resolution import loop_of
@@ -162,7 +161,7 @@ def find_mean_cost(resolved: Scenario, Q: object = None, R: object = None) -> Me
         horizon_s=resolved.timing.horizon_ns / NS_PER_S,
         state_names=loop.state_names or tuple(f"x_{i + 1}" for i in range(n)),
         input_names=loop.input_names or tuple(f"u_{j + 1}" for j in range(loop.m)),
-        with_guarantee=attempt(join_guarantee(link.mansd, link.constraints)),
+        with_guarantee=attempt(link.guarantee),
         without_guarantee=attempt(LossGuarantee()),
     )
 

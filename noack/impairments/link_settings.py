@@ -11,7 +11,8 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from noack.impairments.constraints import AnyConstraint, find_longest_burst, require_consistent
+from noack.guarantee.loss_guarantee import LossGuarantee
+from noack.impairments.constraints import AnyConstraint, join_guarantee, require_consistent
 from noack.impairments.disciplines.maximum_error import MaximumError
 from noack.impairments.feature import LossModel
 from noack.impairments.kinds import AnyImpairment
@@ -73,9 +74,14 @@ class LinkSettings(ScenarioSection):
         )
 
     @property
+    def guarantee(self) -> LossGuarantee:
+        """All rules that the losses of a flow keep; none, if nothing limits them."""
+        return join_guarantee(self.mansd, self.constraints)
+
+    @property
     def longest_burst(self) -> int | None:
         """Maximum number of consecutive losses that the guarantee allows; None: no maximum."""
-        return find_longest_burst(self.mansd, self.constraints)
+        return self.guarantee.longest_burst
 
     @model_validator(mode="after")
     def _check(self) -> Self:

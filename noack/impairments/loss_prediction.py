@@ -30,7 +30,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.guarantee.loss_guarantee import LossGuarantee
-from noack.impairments.constraints import join_guarantee
 from noack.impairments.feature import PacketOrder
 from noack.impairments.link_settings import USUAL_LIMIT, LinkSettings
 from noack.impairments.markov_chain import (
@@ -75,7 +74,7 @@ def predict(settings: LinkSettings) -> LossPrediction:
             for part in impairment.chains()
         ]
         if settings.constraints:
-            rate = _constrained_rate(parts, join_guarantee(settings.mansd, settings.constraints))
+            rate = _constrained_rate(parts, settings.guarantee)
         else:
             rate = _capped_rate(parts, settings.mansd)
     except NotPredictableError as error:

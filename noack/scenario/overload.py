@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 from noack.core.clock import NS_PER_S
 from noack.guarantee.loss_guarantee import WindowBound
-from noack.impairments.constraints import join_guarantee
 from noack.impairments.kinds.opportunities import Opportunities
 from noack.impairments.kinds.rate import Rate
 from noack.impairments.kinds.schedule import Schedule
@@ -71,7 +70,7 @@ def _actuations(loop: Scenario) -> _Sender:
 
 def _refuse(path: str, direction: DirectionSection, senders: Sequence[_Sender], names: Sequence[str]) -> None:
     link = direction.link
-    windows = join_guarantee(link.mansd, link.constraints).windows
+    windows = link.guarantee.windows
     window = min(windows, key=lambda window: window.losses / window.packets, default=WindowBound(1, 1))
     passing = window.packets - window.losses
     share = Fraction(passing, window.packets)

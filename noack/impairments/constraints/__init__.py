@@ -19,14 +19,6 @@ else:
     AnyConstraint = union_of(_KINDS)
 
 
-def find_longest_burst(mansd: int | None, constraints: Sequence[AnyConstraint]) -> int | None:
-    """Return the maximum number of consecutive losses that cap and constraints allow together.
-
-    None: there is no maximum.
-    """
-    return join_guarantee(mansd, constraints).longest_burst
-
-
 def join_guarantee(mansd: int | None, constraints: Sequence[AnyConstraint]) -> LossGuarantee:
     """Return the rules of cap and constraints together."""
     cap = () if mansd is None else (LongestBurst(mansd),)
@@ -46,7 +38,7 @@ def require_consistent(mansd: int | None, constraints: Sequence[AnyConstraint]) 
                 f"constraints.{number}: {constraint.text()}: there is a {constraint.scope} already"
             )
         scopes.add(constraint.scope)
-    if constraints and find_longest_burst(mansd, constraints) is None:
+    if constraints and join_guarantee(mansd, constraints).longest_burst is None:
         raise ValueError(
             f"constraints: {constraints[0].text()}: needs a maximum of losses, too: mansd or at_most (atmost)"
         )
