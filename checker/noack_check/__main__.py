@@ -19,10 +19,10 @@ from noack_check.check import RejectedError
 from noack_check.growth import prove_growth, read_periodic_loop
 from noack_check.keys import RefusedError, Table
 from noack_check.proof import prove
-from noack_check.scenario import output_names, read_loop
-from noack_check.sentences import assumptions, growth_sentences, sentences
+from noack_check.scenario import output_names, read_enclosed, read_loop
+from noack_check.sentences import assumptions, equations_text, growth_sentences, sentences
 
-_PLANTS = {"own": "its plant", "box": "all plants of its uncertainty box"}
+_PLANTS = {"own": "its plant", "box": "all plants of its uncertainty box", "region": "its plant's equations"}
 _CONDITIONS = {"ideal": "ideal conditions", "schedule": "its schedule"}
 _LONGEST_NAME, _MOST_KEYS = 200, 5
 MOST_BYTES = 64 * 1024**2
@@ -92,10 +92,13 @@ def check_file(file: Table, given: Table | None) -> Iterator[str]:
             growth = prove_growth(read_periodic_loop(scenario), document)
             yield from (f"PROVED {of}, nothing late: {sentence}" for sentence in growth_sentences(growth))
             continue
-        loop = read_loop(scenario, box=plants == "box", ideal=conditions == "ideal")
+        enclosed = read_enclosed(scenario, document) if plants == "region" else None
+        loop = read_loop(scenario, box=plants == "box", ideal=conditions == "ideal", enclosed=enclosed)
         for sentence in sentences(prove(loop, document), output_names(scenario)):
             yield f"PROVED {of}: {sentence}"
         yield f"       if there are {assumptions(scenario, loop)}"
+        if enclosed is not None:
+            yield f"       and the plant is {equations_text(document)}"
 
 
 class UnreadableError(ValueError):

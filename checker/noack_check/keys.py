@@ -89,11 +89,15 @@ def key_table() -> KeyTable:
     return KeyTable(Path(__file__).with_name("keys.toml"))
 
 
-def refusals(resolved: Table) -> list[str]:
-    """Return a line for each key of a resolved scenario that no statement of a witness covers."""
+def refusals(resolved: Table, *, has_equations: bool = False) -> list[str]:
+    """Return a line for each key of a resolved scenario that no statement of a witness covers.
+
+    ``has_equations``: the equations of the plant are known.
+    """
     knows_state = _get(resolved, "network", "initial_sync") == "known_state"
     harmless = ["controller.safe_input"] if knows_state else []  # it is never applied
-    found = [line for key, line in key_table().refusals(resolved) if key not in harmless]
+    of = () if has_equations else ("linear",)
+    found = [line for key, line in key_table().refusals(resolved, of) if key not in harmless]
     if _get(resolved, "network", "impairments") and _get(resolved, "certificate", "network_delay_s") is None:
         found.append("certificate.network_delay_s: state the largest delay of updates in the network")
     return found

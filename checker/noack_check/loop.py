@@ -70,6 +70,20 @@ class Noise(NamedTuple):
     """‖W n‖ is at most their sum, times f₁ and f₂."""
 
 
+class Along(NamedTuple):
+    """A disturbance p has p·C(x, u) ≥ k p², as friction that takes energy out of the plant."""
+
+    row: arb_mat  # C, (1, n + m); 0: nothing is known
+    least: arb  # k ≥ 0
+
+
+class Region(NamedTuple):
+    """|x_i| < x[i] and |u_j| < u[j]: where a plant's equations are enclosed; None: any value."""
+
+    x: tuple[arb | None, ...]
+    u: tuple[arb | None, ...]
+
+
 class Loop(NamedTuple):
     """A loop with n states and m inputs, in coordinates in which its set-point is 0."""
 
@@ -92,6 +106,10 @@ class Loop(NamedTuple):
     observer: Observer | None = None
     outputs: arb_mat = zeros(0, 0)
     """The rows of C in y = Cx, (p, n); without rows y is x."""
+    along: tuple[Along, ...] = ()
+    """What is known of each disturbance; (): nothing of any."""
+    region: Region | None = None
+    """Where the plant is one with such matrices and disturbances; None: everywhere."""
 
     @property
     def output_rows(self) -> arb_mat:
@@ -163,6 +181,8 @@ class Loop(NamedTuple):
                 return "observer: its model may not be the plant"
             if not (times.sampling > 0 and self.observer.period > 0):
                 return "observer: without tests at times"
+        if self.along and [(a.row.nrows(), a.row.ncols()) for a in self.along] != [(1, n + m)] * k:
+            return f"along: not a row of {n + m} for each disturbance"
         if n == 0 or len(self.sizes) != k:
             return "no states, or not one size for each disturbance"
         if not all(time >= 0 for time in times) or times.least_sampling > times.sampling:

@@ -65,7 +65,7 @@ from noack_check.balls import (
     upto,
     zeros,
 )
-from noack_check.loop import Loop, Noise
+from noack_check.loop import Along, Loop, Noise
 
 _CLOSE = 1000
 """Nodes of a periodic rule's clock are at least such a share of the period apart."""
@@ -78,13 +78,16 @@ class Unknown(NamedTuple):
 
     column: arb_mat
     rows: arb_mat
+    along: Along | None = None
+    """A row C and k ≥ 0 with p·Cz ≥ k p², as of friction."""
 
 
 class Flow(NamedTuple):
-    """ż = ``matrix`` z + Σ column p."""
+    """ż = ``matrix`` z + Σ column p, with the input u = ``input`` z."""
 
     matrix: arb_mat
     unknowns: tuple[Unknown, ...]
+    input: arb_mat
 
 
 class Location(NamedTuple):
@@ -397,7 +400,7 @@ class Model:
                 error -= smooth
             units = 0 * self.p, -self.rate * self.f1, 0 * self.f2
             matrix = stack([velocity, error, H * self.w, *copies, smooth, *units])
-            found.append(Flow(matrix, tuple(self._unknowns(u))))
+            found.append(Flow(matrix, tuple(self._unknowns(u)), u))
         return tuple(found)
 
     def _unknowns(self, u: arb_mat) -> Iterator[Unknown]:
@@ -413,7 +416,10 @@ class Model:
                     yield Unknown(self._push(columns_of(root * identity(n), [i])), root * row)
         for index, size in enumerate(loop.sizes):
             root = size.sqrt()
-            yield Unknown(self._push(root * columns_of(loop.pushes, [index])), root * self.f2)
+            column, along = self._push(root * columns_of(loop.pushes, [index])), None
+            if loop.along and not is_zero((known := loop.along[index]).row):
+                along = Along(known.row * stack([self.x, u]), root * known.least)
+            yield Unknown(column, root * self.f2, along)
 
     def _push(self, column: arb_mat) -> arb_mat:
         """Return the column of ż for one of ẋ."""
@@ -592,7 +598,8 @@ class Model:
     def output(self, name: str, place: Location) -> list[tuple[arb_mat, Flow | None]]:
         """Return C of an output in a location, for each flow if the output depends on the flow.
 
-        "x" is x, "y[j]" the j-th output, "e_s" and "e_c" are W e_s and W e_c, and
+        "x" is x, "x[i]" one of its entries, "u[j]" one of the input, "y[j]" the j-th output, "e_s" and
+        "e_c" are W e_s and W e_c, and
         "drift" is W (ẋ − H x), by which the sensor's error grows: ė = He − (ẋ − Hx). The bound of the
         drift is one from the first input on.
         """
@@ -605,8 +612,11 @@ class Model:
             return [(loop.weight * (self.e + self.w), None)]
         if name == "drift":
             return [(self._drift(flow.matrix) - loop.weight * loop.H * self.x, flow) for flow in place.flows]
-        index = int(name.removeprefix("y[").removesuffix("]"))
-        return [(rows_of(loop.output_rows, [index]) * self.x, None)]
+        index = int(name[2:].removesuffix("]"))
+        if name.startswith("u["):
+            return [(rows_of(flow.input, [index]), None) for flow in place.flows]
+        row = rows_of(loop.output_rows if name.startswith("y[") else identity(loop.n), [index])
+        return [(row * self.x, None)]
 
     def _drift(self, motion: arb_mat) -> arb_mat:
         return self.loop.weight * rows_of(motion, range(self.loop.n))
@@ -634,12 +644,16 @@ class Model:
                 yield terms.inequality(f"{name}/{corner}", index, len(unknowns))
 
     def _add_signals(self, terms: "_Terms", name: str, unknowns: tuple[Unknown, ...], E: arb_mat) -> None:
-        """Add Σ τ (|p|² − |Rz|²) of the last coordinates, p."""
+        """Add Σ τ (|p|² − |Rz|²) + m (k p² − p·Cz) of the last coordinates, p."""
         size = E.ncols()
         for signal, unknown in enumerate(unknowns):
             one = zeros(1, size)
             one[0, size - len(unknowns) + signal] = 1
             terms.scalar(f"{name}/signal {signal}", square(one) - square(unknown.rows * E))
+            if unknown.along is not None:
+                product = transpose(one) * (unknown.along.row * E)
+                known = 2 * unknown.along.least * square(one) - product - transpose(product)
+                terms.scalar(f"{name}/along {signal}", known)
 
     def _edge_inequalities(self, edge: Edge) -> Iterator[Inequality]:
         """V_target(jump z) ≤ V_source(z) + Σ m q.

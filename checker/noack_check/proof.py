@@ -27,7 +27,7 @@ from flint import arb, arb_mat, fmpq
 from noack_check.balls import around_zero, frobenius, identity, is_zero, upto
 from noack_check.check import RejectedError, verify
 from noack_check.document import read_count, read_matrix, read_number, read_table
-from noack_check.loop import Loop, Noise, Times
+from noack_check.loop import Loop, Noise, Region, Times
 from noack_check.model import Chain, Errors, Model, thresholds
 from noack_check.noise import noise_of
 from noack_check.norms import decays_below, growth
@@ -95,6 +95,8 @@ def prove(loop: Loop, document: Mapping[str, object]) -> Proof:
     require_few_later(loop, assumed, apart if is_quiet else None)
     if assumed.errors is not None:
         _require_errors(loop, rate, proven, assumed.errors)
+    if loop.region is not None:
+        _require_region(loop.region, proven)
     if assumed.chain is not None and sensor is not None:
         jumps = assumed.chain.factor(loop.losses, 1 + assumed.later if loop.times.delay > 0 else 0)
         noise = noise_of(loop, rate).sizes
@@ -288,7 +290,9 @@ def prove_bound(loop: Loop, rate: arb, entry: Mapping[str, object], assumed: Ass
         pieces=assumed.pieces,
     )
     output, starts = str(entry.get("output")), bool(entry.get("from_start", True))
-    if output not in {"x", "e_s", "e_c", "drift", *(f"y[{j}]" for j in range(loop.output_rows.nrows()))}:
+    counts = {"x": loop.n, "u": loop.B.ncols(), "y": loop.output_rows.nrows()}
+    entries = {f"{kind}[{i}]" for kind, count in counts.items() for i in range(count)}
+    if output not in {"x", "e_s", "e_c", "drift"} | entries:
         raise RejectedError(f"output: {output[:50]!r} is none of the loop's")
     if output == "e_s" and model.is_periodic:
         raise RejectedError("e_s: the model of a periodic rule has no error of an update that is lost")
@@ -416,6 +420,22 @@ def _require_errors(loop: Loop, rate: arb, proven: Mapping[str, Bound], errors: 
     exact = loop.times.sampling == 0 and compares_error(loop)
     if not (share < 1 or (exact and share <= 1)):
         raise RejectedError("errors: the sensor's error may exceed them")
+
+
+def _require_region(region: Region, proven: Mapping[str, Bound]) -> None:
+    """Prove that x and u stay in the region: their bounds are below its limits, strictly.
+
+    Up to some time they are in it; so all bounds hold, also at this time, since x is continuous and no
+    edge assumes anything of the plant. So x and the input that acts next are in it a little later, too.
+    """
+    for kind, limits in zip("xu", region, strict=True):
+        for index, limit in enumerate(limits):
+            if limit is None:
+                continue
+            if (bound := proven.get(f"{kind}[{index}]")) is None:
+                raise RejectedError(f"region: {kind}[{index}] has no bound from the start on")
+            if not (bound.decaying**2 + bound.constant**2).sqrt() < limit:
+                raise RejectedError(f"region: {kind}[{index}] may leave it")
 
 
 def share_of_errors(loop: Loop, rate: arb, drift: Bound, errors: Errors) -> arb:

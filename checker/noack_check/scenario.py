@@ -12,9 +12,11 @@ from typing import NamedTuple
 
 from flint import arb, arb_mat, fmpq
 
-from noack_check.balls import beside, columns_of, identity, matrix, number, rows_of, stack, zeros
+from noack_check.balls import beside, columns_of, identity, is_zero, matrix, number, rows_of, stack, zeros
+from noack_check.document import read_table
+from noack_check.equations import LinearPlants, enclose, read_region
 from noack_check.keys import RefusedError, Table, refusals
-from noack_check.loop import Loop, Observer, Rule, Times
+from noack_check.loop import Along, Loop, Observer, Region, Rule, Times
 from noack_check.times import NS_PER_S, Schedule, fraction, nanoseconds
 
 Rows = Sequence[Sequence[float]]
@@ -31,7 +33,14 @@ class _Plants(NamedTuple):
     half_B: Rows
 
 
-def read_loop(resolved: Table, *, box: bool, ideal: bool) -> Loop:
+class Enclosed(NamedTuple):
+    """A plant's equations, enclosed over a region."""
+
+    plants: LinearPlants
+    region: Region
+
+
+def read_loop(resolved: Table, *, box: bool, ideal: bool, enclosed: Enclosed | None = None) -> Loop:
     """Return the loop of a resolved scenario of one loop.
 
     Args:
@@ -39,24 +48,27 @@ def read_loop(resolved: Table, *, box: bool, ideal: bool) -> Loop:
         box: all plants within the uncertainty around the model; else the plant itself.
         ideal: the paper's conditions: no delay, inputs of age 0, tests at all times (at those of its
             grid for a rule that has one).
+        enclosed: the equations of a plant that the scenario does not give by A and B.
 
     Raises:
         RefusedError: a key is not covered, is missing or has a wrong value.
     """
-    for refusal in refusals(resolved):
+    for refusal in refusals(resolved, has_equations=enclosed is not None):
         raise RefusedError(refusal)
     model, plant, trigger = (_table(resolved, key) for key in ("model", "plant", "trigger"))
     A, B = _matrix(model, "model.A"), _matrix(model, "model.B")
     n, m = len(A), len(B[0])
     _require_shapes(resolved, n, m)
-    own = _Plants(_matrix(plant, "plant.A"), _matrix(plant, "plant.B"), [[0] * n] * n, [[0] * m] * n)
+    own = _Plants(A, B, [[0] * n] * n, [[0] * m] * n)
+    if enclosed is None:
+        own = own._replace(A=_matrix(plant, "plant.A"), B=_matrix(plant, "plant.B"))
     plants = _box(plant, A, B, own) if box else own
     x_r = _setpoint(resolved, A, plants)
     _choice(_table(resolved, "network"), "network.initial_sync", ("first_packet", "known_state"))
-    pushes = [*_disturbances(plant, plants), *_at_rest(plants.A, x_r)]
+    pushes = [*_disturbances(plant, matrix(plants.B), matrix(plants.half_B)), *_at_rest(plants.A, x_r)]
     weight = _weight(trigger, n)
     rule = _rule(trigger, weight)
-    return Loop(
+    loop = Loop(
         A=matrix(plants.A),
         B=matrix(plants.B),
         half_A=matrix(plants.half_A),
@@ -76,6 +88,60 @@ def read_loop(resolved: Table, *, box: bool, ideal: bool) -> Loop:
         losses=_losses(_table(resolved, "network")),
         times=_times(resolved, trigger, ideal=ideal),
     )
+    return loop if enclosed is None else _with_equations(loop, resolved, enclosed)
+
+
+def read_enclosed(resolved: Table, document: Table) -> Enclosed:
+    """Return the equations of a witness's document, enclosed over its region.
+
+    Raises:
+        RefusedError: the scenario has no model.
+        RejectedError: the equations have no meaning, or no enclosure.
+    """
+    B = _matrix(_table(resolved, "model"), "model.B")
+    region = read_region(document, len(B), len(B[0]))
+    return Enclosed(enclose(read_table(document, "equations"), region), region)
+
+
+def _with_equations(loop: Loop, resolved: Table, enclosed: Enclosed) -> Loop:
+    """Return the loop with a plant's equations; x and the disturbed input have to stay in their region."""
+    plants, region = enclosed
+    n, m = loop.n, plants.B.ncols()
+    if loop.observer is not None:
+        raise RefusedError("observer: not covered with a plant's equations")
+    setpoint = _optional_table(resolved, "controller").get("setpoint")
+    if setpoint is not None and any(_row({"setpoint": setpoint}, "controller.setpoint")):
+        raise RefusedError("controller.setpoint: not covered with a plant's equations")
+    plant, nothing = _table(resolved, "plant"), Along(arb_mat(1, n + m), arb(0))
+    disturbances, room = list(_disturbances(plant, plants.B, plants.half_B)), _input_room(plant, m)
+    is_moved = any(each > 0 for each in room)
+    along = [
+        nothing if is_moved and not is_zero(columns_of(a.row, range(n, n + m))) else a for a in plants.along
+    ]
+    columns = [columns_of(plants.pushes, [k]).entries() for k in range(plants.pushes.ncols())]
+    columns += disturbances
+    limits = tuple(None if s is None else s - each for s, each in zip(region.u, room, strict=True))
+    return loop._replace(
+        A=plants.A,
+        B=plants.B,
+        half_A=plants.half_A,
+        half_B=plants.half_B,
+        pushes=arb_mat(n, len(columns), [column[i] for i in range(n) for column in columns]),
+        sizes=(arb(1),) * len(columns),
+        along=(*along, *[nothing] * len(disturbances)),
+        region=region._replace(u=limits),
+    )
+
+
+def _input_room(plant: Table, m: int) -> list[arb]:
+    """Return by how much disturbances move each input at most."""
+    room = [arb(0)] * m
+    for entry in _tables(plant, "plant.disturbances"):
+        if entry.get("at") == "input":
+            name = "bound" if entry.get("kind") == "uniform" else "amplitude"
+            values = _row(entry, f"plant.disturbances.{name}")
+            room = [each + abs(number(value)) for each, value in zip(room, values, strict=True)]
+    return room
 
 
 def _box(plant: Table, A: Rows, B: Rows, own: _Plants) -> _Plants:
@@ -91,7 +157,7 @@ def _require_shapes(resolved: Table, n: int, m: int) -> None:
     shapes |= {"plant.B": (n, m), "plant.uncertainty_A": (n, n), "plant.uncertainty_B": (n, m)}
     for name, (height, width) in shapes.items():
         table = model if name.startswith("model.") else plant
-        if name.startswith("plant.uncertainty") and name.partition(".")[2] not in table:
+        if name.startswith("plant.") and name.partition(".")[2] not in table:
             continue
         rows = _matrix(table, name)
         if len(rows) != height or len(rows[0]) != width:
@@ -327,9 +393,9 @@ def _stacked(blocks: Sequence[arb_mat]) -> arb_mat:
 # Disturbances and set-points.
 
 
-def _disturbances(plant: Table, plants: _Plants) -> Iterator[list[arb]]:
+def _disturbances(plant: Table, B: arb_mat, half_B: arb_mat) -> Iterator[list[arb]]:
     """Yield columns: bounded disturbances add their multiples with factors from −1 to 1 to ẋ."""
-    n, m = len(plants.A), len(plants.B[0])
+    n, m = B.nrows(), B.ncols()
     for entry in _tables(plant, "plant.disturbances"):
         at_input = _choice(entry, "plant.disturbances.at", ("input", "state")) == "input"
         kind = _choice(entry, "plant.disturbances.kind", ("sine", "step", "uniform"))
@@ -339,9 +405,9 @@ def _disturbances(plant: Table, plants: _Plants) -> Iterator[list[arb]]:
             raise RefusedError("plant.disturbances: not one number per input or state")
         signals = [[0.0] * k + [v] + [0.0] * (len(values) - k - 1) for k, v in enumerate(values)]
         for signal in signals if each_alone else [values]:
-            yield from _nonzero(_product(plants.B, signal) if at_input else [number(v) for v in signal])
+            yield from _nonzero(_product(B, signal) if at_input else [number(v) for v in signal])
             if at_input:
-                sizes = _product(plants.half_B, [abs(v) for v in signal])
+                sizes = _product(half_B, [abs(v) for v in signal])
                 for i, size in enumerate(sizes):  # B of the plants is not known
                     yield from _nonzero([size if k == i else arb(0) for k in range(n)])
 
@@ -424,8 +490,8 @@ def _require_unknown_start(resolved: Table, name: str) -> None:
         raise RefusedError(f'{name}: with network.initial_sync = "known_state" not covered')
 
 
-def _product(M: Rows, v: Sequence[float]) -> list[arb]:
-    return [sum((number(a) * number(b) for a, b in zip(row, v, strict=True)), arb(0)) for row in M]
+def _product(M: arb_mat, v: Sequence[float]) -> list[arb]:
+    return (M * matrix([[value] for value in v])).entries()
 
 
 def _nonzero(column: list[arb]) -> Iterator[list[arb]]:

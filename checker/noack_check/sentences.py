@@ -5,12 +5,15 @@ from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 
 from flint import arb
 
+from noack_check.document import read_table
+from noack_check.equations import formulas
 from noack_check.growth import Growth
 from noack_check.loop import Loop
 from noack_check.proof import Bound, Proof
 
 _SHORT = 7
 """Longest decimal number that is printed as it is, if it stands for exactly that number."""
+_LONGEST_EQUATIONS = 600
 _NAMES = {"x": "‖x‖", "e_s": "‖W e_s‖", "e_c": "‖W e_c‖", "drift": "‖W(ẋ − Hx)‖"}
 
 
@@ -37,6 +40,14 @@ def assumptions(scenario: Mapping[str, object], loop: Loop) -> str:
     if scenario.get("changes"):
         parts.append("until the first change of settings")
     return ", ".join(parts)
+
+
+def equations_text(document: Mapping[str, object]) -> str:
+    """Return the equations of a plant in a document that was accepted, which a statement is about."""
+    equations = read_table(document, "equations")
+    rates = [f"dx_{i + 1}/dt = {formula}" for i, formula in enumerate(formulas(equations))]
+    text = ", ".join(rates)
+    return text if len(text) <= _LONGEST_EQUATIONS else "that of the equations in the witness's file"
 
 
 def sentences(proof: Proof, outputs: Sequence[str] = ()) -> Iterator[str]:
@@ -76,8 +87,8 @@ def norm(output: str, outputs: Sequence[str] = ()) -> str:
     """Return the norm of an output as a symbol: |angle| of "y[0]", if its name is known."""
     if output in _NAMES:
         return _NAMES[output]
-    index = int(output.removeprefix("y[").removesuffix("]"))
-    return f"|{outputs[index] if outputs else f'y_{index + 1}'}|"
+    kind, index = output[0], int(output[2:].removesuffix("]"))
+    return f"|{outputs[index] if outputs and kind == 'y' else f'{kind}_{index + 1}'}|"
 
 
 def _exception(proof: Proof) -> str:

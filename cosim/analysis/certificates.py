@@ -10,7 +10,7 @@ import numpy as np
 from cosim.analysis.allowed_errors import ThresholdTrials
 from cosim.analysis.constant_rows import constant_rows, covered_plants
 from cosim.analysis.tried_settings import TriedSettings, helpful_box, helpful_settings, largest_settings
-from cosim.analysis.witnesses import Unproven, Witnesses, find_witnesses, needs_matrices, no_witnesses
+from cosim.analysis.witnesses import Unproven, Witnesses, find_region_witnesses, find_witnesses
 from noack.core.errors import CallerError, one_line
 from noack.core.linear_systems import Matrix
 from noack.core.number_checks import one_of, whole_number
@@ -24,6 +24,7 @@ from noack.theory.certificates.assumptions import assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import (
     BOX,
+    LINEAR_EQUATIONS,
     OWN_PLANT,
     REGION,
     about_setpoint,
@@ -53,7 +54,9 @@ SCHEDULE = "schedule"
 MOST_LATE = 1000
 """Most steps of lateness that may be allowed."""
 _STATED = {(IDEAL, OWN_PLANT): ("own", "ideal"), (IDEAL, BOX): ("box", "ideal"),
-           (SCHEDULE, OWN_PLANT): ("own", "schedule"), (SCHEDULE, BOX): ("box", "schedule")}  # fmt: skip
+           (SCHEDULE, OWN_PLANT): ("own", "schedule"), (SCHEDULE, BOX): ("box", "schedule"),
+           **{(under, scope): ("region", conditions) for scope in (REGION, LINEAR_EQUATIONS)
+              for under, conditions in ((IDEAL, "ideal"), (SCHEDULE, "schedule"))}}  # fmt: skip
 """Plants and conditions of witnesses, by those of certificates."""
 
 
@@ -170,7 +173,7 @@ class Certificates:
         """
         scenario, late_periods, *_, nonlinear, equations = self._arguments
         if (other := nonlinear or equations) is not None:
-            found = no_witnesses(scenario, needs_matrices(other))
+            found = find_region_witnesses(other, late_periods, progress, most_work)
         else:
             found = find_witnesses(scenario, late_periods, progress, most_work)
         proven = {(s.plants, s.conditions): s.bounds for s in found.statements if s.bounds is not None}

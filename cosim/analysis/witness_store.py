@@ -40,10 +40,11 @@ class WitnessStore:
     """The file of a loop.
 
     Args:
-        loop: its exact numbers are the key, so that names, seeds and durations do not matter.
+        loop: its exact numbers are the key, so that names, seeds and durations do not matter; of a plant's
+            equations the loop near 0, and the equations.
     """
 
-    def __init__(self, loop: Loop) -> None:
+    def __init__(self, loop: Loop | tuple[Loop, Mapping[str, object]]) -> None:
         key = json.dumps([_FORM, _exact(loop)])
         self._name = hashlib.sha256(key.encode()).hexdigest() + ".json"
 

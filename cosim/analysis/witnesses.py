@@ -5,31 +5,43 @@ the loop from the resolved scenario itself.
 """
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import NamedTuple
 
+import numpy as np
+
 from cosim.analysis.witness_store import StoredSearch, WitnessStore
 from noack.core.errors import CallerError
+from noack.core.linear_systems import Vector
+from noack.plants.systems.traced_equations import NotEnclosedError, TracedEquations, trace
+from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.conditions import with_stated_times
+from noack.theory.certificates.plant_equations import equations_of
 from noack.theory.certificates.proven_bounds import ProvenBounds
 from noack.theory.witnesses.documents import Witness, find_witness
 from noack.theory.witnesses.effort import MOST_WORK, NoWitnessError
 from noack.theory.witnesses.outward import proven_bounds
+from noack.theory.witnesses.regions import PlantOnRegions, find_region_witness, region_table
 from noack_check.check import RejectedError
+from noack_check.equations import read_region
 from noack_check.keys import RefusedError
 from noack_check.loop import Loop
 from noack_check.proof import Proof, prove
+from noack_check.scenario import Enclosed as EnclosedPlant
 from noack_check.scenario import read_loop
+
+_NEAR = 1e-3
+"""The equations near 0, in multiples of typical sizes: they tell searches for other plants apart."""
 
 
 class WitnessedStatement(NamedTuple):
     """What is proven for some plants under some conditions, or why nothing is."""
 
     plants: str
-    """"own" or "box"."""
+    """"own", "box" or "region", of a plant's equations."""
     conditions: str
     """"ideal" or "schedule"."""
     document: dict[str, object] | None
@@ -100,36 +112,42 @@ def find_witnesses(
     return Witnesses(content, found)
 
 
+def find_region_witnesses(
+    resolved: Scenario,
+    late_periods: int,
+    progress: Callable[[float], None] = lambda share: None,
+    most_work: float = MOST_WORK,
+) -> Witnesses:
+    """Search for witnesses of a plant's equations, as :func:`find_witnesses` for a linear plant."""
+    content, conditions = resolved_content(resolved, late_periods), ("ideal", "schedule")
+    found = []
+    for index, under in enumerate(conditions):
+        part = partial(_part_of, progress, index, len(conditions))
+        found.append(find_region_statement(resolved, content, under, part, most_work))
+    progress(1.0)
+    return Witnesses(content, found)
+
+
 def _part_of(progress: Callable[[float], None], index: int, count: int, share: float) -> None:
     """Report the progress of one of several searches."""
     progress((index + share) / count)
 
 
-def needs_matrices(resolved: Scenario) -> str:
-    """Return why a plant that is not linear by its settings has no witness."""
-    kind = resolved.plant.system.kind
-    return f'plant.system.kind = "{kind}": witnesses are for a plant with A and B in the scenario'
-
-
 def require_covered(resolved: Scenario, late_periods: int) -> None:
     """Raise CallerError if the checker covers a scenario neither under its schedule nor under ideal ones."""
-    if not resolved.coverage.is_linear:
-        raise CallerError(f"--witness: {needs_matrices(resolved)}")
     content = resolved_content(resolved, late_periods)
-    for ideal in (False, True):
+    for conditions in ("schedule", "ideal"):
         try:
-            read_loop(content, box=False, ideal=ideal)
-        except RefusedError as error:
-            if ideal:
+            if resolved.coverage.is_linear:
+                read_loop(content, box=False, ideal=conditions == "ideal")
+            else:
+                plant = plant_on_regions(resolved, content, conditions)
+                plant.on(_NEAR * plant.typical)
+        except (RefusedError, NotEnclosedError) as error:
+            if conditions == "ideal":
                 raise CallerError(f"--witness: {error}") from None
         else:
             return
-
-
-def no_witnesses(resolved: Scenario, reason: str) -> Witnesses:
-    """Return that nothing is proven of a scenario."""
-    content: dict[str, object] = {"name": resolved.name}
-    return Witnesses(content, [WitnessedStatement("own", "schedule", None, None, reason)])
 
 
 def resolved_content(resolved: Scenario, late_periods: int) -> dict[str, object]:
@@ -162,6 +180,56 @@ def find_statement(
     return WitnessedStatement(plants, conditions, document, witness.proof, "", bounds)
 
 
+def plant_on_regions(
+    resolved: Scenario,
+    content: Mapping[str, object],
+    conditions: str,
+    adjusted: Callable[[Loop], Loop] = lambda loop: loop,
+) -> PlantOnRegions:
+    """Return the loop of a resolved scenario with its plant's equations, for any region.
+
+    Args:
+        resolved: the scenario.
+        content: its tables, as :func:`resolved_content` returns them.
+        conditions: "ideal" or "schedule".
+        adjusted: returns the loop with other times.
+
+    Raises:
+        NotEnclosedError: the plant has no equations.
+    """
+    loop, system = loop_of(resolved), equations_of(resolved)
+
+    def on(widths: Vector) -> tuple[TracedEquations, Loop]:
+        traced, table = trace(system, loop.n, loop.m, widths), {"region": region_table(widths, loop.n)}
+        enclosed = EnclosedPlant(traced.plants, read_region(table, loop.n, loop.m))
+        found = read_loop(content, box=False, ideal=conditions == "ideal", enclosed=enclosed)
+        return traced, adjusted(found)
+
+    size = float(np.abs(loop.x0).max()) or 1.0
+    typical = size * np.concatenate([np.ones(loop.n), np.abs(loop.K).sum(axis=1)])
+    return PlantOnRegions((*loop.state_names, *loop.input_names), loop.n, typical, on)
+
+
+def find_region_statement(
+    resolved: Scenario,
+    content: Mapping[str, object],
+    conditions: str,
+    progress: Callable[[float], None] = lambda share: None,
+    most_work: float = MOST_WORK,
+) -> WitnessedStatement:
+    """Search for the witness of a plant's equations on a region; see :func:`find_statement`."""
+    try:
+        plant = plant_on_regions(resolved, content, conditions)
+        witness, loop = known_or_found_on_region(
+            plant, progress, most_work, has_outputs=conditions == "schedule"
+        )
+    except (RefusedError, NoWitnessError, NotEnclosedError) as error:
+        return WitnessedStatement("region", conditions, None, None, str(error))
+    document = {"plants": "region", "conditions": conditions, **witness.document}
+    bounds = proven_bounds(witness.proof, loop)
+    return WitnessedStatement("region", conditions, document, witness.proof, "", bounds)
+
+
 def known_or_found(
     loop: Loop, progress: Callable[[float], None], most_work: float, *, has_outputs: bool = True
 ) -> Witness:
@@ -170,21 +238,74 @@ def known_or_found(
     Raises:
         NoWitnessError: none was found.
     """
+    outputs, ultimate = _wanted(loop, has_outputs=has_outputs)
+
+    def search() -> Witness:
+        return find_witness(loop, outputs, ultimate=ultimate, progress=progress, most_work=most_work)
+
+    return _known_or_found(
+        WitnessStore(loop), outputs, ultimate, most_work, search, lambda document: prove(loop, document)
+    )
+
+
+def _wanted(loop: Loop, *, has_outputs: bool) -> tuple[Sequence[str], Sequence[str]]:
+    """Return the outputs to bound from the start on, and in the limit."""
     rows = tuple(f"y[{j}]" for j in range(loop.output_rows.nrows())) if has_outputs else ()
     outputs = ("x", "e_c", *(rows if loop.outputs.nrows() else ()))
-    ultimate = ("x", *rows) if has_outputs and (loop.sizes or loop.noise.ncols()) else ()
+    return outputs, (("x", *rows) if has_outputs and (loop.sizes or loop.noise.ncols()) else ())
+
+
+def known_or_found_on_region(
+    plant: PlantOnRegions,
+    progress: Callable[[float], None],
+    most_work: float,
+    *,
+    has_outputs: bool = True,
+) -> tuple[Witness, Loop]:
+    """Return the witness of a plant on a region, as :func:`known_or_found`, and the loop there.
+
+    Raises:
+        NoWitnessError: none was found.
+        NotEnclosedError: the equations have no enclosure near 0.
+    """
+    equations, near = plant.on(_NEAR * plant.typical)
+    outputs, ultimate = _wanted(near, has_outputs=has_outputs)
+
+    def search() -> Witness:
+        return find_region_witness(plant, outputs, ultimate=ultimate, progress=progress, most_work=most_work)
+
+    def loop_on(document: Mapping[str, object]) -> Loop:
+        region = read_region(document, near.n, near.B.ncols())
+        widths = [np.inf if limit is None else float(limit) for limit in (*region.x, *region.u)]
+        return plant.on(np.array(widths))[1]
+
+    store = WitnessStore((near, equations.document))
+    witness = _known_or_found(
+        store, outputs, ultimate, most_work, search, lambda document: prove(loop_on(document), document)
+    )
+    return witness, loop_on(witness.document)
+
+
+def _known_or_found(
+    store: WitnessStore,
+    outputs: Sequence[str],
+    ultimate: Sequence[str],
+    most_work: float,
+    search: Callable[[], Witness],
+    proven: Callable[[Mapping[str, object]], Proof],
+) -> Witness:
+    """Return what is stored, if it is proven, or what a search finds."""
     wanted = (*outputs, *(f"{output} in the limit" for output in ultimate))
-    store = WitnessStore(loop)
     known = store.read(wanted, most_work)
     if known is not None and known.document is None:
         raise NoWitnessError(known.reason)
     if known is not None and known.document is not None:
-        with suppress(RejectedError):  # it was changed
-            return Witness(known.document, prove(loop, known.document))
+        with suppress(RejectedError, NotEnclosedError):  # it was changed
+            return Witness(known.document, proven(known.document))
     if not most_work:
         raise NoWitnessError("no witness was found earlier")
     try:
-        witness = find_witness(loop, outputs, ultimate=ultimate, progress=progress, most_work=most_work)
+        witness = search()
     except NoWitnessError as error:
         store.write(StoredSearch(None, str(error)), wanted, most_work)
         raise

@@ -311,21 +311,33 @@ def _notes(results: Certificates) -> Iterator[Sentence]:
     yield from _unproven(results)
     if (box := results.helpful_box) is not None:
         yield _prose(f"the box has one{_listed('', [box])}")
-    for under, certificate in results:
-        if certificate.region is not None:
-            loop, region = loop_of(results.scenario), certificate.region
-            limits = zip((*loop.state_names, *loop.input_names), region.x + region.u, strict=True)
-            text = ", ".join(f"|{name}| ≤ {at_most(limit)}" for name, limit in limits)
-            yield Sentence(lead="region", text=f"({under}): {text}", tone=Tone.GOOD, is_prose=True)
+    yield from _regions(results)
     policy = results.scenario.trigger.policy
     exists = results.schedule.exists  # else another norm is tried
     if exists and results.weight is None and policy == "decaying" and any(c.void for c in certificates):
         yield _prose("--weight chosen searches for a norm in which more is certified")
 
 
+def _regions(results: Certificates) -> Iterator[Sentence]:
+    """Yield what a nonlinear plant does not leave."""
+    loop = loop_of(results.scenario)
+    names = (*loop.state_names, *loop.input_names)
+    for under, certificate in results:
+        if certificate.scope != REGION or not certificate.exists:
+            continue
+        if certificate.proven is not None:
+            entries, mark = certificate.proven.entries(loop.n, loop.m), ", ✓"
+            limits = {names[index]: sum(bound) for index, bound in entries.items()}
+        else:
+            assert certificate.region is not None
+            limits, mark = dict(zip(names, certificate.region.x + certificate.region.u, strict=True)), ""
+        text = ", ".join(f"|{name}| ≤ {at_most(limit)}" for name, limit in limits.items())
+        yield Sentence(lead="region", text=f"({under}{mark}): {text}", tone=Tone.GOOD, is_prose=True)
+
+
 def _unproven(results: Certificates) -> Iterator[Sentence]:
     """Yield why no bound is proven for some plants under some conditions."""
-    names = {"ideal": IDEAL, "schedule": SCHEDULE, "own": "plant", "box": "box"}
+    names = {"ideal": IDEAL, "schedule": SCHEDULE, "own": "plant", "box": "box", "region": "region"}
     reasons: dict[str, list[str]] = {}
     for plants, conditions, reason in results.unproven:
         reasons.setdefault(reason, []).append(f"{names[conditions]}, {names[plants]}")

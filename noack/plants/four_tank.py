@@ -6,7 +6,7 @@ import numpy as np
 from pydantic import Field, FiniteFloat
 
 from noack.core.linear_systems import Vector
-from noack.plants.plant_settings import EquationSettings, PlantEquations, sqrt
+from noack.plants.plant_settings import EquationSettings, PlantEquations, at_least, sqrt
 from noack.settings.section import Positive
 
 Share = Annotated[FiniteFloat, Field(gt=0, lt=1)]
@@ -57,12 +57,12 @@ class FourTankSettings(EquationSettings):
         voltages = np.array(self.voltages_v)
 
         def inflows(v1: float, v2: float) -> tuple[float, float, float, float]:
-            flow1, flow2 = k1 * max(v1, 0.0), k2 * max(v2, 0.0)
+            flow1, flow2 = k1 * at_least(v1, 0.0), k2 * at_least(v2, 0.0)
             return share1 * flow1, share2 * flow2, (1 - share2) * flow2, (1 - share1) * flow1
 
         def derivative(t_s: float, h: Vector, v: Vector) -> tuple[float, ...]:
             out1, out2, out3, out4 = (
-                hole * sqrt(twice_gravity * max(level, 0.0))
+                hole * sqrt(twice_gravity * at_least(level, 0.0))
                 for hole, level in zip(holes, h.tolist(), strict=True)
             )
             in1, in2, in3, in4 = inflows(*v.tolist())

@@ -315,7 +315,7 @@ def _of_number(name: str, of_float: Callable[[float], float]) -> Callable[[objec
 
     So equations with these functions, or numpy's, are the plant's motion and a certificate's
     evidence alike: evaluated with floats they give dx/dt, evaluated with the numbers of
-    :mod:`noack.plants.systems.jacobian_enclosure` they give enclosed derivatives. numpy's functions
+    :mod:`noack.plants.systems.traced_equations` they give the steps to be enclosed. numpy's functions
     call a method of the same name of such a number, and so do these.
     """
 
@@ -331,3 +331,11 @@ def _of_number(name: str, of_float: Callable[[float], float]) -> Callable[[objec
 sin = _of_number("sin", math.sin)
 cos = _of_number("cos", math.cos)
 sqrt = _of_number("sqrt", math.sqrt)
+
+
+def at_least(x: object, low: float) -> float:
+    """Return max(x, low) of a float, or of a number that carries an enclosure."""
+    if isinstance(x, float):
+        return max(x, low)
+    value: float = x.maximum(low)  # type: ignore[attr-defined] # stands for a float in the equations
+    return value

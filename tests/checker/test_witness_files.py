@@ -30,7 +30,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.parametrize("name", ["sine_pendulum", "lane_acknowledged"])
+@pytest.mark.parametrize("name", ["saturated_lqr", "lane_acknowledged"])
 def test_what_has_no_witness_is_refused_before_anything_is_certified(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from noack.core.linear_systems import Vector
-from noack.plants.systems.jacobian_enclosure import Inclusion
+from noack.plants.systems.enclosed_motion import Inclusion
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load

@@ -424,12 +424,18 @@ def _output_claim(
 @certified("x stays in the region")
 def region(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> ClaimBound:
     """The region of a nonlinear plant, coordinate by coordinate."""
-    if certificate.region is None:
+    names, x = run.record.loop.state_names, np.abs(samples.plant.x)
+    if certificate.proven is not None and (entries := certificate.proven.entries(len(names), 0)):
+        proven = certificate.proven
+        limits = {i: proven.at(f"x[{i}]", samples.step_s) for i in entries}
+        formulas = {i: proven.formula(f"|{names[i]}|", f"x[{i}]") for i in entries}
+        formula = ", ".join(formulas[i].format(at_most(entries[i].first)) for i in entries)
+    elif certificate.region is not None:
+        limits = {i: np.full(len(x), width) for i, width in enumerate(certificate.region.x)}
+        formula = ", ".join(f"|{names[i]}| ≤ {at_most(limit[0])}" for i, limit in limits.items())
+    else:
         return ClaimBound()
-    limits = np.array(certificate.region.x)
-    shares = (np.abs(samples.plant.x) / limits).max(axis=1)
-    names = run.record.loop.state_names
-    formula = ", ".join(f"|{name}| ≤ {at_most(limit)}" for name, limit in zip(names, limits, strict=True))
+    shares = np.max([x[:, i] / limit for i, limit in limits.items()], axis=0)
     return ClaimBound(Bound(formula, samples.step_s, shares, run.violation_of(certificate)))
 
 

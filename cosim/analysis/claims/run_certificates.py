@@ -9,8 +9,14 @@ from typing import NamedTuple
 
 from flint import fmpq
 
-from cosim.analysis.witnesses import known_or_found, resolved_content
+from cosim.analysis.witnesses import (
+    known_or_found,
+    known_or_found_on_region,
+    plant_on_regions,
+    resolved_content,
+)
 from noack.core.clock import NS_PER_S
+from noack.plants.systems.traced_equations import NotEnclosedError
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.certificates.assumptions import Assumption, assumptions
@@ -104,7 +110,7 @@ def with_proofs(
     certificates: Sequence[ScenarioCertificate], scenario: Scenario, most_work: float
 ) -> list[ScenarioCertificate]:
     """Return certificates of a resolved scenario with what is proven under their conditions."""
-    if not scenario.certificate.prove or not scenario.coverage.is_linear:
+    if not scenario.certificate.prove:
         return [*certificates]
     content = resolved_content(scenario, scenario.certificate.late_periods)
     return [_with_proof(certificate, scenario, content, most_work) for certificate in certificates]
@@ -114,14 +120,31 @@ def _with_proof(
     certificate: ScenarioCertificate, scenario: Scenario, content: dict[str, object], most_work: float
 ) -> ScenarioCertificate:
     is_box = certificate.scope == BOX
-    if certificate.scope not in (OWN_PLANT, BOX) or (is_box and outside_box(scenario) is not None):
+    if is_box and outside_box(scenario) is not None:
         return certificate
-    with suppress(RefusedError, NoWitnessError):
+    with suppress(RefusedError, NoWitnessError, NotEnclosedError):
+        if certificate.scope not in (OWN_PLANT, BOX):
+            return _with_region_proof(certificate, scenario, content, most_work)
         loop = _under(read_loop(content, box=is_box, ideal=False), certificate.conditions)
         if loop is not None:
             witness = known_or_found(loop, lambda share: None, most_work)
             return certificate.with_proof(proven_bounds(witness.proof, loop))
     return certificate
+
+
+def _with_region_proof(
+    certificate: ScenarioCertificate, scenario: Scenario, content: dict[str, object], most_work: float
+) -> ScenarioCertificate:
+    """Return a certificate with what is proven of a plant's equations."""
+
+    def adjusted(loop: Loop) -> Loop:
+        if (under := _under(loop, certificate.conditions)) is None:
+            raise NoWitnessError("the conditions allow more losses")
+        return under
+
+    plant = plant_on_regions(scenario, content, "schedule", adjusted)
+    witness, loop = known_or_found_on_region(plant, lambda share: None, most_work)
+    return certificate.with_proof(proven_bounds(witness.proof, loop))
 
 
 def _under(loop: Loop, conditions: NetworkConditions) -> Loop | None:

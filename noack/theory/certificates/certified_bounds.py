@@ -25,7 +25,7 @@ import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.number_format import at_least, at_most
-from noack.plants.systems.jacobian_enclosure import Inclusion
+from noack.plants.systems.enclosed_motion import Inclusion
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import Constants, NetworkConditions

@@ -11,8 +11,9 @@ import numpy as np
 from noack.core.errors import NoackError
 from noack.core.linear_systems import Matrix
 from noack.plants.linear import LinearSettings
-from noack.plants.plant_settings import PlantStart
-from noack.plants.systems.jacobian_enclosure import EnclosedMotion, NotEnclosedError
+from noack.plants.plant_settings import PlantStart, PlantSystem
+from noack.plants.systems.enclosed_motion import EnclosedMotion
+from noack.plants.systems.traced_equations import NotEnclosedError
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import NetworkConditions
@@ -22,12 +23,19 @@ from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import LINEAR_EQUATIONS
 from noack.theory.certificates.scenario_certificates import CertificateScope
 
-_LARGEST = 1e150
-"""The derivatives are enclosed for all |x_j| and |u_i| up to this; larger squares overflow."""
-
 
 def enclosed_motion(resolved: Scenario) -> EnclosedMotion:
     """Return the equations of a resolved scenario's plant, to be enclosed.
+
+    Raises:
+        NotEnclosedError: it has no equations that can be enclosed, or does not accept x = 0.
+    """
+    loop = loop_of(resolved)
+    return EnclosedMotion(equations_of(resolved), loop.n, loop.m)
+
+
+def equations_of(resolved: Scenario) -> PlantSystem:
+    """Return a resolved scenario's plant at x = 0, with its equations.
 
     Raises:
         NotEnclosedError: it has no equations that can be enclosed, or does not accept x = 0.
@@ -37,10 +45,9 @@ def enclosed_motion(resolved: Scenario) -> EnclosedMotion:
         raise NotEnclosedError(f'a plant of kind "{plant.kind}" has no equations to enclose')
     start = PlantStart(np.zeros(loop.n), loop.A_model, loop.B_model, resolved.timing.plant_period_ns)
     try:
-        system = plant.system(start)
+        return plant.system(start)
     except NoackError as error:  # a user's class that does not accept x = 0, for example
         raise NotEnclosedError(str(error)) from None
-    return EnclosedMotion(system, loop.n, loop.m)
 
 
 def linear_plant(resolved: Scenario) -> Scenario | None:
@@ -53,7 +60,7 @@ def linear_plant(resolved: Scenario) -> Scenario | None:
     if resolved.coverage.is_linear or resolved.controller.setpoint is not None:
         return None
     try:
-        matrices = enclosed_motion(resolved).linear_within(_LARGEST)
+        matrices = enclosed_motion(resolved).linear()
     except NoackError:  # the user's class may refuse large values
         return None
     if matrices is None:

@@ -67,6 +67,11 @@ class ProvenBounds(NamedTuple):
             limits["x"] = _times(size, limits["x"])
         return self._replace(bounds=bounds, limits=limits)
 
+    def entries(self, n: int, m: int) -> Mapping[int, ProvenBound]:
+        """Return the bounds of entries of (x, u), by their index; n states and m inputs."""
+        names = [*(f"x[{i}]" for i in range(n)), *(f"u[{j}]" for j in range(m))]
+        return {index: self.bounds[name] for index, name in enumerate(names) if name in self.bounds}
+
     def at(self, output: str, t_s: Vector) -> Vector:
         """Return the bound of an output at times (k,)."""
         decaying, constant = self.bounds[output]

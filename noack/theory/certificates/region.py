@@ -1,8 +1,8 @@
 """Certificates of a nonlinear plant on a region that it is proven not to leave.
 
 Over the region |x_j| ≤ r_j, |u_i| ≤ r_{n+i} the plant's equations are enclosed: they are A x + B u
-with some A and B of a box, which may change at any time (:mod:`jacobian_enclosure
-<noack.plants.systems.jacobian_enclosure>`). As long as x and u are in the region, the bounds of the
+with some A and B of a box, which may change at any time (:mod:`enclosed_motion
+<noack.plants.systems.enclosed_motion>`). As long as x and u are in the region, the bounds of the
 box hold. If they are below r, x and u never leave it: a first exit would contradict them
 (docs/derivations.md, "Beyond linear plants").
 
@@ -23,7 +23,8 @@ import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector
 from noack.plants.plant_settings import SystemFailedError
-from noack.plants.systems.jacobian_enclosure import EnclosedMotion, Inclusion, NotEnclosedError
+from noack.plants.systems.enclosed_motion import EnclosedMotion, Inclusion
+from noack.plants.systems.traced_equations import NotEnclosedError
 from noack.scenario.resolution import loop_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.box import BoxGains

@@ -20,6 +20,8 @@ Frames = Mapping[str, Matrix]
 _RUNS, _MOST_STEPS = 120, 3000
 _STEPS = 16
 """At least, of the period of a periodic rule."""
+_SLOW = 3.0
+"""Where the model is so exact that e_s seldom reaches the threshold, it begins there."""
 _LOSS_RATES = (0.0, 0.3, 0.6, 0.9, 1.0)
 
 
@@ -84,6 +86,10 @@ class _Runs:
         spread = float(np.linalg.norm(floats(self._loop.start))) or 1.0
         half = _RUNS // 2
         self._z[half:, :n] = spread * self._rng.standard_normal((_RUNS - half, n)) / np.sqrt(n)
+        W, threshold = floats(self._loop.weight), float(np.sqrt(self._unit.sum()))
+        if np.linalg.norm(W @ flows[0][n : 2 * n, :n]) * spread < _SLOW * slowest * threshold:
+            errors = self._rng.standard_normal((_RUNS - half, n)) @ np.linalg.inv(W).T
+            self._z[half:, n : 2 * n] = threshold / np.sqrt(n) * errors
         self._missing = np.zeros(_RUNS, int)
         self._later, self._most = np.zeros(_RUNS, int), model.later
         self._waiting = np.zeros(_RUNS, bool)

@@ -111,17 +111,7 @@ class _Wanted(NamedTuple):
 
 def _by_threshold(loop: Loop, rates: "_Rates", wanted: _Wanted, effort: Effort) -> Witness:
     """Return a witness for a rule that compares ‖W e_s‖: its drift bounds e_s and times between events."""
-    document = first_assumptions(loop, rates.rate)
-    for _ in range(_MOST_GUESSES):
-        search = _OutputSearch(loop, rates, document, effort)
-        levels = search.best_share("drift", starts=True)[1].levels
-        following = next_assumptions(loop, document, levels)
-        if following is None:
-            break
-        document = following
-        effort.expect(_EXPECTED)
-    else:
-        raise NoWitnessError("errors: the sensor's error may be larger than each guess of it")
+    document, search = _confirmed(loop, rates, effort)
     entry = search.bound("drift")
     document["bounds"] = [*search.bounds(wanted), entry]
     numbers = entry["numbers"]
@@ -130,6 +120,45 @@ def _by_threshold(loop: Loop, rates: "_Rates", wanted: _Wanted, effort: Effort) 
     document["inter_event_s"] = apart = inter_event_s(loop, rates.rate, drift)
     document["first_event_s"] = first_event_s(loop, drift, apart)
     return _proven(loop, document)
+
+
+def _confirmed(
+    loop: Loop, rates: "_Rates", effort: Effort, shares: dict[str, float] | None = None
+) -> tuple[dict[str, object], "_OutputSearch"]:
+    """Return a document with assumptions that the bound of the drift confirms, and the search with them."""
+    document = first_assumptions(loop, rates.rate)
+    for _ in range(_MOST_GUESSES):
+        search = _OutputSearch(loop, rates, document, effort, shares)
+        levels = search.best_share("drift", starts=True)[1].levels
+        following = next_assumptions(loop, document, levels)
+        if following is None:
+            return document, search
+        document = following
+        effort.expect(_EXPECTED)
+    raise NoWitnessError("errors: the sensor's error may be larger than each guess of it")
+
+
+def coarse_sizes(loop: Loop, outputs: Sequence[str], effort: Effort, shares: dict[str, float]) -> list[float]:
+    """Return rough bounds of outputs at all times, which are at most little too small.
+
+    Args:
+        loop: the loop.
+        outputs: the outputs.
+        effort: counts the work.
+        shares: for ν of outputs, from a similar loop; those of this one replace them.
+
+    Raises:
+        NoWitnessError: some output has none.
+    """
+    rates = _Rates(loop)
+    if rates.slowest <= 0:
+        raise NoWitnessError("the loop does not decay without losses")
+    if loop.times.period > 0 or not compares_error(loop):
+        document = without_drift(loop, first_assumptions(loop, rates.rate))
+        search = _OutputSearch(loop, rates, document, effort, shares)
+    else:
+        _, search = _confirmed(loop, rates, effort, shares)
+    return [search.best_share(output, starts=True)[1].size for output in outputs]
 
 
 def _by_quadratic_forms(loop: Loop, rates: "_Rates", wanted: _Wanted, effort: Effort) -> Witness:
@@ -196,10 +225,19 @@ class _OutputSearch:
         rates: its rates of decay.
         document: a witness's document with its assumptions.
         effort: counts the work.
+        shares: for ν of outputs from the start on, of a similar loop; those of this one replace them.
     """
 
-    def __init__(self, loop: Loop, rates: _Rates, document: Mapping[str, object], effort: "Effort") -> None:
+    def __init__(
+        self,
+        loop: Loop,
+        rates: _Rates,
+        document: Mapping[str, object],
+        effort: "Effort",
+        shares: dict[str, float] | None = None,
+    ) -> None:
         self._loop, self._rates, self._effort = loop, rates, effort
+        self._similar = {} if shares is None else shares
         self._rate = number(rates.rate)
         require_few(document)
         try:
@@ -296,6 +334,8 @@ class _OutputSearch:
             best = min(found, key=lambda share: found[share].size)
             self._share = self._share or best
             self._best[key] = best, found[best]
+            if starts:
+                self._similar[output] = best
         return self._best[key]
 
     def has_solution(self, output: str) -> bool:
@@ -323,6 +363,8 @@ class _OutputSearch:
             found[share] = solution
             return solution.size
 
+        if starts and output in self._similar and math.isfinite(size(self._similar[output])):
+            return found
         most = _MOST_TRIES
         if self._is_large(output):
             most = 1 if self._share else _FEW_TRIES

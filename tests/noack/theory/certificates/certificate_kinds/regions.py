@@ -12,7 +12,7 @@ from unittest.mock import patch
 import numpy as np
 
 from noack.core.linear_systems import Vector
-from noack.plants.systems.jacobian_enclosure import EnclosedMotion, Inclusion
+from noack.plants.systems.enclosed_motion import EnclosedMotion, Inclusion
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import NetworkConditions

@@ -1,0 +1,197 @@
+"""The search for a region that a plant does not leave, and for the witness of this.
+
+On a larger region a plant's equations are enclosed by more plants, and so have larger bounds. The search
+begins with a small region, and takes little more than the bounds that follow from it as the next one, until
+a region's bounds are inside it.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from noack.core.linear_systems import Vector
+from noack.plants.systems.traced_equations import NotEnclosedError, TracedEquations
+from noack.theory.witnesses.coordinates import floats
+from noack.theory.witnesses.documents import Witness, coarse_sizes, find_witness
+from noack.theory.witnesses.effort import MOST_WORK, Effort, NoWitnessError, WorkLimitError
+from noack_check.loop import Loop
+
+_FIRST = 0.1
+"""The first region, in multiples of what decides which coordinates it restricts."""
+_WIDER, _MOST_REGIONS = 1.03, 12
+_LAST_WIDER, _LAST_TRIES = 1.06, 3
+_LEAST = 1e-3
+"""Least width of a region in each direction, as a share of its largest."""
+_SAME = 1e-6
+_TIGHT = 0.8
+"""A region whose bounds are all below this share of it is replaced by a smaller one."""
+_EXPECTED = 40
+
+
+class PlantOnRegions(NamedTuple):
+    """A loop with a plant's equations, on any region."""
+
+    names: Sequence[str]
+    """Of x and u."""
+    states: int
+    typical: Vector
+    """A width of each of x and u, (n + m,): where the equations show by what they are not linear."""
+    on: Callable[[Vector], tuple[TracedEquations, Loop]]
+    """Return the equations and the loop for widths of x and u; raises NotEnclosedError, RefusedError."""
+
+
+def find_region_witness(
+    plant: PlantOnRegions,
+    outputs: Sequence[str] = ("x", "e_c"),
+    *,
+    ultimate: Sequence[str] = (),
+    progress: Callable[[float], None] = lambda share: None,
+    most_work: float = MOST_WORK,
+) -> Witness:
+    """Return a witness for bounds of outputs of a plant on a region that it is proven not to leave.
+
+    Args:
+        plant: the plant.
+        outputs: those that are bounded from the start on.
+        ultimate: those that are bounded in the limit t → ∞.
+        progress: called with the completed share.
+        most_work: limit of the search, see :class:`Effort`.
+
+    Raises:
+        NoWitnessError: none was found; the message names the region that would be needed.
+    """
+    effort = Effort(lambda share: progress(share / 2), most_work)
+    effort.expect(_EXPECTED)
+    restricted = _restricted(plant)
+    coordinates = [_output(plant, k) for k in restricted]
+    widths = _with(plant, restricted, _FIRST * plant.typical[restricted])
+    reached, shares = np.zeros(len(restricted)), dict[str, float]()
+    for _ in range(_MOST_REGIONS if restricted else 0):
+        last, reached = reached, _reached(plant, widths, coordinates, effort, shares)
+        if (reached < widths[restricted]).all():
+            if (reached > _TIGHT * widths[restricted]).any():
+                break
+            widths = _with(plant, restricted, _WIDER * reached)  # inside it the bounds are not larger
+            continue
+        grown = _WIDER * _extrapolated(last, reached, widths[restricted])
+        widths = _with(plant, restricted, np.maximum(grown, _LEAST * grown.max()))
+    else:
+        if restricted:
+            raise NoWitnessError(f"on the region {_described(plant, widths)}: the bounds are not within it")
+    why: NoWitnessError | None = None
+    for _ in range(_LAST_TRIES):
+        try:
+            return _witness(plant, widths, [*outputs, *coordinates], ultimate, progress, most_work)
+        except WorkLimitError:
+            raise
+        except NoWitnessError as error:
+            why, widths = error, _LAST_WIDER * widths
+    raise NoWitnessError(f"on the region {_described(plant, widths)}: {why}")
+
+
+def _witness(
+    plant: PlantOnRegions,
+    widths: Vector,
+    outputs: Sequence[str],
+    ultimate: Sequence[str],
+    progress: Callable[[float], None],
+    most_work: float,
+) -> Witness:
+    equations, loop = _on(plant, widths)
+    found = find_witness(
+        loop,
+        outputs,
+        ultimate=ultimate,
+        progress=lambda share: progress((1 + share) / 2),
+        most_work=most_work,
+    )
+    region = region_table(widths, plant.states)
+    return found._replace(document={**found.document, "equations": equations.document, "region": region})
+
+
+def region_table(widths: Vector, states: int) -> Mapping[str, object]:
+    """Return a region as a document has it; infinite widths are None."""
+    limits = [None if np.isinf(width) else float(width) for width in widths]
+    return {"x": limits[:states], "u": limits[states:]}
+
+
+def _reached(
+    plant: PlantOnRegions,
+    widths: Vector,
+    outputs: Sequence[str],
+    effort: Effort,
+    shares: dict[str, float],
+) -> Vector:
+    """Return bounds of x and u, where they have to be in a region, by the plants that enclose it there."""
+    _, loop = _on(plant, widths)
+    try:
+        return np.array(coarse_sizes(loop, outputs, effort, shares))
+    except WorkLimitError:
+        raise
+    except NoWitnessError as error:
+        raise NoWitnessError(f"on the region {_described(plant, widths)}: {error}") from None
+
+
+def _on(plant: PlantOnRegions, widths: Vector) -> tuple[TracedEquations, Loop]:
+    try:
+        return plant.on(widths)
+    except NotEnclosedError as error:
+        raise NoWitnessError(f"on the region {_described(plant, widths)}: {error}") from None
+
+
+def _restricted(plant: PlantOnRegions) -> list[int]:
+    """Return the coordinates whose size the enclosure of the equations depends on."""
+    widths, found = plant.typical.copy(), []
+    while True:  # the equations may not be defined on all of the typical region
+        try:
+            best = _halves(plant, widths)
+            break
+        except NotEnclosedError as error:
+            if widths.max() < _FIRST * plant.typical.max():
+                raise NoWitnessError(str(error)) from None
+            widths = widths / 2
+    for k in range(len(widths)):
+        wider = widths.copy()
+        wider[k] = np.inf
+        try:
+            is_same = np.allclose(_halves(plant, wider), best, rtol=_SAME, atol=0)
+        except NotEnclosedError:
+            is_same = False
+        if is_same:
+            widths = wider
+        else:
+            found.append(k)
+    return found
+
+
+def _halves(plant: PlantOnRegions, widths: Vector) -> Vector:
+    """Return half-widths and sizes of disturbances of the plants that enclose the equations."""
+    plants = plant.on(widths)[0].plants
+    parts = [plants.half_A, plants.half_B, *(row for row, _ in plants.along)]
+    sizes = np.sqrt((floats(plants.pushes) ** 2).sum(axis=1))
+    return np.concatenate([*(floats(M).ravel() for M in parts), sizes])
+
+
+def _with(plant: PlantOnRegions, restricted: Sequence[int], sizes: Vector) -> Vector:
+    widths = np.full(len(plant.typical), np.inf)
+    widths[restricted] = sizes
+    return widths
+
+
+def _extrapolated(last: Vector, reached: Vector, widths: Vector) -> Vector:
+    """Return where the bounds tend to if they go on to grow by the same factor from region to region."""
+    steps, before = reached - widths, widths - last
+    ratio = float(np.linalg.norm(steps)) / max(float(np.linalg.norm(before)), 1e-300)
+    if last.any() and ratio < 0.7:
+        return np.maximum(reached, reached + steps * ratio / (1 - ratio))
+    return reached
+
+
+def _output(plant: PlantOnRegions, k: int) -> str:
+    return f"x[{k}]" if k < plant.states else f"u[{k - plant.states}]"
+
+
+def _described(plant: PlantOnRegions, widths: Vector) -> str:
+    sizes = zip(plant.names, widths, strict=True)
+    return ", ".join(f"|{name}| ≤ {width:.3g}" for name, width in sizes if np.isfinite(width))

@@ -1,0 +1,182 @@
+"""The equations of plants on a region: their enclosure, and witnesses of what stays in it."""
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from flint import arb
+
+from cosim.analysis.witnesses import find_region_statement, resolved_content
+from noack.core.linear_systems import Matrix, Vector
+from noack.plants.systems.traced_equations import trace
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import load
+from noack.theory.witnesses.coordinates import floats
+from noack_check.__main__ import check_file
+from noack_check.check import RejectedError
+from noack_check.equations import LinearPlants, enclose
+from noack_check.loop import Region
+from tests.oracles.attacked_regions import SCENARIOS
+
+Field = Callable[[Any, Any], Any]
+FIELDS: dict[str, Field] = {
+    "Coulomb friction": lambda x, u: [x[1], u[0] - 2 * x[0] - 0.3 * np.sign(x[1]) + 0.1 * x[1] ** 3],
+    "friction with a bend": lambda x, u: [x[1], u[0] * np.cos(x[0]) - 0.4 * np.tanh(20 * x[1])],
+    "a saturated input": lambda x, u: [np.sin(x[1]), 3 * np.clip(u[0] - x[0], -0.5, 0.8) - x[1] * abs(x[1])],
+    "a dead zone": lambda x, u: [x[1], (v := u[0] - x[1]) - np.clip(v, -0.1, 0.1) + np.arctan(3 * x[0])],
+    "an outlet": lambda x, u: [np.sqrt(np.maximum(x[0] + 1, 0)) - 1 - x[1], u[0] / (2 + x[0]) - x[1]],
+    "a sign of two states": lambda x, u: [x[1], np.exp(-x[0]) * np.sign(x[0] + x[1]) + u[0]],
+}
+
+
+class Plant:
+    """A plant with equations."""
+
+    def __init__(self, field: Field) -> None:
+        self.field = field
+
+    def expressions(self, t_s: Any, x: Any, u: Any) -> Any:
+        """See :meth:`noack.plants.plant_settings.OdeSystem.expressions`."""
+        return self.field(x, u), x
+
+
+def unexplained(plants: LinearPlants, field: Field, z: Matrix) -> Vector:
+    """Return by how much ẋ is outside the plants, for the best signals by a linear program, at points."""
+    from scipy.optimize import linprog
+
+    A, B, half_A, half_B, D = (floats(M) for M in plants[:5])
+    n, k = len(A), D.shape[1]
+    missed = []
+    for point in z:
+        x, u = point[:n], point[n:]
+        left = np.array(field(x, u), dtype=float) - A @ x - B @ u
+        room = half_A @ np.abs(x) + half_B @ np.abs(u) + 1e-9
+        # p with |p| ≤ 1 and p·Cz ≥ k p², so that p is between 0 and Cz/k: |left − D p| ≤ room.
+        limits = []
+        for row, least in plants.along:
+            along = float((floats(row) @ point)[0])
+            if not floats(row).any():
+                limits.append((-1.0, 1.0))
+                continue
+            most = 1.0 if float(least) == 0 else min(abs(along) / float(least), 1.0)
+            limits.append(
+                (0.0, most + 1e-9) if along > 0 else (-most - 1e-9, 0.0) if along < 0 else (-1.0, 1.0)
+            )
+        columns = np.vstack([np.hstack([s * D, -np.ones((n, 1))]) for s in (1, -1)])
+        sides = np.concatenate([left + room, room - left])
+        answer = linprog([0.0] * k + [1.0], columns, sides, bounds=[*limits, (None, None)])
+        missed.append(answer.x[-1])
+    return np.array(missed)
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_equations_lie_within_the_plants_that_enclose_them(name: str) -> None:
+    field, rng = FIELDS[name], np.random.default_rng(0)
+    for widths in (np.array([0.8, 0.6, 1.5]), np.array([0.3, 0.05, 0.2])):
+        plants = trace(Plant(field), 2, 1, widths).plants  # type: ignore[arg-type]
+        z = rng.uniform(-1, 1, (150, 3)) * widths
+        z[::2] = np.sign(z[::2]) * widths * rng.choice([1.0, 1e-3], (75, 3))
+        assert unexplained(plants, field, z).max() <= 1e-6
+        smaller = trace(Plant(field), 2, 1, widths / 4).plants  # type: ignore[arg-type]
+        if name not in ("Coulomb friction",):
+            assert unexplained(smaller, field, 3 * z).max() > 0
+
+
+def test_friction_is_a_signal_that_takes_energy() -> None:
+    plants = trace(Plant(FIELDS["Coulomb friction"]), 2, 1, np.array([np.inf, 1.0, np.inf])).plants  # type: ignore[arg-type]
+    assert floats(plants.pushes).tolist() == [[0.0], [-0.3]]
+    [(row, least)] = plants.along
+    assert floats(row).tolist() == [[0.0, 1.0, 0.0]]
+    assert least == 0
+
+
+@pytest.mark.parametrize(
+    ("steps", "rates", "reason"),
+    [
+        ([], [0], "not from 1 to"),
+        ([["state", 1]], [0], "no such state"),
+        ([["state", 0], ["add", 0, 2]], [0], "refers to none before it"),
+        ([["state", 0], ["gamma", 0]], [0], "is no step of such a shape"),
+        ([["state", 0], ["sin", 0, 1]], [0], "is no step of such a shape"),
+        ([["state", 0], ["power", 0, 1e6]], [1], "exponent"),
+        ([["state", 0], ["power", 0, "2"]], [1], "not a number"),
+        ([["state", 0], ["power", 0, -1]], [1], "not defined and smooth"),
+        ([["state", 0], ["log", 0]], [1], "not defined and smooth"),
+        ([["state", 0], ["tan", 0]], [1], "not defined and smooth"),
+        ([["state", 0], ["root", 0]], [1], "not defined and smooth"),
+        ([["state", 0], ["positive", 0]], [0], "distinguish cases"),
+        ([["number", float("inf")]], [0], "not finite"),
+        ([["state", 0]], [True], "refers to none"),
+        ([["state", 0]], [], "not one rate for each state"),
+    ],
+)
+def test_wrong_equations_are_rejected(steps: Any, rates: Any, reason: str) -> None:
+    with pytest.raises(RejectedError, match=reason):
+        enclose({"steps": steps, "rates": rates}, Region((arb(2),), (arb(1),)))
+
+
+@pytest.fixture(scope="module")
+def witness() -> dict[str, Any]:
+    """Return the file of a witness: a pendulum on a region, ideal conditions."""
+    resolved = resolve(load(SCENARIOS / "sine_pendulum.toml"))
+    content = resolved_content(resolved, resolved.certificate.late_periods)
+    statement = find_region_statement(resolved, content, "ideal")
+    assert statement.document is not None, statement.reason
+    return {"scenario": content, "statements": [statement.document]}
+
+
+def test_a_region_is_proven_with_the_equations_in_words(witness: dict[str, Any]) -> None:
+    lines = [*check_file(witness, None)]
+    assert any("|x_1| ≤ " in line for line in lines)
+    assert lines[-1].endswith("dx_2/dt = (((sin(x_1) · 9.81) + (−(x_2 · 0.1))) + u_1)")
+
+
+def change(document: Any, place: tuple[Any, ...], value: Any) -> None:
+    """Set a value in a document."""
+    for key in place[:-1]:
+        document = document[key]
+    document[place[-1]] = value(document[place[-1]]) if callable(value) else value
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "reason"),
+    [
+        (("region", "x", 0), lambda r: 0.5 * r, r"region: x\[0\] may leave it"),
+        (("region", "x", 0), lambda r: 1.6 * r, "flow/"),  # the remainder would be too small
+        (("region", "x", 0), None, "flow/"),
+        (("region", "u", 0), 10.0, r"region: u\[0\] has no bound"),
+        (("region", "x", 1), 10.0, r"region: x\[1\] has no bound"),
+        (("region", "x", 0), -1.0, "not above 0"),
+        (("region", "x"), [1.0], "not 2 sizes of x"),
+        (("region",), {}, "not 2 sizes of x"),
+        (("equations", "steps"), lambda steps: [*steps[:-1], ["number", 1.0]], "flow/|start|drift|x: "),
+        (("plants",), "own", "plant.system.kind"),
+    ],
+)
+def test_false_witnesses_of_a_region_are_rejected(
+    witness: dict[str, Any], place: tuple[Any, ...], value: Any, reason: str
+) -> None:
+    changed = copy.deepcopy(witness)
+    change(changed["statements"][0], place, value)
+    with pytest.raises(ValueError, match=reason):
+        list(check_file(changed, None))
+
+
+def test_a_stronger_nonlinearity_is_another_plant(witness: dict[str, Any]) -> None:
+    changed = copy.deepcopy(witness)
+    steps = changed["statements"][0]["equations"]["steps"]
+    [gravity] = [step for step in steps if step[:1] == ["number"] and step[1] > 9]
+    gravity[1] *= 1.1
+    with pytest.raises(RejectedError, match="flow/"):
+        list(check_file(changed, None))
+
+
+def test_a_bound_of_a_region_has_to_be_there_from_the_start_on(witness: dict[str, Any]) -> None:
+    for keep in (lambda entry: entry["output"] != "x[0]", lambda entry: entry["output"] == "drift"):
+        changed = copy.deepcopy(witness)
+        bounds = changed["statements"][0]["bounds"]
+        changed["statements"][0]["bounds"] = [entry for entry in bounds if keep(entry)]
+        with pytest.raises(RejectedError, match=r"region: x\[0\] has no bound"):
+            list(check_file(changed, None))
