@@ -33,7 +33,7 @@ def find_shipped(name: str, folder: str) -> Path:
     """Return the path of a TOML file given by path, or by the name of a shipped one.
 
     Args:
-        name: as the user gave it.
+        name: as the user gave it; without .toml it may also be that of a file in the current folder.
         folder: scenarios or campaigns.
 
     Raises:
@@ -50,6 +50,8 @@ def find_shipped(name: str, folder: str) -> Path:
         return path
     if name in names:
         return _path_of(name, folder)
+    if (own := Path(f"{name}.toml")).is_file():
+        return own
     kind = folder.removesuffix("s")
     for other in KINDS:
         if name in shipped_names(other):

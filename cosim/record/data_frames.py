@@ -34,6 +34,8 @@ def samples(record: RunRecord) -> pa.Table:
     columns: dict[str, NDArray[np.generic]] = {"t_s": _seconds(aligned.t_ns), "t_ns": aligned.t_ns}
     for name, states in (("x", aligned.x), ("x_s", aligned.x_s), ("x_c", aligned.x_c)):
         columns |= dict(zip(entry_names(name, states.shape[1]), states.T, strict=True))
+    for output in record.scenario.loop_outputs() if record.scenario.outputs else ():
+        columns.setdefault(output.name, aligned.x @ np.array(output.row))
     columns |= {
         "e_s_norm": aligned.e_s_norm,
         "threshold": aligned.threshold,

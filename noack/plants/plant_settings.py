@@ -9,8 +9,9 @@ other coordinates, and more of them.
 import math
 import warnings
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Annotated, ClassVar, NamedTuple, Protocol
 
 import numpy as np
@@ -84,6 +85,12 @@ class PlantStart(NamedTuple):
     """Step of the plant."""
 
 
+def name_and_unit(text: str) -> tuple[str, str]:
+    """Return the name and the unit of a state or input that is described as "angle, rad"."""
+    name, comma, unit = text.rpartition(", ")
+    return (name, unit) if comma else (text, "")
+
+
 class PlantOutline(NamedTuple):
     """What a plant's settings say of it without a scenario."""
 
@@ -92,11 +99,15 @@ class PlantOutline(NamedTuple):
     m: int
     """Number of inputs."""
     states: tuple[str, ...] | None = None
-    """Names of the states, if they have any."""
+    """Names of the states, if they have any, perhaps with units: "angle, rad"."""
     inputs: tuple[str, ...] | None = None
     """Names of the inputs, if they have any."""
     rate_hz: float | None = None
     """Steps per second, if only steps of one length are possible."""
+    allowed: Mapping[str, float] = MappingProxyType({})
+    """Allowed errors of states, by their names without units."""
+    initial_state: tuple[float, ...] | None = None
+    """x(0), if it is known."""
 
 
 class PlantSettings(ScenarioSection):

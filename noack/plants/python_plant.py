@@ -4,6 +4,8 @@ The class's code runs in the plant's process. An exception in this code stops th
 but not the run.
 """
 
+import math
+from collections.abc import Iterable
 from functools import partial
 from typing import ClassVar, Literal
 
@@ -15,10 +17,12 @@ from noack.plants.plant_settings import (
     Names,
     OdeSystem,
     PlantEquations,
+    PlantOutline,
     PlantSettings,
     PlantStart,
     PlantSystem,
     SystemFailedError,
+    name_and_unit,
 )
 from noack.settings.user_files import ClassSettings, UserCode, new_instance, read_only, real_vector, user_code
 
@@ -47,6 +51,35 @@ class PythonPlantSettings(ClassSettings, PlantSettings):
 
     def system(self, start: PlantStart) -> PlantSystem:
         return PythonSystem(self, start.x0, start.B.shape[1])
+
+    def outline(self) -> PlantOutline | None:
+        """Return what the class says in ``states``, ``inputs``, ``allowed`` and ``initial_state``."""
+        with user_code(self, _PLACE, CallerError):
+            plant, _ = new_instance(self, _PLACE)
+            if not hasattr(plant, "states") or not hasattr(plant, "inputs"):
+                return None
+            states, inputs = _texts("states", plant.states), _texts("inputs", plant.inputs)
+            names = [name_and_unit(state)[0] for state in states]
+            allowed = dict(getattr(plant, "allowed", {}))
+            for name, value in allowed.items():
+                if name not in names:
+                    raise ValueError(f"allowed: {name!r} is no state; the states are {', '.join(names)}")
+                if not (isinstance(value, int | float) and 0 < value < math.inf):
+                    raise ValueError(f"allowed[{name!r}] is {value!r}; give a positive number")
+            start = getattr(plant, "initial_state", None)
+            x0 = None if start is None else real_vector("initial_state", start, len(states))
+        initial_state = None if x0 is None else tuple(x0.tolist())
+        return PlantOutline(len(states), len(inputs), states, inputs, None, allowed, initial_state)
+
+
+def _texts(name: str, values: object) -> tuple[str, ...]:
+    """Return names of states or inputs; raise ValueError unless they are texts."""
+    if isinstance(values, str) or not isinstance(values, Iterable):
+        raise ValueError(f'{name} is {values!r}; give a list of names, e.g. ["angle, rad"]')
+    texts = tuple(values)
+    if not texts or not all(isinstance(text, str) and text for text in texts):
+        raise ValueError(f'{name} is {values!r}; give a list of names, e.g. ["angle, rad"]')
+    return texts
 
 
 class PythonSystem:

@@ -9,6 +9,7 @@ from typing import Annotated, NamedTuple
 
 from pydantic import Field
 
+from noack.plants.plant_settings import name_and_unit
 from noack.settings.section import Positive, Row, ScenarioSection, require_length
 
 _LONGEST_NAME, _LONGEST_UNIT = 64, 24
@@ -63,7 +64,7 @@ def loop_outputs(
     """
     n = len(state_names)
     if sections is None:
-        units = [text.rpartition(", ")[2] if ", " in text else "" for text in described] or [""] * n
+        units = [name_and_unit(text)[1] for text in described] or [""] * n
         names = zip(state_names[: n - loads], units, strict=False)
         return tuple(LoopOutput(name, unit, _unit_row(i, n)) for i, (name, unit) in enumerate(names))
     found = list[LoopOutput]()

@@ -295,7 +295,7 @@ OUTPUTS: dict[str, tuple[str, ...]] = {
         "--out",
         "{}/campaign",
     ),
-    "a new scenario": ("new", "{}/mine.toml", "--plant", "double_integrator"),
+    "a new scenario": ("new", "double_integrator", "--out", "{}/mine.toml"),
 }
 
 

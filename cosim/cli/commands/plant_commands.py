@@ -121,14 +121,21 @@ def gain(
 @app.command(
     rich_help_panel=FILES,
     epilog=examples(
-        ("noack new pole.toml --plant pole.py:Pole", "everything from a class of yours"),
-        ("noack new pole.toml --plant pole.json", "from the file of linearise or gain"),
-        ("noack new tanks.toml --plant four_tank --set network.mansd=2", "keep a setting"),
+        ("noack new servo.py --allow angle=0.02", "everything from a class of yours: servo.toml"),
+        ("noack new pole.json", "from the file of linearise or gain"),
+        ("noack new four_tank --out tanks.toml --set network.mansd=2", "keep a setting"),
     ),
 )
 def new(
-    file: Annotated[Path, Argument(metavar="FILE.toml", help="The scenario file to write.")],
-    plant: Annotated[str, Option("--plant", metavar="PLANT", help="As for linearise.")],
+    plant: Annotated[str, Argument(metavar="PLANT", help="As for linearise.")],
+    out: Annotated[
+        Path | None,
+        Option(metavar="FILE.toml", help="The scenario file to write; by default with the plant's name."),
+    ] = None,
+    allow: Annotated[
+        list[str] | None,
+        Option(metavar="STATE=ERROR", help="Allowed error of a state, in its unit; can be repeated."),
+    ] = None,
     settings: opt.SetOption = None,
     network: opt.NetworkOption = None,
     x0: Annotated[
@@ -148,19 +155,22 @@ def new(
     from cosim.studies.new_loop.new_scenario import new as new_scenario
     from cosim.studies.new_loop.new_scenario import require_new_file
 
+    file = Path(f"{Path(plant.rpartition(':')[0] or plant).stem}.toml") if out is None else out
     require_new_file(file)
     with status("linearising") as change:
         result = new_scenario(
             plant,
             file,
             initial_state=_numbers("--x0", x0),
+            allowed=_allowed(allow),
             settings=_table(settings),
             network=network,
             report=change,
         )
     result.save(file)
-    following = f"wrote {file}; now noack check, certify, simulate or run {file}"
-    print_lines(json, result.to_json(), *result.notes, following)
+    name = file.stem if file.parent == Path() else file
+    following = f"wrote {file}. Next: noack certify {name}; noack run {name}"
+    print_lines(json, result.to_json(), result.guarantee, *result.notes, following)
 
 
 def _table(assignments: Sequence[str] | None) -> dict[str, object]:
@@ -168,6 +178,20 @@ def _table(assignments: Sequence[str] | None) -> dict[str, object]:
     from noack.scenario.scenario_file import setting_of
 
     return dict(setting_of(assignment, "plant.system.cart_kg=1.0") for assignment in assignments or ())
+
+
+def _allowed(assignments: Sequence[str] | None) -> dict[str, float] | None:
+    """Return the allowed errors by the names of states."""
+    if assignments is None:
+        return None
+    allowed = {}
+    for text in assignments:
+        name, _, value = text.partition("=")
+        try:
+            allowed[name] = float(value)
+        except ValueError:
+            raise CallerError(f"--allow {text}: give a state and a number, e.g. angle=0.02") from None
+    return allowed
 
 
 def _numbers(option: str, text: str | None, kind: Callable[[str], Number] = float) -> list[Number] | None:

@@ -17,7 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
-from cosim.analysis.certificates import with_linear_plant, with_weight
+from cosim.analysis.certificates import Certificates, certificates_of, with_linear_plant, with_weight
+from cosim.analysis.claims.run_certificates import RUN_WORK
+from cosim.output.guarantee_sentence import bounds_of, guarantee_sentence
 from cosim.output.run_verdict import SETTLED_SHARE
 from cosim.record.run_directory import refuse_among_results
 from cosim.simulation.virtual_time import simulate_loops
@@ -39,6 +41,7 @@ from cosim.studies.new_loop.linear_model import (
 from noack.core.errors import CallerError, MachineError, why
 from noack.core.file_access import new_file
 from noack.core.linear_systems import Matrix, Vector, norm
+from noack.core.number_checks import real_number
 from noack.core.number_format import at_most, to_digits
 from noack.plants.linear import LinearSettings
 from noack.scenario.given_settings import given_settings
@@ -50,27 +53,38 @@ from noack.theory.certificates.certified_bounds import ScenarioCertificate, enve
 from noack.theory.certificates.conditions import nominal_conditions
 from noack.theory.certificates.scenario_certificates import own_plant_scope
 from noack.theory.coverage import require_certifiable
+from noack.trigger_policies.decaying import DecayingSettings
 
 _FLOOR_SHARE = 0.05
 """The floor of the threshold, as a share of beta."""
 _FASTEST_ALPHA_PER_S = 1.0
-"""α is at most this, so that the horizon of a fast loop is at least 4.6 s."""
+"""α is at most this, unless allowed errors ask for a fast loop."""
 _RATES_HZ = (1.0, 2.0, 5.0, 10.0, 20.0, 25.0, 50.0, 100.0, 200.0, 250.0, 500.0)
 """Rates that are chosen from: their periods are whole milliseconds."""
 _FASTEST_EIGENVALUE_PER_S = 1000.0
 """Faster eigenvalues do not determine the rate: no loop can follow them."""
 _STEPS_PER_TIME_CONSTANT = 50
 """Least number of steps of the plant in the time constant of the loop's fastest eigenvalue."""
+_OTHER_WEIGHT = 0.01
+"""Weight of a state without an allowed error in the regulator, where others have one, with weight 1."""
 _INPUT_WEIGHTS = (1.0, 10.0, 100.0)
 """r of the regulators that are tried: with a larger one the gain is slower."""
 _LOOSE_BOUND_RATIO = 200.0
 """A bound of ‖x‖ above this multiple of ‖x(0)‖ is used only if there is no other."""
 _DEFAULT_START = 0.1
 """x(0) of a state, if the plant has none."""
+_MOST_THRESHOLDS = 4
+"""Last thresholds that are tried for the allowed errors."""
+_LEAST_USE, _MOST_USE = 0.6, 0.85
+"""Shares of an allowed error that its bound has in the end: at least, and wanted."""
+_MOST_OUTPUTS = 4
+"""Outputs of a plant that states no allowed error."""
 _START_FACTOR, _MOST_REDUCTIONS = 0.5, 5
 """If the loop does not return, x(0) is multiplied by this factor, at most this number of times."""
 _LONGEST_RUN_S = 20.0
 """Wall time of a live run; a longer horizon runs faster."""
+_SHORTEST_HORIZON_S = 4.6
+"""A shorter run would show little."""
 _LONGEST_HORIZON_S, _HIGHEST_SPEED = 1e7, 1000.0
 """The largest that a scenario may have."""
 
@@ -80,13 +94,15 @@ class NewScenario:
     """A scenario for a plant: its ``text`` as a file, the loaded ``scenario``, what was chosen.
 
     ``certificate`` is for the scenario's schedule and the linear plant; it is None if none was
-    found. ``notes`` are sentences about what was chosen and found.
+    found. ``guarantee`` is the sentence of ``noack certify`` about the plant itself; ``notes`` are
+    sentences about what was chosen and found.
     """
 
     gain: LoopGain
     scenario: Scenario
     text: str
     certificate: ScenarioCertificate | None
+    guarantee: str
     notes: tuple[str, ...]
 
     def save(self, path: str | PathLike[str]) -> None:
@@ -101,7 +117,12 @@ class NewScenario:
     def to_json(self) -> Table:
         """Return the document of ``noack new --json``."""
         certificate = self.certificate and self.certificate.to_json()
-        return self.gain.to_json() | {"toml": self.text, "notes": self.notes, "certificate": certificate}
+        return self.gain.to_json() | {
+            "toml": self.text,
+            "guarantee": self.guarantee,
+            "notes": self.notes,
+            "certificate": certificate,
+        }
 
     def __repr__(self) -> str:
         return self.text
@@ -128,6 +149,8 @@ class _Trial:
     alpha_per_s: float
     x0: Vector
     weight: Matrix | None = None
+    floor: float | None = None
+    """Last threshold; None: a share of the first one."""
 
 
 def new(
@@ -135,6 +158,7 @@ def new(
     path: str | PathLike[str] = "new.toml",
     *,
     initial_state: Sequence[float] | None = None,
+    allowed: Mapping[str, float] | None = None,
     settings: ReadTable | None = None,
     network: str | PathLike[str] | None = None,
     report: Callable[[str], None] = lambda text: None,
@@ -145,6 +169,8 @@ def new(
         plant: a gain with its model; a model or a plant, for which K is chosen; or the file of one.
         path: the file that the scenario will have; file names in it are relative to its folder.
         initial_state: x(0), n entries; by default chosen.
+        allowed: allowed errors by the names of states; by default those that the plant states. The
+            threshold is chosen for them.
         settings: values by the keys of a scenario that are not to be chosen.
         network: a file whose table ``[network]`` is used, before the settings.
         report: called with what is being done.
@@ -160,8 +186,9 @@ def new(
     fixed_state = fixed.pop("plant.initial_state", initial_state)
     model = plant_model.model if isinstance(plant_model, LoopGain) else plant_model
     _require_rest(model)
-    trials = _TrialScenarios(model, Path(path), fixed)
-    best = trials.search(list(_list_trials(plant_model, _initial_state(model, fixed_state))), report)
+    errors = _allowed(model, allowed)
+    trials = _TrialScenarios(model, Path(path), fixed, errors)
+    best = trials.search([*_list_trials(plant_model, _initial_state(model, fixed_state), errors)], report)
     report("simulating")
     returns = trials.returns(best)
     for _ in range(_MOST_REDUCTIONS):
@@ -169,11 +196,30 @@ def new(
             break
         best = replace(best, x0=best.x0 * _START_FACTOR)
         returns = trials.returns(best)
+    best, results = trials.with_threshold(best, report)
+    guarantee, of_plant = _guarantee(results), results.guaranteed is not None
     certificate, _ = trials.certify(best)
-    notes = tuple(_notes(best, certificate, returns, trials.is_linear))
-    text = _file_text(trials.content(best), notes, best, fixed)
+    notes = tuple(_notes(best, certificate, returns, of_plant=of_plant))
+    text = _file_text(trials.content(best), (f"{guarantee}.", *notes), best, fixed)
     found_certificate = certificate if certificate.exists else None
-    return NewScenario(best.gain, trials.scenario(best), text, found_certificate, notes)
+    return NewScenario(best.gain, trials.scenario(best), text, found_certificate, guarantee, notes)
+
+
+def _guarantee(results: Certificates) -> str:
+    """Return the sentence of ``noack certify`` about the plant itself."""
+    sentence = guarantee_sentence(results)
+    return f"no guarantee: {results.answer.text}" if sentence is None else sentence
+
+
+def _allowed(model: LinearModel, given: Mapping[str, float] | None) -> Mapping[str, float]:
+    """Return the allowed errors by the names of states: as given, or as the plant states them."""
+    names = model.plant.state_names
+    for name, value in (given or {}).items():
+        if name not in names:
+            raise CallerError(f"--allow {name}: no such state; the states are {', '.join(names)}")
+        real_number(f"--allow {name}", value, above=0.0)
+    stated = {name: float(value) for name, value in model.plant.allowed.items()}  # type: ignore[arg-type]
+    return stated if given is None else given
 
 
 def _network(source: Path, path: Path) -> Table:
@@ -207,9 +253,11 @@ def _initial_state(model: LinearModel, fixed_state: object) -> Vector:
     return np.where(is_rate, 0.0, _DEFAULT_START) if not all(is_rate) else np.full(n, _DEFAULT_START)
 
 
-def _list_trials(model: LinearModel | LoopGain, x0: Vector) -> Iterator[_Trial]:
-    """Yield what is tried, the preferred settings first."""
-    gains = [model] if isinstance(model, LoopGain) else [gain(model, r=weight) for weight in _INPUT_WEIGHTS]
+def _list_trials(model: LinearModel | LoopGain, x0: Vector, allowed: Mapping[str, float]) -> Iterator[_Trial]:
+    """Yield what is tried, the preferred settings first; states without an allowed error may move."""
+    plant = model.model.plant if isinstance(model, LoopGain) else model.plant
+    q = [1.0 if name in allowed else _OTHER_WEIGHT for name in plant.state_names] if allowed else None
+    gains = [model] if isinstance(model, LoopGain) else [gain(model, q=q, r=r) for r in _INPUT_WEIGHTS]
     for loop_gain in gains:
         fastest = max(
             (size for size in np.abs(loop_gain.eigenvalues) if size < _FASTEST_EIGENVALUE_PER_S), default=1
@@ -221,15 +269,18 @@ def _list_trials(model: LinearModel | LoopGain, x0: Vector) -> Iterator[_Trial]:
         for rate_hz in (usual_hz,) if is_fixed else (usual_hz, 2 * usual_hz):
             for mansd in range(DEFAULT_MANSD, 0, -1):
                 for share in (ALPHA_SHARE, ALPHA_SHARE / 2):
-                    alpha = to_digits(min(share * loop_gain.decay_per_s, _FASTEST_ALPHA_PER_S))
+                    fastest_per_s = math.inf if allowed else _FASTEST_ALPHA_PER_S
+                    alpha = to_digits(min(share * loop_gain.decay_per_s, fastest_per_s))
                     yield _Trial(loop_gain, rate_hz, mansd, alpha, x0)
 
 
 class _TrialScenarios:
     """Builds, certifies and simulates the scenarios of trials."""
 
-    def __init__(self, model: LinearModel, path: Path, fixed_settings: ReadTable) -> None:
-        self._model, self._path, self._fixed_settings = model, path, fixed_settings
+    def __init__(
+        self, model: LinearModel, path: Path, fixed_settings: ReadTable, allowed: Mapping[str, float]
+    ) -> None:
+        self._model, self._path, self._fixed_settings, self._allowed = model, path, fixed_settings, allowed
         self.is_linear = isinstance(model.plant.system, LinearSettings)
 
     def content(self, trial: _Trial) -> Table:
@@ -237,7 +288,8 @@ class _TrialScenarios:
         model, reference = self._model, self._model.plant
         start = trial.x0 if trial.weight is None else trial.weight @ trial.x0
         beta, alpha = to_digits(BETA_SHARE * norm(start) or BETA_SHARE), trial.alpha_per_s
-        horizon_s = min(to_digits(math.log(1 / HORIZON_DECAY) / alpha), _LONGEST_HORIZON_S)
+        horizon_s = max(math.log(1 / HORIZON_DECAY) / alpha, _SHORTEST_HORIZON_S)
+        horizon_s = min(to_digits(horizon_s), _LONGEST_HORIZON_S)
         weight = None
         if trial.weight is not None:
             weight = [[to_digits(entry, 6) for entry in row] for row in trial.weight]
@@ -264,7 +316,7 @@ class _TrialScenarios:
                 "policy": "decaying",
                 "beta": beta,
                 "alpha_per_s": alpha,
-                "floor": to_digits(_FLOOR_SHARE * beta),
+                "floor": to_digits(_FLOOR_SHARE * beta) if trial.floor is None else trial.floor,
                 **({"weight": weight} if weight else {}),
             },
             "network": {
@@ -272,10 +324,50 @@ class _TrialScenarios:
                 "loss": {"model": "bernoulli", "probability": DEFAULT_LOSS_PROBABILITY},
             },
             "seeds": {"loss": 1},
+            **({"outputs": outputs} if (outputs := self._outputs()) else {}),
         }
         for key, value in self._fixed_settings.items():
             put(content, key, value, f"--set {key}")
         return content
+
+    def _outputs(self) -> list[Table]:
+        """Return the outputs: the states with an allowed error, or those whose units are known."""
+        units = dict(zip(self._model.plant.state_names, self._model.plant.units, strict=False))
+        names = [*self._allowed] or [name for name, unit in units.items() if unit][:_MOST_OUTPUTS]
+        outputs = []
+        for name in names:
+            unit, allowed = units.get(name, ""), self._allowed.get(name)
+            keys = {"unit": unit, "allowed": allowed}
+            outputs.append({"name": name, **{key: value for key, value in keys.items() if value}})
+        return outputs
+
+    def with_threshold(self, trial: _Trial, report: Callable[[str], None]) -> tuple[_Trial, Certificates]:
+        """Return the trial with the last threshold that the allowed errors need, and its certificates.
+
+        A bound that does not decay is proportional to this threshold, where nothing disturbs the plant.
+        """
+        is_fixed = not self._fixed_settings.keys().isdisjoint(("trigger", "trigger.floor"))
+        for number in range(_MOST_THRESHOLDS):
+            report(f"searching for proofs{f': threshold {number + 1}' if number else ''}")
+            results = certificates_of(self.scenario(trial), of_model=True)
+            results.prove(most_work=RUN_WORK)
+            certificate = results.guaranteed
+            used = results.scenario.trigger
+            if certificate is None or is_fixed or not isinstance(used, DecayingSettings):
+                break
+            shares = [
+                bound.ultimate / bound.output.allowed
+                for bound in bounds_of(results, certificate)
+                if bound.output.allowed is not None
+            ]
+            largest = max(shares, default=1.0)
+            if _LEAST_USE <= largest <= 1.0 or number == _MOST_THRESHOLDS - 1:
+                break
+            wanted = to_digits(min(used.floor * _MOST_USE / largest, used.beta / 2), 2)
+            if wanted == used.floor:
+                break
+            trial = replace(trial, floor=wanted)
+        return trial, results
 
     @property
     def _losses(self) -> str:
@@ -349,11 +441,15 @@ class _TrialScenarios:
         return bool(np.isfinite(sizes).all() and sizes[-1] <= SETTLED_SHARE * sizes.max())
 
 
-def _notes(trial: _Trial, certificate: ScenarioCertificate, returns: bool, is_linear: bool) -> Iterator[str]:
-    """Yield what was chosen and found, a sentence each."""
+def _notes(
+    trial: _Trial, certificate: ScenarioCertificate, returns: bool, *, of_plant: bool
+) -> Iterator[str]:
+    """Yield what was chosen and found, a sentence each; ``of_plant``: a guarantee is for the plant itself."""
     yield f"K: {trial.gain.method}; decay rate of Â + B̂K: {trial.gain.decay_per_s:.3g} /s."
-    plant = "the plant" if is_linear else "the linear plant ẋ = Âx + B̂u"
-    if certificate.constants is None:
+    plant = "the plant" if of_plant else "the linear plant ẋ = Âx + B̂u"
+    if of_plant:
+        pass
+    elif certificate.constants is None:
         yield (
             f"No certificate was found for {plant}: {certificate.void}. Rates, gains and M were "
             "tried; noack certify tries other settings, and names those with a certificate."
@@ -362,7 +458,7 @@ def _notes(trial: _Trial, certificate: ScenarioCertificate, returns: bool, is_li
         bound = envelope_formula("‖x‖", certificate, "state").format(at_most(certificate.constants.state))
         losses = certificate.conditions.guarantee.meaning
         yield f"Certified for {plant}, for every pattern of losses with {losses}: {bound}."
-    if not is_linear:
+    if not of_plant:
         errors = ", ".join(
             f"{of_states.max():.2g} within ±{within:g}" for within, of_states in trial.gain.model.errors
         )
@@ -396,6 +492,7 @@ _COMMENTS = {
     "network.mansd": "Maximum consecutive losses, M − 1. The network delivers the next packet.",
     "network.loss": "Losses, before this limit is applied.",
     "seeds": "Another number: other losses.",
+    "outputs": "What you want to know, in its own unit, and how far it may be from its set-point.",
 }
 """Comments of the file, by table and key."""
 _REASONS = {
@@ -426,6 +523,10 @@ def _section_lines(name: str, table: ReadTable, comments: Mapping[str, str]) -> 
         path = f"{name}.{key}" if name else key
         if isinstance(value, dict):
             inner += _section_lines(path, value, comments)
+        elif isinstance(value, list) and value and isinstance(value[0], dict):
+            inner += ["", *_comment_lines(comments.get(path, ""))]
+            for entry in value:
+                inner += [f"[[{path}]]", *toml_text(entry).splitlines()]
         else:
             lines += _comment_lines(comments.get(path, "")) + toml_text({key: value}).splitlines()
     return lines + inner

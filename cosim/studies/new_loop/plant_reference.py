@@ -4,7 +4,7 @@ import ast
 import re
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from noack.core.errors import CallerError, did_you_mean
 from noack.core.extension_points import missing_extension
 from noack.core.linear_systems import Matrix, Vector
 from noack.plants.linear import LinearSettings
-from noack.plants.plant_settings import PlantSettings, PlantStart, PlantSystem
+from noack.plants.plant_settings import PlantSettings, PlantStart, PlantSystem, name_and_unit
 from noack.plants.python_plant import PythonPlantSettings
 from noack.plants.systems.linearisation import STEP_NS
 from noack.scenario import scenario_file, toml_file
@@ -51,6 +51,10 @@ class PlantReference:
     rates: Mapping[str, float]
     """``rate_hz`` and ``measure_every`` of its plant, if they are given."""
     initial_state: tuple[float, ...] | None = None
+    units: tuple[str, ...] = ()
+    """Of the states, if they are known."""
+    allowed: ReadTable = field(default_factory=dict)
+    """Allowed errors of states, by their names."""
     matrices: tuple[Matrix, Matrix] | None = None
     """A and B of a linear plant."""
     model_matrices: tuple[Matrix, Matrix] | None = None
@@ -113,15 +117,19 @@ def plant_reference(
         if outline.rate_hz is not None:
             rates = {"rate_hz": float(f"{outline.rate_hz:.12g}")}
         names = _plain_names(outline.states), _plain_names(outline.inputs)
-        return PlantReference(label, settings, system, outline.n, outline.m, names, rates)
+        return PlantReference(
+            label, settings, system, outline.n, outline.m, names, rates, outline.initial_state,
+            _units(outline.states), {_plain(name): value for name, value in outline.allowed.items()},
+        )  # fmt: skip
     if isinstance(system, PythonPlantSettings):
         n, m = _sizes_of_class(system, label, sizes)
         return PlantReference(label, settings, system, n, m, (None, None), rates)
     base = _of_scenario(str(system.scenario), {})
     initial = base.initial_state
     return PlantReference(
-        label, settings, system, base.n, base.m, base.names, {**base.rates, **rates}, initial
-    )
+        label, settings, system, base.n, base.m, base.names, {**base.rates, **rates}, initial,
+        _units(system.states),
+    )  # fmt: skip
 
 
 def _system_table(label: str) -> Table | None:
@@ -131,7 +139,11 @@ def _system_table(label: str) -> Table | None:
         if (table := kind.named_by(label)) is not None:
             return table
     if label.endswith(".py"):
-        raise CallerError(f"{label}: which class of it? {_class_hint(Path(label))}")
+        classes = _classes(Path(label))
+        if len(classes) != 1:
+            hint = " or ".join(f"{label}:{each}" for each in classes) or f"{label}:Class"
+            raise CallerError(f"{label}: which class of it? write {hint}")
+        return {"kind": "python", "file": label, "name": classes[0]}
     if colon and file.endswith(".py"):
         return {"kind": "python", "file": file, "name": name}
     if label in PLANTS:
@@ -150,12 +162,12 @@ def _positive_rate(key: str, value: object) -> float:
     return float(value)
 
 
-def _class_hint(path: Path) -> str:
+def _classes(path: Path) -> list[str]:
+    """Return the names of the classes in a Python file, as far as it can be read."""
     with suppress(OSError, SyntaxError, ValueError):
         statements = ast.parse(path.read_bytes()).body
-        if names := [statement.name for statement in statements if isinstance(statement, ast.ClassDef)]:
-            return "write " + " or ".join(f"{path}:{name}" for name in names)
-    return f"write {path}:Class"
+        return [statement.name for statement in statements if isinstance(statement, ast.ClassDef)]
+    return []
 
 
 def _validated_settings(table: object, label: str) -> PlantSettings:
@@ -198,7 +210,15 @@ def _of_scenario(label: str, settings: ReadTable) -> PlantReference:
 
 
 def _plain_names(names: tuple[str, ...] | None) -> tuple[str, ...] | None:
-    return names and tuple(re.sub(r"\W", "_", name) for name in names)
+    return names and tuple(_plain(name_and_unit(name)[0]) for name in names)
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"\W", "_", name)
+
+
+def _units(states: tuple[str, ...] | None) -> tuple[str, ...]:
+    return tuple(name_and_unit(state)[1] for state in states or ())
 
 
 def _sizes_of_class(

@@ -103,7 +103,7 @@ def test_every_command_and_load_take_the_network_of_a_file(tmp_path: Path) -> No
     )
     assert result.exit_code == 0
     new = tmp_path / "new.toml"
-    assert invoke("new", str(new), "--plant", "cart_pole", "--network", str(path)).exit_code == 0
+    assert invoke("new", "cart_pole", "--out", str(new), "--network", str(path)).exit_code == 0
     assert 'file = "measured/network.csv"' in new.read_text()
     assert noack.load(new).network == whole.network
 

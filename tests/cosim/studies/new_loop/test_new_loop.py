@@ -16,6 +16,7 @@ import noack
 from cosim.studies.new_loop.linear_model import controllable_states
 from noack.core.errors import CallerError
 from noack.plants.systems import linearisation
+from noack.scenario.outputs import LoopOutput
 from noack.scenario.resolution import loop_of, resolve
 from tests.helpers.approved import compare_lines
 from tests.helpers.command_line import invoke
@@ -83,7 +84,7 @@ def command(*words: str, ok: bool = True) -> Result:
 def test_three_commands_lead_from_a_class_to_a_certified_run() -> None:
     command("linearise", "pole.py:Pole", "--out", "pole.json")
     command("gain", "pole.json", "--r", "2", "--out", "pole.json")
-    text = command("new", "loop.toml", "--plant", "pole.json").stdout
+    text = command("new", "pole.json", "--out", "loop.toml").stdout
     assert (
         "Certified for the linear plant ẋ = Âx + B̂u, for every pattern of losses with at most M − 1 = "
         in text
@@ -98,7 +99,7 @@ def test_three_commands_lead_from_a_class_to_a_certified_run() -> None:
     certified = command("certify", "loop.toml", "--no-proofs", "--json").stdout
     assert json.loads(certified)["of_the_model_only"] == 'plant.system.kind = "python"'
     assert "what follows is certified for the linear plant" in " ".join(
-        command("certify", "loop.toml", "--no-proofs").stdout.split()
+        command("certify", "loop.toml", "--no-proofs", "--verbose").stdout.split()
     )
     run = noack.simulate(noack.load("loop.toml", {"horizon_s": 2.0}))
     assert run.ok
@@ -107,7 +108,7 @@ def test_three_commands_lead_from_a_class_to_a_certified_run() -> None:
     linear = noack.simulate(noack.load("loop.toml", {"plant.system": {"kind": "linear"}}))
     assert linear.ok
     assert re.search(r"claims +\d+ held$", repr(linear), re.MULTILINE)
-    command("new", "loop.toml", "--plant", "pole.json", ok=False)  # it exists
+    command("new", "pole.json", "--out", "loop.toml", ok=False)  # it exists
 
 
 @pytest.mark.parametrize("name", ["cart_pole", "quadrotor", "dc_motor", "four_tank", "unstable_pendulum"])
@@ -125,6 +126,40 @@ def test_each_plant_of_noack_gets_a_scenario(name: str) -> None:
         assert made.certificate.constants.loop_gain < 1
     assert made.notes[-1].endswith("the loop returns to 0.")
     assert noack.simulate(noack.load("made.toml", {"horizon_s": 0.5})).ok
+
+
+SERVO = """
+class Servo:
+    states = ["angle, rad", "rate, rad/s"]
+    inputs = ["voltage, V"]
+    allowed = {"angle": 0.02}
+    initial_state = [1.0, 0.0]
+
+    def derivative(self, t_s, z, u):
+        return z[1], -4.0 * z[1] + 20.0 * u[0]
+"""
+
+
+def test_one_command_leads_from_a_class_to_a_guarantee_in_its_own_units() -> None:
+    Path("servo.py").write_text(SERVO)
+    first, *_ = command("new", "servo.py").stdout.splitlines()
+    promised = re.fullmatch(
+        r"angle stays within 0.02 rad of its set-point from ([\d.]+) s on, although up to 4 consecutive "
+        r"packets are lost \(.*\)",
+        first,
+    )
+    assert promised is not None
+    scenario = noack.load("servo")  # of the current folder
+    assert scenario.loop_outputs() == (LoopOutput("angle", "rad", (1.0, 0.0), 0.02),)
+    assert scenario.plant.initial_state == (1.0, 0.0)
+    for seed in range(3):
+        run = noack.simulate(noack.load("servo", {"seeds.loss": seed, "certificate.prove": False}))
+        rows = run.table("plant_step").to_pydict()
+        late = np.array(rows["t_s"]) >= float(promised[1])
+        assert np.abs(np.array(rows["x_1"])[late]).max() <= 0.02
+    smaller = command("new", "servo.py", "--allow", "angle=0.002", "--out", "smaller.toml").stdout
+    assert smaller.startswith("angle stays within 0.002 rad")
+    assert noack.load("smaller").trigger.floor < scenario.trigger.floor / 5
 
 
 def test_every_key_of_the_file_that_is_chosen_has_a_comment() -> None:
