@@ -158,7 +158,8 @@ class Run:
         Returns:
             ``t_s`` and ``t_ns``; x, x_s and x_c, one column per state (``x_1``, ``x_s_1``,
             ``x_c_1``, …); each output that the scenario states, by its name; ``e_s_norm`` before a
-            reset, its ``threshold``, and ``e_c_norm``, all in the trigger's norm; ``event``, the number of the transmitted update, or −1. x_s is the
+            reset, its ``threshold``, and ``e_c_norm``, all in the trigger's
+            norm; ``event``, the number of the transmitted update, or −1. x_s is the
             value after a reset. x_c is NaN at times without controller records. x is the state that
             the sensor uses; with noise or an observer it differs from the plant's state.
         """
