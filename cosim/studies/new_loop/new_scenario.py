@@ -334,7 +334,7 @@ class _TrialScenarios:
         """Return the outputs: the states with an allowed error, or those whose units are known."""
         units = dict(zip(self._model.plant.state_names, self._model.plant.units, strict=False))
         names = [*self._allowed] or [name for name, unit in units.items() if unit][:_MOST_OUTPUTS]
-        outputs = []
+        outputs = list[Table]()
         for name in names:
             unit, allowed = units.get(name, ""), self._allowed.get(name)
             keys = {"unit": unit, "allowed": allowed}
