@@ -17,13 +17,14 @@ from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.core_library import CData, CoreMemory, core, reals_at
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.periods import Period
+from noack.core.references import Reference, ReferenceInForce
 from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee, LossHistory, LossRule
 from noack.machines.loop_machines import LoopMachines, MachinePart, Role, parts_of, set_machine, take_changes
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_SETTING, CONTROLLER_STEP, RecordShape
 from noack.protocol.roles import FAILED, External, Notice
 from noack.protocol.wire_format import Flow
 from noack.scenario.parameter_changes import ChangeSchedule
-from noack.scenario.resolution import loop_of, setpoint_of
+from noack.scenario.resolution import loop_of, reference_of
 from noack.scenario.scenario import Scenario
 
 CONTROLLER = Role(
@@ -33,8 +34,6 @@ CONTROLLER = Role(
     (CONTROLLER_STEP, CONTROLLER_DELIVERY, None),
     CONTROLLER_SETTING,
 )
-Setpoint = tuple[Vector, Vector]
-"""x_r and u_r, shapes (n,) and (m,)."""
 
 
 class LossCheck:
@@ -157,7 +156,7 @@ class Controller(MachinePart):
             following ticks if no update arrives until then; only with a linear law.
         timeout_ns: age from which on the newest update is too old; only with a linear law.
         holds_input: whether the last input is then held; else the input is the safe input.
-        setpoint: u = K(x_c − x_r) + u_r; None is 0.
+        reference: u = K(x_c − x_r) + u_r; None is 0.
         schedule: the announced changes of its settings; None if they cannot change.
     """
 
@@ -175,15 +174,14 @@ class Controller(MachinePart):
     predictions: int = 1
     timeout_ns: int = NEVER_NS
     holds_input: bool = False
-    setpoint: Setpoint | None = None
-    schedule: ChangeSchedule[Setpoint | None] | None = None
+    reference: Reference | None = None
+    schedule: ChangeSchedule[Reference | None] | None = None
 
     role = CONTROLLER
 
     def __post_init__(self) -> None:
         self._losses = LossCheck(self.guarantee, self.schedule, known_start=self.x0 is not None)
-        self._points: list[Vector | None] = [self.setpoint and self.setpoint[0]]
-        self._since_ns: list[int] = []
+        self._in_force = ReferenceInForce(self.reference, len(self.H), self.inputs)
         self._failed = False
 
     @property
@@ -217,8 +215,8 @@ class Controller(MachinePart):
         controller.machine.first_ns = self.first_ns
         rests_ns = (length_ns - self.first_ns for length_ns in period.lengths_ns)
         steps_ns = (*period.lengths_ns, self.first_ns, *rests_ns)
-        transitions = memory.transitions(self.H, steps_ns)
-        memory.set_model(controller.model, transitions, (), self._points)
+        controller.model.transitions = memory.transitions(self.H, steps_ns)
+        self._in_force.reference.fill(controller.model.reference, memory)
         K = self.law.K if isinstance(self.law, LinearFeedback) else None
         memory.fill(
             controller,
@@ -236,10 +234,9 @@ class Controller(MachinePart):
                 "newest": core.NOACK_NO_SEQUENCE,
                 "x": np.zeros(n),
                 "u": np.zeros(m),
-                "scratch": np.zeros(3 * n + m),
+                "scratch": np.zeros(3 * n + 2 * m),
             },
         )
-        self._set_point(controller, self.setpoint)
 
     def set_drawn_values(self, controller: CData, memory: CoreMemory) -> None:
         """Set what x(0) determines."""
@@ -252,13 +249,15 @@ class Controller(MachinePart):
         n, t_ns = controller.machine.n, controller.asked_ns
         if question == core.NOACK_ASK_CHANGE:
             for due in take_changes(self.schedule, controller.machine):
-                self._change(controller, due.since_ns, due.prepared)
+                if self._in_force.change(due.since_ns, due.prepared):
+                    self._in_force.reference.fill(controller.model.reference, self._memory)
             return ()
         x, t_s = reals_at(controller.x, n).copy(), t_ns / NS_PER_S
         if question == core.NOACK_ASK_UPDATE:
             return self._call(controller, lambda law: law.update(t_s, x))
         assert question == core.NOACK_ASK_INPUT
-        return self._call(controller, lambda law: law.input(t_s, x, self.setpoint))
+        x_r_and_u_r = self._in_force.point(max(t_ns, controller.model_ns))
+        return self._call(controller, lambda law: law.input(t_s, x, x_r_and_u_r))
 
     def inspect(self, rows: NDArray[np.void]) -> Sequence[Notice]:
         """Compare the losses before received updates with the guarantee; return the violations."""
@@ -285,26 +284,6 @@ class Controller(MachinePart):
                 notices.append(Notice(controller.asked_ns, FAILED, str(error)))
         reals_at(controller.u, m)[:] = safe if u is None else u
         return notices
-
-    def _change(self, controller: CData, since_ns: int, setpoint: Setpoint | None) -> None:
-        """Use another set point; x_c follows it from ``since_ns`` on."""
-        self.setpoint = setpoint
-        point = setpoint and setpoint[0]
-        last_point = self._points[-1]
-        is_same = (
-            point is last_point if point is None or last_point is None else np.array_equal(point, last_point)
-        )
-        if not is_same:
-            self._points.append(point)
-            self._since_ns.append(since_ns)
-            self._memory.set_model(
-                controller.model, controller.model.transitions, self._since_ns, self._points
-            )
-        self._set_point(controller, setpoint)
-
-    def _set_point(self, controller: CData, setpoint: Setpoint | None) -> None:
-        x_r, u_r = (None, None) if setpoint is None else setpoint
-        self._memory.fill(controller, {"has_point": setpoint is not None, "x_r": x_r, "u_r": u_r})
 
 
 def controllers_of(loops: Sequence[Scenario], phases_ns: Sequence[int] | None = None) -> LoopMachines:
@@ -346,8 +325,8 @@ def _part(resolved: Scenario) -> Controller:
         predictions=resolved.controller.predictions,
         timeout_ns=resolved.timing.update_timeout_ns,
         holds_input=resolved.controller.timeout_input == "hold",
-        setpoint=setpoint_of(resolved),
-        schedule=None if acknowledges else ChangeSchedule(resolved, setpoint_of),
+        reference=loop.reference,
+        schedule=None if acknowledges else ChangeSchedule(resolved, reference_of),
     )
 
 

@@ -54,6 +54,12 @@ double noack_exp_at_limits(double x) {
 
 double noack_exp(double x) { return fixed_exp(x); }
 
+void noack_sine_and_cosine(double turns, double parts[2]) {
+    wave_parts both = sine_and_cosine(turns);
+    parts[0] = both.sine;
+    parts[1] = both.cosine;
+}
+
 double noack_expm1(double x) {
     double square = x * x;
     if (fabs(x) < 0x1p-9)

@@ -74,4 +74,34 @@ static inline double fixed_exp(double x) {
     return (parts.high + parts.low) * power_of_2(parts.exponent);
 }
 
+typedef struct {
+    double sine, cosine;
+} wave_parts;
+
+/* sin and cos of 2 pi times a number of turns below 2^50. What is left of the turns after the
+   nearest quarter is exact; the polynomials are those of fdlibm (Sun, 1993) on |angle| <= pi/4. */
+static inline wave_parts sine_and_cosine(double turns) {
+    double quarters = floor(4.0 * turns + 0.5),
+           angle = (turns - 0.25 * quarters) * 0x1.921fb54442d18p+2;
+    double z = angle * angle;
+    double s5 = 2.75573137070700676789e-06
+                + z * (-2.50507602534068634195e-08 + z * 1.58969099521155010221e-10);
+    double s2 = 8.33333333332248946124e-03 + z * (-1.98412698298579493134e-04 + z * s5);
+    double sine = angle + angle * z * (-1.66666666666666324348e-01 + z * s2);
+    double c4 = -2.75573143513906633035e-07
+                + z * (2.08757232129817482790e-09 + z * -1.13596475577881948265e-11);
+    double c2 = -1.38888888888741095749e-03 + z * (2.48015872894767294178e-05 + z * c4);
+    double cosine = 1.0 - (0.5 * z - z * z * (4.16666666666666019037e-02 + z * c2));
+    switch ((int64_t)(quarters - 4.0 * floor(0.25 * quarters))) {
+    case 0:
+        return (wave_parts){sine, cosine};
+    case 1:
+        return (wave_parts){cosine, -sine};
+    case 2:
+        return (wave_parts){-sine, -cosine};
+    default:
+        return (wave_parts){-cosine, sine};
+    }
+}
+
 #endif

@@ -30,6 +30,9 @@ double noack_expm1(double x);
 double noack_log(double x);
 double noack_cube_root(double x);
 
+/* Sine and cosine of 2 pi times a number of turns below 2^50. */
+void noack_sine_and_cosine(double turns, double sine_and_cosine[2]);
+
 /* result = e^M, (n, n); scratch: (10, n, n). See native/loop/exponential.c. */
 void noack_exponential(int64_t n, const double *matrix, double *result, double *scratch);
 

@@ -31,6 +31,7 @@ from noack.core.core_library import CData, CoreMemory, core, reals_at
 from noack.core.linear_systems import Matrix, Vector, discretise
 from noack.core.periods import ANY_PERIOD, Period
 from noack.core.random_streams import normals, uniforms
+from noack.core.references import Reference
 from noack.disturbances.disturbance_settings import Place, SignalSource
 from noack.machines.loop_machines import LoopMachines, MachinePart, Role, parts_of, set_machine
 from noack.plants.linear import LinearSystem
@@ -125,8 +126,9 @@ class Watchdog:
                 "K": self.K,
             },
         )
-        if self.H is not None:
-            memory.set_model(plant.fallback, memory.transitions(self.H, period.lengths_ns))
+        if self.H is not None and self.K is not None:
+            plant.fallback.transitions = memory.transitions(self.H, period.lengths_ns)
+            Reference.constant(*map(np.zeros, self.K.T.shape)).fill(plant.fallback.reference, memory)
 
 
 def too_old(t_ns: NDArray[np.int64], newest_ns: NDArray[np.int64], timeout_ns: int) -> NDArray[np.bool_]:

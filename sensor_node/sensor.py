@@ -15,7 +15,6 @@ and corrected by y (native/loop/observer.c). If measurements are missing, the in
 are unknown, and the first known input is used.
 """
 
-from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -24,6 +23,7 @@ import numpy as np
 from noack.core.core_library import CData, CoreMemory, core, ffi, reals_at
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.periods import Period
+from noack.core.references import Reference, ReferenceInForce
 from noack.machines.loop_machines import LoopMachines, MachinePart, Role, parts_of, set_machine, take_changes
 from noack.observers.observer_settings import EstimationModel, ObserverSettings
 from noack.protocol.record_tables import (
@@ -36,7 +36,7 @@ from noack.protocol.roles import Notice
 from noack.protocol.wire_format import Flow
 from noack.scenario.estimation import assumed_model
 from noack.scenario.parameter_changes import ChangeSchedule
-from noack.scenario.resolution import loop_of, policy_of, setpoint_of
+from noack.scenario.resolution import loop_of, policy_of, reference_of
 from noack.scenario.scenario import Scenario
 from noack.trigger_policies.trigger_rule import (
     CodedPolicy,
@@ -107,7 +107,7 @@ class Sensor(MachinePart):
         inputs: m.
         period: expected time between measurements, for precomputed matrices; others are
             possible.
-        setpoint: x_r, shape (n,); None is 0.
+        reference: x_r; None is 0.
         schedule: the announced changes of its settings; None if they cannot change.
         timeout_ns: how long to wait for an acknowledgement; None: updates are not acknowledged.
         observer: estimates x from the measurements; None: they are x.
@@ -120,8 +120,8 @@ class Sensor(MachinePart):
     x0: Vector | None = None
     inputs: int = 1
     period: Period | None = None
-    setpoint: Vector | None = None
-    schedule: ChangeSchedule[tuple[Vector | None, Policy]] | None = None
+    reference: Reference | None = None
+    schedule: ChangeSchedule[tuple[Reference | None, Policy]] | None = None
     timeout_ns: int | None = None
     observer: Observer | None = None
     reports_error: bool = False
@@ -133,7 +133,7 @@ class Sensor(MachinePart):
         self._trigger: EventTrigger | None = None
         if isinstance(self.policy, CodedPolicy):
             self._trigger = self.policy.new_trigger()
-        self._points, self._since_ns = [self.setpoint], list[int]()
+        self._in_force = ReferenceInForce(self.reference, len(self.H), self.inputs)
         self._policy = self.policy  # also of a copy of another loop, which is not filled
 
     @property
@@ -163,7 +163,8 @@ class Sensor(MachinePart):
             horizon_ns=self.horizon_ns,
         )
         steps_ns = () if period is None else period.lengths_ns
-        memory.set_model(sensor.model, memory.transitions(self.H, steps_ns), (), self._points)
+        sensor.model.transitions = memory.transitions(self.H, steps_ns)
+        self._in_force.reference.fill(sensor.model.reference, memory)
         start = np.zeros(n) if self.x0 is None else self.x0
         memory.fill(sensor, {
             "is_user": self._trigger is not None, "acknowledged": self.timeout_ns is not None,
@@ -195,8 +196,9 @@ class Sensor(MachinePart):
         if question == core.NOACK_ASK_CHANGE:
             for due in take_changes(self.schedule, sensor.machine):
                 assert due.prepared is not None
-                setpoint, policy = due.prepared
-                self._set_point(sensor, due.since_ns, setpoint)
+                reference, policy = due.prepared
+                if self._in_force.change(due.since_ns, reference):
+                    self._in_force.reference.fill(sensor.model.reference, self._memory)
                 if isinstance(policy, TriggerRule) and isinstance(self._policy, TriggerRule):
                     policy = policy.continuing(self._policy, due.since_ns)
                 self._set_policy(sensor, policy)
@@ -216,7 +218,7 @@ class Sensor(MachinePart):
         trigger, n = self._trigger, sensor.machine.n
         assert trigger is not None
         t_ns, e_s = sensor.asked_ns, reals_at(sensor.e_s, n).copy()
-        x = self._from_setpoint(t_ns, reals_at(sensor.x, n).copy())
+        x = self._from_reference(t_ns, reals_at(sensor.x, n).copy())
         if sensor.first:
             trigger.start(t_ns, x)
         decision = trigger.test(t_ns, x, e_s)
@@ -226,7 +228,7 @@ class Sensor(MachinePart):
 
     def _start(self, sensor: CData, t_ns: int, x: Vector) -> None:
         """Restart the trigger's condition at an event at x, (n,)."""
-        x = self._from_setpoint(t_ns, x)
+        x = self._from_reference(t_ns, x)
         if self._trigger is not None:
             self._trigger.start(t_ns, x)
             return
@@ -241,10 +243,9 @@ class Sensor(MachinePart):
             sensor.scratch,
         )
 
-    def _from_setpoint(self, t_ns: int, x: Vector) -> Vector:
+    def _from_reference(self, t_ns: int, x: Vector) -> Vector:
         """Return x − x_r at a time, (n,), which a trigger compares with."""
-        point = self._points[bisect_right(self._since_ns, t_ns)]
-        return x if point is None else x - point
+        return self._in_force.difference(t_ns, x)
 
     def _set_policy(self, sensor: CData, policy: Policy) -> None:
         """Set a policy as if it had been set at the last event."""
@@ -266,13 +267,6 @@ class Sensor(MachinePart):
                 sensor.scratch,
             )
 
-    def _set_point(self, sensor: CData, since_ns: int, setpoint: Vector | None) -> None:
-        """Move x_r from ``since_ns`` on."""
-        if not np.array_equal(_or_zero(self._points[-1]), _or_zero(setpoint)):
-            self._points.append(setpoint)
-            self._since_ns.append(since_ns)
-            self._memory.set_model(sensor.model, sensor.model.transitions, self._since_ns, self._points)
-
     def _make_room(self, sensor: CData, places: int) -> None:
         """Provide room for updates that wait for their acknowledgement."""
         n, count = sensor.machine.n, sensor.sent_count
@@ -282,10 +276,6 @@ class Sensor(MachinePart):
             ffi.memmove(sent, sensor.sent, 8 * count)
             ffi.memmove(x, sensor.sent_x, 8 * n * count)
         sensor.sent, sensor.sent_x, sensor.sent_places = sent, x, places
-
-
-def _or_zero(setpoint: Vector | None) -> Vector:
-    return np.zeros(1) if setpoint is None else setpoint
 
 
 def sensors_of(loops: Sequence[Scenario], phases_ns: Sequence[int] | None = None) -> LoopMachines:
@@ -306,7 +296,7 @@ def _part(resolved: Scenario) -> Sensor:
         loop.known_x0 if starts_from_x0 else None,
         inputs=loop.m,
         period=resolved.timing.measurement_period,
-        setpoint=None if acknowledges else loop.setpoint,
+        reference=None if acknowledges else loop.reference,
         schedule=None if acknowledges else ChangeSchedule(resolved, _prepared),
         timeout_ns=resolved.timing.acknowledgement_timeout_ns if acknowledges else None,
         observer=observer_of(resolved),
@@ -326,10 +316,9 @@ def _with_draws_of(sensor: Sensor, resolved: Scenario) -> Sensor:
     )
 
 
-def _prepared(resolved: Scenario) -> tuple[Vector | None, Policy]:
-    """Return the parts of another scenario that a sensor needs: its set point and its policy."""
-    setpoint = setpoint_of(resolved)
-    return None if setpoint is None else setpoint[0], policy_of(resolved)
+def _prepared(resolved: Scenario) -> tuple[Reference | None, Policy]:
+    """Return the parts of another scenario that a sensor needs: its reference and its policy."""
+    return reference_of(resolved), policy_of(resolved)
 
 
 def observer_of(resolved: Scenario) -> Observer | None:

@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from cosim.record.rows import concatenate_rows
 from cosim.record.run_events import model_flow_of
 from cosim.record.run_record import Rows, RunRecord
-from noack.core.linear_systems import ModelFlow, Propagator
+from noack.core.linear_systems import Propagator
+from noack.core.references import ModelFlow
 from noack.core.row_operations import all_entries, firsts_of_equal, largest_sizes, row_norms, set_rows
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -143,7 +144,7 @@ def align_measurements(
     reset = (measurements["event"] != NO_SEQUENCE) & (not acknowledged)
     x_s = measurements["x_s"].copy()
     x_s[reset] = measurements["x"][reset]
-    flow = ModelFlow(loop.H, loop.setpoint) if flow is None else flow
+    flow = ModelFlow(loop.H, loop.reference) if flow is None else flow
     x_c, received = _controller_states_at(flow, track, t_ns, until_ns)
     e_c = x_c - measurements["x"]
     if loop.weight is not None:
@@ -182,7 +183,7 @@ def _controller_states_at(
     x_c = track.x_c.take(index, axis=0)
     x_c[~known] = np.nan
     dt_ns = t_ns - track.model_ns[index]
-    if flow.moved:
+    if flow.reference is not None:
         for i in np.flatnonzero(known):
             state = int(index[i])
             x_c[i] = flow(track.x_c[state], int(track.model_ns[state]), int(t_ns[i]))

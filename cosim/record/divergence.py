@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector
+from noack.core.references import Reference
 from noack.core.row_operations import all_entries, row_norms
 from noack.disturbances.step import StepDisturbance
 from noack.scenario.resolution import loop_of, policy_of
@@ -32,6 +33,7 @@ GROWTH = 1000.0
 _STILL_GROWING = 2.0
 """Factor by which the last tenth must exceed the middle of the run."""
 _LEAST_SAMPLES = 20
+_REFERENCE_SAMPLES = 1000
 """Shorter records are not judged."""
 
 
@@ -86,7 +88,7 @@ def divergence(
 
 
 def _scale(scenario: Scenario) -> float:
-    """Return the magnitude of ‖x‖ to expect from a scenario's disturbances and set-point."""
+    """Return the magnitude of ‖x‖ to expect from a scenario's disturbances and reference."""
     loop = loop_of(scenario)
     displacement = 0.0
     for disturbance in scenario.plant.disturbances:
@@ -98,8 +100,14 @@ def _scale(scenario: Scenario) -> float:
             )
             until_s = min(disturbance.until_s or scenario.horizon_s, scenario.horizon_s)
             displacement += float(np.linalg.norm(push)) * max(until_s - disturbance.from_s, 0.0)
-    setpoint = 0.0 if loop.setpoint is None else float(np.linalg.norm(loop.setpoint))
+    reference = 0.0 if loop.reference is None else _largest(loop.reference, scenario)
     threshold = policy_of(scenario).largest_threshold
     if loop.weight is not None:
         threshold /= float(np.linalg.svd(loop.weight, compute_uv=False)[-1])
-    return max(displacement, setpoint, threshold)
+    return max(displacement, reference, threshold)
+
+
+def _largest(reference: Reference, scenario: Scenario) -> float:
+    """Return the largest ‖x_r‖ of a run, at sampled times."""
+    t_ns = np.linspace(0, scenario.timing.horizon_ns, _REFERENCE_SAMPLES).astype(np.int64)
+    return float(row_norms(reference.states(t_ns)).max())

@@ -11,7 +11,7 @@ from cosim.record.rows import Rows, messages_in
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.errors import CallerError
-from noack.core.linear_systems import ModelFlow
+from noack.core.references import ModelFlow, Reference, ReferenceInForce
 from noack.protocol.record_tables import (
     CONTROLLER_SETTING,
     NETEM_PACKET,
@@ -25,7 +25,7 @@ from noack.protocol.record_tables import (
 from noack.protocol.roles import CHANGEABLE
 from noack.protocol.wire_format import Flow
 from noack.scenario.parameter_changes import ChangeSchedule, ParameterChange, settings_of
-from noack.scenario.resolution import loop_of
+from noack.scenario.resolution import loop_of, reference_of
 from noack.scenario.runtime_parameters import is_of_loss_alone
 from noack.scenario.scenario import Scenario
 
@@ -86,14 +86,23 @@ def changes_of(record: RunRecord) -> list[RecordedChange]:
 
 
 def model_flow(scenario: Scenario, rows: Rows) -> ModelFlow:
-    """The flow of the controller's model in a run, with its set-points."""
+    """The flow of the controller's model in a run, with its reference."""
     loop, schedule = loop_of(scenario), ChangeSchedule[None](scenario)
-    flow = ModelFlow(loop.H, loop.setpoint)
+    in_force = ReferenceInForce(loop.reference, loop.n, loop.m)
     for change, since_ns in _changes_in(rows):
         _add(schedule, change, since_ns)
     for applied in schedule.take(NEVER_NS):
-        flow.change(applied.since_ns, loop_of(applied.scenario).setpoint)
-    return flow
+        in_force.change(applied.since_ns, reference_of(applied.scenario))
+    return ModelFlow(loop.H, in_force.reference if in_force.moves else None)
+
+
+def reference_in_run(record: RunRecord) -> Reference | None:
+    """Return the reference that a run followed, with the changes of its set-point; None if it was 0."""
+    loop = loop_of(record.scenario)
+    in_force = ReferenceInForce(loop.reference, loop.n, loop.m)
+    for change in changes_of(record):
+        in_force.change(change.first_ns, reference_of(change.scenario))
+    return in_force.reference if in_force.moves else None
 
 
 def claimed_until_s(rows: Rows) -> float:

@@ -42,23 +42,25 @@ int64_t noack_controller_handle(
     return NOACK_DONE;
 }
 
-/* u = K(x - x_r) + u_r, or the answer of the user's law. */
-static void apply_law(noack_controller *controller, const double *x, double *u) {
+/* u = K(x - x_r) + u_r at t_ns, or the answer of the user's law. */
+static void apply_law(noack_controller *controller, int64_t t_ns, const double *x, double *u) {
     int64_t n = controller->machine.n, m = controller->machine.m;
+    const noack_reference *reference = &controller->model.reference;
+    double *difference = controller->scratch + n, *u_r = controller->scratch + 3 * n + m;
     if (controller->is_user) {
         copy(m, controller->u, u);
         return;
     }
-    if (!controller->has_point) {
+    if (!noack_reference_at(reference, t_ns, 0, n, difference)) {
         noack_product(m, n, controller->K, x, u);
         return;
     }
-    double *from_point = controller->scratch + n;
     for (int64_t k = 0; k < n; k++)
-        from_point[k] = x[k] - controller->x_r[k];
-    noack_product(m, n, controller->K, from_point, u);
+        difference[k] = x[k] - difference[k];
+    noack_product(m, n, controller->K, difference, u);
+    noack_reference_at(reference, t_ns, n, m, u_r);
     for (int64_t k = 0; k < m; k++)
-        u[k] += controller->u_r[k];
+        u[k] += u_r[k];
 }
 
 /* Replace u, the input before, by the input for t_ns, at which the model's state is x. */
@@ -66,7 +68,7 @@ static void choose_input(noack_controller *controller, int64_t t_ns, const doubl
     if (!controller->has_state)
         copy(controller->machine.m, controller->safe_input, u);
     else if (t_ns - controller->update_ns < controller->timeout_ns)
-        apply_law(controller, x, u);
+        apply_law(controller, t_ns, x, u);
     else if (!controller->holds_input)
         copy(controller->machine.m, controller->safe_input, u);
 }

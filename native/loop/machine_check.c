@@ -1,9 +1,18 @@
 /* Checks the numbers of a process once, where they enter the core: all that the steps assume. */
+#include <math.h>
 #include <stddef.h>
 
 #include "loop.h"
 
-enum { MOST_PLACES = 1 << 20, MOST_EVERY = 1 << 20, MOST_ROWS = 1 << 16, MOST_PARTS = 100000 };
+enum {
+    MOST_PLACES = 1 << 20,
+    MOST_EVERY = 1 << 20,
+    MOST_ROWS = 1 << 16,
+    MOST_PARTS = 100000,
+    MOST_POWERS = 64,
+    MOST_WAVES = 1 << 16
+};
+static const double MOST_HZ = 1e6;
 static const int64_t MOST_LENGTH = INT64_C(1) << 32;
 
 /* Times and numbers of which a few sums, with the time of a message, fit into an int64_t. */
@@ -41,6 +50,24 @@ static const char *check_machine(const noack_machine *machine) {
     return NULL;
 }
 
+static const char *check_reference(const noack_reference *reference, int64_t n) {
+    if (!is_between(0, reference->changes, MOST_LENGTH) || reference->is_zero == NULL
+        || reference->rows == NULL || !is_between(n, reference->width, 2 * NOACK_MAX_ENTRIES)
+        || !is_between(1, reference->powers, MOST_POWERS)
+        || !is_between(0, reference->waves, MOST_WAVES)
+        || (reference->waves > 0 && reference->hz == NULL)
+        || (reference->changes > 0 && reference->since_ns == NULL))
+        return "a model has no reference";
+    for (int64_t k = 0; k < (reference->changes + 1) * reference->waves; k++)
+        if (!(fabs(reference->hz[k]) <= MOST_HZ))
+            return "a wave of a reference has a frequency out of range";
+    int64_t since_ns = 0;
+    for (int64_t k = 0; k < reference->changes; since_ns = reference->since_ns[k++])
+        if (!is_between(since_ns, reference->since_ns[k], MESSAGE_TIMES_NS))
+            return "the segments of a reference are not in the order of time";
+    return NULL;
+}
+
 static const char *check_model(const noack_model *model, int64_t n) {
     const noack_transitions *transitions = model->transitions;
     if (transitions == NULL || transitions->n != n || transitions->H == NULL
@@ -50,14 +77,7 @@ static const char *check_model(const noack_model *model, int64_t n) {
     if (!is_between(4, transitions->places, MOST_PLACES)
         || (transitions->places & (transitions->places - 1)) != 0)
         return "the number of matrices that a model keeps must be a power of 2, at least 4";
-    if (!is_between(0, model->changes, MOST_LENGTH) || model->has_point == NULL
-        || model->points == NULL || (model->changes > 0 && model->since_ns == NULL))
-        return "a model has no set points";
-    int64_t since_ns = 0;
-    for (int64_t k = 0; k < model->changes; since_ns = model->since_ns[k++])
-        if (!is_between(since_ns, model->since_ns[k], MESSAGE_TIMES_NS))
-            return "the set points of a model are not in the order of time";
-    return NULL;
+    return check_reference(&model->reference, n);
 }
 
 static const char *check_signal(const noack_signal *signal, int64_t width) {
@@ -184,13 +204,14 @@ static const char *check_controller(const noack_controller *controller) {
         || controller->predictions * m + (controller->carries_model ? n : 0) > NOACK_MAX_ENTRIES)
         return "an actuation has more than 64 entries";
     if (controller->K == NULL || controller->safe_input == NULL || controller->x_c == NULL
-        || controller->x == NULL || controller->u == NULL || controller->scratch == NULL
-        || (controller->has_point && (controller->x_r == NULL || controller->u_r == NULL)))
+        || controller->x == NULL || controller->u == NULL || controller->scratch == NULL)
         return "a controller has no state";
     if (!is_model_time(controller->model_ns) || !is_model_time(controller->update_ns)
         || controller->timeout_ns < 1
         || !is_between(NOACK_NO_SEQUENCE, controller->newest, INT64_MAX))
         return "a controller has a time or a newest update out of range";
+    if (controller->model.reference.width < n + m)
+        return "a controller has no input of its reference";
     return check_model(&controller->model, n);
 }
 

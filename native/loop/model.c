@@ -1,7 +1,8 @@
-/* The model of sensor and controller between updates: dx/dt = H(x - x_r), solved exactly.
+/* The model of sensor and controller between updates: d(x - x_r)/dt = H(x - x_r), solved exactly.
 
-   The set point x_r changes at the same times in sensor and controller, so both models stay equal.
-   The same dt always gives the same matrix e^(H dt), whether it was kept or not. */
+   The reference x_r is the same in sensor and controller, so both models stay equal. Where it
+   jumps, x does not. The same dt always gives the same matrix e^(H dt), whether it was kept or not.
+ */
 #include "loop.h"
 
 enum { WAYS = 4 }; /* places at which a matrix can be */
@@ -35,36 +36,35 @@ static void propagate(
         noack_product(n, n, noack_transition(transitions, dt_ns), x, result);
 }
 
-/* Advance x about a set point; x and result may be the same. */
+/* Advance x about a segment of the reference; x and result may be the same. */
 static void advance_about(
-    const noack_model *model, int64_t place, const double *x, int64_t dt_ns, double *result) {
+    const noack_model *model, int64_t segment, const double *x, int64_t from_ns, int64_t to_ns,
+    double *result) {
     int64_t n = model->transitions->n;
-    double *from_point = model->transitions->scratch + 10 * n * n, *advanced = from_point + n;
-    if (!model->has_point[place] || dt_ns == 0) {
-        propagate(model->transitions, x, dt_ns, advanced);
+    const noack_reference *reference = &model->reference;
+    double *point = model->transitions->scratch + 10 * n * n, *advanced = point + n;
+    if (reference->is_zero[segment] || to_ns == from_ns) {
+        propagate(model->transitions, x, to_ns - from_ns, advanced);
         copy(n, advanced, result);
         return;
     }
-    const double *point = model->points + place * n;
+    noack_reference_part(reference, segment, from_ns, 0, n, point);
     for (int64_t k = 0; k < n; k++)
-        from_point[k] = x[k] - point[k];
-    propagate(model->transitions, from_point, dt_ns, advanced);
+        point[k] = x[k] - point[k];
+    propagate(model->transitions, point, to_ns - from_ns, advanced);
+    noack_reference_part(reference, segment, to_ns, 0, n, point);
     for (int64_t k = 0; k < n; k++)
         result[k] = point[k] + advanced[k];
 }
 
-const double *noack_model_point(const noack_model *model, int64_t t_ns) {
-    int64_t place = first_above(model->since_ns, 0, model->changes, t_ns);
-    return model->has_point[place] ? model->points + place * model->transitions->n : NULL;
-}
-
 void noack_model_advance(
     const noack_model *model, const double *x, int64_t from_ns, int64_t to_ns, double *result) {
-    int64_t place = first_above(model->since_ns, 0, model->changes, from_ns);
-    while (place < model->changes && model->since_ns[place] < to_ns) {
-        advance_about(model, place, x, model->since_ns[place] - from_ns, result);
+    const noack_reference *reference = &model->reference;
+    int64_t segment = first_above(reference->since_ns, 0, reference->changes, from_ns);
+    while (segment < reference->changes && reference->since_ns[segment] < to_ns) {
+        advance_about(model, segment, x, from_ns, reference->since_ns[segment], result);
         x = result;
-        from_ns = model->since_ns[place++];
+        from_ns = reference->since_ns[segment++];
     }
-    advance_about(model, place, x, to_ns - from_ns, result);
+    advance_about(model, segment, x, from_ns, to_ns, result);
 }

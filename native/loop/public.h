@@ -107,13 +107,22 @@ typedef struct {
     double *scratch;   /* (10 n n + 3n,) */
 } noack_transitions;
 
-/* The model between updates: dx/dt = H(x - x_r), x_r piecewise constant. */
+/* The reference x_r(t), u_r(t): segments, each a polynomial of the seconds since its begin, plus
+   sine waves. The first begins at 0, and holds before that, too. */
+typedef struct {
+    int64_t width;         /* numbers of a row: n, or n + m with those of u_r */
+    int64_t changes;       /* from one segment to the next */
+    int64_t *since_ns;     /* (changes,) ascending */
+    int64_t *is_zero;      /* (changes + 1,) 1: x_r and u_r are 0 */
+    int64_t powers, waves; /* of each segment; at least 1, at least 0 */
+    double *hz;            /* (changes + 1, waves) */
+    double *rows;          /* (changes + 1, powers + 2 waves, width): of 1, t, ...; sine, cosine ... */
+} noack_reference;
+
+/* The model between updates: d(x - x_r)/dt = H(x - x_r). */
 typedef struct {
     noack_transitions *transitions;
-    int64_t changes;    /* of x_r */
-    int64_t *since_ns;  /* (changes,) ascending */
-    int64_t *has_point; /* (changes + 1,) 0: x_r is 0 */
-    double *points;     /* (changes + 1, n) */
+    noack_reference reference;
 } noack_model;
 
 /* A period of ns + part / parts nanoseconds. */
@@ -252,9 +261,7 @@ typedef struct {
 
     /* Settings */
     noack_model model;
-    double *K;                          /* (m, n) */
-    int64_t has_point;                  /* 1: u = K(x_c - x_r) + u_r, else u = K x_c */
-    double *x_r, *u_r;                  /* (n,), (m,) */
+    double *K;                          /* (m, n): u = K(x_c - x_r) + u_r */
     double *safe_input;                 /* (m,) */
     int64_t is_user;                    /* 1: the user's control law gives u */
     int64_t acknowledges;
@@ -272,7 +279,7 @@ typedef struct {
     double *x, *u;
     int64_t asked_ns;
 
-    double *scratch;                    /* (3n + m,) */
+    double *scratch;                    /* (3n + 2m,) */
 } noack_controller;
 
 /* What a machine does at an input: it writes a row, and may send a message. */
@@ -392,8 +399,18 @@ int64_t noack_trigger_test(
 /* How long after an event at t_s, with |x| = norm, the next one is forecast. */
 double noack_forecast_ns(const noack_trigger_rule *rule, double norm, double t_s);
 
-/* The set point x_r at a time, (n,); NULL if it is 0. */
-const double *noack_model_point(const noack_model *model, int64_t t_ns);
+/* Numbers of a segment of the reference at a time: count of them from the first on. */
+void noack_reference_part(
+    const noack_reference *reference, int64_t segment, int64_t t_ns, int64_t first, int64_t count,
+    double *result);
+
+/* The same of the segment of that time; return 0, without a result, if it is zero. */
+int64_t noack_reference_at(
+    const noack_reference *reference, int64_t t_ns, int64_t first, int64_t count, double *result);
+
+/* All numbers at several times; result is (count, width). */
+void noack_reference_rows(
+    const noack_reference *reference, int64_t count, const int64_t *t_ns, double *result);
 
 /* Advance a state x of the model to another time. */
 void noack_model_advance(

@@ -21,14 +21,13 @@ static double *rule_scratch(const noack_sensor *sensor) {
 }
 
 /* x - x_r at a time. */
-static const double *from_setpoint(const noack_sensor *sensor, int64_t t_ns, const double *x) {
-    const double *point = noack_model_point(&sensor->model, t_ns);
+static const double *from_reference(const noack_sensor *sensor, int64_t t_ns, const double *x) {
     int64_t n = sensor->machine.n;
     double *difference = sensor->scratch + n;
-    if (point == NULL)
+    if (!noack_reference_at(&sensor->model.reference, t_ns, 0, n, difference))
         return x;
     for (int64_t k = 0; k < n; k++)
-        difference[k] = x[k] - point[k];
+        difference[k] = x[k] - difference[k];
     return difference;
 }
 
@@ -37,7 +36,7 @@ static int64_t test_trigger(noack_sensor *sensor, int64_t t_ns, double sides[2])
     if (!sensor->is_user)
         return noack_trigger_test(
             &sensor->rule, &sensor->trigger, sensor->machine.n, t_ns,
-            from_setpoint(sensor, t_ns, sensor->x), sensor->e_s, sides, rule_scratch(sensor));
+            from_reference(sensor, t_ns, sensor->x), sensor->e_s, sides, rule_scratch(sensor));
     sides[0] = sensor->left;
     sides[1] = sensor->right;
     return sensor->event;
@@ -47,7 +46,7 @@ static int64_t test_trigger(noack_sensor *sensor, int64_t t_ns, double sides[2])
 static void start_condition(noack_sensor *sensor, int64_t t_ns, const double *x) {
     int64_t n = sensor->machine.n;
     sensor->trigger.event_ns = t_ns;
-    copy(n, from_setpoint(sensor, t_ns, x), sensor->event_x);
+    copy(n, from_reference(sensor, t_ns, x), sensor->event_x);
     if (!sensor->is_user)
         noack_trigger_start(
             &sensor->rule, &sensor->trigger, n, t_ns, sensor->event_x, rule_scratch(sensor));

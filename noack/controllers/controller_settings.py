@@ -8,7 +8,10 @@ from pydantic import Field, FiniteFloat
 from noack.core.errors import NoackError
 from noack.core.linear_systems import Matrix, Vector
 from noack.protocol.wire_format import MAX_DIMENSION
+from noack.references import AnyPiece
 from noack.settings.section import RateHz, Row, ScenarioSection
+
+MOST_PIECES = 10_000
 
 
 class ControlModel(NamedTuple):
@@ -65,6 +68,10 @@ class ControllerSettings(ScenarioSection):
     setpoint: Row | None = None
     """x_r, n entries: the state at which the loop is to rest; by default 0. It must be an
     equilibrium of the model, Âx_r + B̂u_r = 0; then u = K(x_c − x_r) + u_r."""
+
+    reference: Annotated[tuple[AnyPiece, ...], Field(min_length=1, max_length=MOST_PIECES)] | None = None
+    """The reference that the loop follows in place of a set-point: pieces in the order of time,
+    each a table with ``kind``. x_r and u_r follow from them by the model; u = K(x_c − x_r) + u_r."""
 
     update_timeout_s: Annotated[FiniteFloat, Field(ge=1e-6, le=1e9)] | None = None
     """Age of the newest update from which on it is no longer used; by default there is none."""

@@ -187,21 +187,6 @@ class CoreMemory:
                     core.noack_transition(shared, step_ns)
         return shared
 
-    def set_model(
-        self,
-        model: CData,
-        transitions: CData,
-        since_ns: Iterable[int] = (),
-        points: Iterable[Reals | None] = (None,),
-    ) -> None:
-        """Fill a ``noack_model``: its set points x_r, and the times at which they change."""
-        times_ns, all_points = list(since_ns), list(points)
-        n = transitions.n
-        model.transitions, model.changes = transitions, len(times_ns)
-        model.since_ns = self.integers(times_ns or [0])
-        model.has_point = self.integers([point is not None for point in all_points])
-        model.points = self.reals([np.zeros(n) if point is None else point for point in all_points])
-
     def fill(self, structure: CData, numbers: Mapping[str, object]) -> None:
         """Set fields of a structure; an array becomes a pointer to a copy of it."""
         for name, number in numbers.items():

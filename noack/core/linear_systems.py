@@ -11,7 +11,6 @@ bounds, which are enlarged by more than the rounding.
 """
 
 import math
-from bisect import bisect_right
 from functools import lru_cache
 
 import numpy as np
@@ -184,50 +183,6 @@ def balancing_exponents(sizes: Matrix) -> NDArray[np.int64]:
 
 def _reals(values: Matrix | Vector) -> CData:
     return ffi.from_buffer("double[]", np.ascontiguousarray(values, np.float64))
-
-
-class ModelFlow:
-    """Propagates the state of the model with the closed-loop matrix H, (n, n), per second.
-
-    ``setpoint`` is the initial x_r, (n,); None is 0.
-    """
-
-    def __init__(self, H: Matrix, setpoint: Vector | None = None) -> None:
-        self.propagate = Propagator(H)
-        self._since_ns: list[int] = []
-        self._setpoints = [setpoint]
-        self.moved = setpoint is not None
-        """Whether any set-point differs from 0."""
-
-    def change(self, since_ns: int, setpoint: Vector | None) -> None:
-        """Change the set-point from ``since_ns`` on; times must not decrease."""
-        if not _same(self._setpoints[-1], setpoint):
-            self._since_ns.append(since_ns)
-            self._setpoints.append(setpoint)
-            self.moved = True
-
-    def __call__(self, x: Vector, from_ns: int, to_ns: int) -> Vector:
-        """Return the state at ``to_ns`` of a model with state ``x``, (n,), at ``from_ns``."""
-        if not self.moved:
-            return self.propagate(x, to_ns - from_ns)
-        index = bisect_right(self._since_ns, from_ns)
-        while index < len(self._since_ns) and self._since_ns[index] < to_ns:
-            x = self._propagate_about(self._setpoints[index], x, self._since_ns[index] - from_ns)
-            from_ns = self._since_ns[index]
-            index += 1
-        return self._propagate_about(self._setpoints[index], x, to_ns - from_ns)
-
-    def _propagate_about(self, setpoint: Vector | None, x: Vector, dt_ns: int) -> Vector:
-        if setpoint is None or dt_ns == 0:
-            return self.propagate(x, dt_ns)
-        propagated: Vector = setpoint + self.propagate(x - setpoint, dt_ns)
-        return propagated
-
-
-def _same(a: Vector | None, b: Vector | None) -> bool:
-    if a is None or b is None:
-        return a is b
-    return bool(np.array_equal(a, b))
 
 
 def solve_lyapunov(M: Matrix, Q: Matrix) -> Matrix:

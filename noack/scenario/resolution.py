@@ -14,11 +14,13 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from noack.controllers.controller_settings import ControllerSettings
 from noack.core.cached_method import cached_method
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, discretise, transition
 from noack.core.random_streams import stream
+from noack.core.references import Reference
 from noack.observers.observer_settings import unobservable_mode
 from noack.protocol.record_tables import (
     CONTROLLER_STEP,
@@ -27,14 +29,16 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
     RecordShape,
-    entry_names,
     is_of_network,
     largest,
     tables,
 )
+from noack.references.file import FilePiece
+from noack.references.segment import SolutionSegment
 from noack.scenario.loads import loaded_model, loaded_observer, loaded_plant, loaded_trigger
 from noack.scenario.outputs import LoopOutput
 from noack.scenario.overload import refuse_overload
+from noack.scenario.references import scenario_segments
 from noack.scenario.scenario import (
     Scenario,
     few_of,
@@ -47,7 +51,7 @@ from noack.scenario.scenario import (
 )
 from noack.scenario.scenario_checks import input_at
 from noack.scenario.sections import AnyObserver, ModelSection, PlantSection
-from noack.settings.section import rows_of
+from noack.settings.section import ScenarioSection, rows_of
 from noack.trigger_policies.periodic_trigger import PeriodicSettings
 from noack.trigger_policies.trigger_rule import Policy, TriggerRule, require_rule
 
@@ -72,7 +76,7 @@ class LoopMatrices:
     weight: Matrix | None  # W of the trigger's norm, (n, n); None is the identity
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]
-    setpoint: Vector | None = None  # x_r, (n,); None is 0
+    reference: Reference | None = None  # x_r and u_r; None is 0
     loads: int = 0  # Number of the last states that are unknown constant loads
     outputs: tuple[LoopOutput, ...] = ()
 
@@ -91,7 +95,7 @@ class LoopMatrices:
             self, A_model=self.A_model[:k, :k], B_model=self.B_model[:k], K=self.K[:, :k],
             H=self.H[:k, :k], A=self.A[:k, :k], B=self.B[:k], x0=self.x0[:k],
             weight=None if self.weight is None else self.weight[:k, :k],
-            setpoint=None if self.setpoint is None else self.setpoint[:k],
+            reference=None if self.reference is None else self.reference.of_states(k),
             state_names=self.state_names[:k], loads=0,
             outputs=tuple(output._replace(row=output.row[:k]) for output in self.outputs),
         )  # fmt: skip
@@ -237,8 +241,8 @@ def _drawn_phase(seed: int, number: int) -> float:
 def resolve_run(scenario: Scenario) -> ResolvedRun:
     """Return a run; the scenario in it repeats the run's draws.
 
-    A scenario without [[loops]] is resolved. In an entry of [[loops]], the model and the observer
-    become numbers; the draws of its loops follow from the seeds.
+    A scenario without [[loops]] is resolved. In an entry of [[loops]], the model, the observer and
+    the reference become numbers; the draws of its loops follow from the seeds.
 
     Raises:
         CallerError: as :func:`resolve`, or a link must overflow, in a scenario that no file gives.
@@ -258,7 +262,9 @@ def resolve_run(scenario: Scenario) -> ResolvedRun:
         ):  # the processes draw the loads of each loop
             sections.append(section)
             continue
-        tables = {"model": loop.model, "observer": loop.observer}
+        tables: dict[str, ScenarioSection | None] = {"model": loop.model, "observer": loop.observer}
+        if loop.controller.reference is not None:
+            tables["controller"] = loop.controller
         update = {part: table.content() for part, table in tables.items() if table is not None}
         sections.append(section.model_copy(update=update))
     return ResolvedRun(scenario.model_copy(update={"loops": tuple(sections)}), resolved)
@@ -300,7 +306,7 @@ def _resolved(loops: Sequence[Scenario]) -> list[Scenario]:
     if scenario.mode == "model":
         A, B, K = np.array(model.A), np.array(model.B), np.array(model.gain)
         _require_finite("model", A + B @ K, K.T, scenario.timing.controller_period_ns)
-    shared: dict[str, object] = {"model": model, "plant": plants[0]}
+    shared: dict[str, object] = {"model": model, "plant": plants[0], "controller": _controller(scenario)}
     if explicit.load is not None:
         shared["trigger"] = loaded_trigger(explicit, scenario.trigger)
         shared["observer"] = loaded_observer(scenario.model_copy(update=shared))
@@ -346,25 +352,30 @@ def _resolved_plant(loop: Scenario, model: ModelSection) -> PlantSection:
 
 
 def _explicit_model(model: ModelSection) -> ModelSection:
+    state_names, input_names = model.entry_names
     if model.name is not None:
         named_model = model.named
         return ModelSection(
             A=rows_of(named_model.A),
             B=rows_of(named_model.B),
             gain=model.gain or rows_of(named_model.K),
-            state_names=model.state_names or named_model.state_names,
-            input_names=model.input_names or named_model.input_names,
+            state_names=state_names,
+            input_names=input_names,
             load=model.load,
             hold=model.hold,
             allow_unstable=model.allow_unstable,
         )
-    n, m = np.array(model.B).shape
-    return model.model_copy(
-        update={
-            "state_names": model.state_names or entry_names("x", n),
-            "input_names": model.input_names or entry_names("u", m),
-        }
-    )
+    return model.model_copy(update={"state_names": state_names, "input_names": input_names})
+
+
+def _controller(scenario: Scenario) -> ControllerSettings:
+    """Return the controller with its reference as segments."""
+    controller, segments = scenario.controller, scenario_segments(scenario)
+    if segments is None or isinstance((controller.reference or ())[0], FilePiece):
+        return controller  # the rows of a file stay, which are shorter
+    n = scenario.model.plant_states
+    pieces = tuple(SolutionSegment.of(segment, n) for segment in segments)
+    return controller.model_copy(update={"reference": pieces})
 
 
 def _perturbation(
@@ -427,7 +438,6 @@ def loop_of(resolved: Scenario) -> LoopMatrices:
     A_model, B_model, K = np.array(model.A), np.array(model.B), np.array(model.gain)
     H = A_model + B_model @ K if resolved.mode == "model" else np.zeros_like(A_model)
     weight = resolved.trigger.weight
-    setpoint = setpoint_of(resolved)
     matrices = LoopMatrices(
         A_model=A_model,
         B_model=B_model,
@@ -437,7 +447,7 @@ def loop_of(resolved: Scenario) -> LoopMatrices:
         B=B_model if plant.B is None else np.array(plant.B),
         x0=np.array(plant.initial_state),
         weight=None if weight is None else np.array(weight),
-        setpoint=None if setpoint is None else setpoint[0],
+        reference=reference_of(resolved),
         state_names=model.state_names or (),
         input_names=model.input_names or (),
         loads=model.load_states,
@@ -467,6 +477,17 @@ def setpoint_of(resolved: Scenario) -> tuple[Vector, Vector] | None:
         return None
     x_r = np.concatenate([setpoint, np.zeros(resolved.model.load_states)])
     return x_r, input_at(*resolved.model.matrices, x_r)
+
+
+@cached_method
+def reference_of(resolved: Scenario) -> Reference | None:
+    """Return the reference of a resolved scenario: its pieces, or its set-point; None if it is 0."""
+    segments, setpoint = scenario_segments(resolved), setpoint_of(resolved)
+    if segments is not None:
+        (n, m), states = resolved.model.dimensions, resolved.model.plant_states
+        columns = [*range(states), *[-1] * (n - states), *range(states, states + m)]  # loads are 0
+        return Reference([segment.of_columns(columns) for segment in segments], n)
+    return None if setpoint is None else Reference.constant(*setpoint)
 
 
 @cached_method

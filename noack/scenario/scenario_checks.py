@@ -24,6 +24,7 @@ from noack.impairments.loss_models.trace import TraceLoss
 from noack.impairments.target_loss import number_of_target_loss, with_target_loss
 from noack.protocol.wire_format import MAX_DIMENSION
 from noack.scenario.loads import check_loads, noise_with_loads
+from noack.scenario.references import PieceError, scenario_segments
 from noack.scenario.runtime_parameters import LOSS, put_settings, require_runtime_parameters
 from noack.scenario.scenario_tables import ScenarioTables
 from noack.scenario.sections import AnyController, AnyTrigger, NetworkSection
@@ -64,6 +65,7 @@ def check_sections(scenario: ScenarioTables) -> None:
     require_length(scenario.controller.safe_input, "controller.safe_input", m, "one per input")
     check_setpoint(scenario)
     check_loads(scenario)
+    check_reference(scenario)
     _check_observer(scenario)
     _check_watchdog(scenario)
     _check_use_of_gain(scenario)
@@ -101,6 +103,30 @@ def check_setpoint(scenario: ScenarioTables) -> None:
     require_length(setpoint, key, n, "one per state")
     if setpoint is None:
         return
+    if scenario.controller.reference is not None:
+        raise ValueError(f"{key}: not with controller.reference, of which a piece of kind step is one")
+    _require_reference_possible(scenario, key)
+    try:
+        A, B = scenario.model.matrices
+        input_at(A[:n, :n], B[:n], np.array(setpoint))
+    except ValueError as error:
+        raise ValueError(f"{key}: {error}") from None
+
+
+def check_reference(scenario: ScenarioTables) -> None:
+    """Raise ValueError unless the model can follow the reference and other settings allow one."""
+    key, pieces = "controller.reference", scenario.controller.reference
+    if pieces is None:
+        return
+    _require_reference_possible(scenario, key)
+    try:
+        scenario_segments(scenario)
+    except PieceError as error:
+        raise ValueError(f"{key}.{error.place}.{error}") from None
+
+
+def _require_reference_possible(scenario: ScenarioTables, key: str) -> None:
+    """Raise ValueError if another setting has no reference other than 0."""
     if scenario.protocol.acknowledges:
         raise ValueError(f'{key}: not with network.protocol = "ack"')
     if not scenario.controller.is_linear:
@@ -109,11 +135,6 @@ def check_setpoint(scenario: ScenarioTables) -> None:
         raise ValueError(
             f'{key}: the plant\'s watchdog does not have it; use plant.watchdog.policy = "hold" or "zero"'
         )
-    try:
-        A, B = scenario.model.matrices
-        input_at(A[:n, :n], B[:n], np.array(setpoint))
-    except ValueError as error:
-        raise ValueError(f"{key}: {error}") from None
 
 
 def input_at(A: Matrix, B: Matrix, x_r: Vector) -> Vector:

@@ -17,17 +17,18 @@ import tomli_w
 
 from noack.core.errors import CallerError, did_you_mean, printable, shortened
 from noack.core.file_access import shipped_files
+from noack.references.file import FilePiece
 from noack.scenario import toml_file
 from noack.scenario.matrix_files import with_matrices
 from noack.scenario.overload import refuse_overload
 from noack.scenario.runtime_parameters import SHORT, full_key
 from noack.scenario.scenario import LOOP_NEEDS, PARTS, Scenario, parts_model, with_loop_tables
-from noack.scenario.scenario_checks import check_target_loss
+from noack.scenario.scenario_checks import check_reference, check_target_loss
 from noack.scenario.sections import DirectionSection, NetworkSection
 from noack.scenario.toml_file import keys as known_keys
 from noack.scenario.toml_file import nearest_key
-from noack.settings.section import ReadTable, Table
-from noack.settings.user_files import FileSettings, file_tables, with_absolute_path, with_tables
+from noack.settings.section import ReadTable, ScenarioSection, Table
+from noack.settings.user_files import NamedFile, file_tables, with_absolute_path, with_tables
 
 _ENTRY = r"""[-+\w.]+|"[^"\\\n]*\""""
 _ROW = re.compile(rf"\[\n((?:\s*(?:{_ENTRY}),\n)+)\s*\]")
@@ -168,11 +169,12 @@ def _with_files(scenario: Scenario, path: Path, source: str) -> Scenario:
     except ValueError as error:
         raise CallerError(f"{source}: {error}") from None
 
-    def tables(within: str, loop: Scenario) -> dict[str, FileSettings]:
-        return {
+    def tables(within: str, loop: Scenario) -> dict[str, ScenarioSection]:
+        read = {
             place: with_absolute_path(table, path.parent, f"{source}: {within}{place}")
             for place, table in file_tables(loop)
         }
+        return {**read, **_with_reference(loop, path.parent, f"{source}: {within}")}
 
     scenario = with_tables(scenario, tables("", scenario))
     scenario = with_loop_tables(scenario, lambda place, loop: tables(f"{place}.", loop))
@@ -181,6 +183,21 @@ def _with_files(scenario: Scenario, path: Path, source: str) -> Scenario:
     except ValueError as error:
         raise CallerError(f"{source}: {error}") from None
     return scenario
+
+
+def _with_reference(loop: Scenario, folder: Path, place: str) -> dict[str, ScenarioSection]:
+    """Return the controller with the numbers of the file that its reference names, if it names one."""
+    controller = loop.controller
+    piece = (controller.reference or (None,))[0]
+    if not isinstance(piece, FilePiece) or piece.file is None:
+        return {}
+    file = NamedFile(piece.file, folder, f"{place}controller.reference.0")
+    read = controller.model_copy(update={"reference": (piece.read(file, *loop.model.entry_names),)})
+    try:
+        check_reference(loop.model_copy(update={"controller": read}))
+    except ValueError as error:
+        raise CallerError(f"{place}{error}") from None
+    return {"controller": read}
 
 
 def _without_files(section: DirectionSection, folder: Path, place: str) -> Table:

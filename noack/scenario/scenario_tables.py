@@ -396,6 +396,8 @@ class TheoryCoverage:
     def require_unchanging(self) -> None:
         """Raise CallerError if the settings change, or the set point is not 0."""
         self.require_constant()
+        if self.scenario.controller.reference is not None:
+            raise CallerError("controller.reference: this needs x_r = 0; leave the reference out")
         if any(self.scenario.controller.setpoint or ()):
             raise CallerError("controller.setpoint: this needs the set point 0")
 

@@ -31,6 +31,7 @@ from noack.impairments.loss_models.lossless import NoLoss
 from noack.observers.observer_settings import NoiseVariances, ObserverSettings
 from noack.plants.linear import NAMED_MODELS, LinearSettings, NamedModel, parameters_of
 from noack.plants.plant_settings import PlantSettings
+from noack.protocol.record_tables import entry_names
 from noack.protocol.wire_format import MAX_DIMENSION, Flow
 from noack.settings.section import (
     Bounds,
@@ -222,6 +223,15 @@ class ModelSection(ScenarioSection):
         if self.name is not None:
             return self.named.A, self.named.B
         return np.array(self.A), np.array(self.B)
+
+    @property
+    def entry_names(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """The names of the states and of the inputs."""
+        n, m = self.dimensions
+        states, inputs = self.state_names, self.input_names
+        if self.name is not None:
+            states, inputs = states or self.named.state_names, inputs or self.named.input_names
+        return states or entry_names("x", n), inputs or entry_names("u", m)
 
     @property
     def trigger_matrices(self) -> ModelMatrices:

@@ -75,7 +75,32 @@ class _Draw:
             controller = content["controller"]
             controller["update_timeout_s"] = self.one_of(0.06, self.between(0.005, 0.3))
             controller["timeout_input"] = self.one_of("safe", "hold")
+        can_follow = x_r is None and not acknowledged and content["plant"]["watchdog"]["policy"] != "model"
+        if can_follow and self.chance(0.5):
+            content["controller"]["reference"] = self.reference()
         return content
+
+    def reference(self) -> list[Content]:
+        """Return pieces for one output, or for two if there are as many inputs."""
+        outputs = self.rng.permutation(self.n)[: int(self.rng.integers(1, min(self.n, self.m) + 1))]
+        return [piece for output in outputs for piece in self.pieces(f"x_{output + 1}")]
+
+    def pieces(self, output: str) -> list[Content]:
+        """Return pieces of an output; times are on the plant's grid or between."""
+        first, second = (
+            self.one_of(0.0, 0.4, self.between(0.0, 0.4)),
+            self.one_of(0.9, self.between(0.7, 0.9)),
+        )
+        kinds: list[Content] = [
+            {"kind": "step", "value": self.between(-0.5, 0.5)},
+            {"kind": "ramp", "rate_per_s": self.between(-0.5, 0.5)},
+            {"kind": "sine", "amplitude": self.between(0.1, 0.5), "hz": self.between(0.2, 2.0)},
+        ]
+        pieces = [self.one_of(*kinds) | {"output": output, "from_s": from_s} for from_s in (first, second)]
+        pieces[1]["join_s"] = self.one_of(0.0, 0.3)
+        if self.chance(0.5):
+            pieces[1]["until_s"] = 1.5
+        return pieces
 
     def model(self) -> tuple[Any, Any, Any]:
         """Return Â, B̂ and the regulator's gain; without modes that hardly react to the input."""

@@ -2,13 +2,15 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from noack.core.random_streams import normals, uniforms
+from noack.core.references import ReferenceSegment
 from noack.disturbances.disturbance_settings import SignalSource
-from noack.scenario.resolution import loop_of, setpoint_of
+from noack.scenario.resolution import loop_of, reference_of
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_checks import with_settings
 from tests.oracles.trigger_rules import Array, Rule
@@ -51,7 +53,8 @@ def settings_of(scenario: Scenario) -> Settings:
         controller_period_ns=_period_ns(scenario.controller.rate_hz),
         controller_phase_ns=timing.controller_phase_ns, horizon_ns=timing.horizon_ns,
         rules=[(t_ns, rule_of(scenario_then)) for t_ns, scenario_then in in_force],
-        setpoints=[(t_ns, _x_r(scenario_then)) for t_ns, scenario_then in in_force],
+        references=_references(scenario, in_force),
+        knows_references=scenario.controller.reference is not None,
         safe_input=np.zeros(loop.m) if safe_input is None else np.array(safe_input),
         predictions=scenario.controller.predictions,
         update_timeout_ns=np.rint(1e9 * (scenario.controller.update_timeout_s or np.inf)),
@@ -78,9 +81,25 @@ def rule_of(scenario: Scenario) -> Rule:
     return rule
 
 
-def _x_r(scenario: Scenario) -> Array:
-    setpoint = setpoint_of(scenario)
-    return np.zeros(scenario.model.dimensions[0]) if setpoint is None else setpoint[0]
+def _references(
+    scenario: Scenario, in_force: Sequence[tuple[int, Scenario]]
+) -> list[tuple[int, Callable[[int], Array]]]:
+    """Return [x_r, u_r] by time: the segments of a reference, or the set-points in force."""
+    if scenario.controller.reference is None:
+        return [(t_ns, partial(_rest, scenario_then)) for t_ns, scenario_then in in_force]
+    segments = reference_of(scenario).segments
+    return [(segment.begin_ns, partial(_follow, segment)) for segment in segments]
+
+
+def _rest(scenario: Scenario, t_ns: int) -> Array:
+    """Return a set-point, and the smallest input with Âx_r + B̂u_r = 0."""
+    A, B = (np.array(matrix) for matrix in scenario.model.matrices)
+    x_r = np.array(scenario.controller.setpoint or np.zeros(len(A)))
+    return np.concatenate([x_r, -np.linalg.pinv(B) @ A @ x_r])
+
+
+def _follow(segment: ReferenceSegment, t_ns: int) -> Array:
+    return segment.at((t_ns - segment.begin_ns) * 1e-9)
 
 
 def observer_of(scenario: Scenario) -> Mapping[str, Array]:

@@ -51,7 +51,8 @@ class Settings:
     controller_phase_ns: int  # time of the first tick
     horizon_ns: int  # neither a step nor a tick is later
     rules: Sequence[tuple[int, Rule]]  # from when on which trigger rule is in force
-    setpoints: Sequence[tuple[int, Array]]  # from when on which x_r is in force
+    references: Sequence[tuple[int, Callable[[int], Array]]]  # from when on which [x_r, u_r] of t is in force
+    knows_references: bool  # from the start; else each one when it comes into force
     safe_input: Array  # before the first update
     predictions: int  # inputs in an actuation
     update_timeout_ns: float  # age from which on the newest update is not used
@@ -93,26 +94,27 @@ def held_input(A: Array, B: Array, dt_ns: int | Fraction) -> tuple[Array, Array]
 
 
 class Model:
-    """dx/dt = H (x − x_r), which sensor and controller follow between updates."""
+    """d(x − x_r)/dt = H (x − x_r), which sensor and controller follow between updates."""
 
     def __init__(self, s: Settings) -> None:
         self.s = s
         self.transition = lru_cache(None)(lambda dt_ns: expm(s.H * (dt_ns * 1e-9)))
-        self.rest_input = -np.linalg.pinv(s.B_model) @ s.A_model
 
-    def flow(self, x: Array, from_ns: int, to_ns: int) -> Array:
-        """Follow the model from one time to another, through all changes of the set point."""
-        times = [t_ns for t_ns, _ in self.s.setpoints if from_ns < t_ns < to_ns]
+    def flow(self, x: Array, from_ns: int, to_ns: int, references: Any = None) -> Array:
+        """Follow the model from one time to another, through all changes of the reference."""
+        references = self.s.references if references is None else references
+        times = [t_ns for t_ns, _ in references if from_ns < t_ns < to_ns]
         for begin_ns, end_ns in itertools.pairwise([from_ns, *times, to_ns]):
-            x = self.towards(in_force(self.s.setpoints, begin_ns), x, end_ns - begin_ns)
+            reference, n = in_force(references, begin_ns), len(x)
+            if end_ns > begin_ns:
+                deviation = x - reference(begin_ns)[:n]
+                x = reference(end_ns)[:n] + self.transition(end_ns - begin_ns) @ deviation
         return x
 
-    def towards(self, x_r: Array, x: Array, dt_ns: int) -> Array:
-        return x if dt_ns == 0 else x_r + self.transition(dt_ns) @ (x - x_r)
-
-    def input(self, x_r: Array, x_c: Array) -> Array:
-        """Return u; u_r is the smallest input with Âx_r + B̂u_r = 0."""
-        return self.s.K @ (x_c - x_r) + self.rest_input @ x_r
+    def input(self, point: Array, x_c: Array) -> Array:
+        """Return u for [x_r, u_r]."""
+        n = len(x_c)
+        return self.s.K @ (x_c - point[:n]) + point[n:]
 
 
 class Observer:
@@ -216,7 +218,11 @@ class Sensor:
         self.waiting: dict[int, Array] = {}  # updates without an acknowledgement
         self.wait_until_ns = 0
         if s.known_x0 is not None:
-            self.trigger.event(0, s.known_x0 - in_force(s.setpoints, 0))
+            self.trigger.event(0, s.known_x0 - self.x_r(0))
+
+    def x_r(self, t_ns: int) -> Array:
+        """Return x_r at a time."""
+        return np.asarray(in_force(self.s.references, t_ns)(t_ns)[: len(self.s.x0)])
 
     def measure(self, number: int, t_ns: int, y: Array, u: Array) -> Array | None:
         """Process a measurement y, with the inputs since the last one; return x at an event."""
@@ -226,7 +232,7 @@ class Sensor:
             since_ns, rule = self.rules_to_come.pop(0)
             trigger.use(rule, since_ns)
         first, self.started = not self.started, True
-        distance = x - in_force(self.s.setpoints, t_ns)  # with which the trigger compares
+        distance = x - self.x_r(t_ns)  # with which the trigger compares
         if first:
             trigger.event(t_ns, distance)
         x_s = x if first and resets else self.model.flow(self.x_s, self.t_ns, t_ns)
@@ -297,16 +303,18 @@ class Controller:
     def tick(self, number: int, t_ns: int) -> tuple[int, Array, Array]:
         """Return an actuation: its model time, the inputs for it and the next ticks, and x_c."""
         self.x_c, self.t_ns = self.model.flow(self.x_c, self.t_ns, t_ns), t_ns
-        x_r, x, inputs = in_force(self.s.setpoints, t_ns), self.x_c, [self.u]
+        x, inputs, references = self.x_c, [self.u], self.s.references
+        if not self.s.knows_references:
+            references = [(0, in_force(references, t_ns))]
         for k in range(self.s.predictions):
             now_ns, next_ns = (t_ns + int(j * self.s.controller_period_ns) for j in (k, k + 1))
             age_ns = now_ns - self.update_ns
             if self.has_state and age_ns < self.s.update_timeout_ns:
-                inputs.append(self.model.input(x_r, x))
+                inputs.append(self.model.input(in_force(references, now_ns)(now_ns), x))
             else:
                 holds = self.has_state and self.s.timeout_input == "hold"
                 inputs.append(inputs[-1] if holds else self.s.safe_input)
-            x = self.model.towards(x_r, x, next_ns - now_ns)
+            x = self.model.flow(x, now_ns, next_ns, references)
         inputs = inputs[1:]
         self.u = inputs[0]
         self.rows["controller_step"].append({

@@ -68,7 +68,7 @@ def _watchdog_input(run: ExplainedLoop, newest: np.void | None, inputs: Vector, 
     if policy == "hold" or newest is None:
         return np.asarray(inputs[-1 if policy == "hold" else 0])
     x_c = newest["x_c"]
-    later = run.flow(x_c, t_ns - int(newest["t_ns"]))
+    later = run.flow(x_c, int(newest["t_ns"]), t_ns)
     return np.asarray(inputs[0] + run.loop.K @ (later - x_c))
 
 

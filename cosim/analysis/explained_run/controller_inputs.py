@@ -13,7 +13,6 @@ from noack.protocol.record_tables import (
     PLANT_ACTUATION,
     SENSOR_MEASUREMENT,
 )
-from noack.scenario.resolution import setpoint_of
 
 CONTROLLER = "controller"
 
@@ -63,7 +62,7 @@ def _after_update(run: ExplainedLoop, state: _State, row: np.void, sent: Vector 
     model_ns = max(state.model_ns, event_ns)
     if sent is not None and row["x"].tobytes() != sent.tobytes():
         run.add(event_ns, CONTROLLER, f"update {row['sequence']} has x = {row['x']}, and not {sent}")
-    before, after = run.flow(state.x_c, model_ns - state.model_ns), run.flow(row["x"], model_ns - event_ns)
+    before, after = run.flow(state.x_c, state.model_ns, model_ns), run.flow(row["x"], event_ns, model_ns)
     for name, expected in (("x_c_before", before), ("x_c", after)):
         if not run.is_near(row[name], expected, state.x_c, row["x"]):
             run.add(
@@ -79,7 +78,7 @@ def _after_update(run: ExplainedLoop, state: _State, row: np.void, sent: Vector 
 def _after_tick(run: ExplainedLoop, state: _State, row: np.void) -> _State:
     """Check x_c and u at a tick."""
     model_ns = int(row["model_t_ns"])
-    expected = run.flow(state.x_c, model_ns - state.model_ns)
+    expected = run.flow(state.x_c, state.model_ns, model_ns)
     if not run.is_near(row["x_c"], expected, state.x_c):
         run.add(row["t_ns"], CONTROLLER, f"x_c = {row['x_c']}, but its model leads to {expected}")
     u, scale = _input(run, state, model_ns, row["x_c"], state.u)
@@ -100,8 +99,8 @@ def _input(
         return (before, before) if controller.timeout_input == "hold" else (safe, safe)
     if not controller.is_linear:
         return None, safe
-    K, setpoint = run.loop.K, setpoint_of(run.scenario)
-    x_r, u_r = setpoint or (np.zeros(len(x_c)), np.zeros(len(K)))
+    K, point = run.loop.K, run.point(t_ns)
+    x_r, u_r = point[: len(x_c)], point[len(x_c) :]
     return law(K, x_c, x_r, u_r), np.append(np.abs(K) @ np.abs(x_c - x_r), u_r)
 
 
@@ -127,7 +126,7 @@ def _check_actuation(run: ExplainedLoop, state: _State, row: np.void) -> None:
         scale = np.zeros(1)
         if state.has_state:
             next_ns = t_ns + int(k * period.exact)
-            x, x_ns = run.flow(x, next_ns - x_ns), next_ns
+            x, x_ns = run.flow(x, x_ns, next_ns), next_ns
             expected, scale = _input(run, state, x_ns, x, u)
             u = predicted if expected is None else expected
         if not run.is_near(predicted, u, scale):

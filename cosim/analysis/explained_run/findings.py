@@ -1,5 +1,6 @@
 """What the model does not explain in a run, and what all checks use: exact flows and tolerances."""
 
+from bisect import bisect_right
 from typing import NamedTuple
 
 import numpy as np
@@ -59,13 +60,26 @@ class ExplainedLoop:
         """Add a finding."""
         self.findings.append(Unexplained(t_ns / NS_PER_S, part, what))
 
-    def flow(self, x: Vector, dt_ns: int) -> Vector:
-        """Return where the models bring a state x in a time: about the set-point, by e^{Hτ}."""
-        if dt_ns not in self._flows:
-            self._flows[dt_ns] = exponential(self.loop.H * (dt_ns * 1e-9))
-        point = self.loop.setpoint
-        about = np.zeros(len(x)) if point is None else point
-        return np.asarray(about + self._flows[dt_ns] @ (x - about))
+    def flow(self, x: Vector, from_ns: int, to_ns: int) -> Vector:
+        """Return where the models bring a state x from a time to another: about the reference, by e^{Hτ}."""
+        jumps_ns = [] if self.loop.reference is None else self.loop.reference.since_ns
+        for end_ns in [*(t_ns for t_ns in jumps_ns if from_ns < t_ns < to_ns), to_ns]:
+            dt_ns, n = end_ns - from_ns, len(x)
+            if not dt_ns:
+                continue
+            if dt_ns not in self._flows:
+                self._flows[dt_ns] = exponential(self.loop.H * (dt_ns * 1e-9))
+            about, then = self.point(from_ns)[:n], self.point(end_ns, since_ns=from_ns)[:n]
+            x, from_ns = np.asarray(then + self._flows[dt_ns] @ (x - about)), end_ns
+        return x
+
+    def point(self, t_ns: int, *, since_ns: int | None = None) -> Vector:
+        """Return x_r and u_r at a time, (n + m,), by the segment of that time, or of an earlier one."""
+        reference = self.loop.reference
+        if reference is None:
+            return np.zeros(self.loop.n + self.loop.m)
+        segment = reference.segments[bisect_right(reference.since_ns, t_ns if since_ns is None else since_ns)]
+        return segment.at((t_ns - segment.begin_ns) * 1e-9)
 
     def is_near(self, found: Vector, expected: Vector, *scales: Vector) -> bool:
         """Whether two vectors differ by no more than rounding errors of numbers as large as the scales."""

@@ -31,12 +31,12 @@ def check_events(run: ExplainedLoop) -> None:
     guard = None if rule is None else _Guard(rule)
     x_s, model_ns, events = (run.loop.known_x0, 0, 0) if knows_start else (None, 0, 0)
     if guard is not None and knows_start:
-        guard.start(0, _from_setpoint(run, run.loop.known_x0))
+        guard.start(0, _from_reference(run, 0, run.loop.known_x0))
     for number, row in enumerate(run.rows(SENSOR_MEASUREMENT)):
         t_ns, x = int(row["t_ns"]), row["x"]
         if row["sequence"] != number or not is_moderate(x, row["x_s"]):
             return  # rows are missing, or the run diverges
-        expected = x if x_s is None else run.flow(x_s, t_ns - model_ns)
+        expected = x if x_s is None else run.flow(x_s, model_ns, t_ns)
         if not run.is_near(row["x_s"], expected, x):
             run.add(t_ns, MODEL, f"x_s = {row['x_s']}, but its model leads to {expected}")
         is_event, first = int(row["event"]) != NO_SEQUENCE, x_s is None
@@ -49,7 +49,7 @@ def check_events(run: ExplainedLoop) -> None:
             run.add(t_ns, TRIGGER, f"event {row['event']} follows {events - 1}")
         events += is_event
         if is_event and guard is not None:
-            guard.start(t_ns, _from_setpoint(run, x))
+            guard.start(t_ns, _from_reference(run, t_ns, x))
         x_s, model_ns = x if is_event else row["x_s"], t_ns
 
 
@@ -57,14 +57,16 @@ def _decision(run: ExplainedLoop, guard: "_Guard | None", row: np.void, *, first
     """Return whether a measurement must be an event; None where rounding decides."""
     if guard is None:  # a user's class
         return True if first else bool(row["compared"] > row["threshold"])
+    t_ns = int(row["t_ns"])
+    deviation = _from_reference(run, t_ns, row["x"])
     if first:
-        guard.start(int(row["t_ns"]), _from_setpoint(run, row["x"]))
-    decided = guard.test(int(row["t_ns"]), _from_setpoint(run, row["x"]), row["x_s"] - row["x"])
+        guard.start(t_ns, deviation)
+    decided = guard.test(t_ns, deviation, row["x_s"] - row["x"])
     return True if first else decided
 
 
-def _from_setpoint(run: ExplainedLoop, x: Vector) -> Vector:
-    return x if run.loop.setpoint is None else np.asarray(x - run.loop.setpoint)
+def _from_reference(run: ExplainedLoop, t_ns: int, x: Vector) -> Vector:
+    return np.asarray(x - run.point(t_ns)[: len(x)])
 
 
 class _Guard:

@@ -13,13 +13,11 @@ from numpy.typing import NDArray
 
 from cosim.analysis.summary.summary_model import DisturbancePart, EstimationPart
 from cosim.record.align import AlignedPart, AlignedRun, Reals, bounded_parts, is_bounded
-from cosim.record.run_events import changes_of
+from cosim.record.run_events import reference_in_run
 from cosim.record.run_record import RunRecord
-from noack.core.linear_systems import Matrix
 from noack.core.row_operations import row_norms
 from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.estimation import steady_state
-from noack.scenario.resolution import loop_of, setpoint_of
 from noack.scenario.scenario import Scenario
 
 
@@ -48,15 +46,6 @@ class SizeStatistics:
     def rms(self) -> float | None:
         """Their root mean square; None without values."""
         return float(np.sqrt(self._squares / self._count)) if self._count else None
-
-
-def setpoints_of(record: RunRecord) -> tuple[list[int], Matrix]:
-    """Return when the set point changed, (k,), and the set points x_r, (k + 1, n); 0 is a row."""
-    changes = changes_of(record)
-    given = (setpoint_of(change) for change in (record.scenario, *(change.scenario for change in changes)))
-    nothing = np.zeros(loop_of(record.scenario).n)
-    points = [nothing if setpoint is None else setpoint[0] for setpoint in given]
-    return [change.first_ns for change in changes], np.array(points)
 
 
 def _larger(before: float | None, values: Reals) -> float | None:
@@ -180,18 +169,19 @@ class SignalStatistics:
     def for_summary(self) -> SignalFields:
         """Return norms of the state, of the errors, and of the residual of (I1)."""
         first, last, largest = None, None, None
-        since_ns, points = setpoints_of(self._record)
+        reference = reference_in_run(self._record)
         states = self._record.scenario.model.plant_states
         for steps in self._record.batches(PLANT_STEP, ("t_ns", "x")):
             x = steps["x"]
-            if points.any():
-                x = x - points[np.searchsorted(since_ns, steps["t_ns"], "right")]
+            if reference is not None:
+                x = x - reference.states(steps["t_ns"])
             norms = row_norms(x[:, :states])
             first = float(norms[0]) if first is None else first
             last, largest = float(norms[-1]), _larger(largest, norms)
+        horizon_ns = self._record.scenario.timing.horizon_ns
         scale = max(self._scale, float(np.finfo(float).tiny))
         return {
-            "setpoint": points[-1].tolist() if points.any() else None,
+            "setpoint": None if reference is None else reference.state(horizon_ns).tolist(),
             "initial_state_norm": first,
             "final_state_norm": last,
             "sup_state_norm": largest,

@@ -153,10 +153,6 @@ class _AllLoops:
         sizes = np.array([loop.n for loop in self._loops])
         self._entries = np.arange(sizes.max()) < sizes[:, None]
         """(loops, n) which entries of a vector each loop has; the others are 0 here."""
-        self._setpoints = np.zeros(self._entries.shape)
-        for setpoint, loop in zip(self._setpoints, self._loops, strict=True):
-            if loop.setpoint is not None:
-                setpoint[: loop.n] = loop.setpoint
         self._transitions: dict[int, Reals] = {}
         self._lag_ns = int(LAG_S * NS_PER_S * scenario.speed)
         self._phases_ns = np.array(run.phases_ns)
@@ -235,20 +231,29 @@ class _AllLoops:
         measurements, age_ns, x_c = measurements[known], age_ns[known], models["x"][row[known]]
         for dt_ns in np.unique(age_ns).tolist():
             has_age = age_ns == dt_ns
-            x_c[has_age] = self._propagate(dt_ns, measurements[LOOP][has_age], x_c[has_age])
+            x_c[has_age] = self._propagate(dt_ns, measurements[has_age], x_c[has_age])
         errors = row_norms(x_c - measurements["x"])
         self._raise_largest(self._over_time.errors, measurements[LOOP], at_ns[known], errors)
 
-    def _propagate(self, dt_ns: int, loops: Numbers, x_c: Reals) -> Reals:
-        """Return models of controllers, (k, n), a time later, with the set-points of the start."""
+    def _propagate(self, dt_ns: int, measurements: Rows, x_c: Reals) -> Reals:
+        """Return models of controllers, (k, n), to measurements, by the references of the start."""
+        loops = measurements[LOOP]
         if dt_ns not in self._transitions:
             transitions = np.zeros((*self._entries.shape, self._entries.shape[1]))
             for matrix, loop in zip(transitions, self._loops, strict=True):
                 matrix[: loop.n, : loop.n] = Propagator(loop.H).transition(dt_ns)
             self._transitions[dt_ns] = transitions
-        setpoints = self._setpoints[loops]
-        deviations: Reals = np.einsum("kij,kj->ki", self._transitions[dt_ns][loops], x_c - setpoints)
-        return setpoints + deviations
+        before, then = (self._references(loops, measurements["t_ns"] - age_ns) for age_ns in (dt_ns, 0))
+        deviations: Reals = np.einsum("kij,kj->ki", self._transitions[dt_ns][loops], x_c - before)
+        return then + deviations
+
+    def _references(self, loops: Numbers, t_ns: Numbers) -> Reals:
+        """Return x_r of loops at their own times, (k, n)."""
+        points = np.zeros((len(loops), self._entries.shape[1]))
+        for number in np.unique(loops):
+            if (reference := self._loops[number].reference) is not None:
+                points[loops == number, : reference.n] = reference.states(t_ns[loops == number])
+        return points
 
     def _raise_largest(self, values: Reals, loops: Numbers, t_ns: Numbers, norms: Reals) -> None:
         """Enter norms into the largest values of their loops and intervals."""

@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from cosim.analysis.summary.signal_statistics import setpoints_of
 from cosim.record.align import align_tables, shares_update
-from cosim.record.run_events import packet_outcomes
+from cosim.record.run_events import packet_outcomes, reference_in_run
 from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.exact_simulation import DIVERGED, OK, ROW, TOO_MANY_EVENTS
 from cosim.simulation.virtual_time import simulate, simulate_loops
@@ -103,15 +102,13 @@ class SampledWork:
             row["status"] = TOO_MANY_EVENTS
             return
         row["status"] = OK
-        # Settling, about the set-point.
-        since_ns, points = setpoints_of(record)
-        from_setpoint = norms
-        if points.any():
-            own_points = points[np.searchsorted(since_ns, steps["t_ns"], "right")]
-            from_setpoint = np.linalg.norm(steps["x"] - own_points, axis=1)
-        settled_norm = self.settle * from_setpoint[0]
-        if from_setpoint[-1] <= settled_norm:
-            row["settling_s"] = t_s[from_setpoint > settled_norm].max(initial=0.0)
+        # Settling, about the reference.
+        deviations, reference = norms, reference_in_run(record)
+        if reference is not None:
+            deviations = np.linalg.norm(steps["x"] - reference.states(steps["t_ns"]), axis=1)
+        settled_norm = self.settle * deviations[0]
+        if deviations[-1] <= settled_norm:
+            row["settling_s"] = t_s[deviations > settled_norm].max(initial=0.0)
         row["final_norm"] = norms[-1]
         row["cost"] = self._cost(record)
         # The controller's error, where it shares an update with the sensor.

@@ -18,7 +18,7 @@ from cosim.record.align import (
     shares_update,
 )
 from cosim.record.run_record import Rows
-from noack.core.linear_systems import ModelFlow
+from noack.core.references import ModelFlow, Reference, ReferenceInForce
 from noack.protocol.record_tables import NO_SEQUENCE
 from noack.scenario.resolution import LoopMatrices
 from noack.scenario.scenario import Scenario
@@ -114,8 +114,9 @@ def test_a_track_in_parts_is_the_whole_track(split: int) -> None:
 
 
 def test_the_model_follows_its_set_point_from_the_change_on() -> None:
-    flow, set_point = ModelFlow(LOOP.H), np.array([4.0, -2.0])
-    flow.change(15 * MS, set_point)
+    in_force, set_point = ReferenceInForce(None, 2, 1), np.array([4.0, -2.0])
+    in_force.change(15 * MS, Reference.constant(set_point, np.zeros(1)))
+    flow = ModelFlow(LOOP.H, in_force.reference)
     track = controller_track(START, TICKS[:1], UPDATES[:1])
     aligned = align(track, [10, 15, 30], flow=flow)
     at_change = decayed([2.0, 1.0], 5)

@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 
 import tomli_w
 
+from noack.plants.linear import NAMED_MODELS
+from noack.references.segment import SolutionSegment
 from noack.scenario.scenario import Scenario
 from noack.scenario.toml_file import json_schema
 from tests.fuzz.scenarios.chances import Chances, Table
@@ -22,6 +24,11 @@ NEVER_DRAWN: Mapping[str, str] = {
     "PythonTriggerSettings.sha256": "the user's own copy in a run directory",
     "PythonControllerSettings.setpoint": "refused: it needs u = K x_c",
     "PythonControllerSettings.update_timeout_s": "refused: it needs u = K x_c",
+    "PythonControllerSettings.reference": "refused: it needs u = K x_c",
+    **dict.fromkeys(
+        (f"SolutionSegment.{key}" for key in SolutionSegment.model_fields), "what a resolved scenario has"
+    ),
+    **dict.fromkeys(("FilePiece.t_s", "FilePiece.x", "FilePiece.u"), "what is read from a file"),
     "PythonPlantSettings.on_record": "names methods of a plant that writes files of its own",
 }
 """Keys that no draw has, and why."""
@@ -66,7 +73,52 @@ def draw(seed: int, number: int) -> Draw:
     seeds = ("plant", "initial_state", "loss", "disturbance", "noise")
     of.put(content, 0.8, "seeds", lambda: _some(of, {key: of.integer(0, 2**40) for key in seeds}))
     _without_effect(of, content)
+    if of.chance(0.15) and not acknowledged and not entries:
+        _follow(of, content, model)
     return Draw(seed, number, content, of.files)
+
+
+def _follow(of: Chances, content: Table, model: Model) -> None:
+    """Add a reference, if nothing else excludes one."""
+    controller, names = content.setdefault("controller", {}), content["model"].get("state_names")
+    moved = any("setpoint" in key for change in content.get("changes", ()) for key in change["set"])
+    carries_model = content["plant"].get("watchdog", {}).get("policy") == "model"
+    if moved or carries_model or "setpoint" in controller or controller.get("kind", "linear") != "linear":
+        return
+    if "name" in content["model"]:
+        names = names or NAMED_MODELS[content["model"]["name"]]().state_names
+    names = names or [f"x_{i}" for i in range(1, model.n + 1)]
+    if of.chance(0.2):
+        inputs = content["model"].get("input_names") or [f"u_{i}" for i in range(1, model.m + 1)]
+        if "name" in content["model"]:
+            return
+        columns = ["t_s", *names, *inputs]
+        zeros = ",".join("0" * len(columns))
+        text = f"{','.join(columns)}\n{zeros}\n{content['horizon_s']}{zeros[1:]}\n"
+        piece: Table = {"kind": "file", "file": of.file("reference", ".csv", text)}
+        of.put(piece, 0.5, "tolerance", lambda: of.size(1e-9, 1e-3))
+        controller["reference"] = [piece]
+        return
+    output = of.one_of(*names)
+    controller["reference"] = [_piece(of, output, 0.0, 0.4), _piece(of, output, 0.5, 0.9)]
+
+
+def _piece(of: Chances, output: str, earliest_s: float, latest_s: float) -> Table:
+    """Return a piece of a reference that begins and ends within a time."""
+    kinds: list[Table] = [
+        {"kind": "step", "value": of.between(-0.1, 0.1)},
+        {"kind": "ramp", "rate_per_s": of.between(-0.1, 0.1)},
+        {"kind": "sine", "amplitude": of.between(0.01, 0.1), "hz": of.between(0.1, 2.0)},
+    ]
+    piece = of.one_of(*kinds) | {"output": output, "from_s": of.between(earliest_s, latest_s - 0.2)}
+    if piece["kind"] == "ramp":
+        of.put(piece, 0.3, "value", lambda: of.between(-0.1, 0.1))
+    if piece["kind"] == "sine":
+        of.put(piece, 0.5, "phase_rad", lambda: of.between(-3.0, 3.0))
+        of.put(piece, 0.3, "offset", lambda: of.between(-0.1, 0.1))
+    of.put(piece, 0.5, "until_s", lambda: latest_s)
+    of.put(piece, 0.5, "join_s", lambda: of.between(0.01, 0.09))
+    return piece
 
 
 def _some(of: Chances, table: Table) -> Table:

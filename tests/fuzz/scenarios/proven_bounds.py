@@ -35,7 +35,7 @@ def sizes_of(record: RunRecord) -> Iterator[tuple[str, Vector, Vector]]:
     loop = loop_of(record.scenario)
     W = np.eye(loop.n) if loop.weight is None else loop.weight
     steps, measured = record[PLANT_STEP], record[SENSOR_MEASUREMENT]
-    x_r = 0.0 if loop.setpoint is None else loop.setpoint
+    x_r = 0.0 if loop.reference is None else loop.reference.state(0)
     yield "x", steps["t_ns"] / NS_PER_S, np.linalg.norm(steps["x"] - x_r, axis=1)
     measured = measured[np.isin(measured["t_ns"], steps["t_ns"])]
     x = steps["x"][np.searchsorted(steps["t_ns"], measured["t_ns"])]

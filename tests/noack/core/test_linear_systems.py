@@ -16,7 +16,6 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 
 from noack.core.linear_systems import (
     Matrix,
-    ModelFlow,
     Propagator,
     balancing_exponents,
     discretise,
@@ -132,26 +131,3 @@ def test_lyapunov_equations_are_solved(n: int) -> None:
 def test_a_lyapunov_equation_without_a_solution_is_an_error() -> None:
     with pytest.raises(np.linalg.LinAlgError):
         solve_lyapunov(np.diag([1.0, -1.0]), np.eye(2))
-
-
-H = np.array([[0.0, 1.0], [-1.0, -1.5]])
-X = np.array([1.0, -0.5])
-
-
-def test_without_a_set_point_the_flow_is_the_propagator_bit_for_bit() -> None:
-    flow = ModelFlow(H)
-    flow.change(5, None)
-    assert not flow.moved
-    assert flow(X, 3, 10**9).tobytes() == Propagator(H)(X, 10**9 - 3).tobytes()
-
-
-@given(st.lists(st.integers(0, 5 * 10**9), min_size=2, max_size=8))
-def test_changes_of_the_set_point_during_the_flow_apply_from_their_times(times: list[int]) -> None:
-    *inner, end_ns = sorted(times)
-    flow, by_hand, now_ns, x_r = ModelFlow(H), X, 0, np.zeros(2)
-    for number, t_ns in enumerate(inner):
-        by_hand = x_r + expm(H * (t_ns - now_ns) * 1e-9) @ (by_hand - x_r)
-        now_ns, x_r = t_ns, np.array([float(number), 0.0])
-        flow.change(t_ns, x_r)
-    by_hand = x_r + expm(H * (end_ns - now_ns) * 1e-9) @ (by_hand - x_r)
-    assert flow(X, 0, end_ns) == pytest.approx(by_hand, abs=1e-9)

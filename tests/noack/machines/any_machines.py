@@ -15,6 +15,7 @@ from noack.core.clock import NEVER_NS
 from noack.core.core_library import core, ffi
 from noack.core.linear_systems import Matrix, Vector, norm, product
 from noack.core.periods import Period
+from noack.core.references import Reference, ReferenceSegment
 from noack.guarantee.loss_guarantee import (
     DeliveriesBetweenBursts,
     LongestBurst,
@@ -138,6 +139,24 @@ def matrix(rng: Rng, scale: float, *shape: int) -> Matrix:
     return np.asarray(scale * rng.uniform(-1, 1, shape))
 
 
+def reference(rng: Rng, scale: float, n: int, m: int) -> Reference:
+    """A set-point, or segments with and without waves."""
+    if chance(rng):
+        return Reference.constant(matrix(rng, scale, n), matrix(rng, scale, m))
+    begins_ns = [0, *sorted((rng.integers(1, 100, 2) * MS).tolist())]
+    segments = [
+        ReferenceSegment(
+            begin_ns,
+            matrix(rng, scale, int(rng.integers(1, 4)), n + m),
+            rng.uniform(0.1, 20, waves),
+            matrix(rng, scale, waves, n + m),
+            matrix(rng, scale, waves, n + m),
+        )
+        for begin_ns, waves in zip(begins_ns, rng.integers(0, 3, 3).tolist(), strict=True)
+    ]
+    return Reference(segments, n)
+
+
 def plant(seed: int, of: Sizes, scale: float = 1.0, period_ns: int = 10 * MS) -> Plant:
     """A plant; ``scale`` is that of its matrices and its state."""
     rng = np.random.default_rng(seed)
@@ -197,7 +216,7 @@ def sensor(seed: int, of: Sizes, form: int, scale: float = 1.0) -> Sensor:
         x0=matrix(rng, scale, n) if chance(rng) else None,
         inputs=m,
         period=Period(10 * MS),
-        setpoint=matrix(rng, scale, n) if chance(rng) else None,
+        reference=reference(rng, scale, n, of.m) if chance(rng) else None,
         timeout_ns=int(rng.integers(0, 50)) * MS if of.acknowledged else None,
         observer=observer(rng, of.outputs, n, m, steps, scale) if of.outputs else None,
     )
@@ -232,7 +251,7 @@ def controller(
     laws = [LinearFeedback(K), UserLaw(K), UserLaw(K, float(rng.uniform(0, 0.3)))]
     constraints = [LossesInWindow(1, 3), DeliveriesBetweenBursts(2)]
     chosen = [LongestBurst(int(rng.integers(0, 3))), *constraints[: rng.integers(0, 3)]]
-    point = (matrix(rng, scale, n), matrix(rng, scale, m)) if chance(rng) else None
+    point = reference(rng, scale, n, m) if chance(rng) else None
     return Controller(
         matrix(rng, scale, n, n) * chance(rng),
         laws[rng.integers(0, 3)],
@@ -248,7 +267,7 @@ def controller(
         predictions=of.predictions,
         timeout_ns=int(rng.integers(1, 60)) * MS if chance(rng) else NEVER_NS,
         holds_input=chance(rng),
-        setpoint=point,
+        reference=point,
     )
 
 

@@ -15,6 +15,7 @@ from controller_node.controller import Controller
 from noack.core.core_library import ffi
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
+from noack.core.references import Reference, ReferenceSegment
 from noack.machines.loop_machines import LoopMachines, row_types
 from noack.protocol.record_tables import LOOP, tables
 from noack.protocol.roles import Record
@@ -179,7 +180,13 @@ def machines_of(role: str) -> LoopMachines:
         part.observer = observer(next(_kalman()), 2, 3, 2, 2, 1.0)
         own = LoopMachines([part])
         memory, model = own.memory, own.machines[0].model
-        memory.set_model(model, model.transitions, [20 * MS, 30 * MS], [None, np.ones(3), None])
+        rows = [np.zeros((1, 5)), np.ones((2, 5)), np.zeros((1, 5))]
+        waves = np.ones((1, 5))
+        segments = [
+            ReferenceSegment(begin_ns, row, np.ones(1), waves, waves)
+            for begin_ns, row in zip([0, 20 * MS, 30 * MS], rows, strict=True)
+        ]
+        Reference(segments, 3).fill(model.reference, memory)
     else:
         own = LoopMachines([controller(next(_with_point()), OF)])
     assert text_of(own) is None
@@ -202,7 +209,7 @@ def _kalman() -> Any:
 
 
 def _with_point() -> Any:
-    return (seed for seed in range(100) if controller(seed, OF).setpoint is not None)
+    return (seed for seed in range(100) if controller(seed, OF).reference is not None)
 
 
 def test_each_wrong_number_is_refused_with_the_approved_text() -> None:

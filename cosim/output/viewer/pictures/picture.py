@@ -265,11 +265,12 @@ def reach_of(loop: LoopMatrices, horizon_ns: int) -> Reals:
     It is 1 for a state that stays at 0.
     """
     step = Propagator(loop.A_model + loop.B_model @ loop.K).transition(max(horizon_ns // _SAMPLES, 1))
-    at_rest = np.zeros(loop.n) if loop.setpoint is None else loop.setpoint
-    deviation, reach = loop.x0 - at_rest, np.abs(loop.x0)
+    times_ns = np.linspace(0, horizon_ns, _SAMPLES + 1).astype(np.int64)
+    points = np.zeros((_SAMPLES + 1, loop.n)) if loop.reference is None else loop.reference.states(times_ns)
+    deviation, reach = loop.x0 - points[0], np.abs(loop.x0)
     with np.errstate(all="ignore"):
-        for _ in range(_SAMPLES):
+        for point in points[1:]:
             deviation = step @ deviation
-            reach = np.fmax(reach, np.abs(at_rest + deviation))
+            reach = np.fmax(reach, np.abs(point + deviation))
     known = np.isfinite(reach) & (reach > 0)
     return np.where(known, _REACH_MARGIN * reach, 1.0)

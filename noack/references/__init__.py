@@ -1,0 +1,11 @@
+"""Kinds of pieces of a reference, one per file: its settings, and the output's value over time."""
+
+from typing import TYPE_CHECKING
+
+from noack.references.piece_settings import PieceSettings
+from noack.settings.section import kinds_in, union_of
+
+if TYPE_CHECKING:
+    AnyPiece = PieceSettings
+else:
+    AnyPiece = union_of(kinds_in(__name__, PieceSettings))
