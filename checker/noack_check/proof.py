@@ -73,18 +73,25 @@ def prove(loop: Loop, document: Mapping[str, object]) -> Proof:
     """
     if not isinstance(document, Mapping):
         raise RejectedError("not a table")
-    if fault := loop.fault():
-        raise RejectedError(f"loop: {fault}")
     rate = read_number(document, "rate")
-    if not rate >= 0 or not (loop.rule.level == 0 or rate <= loop.rule.rate):
-        raise RejectedError("rate: not between 0 and that of the threshold")
     assumed = read_assumptions(loop, rate, document)
     entries = _entries(document, "bounds")
     if not entries:
         raise RejectedError("bounds: there is none")
     if len({(str(e.get("output")), bool(e.get("from_start", True))) for e in entries}) < len(entries):
         raise RejectedError("bounds: an output occurs twice")
-    bounds = [prove_bound(loop, rate, entry, assumed) for entry in entries]
+    return conclude(loop, document, assumed, [prove_bound(loop, rate, entry, assumed) for entry in entries])
+
+
+def conclude(
+    loop: Loop, document: Mapping[str, object], assumed: "Assumptions", of_forms: Sequence[Bound]
+) -> Proof:
+    """Return what the bounds of a document's entries prove together, as :func:`prove_bound` returns them.
+
+    Raises:
+        RejectedError: they do not prove what it assumes, or a time that it states.
+    """
+    rate, bounds = read_number(document, "rate"), list(of_forms)
     proven = {bound.output: bound for bound in bounds if bound.from_start}
     apart = first = None
     if "drift" in proven:
@@ -122,11 +129,15 @@ class Assumptions(NamedTuple):
 
 
 def read_assumptions(loop: Loop, rate: arb, document: Mapping[str, object]) -> Assumptions:
-    """Return what a document assumes of a loop.
+    """Return what a document with a rate r assumes of a loop.
 
     Raises:
-        RejectedError: it has no meaning, or the chain's gain is not proven.
+        RejectedError: loop, rate or document have no meaning, or the chain's gain is not proven.
     """
+    if fault := loop.fault():
+        raise RejectedError(f"loop: {fault}")
+    if not rate >= 0 or not (loop.rule.level == 0 or rate <= loop.rule.rate):
+        raise RejectedError("rate: not between 0 and that of the threshold")
     chain = _chain(loop, rate, document)
     later, at_start = (read_count(document, key, MOST_LATER) for key in ("later", "later_at_start"))
     pieces = read_count(document, "pieces", MOST_PIECES) if "pieces" in document else 1

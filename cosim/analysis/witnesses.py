@@ -104,10 +104,13 @@ def find_witnesses(
         for under in ("ideal", "schedule")
         for plants in ("own", *(["box"] if has_box else []))
     ]
-    found = []
+    found: list[WitnessedStatement] = []
     for index, (plants, under) in enumerate(wanted):
         part = partial(_part_of, progress, index, len(wanted))
-        found.append(find_statement(content, plants, under, part, most_work))
+        near = []  # the searches of ideal conditions are short
+        if under == "schedule":
+            near = [s.document for s in found if s.document and (s.plants == plants or s.conditions == under)]
+        found.append(find_statement(content, plants, under, part, most_work, near))
     progress(1.0)
     return Witnesses(content, found)
 
@@ -163,16 +166,18 @@ def find_statement(
     conditions: str,
     progress: Callable[[float], None] = lambda share: None,
     most_work: float = MOST_WORK,
+    near: Sequence[Mapping[str, object]] = (),
 ) -> WitnessedStatement:
     """Search for the witness of one statement of a resolved scenario: its plants and conditions.
 
     The outputs that the scenario states have bounds under the schedule. Where disturbances or noise act, ‖x‖
-    and each output have bounds in the limit t → ∞, too.
+    and each output have bounds in the limit t → ∞, too. ``near`` has documents of other statements of the
+    scenario.
     """
     try:
         loop = read_loop(content, box=plants == "box", ideal=conditions == "ideal")
         has_outputs = conditions == "schedule"
-        witness = known_or_found(loop, progress, most_work, has_outputs=has_outputs)
+        witness = known_or_found(loop, progress, most_work, has_outputs=has_outputs, near=near)
     except (RefusedError, NoWitnessError) as error:
         return WitnessedStatement(plants, conditions, None, None, str(error))
     document = {"plants": plants, "conditions": conditions, **witness.document}
@@ -231,9 +236,16 @@ def find_region_statement(
 
 
 def known_or_found(
-    loop: Loop, progress: Callable[[float], None], most_work: float, *, has_outputs: bool = True
+    loop: Loop,
+    progress: Callable[[float], None],
+    most_work: float,
+    *,
+    has_outputs: bool = True,
+    near: Sequence[Mapping[str, object]] = (),
 ) -> Witness:
     """Return the witness of a loop that was found earlier, or search for it, unless the limit of work is 0.
+
+    ``near`` has documents of similar loops.
 
     Raises:
         NoWitnessError: none was found.
@@ -241,7 +253,9 @@ def known_or_found(
     outputs, ultimate = _wanted(loop, has_outputs=has_outputs)
 
     def search() -> Witness:
-        return find_witness(loop, outputs, ultimate=ultimate, progress=progress, most_work=most_work)
+        return find_witness(
+            loop, outputs, ultimate=ultimate, near=near, progress=progress, most_work=most_work
+        )
 
     return _known_or_found(
         WitnessStore(loop), outputs, ultimate, most_work, search, lambda document: prove(loop, document)

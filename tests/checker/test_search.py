@@ -15,7 +15,7 @@ from noack.theory.witnesses.line_search import search_lowest
 from noack.theory.witnesses.templates import Templates
 from noack_check.balls import matrix, number
 from noack_check.model import Model
-from tests.checker.test_witnesses import IDEAL, double_integrator, relative
+from tests.checker.test_witnesses import IDEAL, bounds_of, double_integrator, relative
 
 
 @pytest.mark.parametrize("lowest", [0.15, 0.42, 0.6, 0.85])
@@ -67,6 +67,33 @@ def test_templates_are_the_inequalities_of_the_model(decay: float) -> None:
         assert own == pytest.approx(exact, abs=1e-9)
         for (name, M), (other, M_float) in zip(item.scalars, template.scalars, strict=True):
             assert (name, M_float) == (other, pytest.approx(floats(M), abs=1e-12))
+
+
+def test_the_rate_of_a_similar_loop_needs_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With ν from ideal conditions each output needs one problem, and its bound is nearly as small."""
+    ideal, loop = find_witness(double_integrator(IDEAL)).document, double_integrator()
+    alone, solved = bounds_of(find_witness(loop)), []
+    solve = semidefinite._Problem.solve
+
+    def counted(*arguments: object) -> semidefinite.SolverAnswer:
+        solved.append(arguments)
+        return solve(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(semidefinite._Problem, "solve", counted)
+    helped = bounds_of(find_witness(loop, near=[ideal]))
+    assert len(solved) <= 5
+    for output, bound in alone.items():
+        assert helped[output] < 1.03 * bound
+
+
+def test_a_rate_of_a_similar_loop_with_which_nothing_is_found_is_left() -> None:
+    """ν is from 0.6 to 1.26: 1.25 is too large here. The third loop has another r."""
+    loop = double_integrator()
+    alone = find_witness(loop, ())
+    for rate, decay in ((0.3, 1e6), (0.3, 1.2534), (0.1, 0.8)):
+        bound = {"output": "drift", "from_start": True, "decay": decay}
+        near = {"rate": rate, "bounds": [bound]}
+        assert bounds_of(find_witness(loop, (), near=[near])) == bounds_of(alone)
 
 
 def test_progress_rises_to_its_end() -> None:

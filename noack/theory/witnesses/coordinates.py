@@ -71,9 +71,9 @@ class _Runs:
         self._sway = self._h * slowest * np.array([0.3, 1.0, 3.0])
         self._exact = [expm(flow * self._h) for flow in flows]
         self._corner = self._rng.integers(0, len(flows), _RUNS)
-        self._unknowns = [
-            (floats(u.column)[:, 0], floats(u.rows)) for u in model.locations[0].flows[0].unknowns
-        ]
+        unknowns = model.locations[0].flows[0].unknowns
+        self._columns = np.array([floats(u.column)[:, 0] for u in unknowns]).reshape(-1, N)
+        self._sizes = np.array([floats(u.rows)[0] for u in unknowns]).reshape(-1, N)
         self._noise = np.flatnonzero(floats(model.p).any(axis=0))
         self._silent, self._unit = floats(model.silent), floats(model.threshold_squared())
         self._sent = [self._jump_matrix(model, later, arrives=False) for later in range(model.later + 1)]
@@ -127,9 +127,10 @@ class _Runs:
         moved = np.empty_like(self._z)
         for index, E in enumerate(self._exact):
             moved[self._corner == index] = self._z[self._corner == index] @ E.T
-        for column, rows in self._unknowns:
-            sign = np.sign(np.sin(step * self._rng.choice(self._sway) + np.arange(_RUNS)))
-            moved += self._h * (sign * np.linalg.norm(self._z @ rows.T, axis=1))[:, None] * column
+        if len(self._columns):
+            phases = step * self._rng.choice(self._sway, len(self._columns)) + np.arange(_RUNS)[:, None]
+            pushes = np.sign(np.sin(phases)) * np.abs(self._z @ self._sizes.T)
+            moved += self._h * pushes @ self._columns
         self._z = moved
 
     def _events(self, step: int) -> NDArray[np.bool_]:

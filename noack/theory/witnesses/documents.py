@@ -26,7 +26,7 @@ from noack_check.balls import number
 from noack_check.check import RejectedError
 from noack_check.loop import Loop
 from noack_check.model import Model
-from noack_check.proof import Proof, compares_error, prove, prove_bound, read_assumptions
+from noack_check.proof import Bound, Proof, compares_error, conclude, prove_bound, read_assumptions
 
 _COARSE = Accuracy(gap=1e-3, feasibility=1e-3, improves_steps=False)
 _ATTEMPTS = (
@@ -63,6 +63,7 @@ def find_witness(
     outputs: Sequence[str] = ("x", "e_c"),
     *,
     ultimate: Sequence[str] = (),
+    near: Sequence[Mapping[str, object]] = (),
     progress: Callable[[float], None] = lambda share: None,
     most_work: float = MOST_WORK,
 ) -> Witness:
@@ -72,6 +73,8 @@ def find_witness(
         loop: the loop.
         outputs: those that are bounded from the start on.
         ultimate: those that are bounded in the limit t → ∞.
+        near: documents of similar loops, say of the same plants under ideal conditions: the best ν of an
+            output is nearly the same share of what is possible, so it is that of the first one with it.
         progress: called with the completed share.
         most_work: limit of the search, see :class:`Effort`.
 
@@ -85,7 +88,7 @@ def find_witness(
         raise NoWitnessError("the loop does not decay without losses")
     effort = Effort(progress, most_work)
     effort.expect(_EXPECTED * (1 + len(outputs) + len(ultimate)))
-    wanted = _Wanted(outputs, ultimate)
+    wanted = _Wanted(outputs, ultimate, near)
     if loop.times.period > 0:
         return _by_clock(loop, wanted, effort)
     if not compares_error(loop):
@@ -103,32 +106,31 @@ def find_witness(
 
 
 class _Wanted(NamedTuple):
-    """Outputs to bound: from the start on, and in the limit."""
+    """Outputs to bound, from the start on and in the limit, and documents of similar loops."""
 
     outputs: Sequence[str]
     ultimate: Sequence[str]
+    near: Sequence[Mapping[str, object]]
 
 
 def _by_threshold(loop: Loop, rates: "_Rates", wanted: _Wanted, effort: Effort) -> Witness:
     """Return a witness for a rule that compares ‖W e_s‖: its drift bounds e_s and times between events."""
-    document, search = _confirmed(loop, rates, effort)
-    entry = search.bound("drift")
-    document["bounds"] = [*search.bounds(wanted), entry]
-    numbers = entry["numbers"]
-    assert isinstance(numbers, dict)
-    drift = tuple(float(np.sqrt(numbers.get(name, 0.0))) for name in ("level 1", "level 2"))
+    document, search = _confirmed(loop, rates, effort, rates.shares(wanted.near))
+    of_drift = search.bound("drift")
+    bounds = [*search.bounds(wanted), of_drift]
+    drift = float(of_drift.bound.decaying), float(of_drift.bound.constant)
     document["inter_event_s"] = apart = inter_event_s(loop, rates.rate, drift)
     document["first_event_s"] = first_event_s(loop, drift, apart)
-    return _proven(loop, document)
+    return search.witness(document, bounds)
 
 
 def _confirmed(
-    loop: Loop, rates: "_Rates", effort: Effort, shares: dict[str, float] | None = None
+    loop: Loop, rates: "_Rates", effort: Effort, shares: "Shares", *, is_rough: bool = False
 ) -> tuple[dict[str, object], "_OutputSearch"]:
     """Return a document with assumptions that the bound of the drift confirms, and the search with them."""
     document = first_assumptions(loop, rates.rate)
     for _ in range(_MOST_GUESSES):
-        search = _OutputSearch(loop, rates, document, effort, shares)
+        search = _OutputSearch(loop, rates, document, shares, effort, is_rough=is_rough)
         levels = search.best_share("drift", starts=True)[1].levels
         following = next_assumptions(loop, document, levels)
         if following is None:
@@ -138,7 +140,7 @@ def _confirmed(
     raise NoWitnessError("errors: the sensor's error may be larger than each guess of it")
 
 
-def coarse_sizes(loop: Loop, outputs: Sequence[str], effort: Effort, shares: dict[str, float]) -> list[float]:
+def coarse_sizes(loop: Loop, outputs: Sequence[str], effort: Effort, shares: "Shares") -> list[float]:
     """Return rough bounds of outputs at all times, which are at most little too small.
 
     Args:
@@ -155,42 +157,42 @@ def coarse_sizes(loop: Loop, outputs: Sequence[str], effort: Effort, shares: dic
         raise NoWitnessError("the loop does not decay without losses")
     if loop.times.period > 0 or not compares_error(loop):
         document = without_drift(loop, first_assumptions(loop, rates.rate))
-        search = _OutputSearch(loop, rates, document, effort, shares)
+        search = _OutputSearch(loop, rates, document, shares, effort, is_rough=True)
     else:
-        _, search = _confirmed(loop, rates, effort, shares)
+        _, search = _confirmed(loop, rates, effort, shares, is_rough=True)
     return [search.best_share(output, starts=True)[1].size for output in outputs]
 
 
 def _by_quadratic_forms(loop: Loop, rates: "_Rates", wanted: _Wanted, effort: Effort) -> Witness:
     """Return a witness for any rule: e_s has quadratic forms, too, and each test may be an event."""
     document = without_drift(loop, first_assumptions(loop, rates.rate))
-    search = _OutputSearch(loop, rates, document, effort)
+    search = _OutputSearch(loop, rates, document, rates.shares(wanted.near), effort)
     sensor = search.bound("e_s")
-    return _proven(loop, {**document, "bounds": [*search.bounds(wanted), sensor]})
+    return search.witness(document, [*search.bounds(wanted), sensor])
 
 
 def _by_clock(loop: Loop, wanted: _Wanted, effort: Effort) -> Witness:
-    """Return a witness for a periodic rule, with the fewest parts of its period for which there is one."""
+    """Return a witness for a periodic rule, with the fewest parts of its period for which there is one.
+
+    Without forms for a small ν there are none for larger ones.
+    """
     for pieces in _PIECES:
         for share in (0.3, 0.02):
             rates = _Rates(loop, slow=share)
-            rates.first_share = _FIRST_CLOCK_SHARE
+            rates.first_share, rates.moves = _FIRST_CLOCK_SHARE, (0,)
             document = {**first_assumptions(loop, rates.rate), "pieces": pieces}
             effort.expect(_EXPECTED)
-            search, (output, *_) = _OutputSearch(loop, rates, document, effort), wanted.outputs
-            if not search.has_solution(output):
+            search = _OutputSearch(loop, rates, document, rates.shares(wanted.near), effort)
+            if not search.has_solution(wanted.outputs[0]):
                 continue
             bounds = search.bounds(wanted)
             if bounds:
-                return _proven(loop, {**document, "bounds": bounds})
+                return search.witness(document, bounds)
     raise NoWitnessError("the solver finds no quadratic forms at any rate of decay")
 
 
-def _proven(loop: Loop, document: Mapping[str, object]) -> Witness:
-    try:
-        return Witness(document, prove(loop, document))
-    except RejectedError as error:
-        raise NoWitnessError(str(error)) from None
+Shares = dict[tuple[str, bool], float]
+"""The share of an output's ν, by its name and whether it is bounded from the start on."""
 
 
 class _Rates:
@@ -207,6 +209,7 @@ class _Rates:
         threshold, level = float(loop.rule.rate), float(loop.rule.level)
         wanted = threshold if level else (slow or 0.3) * self.slowest
         self.first_share = _FIRST_SLOW_SHARE if slow else _FIRST_SHARE
+        self.moves: Sequence[int] = (0, -1, 1, -2, 2)
         if loop.holds or (level and not threshold):
             self.rate = 0.0
         else:
@@ -216,6 +219,25 @@ class _Rates:
         """Return ν at a share of what is possible."""
         return 2 * self.rate + 2 * (self.slowest - self.rate) * share
 
+    def shares(self, documents: Sequence[Mapping[str, object]]) -> Shares:
+        """Return the shares that outputs have in the first document with them, of those with the same r."""
+        found: Shares = {}
+        for document in documents:
+            bounds = document["bounds"] if document["rate"] == self.rate else ()
+            assert isinstance(bounds, Sequence)
+            for bound in bounds:
+                share = (bound["decay"] / 2 - self.rate) / (self.slowest - self.rate)
+                if 0 < share < 1:
+                    found.setdefault((bound["output"], bound["from_start"]), share)
+        return found
+
+
+class _Proven(NamedTuple):
+    """The entry of a document for an output, and what the checker found it to prove."""
+
+    entry: Mapping[str, object]
+    bound: Bound
+
 
 class _OutputSearch:
     """The search for the bounds of one loop; ν of the first output is the first guess for the others.
@@ -224,8 +246,9 @@ class _OutputSearch:
         loop: the loop.
         rates: its rates of decay.
         document: a witness's document with its assumptions.
+        shares: for ν of outputs, from a similar loop; those of this one replace them.
         effort: counts the work.
-        shares: for ν of outputs from the start on, of a similar loop; those of this one replace them.
+        is_rough: no bound is to be proven.
     """
 
     def __init__(
@@ -233,11 +256,13 @@ class _OutputSearch:
         loop: Loop,
         rates: _Rates,
         document: Mapping[str, object],
+        shares: Shares,
         effort: "Effort",
-        shares: dict[str, float] | None = None,
+        *,
+        is_rough: bool = False,
     ) -> None:
-        self._loop, self._rates, self._effort = loop, rates, effort
-        self._similar = {} if shares is None else shares
+        self._loop, self._rates, self._effort, self._is_rough = loop, rates, effort, is_rough
+        self._known, self._shares = dict(shares), shares
         self._rate = number(rates.rate)
         require_few(document)
         try:
@@ -249,6 +274,18 @@ class _OutputSearch:
         self._search = Search(self._templates, self._frames)
         self._best: dict[tuple[str, bool], tuple[float, Found]] = {}
         self._share: float | None = None
+
+    def witness(self, document: Mapping[str, object], proven: Sequence["_Proven"]) -> Witness:
+        """Return the witness of a document with bounds of this search.
+
+        Raises:
+            NoWitnessError: they do not prove what it assumes.
+        """
+        try:
+            proof = conclude(self._loop, document, self._assumed, [each.bound for each in proven])
+        except RejectedError as error:
+            raise NoWitnessError(str(error)) from None
+        return Witness({**document, "bounds": [each.entry for each in proven]}, proof)
 
     def _model(self, decay: float) -> Model:
         assumed = self._assumed
@@ -264,8 +301,8 @@ class _OutputSearch:
             is_exact=False,
         )
 
-    def bounds(self, wanted: _Wanted) -> list[dict[str, object]]:
-        """Return the entries of those outputs for which there is one."""
+    def bounds(self, wanted: _Wanted) -> list["_Proven"]:
+        """Return the bounds of those outputs for which there is one."""
         found = []
         for starts, names in ((True, wanted.outputs), (False, wanted.ultimate)):
             for output in names:
@@ -273,25 +310,25 @@ class _OutputSearch:
                     found.append(self.bound(output, starts=starts))
         return found
 
-    def bound(self, output: str, *, starts: bool = True) -> dict[str, object]:
-        """Return the entry of a document for an output, from the start on or in the limit.
+    def bound(self, output: str, *, starts: bool = True) -> "_Proven":
+        """Return the bound of an output, from the start on or in the limit.
 
         ν is found by coarse solutions. Accurate ones follow, with larger margins and in coordinates of
         the one before, until one is accepted that is not much larger than the coarse one.
         """
         share, coarse = self.best_share(output, starts=starts)
         decay, why = self._rates.decay(share), f"{output}: {self._nothing_found()}"
-        accepted: list[tuple[float, dict[str, object]]] = []
+        accepted: list[tuple[float, _Proven]] = []
         for is_last, found in self._accurate(output, decay, coarse, starts=starts):
             entry = _entry(output, decay, found, starts=starts)
             try:
-                prove_bound(self._loop, self._rate, entry, self._assumed)
+                bound = prove_bound(self._loop, self._rate, entry, self._assumed)
             except RejectedError as error:
                 why = str(error)
             else:
-                accepted.append((found.size, entry))
+                accepted.append((found.size, _Proven(entry, bound)))
                 if found.size < _NEAR * coarse.size:
-                    return entry
+                    return accepted[-1][1]
             if accepted and is_last:
                 break
         if accepted:
@@ -306,7 +343,7 @@ class _OutputSearch:
         With each comes whether more will not give a smaller bound.
         """
         search, attempts = self._search, list(enumerate(_ATTEMPTS))
-        if self._is_large(output):  # the coarse one is as accurate
+        if self._is_direct(output, starts=starts):  # the coarse one is as accurate
             yield False, coarse
             search = Search(self._templates, refined(search.frames, coarse))
             del attempts[0]
@@ -334,8 +371,7 @@ class _OutputSearch:
             best = min(found, key=lambda share: found[share].size)
             self._share = self._share or best
             self._best[key] = best, found[best]
-            if starts:
-                self._similar[output] = best
+            self._shares[key] = best
         return self._best[key]
 
     def has_solution(self, output: str) -> bool:
@@ -351,7 +387,8 @@ class _OutputSearch:
     def _tried(self, output: str, *, starts: bool) -> dict[float, Found]:
         """Return coarse solutions by their shares."""
         found: dict[float, Found] = {}
-        margin, accuracy = _ATTEMPTS[0] if self._is_large(output) else (_COARSE_MARGIN, _COARSE)
+        is_direct, known = self._is_direct(output, starts=starts), self._known.get((output, starts))
+        margin, accuracy = _ATTEMPTS[0] if is_direct else (_COARSE_MARGIN, _COARSE)
 
         def size(share: float) -> float:
             decay = self._rates.decay(share)
@@ -363,16 +400,22 @@ class _OutputSearch:
             found[share] = solution
             return solution.size
 
-        if starts and output in self._similar and math.isfinite(size(self._similar[output])):
-            return found
+        if known is not None:
+            if math.isfinite(size(known)):
+                return found
+            del self._known[output, starts]
+            return self._tried(output, starts=starts)
         most = _MOST_TRIES
-        if self._is_large(output):
+        if is_direct:
             most = 1 if self._share else _FEW_TRIES
-        search_lowest(size, self._share or self._rates.first_share, most, upwards=not self._share)
+        first, upwards = self._share or self._rates.first_share, not self._share
+        search_lowest(size, first, most, upwards=upwards, moves=self._rates.moves)
         return found
 
-    def _is_large(self, output: str) -> bool:
-        return self._templates.work(output) > _LARGE
+    def _is_direct(self, output: str, *, starts: bool) -> bool:
+        """Return whether each solution is an accurate one: few are tried."""
+        is_known = (output, starts) in self._known and not self._is_rough
+        return is_known or self._templates.work(output) > _LARGE
 
     def _solve(
         self, search: Search, output: str, decay: float, *, starts: bool, margin: float, accuracy: Accuracy

@@ -1,6 +1,6 @@
 """The search for the lowest value of a function of a share, with few values, of which some are infinite."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from math import inf, isfinite, log
 
 import numpy as np
@@ -9,7 +9,14 @@ _STEP = 1.5
 _SMALL_GAIN = 0.01
 
 
-def search_lowest(value: Callable[[float], float], first: float, most: int, *, upwards: bool) -> None:
+def search_lowest(
+    value: Callable[[float], float],
+    first: float,
+    most: int,
+    *,
+    upwards: bool,
+    moves: Iterable[int] = (0, -1, 1, -2, 2),
+) -> None:
     """Call a function at shares between 0 and 1: downhill from a first one, then where a parabola is lowest.
 
     Args:
@@ -17,6 +24,7 @@ def search_lowest(value: Callable[[float], float], first: float, most: int, *, u
         first: the first share.
         most: calls, without the last one.
         upwards: the second share is above the first one.
+        moves: steps from the first share, until there is a finite value.
     """
     known: dict[float, float] = {}
 
@@ -25,7 +33,7 @@ def search_lowest(value: Callable[[float], float], first: float, most: int, *, u
             known[share] = value(share) if len(known) < most else inf
         return known[share]
 
-    share = next((s for k in (0, -1, 1, -2, 2) if isfinite(size(s := _moved(first, k)))), None)
+    share = next((s for k in moves if isfinite(size(s := _moved(first, k)))), None)
     if share is None:
         return
     step = 1 if upwards else -1

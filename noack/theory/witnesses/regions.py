@@ -13,7 +13,7 @@ import numpy as np
 from noack.core.linear_systems import Vector
 from noack.plants.systems.traced_equations import NotEnclosedError, TracedEquations
 from noack.theory.witnesses.coordinates import floats
-from noack.theory.witnesses.documents import Witness, coarse_sizes, find_witness
+from noack.theory.witnesses.documents import Shares, Witness, coarse_sizes, find_witness
 from noack.theory.witnesses.effort import MOST_WORK, Effort, NoWitnessError, WorkLimitError
 from noack_check.loop import Loop
 
@@ -66,7 +66,7 @@ def find_region_witness(
     restricted = _restricted(plant)
     coordinates = [_output(plant, k) for k in restricted]
     widths = _with(plant, restricted, _FIRST * plant.typical[restricted])
-    reached, shares = np.zeros(len(restricted)), dict[str, float]()
+    reached, shares = np.zeros(len(restricted)), Shares()
     for _ in range(_MOST_REGIONS if restricted else 0):
         last, reached = reached, _reached(plant, widths, coordinates, effort, shares)
         if (reached < widths[restricted]).all():
@@ -121,7 +121,7 @@ def _reached(
     widths: Vector,
     outputs: Sequence[str],
     effort: Effort,
-    shares: dict[str, float],
+    shares: Shares,
 ) -> Vector:
     """Return bounds of x and u, where they have to be in a region, by the plants that enclose it there."""
     _, loop = _on(plant, widths)
