@@ -1,8 +1,14 @@
 """The launcher: starts the processes of a run, follows them, and ends the run.
 
-When a process fails, the launcher stops the run, says which process failed and why, and leaves a run
-directory with everything that was recorded. Read :func:`launch` first; ``_Run.watch`` follows the
-run.
+Read :func:`launch` first, from top to bottom. It makes numbers of the scenario
+(``noack/scenario/resolution.py``), forks the processes (``processes/child_processes.py``), opens the
+control plane (``coordination/coordinator.py``), and sends each process the run descriptor, which has
+the scenario. A process asks for admission (``noack/runtime/join_run.py``), makes its machines, binds
+its socket, and waits at the start barrier (``noack/runtime/run_process.py``). When all wait there, the
+coordinator sends them the addresses and the common epoch, and each drives its machines.
+
+``_Run.watch`` follows the run. When a process fails, the launcher stops the run, says which process
+failed and why, and leaves a run directory with everything that was recorded.
 """
 
 import contextlib
@@ -101,17 +107,7 @@ def launch(
         ending = stack.enter_context(EndingFile(run_dir))
         _publish_run(stack, descriptor, session)  # first: its file leads to a killed run's socket
         with _no_directory_if_refused(run_dir):
-            listening_descriptor, clock = descriptor, None
-            if listening is not None:
-                clock = remote_access.own_clock(resolved.scenario.clocks or ClocksSection())
-                remote_access.require_free(listening.address)
-                listening_descriptor = stack.enter_context(remote_access.credentials(listening, descriptor))
-                descriptor = descriptor.model_copy(update={"host": listening.address[0]})
-            coordinator = Coordinator(listening_descriptor, spawn, clock)
-            stack.callback(coordinator.close)
-            if session is not None:
-                by_hand = descriptor.model_copy(update={"launched": False})
-                stack.enter_context(descriptor_file(by_hand, session))
+            coordinator, descriptor = _coordinate(stack, descriptor, spawn, session, listening)
         certificates = stack.enter_context(EarlyCertificates())
         told = RunObservers([*observers, *observers_of_extensions(resolved.scenario)])
         if listening is not None:
@@ -127,6 +123,32 @@ def launch(
     return LaunchedEnding(
         run_dir, descriptor.run_id, status, reason, startup_s, expectations=certificates.known
     )
+
+
+def _coordinate(
+    stack: contextlib.ExitStack,
+    descriptor: RunDescriptor,
+    spawn: Sequence[str],
+    session: str | None,
+    listening: remote_access.ListenSettings | None,
+) -> tuple[Coordinator, RunDescriptor]:
+    """Open the control plane, also to other hosts if the run is ``listening``; it closes with the stack.
+
+    Returns:
+        The coordinator, and the run descriptor for the processes of this host.
+    """
+    own_end, clock = descriptor, None
+    if listening is not None:
+        clock = remote_access.own_clock(descriptor.scenario.clocks or ClocksSection())
+        remote_access.require_free(listening.address)
+        own_end = stack.enter_context(remote_access.credentials(listening, descriptor))
+        descriptor = descriptor.model_copy(update={"host": listening.address[0]})
+    coordinator = Coordinator(own_end, spawn, clock)
+    stack.callback(coordinator.close)
+    if session is not None:
+        by_hand = descriptor.model_copy(update={"launched": False})
+        stack.enter_context(descriptor_file(by_hand, session))
+    return coordinator, descriptor
 
 
 @contextlib.contextmanager

@@ -8,7 +8,7 @@ from the first violation of the certificate's conditions on.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -26,6 +26,7 @@ _LEAST_MARGIN, _LARGEST_MARGIN = 1e-9, 1e-6
 _EPSILON = float(np.finfo(float).eps)
 _SMALLEST_NORMAL = float(np.finfo(float).tiny)
 """Smaller numbers have fewer digits: rounding may change them by a multiple."""
+_CERTIFICATE = "certificate"
 _COMPLETE = "a complete record"
 _CONTINUOUS = "a continuous trigger, a network without delay"
 _CAPPED = "at most M − 1 consecutive losses"
@@ -68,35 +69,35 @@ class ClaimBound(NamedTuple):
     """The bound as a curve."""
 
 
+BoundFinder = Callable[[RunEvidence, Samples, Any], ClaimBound]
+"""Returns the bound that a claim sets for some samples of a run, given a certificate.
+
+The third argument is a :class:`ScenarioCertificate`; of a claim that needs none it is None.
+"""
+
+
 @dataclass(frozen=True)
 class ClaimDefinition:
-    """A claim that needs no certificate."""
+    """A claim, in words and as a function."""
 
+    find: BoundFinder
     statement: str
     source: str
+    """``"certificate"``: it is evaluated for each certificate of the scenario."""
     assumes: str
-    find: Callable[[RunEvidence, Samples], ClaimBound]
-    needs_ideal_loop: bool
-    """A run that exceeds the bound does not refute it."""
-    to_the_end: bool
-    """It holds across changes of settings."""
-
-
-@dataclass(frozen=True)
-class CertifiedClaim:
-    """A claim of a certificate; it is evaluated for each one of the scenario."""
-
-    statement: str
-    find: Callable[[RunEvidence, Samples, ScenarioCertificate], ClaimBound]
     constant: Constant | Literal["inter_event"] | None = None
-    """What bounds it: proven or computed; None: it is computed always."""
-    assumes: str = "the conditions of the certificate"
+    """What of a certificate bounds it: proven or computed; None: it is computed always."""
+    needs_ideal_loop: bool = False
+    """A run that exceeds the bound does not refute it."""
+    to_the_end: bool = False
+    """It holds across changes of settings."""
     output: str | None = None
     """The output that it is about."""
 
-    def find_for(self, certificate: ScenarioCertificate) -> Callable[[RunEvidence, Samples], ClaimBound]:
-        """Return the function that finds the bound of a certificate."""
-        return lambda run, samples: self.find(run, samples, certificate)
+    @property
+    def is_certified(self) -> bool:
+        """Whether a certificate claims it."""
+        return self.source == _CERTIFICATE
 
     def is_proven(self, certificate: ScenarioCertificate) -> bool:
         """Whether a certificate has proven this."""
@@ -107,16 +108,21 @@ class CertifiedClaim:
 
 def claim(
     statement: str, source: str, assumes: str, *, needs_ideal_loop: bool = False, to_the_end: bool = False
-) -> Callable[[Callable[[RunEvidence, Samples], ClaimBound]], ClaimDefinition]:
-    """Make a function the definition of a claim."""
-    return lambda find: ClaimDefinition(statement, source, assumes, find, needs_ideal_loop, to_the_end)
+) -> Callable[[BoundFinder], ClaimDefinition]:
+    """Make a function the definition of a claim that needs no certificate."""
+    return lambda find: ClaimDefinition(
+        find, statement, source, assumes, needs_ideal_loop=needs_ideal_loop, to_the_end=to_the_end
+    )
 
 
 def certified(
-    statement: str, constant: Constant | Literal["inter_event"] | None = None
-) -> Callable[[Callable[[RunEvidence, Samples, ScenarioCertificate], ClaimBound]], CertifiedClaim]:
+    statement: str, constant: Constant | Literal["inter_event"] | None = None, output: str | None = None
+) -> Callable[[BoundFinder], ClaimDefinition]:
     """Make a function the definition of a claim of certificates."""
-    return lambda find: CertifiedClaim(statement, find, constant)
+    assumes = "the conditions of the certificate"
+    return lambda find: ClaimDefinition(
+        find, statement, _CERTIFICATE, assumes, constant=constant, output=output
+    )
 
 
 def norm_text(run: RunEvidence, vector: str) -> str:
@@ -192,7 +198,7 @@ def least_inter_event_time(
     _COMPLETE,
     to_the_end=True,
 )
-def i1_controller_error(run: RunEvidence, samples: Samples) -> ClaimBound:
+def i1_controller_error(run: RunEvidence, samples: Samples, _: None) -> ClaimBound:
     """The triangle inequality for (I1)."""
     error, values = (
         "e_c" if run.record.scenario.coverage.knows_state else "x_c − x̂",
@@ -207,7 +213,7 @@ def i1_controller_error(run: RunEvidence, samples: Samples) -> ClaimBound:
 
 
 @claim("x_c − x_s is the sum of the missed jumps", "(I1)", _COMPLETE, to_the_end=True)
-def i1_model_difference(run: RunEvidence, samples: Samples) -> ClaimBound:
+def i1_model_difference(run: RunEvidence, samples: Samples, _: None) -> ClaimBound:
     """(I1) itself, up to rounding."""
     here, margin = samples.is_bounded, _margin(run)
     residual = samples.residual[here]
@@ -235,7 +241,7 @@ def _margin(run: RunEvidence) -> float:
 
 
 @claim("the paper's bound of the controller's error", "eq:LossEv3", _CONTINUOUS, needs_ideal_loop=True)
-def paper_error_bound(run: RunEvidence, samples: Samples) -> ClaimBound:
+def paper_error_bound(run: RunEvidence, samples: Samples, _: None) -> ClaimBound:
     """(I1) with the threshold in place of e_s at the events."""
     coverage = run.record.scenario.coverage
     # Estimates and noise jump at every measurement, so no trigger keeps e_s below a threshold.
@@ -252,7 +258,7 @@ def paper_error_bound(run: RunEvidence, samples: Samples) -> ClaimBound:
     f"{_CONTINUOUS}, {_CAPPED}",
     needs_ideal_loop=True,
 )
-def theorem_1_controller_error(run: RunEvidence, samples: Samples) -> ClaimBound:
+def theorem_1_controller_error(run: RunEvidence, samples: Samples, _: None) -> ClaimBound:
     """Theorem 1 with the Δ of the trajectory."""
     scenario = run.record.scenario
     coverage = scenario.coverage
@@ -265,7 +271,7 @@ def theorem_1_controller_error(run: RunEvidence, samples: Samples) -> ClaimBound
 
 
 @claim("minimum inter-event time", "Theorem 2, eq:tau", _IDEAL, needs_ideal_loop=True)
-def theorem_2_inter_event_time(run: RunEvidence, samples: Samples) -> ClaimBound:
+def theorem_2_inter_event_time(run: RunEvidence, samples: Samples, _: None) -> ClaimBound:
     """Theorem 2's τ."""
     if run.theorem_2 is None:
         return ClaimBound()
@@ -281,7 +287,7 @@ def theorem_2_inter_event_time(run: RunEvidence, samples: Samples) -> ClaimBound
 
 
 @claim("the state decays", "Theorem 2, eq:normXt", _IDEAL, needs_ideal_loop=True)
-def theorem_2_state(run: RunEvidence, samples: Samples) -> ClaimBound:
+def theorem_2_state(run: RunEvidence, samples: Samples, _: None) -> ClaimBound:
     """Theorem 2's bound of ‖x‖."""
     if run.theorem_2 is None:
         return ClaimBound()
@@ -384,7 +390,7 @@ def state(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) 
     )
 
 
-def output_claims(run: RunEvidence, certificate: ScenarioCertificate) -> list[CertifiedClaim]:
+def output_claims(run: RunEvidence, certificate: ScenarioCertificate) -> list[ClaimDefinition]:
     """Return the claims about the outputs that a run's scenario states: their bounds, and allowed errors."""
     scenario = run.record.scenario
     if scenario.outputs is None:
@@ -399,11 +405,12 @@ def output_claims(run: RunEvidence, certificate: ScenarioCertificate) -> list[Ce
 
 def _output_claim(
     output_bound: OutputBound, statement: str, settles_s: float | None = None
-) -> CertifiedClaim:
+) -> ClaimDefinition:
     """Return the claim of an output's bound, or that it stays within its allowed error from a time on."""
     output, certificate = output_bound.output, output_bound.certificate
 
-    def find(run: RunEvidence, samples: Samples, of_loop: ScenarioCertificate) -> ClaimBound:
+    @certified(statement, "state", output.name)
+    def output_claim(run: RunEvidence, samples: Samples, of_loop: ScenarioCertificate) -> ClaimBound:
         observed = np.abs(samples.plant.x @ np.array(output.row))
         slack, t_s = ROUNDING * run.offset, samples.step_s
         void = run.violation_of(of_loop)
@@ -418,7 +425,7 @@ def _output_claim(
             Bound(output_bound.pattern, t_s, upper_shares(observed, values + slack), void, first)
         )
 
-    return CertifiedClaim(statement, find, "state", output=output.name)
+    return output_claim
 
 
 @certified("x stays in the region")
@@ -459,15 +466,6 @@ def state_from_events(run: RunEvidence, samples: Samples, certificate: ScenarioC
 
 
 CLAIMS = (
-    i1_controller_error,
-    i1_model_difference,
-    paper_error_bound,
-    theorem_1_controller_error,
-    theorem_2_inter_event_time,
-    theorem_2_state,
-)
-"""The claims that need no certificate, in the order in which they are shown."""
-CERTIFIED_CLAIMS = (
     controller_error,
     controller_error_from_events,
     estimation_error,
@@ -476,5 +474,11 @@ CERTIFIED_CLAIMS = (
     state,
     region,
     state_from_events,
+    i1_controller_error,
+    i1_model_difference,
+    paper_error_bound,
+    theorem_1_controller_error,
+    theorem_2_inter_event_time,
+    theorem_2_state,
 )
-"""The claims of a certificate, in the order in which they are shown."""
+"""All claims, in the order in which they are evaluated."""

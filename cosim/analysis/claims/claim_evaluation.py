@@ -9,21 +9,14 @@ reached.
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
-from cosim.analysis.claims.claim_catalogue import (
-    CERTIFIED_CLAIMS,
-    CLAIMS,
-    Bound,
-    ClaimBound,
-    Envelope,
-    output_claims,
-)
+from cosim.analysis.claims.claim_catalogue import CLAIMS, Bound, ClaimDefinition, Envelope, output_claims
 from cosim.analysis.claims.common_end import common_end_ns, up_to_common_end
 from cosim.analysis.claims.observed_conditions import AssumptionViolation, VoidFrom
 from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples
@@ -61,22 +54,25 @@ def void_claim(claimed: str, source: str, why: str) -> Claim:
 class ClaimCheck:
     """Checks a run against a bound, samples by samples, up to the end of the claim.
 
-    If the run cannot meet an assumption, ``unmet`` names it. ``proved`` says of the claim of a certificate
-    whether the checker has proven it; ``output`` is the output that it is about.
+    Args:
+        claimed: what is claimed.
+        source: of the claim.
+        until_s: end of the claim.
+        unmet: an assumption that the run cannot meet.
+        proved: of the claim of a certificate: whether the checker has proven it.
     """
 
     def __init__(
         self,
-        statement: str,
+        claimed: ClaimDefinition,
         source: str,
         until_s: float,
         unmet: str = "",
         *,
         proved: bool | None = None,
-        output: str | None = None,
     ) -> None:
-        self._statement, self._source, self.until_s, self._unmet = statement, source, until_s, unmet
-        self._proved, self._output = proved, output
+        self._claimed, self._source, self.until_s, self._unmet = claimed, source, until_s, unmet
+        self._proved = proved
         self._ratio: float | None = None
         self._exceeded_s: float | None = None
         self._bound: Bound | None = None
@@ -129,20 +125,20 @@ class ClaimCheck:
                 observed = constant / ratio if ratio else None
         text = at_least(constant) if bound.is_lower else at_most(constant)
         return Claim(
-            what=self._statement, source=self._source, bound=bound.formula.format(text), certified=constant,
-            observed=observed, ratio=ratio, verdict=verdict,
+            what=self._claimed.statement, source=self._source, bound=bound.formula.format(text),
+            certified=constant, observed=observed, ratio=ratio, verdict=verdict,
             since_s=since_s, why=why,
             until_s=round(self.until_s, 9) if math.isfinite(self.until_s) else None, proved=self._proved,
-            output=self._output,
+            output=self._claimed.output,
         )  # fmt: skip
 
 
 class _ClaimInstance(NamedTuple):
     """A claim about a run, by a certificate or without one."""
 
+    claimed: ClaimDefinition
     run: RunEvidence
     """What it is checked against."""
-    find: Callable[[RunEvidence, Samples], ClaimBound]
     check: ClaimCheck
     curve: list[Envelope]
     """Its curve, from samples to samples."""
@@ -153,7 +149,7 @@ class _ClaimInstance(NamedTuple):
     def take(self, samples: Samples) -> None:
         """Check the next samples, and add to the curve, which is thinned if the run is long."""
         run = self.run
-        bound, envelope = self.find(run, samples)
+        bound, envelope = self.claimed.find(run, samples, self.certificate)
         if run.facts.is_ever_bounded and bound is not None:
             if self.outside is not None:
                 bound = bound._replace(void=VoidFrom(0.0, self.outside))
@@ -285,16 +281,17 @@ class RunClaims:
             if not certificate.exists:
                 continue
             outside = outside_box(run.record.scenario) if certificate.scope == BOX else None
-            for claim in (*output_claims(run, certificate), *CERTIFIED_CLAIMS):
-                proved = claim.is_proven(certificate)
-                source = certificate.source
-                check = ClaimCheck(claim.statement, source, run.until_s, proved=proved, output=claim.output)
-                yield _ClaimInstance(run, claim.find_for(certificate), check, [], certificate, outside)
-        for definition in CLAIMS:
-            unmet = _IDEAL_LOOP if definition.needs_ideal_loop else ""
-            evidence, until_s = (self.evidence, math.inf) if definition.to_the_end else (run, run.until_s)
-            check = ClaimCheck(definition.statement, definition.source, until_s, unmet)
-            yield _ClaimInstance(evidence, definition.find, check, [])
+            for claim in (*output_claims(run, certificate), *CLAIMS):
+                if claim.is_certified:
+                    proved = claim.is_proven(certificate)
+                    check = ClaimCheck(claim, certificate.source, run.until_s, proved=proved)
+                    yield _ClaimInstance(claim, run, check, [], certificate, outside)
+        for claim in CLAIMS:
+            if not claim.is_certified:
+                unmet = _IDEAL_LOOP if claim.needs_ideal_loop else ""
+                evidence, until_s = (self.evidence, math.inf) if claim.to_the_end else (run, run.until_s)
+                check = ClaimCheck(claim, claim.source, until_s, unmet)
+                yield _ClaimInstance(claim, evidence, check, [])
 
     def envelopes(self) -> list[Envelope]:
         """The curves of all bounds of the run itself, each to its end; those of a long run are thinned."""
