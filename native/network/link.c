@@ -2,9 +2,9 @@
 
    How a packet is lost: decide_for applies the stages of native/impairments/ in order. A stage, or
    the limit of packets in flight, loses it by refuse (core.h), unless it must pass
-   (noack_must_pass). A packet that only arrives corrupted is lost, too. noack_settle finds that out;
-   it holds a packet back that would make too many earlier ones stale, and counts the consecutive
-   losses, which noack_must_pass compares with M - 1 for the next packet. */
+   (noack_must_pass). A packet that only arrives corrupted is lost, too. noack_settle finds that
+   out; it holds a packet back that would make too many earlier ones stale, and counts the
+   consecutive losses, which noack_must_pass compares with M - 1 for the next packet. */
 #include <string.h>
 
 #include "../core.h"
