@@ -9,13 +9,20 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from cosim.analysis.claims.observed_conditions import CAUSES, SCHEDULE, worst_time
-from cosim.analysis.summary.summary_model import Claim, ExitPart, IdealLoopPart, LoopSummary, RunSummary
+from cosim.analysis.summary.summary_model import (
+    Claim,
+    ExitPart,
+    IdealLoopPart,
+    LoopSummary,
+    OutputPart,
+    RunSummary,
+)
 from cosim.output.document import Sentence, SentenceRole
 from cosim.output.result_tables import Tone
 from cosim.output.run_tables import changes_in, shares_network, state_norm
 from cosim.simulation.continuous import ContinuousSummary
 from noack.core.errors import ExitStatus
-from noack.core.number_format import counted, duration_at_least
+from noack.core.number_format import counted, duration_at_least, number
 from noack.protocol.roles import RECORDER
 from noack.protocol.wire_format import Rejection
 from noack.runtime.end_reasons import HORIZON
@@ -69,6 +76,7 @@ def verdict(summary: RunSummary) -> tuple[Sentence, ...]:
         ideal = loops[0].ideal_loop.events
     diverged = any(loop.diverged_at_s is not None for loop in loops)
     return (
+        *(_outputs_line(loop, summary) for loop in loops[:1] if len(loops) == 1 and loop.outputs),
         ending_line(
             summary.exit,
             summary.reached_s,
@@ -78,6 +86,35 @@ def verdict(summary: RunSummary) -> tuple[Sentence, ...]:
         _guarantee_line(loops),
         transmission_line(events, deliveries, ideal),
     )
+
+
+def _outputs_line(loop: LoopSummary, summary: RunSummary) -> Sentence:
+    """Return what became of the outputs, and what was guaranteed of them, in one sentence."""
+    held = [claim for claim in loop.claims if claim.output and claim.verdict == "held"]
+    guaranteed = {claim.output: claim.what for claim in held if " stays within " in claim.what}
+    texts, is_good = [], True
+    for output in loop.outputs:
+        if output.allowed is None:
+            continue
+        allowed = f"{output.allowed:g} {output.unit}".rstrip()
+        if output.settled_s is None:
+            texts.append(f"{output.name} was not within {allowed} of its set-point at the end")
+        else:
+            texts.append(
+                f"{output.name} was within {allowed} of its set-point from {output.settled_s:.3g} s on"
+            )
+        promised = guaranteed.get(output.name, "").rpartition(" from ")[2]
+        texts[-1] += f" (guaranteed from {promised})" if promised else " (not guaranteed)"
+        is_good = is_good and output.settled_s is not None
+    if not texts:
+        texts = [f"{output.name} was at most {_with_unit(output.largest, output)}" for output in loop.outputs]
+    lost = loop.longest_loss_burst
+    losses = f", although up to {counted(lost, 'consecutive packet')} {'was' if lost == 1 else 'were'} lost"
+    return _line(f"{' and '.join(texts)}{losses if lost else ''}", Tone.GOOD if is_good else Tone.DOUBTFUL)
+
+
+def _with_unit(value: float | None, output: OutputPart) -> str:
+    return f"{number(value)} {output.unit}".rstrip()
 
 
 def verdict_of_exact_run(summary: ContinuousSummary) -> list[Sentence]:

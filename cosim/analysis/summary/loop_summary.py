@@ -17,6 +17,7 @@ from cosim.analysis.summary.loop_statistics import (
     unintended_losses,
     watchdog_actions,
 )
+from cosim.analysis.summary.output_statistics import output_parts
 from cosim.analysis.summary.signal_statistics import disturbances, signal_statistics
 from cosim.analysis.summary.summary_model import AssumptionPart, ChangePart, ExitPart, LoopSummary
 from cosim.record.divergence import Divergence, divergence
@@ -70,6 +71,7 @@ def summarise_loop(
         acknowledgements=flow_outcome(record, Flow.ACKNOWLEDGEMENT),
         actuations=flow_outcome(record, Flow.ACTUATION),
         **signals.for_summary(),
+        outputs=output_parts(record),
         assumption_violations=reported_violations(record),
         assumptions=_assumptions(record, assumed or assumptions(scenario)),
         uneven_periods=uneven_periods(scenario),

@@ -332,6 +332,19 @@ class ExitPart(SummaryPart):
     reason: str
 
 
+class OutputPart(SummaryPart):
+    """An output that the scenario states: its distance from its set-point during the run."""
+
+    name: Text
+    unit: str
+    allowed: Real
+    """The allowed error; None: nothing is asked."""
+    largest: Real
+    last: Real
+    settled_s: Real
+    """From when on the output stayed within the allowed error; None: it was not within at the end."""
+
+
 class LoopSummary(SummaryPart):
     """A loop of the run; times are its own, which are 0 at its phase."""
 
@@ -371,6 +384,8 @@ class LoopSummary(SummaryPart):
     inter_event_median_s: Real
     inter_delivery_median_s: Real
     setpoint: list[float] | None = None
+    outputs: list[OutputPart] = []
+    """Those that the scenario states."""
     initial_state_norm: Real
     final_state_norm: Real
     sup_state_norm: Real

@@ -33,7 +33,7 @@ VALUES = [None, HUGE, "[/b]", [[[[]]]], {"a": [1]}, DELETED, RENAMED]
 PARTS = (
     "changes", "watchdog", "estimation", "disturbances", "assumption_violations",
     "acknowledgements", "actuations", "lateness_us", "latency_us", "realtime", "replay",
-    "conditions", "certified_for", "claims", "linearisation", "ideal_loop",
+    "conditions", "certified_for", "claims", "linearisation", "ideal_loop", "outputs",
 )  # fmt: skip
 """What only some runs have."""
 

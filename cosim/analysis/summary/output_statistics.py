@@ -1,0 +1,50 @@
+"""What a run shows of each output that its scenario states."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from cosim.analysis.summary.summary_model import OutputPart
+from cosim.record.run_record import RunRecord
+from noack.core.clock import NS_PER_S
+from noack.protocol.record_tables import PLANT_STEP
+from noack.scenario.outputs import LoopOutput
+from noack.scenario.resolution import setpoint_of
+
+
+def output_parts(record: RunRecord) -> list[OutputPart]:
+    """Return the distances of the stated outputs from their set-points, over the steps of the plant."""
+    if record.scenario.outputs is None:
+        return []
+    return [_output_part(record, output) for output in record.scenario.loop_outputs()]
+
+
+def _output_part(record: RunRecord, output: LoopOutput) -> OutputPart:
+    largest, last, outside_s = 0.0, None, None
+    for t_s, distances in _distances(record, output):
+        largest, last = float(np.maximum(largest, distances.max())), float(distances[-1])
+        if output.allowed is not None and len(outside := np.flatnonzero(~(distances <= output.allowed))):
+            outside_s = float(t_s[outside[-1]])
+    settled_s = None
+    if output.allowed is not None and last is not None and last <= output.allowed:
+        period_s = record.scenario.timing.plant_period_ns / NS_PER_S
+        settled_s = 0.0 if outside_s is None else outside_s + period_s
+    return OutputPart(
+        name=output.name,
+        unit=output.unit,
+        allowed=output.allowed,
+        largest=largest,
+        last=last,
+        settled_s=settled_s,
+    )
+
+
+def _distances(
+    record: RunRecord, output: LoopOutput
+) -> Iterator[tuple["np.ndarray[tuple[int], np.dtype[np.float64]]", ...]]:
+    """Yield times in s and |y − r|, (k,) each."""
+    row, setpoint = np.array(output.row), setpoint_of(record.scenario)
+    rest = 0.0 if setpoint is None else float(row @ setpoint[0])
+    for steps in record.batches(PLANT_STEP, ("t_ns", "x")):
+        if len(steps):
+            yield steps["t_ns"] / NS_PER_S, np.abs(steps["x"] @ row - rest)
