@@ -215,8 +215,9 @@ class Evaluation:
         by_slopes, row = self._function(a, value, derivative), self._linear_row(a)
         largest = (value(a.value) - value(a.centre)).abs_upper()
         mean = self._mean_slope(a, derivative)
-        least, gap = mean.lower(), mean.upper() - mean.lower()
-        is_wide = gap > _NARROW and least >= 0 and gap.is_finite() and largest > 0
+        least = mean.lower().max(arb(0))
+        gap = mean.upper() - least
+        is_wide = gap > _NARROW and gap.is_finite() and largest > 0
         if row is None or not is_wide or self._has_all_signals:
             return by_slopes
         p = self._signal(arb(largest), gap / largest * row, arb(1))

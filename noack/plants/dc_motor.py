@@ -37,6 +37,7 @@ class DcMotorSettings(PlantSettings):
     states: ClassVar = ("shaft angle, rad", "speed, rad/s", "armature current, A")
     inputs: ClassVar = ("armature voltage, V",)
     scenario: ClassVar = "dc_motor"
+    has_equations: ClassVar = True
 
     kind: Literal["dc_motor"]
     resistance_ohm: Positive = 4.0
@@ -84,6 +85,14 @@ class DcMotor:
         self._breakaway_a = settings.coulomb_friction_n_m / settings.torque_constant_n_m_per_a
         self.x = np.array(x0, dtype=np.float64)
         self.z = np.zeros(0)
+
+    def expressions(self, t_s: float, x: Vector, u: Vector) -> tuple[Vector, Vector]:
+        """Return dx/dt and x; while the shaft sticks, sign(0) stands for any number from −1 to 1."""
+        matrix, voltage = self._settings.dynamics()
+        rates = np.concatenate([x[1:2], matrix @ x[1:] + voltage * u[0]])
+        if self._deceleration:
+            rates[1] = rates[1] - self._deceleration * np.sign(x[1])
+        return rates, x
 
     def advance(self, u: Vector, t_ns: int, dt_ns: int) -> None:
         """Advance through all changes of the friction's direction within the step."""

@@ -78,7 +78,7 @@ def find_region_witness(
         widths = _with(plant, restricted, np.maximum(grown, _LEAST * grown.max()))
     else:
         if restricted:
-            raise NoWitnessError(f"on the region {_described(plant, widths)}: the bounds are not within it")
+            raise NoWitnessError(f"{_described(plant, widths)}: the bounds are not within it")
     why: NoWitnessError | None = None
     for _ in range(_LAST_TRIES):
         try:
@@ -87,7 +87,7 @@ def find_region_witness(
             raise
         except NoWitnessError as error:
             why, widths = error, _LAST_WIDER * widths
-    raise NoWitnessError(f"on the region {_described(plant, widths)}: {why}")
+    raise NoWitnessError(f"{_described(plant, widths)}: {why}")
 
 
 def _witness(
@@ -130,14 +130,14 @@ def _reached(
     except WorkLimitError:
         raise
     except NoWitnessError as error:
-        raise NoWitnessError(f"on the region {_described(plant, widths)}: {error}") from None
+        raise NoWitnessError(f"{_described(plant, widths)}: {error}") from None
 
 
 def _on(plant: PlantOnRegions, widths: Vector) -> tuple[TracedEquations, Loop]:
     try:
         return plant.on(widths)
     except NotEnclosedError as error:
-        raise NoWitnessError(f"on the region {_described(plant, widths)}: {error}") from None
+        raise NoWitnessError(f"{_described(plant, widths)}: {error}") from None
 
 
 def _restricted(plant: PlantOnRegions) -> list[int]:
@@ -168,9 +168,8 @@ def _restricted(plant: PlantOnRegions) -> list[int]:
 def _halves(plant: PlantOnRegions, widths: Vector) -> Vector:
     """Return half-widths and sizes of disturbances of the plants that enclose the equations."""
     plants = plant.on(widths)[0].plants
-    parts = [plants.half_A, plants.half_B, *(row for row, _ in plants.along)]
     sizes = np.sqrt((floats(plants.pushes) ** 2).sum(axis=1))
-    return np.concatenate([*(floats(M).ravel() for M in parts), sizes])
+    return np.concatenate([floats(plants.half_A).ravel(), floats(plants.half_B).ravel(), sizes])
 
 
 def _with(plant: PlantOnRegions, restricted: Sequence[int], sizes: Vector) -> Vector:
@@ -193,5 +192,6 @@ def _output(plant: PlantOnRegions, k: int) -> str:
 
 
 def _described(plant: PlantOnRegions, widths: Vector) -> str:
-    sizes = zip(plant.names, widths, strict=True)
-    return ", ".join(f"|{name}| ≤ {width:.3g}" for name, width in sizes if np.isfinite(width))
+    pairs = zip(plant.names, widths, strict=True)
+    limits = [f"|{name}| ≤ {width:.3g}" for name, width in pairs if np.isfinite(width)]
+    return f"on the region {', '.join(limits)}" if limits else "for all x and u"
