@@ -1,4 +1,4 @@
-"""Two plants as equations of one's own, for the scenarios sine_pendulum and kinematic_car.
+"""Plants as equations of one's own, for the scenarios sine_pendulum, kinematic_car and friction_servo.
 
 With numpy's functions, and without case distinctions, a plant's equations can be enclosed over a
 region: noack certify proves that the plant does not leave it.
@@ -36,3 +36,19 @@ class KinematicCar:
             self.speed * np.tan(steering) / self.wheelbase,
             self.speed * np.sin(yaw),
         )
+
+
+class FrictionServo:
+    """A servo with viscous and Coulomb friction; z is its angle and its speed, the input is a voltage.
+
+    A tanh that bends within 2 mrad/s stands for the sign of the speed, which no integrator of differential
+    equations accepts.
+    """
+
+    def __init__(self, friction_rad_per_s2=1.0, damping_per_s=2.0, gain_rad_per_v_s2=20.0):
+        self.friction, self.damping, self.gain = friction_rad_per_s2, damping_per_s, gain_rad_per_v_s2
+
+    def derivative(self, t_s, z, u):
+        """Return dz/dt."""
+        _, speed = z
+        return speed, self.gain * u[0] - self.damping * speed - self.friction * np.tanh(speed / 0.002)
