@@ -39,7 +39,8 @@ def test_runs_are_inside_the_bounds(proven: ProvenBounds, seed: int) -> None:
         f"network.loss={{model='bernoulli', probability={rng.uniform(0.3, 1.0)}}}",
     ]
     run = simulate(resolve(load(SERVO, settings)))
-    x, t_s = run.plant.x, run.plant.t_ns * 1e-9
+    steps = run["plant_step"]
+    x, t_s = steps["x"], steps["t_ns"] * 1e-9
     for shares in (
         np.abs(x[:, 0]) / proven.at("y[0]", t_s),
         np.linalg.norm(x, axis=1) / proven.at("x", t_s),
