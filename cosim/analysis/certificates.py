@@ -27,15 +27,16 @@ from noack.theory.certificates.conditions import (
     LINEAR_EQUATIONS,
     OWN_PLANT,
     REGION,
-    about_setpoint,
+    about_reference,
     ideal_conditions,
+    jump_s,
     nominal_conditions,
 )
 from noack.theory.certificates.network_limits import NetworkLimits, network_limits
 from noack.theory.certificates.output_bounds import output_bounds
 from noack.theory.certificates.plant_equations import LinearEquations, linear_plant
 from noack.theory.certificates.proven_bounds import ProvenBounds
-from noack.theory.certificates.refusals import refusal_under, refusals_at_setpoint
+from noack.theory.certificates.refusals import refusal_under, refusals_about_reference
 from noack.theory.certificates.region import RegionScope
 from noack.theory.certificates.scenario_certificates import box_scope, outside_box, own_plant_scope
 from noack.theory.certificates.trigger_weight import choose_weight
@@ -125,10 +126,14 @@ class Certificates:
         self.threshold_advice = dict[str, str]()
         """By output: what brings it within its allowed error, see :meth:`advise`."""
         require_certifiable(scenario, "linear", "whole run")
-        self.setpoint, void = scenario.controller.setpoint, refusals_at_setpoint(scenario)
+        self.setpoint, void = scenario.controller.setpoint, refusals_about_reference(scenario)
         if OWN_PLANT in void:
             raise CallerError(void[OWN_PLANT])
-        scenario = about_setpoint(scenario)
+        self.follows_reference = scenario.controller.reference is not None
+        """Whether x is the distance from a reference that changes over time."""
+        self.jump_s = jump_s(scenario)
+        """When the reference first jumps: the certificates hold until then. None: it does not."""
+        scenario = about_reference(scenario, late_periods)
         self.scenario, self.weight, self.late_periods = scenario, weight, late_periods
         self.scheduled = nominal_conditions(scenario, late_periods)
         """The times of the schedule, with its permitted lateness."""
@@ -138,7 +143,7 @@ class Certificates:
         self._scopes = [scope for scope in scopes if scope is not None]
         if nonlinear is not None:
             self.nonlinear = f'plant.system.kind = "{nonlinear.plant.system.kind}"'
-            self._no_region = refusals_at_setpoint(nonlinear).get(REGION)
+            self._no_region = refusals_about_reference(nonlinear).get(REGION)
             if self._no_region is None and not refusals(nonlinear):
                 self._scopes.append(RegionScope(nonlinear))
         self._certificates = [
@@ -186,7 +191,9 @@ class Certificates:
         if certificate is None or not scenario.coverage.is_linear:
             return
         plants = "box" if certificate.scope == BOX else "own"
-        bounds = output_bounds(certificate, self.scenario.loop_outputs(), self.setpoint)
+        bounds = output_bounds(
+            certificate, self.scenario.loop_outputs(), self.setpoint, follows=self.follows_reference
+        )
         for index, bound in enumerate(bounds):
             if not bound.is_met:
                 stated = ThresholdTrials(scenario, self.late_periods, plants)
@@ -357,7 +364,9 @@ class Certificates:
             "outputs": [
                 {"under": under, "plants": certificate.scope, **bound.to_json()}
                 for under, certificate in self
-                for bound in output_bounds(certificate, self.scenario.loop_outputs(), self.setpoint)
+                for bound in output_bounds(
+                    certificate, self.scenario.loop_outputs(), self.setpoint, follows=self.follows_reference
+                )
             ],
             "unproven": [each._asdict() for each in self.unproven],
             "stability": None if self.stability is None else self.stability._asdict(),

@@ -17,7 +17,7 @@ from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from noack.settings.section import Table
 from noack.theory.bounds.certificate_terms import NetworkConditions
-from noack.theory.certificates.conditions import about_setpoint, certified_delay_s, nominal_conditions
+from noack.theory.certificates.conditions import about_reference, certified_delay_s, nominal_conditions
 from noack.theory.certificates.network_limits import MOST_S
 from noack.theory.certificates.refusals import refusal_under
 from noack.theory.certificates.region import scopes
@@ -126,7 +126,7 @@ class SettingTrials:
         try:
             changed = resolve(self._with(values))
             if changed.coverage.is_linear:
-                changed = about_setpoint(changed)
+                changed = about_reference(changed, self._late_periods)
             scope = box_scope(changed) if box else next(iter(scopes(changed)), None)
         except (NoackError, ValueError):  # not a legal value, or a link that must overflow
             return None

@@ -66,7 +66,7 @@ def _all_tables(results: Certificates) -> Iterator[Block]:
     yield from _on_nonlinear(results)
     yield tables[0] if tables else _prose(f"{_title(results)}: none")
     yield from _notes(results)
-    if any(results.setpoint or ()):
+    if any(results.setpoint or ()) or results.follows_reference:
         yield _note(
             "x is the distance from the set-point, x − x_r. If the plant does not rest there, "
             "A x_r + B u_r is a disturbance: a step at the state."

@@ -76,9 +76,15 @@ class Curve:
 
 
 def state_curves(
-    names: Sequence[str], t_s: Vector, x: Matrix, x_s: Matrix, x_c: Matrix, x_hat: Matrix | None = None
+    names: Sequence[str],
+    t_s: Vector,
+    x: Matrix,
+    x_s: Matrix,
+    x_c: Matrix,
+    x_hat: Matrix | None = None,
+    x_r: Matrix | None = None,
 ) -> list[Curve]:
-    """Return the curves of n states, (k, n): plant, both models, and the sensor's estimate.
+    """Return the curves of n states, (k, n): plant, both models, the sensor's estimate, the reference.
 
     The widths differ, so that equal curves stay visible one inside the other.
     """
@@ -87,6 +93,7 @@ def state_curves(
         ("x̂ sensor", x_hat, CurveStyle(SENSOR, 1.0, (1, 1))),
         ("x_s sensor", x_s, CurveStyle(SENSOR)),
         ("x_c controller", x_c, CurveStyle(CONTROLLER, 2.4)),
+        ("x_r reference", x_r, CurveStyle(THRESHOLD, 1.2, (4, 2))),
     ]
     return [
         Curve(panel, name, "", t_s, states[:, i], style)

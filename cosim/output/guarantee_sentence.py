@@ -24,12 +24,15 @@ def guarantee_sentence(results: Certificates) -> str | None:
     known = "proved" if certificate.is_proven("state") else "computed, not proved"
     plants = {BOX: ", for every plant within the stated uncertainty", REGION: ", on its region"}
     losses = although_lost(results.scenario)
-    return f"{' and '.join(statements)}{losses}{plants.get(certificate.scope, '')} ({known})"
+    until = "" if results.jump_s is None else f", until the reference jumps at {results.jump_s:g} s"
+    return f"{' and '.join(statements)}{until}{losses}{plants.get(certificate.scope, '')} ({known})"
 
 
 def bounds_of(results: Certificates, certificate: ScenarioCertificate) -> list[OutputBound]:
     """Return the bounds of a scenario's outputs by one of its certificates."""
-    return output_bounds(certificate, results.scenario.loop_outputs(), results.setpoint)
+    return output_bounds(
+        certificate, results.scenario.loop_outputs(), results.setpoint, follows=results.follows_reference
+    )
 
 
 def _statements(

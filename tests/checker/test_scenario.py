@@ -12,8 +12,8 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.scenario.resolution import loop_of, rule_of
 from noack.scenario.scenario import Scenario
-from noack.theory.certificates.conditions import about_setpoint, allowed_conditions, ideal_conditions
-from noack.theory.certificates.refusals import refusals_at_setpoint
+from noack.theory.certificates.conditions import about_reference, allowed_conditions, ideal_conditions
+from noack.theory.certificates.refusals import refusals_about_reference
 from noack_check.keys import RefusedError, key_table, refusals
 from noack_check.loop import Loop
 from noack_check.scenario import output_names, read_loop
@@ -64,7 +64,7 @@ def require_same(loop: Loop, resolved: Scenario) -> None:
         floats(loop.weight), np.eye(n) if matrices.weight is None else matrices.weight
     )
     assert loop.holds is (resolved.mode == "zoh")
-    x_0 = loop_of(about_setpoint(resolved)).x0
+    x_0 = loop_of(about_reference(resolved)).x0
     np.testing.assert_allclose(floats(loop.start)[:, 0], x_0, rtol=1e-15)
     assert loop.losses == ideal_conditions(resolved).dropouts
     P, N = rule.form
@@ -194,7 +194,7 @@ def test_a_disturbance_of_the_input_acts_through_each_B_of_the_box() -> None:
 def test_the_setpoint_is_moved_to_0() -> None:
     resolved = first_loop("double_integrator", "controller.setpoint=[2.0, 0.0]")
     loop = read_loop(tables_of(resolved), box=False, ideal=False)
-    moved = about_setpoint(resolved)
+    moved = about_reference(resolved)
     np.testing.assert_allclose(floats(loop.start)[:, 0], moved.plant.initial_state)
     extents = [entry.extent() for entry in moved.plant.disturbances]
     expected = np.hstack(extents) if extents else np.zeros((2, 0))
@@ -204,11 +204,11 @@ def test_the_setpoint_is_moved_to_0() -> None:
 def test_setpoints_that_noack_does_not_cover_are_refused() -> None:
     uncertain = ("controller.setpoint=[2.0, 0.0]", "plant.uncertainty_A=[[0.1, 0.0], [0.0, 0.0]]")
     resolved = first_loop("double_integrator", *uncertain)
-    assert list(refusals_at_setpoint(resolved)) == ["every plant of the uncertainty box"]
+    assert list(refusals_about_reference(resolved)) == ["every plant of the uncertainty box"]
     with pytest.raises(RefusedError, match=r"controller.setpoint: not every plant"):
         read_loop(tables_of(resolved), box=True, ideal=False)
     pendulum = first_loop("unstable_pendulum", "controller.setpoint=[0.1, 0.0]")
-    assert len(refusals_at_setpoint(pendulum)) == 2
+    assert len(refusals_about_reference(pendulum)) == 2
     with pytest.raises(RefusedError, match=r"controller.setpoint: it needs an input"):
         read_loop(tables_of(pendulum), box=False, ideal=False)
 

@@ -23,16 +23,17 @@ from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples
 from cosim.analysis.claims.setpoint_deviations import deviations, start_error
 from cosim.analysis.summary.summary_model import NO_BOUND, Claim, ClaimVerdict, ViolationPart
 from cosim.record.decimation import decimate
+from cosim.record.divergence import largest_reference
 from cosim.record.run_events import changes_of
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NS_PER_S
-from noack.core.linear_systems import Vector
 from noack.core.number_format import at_least, at_most
-from noack.scenario.resolution import setpoint_of
+from noack.core.references import Reference
+from noack.scenario.resolution import loop_of
 from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.conditions import BOX, OWN_PLANT
-from noack.theory.certificates.refusals import refusals_at_setpoint
+from noack.theory.certificates.conditions import BOX, OWN_PLANT, jump_s
+from noack.theory.certificates.refusals import refusals_about_reference
 from noack.theory.certificates.scenario_certificates import outside_box
 from noack.theory.coverage import refusal, refusals
 
@@ -183,8 +184,8 @@ class RunClaims:
         return None if end_ns is None else end_ns / NS_PER_S
 
     @property
-    def _setpoint(self) -> tuple[Vector, Vector] | None:
-        return setpoint_of(self.record.scenario)
+    def _reference(self) -> Reference | None:
+        return loop_of(self.record.scenario).reference
 
     @cached_property
     def evidence(self) -> RunEvidence:
@@ -193,15 +194,14 @@ class RunClaims:
 
     @cached_property
     def certified_evidence(self) -> RunEvidence:
-        """What certificates are checked against: the run in deviations from its set-point."""
-        if self._setpoint is None:
+        """What certificates are checked against: the run in deviations from its reference."""
+        if (reference := self._reference) is None:
             return self.evidence
-        x_r, u_r = self._setpoint
-        moved = deviations(self._checked_record, x_r, u_r)
+        moved = deviations(self._checked_record, reference)
         error = None
-        if u_r.any():  # the input is 0 at first, and not u_r
+        if reference.is_constant and reference.input(0).any():  # the input is 0 at first, and not u_r
             error = start_error(moved, self._evidence(moved).started_s)
-        return self._evidence(moved, None, error, float(np.linalg.norm(x_r)))
+        return self._evidence(moved, None, error, largest_reference(self.record.scenario))
 
     def _evidence(
         self,
@@ -212,7 +212,9 @@ class RunClaims:
     ) -> RunEvidence:
         changes = [change.first_ns for change in changes_of(self._checked_record) if change.touches_claims]
         until_s = changes[0] * 1e-9 if changes else math.inf  # as the times of samples are computed
-        void = refusals_at_setpoint(self.record.scenario, knows_inputs=True)
+        if record is not self._checked_record and (at_s := jump_s(self.record.scenario)) is not None:
+            until_s = min(until_s, at_s)
+        void = refusals_about_reference(self.record.scenario, knows_inputs=True)
         whole, most_work = self.record, self.most_work
         return RunEvidence(record, whole, until_s, error, void, certificates, offset, most_work)
 

@@ -198,6 +198,8 @@ class RunEvidence:
         if not any(certificate.exists for certificate in self._scheduled):
             return None
         stated, most_work = whole_record.scenario, self.most_work
+        if stated.controller.reference is not None and widest.hold_s > self.allowed.hold_s:
+            return None  # u_r of an older input would differ by more than the certificates allow for
         certificates = certificates_under(
             widest, self.record.scenario, self.start_error, stated, most_work=most_work
         )

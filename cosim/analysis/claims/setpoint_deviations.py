@@ -12,32 +12,41 @@ import numpy as np
 
 from cosim.record.align import Reals
 from cosim.record.run_record import Rows, RunRecord
-from noack.core.linear_systems import Vector
+from noack.core.references import Reference
 from noack.core.row_operations import row_norms
 from noack.protocol.record_tables import PLANT_STEP, SETTINGS
 from noack.scenario.resolution import policy_of
 from noack.theory.bounds.disturbances import bound_forcing
 from noack.theory.bounds.enclosure import factors
-from noack.theory.certificates.conditions import about_setpoint
+from noack.theory.certificates.conditions import about_reference
 
 _STATES = ("x", "x_s", "x_c", "x_c_before", "x_s_before")
 _ROUNDED = 1e-9
 """Share of an input outside of the range of K that is rounding."""
 
 
-def deviations(record: RunRecord, x_r: Vector, u_r: Vector) -> RunRecord:
-    """Return the record of a run in deviations from its set-point, without changes of settings."""
+def deviations(record: RunRecord, reference: Reference) -> RunRecord:
+    """Return the record of a run in deviations from its reference, without changes of settings."""
+    scenario = record.scenario
 
     def derive(table: str, rows: Rows) -> Rows:
         shifted = (rows[:0] if table in SETTINGS else rows).copy()
-        for name in shifted.dtype.names or ():
+        names = shifted.dtype.names or ()
+        if not {*names} & {*_STATES, "u"}:
+            return shifted
+        measured = reference.rows(shifted["t_ns"])
+        of_model = reference.rows(shifted["model_t_ns"]) if "model_t_ns" in names else measured
+        for name in names:
             if name in _STATES:
-                shifted[name] -= x_r
+                shifted[name] -= (measured if name == "x" else of_model)[:, : reference.n]
             elif name == "u":
-                shifted[name] -= u_r
+                shifted[name] -= of_model[:, reference.n :]
         return shifted
 
-    return record.derived(about_setpoint(record.scenario).model_copy(update={"changes": ()}), derive)
+    return record.derived(
+        about_reference(scenario, scenario.certificate.late_periods).model_copy(update={"changes": ()}),
+        derive,
+    )
 
 
 def start_error(record: RunRecord, started_s: float) -> float:

@@ -52,7 +52,7 @@ from cosim.output.figures.timing_figures import (
 )
 from cosim.record.align import AlignedRun, Reals, aligned_parts
 from cosim.record.decimation import decimate_all
-from cosim.record.run_events import packet_outcomes
+from cosim.record.run_events import packet_outcomes, reference_in_run
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NS_PER_S
 from noack.core.row_operations import row_norms
@@ -298,7 +298,9 @@ def _states(record: RunRecord, aligned: _Thinned) -> PageFigure:
 def _states_of(record: RunRecord, samples: _Thinned) -> list[Curve]:
     run, true_x = samples
     x, x_hat = (run.x, None) if true_x is None else (true_x, run.x)
-    return state_curves(record.loop.state_names, _seconds(run.t_ns), x, run.x_s, run.x_c, x_hat)
+    reference = reference_in_run(record)
+    x_r = None if reference is None else reference.states(run.t_ns)
+    return state_curves(record.loop.state_names, _seconds(run.t_ns), x, run.x_s, run.x_c, x_hat, x_r)
 
 
 def _errors_of(run: AlignedRun) -> list[Curve]:

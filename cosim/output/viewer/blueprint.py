@@ -49,6 +49,7 @@ from cosim.output.figures.palette import (
 )
 from cosim.output.viewer.network_diagram import DIAGRAM, NetworkDiagram
 from cosim.output.viewer.pictures.picture import PICTURE, TIMELINE, Picture, Shape, label, lines, panel
+from noack.core.references import Reference
 
 Static = rr.TextDocument | rr.SeriesLines | rr.SeriesPoints | Shape
 """Data that do not change during a run."""
@@ -100,6 +101,8 @@ class LoopLayout:
     """Picture of the plant, if there is one."""
     diagram: NetworkDiagram | None = None
     """Diagram of the network, if there is one."""
+    reference: Reference | None = None
+    """The reference at the run's start; None is 0."""
     folder: str = ""
     """Entities of the loop are below it; it ends with a slash, or is empty."""
     phase_ns: int = 0
@@ -154,10 +157,11 @@ class LoopLayout:
 def _styles(layout: LoopLayout) -> dict[str, Static]:
     """Return name, colour and width of every series, by entity."""
     input_names, m = layout.input_names, len(layout.input_names)
-    triple = rr.SeriesLines(
-        names=["x plant", "x_s sensor model", "x_c controller model"],
-        colors=[PLANT, SENSOR, CONTROLLER],
-        widths=[4.5, 1.5, 1.5],
+    states = 3 if layout.reference is None else 4
+    of_state = rr.SeriesLines(
+        names=["x plant", "x_s sensor model", "x_c controller model", "x_r reference"][:states],
+        colors=[PLANT, SENSOR, CONTROLLER, THRESHOLD][:states],
+        widths=[4.5, 1.5, 1.5, 1.0][:states],
     )
     # Later series are drawn on top: ‖e_c‖ often equals its bound, and stays visible on it.
     errors = ["bound (I1)", "‖e_s‖ sensor", "threshold", "‖e_c‖ controller", "certified"]
@@ -165,7 +169,7 @@ def _styles(layout: LoopLayout) -> dict[str, Static]:
     widths = [3.5, 1.5, 2.0, 1.5, 2.0]
     lateness = {lateness_path(process): line for process, line in _process_styles(layout.processes).items()}
     return {
-        **{state_path(name): triple for name in layout.state_names},
+        **{state_path(name): of_state for name in layout.state_names},
         ERROR: rr.SeriesLines(names=errors[:4], colors=colours[:4], widths=widths[:4]),
         ERROR_LOG10: rr.SeriesLines(names=errors, colors=colours, widths=widths),
         SIZE_LOG10: rr.SeriesLines(

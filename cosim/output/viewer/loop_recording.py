@@ -211,9 +211,12 @@ class LoopView:
                 none.
         """
         t_ns = aligned.t_ns
-        triples = np.stack([aligned.x, aligned.x_s, aligned.x_c], axis=2)
+        states, reference = [aligned.x, aligned.x_s, aligned.x_c], self._layout.reference
+        if reference is not None:
+            states.append(reference.states(t_ns))
+        of_each = np.stack(states, axis=2)
         for i, entity in enumerate(self._states):
-            self._send(entity, t_ns, triples[:, i, :])
+            self._send(entity, t_ns, of_each[:, i, :])
         measured = (aligned.e_s_norm, aligned.threshold, aligned.e_c_norm)
         norms = np.column_stack([e_c_bounds[:, 0], *measured, e_c_bounds[:, 1]])
         # On a linear scale, a certified bound would flatten everything else.

@@ -212,6 +212,7 @@ def _loop_layout(
         processes=LOOP_ROLES if is_timed else (),
         picture=picture_of(scenario),
         diagram=NetworkDiagram(*scenario.network.flows[1:]) if animated else None,
+        reference=loop.reference,
         folder=folder,
         phase_ns=phase_ns,
     )

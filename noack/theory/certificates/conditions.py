@@ -1,4 +1,4 @@
-"""The conditions of a scenario's run, its own and the paper's; and a set-point moved to 0.
+"""The conditions of a scenario's run, its own and the paper's; and a reference moved to 0.
 
 At a set-point x_r the loop is described in the coordinates x − x_r, x_s − x_r and x_c − x_r. The
 models rest at x_r with u_r: Âx_r + B̂u_r = 0. The plant need not. What is left, w = A x_r + B u_r,
@@ -14,7 +14,9 @@ from noack.core.cached_method import cached_method
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Vector
 from noack.core.periods import exact_ns
+from noack.disturbances.disturbance_settings import DisturbanceSettings
 from noack.disturbances.step import StepDisturbance
+from noack.disturbances.uniform import UniformDisturbance
 from noack.guarantee.loss_guarantee import LongestBurst, LossGuarantee
 from noack.impairments.markov_chain import NotPredictableError
 from noack.impairments.target_loss import loss_process
@@ -23,6 +25,7 @@ from noack.scenario.scenario import Scenario
 from noack.settings.section import Table
 from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.bounds.disturbances import excluded_probability
+from noack.theory.bounds.reference_limits import ReferenceLimits
 
 OWN_PLANT = "the scenario's plant"
 BOX = "every plant of the uncertainty box"
@@ -198,28 +201,70 @@ def kept_probability(
     return max(kept - excluded_probability(resolved), 0.0)
 
 
-def about_setpoint(resolved: Scenario) -> Scenario:
-    """Return the loop in the coordinates around its set-point, which is 0 there."""
-    setpoint = setpoint_of(resolved)
-    if setpoint is None:
+def about_reference(resolved: Scenario, late_periods: int = 0) -> Scenario:
+    """Return the loop in the coordinates around its reference or set-point, which is 0 there.
+
+    ``late_periods``: the permitted lateness, on which the age of u_r in a held input depends.
+    """
+    loop = loop_of(resolved)
+    if loop.reference is None:
         return resolved
-    x_r, _ = setpoint
-    w, plant = constant_disturbance(resolved), resolved.plant
-    constant = StepDisturbance(kind="step", at="state", amplitude=tuple(w.tolist()))
+    plant = resolved.plant
+    pushes = reference_pushes(resolved, nominal_conditions(resolved, late_periods).hold_s)
     update = {
-        "initial_state": tuple((np.array(plant.initial_state) - x_r).tolist()),
-        "disturbances": (*plant.disturbances, *([constant] if w.any() else [])),
+        "initial_state": tuple((loop.x0 - loop.reference.state(0)).tolist()),
+        "disturbances": (*plant.disturbances, *pushes),
     }
     return resolved.model_copy(
         update={
             "plant": plant.model_copy(update=update),
-            "controller": resolved.controller.model_copy(update={"setpoint": None}),
+            "controller": resolved.controller.model_copy(update={"setpoint": None, "reference": None}),
         }
     )
 
 
+def reference_pushes(resolved: Scenario, hold_s: float) -> list[DisturbanceSettings]:
+    """Return what disturbs a linear loop in the coordinates around its reference, until x_r first jumps.
+
+    With x̃ = x − x_r and the held u_r(t_k), the plant has
+
+        dx̃/dt = A x̃ + B (ũ + u_r(t_k) − u_r(t)) + (A − Â) x_r + (B − B̂) u_r + (Â x_r + B̂ u_r − ẋ_r).
+
+    At a set-point all of this is the constant A x_r + B u_r. ``hold_s``: largest t − t_k.
+    """
+    loop = loop_of(resolved)
+    assert loop.reference is not None
+    if loop.reference.is_constant:
+        w = constant_disturbance(resolved)
+        return [StepDisturbance(kind="step", at="state", amplitude=tuple(w.tolist()))] if w.any() else []
+    limits, plant = ReferenceLimits(loop.reference, resolved.timing.horizon_ns), resolved.plant
+    own = np.hstack([loop.A - loop.A_model, loop.B - loop.B_model])
+    state = limits.largest(own)
+    if plant.uncertainty_A is not None or plant.uncertainty_B is not None:
+        half = np.hstack([
+            np.zeros_like(loop.A) if plant.uncertainty_A is None else np.array(plant.uncertainty_A),
+            np.zeros_like(loop.B) if plant.uncertainty_B is None else np.array(plant.uncertainty_B),
+        ])  # fmt: skip
+        state = np.maximum(state, half @ limits.largest(np.eye(loop.n + loop.m)))
+    state = state + limits.residual(loop.A_model, loop.B_model)
+    held = limits.largest_change(hold_s)[loop.n :]
+    return [
+        UniformDisturbance.model_validate({"kind": "uniform", "at": at, "bound": tuple(bound.tolist())})
+        for at, bound in (("input", held), ("state", state))
+        if bound.any()
+    ]
+
+
+def jump_s(resolved: Scenario) -> float | None:
+    """Return when the reference first jumps, to which time certificates hold; None: it never does."""
+    reference = loop_of(resolved).reference
+    if reference is None or reference.is_constant:
+        return None
+    return ReferenceLimits(reference, resolved.timing.horizon_ns).jump_s
+
+
 def constant_disturbance(resolved: Scenario) -> Vector:
-    """Return A x_r + B u_r, (n,), of a linear plant; 0 if that is due to rounding."""
+    """Return A x_r + B u_r, (n,), at the set-point of a linear plant; 0 if that is due to rounding."""
     loop, setpoint = loop_of(resolved), setpoint_of(resolved)
     if setpoint is None:
         return np.zeros(loop.n)

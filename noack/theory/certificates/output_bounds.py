@@ -22,7 +22,9 @@ class OutputBound(NamedTuple):
     certificate: ScenarioCertificate
     """With the bound of the output in the place of that of ‖x‖."""
     is_deviation: bool = False
-    """Whether the output has a set-point other than 0."""
+    """Whether the output has a set-point other than 0, or a reference."""
+    target: str = "set-point"
+    """What the output is to follow."""
 
     @property
     def is_proven(self) -> bool:
@@ -69,9 +71,9 @@ class OutputBound(NamedTuple):
         allowed = output.quantity(f"{output.allowed:g}")
         if settles_s is not None:
             when = f"from {at_most(settles_s, _DIGITS)} s on" if settles_s else "at all times"
-            return f"{output.name} stays within {allowed} of its set-point {when}"
+            return f"{output.name} stays within {allowed} of its {self.target} {when}"
         least = output.quantity(at_most(self.ultimate, _DIGITS))
-        return f"{output.name} stays within {least} of its set-point in the end, not within {allowed}"
+        return f"{output.name} stays within {least} of its {self.target} in the end, not within {allowed}"
 
     def to_json(self) -> dict[str, object]:
         """Return the bound for JSON."""
@@ -92,7 +94,11 @@ def escaped(text: str) -> str:
 
 
 def output_bounds(
-    certificate: ScenarioCertificate, outputs: Sequence[LoopOutput], setpoint: Sequence[float] | None = None
+    certificate: ScenarioCertificate,
+    outputs: Sequence[LoopOutput],
+    setpoint: Sequence[float] | None = None,
+    *,
+    follows: bool = False,
 ) -> list[OutputBound]:
     """Return the bound of each output; none without a bound of ‖x‖.
 
@@ -100,11 +106,14 @@ def output_bounds(
         certificate: of the loop.
         outputs: its p outputs.
         setpoint: x_r, n entries; None is 0.
+        follows: the loop follows a reference that changes over time instead.
     """
     if certificate.first("state") is None:
         return []
     bounds = []
     for index, output in enumerate(outputs):
         moved = sum(c * x for c, x in zip(output.row, setpoint or (), strict=False))
-        bounds.append(OutputBound(output, certificate.of_output(index, output.row), bool(moved)))
+        target = "reference" if follows else "set-point"
+        of_output = certificate.of_output(index, output.row)
+        bounds.append(OutputBound(output, of_output, follows or bool(moved), target))
     return bounds

@@ -10,11 +10,12 @@ import numpy as np
 
 from noack.core.clock import NS_PER_S
 from noack.core.periods import nearest_ns
-from noack.scenario.resolution import setpoint_of
+from noack.scenario.resolution import loop_of, setpoint_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.certificate_terms import NetworkConditions
 from noack.theory.bounds.disturbances import excluded_probability
-from noack.theory.certificates.conditions import BOX, OWN_PLANT, REGION, first_input_ns
+from noack.theory.bounds.reference_limits import ReferenceLimits
+from noack.theory.certificates.conditions import BOX, OWN_PLANT, REGION, first_input_ns, nominal_conditions
 
 _ESTIMATE_NOT_KNOWN = "at a set-point the error of the observer's first estimate is not known"
 
@@ -119,12 +120,14 @@ def refusal_of_steps(resolved: Scenario) -> str | None:
     )
 
 
-def refusals_at_setpoint(resolved: Scenario, *, knows_inputs: bool = False) -> Mapping[str, str]:
-    """Return by plants why there is no certificate at the set-point.
+def refusals_about_reference(resolved: Scenario, *, knows_inputs: bool = False) -> Mapping[str, str]:
+    """Return by plants why there is no certificate at the set-point, or about the reference.
 
     Until the first input arrives, the input is 0, and not u_r; ``knows_inputs``: a run shows how long.
     """
     setpoint = setpoint_of(resolved)
+    if resolved.controller.reference is not None:
+        return _refusals_of_moving(resolved)
     if setpoint is None:
         return {}
     if not resolved.coverage.is_linear:
@@ -146,3 +149,21 @@ def refusals_at_setpoint(resolved: Scenario, *, knows_inputs: bool = False) -> M
     if moved.any():
         return {BOX: "controller.setpoint: not every plant of the box rests there, A x_r + B u_r ≠ 0"}
     return {}
+
+
+def _refusals_of_moving(resolved: Scenario) -> Mapping[str, str]:
+    """Return by plants why there is no certificate about a reference that changes over time."""
+    if not resolved.coverage.is_linear:
+        return {REGION: "controller.reference: the region of a nonlinear plant is one about 0"}
+    start_s = nominal_conditions(resolved, resolved.certificate.late_periods).start_s
+    reference, why = loop_of(resolved).reference, ""
+    assert reference is not None
+    limits = ReferenceLimits(reference, resolved.timing.horizon_ns)
+    if resolved.observer is not None:
+        why = "with an observer the error of its first estimate is not known"
+    elif not limits.is_at_rest_until(start_s):
+        why = (
+            "the input is 0 until the first one arrives, and not u_r; begin the first piece after "
+            f"{start_s:g} s"
+        )
+    return dict.fromkeys((OWN_PLANT, BOX), f"controller.reference: {why}") if why else {}

@@ -8,7 +8,7 @@ from cosim.analysis.certificates import certificates_of
 from cosim.analysis.claims.run_certificates import scheduled_certificates
 from noack.core.errors import CallerError
 from noack.theory.certificates.conditions import BOX, OWN_PLANT, REGION, nominal_conditions
-from noack.theory.certificates.refusals import refusal_under, refusals_at_setpoint
+from noack.theory.certificates.refusals import refusal_under, refusals_about_reference
 from noack.theory.coverage import Statement, key_table, refusal, refusals, require_exact
 from tests.helpers.key_tables import faulty_rows, missing_keys, unknown_keys
 from tests.helpers.resolved_tables import resolved_tables
@@ -149,6 +149,6 @@ def test_a_refusal_from_several_settings_begins_with_a_key(
 
 def test_a_refusal_at_a_setpoint_begins_with_its_key() -> None:
     scenario = resolved("unstable_pendulum", "controller.setpoint=[0.1, 0.0]")
-    found = refusals_at_setpoint(scenario)
+    found = refusals_about_reference(scenario)
     assert list(found) == [OWN_PLANT, BOX]
     assert all(line.startswith("controller.setpoint: ") for line in found.values())
