@@ -25,7 +25,7 @@ REFUSED = {
     "cart_pole", "dc_motor", "dc_motor_load", "four_tank", "kinematic_car", "lane_acknowledged",
     "lane_actuation_loss", "lane_crosswind_load", "lane_python_trigger",
     "model_predictive", "pendulum_observed", "quadrotor_hover", "saturated_lqr",
-    "selivanov_switching", "sine_pendulum", "tabuada_dynamic",
+    "selivanov_switching", "servo_reference", "sine_pendulum", "tabuada_dynamic",
 }  # fmt: skip
 
 
