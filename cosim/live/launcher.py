@@ -44,7 +44,7 @@ from noack.protocol.roles import RECORDER, ROLES
 from noack.runtime.active_runs import registered_run, run_name
 from noack.runtime.command_line import Signals, StopRequestError, stop_reason
 from noack.runtime.end_reasons import HORIZON
-from noack.runtime.run_descriptor import RunDescriptor, descriptor_file, new_descriptor
+from noack.runtime.run_descriptor import RunAccess, RunDescriptor, descriptor_file, new_access, new_descriptor
 from noack.scenario.resolution import ResolvedRun, resolve_run
 from noack.scenario.run_sections import ClocksSection
 from noack.scenario.scenario import Scenario
@@ -102,32 +102,31 @@ def launch(
         with _no_directory_if_refused(run_dir):
             children.start()  # before this process has threads, and files that a fork would inherit
         resolved = write_scenario(resolved, run_dir)
-        descriptor = new_descriptor(resolved.scenario, run_dir.resolve(), launched=True)
+        access = new_access(run_dir.resolve(), launched=True)
         stack.enter_context(active_run(run_dir))
         ending = stack.enter_context(EndingFile(run_dir))
-        _publish_run(stack, descriptor, session)  # first: its file leads to a killed run's socket
+        _publish_run(stack, access, session)  # first: its file leads to a killed run's socket
         with _no_directory_if_refused(run_dir):
-            coordinator, descriptor = _coordinate(stack, descriptor, spawn, session, listening)
+            coordinator, descriptor = _coordinate(stack, access, resolved, spawn, session, listening)
         certificates = stack.enter_context(EarlyCertificates())
         told = RunObservers([*observers, *observers_of_extensions(resolved.scenario)])
         if listening is not None:
             told.tell(lambda observer: observer.listening(listening))
         stack.callback(children.end)  # before all else ends
         children.send(descriptor)
-        run = _Run(resolved, descriptor.run_id, run_dir, coordinator, children, told, certificates)
+        run = _Run(resolved, access.run_id, run_dir, coordinator, children, told, certificates)
         status, reason = run.watch(signals, ending.store)
         if coordinator.epoch_ns is None:
             raise NeverStartedError(f"{reason} (logs in {run_dir / 'logs'})", status)
         startup_s = (coordinator.epoch_ns - began_ns) * 1e-9
         ending.store(status, reason, startup_s)
-    return LaunchedEnding(
-        run_dir, descriptor.run_id, status, reason, startup_s, expectations=certificates.known
-    )
+    return LaunchedEnding(run_dir, access.run_id, status, reason, startup_s, expectations=certificates.known)
 
 
 def _coordinate(
     stack: contextlib.ExitStack,
-    descriptor: RunDescriptor,
+    access: RunAccess,
+    run: ResolvedRun,
     spawn: Sequence[str],
     session: str | None,
     listening: remote_access.ListenSettings | None,
@@ -137,14 +136,15 @@ def _coordinate(
     Returns:
         The coordinator, and the run descriptor for the processes of this host.
     """
-    own_end, clock = descriptor, None
+    own_end, clock = access, None
     if listening is not None:
-        clock = remote_access.own_clock(descriptor.scenario.clocks or ClocksSection())
+        clock = remote_access.own_clock(run.scenario.clocks or ClocksSection())
         remote_access.require_free(listening.address)
-        own_end = stack.enter_context(remote_access.credentials(listening, descriptor))
-        descriptor = descriptor.model_copy(update={"host": listening.address[0]})
-    coordinator = Coordinator(own_end, spawn, clock)
+        own_end = stack.enter_context(remote_access.credentials(listening, access, run.scenario))
+        access = access.model_copy(update={"host": listening.address[0]})
+    coordinator = Coordinator(own_end, run, spawn, clock)
     stack.callback(coordinator.close)
+    descriptor = new_descriptor(access, run.scenario)
     if session is not None:
         by_hand = descriptor.model_copy(update={"launched": False})
         stack.enter_context(descriptor_file(by_hand, session))
@@ -175,10 +175,10 @@ def _stop_signals(run_dir: Path) -> Iterator[Signals]:
             raise error from None
 
 
-def _publish_run(stack: contextlib.ExitStack, descriptor: RunDescriptor, session: str | None) -> None:
+def _publish_run(stack: contextlib.ExitStack, access: RunAccess, session: str | None) -> None:
     """Let `noack set` find the run; without that the run goes on."""
     try:
-        stack.enter_context(registered_run(descriptor, session))
+        stack.enter_context(registered_run(access, session))
     except NoackError as error:
         print(f"noack: warning: `noack set` cannot reach this run: {error}", file=sys.stderr)
 

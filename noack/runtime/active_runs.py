@@ -16,7 +16,7 @@ from noack.core.errors import CallerError, PeerError
 from noack.runtime.connections.zenoh_session import answer_to, cause_of, open_session
 from noack.runtime.control_messages import ChangeReply, ChangeRequest, message_json, parse_message
 from noack.runtime.private_folder import LockFile, live_lock_files, lock_file
-from noack.runtime.run_descriptor import RunDescriptor
+from noack.runtime.run_descriptor import RunAccess
 from noack.scenario.runtime_parameters import require_finite
 from noack.scenario.toml_file import brief
 
@@ -43,9 +43,9 @@ _OPEN_RUN = TypeAdapter(OpenRun, config=ConfigDict(defer_build=True))
 
 
 @contextmanager
-def registered_run(descriptor: RunDescriptor, session: str | None) -> Iterator[Path]:
+def registered_run(access: RunAccess, session: str | None) -> Iterator[Path]:
     """Keep a run's lock file while the context lasts."""
-    run = OpenRun(run_name(descriptor.run_id), descriptor.run_dir, session)
+    run = OpenRun(run_name(access.run_id), access.run_dir, session)
     with lock_file(RUNS, run.name, run._asdict()) as path:
         yield path
 

@@ -31,7 +31,7 @@ from noack.runtime.connections.zenoh_session import (
     open_session,
 )
 from noack.runtime.control_messages import ChangeAnnouncement, message_json, parse_message
-from noack.runtime.run_descriptor import RunDescriptor
+from noack.runtime.run_descriptor import RunAccess
 from noack.runtime.spool import writer_of
 from noack.scenario.scenario_tables import MOST_CHANGES
 
@@ -49,18 +49,18 @@ class ControlPlane:
     CallerError if other users have access to the user's runtime directory.
     """
 
-    def __init__(self, descriptor: RunDescriptor, role: str, *, listen: bool = False) -> None:
-        self._prefix = f"noack/{run_name(descriptor.run_id)}"
+    def __init__(self, access: RunAccess, role: str, *, listen: bool = False) -> None:
+        self._prefix = f"noack/{run_name(access.run_id)}"
         self.role = role
         self.secret = secrets.token_hex(32)
         self.instance = writer_of(self.secret)
         remote = None
-        if (address := descriptor.remote) is not None:
+        if (address := access.remote) is not None:
             rules = access_control(self._prefix) if listen else None
-            remote = TlsEndpoint(address, tls_settings(descriptor.credentials, listen=listen), rules)
+            remote = TlsEndpoint(address, tls_settings(access.credentials, listen=listen), rules)
         try:
             self.session = (
-                open_session(RUNS, run_name(descriptor.run_id), listen=listen, remote=remote)
+                open_session(RUNS, run_name(access.run_id), listen=listen, remote=remote)
                 if listen or remote is None
                 else open_remote_session(remote)
             )

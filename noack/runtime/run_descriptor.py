@@ -28,8 +28,8 @@ from noack.settings.section import ScenarioSection, Seed
 DEFAULT_SESSION = "default"
 
 
-class RunDescriptor(ScenarioSection):
-    """All that a process needs to join a run; its JSON has the key in hexadecimal."""
+class RunAccess(ScenarioSection):
+    """How a process reaches a run, and who may; its JSON has the key in hexadecimal."""
 
     model_config = ConfigDict(val_json_bytes="hex", ser_json_bytes="hex")
 
@@ -46,19 +46,31 @@ class RunDescriptor(ScenarioSection):
     """The role that a process on another host has."""
     clock: str
     """The coordinator's monotonic clock, of which the run's epoch is a reading."""
+
+
+class RunDescriptor(RunAccess):
+    """All that a process needs to join a run."""
+
     target_losses: Annotated[dict[str, FiniteFloat], AfterValidator(store_probabilities)] = Field({})
     """Probabilities that the check of the scenario needs."""
     scenario: Scenario  # resolved
 
 
-def new_descriptor(scenario: Scenario, run_dir: Path, *, launched: bool) -> RunDescriptor:
-    """Return a run descriptor with a fresh run id and key."""
-    return RunDescriptor(
+def new_access(run_dir: Path, *, launched: bool) -> RunAccess:
+    """Return the access to a new run, with a fresh run id and key."""
+    return RunAccess(
         run_id=secrets.randbits(64),
         key=secrets.token_bytes(KEY_BYTES),
         run_dir=str(run_dir),
         launched=launched,
         clock=clock_identity(),
+    )
+
+
+def new_descriptor(access: RunAccess, scenario: Scenario) -> RunDescriptor:
+    """Return the run descriptor for a process that reaches a run like this."""
+    return RunDescriptor(
+        **{name: getattr(access, name) for name in RunAccess.model_fields},
         target_losses=known_probabilities(*map(scenario.network.link_of, scenario.network.flows)),
         scenario=scenario,
     )

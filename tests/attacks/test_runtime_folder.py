@@ -29,7 +29,13 @@ from noack.core.file_access import (
     write_whole,
 )
 from noack.runtime import active_runs
-from noack.runtime.run_descriptor import RunDescriptor, descriptor_file, find_descriptor, new_descriptor
+from noack.runtime.run_descriptor import (
+    RunDescriptor,
+    descriptor_file,
+    find_descriptor,
+    new_access,
+    new_descriptor,
+)
 from noack.runtime.spool import SPOOL, SpoolWriter
 from noack.scenario.matrix_files import write_matrices
 from noack.scenario.resolution import resolve
@@ -63,7 +69,7 @@ def shared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def descriptor(content: dict[str, Any]) -> RunDescriptor:
     scenario = resolve(validate(content, "small"))
-    return new_descriptor(scenario, Path("run"), launched=False)
+    return new_descriptor(new_access(Path("run"), launched=False), scenario)
 
 
 def join() -> RunDescriptor:

@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
-from noack.runtime.run_descriptor import RunDescriptor, new_descriptor
+from noack.runtime.run_descriptor import RunDescriptor, new_access, new_descriptor
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from tests.fuzz.edits import bases
 
 RUN_DESCRIPTOR: RunDescriptor = new_descriptor(
-    resolve(validate(bases("scenarios")[0], "base")), Path("run"), launched=True
+    new_access(Path("run"), launched=True), resolve(validate(bases("scenarios")[0], "base"))
 ).model_copy(
     update={"run_id": 7, "key": bytes(32), "clock": "one"}
 )  # fmt: skip

@@ -10,7 +10,6 @@ from noack.core.errors import CallerError
 from noack.impairments.target_loss import known_probabilities
 from noack.runtime.control_messages import ChangeAnnouncement, ChangeReply, ChangeRequest, parse_message
 from noack.runtime.control_plane import ControlPlane
-from noack.runtime.run_descriptor import RunDescriptor
 from noack.scenario.overload import refuse_overload
 from noack.scenario.parameter_changes import (
     ChangeSchedule,
@@ -33,18 +32,15 @@ _MILLISECOND_NS = 1_000_000
 class ChangeRequests:
     """The changes of a run."""
 
-    def __init__(self, descriptor: RunDescriptor, plane: ControlPlane) -> None:
-        self._scenario, self._run_dir = descriptor.scenario, descriptor.run_dir
+    def __init__(self, run: ResolvedRun, run_dir: str, plane: ControlPlane) -> None:
+        self._scenario, self._run_dir = run.scenario, run_dir
         self._plane = plane
-        self._schedule = ChangeSchedule[None](descriptor.scenario)
-        self._entries = {
-            entry.name: ChangeSchedule[None](entry.scenario)
-            for entry in ResolvedRun(descriptor.scenario).entries
-        }
+        self._schedule = ChangeSchedule[None](run.scenario)
+        self._entries = {entry.name: ChangeSchedule[None](entry.scenario) for entry in run.entries}
         """The changes of the loops of each entry of [[loops]], by its name."""
         self.announced: tuple[ChangeAnnouncement, ...] = ()
         """Announcements of all changes so far."""
-        for change in scheduled(descriptor.scenario):
+        for change in scheduled(run.scenario):
             self._add(change, 0, "in the scenario")
 
     def answer(self, request: bytes, clock: Callable[[], int], obstacle: str | None) -> ChangeReply:

@@ -31,7 +31,8 @@ from noack.runtime.control_messages import (
 from noack.runtime.control_plane import ControlPlane
 from noack.runtime.end_reasons import HORIZON, LAUNCHED_LOST_S, LOST_AFTER_S
 from noack.runtime.host_clocks import STATED, realtime_offset_ns, require_small_error
-from noack.runtime.run_descriptor import RunDescriptor
+from noack.runtime.run_descriptor import RunAccess
+from noack.scenario.resolution import ResolvedRun
 
 _REPORT_GRACE_S = 0.3
 """A process's last message may arrive this much later than its exit is seen."""
@@ -79,7 +80,8 @@ class Coordinator:
     """The coordinator of one run.
 
     Args:
-        descriptor: of the run.
+        access: of this end of the control plane.
+        run: the run.
         launched: roles of the processes that the launcher has started.
         own_clock: how far this host's clock may be off, if processes of other hosts can join.
 
@@ -89,15 +91,16 @@ class Coordinator:
 
     def __init__(
         self,
-        descriptor: RunDescriptor,
+        access: RunAccess,
+        run: ResolvedRun,
         launched: Collection[str] = (),
         own_clock: ClockError | None = None,
     ) -> None:
         self._launched, self._own_clock = launched, own_clock
-        self._clock_settings = descriptor.scenario.clocks
+        self._clock_settings = run.scenario.clocks
         self.notices = [] if own_clock is None else [_clock_line("the clock of this host", own_clock)]
         """Lines for the person who watches the run, which have not been taken yet."""
-        self.plane = ControlPlane(descriptor, COORDINATOR, listen=True)
+        self.plane = ControlPlane(access, COORDINATOR, listen=True)
         session, key = self.plane.session, self.plane.key
         self._admissions = session.declare_queryable(key("admit", "*"), FifoChannel(64))
         self._joins = session.declare_queryable(key("join", "*"), FifoChannel(64))
@@ -105,8 +108,8 @@ class Coordinator:
         self._ends = session.declare_subscriber(key("ended", "*", "*"), RingChannel(256))
         self._progress = session.declare_subscriber(key("progress"), RingChannel(1))
         self._change_queries = session.declare_queryable(key("runtime_parameters"), FifoChannel(64))
-        self._changes = ChangeRequests(descriptor, self.plane)
-        self._speed = descriptor.scenario.speed
+        self._changes = ChangeRequests(run, access.run_dir, self.plane)
+        self._speed = run.scenario.speed
         self._clock: RunClock | None = None
         self._realtime_offset_ns = 0
         """This host's CLOCK_REALTIME minus its CLOCK_MONOTONIC, at the start of the run."""

@@ -24,8 +24,9 @@ from noack.runtime.address import Address, address_text, parse_address
 from noack.runtime.connections.credentials import CA_FILE, CERTIFICATE_FILE, KEY_FILE, RUN_FILE, own_host
 from noack.runtime.control_messages import ClockError
 from noack.runtime.host_clocks import clock_error, require_small_error
-from noack.runtime.run_descriptor import RunDescriptor
+from noack.runtime.run_descriptor import RunAccess, new_descriptor
 from noack.scenario.run_sections import ClocksSection
+from noack.scenario.scenario import Scenario
 
 DEFAULT_PORT = 7447
 """Of zenoh."""
@@ -86,8 +87,8 @@ def require_free(address: Address) -> None:
 
 
 @contextmanager
-def credentials(listening: ListenSettings, descriptor: RunDescriptor) -> Iterator[RunDescriptor]:
-    """Write the folder of credentials; yield the run descriptor of the end that listens.
+def credentials(listening: ListenSettings, access: RunAccess, scenario: Scenario) -> Iterator[RunAccess]:
+    """Write the folder of credentials; yield the access of the end that listens.
 
     The folder is private: each role's part of it gives access to the run. It replaces that of an
     earlier run, and is removed at the end. Raise CallerError if it cannot be written.
@@ -95,8 +96,8 @@ def credentials(listening: ListenSettings, descriptor: RunDescriptor) -> Iterato
     from cosim.live.coordination.certificate_authority import CertificateAuthority  # imports cryptography
 
     folder = listening.folder
-    descriptor = descriptor.model_copy(update={"remote": listening.address, "launched": False})
-    run_s = descriptor.scenario.horizon_s / descriptor.scenario.speed
+    access = access.model_copy(update={"remote": listening.address, "launched": False})
+    run_s = scenario.horizon_s / scenario.speed
     authority = CertificateAuthority(_TO_START + datetime.timedelta(seconds=run_s))
     try:
         with _replacing(folder) as new:
@@ -107,15 +108,16 @@ def credentials(listening: ListenSettings, descriptor: RunDescriptor) -> Iterato
                 certificate, key = authority.key_pair(role, address)
                 files = {CA_FILE: authority.certificate, CERTIFICATE_FILE: certificate, KEY_FILE: key}
                 if role != RECORDER:
-                    of_role = descriptor.model_copy(update={"credentials_for": role})
-                    files[RUN_FILE] = (of_role.model_dump_json(indent=1) + "\n").encode()
+                    of_role = access.model_copy(update={"credentials_for": role})
+                    descriptor = new_descriptor(of_role, scenario)
+                    files[RUN_FILE] = (descriptor.model_dump_json(indent=1) + "\n").encode()
                 for name, content in files.items():
                     _write_private(part / name, content)
         identity = _identity(folder)
     except OSError as error:
         raise CallerError(f"{folder}: the credentials cannot be written: {why(error)}") from None
     try:
-        yield descriptor.model_copy(update={"credentials": str((folder / RECORDER).resolve())})
+        yield access.model_copy(update={"credentials": str((folder / RECORDER).resolve())})
     finally:
         with suppress(OSError):
             if _identity(folder) == identity:  # else another run has replaced it

@@ -16,9 +16,9 @@ from noack.core.errors import CallerError
 from noack.runtime import active_runs
 from noack.runtime.active_runs import OpenRun
 from noack.runtime.control_messages import ChangeReply
-from noack.runtime.run_descriptor import RunDescriptor, new_descriptor
+from noack.runtime.run_descriptor import RunDescriptor, new_access, new_descriptor
 from noack.scenario.parameter_changes import changed
-from noack.scenario.resolution import resolve
+from noack.scenario.resolution import ResolvedRun, resolve
 from noack.scenario.runtime_parameters import SHORT
 from noack.scenario.scenario_file import load, validate
 from tests.fuzz.plane import Query
@@ -30,12 +30,12 @@ from tests.helpers.command_line import invoke
 def descriptor(content: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunDescriptor:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     scenario = resolve(validate(content, "here"))
-    return new_descriptor(scenario, tmp_path / "run", launched=True)
+    return new_descriptor(new_access(tmp_path / "run", launched=True), scenario)
 
 
 @pytest.fixture
 def coordinator(descriptor: RunDescriptor) -> Iterator[Coordinator]:
-    running = Coordinator(descriptor)
+    running = Coordinator(descriptor, ResolvedRun(descriptor.scenario))
     try:
         yield running
     finally:
@@ -83,13 +83,13 @@ def test_a_mistake_in_the_words_gives_the_approved_line(descriptor: RunDescripto
 def test_a_run_is_found_by_its_session_its_directory_or_as_the_only_one(
     descriptor: RunDescriptor, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    second_descriptor = new_descriptor(descriptor.scenario, Path("elsewhere"), launched=True)
-    with active_runs.registered_run(second_descriptor, "lab"):
+    second = new_access(Path("elsewhere"), launched=True)
+    with active_runs.registered_run(second, "lab"):
         assert active_runs.find_run().run_dir == "elsewhere"
         warn_of_other_runs()
         assert "elsewhere is active, too" in capsys.readouterr().err
     with (
-        active_runs.registered_run(second_descriptor, "lab"),
+        active_runs.registered_run(second, "lab"),
         active_runs.registered_run(descriptor, None) as path,
     ):
         assert stat.S_IMODE(path.stat().st_mode) == 0o600

@@ -18,7 +18,7 @@ from noack.core.errors import CallerError, ExitStatus
 from noack.protocol.roles import RECORDER, ROLES
 from noack.runtime import command_line
 from noack.runtime.command_line import Signals, StopRequestError
-from noack.runtime.run_descriptor import descriptor_file, new_descriptor
+from noack.runtime.run_descriptor import descriptor_file, new_access, new_descriptor
 from noack.scenario.resolution import resolve, resolve_run
 from noack.scenario.scenario_file import validate
 from tests.helpers.waiting import wait_for
@@ -256,7 +256,7 @@ def test_a_refused_session_leaves_no_run_directory(
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     scenario = validate(content | {"ports": {}}, "")
-    descriptor = new_descriptor(resolve(scenario), tmp_path, launched=False)
+    descriptor = new_descriptor(new_access(tmp_path, launched=False), resolve(scenario))
     with descriptor_file(descriptor, "lab"), pytest.raises(CallerError, match="another run is open in it"):
         launch(scenario, tmp_path / "runs", spawn=(), session="lab")
     assert list((tmp_path / "runs").iterdir()) == []

@@ -14,6 +14,7 @@ from noack.runtime import active_runs, run_descriptor
 from noack.runtime.control_messages import ChangeAnnouncement, ChangeReply, ChangeRequest, parse_message
 from noack.runtime.private_folder import open_private
 from noack.scenario.parameter_changes import ChangeSchedule, settings_bytes, settings_of
+from noack.scenario.resolution import ResolvedRun
 from noack.scenario.runtime_parameters import SHORT
 from noack.scenario.scenario import Scenario
 from noack.scenario.toml_file import json_schema
@@ -55,7 +56,7 @@ def barrier_input(choices: Choices) -> None:
     """The coordinator takes any messages before the start; each request has one answer."""
     plane = FakePlane()
     with patch.object(coordinator, "ControlPlane", lambda *_, **__: plane):
-        barrier = coordinator.Coordinator(RUN_DESCRIPTOR)
+        barrier = coordinator.Coordinator(RUN_DESCRIPTOR, ResolvedRun(RUN_DESCRIPTOR.scenario))
     queries: dict[str, list[Query]] = {}
     admissions: list[Query] = []
     for _ in range(choices.below(12)):
@@ -143,7 +144,7 @@ def _request(content: bytes) -> None:
     """The coordinator replies, and every process can apply the announced changes."""
     plane = FakePlane()
     with patch.object(coordinator, "ControlPlane", lambda *_, **__: plane):
-        centre = coordinator.Coordinator(RUN_DESCRIPTOR)
+        centre = coordinator.Coordinator(RUN_DESCRIPTOR, ResolvedRun(RUN_DESCRIPTOR.scenario))
     centre._clock = RunClock(0, 1.0, lambda: 0)
     query = Query("noack/0/runtime_parameters", content)
     plane.put("runtime_parameters", query)

@@ -26,8 +26,8 @@ from noack.runtime.control_messages import RunStart, parse_message
 from noack.runtime.control_plane import ControlPlane
 from noack.runtime.join_run import _request_admission
 from noack.runtime.private_folder import private_folder
-from noack.runtime.run_descriptor import RunDescriptor, new_descriptor
-from noack.scenario.resolution import resolve
+from noack.runtime.run_descriptor import RunDescriptor, new_access, new_descriptor
+from noack.scenario.resolution import ResolvedRun, resolve
 from noack.scenario.scenario_file import validate
 from tests.attacks.other_user import needs_root, output_of_another_user
 from tests.fuzz.plane import FakePlane
@@ -36,12 +36,12 @@ from tests.helpers.waiting import wait_for
 
 @pytest.fixture
 def descriptor(content: dict[str, Any], tmp_path: Path) -> RunDescriptor:
-    return new_descriptor(resolve(validate(content, "")), tmp_path, launched=True)
+    return new_descriptor(new_access(tmp_path, launched=True), resolve(validate(content, "")))
 
 
 @pytest.fixture
 def coordinator(descriptor: RunDescriptor) -> Iterator[Coordinator]:
-    coordinator = Coordinator(descriptor)
+    coordinator = Coordinator(descriptor, ResolvedRun(descriptor.scenario))
     yield coordinator
     coordinator.close()
 
@@ -77,7 +77,7 @@ def test_a_message_that_arrives_under_another_key_is_ignored(
 def test_the_coordinator_listens_on_no_port(descriptor: RunDescriptor) -> None:
     own = psutil.Process()
     before = set(own.net_connections("inet"))
-    coordinator = Coordinator(descriptor)
+    coordinator = Coordinator(descriptor, ResolvedRun(descriptor.scenario))
     assert set(own.net_connections("inet")) <= before
     coordinator.close()
 
@@ -106,7 +106,7 @@ def test_another_user_can_neither_connect_nor_listen(
     with tempfile.TemporaryDirectory() as short:
         Path(short).chmod(0o777)  # its users may come in, and make files
         monkeypatch.setenv("XDG_RUNTIME_DIR", short)
-        coordinator = Coordinator(descriptor)
+        coordinator = Coordinator(descriptor, ResolvedRun(descriptor.scenario))
         path = private_folder() / RUNS / f"{run_name(descriptor.run_id)}.sock"
         assert path.is_socket()
         output = output_of_another_user(REACH, str(path))

@@ -11,7 +11,7 @@ import pytest
 
 from noack.core.errors import CallerError
 from noack.runtime.private_folder import private_folder
-from noack.runtime.run_descriptor import descriptor_file, find_descriptor, loads, new_descriptor
+from noack.runtime.run_descriptor import descriptor_file, find_descriptor, loads, new_access, new_descriptor
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 
@@ -21,7 +21,7 @@ KEY = "ab" * 32
 @pytest.fixture
 def fields(content: dict[str, Any]) -> dict[str, Any]:
     scenario = resolve(validate(content, "small"))
-    descriptor = new_descriptor(scenario, Path("run"), launched=True)
+    descriptor = new_descriptor(new_access(Path("run"), launched=True), scenario)
     return descriptor.model_copy(update={"key": bytes.fromhex(KEY)}).model_dump(mode="json")
 
 

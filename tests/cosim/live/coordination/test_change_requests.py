@@ -12,15 +12,16 @@ from cosim.live.coordination import change_requests
 from cosim.live.coordination.change_requests import ChangeRequests
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
+from noack.scenario.resolution import ResolvedRun
 from noack.scenario.scenario_file import load
 
 SHARED = Path(__file__).parents[4] / "scenarios" / "shared_bottleneck.toml"
 
 
 def requests_of(loops: str, *settings: str) -> ChangeRequests:
-    descriptor = SimpleNamespace(scenario=load(SHARED, [f"loops=[{loops}]", *settings]), run_dir="here")
+    run = ResolvedRun(load(SHARED, [f"loops=[{loops}]", *settings]))
     plane = SimpleNamespace(announce_change=lambda announcement: None)
-    return ChangeRequests(cast("Any", descriptor), cast("Any", plane))
+    return ChangeRequests(run, "here", cast("Any", plane))
 
 
 def requested(requests: ChangeRequests, settings: dict[str, Any], now_s: float = 0.0) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from cosim.live.coordination.coordinator import Coordinator
 from noack.protocol.roles import LOOP_ROLES, RECORDER, ROLES
 from noack.runtime.control_messages import ClockError
 from noack.runtime.host_clocks import CHRONY
+from noack.scenario.resolution import ResolvedRun
 from noack.scenario.run_sections import ClocksSection
 from tests.fuzz.plane import FakePlane, Query, Sample
 from tests.helpers.run_descriptors import JUNK, RUN_DESCRIPTOR
@@ -25,7 +26,7 @@ def plane() -> FakePlane:
 def barrier(plane: FakePlane, monkeypatch: pytest.MonkeyPatch) -> Coordinator:
     monkeypatch.setattr(coordinator, "ControlPlane", lambda *_, **__: plane)
     monkeypatch.setattr(coordinator, "_REPORT_GRACE_S", -1.0)  # do not wait for reports
-    return Coordinator(RUN_DESCRIPTOR)
+    return Coordinator(RUN_DESCRIPTOR, ResolvedRun(RUN_DESCRIPTOR.scenario))
 
 
 def ask(
@@ -151,8 +152,7 @@ def test_a_host_whose_clock_may_be_off_by_too_much_is_refused(
     monkeypatch.setattr(coordinator, "ControlPlane", lambda *_, **__: plane)
     scenario = RUN_DESCRIPTOR.scenario.model_copy(update={"clocks": ClocksSection()})
     own = ClockError(clock="one", error_ns=7000, source=CHRONY)
-    descriptor = RUN_DESCRIPTOR.model_copy(update={"scenario": scenario})
-    barrier = Coordinator(descriptor, own_clock=own)
+    barrier = Coordinator(RUN_DESCRIPTOR, ResolvedRun(scenario), own_clock=own)
     other = ClockError(clock="two", error_ns=error_us * 1000, source=CHRONY)
     answer = ask(plane, barrier, "admit", role="sensor", clock=other.fields())
     if refused:

@@ -85,7 +85,7 @@ def test_a_taken_address_and_one_of_another_host_are_refused() -> None:
 
 def test_the_folder_is_private_and_goes_with_the_run(settings: ListenSettings, tmp_path: Path) -> None:
     folder = settings.folder
-    with credentials(settings, RUN_DESCRIPTOR) as own:
+    with credentials(settings, RUN_DESCRIPTOR, RUN_DESCRIPTOR.scenario) as own:
         assert own.credentials == str(folder / RECORDER)
         assert {path.name for path in folder.iterdir()} == {RECORDER, *LOOP_ROLES}
         for path in (folder, *folder.rglob("*")):
@@ -98,10 +98,10 @@ def test_the_folder_is_private_and_goes_with_the_run(settings: ListenSettings, t
         assert descriptor.run_dir == str(tmp_path / "kept" / "run")
         assert descriptor.key == RUN_DESCRIPTOR.key
         assert not descriptor.launched
-        with credentials(settings, RUN_DESCRIPTOR):  # of a later run
+        with credentials(settings, RUN_DESCRIPTOR, RUN_DESCRIPTOR.scenario):  # of a later run
             later = (folder / "sensor" / "ca.pem").read_bytes()
         assert not folder.exists()
-        with credentials(settings, RUN_DESCRIPTOR):
+        with credentials(settings, RUN_DESCRIPTOR, RUN_DESCRIPTOR.scenario):
             assert (folder / "sensor" / "ca.pem").read_bytes() != later
             folder.rename(tmp_path / "moved")
             shutil.copytree(tmp_path / "moved", folder)
@@ -114,14 +114,14 @@ def test_another_folder_is_not_replaced(settings: ListenSettings, name: str) -> 
     path.parent.mkdir(parents=True)
     path.touch()
     with pytest.raises(CallerError, match="exists, and is not a folder of credentials"):
-        credentials(settings, RUN_DESCRIPTOR).__enter__()
+        credentials(settings, RUN_DESCRIPTOR, RUN_DESCRIPTOR.scenario).__enter__()
     assert path.exists()
 
 
 def test_a_folder_that_cannot_be_written_is_named(settings: ListenSettings) -> None:
     elsewhere = settings._replace(folder=settings.folder / "no" / "folder")
     with pytest.raises(CallerError, match="credentials cannot be written: No such file or directory"):
-        credentials(elsewhere, RUN_DESCRIPTOR).__enter__()
+        credentials(elsewhere, RUN_DESCRIPTOR, RUN_DESCRIPTOR.scenario).__enter__()
 
 
 # --- who is admitted ------------------------------------------------------------------------------
@@ -134,7 +134,10 @@ def run(
     """The coordinator's end of a control plane, which answers all requests; its folder of credentials."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setattr(zenoh_session, "_CONNECT_MS", 1500)  # after which a connection has failed
-    with credentials(settings, RUN_DESCRIPTOR) as own, ControlPlane(own, COORDINATOR, listen=True) as plane:
+    with (
+        credentials(settings, RUN_DESCRIPTOR, RUN_DESCRIPTOR.scenario) as own,
+        ControlPlane(own, COORDINATOR, listen=True) as plane,
+    ):
 
         def answer(query: zenoh.Query) -> None:
             plane.answer(query, {"to": str(query.key_expr)})
@@ -193,7 +196,7 @@ def test_the_certificates_of_a_third_party_are_refused(
     _, folder = run
     mine = tmp_path / "mine"
     shutil.copytree(folder / "sensor", mine)
-    with credentials(settings._replace(folder=tmp_path / "third"), RUN_DESCRIPTOR):
+    with credentials(settings._replace(folder=tmp_path / "third"), RUN_DESCRIPTOR, RUN_DESCRIPTOR.scenario):
         if which == "another run":
             for name in ("certificate.pem", "private_key.pem"):
                 shutil.copy(tmp_path / "third" / "sensor" / name, mine / name)
@@ -212,7 +215,7 @@ def test_a_process_refuses_a_run_with_other_certificates(
 ) -> None:
     """Who listens in the place of the recording host is not believed."""
     with (
-        credentials(settings._replace(folder=tmp_path / "third"), RUN_DESCRIPTOR),
+        credentials(settings._replace(folder=tmp_path / "third"), RUN_DESCRIPTOR, RUN_DESCRIPTOR.scenario),
         pytest.raises(
             NoAnswerError,
             match="a program listens there, but it is busy, or did not accept these credentials",
@@ -223,7 +226,7 @@ def test_a_process_refuses_a_run_with_other_certificates(
 
 def test_without_a_run_the_line_says_that_nothing_listens(settings: ListenSettings, tmp_path: Path) -> None:
     with (
-        credentials(settings, RUN_DESCRIPTOR),
+        credentials(settings, RUN_DESCRIPTOR, RUN_DESCRIPTOR.scenario),
         pytest.raises(NoAnswerError, match="nothing listens there; has `noack record` ended"),
     ):
         ControlPlane(remote(settings.folder, "sensor", tmp_path), "sensor")
