@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from noack.core.clock import NEVER_NS, NS_PER_S
 from noack.core.core_library import CData, CoreMemory, core, reals_at
-from noack.core.linear_systems import Matrix, Vector, discretise
+from noack.core.linear_systems import Matrix, Vector, discretise, product, transition
 from noack.core.periods import ANY_PERIOD, Period
 from noack.core.random_streams import normals, uniforms
 from noack.core.references import Reference
@@ -349,9 +349,10 @@ def system_of(resolved: Scenario) -> PlantSystem:
         B = np.hstack([B, np.eye(len(A))])
     x0, k = np.array(plant.initial_state), model.load_states
     step_ns = resolved.timing.plant_period_ns
-    if k and not resolved.coverage.is_linear:
-        n = len(x0) - k
-        return LoadedSystem(plant.system.system(PlantStart(x0[:n], A[:n, :n], B[:n], step_ns)), x0[n:])
+    if not resolved.coverage.is_linear and model.states > model.plant_states:
+        n = model.plant_states
+        system = plant.system.system(PlantStart(x0[:n], A[:n, :n], B[:n], step_ns))
+        return LoadedSystem(system, x0[n:]) if k else ControlledSystem(system, A[n:])
     return plant.system.system(PlantStart(x0, A, B, step_ns))
 
 
@@ -377,6 +378,39 @@ class LoadedSystem:
     def advance(self, u: Vector, t_ns: int, dt_ns: int) -> None:
         """Advance the system under u + d."""
         self._system.advance(u + self._load if self._load.any() else u, t_ns, dt_ns)
+
+
+class ControlledSystem:
+    """A plant that is not linear, whose state x goes on with the controller's states ξ, (n + k,).
+
+    dξ/dt = B_c x + A_c ξ, ξ(0) = 0. During a step, x is taken to change linearly.
+    """
+
+    def __init__(self, system: PlantSystem, rows: Matrix) -> None:
+        """Take ``rows`` = [B_c, A_c], (k, n + k)."""
+        self._system, self._rows, self._xi = system, rows, np.zeros(len(rows))
+
+    @property
+    def x(self) -> Vector:
+        """The plant's state and the controller's."""
+        return np.concatenate([self._system.x, self._xi])
+
+    @property
+    def z(self) -> Vector:
+        """The system's own state."""
+        return self._system.z
+
+    def advance(self, u: Vector, t_ns: int, dt_ns: int) -> None:
+        """Advance the system under u, and ξ under x."""
+        before = self._system.x.copy()
+        self._system.advance(u, t_ns, dt_ns)
+        slope_per_s = (self._system.x - before) / (dt_ns * 1e-9)
+        n, k = len(before), len(self._xi)
+        flow = np.zeros((2 * n + k, 2 * n + k))  # of (x, ξ, dx/dt)
+        flow[:n, n + k :] = np.eye(n)
+        flow[n : n + k, : n + k] = self._rows
+        moved = product(transition(flow, dt_ns), np.concatenate([before, self._xi, slope_per_s]))
+        self._xi = moved[n : n + k]
 
 
 def disturbance_of(resolved: Scenario) -> Disturbance | None:

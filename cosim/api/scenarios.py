@@ -20,7 +20,7 @@ from cosim.studies.new_loop import (
 from noack.core.linear_systems import spectral_abscissa
 from noack.core.number_format import to_digits
 from noack.scenario.given_settings import given_settings, plain, plain_table
-from noack.scenario.matrix_files import matrices_of, model_of
+from noack.scenario.matrix_files import controller_of, matrices_of, model_of
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import completed_with, load_with, network_of
 from noack.settings.section import ReadTable, Table
@@ -98,6 +98,7 @@ def from_system(
     initial_state: Sequence[float],
     *,
     plant: object = None,
+    controller: object = None,
     settings: ReadTable | None = None,
     name: str = "own_system",
     state_names: Sequence[str] | None = None,
@@ -117,6 +118,8 @@ def from_system(
             ``scipy.signal.place_poles`` return the K of u = −Kx.
         initial_state: x(0), n entries.
         plant: the true plant, as ``system``; by default it is the model, and x_s equals x.
+        controller: a linear controller with states of its own, dξ/dt = Aξ + Bx, u = Cξ + Dx: a tuple (A,
+            B, C) or (A, B, C, D), or an object as for ``system``, in continuous time. By default u = Kx.
         settings: as in :func:`with_settings`.
         name: of the scenario: letters, digits, _ and -.
         state_names: n names, for plots; by default the names in ``system``, or x_1, x_2, ….
@@ -151,6 +154,8 @@ def from_system(
             "loss": {"model": "bernoulli", "probability": DEFAULT_LOSS_PROBABILITY},
         },
     }
+    if controller is not None:
+        content["controller"] = controller_of(controller)
     return completed_with(content, given_settings(settings), Path("from_system"), _NAMED)
 
 

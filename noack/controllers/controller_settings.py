@@ -83,6 +83,11 @@ class ControllerSettings(ScenarioSection):
     ticks. The plant applies each at its time, until a newer actuation arrives (packetised
     predictive control)."""
 
+    @property
+    def states(self) -> int:
+        """Number of the controller's own states, which belong to the model."""
+        return 0
+
     @abstractmethod
     def law(self, model: ControlModel) -> ControlLaw:
         """Return the control law.

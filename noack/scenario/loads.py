@@ -35,7 +35,7 @@ _ROUNDING = 1e-9
 """Largest share of the load's effect that the solved regulator equations may leave."""
 _OBSERVER_SPEED = 4.0
 """How much faster than the slowest pole of A + BK an observer without settings is."""
-_POLICIES = ("absolute", "deadline", "decaying", "dwell", "periodic", "python", "send_on_area")
+COMPARING_ERRORS = ("absolute", "deadline", "decaying", "dwell", "periodic", "python", "send_on_area")
 """Policies that compare x_s − x, or times, only: a load is not small like a state."""
 
 
@@ -98,10 +98,10 @@ def check_loads(scenario: ScenarioTables) -> None:
     _check_changes(scenario)
     load_gains(model)
     policy = scenario.trigger.rule if isinstance(scenario.trigger, CombinedSettings) else scenario.trigger
-    if policy.policy not in _POLICIES:
+    if policy.policy not in COMPARING_ERRORS:
         raise ValueError(
             f'trigger.policy: "{policy.policy}" compares with ‖x‖, and a load is not small; with model.load '
-            f"take one of {', '.join(_POLICIES)}"
+            f"take one of {', '.join(COMPARING_ERRORS)}"
         )
     if not scenario.controller.is_linear:
         raise ValueError(
@@ -130,9 +130,9 @@ def noise_with_loads(scenario: ScenarioTables) -> NoiseVariances:
     """Return the variances of a scenario's noise for the model's states; those of loads are 0."""
     model, (_, m) = scenario.model, scenario.model.dimensions
     noise = scenario.plant.noise_variances(model.dimensions[0], m)
-    padded = np.zeros(model.states)
-    padded[: len(noise.at_state)] = noise.at_state
-    return noise._replace(at_state=padded)
+    at_state = np.zeros(model.states)
+    at_state[: len(noise.at_state)] = noise.at_state
+    return noise._replace(at_state=at_state)
 
 
 def loaded_model(model: ModelSection) -> ModelSection:
@@ -160,7 +160,7 @@ def loaded_plant(scenario: S, plant: PlantSection, load: Vector) -> PlantSection
     update: dict[str, object] = {
         "initial_state": (*plant.initial_state, *load.tolist()),
         "load": None, "load_halfwidth": None, "load_changes": (),
-        "disturbances": (*(_padded(each, k) for each in plant.disturbances), *_steps(scenario, load)),
+        "disturbances": (*(padded(each, k) for each in plant.disturbances), *_steps(scenario, load)),
     }  # fmt: skip
     C = np.hstack([plant.measurement.matrix(n), np.zeros((plant.measurement.outputs(n), k))])
     update["measurement"] = plant.measurement.model_copy(update={"C": rows_of(C)})
@@ -193,7 +193,7 @@ def _steps(scenario: ScenarioTables, load: Vector) -> list[StepDisturbance]:
     return steps
 
 
-def _padded(disturbance: DisturbanceSettings, k: int) -> DisturbanceSettings:
+def padded(disturbance: DisturbanceSettings, k: int) -> DisturbanceSettings:
     """Return a disturbance with zeros for k further states, if it is one of the state."""
     if disturbance.at != "state":
         return disturbance
@@ -206,13 +206,24 @@ def loaded_trigger(model: ModelSection, trigger: PolicySettings) -> PolicySettin
     The weight of a load is the distance, in the trigger's norm, at which the closed loop rests if
     the load is 1 and the model has 0: so an error of the load counts as the offset that it causes.
     """
+    A, B, K = model.trigger_matrices
+    return with_weight(trigger, A + B @ K, load_gains(model).E)
+
+
+def with_weight(trigger: PolicySettings, closed_loop: Matrix, effect: Matrix) -> PolicySettings:
+    """Return a trigger whose weight has k more states, by the offsets that they cause.
+
+    Args:
+        trigger: for n states.
+        closed_loop: M in dx/dt = Mx + effect·d, (n, n).
+        effect: of the further states d on dx/dt, (n, k).
+    """
     if isinstance(trigger, CombinedSettings):
-        return trigger.model_copy(update={"rule": loaded_trigger(model, trigger.rule)})
+        return trigger.model_copy(update={"rule": with_weight(trigger.rule, closed_loop, effect)})
     if not isinstance(trigger, WeightedSettings):
         return trigger
-    (A, B, K), E = model.trigger_matrices, load_gains(model).E
-    W = np.eye(len(A)) if trigger.weight is None else np.array(trigger.weight)
-    offsets = np.linalg.norm(W @ np.linalg.solve(A + B @ K, E), axis=0)
+    W = np.eye(len(closed_loop)) if trigger.weight is None else np.array(trigger.weight)
+    offsets = np.linalg.norm(W @ np.linalg.lstsq(closed_loop, effect, rcond=None)[0], axis=0)
     return trigger.model_copy(update={"weight": rows_of(_diagonal(W, np.diag(np.maximum(offsets, 1e-12))))})
 
 

@@ -43,8 +43,9 @@ def with_matrices(content: ReadTable, folder: Path, source: str) -> ReadTable:
     """Return a scenario's content with the matrices of the files that it names.
 
     ``model.file`` gives A, B and, unless the scenario has one, the gain; ``plant.file`` gives A and
-    B. Names are relative to ``folder``. Invalid content is returned unchanged. If a file cannot be
-    read or lacks a matrix, CallerError has one line, which begins with ``source``.
+    B, ``controller.file`` of a state-space controller A, B, C and D. Names are relative to ``folder``.
+    Invalid content is returned unchanged. If a file cannot be read or lacks a matrix, CallerError has
+    one line, which begins with ``source``.
     """
     updated = dict(content)
     if isinstance(loops := content.get("loops"), list):
@@ -57,7 +58,26 @@ def with_matrices(content: ReadTable, folder: Path, source: str) -> ReadTable:
         if isinstance(section, Mapping) and (names := _names(section)) is not None:
             file = NamedFile(section["file"], folder, f"{source}: {table}")
             updated[table] = _with_file(section, keys, file, names)
+    controller = content.get("controller")
+    if isinstance(controller, Mapping) and controller.get("kind") == "state_space":
+        updated["controller"] = _with_controller(controller, folder, f"{source}: controller")
     return updated
+
+
+def _with_controller(section: ReadTable, folder: Path, place: str) -> ReadTable:
+    """Return a controller's table with the matrices A, B, C and D of its file."""
+    if not isinstance(section.get("file"), str):
+        return section
+    file = NamedFile(section["file"], folder, place)
+    if twice := [key for key in "ABCD" if key in section]:
+        file.wrong(f"the file has {twice[0]}, and so has the scenario; give one or the other")
+    arrays = _arrays(file)
+    if missing := [key for key in "ABC" if key not in arrays]:
+        file.wrong(_missing(missing[0], arrays))
+    if (reason := _discrete(arrays.get("dt"))) is not None:
+        file.wrong(reason)
+    matrices = {key: _matrix(file, key, arrays[key]).tolist() for key in "ABCD" if key in arrays}
+    return {key: value for key, value in section.items() if key != "file"} | matrices
 
 
 def _is_flat(loop: object) -> bool:
@@ -121,11 +141,8 @@ def unfit(C: ArrayLike | None, D: ArrayLike | None, dt: ArrayLike | None, n: int
 
     C, D and the sampling time dt may be None; dt = 0 is continuous time.
     """
-    if dt is not None and np.any(np.asarray(dt) != 0):
-        return (
-            f"dt is {np.asarray(dt).ravel()[0]}, so it is a system in discrete time; "
-            "the loop is in continuous time (MATLAB: d2c)"
-        )
+    if (reason := _discrete(dt)) is not None:
+        return reason
     if C is not None and (np.shape(C) != (n, n) or not np.array_equal(C, np.eye(n))):
         return (
             "C is not the identity, but the loop measures the state; where C has an inverse, "
@@ -134,6 +151,16 @@ def unfit(C: ArrayLike | None, D: ArrayLike | None, dt: ArrayLike | None, n: int
     if D is not None and np.any(np.asarray(D) != 0):
         return "D is not zero, but what the loop measures is the state alone"
     return None
+
+
+def _discrete(dt: ArrayLike | None) -> str | None:
+    """Return why a system with this sampling time cannot be used; None if it is in continuous time."""
+    if dt is None or not np.any(np.asarray(dt) != 0):
+        return None
+    return (
+        f"dt is {np.asarray(dt).ravel()[0]}, so it is a system in discrete time; "
+        "the loop is in continuous time (MATLAB: d2c)"
+    )
 
 
 def write_matrices(path: Path, matrices: Mapping[str, Matrix]) -> None:
@@ -266,19 +293,7 @@ def matrices_of(system: object, gain: ArrayLike | None = None) -> dict[str, Matr
 
     Arguments and errors are those of :func:`model_of`.
     """
-    if isinstance(system, tuple):
-        if len(system) not in (2, 4):
-            raise CallerError(f"the system: a tuple of {len(system)}; give (A, B) or (A, B, C, D)")
-        A, B, C, D = (*system, None, None)[:4]
-        dt = None
-    else:
-        missing = [key for key in ("A", "B", "C", "D") if not hasattr(system, key)]
-        if missing:
-            raise CallerError(
-                f"the system: an object of type {type(system).__name__} has no {missing[0]}; "
-                "give a state space, e.g. with .to_ss(), control.ss, or a tuple (A, B, C, D)"
-            )
-        A, B, C, D, dt = (getattr(system, key, None) for key in ("A", "B", "C", "D", "dt"))
+    A, B, C, D, dt = _parts(system, "the system", (2, 4))
     matrices = {"A": _finite_matrix("A", A), "B": _finite_matrix("B", B)}
     n, m = matrices["B"].shape
     try:
@@ -293,6 +308,39 @@ def matrices_of(system: object, gain: ArrayLike | None = None) -> dict[str, Matr
     if gain is not None and (reason := instability(matrices["A"], matrices["B"], matrices[GAIN])) is not None:
         raise CallerError(f"gain: {reason}")
     return matrices
+
+
+def _parts(system: object, what: str, sizes: tuple[int, ...]) -> Sequence[ArrayLike]:
+    """Return A, B, C, D and dt of an object or a tuple; what it does not have is None."""
+    if isinstance(system, tuple):
+        if len(system) not in sizes:
+            forms = " or ".join(f"({', '.join('ABCD'[:size])})" for size in sizes)
+            raise CallerError(f"{what}: a tuple of {len(system)}; give {forms}")
+        return (*(*system, None, None)[:4], None)
+    if missing := [key for key in "ABCD" if not hasattr(system, key)]:
+        raise CallerError(
+            f"{what}: an object of type {type(system).__name__} has no {missing[0]}; "
+            "give a state space, e.g. with .to_ss(), control.ss, or a tuple (A, B, C, D)"
+        )
+    return [getattr(system, key, None) for key in ("A", "B", "C", "D", "dt")]
+
+
+def controller_of(system: object) -> dict[str, object]:
+    """Return the table ``controller`` of a scenario for a linear controller with states of its own.
+
+    Args:
+        system: dξ/dt = A ξ + B x, u = C ξ + D x: a tuple (A, B, C) or (A, B, C, D), or an object of
+            python-control or SciPy, in continuous time. Without D, u = C ξ + K x.
+
+    Raises:
+        CallerError: it is none, or in discrete time.
+    """
+    *matrices, dt = _parts(system, "controller", (3, 4))
+    if (reason := _discrete(dt)) is not None:
+        raise CallerError(f"controller: {reason}")
+    named = {key: M for key, M in zip("ABCD", matrices, strict=True) if M is not None}
+    rows = {key: _finite_matrix(f"controller.{key}", M).tolist() for key, M in named.items()}
+    return {"kind": "state_space", **rows}
 
 
 def _finite_matrix(name: str, value: ArrayLike) -> Matrix:

@@ -49,15 +49,15 @@ def loop_outputs(
     sections: Sequence[OutputSection] | None,
     state_names: Sequence[str],
     described: Sequence[str] = (),
-    loads: int = 0,
+    further: int = 0,
 ) -> tuple[LoopOutput, ...]:
     """Return the outputs of a loop, p of them.
 
     Args:
-        sections: those of the scenario; None: the states, without loads.
+        sections: those of the scenario; None: the states of the plant.
         state_names: the names of the states.
         described: the states as the plant's kind describes them, e.g. "angle, rad"; may be empty.
-        loads: the number of the last states that are loads.
+        further: the number of the last states that are not the plant's: loads, or the controller's.
 
     Raises:
         ValueError: a row does not fit; the message begins with its key.
@@ -65,7 +65,7 @@ def loop_outputs(
     n = len(state_names)
     if sections is None:
         units = [name_and_unit(text)[1] for text in described] or [""] * n
-        names = zip(state_names[: n - loads], units, strict=False)
+        names = zip(state_names[: n - further], units, strict=False)
         return tuple(LoopOutput(name, unit, _unit_row(i, n)) for i, (name, unit) in enumerate(names))
     found = list[LoopOutput]()
     for index, section in enumerate(sections):

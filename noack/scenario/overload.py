@@ -60,7 +60,7 @@ def _updates(loop: Scenario) -> _Sender:
     longest_ns = None
     if not isinstance(rule, CodedPolicy) and rule.longest_ns < loop.timing.horizon_ns:
         longest_ns = int(rule.latest_ns(loop.timing.measurement_period_ns))
-    return _Sender(datagram_bytes(loop.model.states), longest_ns)
+    return _Sender(datagram_bytes(loop.states), longest_ns)
 
 
 def _actuations(loop: Scenario) -> _Sender:

@@ -35,6 +35,7 @@ from noack.protocol.record_tables import (
 )
 from noack.references.file import FilePiece
 from noack.references.segment import SolutionSegment
+from noack.scenario.controller_states import with_controller_states
 from noack.scenario.loads import loaded_model, loaded_observer, loaded_plant, loaded_trigger
 from noack.scenario.outputs import LoopOutput
 from noack.scenario.overload import refuse_overload
@@ -257,9 +258,8 @@ def resolve_run(scenario: Scenario) -> ResolvedRun:
     sections, first = [], 0
     for section in scenario.loops:
         loop, first = resolved[first], first + section.count
-        if (
-            loop_scenario(scenario, section).model.load is not None
-        ):  # the processes draw the loads of each loop
+        given = loop_scenario(scenario, section)
+        if given.model.load is not None or given.controller.states:  # the processes add these states
             sections.append(section)
             continue
         tables: dict[str, ScenarioSection | None] = {"model": loop.model, "observer": loop.observer}
@@ -312,14 +312,14 @@ def _resolved(loops: Sequence[Scenario]) -> list[Scenario]:
         shared["observer"] = loaded_observer(scenario.model_copy(update=shared))
     else:
         shared["observer"] = _observer(scenario, model)
-    n = model.dimensions[0]
+    n = model.dimensions[0] + scenario.controller.states
     if scenario.outputs is not None:
         shared["outputs"] = tuple(
             section.model_copy(update={"row": (*output.row, *(0.0,) * (n - len(output.row)))})
             for section, output in zip(scenario.outputs, scenario.loop_outputs(), strict=True)
         )
     return [
-        loop.model_copy(update={**shared, "plant": own_plant})
+        with_controller_states(loop.model_copy(update={**shared, "plant": own_plant}))
         for loop, own_plant in zip(loops, cycle(plants), strict=False)
     ]
 
@@ -475,7 +475,7 @@ def setpoint_of(resolved: Scenario) -> tuple[Vector, Vector] | None:
     setpoint = resolved.controller.setpoint
     if not any(setpoint or ()):
         return None
-    x_r = np.concatenate([setpoint, np.zeros(resolved.model.load_states)])
+    x_r = np.concatenate([setpoint, np.zeros(resolved.model.dimensions[0] - len(setpoint))])
     return x_r, input_at(*resolved.model.matrices, x_r)
 
 
@@ -498,7 +498,7 @@ def tables_of(resolved: Scenario) -> Mapping[str, np.dtype[np.void]]:
 
 def shape_of(resolved: Scenario) -> RecordShape:
     """Return the sizes of a loop's vectors in the record."""
-    n, m = resolved.model.states, resolved.model.dimensions[1]
+    n, m = resolved.states, resolved.model.dimensions[1]
     disturbed = {disturbance.at for disturbance in resolved.plant.disturbances}
     if resolved.plant.load_changes:
         disturbed.add("state")

@@ -23,6 +23,7 @@ from noack.impairments.loss_models import Loss
 from noack.impairments.loss_models.trace import TraceLoss
 from noack.impairments.target_loss import number_of_target_loss, with_target_loss
 from noack.protocol.wire_format import MAX_DIMENSION
+from noack.scenario.controller_states import check_controller_states
 from noack.scenario.loads import check_loads, noise_with_loads
 from noack.scenario.references import PieceError, scenario_segments
 from noack.scenario.runtime_parameters import LOSS, put_settings, require_runtime_parameters
@@ -66,6 +67,7 @@ def check_sections(scenario: ScenarioTables) -> None:
     check_setpoint(scenario)
     check_loads(scenario)
     check_reference(scenario)
+    check_controller_states(scenario)
     _check_observer(scenario)
     _check_watchdog(scenario)
     _check_use_of_gain(scenario)
@@ -243,7 +245,7 @@ def _check_actuation_size(scenario: ScenarioTables) -> None:
     """Raise ValueError if the numbers of an actuation do not fit into a message."""
     if scenario.message_sizes.actuation_entries <= MAX_DIMENSION:
         return
-    n, m = scenario.model.states, scenario.model.dimensions[1]
+    n, m = scenario.states, scenario.model.dimensions[1]
     carries_model = scenario.message_sizes.carries_model
     if (predictions := scenario.controller.predictions) > 1:
         state_text = f" and {n} of x_c" if carries_model else ""

@@ -88,7 +88,13 @@ class ScenarioTables(ScenarioSection):
         names = self.model.state_names or (self.model.name and self.model.named.state_names)
         n = self.model.dimensions[0]
         described = self.plant.system.states
-        return loop_outputs(self.outputs, names or entry_names("x", n), described, self.model.load_states)
+        further = n - self.model.plant_states
+        return loop_outputs(self.outputs, names or entry_names("x", n), described, further)
+
+    @property
+    def states(self) -> int:
+        """Number of states of the model with its loads and the controller's states: an update has them."""
+        return self.model.states + self.controller.states
 
     @property
     def between_updates(self) -> str:
@@ -100,7 +106,7 @@ class ScenarioTables(ScenarioSection):
         return f"{words} for {self.controller.update_timeout_s:g} s, then {later}"
 
     def _rows(self) -> list[tuple[str, str]]:
-        n, m = self.model.states, self.model.dimensions[1]
+        n, m = self.states, self.model.dimensions[1]
         rows = [
             ("scenario", self.name + (f": {self.description}" if self.description else "")),
             ("mode", self.between_updates),
@@ -346,14 +352,14 @@ class MessageSizes:
     @property
     def actuation_entries(self) -> int:
         """Number of entries of an actuation: its inputs, with x_c if it carries the model state."""
-        n, m = self.scenario.model.states, self.scenario.model.dimensions[1]
+        n, m = self.scenario.states, self.scenario.model.dimensions[1]
         return m * self.scenario.controller.predictions + n * self.carries_model
 
     def entries(self, flow: Flow) -> int:
         """Number of entries of a message of a flow."""
         return {
             Flow.MEASUREMENT: self.measurement_entries,
-            Flow.UPDATE: self.scenario.model.states,
+            Flow.UPDATE: self.scenario.states,
             Flow.ACTUATION: self.actuation_entries,
             Flow.ACKNOWLEDGEMENT: 0,
         }[flow]

@@ -111,6 +111,9 @@ class ModelSection(ScenarioSection):
     load_states: Annotated[int, Field(ge=0, le=MAX_DIMENSION)] = 0
     """Number of the last states that are loads: a resolved scenario has them in its matrices, in
     place of load."""
+    controller_states: Annotated[int, Field(ge=0, le=MAX_DIMENSION)] = 0
+    """Number of the last states that are the controller's own: a resolved scenario has them in its
+    matrices, in place of those of controller.kind = "state_space"."""
     allow_unstable: bool = False
     """Accept a gain with which the model's closed loop Â + B̂K is unstable."""
 
@@ -134,6 +137,8 @@ class ModelSection(ScenarioSection):
             raise ValueError(
                 "load_states: it is for resolved scenarios, whose matrices have the loads; give load"
             )
+        if self.load_states + self.controller_states >= n:
+            raise ValueError("controller_states: it is for resolved scenarios, whose matrices have them")
         if self.load is not None and self.load != "input":
             _, k = shape(self.load, "load")
             require_shape(self.load, "load", (n, k), "one row per state, one column per load")
@@ -151,7 +156,7 @@ class ModelSection(ScenarioSection):
     def _require_stable(self) -> None:
         (A, B), uses_named_gain = self.matrices, self.gain is None  # a named model's own gain
         K = self.named.K if uses_named_gain else np.array(self.gain)
-        n = self.plant_states
+        n = self.dimensions[0] - self.load_states
         A, B, K = A[:n, :n], B[:n], K[:, :n]  # a constant load does not decay
         key = "parameters" if uses_named_gain else "gain"
         if not np.isfinite(_closed_loop(A, B, K)).all():
@@ -202,8 +207,8 @@ class ModelSection(ScenarioSection):
 
     @property
     def plant_states(self) -> int:
-        """Number of states that are not loads."""
-        return self.dimensions[0] - self.load_states
+        """Number of states that are neither loads nor the controller's."""
+        return self.dimensions[0] - self.load_states - self.controller_states
 
     @property
     def loads(self) -> int:
@@ -214,8 +219,8 @@ class ModelSection(ScenarioSection):
 
     @property
     def states(self) -> int:
-        """Number of states of the model with its loads, which an update carries."""
-        return self.plant_states + self.loads
+        """Number of states of the model with its loads."""
+        return self.plant_states + self.loads + self.controller_states
 
     @property
     def matrices(self) -> tuple[Matrix, Matrix]:

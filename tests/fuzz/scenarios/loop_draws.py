@@ -79,7 +79,29 @@ def loop(of: Chances, *, acknowledged: bool) -> tuple[Table, Model]:
     of.put(content, 0.8, "controller", lambda: controller(of, model, plant, acknowledged=acknowledged))
     if of.chance(0.15) and "observer" not in content:
         loads(of, model, content)
+    elif of.chance(0.1) and not content.keys() & {"observer"} and not plant.get("measurement"):
+        controller_states(of, model, content)
     return content, model
+
+
+def controller_states(of: Chances, model: Model, content: Table) -> None:
+    """Replace the controller of a loop without an observer by one that filters x, and adds the result."""
+    k, table = of.integer(1, 2), dict(content.get("controller", {}))
+    for key in ("kind", "setpoint", "file", "name", "parameters"):
+        table.pop(key, None)
+    matrices = {
+        "A": -of.between(1.0, 5.0) * np.eye(k),
+        "B": 0.1 * np.eye(k, model.n),
+        "C": 0.1 * np.eye(model.m, k),
+    }
+    of.put(matrices, 0.5, "D", lambda: model.K)
+    if of.flag():
+        rows = {key: np.array(matrix).tolist() for key, matrix in matrices.items()}
+        content["controller"] = {"kind": "state_space", **table, **rows}
+    else:
+        file = of.file("controller", ".npz", npz(matrices))
+        content["controller"] = {"kind": "state_space", "file": file, **table}
+    content["trigger"] = {"policy": "decaying", "beta": 0.5, "alpha_per_s": 0.2, "floor": 0.05}
 
 
 def loads(of: Chances, model: Model, content: Table) -> None:
