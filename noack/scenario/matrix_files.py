@@ -12,6 +12,7 @@ import warnings
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -66,9 +67,10 @@ def with_matrices(content: ReadTable, folder: Path, source: str) -> ReadTable:
 
 def _with_controller(section: ReadTable, folder: Path, place: str) -> ReadTable:
     """Return a controller's table with the matrices A, B, C and D of its file."""
-    if not isinstance(section.get("file"), str):
+    name = section.get("file")
+    if not isinstance(name, str):
         return section
-    file = NamedFile(section["file"], folder, place)
+    file = NamedFile(name, folder, place)
     if twice := [key for key in "ABCD" if key in section]:
         file.wrong(f"the file has {twice[0]}, and so has the scenario; give one or the other")
     arrays = _arrays(file)
@@ -310,7 +312,7 @@ def matrices_of(system: object, gain: ArrayLike | None = None) -> dict[str, Matr
     return matrices
 
 
-def _parts(system: object, what: str, sizes: tuple[int, ...]) -> Sequence[ArrayLike]:
+def _parts(system: object, what: str, sizes: tuple[int, ...]) -> Sequence[Any]:
     """Return A, B, C, D and dt of an object or a tuple; what it does not have is None."""
     if isinstance(system, tuple):
         if len(system) not in sizes:

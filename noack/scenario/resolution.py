@@ -475,7 +475,7 @@ def setpoint_of(resolved: Scenario) -> tuple[Vector, Vector] | None:
     setpoint = resolved.controller.setpoint
     if not any(setpoint or ()):
         return None
-    x_r = np.concatenate([setpoint, np.zeros(resolved.model.dimensions[0] - len(setpoint))])
+    x_r = np.concatenate([setpoint, np.zeros(resolved.model.load_states)])
     return x_r, input_at(*resolved.model.matrices, x_r)
 
 
