@@ -65,6 +65,13 @@ def test_updates_may_be_on_their_way_for_more_than_a_period() -> None:
         prove(SHORT, {**find_witness(SHORT, ("x",)).document, "later": 0})
 
 
+def test_no_bound_decays_faster_than_that_of_a_similar_loop() -> None:
+    rate = find_witness(SHORT, ("x",)).document["rate"]
+    assert isinstance(rate, float)
+    slower = find_witness(SHORT, ("x",), near=[{"rate": 0.9 * rate, "bounds": []}]).document
+    assert slower["rate"] == pytest.approx(rate * 0.02 / 0.3)
+
+
 CHANGES: dict[str, Callable[[Loop], Loop]] = {
     "period x 2": lambda loop: loop._replace(
         times=loop.times._replace(least_period=2 * loop.times.least_period, period=2 * loop.times.period)
